@@ -1,0 +1,80 @@
+"""Finding the ROS master: local defaults for the environment, and a probe that never hangs. Imports no rospy."""
+
+from __future__ import annotations
+
+import http.client
+import os
+import threading
+import xmlrpc.client
+from collections.abc import MutableMapping
+from urllib.parse import urlsplit
+
+DEFAULT_URI = "http://127.0.0.1:11311"
+PROBE_SECONDS = 3.0
+RESOLVE_SECONDS = 5.0  # the whole probe; a name server that is silent is not bound by the socket's timeout
+
+
+class MasterError(Exception):
+    """There is no master to work with; the text is one line that says what to do."""
+
+
+def set_local_defaults(environ: MutableMapping[str, str] = os.environ) -> None:
+    """Let ROS work on this machine alone where the environment says nothing else.
+
+    Numbers instead of `localhost`, which rospy waits for without end on a machine without /etc/hosts. ROS_IP is left
+    alone beside a master on another host, which could not call back to loopback.
+    """
+    if not environ.get("ROS_MASTER_URI"):
+        environ["ROS_MASTER_URI"] = DEFAULT_URI
+    if not (environ.get("ROS_IP") or environ.get("ROS_HOSTNAME")) and is_local(environ["ROS_MASTER_URI"]):
+        environ["ROS_IP"] = "127.0.0.1"
+
+
+def is_local(uri: str) -> bool:
+    """Whether `uri` names this machine by a loopback address."""
+    try:
+        host = urlsplit(uri).hostname or ""
+    except ValueError:
+        return False
+    return host in ("localhost", "::1") or host.startswith("127.")
+
+
+def check_master(uri: str) -> None:
+    """Return if a ROS master answers at `uri` within a few seconds, else raise MasterError."""
+    try:
+        parts = urlsplit(uri)
+        usable = parts.scheme == "http" and parts.hostname and parts.port
+    except ValueError:
+        usable = None
+    if not usable:
+        raise MasterError(f"ROS_MASTER_URI is {uri!r}, which is no address like {DEFAULT_URI}")
+    outcome: list[str] = []
+    asking = threading.Thread(target=lambda: outcome.append(_ask(uri)), daemon=True)
+    asking.start()
+    asking.join(RESOLVE_SECONDS)
+    problem = outcome[0] if outcome else "no answer"
+    if problem:
+        raise MasterError(f"no ROS master at {uri} ({problem}): start roscore first, or set ROS_MASTER_URI to where it runs")
+
+
+def _ask(uri: str) -> str:
+    """What is wrong with the master at `uri`; empty where it answers."""
+    try:
+        with xmlrpc.client.ServerProxy(uri, transport=_Transport()) as master:
+            master.getPid("/rosafe_probe")
+    except TimeoutError:
+        return "no answer"
+    except OSError as error:
+        return error.strerror or str(error)
+    except (xmlrpc.client.Error, http.client.HTTPException, ValueError, SyntaxError) as error:
+        return f"not a ROS master: {type(error).__name__}"
+    return ""
+
+
+class _Transport(xmlrpc.client.Transport):
+    """HTTP that gives up."""
+
+    def make_connection(self, host: object) -> http.client.HTTPConnection:
+        connection = super().make_connection(host)  # type: ignore[arg-type]
+        connection.timeout = PROBE_SECONDS
+        return connection
