@@ -1,0 +1,1 @@
+"""ROS side of rosAFE: components, message generation, wire codecs and the node; may import rospy."""
