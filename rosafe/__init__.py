@@ -1,3 +1,23 @@
-"""rosAFE: the Two!Ears auditory front-end for ROS 1, in Python."""
+"""rosAFE: the Two!Ears auditory front-end for ROS 1, in Python.
+
+`rosafe.process` computes auditory representations of a signal in memory; everything else is reached through the nodes.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
 
 __version__ = "0.1.0"
+__all__ = ["__version__", "process"]
+
+if TYPE_CHECKING:
+    from rosafe.offline import process
+
+
+def __getattr__(name: str) -> Any:
+    # The numerics load numpy and scipy, which programs that only speak ROS need not wait for.
+    if name == "process":
+        from rosafe.offline import process
+
+        return process
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

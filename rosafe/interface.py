@@ -141,12 +141,12 @@ class Parameter:
         if isinstance(value, (str, bytes, Mapping)):
             raise self._refuse(value, f"a list of {element}")
         try:
-            items = list(value)
+            items = [item.item() if hasattr(item, "item") else item for item in value]
         except TypeError:  # a single number is a list of one: MATLAB users write 0 for "no list"
             items = [value]
         if len(items) > MAX_SEQUENCE:
             raise ValueError(f"{self.name}: {len(items)} values are too many, at most {MAX_SEQUENCE}")
-        if items and all(_is_zero(item) for item in items) and len(items) == 1:
+        if len(items) == 1 and isinstance(items[0], (int, float)) and items[0] == 0:  # [0] is "no list" likewise
             return []
         return [self._check_scalar(element, item) for item in items]
 
@@ -157,13 +157,15 @@ class Parameter:
             if len(value) > MAX_STRING or "\0" in value:
                 raise self._refuse(value, f"a text of at most {MAX_STRING} characters")
             return value
+        if hasattr(value, "item") and getattr(value, "ndim", 1) == 0:  # numpy's scalars
+            value = value.item()
         if idl == "boolean":
-            if value in (0, 1) and not isinstance(value, str):  # True, False, 0, 1 and numpy's
+            if isinstance(value, (bool, int, float)) and value in (0, 1):
                 return bool(value)
             raise self._refuse(value, "a boolean")
         try:
-            number = float(value) if not isinstance(value, (str, bytes)) else math.nan
-        except (TypeError, ValueError, OverflowError):
+            number = float(value) if isinstance(value, (int, float)) and not isinstance(value, bool) else math.nan
+        except OverflowError:
             number = math.nan
         if not math.isfinite(number):
             raise self._refuse(value, "a finite number")
@@ -225,10 +227,6 @@ class Parameter:
         if not self.choices or value in self.choices:
             return value
         return self.fallback or str(self.default)
-
-
-def _is_zero(value: Any) -> bool:
-    return isinstance(value, (int, float)) and value == 0 or getattr(value, "shape", None) == () and value == 0
 
 
 MAX_STRING = 4096  # characters in any string that a request carries

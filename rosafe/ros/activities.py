@@ -1,0 +1,206 @@
+"""Activities: requests that live until they end, are stopped or are replaced. No ROS in here."""
+
+from __future__ import annotations
+
+import itertools
+import threading
+import time
+from collections.abc import Callable, Iterable
+from typing import Any
+
+from rosafe.interface import MAX_ACTIVITIES, ComponentError, Service
+
+Handler = Callable[["Activity", dict[str, Any]], None]
+
+
+class Activity:
+    """One request under way.
+
+    Its handler runs in a thread of its own, says `running()` once it does what it was asked for, watches
+    `stop_requested`, returns for a normal end and raises ComponentError for any other.
+    """
+
+    def __init__(self, number: int, service: Service, others: Callable[[Activity], None]) -> None:
+        self.id = number
+        self.service = service
+        self.stop_requested = threading.Event()
+        self.stopped_by = ""
+        self.error: ComponentError | None = None
+        self.begun = threading.Event()  # running, or ended without ever running
+        self.ended = threading.Event()
+        self._others = others
+
+    def running(self) -> None:
+        """Tell those who wait for it that the activity does what was asked for."""
+        self.begun.set()
+
+    def interrupt(self, by: str) -> None:
+        """Ask the activity to end; `by` is the service that did so (the first one counts)."""
+        if not self.stop_requested.is_set():
+            self.stopped_by = by
+            self.stop_requested.set()
+
+    def interrupt_others(self) -> None:
+        """End the running activities that this request replaces, and wait until they have ended."""
+        self._others(self)
+
+    def finish(self, error: ComponentError | None) -> None:
+        """Record the end, good or bad."""
+        self.error = error
+        self.ended.set()
+        self.begun.set()
+
+
+class TaskMeter:
+    """What one task of the component measured of itself: cycles, their duration, and its load."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.cycles = 0
+        self.last = self.longest = self.total = 0.0
+        self.load = self.load_max = 0.0
+        self._busy = 0.0
+        self._since = self._start = time.monotonic()
+        self._busy_total = 0.0
+        self._lock = threading.Lock()
+
+    def cycle(self, seconds: float) -> None:
+        """Count one cycle of work that took `seconds`."""
+        with self._lock:
+            self.cycles += 1
+            self.last = seconds
+            self.longest = max(self.longest, seconds)
+            self.total += seconds
+            self._busy += seconds
+            self._busy_total += seconds
+
+    def snapshot(self) -> dict[str, Any]:
+        """The `rusage` member of genom_state: seconds for timings, busy fraction since the last snapshot for load."""
+        with self._lock:
+            now = time.monotonic()
+            if now > self._since:
+                self.load = self._busy / (now - self._since)
+                self.load_max = max(self.load_max, self.load)
+            self._busy, self._since = 0.0, now
+            average = self.total / self.cycles if self.cycles else 0.0
+            return {
+                "cycles": self.cycles % 2**32,
+                "timings": {"last": self.last, "max": self.longest, "avg": average},
+                "load": {
+                    "last": self.load,
+                    "max": self.load_max,
+                    "avg": self._busy_total / max(now - self._start, 1e-9),
+                },
+            }
+
+
+class Activities:
+    """All live activities of one component.
+
+    Parameters
+    ----------
+    tasks : iterable of str
+        Names of the component's tasks; each takes `MAX_ACTIVITIES` less its permanent one.
+    changed : callable
+        Called after every beginning and end.
+    crashed : callable
+        Called with (activity, exception) where a handler failed in a way that no interface exception names.
+    """
+
+    def __init__(
+        self,
+        tasks: Iterable[str],
+        changed: Callable[[], None],
+        crashed: Callable[[Activity, BaseException], None],
+    ) -> None:
+        self.tasks = tuple(tasks)
+        self._changed = changed
+        self._crashed = crashed
+        self._numbers = itertools.count(1)
+        self._live: dict[int, Activity] = {}
+        self._lock = threading.Lock()
+
+    def start(
+        self, service: Service, handler: Handler, values: dict[str, Any], on_end: Callable[[Activity], None] | None
+    ) -> Activity:
+        """Begin an activity; raises ``::genom::too_many_activities`` where its task has no slot left."""
+        with self._lock:
+            if self._full(service):
+                raise ComponentError("::genom::too_many_activities")
+            activity = Activity(next(self._numbers) % 2**32, service, self._interrupt_replaced)
+            self._live[activity.id] = activity
+        thread = threading.Thread(
+            target=self._run, args=(activity, handler, values, on_end), name=f"{service.name}-{activity.id}", daemon=True
+        )
+        thread.start()
+        return activity
+
+    def _full(self, service: Service) -> bool:
+        return sum(a.service.task == service.task for a in self._live.values()) >= MAX_ACTIVITIES - 1
+
+    def full(self, service: Service) -> bool:
+        """Whether the task of `service` has no slot left."""
+        with self._lock:
+            return self._full(service)
+
+    def _run(
+        self,
+        activity: Activity,
+        handler: Handler,
+        values: dict[str, Any],
+        on_end: Callable[[Activity], None] | None,
+    ) -> None:
+        self._changed()
+        error: ComponentError | None = None
+        try:
+            handler(activity, values)
+        except ComponentError as problem:
+            error = problem
+        except MemoryError as problem:
+            self._crashed(activity, problem)
+            error = ComponentError("::genom::syserr", code=12)  # ENOMEM
+        except Exception as problem:  # a fault of ours: the node lives on, the requester and the log are told
+            self._crashed(activity, problem)
+            error = ComponentError("::genom::unkex", what=f"{type(problem).__name__}: {problem}"[:127])
+        finally:
+            with self._lock:
+                self._live.pop(activity.id, None)
+            activity.finish(error)
+            self._changed()
+            if on_end is not None:
+                on_end(activity)
+
+    def _interrupt_replaced(self, newcomer: Activity) -> None:
+        replaced = [
+            a for a in self.live() if a.id < newcomer.id and a.service.name in newcomer.service.interrupts
+        ]
+        self.interrupt(replaced, newcomer.service.name)
+        for activity in replaced:
+            activity.ended.wait()
+
+    def live(self) -> list[Activity]:
+        """The live activities in the order of their numbers."""
+        with self._lock:
+            return sorted(self._live.values(), key=lambda a: a.id)
+
+    def find(self, number: int) -> Activity:
+        """The live activity `number`, or ``::genom::no_such_activity``."""
+        with self._lock:
+            try:
+                return self._live[number]
+            except KeyError:
+                raise ComponentError("::genom::no_such_activity") from None
+
+    def interrupt(self, which: Iterable[Activity], by: str) -> None:
+        """Ask each of `which` to end."""
+        for activity in which:
+            activity.interrupt(by)
+
+    def interrupt_named(self, names: Iterable[str], by: str, wait: float) -> None:
+        """End the activities of the services `names`, and wait for them up to `wait` seconds in all."""
+        wanted = set(names)
+        chosen = [a for a in self.live() if a.service.name in wanted]
+        self.interrupt(chosen, by)
+        deadline = time.monotonic() + wait
+        for activity in chosen:
+            activity.ended.wait(max(0.0, deadline - time.monotonic()))

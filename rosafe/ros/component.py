@@ -1,0 +1,274 @@
+"""A component on the ROS graph, as GenoM makes them: services, actions, ports, genom_state and diagnostics.
+
+Everything that `rosAFE` and `bass` have in common. A node gives its handlers to `ComponentNode`; names, types and
+rules come from the interface table.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import importlib
+import os
+import re
+import threading
+import time
+import traceback
+from collections.abc import Callable
+from typing import Any
+
+import actionlib
+import diagnostic_updater
+import rosgraph
+import rospy
+
+from rosafe import __version__, interface
+from rosafe.interface import ComponentError
+from rosafe.ros.activities import Activities, Activity, Handler, TaskMeter
+
+STATE_PERIOD = 1.0  # seconds between two genom_state messages at the most
+STOP_WAIT = 2.0  # seconds that Stop waits for what it ends
+
+
+class ComponentNode:
+    """The ROS side of one component. Make it after `rospy.init_node`; call `start` once all handlers are in.
+
+    Parameters
+    ----------
+    component : interface.Component
+        The table to follow.
+    bad_value : callable
+        Turns the ValueError of a refused argument into the component's exception.
+    """
+
+    def __init__(self, component: interface.Component, bad_value: Callable[[ValueError], ComponentError]) -> None:
+        self.component = component
+        self.name = rospy.get_name()
+        self.finished = threading.Event()
+        self.activities = Activities(component.tasks, self._state_changed, self._log_crash)
+        self.meters = {task: TaskMeter(task) for task in component.tasks}
+        self.diagnostics = diagnostic_updater.Updater()
+        self.diagnostics.setHardwareID("none")
+        self._bad_value = bad_value
+        self._srv = importlib.import_module(f"{component.name}.srv")
+        self._msg = importlib.import_module(f"{component.name}.msg")
+        self._handlers: dict[str, Callable[..., Any]] = {}
+        self._connectors: dict[str, Callable[[str], None]] = {}
+        self._control = threading.Lock()
+        self._turn = threading.Event()
+        self._keep: list[Any] = []  # services and action servers, alive as long as the node
+        self._digest = _digest(component)
+        rospy.set_param(f"{self.name}/actionlib_status_frequency", 0)  # status is published on change only
+        self.function("connect_port", self._connect_port)
+        self.function("connect_service", self._connect_service)
+        self.function("abort_activity", self._abort_activity)
+        self.function("kill", self._kill)
+
+    # --- for the node ---
+
+    def activity(self, name: str, handler: Handler) -> None:
+        """Let `handler(activity, values)` serve the activity request `name`."""
+        self._handlers[self.component.service(name).name] = handler
+
+    def function(self, name: str, handler: Callable[[dict[str, Any]], dict[str, Any] | None]) -> None:
+        """Let `handler(values)` serve the function `name`; it returns the outputs by name."""
+        self._handlers[self.component.service(name).name] = handler
+
+    def input_port(self, name: str, connect: Callable[[str], None]) -> None:
+        """Let `connect(topic)` take the input port `name` to a topic that is known to be published."""
+        self._connectors[name] = connect
+
+    def advertise(self, port: str, message_class: Any, element: str = "") -> rospy.Publisher:
+        """The latched publisher of an output port, or of one element of a multiple port."""
+        topic = f"{self.name}/{self.component.port(port).name}" + (f"/{element}" if element else "")
+        return rospy.Publisher(topic, message_class, latch=True, queue_size=1, tcp_nodelay=True)
+
+    def start(self) -> None:
+        """Offer all services and actions, and publish genom_state from now on."""
+        missing = {s.name for s in self.component.services} - set(self._handlers)
+        if missing:
+            raise RuntimeError(f"no handler for {', '.join(sorted(missing))}")
+        self._state = self.advertise("genom_state", self._msg.genom_state_component)
+        for service in self.component.services:
+            serve = self._serve_activity if service.activity else self._serve_function
+            self._keep.append(
+                rospy.Service(
+                    f"{self.name}/{service.name}",
+                    getattr(self._srv, service.name),
+                    lambda request, service=service, serve=serve: serve(service, request),
+                )
+            )
+            if service.activity:
+                self._keep.append(self._action_server(service))
+        threading.Thread(target=self._publish_state, name="genom_state", daemon=True).start()
+
+    def shutdown(self, by: str) -> None:
+        """End all activities and wait for them (bounded); `by` is what their exceptions name."""
+        self.finished.set()
+        self.activities.interrupt_named((s.name for s in self.component.activities), by, wait=STOP_WAIT)
+        self._turn.set()
+
+    # --- requests ---
+
+    def _values(self, service: interface.Service, request: Any) -> dict[str, Any]:
+        try:
+            return service.from_ros(request)
+        except ValueError as problem:
+            raise self._bad_value(problem) from None
+
+    def _begin(
+        self, service: interface.Service, request: Any, on_end: Callable[[Activity], None] | None = None
+    ) -> Activity:
+        if self.finished.is_set():
+            raise ComponentError("::genom::disallowed", "the component is shutting down")
+        return self.activities.start(service, self._handlers[service.name], self._values(service, request), on_end)
+
+    def _serve_activity(self, service: interface.Service, request: Any) -> Any:
+        response = getattr(self._srv, f"{service.name}Response")
+        try:
+            activity = self._begin(service, request)
+        except ComponentError as problem:
+            return response(False, self._told(service, problem))
+        activity.begun.wait()
+        if activity.ended.is_set() and activity.error is not None:
+            return response(False, self._told(service, activity.error))
+        return response(True, "")
+
+    def _serve_function(self, service: interface.Service, request: Any) -> Any:
+        response = getattr(self._srv, f"{service.name}Response")
+        with self._control:
+            try:
+                outputs = self._handlers[service.name](self._values(service, request)) or {}
+            except ComponentError as problem:
+                return response(genom_success=False, genom_exdetail=self._told(service, problem))
+            except Exception as problem:  # a fault of ours must reach the caller and the log, and not end the node
+                rospy.logerr(f"{service.name}: {traceback.format_exc()}")
+                error = ComponentError("::genom::unkex", what=f"{type(problem).__name__}: {problem}"[:127])
+                return response(genom_success=False, genom_exdetail=error.exdetail)
+        if service.interrupts:
+            self.activities.interrupt_named(service.interrupts, service.name, wait=STOP_WAIT)
+        self._state_changed()
+        whole = outputs.pop("response", None)  # a handler may bring a response of its own, with arrays in it
+        return whole if whole is not None else response(genom_success=True, genom_exdetail="", **outputs)
+
+    def _told(self, service: interface.Service, problem: ComponentError) -> str:
+        """The exdetail for the client; the log gets the reason, which often has no place on the wire."""
+        rospy.logwarn(f"{service.name}: {problem.ex}" + (f": {problem}" if str(problem) != problem.ex else ""))
+        return problem.exdetail
+
+    def _action_server(self, service: interface.Service) -> actionlib.ActionServer:
+        result = getattr(self._msg, f"{service.name}Result")
+
+        def answer(goal: Any, error: ComponentError | None) -> None:
+            text = self._told(service, error) if error is not None else ""
+            goal.set_succeeded(result(genom_success=error is None, genom_exdetail=text))
+
+        def accept(goal: Any) -> None:
+            if self.activities.full(service):
+                goal.set_rejected(text=f"{service.task}: too many activities")
+                return
+            goal.set_accepted()
+            try:
+                activity = self._begin(service, goal.get_goal(), lambda activity: answer(goal, activity.error))
+            except ComponentError as problem:
+                answer(goal, problem)
+            else:
+                goals[goal.get_goal_id().id] = activity
+
+        def cancel(goal: Any) -> None:
+            activity = goals.get(goal.get_goal_id().id)
+            if activity is not None:
+                activity.interrupt("client")
+
+        goals: dict[str, Activity] = _Recent()
+        server = actionlib.ActionServer(
+            f"{self.name}/{service.name}", getattr(self._msg, f"{service.name}Action"), accept, cancel, auto_start=False
+        )
+        server.start()
+        return server
+
+    # --- what every component answers ---
+
+    def _connect_port(self, values: dict[str, Any]) -> None:
+        local, remote = values["local"], values["remote"]
+        if local not in self._connectors:
+            known = ", ".join(sorted(self._connectors)) or "none"
+            raise ComponentError("::genom::no_such_inport", f"no input port {local!r}; there are: {known}")
+        if not rosgraph.names.is_legal_name(remote):
+            raise ComponentError("::genom::no_such_outport", f"{remote!r} is no topic name")
+        namespace = rosgraph.names.namespace(self.name)
+        topic = rosgraph.names.resolve_name(remote, namespace, rospy.names.get_mappings())
+        published = dict(rosgraph.Master(self.name).getPublishedTopics(""))
+        if topic not in published:
+            raise ComponentError("::genom::no_such_outport", f"nobody publishes {topic}; see `rostopic list`")
+        wanted = interface.ros_type(self.component.port(local).idl)
+        if published[topic].split("/")[-1] not in (wanted, "*"):
+            raise ComponentError("::genom::port_io", f"{topic} is a {published[topic]}, {local} takes {wanted}")
+        self._connectors[local](topic)
+
+    def _connect_service(self, values: dict[str, Any]) -> None:
+        raise ComponentError("::genom::no_such_remote", f"{self.component.name} has no remote services")
+
+    def _abort_activity(self, values: dict[str, Any]) -> None:
+        self.activities.find(values["activity"]).interrupt("abort_activity")
+
+    def _kill(self, values: dict[str, Any]) -> None:
+        # A moment for the answer to leave before the process goes.
+        threading.Timer(0.1, self.finished.set).start()
+
+    # --- genom_state ---
+
+    def _state_changed(self) -> None:
+        self._turn.set()
+
+    def _log_crash(self, activity: Activity, problem: BaseException) -> None:
+        text = "".join(traceback.format_exception(problem))
+        rospy.logerr(f"{activity.service.name} (activity {activity.id}): {text}")
+
+    def _publish_state(self) -> None:
+        while not rospy.is_shutdown():
+            self._turn.clear()
+            self._state.publish(self._state_message())
+            self.diagnostics.update()
+            if self.finished.is_set():
+                return
+            self._turn.wait(STATE_PERIOD)
+            # A burst of requests makes one message, not one each.
+            self.finished.wait(0.005)
+
+    def _state_message(self) -> Any:
+        msg = self._msg
+        live = self.activities.live()
+        tasks = []
+        for name, meter in self.meters.items():
+            usage = meter.snapshot()
+            tasks.append(
+                msg.genom_state_task(
+                    name=name,
+                    rusage=msg.genom_state_rusage(
+                        cycles=usage["cycles"],
+                        timings=msg.genom_state_stats(**usage["timings"]),
+                        load=msg.genom_state_stats(**usage["load"]),
+                    ),
+                    activity=[
+                        msg.genom_state_activity(id=a.id, name=a.service.name) for a in live if a.service.task == name
+                    ],
+                )
+            )
+        return msg.genom_state_component(task=tasks, digest=self._digest, date=_DATE, version=__version__)
+
+
+_DATE = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(os.path.getmtime(interface.__file__)))
+
+
+def _digest(component: interface.Component) -> str:
+    """A fingerprint of the interface, 32 hex digits."""
+    return hashlib.md5(re.sub(r" at 0x\w+", "", repr(component)).encode()).hexdigest()
+
+
+class _Recent(dict):
+    """A dict that forgets its oldest entries; actionlib never says when a goal is no longer of interest."""
+
+    def __setitem__(self, key: str, value: Activity) -> None:
+        super().__setitem__(key, value)
+        while len(self) > 1000:
+            del self[next(iter(self))]

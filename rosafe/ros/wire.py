@@ -1,0 +1,224 @@
+"""Fast serialisation: the ROS wire format of every struct of the interface table, from and to numpy without lists.
+
+`message_class` makes a subclass of a generated message class with the same type name, md5 and bytes on the wire,
+whose sample arrays are numpy arrays. Publishers give it arrays (or the pieces of a sliding window); subscribers get
+read-only views of the received buffer:
+
+>>> from rosafe.ros import wire                                        # doctest: +SKIP
+>>> TimeFrequency = wire.message_class("rosAFE", "::rosAFE::TimeFrequencySignalPortStruct")
+>>> rospy.Subscriber("/rosAFE/ildPort/ild", TimeFrequency, lambda m: print(m.left.shape, m.left[:, -1]))
+
+In such a message `left` and `right` are arrays of shape (frames,), (channels, frames) or (lags, channels, frames)
+instead of the nested `data`, `dataN` and `dataNxN` lists of the generated class.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import io
+import struct
+from collections.abc import Callable
+from typing import Any
+
+import genpy
+import numpy as np
+
+from rosafe import interface
+from rosafe.ros import generate
+from rosafe.tree.window import WindowView
+
+_SCALARS = {
+    "boolean": "?",
+    "unsigned short": "H",
+    "short": "h",
+    "unsigned long": "I",
+    "long": "i",
+    "unsigned long long": "Q",
+    "long long": "q",
+    "float": "f",
+    "double": "d",
+    "char": "b",
+    "octet": "B",
+}
+_SAMPLES = {"double": np.dtype("<f8"), "long": np.dtype("<i4"), "float": np.dtype("<f4")}
+# How many levels of nested sequences a signal struct wraps; its one member is the sequence.
+_SIGNALS = {"::rosAFE::signalOneD": 1, "::rosAFE::signalND": 2, "::rosAFE::signalNxND": 3}
+_COUNT = struct.Struct("<I")
+
+
+# --- writing ----------------------------------------------------------------------------------------------------
+
+
+def nested_dtype(shape: tuple[int, ...], samples: np.dtype) -> np.dtype:
+    """The wire layout of one nested sequence of regular `shape`: at every level a uint32 count, then the elements."""
+    layout = samples
+    for length in reversed(shape):
+        layout = np.dtype([("n", "<u4"), ("d", layout, (length,))])
+    return layout
+
+
+def _pack_nested(view: WindowView) -> memoryview:
+    """The bytes of a signal of shape (..., frames), each level preceded by its count."""
+    samples = np.dtype("<f8")
+    record = np.zeros((), nested_dtype(view.shape, samples))
+    level = record
+    for length in view.shape:
+        level["n"] = length
+        level = level["d"]
+    view.copy_to(level)
+    return memoryview(record.reshape(1).view(np.uint8))
+
+
+def _write_signal(out: io.BytesIO, levels: int, value: Any) -> None:
+    view = value if isinstance(value, WindowView) else WindowView.of(np.asarray(value, dtype=np.float64))
+    if view.shape == (0,) and levels > 1:  # an absent signal, such as ILD's `right`
+        out.write(_COUNT.pack(0))
+        return
+    if len(view.shape) != levels:
+        raise genpy.SerializationError(f"a signal of shape {view.shape} where {levels} dimensions are wanted")
+    out.write(_pack_nested(view))
+
+
+def _member(value: Any, name: str) -> Any:
+    return value[name] if isinstance(value, dict) else getattr(value, name)
+
+
+def encode(out: io.BytesIO, component: interface.Component, idl: str, value: Any) -> None:
+    """Append `value` (a message, or a dict by member name) of IDL type `idl` to `out`."""
+    if idl in _SCALARS:
+        out.write(struct.pack("<" + _SCALARS[idl], value))
+    elif idl == "string":
+        text = value.encode() if isinstance(value, str) else value
+        out.write(_COUNT.pack(len(text)))
+        out.write(text)
+    elif idl in _SIGNALS:
+        _write_signal(out, _SIGNALS[idl], value)
+    elif idl.startswith("sequence<"):
+        element = idl[len("sequence<") : -1]
+        out.write(_COUNT.pack(len(value)))
+        if element in _SAMPLES:
+            out.write(memoryview(np.ascontiguousarray(value, _SAMPLES[element])).cast("B") if len(value) else b"")
+        else:
+            for item in value:
+                encode(out, component, element, item)
+    else:
+        for name, kind in component.structs[idl]:
+            encode(out, component, kind, _member(value, name))
+
+
+# --- reading ----------------------------------------------------------------------------------------------------
+
+
+class _Reader:
+    """A cursor over one received message; every read is checked against the end of the buffer."""
+
+    def __init__(self, data: bytes) -> None:
+        self.data = memoryview(data)
+        self.at = 0
+
+    def take(self, size: int) -> memoryview:
+        if size < 0 or self.at + size > len(self.data):
+            raise genpy.DeserializationError(f"message ends at {len(self.data)} bytes, {self.at + size} are needed")
+        piece = self.data[self.at : self.at + size]
+        self.at += size
+        return piece
+
+    def count(self) -> int:
+        return int(_COUNT.unpack(self.take(4))[0])
+
+    def samples(self, dtype: np.dtype) -> np.ndarray:
+        return np.frombuffer(self.take(self.count() * dtype.itemsize), dtype)
+
+
+def _read_signal(reader: _Reader, levels: int) -> np.ndarray | list[Any]:
+    """A regular nested sequence as one strided view; a ragged one (no sender of ours makes it) as lists of arrays."""
+    start = reader.at
+    shape = []
+    for _ in range(levels):
+        shape.append(reader.count())
+        if shape[-1] == 0:
+            break
+    reader.at = start
+    if len(shape) < levels or shape[-1] == 0:
+        if levels == 1 or shape[0] == 0:
+            reader.count()
+            return np.zeros((0,) * levels)
+        return _read_ragged(reader, levels)
+    if np.prod(shape, dtype=float) * 8 > len(reader.data):
+        return _read_ragged(reader, levels)  # raises where it passes the end
+    layout = nested_dtype(tuple(shape), np.dtype("<f8"))
+    if start + layout.itemsize <= len(reader.data):
+        record = np.frombuffer(reader.take(layout.itemsize), layout)[0:1]
+        level = record
+        regular = True
+        for length in shape:
+            regular = regular and bool(np.all(level["n"] == length))
+            level = level["d"]
+        if regular:
+            return np.asarray(level[0])
+        reader.at = start
+    return _read_ragged(reader, levels)
+
+
+def _read_ragged(reader: _Reader, levels: int) -> np.ndarray | list[Any]:
+    if levels == 1:
+        return reader.samples(_SAMPLES["double"])
+    return [_read_ragged(reader, levels - 1) for _ in range(reader.count())]
+
+
+def decode(reader: _Reader, component: interface.Component, idl: str) -> Any:
+    """The next value of IDL type `idl`: structs as dicts, signals and numeric sequences as read-only arrays."""
+    if idl in _SCALARS:
+        form = "<" + _SCALARS[idl]
+        return struct.unpack(form, reader.take(struct.calcsize(form)))[0]
+    if idl == "string":
+        return str(reader.take(reader.count()), "utf-8", "replace")
+    if idl in _SIGNALS:
+        return _read_signal(reader, _SIGNALS[idl])
+    if idl.startswith("sequence<"):
+        element = idl[len("sequence<") : -1]
+        if element in _SAMPLES:
+            return reader.samples(_SAMPLES[element])
+        return [decode(reader, component, element) for _ in range(reader.count())]
+    return {name: decode(reader, component, kind) for name, kind in component.structs[idl]}
+
+
+# --- message classes --------------------------------------------------------------------------------------------
+
+
+def _codec(
+    component: interface.Component, members: tuple[tuple[str, str], ...]
+) -> tuple[Callable[[Any, io.BytesIO], None], Callable[[Any, bytes], Any]]:
+    def serialize(self: Any, out: io.BytesIO) -> None:
+        for name, kind in members:
+            encode(out, component, kind, getattr(self, name))
+
+    def deserialize(self: Any, data: bytes) -> Any:
+        reader = _Reader(data)
+        for name, kind in members:
+            setattr(self, name, decode(reader, component, kind))
+        return self
+
+    return serialize, deserialize
+
+
+@functools.cache
+def message_class(package: str, idl: str) -> Any:
+    """The message class of struct `idl` in ROS package `package` (`rosAFE` or `bass`), with arrays instead of lists."""
+    generate.ensure_messages()
+    component = interface.COMPONENTS[package]
+    generated = getattr(importlib.import_module(f"{package}.msg"), interface.ros_type(idl))
+    serialize, deserialize = _codec(component, component.structs[idl])
+    return type(generated.__name__, (generated,), {"__slots__": (), "serialize": serialize, "deserialize": deserialize})
+
+
+@functools.cache
+def response_class(package: str, service: str) -> Any:
+    """The response class of a service whose outputs hold signals (getSignals), with arrays instead of lists."""
+    generate.ensure_messages()
+    component = interface.COMPONENTS[package]
+    generated = getattr(importlib.import_module(f"{package}.srv"), f"{service}Response")
+    members = (("genom_success", "boolean"), ("genom_exdetail", "string"), *component.service(service).outputs)
+    serialize, deserialize = _codec(component, members)
+    return type(generated.__name__, (generated,), {"__slots__": (), "serialize": serialize, "deserialize": deserialize})
