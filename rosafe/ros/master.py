@@ -78,3 +78,28 @@ class _Transport(xmlrpc.client.Transport):
         connection = super().make_connection(host)  # type: ignore[arg-type]
         connection.timeout = PROBE_SECONDS
         return connection
+
+
+class PrivateMaster:
+    """A master of this process' own on a free port of the loopback interface, up once made.
+
+    Use it as a context manager, or `close` it. `uri` is its address.
+    """
+
+    def __init__(self) -> None:
+        import rosmaster.master
+
+        set_local_defaults()
+        self._master = rosmaster.master.Master(port=0)
+        self._master.start()
+        self.uri = f"http://127.0.0.1:{self._master.master_node.port}"
+
+    def close(self) -> None:
+        """End the master; nodes that it knows notice at their next call."""
+        self._master.stop()
+
+    def __enter__(self) -> PrivateMaster:
+        return self
+
+    def __exit__(self, *exception: object) -> None:
+        self.close()

@@ -1,0 +1,40 @@
+"""Fixtures of the whole suite; tests/harness.py is what stands behind them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from rosafe.ros import generate
+from tests import harness
+
+generate.ensure_messages()  # test modules import rosAFE.msg and bass.msg at their top
+
+@pytest.fixture(scope="session")
+def graph(tmp_path_factory: pytest.TempPathFactory) -> Iterator[harness.Graph]:
+    """The ROS graph that all tests of this process share: a master on a free port."""
+    with harness.shared_graph(tmp_path_factory.mktemp("home")) as graph:
+        yield graph
+
+
+@pytest.fixture
+def private_graph(tmp_path: Path) -> Iterator[tuple[harness.Graph, harness.MasterProcess]]:
+    """A ROS graph of the test's own, and its master, which may be killed and started again."""
+    with harness.private_graph(tmp_path) as pair:
+        yield pair
+
+
+@pytest.fixture
+def bass_node(graph: harness.Graph) -> Iterator[harness.Process]:
+    """A running bass-ros, new for the test."""
+    with graph.node("bass-ros") as process:
+        yield process
+
+
+@pytest.fixture
+def rosafe_node(graph: harness.Graph) -> Iterator[harness.Process]:
+    """A running rosAFE-ros, new for the test."""
+    with graph.node("rosAFE-ros") as process:
+        yield process
