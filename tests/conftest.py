@@ -12,6 +12,7 @@ from tests import harness
 
 generate.ensure_messages()  # test modules import rosAFE.msg and bass.msg at their top
 
+
 @pytest.fixture(scope="session")
 def graph(tmp_path_factory: pytest.TempPathFactory) -> Iterator[harness.Graph]:
     """The ROS graph that all tests of this process share: a master on a free port."""

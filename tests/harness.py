@@ -11,7 +11,7 @@ of its own in a process of its own, for tests that kill it. Everything started d
 
 from __future__ import annotations
 
-import importlib
+import itertools
 import os
 import signal
 import socket
@@ -58,7 +58,7 @@ def wait_for(condition: Callable[[], T], timeout: float = 10.0, what: str | Call
             return value
         if time.monotonic() > end:
             told = what() if callable(what) else what
-            raise AssertionError(f"not within {timeout:g} s: {told or getattr(condition, '__name__', condition)}")
+            raise AssertionError(f"not within {timeout:g} s: {told or condition}")
         time.sleep(0.02)
 
 
@@ -74,7 +74,8 @@ class Process:
 
     def __init__(self, command: list[str], env: dict[str, str], cwd: Path | None = None) -> None:
         self.command = command
-        self._out, self._err = tempfile.TemporaryFile(), tempfile.TemporaryFile()
+        self._out: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115  # open as long as the process is of interest
+        self._err: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115
         # setpriv: the kernel ends the child should this process be killed before it can clean up
         self._popen = subprocess.Popen(
             ["setpriv", "--pdeathsig", "KILL", "--", *command],
@@ -136,7 +137,9 @@ class Process:
     def __enter__(self) -> Process:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         self.close()
         if error is not None:
             print(self)  # pytest shows it with the failure
@@ -178,7 +181,7 @@ class Graph:
         """A node of scripts/ (``bass-ros``, ``rosAFE-ros``) that is up: all its services are there."""
         component = interface.COMPONENTS[Path(script).name.removesuffix("-ros")]
         name = component.name
-        for option, value in zip(arguments, arguments[1:]):
+        for option, value in itertools.pairwise(arguments):
             if option in ("-i", "--name", "--instance"):
                 name = value
         self._forget(f"/{name}")
@@ -191,18 +194,16 @@ class Graph:
         self, *command: str, timeout: float = 30.0, check: bool = True, stdin: str = "", **env: str
     ) -> subprocess.CompletedProcess[str]:
         """Run a command to its end; AssertionError where it fails (unless told not to check) or takes too long."""
-        try:
-            done = subprocess.run(
-                list(command),
-                env={**self.env, **env},
-                input=stdin,
-                text=True,
-                capture_output=True,
-                timeout=timeout,
-                check=False,
-            )
-        except subprocess.TimeoutExpired as late:
-            raise AssertionError(f"{' '.join(command)}: not done after {timeout:g} s\n{late.stdout}\n{late.stderr}") from late
+        done = subprocess.run(
+            ["timeout", "-k", "2", str(timeout), *command],
+            env={**self.env, **env},
+            input=stdin,
+            text=True,
+            capture_output=True,
+            check=False,
+        )
+        if done.returncode == 124:
+            raise AssertionError(f"{' '.join(command)}: not done after {timeout:g} s\n{done.stdout}\n{done.stderr}")
         if check and done.returncode != 0:
             raise AssertionError(f"{' '.join(command)}: exit {done.returncode}\n{done.stdout}\n{done.stderr}")
         return done
@@ -263,13 +264,18 @@ class Graph:
 
         `service` is a name like ``/bass/Acquire``; the types are those of the package that its node was made from.
         """
+        import rospy
         import rosservice
 
         self.client()
-        return importlib.import_module("rospy").ServiceProxy(service, rosservice.get_service_class_by_name(service))(**fields)
+        return rospy.ServiceProxy(service, rosservice.get_service_class_by_name(service))(**fields)
 
     def message(
-        self, topic: str, message_class: Any = None, accept: Callable[[Any], bool] = lambda message: True, timeout: float = 10.0
+        self,
+        topic: str,
+        message_class: Any = None,
+        accept: Callable[[Any], bool] = lambda message: True,
+        timeout: float = 10.0,
     ) -> Any:
         """The first message on `topic` that `accept` takes (the latched one counts)."""
         with self.collect(topic, message_class) as messages:

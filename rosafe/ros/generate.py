@@ -69,7 +69,9 @@ def split_action(name: str, text: str) -> dict[str, str]:
             parts[-1] += line
     if len(parts) != 3:
         raise GenerationError(f"{name}.action has {len(parts)} parts instead of goal, result and feedback")
-    messages = {name + kind: _ACTION_HEAD + part for kind, part in zip(("Goal", "Result", "Feedback"), parts)}
+    messages = {
+        name + kind: _ACTION_HEAD + part for kind, part in zip(("Goal", "Result", "Feedback"), parts, strict=True)
+    }
     for kind, body in _ACTION_MESSAGES.items():
         messages[name + kind] = _ACTION_HEAD + body.format(name)
     return messages
@@ -248,7 +250,8 @@ def _ahead(directories: list[Path], variable: str) -> str:
 def main(argv: list[str] | None = None) -> int:
     """``python3 -m rosafe.ros.generate``: generate what is missing or stale and print the folder that holds it."""
     parser = argparse.ArgumentParser(
-        prog="rosafe.ros.generate", description="Generate the message modules where missing or stale; print their folder."
+        prog="rosafe.ros.generate",
+        description="Generate the message modules where missing or stale; print their folder.",
     )
     parser.parse_args(argv)
     try:

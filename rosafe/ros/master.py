@@ -54,7 +54,9 @@ def check_master(uri: str) -> None:
     asking.join(RESOLVE_SECONDS)
     problem = outcome[0] if outcome else "no answer"
     if problem:
-        raise MasterError(f"no ROS master at {uri} ({problem}): start roscore first, or set ROS_MASTER_URI to where it runs")
+        raise MasterError(
+            f"no ROS master at {uri} ({problem}): start roscore first, or set ROS_MASTER_URI to where it runs"
+        )
 
 
 def _ask(uri: str) -> str:

@@ -7,7 +7,7 @@ import sys
 import tempfile
 from pathlib import Path
 
-PYPI_DIR = Path("/usr/local/lib/rosafe/python")  # scripts/install puts the packages here that Debian lacks or has broken
+PYPI_DIR = Path("/usr/local/lib/rosafe/python")  # where scripts/install puts what Debian lacks or has broken
 CODE_DIR = Path(__file__).resolve().parents[2]  # the folder that holds the `rosafe` package
 
 

@@ -108,9 +108,7 @@ def _parse(component: interface.Component, arguments: list[str]) -> argparse.Nam
 # --- start ------------------------------------------------------------------------------------------------------
 
 
-def _start(
-    component: interface.Component, build: Callable[[str], Node], instance: str, remappings: list[str]
-) -> Node:
+def _start(component: interface.Component, build: Callable[[str], Node], instance: str, remappings: list[str]) -> Node:
     import rosgraph.names
 
     mappings = dict(remapping.split(":=", 1) for remapping in remappings)
