@@ -1,0 +1,47 @@
+"""Recursive filters that run on from block to block: cascades of first- and second-order sections."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import signal
+
+from .guard import flush
+
+
+class Cascade:
+    """Second-order sections with their state, from rest.
+
+    Parameters
+    ----------
+    sections : ndarray (S, 6)
+        Real or complex sections as in `scipy.signal.sosfilt`: b0, b1, b2, 1, a1, a2.
+    """
+
+    def __init__(self, sections: NDArray[Any]) -> None:
+        self.sections = np.ascontiguousarray(sections)
+        self.state: NDArray[Any] | None = None  # (S, *rows, 2), direct form II transposed; None is rest
+
+    def reset(self) -> None:
+        """Back to rest."""
+        self.state = None
+
+    def process(self, block: NDArray[Any]) -> NDArray[Any]:
+        """Filter (*rows, N) along its last axis. Other rows than in the last block mean a start from rest."""
+        shape = (len(self.sections), *block.shape[:-1], 2)
+        kind = np.result_type(self.sections, block)
+        if self.state is None or self.state.shape != shape:
+            self.state = np.zeros(shape, kind)
+        if block.size == 0:
+            return np.zeros(block.shape, kind)
+        result, state = signal.sosfilt(self.sections, block, zi=self.state)
+        self.state = np.ascontiguousarray(state)
+        flush(self.state)
+        return result
+
+
+def leaky_integrator(retention: float) -> NDArray[np.float64]:
+    """The section of u[n] = r u[n-1] + (1-r) x[n]; its first state value is r u[n]."""
+    return np.array([[1.0 - retention, 0.0, 0.0, 1.0, -retention, 0.0]])

@@ -1,0 +1,72 @@
+"""The interaural cross-correlation stage."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from scipy import fft
+
+from .checks import MAX_SAMPLES, positive
+from .framing import FramedStage, frame_parameters
+from .guard import FloatArray, limited
+from .stage import Parameter
+
+EPSILON = 2.2204e-16  # the original's literal
+BATCH = 2**18  # samples per ear that are transformed at a time, to bound memory and stay in the cache
+
+
+class CrossCorrelation(FramedStage):
+    """Normalised correlation of the ears over lags and frames, (2, C, N) to (C, L, F).
+
+    c[m] = sum over n of l[n+m] r[n] / sqrt(sum l**2 sum r**2 + eps), l and r being windowed frames, no mean removed,
+    for lags m from -M to M, M = ceil(cc_maxDelaySec fs). A positive lag means that the left ear hears it later. Lags
+    of a window's length and beyond give 0, and so does silence.
+    """
+
+    PREFIX = "cc"
+    PARAMETERS = {**frame_parameters("cc"), "cc_maxDelaySec": Parameter(0.0011, positive)}
+
+    @property
+    def lags(self) -> FloatArray:
+        """The lags (L,) in seconds, ascending."""
+        return np.arange(-self._max_lag, self._max_lag + 1) / self.sample_rate
+
+    def output_rows(self, rows: tuple[int, ...]) -> tuple[int, ...]:
+        return (rows[1], 2 * self._max_lag + 1)
+
+    def process(self, block: FloatArray) -> FloatArray:
+        samples = self._buffer.append(limited(self._checked(block)))
+        frames = self._framing.frames(samples)  # (2, C, F, w)
+        channel_count, frame_count, size = frames.shape[1:]
+        reach = min(self._max_lag, size - 1)  # beyond, frames do not overlap
+        inner = slice(self._max_lag - reach, self._max_lag + reach + 1)
+        result = np.zeros((channel_count, 2 * self._max_lag + 1, frame_count))
+        transform = fft.next_fast_len(size + reach, real=True)
+        at_once = max(1, BATCH // transform)  # frames of one channel, or of as many channels as go with them
+        channels_at_once = max(1, at_once // max(1, frame_count))
+        for first in range(0, channel_count, channels_at_once):
+            channels = slice(first, first + channels_at_once)
+            for begin in range(0, frame_count, at_once):
+                part = slice(begin, begin + at_once)
+                correlations = self._correlate(frames[:, channels, part], reach, transform)
+                result[channels, inner, part] = correlations.swapaxes(1, 2)
+        self._buffer.drop(frame_count * self._framing.hop)
+        return result
+
+    def _correlate(self, frames: FloatArray, reach: int, transform: int) -> FloatArray:
+        """Frames (2, C, F, w) of both ears to (C, F, 2 reach + 1)."""
+        left, right = frames * self._framing.window
+        energies = np.einsum("cfi,cfi->cf", left, left) * np.einsum("cfi,cfi->cf", right, right)
+        spectrum = fft.rfft(left, transform) * np.conj(fft.rfft(right, transform))
+        circular = fft.irfft(spectrum, transform)
+        lags = np.concatenate((circular[..., transform - reach :], circular[..., : reach + 1]), axis=-1)
+        return lags / np.sqrt(energies + EPSILON)[..., np.newaxis]
+
+    def _build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
+        lag = values["cc_maxDelaySec"] * self.sample_rate
+        if lag > MAX_SAMPLES:
+            raise ValueError(f"cc_maxDelaySec: too long, {lag:.6g} samples")
+        super()._build(values, changed)
+        self._max_lag = math.ceil(lag)

@@ -1,0 +1,29 @@
+"""The interaural level difference stage."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from .framing import FramedStage, frame_parameters
+from .guard import FloatArray, limited
+
+EPSILON = 2.2204e-16  # the original's literal
+
+
+class Ild(FramedStage):
+    """Level of the right ear over the left in dB, (2, C, N) to (C, F); positive where the right ear is louder.
+
+    10 log10((E_R + eps) / (E_L + eps)) with E = mean((window x)**2) per frame; silence gives 0 dB.
+    """
+
+    PREFIX = "ild"
+    PARAMETERS = frame_parameters("ild")
+
+    def output_rows(self, rows: tuple[int, ...]) -> tuple[int, ...]:
+        return rows[1:]
+
+    def process(self, block: FloatArray) -> FloatArray:
+        samples = self._buffer.append(limited(self._checked(block)))
+        left, right = self._framing.mean_squares(samples)
+        self._buffer.drop(left.shape[-1] * self._framing.hop)
+        return 10 * np.log10((right + EPSILON) / (left + EPSILON))

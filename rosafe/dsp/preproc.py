@@ -1,0 +1,145 @@
+"""The pre-processing stage: DC removal, pre-emphasis, gain control, level scaling and middle ear, in this order."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from scipy import signal
+
+from .cascade import Cascade, leaky_integrator
+from .checks import flag, positive, round_half_away, within, word
+from .guard import FloatArray, limited
+from .middle_ear import MODELS, middle_ear_fir
+from .stage import Parameter, Stage
+
+DC_ORDER = 4
+LEVEL_OF_RMS_1 = 100.0  # dB SPL
+
+
+class PreProc(Stage):
+    """Conditioning of the ear signals, (2, N) to (2, N). Any change of a parameter starts all filters anew.
+
+    Level scaling multiplies by 10**((100 - pp_refSPLdB) / 20): inside, an RMS of 1 stands for 100 dB SPL.
+    """
+
+    PARAMETERS = {
+        "pp_bRemoveDC": Parameter(False, flag),
+        "pp_cutoffHzDC": Parameter(20.0, positive),
+        "pp_bPreEmphasis": Parameter(False, flag),
+        "pp_coefPreEmphasis": Parameter(0.97, within(-1.0, 1.0)),
+        "pp_bNormalizeRMS": Parameter(False, flag),
+        "pp_intTimeSecRMS": Parameter(0.5, positive),
+        "pp_bLevelScaling": Parameter(False, flag),
+        "pp_refSPLdB": Parameter(100.0, within(-200.0, 400.0)),
+        "pp_bMiddleEarFiltering": Parameter(False, flag),
+        "pp_middleEarModel": Parameter("jepsen", word(*MODELS, jespen="jepsen")),
+        "pp_bUnityComp": Parameter(False, flag),
+    }
+    BLOCK = ("2 ears", "samples")
+
+    def process(self, block: FloatArray) -> FloatArray:
+        samples = limited(self._checked(block))
+        for step in self._steps:
+            samples = step.process(samples)
+        return samples * self._gain
+
+    def reset(self) -> None:
+        for step in self._steps:
+            step.reset()
+
+    def _build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
+        steps: list[Cascade | PreEmphasis | GainControl | Fir] = []
+        if values["pp_bRemoveDC"]:
+            cutoff = values["pp_cutoffHzDC"]
+            if cutoff >= self.sample_rate / 2:
+                raise ValueError(f"pp_cutoffHzDC: {cutoff:.12g} Hz is not below half the sample rate")
+            steps.append(Cascade(signal.butter(DC_ORDER, cutoff, "highpass", fs=self.sample_rate, output="sos")))
+        if values["pp_bPreEmphasis"]:
+            steps.append(PreEmphasis(abs(values["pp_coefPreEmphasis"])))
+        if values["pp_bNormalizeRMS"]:
+            steps.append(GainControl(values["pp_intTimeSecRMS"] * self.sample_rate))
+        if values["pp_bMiddleEarFiltering"]:
+            fir = middle_ear_fir(values["pp_middleEarModel"], self.sample_rate, values["pp_bUnityComp"])
+            steps.append(Fir(fir))
+        self._steps = steps
+        # A constant factor may come after the middle ear as well as before it.
+        self._gain = 10 ** ((LEVEL_OF_RMS_1 - values["pp_refSPLdB"]) / 20) if values["pp_bLevelScaling"] else 1.0
+
+
+class PreEmphasis:
+    """y[n] = x[n] - c x[n-1]."""
+
+    def __init__(self, coefficient: float) -> None:
+        self.coefficient = coefficient
+        self.reset()
+
+    def reset(self) -> None:
+        self.last = np.zeros((2, 1))  # x[n-1]
+
+    def process(self, block: FloatArray) -> FloatArray:
+        """Filter (2, N)."""
+        delayed = np.concatenate((self.last, block), axis=-1)
+        self.last = delayed[:, -1:].copy()
+        return block - self.coefficient * delayed[:, :-1]
+
+
+class GainControl:
+    """Division by the running RMS of the louder ear: y = x / max over ears of (sqrt(p) + 1e-8).
+
+    p[n] = r p[n-1] + (1 - r) x[n]**2 with r = exp(-1 / time_constant). Each ear starts with its first block that is not
+    all zero, from the mean square p[-1] of that block's first samples, one time constant at most. This start is the
+    one thing in the chain that depends on where blocks are cut.
+
+    Parameters
+    ----------
+    time_constant : float
+        In samples.
+    """
+
+    FLOOR = 1e-8
+
+    def __init__(self, time_constant: float) -> None:
+        self.retention = float(np.exp(-1 / time_constant))
+        self.start_span = max(1.0, time_constant)
+        self.reset()
+
+    def reset(self) -> None:
+        self.started = [False, False]
+        self.power = [Cascade(leaky_integrator(self.retention)) for _ in range(2)]
+
+    def process(self, block: FloatArray) -> FloatArray:
+        """Normalise (2, N)."""
+        gain = np.zeros(block.shape[-1])
+        for ear, samples in enumerate(block):
+            squares = samples * samples
+            if not self.started[ear]:
+                self._start(ear, squares)
+            if self.started[ear]:
+                np.maximum(gain, np.sqrt(self.power[ear].process(squares)), out=gain)
+        return block / (gain + self.FLOOR)
+
+    def _start(self, ear: int, squares: FloatArray) -> None:
+        if squares.any():
+            span = round_half_away(min(len(squares), self.start_span))
+            self.power[ear].state = np.array([[self.retention * squares[:span].mean(), 0.0]])
+            self.started[ear] = True
+
+
+class Fir:
+    """A finite impulse response, by direct convolution: exact, and no faster by FFT at some 500 taps."""
+
+    def __init__(self, taps: FloatArray) -> None:
+        self.taps = taps
+        self.reset()
+
+    def reset(self) -> None:
+        self.history = np.zeros((2, len(self.taps) - 1))
+
+    def process(self, block: FloatArray) -> FloatArray:
+        """Filter (2, N)."""
+        if block.shape[-1] == 0:
+            return block
+        samples = np.concatenate((self.history, block), axis=-1)
+        self.history = samples[:, block.shape[-1] :].copy()
+        return np.array([np.convolve(ear, self.taps, mode="valid") for ear in samples])

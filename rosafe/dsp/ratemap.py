@@ -1,0 +1,46 @@
+"""The ratemap (cochleagram) stage: smoothed firing rate per frame."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from .cascade import Cascade, leaky_integrator
+from .checks import positive, word
+from .framing import FramedStage, frame_parameters
+from .guard import FloatArray, limited
+from .stage import Parameter
+
+
+class Ratemap(FramedStage):
+    """Leaky integration and mean per frame, (2, C, N) to (2, C, F).
+
+    u[n] = r u[n-1] + (1 - r) x[n] with r = exp(-1 / (fs rm_decaySec)); then, per frame, mean(window u) for `magnitude`
+    or mean((window u)**2) for `power`. A change of rm_decaySec or rm_scaling starts the integrator anew; the samples
+    integrated before stay buffered.
+    """
+
+    PREFIX = "rm"
+    PARAMETERS = {
+        **frame_parameters("rm"),
+        "rm_scaling": Parameter("power", word("power", "magnitude")),
+        "rm_decaySec": Parameter(0.008, positive),
+    }
+
+    def process(self, block: FloatArray) -> FloatArray:
+        samples = self._buffer.append(self._integrator.process(limited(self._checked(block))))
+        power = self._values["rm_scaling"] == "power"
+        rates = self._framing.mean_squares(samples) if power else self._framing.means(samples)
+        self._buffer.drop(rates.shape[-1] * self._framing.hop)
+        return rates
+
+    def reset(self) -> None:
+        super().reset()
+        self._integrator.reset()
+
+    def _build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
+        super()._build(values, changed)
+        if changed & {"rm_decaySec", "rm_scaling"}:
+            retention = float(np.exp(-1 / (self.sample_rate * values["rm_decaySec"])))
+            self._integrator = Cascade(leaky_integrator(retention))
