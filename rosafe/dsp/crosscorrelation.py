@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from scipy import fft
@@ -11,7 +11,7 @@ from scipy import fft
 from .checks import MAX_SAMPLES, positive
 from .framing import FramedStage, frame_parameters
 from .guard import FloatArray, limited
-from .stage import Parameter
+from .stage import Parameter, ParameterTable
 
 EPSILON = 2.2204e-16  # the original's literal
 BATCH = 2**18  # samples per ear that are transformed at a time, to bound memory and stay in the cache
@@ -26,7 +26,7 @@ class CrossCorrelation(FramedStage):
     """
 
     PREFIX = "cc"
-    PARAMETERS = {**frame_parameters("cc"), "cc_maxDelaySec": Parameter(0.0011, positive)}
+    PARAMETERS: ClassVar[ParameterTable] = {**frame_parameters("cc"), "cc_maxDelaySec": Parameter(0.0011, positive)}
 
     @property
     def lags(self) -> FloatArray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from .drnl import DrnlBank
 from .erb import erb_rate, erb_rate_to_frequency
 from .gammatone import GammatoneBank
 from .guard import FloatArray, limited
-from .stage import Parameter, Stage
+from .stage import Parameter, ParameterTable, Stage
 
 MAX_CHANNELS = 1024
 
@@ -48,7 +48,7 @@ class Filterbank(Stage):
         Of the last block: 2 abs(H x) for gammatone; for DRNL see `DrnlBank`.
     """
 
-    PARAMETERS = {
+    PARAMETERS: ClassVar[ParameterTable] = {
         "fb_type": Parameter("gammatone", word("gammatone", "drnl")),
         "fb_lowFreqHz": Parameter(80.0, positive),
         "fb_highFreqHz": Parameter(8000.0, positive),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from scipy import signal
@@ -10,7 +10,7 @@ from scipy import signal
 from .cascade import Cascade
 from .checks import word
 from .guard import LIMIT, FloatArray, limited
-from .stage import Parameter, Stage
+from .stage import Parameter, ParameterTable, Stage
 
 # Butterworth low-pass after the rectification: order, cutoff (Hz), how many in cascade
 LOWPASS = {
@@ -39,7 +39,7 @@ class InnerHairCell(Stage):
     ========== ===================================================================================================
     """
 
-    PARAMETERS = {"ihc_method": Parameter("dau", word(*METHODS))}
+    PARAMETERS: ClassVar[ParameterTable] = {"ihc_method": Parameter("dau", word(*METHODS))}
 
     @property
     def needs_envelope(self) -> bool:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 import numpy as np
 
 from .framing import FramedStage, frame_parameters
 from .guard import FloatArray, limited
+from .stage import ParameterTable
 
 EPSILON = 2.2204e-16  # the original's literal
 
@@ -17,7 +20,7 @@ class Ild(FramedStage):
     """
 
     PREFIX = "ild"
-    PARAMETERS = frame_parameters("ild")
+    PARAMETERS: ClassVar[ParameterTable] = frame_parameters("ild")
 
     def output_rows(self, rows: tuple[int, ...]) -> tuple[int, ...]:
         return rows[1:]

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
 from .checks import flag, whole
 from .guard import FloatArray, limited
-from .stage import Parameter, Stage
+from .stage import Parameter, ParameterTable, Stage
 
 
 class Input(Stage):
@@ -17,7 +17,7 @@ class Input(Stage):
     Full scale of int32 becomes 1 with the default of 2**31 - 1. Samples beyond ±1e70 are taken as that.
     """
 
-    PARAMETERS = {
+    PARAMETERS: ClassVar[ParameterTable] = {
         "in_doNormalize": Parameter(True, flag),
         "in_normalizeValue": Parameter(2**31 - 1, whole(1, 2**64 - 1)),
     }

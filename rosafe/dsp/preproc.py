@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from scipy import signal
@@ -11,7 +11,7 @@ from .cascade import Cascade, leaky_integrator
 from .checks import flag, positive, round_half_away, within, word
 from .guard import FloatArray, limited
 from .middle_ear import MODELS, middle_ear_fir
-from .stage import Parameter, Stage
+from .stage import Parameter, ParameterTable, Stage
 
 DC_ORDER = 4
 LEVEL_OF_RMS_1 = 100.0  # dB SPL
@@ -23,7 +23,7 @@ class PreProc(Stage):
     Level scaling multiplies by 10**((100 - pp_refSPLdB) / 20): inside, an RMS of 1 stands for 100 dB SPL.
     """
 
-    PARAMETERS = {
+    PARAMETERS: ClassVar[ParameterTable] = {
         "pp_bRemoveDC": Parameter(False, flag),
         "pp_cutoffHzDC": Parameter(20.0, positive),
         "pp_bPreEmphasis": Parameter(False, flag),

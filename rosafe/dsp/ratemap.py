@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -10,7 +10,7 @@ from .cascade import Cascade, leaky_integrator
 from .checks import positive, word
 from .framing import FramedStage, frame_parameters
 from .guard import FloatArray, limited
-from .stage import Parameter
+from .stage import Parameter, ParameterTable
 
 
 class Ratemap(FramedStage):
@@ -22,7 +22,7 @@ class Ratemap(FramedStage):
     """
 
     PREFIX = "rm"
-    PARAMETERS = {
+    PARAMETERS: ClassVar[ParameterTable] = {
         **frame_parameters("rm"),
         "rm_scaling": Parameter("power", word("power", "magnitude")),
         "rm_decaySec": Parameter(0.008, positive),

@@ -18,6 +18,9 @@ class Parameter(NamedTuple):
     check: Check
 
 
+ParameterTable = Mapping[str, Parameter]
+
+
 class Stage:
     """One processor of the chain: blocks in, blocks out, state kept between.
 
@@ -34,7 +37,7 @@ class Stage:
         One line that names the parameter.
     """
 
-    PARAMETERS: ClassVar[Mapping[str, Parameter]]
+    PARAMETERS: ClassVar[ParameterTable]
     BLOCK: ClassVar[tuple[str, ...]] = ("2 ears", "channels", "samples")
 
     def __init__(self, sample_rate: float, **parameters: Any) -> None:
@@ -94,7 +97,5 @@ class Stage:
         """`block` as contiguous float64 of the right shape, or ValueError."""
         array = np.asarray(block)
         if array.dtype.kind not in "iuf" or array.ndim != len(self.BLOCK) or array.shape[0] != 2:
-            raise ValueError(
-                f"block: {array.dtype} of shape {array.shape} is not numbers in ({', '.join(self.BLOCK)})"
-            )
+            raise ValueError(f"block: {array.dtype} of shape {array.shape} is not numbers in ({', '.join(self.BLOCK)})")
         return np.asarray(array, np.float64, order="C")
