@@ -1,0 +1,103 @@
+"""Audio files as int32 samples, scaled the same way wherever the project reads one (capture node, offline tools)."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+
+import numpy as np
+import soundfile
+
+FULL_SCALE = 2**31 - 1  # what 1.0 in a float file becomes
+_FLOAT_SUBTYPES = ("FLOAT", "DOUBLE", "VORBIS", "OPUS", "MPEG")  # the decoder's own numbers are floats
+_UNKNOWN_LENGTH = 0x7FFFF000  # a writer to a pipe leaves a data size from here up: it could not know the length
+
+
+class AudioFileError(Exception):
+    """The file cannot be read; the text is one line that says why."""
+
+
+def to_int32(signal: np.ndarray) -> np.ndarray:
+    """Float samples, full scale 1.0, as int32: scaled by 2^31 - 1, rounded, clipped; NaN is silence."""
+    scaled = np.nan_to_num(np.asarray(signal, dtype=np.float64), posinf=1.0, neginf=-1.0) * FULL_SCALE
+    return np.clip(np.rint(scaled), -(2**31), FULL_SCALE).astype(np.int32)
+
+
+class AudioFile:
+    """A sound file of any kind that libsndfile knows (WAV, FLAC, Ogg, AIFF, MP3...), read from disk bit by bit.
+
+    Attributes
+    ----------
+    sample_rate : int
+        Hz.
+    channels, frames : int
+        Size of the file; at least 1 each.
+
+    Raises
+    ------
+    AudioFileError
+        The file is missing, unreadable, not a sound file, empty or cut off.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path = Path(os.path.expanduser(path))
+        try:
+            if self.path.exists() and not self.path.is_file():  # a FIFO would block the open for ever
+                raise AudioFileError(f"{self.path} is not a regular file")
+            with self.path.open("rb") as probe:
+                if not probe.read(1):
+                    raise AudioFileError(f"{self.path} is empty")
+        except (OSError, ValueError) as problem:  # ValueError: a path that no file can have
+            raise AudioFileError(f"{self.path}: {getattr(problem, 'strerror', None) or problem}") from None
+        try:
+            self._file = soundfile.SoundFile(str(self.path))
+        except soundfile.LibsndfileError as problem:
+            raise AudioFileError(f"{self.path} is not a sound file: {problem.error_string}") from None
+        self.sample_rate = int(self._file.samplerate)
+        self.channels = int(self._file.channels)
+        self.frames = int(self._file.frames)
+        self._float = self._file.subtype.startswith(_FLOAT_SUBTYPES)
+        try:
+            self._check_whole()
+        except AudioFileError:
+            self.close()
+            raise
+
+    def _check_whole(self) -> None:
+        if self.frames == 0:
+            raise AudioFileError(f"{self.path} holds no samples")
+        # libsndfile shortens a WAV or AIFF that was cut off to what is there; only its log tells.
+        cut = re.search(r"^\s*(?:data|SSND)\s*:\s*(\d+) \(should be (\d+)\)", self._file.extra_info, re.MULTILINE)
+        if cut and int(cut[2]) < int(cut[1]) < _UNKNOWN_LENGTH:
+            raise AudioFileError(f"{self.path} is cut off: {cut[2]} of {cut[1]} bytes of sound are there")
+        self.seek(self.frames - 1)  # compressed files show it where their end cannot be reached
+        if self.read(1).shape[1] != 1:
+            raise AudioFileError(f"{self.path} is cut off before its {self.frames} frames")
+        self.seek(0)
+
+    def seek(self, frame: int) -> None:
+        """Go on reading at `frame`, from 0 to `frames`."""
+        try:
+            self._file.seek(frame)
+        except soundfile.LibsndfileError as problem:
+            raise AudioFileError(f"{self.path} is cut off or damaged: {problem.error_string}") from None
+
+    def read(self, frames: int) -> np.ndarray:
+        """The next `frames` frames, fewer at the end of the file.
+
+        Returns
+        -------
+        ndarray of int32, (channels, n)
+            Samples of 8, 16 or 24 bits fill the upper bits; float samples are converted by `to_int32`.
+        """
+        try:
+            if self._float:
+                return to_int32(self._file.read(frames, dtype="float64", always_2d=True).T)
+            return np.asarray(self._file.read(frames, dtype="int32", always_2d=True).T)
+        except soundfile.LibsndfileError as problem:
+            raise AudioFileError(f"{self.path} is cut off or damaged: {problem.error_string}") from None
+
+    def close(self) -> None:
+        """Close the file."""
+        self._file.close()

@@ -1,0 +1,187 @@
+"""DedicatedSocket: the Audio port's content over plain TCP, for clients without ROS. No ROS in here.
+
+A request is a text with ``Read Port``, ``N <int>`` and ``nfr <int>``, such as ``Read Port - N 4410 - nfr 1``, with or
+without a line end: up to N frames from frame nfr on. The answer is little-endian: int32 n, int32 loss (frames from nfr
+on that were no longer there), int64 nfr to ask for next, n int32 of the left ear, n int32 of the right ear.
+"""
+
+from __future__ import annotations
+
+import re
+import selectors
+import socket
+import struct
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+from rosafe.bass.capture import Snapshot
+
+DEFAULT_HOST, DEFAULT_PORT = "127.0.0.1", 8081
+MAX_CLIENTS = 31
+QUIET_SECONDS = 0.05  # after which a request without a line end is taken for complete
+DEAD_SECONDS = 10.0  # without taking a byte of an answer, a client counts as dead
+_MAX_REQUEST = 4096  # bytes without a request in them, then they are forgotten
+_MARK = b"Read Port"
+_COUNT, _FIRST = re.compile(rb"N[^\w-]*(\d{1,40})"), re.compile(rb"nfr[^\w-]*(\d{1,40})")
+_HEADER = struct.Struct("<iiq")
+
+
+def read_frames(snapshot: Snapshot | None, count: int, first: int) -> bytes:
+    """The answer to a request for `count` frames from index `first` on."""
+    if snapshot is None:
+        return _HEADER.pack(0, 0, min(first, 2**63 - 1))
+    last, length = snapshot.last_frame_index, len(snapshot.left)
+    oldest = max(0, last - length + 1)
+    start = max(first, oldest)
+    loss = start - first
+    n = max(0, min(count, last - start + 1, length))
+    at = length - (last - start + 1)
+    header = _HEADER.pack(n, min(loss, 2**31 - 1), min(start + n, 2**63 - 1))
+    parts = (channel[at : at + n].astype("<i4", copy=False).tobytes() for channel in (snapshot.left, snapshot.right))
+    return header + b"".join(parts) if n else header
+
+
+def take_requests(inbox: bytearray, quiet: bool) -> Iterator[tuple[int, int]]:
+    """Take all complete requests (count, first) out of `inbox`.
+
+    One is complete at a line end, where the next begins, or when nothing more came for a while (`quiet`).
+    """
+    ends = [match.end() for match in re.finditer(rb"[\n\r\0]", inbox)]
+    complete = max(ends[-1] if ends else 0, inbox.rfind(_MARK))
+    if quiet and _parse(bytes(inbox[complete:])):
+        complete = len(inbox)
+    texts = bytes(inbox[:complete])
+    del inbox[:complete]
+    del inbox[: max(0, len(inbox) - _MAX_REQUEST)]
+    for text in texts.split(_MARK)[1:]:
+        request = _parse(_MARK + text)
+        if request:
+            yield request
+
+
+def _parse(text: bytes) -> tuple[int, int] | None:
+    """The (count, first) that `text` asks for, if it does."""
+    count, first = _COUNT.search(text), _FIRST.search(text)
+    return (int(count[1]), int(first[1])) if text.startswith(_MARK) and count and first else None
+
+
+class _Client:
+    def __init__(self, connection: socket.socket) -> None:
+        self.connection = connection
+        self.inbox = bytearray()
+        self.requests: list[tuple[int, int]] = []
+        self.outbox = memoryview(b"")
+        self.pending = False  # whether the inbox may hold a request without a line end
+        self.heard = self.moved = time.monotonic()
+
+
+class DedicatedSocket:
+    """The server. Each client has at most one answer under way, so a slow one takes no more memory than a window.
+
+    Parameters
+    ----------
+    snapshot : callable
+        Returns the port's content, or None where there was no acquisition yet.
+    host, port : str, int
+        Address to serve.
+    report : callable
+        Takes a line about clients turned away.
+
+    Raises
+    ------
+    OSError
+        The address cannot be had.
+    """
+
+    def __init__(
+        self, snapshot: Callable[[], Snapshot | None], host: str, port: int, report: Callable[[str], None]
+    ) -> None:
+        self._snapshot = snapshot
+        self._report = report
+        self._clients: dict[int, _Client] = {}
+        self._listener = socket.create_server((host, port), backlog=5)  # with SO_REUSEADDR
+        self._listener.setblocking(False)
+        self.address = self._listener.getsockname()
+        self._selector = selectors.DefaultSelector()
+        self._selector.register(self._listener, selectors.EVENT_READ)
+
+    def serve(self, stopping: threading.Event) -> None:
+        """Answer clients until told to stop; then close all connections."""
+        try:
+            while not stopping.is_set():
+                for key, events in self._selector.select(0.01 if self._expects_quiet() else 0.05):
+                    if key.fileobj is self._listener:
+                        self._accept()
+                    else:
+                        self._attend(key.data, events)
+                self._look_after_quiet()
+        finally:
+            for client in list(self._clients.values()):
+                self._drop(client)
+            self._selector.close()
+            self._listener.close()
+
+    def _expects_quiet(self) -> bool:
+        return any(client.pending for client in self._clients.values())
+
+    def _accept(self) -> None:
+        try:
+            connection, address = self._listener.accept()
+        except OSError:  # gone before we came, or no descriptor left: nobody to answer
+            return
+        if len(self._clients) >= MAX_CLIENTS:
+            self._report(f"DedicatedSocket: {address[0]} turned away, {MAX_CLIENTS} clients are connected")
+            connection.close()
+            return
+        connection.setblocking(False)
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)  # finds those who left without a word
+        client = _Client(connection)
+        self._clients[connection.fileno()] = client
+        self._selector.register(connection, selectors.EVENT_READ, client)
+
+    def _drop(self, client: _Client) -> None:
+        del self._clients[client.connection.fileno()]
+        self._selector.unregister(client.connection)
+        client.connection.close()
+
+    def _attend(self, client: _Client, events: int) -> None:
+        try:
+            if events & selectors.EVENT_READ:
+                data = client.connection.recv(_MAX_REQUEST)
+                if not data:
+                    return self._drop(client)
+                client.heard = time.monotonic()
+                client.inbox += data
+                client.requests += take_requests(client.inbox, quiet=False)
+                client.pending = bool(client.inbox)
+            self._send(client)
+        except OSError:  # reset by the client: no more to do for it
+            self._drop(client)
+
+    def _send(self, client: _Client) -> None:
+        while client.requests or client.outbox:
+            if not client.outbox:
+                client.outbox = memoryview(read_frames(self._snapshot(), *client.requests.pop(0)))
+                client.moved = time.monotonic()
+            try:
+                sent = client.connection.send(client.outbox)
+            except BlockingIOError:
+                break
+            client.outbox = client.outbox[sent:]
+            client.moved = time.monotonic()
+        # While an answer is under way nothing more is read; what the client sends waits in the kernel.
+        wanted = selectors.EVENT_WRITE if client.outbox else selectors.EVENT_READ
+        self._selector.modify(client.connection, wanted, client)
+
+    def _look_after_quiet(self) -> None:
+        """Answer requests without a line end, and drop clients who do not take their answers."""
+        now = time.monotonic()
+        for client in list(self._clients.values()):
+            if client.outbox and now - client.moved > DEAD_SECONDS:
+                self._drop(client)
+            elif client.pending and not client.outbox and now - client.heard > QUIET_SECONDS:
+                client.pending = False
+                client.requests += take_requests(client.inbox, quiet=True)
+                self._attend(client, 0)

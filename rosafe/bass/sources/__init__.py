@@ -1,0 +1,49 @@
+"""Where sound comes from: `open_source` turns a device name into a source. No ROS in here."""
+
+from __future__ import annotations
+
+import threading
+
+from rosafe.bass.sources.base import Chunk, Source
+
+__all__ = ["BUILT_IN", "Chunk", "Source", "open_source"]
+
+DEFAULT_RATE = 44100
+# What ListDevices says of the sources that need no hardware: name, contents.
+BUILT_IN = (
+    ("file:PATH", "a sound file in real time; ?loop=1 repeats it, ?start=SECONDS skips its beginning"),
+    ("scene:", "a source that walks from far left to far right and back; ?seconds=10&level=-30&seed=0"),
+)
+
+
+def open_source(device: str, sample_rate: int, frames_per_chunk: int, stopping: threading.Event) -> Source:
+    """Open `device` for reading.
+
+    Parameters
+    ----------
+    device : str
+        ``file:PATH``, ``scene:`` or the name of an ALSA capture device, each with options after a question mark.
+    sample_rate : int
+        Hz; 0 is the file's own rate, or 44100 with other sources.
+    frames_per_chunk : int
+        Length of what `Source.read` returns.
+    stopping : threading.Event
+        Once set, a waiting `read` returns None.
+
+    Raises
+    ------
+    interface.ComponentError
+        ``::bass::e_device`` or ``::bass::e_hwparams``, with one line that says why.
+    """
+    # Imported here: a missing library must only hurt those who use its source.
+    if device.startswith("file:"):
+        from rosafe.bass.sources.file import FileSource
+
+        return FileSource(device[len("file:") :], sample_rate, frames_per_chunk, stopping)
+    if device.startswith("scene:"):
+        from rosafe.bass.sources.scene import SceneSource
+
+        return SceneSource(device[len("scene:") :], sample_rate or DEFAULT_RATE, frames_per_chunk, stopping)
+    from rosafe.bass.sources.alsa import AlsaSource
+
+    return AlsaSource(device, sample_rate or DEFAULT_RATE, frames_per_chunk, stopping)

@@ -1,0 +1,259 @@
+"""The source for ALSA capture devices, through pyalsaaudio."""
+
+from __future__ import annotations
+
+import errno
+import os
+import select
+import threading
+import time
+from typing import Any
+
+import numpy as np
+
+from rosafe.bass.sources.base import Chunk, device_error, hwparams_error, parse_options
+from rosafe.bass.sources.libasound import complaints, load_alsaaudio
+from rosafe.interface import ComponentError
+
+RING_CHUNKS = 8  # asked for; the device may give fewer
+MAX_CHANNELS = 32  # of a device of which two are picked
+POLL_SECONDS = 0.1  # at most, so that a stop is seen
+STALL_SECONDS = 2.0  # without a frame, beyond the chunk's own length, a device counts as gone
+RETRIES, RETRY_SECONDS = 5, 0.2  # to reopen a device that failed
+
+
+def _channel_pair(text: str) -> tuple[int, int]:
+    wanted = f"two channel numbers from 1 to {MAX_CHANNELS}, such as 3,4"
+    words = text.split(",")
+    if len(words) != 2 or not all(word.isascii() and word.isdigit() and len(word) <= 2 for word in words):
+        raise ValueError(wanted)
+    left, right = (int(word) for word in words)
+    if not (1 <= left <= MAX_CHANNELS and 1 <= right <= MAX_CHANNELS):
+        raise ValueError(wanted)
+    return left, right
+
+
+class AlsaSource:
+    """Two channels of an ALSA PCM, S32_LE, with exactly the sample rate and period that were asked for.
+
+    An overrun is an event with a length: the frames lost, estimated from the clock, come as zeros or as the gap
+    before a chunk, and count. A device that fails is reopened a few times before it counts as gone.
+
+    Parameters
+    ----------
+    device : str
+        PCM name, with ``?channels=L,R`` for the channels (from 1) of a device that has others than two.
+    sample_rate : int
+        Hz.
+    frames_per_chunk : int
+        The device's period.
+    """
+
+    def __init__(self, device: str, sample_rate: int, frames_per_chunk: int, stopping: threading.Event) -> None:
+        self.name = device
+        self.sample_rate = sample_rate
+        self.overruns = 0
+        self.lost_frames = 0
+        self._pcm_name, _, options = device.partition("?")
+        self._channels: tuple[int, int] | None = parse_options(device, options, {"channels": _channel_pair}).get(
+            "channels"
+        )
+        self._frames_per_chunk = frames_per_chunk
+        self._stopping = stopping
+        self._alsa = load_alsaaudio()
+        self._pcm: Any = None
+        self._width = 2
+        self._open()
+        self._samples = np.zeros((2, frames_per_chunk), np.int32)
+        self._filled = 0
+        self._rest = np.zeros((2, 0), np.int32)  # read from the device beyond the end of a chunk
+        self._missing = 0  # lost frames that come next in the stream
+        self._heard: float | None = None  # when the newest frame that was read left the converter
+        self._time = 0.0
+        self._failures = 0  # attempts to reopen the device since it last gave sound
+        self._barren = 0  # overruns since then
+
+    # --- opening ---
+
+    def _open(self) -> None:
+        if self._channels is None:
+            self._pcm = self._open_with(2)
+            return
+        for self._width in range(max(self._channels), MAX_CHANNELS + 1):
+            self._pcm = self._open_with(self._width, exact_channels=False)
+            if self._pcm is not None:
+                return
+        raise hwparams_error(f"{self.name} has no {max(self._channels)} channels")
+
+    def _open_with(self, channels: int, exact_channels: bool = True) -> Any:
+        """The PCM, open and exact; None where only the number of channels is wrong and another one may be tried."""
+        with complaints() as heard:
+            try:
+                pcm = self._alsa.PCM(
+                    type=self._alsa.PCM_CAPTURE,
+                    mode=self._alsa.PCM_NONBLOCK,  # a busy device must not block the open, nor a mute one the stop
+                    device=self._pcm_name,
+                    rate=self.sample_rate,
+                    channels=channels,
+                    format=self._alsa.PCM_FORMAT_S32_LE,
+                    periodsize=self._frames_per_chunk,
+                    periods=RING_CHUNKS,
+                )
+            except self._alsa.ALSAAudioError as problem:
+                raise self._refusal(str(problem), heard) from None
+            info = pcm.info()
+            faults = self._faults(pcm, info, channels)
+        if not faults:
+            return pcm
+        pcm.close()
+        if not exact_channels and info["channels"] != channels:
+            return None
+        raise hwparams_error(f"{self.name}: {'; '.join(faults)}")
+
+    def _refusal(self, problem: str, heard: list[str]) -> ComponentError:
+        """e_device for a PCM that is not there, is busy or broken; what libasound said of it last comes along."""
+        text = problem.removesuffix(f" [{self._pcm_name}]")
+        hint = {
+            os.strerror(errno.EBUSY): "another program uses it; see `fuser -v /dev/snd/*`",
+            os.strerror(errno.ENOENT): "see ListDevices and `arecord -L` for what there is",
+            os.strerror(errno.EACCES): "put the user into the group audio",
+        }.get(text)
+        if text == os.strerror(errno.EINVAL) and not heard:  # an open that fails does not do so silently
+            return hwparams_error(f"{self.name}: the device takes no {self.sample_rate} Hz with two channels of S32_LE")
+        details = [word for word in (heard[-1] if heard else "", hint) if word]
+        why = f"{self.name}: {text}" + (f" ({'; '.join(details)})" if details else "")
+        return DeviceBusyError(why) if text == os.strerror(errno.EBUSY) else device_error(why)
+
+    def _faults(self, pcm: Any, info: dict[str, Any], channels: int) -> list[str]:
+        """What of the PCM is not as asked for, each with what it offers."""
+        faults = []
+        if info["format_name"] != "S32_LE":
+            formats = ", ".join(sorted(pcm.getformats())) or info["format_name"]
+            faults.append(f"no format S32_LE, it offers {formats}: plug{self._pcm_name} converts")
+        if info["channels"] != channels:
+            faults.append(
+                f"not {channels} channels, it opens with {info['channels']}: pick two with ?channels=1,2"
+                + (", or 1,1 for both ears" if info["channels"] == 1 else "")
+            )
+        if info["rate"] != self.sample_rate:
+            faults.append(f"no sample rate of {self.sample_rate} Hz, it offers {_listed(pcm.getrates())}")
+        elif info["period_size"] != self._frames_per_chunk:
+            faults.append(f"no chunks of {self._frames_per_chunk} frames, the nearest are of {info['period_size']}")
+        return faults
+
+    # --- reading ---
+
+    def read(self) -> Chunk | None:
+        """The next chunk; None when told to stop, ``::bass::e_device`` when the device is gone."""
+        gap = 0
+        with complaints():
+            while self._filled < self._frames_per_chunk:
+                if self._stopping.is_set():
+                    return None
+                if self._missing and self._filled == 0:
+                    gap += self._missing
+                    self._missing = 0
+                elif self._missing:
+                    zeros = min(self._missing, self._frames_per_chunk - self._filled)
+                    self._filled += zeros  # the chunk was made of zeros
+                    self._missing -= zeros
+                elif self._rest.shape[1]:
+                    self._put(self._rest)
+                else:
+                    self._read_some()
+        samples = self._samples
+        self._samples, self._filled = np.zeros_like(samples), 0
+        behind = (self._rest.shape[1] + self._missing) / self.sample_rate
+        self._time = max(self._time, (self._heard or 0.0) - behind)
+        return Chunk(samples, gap, self._time)
+
+    def _put(self, frames: np.ndarray) -> None:
+        """Add `frames` to the chunk; what does not fit stays for the next one."""
+        room = min(self._frames_per_chunk - self._filled, frames.shape[1])
+        self._samples[:, self._filled : self._filled + room] = frames[:, :room]
+        self._filled += room
+        self._rest = frames[:, room:]
+
+    def _read_some(self) -> None:
+        """Take what the device has, which may be less than asked for; or wait a little; or note what was lost."""
+        before = time.monotonic()
+        if self._heard is None:
+            self._heard = before  # the first read starts the device
+        try:
+            count, data = self._pcm.read()
+            if count > 0:
+                # What is still in the device came after the newest frame of this read.
+                behind = min(max(0, self._pcm.avail()), RING_CHUNKS * self._frames_per_chunk)
+                self._heard = time.monotonic() - behind / self.sample_rate
+                left, right = self._channels or (1, 2)
+                frames = np.frombuffer(data, "<i4").reshape(-1, self._width).T
+                self._put(frames[[left - 1, right - 1]])
+                self._failures = self._barren = 0
+            elif count == 0:
+                self._wait_for_sound(before)
+            elif count == -errno.EPIPE:  # pyalsaaudio has prepared the device; the next read starts it again
+                self._barren += 1
+                if self._barren > RETRIES:
+                    raise self._alsa.ALSAAudioError("overrun after overrun and no sound")
+                self._lose(before)
+            else:
+                raise self._alsa.ALSAAudioError(os.strerror(-count))
+        except self._alsa.ALSAAudioError as problem:
+            self._reopen(str(problem))
+
+    def _wait_for_sound(self, now: float) -> None:
+        if self._heard is not None and now - self._heard > STALL_SECONDS + self._frames_per_chunk / self.sample_rate:
+            raise self._alsa.ALSAAudioError("no sound comes any more")
+        poll = select.poll()
+        for descriptor, events in self._pcm.polldescriptors():
+            poll.register(descriptor, events)
+        ready = poll.poll(POLL_SECONDS * 1000)
+        if ready:
+            self._pcm.polldescriptors_revents(ready)  # plugins need to see it, or they stay ready for ever
+            # Some are ready before there is a frame to read; the pause keeps that from becoming a busy loop.
+            self._stopping.wait(0.001)
+
+    def _lose(self, now: float) -> None:
+        """Account for the frames between the newest one read and `now`, when the device begins anew."""
+        heard = now if self._heard is None else self._heard
+        lost = max(1, round((now - heard) * self.sample_rate))
+        self._heard = now
+        self.overruns += 1
+        self.lost_frames += lost
+        self._missing += lost
+
+    def _reopen(self, problem: str) -> None:
+        """Get a failed device back, or raise ``::bass::e_device`` after some attempts."""
+        text = problem.removesuffix(f" [{self._pcm_name}]")
+        self._pcm.close()
+        while self._failures < RETRIES:
+            self._failures += 1
+            if self._stopping.wait(RETRY_SECONDS):
+                return
+            try:
+                self._open()
+            except ComponentError:
+                continue
+            self._lose(time.monotonic())
+            return
+        raise device_error(f"{self.name}: {text}; given up after {RETRIES} attempts to open it again")
+
+    def close(self) -> None:
+        """Give the device back."""
+        self._pcm.close()
+
+
+class DeviceBusyError(ComponentError):
+    """``::bass::e_device`` because somebody, maybe this component's running acquisition, uses the device."""
+
+    def __init__(self, why: str) -> None:
+        super().__init__(device_error(why).ex, why)
+
+
+def _listed(rates: int | tuple[int, int] | list[int]) -> str:
+    """pyalsaaudio's three ways to say which rates there are, in words."""
+    if isinstance(rates, int):
+        return f"{rates} Hz"
+    if isinstance(rates, tuple):
+        return f"{rates[0]} to {rates[1]} Hz"
+    return ", ".join(map(str, rates)) + " Hz"

@@ -1,0 +1,78 @@
+"""What is needed of libasound besides capturing: the binding in a version that works, and its complaints as text."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import importlib
+import platform
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from rosafe import interface
+from rosafe.bass.sources.base import device_error
+
+_HANDLER = ctypes.CFUNCTYPE(
+    None, ctypes.c_char_p, ctypes.c_int, ctypes.c_char_p, ctypes.c_int, ctypes.c_char_p, ctypes.c_void_p
+)
+# Where a va_list argument is passed as a pointer, so that a callback can hand it on.
+_POINTER_VA_LIST = ("x86_64", "aarch64")
+
+
+def load_alsaaudio() -> Any:
+    """The module `alsaaudio` of pyalsaaudio 0.11 or later, or ``::bass::e_device`` saying what is wrong with it."""
+    try:
+        module = importlib.import_module("alsaaudio")
+    except ImportError as problem:
+        raise device_error(f"ALSA devices need pyalsaaudio ({problem}); scripts/install brings it") from None
+    if not hasattr(module, "asoundlib_version"):
+        raise device_error(
+            f"{module.__file__} is Debian's python3-alsaaudio 0.8, which cannot capture on this Python; "
+            "scripts/install brings pyalsaaudio 0.11"
+        )
+    return module
+
+
+@contextlib.contextmanager
+def complaints() -> Iterator[list[str]]:
+    """Collect what libasound would print on stderr for this thread, one line each."""
+    heard: list[str] = []
+    try:
+        library, libc = ctypes.CDLL("libasound.so.2"), ctypes.CDLL(None)
+    except OSError:
+        yield heard
+        return
+
+    def hear(_file: bytes, _line: int, _function: bytes, _error: int, form: bytes, arguments: int) -> None:
+        text = ctypes.create_string_buffer(500)
+        if platform.machine() in _POINTER_VA_LIST:
+            libc.vsnprintf(text, ctypes.c_size_t(len(text)), form, ctypes.c_void_p(arguments))
+        else:
+            text.value = form[:499]
+        heard.append(" ".join(text.value.decode(errors="replace").split()))
+
+    handler = _HANDLER(hear)
+    library.snd_lib_error_set_local.restype = ctypes.c_void_p
+    library.snd_lib_error_set_local(handler)
+    try:
+        yield heard
+    finally:
+        library.snd_lib_error_set_local(None)
+
+
+def capture_devices(proc: Path = Path("/proc/asound")) -> list[tuple[int, int, str, str]]:
+    """The capture PCMs of all sound cards: (card, device, card id, PCM id), as the kernel lists them under `proc`.
+
+    Raises ``::bass::e_nodevice`` where there is no sound card at all.
+    """
+    cards = sorted(proc.glob("card[0-9]*"), key=lambda path: int(path.name[len("card") :]))
+    if not cards:
+        raise interface.BASS.error("e_nodevice", f"no sound card ({proc}/card* is empty)")
+    found = []
+    for card in cards:
+        card_id = (card / "id").read_text().strip()
+        for info in sorted(card.glob("pcm*c/info"), key=lambda path: int(path.parent.name[3:-1])):
+            fields = dict(line.partition(": ")[::2] for line in info.read_text().splitlines())
+            found.append((int(fields["card"]), int(fields["device"]), card_id, fields["id"].strip()))
+    return found

@@ -1,0 +1,207 @@
+"""The source `scene:`: a built-in binaural scene, a talker who walks from far left to far right and back again.
+
+The head is the sphere of Brown and Duda, "A structural model for binaural sound synthesis", IEEE Trans. Speech Audio
+Process. 6(5), 1998: Woodworth's delays and a head shadow of one pole and one zero for each ear.
+"""
+
+from __future__ import annotations
+
+import threading
+
+import numpy as np
+from scipy import signal
+
+from rosafe.audiofile import to_int32
+from rosafe.bass.sources.base import Chunk, Pacer, device_error, hwparams_error, number, parse_options
+
+HEAD_RADIUS = 0.0875  # m
+SPEED_OF_SOUND = 343.0  # m/s
+WALK_SECONDS = 10.0
+LEVEL_DB = -30.0
+MIN_RATE = 1000  # Hz; below, nothing of the sound would be left
+_HEAD_TIME = HEAD_RADIUS / SPEED_OF_SOUND
+_BLOCK = 4096  # frames made at once, whatever the chunks, so that the samples never depend on them
+_REACH = 3  # frames on each side that the interpolation looks at
+_PITCH = (125.0, 25.0, 0.37)  # Hz: mean, excursion and speed of the talker's gliding voice
+_SYLLABLE = 0.25  # s
+
+
+def scene_azimuth(seconds: np.ndarray | float, walk: float = WALK_SECONDS) -> np.ndarray:
+    """Where the source is: degrees from straight ahead, -90 far left, 90 far right.
+
+    Parameters
+    ----------
+    seconds : array_like
+        Time since the scene's first frame.
+    walk : float
+        Seconds from one side to the other (option `seconds`); then it walks back.
+    """
+    way = np.mod(np.asarray(seconds, dtype=np.float64) / walk, 2.0)
+    return 90.0 - 180.0 * np.abs(way - 1.0)
+
+
+def ear_delay(incidence: np.ndarray) -> np.ndarray:
+    """Woodworth's delay (s) to an ear that the sound meets at `incidence` rad from its axis, 0 to pi; 0 at the centre."""
+    return _HEAD_TIME * np.where(incidence < np.pi / 2, -np.cos(incidence), incidence - np.pi / 2)
+
+
+def shadow_gain(incidence: np.ndarray) -> np.ndarray:
+    """Gain of the head at high frequencies, from 2 at the ear to 0.1 behind the head (Brown and Duda, eq. 4)."""
+    return 1.05 + 0.95 * np.cos(incidence * (180.0 / 150.0))
+
+
+class Scene:
+    """The samples of the scene, in order. The same for the same options and sample rate, however they are asked for.
+
+    Parameters
+    ----------
+    sample_rate : int
+        Hz.
+    seconds : float
+        Length of one walk.
+    level : float
+        RMS level of the source, before the head, in dB below full scale.
+    seed : int
+        Another seed, another noise.
+    """
+
+    def __init__(
+        self, sample_rate: int, seconds: float = WALK_SECONDS, level: float = LEVEL_DB, seed: int = 0
+    ) -> None:
+        self.sample_rate = sample_rate
+        self.seconds = seconds
+        self._carrier = _Carrier(sample_rate, seed)
+        first_second = _Carrier(sample_rate, seed).block(np.arange(sample_rate) / sample_rate)
+        self._gain = 10 ** (level / 20) / np.sqrt(np.mean(first_second**2))
+        # The shadow is alpha + (1 - alpha) / (1 + s / (2 omega0)): its pole stands still while the source walks.
+        self._pole = signal.bilinear([1.0], [_HEAD_TIME / 2, 1.0], sample_rate)
+        self._pole_state = np.zeros(1)
+        self._history = _REACH + int(np.ceil(_HEAD_TIME * (1 + np.pi / 2) * sample_rate)) + _REACH
+        self._ears = np.zeros((2, self._history + _BLOCK))
+        self._frame = 0  # the first one of the next block
+        self._block = np.zeros((2, 0), np.int32)
+
+    def frames(self, count: int) -> np.ndarray:
+        """The next `count` frames: int32, (2, count)."""
+        parts = [self._block[:, :count]]
+        self._block = self._block[:, count:]
+        missing = count - parts[0].shape[1]
+        while missing > 0:
+            block = self._next_block()
+            parts.append(block[:, :missing])
+            self._block = block[:, missing:]
+            missing -= parts[-1].shape[1]
+        return np.concatenate(parts, axis=1)
+
+    def _next_block(self) -> np.ndarray:
+        times = (self._frame + np.arange(_BLOCK)) / self.sample_rate
+        self._frame += _BLOCK
+        azimuth = np.radians(scene_azimuth(times, self.seconds))
+        source = self._gain * self._carrier.block(times)
+        lowpassed, self._pole_state = signal.lfilter(*self._pole, source, zi=self._pole_state)
+        out = np.empty((2, _BLOCK))
+        for ear, incidence in enumerate((np.pi / 2 + azimuth, np.pi / 2 - azimuth)):
+            history = self._ears[ear]
+            history[: self._history] = history[_BLOCK:]
+            history[self._history :] = lowpassed + shadow_gain(incidence) * (source - lowpassed)
+            # The nearest that an ear comes is one head radius before the centre; no sample may come from the future.
+            delay = (ear_delay(incidence) + _HEAD_TIME) * self.sample_rate + _REACH
+            out[ear] = _interpolate(history, self._history + np.arange(_BLOCK) - delay)
+        return to_int32(out)
+
+
+class SceneSource:
+    """The scene in real time.
+
+    Parameters
+    ----------
+    text : str
+        Options, after an optional question mark: ``seconds`` of one walk (default 10), ``level`` in dB below full
+        scale (default -30), ``seed`` of the noise (default 0).
+    """
+
+    overruns = 0
+    lost_frames = 0
+
+    def __init__(self, text: str, sample_rate: int, frames_per_chunk: int, stopping: threading.Event) -> None:
+        self.name = f"scene:{text}"
+        if text and not text.startswith("?"):
+            raise device_error(f"{self.name}: options follow a question mark, such as scene:?seconds=5")
+        options = parse_options(self.name, text[1:], _OPTIONS)
+        if sample_rate < MIN_RATE:
+            raise hwparams_error(f"{self.name}: offers sample rates from {MIN_RATE} Hz, asked for were {sample_rate}")
+        self.sample_rate = sample_rate
+        self._scene = Scene(sample_rate, **options)
+        self._frames_per_chunk = frames_per_chunk
+        self._pacer = Pacer(sample_rate, stopping)
+
+    def read(self) -> Chunk | None:
+        """The next chunk in its time; None when told to stop."""
+        samples = self._scene.frames(self._frames_per_chunk)
+        due = self._pacer.wait(self._frames_per_chunk)
+        return None if due is None else Chunk(samples, 0, due)
+
+    def close(self) -> None:
+        """Nothing to give back."""
+
+
+def _seed(text: str) -> int:
+    if not (text.isascii() and text.isdigit() and len(text) <= 18):
+        raise ValueError("a whole number of at most 18 digits")
+    return int(text)
+
+
+_OPTIONS = {"seconds": number(0.1, 86400), "level": number(-120, 0), "seed": _seed}
+
+
+class _Carrier:
+    """What the source utters, (block,) of float64: voiced syllables and bursts of noise, up to a fifth of the sample
+    rate (where the interpolation is still exact) and at most 8 kHz."""
+
+    def __init__(self, sample_rate: int, seed: int) -> None:
+        top = min(8000.0, sample_rate / 5)
+        self._harmonics = max(1, int(top / (_PITCH[0] + _PITCH[1])))
+        self._random = np.random.PCG64(seed)
+        self._tilt = signal.butter(1, min(700.0, sample_rate / 10), fs=sample_rate)
+        self._tilt_state = np.zeros(1)
+        self._band = signal.butter(4, top, fs=sample_rate, output="sos")
+        self._band_state = np.zeros((self._band.shape[0], 2))
+
+    def block(self, times: np.ndarray) -> np.ndarray:
+        """The samples at `times` (s), which must follow those of the call before."""
+        within = np.mod(times, _SYLLABLE) / _SYLLABLE
+        voiced, self._tilt_state = signal.lfilter(*self._tilt, self._voice(times), zi=self._tilt_state)
+        # random_raw is the same in every version of numpy; the distributions on top of it may not be.
+        uniform = (self._random.random_raw(len(times)) >> np.uint64(11)) * 2.0**-52 - 1.0
+        noise, self._band_state = signal.sosfilt(self._band, uniform, zi=self._band_state)
+        voiced *= np.where(within < 0.7, np.sin(np.pi * within / 0.7) ** 2, 0.0)
+        noise *= 0.05 + np.where(within > 0.6, np.sin(np.pi * (within - 0.6) / 0.4) ** 2, 0.0)
+        return 2.0 * voiced + 3.0 * noise
+
+    def _voice(self, times: np.ndarray) -> np.ndarray:
+        """A sum of equal harmonics, in closed form, with an RMS of 1."""
+        mean, excursion, speed = _PITCH
+        glide = excursion / speed * (1.0 - np.cos(2 * np.pi * speed * times))
+        half = np.pi * np.mod(mean * times + glide / (2 * np.pi), 1.0)  # half the phase of the fundamental
+        low = np.sin(half)
+        safe = np.where(np.abs(low) < 1e-9, 1.0, low)
+        count = self._harmonics
+        kernel = np.where(np.abs(low) < 1e-9, 2.0 * count + 1.0, np.sin((2 * count + 1) * half) / safe)
+        return (kernel - 1.0) / np.sqrt(2.0 * count)
+
+
+def _interpolate(samples: np.ndarray, positions: np.ndarray) -> np.ndarray:
+    """`samples` at fractional `positions`: Lagrange interpolation through the six nearest."""
+    base = np.floor(positions).astype(np.intp)
+    part = positions - base
+    offsets = [part - k for k in range(-2, 4)]  # distances from the six points
+    before = [np.ones_like(part)]
+    for offset in offsets[:-1]:
+        before.append(before[-1] * offset)
+    after = np.ones_like(part)
+    result = np.zeros_like(part)
+    # Denominators of the basis polynomials: products of the distances between the points.
+    for k, denominator in zip(range(5, -1, -1), (120.0, -24.0, 12.0, -12.0, 24.0, -120.0), strict=True):
+        result += samples[base + (k - 2)] * (before[k] * after) / denominator
+        after = after * offsets[k]
+    return result
