@@ -259,10 +259,7 @@ class Service:
         raise KeyError(name)
 
     def from_ros(self, request: Any) -> dict[str, Any]:
-        """The checked values of a ROS request or goal, where 0, "" and [] stand for the default.
-
-        Raises ValueError naming the parameter.
-        """
+        """The values of a ROS request or goal, not yet checked; 0, "" and [] there stand for the default."""
         values = {}
         for parameter in self.parameters:
             value = getattr(request, parameter.name)
@@ -271,8 +268,12 @@ class Service:
             )
             if unset and parameter.zero_is_default and parameter.default is not REQUIRED:
                 value = parameter.default
-            values[parameter.name] = parameter.check(value)
+            values[parameter.name] = value
         return values
+
+    def check(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """All values as their parameters' Python types, or ValueError naming the first that is refused."""
+        return {parameter.name: parameter.check(values[parameter.name]) for parameter in self.parameters}
 
 
 @dataclass(frozen=True)
@@ -456,15 +457,11 @@ def _window(prefix: str) -> Parameter:
 
 
 def _window_size(prefix: str) -> Parameter:
-    return Parameter(
-        f"{prefix}_wSizeSec", "double", 0.02, "Window duration (s)", 0.0, MAX_SECONDS, open_minimum=True
-    )
+    return Parameter(f"{prefix}_wSizeSec", "double", 0.02, "Window duration (s)", 0.0, MAX_SECONDS, open_minimum=True)
 
 
 def _hop_size(prefix: str) -> Parameter:
-    return Parameter(
-        f"{prefix}_hSizeSec", "double", 0.01, "Window step size (s)", 0.0, MAX_SECONDS, open_minimum=True
-    )
+    return Parameter(f"{prefix}_hSizeSec", "double", 0.01, "Window step size (s)", 0.0, MAX_SECONDS, open_minimum=True)
 
 
 INPUT_PARAMETERS = (
@@ -473,9 +470,7 @@ INPUT_PARAMETERS = (
 )
 PREPROC_PARAMETERS = (
     Parameter("pp_bRemoveDC", "boolean", False, "Flag to activate the DC-removal high-pass filter"),
-    Parameter(
-        "pp_cutoffHzDC", "double", 20.0, "Cutoff frequency (Hz) of DC-removal high-pass filter", 0.0, 1e6, True
-    ),
+    Parameter("pp_cutoffHzDC", "double", 20.0, "Cutoff frequency (Hz) of DC-removal high-pass filter", 0.0, 1e6, True),
     Parameter("pp_bPreEmphasis", "boolean", False, "Flag to activate pre-emphasis"),
     Parameter(
         "pp_coefPreEmphasis",
@@ -486,9 +481,7 @@ PREPROC_PARAMETERS = (
         1.0,
     ),
     Parameter("pp_bNormalizeRMS", "boolean", False, "Flag to activate binaural RMS normalization"),
-    Parameter(
-        "pp_intTimeSecRMS", "double", 0.5, "Time constant (s) for automatic gain control", 0.0, 3600.0, True
-    ),
+    Parameter("pp_intTimeSecRMS", "double", 0.5, "Time constant (s) for automatic gain control", 0.0, 3600.0, True),
     Parameter("pp_bLevelScaling", "boolean", False, "Flag to activate the level scaling"),
     Parameter(
         "pp_refSPLdB",
@@ -522,9 +515,7 @@ GAMMATONE_PARAMETERS = (
     Parameter("fb_lowFreqHz", "double", 80.0, "Lowest center frequency (Hz)", 0.0, 1e6, True),
     Parameter("fb_highFreqHz", "double", 8000.0, "Highest center frequency (Hz)", 0.0, 1e6, True),
     Parameter("fb_nERBs", "double", 1.0, "Distance between neighboring filters in ERBs", 0.0, 100.0, True),
-    Parameter(
-        "fb_nChannels", "unsigned long", 0, "Number of channels; 0: as many as fb_nERBs gives", 0, MAX_SEQUENCE
-    ),
+    Parameter("fb_nChannels", "unsigned long", 0, "Number of channels; 0: as many as fb_nERBs gives", 0, MAX_SEQUENCE),
     Parameter(
         "fb_cfHz",
         "sequence<double>",

@@ -96,7 +96,7 @@ def _checked_signal(signal: Any) -> np.ndarray:
 
 
 def _block_sizes(block_frames: int | Sequence[int]) -> Iterable[int]:
-    sizes = [block_frames] if np.ndim(block_frames) == 0 else list(block_frames)  # type: ignore[arg-type]
+    sizes: list[Any] = list(block_frames) if isinstance(block_frames, (Sequence, np.ndarray)) else [block_frames]
     whole = all(isinstance(n, (int, np.integer)) and not isinstance(n, bool) and n >= 0 for n in sizes)
     if not sizes or not whole or not any(sizes):
         raise ValueError(f"block_frames: {block_frames!r} is not a positive whole number, or a sequence of such")
@@ -127,7 +127,7 @@ def _join(kind: str, blocks: list[np.ndarray], rows: tuple[int, ...]) -> np.ndar
         return np.zeros((*rows, 0))
     if all(block.shape[:-1] == blocks[0].shape[:-1] for block in blocks):
         return np.concatenate(blocks, axis=-1)
-    shape = tuple(max(sizes) for sizes in zip(*(block.shape[:-1] for block in blocks)))
+    shape = tuple(max(sizes) for sizes in zip(*(block.shape[:-1] for block in blocks), strict=True))
     joined = np.zeros((*shape, sum(block.shape[-1] for block in blocks)))
     at = 0
     for block in blocks:

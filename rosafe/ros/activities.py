@@ -130,7 +130,10 @@ class Activities:
             activity = Activity(next(self._numbers) % 2**32, service, self._interrupt_replaced)
             self._live[activity.id] = activity
         thread = threading.Thread(
-            target=self._run, args=(activity, handler, values, on_end), name=f"{service.name}-{activity.id}", daemon=True
+            target=self._run,
+            args=(activity, handler, values, on_end),
+            name=f"{service.name}-{activity.id}",
+            daemon=True,
         )
         thread.start()
         return activity
@@ -171,9 +174,7 @@ class Activities:
                 on_end(activity)
 
     def _interrupt_replaced(self, newcomer: Activity) -> None:
-        replaced = [
-            a for a in self.live() if a.id < newcomer.id and a.service.name in newcomer.service.interrupts
-        ]
+        replaced = [a for a in self.live() if a.id < newcomer.id and a.service.name in newcomer.service.interrupts]
         self.interrupt(replaced, newcomer.service.name)
         for activity in replaced:
             activity.ended.wait()

@@ -52,6 +52,7 @@ class ComponentNode:
         self._srv = importlib.import_module(f"{component.name}.srv")
         self._msg = importlib.import_module(f"{component.name}.msg")
         self._handlers: dict[str, Callable[..., Any]] = {}
+        self._validators: dict[str, Callable[[dict[str, Any]], None]] = {}
         self._connectors: dict[str, Callable[[str], None]] = {}
         self._control = threading.Lock()
         self._turn = threading.Event()
@@ -65,9 +66,14 @@ class ComponentNode:
 
     # --- for the node ---
 
-    def activity(self, name: str, handler: Handler) -> None:
-        """Let `handler(activity, values)` serve the activity request `name`."""
+    def activity(self, name: str, handler: Handler, validate: Callable[[dict[str, Any]], None] | None = None) -> None:
+        """Let `handler(activity, values)` serve the activity request `name`.
+
+        `validate(values)` may refuse a request before its values are checked against their ranges.
+        """
         self._handlers[self.component.service(name).name] = handler
+        if validate is not None:
+            self._validators[self.component.service(name).name] = validate
 
     def function(self, name: str, handler: Callable[[dict[str, Any]], dict[str, Any] | None]) -> None:
         """Let `handler(values)` serve the function `name`; it returns the outputs by name."""
@@ -110,8 +116,11 @@ class ComponentNode:
     # --- requests ---
 
     def _values(self, service: interface.Service, request: Any) -> dict[str, Any]:
+        values = service.from_ros(request)
+        if service.name in self._validators:
+            self._validators[service.name](values)
         try:
-            return service.from_ros(request)
+            return service.check(values)
         except ValueError as problem:
             raise self._bad_value(problem) from None
 

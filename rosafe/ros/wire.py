@@ -41,7 +41,7 @@ _SCALARS = {
     "char": "b",
     "octet": "B",
 }
-_SAMPLES = {"double": np.dtype("<f8"), "long": np.dtype("<i4"), "float": np.dtype("<f4")}
+_SAMPLES: dict[str, np.dtype[Any]] = {"double": np.dtype("<f8"), "long": np.dtype("<i4"), "float": np.dtype("<f4")}
 # How many levels of nested sequences a signal struct wraps; its one member is the sequence.
 _SIGNALS = {"::rosAFE::signalOneD": 1, "::rosAFE::signalND": 2, "::rosAFE::signalNxND": 3}
 _COUNT = struct.Struct("<I")
@@ -67,7 +67,7 @@ def _pack_nested(view: WindowView) -> memoryview:
         level["n"] = length
         level = level["d"]
     view.copy_to(level)
-    return memoryview(record.reshape(1).view(np.uint8))
+    return record.reshape(1).view(np.uint8).data
 
 
 def _write_signal(out: io.BytesIO, levels: int, value: Any) -> None:
@@ -98,7 +98,7 @@ def encode(out: io.BytesIO, component: interface.Component, idl: str, value: Any
         element = idl[len("sequence<") : -1]
         out.write(_COUNT.pack(len(value)))
         if element in _SAMPLES:
-            out.write(memoryview(np.ascontiguousarray(value, _SAMPLES[element])).cast("B") if len(value) else b"")
+            out.write(np.ascontiguousarray(value, _SAMPLES[element]).view(np.uint8).data)
         else:
             for item in value:
                 encode(out, component, element, item)
@@ -210,7 +210,7 @@ def message_class(package: str, idl: str) -> Any:
     component = interface.COMPONENTS[package]
     generated = getattr(importlib.import_module(f"{package}.msg"), interface.ros_type(idl))
     serialize, deserialize = _codec(component, component.structs[idl])
-    return type(generated.__name__, (generated,), {"__slots__": (), "serialize": serialize, "deserialize": deserialize})
+    return type(generated.__name__, (generated,), {"serialize": serialize, "deserialize": deserialize})
 
 
 @functools.cache
@@ -221,4 +221,4 @@ def response_class(package: str, service: str) -> Any:
     generated = getattr(importlib.import_module(f"{package}.srv"), f"{service}Response")
     members = (("genom_success", "boolean"), ("genom_exdetail", "string"), *component.service(service).outputs)
     serialize, deserialize = _codec(component, members)
-    return type(generated.__name__, (generated,), {"__slots__": (), "serialize": serialize, "deserialize": deserialize})
+    return type(generated.__name__, (generated,), {"serialize": serialize, "deserialize": deserialize})

@@ -11,6 +11,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from rosafe.dsp.haircell import ENVELOPE_METHODS
 from rosafe.tree.window import History, WindowView
 from rosafe.tree.zone import Block, SharedZone
 
@@ -168,7 +169,7 @@ class Processor:
         with self._changing:
             wanted = getattr(self._stage, "needs_envelope", False)
             due = [v for at, name, v in self._scheduled if name == _ENVELOPE_PARAMETER and (at is None or at <= number)]
-            return wanted or any(self._stage.method_needs_envelope(method) for method in due)
+            return wanted or any(method in ENVELOPE_METHODS for method in due)
 
     # --- life ---
 
@@ -304,9 +305,7 @@ class Processor:
         for change in self._scheduled:
             at, name, value = change
             waits = (at is not None and at > taken.number) or (
-                name == _ENVELOPE_PARAMETER
-                and self._stage.method_needs_envelope(value)
-                and taken.envelope is None
+                name == _ENVELOPE_PARAMETER and value in ENVELOPE_METHODS and taken.envelope is None
             )
             if waits:
                 later.append(change)

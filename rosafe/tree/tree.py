@@ -134,9 +134,7 @@ class Tree:
         with self._requests:
             parent = self.check(kind, name, parent_name)
             stage = _make_stage(kind, self.sample_rate, parameters or {})
-            _check_size(
-                stage.output_rows(parent.rows), stage.output_rate, max(self.port_seconds, self.history_seconds)
-            )
+            _check_size(stage.output_rows(parent.rows), stage.output_rate, max(self.port_seconds, self.history_seconds))
             processor = self._processor(name, kind, stage, parent, None)
             self._processors[name] = processor
             self._listener.added(processor)
@@ -256,5 +254,3 @@ def _check_size(rows: tuple[int, ...], rate: float, seconds: float) -> None:
             what=f"{seconds:g} s of {'x'.join(map(str, rows))} values at {rate:g} Hz are {size / 2**20:.0f} MiB, "
             f"more than {MAX_WINDOW_BYTES // 2**20} MiB",
         )
-
-

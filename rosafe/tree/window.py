@@ -109,7 +109,7 @@ class History:
             return
         self._pieces.append(block)
         self._frames += block.shape[-1]
-        while self._frames - self._pieces[0].shape[-1] >= self.capacity:
+        while self._pieces and self._frames - self._pieces[0].shape[-1] >= self.capacity:
             self._frames -= self._pieces.pop(0).shape[-1]
         if len(self._pieces) > MAX_PIECES:
             self._pieces = [self._view().array()]

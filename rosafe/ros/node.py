@@ -1,0 +1,211 @@
+"""The rosAFE node: its requests on the processor tree, its ports, its health."""
+
+from __future__ import annotations
+
+import re
+import threading
+from typing import Any
+
+import rospy
+from diagnostic_msgs.msg import DiagnosticStatus
+
+from rosafe import interface
+from rosafe.interface import KINDS, ROSAFE, ComponentError, ProcessorKind
+from rosafe.ros import wire
+from rosafe.ros.activities import Activity
+from rosafe.ros.audio import AudioRing
+from rosafe.ros.component import ComponentNode
+from rosafe.ros.ports import OutputPort, element, parameters_message, signal_fields
+from rosafe.ros.startup import run_server
+from rosafe.tree import Processor, Tree
+from rosafe.tree.zone import Block
+
+FIRST_AUDIO_SECONDS = 1.0  # how long InputProc waits for a first message
+
+
+class RosafeNode:
+    """The component `rosAFE`. Make it after `rospy.init_node`."""
+
+    def __init__(self, instance: str) -> None:
+        self._node = ComponentNode(ROSAFE, lambda problem: ROSAFE.error("e_badNewValue", what=str(problem)))
+        self.finished = self._node.finished
+        self._tree = Tree(self)
+        self._ring = AudioRing(rospy.logwarn)
+        self._audio: rospy.Subscriber | None = None
+        self._audio_topic = ""
+        self._ports: dict[Processor, OutputPort] = {}
+        self._ends: dict[Processor, Activity] = {}
+        self._starting = threading.Lock()  # one InputProc at a time decides about the tree's root
+        self._data_object = self._node.advertise("dataObj", wire.message_class("rosAFE", "::rosAFE::dataObjSt"))
+        self._input_port = self._advertise("input")
+
+        self._node.input_port("Audio", self._connect_audio)
+        self._node.activity("InputProc", self._input_proc)
+        for kind in KINDS.values():
+            if kind.parent:
+                self._serve_processor(kind)
+        self._node.function("getSignals", self._get_signals)
+        self._node.function("getParameters", self._get_parameters)
+        self._node.function("getDependencies", lambda v: {"dependencies": self._tree.dependencies(v["nameProc"])})
+        self._node.function("modifyParameter", self._modify_parameter)
+        self._node.function("removeProcessor", self._remove_processor)
+        self._node.function("Stop", lambda _: self._tree.stop())
+        self._node.diagnostics.add(f"{self._node.name[1:]}: audio", self._audio_health)
+        self._node.diagnostics.add(f"{self._node.name[1:]}: processors", self._tree_health)
+        self._node.start()
+
+    def shutdown(self, by: str) -> None:
+        """End all processors."""
+        self._node.shutdown(by)
+        self._tree.stop()
+
+    # --- Audio ---
+
+    def _connect_audio(self, topic: str) -> None:
+        if self._audio is not None:
+            self._audio.unregister()
+        self._ring.forget()
+        self._audio_topic = topic
+        self._audio = rospy.Subscriber(
+            topic,
+            wire.message_class("rosAFE", "::binaudio::portStruct"),
+            self._ring.feed,
+            queue_size=1,  # windows overlap: the newest has all that the one before had
+            buff_size=2**22,
+            tcp_nodelay=True,
+        )
+
+    # --- processors ---
+
+    def _input_proc(self, activity: Activity, values: dict[str, Any]) -> None:
+        name, frames = values["name"], values["nFramesPerBlock"]
+        with self._starting:
+            if self._audio is None:
+                raise ROSAFE.error("e_noData", "the Audio port is not connected: call connect_port first")
+            if not self._ring.wait_first(FIRST_AUDIO_SECONDS, activity.stop_requested.is_set):
+                raise ROSAFE.error("e_noData", f"nothing has come from {self._audio_topic}: is bass acquiring?")
+            self._tree.check_input(name, self._ring.sample_rate)
+            processor = self._tree.add_input(
+                name,
+                self._ring.reader(frames),
+                frames,
+                values["bufferSize_s_port"],
+                values["bufferSize_s_getSignal"],
+            )
+        activity.interrupt_others()
+        self._live(activity, processor)
+
+    def _serve_processor(self, kind: ProcessorKind) -> None:
+        def validate(values: dict[str, Any]) -> None:
+            """The original's order: parent unknown, name taken, parent of the wrong type; then the values."""
+            self._tree.check(kind.kind, values["name"], values["upperDepName"])
+
+        def handle(activity: Activity, values: dict[str, Any]) -> None:
+            self._processor(activity, values, kind)
+
+        self._node.activity(kind.request, handle, validate)
+
+    def _processor(self, activity: Activity, values: dict[str, Any], kind: ProcessorKind) -> None:
+        name, parent = values.pop("name"), values.pop("upperDepName")
+        if not re.fullmatch(r"\w+(/\w+)*", name, re.ASCII):
+            raise ROSAFE.error("e_badNewValue", what=f"name: {name!r} names a topic too: letters, digits and _ only")
+        known = {p.name: p.known_word(values[p.name]) if p.choices else values[p.name] for p in kind.parameters}
+        self._live(activity, self._tree.add(kind.kind, name, parent, known))
+
+    def _live(self, activity: Activity, processor: Processor) -> None:
+        """From now on the activity is the processor: they end together."""
+        self._ends[processor] = activity
+        if processor not in self._tree.processors:  # it may have ended before its activity was known
+            activity.interrupt("")
+        activity.running()
+        activity.stop_requested.wait()
+        self._ends.pop(processor, None)
+        self._tree.end(processor)
+        if processor.error is not None:
+            raise ComponentError("::genom::unkex", what=f"{type(processor.error).__name__}: {processor.error}"[:127])
+
+    # --- what the tree tells (on its threads) ---
+
+    def _advertise(self, kind: str, name: str = "") -> rospy.Publisher:
+        port = ROSAFE.port(KINDS[kind].port)
+        return self._node.advertise(port.name, wire.message_class("rosAFE", port.idl), element(kind, name))
+
+    def added(self, processor: Processor) -> None:
+        """Open the processor's port, full of zeros."""
+        if processor.kind == "input":
+            port = OutputPort(processor, self._input_port, lambda: None)
+        else:
+            publisher = self._advertise(processor.kind, processor.name)
+            port = OutputPort(processor, publisher, publisher.unregister)
+        self._ports[processor] = port
+        port.open(self._tree.port_seconds)
+
+    def executed(self, processor: Processor, seconds: float) -> None:
+        """Count the work for genom_state."""
+        self._node.meters[ROSAFE.service(KINDS[processor.kind].request).task].cycle(seconds)
+
+    def released(self, processor: Processor, block: Block) -> None:
+        """Publish the processor's window."""
+        self._ports[processor].append(block, self._tree.port_seconds)
+
+    def ended(self, processor: Processor) -> None:
+        """Close the port and end the activity."""
+        self._ports.pop(processor).close()
+        if processor.error is not None:
+            rospy.logerr(f"{processor.kind} {processor.name!r} failed: {processor.error!r}")
+        activity = self._ends.get(processor)
+        if activity is not None:
+            activity.interrupt("")
+
+    # --- functions ---
+
+    def _get_signals(self, values: dict[str, Any]) -> dict[str, Any]:
+        arrays: dict[str, list[Any]] = {kind: [] for kind in KINDS}
+        for processor in self._tree.processors:
+            arrays[processor.kind].append(signal_fields(processor.kind, *processor.take_signals()))
+        response = wire.response_class("rosAFE", "getSignals")
+        return {"response": response(genom_success=True, genom_exdetail="", signals=arrays)}
+
+    def _get_parameters(self, values: dict[str, Any]) -> dict[str, Any]:
+        import rosAFE.msg as messages
+
+        return {"parameters": parameters_message(self._tree.processors, messages)}
+
+    def _modify_parameter(self, values: dict[str, Any]) -> None:
+        self._tree.modify(values["nameProc"], values["nameParam"], values["newValue"])
+
+    def _remove_processor(self, values: dict[str, Any]) -> None:
+        self._tree.remove(values["name"])
+
+    # --- health ---
+
+    def _audio_health(self, status: Any) -> Any:
+        counters = self._ring.counters
+        root = self._tree.input
+        if counters.lost or counters.dropped or counters.refused:
+            status.summary(DiagnosticStatus.WARN, f"{counters.lost} frames lost in {counters.gaps} gaps")
+        elif root is not None and self._ring.sample_rate != self._tree.sample_rate:
+            status.summary(
+                DiagnosticStatus.ERROR,
+                f"Audio is at {self._ring.sample_rate} Hz, the tree at {self._tree.sample_rate:g} Hz: call Stop",
+            )
+        else:
+            status.summary(DiagnosticStatus.OK, "no frames lost" if counters.messages else "no audio yet")
+        status.add("topic", self._audio_topic or "not connected")
+        status.add("sample rate (Hz)", str(self._ring.sample_rate))
+        status.add("frames waiting", str(self._ring.behind))
+        for name, value in vars(counters).items():
+            status.add(name.replace("_", " "), str(value))
+        return status
+
+    def _tree_health(self, status: Any) -> Any:
+        processors = self._tree.processors
+        status.summary(DiagnosticStatus.OK, f"{len(processors)} processors")
+        for processor in processors:
+            status.add(processor.name, f"{processor.kind}, {processor.state.value}, {processor.blocks} blocks")
+        return status
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run the node; the `rosAFE-ros` command."""
+    return run_server(interface.ROSAFE, RosafeNode, argv)
