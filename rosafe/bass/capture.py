@@ -133,7 +133,7 @@ class Capture:
             self.last_frame_index += new
             self._unpublished += new
             # The wall clock as it is now; a clock that somebody sets shows in the stamps, as it should.
-            self._time_ns = time.time_ns() - int((begin - chunk.time) * 1e9)
+            self._time_ns = time.time_ns() - int((time.monotonic() - chunk.time) * 1e9)
             if self.source.overruns != overruns:
                 overruns = self.source.overruns
                 self._report(

@@ -1,0 +1,147 @@
+"""The bass node: its requests, the port Audio, its health."""
+
+from __future__ import annotations
+
+import threading
+from typing import Any
+
+import rospy
+from diagnostic_msgs.msg import DiagnosticStatus
+
+from rosafe.bass.capture import Capture, Snapshot, check_window
+from rosafe.bass.socket_server import DEFAULT_HOST, DEFAULT_PORT, DedicatedSocket
+from rosafe.bass.sources import BUILT_IN, Source, open_source
+from rosafe.bass.sources.alsa import AlsaSource, DeviceBusyError
+from rosafe.bass.sources.libasound import capture_devices
+from rosafe.interface import BASS, ComponentError
+from rosafe.ros import wire
+from rosafe.ros.activities import Activity
+from rosafe.ros.component import ComponentNode
+from rosafe.ros.startup import run_server
+
+
+class BassNode:
+    """The component `bass`. Make it after `rospy.init_node`.
+
+    ROS parameters, read at each DedicatedSocket: ``socket_host`` (default 127.0.0.1; empty for all interfaces) and
+    ``socket_port`` (default 8081) in the node's namespace.
+    """
+
+    def __init__(self, instance: str) -> None:
+        self._node = ComponentNode(BASS, lambda problem: BASS.error("e_hwparams", str(problem)))
+        self.finished = self._node.finished
+        self._message_class = wire.message_class("bass", BASS.port("Audio").idl)
+        self._audio = self._node.advertise("Audio", self._message_class)
+        self._snapshot: Snapshot | None = None
+        self._source: Source | None = None  # of the acquisition under way
+        self._last_end = "none"
+        self._printing = threading.Lock()
+
+        self._node.activity("Acquire", self._acquire)
+        self._node.activity("DedicatedSocket", self._dedicated_socket)
+        self._node.activity("CloseSocket", lambda activity, _: activity.interrupt_others())
+        self._node.function("ListDevices", self._list_devices)
+        self._node.function("Stop", lambda _: None)  # the table says what it interrupts
+        self._node.diagnostics.add(f"{self._node.name[1:]}: capture", self._health)
+        self._node.start()
+
+    def shutdown(self, by: str) -> None:
+        """End the acquisition and the socket."""
+        self._node.shutdown(by)
+
+    # --- Acquire ---
+
+    def _acquire(self, activity: Activity, values: dict[str, Any]) -> None:
+        device, frames_per_chunk, chunks = values["device"], values["nFramesPerChunk"], values["nChunksOnPort"]
+        check_window(frames_per_chunk, chunks)
+        # Whatever can fail comes before the running acquisition ends, so that a mistake leaves that as it is.
+        source = self._open(activity, device, values["sampleRate"], frames_per_chunk)
+        try:
+            capture = Capture(source, frames_per_chunk, chunks, self._publish, rospy.logwarn)
+            activity.interrupt_others()
+            if activity.stop_requested.is_set():
+                raise ComponentError("::genom::interrupted", by=activity.stopped_by)
+            self._source = source
+            capture.publish()
+            activity.running()
+            rospy.loginfo(f"acquiring from {device} at {source.sample_rate} Hz")
+            capture.run(activity.stop_requested, self._node.meters["capture"].cycle)
+            self._last_end = f"{device}: {'stopped' if activity.stop_requested.is_set() else 'end of the source'}"
+            rospy.loginfo(f"the acquisition has ended: {self._last_end}")
+        except ComponentError as problem:
+            self._last_end = str(problem)
+            if activity.begun.is_set():  # whoever asked has had an answer already
+                rospy.logerr(f"the acquisition has ended: {problem}")
+            raise
+        finally:
+            if self._source is source:
+                self._source = None
+            source.close()
+
+    def _open(self, activity: Activity, device: str, sample_rate: int, frames_per_chunk: int) -> Source:
+        try:
+            return open_source(device, sample_rate, frames_per_chunk, activity.stop_requested)
+        except DeviceBusyError:
+            if not isinstance(self._source, AlsaSource):
+                raise
+        # Likely busy with our own acquisition, perhaps under another name.
+        activity.interrupt_others()
+        return open_source(device, sample_rate, frames_per_chunk, activity.stop_requested)
+
+    def _publish(self, snapshot: Snapshot) -> None:
+        self._snapshot = snapshot
+        seconds, nanoseconds = divmod(snapshot.time_ns, 1_000_000_000)
+        self._audio.publish(
+            self._message_class(
+                sampleRate=snapshot.sample_rate,
+                nChunksOnPort=snapshot.chunks_on_port,
+                nFramesPerChunk=snapshot.frames_per_chunk,
+                lastFrameIndex=snapshot.last_frame_index,
+                left=snapshot.left,
+                right=snapshot.right,
+                stamp={"sec": seconds, "nsec": nanoseconds},
+            )
+        )
+
+    # --- the other requests ---
+
+    def _list_devices(self, _: dict[str, Any]) -> None:
+        """Print the built-in sources, then a line for each capture PCM as the original does."""
+        with self._printing:
+            for name, contents in BUILT_IN:
+                print(f"{name} [{contents}]", flush=True)
+            for card, device, card_id, pcm_id in capture_devices():
+                print(f"hw:{card},{device} [{card_id}] [{pcm_id}]", flush=True)
+
+    def _dedicated_socket(self, activity: Activity, _: dict[str, Any]) -> None:
+        activity.interrupt_others()  # it has the address
+        host = rospy.get_param("~socket_host", DEFAULT_HOST)
+        port = rospy.get_param("~socket_port", DEFAULT_PORT)
+        try:
+            server = DedicatedSocket(lambda: self._snapshot, str(host), int(port), rospy.logwarn)
+        except (OSError, OverflowError, ValueError, TypeError) as problem:
+            why = f"cannot serve {host}:{port}: {getattr(problem, 'strerror', None) or problem}"
+            raise ComponentError("::genom::syserr", why, code=getattr(problem, "errno", None) or 22) from None
+        activity.running()
+        rospy.loginfo("DedicatedSocket: serving {}:{}".format(*server.address))
+        server.serve(activity.stop_requested)
+
+    def _health(self, status: Any) -> Any:
+        source, snapshot = self._source, self._snapshot
+        if source is None:
+            status.summary(DiagnosticStatus.OK, "idle")
+        elif source.overruns:
+            status.summary(DiagnosticStatus.WARN, f"capturing, {source.overruns} gaps so far")
+        else:
+            status.summary(DiagnosticStatus.OK, "capturing")
+        status.add("device", source.name if source else "none")
+        status.add("frames", snapshot.last_frame_index if snapshot else 0)
+        status.add("lost frames", source.lost_frames if source else 0)
+        status.add("overruns", source.overruns if source else 0)
+        status.add("last end", self._last_end)
+        return status
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run `bass-ros`; returns its exit code."""
+    return run_server(BASS, BassNode, argv)
