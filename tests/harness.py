@@ -162,8 +162,7 @@ class Graph:
         self.env = {k: v for k, v in os.environ.items() if not k.startswith("ROS_")}
         self.env.update(
             generate.environment(),
-            PATH=f"{SCRIPTS}:/usr/local/bin:/usr/bin:/bin",
-            TCLLIBPATH=str(ROOT / "tcl"),
+            PATH=f"{SCRIPTS}:/usr/local/bin:/usr/bin:/bin",  # not the tester's: the commands run Debian's python3
             HOME=str(home),
             ROS_HOME=str(home / ".ros"),
             ROS_IP="127.0.0.1",

@@ -9,14 +9,13 @@ a reader never meets half of one and a killed generator leaves nothing that coun
         <digest>/share/{rosAFE,bass,...}           for ROS_PACKAGE_PATH (rosmsg, rossrv, rosrun)
         current -> <digest>                        what scripts/env.sh names
 
-Where the checkout cannot be written the same goes into the user's cache, and where that cannot either, into
-a temporary folder. Installed by catkin there is nothing to generate: the modules lie beside this package.
+Where the checkout cannot be written the same goes into the user's cache, and where that cannot either, into a folder
+of the user's below /tmp. Installed by catkin there is nothing to generate: the modules lie beside this package.
 """
 
 from __future__ import annotations
 
 import argparse
-import atexit
 import compileall
 import contextlib
 import fcntl
@@ -25,13 +24,14 @@ import hashlib
 import importlib.util
 import io
 import os
+import shlex
 import shutil
 import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-from rosafe.ros import paths
+from rosafe.ros import master, paths
 
 PACKAGES = {"rosAFE": ".", "bass": "bass"}  # ROS package -> its folder in the checkout
 # Debian ships the messages of these without package.xml, without which rosmsg finds no message that uses them.
@@ -62,11 +62,11 @@ def split_action(name: str, text: str) -> dict[str, str]:
     Raises GenerationError where `text` has not the three parts goal, result and feedback.
     """
     parts = [""]
-    for line in text.splitlines(keepends=True):
-        if line.strip() == "---":
+    for line in text.split("\n"):
+        if line.startswith("---"):
             parts.append("")
         else:
-            parts[-1] += line
+            parts[-1] += line + "\n"
     if len(parts) != 3:
         raise GenerationError(f"{name}.action has {len(parts)} parts instead of goal, result and feedback")
     messages = {
@@ -126,16 +126,17 @@ def _build_share(root: Path, source: Path, share: Path) -> None:
 
 
 def _build_python(package: str, share: Path, python: Path, search: dict[str, list[str]]) -> None:
+    from genpy import generator
     from genpy.generate_initpy import write_modules
-    from genpy.generator import MsgGenerator, SrvGenerator
 
-    for kind, generator in (("msg", MsgGenerator()), ("srv", SrvGenerator())):
-        files = sorted(str(path) for path in (share / kind).glob(f"*.{kind}"))
-        said = io.StringIO()
-        with contextlib.redirect_stderr(said):  # genpy prints what is wrong and returns a code
-            failed = generator.generate_messages(package, files, str(python / kind), search)
-        if failed:
-            raise GenerationError(" ".join(said.getvalue().split()))
+    for kind, generate in (("msg", generator.MsgGenerator()), ("srv", generator.SrvGenerator())):
+        for path in sorted((share / kind).glob(f"*.{kind}")):
+            generator.reset_var()  # it numbers its variables; catkin generates each file in a process of its own
+            said = io.StringIO()
+            with contextlib.redirect_stderr(said):  # genpy prints what is wrong and returns a code
+                failed = generate.generate_messages(package, [str(path)], str(python / kind), search)
+            if failed:
+                raise GenerationError(" ".join(said.getvalue().split()))
         write_modules(str(python / kind))
     write_modules(str(python))
 
@@ -199,7 +200,7 @@ def _is_current(base: Path, name: str) -> bool:
 
 
 @functools.cache
-def _generation(keep: bool = False) -> Path | None:
+def _generation() -> Path | None:
     """The folder with ``python`` and ``share`` for the sources as they are; None where catkin has installed them."""
     root = paths.source_root()
     if root is None:
@@ -209,13 +210,11 @@ def _generation(keep: bool = False) -> Path | None:
     for base in places:
         if (base / name).is_dir() and (_is_current(base, name) or not paths.writable(base)):
             return base / name
-    for base in places:
-        if paths.writable(base):
-            return _generate(root, base, name)
-    base = Path(tempfile.mkdtemp(prefix="rosafe-messages-"))
-    if not keep:
-        atexit.register(shutil.rmtree, base, ignore_errors=True)
-    return _generate(root, base, name)
+    try:
+        writable = [base for base in places if paths.writable(base)]
+        return _generate(root, writable[0] if writable else paths.private_temporary(), name)
+    except OSError as problem:
+        raise GenerationError(f"cannot write the generated messages: {problem}") from problem
 
 
 def ensure_messages() -> None:
@@ -227,43 +226,63 @@ def ensure_messages() -> None:
     paths.put_ahead(paths.CODE_DIR if generation is None else generation / "python")
 
 
-def environment() -> dict[str, str]:
-    """The environment variables by which child processes find `rosafe`, the messages and the ROS packages.
+# --- for the processes that we start, and for the shell ---------------------------------------------------------
 
-    PYTHONPATH and ROS_PACKAGE_PATH, with what is in them now kept behind. Raises GenerationError.
+
+def environment() -> dict[str, str]:
+    """The environment variables by which child processes find the executables, `rosafe`, the messages and genomix.
+
+    PATH, PYTHONPATH, ROS_PACKAGE_PATH and TCLLIBPATH; what they hold now is kept behind. Raises GenerationError.
     """
     generation = _generation()
-    if generation is None:  # <install>/lib/python3/dist-packages, with <install>/share beside lib
-        python, share = [paths.CODE_DIR], [paths.CODE_DIR.parents[2] / "share"]
+    if generation is None:  # <prefix>/lib/python3/dist-packages
+        prefix = paths.CODE_DIR.parents[2]
+        programs, python, share, tcl = prefix / "bin", [], prefix / "share", prefix / "lib" / "tcltk"
     else:
-        python, share = [generation / "python", paths.CODE_DIR], [generation / "share"]
+        if _is_current(generation.parent, generation.name):  # the name that stays when the sources change
+            generation = generation.parent / "current"
+        programs, tcl = paths.CODE_DIR / "scripts", paths.CODE_DIR / "tcl"
+        python, share = [generation / "python"], generation / "share"
+    python.append(paths.CODE_DIR)
     if paths.PYPI_DIR.is_dir():
         python.append(paths.PYPI_DIR)
-    return {"PYTHONPATH": _ahead(python, "PYTHONPATH"), "ROS_PACKAGE_PATH": _ahead(share, "ROS_PACKAGE_PATH")}
+    return {
+        "PATH": _ahead(":", "PATH", [programs]),
+        "PYTHONPATH": _ahead(":", "PYTHONPATH", python),
+        "ROS_PACKAGE_PATH": _ahead(":", "ROS_PACKAGE_PATH", [share]),
+        "TCLLIBPATH": _ahead(" ", "TCLLIBPATH", [tcl]),  # a Tcl list
+    }
 
 
-def _ahead(directories: list[Path], variable: str) -> str:
-    first = [str(directory) for directory in directories]
-    return ":".join([*first, *(p for p in os.environ.get(variable, "").split(":") if p and p not in first)])
+def _ahead(separator: str, variable: str, directories: list[Path]) -> str:
+    """The list in `variable` with `directories` at its head, each entry once."""
+    first = [f"{{{d}}}" if separator == " " and " " in str(d) else str(d) for d in directories]
+    present = f"{separator}{os.environ.get(variable, '')}{separator}"
+    for entry in first:
+        while f"{separator}{entry}{separator}" in present:  # not split: entries of a Tcl list may hold blanks
+            present = present.replace(f"{separator}{entry}{separator}", separator)
+    present = present.strip(separator)
+    return separator.join([*first, present] if present else first)
 
 
 def main(argv: list[str] | None = None) -> int:
-    """``python3 -m rosafe.ros.generate``: generate what is missing or stale and print the folder that holds it."""
+    """``python3 -m rosafe.ros.generate``: generate what is missing or stale; ``--shell`` prints what env.sh exports."""
     parser = argparse.ArgumentParser(
-        prog="rosafe.ros.generate",
-        description="Generate the message modules where missing or stale; print their folder.",
+        prog="rosafe.ros.generate", description="Generate the message modules where they are missing or stale."
     )
-    parser.parse_args(argv)
+    parser.add_argument("--shell", action="store_true", help="print the environment as commands for the shell")
+    options = parser.parse_args(argv)
     try:
-        generation = _generation(keep=True)
-    except (GenerationError, OSError) as error:
-        print(f"rosafe: cannot generate the messages: {error}", file=sys.stderr)
+        variables = environment()
+    except GenerationError as problem:
+        print(f"rosafe: {problem}", file=sys.stderr)
         return 1
-    if generation is None:
-        print(paths.CODE_DIR.parents[2])
-        return 0
-    current = generation.parent / "current"
-    print(current if current.exists() else generation)
+    if options.shell:
+        ros = dict(os.environ)
+        master.set_local_defaults(ros)
+        variables |= {name: ros[name] for name in ("ROS_MASTER_URI", "ROS_IP") if ros.get(name)}
+        for name, value in variables.items():
+            print(f"export {name}={shlex.quote(value)}")
     return 0
 
 

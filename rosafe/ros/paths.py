@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import stat
 import sys
 import tempfile
 from pathlib import Path
@@ -36,6 +37,19 @@ def user_cache() -> Path:
     """The user's own place for files that can be made again."""
     base = os.environ.get("XDG_CACHE_HOME", "")
     return (Path(base) if os.path.isabs(base) else Path(os.path.expanduser("~"), ".cache")) / "rosafe"
+
+
+def private_temporary() -> Path:
+    """A folder below /tmp that is this user's alone and the same every time, for what can be written nowhere else.
+
+    Raises OSError where the name is taken by somebody else, who could otherwise slip us files of theirs.
+    """
+    folder = Path(tempfile.gettempdir(), f"rosafe-{os.getuid()}")
+    folder.mkdir(mode=0o700, exist_ok=True)
+    found = folder.lstat()
+    if not stat.S_ISDIR(found.st_mode) or found.st_uid != os.getuid() or found.st_mode & 0o077:
+        raise PermissionError(f"{folder} is not private to this user; remove it")
+    return folder
 
 
 def writable(directory: Path) -> bool:

@@ -6,7 +6,6 @@ import argparse
 import os
 import signal
 import sys
-import tempfile
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -147,7 +146,7 @@ def _ensure_log_directory() -> None:
     import rospkg
 
     if not paths.writable(Path(rospkg.get_log_dir())):
-        os.environ["ROS_LOG_DIR"] = tempfile.mkdtemp(prefix="rosafe-log-")
+        os.environ["ROS_LOG_DIR"] = str(paths.private_temporary() / "log")
 
 
 def _log_to_stderr() -> None:
