@@ -39,3 +39,11 @@ def rosafe_node(graph: harness.Graph) -> Iterator[harness.Process]:
     """A running rosAFE-ros, new for the test."""
     with graph.node("rosAFE-ros") as process:
         yield process
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark what `scripts/test --fast` leaves out: tests on a ROS graph, and those that build, install or lint."""
+    for item in items:
+        uses_graph = {"graph", "private_graph"} & set(getattr(item, "fixturenames", ()))
+        if uses_graph or item.path.relative_to(harness.ROOT).parts[1] in ("demo", "packaging"):
+            item.add_marker("ros")

@@ -162,6 +162,7 @@ def _build_stub(package: str, share: Path) -> None:
 def _generate(root: Path, base: Path, name: str) -> Path:
     """The generation `name` under `base`, built if it is not there yet. One process at a time builds."""
     wanted = base / name
+    base.mkdir(parents=True, exist_ok=True)
     with open(base / "lock", "w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)  # given back by the kernel even if this process is killed
         for orphan in base.glob("build-*"):  # nobody else builds now: left by one that was killed
@@ -212,7 +213,7 @@ def _generation() -> Path | None:
             return base / name
     try:
         writable = [base for base in places if paths.writable(base)]
-        return _generate(root, writable[0] if writable else paths.private_temporary(), name)
+        return _generate(root, writable[0] if writable else paths.private_temporary() / "messages", name)
     except OSError as problem:
         raise GenerationError(f"cannot write the generated messages: {problem}") from problem
 
