@@ -1,0 +1,75 @@
+"""Bare stages joined by hand: block cutting and the default chain, without the processor tree."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rosafe import interface
+from rosafe.dsp import STAGES, Filterbank, InnerHairCell, Stage
+
+FloatArray = NDArray[np.float64]
+
+KIND_OF = {p.name: kind.kind for kind in interface.KINDS.values() for p in kind.parameters}
+
+
+def cut(signal: NDArray[Any], sizes: int | Iterable[int]) -> list[NDArray[Any]]:
+    """`signal` in blocks of `sizes` along its last axis, used cyclically; the last block is what is left."""
+    blocks = []
+    position = 0
+    for size in itertools.cycle([sizes] if isinstance(sizes, int) else sizes):
+        if position >= signal.shape[-1]:
+            return blocks
+        blocks.append(signal[..., position : position + size])
+        position += size
+    return blocks
+
+
+def run(stage: Stage, blocks: Iterable[NDArray[Any]]) -> FloatArray:
+    """What `stage` makes of `blocks`, joined."""
+    return np.concatenate([stage.process(block) for block in blocks], axis=-1)
+
+
+class Chain:
+    """All seven stages, `ihc` feeding the last three."""
+
+    def __init__(self, sample_rate: float, parameters: Mapping[str, Any]) -> None:
+        own: dict[str, dict[str, Any]] = {kind: {} for kind in STAGES}
+        for name, value in parameters.items():
+            own[KIND_OF[name]][name] = value
+        self.stages = {kind: stage(sample_rate, **own[kind]) for kind, stage in STAGES.items()}
+
+    def process(self, block: NDArray[Any]) -> dict[str, FloatArray]:
+        """The output of every stage for one block."""
+        filterbank, hair_cell = self.stages["gammatone"], self.stages["ihc"]
+        assert isinstance(filterbank, Filterbank)
+        assert isinstance(hair_cell, InnerHairCell)
+        filterbank.provide_envelope = hair_cell.needs_envelope
+        out = {"input": self.stages["input"].process(block)}
+        out["preProc"] = self.stages["preProc"].process(out["input"])
+        out["gammatone"] = filterbank.process(out["preProc"])
+        out["ihc"] = hair_cell.process(out["gammatone"], filterbank.envelope)
+        for kind in ("ild", "ratemap", "crossCorrelation"):
+            out[kind] = self.stages[kind].process(out["ihc"])
+        return out
+
+    def run(
+        self, blocks: Sequence[NDArray[Any]], changes: Iterable[tuple[int, str, Any]] = ()
+    ) -> list[dict[str, FloatArray]]:
+        """Outputs block by block; `changes` are (block index, parameter, value), made before that block."""
+        changes = list(changes)
+        outputs = []
+        for index, block in enumerate(blocks):
+            for _, name, value in (change for change in changes if change[0] == index):
+                self.stages[KIND_OF[name]].configure(**{name: value})
+            outputs.append(self.process(block))
+        return outputs
+
+
+def joined(outputs: Sequence[Mapping[str, FloatArray]]) -> dict[str, FloatArray]:
+    """The outputs of all blocks as one array per stage."""
+    return {kind: np.concatenate([output[kind] for output in outputs], axis=-1) for kind in outputs[0]}

@@ -1,0 +1,184 @@
+"""How a signal is cut into blocks makes no difference; shapes, and who owns the arrays."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rosafe.dsp import STAGES, Filterbank, InnerHairCell, PreProc
+
+from .bare import Chain, cut, joined, run
+from .stages import CHANNELS, MODES, NAMES, RATE, make, noise, rows
+
+SAMPLES = 600
+
+every_mode = pytest.mark.parametrize(("kind", "parameters"), MODES, ids=NAMES)
+# gain control starts from its first block: 16 samples are one time constant, more do not change the start
+sizes = st.lists(st.one_of(st.sampled_from([0, 1, 2]), st.integers(0, 250)), min_size=1, max_size=12).filter(any)
+
+
+@every_mode
+@given(sizes=sizes)
+@settings(max_examples=20, deadline=None, database=None)
+def test_block_cutting(kind: str, parameters: dict[str, Any], sizes: list[int]) -> None:
+    signal = noise(kind, SAMPLES)
+    whole = make(kind, parameters).process(signal)
+    blocks = cut(signal, [16, *sizes]) if parameters.get("pp_bNormalizeRMS") else cut(signal, sizes)
+    pieces = run(make(kind, parameters), blocks)
+    assert pieces.shape == whole.shape
+    np.testing.assert_allclose(pieces, whole, rtol=0, atol=1e-12 * max(1.0, np.abs(whole).max()))
+
+
+@pytest.mark.parametrize("method", ["dau", "bernstein"])
+def test_whole_chain_sample_by_sample(method: str) -> None:
+    parameters = {
+        "fb_nChannels": 3,
+        "fb_highFreqHz": 4000.0,
+        "ihc_method": method,
+        "pp_bRemoveDC": True,
+        "pp_bMiddleEarFiltering": True,
+    }
+    signal = (noise("input", 900)).astype(np.int32)
+    whole = Chain(RATE, parameters).process(signal)
+    single = joined(Chain(RATE, parameters).run(cut(signal, 1)))
+    assert whole["ild"].shape[-1] == (900 - 320) // 160 + 1
+    for kind, expected in whole.items():
+        tolerance = 1e-12 * max(1.0, np.abs(expected).max())
+        np.testing.assert_allclose(single[kind], expected, rtol=0, atol=tolerance, err_msg=kind)
+
+
+def test_window_longer_than_many_blocks() -> None:
+    """1000 samples over blocks of 7: the buffer grows, fills and is moved many times."""
+    signal = noise("ild", 5000)
+    parameters = {"ild_wSizeSec": 1000 / RATE, "ild_hSizeSec": 3 / RATE}
+    whole = make("ild", parameters).process(signal)
+    assert whole.shape == (CHANNELS, (5000 - 1000) // 3 + 1)
+    np.testing.assert_allclose(run(make("ild", parameters), cut(signal, 7)), whole, rtol=0, atol=1e-11)
+
+
+@every_mode
+@pytest.mark.parametrize("samples", [0, 1, 20, 333])
+def test_shapes_and_ownership(kind: str, parameters: dict[str, Any], samples: int) -> None:
+    stage = STAGES[kind](RATE, **parameters)
+    block = noise(kind, samples)
+    block.setflags(write=False)
+    before = block.copy()
+
+    def process(block: Any) -> Any:
+        if isinstance(stage, InnerHairCell):
+            return stage.process(block, np.abs(block))
+        return stage.process(block)
+
+    out = process(block)
+    assert out.shape[:-1] == stage.output_rows(rows(kind))
+    assert out.dtype == np.float64
+    assert out.flags.c_contiguous
+    assert not np.shares_memory(out, block)
+    kept = out.copy()
+    assert not np.shares_memory(process(noise(kind, samples, seed=2)), out)
+    np.testing.assert_array_equal(out, kept)
+    np.testing.assert_array_equal(block, before)
+
+
+@every_mode
+def test_memory_order_and_plain_lists(kind: str, parameters: dict[str, Any]) -> None:
+    block = noise(kind, 200)
+    expected = make(kind, parameters).process(block)
+    for other in (np.asfortranarray(block), np.repeat(block, 2, axis=-1)[..., ::2]):
+        got = STAGES[kind](RATE, **parameters)
+        out = got.process(other, np.abs(other) + 0.5) if isinstance(got, InnerHairCell) else got.process(other)
+        assert out.flags.c_contiguous
+        np.testing.assert_array_equal(out, expected[:2] if kind == "gammatone" else expected)
+
+
+@every_mode
+def test_reset_is_a_new_stage(kind: str, parameters: dict[str, Any]) -> None:
+    stage = STAGES[kind](RATE, **parameters)
+
+    def process(block: Any) -> Any:
+        return stage.process(block, np.abs(block)) if isinstance(stage, InnerHairCell) else stage.process(block)
+
+    first = process(noise(kind, 333))
+    process(noise(kind, 50, seed=3))
+    stage.reset()
+    np.testing.assert_array_equal(process(noise(kind, 333)), first)
+
+
+@every_mode
+def test_other_channel_count_starts_anew(kind: str, parameters: dict[str, Any]) -> None:
+    if len(rows(kind)) == 1:
+        return  # no channels to change
+    stage = make(kind, parameters)
+    stage.process(noise(kind, 250, channels=3))
+    block = noise(kind, 300, seed=4, channels=5)
+    got = stage.process(block)
+    np.testing.assert_array_equal(got, make(kind, parameters).process(block))
+    back = noise(kind, 300, seed=5, channels=3)
+    np.testing.assert_array_equal(stage.process(back), make(kind, parameters).process(back))
+
+
+@every_mode
+def test_bad_blocks(kind: str, parameters: dict[str, Any]) -> None:
+    stage = STAGES[kind](RATE, **parameters)
+    good = noise(kind, 10)
+    for bad in (good[0], good[:1], good[np.newaxis], np.concatenate([good, good]), good * 1j, good > 0, [["a"], ["b"]]):
+        with pytest.raises(ValueError, match="block: "):
+            stage.process(bad)  # type: ignore[arg-type]
+
+
+def test_the_envelope_costs_only_when_asked_for() -> None:
+    bank = Filterbank(RATE, fb_nChannels=2, fb_highFreqHz=4000.0)
+    bank.process(noise("gammatone", 100))
+    assert bank.envelope is None
+    bank.provide_envelope = True
+    bank.process(noise("gammatone", 50))
+    assert bank.envelope is not None
+    assert bank.envelope.shape == (2, 2, 50)
+    assert InnerHairCell(RATE, ihc_method="hilbert").needs_envelope
+    assert not InnerHairCell(RATE).needs_envelope
+    with pytest.raises(ValueError, match="envelope: bernstein"):
+        InnerHairCell(RATE, ihc_method="bernstein").process(noise("ihc", 5))
+    with pytest.raises(ValueError, match="envelope: hilbert"):
+        InnerHairCell(RATE, ihc_method="hilbert").process(noise("ihc", 5), noise("ihc", 4))
+
+
+@pytest.mark.parametrize("fb_type", ["gammatone", "drnl"])
+def test_asking_for_the_envelope_later_gives_the_same_one(fb_type: str) -> None:
+    signal = noise("gammatone", 200)
+    early, late = (Filterbank(RATE, fb_type=fb_type, fb_cfHz=[300.0, 1000.0]) for _ in range(2))
+    early.provide_envelope = True
+    for stage in (early, late):
+        stage.process(signal[:, :90])
+    late.provide_envelope = True
+    for stage in (early, late):
+        stage.process(signal[:, 90:])
+    assert early.envelope is not None
+    np.testing.assert_array_equal(early.envelope, late.envelope)
+
+
+def test_gain_control_starts_at_each_ears_first_sound() -> None:
+    """Silent blocks, empty ones among them, do not start an ear; a later start of one ear leaves the other alone."""
+    stage = PreProc(RATE, pp_bNormalizeRMS=True, pp_intTimeSecRMS=0.01)
+    sound = noise("preProc", 400)
+    assert not stage.process(np.zeros((2, 100))).any()
+    stage.process(np.zeros((2, 0)))
+    left_only = sound[:, :200] * [[1.0], [0.0]]
+    first = stage.process(left_only)
+    second = stage.process(sound[:, 200:])
+
+    retention = np.exp(-1 / (0.01 * RATE))
+    power = [np.mean(sound[0, :160] ** 2), np.mean(sound[1, 200:360] ** 2)]
+    expected = np.zeros((2, 400))
+    for n in range(400):
+        x = [sound[0, n], sound[1, n] if n >= 200 else 0.0]
+        loudest = 0.0
+        for ear in range(2):
+            if ear == 0 or n >= 200:
+                power[ear] = retention * power[ear] + (1 - retention) * x[ear] ** 2
+                loudest = max(loudest, np.sqrt(power[ear]) + 1e-8)
+        expected[:, n] = np.array(x) / loudest
+    np.testing.assert_allclose(np.concatenate([first, second], axis=-1), expected, rtol=1e-12, atol=0)

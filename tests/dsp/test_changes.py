@@ -1,0 +1,328 @@
+"""Parameters: the table of the interface, what is refused, changes between blocks and what they reset."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rosafe import interface
+from rosafe.dsp import STAGES, CrossCorrelation, Filterbank, Ild, InnerHairCell, Input, PreProc, Ratemap, Stage
+from rosafe.dsp.erb import erb_rate
+from rosafe.dsp.windows import window
+
+from .bare import run
+from .stages import MODES, NAMES, RATE, make, noise, rows
+
+# --- the table --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", interface.KINDS)
+def test_parameters_are_those_of_the_interface(kind: str) -> None:
+    wanted = {p.name: p for p in interface.KINDS[kind].parameters}
+    table = STAGES[kind].PARAMETERS
+    assert list(STAGES[kind](44100.0).parameters) == list(table) == list(wanted)
+    for name, parameter in table.items():
+        assert parameter.default == wanted[name].default
+        for word in wanted[name].choices:
+            assert parameter.check(name, word) == word
+        for bound in (wanted[name].minimum, wanted[name].maximum):
+            if bound and wanted[name].idl != "sequence<double>":
+                assert parameter.check(name, int(bound) if "long" in wanted[name].idl else bound) == bound
+
+
+def test_channels_in_force() -> None:
+    default = Filterbank(44100).parameters
+    assert (default["fb_nChannels"], default["fb_nERBs"], default["fb_highFreqHz"]) == (31, 1.0, 8000.0)
+    assert default["fb_cfHz"][-1] == pytest.approx(7641.313909)
+
+    number = Filterbank(44100, fb_nChannels=23).parameters
+    assert number["fb_nERBs"] == pytest.approx(1.322300741)
+    assert (number["fb_cfHz"][0], number["fb_cfHz"][-1], len(number["fb_cfHz"])) == (80.0, 8000.0, 23)
+    np.testing.assert_allclose(np.diff(erb_rate(number["fb_cfHz"]), 2), 0, atol=1e-12)
+
+    listed = Filterbank(44100, fb_cfHz=np.array([500, 250, 1000]), fb_nChannels=7).parameters
+    assert listed["fb_cfHz"] == [500.0, 250.0, 1000.0]
+    assert (listed["fb_lowFreqHz"], listed["fb_highFreqHz"]) == (500.0, 1000.0)
+    assert (listed["fb_nERBs"], listed["fb_nChannels"]) == (0.0, 3)
+    assert Filterbank(44100, **listed).parameters == listed
+
+    assert Filterbank(44100, fb_nChannels=1).parameters["fb_cfHz"] == [80.0]
+    for nothing in ([], (), 0, [0], None, np.array([])):
+        assert Filterbank(44100, fb_cfHz=nothing).parameters == default
+    assert Filterbank(44100, fb_cfHz=440).parameters["fb_cfHz"] == [440.0]
+
+
+@pytest.mark.parametrize("step", [0.1, 1.0, 2.5, 10.0])
+def test_a_range_of_whole_steps_excludes_its_end(step: float) -> None:
+    low = 100.0
+    high = 24.7 * 9.265 * math.expm1((erb_rate(low) + 10) / 9.265)
+    assert Filterbank(44100, fb_lowFreqHz=low, fb_highFreqHz=high, fb_nERBs=step).parameters["fb_nChannels"] == round(
+        10 / step
+    )
+
+
+# --- refusals ---------------------------------------------------------------------------------------------------
+
+NAN, INF = math.nan, math.inf
+
+REFUSED: list[tuple[str, dict[str, Any]]] = [
+    ("input", {"in_normalizeValue": 0}),
+    ("input", {"in_normalizeValue": 2**64}),
+    ("input", {"in_normalizeValue": 1.5}),
+    ("input", {"in_doNormalize": 2}),
+    ("input", {"in_doNormalize": "yes"}),
+    ("preProc", {"pp_bRemoveDC": True, "pp_cutoffHzDC": 8000.0}),
+    *(("preProc", {name: value}) for name in ("pp_cutoffHzDC", "pp_intTimeSecRMS") for value in (0.0, -1.0, NAN, INF, "1")),
+    *(("preProc", {"pp_coefPreEmphasis": value}) for value in (1.1, NAN, None, [])),
+    *(("preProc", {"pp_refSPLdB": value}) for value in (401, -1e300, NAN)),
+    *(("preProc", {"pp_middleEarModel": value}) for value in ("", "ear", 3, None)),
+    *(("gammatone", {name: value}) for name in ("fb_lowFreqHz", "fb_highFreqHz", "fb_nERBs") for value in (0, -3, NAN)),
+    *(("gammatone", {"fb_bwERBs": value}) for value in (0, NAN, INF)),
+    *(("gammatone", {"fb_nGamma": value}) for value in (0, 65, 2.5, NAN, "4")),
+    *(("gammatone", {"fb_nChannels": value}) for value in (-1, 1025, 1e300, 0.5)),
+    ("gammatone", {"fb_lowFreqHz": 5000.0, "fb_highFreqHz": 4000.0}),
+    ("gammatone", {"fb_lowFreqHz": 4000.0, "fb_highFreqHz": 4000.0}),
+    ("gammatone", {"fb_highFreqHz": 8000.0, "fb_nChannels": 16}),  # the last channel at half the sample rate
+    ("gammatone", {"fb_nERBs": 1e-9}),
+    *(("gammatone", {"fb_cfHz": value}) for value in ([100, 8000], [100, 0], [NAN], [-5], "440", ["a"], [[1], "x"], [1] * 1025)),
+    ("gammatone", {"fb_type": "drnl", "fb_cfHz": [7900.0]}),
+    ("gammatone", {"fb_type": "gammachirp"}),
+    ("ihc", {"ihc_method": "breebaart"}),
+    *(("ild", {name: value}) for name in ("ild_wSizeSec", "ild_hSizeSec") for value in (0, -1, NAN, 1e300, 1e-6, "x")),
+    ("ild", {"ild_wname": "hanns"}),
+    ("ratemap", {"rm_scaling": "_power"}),
+    ("ratemap", {"rm_decaySec": 0}),
+    ("crossCorrelation", {"cc_maxDelaySec": 0}),
+    ("crossCorrelation", {"cc_maxDelaySec": 1e300}),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("kind", "changes"), REFUSED)
+def test_what_is_refused_changes_nothing(kind: str, changes: dict[str, Any]) -> None:
+    names = "|".join(changes) + "|fb_cfHz|fb_highFreqHz"
+    with pytest.raises(ValueError, match=f"^({names}): ") as refusal:
+        STAGES[kind](RATE, **changes)
+    assert "\n" not in str(refusal.value)
+    assert len(str(refusal.value)) < 200
+
+    stage, twin = (STAGES[kind](RATE) for _ in range(2))
+    for each in (stage, twin):
+        each.process(noise(kind, 500))
+    other = {p.name: p.default for p in interface.KINDS[kind].parameters if p.name not in changes}
+    with pytest.raises(ValueError, match=f"^({names}): "):
+        stage.configure(**other, **changes)  # the good ones first
+    assert stage.parameters == twin.parameters
+    block = noise(kind, 700, seed=2)
+    np.testing.assert_array_equal(stage.process(block), twin.process(block))
+    assert stage.output_rate == twin.output_rate
+
+
+@pytest.mark.parametrize("kind", STAGES)
+@pytest.mark.parametrize("rate", [0, -1, NAN, INF, "44100", None])
+def test_bad_sample_rates(kind: str, rate: Any) -> None:
+    with pytest.raises(ValueError, match="^sample_rate: "):
+        STAGES[kind](rate)
+
+
+@pytest.mark.parametrize("kind", STAGES)
+def test_unknown_names(kind: str) -> None:
+    with pytest.raises(ValueError, match="^fb_bAlign: .*no such parameter"):
+        STAGES[kind](RATE, fb_bAlign=True)
+    with pytest.raises(ValueError, match="^name: "):
+        STAGES[kind](RATE).configure(name="x")
+
+
+def test_sample_rates_too_low_for_a_filter() -> None:
+    with pytest.raises(ValueError, match="^ihc_method: dau"):
+        InnerHairCell(2000)
+    with pytest.raises(ValueError, match="^pp_middleEarModel: lopezpoveda"):
+        PreProc(200, pp_bMiddleEarFiltering=True, pp_middleEarModel="lopezpoveda")
+    PreProc(30)  # what is switched off does not matter
+    assert PreProc(RATE, pp_middleEarModel="jespen").parameters["pp_middleEarModel"] == "jepsen"
+
+
+# --- changes and their resets -----------------------------------------------------------------------------------
+
+PREPROC = {"pp_bRemoveDC": True, "pp_bPreEmphasis": True, "pp_bNormalizeRMS": True, "pp_bMiddleEarFiltering": True}
+
+
+@pytest.mark.parametrize("name", PreProc.PARAMETERS)
+def test_any_preproc_parameter_starts_all_its_filters_anew(name: str) -> None:
+    stage = PreProc(RATE, **PREPROC)
+    stage.process(noise("preProc", 500) + 0.5)
+    changed = {**stage.parameters, name: {"pp_middleEarModel": "lopezpoveda", "pp_cutoffHzDC": 50.0}.get(name, 1)}
+    stage.configure(**{name: changed[name]})
+    block = noise("preProc", 500, seed=2)
+    np.testing.assert_array_equal(stage.process(block), PreProc(RATE, **changed).process(block))
+
+
+def test_input_changes_from_the_next_block() -> None:
+    stage = Input(RATE)
+    block = noise("input", 10)
+    stage.configure(in_normalizeValue=1000)
+    np.testing.assert_array_equal(stage.process(block), block / 1000)
+    stage.configure(in_doNormalize=False)
+    np.testing.assert_array_equal(stage.process(block), block)
+
+
+@pytest.mark.parametrize(
+    "changes", [{"fb_bwERBs": 1.3}, {"fb_nGamma": 2}, {"fb_type": "drnl"}, {"fb_nChannels": 3}, {"fb_bwERBs": 1.018}]
+)
+def test_any_filterbank_parameter_starts_all_its_filters_anew(changes: dict[str, Any]) -> None:
+    base: dict[str, Any] = {"fb_highFreqHz": 4000.0, "fb_nChannels": 4}
+    stage = Filterbank(RATE, **base)
+    stage.process(noise("gammatone", 500))
+    stage.configure(**changes)
+    block = noise("gammatone", 500, seed=2)
+    np.testing.assert_array_equal(stage.process(block), Filterbank(RATE, **{**base, **changes}).process(block))
+    assert stage.output_rows((2,)) == (2, changes.get("fb_nChannels", 4))
+
+
+def test_which_channel_setting_decides() -> None:
+    stage = Filterbank(44100, fb_cfHz=[440.0, 880.0])
+
+    def channels() -> list[float]:
+        return [round(f, 6) for f in stage.parameters["fb_cfHz"]]
+
+    stage.configure(fb_bwERBs=1.2)
+    assert channels() == [440, 880]
+    stage.configure(fb_nChannels=0)
+    assert channels() == [440, 880]  # no number of channels: the list stays
+    stage.configure(fb_nChannels=2)
+    assert channels() == [80, 8000]
+    stage.configure(fb_cfHz=[500.0])
+    assert channels() == [500]
+    assert stage.parameters["fb_nERBs"] == 0
+    stage.configure(fb_cfHz=[])
+    assert channels() == [80, 8000]  # as before the list
+    stage.configure(fb_lowFreqHz=100)
+    assert channels() == [100, 8000]
+    stage.configure(fb_nERBs=10.0)
+    assert len(channels()) == 3
+    assert stage.parameters["fb_nERBs"] == 10
+    stage.configure(fb_cfHz=[500.0])
+    stage.configure(fb_highFreqHz=1000)
+    assert len(channels()) == math.ceil((erb_rate(1000) - erb_rate(100)) / 10)
+    stage.configure(fb_cfHz=[300.0], fb_nChannels=9, fb_nERBs=2)
+    assert channels() == [300]
+    stage.configure(fb_cfHz=0)
+    assert len(channels()) == 9
+    stage.configure(fb_nERBs=3.0, fb_nChannels=5)
+    assert len(channels()) == 5
+
+
+def test_hair_cell_method_starts_the_filter_anew() -> None:
+    stage = InnerHairCell(RATE)
+    stage.process(noise("ihc", 500))
+    stage.configure(ihc_method="joergensen")
+    assert stage.needs_envelope
+    block = noise("ihc", 300, seed=2)
+    expected = InnerHairCell(RATE, ihc_method="joergensen").process(block, np.abs(block))
+    np.testing.assert_array_equal(stage.process(block, np.abs(block)), expected)
+
+
+def ild_of(frame: Any, name: str) -> Any:
+    energy = np.mean((window(name, frame.shape[-1]) * frame) ** 2, axis=-1)
+    return 10 * np.log10((energy[1] + 2.2204e-16) / (energy[0] + 2.2204e-16))
+
+
+def test_window_and_hop_change_keep_the_buffer_and_the_grid() -> None:
+    """The next frame starts where it would have started, with the new window; its followers by the new hop."""
+    x = noise("ild", 1000)
+    stage = Ild(RATE, ild_wSizeSec=100 / RATE, ild_hSizeSec=40 / RATE)
+    before = stage.process(x[..., :330])  # frames at 0, 40 ... 200; the next at 240
+    assert before.shape[-1] == 6
+    stage.configure(ild_wSizeSec=60 / RATE, ild_wname="blackman", ild_hSizeSec=25 / RATE)
+    after = stage.process(x[..., 330:])
+    starts = range(240, 1000 - 60 + 1, 25)
+    assert after.shape[-1] == len(starts)
+    for frame, start in enumerate(starts):
+        np.testing.assert_allclose(after[:, frame], ild_of(x[..., start : start + 60], "blackman"), rtol=0, atol=1e-11)
+    assert stage.output_rate == RATE / 25
+
+
+def test_a_shorter_window_finds_its_frames_in_the_buffer() -> None:
+    x = noise("ild", 500)
+    stage = Ild(RATE, ild_wSizeSec=400 / RATE, ild_hSizeSec=50 / RATE)
+    assert stage.process(x[..., :390]).shape[-1] == 0
+    stage.configure(ild_wSizeSec=100 / RATE)
+    assert stage.process(x[..., :0]).shape[-1] == (390 - 100) // 50 + 1
+
+
+def test_hop_longer_than_window_then_shorter() -> None:
+    x = noise("ild", 500)
+    stage = Ild(RATE, ild_wSizeSec=20 / RATE, ild_hSizeSec=150 / RATE)
+    stage.process(x[..., :30])  # the next frame starts at 150
+    stage.configure(ild_hSizeSec=10 / RATE)
+    after = stage.process(x[..., 30:])
+    np.testing.assert_allclose(after[:, 0], ild_of(x[..., 150:170], "hann"), rtol=0, atol=1e-11)
+    assert after.shape[-1] == (350 - 20) // 10 + 1
+
+
+@pytest.mark.parametrize("change", [{"rm_decaySec": 0.02}, {"rm_scaling": "power"}, {"rm_decaySec": 0.008}])
+def test_ratemap_integrator_starts_anew_and_the_buffer_stays(change: dict[str, Any]) -> None:
+    x = np.abs(noise("ratemap", 400))
+    stage = Ratemap(RATE, rm_wSizeSec=100 / RATE, rm_hSizeSec=50 / RATE, rm_scaling="magnitude")
+    stage.process(x[..., :130])  # one frame; the next at 50
+    stage.configure(**change)
+    got = stage.process(x[..., 130:])
+
+    def integrated(part: Any, decay: float) -> Any:
+        retention = math.exp(-1 / (RATE * decay))
+        out, last = np.zeros_like(part), np.zeros(part.shape[:-1])
+        for n in range(part.shape[-1]):
+            out[..., n] = last = retention * last + (1 - retention) * part[..., n]
+        return out
+
+    smooth = np.concatenate(
+        [integrated(x[..., :130], 0.008), integrated(x[..., 130:], change.get("rm_decaySec", 0.008))], axis=-1
+    )
+    frames = np.stack([smooth[..., s : s + 100] for s in range(50, 301, 50)], axis=-2) * window("hann", 100)
+    expected = np.mean(frames**2 if "rm_scaling" in change else frames, axis=-1)
+    np.testing.assert_allclose(got, expected, rtol=1e-12, atol=0)
+
+
+def test_ratemap_window_change_leaves_the_integrator_running() -> None:
+    x = np.abs(noise("ratemap", 400))
+    framed = {"rm_wSizeSec": 50 / RATE, "rm_hSizeSec": 50 / RATE}
+    whole = Ratemap(RATE, **framed, rm_wname="hamming").process(x)
+    stage = Ratemap(RATE, **framed)
+    stage.process(x[..., :100])
+    stage.configure(rm_wname="hamming")
+    np.testing.assert_allclose(stage.process(x[..., 100:]), whole[..., 2:], rtol=1e-13)
+
+
+def test_lag_and_frame_shapes_are_rebuilt() -> None:
+    x = noise("crossCorrelation", 900)
+    whole = CrossCorrelation(RATE, cc_maxDelaySec=40 / RATE).process(x)
+    stage = CrossCorrelation(RATE, cc_maxDelaySec=5 / RATE)
+    assert stage.process(x[..., :500]).shape == (3, 11, 2)
+    stage.configure(cc_maxDelaySec=40 / RATE)
+    assert stage.output_rows((2, 3)) == (3, 81)
+    assert len(stage.lags) == 81
+    np.testing.assert_allclose(stage.process(x[..., 500:]), whole[..., 2:], rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize(("kind", "parameters"), MODES, ids=NAMES)
+def test_no_change_is_no_reset(kind: str, parameters: dict[str, Any]) -> None:
+    stage, twin = STAGES[kind](RATE, **parameters), make(kind, parameters)
+
+    class Configured(Stage):
+        """`stage` with an empty change before every block."""
+
+        def __init__(self) -> None:
+            pass
+
+        def process(self, block: Any) -> Any:
+            stage.configure()
+            return (
+                stage.process(block, np.abs(block) + 0.5) if isinstance(stage, InnerHairCell) else stage.process(block)
+            )
+
+    blocks = [noise(kind, 200, seed) for seed in range(3)]
+    expected = run(twin, blocks)
+    np.testing.assert_array_equal(run(Configured(), blocks), expected[:2] if kind == "gammatone" else expected)
+    assert len(rows(kind)) + 1 == blocks[0].ndim

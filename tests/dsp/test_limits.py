@@ -1,0 +1,160 @@
+"""Huge, tiny and broken numbers: finite in gives finite out, and nothing stays denormal."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rosafe.dsp import STAGES, Filterbank, Input, PreProc, Ratemap
+from rosafe.dsp.cascade import Cascade, leaky_integrator
+from rosafe.dsp.guard import LIMIT
+
+from .bare import Chain, cut, run
+from .stages import MODES, NAMES, RATE, make, noise, rows
+
+every_mode = pytest.mark.parametrize(("kind", "parameters"), MODES, ids=NAMES)
+
+BIGGEST = float(np.finfo(np.float64).max)
+SMALLEST = 5e-324
+SAMPLES = 400
+
+PATTERNS = {
+    "constant 1e300": np.full(SAMPLES, 1e300),
+    "alternating biggest": BIGGEST * (-1.0) ** np.arange(SAMPLES),
+    "one huge among small": np.where(np.arange(SAMPLES) == 150, -BIGGEST, 1e-3),
+    "huge, then smallest": np.where(np.arange(SAMPLES) < 100, 1e160, SMALLEST),
+    "smallest": np.full(SAMPLES, SMALLEST),
+    "tiny": np.full(SAMPLES, 1e-170),
+    "at the limit": LIMIT * (-1.0) ** (np.arange(SAMPLES) // 20),
+    "full scale integers": np.where(np.arange(SAMPLES) % 30 < 15, -(2.0**31), 2.0**31 - 1),
+}
+
+
+@every_mode
+@pytest.mark.parametrize("pattern", PATTERNS)
+def test_finite_in_finite_out(kind: str, parameters: dict[str, Any], pattern: str) -> None:
+    stage = make(kind, parameters)
+    block = np.broadcast_to(PATTERNS[pattern], (*rows(kind), SAMPLES))
+    with np.errstate(over="raise", invalid="raise", divide="raise"):
+        for part in (*cut(block, [1, 150, 64]), noise(kind, SAMPLES)):
+            assert np.isfinite(stage.process(part)).all()
+
+
+@pytest.mark.parametrize("pattern", PATTERNS)
+@pytest.mark.parametrize("method", ["dau", "square", "bernstein", "breebart"])
+@pytest.mark.parametrize("fb_type", ["gammatone", "drnl"])
+def test_finite_through_the_chain(pattern: str, method: str, fb_type: str) -> None:
+    chain = Chain(
+        RATE,
+        {
+            "in_normalizeValue": 1,
+            "pp_bLevelScaling": True,
+            "pp_refSPLdB": -200.0,
+            "pp_bMiddleEarFiltering": True,
+            "pp_bUnityComp": True,
+            "fb_type": fb_type,
+            "fb_cfHz": [200.0, 3000.0],
+            "ihc_method": method,
+        },
+    )
+    block = np.array([PATTERNS[pattern], -0.1 * PATTERNS[pattern]])
+    for part in cut(np.tile(block, 3), 450):
+        for kind, out in chain.process(part).items():
+            assert np.isfinite(out).all(), kind
+            if kind == "crossCorrelation":
+                assert np.abs(out).max(initial=0.0) <= 1 + 1e-12
+
+
+def test_one_huge_sample_does_not_poison_the_rest() -> None:
+    bank = Filterbank(RATE, fb_nChannels=3, fb_highFreqHz=4000.0)
+    block = noise("gammatone", 1000)
+    block[:, 10] = BIGGEST
+    bank.process(block)
+    for _ in range(60):
+        bank.process(np.zeros((2, 1000)))
+    sound = noise("gammatone", 1000, seed=2)
+    expected = Filterbank(RATE, fb_nChannels=3, fb_highFreqHz=4000.0).process(sound)
+    np.testing.assert_allclose(bank.process(sound), expected, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_the_input_refuses_what_is_not_finite(bad: float) -> None:
+    stage = Input(RATE, in_doNormalize=False)
+    block = noise("input", 10)
+    block[1, 3] = bad
+    with pytest.raises(ValueError, match="block: .*not finite"):
+        stage.process(block)
+
+
+def test_sample_types() -> None:
+    whole = np.arange(-6, 6).reshape(2, 6) * 1000
+    for kind in (np.int16, np.int32, np.int64, np.float32, np.float64):
+        np.testing.assert_array_equal(Input(RATE, in_doNormalize=False).process(whole.astype(kind)), whole)
+
+
+# --- tiny states ------------------------------------------------------------------------------------------------
+
+
+def silence_after_burst(kind: str, parameters: dict[str, Any], blocks: int) -> Any:
+    """Output of the last of so many silent blocks after a loud one."""
+    stage = make(kind, parameters)
+    stage.process(noise(kind, 1000))
+    for _ in range(blocks):
+        out = stage.process(np.zeros((*rows(kind), 1000)))
+    return out
+
+
+@pytest.mark.parametrize(
+    ("kind", "parameters", "blocks"),
+    [
+        ("preProc", {"pp_bRemoveDC": True}, 250),
+        ("gammatone", {"fb_cfHz": [80.0, 1000.0, 7000.0]}, 40),
+        ("gammatone", {"fb_cfHz": [100.0, 1000.0, 6000.0], "fb_type": "drnl"}, 80),
+        ("ihc", {"ihc_method": "dau"}, 10),
+        ("ihc", {"ihc_method": "breebart"}, 10),
+        ("ratemap", {"rm_scaling": "magnitude"}, 70),
+    ],
+)
+def test_silence_becomes_exactly_silent(kind: str, parameters: dict[str, Any], blocks: int) -> None:
+    """Unflushed, a decaying state ends at the smallest denormal and stays there."""
+    out = silence_after_burst(kind, parameters, blocks)
+    assert out.size
+    assert not out.any()
+
+
+@pytest.mark.parametrize("retention", [0.5, 0.99, 0.9999])
+def test_states_are_never_denormal_between_blocks(retention: float) -> None:
+    cascade = Cascade(leaky_integrator(retention))
+    cascade.process(np.ones((2, 1)))
+    for _ in range(100):
+        cascade.process(np.zeros((2, 1000)))
+        assert cascade.state is not None
+        size = np.abs(cascade.state)
+        assert ((size == 0) | (size >= 1e-200)).all()
+
+
+def test_complex_states_are_flushed_too() -> None:
+    sections = np.tile(np.array([0.1, 0, 0, 1, -0.9 * np.exp(0.3j), 0]), (4, 1))
+    cascade = Cascade(sections)
+    cascade.process(np.ones((2, 5)))
+    for _ in range(10):
+        cascade.process(np.zeros((2, 1000)))
+    assert cascade.state is not None
+    assert not cascade.state.any()
+
+
+def test_flush_changes_nothing_that_matters() -> None:
+    """The tail of a burst through many short blocks (many flushes) is that through one long block (one flush)."""
+    signal = np.zeros((2, 30000))
+    signal[:, :100] = noise("gammatone", 100)
+    whole = Filterbank(RATE, fb_cfHz=[80.0]).process(signal)
+    pieces = run(Filterbank(RATE, fb_cfHz=[80.0]), cut(signal, 100))
+    np.testing.assert_allclose(pieces, whole, rtol=0, atol=1e-199)
+
+
+def test_all_zero_blocks_stay_exactly_zero() -> None:
+    for stage in (PreProc(RATE, pp_bMiddleEarFiltering=True, pp_bNormalizeRMS=True), Filterbank(RATE), Ratemap(RATE)):
+        kind = next(kind for kind, made in STAGES.items() if isinstance(stage, made))
+        assert not stage.process(np.zeros((*rows(kind), 700))).any()

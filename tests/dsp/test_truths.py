@@ -1,0 +1,377 @@
+"""Numbers against what is known without this code: closed forms, published values, scipy's designs, direct sums."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy import signal as scipy_signal
+
+from rosafe.dsp import CrossCorrelation, Filterbank, Ild, InnerHairCell, Input, PreProc, Ratemap
+from rosafe.dsp.checks import round_half_away
+from rosafe.dsp.drnl import DrnlBank
+from rosafe.dsp.erb import erb_rate, erb_rate_to_frequency
+from rosafe.dsp.middle_ear import middle_ear_fir
+from rosafe.dsp.windows import NAMES, window
+
+from .bare import FloatArray, cut, run
+from .stages import noise
+
+DEFAULT_FREQUENCIES = [
+    80, 115.200109, 154.412087, 198.09318, 246.752746, 300.958199, 361.341621, 428.607134, 503.539113, 587.011329,
+    679.997141, 783.580843, 898.97031, 1027.511084, 1170.702061, 1330.212972, 1507.903851, 1705.846727, 1926.349787,
+    2171.984285, 2445.614532, 2750.431293, 3089.988995, 3468.247175, 3889.616648, 4359.010948, 4881.903616,
+    5464.392035, 6113.26852, 6836.099534, 7641.313909,
+]  # fmt: skip
+
+
+def impulse(samples: int) -> FloatArray:
+    block = np.zeros((2, samples))
+    block[0, 0], block[1, 0] = 1.0, -0.5
+    return block
+
+
+# --- scales, windows, rounding ----------------------------------------------------------------------------------
+
+
+def test_erb_scale() -> None:
+    assert erb_rate(80.0) == pytest.approx(2.777591859212, abs=1e-11)
+    assert erb_rate(8000.0) == pytest.approx(33.190508892713, abs=1e-11)
+    frequencies = np.geomspace(1.0, 2e4, 50)
+    np.testing.assert_allclose(erb_rate_to_frequency(erb_rate(frequencies)), frequencies, rtol=1e-13)
+    np.testing.assert_allclose(Filterbank(44100).parameters["fb_cfHz"], DEFAULT_FREQUENCIES, rtol=1e-8)
+
+
+def test_rounding_is_half_away_from_zero() -> None:
+    assert [round_half_away(x) for x in (0.0, 0.5, 1.5, 2.5, 220.5, 0.49999999999999994, 7.49)] == [
+        0,
+        1,
+        2,
+        3,
+        221,
+        0,
+        7,
+    ]
+    assert Ild(22050.0).output_rate == 22050 / 221
+
+
+@pytest.mark.parametrize("length", [2, 7, 882])
+def test_windows(length: int) -> None:
+    i = np.arange(length)
+    turn = 2 * np.pi * i / (length - 1)
+    rising = np.minimum(i, i[::-1])
+    triangle = (2 * rising + 1) / length if length % 2 == 0 else 2 * (rising + 1) / (length + 1)
+    expected = {
+        "hann": 0.5 - 0.5 * np.cos(turn),
+        "hamming": 0.54 - 0.46 * np.cos(turn),
+        "hanning": 0.5 - 0.5 * np.cos(2 * np.pi * (i + 1) / (length + 1)),
+        "blackman": 0.42 - 0.5 * np.cos(turn) + 0.08 * np.cos(2 * turn),
+        "triang": triangle,
+        "sqrt_win": np.sqrt(triangle),
+    }
+    assert set(expected) == set(NAMES)
+    for name, values in expected.items():
+        np.testing.assert_allclose(window(name, length), values, rtol=0, atol=1e-15, err_msg=name)
+    with pytest.raises(ValueError, match="bartlett"):
+        window("bartlett", length)
+
+
+# --- input and pre-processing -----------------------------------------------------------------------------------
+
+
+def test_input_scaling() -> None:
+    block = np.array([[2**31 - 1, -(2**31), 0], [1, 5, -7]], np.int32)
+    np.testing.assert_array_equal(Input(44100).process(block), block / (2**31 - 1))
+    np.testing.assert_array_equal(Input(44100, in_doNormalize=False).process(block), block)
+    np.testing.assert_array_equal(Input(44100, in_normalizeValue=2**64 - 1).process(block), block / 2.0**64)
+
+
+@pytest.mark.parametrize(("rate", "cutoff"), [(16000, 20.0), (44100, 20.0), (48000, 5.0)])
+def test_dc_removal_is_a_butterworth_high_pass(rate: int, cutoff: float) -> None:
+    got = PreProc(rate, pp_bRemoveDC=True, pp_cutoffHzDC=cutoff).process(impulse(4 * rate))[0]
+    frequencies = np.array([cutoff / 2, cutoff, 2 * cutoff, 1000.0])
+    response = np.array([np.sum(got * np.exp(-2j * np.pi * f / rate * np.arange(len(got)))) for f in frequencies])
+    warped = np.tan(np.pi * frequencies / rate) / np.tan(np.pi * cutoff / rate)
+    np.testing.assert_allclose(np.abs(response), warped**4 / np.sqrt(1 + warped**8), rtol=1e-9, atol=1e-9)
+
+
+def test_pre_emphasis_and_level() -> None:
+    x = noise("preProc", 300)
+    stage = PreProc(16000, pp_bPreEmphasis=True, pp_coefPreEmphasis=-0.9, pp_bLevelScaling=True, pp_refSPLdB=94.0)
+    expected = (x - 0.9 * np.pad(x, ((0, 0), (1, 0)))[:, :-1]) * 10**0.3
+    np.testing.assert_allclose(stage.process(x), expected, rtol=1e-14, atol=1e-15)
+
+
+def test_the_whole_order_of_pre_processing() -> None:
+    """Gain is measured on the high-passed, pre-emphasised signal; the middle ear comes last."""
+    x = noise("preProc", 2000) + 0.5
+    first = PreProc(16000, pp_bRemoveDC=True, pp_bPreEmphasis=True).process(x)
+    second = PreProc(16000, pp_bNormalizeRMS=True, pp_intTimeSecRMS=0.02).process(first)
+    third = PreProc(16000, pp_bLevelScaling=True, pp_refSPLdB=80.0).process(second)
+    last = PreProc(16000, pp_bMiddleEarFiltering=True).process(third)
+    everything = PreProc(
+        16000,
+        pp_bRemoveDC=True,
+        pp_bPreEmphasis=True,
+        pp_bNormalizeRMS=True,
+        pp_intTimeSecRMS=0.02,
+        pp_bLevelScaling=True,
+        pp_refSPLdB=80.0,
+        pp_bMiddleEarFiltering=True,
+    )
+    np.testing.assert_allclose(everything.process(x), last, rtol=0, atol=1e-14 * np.abs(last).max())
+
+
+@pytest.mark.parametrize(
+    ("model", "rate", "peak"),
+    [
+        ("jepsen", 16000, -55.997),
+        ("jepsen", 44100, -55.917),
+        ("jepsen", 48000, -55.974),
+        ("lopezpoveda", 16000, -66.296),
+        ("lopezpoveda", 44100, -66.483),
+        ("lopezpoveda", 48000, -66.586),
+    ],
+)
+def test_middle_ear_peaks_and_phases(model: str, rate: int, peak: float) -> None:
+    fir = middle_ear_fir(model, rate, unity=False)
+    assert fir.shape == (513,)
+    assert 20 * math.log10(np.abs(np.fft.rfft(fir, 2**16)).max()) == pytest.approx(peak, abs=1e-3)
+    unity = middle_ear_fir(model, rate, unity=True)
+    np.testing.assert_allclose(unity / fir, 10 ** ({"jepsen": 55.9986, "lopezpoveda": 66.2888}[model] / 20), rtol=1e-12)
+    if model == "jepsen":
+        np.testing.assert_allclose(fir, fir[::-1], rtol=0, atol=1e-17)  # linear phase
+        assert np.abs(fir).argmax() == 256
+    else:
+        assert np.cumsum(fir**2)[100] > 0.99 * np.sum(fir**2)  # minimum phase: the energy comes first
+
+
+def test_middle_ear_is_that_convolution() -> None:
+    x = noise("preProc", 700)
+    fir = middle_ear_fir("jepsen", 16000, unity=False)
+    got = PreProc(16000, pp_bMiddleEarFiltering=True, pp_middleEarModel="jespen").process(x)
+    expected = scipy_signal.lfilter(fir, 1.0, x)
+    np.testing.assert_allclose(got, expected, rtol=0, atol=1e-14 * np.abs(expected).max())
+
+
+# --- filterbanks ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("rate", [16000, 44100, 48000])
+@pytest.mark.parametrize(("order", "width"), [(4, 1.018), (1, 0.5), (7, 2.0)])
+def test_gammatone_impulse_response(rate: int, order: int, width: float) -> None:
+    """h[k] = 2 g^n C(k+n-1, n-1) exp(-beta k) cos(theta k), in extended precision."""
+    frequencies = [80.0, 1000.0, 0.45 * rate]
+    bank = Filterbank(rate, fb_cfHz=frequencies, fb_nGamma=order, fb_bwERBs=width)
+    bank.provide_envelope = True
+    samples = rate // 2
+    got = run(bank, cut(impulse(samples), samples))
+    pi = np.longdouble("3.141592653589793238462643383279502884197")
+    k = np.arange(samples, dtype=np.longdouble)
+    assert bank.envelope is not None
+    for channel, frequency in enumerate(np.array(frequencies, np.longdouble)):
+        beta = 2 * pi * np.longdouble(width) * (np.longdouble(24.7) + np.longdouble(0.108) * frequency) / rate
+        binomial = np.prod([(k + j) / j for j in range(1, order)], axis=0) if order > 1 else np.longdouble(1)
+        size = 2 * (-np.expm1(-beta)) ** order * binomial * np.exp(-beta * k)
+        expected = size * np.cos(2 * pi * frequency / rate * k)
+        peak = float(np.abs(expected).max())
+        for ear, amplitude in ((0, 1.0), (1, -0.5)):
+            error = np.abs(got[ear, channel] - amplitude * expected)
+            assert error.max() < 1e-12 * peak
+            error = np.abs(bank.envelope[ear, channel] - abs(amplitude) * size)
+            assert error.max() < 1e-12 * peak
+
+
+def test_gammatone_has_unit_gain_at_its_centre() -> None:
+    rate, frequency = 16000, 1000.0
+    n = np.arange(4000)
+    tone = np.sin(2 * np.pi * frequency / rate * n) * np.ones((2, 1))
+    bank = Filterbank(rate, fb_cfHz=[frequency])
+    bank.provide_envelope = True
+    bank.process(tone)
+    assert bank.envelope is not None
+    np.testing.assert_allclose(bank.envelope[..., 2000:], 1.0, atol=1e-4)  # the image at -f is 80 dB down
+
+
+def drnl_linear_response(frequency: float, rate: float, at: float) -> complex:
+    """The linear path as a formula, from the published numbers."""
+    log = math.log10(frequency)
+    z = np.exp(2j * np.pi * at / rate)
+    centre, width = 10 ** (-0.06762 + 1.01679 * log), 10 ** (0.03728 + 0.75 * log)
+
+    def resonator(point: complex) -> complex:
+        decay = math.exp(-2 * math.pi * width / rate)
+        alpha = -decay * math.cos(2 * math.pi * centre / rate)
+        return complex((1 + alpha / point) / (1 + 2 * alpha / point + decay**2 / point**2))
+
+    unit = abs(resonator(complex(np.exp(2j * np.pi * centre / rate))))
+    c = 1 / math.tan(math.pi * 10 ** (-0.06762 + 1.01 * log) / rate)
+    s = c * (z - 1) / (z + 1)
+    lowpass = 1 / (s**2 + math.sqrt(2) * s + 1)
+    return complex(10 ** (4.20405 - 0.47909 * log) * (resonator(z) / unit) ** 2 * lowpass**4)
+
+
+@pytest.mark.parametrize("frequency", [250.0, 1000.0, 4000.0])
+def test_drnl_linear_path_by_its_formula(frequency: float) -> None:
+    rate = 44100.0
+    channel = DrnlBank(rate, np.array([frequency])).channels[0]
+    response = channel.linear.process(impulse(16384)[:1])[0]
+    for at in (0.7 * frequency, frequency, 1.3 * frequency):
+        got = np.sum(response * np.exp(-2j * np.pi * at / rate * np.arange(len(response))))
+        assert got == pytest.approx(drnl_linear_response(frequency, rate, at), rel=1e-9)
+
+
+def test_drnl_compresses_middle_levels_and_not_low_ones() -> None:
+    """The input-output curve of the model's 1 kHz channel: slope 1 at low levels, near 0.25 in the middle."""
+    rate, frequency = 44100.0, 1000.0
+    tone = np.sin(2 * np.pi * frequency / rate * np.arange(8820)) * np.ones((2, 1))
+    levels = []
+    for velocity in (1e-9, 1e-8, 1e-5, 1e-4):
+        out = DrnlBank(rate, np.array([frequency])).process(tone * velocity, with_envelope=False)[0]
+        levels.append(20 * math.log10(np.abs(out[0, 0, 4410:]).max()))
+    assert levels[1] - levels[0] == pytest.approx(20, abs=0.5)
+    assert levels[3] - levels[2] < 10
+
+
+def test_drnl_broken_stick() -> None:
+    channel = DrnlBank(44100.0, np.array([1000.0])).channels[0]
+    a, b, c = 10 ** (1.40298 + 0.81916 * 3), 10 ** (1.61912 - 0.81867 * 3), 10**-0.60206
+    x = np.array([0.0, 1e-12, -1e-12, 1e-3, -1e-3, 10.0])
+    expected = np.sign(x) * np.minimum(a * np.abs(x), b * np.abs(x) ** c)
+    np.testing.assert_allclose(channel._broken_stick(x), expected, rtol=1e-12)
+    high = DrnlBank(44100.0, np.array([3000.0])).channels[0]
+    assert high.slope == pytest.approx(10 ** (1.40298 + 0.81916 * math.log10(1500)))
+
+
+def test_drnl_envelope_is_exact_for_a_tone_at_the_channel() -> None:
+    rate, frequency = 16000.0, 700.0
+    bank = Filterbank(rate, fb_cfHz=[frequency], fb_type="drnl")
+    bank.provide_envelope = True
+    tone = 1e-12 * np.sin(2 * np.pi * frequency / rate * np.arange(8000)) * np.ones((2, 1))  # the linear range
+    out = bank.process(tone)
+    assert bank.envelope is not None
+    np.testing.assert_allclose(bank.envelope[..., 4000:], np.abs(out[..., 4000:]).max(), rtol=1e-4)
+    np.testing.assert_allclose(bank.envelope[..., 4000:] / bank.envelope[0, 0, -1], 1.0, rtol=1e-9)
+
+
+# --- hair cells -------------------------------------------------------------------------------------------------
+
+DAU_44100 = ([0.004603998475022464 * c for c in (1, 2, 1)], [1, -1.7990964094846684, 0.8175124033847582])
+
+
+def test_hair_cell_methods() -> None:
+    x = noise("ihc", 3000)
+    envelope = np.abs(x) + 0.1
+    half = np.maximum(x, 0)
+
+    def lowpass(order: int, cutoff: float, signal: FloatArray) -> FloatArray:
+        return scipy_signal.lfilter(*scipy_signal.butter(order, cutoff / 22050), signal)
+
+    breebart = half
+    for _ in range(5):
+        breebart = lowpass(1, 2000, breebart)
+    expected = {
+        "none": x,
+        "halfwave": half,
+        "fullwave": np.abs(x),
+        "square": x**2,
+        "hilbert": envelope,
+        "joergensen": lowpass(1, 150, envelope),
+        "dau": scipy_signal.lfilter(*DAU_44100, half),
+        "breebart": breebart,
+        "bernstein": lowpass(2, 425, np.maximum(envelope**-0.77 * x, 0) ** 2),
+    }
+    for method, values in expected.items():
+        stage = InnerHairCell(44100, ihc_method=method)
+        got = stage.process(x, envelope if stage.needs_envelope else None)
+        np.testing.assert_allclose(got, values, rtol=0, atol=1e-12 * np.abs(values).max(), err_msg=method)
+
+
+def test_bernstein_without_envelope_is_silent() -> None:
+    zeros = np.zeros((2, 1, 50))
+    assert not InnerHairCell(44100, ihc_method="bernstein").process(zeros, zeros).any()
+
+
+# --- framed stages ----------------------------------------------------------------------------------------------
+
+FRAMES = [("hann", 80, 40), ("hamming", 32, 50), ("blackman", 64, 9), ("sqrt_win", 2, 1), ("hanning", 100, 100)]
+RATE = 16000.0
+
+
+def frames_of(x: FloatArray, size: int, hop: int) -> FloatArray:
+    """(..., F, w), one by one."""
+    starts = range(0, x.shape[-1] - size + 1, hop)
+    return np.stack([x[..., s : s + size] for s in starts], axis=-2)
+
+
+@pytest.mark.parametrize(("name", "size", "hop"), FRAMES)
+def test_ild_and_ratemap_by_definition(name: str, size: int, hop: int) -> None:
+    x = np.maximum(noise("ild", 1000), 0)
+    framed = {"wname": name, "wSizeSec": size / RATE, "hSizeSec": hop / RATE}
+    shape = window(name, size)
+    energy = np.mean((shape * frames_of(x, size, hop)) ** 2, axis=-1)
+    expected = 10 * np.log10((energy[1] + 2.2204e-16) / (energy[0] + 2.2204e-16))
+    got = Ild(RATE, **{f"ild_{k}": v for k, v in framed.items()}).process(x)
+    np.testing.assert_allclose(got, expected, rtol=0, atol=1e-11)
+
+    retention = math.exp(-1 / (RATE * 0.008))
+    smooth = np.zeros_like(x)
+    last = np.zeros(x.shape[:-1])
+    for n in range(x.shape[-1]):
+        last = retention * last + (1 - retention) * x[..., n]
+        smooth[..., n] = last
+    frames = shape * frames_of(smooth, size, hop)
+    for scaling, expected in (("power", np.mean(frames**2, axis=-1)), ("magnitude", np.mean(frames, axis=-1))):
+        got = Ratemap(RATE, rm_scaling=scaling, **{f"rm_{k}": v for k, v in framed.items()}).process(x)
+        np.testing.assert_allclose(got, expected, rtol=1e-12, atol=1e-18)
+
+
+@pytest.mark.parametrize(("name", "size", "hop"), FRAMES)
+@pytest.mark.parametrize("reach", [1, 17, 32, 150])
+def test_cross_correlation_by_direct_sums(name: str, size: int, hop: int, reach: int) -> None:
+    x = noise("crossCorrelation", 500, channels=2)
+    stage = CrossCorrelation(
+        RATE, cc_wname=name, cc_wSizeSec=size / RATE, cc_hSizeSec=hop / RATE, cc_maxDelaySec=reach / RATE
+    )
+    got = stage.process(x)
+    left, right = window(name, size) * frames_of(x, size, hop)
+    expected = np.zeros((2, 2 * reach + 1, left.shape[1]))
+    for lag in range(-min(reach, size - 1), min(reach, size - 1) + 1):
+        late, early = left[..., max(lag, 0) : size + min(lag, 0)], right[..., max(-lag, 0) : size - max(lag, 0)]
+        expected[:, lag + reach] = np.sum(late * early, axis=-1)
+    expected /= np.sqrt(np.sum(left**2, -1) * np.sum(right**2, -1) + 2.2204e-16)[:, np.newaxis]
+    assert got.shape == expected.shape
+    np.testing.assert_allclose(got, expected, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(stage.lags, np.arange(-reach, reach + 1) / RATE, rtol=1e-15)
+
+
+def test_lag_count_is_rounded_up_in_floating_point() -> None:
+    lags = {rate: len(CrossCorrelation(rate).lags) for rate in (44100, 16000, 48000, 10000)}
+    assert lags == {44100: 99, 16000: 37, 48000: 107, 10000: 23}
+
+
+def test_signs() -> None:
+    """A source on the right: the left ear is later and quieter, so lag and level difference are positive."""
+    source = np.random.default_rng(3).standard_normal(2000)
+    x = np.zeros((2, 1, 1900))
+    x[0, 0], x[1, 0] = 0.5 * source[93:1993], source[100:2000]
+    stage = CrossCorrelation(RATE)
+    correlation = stage.process(x)
+    assert (stage.lags[correlation[0].argmax(axis=0)] == 7 / RATE).all()
+    assert (Ild(RATE).process(x) > 4).all()
+
+
+def test_silence() -> None:
+    zeros = np.zeros((2, 2, 1000))
+    assert not Ild(RATE).process(zeros).any()
+    assert not Ratemap(RATE).process(zeros).any()
+    assert not CrossCorrelation(RATE).process(zeros).any()
+
+
+def test_many_frames_go_in_batches(monkeypatch: pytest.MonkeyPatch) -> None:
+    x = noise("crossCorrelation", 3000, channels=3)
+    expected = CrossCorrelation(RATE).process(x)
+    for batch in (1, 1000, 3000):
+        monkeypatch.setattr("rosafe.dsp.crosscorrelation.BATCH", batch)
+        np.testing.assert_allclose(CrossCorrelation(RATE).process(x), expected, rtol=0, atol=1e-14)
