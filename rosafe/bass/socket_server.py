@@ -100,7 +100,7 @@ class DedicatedSocket:
         self._snapshot = snapshot
         self._report = report
         self._clients: dict[int, _Client] = {}
-        self._listener = socket.create_server((host, port), backlog=5)  # with SO_REUSEADDR
+        self._listener = socket.create_server((host, port), backlog=MAX_CLIENTS + 1)  # with SO_REUSEADDR
         self._listener.setblocking(False)
         self.address = self._listener.getsockname()
         self._selector = selectors.DefaultSelector()

@@ -18,7 +18,7 @@ from rosafe.interface import ComponentError
 RING_CHUNKS = 8  # asked for; the device may give fewer
 MAX_CHANNELS = 32  # of a device of which two are picked
 POLL_SECONDS = 0.1  # at most, so that a stop is seen
-STALL_SECONDS = 2.0  # without a frame, beyond the chunk's own length, a device counts as gone
+STALL_SECONDS = 5.0  # without a frame, a device counts as gone; PulseAudio takes 2 s to begin
 RETRIES, RETRY_SECONDS = 5, 0.2  # to reopen a device that failed
 
 
@@ -79,9 +79,10 @@ class AlsaSource:
         if self._channels is None:
             self._pcm = self._open_with(2)
             return
-        for self._width in range(max(self._channels), MAX_CHANNELS + 1):
-            self._pcm = self._open_with(self._width, exact_channels=False)
-            if self._pcm is not None:
+        for width in range(max(self._channels), MAX_CHANNELS + 1):
+            pcm = self._open_with(width, exact_channels=False)
+            if pcm is not None:
+                self._pcm, self._width = pcm, width
                 return
         raise hwparams_error(f"{self.name} has no {max(self._channels)} channels")
 
@@ -129,7 +130,8 @@ class AlsaSource:
         faults = []
         if info["format_name"] != "S32_LE":
             formats = ", ".join(sorted(pcm.getformats())) or info["format_name"]
-            faults.append(f"no format S32_LE, it offers {formats}: plug{self._pcm_name} converts")
+            converter = ("plug" if self._pcm_name.startswith("hw:") else "plug:") + self._pcm_name
+            faults.append(f"no format S32_LE, it offers {formats}: {converter} converts")
         if info["channels"] != channels:
             faults.append(
                 f"not {channels} channels, it opens with {info['channels']}: pick two with ?channels=1,2"
@@ -195,7 +197,7 @@ class AlsaSource:
                 self._barren += 1
                 if self._barren > RETRIES:
                     raise self._alsa.ALSAAudioError("overrun after overrun and no sound")
-                self._lose(before)
+                self._lose(time.monotonic())
             else:
                 raise self._alsa.ALSAAudioError(os.strerror(-count))
         except self._alsa.ALSAAudioError as problem:

@@ -70,16 +70,18 @@ class FileSource:
 
     def _check(self, sample_rate: int) -> None:
         path, channels = self._file.path, self._file.channels
+        if self._start >= self._file.frames:
+            seconds = self._file.frames / self.sample_rate
+            raise device_error(
+                f"{path} lasts {seconds:g} s, start={self._start / self.sample_rate:g} is behind its end"
+            )
         if channels != 2:
             cure = f"`sox {path} -c 2 two.wav` makes two of it" if channels == 1 else "keep two, left and right ear"
             raise hwparams_error(f"{path} has {channels} channel{'s' * (channels > 1)}, two are needed: {cure}")
         if sample_rate not in (0, self.sample_rate):
             raise hwparams_error(
-                f"{path} has a sample rate of {self.sample_rate} Hz, asked for were {sample_rate}; 0 takes the file's own"
+                f"{path} has a sample rate of {self.sample_rate} Hz, asked for were {sample_rate}; 0 is the file's own"
             )
-        if self._start >= self._file.frames:
-            seconds = self._file.frames / self.sample_rate
-            raise device_error(f"{path} lasts {seconds:g} s, start={self._start / self.sample_rate:g} lies behind its end")
 
     def read(self) -> Chunk | None:
         """The next chunk in its time; None after the end of the file."""

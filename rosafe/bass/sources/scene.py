@@ -41,7 +41,7 @@ def scene_azimuth(seconds: np.ndarray | float, walk: float = WALK_SECONDS) -> np
 
 
 def ear_delay(incidence: np.ndarray) -> np.ndarray:
-    """Woodworth's delay (s) to an ear that the sound meets at `incidence` rad from its axis, 0 to pi; 0 at the centre."""
+    """Woodworth's delay (s) to an ear that the sound meets at `incidence` rad from its axis (0 to pi), after the head's centre."""
     return _HEAD_TIME * np.where(incidence < np.pi / 2, -np.cos(incidence), incidence - np.pi / 2)
 
 
@@ -65,9 +65,7 @@ class Scene:
         Another seed, another noise.
     """
 
-    def __init__(
-        self, sample_rate: int, seconds: float = WALK_SECONDS, level: float = LEVEL_DB, seed: int = 0
-    ) -> None:
+    def __init__(self, sample_rate: int, seconds: float = WALK_SECONDS, level: float = LEVEL_DB, seed: int = 0) -> None:
         self.sample_rate = sample_rate
         self.seconds = seconds
         self._carrier = _Carrier(sample_rate, seed)

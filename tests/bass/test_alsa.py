@@ -1,0 +1,403 @@
+"""The ALSA source: a scripted PCM for what hardware does at its worst, and the real libasound with plugins."""
+
+from __future__ import annotations
+
+import errno
+import importlib
+import os
+import sys
+import threading
+import types
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+
+from rosafe.bass.sources import alsa, libasound, open_source
+from rosafe.bass.sources.alsa import AlsaSource, DeviceBusyError
+from rosafe.interface import ComponentError
+from rosafe.ros import paths
+
+CHUNK, RATE = 10, 1000
+XRUN = -errno.EPIPE
+
+
+class FakePcm:
+    """A PCM that follows `script`: a number of frames to give, XRUN, 0 (nothing yet) or an exception's text.
+
+    Frame k of channel c is 1000 * k + c, counted over all reads. `clock` moves by the frames that are given.
+    """
+
+    script: ClassVar[list[Any]] = []
+    info_changes: ClassVar[dict[str, Any]] = {}
+    refusals: ClassVar[list[str]] = []
+    available_channels: ClassVar[tuple[int, ...]] = (2,)
+    opened: ClassVar[list[FakePcm]] = []
+    frame: ClassVar[int] = 0
+    clock: ClassVar[float] = 100.0
+
+    def __init__(self, **wanted: Any) -> None:
+        if self.refusals:
+            raise FakeAlsa.ALSAAudioError(f"{self.refusals.pop(0)} [{wanted['device']}]")
+        channels = wanted["channels"] if wanted["channels"] in self.available_channels else self.available_channels[0]
+        self.channels = channels
+        self.settings = {
+            "format_name": "S32_LE",
+            "channels": channels,
+            "rate": wanted["rate"],
+            "period_size": wanted["periodsize"],
+            **self.info_changes,
+        }
+        self.closed = False
+        self._pipe = os.pipe()  # never readable
+        self.opened.append(self)
+
+    def info(self) -> dict[str, Any]:
+        """As pyalsaaudio gives it."""
+        return self.settings
+
+    def getformats(self) -> dict[str, int]:
+        """Of a cheap microphone."""
+        return {"S16_LE": 2, "S24_3LE": 32}
+
+    def getrates(self) -> list[int]:
+        """Of a cheap microphone."""
+        return [32000, 48000]
+
+    def avail(self) -> int:
+        """Nothing more."""
+        return 0
+
+    def polldescriptors(self) -> list[tuple[int, int]]:
+        """One that is ready at once."""
+        os.write(self._pipe[1], b"x")
+        return [(self._pipe[0], 1)]
+
+    def polldescriptors_revents(self, ready: list[tuple[int, int]]) -> int:
+        """Takes note."""
+        os.read(self._pipe[0], 1)
+        return ready[0][1]
+
+    def read(self) -> tuple[int, bytes]:
+        """The next step of the script; for ever what is asked for at its end."""
+        step = FakePcm.script.pop(0) if FakePcm.script else CHUNK
+        if isinstance(step, tuple):
+            step, seconds = step
+            FakePcm.clock += seconds
+        if isinstance(step, str):
+            raise FakeAlsa.ALSAAudioError(f"{step} [hw:9]")
+        if step <= 0:
+            return step, b""
+        numbers = np.arange(FakePcm.frame, FakePcm.frame + step)
+        FakePcm.frame += step
+        FakePcm.clock += step / RATE
+        return step, (1000 * numbers[:, None] + np.arange(self.channels)).astype("<i4").tobytes()
+
+    def close(self) -> None:
+        """Close the pipe too."""
+        if not self.closed:
+            self.closed = True
+            for end in self._pipe:
+                os.close(end)
+
+
+class FakeAlsa:
+    """The module alsaaudio as far as the source uses it."""
+
+    class ALSAAudioError(Exception):
+        """As pyalsaaudio's."""
+
+    PCM_CAPTURE, PCM_NONBLOCK, PCM_FORMAT_S32_LE = 1, 1, 10
+    PCM = FakePcm
+
+
+@pytest.fixture
+def pcm(monkeypatch: pytest.MonkeyPatch) -> Iterator[type[FakePcm]]:
+    """The fake in place of pyalsaaudio, with its own clock and without pauses between attempts."""
+    monkeypatch.setattr(alsa, "load_alsaaudio", lambda: FakeAlsa)
+    monkeypatch.setattr(alsa, "time", types.SimpleNamespace(monotonic=lambda: FakePcm.clock))
+    monkeypatch.setattr(alsa, "RETRY_SECONDS", 0.001)
+    for name, value in {
+        "script": [],
+        "info_changes": {},
+        "refusals": [],
+        "available_channels": (2,),
+        "opened": [],
+        "frame": 0,
+        "clock": 100.0,
+    }.items():
+        monkeypatch.setattr(FakePcm, name, value)
+    yield FakePcm
+    for opened in FakePcm.opened:
+        opened.close()
+
+
+def open_fake(device: str = "hw:9", stopping: threading.Event | None = None) -> AlsaSource:
+    source = open_source(device, RATE, CHUNK, stopping or threading.Event())
+    assert isinstance(source, AlsaSource)
+    return source
+
+
+def left(source: AlsaSource) -> tuple[list[int], int]:
+    """Frame numbers of the left ear in the next chunk (-1 for zeros after frame 0), and the gap before it."""
+    chunk = source.read()
+    assert chunk is not None
+    return [int(v) // 1000 if v else -1 for v in chunk.samples[0]], chunk.gap
+
+
+def test_short_reads_are_put_together(pcm: type[FakePcm]) -> None:
+    pcm.frame = 1
+    pcm.script[:] = [3, 0, 4, 2, 8, 3, 0, 0, 10]
+    source = open_fake()
+    assert [left(source) for _ in range(3)] == [
+        (list(range(1, 11)), 0),
+        (list(range(11, 21)), 0),
+        (list(range(21, 31)), 0),
+    ]
+    assert source.overruns == source.lost_frames == 0
+
+
+def test_ears_and_time_of_the_last_frame(pcm: type[FakePcm]) -> None:
+    pcm.script[:] = [10, 15]
+    source = open_fake()
+    first, second = source.read(), source.read()
+    assert first is not None and second is not None
+    assert first.samples[1].tolist() == [1000 * k + 1 for k in range(10)]
+    assert first.time == pytest.approx(100.010)
+    assert second.time == pytest.approx(100.020)  # five frames of that read belong to the next chunk
+
+
+def test_overrun_between_chunks_is_a_gap(pcm: type[FakePcm]) -> None:
+    pcm.frame = 1
+    pcm.script[:] = [10, (XRUN, 0.0), (XRUN, 0.025), 10]
+    source = open_fake()
+    assert left(source) == (list(range(1, 11)), 0)
+    pcm.clock += 0.032
+    assert left(source) == (list(range(11, 21)), 57)  # 32 and 25 ms at 1 kHz
+    assert (source.overruns, source.lost_frames) == (2, 57)
+
+
+def test_overrun_within_a_chunk_is_zeros_and_then_a_gap(pcm: type[FakePcm]) -> None:
+    pcm.frame = 1
+    pcm.script[:] = [4, XRUN, 10]
+    source = open_fake()
+    source._read_some()
+    pcm.clock += 0.003
+    assert left(source) == ([1, 2, 3, 4, -1, -1, -1, 5, 6, 7], 0)
+    pcm.script[:] = [XRUN]
+    pcm.clock += 0.040
+    # 8 to 14 are still to come; the loss falls into the chunk that they begin, and the rest of it before the next.
+    chunk, gap = left(source)
+    assert (chunk, gap) == ([8, 9, 10, 11, 12, 13, 14, -1, -1, -1], 0)
+    chunk, gap = left(source)
+    assert (chunk, gap) == (list(range(15, 25)), 37)
+    assert source.lost_frames == 43
+
+
+def test_overruns_without_any_sound_end_as_a_broken_device(pcm: type[FakePcm]) -> None:
+    pcm.script[:] = [XRUN] * 1000
+    with pytest.raises(ComponentError, match="overrun after overrun") as caught:
+        open_fake().read()
+    assert caught.value.ex == "::bass::e_device"
+
+
+def test_device_that_comes_back_goes_on(pcm: type[FakePcm]) -> None:
+    pcm.frame = 1
+    pcm.script[:] = [10, ("Input/output error", 0.5), 10]
+    source = open_fake()
+    left(source)
+    pcm.refusals += ["No such device", "No such device"]
+    chunk, gap = left(source)
+    assert (chunk, gap) == (list(range(11, 21)), 500)
+    assert len(pcm.opened) == 2 and pcm.opened[0].closed
+
+
+def test_device_that_is_gone_ends_after_bounded_attempts(pcm: type[FakePcm]) -> None:
+    pcm.script[:] = [10, "No such device"]
+    source = open_fake()
+    left(source)
+    pcm.refusals += ["No such device"] * 100
+    with pytest.raises(ComponentError, match="hw:9: No such device; given up after 5 attempts") as caught:
+        source.read()
+    assert caught.value.ex == "::bass::e_device"
+    assert len(pcm.refusals) == 95
+    source.close()
+
+
+def test_device_that_opens_but_never_works_ends(pcm: type[FakePcm]) -> None:
+    pcm.script[:] = ["Input/output error"] * 100
+    with pytest.raises(ComponentError, match="given up after 5"):
+        open_fake().read()
+
+
+def test_mute_device_counts_as_gone(pcm: type[FakePcm]) -> None:
+    pcm.script[:] = [(0, 1.0)] * 1000
+    with pytest.raises(ComponentError, match="no sound comes any more"):
+        open_fake().read()
+
+
+def test_stop_ends_the_wait_for_sound(pcm: type[FakePcm]) -> None:
+    stopping = threading.Event()
+    source = open_fake(stopping=stopping)
+    pcm.script[:] = [0] * 100_000
+    threading.Timer(0.05, stopping.set).start()
+    assert source.read() is None
+
+
+@pytest.mark.parametrize(
+    ("changes", "why"),
+    [
+        ({"format_name": "S16_LE"}, "no format S32_LE, it offers S16_LE, S24_3LE: plughw:9 converts"),
+        ({"rate": 48000}, "no sample rate of 1000 Hz, it offers 32000, 48000 Hz"),
+        ({"period_size": 16}, "no chunks of 10 frames, the nearest are of 16"),
+        ({"channels": 8}, "not 2 channels, it opens with 8: pick two with ?channels=1,2"),
+        ({"channels": 1}, "1,1 for both ears"),
+    ],
+)
+def test_inexact_device_is_refused_with_its_offer(pcm: type[FakePcm], changes: dict[str, Any], why: str) -> None:
+    pcm.info_changes.update(changes)
+    with pytest.raises(ComponentError) as caught:
+        open_fake()
+    assert caught.value.ex == "::bass::e_hwparams"
+    assert why in caught.value.why and "\n" not in caught.value.why
+    assert pcm.opened[0].closed
+
+
+@pytest.mark.parametrize(
+    ("strerror", "exception"),
+    [
+        ("No such file or directory", "e_device"),
+        ("Permission denied", "e_device"),
+        ("Device or resource busy", "e_device"),
+        ("Invalid argument", "e_hwparams"),  # libasound had nothing to say against the name
+    ],
+)
+def test_refusal_of_the_device(pcm: type[FakePcm], strerror: str, exception: str) -> None:
+    pcm.refusals.append(strerror)
+    with pytest.raises(ComponentError) as caught:
+        open_fake()
+    assert caught.value.ex == f"::bass::{exception}"
+    assert isinstance(caught.value, DeviceBusyError) == ("busy" in strerror)
+
+
+def test_two_channels_of_many(pcm: type[FakePcm]) -> None:
+    pcm.available_channels = (6, 8)
+    source = open_fake("hw:9?channels=4,3")
+    assert pcm.opened[-1].channels == 6
+    assert all(opened.closed for opened in pcm.opened[:-1])
+    chunk = source.read()
+    assert chunk is not None
+    assert chunk.samples[:, 2].tolist() == [2003, 2002]
+    pcm.available_channels = (2,)
+    with pytest.raises(ComponentError, match="has no 4 channels"):
+        open_fake("hw:9?channels=4,3")
+
+
+@pytest.mark.parametrize("options", ["channels=3", "channels=0,1", "channels=1,33", "channels=a,b", "rate=5"])
+def test_bad_options(pcm: type[FakePcm], options: str) -> None:
+    with pytest.raises(ComponentError) as caught:
+        open_fake(f"hw:9?{options}")
+    assert caught.value.ex == "::bass::e_device"
+    assert not pcm.opened
+
+
+def test_debians_module_and_no_module_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    broken = types.ModuleType("alsaaudio")
+    broken.__file__ = "/usr/lib/python3/dist-packages/alsaaudio.so"
+    monkeypatch.setitem(sys.modules, "alsaaudio", broken)
+    with pytest.raises(ComponentError, match=r"Debian's python3-alsaaudio 0\.8.*scripts/install"):
+        open_source("hw:0", 44100, 2205, threading.Event())
+    monkeypatch.setitem(sys.modules, "alsaaudio", None)  # type: ignore[misc]  # how Python marks what is not there
+    with pytest.raises(ComponentError, match=r"need pyalsaaudio.*scripts/install"):
+        open_source("hw:0", 44100, 2205, threading.Event())
+
+
+def test_capture_devices_as_the_kernel_lists_them(tmp_path: Path) -> None:
+    with pytest.raises(ComponentError) as caught:
+        libasound.capture_devices(tmp_path)
+    assert caught.value.ex == "::bass::e_nodevice"
+    for card, name, pcms in ((0, "PCH", ("pcm0p", "pcm0c")), (10, "Mic", ("pcm0c",)), (2, "Loop", ("pcm1c", "pcm10c"))):
+        folder = tmp_path / f"card{card}"
+        folder.mkdir()
+        (folder / "id").write_text(f"{name}\n")
+        for pcm_name in pcms:
+            (folder / pcm_name).mkdir()
+            number = pcm_name[3:-1]
+            (folder / pcm_name / "info").write_text(f"card: {card}\ndevice: {number}\nid: {name} Analog: x\nname: y\n")
+    assert libasound.capture_devices(tmp_path) == [
+        (0, 0, "PCH", "PCH Analog: x"),
+        (2, 1, "Loop", "Loop Analog: x"),
+        (2, 10, "Loop", "Loop Analog: x"),
+        (10, 0, "Mic", "Mic Analog: x"),
+    ]
+
+
+# --- the real libasound -----------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def real_alsa(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A configuration with plugin PCMs that need no hardware; `samples.raw` is what `recorded` gives."""
+    paths.prefer_pypi_packages()
+    try:
+        importlib.import_module("alsaaudio")
+    except ImportError:
+        pytest.skip("pyalsaaudio is not here: scripts/install brings it")
+    bindings = " ".join(f"{k} {{ slave a channel {k} }}" for k in range(4))
+    (tmp_path / "asound.conf").write_text(
+        f"""</usr/share/alsa/alsa.conf>
+pcm.recorded {{ type file slave.pcm "null" file /dev/null infile "{tmp_path}/samples.raw" format raw }}
+pcm.floating {{ type lfloat slave {{ pcm "null" format S32_LE }} }}
+pcm.four {{
+    type multi
+    slaves.a {{ pcm "null" channels 4 }}
+    bindings {{ {bindings} }}
+}}
+"""
+    )
+    monkeypatch.setenv("ALSA_CONFIG_PATH", str(tmp_path / "asound.conf"))
+    return tmp_path
+
+
+def test_samples_of_the_file_plugin_are_exact(real_alsa: Path) -> None:
+    samples = np.random.default_rng(1).integers(-(2**31), 2**31, (2, 2205 * 5)).astype("<i4")
+    samples.T.tofile(real_alsa / "samples.raw")
+    source = open_source("recorded", 44100, 2205, threading.Event())
+    chunks = [source.read() for _ in range(5)]
+    source.close()
+    assert np.array_equal(np.concatenate([c.samples for c in chunks if c], axis=1), samples)
+
+
+def test_plug_and_channel_options_work(real_alsa: Path) -> None:
+    samples = np.random.default_rng(2).integers(-(2**31), 2**31, (4, 1000)).astype("<i4")
+    samples.T.tofile(real_alsa / "samples.raw")
+    source = open_source("recorded?channels=4,2", 48000, 500, threading.Event())
+    chunk = source.read()
+    source.close()
+    assert chunk is not None and np.array_equal(chunk.samples, samples[[3, 1], :500])
+    source = open_source("plug:recorded", 44100, 500, threading.Event())
+    assert source.read() is not None
+    source.close()
+
+
+@pytest.mark.parametrize(
+    ("device", "exception", "why"),
+    [
+        ("hw:7,0", "e_device", "hw:7,0: No such file or directory (Cannot get card index for 7;"),
+        ("nosuch", "e_device", "Unknown PCM nosuch"),
+        ("file", "e_device", "file is not defined"),
+        ("", "e_device", "No such file"),
+        ("floating", "e_hwparams", "no format S32_LE, it offers FLOAT64_BE, FLOAT64_LE, FLOAT_BE, FLOAT_LE: plug:f"),
+        ("four", "e_hwparams", "not 2 channels, it opens with 4"),
+    ],
+)
+def test_real_refusals_are_one_line(
+    real_alsa: Path, capfd: pytest.CaptureFixture[str], device: str, exception: str, why: str
+) -> None:
+    with pytest.raises(ComponentError) as caught:
+        open_source(device, 44100, 2205, threading.Event())
+    assert caught.value.ex == f"::bass::{exception}"
+    assert why in caught.value.why and "\n" not in caught.value.why
+    assert capfd.readouterr().err == ""  # nothing of libasound's own

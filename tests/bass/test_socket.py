@@ -1,0 +1,236 @@
+"""The dedicated socket's protocol, over real TCP connections."""
+
+from __future__ import annotations
+
+import socket
+import struct
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rosafe.bass import socket_server
+from rosafe.bass.capture import Snapshot
+from rosafe.bass.socket_server import DedicatedSocket, read_frames, take_requests
+from tests.harness import wait_for
+
+
+def port_content(last: int, length: int) -> Snapshot:
+    """A window in which frame k is k on the left and -k on the right, zeros before frame 1."""
+    left = np.maximum(np.arange(last - length + 1, last + 1), 0).astype(np.int32)
+    return Snapshot(44100, 1, length, last, left, -left, 0)
+
+
+def parse(answer: bytes) -> tuple[int, int, int, list[int], list[int]]:
+    n, loss, following = struct.unpack("<iiq", answer[:16])
+    samples = np.frombuffer(answer[16:], "<i4").tolist()
+    assert len(samples) == 2 * n
+    return n, loss, following, samples[:n], samples[n:]
+
+
+def receive(connection: socket.socket) -> tuple[int, int, int, list[int], list[int]]:
+    """One whole answer."""
+    with connection.makefile("rb", buffering=0) as stream:
+        answer = bytearray()
+        wanted = 16
+        while len(answer) < wanted:
+            part = stream.read(wanted - len(answer))
+            assert part, f"closed after {len(answer)} of {wanted} bytes"
+            answer += part
+            if len(answer) >= 16:
+                wanted = 16 + 8 * struct.unpack_from("<i", answer)[0]
+    return parse(bytes(answer))
+
+
+class Server:
+    """A server in a thread; `content` is what it serves."""
+
+    def __init__(self) -> None:
+        self.content: Snapshot | None = port_content(100, 20)
+        self.reports: list[str] = []
+        self.stopping = threading.Event()
+        self._socket = DedicatedSocket(lambda: self.content, "127.0.0.1", 0, self.reports.append)
+        self.address = self._socket.address
+        self.thread = threading.Thread(target=self._socket.serve, args=(self.stopping,))
+        self.thread.start()
+
+    def clients(self) -> int:
+        return len(self._socket._clients)
+
+    @contextmanager
+    def client(self) -> Iterator[socket.socket]:
+        with socket.create_connection(self.address, timeout=10) as connection:
+            yield connection
+
+
+@pytest.fixture
+def server() -> Iterator[Server]:
+    running = Server()
+    yield running
+    running.stopping.set()
+    running.thread.join(5)
+    assert not running.thread.is_alive()
+
+
+@pytest.mark.parametrize(
+    ("count", "first", "expected"),
+    [
+        (5, 90, (5, 0, 95, [90, 91, 92, 93, 94])),
+        (50, 99, (2, 0, 101, [99, 100])),  # no more than there is
+        (3, 11, (3, 70, 84, [81, 82, 83])),  # 11 to 80 have left the window
+        (5, 101, (0, 0, 101, [])),  # nothing new yet
+        (5, 500, (0, 0, 500, [])),  # from before a restart, or nonsense: never a negative count
+        (5, 10**30, (0, 0, 2**63 - 1, [])),
+        (0, 90, (0, 0, 90, [])),
+        (10**30, 81, (20, 0, 101, list(range(81, 101)))),
+    ],
+)
+def test_answer(count: int, first: int, expected: tuple[int, int, int, list[int]]) -> None:
+    n, loss, following, left, right = parse(read_frames(port_content(100, 20), count, first))
+    assert (n, loss, following, left) == expected
+    assert right == [-k for k in left]
+
+
+def test_answer_before_and_at_the_start_of_an_acquisition() -> None:
+    assert parse(read_frames(None, 5, 3)) == (0, 0, 3, [], [])
+    assert parse(read_frames(port_content(0, 20), 5, 1)) == (0, 0, 1, [], [])
+    assert parse(read_frames(port_content(4, 20), 10, 1))[:4] == (4, 0, 5, [1, 2, 3, 4])
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.lists(st.tuples(st.integers(1, 60), st.integers(1, 60)), min_size=1, max_size=20), st.integers(1, 50))
+def test_a_reader_gets_every_frame_or_is_told_how_many_are_lost(steps: list[tuple[int, int]], length: int) -> None:
+    last, following, seen, lost = 0, 1, [], 0
+    for advance, count in steps:
+        last += advance
+        n, loss, following, left, _ = parse(read_frames(port_content(last, length), count, following))
+        assert n == len(left) <= length
+        lost += loss
+        assert left == list(range(following - n, following))
+        seen += left
+    assert len(seen) + lost == following - 1
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.lists(st.tuples(st.integers(0, 10**6), st.integers(0, 10**12)), max_size=6), st.data())
+def test_requests_may_be_cut_anywhere(requests: list[tuple[int, int]], data: st.DataObject) -> None:
+    text = b"".join(b"Read Port - N %d - nfr %d\n" % request for request in requests)
+    inbox = bytearray()
+    found: list[tuple[int, int]] = []
+    while text:
+        size = data.draw(st.integers(1, len(text)))
+        inbox += text[:size]
+        text = text[size:]
+        found += take_requests(inbox, quiet=False)
+    assert found == requests
+    assert not inbox
+
+
+def test_requests_without_line_ends() -> None:
+    inbox = bytearray(b"CloseRead Port - N 1 - nfr 2Read Port - N 3 - nfr 4")
+    assert list(take_requests(inbox, quiet=False)) == [(1, 2)]
+    assert list(take_requests(inbox, quiet=True)) == [(3, 4)]
+    assert not inbox
+    inbox += b"Read Port - N 5"  # the rest is on its way
+    assert list(take_requests(inbox, quiet=True)) == []
+    inbox += b" - nfr 6"
+    assert list(take_requests(inbox, quiet=True)) == [(5, 6)]
+
+
+@pytest.mark.parametrize(
+    "text", [b"Read Port\n", b"Read Port - N 5\n", b"Read Port - nfr 5\n", b"N 1 - nfr 1\n", b"Close\n", b"\n\0\r", b""]
+)
+def test_what_is_no_request_has_no_answer(text: bytes) -> None:
+    assert list(take_requests(bytearray(text), quiet=True)) == []
+
+
+def test_rubbish_is_not_kept() -> None:
+    inbox = bytearray()
+    for _ in range(100):
+        inbox += b"x" * 1000
+        assert not list(take_requests(inbox, quiet=True))
+    assert len(inbox) <= 4096
+    inbox += b"Read Port - N " + b"9" * 8000 + b" - nfr 1\n"
+    list(take_requests(inbox, quiet=False))
+
+
+def test_conversation(server: Server) -> None:
+    with server.client() as connection:
+        connection.sendall(b"Read Port - N 3 - nfr 98\n")
+        assert receive(connection) == (3, 0, 101, [98, 99, 100], [-98, -99, -100])
+        connection.sendall(b"Read Port - N 3 - nfr 101\nRead Port - N 1 - nfr 100\n")
+        assert receive(connection)[0] == 0
+        assert receive(connection)[3] == [100]
+        server.content = port_content(103, 20)
+        connection.sendall(b"Read Port - N 3 - nfr 101")  # as a client that ends no lines
+        assert receive(connection)[3] == [101, 102, 103]
+        connection.sendall(b"Close")
+        connection.sendall(b"\nRead Po")
+        connection.sendall(b"rt - N 1 - nfr 103\n")
+        assert receive(connection)[3] == [103]
+
+
+def test_as_many_clients_as_promised(server: Server) -> None:
+    connections = [socket.create_connection(server.address, timeout=10) for _ in range(socket_server.MAX_CLIENTS)]
+    for index, connection in enumerate(connections):
+        connection.sendall(b"Read Port - N 1 - nfr %d\n" % (81 + index % 20))
+    assert [receive(c)[3] for c in connections] == [[81 + index % 20] for index in range(len(connections))]
+    with server.client() as one_more:
+        assert one_more.recv(1) == b""  # turned away
+    assert "turned away" in server.reports[0]
+    connections.pop().close()
+    wait_for(lambda: server.clients() == socket_server.MAX_CLIENTS - 1)
+    with server.client() as again:
+        again.sendall(b"Read Port - N 1 - nfr 100\n")
+        assert receive(again)[3] == [100]
+    for connection in connections:
+        connection.close()
+    wait_for(lambda: server.clients() == 0)
+
+
+def test_slow_client_neither_hinders_others_nor_fills_memory(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
+    server.content = port_content(2_000_000, 2_000_000)
+    with server.client() as slow, server.client() as quick:
+        for _ in range(20):
+            slow.sendall(b"Read Port - N 2000000 - nfr 1\n")  # 16 MB each, and it reads none
+        quick.sendall(b"Read Port - N 1 - nfr 1\n")
+        assert receive(quick)[3] == [1]
+        wait_for(lambda: any(client.outbox for client in server._socket._clients.values()))
+        assert sum(len(client.outbox) for client in server._socket._clients.values()) <= 16_000_016
+        assert receive(slow)[0] == 2_000_000  # and it gets its answers when it wakes up
+        assert receive(slow)[4][-1] == -2_000_000
+        monkeypatch.setattr(socket_server, "DEAD_SECONDS", 0.2)
+        wait_for(lambda: server.clients() == 1, what="the end of the client that takes no answer")
+        quick.sendall(b"Read Port - N 1 - nfr 2\n")
+        assert receive(quick)[3] == [2]
+
+
+def test_client_that_resets_its_connection(server: Server) -> None:
+    server.content = port_content(2_000_000, 2_000_000)
+    with server.client() as rude:
+        rude.sendall(b"Read Port - N 2000000 - nfr 1\n" * 3)
+        rude.recv(1)
+        rude.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+    wait_for(lambda: server.clients() == 0)
+    with server.client() as other:
+        other.sendall(b"Read Port - N 1 - nfr 7\n")
+        assert receive(other)[3] == [7]
+
+
+def test_end_closes_connections_and_frees_the_port(server: Server) -> None:
+    with server.client() as connection:
+        wait_for(lambda: server.clients() == 1)
+        server.stopping.set()
+        assert connection.recv(1) == b""
+    server.thread.join(5)
+    with socket.create_server(server.address):
+        pass
+
+
+def test_taken_port_is_an_error(server: Server) -> None:
+    with pytest.raises(OSError, match="in use"):
+        DedicatedSocket(lambda: None, "127.0.0.1", server.address[1], server.reports.append)
