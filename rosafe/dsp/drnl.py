@@ -15,6 +15,7 @@ from .guard import FloatArray
 COMPRESSION = 10**-0.60206
 HIGHEST_FITTED = 1000.0  # Hz; above, the nonlinear path has the gains of CASP_GAIN_FREQUENCY
 CASP_GAIN_FREQUENCY = 1500.0  # Hz
+LOWEST = 1.0  # Hz; the power laws were fitted from 250 Hz on and end in nonsense far below
 
 
 class DrnlBank:
@@ -33,7 +34,7 @@ class DrnlBank:
     Raises
     ------
     ValueError
-        Where one of the filters of a channel would lie at or above half the sample rate.
+        Where a frequency is below 1 Hz, or one of a channel's filters would lie at or above half the sample rate.
     """
 
     def __init__(self, sample_rate: float, frequencies: FloatArray) -> None:
@@ -75,6 +76,8 @@ class _Channel:
         def lowpass(cutoff: float) -> FloatArray:
             return signal.butter(2, cutoff, fs=sample_rate, output="sos")
 
+        if frequency < LOWEST:
+            raise ValueError(f"fb_cfHz: drnl has no channel at {frequency:.6g} Hz, below {LOWEST:.12g} Hz")
         linear_centre, linear_cutoff = power_law(-0.06762, 1.01679), power_law(-0.06762, 1.01)
         centre, cutoff = power_law(-0.05252, 1.01650), power_law(-0.05252, 1.01)
         highest = max(linear_centre, linear_cutoff, centre, cutoff)

@@ -19,7 +19,7 @@ KIND_OF = {p.name: kind.kind for kind in interface.KINDS.values() for p in kind.
 
 def cut(signal: NDArray[Any], sizes: int | Iterable[int]) -> list[NDArray[Any]]:
     """`signal` in blocks of `sizes` along its last axis, used cyclically; the last block is what is left."""
-    blocks = []
+    blocks: list[NDArray[Any]] = []
     position = 0
     for size in itertools.cycle([sizes] if isinstance(sizes, int) else sizes):
         if position >= signal.shape[-1]:

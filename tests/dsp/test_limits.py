@@ -84,7 +84,7 @@ def test_the_input_refuses_what_is_not_finite(bad: float) -> None:
     stage = Input(RATE, in_doNormalize=False)
     block = noise("input", 10)
     block[1, 3] = bad
-    with pytest.raises(ValueError, match="block: .*not finite"):
+    with pytest.raises(ValueError, match=r"block: .*not finite"):
         stage.process(block)
 
 

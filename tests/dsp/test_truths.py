@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -265,7 +266,7 @@ def test_hair_cell_methods() -> None:
     envelope = np.abs(x) + 0.1
     half = np.maximum(x, 0)
 
-    def lowpass(order: int, cutoff: float, signal: FloatArray) -> FloatArray:
+    def lowpass(order: int, cutoff: float, signal: Any) -> Any:
         return scipy_signal.lfilter(*scipy_signal.butter(order, cutoff / 22050), signal)
 
     breebart = half
