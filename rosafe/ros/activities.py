@@ -20,7 +20,13 @@ class Activity:
     `stop_requested`, returns for a normal end and raises ComponentError for any other.
     """
 
-    def __init__(self, number: int, service: Service, others: Callable[[Activity], None]) -> None:
+    def __init__(
+        self,
+        number: int,
+        service: Service,
+        others: Callable[[Activity], None],
+        on_begun: Callable[[], None] | None = None,
+    ) -> None:
         self.id = number
         self.service = service
         self.stop_requested = threading.Event()
@@ -29,10 +35,14 @@ class Activity:
         self.begun = threading.Event()  # running, or ended without ever running
         self.ended = threading.Event()
         self._others = others
+        self._on_begun = on_begun
 
     def running(self) -> None:
         """Tell those who wait for it that the activity does what was asked for."""
-        self.begun.set()
+        if not self.begun.is_set():
+            if self._on_begun is not None:
+                self._on_begun()
+            self.begun.set()
 
     def interrupt(self, by: str) -> None:
         """Ask the activity to end; `by` is the service that did so (the first one counts)."""
@@ -48,7 +58,7 @@ class Activity:
         """Record the end, good or bad."""
         self.error = error
         self.ended.set()
-        self.begun.set()
+        self.running()
 
 
 class TaskMeter:
@@ -121,13 +131,21 @@ class Activities:
         self._lock = threading.Lock()
 
     def start(
-        self, service: Service, handler: Handler, values: dict[str, Any], on_end: Callable[[Activity], None] | None
+        self,
+        service: Service,
+        handler: Handler,
+        values: dict[str, Any],
+        on_end: Callable[[Activity], None] | None,
+        on_begun: Callable[[], None] | None = None,
     ) -> Activity:
-        """Begin an activity; raises ``::genom::too_many_activities`` where its task has no slot left."""
+        """Begin an activity; raises ``::genom::too_many_activities`` where its task has no slot left.
+
+        The activity's thread calls `on_begun` once it runs, or has ended without, and `on_end` after the end.
+        """
         with self._lock:
             if self._full(service):
                 raise ComponentError("::genom::too_many_activities")
-            activity = Activity(next(self._numbers) % 2**32, service, self._interrupt_replaced)
+            activity = Activity(next(self._numbers) % 2**32, service, self._interrupt_replaced, on_begun)
             self._live[activity.id] = activity
         thread = threading.Thread(
             target=self._run,

@@ -125,11 +125,16 @@ class ComponentNode:
             raise self._bad_value(problem) from None
 
     def _begin(
-        self, service: interface.Service, request: Any, on_end: Callable[[Activity], None] | None = None
+        self,
+        service: interface.Service,
+        request: Any,
+        on_end: Callable[[Activity], None] | None = None,
+        on_begun: Callable[[], None] | None = None,
     ) -> Activity:
         if self.finished.is_set():
             raise ComponentError("::genom::disallowed", "the component is shutting down")
-        return self.activities.start(service, self._handlers[service.name], self._values(service, request), on_end)
+        values = self._values(service, request)
+        return self.activities.start(service, self._handlers[service.name], values, on_end, on_begun)
 
     def _serve_activity(self, service: interface.Service, request: Any) -> Any:
         response = getattr(self._srv, f"{service.name}Response")
@@ -175,13 +180,17 @@ class ComponentNode:
             if self.activities.full(service):
                 goal.set_rejected(text=f"{service.task}: too many activities")
                 return
-            goal.set_accepted()
+            # Accepted means running: a client that waits for it can make the next request, which may need this one.
             try:
-                activity = self._begin(service, goal.get_goal(), lambda activity: answer(goal, activity.error))
+                activity = self._begin(
+                    service, goal.get_goal(), lambda activity: answer(goal, activity.error), goal.set_accepted
+                )
             except ComponentError as problem:
+                goal.set_accepted()
                 answer(goal, problem)
             else:
                 goals[goal.get_goal_id().id] = activity
+                server.publish_status()  # the client learns that its goal is here
 
         def cancel(goal: Any) -> None:
             activity = goals.get(goal.get_goal_id().id)
