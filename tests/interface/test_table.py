@@ -1,0 +1,146 @@
+"""The interface table and the .msg, .srv and .action files agree field by field, and neither has more than the other."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from rosafe import interface
+from rosafe.interface import BASS, ROSAFE, Component, Service
+from tests import harness
+
+FOLDERS = {"rosAFE": harness.ROOT, "bass": harness.ROOT / "bass"}
+REPLY = [("bool", "genom_success"), ("string", "genom_exdetail")]
+COMPONENTS = pytest.mark.parametrize("component", interface.COMPONENTS.values(), ids=lambda c: c.name)
+SERVICES = pytest.mark.parametrize(
+    ("component", "service"), list(interface.all_services()), ids=lambda x: x.name if isinstance(x, Service) else x.name
+)
+
+
+def parts(path: Path) -> list[list[tuple[str, str]]]:
+    """The (type, name) pairs of each part of an interface file."""
+    found: list[list[tuple[str, str]]] = [[]]
+    for line in path.read_text("utf-8").splitlines():
+        line = line.split("#")[0].strip()
+        if line == "---":
+            found.append([])
+        elif line:
+            kind, name = line.split()
+            found[-1].append((kind, name))
+    return found
+
+
+def names(component: Component, kind: str) -> set[str]:
+    return {path.stem for path in (FOLDERS[component.name] / kind).glob(f"*.{kind}")}
+
+
+@SERVICES
+def test_srv(component: Component, service: Service) -> None:
+    request = [(p.ros, p.name) for p in service.parameters]
+    outputs = [(interface.ros_type(idl), name) for name, idl in service.outputs]
+    assert parts(FOLDERS[component.name] / "srv" / f"{service.name}.srv") == [request, REPLY + outputs]
+
+
+@SERVICES
+def test_action(component: Component, service: Service) -> None:
+    path = FOLDERS[component.name] / "action" / f"{service.name}.action"
+    assert path.exists() == service.activity
+    if service.activity:
+        assert parts(path) == [[(p.ros, p.name) for p in service.parameters], REPLY, []]
+
+
+@COMPONENTS
+def test_msg(component: Component) -> None:
+    for idl, fields in component.structs.items():
+        path = FOLDERS[component.name] / "msg" / f"{interface.ros_type(idl)}.msg"
+        assert parts(path) == [[(interface.ros_type(kind), name) for name, kind in fields]], idl
+
+
+@COMPONENTS
+def test_no_file_is_without_an_entry(component: Component) -> None:
+    assert names(component, "msg") == {interface.ros_type(idl) for idl in component.structs}
+    assert names(component, "srv") == {s.name for s in component.services}
+    assert names(component, "action") == {s.name for s in component.activities}
+
+
+@COMPONENTS
+def test_cmake_lists_every_file(component: Component) -> None:
+    text = (FOLDERS[component.name] / "CMakeLists.txt").read_text("utf-8").split()
+    for kind in ("msg", "srv", "action"):
+        assert {word.removesuffix(f".{kind}") for word in text if word.endswith(f".{kind}")} == names(component, kind)
+
+
+@COMPONENTS
+def test_ports_and_outputs_have_types(component: Component) -> None:
+    used = [p.idl for p in component.ports] + [idl for s in component.services for _, idl in s.outputs]
+    for idl in used:
+        base = idl.removeprefix("sequence<").removesuffix(">")
+        assert base in component.structs or base in interface.ROS_TYPES, idl
+
+
+# What the original's interface definition says, in its own order; REQUIRED where it has no default.
+DEFAULTS = {
+    "InputProc": ["input", 12000, 1, 1],
+    "PreProc": ["preProc", "input", False, 20, False, 0.97, False, 0.5, False, 100, False, "jepsen", False],
+    "GammatoneProc": ["gammatone", "preProc", "gammatone", 80, 8000, 1, 0, (), 4, 1.018],
+    "IhcProc": ["ihc", "gammatone", "dau"],
+    "IldProc": ["ild", "ihc", "hann", 0.02, 0.01],
+    "RatemapProc": ["ratemap", "ihc", "hann", 0.02, 0.01, "power", 0.008],
+    "CrossCorrelationProc": ["crosscorrelation", "ihc", 0.02, 0.01, 0.0011, "hann"],
+    "getSignals": [],
+    "getDependencies": ["nameProc"],
+    "getParameters": [],
+    "modifyParameter": ["nameProc", "nameParam", "newValue"],
+    "removeProcessor": ["name"],
+    "Acquire": ["hw:1,0", 44100, 2205, 20],
+    "DedicatedSocket": [],
+    "CloseSocket": [],
+    "ListDevices": [],
+    "Stop": [],
+    "kill": [],
+    "connect_port": [interface.REQUIRED] * 2,
+    "connect_service": [interface.REQUIRED] * 2,
+    "abort_activity": [interface.REQUIRED],
+}
+
+
+@SERVICES
+def test_defaults(component: Component, service: Service) -> None:
+    assert [p.default for p in service.parameters] == DEFAULTS[service.name]
+
+
+@SERVICES
+def test_defaults_pass_their_own_check(component: Component, service: Service) -> None:
+    for parameter in service.parameters:
+        if parameter.default is not interface.REQUIRED:
+            parameter.check(parameter.default)
+
+
+def test_parameter_structs_hold_the_parameters_of_the_requests() -> None:
+    for kind in interface.KINDS.values():
+        request = {p.name for p in ROSAFE.service(kind.request).parameters}
+        own = {p.name for p in kind.parameters}
+        assert own <= request or kind.kind == "input", kind.kind
+
+
+def test_tasks() -> None:
+    assert ROSAFE.tasks == (
+        *("init", "input", "preProc", "gammatoneProc", "ihcProc", "ildProc", "ratemapProc", "crossCorrelationProc"),
+    )
+    assert BASS.tasks == ("capture", "socket")
+    for component in interface.COMPONENTS.values():
+        assert {s.task for s in component.activities} <= set(component.tasks)
+
+
+def test_exceptions() -> None:
+    assert list(ROSAFE.exceptions) == [
+        *("e_noData", "e_noMemory", "e_existsAlready", "e_noSuchProcessor", "e_noSuchParameter"),
+        *("e_noUpperDependencie", "e_badIndexParam", "e_badNewValue"),
+    ]
+    assert list(BASS.exceptions) == ["e_nomem", "e_nodevice", "e_device", "e_hwparams", "e_swparams"]
+    for component, service in interface.all_services():
+        for thrown in service.throws:
+            _, owner, short = thrown.split("::")
+            known = interface.GENOM_EXCEPTIONS if owner == "genom" else component.exceptions
+            assert short in known, f"{service.name} throws {thrown}"
