@@ -7,6 +7,7 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import NoReturn, Protocol
@@ -14,6 +15,7 @@ from typing import NoReturn, Protocol
 from rosafe import __version__, interface
 from rosafe.ros import generate, master, paths
 
+MASTER_SECONDS = 5.0  # `roscore & rosAFE-ros &` starts both at once, and roscore takes a second or two
 START_SECONDS = 20.0  # a node that is not up by then waits for something that does not come
 END_SECONDS = 4.5  # from the wish to end until the process is gone, whatever its threads do
 SWITCH_SECONDS = 0.0005  # threads that only wait for their turn answer requests ten times faster than with the default
@@ -61,7 +63,7 @@ def run_server(component: interface.Component, build: Callable[[str], Node], arg
     for number in SIGNALS:
         signal.signal(number, lambda number, frame: received.append(number))
     try:
-        node = _start(component, build, options.instance, remappings)
+        node = _start(component, build, options.instance, remappings, received)
     except (_Failure, generate.GenerationError, master.MasterError, interface.ComponentError, OSError) as problem:
         print(f"{component.name}-ros: {problem}", file=sys.stderr)
         _watchdog(END_SECONDS, 1)
@@ -107,7 +109,13 @@ def _parse(component: interface.Component, arguments: list[str]) -> argparse.Nam
 # --- start ------------------------------------------------------------------------------------------------------
 
 
-def _start(component: interface.Component, build: Callable[[str], Node], instance: str, remappings: list[str]) -> Node:
+def _start(
+    component: interface.Component,
+    build: Callable[[str], Node],
+    instance: str,
+    remappings: list[str],
+    received: list[int],
+) -> Node:
     import rosgraph.names
 
     mappings = dict(remapping.split(":=", 1) for remapping in remappings)
@@ -118,7 +126,7 @@ def _start(component: interface.Component, build: Callable[[str], Node], instanc
         if mappings.get(name):
             os.environ[variable] = mappings[name]
     master.set_local_defaults()
-    master.check_master(os.environ["ROS_MASTER_URI"])
+    _await_master(os.environ["ROS_MASTER_URI"], received)
     generate.ensure_messages()
     paths.prefer_pypi_packages()
     _ensure_log_directory()
@@ -139,6 +147,18 @@ def _start(component: interface.Component, build: Callable[[str], Node], instanc
     node = build(instance)
     watchdog.cancel()
     return node
+
+
+def _await_master(uri: str, received: list[int]) -> None:
+    """Give a master that is just starting a moment; MasterError where none is there by then, or at a signal."""
+    deadline = time.monotonic() + MASTER_SECONDS
+    while True:
+        try:
+            return master.check_master(uri)
+        except master.MasterError:
+            if received or time.monotonic() > deadline:
+                raise
+        time.sleep(0.1)
 
 
 def _ensure_log_directory() -> None:
