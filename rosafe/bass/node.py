@@ -42,7 +42,7 @@ class BassNode:
         self._node.activity("CloseSocket", lambda activity, _: activity.interrupt_others())
         self._node.function("ListDevices", self._list_devices)
         self._node.function("Stop", lambda _: None)  # the table says what it interrupts
-        self._node.diagnostics.add(f"{self._node.name[1:]}: capture", self._health)
+        self._node.diagnostics.add("capture", self._health)
         self._node.start()
 
     def shutdown(self, by: str) -> None:

@@ -41,7 +41,7 @@ def scene_azimuth(seconds: np.ndarray | float, walk: float = WALK_SECONDS) -> np
 
 
 def ear_delay(incidence: np.ndarray) -> np.ndarray:
-    """Woodworth's delay (s) to an ear that the sound meets at `incidence` rad from its axis (0 to pi), after the head's centre."""
+    """Woodworth's delay (s) to an ear with the sound `incidence` rad (0 to pi) off its axis; 0 is the head's centre."""
     return _HEAD_TIME * np.where(incidence < np.pi / 2, -np.cos(incidence), incidence - np.pi / 2)
 
 
