@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import re
 import signal
 import sys
 import threading
@@ -56,7 +57,7 @@ def run_server(component: interface.Component, build: Callable[[str], Node], arg
     arguments = sys.argv[1:] if argv is None else argv
     options = _parse(component, [a for a in arguments if ":=" not in a])
     remappings = [a for a in arguments if ":=" in a]
-    told = _Background() if options.background else None
+    told = Background() if options.background else None
     if told is not None and told.in_parent:
         return told.wait()
     received: list[int] = []
@@ -66,7 +67,7 @@ def run_server(component: interface.Component, build: Callable[[str], Node], arg
         node = _start(component, build, options.instance, remappings, received)
     except (_Failure, generate.GenerationError, master.MasterError, interface.ComponentError, OSError) as problem:
         print(f"{component.name}-ros: {problem}", file=sys.stderr)
-        _watchdog(END_SECONDS, 1)
+        watchdog(END_SECONDS, 1)
         return 1
     if told is not None:
         told.up()
@@ -77,14 +78,16 @@ def run_server(component: interface.Component, build: Callable[[str], Node], arg
 # --- command line -----------------------------------------------------------------------------------------------
 
 
-class _Parser(argparse.ArgumentParser):
+class Parser(argparse.ArgumentParser):
+    """A parser whose errors are one line."""
+
     def error(self, message: str) -> NoReturn:
         self.exit(2, f"{self.prog}: {message}; {self.prog} -h shows what is possible\n")
 
 
 def _parse(component: interface.Component, arguments: list[str]) -> argparse.Namespace:
     program = f"{component.name}-ros"
-    parser = _Parser(
+    parser = Parser(
         prog=program,
         usage=f"{program} [-b] [-i NAME] [-h] [--version] [NAME:=VALUE ...]",
         description=f"{component.doc}.",
@@ -116,11 +119,9 @@ def _start(
     remappings: list[str],
     received: list[int],
 ) -> Node:
-    import rosgraph.names
-
     mappings = dict(remapping.split(":=", 1) for remapping in remappings)
     instance = mappings.get("__name", instance)
-    if not rosgraph.names.is_legal_base_name(instance):
+    if not re.fullmatch("[A-Za-z][A-Za-z0-9_]*", instance):
         raise _Failure(f"{instance!r} is no instance name: letters, digits and _ only, a letter first")
     for name, variable in _ENVIRONMENT_REMAPPINGS.items():
         if mappings.get(name):
@@ -129,8 +130,8 @@ def _start(
     _await_master(os.environ["ROS_MASTER_URI"], received)
     generate.ensure_messages()
     paths.prefer_pypi_packages()
-    _ensure_log_directory()
-    watchdog = _watchdog(
+    ensure_log_directory()
+    limit = watchdog(
         START_SECONDS,
         1,
         f"{component.name}-ros: not up after {START_SECONDS:g} s: is this machine reachable under the name or address "
@@ -143,9 +144,9 @@ def _start(
         rospy.init_node(instance, argv=[f"{component.name}-ros", *remappings], disable_signals=True)
     except (rospy.ROSException, ValueError) as problem:
         raise _Failure(f"cannot start the node: {problem}") from problem
-    _log_to_stderr()
+    log_to_stderr()
     node = build(instance)
-    watchdog.cancel()
+    limit.cancel()
     return node
 
 
@@ -161,7 +162,7 @@ def _await_master(uri: str, received: list[int]) -> None:
         time.sleep(0.1)
 
 
-def _ensure_log_directory() -> None:
+def ensure_log_directory() -> None:
     """Send rospy's log file to a temporary folder where the usual one cannot be written: it is not worth failing."""
     import rospkg
 
@@ -169,7 +170,7 @@ def _ensure_log_directory() -> None:
         os.environ["ROS_LOG_DIR"] = str(paths.private_temporary() / "log")
 
 
-def _log_to_stderr() -> None:
+def log_to_stderr() -> None:
     """Move rospy's information lines to stderr, where its warnings are: stdout belongs to what a request prints."""
     import logging
 
@@ -193,12 +194,12 @@ def _serve(node: Node, received: list[int]) -> None:
     # An Event must not be set from a signal handler, which may interrupt the wait while that holds its lock.
     while not received and not rospy.is_shutdown() and not node.finished.wait(0.1):
         pass
-    _watchdog(END_SECONDS, 0)
+    watchdog(END_SECONDS, 0)
     node.shutdown("kill")
     rospy.signal_shutdown("signal" if received else "kill")
 
 
-def _watchdog(seconds: float, code: int, message: str = "") -> threading.Timer:
+def watchdog(seconds: float, code: int, message: str = "") -> threading.Timer:
     """End the process with `code` after `seconds` unless it has ended, or the timer is cancelled, by then."""
 
     def end() -> None:
@@ -217,7 +218,7 @@ def _watchdog(seconds: float, code: int, message: str = "") -> threading.Timer:
 # --- background -------------------------------------------------------------------------------------------------
 
 
-class _Background:
+class Background:
     """The process cut in two: the parent waits for the shell until the child, which becomes the node, is up."""
 
     def __init__(self) -> None:
