@@ -231,7 +231,7 @@ class Graph:
             raise AssertionError(f"ended at once: {process}")
         _, subscribed, served = ({entry for entry, _ in kind} for kind in self._state())
         return {f"/{name}/{s.name}" for s in component.services} <= served and {
-            f"/{name}/{s.name}/goal" for s in component.activities
+            f"/{name}/{s.name}/cancel" for s in component.activities
         } <= subscribed
 
     def _forget(self, name: str) -> None:

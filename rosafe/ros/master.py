@@ -39,8 +39,8 @@ def is_local(uri: str) -> bool:
     return host in ("localhost", "::1") or host.startswith("127.")
 
 
-def check_master(uri: str) -> None:
-    """Return if a ROS master answers at `uri` within a few seconds, else raise MasterError."""
+def check_address(uri: str) -> None:
+    """Return if `uri` could be that of a ROS master, else raise MasterError."""
     try:
         parts = urlsplit(uri)
         usable = parts.scheme == "http" and parts.hostname and parts.port
@@ -48,6 +48,11 @@ def check_master(uri: str) -> None:
         usable = None
     if not usable:
         raise MasterError(f"ROS_MASTER_URI is {uri!r}, which is no address like {DEFAULT_URI}")
+
+
+def check_master(uri: str) -> None:
+    """Return if a ROS master answers at `uri` within a few seconds, else raise MasterError."""
+    check_address(uri)
     outcome: list[str] = []
     asking = threading.Thread(target=lambda: outcome.append(_ask(uri)), daemon=True)
     asking.start()

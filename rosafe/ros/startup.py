@@ -152,6 +152,7 @@ def _start(
 
 def _await_master(uri: str, received: list[int]) -> None:
     """Give a master that is just starting a moment; MasterError where none is there by then, or at a signal."""
+    master.check_address(uri)  # a wrong one does not get better
     deadline = time.monotonic() + MASTER_SECONDS
     while True:
         try:

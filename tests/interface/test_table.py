@@ -1,4 +1,4 @@
-"""The interface table and the .msg, .srv and .action files agree field by field, and neither has more than the other."""
+"""The interface table and the .msg, .srv and .action files agree, field by field; neither has more than the other."""
 
 from __future__ import annotations
 
@@ -13,9 +13,7 @@ from tests import harness
 FOLDERS = {"rosAFE": harness.ROOT, "bass": harness.ROOT / "bass"}
 REPLY = [("bool", "genom_success"), ("string", "genom_exdetail")]
 COMPONENTS = pytest.mark.parametrize("component", interface.COMPONENTS.values(), ids=lambda c: c.name)
-SERVICES = pytest.mark.parametrize(
-    ("component", "service"), list(interface.all_services()), ids=lambda x: x.name if isinstance(x, Service) else x.name
-)
+SERVICES = pytest.mark.parametrize(("component", "service"), list(interface.all_services()), ids=lambda x: x.name)
 
 
 def parts(path: Path) -> list[list[tuple[str, str]]]:

@@ -1,0 +1,292 @@
+"""Both nodes from the shell and back: options, names, signals, background, a missing or silent master, takeover."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from http.server import BaseHTTPRequestHandler, HTTPServer
+from pathlib import Path
+
+import pytest
+
+from rosafe import __version__
+from tests.harness import SCRIPTS, Graph, MasterProcess, Process, free_port, wait_for
+
+PROGRAMS = pytest.mark.parametrize("program", ["rosAFE-ros", "bass-ros"])
+
+
+@contextmanager
+def silent_port() -> Iterator[int]:
+    """A port that takes connections and never answers."""
+    with socket.socket() as listener:
+        listener.bind(("127.0.0.1", 0))
+        listener.listen(8)
+        yield listener.getsockname()[1]
+
+
+@contextmanager
+def web_server() -> Iterator[int]:
+    """A port where something else than a ROS master answers."""
+    server = HTTPServer(("127.0.0.1", 0), type("Quiet", (BaseHTTPRequestHandler,), {"log_message": lambda *a: None}))
+    thread = threading.Thread(target=server.serve_forever)
+    thread.start()
+    try:
+        yield server.server_port
+    finally:
+        server.shutdown()
+        thread.join()
+        server.server_close()
+
+
+# --- the command line -------------------------------------------------------------------------------------------
+
+
+@PROGRAMS
+def test_help_shows_an_example(graph: Graph, program: str) -> None:
+    text = graph.run(program, "-h").stdout
+    assert f"{program} -b -i left" in text
+    for option in ("--background", "--instance", "--name", "--version", "__ip"):
+        assert option in text
+
+
+@PROGRAMS
+def test_version(graph: Graph, program: str) -> None:
+    assert graph.run(program, "--version").stdout == f"{program.removesuffix('-ros')} {__version__}\n"
+
+
+@PROGRAMS
+@pytest.mark.parametrize("arguments", [["--frobnicate"], ["-i"], ["-b", "stray"], ["--back"]])
+def test_wrong_option(graph: Graph, program: str, arguments: list[str]) -> None:
+    done = graph.run(program, *arguments, check=False)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith(f"{program}: ") and done.stderr.count("\n") == 1
+    assert f"{program} -h" in done.stderr
+
+
+@pytest.mark.parametrize("name", ["", "1left", "left ear", "a/b", "/left", "höhe", "a-b", "~x", "x" * 300 + "!"])
+def test_wrong_instance_name(graph: Graph, name: str) -> None:
+    for arguments in (["-i", name], [f"__name:={name}"]):
+        done = graph.run("bass-ros", *arguments, check=False)
+        assert (done.returncode, done.stdout) == (1, "")
+        assert "no instance name" in done.stderr and done.stderr.count("\n") == 1
+
+
+# --- no master --------------------------------------------------------------------------------------------------
+
+
+def refused(graph: Graph, program: str, uri: str) -> str:
+    done = graph.run(program, check=False, timeout=15, ROS_MASTER_URI=uri)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr.startswith(f"{program}: ") and done.stderr.count("\n") == 1
+    assert "Traceback" not in done.stderr
+    return done.stderr
+
+
+@PROGRAMS
+def test_no_master(graph: Graph, program: str) -> None:
+    uri = f"http://127.0.0.1:{free_port()}"
+    text = refused(graph, program, uri)
+    assert uri in text and "start roscore first" in text
+
+
+def test_silent_master(graph: Graph) -> None:
+    with silent_port() as port:
+        assert "no answer" in refused(graph, "bass-ros", f"http://127.0.0.1:{port}")
+
+
+def test_something_else_at_the_masters_port(graph: Graph) -> None:
+    with web_server() as port:
+        assert "not a ROS master" in refused(graph, "bass-ros", f"http://127.0.0.1:{port}")
+
+
+@pytest.mark.parametrize(
+    "uri", ["nonsense", "http://127.0.0.1", "http://127.0.0.1:99999", "ftp://127.0.0.1:1", "http://[::1"]
+)
+def test_address_that_is_none(graph: Graph, uri: str) -> None:
+    assert "ROS_MASTER_URI" in refused(graph, "bass-ros", uri)
+
+
+def test_no_master_in_the_background(graph: Graph) -> None:
+    done = graph.run("bass-ros", "-b", check=False, ROS_MASTER_URI=f"http://127.0.0.1:{free_port()}")
+    assert done.returncode == 1 and done.stderr.count("\n") == 1
+
+
+# --- up and down ------------------------------------------------------------------------------------------------
+
+
+@PROGRAMS
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_signal_ends_it_and_leaves_nothing(graph: Graph, program: str, number: int) -> None:
+    name = f"/{program.removesuffix('-ros')}"
+    with graph.node(program) as node:
+        assert node.stop(number, timeout=5) == 0
+        assert name not in graph.nodes()
+        assert "Traceback" not in node.err
+
+
+@PROGRAMS
+def test_kill_request_ends_it(graph: Graph, program: str) -> None:
+    name = program.removesuffix("-ros")
+    with graph.node(program) as node:
+        assert "genom_success: True" in graph.run("rosservice", "call", f"/{name}/kill", "{}").stdout
+        assert node.wait(5) == 0
+        assert f"/{name}" not in graph.nodes()
+
+
+def test_rosnode_kill_ends_it(graph: Graph) -> None:
+    with graph.node("bass-ros") as node:
+        graph.run("rosnode", "kill", "/bass")
+        assert node.wait(5) == 0
+
+
+def test_the_shells_process_is_the_node(graph: Graph) -> None:
+    with graph.node("bass-ros") as node:
+        assert f"Pid: {node.pid}\n" in graph.run("rosnode", "info", "/bass").stdout
+
+
+def test_ends_without_the_master(private_graph: tuple[Graph, MasterProcess]) -> None:
+    graph, master = private_graph
+    with graph.node("bass-ros") as node:
+        master.kill()
+        assert node.stop(signal.SIGTERM, timeout=6) == 0
+
+
+def test_stdout_is_left_to_the_requests(graph: Graph) -> None:
+    with graph.node("bass-ros") as node:
+        node.stop()
+        assert node.out == ""
+
+
+# --- names ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "name"),
+    [
+        (["-i", "left"], "/left"),
+        (["--name", "left"], "/left"),
+        (["--instance=left"], "/left"),
+        (["__name:=left"], "/left"),
+        (["-i", "right", "__name:=left"], "/left"),
+        (["-i", "left", "__ns:=/robot"], "/robot/left"),
+    ],
+)
+def test_instance(graph: Graph, arguments: list[str], name: str) -> None:
+    with graph.start("bass-ros", *arguments) as node:
+        wait_for(lambda: f"{name}/kill" in graph.services(), 20, lambda: str(node))
+        assert not any(service.startswith("/bass/") for service in graph.services())
+        assert node.stop() == 0
+
+
+def test_two_instances_at_once(graph: Graph) -> None:
+    with graph.node("bass-ros", "-i", "left") as left, graph.node("bass-ros", "-i", "right") as right:
+        assert left.stop() == 0
+        assert right.alive and "/right/Acquire" in graph.services()
+
+
+def test_a_second_one_of_the_same_name_takes_over(graph: Graph) -> None:
+    with graph.node("bass-ros") as old, graph.start("bass-ros") as new:
+        assert old.wait(10) == 0
+        assert "new node registered with same name" in old.out
+        wait_for(lambda: f"Pid: {new.pid}\n" in graph.run("rosnode", "info", "/bass", check=False).stdout)
+        wait_for(lambda: "/bass/Stop" in graph.services())
+        assert graph.call("/bass/Stop").genom_success
+
+
+def test_master_and_address_by_remapping(graph: Graph) -> None:
+    command = ["bass-ros", "-i", "mapped", f"__master:={graph.uri}", "__ip:=127.0.0.2"]
+    with graph.start(*command, ROS_MASTER_URI="http://127.0.0.1:1", ROS_IP="") as node:
+        wait_for(lambda: "/mapped/kill" in graph.services(), 20, lambda: str(node))
+        assert "127.0.0.2" in graph.run("rosservice", "uri", "/mapped/kill").stdout
+
+
+# --- background -------------------------------------------------------------------------------------------------
+
+
+def test_background_is_up_when_the_shell_goes_on(graph: Graph) -> None:
+    done = graph.run("bass-ros", "-b", "-i", "behind")  # returns although stdout is a pipe that the node could hold
+    try:
+        assert (done.stdout, done.returncode) == ("", 0)
+        assert "/behind/kill" in graph.services()
+    finally:
+        graph.run("rosservice", "call", "/behind/kill", "{}")
+    wait_for(lambda: "/behind" not in graph.nodes())
+
+
+def test_background_keeps_writing_to_a_file(graph: Graph, tmp_path: Path) -> None:
+    log = tmp_path / "log"
+    graph.run("/bin/sh", "-c", f"bass-ros -b -i logged >{log} 2>&1")
+    try:
+        graph.run("rosservice", "call", "/logged/connect_port", "{local: a, remote: b}")
+        wait_for(lambda: "no_such_inport" in log.read_text(), what=log.read_text)
+    finally:
+        graph.run("rosservice", "call", "/logged/kill", "{}")
+
+
+# --- surroundings -----------------------------------------------------------------------------------------------
+
+
+def test_symbolic_link_elsewhere(graph: Graph, tmp_path: Path) -> None:
+    link = tmp_path / "bass"
+    link.symlink_to(SCRIPTS / "bass-ros")
+    done = graph.run(str(link), "--version", PYTHONPATH="", PATH="/usr/bin:/bin")
+    assert done.stdout == f"bass {__version__}\n"
+
+
+def test_starts_without_any_environment(graph: Graph) -> None:
+    """No env.sh, no PYTHONPATH, no HOME, another folder."""
+    command = ["env", "-i", f"ROS_MASTER_URI={graph.uri}", str(SCRIPTS / "bass-ros"), "-i", "bare"]
+    with graph.start(*command, cwd=Path("/")) as node:
+        wait_for(lambda: "/bare/kill" in graph.services(), 20, lambda: str(node))
+        assert node.stop() == 0
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="becoming another user takes root")
+def test_home_that_cannot_be_written(graph: Graph) -> None:
+    command = [
+        "setpriv",
+        "--reuid=65534",
+        "--regid=65534",
+        "--clear-groups",
+        "--",
+        str(SCRIPTS / "bass-ros"),
+        "-i",
+        "poor",
+    ]
+    with graph.start(*command, HOME="/nonexistent", ROS_HOME="/nonexistent/.ros") as node:
+        wait_for(lambda: "/poor/kill" in graph.services(), 20, lambda: str(node))
+        assert "WARNING" not in node.err
+        assert node.stop() == 0
+
+
+def test_end_is_bounded_when_threads_hang(graph: Graph, tmp_path: Path) -> None:
+    program = tmp_path / "stuck"
+    program.write_text(
+        f"""#!/usr/bin/python3
+import sys, threading
+sys.path.insert(0, {str(SCRIPTS.parent)!r})
+from rosafe import interface
+from rosafe.ros.startup import run_server
+class Stuck:
+    finished = threading.Event()
+    def shutdown(self, by):
+        threading.Event().wait()
+def build(instance):
+    threading.Thread(target=threading.Event().wait).start()
+    import rospy
+    rospy.set_param("/stuck_is_up", True)
+    return Stuck()
+sys.exit(run_server(interface.BASS, build))
+"""
+    )
+    program.chmod(0o755)
+    with Process([str(program)], graph.env) as node:
+        graph.client()
+        import rospy
+
+        wait_for(lambda: rospy.get_param("/stuck_is_up", False), 20, lambda: str(node))
+        assert node.stop(signal.SIGTERM, timeout=6) == 0
