@@ -7,8 +7,10 @@ It imports nothing but the standard library.
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
+import numbers
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -141,12 +143,12 @@ class Parameter:
         if isinstance(value, (str, bytes, Mapping)):
             raise self._refuse(value, f"a list of {element}")
         try:
-            items = [item.item() if hasattr(item, "item") else item for item in value]
+            items = list(itertools.islice(value, MAX_SEQUENCE + 1))
         except TypeError:  # a single number is a list of one: MATLAB users write 0 for "no list"
             items = [value]
         if len(items) > MAX_SEQUENCE:
-            raise ValueError(f"{self.name}: {len(items)} values are too many, at most {MAX_SEQUENCE}")
-        if len(items) == 1 and isinstance(items[0], (int, float)) and items[0] == 0:  # [0] is "no list" likewise
+            raise ValueError(f"{self.name}: too many values, at most {MAX_SEQUENCE}")
+        if len(items) == 1 and isinstance(items[0], numbers.Real) and items[0] == 0:  # [0] is "no list" likewise
             return []
         return [self._check_scalar(element, item) for item in items]
 

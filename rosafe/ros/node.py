@@ -150,7 +150,9 @@ class RosafeNode:
 
     def ended(self, processor: Processor) -> None:
         """Close the port and end the activity."""
-        self._ports.pop(processor).close()
+        port = self._ports.pop(processor, None)  # None where it could not be opened
+        if port is not None:
+            port.close()
         if processor.error is not None:
             rospy.logerr(f"{processor.kind} {processor.name!r} failed: {processor.error!r}")
         activity = self._ends.get(processor)

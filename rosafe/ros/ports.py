@@ -12,7 +12,7 @@ from rosafe import interface
 from rosafe.interface import KINDS, ROSAFE
 from rosafe.ros import wire
 from rosafe.tree import Processor
-from rosafe.tree.window import SlidingWindow, WindowView
+from rosafe.tree.window import SlidingWindow, WindowView, frames_in
 from rosafe.tree.zone import Block
 
 _NOTHING = np.zeros(0)  # ILD's `right`
@@ -38,11 +38,6 @@ def signal_fields(kind: str, view: WindowView, next_index: int, rate: float) -> 
     return {**fields, "left": view.select(0), "right": view.select(1)}
 
 
-def port_frames(seconds: float, rate: float) -> int:
-    """Frames on a port of so many seconds."""
-    return int(np.floor(seconds * rate + 1e-9))
-
-
 class OutputPort:
     """The topic of one processor."""
 
@@ -56,7 +51,7 @@ class OutputPort:
 
     def open(self, seconds: float) -> None:
         """Publish the first message: zeros."""
-        self._fit(self.processor.rows, port_frames(seconds, self.processor.rate))
+        self._fit(self.processor.rows, frames_in(seconds, self.processor.rate))
         self._publish(self.processor.next_index, self.processor.rate)
 
     def _fit(self, rows: tuple[int, ...], frames: int) -> SlidingWindow:
@@ -67,7 +62,7 @@ class OutputPort:
 
     def append(self, block: Block, seconds: float) -> None:
         """Shift the window by a block and publish it."""
-        self._fit(block.data.shape[:-1], port_frames(seconds, block.rate)).append(block.data)
+        self._fit(block.data.shape[:-1], frames_in(seconds, block.rate)).append(block.data)
         self._publish(block.next_index, block.rate)
 
     def _publish(self, next_index: int, rate: float) -> None:
@@ -95,8 +90,6 @@ def parameters_message(processors: list[Processor], messages: Any) -> Any:
         idl = dict(ROSAFE.structs["::rosAFE::parameters"])[processor.kind]
         struct = getattr(messages, interface.ros_type(idl[len("sequence<") : -1]))
         values = processor.parameters()
-        if processor.lags is not None:
-            values["cc_lags"] = processor.lags.tolist()
         if "fb_cfHz" in values:
             values["fb_cfHz"] = [float(f) for f in values["fb_cfHz"]]
         arrays[processor.kind].append(struct(name=processor.name, **values))

@@ -4,19 +4,16 @@ from __future__ import annotations
 
 import copy
 import enum
+import itertools
 import threading
 import time
-from collections.abc import Callable, Iterable
-from typing import Any, Protocol
+from collections.abc import Callable, Iterator
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from rosafe.dsp.haircell import ENVELOPE_METHODS
 from rosafe.tree.window import History, WindowView
 from rosafe.tree.zone import Block, SharedZone
-
-# The stage wants an envelope that only blocks from the next exec of its parent on carry.
-_ENVELOPE_PARAMETER = "ihc_method"
 
 
 class State(enum.Enum):
@@ -46,10 +43,10 @@ class Listener(Protocol):
     """Who hears of what the processors do. Called on their threads; must not wait for the tree."""
 
     def added(self, processor: Processor) -> None:
-        """A processor is in the tree and about to start; nothing was released yet."""
+        """A processor is about to start; nothing was released yet. Where this raises, it is taken out again."""
 
     def executed(self, processor: Processor, seconds: float) -> None:
-        """One block was computed in so many seconds."""
+        """One block was computed in so many seconds; the last one perhaps after `ended`."""
 
     def released(self, processor: Processor, block: Block) -> None:
         """A block was released. Never called after `ended`."""
@@ -58,19 +55,31 @@ class Listener(Protocol):
         """The processor is gone; `processor.error` tells why where it was not asked to."""
 
 
+class Change(NamedTuple):
+    """A parameter change that waits for the processor's next block, or for a later one."""
+
+    block: int  # of the input; it is made before this one, or the next one if that is a later one
+    name: str
+    value: Any
+
+
 class Processor:
     """A node of the tree. Made and wired by `Tree`; the public members are safe from any thread.
+
+    Locks are taken in this order: the tree's requests, `_publishing`, `_changing` or the tree's lock.
 
     Parameters
     ----------
     name, kind : str
         The user's name for it; a key of `rosafe.interface.KINDS`.
-    stage : object
-        The numerics, of `rosafe.dsp.STAGES`.
+    stage : rosafe.dsp.Stage
+        The numerics.
     parent : Processor or None
         None for the input, which reads from `source`.
     lock : threading.RLock
         The tree's lock, which guards all tokens.
+    failed : callable
+        Called at the end of its thread where `error` is set.
     """
 
     def __init__(
@@ -96,15 +105,16 @@ class Processor:
         self.history_seconds = history_seconds
         self.zone = SharedZone()
         self.turn = threading.Condition(lock)
-        self._stage = stage
+        self.stage = stage  # as it will be after all changes, to be asked and not to be run
+        self._stage = stage  # at work
         self._source = source
         self._listener = listener
         self._failed = failed
-        self._computing = threading.Lock()  # held while the stage works: changes are made between blocks
-        self._changing = threading.Lock()  # held while parameters change, which is short; taken after _computing
-        self._publishing = threading.RLock()  # `released` and `ended` exclude each other
-        self._scheduled: list[tuple[int | None, str, Any]] = []
-        self._history: History | None = None
+        self._reading: Processor | None = None  # the parent whose block it holds: the input may be replaced meanwhile
+        self._changing = threading.Lock()  # guards _changes, and the exchange of _stage
+        self._changes: list[Change] = []
+        self._publishing = threading.Lock()  # `released` and `ended` exclude each other
+        self._history = History(self.rows, self.rate, history_seconds)
         self._thread = threading.Thread(target=self._run, name=f"{kind}:{name}", daemon=True)
 
     def __repr__(self) -> str:
@@ -115,73 +125,68 @@ class Processor:
     @property
     def rows(self) -> tuple[int, ...]:
         """Leading shape of its output: (2,), (2, channels), (channels,) or (channels, lags)."""
-        return self._stage.output_rows(self.parent.rows if self.parent is not None else (2,))
-
-    def check_rows(self, rows: tuple[int, ...], check: Callable[[tuple[int, ...], float], None]) -> None:
-        """Call `check(rows, rate)` for what it and all below would put out if its parent's rows were `rows`."""
-        mine = self._stage.output_rows(rows)
-        check(mine, self.rate)
-        for child in self.children:
-            child.check_rows(mine, check)
+        return tuple(self.stage.output_rows(self.parent.rows if self.parent is not None else (2,)))
 
     @property
     def rate(self) -> float:
         """Frames of output per second."""
-        return float(self._stage.output_rate)
-
-    @property
-    def lags(self) -> np.ndarray | None:
-        """Lags of a cross-correlation in seconds, (L,); None for other kinds."""
-        return getattr(self._stage, "lags", None)
+        return float(self.stage.output_rate)
 
     def parameters(self) -> dict[str, Any]:
-        """The values in force, or about to be from the next block on, in the order of the parameter structure."""
-        with self._changing:
-            values = dict(self._stage.parameters)
-            values.update({name: value for at, name, value in self._scheduled if at is None})
+        """The values from the next block on, in the order of the parameter structure; `cc_lags` (s) at its end."""
+        stage = self.stage
+        values = dict(stage.parameters)
+        if hasattr(stage, "lags"):
+            values["cc_lags"] = stage.lags.tolist()
         return values
 
     # --- changes ---
 
-    def configure(self, name: str, value: Any, accept: Callable[[Any], None]) -> None:
-        """Change one parameter from the next block on.
+    def change(self, name: str, value: Any, accept: Callable[[Any], None], block: int = 0) -> None:
+        """Change one parameter before block `block` of the input, or before the next one if that is a later one.
 
-        `accept` sees the changed stage before it is put to work and may raise; then, as with any ValueError of the
-        stage itself, everything stays as it was.
+        `accept` sees the changed stage before it is put to work and may raise ValueError; then, as where the stage
+        itself does, everything stays as it was. The caller makes one change at a time, in the order of their blocks.
         """
-        with self._computing, self._changing:
-            changed = copy.deepcopy(self._stage)
-            changed.configure(**{name: value})
-            accept(changed)
-            if name == _ENVELOPE_PARAMETER:
-                # Blocks that are already on their way may lack the envelope: the change waits for one that has it.
-                self._scheduled.append((None, name, value))
-            else:
-                self._stage = changed
-
-    def schedule(self, block: int, name: str, value: Any) -> None:
-        """Change one parameter before block `block` of the input."""
+        change = Change(block, name, value)
+        planned = _changed(self.stage, [change])
+        accept(planned)
         with self._changing:
-            self._scheduled.append((block, name, value))
+            self._changes.append(change)
+            self.stage = planned
+
+    def _due(self, block: int) -> list[Change]:
+        return list(itertools.takewhile(lambda change: change.block <= block, self._changes))
+
+    def _apply_changes(self, taken: Block) -> None:
+        """Make the changes that are due, up to the last one after which the stage can work on block `taken`.
+
+        A method that needs the filterbank's envelope waits for a block that has it.
+        """
+        with self._changing:
+            due = self._due(taken.number)
+            while due:
+                stage = _changed(self._stage, due)
+                if taken.envelope is not None or not _needs_envelope(stage):
+                    self._stage = stage
+                    del self._changes[: len(due)]
+                    return
+                due.pop()
 
     def wants_envelope(self, number: int) -> bool:
         """Whether block `number` of the parent should carry its envelope."""
         with self._changing:
-            wanted = getattr(self._stage, "needs_envelope", False)
-            due = [v for at, name, v in self._scheduled if name == _ENVELOPE_PARAMETER and (at is None or at <= number)]
-            return wanted or any(method in ENVELOPE_METHODS for method in due)
+            return _needs_envelope(_changed(self._stage, self._due(number)))
 
     # --- life ---
 
     def start(self) -> None:
-        """Begin to work."""
-        self._thread.start()
-
-    def hang_on(self, parent: Processor) -> None:
-        """Become a child of `parent`; begins with the block that it released last."""
+        """Begin to work, with the block that the parent released last."""
         with self.turn:
-            parent.children.append(self)
-            parent.zone.attach(self)
+            self._thread.start()  # nothing is attached where the system has no thread left
+            if self.parent is not None:
+                self.parent.children.append(self)
+                self.parent.zone.attach(self)
 
     def remove(self) -> None:
         """Take it out of the tree at once: its parent no longer waits for it and it will release nothing more."""
@@ -189,7 +194,8 @@ class Processor:
             self.state = State.REMOVED
             if self.parent is not None:
                 self.parent.zone.detach(self)
-                self.parent.children.remove(self)
+                if self in self.parent.children:
+                    self.parent.children.remove(self)
                 self.parent.turn.notify_all()
             self.turn.notify_all()
         if self._source is not None:
@@ -197,27 +203,22 @@ class Processor:
         with self._publishing:
             self._listener.ended(self)
 
-    def join(self, timeout: float | None = None) -> bool:
-        """Wait for its thread; whether that has ended."""
-        self._thread.join(timeout)
-        return not self._thread.is_alive()
-
-    @property
-    def is_this_thread(self) -> bool:
-        """Whether the caller runs on this processor's thread."""
-        return threading.current_thread() is self._thread
-
     def adopt(self, child: Processor) -> None:
-        """Take over a child of another processor, from the next block on."""
+        """Take over a child of another processor: it finishes the block it works on, then waits for one from here."""
         with self.turn:
-            if child.parent is None or self.zone.block is not None:
-                raise RuntimeError("only a processor that has not started can adopt, and not an input")
+            assert child.parent is not None
             child.parent.zone.detach(child)
             child.parent.children.remove(child)
             child.parent = self
-            self.zone.attach(child)
             self.children.append(child)
+            self.zone.attach(child)
             child.turn.notify_all()
+
+    def join(self, timeout: float | None = None) -> bool:
+        """Wait for its thread; whether that has ended."""
+        if self._thread.ident is not None:
+            self._thread.join(timeout)
+        return not self._thread.is_alive()
 
     @property
     def _gone(self) -> bool:
@@ -227,12 +228,11 @@ class Processor:
         try:
             while self._cycle():
                 self.blocks += 1
-        except BaseException as problem:  # whatever it was: the tree must hear of it, and the children must not wait
+        except BaseException as problem:  # whatever it was: the tree must hear of it, and nobody may wait for this one
             self.error = problem
         with self.turn:
-            if not self._gone:
-                self.state = State.DONE
-            self.zone.closed = True
+            self._enter(State.DONE)
+            self.zone.close()
             if self.parent is not None:
                 self.parent.zone.detach(self)
                 self.parent.turn.notify_all()
@@ -241,125 +241,125 @@ class Processor:
         if self.error is not None:
             self._failed(self)
 
+    # --- the four states ---
+
     def _cycle(self) -> bool:
         """One block; False when there is no more."""
-        self._set(State.WAIT_EXEC)
-        taken = self._read() if self.parent is None else self._wait_exec()
+        self._enter(State.WAIT_EXEC)
+        taken = self._wait_exec() if self._source is None else self._read(self._source)
         if taken is None:
             return False
-        self._set(State.EXEC)
+        self._enter(State.EXEC)
         begun = time.perf_counter()
-        block = self._exec(taken)
-        self._listener.executed(self, time.perf_counter() - begun)
-        self._token_back()
-        return block is None or (self._wait_release() and self._release(block))
+        private = self._exec(taken)
+        seconds = time.perf_counter() - begun
+        self._give_back()
+        self._listener.executed(self, seconds)
+        if private is not None and self._wait_release(private):
+            self._publish(private)
+        return True
 
-    def _set(self, state: State) -> None:
+    def _enter(self, state: State) -> None:
         with self.turn:
             if not self._gone:
                 self.state = state
 
-    def _read(self) -> Block | None:
-        assert self._source is not None
-        got = self._source.read()
+    def _read(self, source: Source) -> Block | None:
+        got = source.read()
         if got is None or self._gone:
             return None
-        data, next_index = got
-        return Block(self.blocks, data, next_index, self._source.sample_rate)
+        return Block(self.blocks, *got, source.sample_rate)
 
     def _wait_exec(self) -> Block | None:
+        """Wait for a token of the parent; None where none will come."""
         with self.turn:
-            while True:
-                if self._gone:
-                    return None
-                assert self.parent is not None
-                if self.parent.zone.has_token(self):
-                    return self.parent.zone.take(self)
-                if self.parent.zone.exhausted(self):
+            while not self._gone:
+                parent = self.parent
+                assert parent is not None
+                if parent.zone.has_token(self):
+                    self._reading = parent
+                    return parent.zone.take(self)
+                if parent.zone.exhausted(self):
                     return None
                 self.turn.wait()
+            return None
 
     def _exec(self, taken: Block) -> Block | None:
         """Compute into the private zone; None where the block cannot be used."""
-        with self.turn:
-            children = list(self.children)
-        envelope_wanted = any(child.wants_envelope(taken.number) for child in children)
-        with self._computing:
-            with self._changing:
-                self._apply_changes(taken)
-            stage = self._stage
-            if getattr(stage, "needs_envelope", False):
-                if taken.envelope is None:  # released before the filterbank knew that somebody wants it
-                    return None
-                data = stage.process(taken.data, taken.envelope)
-            else:
-                if hasattr(stage, "provide_envelope"):
-                    stage.provide_envelope = envelope_wanted
-                data = stage.process(taken.data)
-            return Block(
-                taken.number, data, taken.next_index, float(stage.output_rate), getattr(stage, "envelope", None)
-            )
+        self._apply_changes(taken)
+        stage = self._stage
+        if not _needs_envelope(stage):
+            if hasattr(stage, "provide_envelope"):
+                with self.turn:
+                    children = list(self.children)
+                stage.provide_envelope = any(child.wants_envelope(taken.number) for child in children)
+            data = stage.process(taken.data)
+        elif taken.envelope is not None:
+            data = stage.process(taken.data, taken.envelope)
+        else:  # from before the filterbank knew that somebody wants the envelope
+            return None
+        envelope = getattr(stage, "envelope", None)
+        return Block(taken.number, data, taken.next_index, float(stage.output_rate), envelope)
 
-    def _apply_changes(self, taken: Block) -> None:
-        later = []
-        for change in self._scheduled:
-            at, name, value = change
-            waits = (at is not None and at > taken.number) or (
-                name == _ENVELOPE_PARAMETER and value in ENVELOPE_METHODS and taken.envelope is None
-            )
-            if waits:
-                later.append(change)
-            else:
-                self._stage.configure(**{name: value})
-        self._scheduled = later
-
-    def _token_back(self) -> None:
-        if self.parent is None:
-            return
+    def _give_back(self) -> None:
+        """Return the token: the parent may release its next block."""
         with self.turn:
-            if self.parent is not None:
-                self.parent.zone.give_back(self)
-                self.parent.turn.notify_all()
+            if self._reading is not None:
+                self._reading.zone.give_back(self)
+                self._reading.turn.notify_all()
+                self._reading = None
 
-    def _wait_release(self) -> bool:
+    def _wait_release(self, private: Block) -> bool:
+        """Wait until no child holds the last block, and release `private`; False where it was removed instead."""
         with self.turn:
-            if not self._gone:
-                self.state = State.WAIT_RELEASE
-            while not self.zone.free and not self._gone:
+            self._enter(State.WAIT_RELEASE)
+            while not self._gone:
+                if self.zone.free:
+                    # in one go with the look at the tokens: a child that comes now takes this block, not the last one
+                    self._enter(State.RELEASE)
+                    self.zone.release(private)
+                    for child in self.children:
+                        child.turn.notify_all()
+                    return True
                 self.turn.wait()
-            return not self._gone
+            return False
 
-    def _release(self, block: Block) -> bool:
+    def _publish(self, block: Block) -> None:
+        """Tell the world, while the children work on the block."""
         with self._publishing:
-            if self._gone:
-                return False
-            self._set(State.RELEASE)
-            self._remember(block)
-            self.next_index = block.next_index
-            self._listener.released(self, block)
-        with self.turn:
-            self.zone.release(block)
-            for child in self.children:
-                child.turn.notify_all()
-        return True
+            if not self._gone:
+                self.next_index = block.next_index
+                self._remember(block)
+                self._listener.released(self, block)
 
     # --- history, for getSignals ---
 
     def _remember(self, block: Block) -> None:
-        rows, capacity = block.data.shape[:-1], int(self.history_seconds * block.rate + 1e-9)
-        if self._history is None or (self._history.rows, self._history.capacity) != (rows, capacity):
-            self._history = History(rows, capacity)
+        like = (block.data.shape[:-1], block.rate, self.history_seconds)
+        if (self._history.rows, self._history.rate, self._history.seconds) != like:
+            self._history = History(*like)  # frames of different shapes or rates do not go together
         self._history.append(block.data)
 
     def take_signals(self) -> tuple[WindowView, int, float]:
         """What it released since the last call: data, index after it in audio frames, frames per second."""
         with self._publishing:
-            if self._history is None:
-                return WindowView.of(np.empty((*self.rows, 0))), self.next_index, self.rate
-            return self._history.take(), self.next_index, self.rate
+            return self._history.take(), self.next_index, self._history.rate
 
 
-def subtree(processor: Processor) -> Iterable[Processor]:
+def _changed(stage: Any, changes: list[Change]) -> Any:
+    """`stage` after `changes`. It shares the state of `stage`, which does not notice."""
+    if changes:
+        stage = copy.copy(stage)
+    for change in changes:
+        stage.configure(**{change.name: change.value})
+    return stage
+
+
+def _needs_envelope(stage: Any) -> bool:
+    return bool(getattr(stage, "needs_envelope", False))
+
+
+def subtree(processor: Processor) -> Iterator[Processor]:
     """`processor` and all below it, leaves first."""
     for child in list(processor.children):
         yield from subtree(child)

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+import math
 import threading
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 from rosafe.dsp import STAGES
-from rosafe.interface import KINDS, ROSAFE, ProcessorKind
-from rosafe.tree.processor import Listener, Processor, Source, subtree
+from rosafe.interface import KINDS, ROSAFE, ComponentError, Parameter, ProcessorKind
+from rosafe.tree.processor import Listener, Processor, Source, State, subtree
 
-MAX_WINDOW_BYTES = 2**30  # of one output port or one processor's history
-_JOIN_SECONDS = 0.5  # a removed processor's thread may still be busy with one long block; nobody needs it any more
+MAX_BYTES = 2**30  # of one output port, of one processor's history, and of the samples that it keeps for a frame
 
 
 class Tree:
@@ -33,7 +34,6 @@ class Tree:
         self.sample_rate = 0.0
         self.port_seconds = 1.0
         self.history_seconds = 1.0
-        self.error: BaseException | None = None  # of the first processor that failed
 
     # --- asking ---
 
@@ -92,29 +92,40 @@ class Tree:
     ) -> Processor:
         """Add the input, which starts to read `source`; it takes over the children of the one it replaces.
 
-        Histories are raised to two blocks, as the original meant to.
+        Histories are raised to two blocks, as the original meant to. A tree whose source has come to its end is
+        removed: its processors have ended. A source that is refused is stopped.
         """
         with self._requests:
-            self.check_input(name, source.sample_rate)
             history_seconds = max(history_seconds, 2 * frames_per_block / source.sample_rate)
-            _check_size((2,), source.sample_rate, max(port_seconds, history_seconds))
             old = self.input
-            stage = _make_stage("input", source.sample_rate, parameters or {})
+            try:
+                self.check_input(name, source.sample_rate)
+                with _refusing():
+                    stage = STAGES["input"](source.sample_rate, **(parameters or {}))
+                    children = old.children if old is not None else ()
+                    _check_sizes(stage, (2,), max(port_seconds, history_seconds), children)
+            except ComponentError:
+                source.stop()
+                raise
             self.sample_rate = source.sample_rate
             self.port_seconds = port_seconds
             self.history_seconds = history_seconds
             new = self._processor(name, "input", stage, None, source)
-            others = [p for p in self._processors.values() if p is not old]
-            for child in list(old.children) if old is not None else ():
-                new.adopt(child)
-            for processor in others:
-                processor.history_seconds = history_seconds
             if old is not None:
-                old.remove()
-            self._processors = {p.name: p for p in (new, *others)}
-            self._listener.added(new)
-            new.start()
+                self._replace(old, new)
+            self._begin(new)
             return new
+
+    def _replace(self, old: Processor, new: Processor) -> None:
+        """Hang all that depends on input `old` on `new`, and remove `old`; if it has ended, remove it all."""
+        with self._lock:
+            if old.state is not State.DONE:
+                for child in list(old.children):
+                    new.adopt(child)
+        self._remove(old)
+        for processor in self._processors.values():
+            processor.history_seconds = self.history_seconds
+        self._processors = {new.name: new, **self._processors}
 
     def check(self, kind: str, name: str, parent_name: str) -> Processor:
         """The parent of a processor that could be added now; the original's order of errors."""
@@ -133,21 +144,33 @@ class Tree:
         """Add a processor of `kind` under `parent_name`; it runs when this returns."""
         with self._requests:
             parent = self.check(kind, name, parent_name)
-            stage = _make_stage(kind, self.sample_rate, parameters or {})
-            _check_size(stage.output_rows(parent.rows), stage.output_rate, max(self.port_seconds, self.history_seconds))
+            with _refusing():
+                stage = STAGES[kind](self.sample_rate, **(parameters or {}))
+                _check_sizes(stage, parent.rows, self._longest)
             processor = self._processor(name, kind, stage, parent, None)
-            self._processors[name] = processor
-            self._listener.added(processor)
-            processor.hang_on(parent)
-            processor.start()
+            self._begin(processor)
             return processor
 
     def _processor(
         self, name: str, kind: str, stage: Any, parent: Processor | None, source: Source | None
     ) -> Processor:
         return Processor(
-            name, kind, stage, parent, source, self._lock, self._listener, self.history_seconds, self._failed
+            name, kind, stage, parent, source, self._lock, self._listener, self.history_seconds, failed=self.end
         )
+
+    def _begin(self, processor: Processor) -> None:
+        self._processors[processor.name] = processor
+        try:
+            self._listener.added(processor)
+            processor.start()
+        except BaseException:
+            self._remove(processor)
+            raise
+
+    @property
+    def _longest(self) -> float:
+        """Seconds of output that are kept, on a port or as history."""
+        return max(self.port_seconds, self.history_seconds)
 
     # --- changing ---
 
@@ -158,28 +181,29 @@ class Tree:
             parameter = _parameter(KINDS[processor.kind], parameter_name)
             if parameter_name == "set_rm_scailing":  # the original's misspelt name came with misspelt values
                 text = text.strip().removeprefix("_")
-            try:
+            with _refusing():
                 value = parameter.parse(text)
                 if parameter.choices:
                     value = parameter.known_word(value)
-                processor.configure(parameter.name, value, lambda stage: self._check_sizes(processor, stage))
-            except ValueError as problem:
-                raise ROSAFE.error("e_badNewValue", what=str(problem)) from None
+                self._change(processor, parameter.name, value)
 
     def schedule(self, block: int, parameter_name: str, value: Any) -> None:
-        """Change a parameter, of every processor that has it, before block `block` of the input."""
-        with self._requests:
+        """Change a parameter, of every processor that has it, before block `block` of the input.
+
+        Several changes come in the order of their blocks: each is checked after all that were made before it.
+        """
+        with self._requests, _refusing():
             for processor in self._processors.values():
                 if any(parameter_name == p.name for p in KINDS[processor.kind].parameters):
-                    processor.schedule(block, parameter_name, value)
+                    self._change(processor, parameter_name, value, block)
 
-    def _check_sizes(self, processor: Processor, stage: Any) -> None:
-        """Refuse a changed `stage` where its windows, or those of processors below, would get absurdly large."""
-        seconds = max(self.port_seconds, self.history_seconds)
-        rows = stage.output_rows(processor.parent.rows if processor.parent is not None else (2,))
-        _check_size(rows, stage.output_rate, seconds)
-        for child in processor.children:
-            child.check_rows(rows, lambda rows, rate: _check_size(rows, rate, seconds))
+    def _change(self, processor: Processor, name: str, value: Any, block: int = 0) -> None:
+        rows = processor.parent.rows if processor.parent is not None else (2,)
+
+        def accept(stage: Any) -> None:
+            _check_sizes(stage, rows, self._longest, processor.children)
+
+        processor.change(name, value, accept, block)
 
     # --- removing ---
 
@@ -205,31 +229,15 @@ class Tree:
                 self._remove(root)
 
     def _remove(self, processor: Processor) -> list[Processor]:
+        # Their threads may still work on one long block; nobody waits for that, and nobody will see it.
         going = list(subtree(processor))
         for one in going:
             one.remove()
             del self._processors[one.name]
-        for one in going:
-            if one.is_this_thread:
-                continue
-            one.join(_JOIN_SECONDS)
         return going
 
-    def _failed(self, processor: Processor) -> None:
-        # On the processor's own thread, which holds no lock here.
-        with self._requests:
-            self.error = self.error or processor.error
-            self.end(processor)
 
-    def wait_done(self) -> None:
-        """Wait until every processor has come to the end of the input; raises what a processor failed with."""
-        for processor in self.processors:
-            processor.join()
-        if self.error is not None:
-            raise self.error
-
-
-def _parameter(kind: ProcessorKind, name: str) -> Any:
+def _parameter(kind: ProcessorKind, name: str) -> Parameter:
     try:
         return kind.parameter(name)
     except KeyError:
@@ -237,20 +245,34 @@ def _parameter(kind: ProcessorKind, name: str) -> Any:
         raise ROSAFE.error("e_noSuchParameter", f"a {kind.kind} processor has no {name!r}, but: {known}") from None
 
 
-def _make_stage(kind: str, sample_rate: float, parameters: Mapping[str, Any]) -> Any:
+@contextmanager
+def _refusing() -> Iterator[None]:
+    """Make e_badNewValue of any ValueError."""
     try:
-        return STAGES[kind](sample_rate, **parameters)
+        yield
     except ValueError as problem:
         raise ROSAFE.error("e_badNewValue", what=str(problem)) from None
 
 
-def _check_size(rows: tuple[int, ...], rate: float, seconds: float) -> None:
-    size = 8.0 * rate * seconds
-    for length in rows:
-        size *= length
-    if size > MAX_WINDOW_BYTES:
-        raise ROSAFE.error(
-            "e_badNewValue",
-            what=f"{seconds:g} s of {'x'.join(map(str, rows))} values at {rate:g} Hz are {size / 2**20:.0f} MiB, "
-            f"more than {MAX_WINDOW_BYTES // 2**20} MiB",
+def _check_sizes(stage: Any, rows: tuple[int, ...], seconds: float, children: Iterable[Processor] = ()) -> None:
+    """ValueError where `stage`, given blocks of leading shape `rows`, or one of `children` would fill the memory.
+
+    That is with `seconds` of output, or with the samples of one frame.
+    """
+    output_rows = stage.output_rows(rows)
+    _check_size("port or history", seconds, output_rows, stage.output_rate)
+    for name, value in stage.parameters.items():
+        if name.endswith("_wSizeSec"):
+            _check_size(name, value, rows, stage.sample_rate)
+    for child in children:
+        _check_sizes(child.stage, output_rows, seconds, child.children)
+
+
+def _check_size(what: str, seconds: float, rows: tuple[int, ...], rate: float) -> None:
+    size = math.prod(rows, start=8.0 * rate * seconds)
+    if size > MAX_BYTES:
+        shape = "x".join(map(str, rows))
+        raise ValueError(
+            f"{what}: {seconds:g} s of {shape} values at {rate:g} Hz take {size / 2**20:.0f} MiB, "
+            f"more than {MAX_BYTES // 2**20} MiB"
         )

@@ -6,11 +6,17 @@ Released blocks are never written again, so a window is just the newest blocks. 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 MAX_PIECES = 32  # beyond that, the pieces of a window are joined, so that small blocks in long windows stay cheap
+
+
+def frames_in(seconds: float, rate: float) -> int:
+    """Whole frames in so many seconds; a hair less than a whole number is that number (0.29 s at 100 Hz are 29)."""
+    return math.floor(seconds * rate + 1e-9)
 
 
 @dataclass(frozen=True)
@@ -95,11 +101,23 @@ class SlidingWindow:
 
 
 class History:
-    """What a processor put out since somebody last asked, at most the newest `capacity` frames."""
+    """What a processor put out since somebody last asked, at most the newest `seconds`.
 
-    def __init__(self, rows: tuple[int, ...], capacity: int) -> None:
+    Parameters
+    ----------
+    rows : tuple of int
+        Leading shape of the blocks.
+    rate : float
+        Frames per second.
+    seconds : float
+        Its length.
+    """
+
+    def __init__(self, rows: tuple[int, ...], rate: float, seconds: float) -> None:
         self.rows = rows
-        self.capacity = capacity
+        self.rate = rate
+        self.seconds = seconds
+        self.capacity = frames_in(seconds, rate)
         self._pieces: list[np.ndarray] = []
         self._frames = 0
 

@@ -42,7 +42,7 @@ class SharedZone:
 
     def __init__(self) -> None:
         self.block: Block | None = None
-        self.closed = False  # nothing will be released any more
+        self._closed = False  # nothing will be released any more
         self._children: set[Hashable] = set()
         self._fresh: set[Hashable] = set()  # tokens handed out and not taken yet
         self._held: set[Hashable] = set()  # children that have not given the block back
@@ -72,6 +72,10 @@ class SharedZone:
         self._fresh = set(self._children)
         self._held = set(self._children)
 
+    def close(self) -> None:
+        """Nothing more will be released; the last block may still be taken."""
+        self._closed = True
+
     def has_token(self, child: Hashable) -> bool:
         """Whether a block waits for `child`."""
         return child in self._fresh
@@ -88,4 +92,4 @@ class SharedZone:
 
     def exhausted(self, child: Hashable) -> bool:
         """Whether nothing will ever come for `child` again."""
-        return self.closed and child not in self._fresh
+        return self._closed and child not in self._fresh
