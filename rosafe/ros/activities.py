@@ -12,6 +12,8 @@ from rosafe.interface import MAX_ACTIVITIES, ComponentError, Service
 
 Handler = Callable[["Activity", dict[str, Any]], None]
 
+LOAD_SECONDS = 1.0  # the load is that of so much time at least; over less, one cycle would look like overload
+
 
 class Activity:
     """One request under way.
@@ -20,29 +22,19 @@ class Activity:
     `stop_requested`, returns for a normal end and raises ComponentError for any other.
     """
 
-    def __init__(
-        self,
-        number: int,
-        service: Service,
-        others: Callable[[Activity], None],
-        on_begun: Callable[[], None] | None = None,
-    ) -> None:
+    def __init__(self, number: int, service: Service, others: Callable[[Activity], None]) -> None:
         self.id = number
         self.service = service
         self.stop_requested = threading.Event()
         self.stopped_by = ""
         self.error: ComponentError | None = None
-        self.begun = threading.Event()  # running, or ended without ever running
+        self.begun = threading.Event()  # running, or ended without (`error` tells why)
         self.ended = threading.Event()
         self._others = others
-        self._on_begun = on_begun
 
     def running(self) -> None:
         """Tell those who wait for it that the activity does what was asked for."""
-        if not self.begun.is_set():
-            if self._on_begun is not None:
-                self._on_begun()
-            self.begun.set()
+        self.begun.set()
 
     def interrupt(self, by: str) -> None:
         """Ask the activity to end; `by` is the service that did so (the first one counts)."""
@@ -54,15 +46,17 @@ class Activity:
         """End the running activities that this request replaces, and wait until they have ended."""
         self._others(self)
 
-    def finish(self, error: ComponentError | None) -> None:
-        """Record the end, good or bad."""
-        self.error = error
-        self.ended.set()
-        self.running()
+    def raise_if_interrupted(self) -> None:
+        """For handlers that have not come to `running` yet: ``::genom::interrupted`` where they were told to end."""
+        if self.stop_requested.is_set():
+            raise ComponentError("::genom::interrupted", by=self.stopped_by)
 
 
 class TaskMeter:
-    """What one task of the component measured of itself: cycles, their duration, and its load."""
+    """What one task of the component measured of itself: cycles, their duration, and its load.
+
+    The load is the time spent in cycles per time gone by; several processors of one task can make it more than 1.
+    """
 
     def __init__(self, name: str) -> None:
         self.name = name
@@ -85,13 +79,13 @@ class TaskMeter:
             self._busy_total += seconds
 
     def snapshot(self) -> dict[str, Any]:
-        """The `rusage` member of genom_state: seconds for timings, busy fraction since the last snapshot for load."""
+        """The `rusage` member of genom_state: timings in seconds, and the load of the last second or so."""
         with self._lock:
             now = time.monotonic()
-            if now > self._since:
+            if now - self._since >= LOAD_SECONDS:
                 self.load = self._busy / (now - self._since)
                 self.load_max = max(self.load_max, self.load)
-            self._busy, self._since = 0.0, now
+                self._busy, self._since = 0.0, now
             average = self.total / self.cycles if self.cycles else 0.0
             return {
                 "cycles": self.cycles % 2**32,
@@ -131,21 +125,16 @@ class Activities:
         self._lock = threading.Lock()
 
     def start(
-        self,
-        service: Service,
-        handler: Handler,
-        values: dict[str, Any],
-        on_end: Callable[[Activity], None] | None,
-        on_begun: Callable[[], None] | None = None,
+        self, service: Service, handler: Handler, values: dict[str, Any], on_end: Callable[[Activity], None] | None
     ) -> Activity:
         """Begin an activity; raises ``::genom::too_many_activities`` where its task has no slot left.
 
-        The activity's thread calls `on_begun` once it runs, or has ended without, and `on_end` after the end.
+        Its thread calls `on_end` when it has ended, before anybody who waits for that goes on.
         """
         with self._lock:
             if self._full(service):
                 raise ComponentError("::genom::too_many_activities")
-            activity = Activity(next(self._numbers) % 2**32, service, self._interrupt_replaced, on_begun)
+            activity = Activity(next(self._numbers) % 2**32, service, self._interrupt_replaced)
             self._live[activity.id] = activity
         thread = threading.Thread(
             target=self._run,
@@ -174,6 +163,7 @@ class Activities:
         self._changed()
         error: ComponentError | None = None
         try:
+            activity.raise_if_interrupted()
             handler(activity, values)
         except ComponentError as problem:
             error = problem
@@ -183,13 +173,16 @@ class Activities:
         except Exception as problem:  # a fault of ours: the node lives on, the requester and the log are told
             self._crashed(activity, problem)
             error = ComponentError("::genom::unkex", what=f"{type(problem).__name__}: {problem}"[:127])
-        finally:
-            with self._lock:
-                self._live.pop(activity.id, None)
-            activity.finish(error)
-            self._changed()
+        with self._lock:
+            del self._live[activity.id]
+        activity.error = error
+        activity.begun.set()
+        try:
             if on_end is not None:
                 on_end(activity)
+        finally:  # whoever waits for the end finds that the requester was told
+            activity.ended.set()
+            self._changed()
 
     def _interrupt_replaced(self, newcomer: Activity) -> None:
         replaced = [a for a in self.live() if a.id < newcomer.id and a.service.name in newcomer.service.interrupts]

@@ -20,13 +20,19 @@ import actionlib
 import diagnostic_updater
 import rosgraph
 import rospy
+from actionlib_msgs.msg import GoalStatus
 
 from rosafe import __version__, interface
 from rosafe.interface import ComponentError
 from rosafe.ros.activities import Activities, Activity, Handler, TaskMeter
+from rosafe.ros.master import MasterError, check_master
 
-STATE_PERIOD = 1.0  # seconds between two genom_state messages at the most
+STATE_PERIOD = 0.9  # seconds between two genom_state messages at the most; the contract is 1
+BURST_SECONDS = 0.005  # what changes within this makes one message, not one each
+DIAGNOSTICS_PERIOD = 1.0
 STOP_WAIT = 2.0  # seconds that Stop waits for what it ends
+ACCEPT_SECONDS = 0.2  # a goal is accepted once its activity runs, or after this
+SEND_SECONDS = 0.1  # rospy sends answers and results on threads of its own, and does not tell when it has
 
 
 class ComponentNode:
@@ -84,8 +90,12 @@ class ComponentNode:
         self._connectors[name] = connect
 
     def advertise(self, port: str, message_class: Any, element: str = "") -> rospy.Publisher:
-        """The latched publisher of an output port, or of one element of a multiple port."""
+        """The latched publisher of an output port, or of one element of a multiple port.
+
+        Raises ComponentError where the master does not answer.
+        """
         topic = f"{self.name}/{self.component.port(port).name}" + (f"/{element}" if element else "")
+        _check_master()
         return rospy.Publisher(topic, message_class, latch=True, queue_size=1, tcp_nodelay=True)
 
     def start(self) -> None:
@@ -105,13 +115,15 @@ class ComponentNode:
             )
             if service.activity:
                 self._keep.append(self._action_server(service))
-        threading.Thread(target=self._publish_state, name="genom_state", daemon=True).start()
+        for task in (self._publish_state, self._publish_diagnostics):
+            threading.Thread(target=task, name=task.__name__, daemon=True).start()
 
     def shutdown(self, by: str) -> None:
         """End all activities and wait for them (bounded); `by` is what their exceptions name."""
         self.finished.set()
-        self.activities.interrupt_named((s.name for s in self.component.activities), by, wait=STOP_WAIT)
         self._turn.set()
+        self.activities.interrupt_named((s.name for s in self.component.activities), by, wait=STOP_WAIT)
+        time.sleep(SEND_SECONDS)
 
     # --- requests ---
 
@@ -125,16 +137,11 @@ class ComponentNode:
             raise self._bad_value(problem) from None
 
     def _begin(
-        self,
-        service: interface.Service,
-        request: Any,
-        on_end: Callable[[Activity], None] | None = None,
-        on_begun: Callable[[], None] | None = None,
+        self, service: interface.Service, request: Any, on_end: Callable[[Activity], None] | None = None
     ) -> Activity:
         if self.finished.is_set():
             raise ComponentError("::genom::disallowed", "the component is shutting down")
-        values = self._values(service, request)
-        return self.activities.start(service, self._handlers[service.name], values, on_end, on_begun)
+        return self.activities.start(service, self._handlers[service.name], self._values(service, request), on_end)
 
     def _serve_activity(self, service: interface.Service, request: Any) -> Any:
         response = getattr(self._srv, f"{service.name}Response")
@@ -143,7 +150,7 @@ class ComponentNode:
         except ComponentError as problem:
             return response(False, self._told(service, problem))
         activity.begun.wait()
-        if activity.ended.is_set() and activity.error is not None:
+        if activity.error is not None:
             return response(False, self._told(service, activity.error))
         return response(True, "")
 
@@ -171,33 +178,48 @@ class ComponentNode:
 
     def _action_server(self, service: interface.Service) -> actionlib.ActionServer:
         result = getattr(self._msg, f"{service.name}Result")
+        running: dict[str, Activity] = {}  # by goal id
 
         def answer(goal: Any, error: ComponentError | None) -> None:
             text = self._told(service, error) if error is not None else ""
             goal.set_succeeded(result(genom_success=error is None, genom_exdetail=text))
 
-        def accept(goal: Any) -> None:
+        def accept(goal: Any) -> None:  # actionlib calls this and `cancel` under the lock that set_succeeded needs
             if self.activities.full(service):
-                goal.set_rejected(text=f"{service.task}: too many activities")
+                error = ComponentError("::genom::too_many_activities")
+                goal.set_rejected(result(False, self._told(service, error)), f"too many activities in {service.task}")
                 return
-            # Accepted means running: a client that waits for it can make the next request, which may need this one.
+
+            def set_accepted() -> None:
+                with server.lock:
+                    if goal.get_goal_status().status in (GoalStatus.PENDING, GoalStatus.RECALLING):
+                        goal.set_accepted()
+
+            def end(activity: Activity) -> None:
+                set_accepted()
+                answer(goal, activity.error)
+                del running[goal.get_goal_id().id]
+
+            def wait(activity: Activity) -> None:
+                # Accepted means running: a client that waits for it can make the next request, which may need this one.
+                activity.begun.wait(ACCEPT_SECONDS)
+                set_accepted()
+
             try:
-                activity = self._begin(
-                    service, goal.get_goal(), lambda activity: answer(goal, activity.error), goal.set_accepted
-                )
+                activity = self._begin(service, goal.get_goal(), end)
             except ComponentError as problem:
                 goal.set_accepted()
                 answer(goal, problem)
-            else:
-                goals[goal.get_goal_id().id] = activity
-                server.publish_status()  # the client learns that its goal is here
+                return
+            running[goal.get_goal_id().id] = activity
+            server.publish_status()  # the client learns that its goal is here
+            threading.Thread(target=wait, args=(activity,), name=f"accept-{activity.id}", daemon=True).start()
 
         def cancel(goal: Any) -> None:
-            activity = goals.get(goal.get_goal_id().id)
+            activity = running.get(goal.get_goal_id().id)
             if activity is not None:
                 activity.interrupt("client")
 
-        goals: dict[str, Activity] = _Recent()
         server = actionlib.ActionServer(
             f"{self.name}/{service.name}", getattr(self._msg, f"{service.name}Action"), accept, cancel, auto_start=False
         )
@@ -211,10 +233,10 @@ class ComponentNode:
         if local not in self._connectors:
             known = ", ".join(sorted(self._connectors)) or "none"
             raise ComponentError("::genom::no_such_inport", f"no input port {local!r}; there are: {known}")
-        if not rosgraph.names.is_legal_name(remote):
+        if not remote or not rosgraph.names.is_legal_name(remote):
             raise ComponentError("::genom::no_such_outport", f"{remote!r} is no topic name")
-        namespace = rosgraph.names.namespace(self.name)
-        topic = rosgraph.names.resolve_name(remote, namespace, rospy.names.get_mappings())
+        topic = rospy.resolve_name(remote)
+        _check_master()
         published = dict(rosgraph.Master(self.name).getPublishedTopics(""))
         if topic not in published:
             raise ComponentError("::genom::no_such_outport", f"nobody publishes {topic}; see `rostopic list`")
@@ -230,10 +252,9 @@ class ComponentNode:
         self.activities.find(values["activity"]).interrupt("abort_activity")
 
     def _kill(self, values: dict[str, Any]) -> None:
-        # A moment for the answer to leave before the process goes.
-        threading.Timer(0.1, self.finished.set).start()
+        threading.Timer(SEND_SECONDS, self.finished.set).start()
 
-    # --- genom_state ---
+    # --- genom_state and diagnostics ---
 
     def _state_changed(self) -> None:
         self._turn.set()
@@ -246,12 +267,14 @@ class ComponentNode:
         while not rospy.is_shutdown():
             self._turn.clear()
             self._state.publish(self._state_message())
-            self.diagnostics.update()
             if self.finished.is_set():
                 return
             self._turn.wait(STATE_PERIOD)
-            # A burst of requests makes one message, not one each.
-            self.finished.wait(0.005)
+            self.finished.wait(BURST_SECONDS)
+
+    def _publish_diagnostics(self) -> None:
+        while not self.finished.wait(DIAGNOSTICS_PERIOD):
+            self.diagnostics.force_update()  # `update` would ask the master for the period, and fail without one
 
     def _state_message(self) -> Any:
         msg = self._msg
@@ -283,10 +306,9 @@ def _digest(component: interface.Component) -> str:
     return hashlib.md5(re.sub(r" at 0x\w+", "", repr(component)).encode()).hexdigest()
 
 
-class _Recent(dict):
-    """A dict that forgets its oldest entries; actionlib never says when a goal is no longer of interest."""
-
-    def __setitem__(self, key: str, value: Activity) -> None:
-        super().__setitem__(key, value)
-        while len(self) > 1000:
-            del self[next(iter(self))]
+def _check_master() -> None:
+    """Raise ``::genom::port_io`` where the master does not answer: rospy would wait for it without end."""
+    try:
+        check_master(rosgraph.get_master_uri())
+    except MasterError as problem:
+        raise ComponentError("::genom::port_io", str(problem)) from None

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import threading
 from typing import Any
 
 import rospy
@@ -35,7 +34,6 @@ class RosafeNode:
         self._audio_topic = ""
         self._ports: dict[Processor, OutputPort] = {}
         self._ends: dict[Processor, Activity] = {}
-        self._starting = threading.Lock()  # one InputProc at a time decides about the tree's root
         self._data_object = self._node.advertise("dataObj", wire.message_class("rosAFE", "::rosAFE::dataObjSt"))
         self._input_port = self._advertise("input")
 
@@ -50,8 +48,8 @@ class RosafeNode:
         self._node.function("modifyParameter", self._modify_parameter)
         self._node.function("removeProcessor", self._remove_processor)
         self._node.function("Stop", lambda _: self._tree.stop())
-        self._node.diagnostics.add(f"{self._node.name[1:]}: audio", self._audio_health)
-        self._node.diagnostics.add(f"{self._node.name[1:]}: processors", self._tree_health)
+        self._node.diagnostics.add("audio", self._audio_health)
+        self._node.diagnostics.add("processors", self._tree_health)
         self._node.start()
 
     def shutdown(self, by: str) -> None:
@@ -64,13 +62,20 @@ class RosafeNode:
     def _connect_audio(self, topic: str) -> None:
         if self._audio is not None:
             self._audio.unregister()
-        self._ring.forget()
+        feed = self._ring.connect()
+
+        def take(message: Any) -> None:
+            if message.problem:
+                self._ring.refuse(message.problem)
+            else:
+                feed(message)
+
         self._audio_topic = topic
         self._audio = rospy.Subscriber(
             topic,
-            wire.message_class("rosAFE", "::binaudio::portStruct"),
-            self._ring.feed,
-            queue_size=1,  # windows overlap: the newest has all that the one before had
+            wire.lenient_class("rosAFE", "::binaudio::portStruct"),
+            take,
+            queue_size=None,  # all that has come is looked at: a window may be shorter than a hiccup
             buff_size=2**22,
             tcp_nodelay=True,
         )
@@ -79,19 +84,15 @@ class RosafeNode:
 
     def _input_proc(self, activity: Activity, values: dict[str, Any]) -> None:
         name, frames = values["name"], values["nFramesPerBlock"]
-        with self._starting:
-            if self._audio is None:
-                raise ROSAFE.error("e_noData", "the Audio port is not connected: call connect_port first")
-            if not self._ring.wait_first(FIRST_AUDIO_SECONDS, activity.stop_requested.is_set):
-                raise ROSAFE.error("e_noData", f"nothing has come from {self._audio_topic}: is bass acquiring?")
-            self._tree.check_input(name, self._ring.sample_rate)
-            processor = self._tree.add_input(
-                name,
-                self._ring.reader(frames),
-                frames,
-                values["bufferSize_s_port"],
-                values["bufferSize_s_getSignal"],
-            )
+        if self._audio is None:
+            raise ROSAFE.error("e_noData", "the Audio port is not connected: call connect_port first")
+        reader = self._ring.open_reader(frames, FIRST_AUDIO_SECONDS, activity.stop_requested.is_set)
+        if reader is None:
+            activity.raise_if_interrupted()
+            raise ROSAFE.error("e_noData", f"nothing has come from {self._audio_topic}: is bass acquiring?")
+        processor = self._tree.add_input(
+            name, reader, frames, values["bufferSize_s_port"], values["bufferSize_s_getSignal"]
+        )
         activity.interrupt_others()
         self._live(activity, processor)
 
@@ -182,19 +183,21 @@ class RosafeNode:
     # --- health ---
 
     def _audio_health(self, status: Any) -> Any:
-        counters = self._ring.counters
-        root = self._tree.input
-        if counters.lost or counters.dropped or counters.refused:
-            status.summary(DiagnosticStatus.WARN, f"{counters.lost} frames lost in {counters.gaps} gaps")
-        elif root is not None and self._ring.sample_rate != self._tree.sample_rate:
+        counters, rate, root = self._ring.counters, self._ring.sample_rate, self._tree.input
+        if root is not None and rate not in (0, self._tree.sample_rate):
             status.summary(
-                DiagnosticStatus.ERROR,
-                f"Audio is at {self._ring.sample_rate} Hz, the tree at {self._tree.sample_rate:g} Hz: call Stop",
+                DiagnosticStatus.ERROR, f"Audio is at {rate} Hz, the tree at {self._tree.sample_rate:g} Hz: call Stop"
+            )
+        elif counters.lost or counters.dropped or counters.refused or counters.breaks:
+            status.summary(
+                DiagnosticStatus.WARN,
+                f"{counters.lost} frames lost in {counters.gaps} gaps, {counters.dropped} dropped, "
+                f"{counters.refused} messages refused, {counters.breaks} breaks",
             )
         else:
             status.summary(DiagnosticStatus.OK, "no frames lost" if counters.messages else "no audio yet")
         status.add("topic", self._audio_topic or "not connected")
-        status.add("sample rate (Hz)", str(self._ring.sample_rate))
+        status.add("sample rate (Hz)", str(rate))
         status.add("frames waiting", str(self._ring.behind))
         for name, value in vars(counters).items():
             status.add(name.replace("_", " "), str(value))

@@ -9,7 +9,8 @@ read-only views of the received buffer:
 >>> rospy.Subscriber("/rosAFE/ildPort/ild", TimeFrequency, lambda m: print(m.left.shape, m.left[:, -1]))
 
 In such a message `left` and `right` are arrays of shape (frames,), (channels, frames) or (lags, channels, frames)
-instead of the nested `data`, `dataN` and `dataNxN` lists of the generated class.
+instead of the nested `data`, `dataN` and `dataNxN` lists of the generated class. Structs within it are dicts whose
+members are attributes too (`message.stamp.sec`).
 """
 
 from __future__ import annotations
@@ -45,14 +46,15 @@ _SAMPLES: dict[str, np.dtype[Any]] = {"double": np.dtype("<f8"), "long": np.dtyp
 # How many levels of nested sequences a signal struct wraps; its one member is the sequence.
 _SIGNALS = {"::rosAFE::signalOneD": 1, "::rosAFE::signalND": 2, "::rosAFE::signalNxND": 3}
 _COUNT = struct.Struct("<I")
+_MAX_RECORD = 2**31 - 1  # bytes; numpy's layouts go no further
 
 
 # --- writing ----------------------------------------------------------------------------------------------------
 
 
-def nested_dtype(shape: tuple[int, ...], samples: np.dtype) -> np.dtype:
-    """The wire layout of one nested sequence of regular `shape`: at every level a uint32 count, then the elements."""
-    layout = samples
+def nested_dtype(shape: tuple[int, ...]) -> np.dtype:
+    """The wire layout of a signal of regular `shape`: at every level a uint32 count, then the elements."""
+    layout = _SAMPLES["double"]
     for length in reversed(shape):
         layout = np.dtype([("n", "<u4"), ("d", layout, (length,))])
     return layout
@@ -60,8 +62,7 @@ def nested_dtype(shape: tuple[int, ...], samples: np.dtype) -> np.dtype:
 
 def _pack_nested(view: WindowView) -> memoryview:
     """The bytes of a signal of shape (..., frames), each level preceded by its count."""
-    samples = np.dtype("<f8")
-    record = np.zeros((), nested_dtype(view.shape, samples))
+    record = np.zeros((), nested_dtype(view.shape))
     level = record
     for length in view.shape:
         level["n"] = length
@@ -71,6 +72,9 @@ def _pack_nested(view: WindowView) -> memoryview:
 
 
 def _write_signal(out: io.BytesIO, levels: int, value: Any) -> None:
+    if isinstance(value, genpy.Message):  # of the generated class, as in a message that was made without it
+        value.serialize(out)
+        return
     view = value if isinstance(value, WindowView) else WindowView.of(np.asarray(value, dtype=np.float64))
     if view.shape == (0,) and levels > 1:  # an absent signal, such as ILD's `right`
         out.write(_COUNT.pack(0))
@@ -78,6 +82,19 @@ def _write_signal(out: io.BytesIO, levels: int, value: Any) -> None:
     if len(view.shape) != levels:
         raise genpy.SerializationError(f"a signal of shape {view.shape} where {levels} dimensions are wanted")
     out.write(_pack_nested(view))
+
+
+def _samples(value: Any, dtype: np.dtype) -> np.ndarray:
+    """A sequence of numbers as an array, without silent rounding or wrapping."""
+    array = np.asarray(value)
+    if array.ndim != 1:
+        raise ValueError(f"an array of shape {array.shape} where a sequence is wanted")
+    if array.dtype == dtype or array.size == 0:
+        return np.ascontiguousarray(array, dtype)
+    converted = array.astype(dtype, casting="same_kind")
+    if dtype.kind == "i" and not np.array_equal(converted, array):
+        raise ValueError(f"numbers beyond {dtype}")
+    return converted
 
 
 def _member(value: Any, name: str) -> Any:
@@ -96,9 +113,11 @@ def encode(out: io.BytesIO, component: interface.Component, idl: str, value: Any
         _write_signal(out, _SIGNALS[idl], value)
     elif idl.startswith("sequence<"):
         element = idl[len("sequence<") : -1]
+        if element in _SAMPLES:
+            value = _samples(value, _SAMPLES[element])
         out.write(_COUNT.pack(len(value)))
         if element in _SAMPLES:
-            out.write(np.ascontiguousarray(value, _SAMPLES[element]).view(np.uint8).data)
+            out.write(value.view(np.uint8).data)
         else:
             for item in value:
                 encode(out, component, element, item)
@@ -134,23 +153,15 @@ class _Reader:
 def _read_signal(reader: _Reader, levels: int) -> np.ndarray | list[Any]:
     """A regular nested sequence as one strided view; a ragged one (no sender of ours makes it) as lists of arrays."""
     start = reader.at
-    shape = []
-    for _ in range(levels):
-        shape.append(reader.count())
-        if shape[-1] == 0:
-            break
+    shape = [reader.count()]
+    while len(shape) < levels:
+        shape.append(reader.count() if shape[-1] else 0)
     reader.at = start
-    if len(shape) < levels or shape[-1] == 0:
-        if levels == 1 or shape[0] == 0:
-            reader.count()
-            return np.zeros((0,) * levels)
-        return _read_ragged(reader, levels)
-    if np.prod(shape, dtype=float) * 8 > len(reader.data):
-        return _read_ragged(reader, levels)  # raises where it passes the end
-    layout = nested_dtype(tuple(shape), np.dtype("<f8"))
-    if start + layout.itemsize <= len(reader.data):
-        record = np.frombuffer(reader.take(layout.itemsize), layout)[0:1]
-        level = record
+    size = 8
+    for length in reversed(shape):
+        size = 4 + length * size
+    if size <= min(len(reader.data) - start, _MAX_RECORD):
+        level = np.frombuffer(reader.take(size), nested_dtype(tuple(shape)))
         regular = True
         for length in shape:
             regular = regular and bool(np.all(level["n"] == length))
@@ -158,7 +169,7 @@ def _read_signal(reader: _Reader, levels: int) -> np.ndarray | list[Any]:
         if regular:
             return np.asarray(level[0])
         reader.at = start
-    return _read_ragged(reader, levels)
+    return _read_ragged(reader, levels)  # raises where it passes the end
 
 
 def _read_ragged(reader: _Reader, levels: int) -> np.ndarray | list[Any]:
@@ -167,8 +178,18 @@ def _read_ragged(reader: _Reader, levels: int) -> np.ndarray | list[Any]:
     return [_read_ragged(reader, levels - 1) for _ in range(reader.count())]
 
 
+class Struct(dict):
+    """A struct within a message: its members by name, and as attributes."""
+
+    def __getattr__(self, name: str) -> Any:
+        try:
+            return self[name]
+        except KeyError:
+            raise AttributeError(name) from None
+
+
 def decode(reader: _Reader, component: interface.Component, idl: str) -> Any:
-    """The next value of IDL type `idl`: structs as dicts, signals and numeric sequences as read-only arrays."""
+    """The next value of IDL type `idl`: structs as `Struct`, signals and numeric sequences as read-only arrays."""
     if idl in _SCALARS:
         form = "<" + _SCALARS[idl]
         return struct.unpack(form, reader.take(struct.calcsize(form)))[0]
@@ -181,7 +202,7 @@ def decode(reader: _Reader, component: interface.Component, idl: str) -> Any:
         if element in _SAMPLES:
             return reader.samples(_SAMPLES[element])
         return [decode(reader, component, element) for _ in range(reader.count())]
-    return {name: decode(reader, component, kind) for name, kind in component.structs[idl]}
+    return Struct((name, decode(reader, component, kind)) for name, kind in component.structs[idl])
 
 
 # --- message classes --------------------------------------------------------------------------------------------
@@ -191,8 +212,11 @@ def _codec(
     component: interface.Component, members: tuple[tuple[str, str], ...]
 ) -> tuple[Callable[[Any, io.BytesIO], None], Callable[[Any, bytes], Any]]:
     def serialize(self: Any, out: io.BytesIO) -> None:
-        for name, kind in members:
-            encode(out, component, kind, getattr(self, name))
+        try:
+            for name, kind in members:
+                encode(out, component, kind, getattr(self, name))
+        except (struct.error, TypeError, ValueError, LookupError, AttributeError) as problem:
+            raise genpy.SerializationError(f"{self._type}: {name}: {problem}") from problem
 
     def deserialize(self: Any, data: bytes) -> Any:
         reader = _Reader(data)
@@ -211,6 +235,25 @@ def message_class(package: str, idl: str) -> Any:
     generated = getattr(importlib.import_module(f"{package}.msg"), interface.ros_type(idl))
     serialize, deserialize = _codec(component, component.structs[idl])
     return type(generated.__name__, (generated,), {"serialize": serialize, "deserialize": deserialize})
+
+
+@functools.cache
+def lenient_class(package: str, idl: str) -> Any:
+    """As `message_class`, but what cannot be read becomes a message whose `problem` says why (else it is empty).
+
+    Where deserialisation raises, rospy breaks the connection, and cannot mend it: one bad message would end a topic.
+    """
+    strict = message_class(package, idl)
+
+    def deserialize(self: Any, data: bytes) -> Any:
+        try:
+            strict.deserialize(self, data)
+            self.problem = ""
+        except genpy.DeserializationError as problem:
+            self.problem = str(problem)
+        return self
+
+    return type(strict.__name__, (strict,), {"deserialize": deserialize})
 
 
 @functools.cache
