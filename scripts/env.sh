@@ -34,7 +34,7 @@ if [ ! -f "$_rosafe_root/rosafe/ros/generate.py" ]; then
 elif [ ! -x /usr/bin/python3 ]; then
   echo "rosafe: /usr/bin/python3 is missing; run $_rosafe_root/scripts/install" >&2
 elif _rosafe_exports=$(PYTHONPATH="$_rosafe_root${PYTHONPATH:+:$PYTHONPATH}" \
-  /usr/bin/python3 -m rosafe.ros.generate --shell); then
+  /usr/bin/python3 -P -m rosafe.ros.generate --shell); then
   eval "$_rosafe_exports"
   _rosafe_status=0
 fi

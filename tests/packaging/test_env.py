@@ -1,0 +1,158 @@
+"""scripts/env.sh in bash, dash and zsh: found from anywhere, the same twice, and harmless where it fails."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.harness import Graph
+from tests.packaging.clone import environment, fresh_copy, run
+
+SHELLS = pytest.mark.parametrize("shell", ["bash", "dash", "zsh"])
+VARIABLES = ("PATH", "PYTHONPATH", "ROS_PACKAGE_PATH", "TCLLIBPATH", "ROS_MASTER_URI", "ROS_IP", "ROS_HOSTNAME")
+SHOW = "; ".join(f'echo "${{{name}-unset}}"' for name in VARIABLES)
+
+
+@pytest.fixture(scope="module")
+def copy() -> Iterator[Path]:
+    with fresh_copy() as path:
+        yield path
+
+
+def sourced(
+    shell: str, commands: str, cwd: Path = Path("/"), env: dict[str, str] | None = None
+) -> subprocess.CompletedProcess[str]:
+    if shutil.which(shell) is None:
+        pytest.skip(f"{shell} is not installed; scripts/install --tests brings it")
+    return run(shell, "-c", commands, env=env or environment(), cwd=cwd)
+
+
+def variables(done: subprocess.CompletedProcess[str]) -> dict[str, str]:
+    """What SHOW printed, last."""
+    assert done.returncode == 0 and done.stderr == "", done.stderr
+    return dict(zip(VARIABLES, done.stdout.splitlines()[-len(VARIABLES) :], strict=True))
+
+
+def source(copy: Path) -> str:
+    return f". {shlex.quote(str(copy / 'scripts' / 'env.sh'))}"
+
+
+@SHELLS
+def test_sets_the_paths(copy: Path, shell: str) -> None:
+    found = variables(sourced(shell, f"{source(copy)}; {SHOW}"))
+    generated = copy / ".generated" / "current"
+    assert found["PATH"] == f"{copy}/scripts:{environment()['PATH']}"
+    assert found["PYTHONPATH"].split(":")[:2] == [f"{generated}/python", str(copy)]
+    assert found["ROS_PACKAGE_PATH"] == f"{generated}/share"
+    assert found["TCLLIBPATH"] == f"{{{copy}/tcl}}"  # a Tcl list, and the path has a blank
+    assert found["ROS_MASTER_URI"] == "http://127.0.0.1:11311"
+    assert found["ROS_IP"] == "127.0.0.1"
+    assert found["ROS_HOSTNAME"] == "unset"
+    assert (generated / "python" / "rosAFE" / "msg" / "__init__.py").is_file()
+
+
+@SHELLS
+def test_twice_is_once(copy: Path, shell: str) -> None:
+    once = variables(sourced(shell, f"{source(copy)}; {SHOW}"))
+    assert variables(sourced(shell, f"{source(copy)}; {source(copy)}; {source(copy)}; {SHOW}")) == once
+
+
+@SHELLS
+@pytest.mark.parametrize(
+    ("folder", "command"),
+    [
+        ("", ". scripts/env.sh"),
+        ("", ". ./scripts/env.sh"),
+        ("scripts", ". ./env.sh"),
+        ("rosafe/ros", ". ../../scripts/env.sh"),
+        ("", "(. scripts/env.sh && {show})"),  # in a subshell
+        ("", "set -eu; . scripts/env.sh"),
+    ],
+)
+def test_from_anywhere(copy: Path, shell: str, folder: str, command: str) -> None:
+    done = sourced(shell, command.replace("{show}", SHOW) + ("" if "{show}" in command else f"; {SHOW}"), copy / folder)
+    assert variables(done)["PATH"].split(":")[0] == f"{copy}/scripts"
+
+
+@SHELLS
+def test_through_a_symbolic_link(copy: Path, shell: str, tmp_path: Path) -> None:
+    (tmp_path / "link").symlink_to(copy)
+    found = variables(sourced(shell, f". {tmp_path}/link/scripts/env.sh; {SHOW}"))
+    assert found["PATH"].split(":")[0] == f"{copy}/scripts"
+
+
+@SHELLS
+def test_not_taken_in_by_another_checkout_around(copy: Path, shell: str) -> None:
+    """The file that is sourced counts, not the folder in which one happens to be."""
+    with fresh_copy() as other:
+        found = variables(sourced(shell, f"{source(copy)}; {SHOW}", cwd=other))
+        assert found["PYTHONPATH"].startswith(f"{copy}/.generated/")
+        assert not (other / ".generated").exists()
+        both = variables(sourced(shell, f"{source(copy)}; {source(other)}; {SHOW}"))
+        assert both["PATH"].split(":")[:2] == [f"{other}/scripts", f"{copy}/scripts"]
+
+
+@SHELLS
+def test_leaves_what_the_user_has_set(copy: Path, shell: str) -> None:
+    mine = {
+        "ROS_MASTER_URI": "http://robot:11311",
+        "PYTHONPATH": "/mine/python",
+        "ROS_PACKAGE_PATH": "/mine/ros",
+        "TCLLIBPATH": "{/my tcl} /mine",
+    }
+    found = variables(sourced(shell, f"{source(copy)}; {source(copy)}; {SHOW}", env=environment(**mine)))
+    assert found["ROS_MASTER_URI"] == "http://robot:11311"
+    assert found["ROS_IP"] == "unset", "the robot could not call back to loopback"
+    assert found["PYTHONPATH"].split(":")[-1] == "/mine/python"
+    assert found["ROS_PACKAGE_PATH"].split(":")[-1] == "/mine/ros"
+    assert found["TCLLIBPATH"].endswith("/tcl} {/my tcl} /mine")
+    for mine in ({"ROS_IP": "10.0.0.7"}, {"ROS_HOSTNAME": "desk"}):
+        found = variables(sourced(shell, f"{source(copy)}; {SHOW}", env=environment(**mine)))
+        assert {name: found[name] for name in mine} == mine
+        assert found["ROS_IP"] == mine.get("ROS_IP", "unset")
+
+
+@SHELLS
+def test_leaves_no_names_behind(copy: Path, shell: str) -> None:
+    done = sourced(shell, f"{source(copy)}; set | grep -c '^_rosafe'")
+    assert done.stdout == "0\n"
+
+
+@SHELLS
+def test_failure_is_one_line_and_changes_nothing(shell: str) -> None:
+    with fresh_copy() as broken:
+        (broken / "msg" / "rosAFE_signalOneD.msg").write_text("nonsense data\n")
+        done = sourced(shell, f"{source(broken)}; echo $?; {SHOW}; set | grep -c '^_rosafe'")
+    assert done.stdout.splitlines() == ["1", environment()["PATH"], *["unset"] * 6, "0"]
+    assert done.stderr.startswith("rosafe: ") and done.stderr.count("\n") == 1
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="a mount namespace of its own takes root")
+def test_dash_without_proc(copy: Path) -> None:
+    def hidden(commands: str, cwd: Path) -> subprocess.CompletedProcess[str]:
+        command = f"mount -t tmpfs none /proc && exec dash -c {shlex.quote(commands)}"
+        return run("unshare", "--mount", "sh", "-c", command, env=environment(PATH=os.environ["PATH"]), cwd=cwd)
+
+    probe = hidden("true", Path("/"))
+    if probe.returncode != 0:
+        pytest.skip(f"no mount namespace here: {probe.stderr}")
+    for folder in (copy, copy / "rosafe" / "ros"):
+        assert variables(hidden(f"{source(copy)}; {SHOW}", folder))["PATH"].startswith(f"{copy}/scripts:")
+    done = hidden(f"{source(copy)}; echo $?", Path("/"))
+    assert done.stdout == "1\n"
+    assert "change into the checkout" in done.stderr and done.stderr.count("\n") == 1
+
+
+@SHELLS
+def test_commands_work_after_it(copy: Path, shell: str, graph: Graph) -> None:
+    env = environment(ROS_MASTER_URI=graph.uri, HOME=str(graph.home))
+    commands = "bass-ros --version && rosrun bass bass-ros --version && rosmsg show bass/binaudio_timestamp"
+    done = sourced(shell, f"{source(copy)} && {commands}", env=env)
+    assert done.returncode == 0, done.stderr
+    assert "uint32 sec\nuint32 nsec\n" in done.stdout

@@ -1,0 +1,244 @@
+"""Message generation: complete, once however many start at the same time, fresh, and never half done."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.harness import PYTHON, ROOT, Graph, run_together, wait_for
+from tests.packaging.clone import environment, fresh_copy, generate, run, without_rights
+
+IMPORT = (
+    "from rosafe.ros import generate; generate.ensure_messages(); "
+    "import rosAFE.msg, rosAFE.srv, bass.msg, bass.srv; "
+    "print(rosAFE.msg.__file__, rosAFE.msg.InputProcAction._md5sum, bass.srv.Acquire._md5sum)"
+)
+MD5_OF_INPUTPROC_ACTION = "2dc56590e981689aa1ab72a9e6db474e"
+
+
+@pytest.fixture
+def copy() -> Iterator[Path]:
+    with fresh_copy() as path:
+        yield path
+
+
+def generations(base: Path) -> list[str]:
+    return sorted(p.name for p in base.iterdir() if p.is_dir() and not p.is_symlink())
+
+
+def imported(copy: Path, done: subprocess.CompletedProcess[str]) -> Path:
+    """Where a process that ran IMPORT has found the messages of rosAFE."""
+    assert done.returncode == 0, done.stderr
+    *place, action, _ = done.stdout.split()
+    assert action == MD5_OF_INPUTPROC_ACTION
+    return Path(" ".join(place))
+
+
+def test_ten_at_once_on_a_fresh_tree(copy: Path) -> None:
+    def start(index: int) -> subprocess.CompletedProcess[str]:
+        return run(PYTHON, "-c", IMPORT, env=environment(PYTHONPATH=str(copy)))
+
+    places = {imported(copy, done) for done in run_together(10, start)}
+    assert len(places) == 1
+    assert places.pop().is_relative_to(copy / ".generated")
+    assert len(generations(copy / ".generated")) == 1
+
+
+def test_generated_once_then_left_alone(copy: Path) -> None:
+    assert run(*generate(copy), env=environment()).returncode == 0
+    before = {p: p.stat().st_mtime_ns for p in (copy / ".generated").rglob("*")}
+    assert run(*generate(copy), env=environment()).returncode == 0
+    assert {p: p.stat().st_mtime_ns for p in (copy / ".generated").rglob("*")} == before
+
+
+def test_generated_again_when_a_message_changes(copy: Path) -> None:
+    message = copy / "msg" / "rosAFE_signalOneD.msg"
+    show = [PYTHON, "-c", f"{IMPORT}; print(rosAFE.msg.rosAFE_signalOneD.__slots__)"]
+    assert run(*show, env=environment(PYTHONPATH=str(copy))).stdout.endswith("['data']\n")
+    original = message.read_text()
+    message.write_text(original + "string extra\n")
+    assert run(*show, env=environment(PYTHONPATH=str(copy))).stdout.endswith("['data', 'extra']\n")
+    current = (copy / ".generated" / "current").resolve()
+    message.write_text(original)
+    assert run(*show, env=environment(PYTHONPATH=str(copy))).stdout.endswith("['data']\n")
+    assert (copy / ".generated" / "current").resolve() != current
+    assert len(generations(copy / ".generated")) == 2, "a node that runs may still need the other one"
+
+
+def test_old_generations_go(copy: Path) -> None:
+    message = copy / "msg" / "rosAFE_signalOneD.msg"
+    for number in range(6):
+        message.write_text(f"# version {number}\nfloat64[] data\n")
+        assert run(*generate(copy), env=environment()).returncode == 0
+    assert len(generations(copy / ".generated")) == 3
+
+
+def test_new_file_is_noticed(copy: Path) -> None:
+    assert run(*generate(copy), env=environment()).returncode == 0
+    (copy / "bass" / "srv" / "Extra.srv").write_text("uint8 a\n---\n")
+    done = run(PYTHON, "-c", f"{IMPORT}; print(bass.srv.Extra)", env=environment(PYTHONPATH=str(copy)))
+    assert "bass.srv._Extra.Extra" in done.stdout
+
+
+def test_moved_tree_is_generated_again(copy: Path) -> None:
+    """rosrun's links hold the place of the tree."""
+    assert run(*generate(copy), env=environment()).returncode == 0
+    moved = copy.rename(copy.with_name("moved"))
+    assert run(*generate(moved), env=environment()).returncode == 0
+    link = moved / ".generated" / "current" / "share" / "rosAFE" / "scripts"
+    assert link.resolve() == moved / "scripts"
+
+
+@pytest.mark.parametrize("delay", [0.03, 0.08, 0.15, 0.3])
+def test_killed_half_way(copy: Path, delay: float) -> None:
+    build = subprocess.Popen(list(map(str, generate(copy))), env=environment(), cwd="/")
+    try:
+        build.wait(delay)
+    except subprocess.TimeoutExpired:
+        build.send_signal(signal.SIGKILL)
+    build.wait()
+    imported(copy, run(PYTHON, "-c", IMPORT, env=environment(PYTHONPATH=str(copy))))
+    assert len(generations(copy / ".generated")) == 1, "what the killed one left is gone"
+
+
+def test_another_waits_for_the_one_that_builds(copy: Path) -> None:
+    """Holding the lock as a generator does keeps others out, and its death lets them in."""
+    (copy / ".generated").mkdir()
+    hold = (
+        "import fcntl, sys, threading; f = open(sys.argv[1], 'w'); fcntl.flock(f, fcntl.LOCK_EX); print(flush=True); "
+    )
+    hold += "threading.Event().wait()"
+    lock = copy / ".generated" / "lock"
+    holder = subprocess.Popen([PYTHON, "-c", hold, str(lock)], stdout=subprocess.PIPE)
+    waiting = subprocess.Popen(list(map(str, generate(copy))), env=environment(), cwd="/")
+    try:
+        assert holder.stdout is not None
+        holder.stdout.readline()
+        with pytest.raises(subprocess.TimeoutExpired):
+            waiting.wait(1.0)
+        assert not (copy / ".generated" / "current").exists()
+        holder.kill()
+        assert waiting.wait(20) == 0
+    finally:
+        for process in (holder, waiting):
+            process.kill()
+            process.wait()
+        if holder.stdout is not None:
+            holder.stdout.close()
+    assert (copy / ".generated" / "current").exists()
+
+
+def protect(copy: Path) -> None:
+    for path in [copy, *copy.rglob("*")]:
+        if not path.is_symlink():
+            path.chmod(path.stat().st_mode & ~0o222)
+
+
+def unprotect(copy: Path) -> None:
+    for path in [copy, *copy.rglob("*")]:
+        if path.is_dir() and not path.is_symlink():
+            path.chmod(0o755)
+
+
+def test_read_only_tree_uses_the_users_cache(copy: Path) -> None:
+    home = copy.with_name("home")
+    home.mkdir()
+    home.chmod(0o777)
+    protect(copy)
+    try:
+        command = without_rights("env", f"PYTHONPATH={copy}", PYTHON, "-c", IMPORT)
+        for _ in range(2):
+            place = imported(copy, run(*command, env=environment(HOME=str(home))))
+            assert place.is_relative_to(home / ".cache" / "rosafe" / "messages")
+        assert not (copy / ".generated").exists()
+    finally:
+        unprotect(copy)
+
+
+def test_read_only_tree_and_home_use_a_private_folder(copy: Path) -> None:
+    temporary = copy.with_name("tmp")
+    temporary.mkdir()
+    temporary.chmod(0o1777)
+    protect(copy)
+    try:
+        command = without_rights("env", f"PYTHONPATH={copy}", PYTHON, "-c", IMPORT)
+        places = {imported(copy, run(*command, env=environment(TMPDIR=str(temporary)))) for _ in range(2)}
+        assert len(places) == 1, "the same at every start"
+        (private,) = temporary.iterdir()
+        assert places.pop().is_relative_to(private)
+        assert private.stat().st_mode & 0o777 == 0o700
+    finally:
+        unprotect(copy)
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="making another user's folder takes root")
+def test_private_folder_that_somebody_else_made_is_refused(copy: Path) -> None:
+    temporary = copy.with_name("tmp")
+    temporary.mkdir()
+    temporary.chmod(0o1777)
+    (temporary / "rosafe-65534").mkdir(mode=0o777)
+    protect(copy)
+    try:
+        command = without_rights(*generate(copy))
+        done = run(*command, env=environment(TMPDIR=str(temporary)))
+    finally:
+        unprotect(copy)
+    assert done.returncode == 1
+    assert "not private" in done.stderr and done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("path", "text", "reason"),
+    [
+        ("msg/rosAFE_signalOneD.msg", "nonsense data\n", "nonsense"),
+        ("msg/rosAFE_signalOneD.msg", "float64[ data\n", "float64["),
+        ("srv/Stop.srv", "string a\n---\nnowhere/Nothing b\n", "nowhere"),
+        ("action/IhcProc.action", "string a\n---\nbool b\n", "IhcProc.action has 2 parts"),
+    ],
+)
+def test_wrong_definition_is_one_line_and_keeps_what_was(copy: Path, path: str, text: str, reason: str) -> None:
+    assert run(*generate(copy), env=environment()).returncode == 0
+    current = (copy / ".generated" / "current").resolve()
+    (copy / path).write_text(text)
+    done = run(*generate(copy), env=environment())
+    assert done.returncode == 1
+    assert reason in done.stderr and done.stderr.count("\n") == 1, done.stderr
+    assert (copy / ".generated" / "current").resolve() == current
+    assert generations(copy / ".generated") == [current.name]
+
+
+def test_rosmsg_and_rossrv_know_everything(graph: Graph) -> None:
+    for package, folder in (("rosAFE", ROOT), ("bass", ROOT / "bass")):
+        listed = graph.run("rosmsg", "package", package).stdout.split()
+        actions = [p.stem for p in (folder / "action").iterdir()]
+        parts = ("Action", "Goal", "ActionGoal", "Result", "ActionResult", "Feedback", "ActionFeedback")
+        expected = [p.stem for p in (folder / "msg").iterdir()] + [a + part for a in actions for part in parts]
+        assert sorted(listed) == sorted(f"{package}/{name}" for name in expected)
+        services = graph.run("rossrv", "package", package).stdout.split()
+        assert sorted(services) == sorted(f"{package}/{p.stem}" for p in (folder / "srv").iterdir())
+    shown = graph.run("rosmsg", "show", "rosAFE/InputProcAction").stdout  # needs std_msgs and actionlib_msgs
+    assert "actionlib_msgs/GoalID goal_id" in shown and "string frame_id" in shown
+    assert "float64[] data" in graph.run("rosmsg", "show", "rosAFE_TimeDomainSignalPortStruct").stdout
+    assert graph.run("rosmsg", "md5", "rosAFE/InputProcAction").stdout.strip() == MD5_OF_INPUTPROC_ACTION
+
+
+def test_rosrun_finds_the_executables(graph: Graph) -> None:
+    for package, program in (("rosAFE", "rosAFE-ros"), ("bass", "bass-ros")):
+        assert graph.run("rosrun", package, program, "--version").stdout.startswith(package)
+
+
+def test_quick_when_fresh(copy: Path) -> None:
+    """Nothing of genpy is imported: its import alone would take longer than the rest."""
+    assert run(*generate(copy), env=environment()).returncode == 0
+    code = "import sys; from rosafe.ros import generate; generate.ensure_messages(); print('genpy' in sys.modules)"
+    assert run(PYTHON, "-c", code, env=environment(PYTHONPATH=str(copy))).stdout == "False\n"
+
+
+def test_wait_for_is_bounded() -> None:
+    with pytest.raises(AssertionError, match="not within 0"):
+        wait_for(lambda: False, 0.05, "never")

@@ -1,0 +1,222 @@
+"""scripts/install: nothing to do is quick, and every way to fail is one line that says what to do."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+
+from tests.harness import SCRIPTS
+from tests.packaging.clone import environment, run, without_rights
+
+TOOLS = ("bash", "cat", "chmod", "dirname", "env", "flock", "grep", "head", "id", "mkdir", "mktemp", "mv", "rm", "tail")
+PREFIX = "prefix=/usr/local/lib/rosafe"
+NOTHING_INSTALLED = "exit 1"
+ALL_INSTALLED = 'shift 2; for name in "$@"; do echo "$name installed"; done'
+
+
+class Machine:
+    """A PATH of chosen commands, scripted or real, and the script with a prefix of its own."""
+
+    def __init__(self, folder: Path) -> None:
+        self.bin = folder / "bin"
+        self.bin.mkdir()
+        self.prefix = folder / "prefix"
+        self.calls = folder / "calls"
+        self.calls.touch()
+        self.script = folder / "install"
+        text = (SCRIPTS / "install").read_text()
+        assert PREFIX in text
+        self.script.write_text(text.replace(PREFIX, f"prefix={self.prefix}"))
+        self.script.chmod(0o755)
+        for tool in TOOLS:
+            real = shutil.which(tool, path="/usr/bin:/bin")
+            assert real is not None
+            (self.bin / tool).symlink_to(real)
+
+    def command(self, name: str, body: str) -> None:
+        """Put a command on the PATH that notes its call and then does `body`."""
+        path = self.bin / name
+        path.unlink(missing_ok=True)
+        path.write_text(f'#!/bin/bash\necho "{name} $*" >>"{self.calls}"\n{body}\n')
+        path.chmod(0o755)
+
+    def install(self, *arguments: str, **env: str) -> tuple[int, str, str]:
+        """Exit code, stdout and stderr of the script."""
+        done = run("/bin/bash", self.script, *arguments, env=environment(PATH=str(self.bin), **env))
+        return done.returncode, done.stdout, done.stderr
+
+    def called(self, name: str) -> list[str]:
+        return [line for line in self.calls.read_text().splitlines() if line.split()[0] == name]
+
+
+@pytest.fixture
+def machine(tmp_path: Path) -> Machine:
+    machine = Machine(tmp_path)
+    machine.command("dpkg-query", NOTHING_INSTALLED)
+    machine.command("apt-get", "exit 0")
+    machine.command("id", "echo 0")
+    return machine
+
+
+def pypi(machine: Machine, folder: str, package: str) -> Path:
+    path = machine.prefix / folder / f"{package}.dist-info"
+    path.mkdir(parents=True)
+    return path
+
+
+def test_nothing_to_do_on_this_machine(tmp_path: Path) -> None:
+    """What scripts/test has just installed is all found, by a user without rights too, and apt is not asked."""
+    (tmp_path / "apt-get").write_text("#!/bin/sh\nexit 99\n")
+    (tmp_path / "apt-get").chmod(0o755)
+    tmp_path.chmod(0o755)
+    for options in ("", "--tests"):
+        done = run(SCRIPTS / "install", *options.split(), env=environment(PATH=f"{tmp_path}:/usr/bin:/bin"))
+        assert (done.returncode, done.stdout, done.stderr) == (0, "everything is installed\n", "")
+
+
+def test_nothing_to_do_asks_apt_nothing(machine: Machine) -> None:
+    machine.command("dpkg-query", ALL_INSTALLED)
+    machine.command("id", "echo 1000")
+    pypi(machine, "python", "pyalsaaudio-0.11.0")
+    assert machine.install() == (0, "everything is installed\n", "")
+    assert machine.called("apt-get") == []
+
+
+def test_installs_only_what_is_missing(machine: Machine) -> None:
+    machine.command("dpkg-query", 'for name in "${@:3}"; do [ $name = tcl ] || echo "$name installed"; done')
+    pypi(machine, "python", "pyalsaaudio-0.11.0")
+    code, out, err = machine.install()
+    assert (code, err) == (0, "")
+    assert out.endswith("done\n")
+    update, install = machine.called("apt-get")
+    assert update.endswith(" update")
+    assert install.split()[-2:] == ["install", "tcl"]
+    assert "--no-install-recommends" in install and " -y " in install
+
+
+def test_removed_but_configured_counts_as_missing(machine: Machine) -> None:
+    machine.command("dpkg-query", 'for name in "${@:3}"; do echo "$name config-files"; done')
+    pypi(machine, "python", "pyalsaaudio-0.11.0")
+    assert machine.install()[0] == 0
+    assert " python3-rospy " in machine.called("apt-get")[1]
+
+
+def test_tests_brings_more(machine: Machine) -> None:
+    pypi(machine, "python", "pyalsaaudio-0.11.0")
+    assert machine.install()[0] == 0
+    assert not any("python3-pytest" in call for call in machine.called("apt-get"))
+    machine.install("--tests", PIP_NO_INDEX="1", PIP_FIND_LINKS="")
+    assert any("python3-pytest" in call for call in machine.called("apt-get"))
+
+
+def test_no_network(machine: Machine) -> None:
+    machine.command("apt-get", 'echo "E: Unable to fetch some archives"; exit 100')
+    code, out, err = machine.install()
+    assert code == 1
+    assert "installing" in out
+    *apts, last = err.splitlines()
+    assert set(apts) == {"E: Unable to fetch some archives"}
+    assert last.startswith("scripts/install: ") and "is there a network" in last
+    assert not machine.prefix.exists()
+
+
+def test_old_package_lists_are_no_reason_to_fail(machine: Machine) -> None:
+    machine.command("apt-get", '[ "${*: -1}" != update ]')
+    pypi(machine, "python", "pyalsaaudio-0.11.0")
+    code, out, err = machine.install()
+    assert (code, err) == (0, "")
+    assert "could not be brought up to date" in out
+
+
+def test_no_network_for_pypi_keeps_what_was(machine: Machine) -> None:
+    machine.command("dpkg-query", ALL_INSTALLED)
+    old = pypi(machine, "python", "pyalsaaudio-0.10.0")
+    code, _, err = machine.install(PIP_NO_INDEX="1", PIP_FIND_LINKS="")
+    assert code == 1
+    assert "pip cannot install pyalsaaudio==0.11.0: is there a network?" in err.splitlines()[-1]
+    assert old.is_dir()
+    assert [p.name for p in machine.prefix.iterdir()] == ["python"], "nothing half done is left"
+
+
+def test_no_right(machine: Machine) -> None:
+    machine.command("id", "echo 1000")
+    code, out, err = machine.install()
+    assert (code, out) == (1, "")
+    assert "run this as root, or have sudo" in err and err.count("\n") == 1
+    assert machine.called("apt-get") == []
+
+
+def test_sudo_that_refuses(machine: Machine) -> None:
+    machine.command("id", "echo 1000")
+    machine.command("sudo", 'echo "sudo: a password is required" >&2; exit 1')
+    code, _, err = machine.install()
+    assert code == 1
+    assert "scripts/install: " in err.splitlines()[-1]
+    assert machine.called("apt-get") == []
+
+
+def test_through_sudo(machine: Machine) -> None:
+    machine.command("id", "echo 1000")
+    machine.command("sudo", 'shift; "$@"')
+    pypi(machine, "python", "pyalsaaudio-0.11.0")
+    assert machine.install()[0] == 0
+    assert [call.split()[2] for call in machine.called("sudo")] == ["apt-get", "env"]
+    assert len(machine.called("apt-get")) == 2
+
+
+def test_not_debian(machine: Machine) -> None:
+    (machine.bin / "apt-get").unlink()
+    code, out, err = machine.install()
+    assert (code, out) == (1, "")
+    assert "this is for Debian 12" in err and err.count("\n") == 1
+
+
+@pytest.mark.parametrize("arguments", [["--test"], ["--tests", "more"], ["x"]])
+def test_wrong_option(machine: Machine, arguments: list[str]) -> None:
+    code, out, err = machine.install(*arguments)
+    assert (code, out) == (2, "")
+    assert err.startswith("usage: scripts/install [--tests]")
+
+
+def test_help(machine: Machine) -> None:
+    code, out, _ = machine.install("--help")
+    assert code == 0 and "pyalsaaudio" in out
+    assert machine.calls.read_text() == ""
+
+
+def test_uninstall(tmp_path: Path) -> None:
+    """In a tree and with a prefix of its own: the generated files, the caches and the prefix go, the sources stay."""
+    root, home, temporary, prefix, programs = (tmp_path / name for name in ("tree", "home", "tmp", "prefix", "bin"))
+    (root / "scripts").mkdir(parents=True)
+    text = (SCRIPTS / "uninstall").read_text()
+    (root / "scripts" / "uninstall").write_text(text.replace("/usr/local/lib/rosafe", str(prefix)))
+    programs.mkdir()
+    (programs / "sudo").write_text('#!/bin/sh\nshift; exec "$@"\n')
+    (programs / "sudo").chmod(0o755)
+    goes = [root / ".generated", home / ".cache" / "rosafe", temporary / f"rosafe-{os.getuid()}", prefix / "python"]
+    stays = [root / "msg", home / ".cache" / "other", temporary / "rosafe-x"]
+    for folder in goes + stays:
+        folder.mkdir(parents=True)
+    env = environment(HOME=str(home), TMPDIR=str(temporary), PATH=f"{programs}:/usr/bin:/bin")
+    for _ in range(2):  # twice is no error
+        done = run("/bin/bash", root / "scripts" / "uninstall", env=env)
+        assert (done.returncode, done.stderr) == (0, "")
+    assert not any(folder.exists() for folder in [*goes, prefix])
+    assert all(folder.exists() for folder in stays)
+
+
+def test_a_user_without_rights_is_told(machine: Machine) -> None:
+    machine.script.parent.chmod(0o755)
+    for folder in machine.script.parents:
+        if folder == Path("/tmp"):
+            break
+        folder.chmod(0o755)
+    machine.calls.chmod(0o666)
+    (machine.bin / "id").unlink()
+    (machine.bin / "id").symlink_to("/usr/bin/id")
+    done = run(*without_rights("/bin/bash", machine.script), env=environment(PATH=f"{machine.bin}"))
+    assert done.returncode == 1
+    assert "run this as root" in done.stderr
