@@ -59,8 +59,7 @@ class BassNode:
         try:
             capture = Capture(source, frames_per_chunk, chunks, self._publish, rospy.logwarn)
             activity.interrupt_others()
-            if activity.stop_requested.is_set():
-                raise ComponentError("::genom::interrupted", by=activity.stopped_by)
+            activity.raise_if_interrupted()
             self._source = source
             capture.publish()
             activity.running()

@@ -137,13 +137,13 @@ def test_mistakes_change_nothing(graph: Graph, bass_node: Process, wav: tuple[st
     indexes = [message.lastFrameIndex for message in messages]
     assert indexes == sorted(set(indexes))
     assert {message.nFramesPerChunk for message in messages} == {CHUNK}
-    assert live(graph) == ["Acquire"]
+    wait_for(lambda: live(graph) == ["Acquire"])
 
 
 def test_failed_acquisition_leaves_the_port_silent(graph: Graph, bass_node: Process) -> None:
     with graph.collect("/bass/Audio", audio_class()) as messages:
         assert not acquire(graph, "hw:77,0", 44100).genom_success
-        assert live(graph) == []
+        wait_for(lambda: live(graph) == [])
     assert messages == []
 
 
@@ -156,7 +156,7 @@ def test_acquire_replaces_and_stop_keeps_the_port(graph: Graph, bass_node: Proce
         after = [m for m in messages if m.sampleRate == 16000]
         assert after[0].lastFrameIndex == 0 and not after[0].left.any()
         assert messages[-len(after) :] == after  # nothing of the old one comes after the new one has begun
-        assert live(graph) == ["Acquire"]
+        wait_for(lambda: live(graph) == ["Acquire"])
         assert graph.call("/bass/Stop").genom_success
         wait_for(lambda: live(graph) == [])
     kept = graph.message("/bass/Audio", audio_class())  # latched, for those who come later
@@ -250,7 +250,7 @@ def test_dedicated_socket(graph: Graph, bass_node: Process, wav: tuple[str, np.n
             pieces.append(samples)
         received = np.concatenate(pieces, axis=1)
         assert np.array_equal(received[:, :4100], wav[1]) and not received[:, 4100:].any()
-        assert live(graph) == ["DedicatedSocket"]
+        wait_for(lambda: live(graph) == ["DedicatedSocket"])
         assert graph.call("/bass/CloseSocket").genom_success
         assert connection.recv(1) == b""
     with socket.create_server(("127.0.0.1", port)):
