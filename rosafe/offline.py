@@ -3,76 +3,18 @@
 from __future__ import annotations
 
 import itertools
-import threading
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from rosafe.interface import KINDS, REQUIRED, ComponentError, Parameter
-from rosafe.tree import Processor, Tree
+from rosafe.chain import Chain, check_outputs, check_parameter, check_parameters, lags
+from rosafe.interface import REQUIRED, Parameter
 from rosafe.tree.zone import Block
 
 DEFAULT_BLOCK = 12000  # frames, as InputProc's
 
 _SAMPLE_RATE = Parameter("sample_rate", "double", REQUIRED, "Samples per second (Hz)", 0.0, 1e9, open_minimum=True)
-_PARAMETERS = {name: p for kind in KINDS.values() for p in kind.parameters for name in (p.name, *p.aliases)}
-
-
-class _ArraySource:
-    """Feeds a signal to the tree, cut after the frames `ends`, once `open` says that the whole tree stands."""
-
-    def __init__(self, signal: np.ndarray, sample_rate: float, ends: list[int]) -> None:
-        self.sample_rate = sample_rate
-        self._signal = signal
-        self._cuts = itertools.pairwise((0, *ends))
-        self._stopped = False
-        self._gate = threading.Event()
-
-    def open(self) -> None:
-        """Let the signal flow."""
-        self._gate.set()
-
-    def read(self) -> tuple[np.ndarray, int] | None:
-        self._gate.wait()
-        cut = None if self._stopped else next(self._cuts, None)
-        return (self._signal[:, slice(*cut)], cut[1]) if cut is not None else None
-
-    def stop(self) -> None:
-        self._stopped = True
-        self._gate.set()
-
-
-class _Run:
-    """Keeps what the wanted processors release, and the first error, which ends the run."""
-
-    def __init__(self, wanted: set[str], source: _ArraySource) -> None:
-        self.blocks: dict[str, list[np.ndarray]] = {kind: [] for kind in wanted}
-        self._source = source
-        self.processors: list[Processor] = []
-        self._error: BaseException | None = None
-
-    def added(self, processor: Processor) -> None:
-        self.processors.append(processor)
-
-    def executed(self, processor: Processor, seconds: float) -> None:
-        pass
-
-    def released(self, processor: Processor, block: Block) -> None:
-        if processor.kind in self.blocks:
-            self.blocks[processor.kind].append(block.data)
-
-    def ended(self, processor: Processor) -> None:
-        if processor.error is not None:
-            self._error = self._error or processor.error
-            self._source.stop()
-
-    def wait(self) -> None:
-        """Wait until every processor has ended; raises what one failed with."""
-        for processor in self.processors:
-            processor.join()
-        if self._error is not None:
-            raise self._error
 
 
 def process(
@@ -121,27 +63,28 @@ def process(
     samples = _checked_signal(signal)
     rate = _SAMPLE_RATE.check(sample_rate)
     ends = _block_ends(block_frames, samples.shape[1])
-    values = {"in_doNormalize": samples.dtype == np.int32, **_checked_parameters(parameters)}
+    values = {"in_doNormalize": samples.dtype == np.int32, **check_parameters(parameters)}
     changes = _checked_modifications(modifications)
-    wanted, needed = _needed(outputs)
+    wanted = check_outputs(outputs)
 
-    source = _ArraySource(samples, rate, ends)
-    run = _Run(wanted, source)
-    tree = Tree(run)
-    try:
-        _build(tree, source, needed, values)
+    released: dict[str, list[np.ndarray]] = {kind: [] for kind in wanted}
+
+    def keep(kind: str, block: Block) -> None:
+        released[kind].append(block.data)
+
+    blocks = (samples[:, first:end] for first, end in itertools.pairwise((0, *ends)))
+    with Chain(blocks, rate, values, wanted, keep) as chain:
         for block, name, value in changes:
             if block < len(ends):
-                tree.schedule(block, name, value)
-        source.open()
-        run.wait()
-        return _results(tree, run)
-    except ComponentError as problem:
-        raise ValueError(str(problem)) from None
-    finally:
-        tree.stop()
-        for processor in run.processors:
-            processor.join()
+                chain.schedule(block, name, value)
+        chain.run()
+        results: dict[str, Any] = {}
+        for kind in wanted:
+            results[kind] = _join(kind, released.pop(kind), chain.rows(kind))
+        results.update(chain.describe())
+        if "crossCorrelation" in results:
+            results["cc_lags"] = lags(results["crossCorrelation"].shape[1], rate)
+        return results
 
 
 # --- arguments ---
@@ -176,28 +119,6 @@ def _block_ends(block_frames: Any, frames: int) -> list[int]:
     return [*itertools.takewhile(lambda end: end < frames, ends), frames] if frames else []
 
 
-def _checked_parameters(parameters: Any) -> dict[str, Any]:
-    if parameters is None:
-        return {}
-    if not isinstance(parameters, Mapping):
-        raise ValueError(f"parameters: {type(parameters).__name__} is not a dict of names and values")
-    return dict(_checked_value(name, value) for name, value in parameters.items())
-
-
-def _checked_value(name: Any, value: Any) -> tuple[str, Any]:
-    """The real name and the checked value of one parameter."""
-    if not isinstance(name, str) or name not in _PARAMETERS:
-        known = ", ".join(p.name for kind in KINDS.values() for p in kind.parameters)
-        raise ValueError(f"unknown parameter {name!r}; there are: {known}")
-    parameter = _PARAMETERS[name]
-    checked = parameter.check(value)
-    if checked == "jespen":  # the guide's slip for jepsen
-        checked = parameter.known_word(checked)
-    if parameter.choices and checked not in parameter.choices:
-        raise ValueError(f"{name}: {checked!r} is not {parameter.range_text}")
-    return parameter.name, checked
-
-
 def _checked_modifications(modifications: Any) -> list[tuple[int, str, Any]]:
     """The changes in the order of their blocks."""
     changes = []
@@ -211,53 +132,11 @@ def _checked_modifications(modifications: Any) -> list[tuple[int, str, Any]]:
         block, name, value = change
         if isinstance(block, bool) or not isinstance(block, (int, np.integer)) or block < 0:
             raise ValueError(f"modifications: {block!r} is not a block number")
-        changes.append((int(block), *_checked_value(name, value)))
+        changes.append((int(block), *check_parameter(name, value)))
     return sorted(changes, key=lambda change: change[0])
 
 
-def _needed(outputs: Any) -> tuple[set[str], set[str]]:
-    """The outputs to keep, and the processors to run for them."""
-    try:
-        wanted = [outputs] if isinstance(outputs, str) else list(KINDS if outputs is None else outputs)
-    except TypeError:
-        raise ValueError(f"outputs: {outputs!r} is not a sequence of names") from None
-    for name in wanted:
-        if not isinstance(name, str) or name not in KINDS:
-            raise ValueError(f"unknown output {name!r}; there are: {', '.join(KINDS)}")
-    needed = {"input"}
-    for kind in wanted:
-        while kind:
-            needed.add(kind)
-            kind = KINDS[kind].parent
-    return set(wanted), needed
-
-
-# --- the tree and what comes out of it ---
-
-
-def _build(tree: Tree, source: _ArraySource, needed: set[str], values: Mapping[str, Any]) -> None:
-    for kind in KINDS.values():  # parents come first in the table
-        mine = {p.name: values[p.name] for p in kind.parameters if p.name in values}
-        if not kind.parent:
-            tree.add_input(kind.kind, source, 1, 0.0, 0.0, mine)
-        elif kind.kind in needed:
-            tree.add(kind.kind, kind.kind, kind.parent, mine)
-
-
-def _results(tree: Tree, run: _Run) -> dict[str, Any]:
-    results: dict[str, Any] = {}
-    for processor in tree.processors:
-        kind = processor.kind
-        if kind in run.blocks:
-            results[kind] = _join(kind, run.blocks.pop(kind), processor.rows)
-        if kind == "gammatone":
-            results["fb_cfHz"] = np.array(processor.parameters()["fb_cfHz"])
-        if kind in ("ild", "ratemap", "crossCorrelation"):
-            results[f"{kind}_frameRate"] = processor.rate
-        if kind == "crossCorrelation":
-            longest = results[kind].shape[1] // 2
-            results["cc_lags"] = np.arange(-longest, longest + 1) / tree.sample_rate
-    return results
+# --- what comes out ---
 
 
 def _join(kind: str, blocks: list[np.ndarray], rows: tuple[int, ...]) -> np.ndarray:
