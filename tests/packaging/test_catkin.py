@@ -1,0 +1,128 @@
+"""A catkin workspace with both packages: built, installed, and used from the install space alone."""
+
+from __future__ import annotations
+
+import filecmp
+import os
+import shutil
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from rosafe import __version__
+from rosafe.ros import generate
+from tests.harness import PYTHON, Graph, MasterProcess, wait_for
+from tests.packaging.clone import environment, fresh_copy, run
+
+NEEDED = ("catkin_make", "cmake", "make", "cc")
+
+
+@pytest.fixture(scope="module")
+def workspace() -> Iterator[Path]:
+    """A workspace after ``catkin_make install``; the sources that it was built from are gone."""
+    missing = [tool for tool in NEEDED if shutil.which(tool) is None]
+    if missing or not Path("/usr/share/message_generation").exists():
+        pytest.skip(f"no catkin here ({missing or 'message_generation'}); scripts/install --tests brings it")
+    with fresh_copy() as copy:
+        folder = copy.with_name("workspace")
+        sources = folder / "src"
+        sources.mkdir(parents=True)
+        (sources / "rosAFE").symlink_to(copy)
+        (sources / "bass").symlink_to(copy / "bass")
+        done = run(
+            *("catkin_make", "-C", folder, "install", f"-DPYTHON_EXECUTABLE={PYTHON}"),
+            env=environment(HOME=str(folder), ROS_LANG_DISABLE="genlisp"),
+            cwd=folder,
+        )
+        assert done.returncode == 0, done.stdout[-5000:] + done.stderr[-5000:]
+        assert "CMake Warning" not in done.stderr.replace("CMake Deprecation Warning", ""), done.stderr
+        copy.rename(copy.with_name("gone"))
+        yield folder
+
+
+def sourced(workspace: Path, commands: str, shell: str = "bash", **env: str) -> subprocess.CompletedProcess[str]:
+    """Run commands after sourcing the install space's setup file, as a user in a new shell does."""
+    return run(
+        shell, "-c", f". {workspace}/install/setup.{shell.replace('dash', 'sh')} && {commands}", env=environment(**env)
+    )
+
+
+def printed(done: subprocess.CompletedProcess[str]) -> str:
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
+@pytest.mark.parametrize("package", ["rosAFE", "bass"])
+def test_messages_are_those_of_our_own_generator(workspace: Path, package: str) -> None:
+    """Byte for byte, the split actions included."""
+    generation = Path(generate.environment()["ROS_PACKAGE_PATH"].split(":")[0]).parent
+    for kind in ("msg", "srv"):
+        for ours, catkins in (
+            (generation / "python" / package / kind, workspace / "install/lib/python3/dist-packages" / package / kind),
+            (generation / "share" / package / kind, workspace / "install/share" / package / kind),
+        ):
+            names = sorted(p.name for p in ours.iterdir() if p.is_file())
+            assert names == sorted(p.name for p in catkins.iterdir() if p.is_file())
+            assert filecmp.cmpfiles(ours, catkins, names, shallow=False) == (names, [], [])
+
+
+def test_python(workspace: Path) -> None:
+    code = "import rosafe, rosafe.offline, rosAFE.msg, bass.srv; print(rosafe.__file__, rosAFE.msg.__file__)"
+    found = printed(sourced(workspace, f"{PYTHON} -c '{code}'")).split()
+    packages = workspace / "install" / "lib" / "python3" / "dist-packages"
+    assert found == [str(packages / "rosafe/__init__.py"), str(packages / "rosAFE/msg/__init__.py")]
+
+
+@pytest.mark.parametrize("program", ["rosAFE-ros", "bass-ros"])
+def test_executables(workspace: Path, program: str) -> None:
+    package = program.removesuffix("-ros")
+    for shell in ("bash", "dash"):
+        where = printed(sourced(workspace, f"command -v {program}", shell)).strip()
+        assert where == str(workspace / "install" / "bin" / program)
+    assert printed(sourced(workspace, f"{program} --version")) == f"{package} {__version__}\n"
+    assert printed(sourced(workspace, f"rosrun {package} {program} --version")) == f"{package} {__version__}\n"
+    unsourced = run(workspace / "install" / "bin" / program, "--version", env=environment())
+    assert printed(unsourced) == f"{package} {__version__}\n"
+
+
+def test_ros_tools(workspace: Path) -> None:
+    assert "float64[] data" in printed(sourced(workspace, "rosmsg show rosAFE/rosAFE_signalOneD"))
+    assert "string device" in printed(sourced(workspace, "rossrv show bass/Acquire"))
+    assert printed(sourced(workspace, "rospack find rosAFE")).strip() == str(workspace / "install" / "share" / "rosAFE")
+
+
+def test_tcl_package(workspace: Path) -> None:
+    script = workspace / "require.tcl"
+    script.write_text("puts [package require genomix]\nputs [package ifneeded genomix [package require genomix]]\n")
+    shown = printed(sourced(workspace, f"tclsh {script}"))
+    assert str(workspace / "install" / "lib" / "tcltk" / "genomix") in shown
+
+
+def test_setup_twice_is_once(workspace: Path) -> None:
+    again = f". {workspace}/install/setup.bash && echo $TCLLIBPATH"
+    assert printed(sourced(workspace, again)).strip() == str(workspace / "install" / "lib" / "tcltk")
+
+
+def test_both_nodes_run_from_the_install_space(
+    workspace: Path, private_graph: tuple[Graph, MasterProcess], tmp_path: Path
+) -> None:
+    graph, _ = private_graph
+    setup = f". {workspace}/install/setup.sh"
+    ros = {"ROS_MASTER_URI": graph.uri, "ROS_IP": "127.0.0.1", "HOME": str(tmp_path)}
+    plain = [f"{name}={value}" for name, value in {**environment(), **ros}.items()]
+    with (
+        graph.start("env", "-i", *plain, "sh", "-c", f"{setup} && exec bass-ros") as bass,
+        graph.start("env", "-i", *plain, "sh", "-c", f"{setup} && exec rosAFE-ros") as rosafe,
+    ):
+        for name, node in (("bass", bass), ("rosAFE", rosafe)):
+            wait_for(lambda name=name: f"/{name}/Stop" in graph.services(), 30, lambda node=node: str(node))  # type: ignore[misc]
+        called = printed(sourced(workspace, "rosservice call /bass/Acquire \"{device: 'scene:'}\"", **ros))
+        assert "genom_success: True" in called
+        heard = printed(sourced(workspace, "rostopic echo -n1 /bass/Audio/sampleRate", **ros))
+        assert heard.startswith("44100")
+        assert bass.stop() == 0 and rosafe.stop() == 0
+    installed = workspace / "install" / "lib" / "python3" / "dist-packages"
+    assert not any(installed.rglob(".generated")) and not (tmp_path / ".cache").exists()
+    assert os.access(installed / "rosafe" / "__init__.py", os.R_OK)
