@@ -1,0 +1,156 @@
+"""The ROS graph as genomixd sees it: the master and nodes by XML-RPC, and a node of its own once one is needed.
+
+All calls are coroutines with a time limit. A master that is away, or comes back empty, is an error while it lasts and
+nothing more.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import time
+import xmlrpc.client
+from typing import Any
+from urllib.parse import urlsplit
+
+import aiohttp
+
+from rosafe.interface import ComponentError
+
+RPC_SECONDS = 3.0  # for one call of the master or of a node
+CHECK_SECONDS = 1.0  # between two looks whether the master still knows our node
+NODE_SECONDS = 15.0  # for becoming a node of the graph
+
+
+class Unknown(Exception):
+    """The master, or a node, answered that there is no such thing."""
+
+
+def middleware_error(what: str) -> ComponentError:
+    """The error of a component or master that cannot be reached, or does not answer."""
+    return ComponentError("::genom::mwerr", what=what)
+
+
+class Graph:
+    """The graph of the master at `uri`. Make it inside a running event loop; `close` it in the end."""
+
+    def __init__(self, uri: str) -> None:
+        self.uri = uri
+        self.name = f"/genomixd_{os.getpid()}_{int(time.time() * 1000)}"
+        self.gone = asyncio.Event()  # set where our node was told to end, as by `rosnode kill`
+        self._http = aiohttp.ClientSession(
+            connector=aiohttp.TCPConnector(force_close=True, limit=0),
+            timeout=aiohttp.ClientTimeout(total=RPC_SECONDS),
+        )
+        self._node: asyncio.Task[None] | None = None
+        self._watch: asyncio.Task[None] | None = None
+
+    async def close(self) -> None:
+        """Leave the graph."""
+        for task in (self._watch, self._node):
+            if task is not None:
+                task.cancel()
+        if self._watch is not None:
+            import rospy
+
+            await asyncio.to_thread(rospy.signal_shutdown, "genomixd ends")
+        await self._http.close()
+
+    # --- XML-RPC ---
+
+    async def master(self, method: str, *arguments: Any) -> Any:
+        """The value of the master's `method`; Unknown where it has none, ComponentError where it does not answer."""
+        try:
+            return await self.node(self.uri, method, *arguments)
+        except (TimeoutError, OSError, aiohttp.ClientError, xmlrpc.client.Error, ValueError) as problem:
+            raise middleware_error(
+                f"no ROS master at {self.uri} ({_reason(problem)}): start roscore first, or set ROS_MASTER_URI"
+            ) from None
+
+    async def node(self, uri: str, method: str, *arguments: Any) -> Any:
+        """The value of `method` of the node (or master) at `uri`."""
+        body = xmlrpc.client.dumps((self.name, *arguments), method)
+        async with self._http.post(uri, data=body.encode(), headers={"Content-Type": "text/xml"}) as response:
+            text = await response.text()
+        values: Any = xmlrpc.client.loads(text)[0]
+        code, message, value = values[0]
+        if code != 1:
+            raise Unknown(message)
+        return value
+
+    async def service_address(self, name: str) -> tuple[str, int]:
+        """Host and port of the service `name`, or Unknown."""
+        return _address(await self.master("lookupService", name))
+
+    async def topics(self) -> dict[str, str]:
+        """All topics that somebody publishes, with their types."""
+        return dict(await self.master("getPublishedTopics", ""))
+
+    async def topic_address(self, topic: str, node: str) -> tuple[str, int]:
+        """Host and port where `node` gives out `topic`, or Unknown."""
+        uri = await self.master("lookupNode", node)
+        try:
+            protocol = await self.node(uri, "requestTopic", topic, [["TCPROS"]])
+        except (TimeoutError, OSError, aiohttp.ClientError, xmlrpc.client.Error) as problem:
+            raise middleware_error(f"{node} does not answer ({_reason(problem)})") from None
+        if len(protocol) != 3 or protocol[0] != "TCPROS":
+            raise Unknown(f"{node} does not give out {topic}")
+        return str(protocol[1]), int(protocol[2])
+
+    # --- our node ---
+
+    async def become_node(self) -> None:
+        """Have a rospy node in this process, which actions need; ComponentError where there is no master."""
+        if self._node is None or (self._node.done() and (self._node.cancelled() or self._node.exception())):
+            self._node = asyncio.create_task(self._start_node())
+        try:
+            await asyncio.wait_for(asyncio.shield(self._node), NODE_SECONDS)
+        except TimeoutError:
+            raise middleware_error(f"cannot become a node of the graph at {self.uri} in {NODE_SECONDS:g} s") from None
+
+    async def _start_node(self) -> None:
+        await self.master("getPid")  # rospy would wait for the master without end
+        import rospy
+
+        loop = asyncio.get_running_loop()
+        await asyncio.to_thread(rospy.init_node, self.name[1:], argv=["genomixd"], disable_signals=True)
+        rospy.on_shutdown(lambda: loop.is_closed() or loop.call_soon_threadsafe(self.gone.set))
+        self._watch = asyncio.create_task(self._keep_registered())
+
+    async def _keep_registered(self) -> None:
+        """Make a master that was restarted know our node again, as it knew it before."""
+        while True:
+            await asyncio.sleep(CHECK_SECONDS)
+            try:
+                await self.master("lookupNode", self.name)
+            except Unknown:
+                await self._register_again()
+            except ComponentError:
+                continue  # no master for now; requests say so
+
+    async def _register_again(self) -> None:
+        import rospy
+
+        own = rospy.get_node_uri()
+        try:
+            for topic, kind in await self.node(own, "getSubscriptions"):
+                publishers = await self.master("registerSubscriber", topic, kind, own)
+                await self.node(own, "publisherUpdate", topic, publishers)
+            for topic, kind in await self.node(own, "getPublications"):
+                await self.master("registerPublisher", topic, kind, own)
+        except (TimeoutError, ComponentError, Unknown, OSError, aiohttp.ClientError) as problem:
+            rospy.logwarn(f"genomixd: cannot register with the new master yet: {problem}")
+
+
+def _address(uri: str) -> tuple[str, int]:
+    parts = urlsplit(uri)
+    if parts.hostname is None or parts.port is None:
+        raise Unknown(f"{uri!r} is no service address")
+    return parts.hostname, parts.port
+
+
+def _reason(problem: BaseException) -> str:
+    if isinstance(problem, asyncio.TimeoutError):
+        return "no answer"
+    cause = getattr(problem, "os_error", problem)
+    return getattr(cause, "strerror", None) or type(problem).__name__

@@ -1,0 +1,303 @@
+"""One component instance on the graph, as genomixd's clients use it: its functions, activities and ports."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import rosgraph.names
+
+from rosafe.genomix import syntax
+from rosafe.genomix.actions import ActionClient, Goal
+from rosafe.genomix.graph import Graph, Unknown, middleware_error
+from rosafe.genomix.syntax import Syntax
+from rosafe.genomix.tcpros import Connection, Refused, ServiceClient, TopicReader, component_exception
+from rosafe.interface import COMPONENTS, REQUIRED, Component, ComponentError, Parameter, Port, Service
+from rosafe.ros import wire
+
+CALL_SECONDS = 60.0  # for the answer to one request
+APPEAR_SECONDS = 2.0  # that `load` waits for a component that is just starting
+POLL_SECONDS = 0.05
+LATE_SECONDS = 0.5  # results that a component sent before it ended arrive within
+MAX_PENDING = 1000  # requests to one component that are not answered yet
+
+
+class Value:
+    """A result: members by name, with their IDL types, that can be written in any syntax, in pieces."""
+
+    def __init__(self, component: Component, members: tuple[tuple[str, str], ...], values: Mapping[str, Any]) -> None:
+        self._component = component
+        self._members = members
+        self._values = values
+
+    def pieces(self, form: Syntax) -> Iterator[str]:
+        """The text, as one nested value, in short pieces."""
+        return syntax.structure(form, self._component, self._members, self._values)
+
+    @property
+    def size(self) -> int:
+        """About how many bytes the value occupies."""
+        return _size(self._values)
+
+
+NOTHING = Value(COMPONENTS["rosAFE"], (), {})
+
+
+def _size(value: Any) -> int:
+    if isinstance(value, Mapping):
+        return sum(map(_size, value.values())) + 64
+    if isinstance(value, list):
+        return sum(map(_size, value)) + 64
+    return int(getattr(value, "nbytes", 32))
+
+
+class Proxy:
+    """The component `instance` of the interface `component`. Several sessions may share one."""
+
+    def __init__(self, graph: Graph, component: Component, instance: str) -> None:
+        self.component = component
+        self.instance = instance
+        self._graph = graph
+        self._services: dict[str, ServiceClient] = {}
+        self._actions: dict[str, asyncio.Task[ActionClient]] = {}
+        self._readers: dict[str, TopicReader] = {}
+        self._link: asyncio.Task[None] | None = None
+        self._pending = 0
+
+    @classmethod
+    async def load(cls, graph: Graph, name: str, instance: str) -> Proxy:
+        """The proxy of a component that runs, or ComponentError.
+
+        Parameters
+        ----------
+        graph : Graph
+        name : str
+            Of the component, or of an instance; a path to a plugin (``/opt/lib/rosAFE.so``) counts by its last part.
+        instance : str
+            Name of the node; empty: as `name`.
+        """
+        name = name.rstrip("/").rsplit("/", 1)[-1].removesuffix(".so")
+        instance = instance.strip("/") or name
+        for word in (name, instance):
+            if not rosgraph.names.is_legal_base_name(word):
+                raise ComponentError("::genomix::e_load", what=f"{word!r} is no name of a component or instance")
+        package = await _package(graph, instance)
+        if package not in COMPONENTS:
+            known = ", ".join(COMPONENTS)
+            raise ComponentError("::genomix::e_load", what=f"/{instance} is a {package}; genomixd knows {known}")
+        if name not in (package, instance):
+            raise ComponentError("::genomix::e_load", what=f"/{instance} is a {package}, and no {name}")
+        return cls(graph, COMPONENTS[package], instance)
+
+    async def close(self) -> None:
+        """Let go of all connections; activities go on."""
+        if self._link is not None:
+            self._link.cancel()
+        for service in self._services.values():
+            service.close()
+        for task in self._actions.values():
+            if task.done() and not task.cancelled() and task.exception() is None:
+                await task.result().close()
+            else:
+                task.cancel()
+
+    # --- requests ---
+
+    def service(self, name: str) -> Service:
+        """The service called `name` (aliases count), or ``::genom::no_such_service``."""
+        try:
+            return self.component.service(name)
+        except KeyError:
+            known = ", ".join(s.name for s in self.component.services)
+            what = f"{self.component.name} has no service {name[:80]!r}; it has {known}"
+            raise ComponentError("::genom::no_such_service", what=what) from None
+
+    async def call(self, service: Service, values: Mapping[str, Any]) -> Value:
+        """What a function returns; an activity returns nothing, as soon as it runs."""
+        with self._one_more():
+            client = self._client(service.name)
+            response = await client.call(values, CALL_SECONDS)
+        if not response.genom_success:
+            raise component_exception(response.genom_exdetail)
+        return Value(self.component, service.outputs, {name: getattr(response, name) for name, _ in service.outputs})
+
+    async def start(self, service: Service, values: Mapping[str, Any]) -> Goal:
+        """Send an activity; its goal tells when it runs and when it has ended."""
+        with self._one_more():
+            await self._watch()
+            client = await self._action(service.name)
+            return await client.send(values)
+
+    @contextlib.contextmanager
+    def _one_more(self) -> Iterator[None]:
+        if self._pending >= MAX_PENDING:
+            raise ComponentError("::genomix::e_tooMany", what=f"{self.instance}: {MAX_PENDING} requests are waiting")
+        self._pending += 1
+        try:
+            yield
+        finally:
+            self._pending -= 1
+
+    def _client(self, service: str) -> ServiceClient:
+        if service not in self._services:
+            self._services[service] = ServiceClient(self._graph, self.component.name, self.instance, service)
+        return self._services[service]
+
+    async def _action(self, action: str) -> ActionClient:
+        task = self._actions.get(action)
+        if task is None or (task.done() and (task.cancelled() or task.exception() is not None)):
+            made = ActionClient.create(self._graph, self.component.name, self.instance, action)
+            task = self._actions[action] = asyncio.create_task(made)
+        return await asyncio.shield(task)
+
+    async def _watch(self) -> None:
+        """Have a connection to the component whose end tells that the component has ended."""
+        if self._link is None or self._link.done():
+            connection = await self._client("connect_port").connect()
+            self._link = asyncio.create_task(self._wait_for_end(connection))
+
+    async def _wait_for_end(self, connection: Connection) -> None:
+        try:
+            await connection.closed()
+        finally:
+            connection.close()
+        await asyncio.sleep(LATE_SECONDS)
+        problem = middleware_error(f"{self.instance} ended before its activity did")
+        for task in self._actions.values():
+            if task.done() and not task.cancelled() and task.exception() is None:
+                task.result().lost(problem)
+
+    # --- ports ---
+
+    def port(self, name: str) -> Port | None:
+        """The port called `name` (aliases count), if there is one."""
+        try:
+            return self.component.port(name)
+        except KeyError:
+            return None
+
+    async def read(self, port: Port, element: str) -> Value:
+        """The newest sample of a port, keyed by the port's name; zeros where it has none yet.
+
+        Raises ComponentError: ``::genom::no_such_outport`` where there is no such port or element.
+        """
+        with self._one_more():
+            if not port.output:
+                raise _no_port(f"{port.name} is an input port; connect_port connects it")
+            message = await self._read(port, element)
+        value = _zero(self.component, port.idl)
+        if message is not None:
+            value = {name: getattr(message, name) for name, _ in self.component.structs[port.idl]}
+        return Value(self.component, ((port.name, port.idl),), {port.name: value})
+
+    async def _other_element(self, topic: str, port: Port, element: str) -> str:
+        """An element that differs in the case of letters only: the user's guide reads 'crossCorrelation'."""
+        topics = [t for t in await self._graph.topics() if t.startswith(f"{topic}/")]
+        alike = [t for t in topics if t.lower() == f"{topic}/{element}".lower()]
+        if len(alike) == 1:
+            return alike[0]
+        names = ", ".join(t.removeprefix(f"{topic}/") for t in topics) or "none"
+        raise _no_port(f"{port.name} has no element {element[:80]!r}; there are: {names}")
+
+    def _reader(self, port: Port) -> TopicReader:
+        if port.idl not in self._readers:
+            kind = wire.message_class(self.component.name, port.idl)
+            self._readers[port.idl] = TopicReader(self._graph, self.instance, kind)
+        return self._readers[port.idl]
+
+    async def _read(self, port: Port, element: str) -> Any:
+        topic, reader = f"/{self.instance}/{port.name}", self._reader(port)
+        try:
+            if not port.multiple:
+                return await reader.read(topic)  # an element is of no use, and scripts give one
+            if rosgraph.names.is_legal_name(f"{topic}/{element}"):
+                with contextlib.suppress(Unknown):
+                    return await reader.read(f"{topic}/{element}")
+            return await reader.read(await self._other_element(topic, port, element))
+        except Unknown as problem:
+            raise _no_port(f"{self.instance} does not give out {topic}: {problem}") from None
+
+    # --- description ---
+
+    def describe(self, name: str) -> dict[str, Any]:
+        """What a client needs to offer the component under `name`: services and ports with all that the table says."""
+        component = self.component
+        return {
+            "name": name,
+            "component": component.name,
+            "instance": self.instance,
+            "doc": component.doc,
+            "services": {s.name: _describe_service(s) for s in component.services},
+            "ports": {
+                p.name: {
+                    "doc": p.doc,
+                    "type": p.idl,
+                    "multiple": p.multiple,
+                    "output": p.output,
+                    "aliases": list(p.aliases),
+                }
+                for p in component.ports
+            },
+            "exceptions": {f"::{component.name}::{short}": doc for short, doc in component.exceptions.items()},
+        }
+
+
+async def _package(graph: Graph, instance: str) -> str:
+    """The ROS package of the component that runs as `instance`, asked of the component itself."""
+    name = f"/{instance}/connect_port"
+    deadline = asyncio.get_running_loop().time() + APPEAR_SECONDS
+    while True:
+        try:
+            address = await graph.service_address(name)
+            probe = {"service": name, "md5sum": "*", "probe": "1", "callerid": graph.name}
+            connection = await Connection.open(address, probe)
+            connection.close()
+            return connection.header.get("type", "").split("/")[0]
+        except Unknown:
+            problem = middleware_error(f"{instance} is not running: nobody serves {name}")
+        except ComponentError as no_master:
+            problem = no_master
+        except (Refused, OSError) as failure:
+            problem = middleware_error(f"{instance} is not running, though the master lists it ({failure})")
+        if asyncio.get_running_loop().time() > deadline:
+            raise problem
+        await asyncio.sleep(POLL_SECONDS)
+
+
+def _no_port(what: str) -> ComponentError:
+    return ComponentError("::genom::no_such_outport", what=what)
+
+
+def _zero(component: Component, idl: str) -> Any:
+    if idl.startswith("sequence<"):
+        return []
+    if idl in component.structs:
+        if idl in syntax.SIGNALS:
+            return []
+        return {name: _zero(component, kind) for name, kind in component.structs[idl]}
+    return "" if idl == "string" else 0
+
+
+def _describe_service(service: Service) -> dict[str, Any]:
+    return {
+        "doc": service.doc,
+        "activity": service.activity,
+        "aliases": list(service.aliases),
+        "parameters": {p.name: _describe_parameter(p) for p in service.parameters},
+        "outputs": dict(service.outputs),
+        "throws": list(service.throws),
+    }
+
+
+def _describe_parameter(parameter: Parameter) -> dict[str, Any]:
+    required = parameter.default is REQUIRED
+    return {
+        "type": parameter.idl,
+        "doc": parameter.doc,
+        "required": required,
+        "default": "" if required else parameter.default,
+        "range": parameter.range_text,
+        "aliases": list(parameter.aliases),
+    }

@@ -1,0 +1,422 @@
+"""The URL space of genomixd (docs/genomixd.md) on aiohttp, and who may use it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import functools
+import ipaddress
+import logging
+import re
+import socket
+import time
+from collections.abc import Awaitable, Callable, Iterator
+from typing import Any
+
+from aiohttp import web
+
+from rosafe import __version__
+from rosafe.genomix.proxy import Proxy, Value
+from rosafe.genomix.sessions import Request, Session, Sessions, error_body, too_many
+from rosafe.genomix.syntax import SYNTAXES, TCL, Syntax, plain
+from rosafe.genomix.values import parse_input, refused
+from rosafe.interface import ComponentError
+
+MAX_CONNECTIONS = 2000
+MAX_URL = 256 * 1024  # bytes of a request line: a list of 1024 numbers fits, percent signs and all
+MAX_WAIT_MS = 3_600_000
+BATCH = 128 * 1024  # characters written at a time
+HEARTBEAT_SECONDS = 15.0  # between two signs of life to a listener
+LAST_WORDS_SECONDS = 1.0  # that answers under way have at the end
+IDLE_SECONDS = 3600.0  # a connection without requests is closed after
+
+log = logging.getLogger("genomixd")
+
+_STATUS = {
+    "::genom::serialization": 400,
+    "::genom::no_such_service": 404,
+    "::genom::no_such_outport": 404,
+    "::genomix::e_noSuchRequest": 404,
+    "::genomix::e_load": 404,
+    "::genomix::e_forbidden": 403,
+    "::genomix::e_url": 404,
+    "::genomix::e_notDone": 409,
+    "::genom::mwerr": 502,
+    "::genom::unkex": 500,
+    "::genomix::e_tooMany": 503,
+}
+_COMPONENT_ERROR = 422  # the request was understood, sent and refused
+_SESSION_NAME = re.compile(r"[\w.:@-]{1,100}")
+_HELP = """genomixd {version}: components of the ROS graph by HTTP GET. Answers are JSON, or Tcl dicts with syntax=tcl.
+/session/start?s=NAME  /session/stop?s=NAME  /session/listen?s=NAME (server-sent events: request, unload, quit)
+/load/COMPONENT[?i=INSTANCE][&as=NAME]  /unload/NAME  /describe/NAME  /components  /rpath?dir=DIR
+/call/NAME/SERVICE[?input=JSON]  /call/NAME/PORT[/ELEMENT]      waits for the result; an activity returns once it runs
+/send/NAME/SERVICE[?input=JSON][&ack][&oneway]                  returns the request's id and status at once
+/request/status?id=ID  /request/result?id=ID  /request/wait?id=ID[&ms=N]  /request/abort?id=ID  /request/clean?id=ID
+/requests
+Every URL may carry s=SESSION. docs/genomixd.md tells the rest.
+"""
+
+Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
+
+
+class Server:
+    """The HTTP server for `sessions`.
+
+    Parameters
+    ----------
+    sessions : Sessions
+    hosts : set of str
+        Names, besides IP addresses and localhost, by which clients may call this machine.
+    """
+
+    def __init__(self, sessions: Sessions, hosts: set[str]) -> None:
+        self._sessions = sessions
+        self._hosts = {"localhost", *(host.lower() for host in hosts)}
+        self._started = time.monotonic()
+        app = web.Application(middlewares=[self._guard])
+        app.add_routes(
+            [
+                web.get("/", self._help),
+                web.get("/session/start", self._session_start),
+                web.get("/session/stop", self._session_stop),
+                web.get("/session/listen", self._session_listen),
+                web.get("/load/{component:.+}", self._load),
+                web.get("/unload/{name}", self._unload),
+                web.get("/describe/{name}", self._describe),
+                web.get("/components", self._components),
+                web.get("/rpath", self._rpath),
+                web.get("/call/{name}/{service}", self._call),
+                web.get("/call/{name}/{service}/{element:.+}", self._call),
+                web.get("/send/{name}/{service}", self._send),
+                web.get("/send/{name}/{service}/{element:.+}", self._send),
+                web.get("/request/status", self._request_status),
+                web.get("/request/result", self._request_result),
+                web.get("/request/wait", self._request_wait),
+                web.get("/request/abort", self._request_abort),
+                web.get("/request/clean", self._request_clean),
+                web.get("/requests", self._requests),
+            ]
+        )
+        self._runner = web.AppRunner(
+            app,
+            access_log=log if log.isEnabledFor(logging.DEBUG) else None,
+            keepalive_timeout=IDLE_SECONDS,
+            max_line_size=MAX_URL,
+        )
+        self._listener: asyncio.AbstractServer | None = None
+
+    async def start(self, host: str, port: int) -> int:
+        """Listen and return the port; OSError where that cannot be."""
+        await self._runner.setup()
+        assert self._runner.server is not None
+        connect = functools.partial(_connect, self._runner.server)
+        self._listener = await asyncio.get_running_loop().create_server(connect, host, port, backlog=512)
+        return int(self._listener.sockets[0].getsockname()[1])
+
+    async def close(self) -> None:
+        """Stop listening, end all sessions and connections."""
+        if self._listener is not None:
+            self._listener.close()
+        await self._sessions.close()
+        if self._runner.server is not None:
+            await self._runner.server.shutdown(LAST_WORDS_SECONDS)
+        await self._runner.cleanup()
+
+    # --- who may ---
+
+    @web.middleware
+    async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+        """Refuse what comes from a web page, and put every error into the client's syntax."""
+        session: Session | None = None
+        try:
+            self._refuse_web_pages(request)
+            _syntax(request)
+            if not request.path.startswith("/session/"):
+                session = self._session(request)
+                session.busy += 1
+            return await handler(request)
+        except ComponentError as problem:
+            return _error(request, problem)
+        except web.HTTPException as problem:
+            what = f"{request.method} {request.path[:200]}: {problem.reason}; see /"
+            return _error(request, ComponentError("::genomix::e_url", what=what), problem.status)
+        except (ConnectionResetError, asyncio.CancelledError):
+            raise
+        except Exception as problem:  # a fault of ours: the log has all, the client a line
+            log.exception("%s", request.path_qs[:500])
+            return _error(request, ComponentError("::genom::unkex", what=f"{type(problem).__name__}: {problem}"[:127]))
+        finally:
+            if session is not None:
+                session.busy -= 1
+                session.touch()
+
+    def _refuse_web_pages(self, request: web.Request) -> None:
+        """A robot obeys programs, and no page that someone happens to look at.
+
+        Pages can make browsers send GETs anywhere. Browsers say so, each in one of these ways at least; and a page
+        cannot reach us under a name of its own (DNS rebinding), as only names of this machine count.
+        """
+        host = _host_name(request.headers.get("Host", ""))
+        if host not in self._hosts and not _is_address(host):
+            raise _forbidden(f"{host[:80]!r} is no name of this server; --host gives it one")
+        for header in ("Origin", "Referer", "Sec-Fetch-Site", "Sec-Fetch-Mode", "Sec-Fetch-Dest"):
+            if header in request.headers:
+                raise _forbidden(f"requests of web pages and browsers are refused ({header})")
+        if request.headers.get("User-Agent", "").startswith("Mozilla/"):
+            raise _forbidden("requests of web browsers are refused (User-Agent)")
+
+    def _session(self, request: web.Request) -> Session:
+        name = request.query.get("s", "")
+        if name and not _SESSION_NAME.fullmatch(name):
+            raise refused("s: a session's name has up to 100 letters, digits and . : @ _ -")
+        return self._sessions.get(name)
+
+    # --- sessions ---
+
+    async def _help(self, request: web.Request) -> web.Response:
+        return _text(_HELP.format(version=__version__))
+
+    async def _session_start(self, request: web.Request) -> web.Response:
+        if not request.query.get("s"):
+            raise refused("s: the session needs a name")
+        return _text(self._session(request).name)
+
+    async def _session_stop(self, request: web.Request) -> web.Response:
+        await self._sessions.stop(request.query.get("s", ""))
+        return _text("")
+
+    async def _session_listen(self, request: web.Request) -> web.StreamResponse:
+        session, form = self._session(request), _syntax(request)
+        queue = session.listen()
+        try:
+            response = web.StreamResponse(headers={"Content-Type": "text/event-stream", **_HEADERS})
+            await response.prepare(request)
+            await response.write(b": genomixd\n\n")
+            while True:
+                try:
+                    event, data = await asyncio.wait_for(queue.get(), HEARTBEAT_SECONDS)
+                except TimeoutError:
+                    await response.write(b":\n\n")
+                    continue
+                if isinstance(data, Request):
+                    data = "".join(_unwrapped(form, data.pieces(form)))
+                elif data:
+                    data = "".join(_unwrapped(form, iter((plain(form, data),))))
+                await response.write(f"event: {event}\ndata: {data}\n\n".encode())
+                if event == "quit":
+                    return response
+        finally:
+            session.leave(queue)
+
+    # --- components ---
+
+    async def _load(self, request: web.Request) -> web.StreamResponse:
+        name = request.query.get("as", "")
+        if name and not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII):
+            raise refused("as: letters, digits and _ only, a letter first")
+        component, instance = request.match_info["component"], request.query.get("i", "")
+        return _small(request, await self._session(request).load(component, instance, name))
+
+    async def _unload(self, request: web.Request) -> web.StreamResponse:
+        await self._session(request).unload(request.match_info["name"])
+        return _small(request, {})
+
+    async def _describe(self, request: web.Request) -> web.StreamResponse:
+        name = request.match_info["name"]
+        return _small(request, (await self._component(request)).describe(name))
+
+    async def _components(self, request: web.Request) -> web.StreamResponse:
+        loaded = self._session(request).components
+        return _small(request, {n: {"component": p.component.name, "instance": p.instance} for n, p in loaded.items()})
+
+    async def _rpath(self, request: web.Request) -> web.StreamResponse:
+        # Components are found on the graph: there are no plugins to look for. Scripts of the original say it anyway.
+        return _small(request, {})
+
+    # --- requests ---
+
+    async def _component(self, request: web.Request) -> Proxy:
+        name = request.match_info["name"]
+        return await self._session(request).component(name, request.query.get("i", ""))
+
+    async def _target(self, request: web.Request) -> tuple[Session, Proxy, str, Any, str]:
+        session, path = self._session(request), request.match_info
+        given = parse_input(request.query.get("input", request.query.get("argv", "")))
+        proxy = await self._component(request)
+        return session, proxy, path["service"], given, path.get("element", request.query.get("element", ""))
+
+    async def _call(self, request: web.Request) -> web.StreamResponse:
+        session, proxy, name, given, element = await self._target(request)
+        return await _stream(request, await session.call(proxy, name, given, element))
+
+    async def _send(self, request: web.Request) -> web.StreamResponse:
+        session, proxy, name, given, element = await self._target(request)
+        oneway = _flag(request, "oneway")
+        sent = session.send(request.match_info["name"], proxy, name, given, element, not oneway)
+        if oneway:
+            return _small(request, {})
+        if _flag(request, "ack"):
+            await sent.acknowledged.wait()
+        return await _status(request, sent)
+
+    def _known(self, request: web.Request) -> Request:
+        return self._session(request).request(request.query.get("id", ""))
+
+    async def _request_status(self, request: web.Request) -> web.StreamResponse:
+        return await _status(request, self._known(request))
+
+    async def _request_result(self, request: web.Request) -> web.StreamResponse:
+        known = self._known(request)
+        if known.error is not None:
+            raise known.error
+        if known.status == "sent":
+            raise ComponentError("::genomix::e_notDone", what=f"{known.id} is not done yet")
+        return await _stream(request, known.value)
+
+    async def _request_wait(self, request: web.Request) -> web.StreamResponse:
+        known = self._known(request)
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(known.finished.wait(), _milliseconds(request) / 1000)
+        return await _status(request, known)
+
+    async def _request_abort(self, request: web.Request) -> web.StreamResponse:
+        known = self._known(request)
+        self._session(request).abort(known.id)
+        return await _status(request, known)
+
+    async def _request_clean(self, request: web.Request) -> web.StreamResponse:
+        self._session(request).clean(request.query.get("id", ""))
+        return _small(request, {})
+
+    async def _requests(self, request: web.Request) -> web.StreamResponse:
+        return _small(request, {r.id: r.status for r in self._session(request).requests.values()})
+
+
+# --- reading ----------------------------------------------------------------------------------------------------
+
+
+def _syntax(request: web.Request) -> Syntax:
+    name = request.query.get("syntax", "json")
+    if name not in SYNTAXES:
+        raise refused(f"syntax: {name[:20]!r} is not one of {', '.join(SYNTAXES)}")
+    return SYNTAXES[name]
+
+
+def _flag(request: web.Request, name: str) -> bool:
+    return request.query.get(name, "0").lower() not in ("0", "false", "no")
+
+
+def _milliseconds(request: web.Request) -> int:
+    text = request.query.get("ms", str(MAX_WAIT_MS))
+    if not re.fullmatch(r"[0-9]{1,9}", text):
+        raise refused(f"ms: {text[:20]!r} is not a number of milliseconds")
+    return min(int(text), MAX_WAIT_MS)
+
+
+def _host_name(header: str) -> str:
+    """The host of a Host header, without port and brackets."""
+    match = re.fullmatch(r"\[([^\]]+)\](:\d*)?|([^:]*)(:\d*)?", header.strip())
+    return (match[1] or match[3] or "").lower().rstrip(".") if match else header.lower()
+
+
+def _is_address(host: str) -> bool:
+    try:
+        ipaddress.ip_address(host)
+    except ValueError:
+        return False
+    return True
+
+
+def _forbidden(what: str) -> ComponentError:
+    return ComponentError("::genomix::e_forbidden", what=what)
+
+
+def own_names() -> set[str]:
+    """What this machine is called by others."""
+    return {socket.gethostname(), socket.getfqdn()}
+
+
+# --- writing ----------------------------------------------------------------------------------------------------
+
+_HEADERS = {
+    "Cache-Control": "no-store",
+    "X-Content-Type-Options": "nosniff",
+    "Cross-Origin-Resource-Policy": "same-origin",
+}
+
+
+def _text(text: str) -> web.Response:
+    return web.Response(text=text, headers=_HEADERS)
+
+
+def _unwrapped(form: Syntax, pieces: Iterator[str]) -> Iterator[str]:
+    """A whole document: in Tcl the outermost braces would make it a list of one."""
+    if form is not TCL:
+        yield from pieces
+        return
+    held = next(pieces)[1:]
+    for piece in pieces:
+        yield held
+        held = piece
+    yield held[:-1]
+
+
+def _respond(request: web.Request, form: Syntax, text: str, status: int = 200) -> web.Response:
+    return web.Response(text=text, status=status, content_type=form.media_type, charset="utf-8", headers=_HEADERS)
+
+
+def _small(request: web.Request, value: Any) -> web.Response:
+    form = _syntax(request)
+    return _respond(request, form, "".join(_unwrapped(form, iter((plain(form, value),)))))
+
+
+def _error(request: web.Request, error: ComponentError, status: int = 0) -> web.Response:
+    form = SYNTAXES.get(request.query.get("syntax", "json"), SYNTAXES["json"])
+    text = "".join(_unwrapped(form, iter((plain(form, error_body(error)),))))
+    return _respond(request, form, text, status or _STATUS.get(error.ex, _COMPONENT_ERROR))
+
+
+async def _status(request: web.Request, known: Request) -> web.StreamResponse:
+    form = _syntax(request)
+    return _respond(request, form, "".join(_unwrapped(form, known.pieces(form))))
+
+
+async def _stream(request: web.Request, value: Value) -> web.StreamResponse:
+    """Send a value, however large, in pieces that are made in another thread as fast as the client takes them."""
+    form = _syntax(request)
+    pieces = _unwrapped(form, value.pieces(form))
+    if value.size <= BATCH // 8:
+        return _respond(request, form, "".join(pieces))
+    response = web.StreamResponse(headers={"Content-Type": f"{form.media_type}; charset=utf-8", **_HEADERS})
+    await response.prepare(request)
+    while batch := await asyncio.to_thread(_batch, pieces):
+        await response.write(batch)
+    await response.write_eof()
+    return response
+
+
+def _batch(pieces: Iterator[str]) -> bytes:
+    parts: list[str] = []
+    size = 0
+    for piece in pieces:
+        parts.append(piece)
+        size += len(piece)
+        if size >= BATCH:
+            break
+    return "".join(parts).encode()
+
+
+def _connect(server: web.Server) -> asyncio.Protocol:
+    return server() if len(server.connections) < MAX_CONNECTIONS else _Full()
+
+
+class _Full(asyncio.Protocol):
+    """A connection too many."""
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        assert isinstance(transport, asyncio.Transport)
+        body = plain(SYNTAXES["json"], error_body(too_many(f"{MAX_CONNECTIONS} clients are connected"))).encode()
+        head = f"HTTP/1.1 503 Service Unavailable\r\nConnection: close\r\nContent-Length: {len(body)}\r\n\r\n"
+        transport.write(head.encode() + body)
+        transport.close()

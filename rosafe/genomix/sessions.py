@@ -1,0 +1,359 @@
+"""Clients and what they asked for: sessions with their components, requests with their results, and events."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import logging
+from collections.abc import Awaitable, Callable, Iterator
+from typing import Any, TypeVar
+
+from rosafe.genomix.graph import Graph
+from rosafe.genomix.proxy import NOTHING, Proxy, Value
+from rosafe.genomix.syntax import Syntax, plain
+from rosafe.genomix.values import complete
+from rosafe.interface import ComponentError
+
+MAX_SESSIONS = 1000
+MAX_REQUESTS = 1000  # kept per session
+MAX_LISTENERS = 8  # per session
+MAX_EVENTS = 10_000  # waiting for one listener
+MAX_KEPT = 512 * 2**20  # bytes of results kept per session
+MAX_COMPONENTS = 64  # per session
+IDLE_SECONDS = 600.0  # a session without a listener ends so long after its last request
+LINGER_SECONDS = 10.0  # a session that lost its last listener ends so long after
+SWEEP_SECONDS = 1.0
+ORDER_SECONDS = 5.0  # the next request of a session waits at most so long for the one before to be acknowledged
+EVENT_BYTES = 65_536  # larger results are not part of events and of the status
+
+log = logging.getLogger("genomixd")
+T = TypeVar("T")
+
+
+class Request:
+    """One request that a client follows by its id. `status` is ``sent``, ``done`` or ``error``."""
+
+    def __init__(self, number: str) -> None:
+        self.id = number
+        self.status = "sent"
+        self.value: Value = NOTHING
+        self.error: ComponentError | None = None
+        self.acknowledged = asyncio.Event()
+        self.finished = asyncio.Event()
+        self.abort: Callable[[], None] | None = None
+        self.task: asyncio.Task[None] | None = None
+
+    def finish(self, value: Value, error: ComponentError | None) -> None:
+        """Record the end."""
+        self.value, self.error = value, error
+        self.status = "done" if error is None else "error"
+        self.acknowledged.set()
+        self.finished.set()
+
+    def pieces(self, form: Syntax) -> Iterator[str]:
+        """The status as text: id, status, and output or exception once there is one."""
+        yield form.open("struct")
+        yield form.key(0, "id") + form.string(self.id) + form.key(1, "status") + form.string(self.status)
+        if self.error is not None:
+            yield form.key(2, "exception") + plain(form, error_body(self.error))
+        elif self.status == "done" and self.value.size <= EVENT_BYTES:
+            yield form.key(2, "output")
+            yield from self.value.pieces(form)
+        elif self.status == "done":
+            yield form.key(2, "large") + str(self.value.size)
+        yield form.close("struct")
+
+
+def error_body(error: ComponentError) -> dict[str, Any]:
+    """An exception as clients get it."""
+    return {"ex": error.ex, **({"detail": error.detail} if error.detail else {})}
+
+
+class Session:
+    """One client: the components it loaded, its requests, and those who listen to its events.
+
+    The requests of a session that has a name go out in order: each once the one before is acknowledged, so that
+    a script may ask for a processor and for its child in one breath. Those without a name share one session and wait
+    for nobody.
+    """
+
+    def __init__(self, name: str, sessions: Sessions) -> None:
+        self.name = name
+        self.components: dict[str, Proxy] = {}
+        self.requests: dict[str, Request] = {}
+        self.listeners: list[asyncio.Queue[tuple[str, Any]]] = []
+        self.busy = 0  # HTTP requests under way
+        self.ends_at = 0.0
+        self._listened = False
+        self._sessions = sessions
+        self._turn = asyncio.Lock()
+        self.touch()
+
+    # --- life ---
+
+    def touch(self) -> None:
+        """Something happened: the session lives on for a while."""
+        linger = LINGER_SECONDS if self._listened else IDLE_SECONDS
+        self.ends_at = asyncio.get_running_loop().time() + linger
+
+    @property
+    def over(self) -> bool:
+        """Whether its client is gone, as far as one can tell."""
+        return not self.busy and not self.listeners and asyncio.get_running_loop().time() > self.ends_at
+
+    def listen(self) -> asyncio.Queue[tuple[str, Any]]:
+        """A queue of all events from now on: (name, request or text)."""
+        if len(self.listeners) >= MAX_LISTENERS:
+            raise too_many(f"a session has at most {MAX_LISTENERS} listeners")
+        queue: asyncio.Queue[tuple[str, Any]] = asyncio.Queue()
+        self.listeners.append(queue)
+        self._listened = True
+        return queue
+
+    def leave(self, queue: asyncio.Queue[tuple[str, Any]]) -> None:
+        """A listener is gone."""
+        if queue in self.listeners:
+            self.listeners.remove(queue)
+        self.touch()
+
+    def tell(self, event: str, data: Any) -> None:
+        """Put an event into the queues of all listeners."""
+        for queue in self.listeners[:]:
+            if queue.qsize() < MAX_EVENTS:
+                queue.put_nowait((event, data))
+            else:  # a client that does not read any more
+                self.listeners.remove(queue)
+                queue.put_nowait(("quit", ""))
+
+    async def close(self) -> None:
+        """End the session. Activities that it began go on."""
+        self.tell("quit", "")
+        for request in self.requests.values():
+            if request.task is not None:
+                request.task.cancel()
+        for name in list(self.components):
+            await self.unload(name)
+
+    # --- components ---
+
+    async def load(self, component: str, instance: str, name: str) -> dict[str, Any]:
+        """Load a component, under `name` if given, and describe it."""
+        proxy = await self._sessions.proxy(component, instance)
+        name = name or proxy.instance
+        old = self.components.get(name)
+        if old is None and len(self.components) >= MAX_COMPONENTS:
+            raise too_many(f"a session loads at most {MAX_COMPONENTS} components")
+        self.components[name] = proxy
+        return proxy.describe(name)
+
+    async def unload(self, name: str) -> None:
+        """Forget a component."""
+        try:
+            del self.components[name]
+        except KeyError:
+            raise ComponentError("::genomix::e_load", what=f"{name[:80]!r} is not loaded") from None
+        self.tell("unload", {"component": name})
+        await self._sessions.release()
+
+    async def component(self, name: str, instance: str) -> Proxy:
+        """The component loaded under `name`; `instance`, or the one of that name, is loaded if need be."""
+        if name not in self.components:
+            await self.load(instance or name, instance, name)
+        return self.components[name]
+
+    # --- requests ---
+
+    async def call(self, proxy: Proxy, name: str, given: Any, element: str) -> Value:
+        """Make a request, or read a port, and wait for what it returns."""
+        port = proxy.port(name)
+        if port is not None:
+            return await proxy.read(port, element)
+        service = proxy.service(name)
+        values = complete(service, given)
+        return await self._in_turn(lambda _: proxy.call(service, values))
+
+    def send(self, component: str, proxy: Proxy, name: str, given: Any, element: str, keep: bool) -> Request:
+        """Make a request that the client follows by its id, unless it does not want to `keep` it."""
+        port = proxy.port(name)
+        request = Request(f"{component}::{next(self._sessions.numbers)}")
+        if port is not None:
+            work = self._reading(request, proxy, port, element)
+        else:
+            service = proxy.service(name)
+            values = complete(service, given)
+            steps = self._activity if service.activity else self._function
+            work = self._in_turn(lambda turn: steps(request, proxy, service, values, turn))
+        if keep:
+            self._make_room()
+            self.requests[request.id] = request
+        request.task = asyncio.create_task(self._follow(request, work))
+        self._sessions.keep(request.task)
+        return request
+
+    async def _follow(self, request: Request, work: Awaitable[Value]) -> None:
+        value, error = NOTHING, None
+        try:
+            value = await work
+        except ComponentError as problem:
+            error = problem
+        except Exception as problem:  # a fault of ours must not leave the client waiting
+            log.exception("request %s", request.id)
+            error = ComponentError("::genom::unkex", what=f"{type(problem).__name__}: {problem}"[:127])
+        request.finish(value, error)
+        if request.id in self.requests:
+            self.tell("request", request)
+            self._drop_large()
+
+    async def _reading(self, request: Request, proxy: Proxy, port: Any, element: str) -> Value:
+        return await proxy.read(port, element)
+
+    async def _function(self, request: Request, proxy: Proxy, service: Any, values: Any, turn: _Turn) -> Value:
+        return await proxy.call(service, values)
+
+    async def _activity(self, request: Request, proxy: Proxy, service: Any, values: Any, turn: _Turn) -> Value:
+        goal = await proxy.start(service, values)
+        try:
+            request.abort = goal.cancel
+            await goal.acknowledged.wait()
+            request.acknowledged.set()
+            turn.over()
+            if not goal.ended.is_set():
+                self.tell("request", request)
+            await goal.ended.wait()
+        finally:
+            goal.forget()
+        if goal.error is not None:
+            raise goal.error
+        return NOTHING
+
+    async def _in_turn(self, work: Callable[[_Turn], Awaitable[T]]) -> T:
+        turn = _Turn()
+        if self.name:
+            await self._turn.acquire()
+            turn = _Turn(self._turn)
+        try:
+            return await work(turn)
+        finally:
+            turn.over()
+
+    def request(self, number: str) -> Request:
+        """The request of that id."""
+        try:
+            return self.requests[number]
+        except KeyError:
+            raise ComponentError("::genomix::e_noSuchRequest", what=f"no request {number[:80]!r}") from None
+
+    def abort(self, number: str) -> None:
+        """Ask an activity to end; ``::genom::syserr`` (EAGAIN) while it is not in the component's hands."""
+        request = self.request(number)
+        if request.finished.is_set():
+            return
+        if request.abort is None:
+            raise ComponentError("::genom::syserr", code=11)
+        request.abort()
+
+    def clean(self, number: str) -> None:
+        """Forget a request; what it started goes on."""
+        request = self.request(number)
+        del self.requests[number]
+        if request.task is not None:
+            request.task.cancel()
+
+    def _make_room(self) -> None:
+        while len(self.requests) >= MAX_REQUESTS:
+            oldest = next((r.id for r in self.requests.values() if r.finished.is_set()), None)
+            if oldest is None:
+                raise too_many(f"a session has at most {MAX_REQUESTS} requests under way")
+            del self.requests[oldest]
+
+    def _drop_large(self) -> None:
+        """Forget the oldest large results where all together are too large."""
+        large = [(r, r.value.size) for r in self.requests.values() if r.value is not NOTHING]
+        excess = sum(size for _, size in large) - MAX_KEPT
+        for request, size in large[:-1]:
+            if excess <= 0:
+                return
+            del self.requests[request.id]
+            excess -= size
+
+
+class _Turn:
+    """A session's right to send, given back once; after a while by itself."""
+
+    def __init__(self, lock: asyncio.Lock | None = None) -> None:
+        self._lock = lock
+        self._timer = asyncio.get_running_loop().call_later(ORDER_SECONDS, self.over) if lock is not None else None
+
+    def over(self) -> None:
+        if self._lock is not None:
+            self._lock.release()
+            self._lock = None
+        if self._timer is not None:
+            self._timer.cancel()
+
+
+def too_many(what: str) -> ComponentError:
+    """The error of a bound that is reached."""
+    return ComponentError("::genomix::e_tooMany", what=what)
+
+
+class Sessions:
+    """All sessions, and the components that they share."""
+
+    def __init__(self, graph: Graph) -> None:
+        self.graph = graph
+        self.numbers = itertools.count(1)
+        self._sessions: dict[str, Session] = {}
+        self._proxies: dict[str, Proxy] = {}
+        self._tasks: set[asyncio.Task[Any]] = set()
+        self.keep(asyncio.create_task(self._sweep()))
+
+    def keep(self, task: asyncio.Task[Any]) -> None:
+        """Hold a task until it is done; asyncio does not."""
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    def get(self, name: str) -> Session:
+        """The session `name`, new if need be."""
+        if name not in self._sessions:
+            if len(self._sessions) >= MAX_SESSIONS:
+                raise too_many(f"{MAX_SESSIONS} sessions are open")
+            self._sessions[name] = Session(name, self)
+        return self._sessions[name]
+
+    async def stop(self, name: str) -> None:
+        """End the session `name`; an unknown one has ended already."""
+        session = self._sessions.pop(name, None)
+        if session is not None:
+            await session.close()
+
+    async def proxy(self, component: str, instance: str) -> Proxy:
+        """The proxy of a component that runs; the one that is in use, if there is one for the instance."""
+        fresh = await Proxy.load(self.graph, component, instance)
+        used = self._proxies.get(fresh.instance)
+        if used is None or used.component is not fresh.component:
+            self._proxies[fresh.instance] = fresh
+        return self._proxies[fresh.instance]
+
+    async def release(self) -> None:
+        """Close the proxies that no session has loaded any more."""
+        used = {proxy for session in self._sessions.values() for proxy in session.components.values()}
+        for instance, proxy in list(self._proxies.items()):
+            if proxy not in used:  # those of sessions that are just loading are made again if need be
+                del self._proxies[instance]
+                await proxy.close()
+
+    async def close(self) -> None:
+        """End all sessions."""
+        for name in list(self._sessions):
+            await self.stop(name)
+        for task in list(self._tasks):
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+
+    async def _sweep(self) -> None:
+        while True:
+            await asyncio.sleep(SWEEP_SECONDS)
+            for name, session in list(self._sessions.items()):
+                if session.over:
+                    await self.stop(name)

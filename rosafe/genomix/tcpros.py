@@ -1,0 +1,266 @@
+"""ROS' TCP protocol as coroutines: service calls on kept connections, and the newest message of a latched topic.
+
+rospy's own clients block a thread for as long as a component does not answer; these have time limits, can be
+cancelled, and serve hundreds of callers from one thread.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import importlib
+import io
+import json
+import socket
+import struct
+from collections.abc import Mapping
+from typing import Any
+
+import rosgraph.network
+
+from rosafe.genomix.graph import Graph, Unknown, middleware_error
+from rosafe.interface import ComponentError
+from rosafe.ros import wire
+
+CONNECT_SECONDS = 3.0
+IDLE_CONNECTIONS = 4  # kept per service
+MAX_MESSAGE = 2**30  # bytes
+SAMPLE_SECONDS = 0.3  # a latched message comes at once; where none comes there is none yet
+MESSAGE_SECONDS = 30.0  # for the rest of it
+READ_BUFFER = 2**20
+
+_LENGTH = struct.Struct("<I")
+
+
+class Refused(Exception):
+    """The other side answered the connection with an error; the text is its own."""
+
+
+class Connection:
+    """One TCPROS connection after the exchange of headers."""
+
+    def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, header: Mapping[str, str]) -> None:
+        self._reader = reader
+        self._writer = writer
+        self.header = header
+
+    @classmethod
+    async def open(cls, address: tuple[str, int], header: Mapping[str, str]) -> Connection:
+        """Connect and exchange headers; OSError, Refused or asyncio.TimeoutError."""
+
+        async def attempt() -> Connection:
+            reader, writer = await asyncio.open_connection(*address, limit=READ_BUFFER)
+            try:
+                _keep_alive(writer.get_extra_info("socket"))
+                writer.write(rosgraph.network.encode_ros_handshake_header(header))
+                answer = await _read_frame(reader)
+                fields = rosgraph.network.decode_ros_handshake_header(_LENGTH.pack(len(answer)) + answer)
+                if "error" in fields:
+                    raise Refused(fields["error"])
+            except BaseException:
+                writer.close()
+                raise
+            return cls(reader, writer, fields)
+
+        try:
+            return await asyncio.wait_for(attempt(), CONNECT_SECONDS)
+        except (asyncio.IncompleteReadError, rosgraph.network.ROSHandshakeException) as problem:
+            raise Refused(f"no ROS node: {problem}") from None
+
+    @property
+    def open_still(self) -> bool:
+        """Whether the other side has neither closed nor sent anything unasked."""
+        return not (self._writer.is_closing() or self._reader.at_eof())
+
+    async def closed(self) -> None:
+        """Wait until the other side closes the connection."""
+        try:
+            while await self._reader.read(READ_BUFFER):
+                continue
+        except OSError:
+            return
+
+    def close(self) -> None:
+        self._writer.close()
+
+    async def request(self, payload: bytes) -> bytearray:
+        """One service call; Refused with the text of an answer that is an error."""
+        self._writer.write(_LENGTH.pack(len(payload)) + payload)
+        good = await self._reader.readexactly(1)
+        answer = await _read_frame(self._reader)
+        if good != b"\1":
+            raise Refused(answer.decode("utf-8", "replace"))
+        return answer
+
+    async def message(self) -> bytearray | None:
+        """The latched message of a topic; None where it has none yet."""
+        try:
+            length = await asyncio.wait_for(self._reader.readexactly(4), SAMPLE_SECONDS)
+        except TimeoutError:
+            return None
+        return await asyncio.wait_for(_read_body(self._reader, length), MESSAGE_SECONDS)
+
+
+def _keep_alive(sock: socket.socket) -> None:
+    """Notice within half a minute that the other host is gone without a word."""
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 15)
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, 5)
+    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, 3)
+
+
+async def _read_frame(reader: asyncio.StreamReader) -> bytearray:
+    """A length and as many bytes, read into one piece of memory without copies of the whole."""
+    return await _read_body(reader, await reader.readexactly(4))
+
+
+async def _read_body(reader: asyncio.StreamReader, prefix: bytes) -> bytearray:
+    (length,) = _LENGTH.unpack(prefix)
+    if length > MAX_MESSAGE:
+        raise Refused(f"a message of {length} bytes is more than genomixd takes")
+    frame = bytearray(length)
+    at = 0
+    while at < length:
+        part = await reader.read(length - at)
+        if not part:
+            raise asyncio.IncompleteReadError(bytes(frame[:at][:64]), length)
+        frame[at : at + len(part)] = part
+        at += len(part)
+    return frame
+
+
+# --- services ---------------------------------------------------------------------------------------------------
+
+
+class ServiceClient:
+    """Calls one service of one component instance, on connections that are kept."""
+
+    def __init__(self, graph: Graph, package: str, instance: str, service: str) -> None:
+        self._graph = graph
+        self._instance = instance
+        self.name = f"/{instance}/{service}"
+        definition = getattr(importlib.import_module(f"{package}.srv"), service)
+        self._request_class = getattr(importlib.import_module(f"{package}.srv"), f"{service}Request")
+        self._response_class = wire.response_class(package, service)
+        self._header = {
+            "service": self.name,
+            "md5sum": definition._md5sum,
+            "type": definition._type,
+            "callerid": graph.name,
+            "persistent": "1",
+        }
+        self._idle: list[Connection] = []
+
+    async def connect(self) -> Connection:
+        """A connection to the service; ComponentError where the component cannot be reached."""
+        while self._idle:
+            connection = self._idle.pop()
+            if connection.open_still:
+                return connection
+            connection.close()
+        try:
+            return await Connection.open(await self._graph.service_address(self.name), self._header)
+        except Unknown:
+            raise middleware_error(f"{self._instance} is not running: nobody serves {self.name}") from None
+        except Refused as problem:
+            raise middleware_error(f"{self.name}: {problem}") from None
+        except TimeoutError:
+            raise middleware_error(f"{self._instance} does not answer: no connection to {self.name}") from None
+        except OSError as problem:
+            raise middleware_error(
+                f"{self._instance} is not running any more, though the master still lists it ({problem.strerror})"
+            ) from None
+
+    def keep(self, connection: Connection) -> None:
+        """Take back a connection that is fit for another call."""
+        if connection.open_still and len(self._idle) < IDLE_CONNECTIONS:
+            self._idle.append(connection)
+        else:
+            connection.close()
+
+    async def call(self, values: Mapping[str, Any], timeout: float) -> Any:
+        """The response, with arrays in it, to a request made of `values`.
+
+        Raises ComponentError: the component's own exception, or ``::genom::mwerr`` where none came.
+        """
+        buffer = io.BytesIO()
+        self._request_class(**values).serialize(buffer)
+        connection = await self.connect()
+        try:
+            answer = await asyncio.wait_for(connection.request(buffer.getvalue()), timeout)
+        except BaseException as problem:
+            connection.close()
+            raise self._failure(problem, timeout) from None
+        self.keep(connection)
+        return self._response_class().deserialize(answer)
+
+    def _failure(self, problem: BaseException, timeout: float) -> BaseException:
+        if isinstance(problem, asyncio.TimeoutError):
+            return middleware_error(f"{self._instance} did not answer {self.name} within {timeout:g} s")
+        if isinstance(problem, Refused):
+            return middleware_error(f"{self.name}: {problem}")
+        if isinstance(problem, (asyncio.IncompleteReadError, OSError)):
+            return middleware_error(f"{self._instance} ended before it answered {self.name}")
+        return problem
+
+    def close(self) -> None:
+        for connection in self._idle:
+            connection.close()
+        self._idle.clear()
+
+
+# --- topics -----------------------------------------------------------------------------------------------------
+
+
+class TopicReader:
+    """Reads the newest message of latched topics of one type of message."""
+
+    def __init__(self, graph: Graph, instance: str, message_class: Any) -> None:
+        self._graph = graph
+        self._node = f"/{instance}"
+        self._class = message_class
+        self._address: tuple[str, int] | None = None  # one node gives out all its topics at one address
+
+    async def read(self, topic: str) -> Any:
+        """The message, None where the topic has none yet, or Unknown where the component has no such topic."""
+        if self._address is not None:
+            try:
+                return await self._read(self._address, topic)
+            except (TimeoutError, Refused, OSError, asyncio.IncompleteReadError):
+                self._address = None  # restarted, or the topic is gone
+        try:
+            self._address = await self._graph.topic_address(topic, self._node)
+            return await self._read(self._address, topic)
+        except Refused as problem:
+            raise middleware_error(f"{topic}: {problem}") from None
+        except (TimeoutError, OSError, asyncio.IncompleteReadError) as problem:
+            why = type(problem).__name__
+            raise middleware_error(f"{self._node[1:]} does not give out {topic} any more ({why})") from None
+
+    async def _read(self, address: tuple[str, int], topic: str) -> Any:
+        header = {
+            "topic": topic,
+            "type": self._class._type,
+            "md5sum": self._class._md5sum,
+            "callerid": self._graph.name,
+            "tcp_nodelay": "1",
+            "message_definition": self._class._full_text,
+        }
+        connection = await Connection.open(address, header)
+        try:
+            data = await connection.message()
+        finally:
+            connection.close()
+        return None if data is None else self._class().deserialize(data)
+
+
+def component_exception(exdetail: str) -> ComponentError:
+    """The exception that a component's `genom_exdetail` names."""
+    try:
+        body = json.loads(exdetail)
+    except ValueError:
+        body = exdetail
+    if isinstance(body, dict) and isinstance(body.get("ex"), str):
+        detail = body.get("detail")
+        return ComponentError(body["ex"], **(detail if isinstance(detail, dict) else {}))
+    return ComponentError("::genom::unkex", what=str(body)[:127])

@@ -1,0 +1,129 @@
+"""What clients send as arguments, checked and converted by the interface table before anything goes to a component."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+from collections.abc import Mapping
+from typing import Any
+
+from rosafe.interface import REQUIRED, ComponentError, Parameter, Service
+
+_WORDS = {
+    **dict.fromkeys(("1", "true", "yes", "on", "t"), True),
+    **dict.fromkeys(("0", "false", "no", "off", "f"), False),
+}
+_WHOLE = re.compile(r"[+-]?[0-9]{1,30}")
+
+
+def refused(what: str) -> ComponentError:
+    """The error of an argument that is not sent at all."""
+    return ComponentError("::genom::serialization", what=what)
+
+
+def parse_input(text: str) -> Any:
+    """The JSON value `text`, or the error that says why it is none; nothing stands for no arguments."""
+    if not text.strip():
+        return {}
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as problem:
+        raise refused(f"input is not JSON: {problem}") from None
+
+
+def complete(service: Service, given: Any) -> dict[str, Any]:
+    """All arguments of `service`: those `given`, checked, and the defaults of the others.
+
+    Parameters
+    ----------
+    service : Service
+    given : mapping or sequence
+        By name (aliases count, any order), or by position in the order of declaration. The numbers and booleans of
+        clients without types may be texts.
+
+    Returns
+    -------
+    dict
+        Values by the parameters' own names, of the right Python types. Ranges are the component's business.
+
+    Raises
+    ------
+    ComponentError
+        ``::genom::serialization`` whose `what` names the argument and says what is allowed.
+    """
+    values = {}
+    for name, value in _named(service, given):
+        parameter = _parameter(service, name)
+        if parameter.name in values:
+            raise refused(f"{service.name}: {parameter.name} is given twice")
+        values[parameter.name] = _convert(service, parameter, value)
+    missing = [p.name for p in service.parameters if p.default is REQUIRED and p.name not in values]
+    if missing:
+        raise refused(f"{service.name}: {missing[0]} is missing; {expected(service)}")
+    return {p.name: values.get(p.name, p.default) for p in service.parameters}
+
+
+def expected(service: Service) -> str:
+    """One line with the names and types of the parameters."""
+    if not service.parameters:
+        return f"{service.name} takes no parameters"
+    return f"{service.name} takes " + ", ".join(f"{p.name} ({p.idl})" for p in service.parameters)
+
+
+def _named(service: Service, given: Any) -> list[tuple[str, Any]]:
+    if isinstance(given, Mapping):
+        return list(given.items())
+    if isinstance(given, (list, tuple)):
+        if len(given) > len(service.parameters):
+            raise refused(f"{len(given)} arguments are too many; {expected(service)}")
+        return [(p.name, value) for p, value in zip(service.parameters, given, strict=False)]
+    raise refused(f"input is neither an object nor an array; {expected(service)}")
+
+
+def _parameter(service: Service, name: str) -> Parameter:
+    try:
+        return service.parameter(name)
+    except KeyError:
+        raise refused(f"unknown parameter {name[:80]!r}; {expected(service)}") from None
+
+
+def _convert(service: Service, parameter: Parameter, value: Any) -> Any:
+    unbounded = dataclasses.replace(parameter, minimum=None, maximum=None)
+    try:
+        return unbounded.check(_typed(parameter.idl, value))
+    except ValueError as problem:
+        allowed = f"; {parameter.range_text}" if parameter.range_text else ""
+        raise refused(f"{service.name}: {problem} ({parameter.name} is a {parameter.idl}{allowed})") from None
+
+
+def _typed(idl: str, value: Any) -> Any:
+    """`value` with texts turned into numbers and booleans, where the type asks for those and the text is one."""
+    if idl.startswith("sequence<"):
+        element = idl[len("sequence<") : -1]
+        if isinstance(value, Mapping):
+            value = _by_index(value)
+        if isinstance(value, list):
+            return [_typed(element, item) for item in value]
+        if value == "":
+            return []
+        return [_typed(element, value)] if isinstance(value, str) else value
+    if idl == "string" or not isinstance(value, str):
+        return value
+    text = value.strip()
+    if idl == "boolean":
+        return _WORDS.get(text.lower(), value)
+    if _WHOLE.fullmatch(text):
+        return int(text)
+    try:
+        return float(text) if "_" not in text else value
+    except ValueError:
+        return value
+
+
+def _by_index(items: Mapping[str, Any]) -> list[Any]:
+    """``{"0": a, "1": b}`` as a list; ValueError where the keys are not the indexes from 0 on."""
+    wanted = [str(i) for i in range(len(items))]
+    if sorted(items) != sorted(wanted):
+        raise ValueError("the keys of a sequence given as an object are its indexes, from 0 on")
+    return [items[i] for i in wanted]

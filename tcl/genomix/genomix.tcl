@@ -1,0 +1,95 @@
+# The Tcl package genomix: uses components of the ROS graph (rosAFE, bass) through the HTTP server genomixd.
+#
+#   package require genomix
+#   set g [genomix::connect]                  ;# or genomix::connect host:port, or genomix::localhost
+#   $g load rosAFE
+#   rosAFE::GammatoneProc {name left fb_nChannels 32}
+#   puts [rosAFE::getParameters]
+#   set request [rosAFE::getSignals &]; $request wait; puts [$request result]
+#   rosAFE::GammatoneProc -h                  ;# tells parameters, types, defaults and ranges
+#
+# Errors: the message is a dict `ex ::rosAFE::e_noSuchProcessor ?detail {...}?`, the error code {GENOM ex detail}.
+# What comes from the server is data; none of it is ever evaluated.
+
+package require Tcl 8.6
+
+namespace eval ::genomix {
+    namespace export connect localhost
+
+    variable root [file dirname [file normalize [info script]]]
+    variable clients 0 ;# made so far; handles are genomix1, genomix2, ...
+    variable requests 0 ;# in the background, made so far; their commands are ::genomix::request1, ...
+    variable private {} ;# the server that localhost started: {channel port}
+}
+
+# genomix::connect ?host?:port??
+#
+# Connect to a genomixd, by default that on localhost:8080, and return a handle: a command with the methods
+# load, unload, rpath and destroy.
+proc ::genomix::connect {{address localhost:8080}} {
+    variable clients
+    if {![regexp {^(\[[^]]+\]|[^:]*)(:(\d+))?$} $address -> host - port]} {
+        ::genomix::Refuse "address \"$address\" is not host, host:port or :port"
+    }
+    set host [string trim $host {[]}]
+    set client [::genomix::Client create ::genomix[incr clients] \
+        [expr {$host in {"" localhost} ? "127.0.0.1" : $host}] [expr {$port eq "" ? 8080 : $port}]]
+    return [namespace tail $client]
+}
+
+# genomix::localhost
+#
+# The same with a server of our own, on a free port, that ends with this process.
+proc ::genomix::localhost {} {
+    variable private
+    if {$private eq {} || [eof [lindex $private 0]]} {
+        set private [::genomix::StartServer]
+    }
+    return [::genomix::connect 127.0.0.1:[lindex $private 1]]
+}
+
+proc ::genomix::StartServer {} {
+    variable root
+    # In a checkout beside the package; where catkin installed us, in bin/; else wherever PATH has it.
+    set program [lindex [auto_execok genomixd] 0]
+    foreach place {../../scripts ../../../bin ../../bin} {
+        set candidate [file normalize [file join $root $place genomixd]]
+        if {[file executable $candidate]} {
+            set program $candidate
+            break
+        }
+    }
+    if {$program eq ""} {
+        ::genomix::Refuse "genomixd is not on PATH" ::genom::mwerr
+    }
+    set channel [open [list | $program -p 0 --until-eof 2>@stderr] r+]
+    if {[gets $channel port] < 0 || ![string is digit -strict $port]} {
+        catch {close $channel}
+        ::genomix::Refuse "cannot start $program" ::genom::mwerr
+    }
+    # Non-blocking, so that the end of this process does not wait for that of the server.
+    fconfigure $channel -blocking 0
+    return [list $channel $port]
+}
+
+# Raise the error of a component or of the server; body is a dict ex ... ?detail {...}?.
+proc ::genomix::Raise {body} {
+    set detail {}
+    if {[dict exists $body detail]} {
+        set detail [dict get $body detail]
+    }
+    return -code error -level 2 -errorcode [list GENOM [dict get $body ex] $detail] $body
+}
+
+# Raise the error of something that was not even sent.
+proc ::genomix::Refuse {what {ex ::genom::serialization}} {
+    set detail [dict create what $what]
+    return -code error -level 2 -errorcode [list GENOM $ex $detail] [dict create ex $ex detail $detail]
+}
+
+foreach part {http client request command arguments help} {
+    source -encoding utf-8 [file join $::genomix::root $part.tcl]
+}
+unset part
+
+package provide genomix 1.8
