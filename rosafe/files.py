@@ -1,0 +1,198 @@
+"""`process_file`: a sound file of any length to an .npz, in memory that does not grow with it."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import json
+import os
+import stat
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rosafe.audiofile import AudioFile, AudioFileError
+from rosafe.chain import Chain, check_outputs, check_parameters
+from rosafe.npz import NpzWriter
+from rosafe.offline import DEFAULT_BLOCK
+from rosafe.tree.zone import Block
+
+PART = ".part"  # what the name of an unfinished output ends with
+
+
+class OutputError(Exception):
+    """The output cannot be written; the text is one line that says why."""
+
+
+def process_file(
+    source: str | Path,
+    target: str | Path,
+    parameters: Mapping[str, Any] | None = None,
+    block_frames: int = DEFAULT_BLOCK,
+    outputs: Sequence[str] | None = None,
+    replace: bool = False,
+    progress: Callable[[int, int], None] = lambda done, frames: None,
+) -> tuple[float, int]:
+    """Compute the auditory representations of a sound file, block by block, as they come into an .npz.
+
+    The numbers are those of `rosafe.process` on the file's int32 samples, and of the node on the same samples and
+    blocks, bit for bit. The .npz holds what that returns, and `sample_rate` (Hz), `block_frames` and `parameters` (all
+    values in force, as a JSON object). Nothing of the name `target` is there before it is complete.
+
+    Parameters
+    ----------
+    source : path
+        Sound file of two channels, left and right ear.
+    target : path
+        The .npz; where it exists it is left alone, unless `replace`.
+    parameters, outputs
+        As of `rosafe.process`; `in_doNormalize` is True by default.
+    block_frames : int
+        Frames that are read and processed at a time.
+    progress : callable
+        Called now and then with the frames that are done and those that there are. What it raises ends the work.
+
+    Returns
+    -------
+    tuple
+        Seconds of sound and bytes of output.
+
+    Raises
+    ------
+    AudioFileError
+        The file cannot be read, or has not two channels.
+    ValueError
+        Parameters or outputs that cannot be, for this file's sample rate or at all.
+    OutputError
+        The output is there already, or there is no room for it, or it cannot be written.
+    """
+    values, wanted = check_parameters(parameters), check_outputs(outputs)
+    file = AudioFile(source)
+    try:
+        path = _target(file.path, target, replace)
+        if file.channels != 2:
+            kind = "is mono (one channel)" if file.channels == 1 else f"has {file.channels} channels"
+            raise AudioFileError(f"{file.path} {kind}; wanted are two: left and right ear")
+        try:
+            with _new_file(path, replace) as descriptor:
+                return _stream(file, descriptor, values, block_frames, wanted, progress)
+        except OSError as problem:
+            raise OutputError(f"cannot write {path}: {problem.strerror or problem}") from problem
+    finally:
+        file.close()
+
+
+def _stream(
+    file: AudioFile,
+    descriptor: int,
+    values: Mapping[str, Any],
+    block_frames: int,
+    wanted: list[str],
+    progress: Callable[[int, int], None],
+) -> tuple[float, int]:
+    done = dict.fromkeys(wanted, 0)
+    telling = threading.Lock()
+
+    def keep(kind: str, block: Block) -> None:
+        writer.append(kind, block.data)
+        with telling:
+            done[kind] = block.next_index
+            progress(min(done.values()), file.frames)
+
+    with Chain(_blocks(file, block_frames), file.sample_rate, values, wanted, keep) as chain:
+        writer = NpzWriter(
+            descriptor,
+            {
+                "sample_rate": file.sample_rate,
+                "block_frames": block_frames,
+                "parameters": json.dumps(chain.parameters()),
+                **chain.describe(),
+            },
+            {kind: chain.shape(kind, file.frames) for kind in wanted},
+        )
+        _check_room(descriptor, writer.size)
+        chain.run()
+        writer.finish()
+    return file.frames / file.sample_rate, os.fstat(descriptor).st_size
+
+
+def _blocks(file: AudioFile, block_frames: int) -> Iterator[np.ndarray]:
+    for at in range(0, file.frames, block_frames):
+        wanted = min(block_frames, file.frames - at)
+        block = file.read(wanted)
+        if block.shape[1] != wanted:
+            raise AudioFileError(f"{file.path} is cut off: {at + block.shape[1]} of {file.frames} frames are there")
+        yield block
+
+
+# --- the output -------------------------------------------------------------------------------------------------
+
+
+def _target(source: Path, target: str | Path, replace: bool) -> Path:
+    """Where the output goes, links followed: to a new file, or in the place of a file that may be replaced."""
+    path = Path(os.path.realpath(target))
+    try:
+        found = path.stat()
+    except FileNotFoundError:
+        return path
+    except OSError as problem:
+        raise OutputError(f"cannot write {target}: {problem.strerror}") from None
+    if not stat.S_ISREG(found.st_mode):
+        raise OutputError(f"{target} is not a regular file")
+    if os.path.samefile(source, path):
+        raise OutputError(f"{target} is the input itself")
+    if not replace:
+        raise OutputError(f"{target} is there already; --force replaces it")
+    return path
+
+
+@contextmanager
+def _new_file(path: Path, replace: bool) -> Iterator[int]:
+    """A descriptor of an empty file that takes the place `path` if all goes well, and else is gone.
+
+    Its name until then is always the same, and it is locked: two at once for one place notice each other, and what
+    a killed process has left is used up by the next one.
+    """
+    part = path.with_name(path.name + PART)
+    descriptor = _open_locked(part)
+    try:
+        yield descriptor
+        if not replace and path.exists():
+            raise FileExistsError(errno.EEXIST, "it has come into being meanwhile")
+        part.rename(path)
+    except BaseException:
+        part.unlink(missing_ok=True)
+        raise
+    finally:
+        os.close(descriptor)
+
+
+def _open_locked(part: Path) -> int:
+    while True:
+        descriptor = os.open(part, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o666)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if part.exists() and os.path.samestat(part.stat(), os.fstat(descriptor)):
+                os.ftruncate(descriptor, 0)
+                return descriptor
+        except BlockingIOError:
+            os.close(descriptor)
+            raise BlockingIOError(errno.EAGAIN, "another process is writing it") from None
+        except BaseException:
+            os.close(descriptor)
+            raise
+        os.close(descriptor)  # whoever had it has just finished, and moved or removed it
+
+
+def _check_room(descriptor: int, size: int) -> None:
+    """OutputError where the disk has less than `size` bytes left, before hours of work."""
+    disk = os.fstatvfs(descriptor)
+    free = disk.f_bavail * disk.f_frsize
+    if size > free:
+        raise OutputError(
+            f"the output would take {size / 1e9:.1f} GB, {free / 1e9:.1f} GB are free there; name fewer --outputs"
+        )
