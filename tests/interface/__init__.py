@@ -1,1 +1,1 @@
-"""Tests of the interface: wire types, md5 sums, and the one table that states them."""
+"""Tests of rosafe.interface."""

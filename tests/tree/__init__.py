@@ -1,0 +1,1 @@
+"""Tests of rosafe.tree: tokens, requests, changes, windows."""

@@ -1,0 +1,277 @@
+"""A scheduler of its own for threads: one runs at a time, and every place where another could go on is a decision.
+
+`explore` runs a scenario under very many schedules. The code under test is the real one; only its locks, conditions and
+threads are this module's. Few deviations from a plain schedule find nearly all faults that orders of events can cause:
+it tries all schedules with so many delays (Emmi, Qadeer and Rakamaric, POPL 2011), and beyond that some of the many
+with random priorities (Burckhardt et al., ASPLOS 2010).
+"""
+
+from __future__ import annotations
+
+import os
+import random
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from types import SimpleNamespace, TracebackType
+from typing import Any
+
+HANG_SECONDS = 30.0  # no thread gets its turn for so long: the scheduler itself has failed
+
+
+class Abandoned(BaseException):
+    """Ends the threads of a run that cannot go on."""
+
+
+class Task:
+    """One thread under the scheduler's control."""
+
+    def __init__(self, name: str) -> None:
+        self.name = name
+        self.ready: Callable[[], bool] = lambda: True
+        self.finished = False
+        self.go = threading.Lock()  # released to give it its turn
+        self.go.acquire()
+
+
+class Delays:
+    """The running thread goes on until it cannot, then the next one in turn; at the decisions `at`, the one after."""
+
+    def __init__(self, at: tuple[int, ...]) -> None:
+        self.at = at
+        self.decisions = 0
+
+    def choose(self, able: list[Task]) -> Task:
+        self.decisions += 1
+        return able[self.decisions - 1 in self.at]
+
+    def __repr__(self) -> str:
+        return f"delays at {self.at}"
+
+
+class Priorities:
+    """Threads have random priorities; the one that would run falls behind all others at some random decisions."""
+
+    FALLS = 3
+    SPAN = 150  # decisions among which the falls are
+
+    def __init__(self, seed: int) -> None:
+        self.seed = seed
+        self._random = random.Random(seed)
+        self._falls = [self._random.randrange(self.SPAN) for _ in range(self.FALLS)]
+        self._priorities: dict[Task, float] = {}
+        self._decisions = 0
+
+    def choose(self, able: list[Task]) -> Task:
+        for task in able:
+            self._priorities.setdefault(task, self._random.random())
+        chosen = max(able, key=self._priorities.__getitem__)
+        if self._decisions in self._falls:
+            self._priorities[chosen] = -self._decisions
+            chosen = max(able, key=self._priorities.__getitem__)
+        self._decisions += 1
+        return chosen
+
+    def __repr__(self) -> str:
+        return f"seed {self.seed}"
+
+
+class Scheduler:
+    """Lets one thread run at a time; `strategy` decides which where there is a choice."""
+
+    def __init__(self, strategy: Delays | Priorities) -> None:
+        self.trace: list[str] = []
+        self.deadlock = ""
+        self.tasks = [Task("main")]
+        self._current = self.tasks[0]
+        self._strategy = strategy
+        self.threading = SimpleNamespace(
+            Lock=lambda: Lock(self),
+            RLock=lambda: Lock(self),
+            Condition=lambda lock: Condition(self, lock),
+            Thread=lambda target, name="", daemon=False: Thread(self, target, name),
+            current_thread=threading.current_thread,
+        )
+
+    def until(self, ready: Callable[[], bool]) -> None:
+        """Let others run as the schedule says, until `ready()` holds and it is this thread's turn."""
+        me = self._current
+        me.ready = ready
+        self._switch(me)
+
+    def _switch(self, me: Task) -> None:
+        start = self.tasks.index(me)
+        in_turn = self.tasks[start:] + self.tasks[:start]
+        able = [task for task in in_turn if not task.finished and task.ready()]
+        if not able:
+            waiting = [task.name for task in self.tasks if not task.finished]
+            if waiting and not self.deadlock:
+                self.deadlock = ", ".join(waiting)
+            self._abandon()
+        else:
+            chosen = able[0] if len(able) == 1 else self._strategy.choose(able)
+            self._current = chosen
+            if chosen is me:
+                return
+            self.trace.append(chosen.name)
+            chosen.go.release()
+        if not me.finished:
+            if not me.go.acquire(timeout=HANG_SECONDS):
+                raise RuntimeError(f"{me.name} never got its turn")
+            if self.deadlock:
+                raise Abandoned
+
+    def _abandon(self) -> None:
+        for task in self.tasks:
+            if task.go.locked():
+                task.go.release()
+
+    def finish(self, task: Task) -> None:
+        """`task` has come to its end."""
+        task.finished = True
+        if not self.deadlock:
+            self._switch(task)
+
+
+class Lock:
+    """`threading.RLock`, and `threading.Lock` as well: nobody takes one of those twice."""
+
+    def __init__(self, scheduler: Scheduler) -> None:
+        self._scheduler = scheduler
+        self.owner: Task | None = None
+        self.depth = 0
+
+    def acquire(self) -> None:
+        scheduler = self._scheduler
+        if scheduler.deadlock:
+            raise Abandoned
+        me = scheduler._current
+        if self.owner is not me:
+            scheduler.until(lambda: self.owner is None)
+            self.owner = me
+        self.depth += 1
+
+    def release(self) -> None:
+        self.depth -= 1
+        if self.depth == 0:
+            self.owner = None
+
+    def __enter__(self) -> None:
+        self.acquire()
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, tb: TracebackType | None) -> None:
+        self.release()
+
+
+class Condition(Lock):
+    """`threading.Condition` on a lock that others share."""
+
+    def __init__(self, scheduler: Scheduler, lock: Lock) -> None:
+        super().__init__(scheduler)
+        self._lock = lock
+        self._waiting: set[Task] = set()
+
+    def acquire(self) -> None:
+        self._lock.acquire()
+
+    def release(self) -> None:
+        self._lock.release()
+
+    def wait(self) -> None:
+        lock, me = self._lock, self._scheduler._current
+        depth, lock.owner, lock.depth = lock.depth, None, 0
+        self._waiting.add(me)
+        self._scheduler.until(lambda: me not in self._waiting and lock.owner is None)
+        lock.owner, lock.depth = me, depth
+
+    def notify_all(self) -> None:
+        assert self._lock.owner is self._scheduler._current
+        self._waiting.clear()
+
+
+class Thread:
+    """`threading.Thread`."""
+
+    def __init__(self, scheduler: Scheduler, target: Callable[[], None], name: str) -> None:
+        self.ident: int | None = None
+        self._scheduler = scheduler
+        self._target = target
+        self._task = Task(name)
+        self._thread = threading.Thread(target=self._run, name=name, daemon=True)
+
+    def start(self) -> None:
+        self._scheduler.tasks.append(self._task)
+        self._thread.start()
+        self.ident = self._thread.ident
+
+    def _run(self) -> None:
+        self._task.go.acquire()
+        try:
+            if not self._scheduler.deadlock:
+                self._target()
+        except Abandoned:
+            pass
+        finally:
+            self._scheduler.finish(self._task)
+
+    def join(self, timeout: float | None = None) -> None:
+        self._scheduler.until(lambda: self._task.finished)
+
+    def is_alive(self) -> bool:
+        return not self._task.finished
+
+
+def delay_bounded(bound: int) -> Iterator[Delays]:
+    """All strategies with up to `bound` delays. Each must have run before the next one is asked for."""
+    unexplored: list[tuple[int, ...]] = [()]
+    while unexplored:
+        strategy = Delays(unexplored.pop())
+        yield strategy
+        if len(strategy.at) < bound:
+            first = strategy.at[-1] + 1 if strategy.at else 0
+            unexplored += [(*strategy.at, at) for at in range(first, strategy.decisions)]
+
+
+def explore(
+    scenario: Callable[[Scheduler], Callable[[], None]], use: Callable[[Any], None], delays: int, walks: int
+) -> int:
+    """Run `scenario(scheduler)` and then what it returns, its check, under all `delays` and `walks` random priorities.
+
+    `use` puts a replacement of the module `threading` into the code under test. Returns the number of schedules.
+    """
+    count = 0
+    with _one_processor():
+        for strategy in delay_bounded(delays):
+            _run(scenario, use, strategy)
+            count += 1
+        for seed in range(walks):
+            _run(scenario, use, Priorities(seed))
+            count += 1
+    return count
+
+
+def _run(
+    scenario: Callable[[Scheduler], Callable[[], None]], use: Callable[[Any], None], strategy: Delays | Priorities
+) -> None:
+    scheduler = Scheduler(strategy)
+    use(scheduler.threading)
+    try:
+        check = scenario(scheduler)
+        scheduler.until(lambda: all(task.finished for task in scheduler.tasks[1:]))
+    except Abandoned:
+        raise AssertionError(f"deadlock of {scheduler.deadlock}; {strategy}: {' '.join(scheduler.trace)}") from None
+    try:
+        check()
+    except AssertionError as problem:
+        raise AssertionError(f"{problem}; {strategy}: {' '.join(scheduler.trace)}") from problem
+
+
+@contextmanager
+def _one_processor() -> Iterator[None]:
+    """Keep all threads on one processor of the machine, between which handing over takes twice as long."""
+    processors = os.sched_getaffinity(0)
+    os.sched_setaffinity(0, {min(processors)})
+    try:
+        yield
+    finally:
+        os.sched_setaffinity(0, processors)

@@ -1,0 +1,158 @@
+"""Sources, listeners and stages for tests of the tree: everything that comes out can be told from what went in."""
+
+from __future__ import annotations
+
+import collections
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rosafe.dsp import STAGES
+from rosafe.tree import Processor, Tree
+from rosafe.tree.zone import Block
+
+RATE = 16000.0
+WAIT_SECONDS = 20.0  # for anything that must happen
+
+
+class Feed:
+    """A source that gives what the test puts in. Without data, frame n of a block holds n in both ears."""
+
+    def __init__(self, rate: float = RATE, frames: int = 160) -> None:
+        self.sample_rate = rate
+        self.frames = frames
+        self.stopped = False
+        self._at = 0
+        self._blocks: collections.deque[np.ndarray] = collections.deque()
+        self._ended = False
+        self._turn = threading.Condition()
+
+    def put(self, *blocks: np.ndarray, count: int = 0) -> None:
+        """Add `blocks`, or `count` blocks of numbered frames."""
+        with self._turn:
+            for _ in range(count):
+                numbers = np.arange(self._at, self._at + self.frames, dtype=float)
+                self._blocks.append(np.stack((numbers, numbers)))
+                self._at += self.frames
+            self._blocks.extend(blocks)
+            self._turn.notify_all()
+
+    def end(self) -> None:
+        """Nothing more will come."""
+        with self._turn:
+            self._ended = True
+            self._turn.notify_all()
+
+    def read(self) -> tuple[np.ndarray, int] | None:
+        with self._turn:
+            while not self._blocks and not self._ended and not self.stopped:
+                self._turn.wait(WAIT_SECONDS)
+            if self.stopped or not self._blocks:
+                return None
+            block = self._blocks.popleft()
+            return block, int(block[0, -1]) + 1 if block.size else 0
+
+    def stop(self) -> None:
+        with self._turn:
+            self.stopped = True
+            self._turn.notify_all()
+
+
+class Recorder:
+    """A listener that remembers everything and lets the test wait for it."""
+
+    def __init__(self) -> None:
+        self.processors: list[Processor] = []
+        self.blocks: dict[Processor, list[Block]] = {}
+        self.executed_blocks: collections.Counter[Processor] = collections.Counter()
+        self.ends: list[Processor] = []
+        self.late: list[Processor] = []  # released something after their end
+        self._turn = threading.Condition()
+
+    def added(self, processor: Processor) -> None:
+        with self._turn:
+            self.processors.append(processor)
+            self.blocks[processor] = []
+
+    def executed(self, processor: Processor, seconds: float) -> None:
+        with self._turn:
+            self.executed_blocks[processor] += 1
+            self._turn.notify_all()
+
+    def released(self, processor: Processor, block: Block) -> None:
+        with self._turn:
+            if processor in self.ends:
+                self.late.append(processor)
+            self.blocks[processor].append(block)
+            self._turn.notify_all()
+
+    def ended(self, processor: Processor) -> None:
+        with self._turn:
+            self.ends.append(processor)
+            self._turn.notify_all()
+
+    def wait(self, condition: Callable[[], Any]) -> None:
+        """Wait until `condition()` holds after something that a processor did."""
+        with self._turn:
+            assert self._turn.wait_for(condition, WAIT_SECONDS), f"not within {WAIT_SECONDS:g} s"
+
+    def wait_blocks(self, processor: Processor, count: int) -> None:
+        """Wait until `processor` has released `count` blocks in all."""
+        self.wait(lambda: len(self.blocks[processor]) >= count)
+
+    def data(self, processor: Processor) -> np.ndarray:
+        """All that it released, joined."""
+        return np.concatenate([block.data for block in self.blocks[processor]], axis=-1)
+
+
+class Plain:
+    """A stage of any kind that hands its blocks on as they are."""
+
+    work: Callable[[np.ndarray], None] = staticmethod(lambda block: None)
+
+    def __init__(self, sample_rate: float, **parameters: Any) -> None:
+        self.sample_rate = self.output_rate = sample_rate
+        self.parameters = parameters
+
+    def configure(self, **changes: Any) -> None:
+        self.parameters = {**self.parameters, **changes}
+
+    def output_rows(self, rows: tuple[int, ...]) -> tuple[int, ...]:
+        return rows
+
+    def process(self, block: np.ndarray) -> np.ndarray:
+        self.work(block)
+        return block
+
+
+def use_plain_stages(patch: pytest.MonkeyPatch, **stages: type[Plain]) -> None:
+    """Let the tree make `Plain` stages, or those given, of all kinds."""
+    for kind in STAGES:
+        patch.setitem(STAGES, kind, stages.get(kind, Plain))  # type: ignore[misc]
+
+
+def default_tree(listener: Recorder, feed: Feed) -> Tree:
+    """The tree of the guide: one processor of each kind, called as its kind."""
+    tree = Tree(listener)
+    tree.add_input("input", feed, feed.frames, 1.0, 1.0)
+    for kind, parent in (
+        ("preProc", "input"),
+        ("gammatone", "preProc"),
+        ("ihc", "gammatone"),
+        ("ild", "ihc"),
+        ("ratemap", "ihc"),
+        ("crossCorrelation", "ihc"),
+    ):
+        tree.add(kind, kind, parent, {"fb_highFreqHz": 4000.0, "fb_nChannels": 5} if kind == "gammatone" else {})
+    return tree
+
+
+def end(tree: Tree, listener: Recorder) -> None:
+    """Stop the tree and see to it that no thread is left."""
+    tree.stop()
+    for processor in listener.processors:
+        assert processor.join(WAIT_SECONDS), f"{processor!r} is still running"
+    assert listener.late == []

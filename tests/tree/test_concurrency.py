@@ -1,0 +1,237 @@
+"""The tree on real threads: who works at the same time as whom, and blocks that arrive whole and in order."""
+
+from __future__ import annotations
+
+import contextlib
+import random
+import sys
+import threading
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from rosafe.interface import ComponentError
+from rosafe.tree import State, Tree
+from tests.harness import wait_for
+
+from .support import RATE, WAIT_SECONDS, Feed, Plain, Recorder, end, use_plain_stages
+
+
+@pytest.fixture
+def listener() -> Recorder:
+    return Recorder()
+
+
+@pytest.fixture
+def feed() -> Feed:
+    return Feed(frames=1)
+
+
+@pytest.fixture
+def tree(listener: Recorder) -> Iterator[Tree]:
+    tree = Tree(listener)
+    yield tree
+    end(tree, listener)
+
+
+def test_siblings_work_at_the_same_time(
+    tree: Tree, listener: Recorder, feed: Feed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each waits, in the middle of its work, until the other two are in the middle of theirs."""
+    meeting = threading.Barrier(3)
+
+    class Meeting(Plain):
+        def process(self, block: np.ndarray) -> np.ndarray:
+            meeting.wait(WAIT_SECONDS)
+            return block
+
+    use_plain_stages(monkeypatch, preProc=Meeting)
+    tree.add_input("input", feed, 1, 1.0, 1.0)
+    siblings = [tree.add("preProc", name, "input") for name in ("a", "b", "c")]
+    feed.put(count=3)
+    for one in siblings:
+        listener.wait_blocks(one, 3)
+        assert one.error is None
+
+
+def test_a_parent_works_on_the_next_block_while_its_child_works_on_the_last(
+    tree: Tree, listener: Recorder, feed: Feed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The child finishes block n only after the parent has computed n + 1; the parent releases only after that."""
+    computed: list[int] = []
+    last = 6
+    turn = threading.Condition()
+
+    class Parent(Plain):
+        def process(self, block: np.ndarray) -> np.ndarray:
+            with turn:
+                computed.append(int(block[0, 0]))
+                turn.notify_all()
+            return block
+
+    class Child(Plain):
+        def process(self, block: np.ndarray) -> np.ndarray:
+            with turn:
+                number = int(block[0, 0])
+                assert turn.wait_for(lambda: number == last or number + 1 in computed, WAIT_SECONDS)
+                assert number + 2 not in computed, "the parent went on without the child's token"
+            return block
+
+    use_plain_stages(monkeypatch, preProc=Parent, gammatone=Child)
+    tree.add_input("input", feed, 1, 1.0, 1.0)
+    tree.add("preProc", "parent", "input")
+    child = tree.add("gammatone", "child", "parent")
+    feed.put(count=last + 1)
+    listener.wait_blocks(child, last + 1)
+
+
+def test_children_read_the_parents_memory(
+    tree: Tree, listener: Recorder, feed: Feed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    use_plain_stages(monkeypatch)
+    tree.add_input("input", feed, 1, 1.0, 1.0)
+    one, other = (tree.add("preProc", name, "input") for name in ("one", "other"))
+    block = np.ones((2, 5))
+    feed.put(block)
+    for child in (one, other):
+        listener.wait_blocks(child, 1)
+        assert listener.blocks[child][0].data is block
+
+
+def test_the_four_states(tree: Tree, listener: Recorder, feed: Feed, monkeypatch: pytest.MonkeyPatch) -> None:
+    working, go_on = threading.Event(), threading.Event()
+
+    class Slow(Plain):
+        def process(self, block: np.ndarray) -> np.ndarray:
+            working.set()
+            assert go_on.wait(WAIT_SECONDS)
+            return block
+
+    use_plain_stages(monkeypatch, gammatone=Slow)
+    root = tree.add_input("input", feed, 1, 1.0, 1.0)
+    parent = tree.add("preProc", "parent", "input")
+    child = tree.add("gammatone", "child", "parent")
+    assert [p.state for p in (root, parent, child)] == [State.WAIT_EXEC] * 3
+    feed.put(count=1)
+    assert working.wait(WAIT_SECONDS)
+    assert child.state is State.EXEC
+    wait_for(lambda: parent.state is State.WAIT_EXEC)
+    feed.put(count=1)
+    wait_for(lambda: parent.state is State.WAIT_RELEASE)  # its child still has the last block
+    assert child.state is State.EXEC
+    states: set[State] = set()
+    monkeypatch.setattr(Recorder, "released", lambda self, processor, block: states.add(processor.state))
+    go_on.set()
+    wait_for(lambda: [p.state for p in (root, parent, child)] == [State.WAIT_EXEC] * 3)
+    assert states == {State.RELEASE}
+    tree.stop()
+    assert [p.state for p in (root, parent, child)] == [State.REMOVED] * 3
+
+
+def test_nobody_waits_for_a_removed_child(
+    tree: Tree, listener: Recorder, feed: Feed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It goes while it is in the middle of its work; the call does not wait for it, its name is free at once."""
+    working, go_on = threading.Event(), threading.Event()
+
+    class Slow(Plain):
+        def process(self, block: np.ndarray) -> np.ndarray:
+            if self.parameters.get("slow"):
+                working.set()
+                assert go_on.wait(WAIT_SECONDS)
+            return block
+
+    use_plain_stages(monkeypatch, preProc=Slow)
+    root = tree.add_input("input", feed, 1, 1.0, 1.0)
+    slow = tree.add("preProc", "slow", "input", {"slow": True})
+    below = tree.add("gammatone", "below", "slow")
+    other = tree.add("preProc", "other", "input")
+    feed.put(count=5)
+    assert working.wait(WAIT_SECONDS)
+    assert tree.remove("slow") == [below, slow]
+    assert listener.ends == [below, slow]
+    again = tree.add("preProc", "slow", "input")
+    listener.wait_blocks(other, 5)
+    listener.wait_blocks(again, 4)
+    assert len(listener.blocks[root]) == 5
+    assert not slow.join(0.0)
+    go_on.set()
+    assert slow.join(WAIT_SECONDS)
+    assert listener.blocks[slow] == listener.blocks[below] == []
+
+
+def test_blocks_arrive_whole_and_in_order_whoever_comes_and_goes(
+    tree: Tree, listener: Recorder, feed: Feed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Work of random length, threads that are switched often, and two users who add and remove all the time."""
+    dice = random.Random(1)
+
+    class Erratic(Plain):
+        def process(self, block: np.ndarray) -> np.ndarray:
+            for _ in range(dice.choice((0, 0, 10, 300))):
+                pass
+            return block
+
+    use_plain_stages(monkeypatch, **dict.fromkeys(("input", "preProc", "gammatone", "ihc", "ild"), Erratic))
+    levels = ("preProc", "gammatone", "ihc", "ild")
+    tree.add_input("input", feed, 1, 1.0, 1.0)
+    tree.add("preProc", "constant", "input")
+    errors: list[BaseException] = []
+
+    def user(seed: int) -> None:
+        mine = random.Random(seed)
+        try:
+            for step in range(150):
+                names = [p.name for p in tree.processors if p.name.startswith(f"{seed}-")]
+                if names and mine.random() < 0.4:
+                    with contextlib.suppress(ComponentError):  # the other user has removed its parent
+                        tree.remove(mine.choice(names))
+                    continue
+                parent = mine.choice([p for p in tree.processors if p.kind != "ild"])
+                kind = levels[0] if parent.kind == "input" else levels[levels.index(parent.kind) + 1]
+                try:
+                    tree.add(kind, f"{seed}-{step}", parent.name)
+                except ComponentError as problem:  # the other user was faster
+                    assert problem.ex.endswith("e_noUpperDependencie")
+        except BaseException as problem:  # told to the test below
+            errors.append(problem)
+
+    interval = sys.getswitchinterval()
+    sys.setswitchinterval(1e-5)
+    try:
+        feed.put(count=2000)
+        users = [threading.Thread(target=user, args=(seed,)) for seed in (1, 2)]
+        for one in users:
+            one.start()
+        for one in users:
+            one.join()
+        feed.end()
+        alive = tree.processors
+        for processor in alive:
+            assert processor.join(WAIT_SECONDS), f"{processor!r} hangs"
+    finally:
+        sys.setswitchinterval(interval)
+    assert errors == []
+    assert len(listener.processors) > 100
+    for processor in listener.processors:
+        assert processor.error is None
+        if listener.blocks[processor]:
+            numbers = listener.data(processor)[0]
+            np.testing.assert_array_equal(numbers, np.arange(numbers[0], numbers[-1] + 1))
+            if processor in alive:
+                assert numbers[-1] == 1999
+        else:
+            assert processor not in alive or processor.parent not in alive
+
+
+def test_a_stream_of_any_rate_ends_by_itself(listener: Recorder, tree: Tree) -> None:
+    feed = Feed(rate=RATE, frames=100)
+    root = tree.add_input("input", feed, 100, 1.0, 1.0, {"in_doNormalize": False})
+    child = tree.add("preProc", "child", "input")
+    feed.put(count=3)
+    feed.end()
+    assert child.join(WAIT_SECONDS)
+    assert root.state is child.state is State.DONE
+    np.testing.assert_array_equal(listener.data(child)[0], np.arange(300))
+    assert listener.blocks[child][-1].next_index == child.next_index == 300
