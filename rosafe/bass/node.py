@@ -62,8 +62,8 @@ class BassNode:
             activity.raise_if_interrupted()
             self._source = source
             capture.publish()
-            activity.running()
             rospy.loginfo(f"acquiring from {device} at {source.sample_rate} Hz")
+            activity.running()
             capture.run(activity.stop_requested, self._node.meters["capture"].cycle)
             self._last_end = f"{device}: {'stopped' if activity.stop_requested.is_set() else 'end of the source'}"
             rospy.loginfo(f"the acquisition has ended: {self._last_end}")

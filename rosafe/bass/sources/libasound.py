@@ -53,12 +53,13 @@ def complaints() -> Iterator[list[str]]:
         heard.append(" ".join(text.value.decode(errors="replace").split()))
 
     handler = _HANDLER(hear)
+    library.snd_lib_error_set_local.argtypes = (ctypes.c_void_p,)
     library.snd_lib_error_set_local.restype = ctypes.c_void_p
-    library.snd_lib_error_set_local(handler)
+    before = library.snd_lib_error_set_local(ctypes.cast(handler, ctypes.c_void_p))
     try:
         yield heard
     finally:
-        library.snd_lib_error_set_local(None)
+        library.snd_lib_error_set_local(before)
 
 
 def capture_devices(proc: Path = Path("/proc/asound")) -> list[tuple[int, int, str, str]]:
