@@ -1,0 +1,161 @@
+"""The command `scripts/demo`: options, the course of the demonstration, signals and exit codes."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import os
+import signal
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NoReturn
+
+DEFAULT_DEVICE = "scene:"
+DEFAULT_SECONDS = 10.0
+SHORTEST, LONGEST = 2.0, 600.0
+PICTURE = "rosafe-demo.png"
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+
+
+class _Stopped(BaseException):
+    """A signal came that ends the program."""
+
+
+class _Signals:
+    """Turns the signals that end a program into `_Stopped` in the main thread, wherever that is.
+
+    Attributes
+    ----------
+    received : int
+        The first one that came, or 0.
+    """
+
+    def __init__(self) -> None:
+        self.received = 0
+        for number in SIGNALS:
+            if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # nohup wants it ignored
+                signal.signal(number, self._take)
+
+    def _take(self, number: int, frame: object) -> None:
+        self.defer()
+        self.received = number
+        raise _Stopped
+
+    def check(self) -> None:
+        """Raise `_Stopped` where that got lost: Python drops what is raised while it destroys an object."""
+        if self.received:
+            raise _Stopped
+
+    def defer(self) -> None:
+        """From now on only remember signals: nothing may cut the end short."""
+        for number in SIGNALS:
+            if signal.getsignal(number) == self._take:
+                signal.signal(number, self._remember)
+
+    def _remember(self, number: int, frame: object) -> None:
+        self.received = self.received or number
+
+
+class _Parser(argparse.ArgumentParser):
+    def error(self, message: str) -> NoReturn:
+        self.exit(2, f"demo: {message}; scripts/demo -h shows what is possible\n")
+
+
+def _seconds(text: str) -> float:
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = float("nan")
+    if not SHORTEST <= seconds <= LONGEST:
+        raise argparse.ArgumentTypeError(f"{text!r} is no number of seconds from {SHORTEST:g} to {LONGEST:g}")
+    return seconds
+
+
+def _parse(arguments: list[str] | None) -> argparse.Namespace:
+    parser = _Parser(
+        prog="scripts/demo",
+        description="Sound goes in, seven auditory representations come out on ROS topics, and a picture of them.",
+        epilog="examples:\n"
+        "  scripts/demo                              the built-in scene\n"
+        "  scripts/demo speech.wav --seconds 5       a sound file with two channels\n"
+        "  scripts/demo plughw:1,0 --out /tmp/me     a microphone pair",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    parser.add_argument(
+        "sound",
+        nargs="?",
+        default=DEFAULT_DEVICE,
+        metavar="WAV or ALSA device",
+        help="sound file, ALSA capture device or scene: (default: %(default)s, which walks from left to right in 10 s)",
+    )
+    parser.add_argument(
+        "--seconds", type=_seconds, default=DEFAULT_SECONDS, metavar="N", help="seconds of sound (default: 10)"
+    )
+    parser.add_argument(
+        "--out",
+        type=Path,
+        default=Path("rosafe-demo"),
+        metavar="DIR",
+        help=f"folder for the picture, {PICTURE} (default: ./rosafe-demo)",
+    )
+    return parser.parse_args(arguments)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the demonstration.
+
+    Returns
+    -------
+    int
+        0 at its end, 1 where something failed, 128 + number where a signal ended it. A wrong command line raises
+        SystemExit(2), and -h SystemExit(0).
+    """
+    signals = _Signals()
+    try:
+        options = _parse(arguments)
+        try:
+            with _folder(options.out, signals), tempfile.TemporaryDirectory(prefix="rosafe-demo-") as scratch:
+                return _run(options, signals, scratch)
+        except BrokenPipeError:  # nobody reads what is printed: `scripts/demo | head`
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what Python still has to flush
+            return 1
+    except BaseException:
+        if not signals.received:
+            raise
+        return 128 + signals.received  # a library may have made another error of it (numpy does while it is imported)
+
+
+@contextlib.contextmanager
+def _folder(path: Path, signals: _Signals) -> Iterator[None]:
+    """Make the folder `path`; it goes again where nothing was put into it."""
+    made = [folder for folder in (path, *path.parents) if not folder.exists()]
+    try:
+        yield
+    finally:
+        signals.defer()
+        for folder in made:
+            if folder.is_dir() and not any(folder.iterdir()):
+                folder.rmdir()
+
+
+def _run(options: argparse.Namespace, signals: _Signals, scratch: str) -> int:
+    """The demonstration, with its failures as one line; `scratch` is a folder for log files and caches."""
+    from rosafe.audiofile import AudioFileError
+    from rosafe.demo import course
+    from rosafe.interface import ComponentError
+    from rosafe.ros.generate import GenerationError
+    from rosafe.ros.paths import user_cache, writable
+
+    try:
+        if not writable(options.out):
+            raise course.DemoError(f"cannot write to {options.out}: choose another folder with --out")
+        cache = user_cache() / "matplotlib"
+        os.environ["MPLCONFIGDIR"] = str(cache) if writable(cache) else scratch
+        course.run(options.sound, options.seconds, options.out / PICTURE, scratch, signals.check, signals.defer)
+    except (course.DemoError, AudioFileError, ComponentError, GenerationError) as problem:
+        print(f"demo: {' '.join(str(problem).split())}", file=sys.stderr)
+        return 1
+    return 0

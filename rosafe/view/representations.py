@@ -1,0 +1,111 @@
+"""The representations that are shown, on one time axis, from `rosafe.process` or from the ports."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+
+@dataclass(frozen=True)
+class Representations:
+    """Ratemap, level difference and cross-correlation of one binaural signal, frame by frame.
+
+    Attributes
+    ----------
+    times : ndarray, (F,)
+        Centres of the frames in seconds, evenly spaced.
+    center_frequencies : ndarray, (C,)
+        Hz, in the order of the channels.
+    lags : ndarray, (L,)
+        Seconds; positive where the left ear hears later.
+    ratemap : ndarray, (2, C, F)
+        Power, left and right ear.
+    ild : ndarray, (C, F)
+        dB, positive where the right ear is louder.
+    correlation : ndarray, (L, F)
+        Cross-correlation, averaged over the channels.
+    """
+
+    times: np.ndarray
+    center_frequencies: np.ndarray
+    lags: np.ndarray
+    ratemap: np.ndarray
+    ild: np.ndarray
+    correlation: np.ndarray
+
+    @classmethod
+    def from_process(cls, result: Mapping[str, Any], start: float = 0.0) -> Representations:
+        """What `rosafe.process` returned, with ``rm_scaling`` power (the default).
+
+        Parameters
+        ----------
+        result : mapping
+            Holds `ild`, `ratemap`, `crossCorrelation`, `gammatone` or any other that brings `fb_cfHz`, and the rates.
+        start : float
+            Time of the signal's first sample (s).
+
+        The times are exact for windows of two hops (the default).
+        """
+        series = {
+            "ild": result["ild"],
+            "ratemap": result["ratemap"],
+            "correlation": result["crossCorrelation"].mean(axis=0),
+        }
+        rates = [result[f"{kind}_frameRate"] for kind in ("ild", "ratemap", "crossCorrelation")]
+        times = [
+            start + (1 + np.arange(data.shape[-1])) / rate for data, rate in zip(series.values(), rates, strict=True)
+        ]
+        return cls.aligned(
+            result["fb_cfHz"],
+            result["cc_lags"],
+            **{name: (time, data) for (name, data), time in zip(series.items(), times, strict=True)},
+        )
+
+    @classmethod
+    def aligned(
+        cls,
+        center_frequencies: np.ndarray,
+        lags: np.ndarray,
+        ratemap: tuple[np.ndarray, np.ndarray],
+        ild: tuple[np.ndarray, np.ndarray],
+        correlation: tuple[np.ndarray, np.ndarray],
+    ) -> Representations:
+        """Bring three series, each (times, data), to the times of `ild` that all of them cover: nearest frames.
+
+        Nothing is invented: times that one of them does not cover are left out.
+        """
+        series = (ratemap, ild, correlation)
+        if any(len(times) == 0 for times, _ in series):
+            times = np.zeros(0)
+        else:
+            slack = 0.5 * max((t[-1] - t[0]) / max(1, len(t) - 1) for t, _ in series) + 1e-9
+            first = max(t[0] for t, _ in series) - slack
+            last = min(t[-1] for t, _ in series) + slack
+            times = ild[0][(ild[0] >= first) & (ild[0] <= last)]
+        at_times = [data[..., _nearest(own, times)] for own, data in series]
+        return cls(times, np.asarray(center_frequencies), np.asarray(lags), *at_times)
+
+    def tail(self, seconds: float) -> Representations:
+        """The last `seconds` of it."""
+        first = int(np.searchsorted(self.times, self.times[-1] - seconds)) if len(self.times) else 0
+        return Representations(
+            self.times[first:],
+            self.center_frequencies,
+            self.lags,
+            self.ratemap[..., first:],
+            self.ild[..., first:],
+            self.correlation[..., first:],
+        )
+
+
+def _nearest(sorted_values: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """For each of `wanted` the index of the nearest value."""
+    if len(sorted_values) == 0 or len(wanted) == 0:
+        return np.zeros(0, int)
+    right = np.clip(np.searchsorted(sorted_values, wanted), 1, max(1, len(sorted_values) - 1))
+    right = np.minimum(right, len(sorted_values) - 1)
+    left = np.maximum(right - 1, 0)
+    return np.where(wanted - sorted_values[left] <= sorted_values[right] - wanted, left, right)
