@@ -45,7 +45,8 @@ class Machine:
 
     def install(self, *arguments: str, **env: str) -> tuple[int, str, str]:
         """Exit code, stdout and stderr of the script."""
-        done = run("/bin/bash", self.script, *arguments, env=environment(PATH=str(self.bin), **env))
+        env = environment(PATH=str(self.bin), TMPDIR=str(self.bin.parent), **env)
+        done = run("/bin/bash", self.script, *arguments, env=env)
         return done.returncode, done.stdout, done.stderr
 
     def called(self, name: str) -> list[str]:

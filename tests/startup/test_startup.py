@@ -15,6 +15,7 @@ import pytest
 
 from rosafe import __version__
 from tests.harness import SCRIPTS, Graph, MasterProcess, Process, free_port, wait_for
+from tests.packaging.clone import fresh_copy, without_rights
 
 PROGRAMS = pytest.mark.parametrize("program", ["rosAFE-ros", "bass-ros"])
 
@@ -247,20 +248,16 @@ def test_starts_without_any_environment(graph: Graph) -> None:
 
 @pytest.mark.skipif(os.getuid() != 0, reason="becoming another user takes root")
 def test_home_that_cannot_be_written(graph: Graph) -> None:
-    command = [
-        "setpriv",
-        "--reuid=65534",
-        "--regid=65534",
-        "--clear-groups",
-        "--",
-        str(SCRIPTS / "bass-ros"),
-        "-i",
-        "poor",
-    ]
-    with graph.start(*command, HOME="/nonexistent", ROS_HOME="/nonexistent/.ros") as node:
-        wait_for(lambda: "/poor/kill" in graph.services(), 20, lambda: str(node))
-        assert "WARNING" not in node.err
-        assert node.stop() == 0
+    with fresh_copy() as copy:
+        temporary = copy.with_name("tmp")
+        temporary.mkdir()
+        temporary.chmod(0o1777)
+        command = [str(word) for word in without_rights(copy / "scripts" / "bass-ros", "-i", "poor")]
+        nowhere = {"HOME": "/nonexistent", "ROS_HOME": "/nonexistent/.ros", "TMPDIR": str(temporary), "PYTHONPATH": ""}
+        with graph.start(*command, **nowhere) as node:
+            wait_for(lambda: "/poor/kill" in graph.services(), 20, lambda: str(node))
+            assert "WARNING" not in node.err
+            assert node.stop() == 0
 
 
 def test_end_is_bounded_when_threads_hang(graph: Graph, tmp_path: Path) -> None:
