@@ -65,16 +65,16 @@ def run(
         recorder = Recorder(NAMES, sound.sample_rate, sound.frames_per_block)
         start = _build(session, recorder, sound)
         _follow(session, recorder, sound, seconds, start)
+        session.kill_nodes(_say_command)
         _say_ports(recorder)
-        session.stop_nodes(_say_command)
+        shown = recorder.representations()
+        if len(shown.times) < 2:
+            raise DemoError(f"{sound.device} gave too little sound for a picture")
+        _say_path(shown, sound)
+        _draw(shown, sound, picture)
     finally:
         defer()
         session.close()
-    shown = recorder.representations()
-    if len(shown.times) < 2:
-        raise DemoError(f"{sound.device} gave too little sound for a picture")
-    _say_path(shown, sound)
-    _draw(shown, sound, picture)
     print(f"\npicture: {picture}", flush=True)
 
 

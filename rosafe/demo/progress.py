@@ -13,7 +13,7 @@ from rosafe.view import estimates, report
 REFRESH_SECONDS = 0.1
 LINE_SECONDS = 1.0
 LOOK_BACK = 0.25  # s; levels and side are of the newest sound
-BAR = 12
+BAR = 7  # the line fits into 80 columns
 QUIET_DB, LOUD_DB = -70.0, -10.0
 
 
@@ -36,10 +36,7 @@ class Progress:
         azimuth = self._azimuth()
         if self._live:
             left, right = (_bar(level) for level in levels)
-            line = (
-                f"{elapsed:4.1f}/{self._seconds:.1f} s  L {left[::-1]} {right} R  "
-                f"{report.ruler({'@': azimuth})} {report.side(azimuth)}"
-            )
+            line = f"{elapsed:5.1f}/{self._seconds:.1f} s  L {left[::-1]}|{right} R  {report.ruler({'@': azimuth})}"
             print(f"\r{line}\x1b[K", end="", flush=True)
         else:
             print(

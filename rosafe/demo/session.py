@@ -214,13 +214,10 @@ class Session:
         failures = re.findall(r"\[ERROR\].*the acquisition has ended: (.*)", self.nodes["bass"].err)
         return failures[-1].removesuffix(_RESET) if failures else ""
 
-    def stop_nodes(self, say: Callable[[str], None]) -> None:
-        """End both nodes the guide's way, and wait until they are gone."""
-        self.requests_together([("/rosAFE/Stop", {}), ("/bass/Stop", {})], say)
-        children = list(self.nodes.values())
+    def kill_nodes(self, say: Callable[[str], None]) -> None:
+        """Ask both nodes to end; `close` waits for it."""
         self._ending = True
-        self.requests_together([("/rosAFE/kill", {}), ("/bass/kill", {})], say)
-        self.wait(lambda: all(child.has_ended() for child in children), START_SECONDS, "the nodes do not end")
+        self.requests_together([(f"/{name}/kill", {}) for name in NODES], say)
 
     def close(self) -> None:
         """End everything, whatever state it is in."""
