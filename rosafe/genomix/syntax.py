@@ -21,7 +21,7 @@ from rosafe.interface import Component
 STEP = 1024  # numbers formatted at a time: about 0.3 ms, during which no other thread runs
 
 _PLAIN_WORD = re.compile(r"[\w.:/+,=@%!?*|~^&<>()'-]+", re.ASCII)
-_BRACEABLE = re.compile(r"[^{}\\]*")
+_BRACEABLE = re.compile(r"[^{}\\\r\n]*")  # no line ends: an event is one line
 _TCL_ESCAPES = {
     **{ord(mark): "\\" + mark for mark in ' ;"$[]{}\\'},
     **{ord(mark): f"\\{name}" for mark, name in zip("\t\n\r\f\v", "tnrfv", strict=True)},

@@ -52,7 +52,7 @@ proc ::genomix::StartServer {} {
     variable root
     # In a checkout beside the package; where catkin installed us, in bin/; else wherever PATH has it.
     set program [lindex [auto_execok genomixd] 0]
-    foreach place {../../scripts ../../../bin ../../bin} {
+    foreach place {../../scripts ../../../bin} {
         set candidate [file normalize [file join $root $place genomixd]]
         if {[file executable $candidate]} {
             set program $candidate

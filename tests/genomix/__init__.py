@@ -1,0 +1,1 @@
+"""Tests of genomixd and of the Tcl package, with real masters, nodes, HTTP clients and tclsh."""

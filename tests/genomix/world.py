@@ -1,0 +1,165 @@
+"""A ROS graph with a genomixd for the tests, an HTTP client that knows its errors, and Tcl scripts that run in it."""
+
+from __future__ import annotations
+
+import http.client
+import json
+import re
+import subprocess
+import textwrap
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote, urlencode
+
+from tests import harness
+
+
+class HttpError(Exception):
+    """An answer that is no 200. `ex` and `what` are those of its body."""
+
+    def __init__(self, status: int, body: dict[str, Any]) -> None:
+        super().__init__(status, body)
+        self.status = status
+        self.ex = body.get("ex", "")
+        self.what = body.get("detail", {}).get("what", "")
+
+
+class Http:
+    """GETs from one genomixd; every call is a connection of its own, as with curl."""
+
+    def __init__(self, port: int) -> None:
+        self.port = port
+
+    def raw(self, url: str, method: str = "GET", headers: dict[str, str] | None = None) -> tuple[int, str]:
+        """Status and body of any URL."""
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=90)
+        try:
+            connection.request(method, url, headers=headers or {})
+            response = connection.getresponse()
+            return response.status, response.read().decode()
+        finally:
+            connection.close()
+
+    def get(self, path: str, given: Any = None, **query: Any) -> Any:
+        """The value of the JSON answer; `given` are the arguments of a request. HttpError where it is no 200."""
+        if given is not None:
+            query["input"] = json.dumps(given)
+        status, body = self.raw(f"{quote(path)}?{urlencode(query)}")
+        value = json.loads(body) if body else ""
+        if status != 200:
+            raise HttpError(status, value)
+        return value
+
+    def call(self, target: str, given: Any = None, **query: Any) -> Any:
+        """Make a request of `component/service` and wait for its result."""
+        return self.get(f"/call/{target}", given, **query)
+
+    def send(self, target: str, given: Any = None, **query: Any) -> str:
+        """Send a request in the session ``t`` and return its id."""
+        return str(self.get(f"/send/{target}", given, **{"s": "t", **query})["id"])
+
+    def status(self, number: str, **query: Any) -> dict[str, Any]:
+        """What has become of a request of the session ``t``."""
+        return dict(self.get("/request/status", id=number, **{"s": "t", **query}))
+
+    def wait(self, number: str, status: str, seconds: float = 10.0) -> dict[str, Any]:
+        """The status of a request of the session ``t`` once it is that."""
+        return harness.wait_for(
+            lambda: (now := self.status(number))["status"] == status and now,
+            seconds,
+            lambda: f"{status} of {self.status(number)}",
+        )
+
+    @contextmanager
+    def listening(self, **query: Any) -> Iterator[Iterator[tuple[str, str]]]:
+        """The events of a session, as they come: (name, data)."""
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=30)
+        connection.request("GET", f"/session/listen?{urlencode(query)}")
+        response = connection.getresponse()
+        assert response.status == 200
+        assert response.getheader("Content-Type") == "text/event-stream"
+        try:
+            yield _events(response)
+        finally:
+            response.close()
+            connection.close()
+
+
+def _events(response: http.client.HTTPResponse) -> Iterator[tuple[str, str]]:
+    fields: dict[str, str] = {}
+    for raw in response:
+        line = raw.decode().rstrip("\n")
+        if line.startswith(":"):
+            continue
+        if line:
+            name, _, value = line.partition(": ")
+            fields[name] = value
+        elif fields:
+            yield fields["event"], fields["data"]
+            fields = {}
+
+
+class World:
+    """A graph with its master, and the genomixd that works in it."""
+
+    def __init__(self, graph: harness.Graph, master: harness.MasterProcess, server: harness.Process, port: int) -> None:
+        self.graph = graph
+        self.master = master
+        self.server = server
+        self.port = port
+        self.http = Http(port)
+
+    def tcl(self, script: str, timeout: float = 60.0, check: bool = True) -> subprocess.CompletedProcess[str]:
+        """Run a script in tclsh; ``$address`` is that of genomixd, and ``show`` prints a value on a line."""
+        prelude = f"""
+            package require genomix
+            set address 127.0.0.1:{self.port}
+            proc show {{args}} {{puts [join $args |]}}
+            proc failure {{script}} {{
+                if {{![catch {{uplevel 1 $script}} message options]}} {{error "no error: $script"}}
+                return [list $message [dict get $options -errorcode]]
+            }}
+        """
+        path = self.graph.home / "script.tcl"
+        path.write_text(textwrap.dedent(prelude) + textwrap.dedent(script), "utf-8")
+        return self.graph.run("tclsh", str(path), timeout=timeout, check=check)
+
+    def lines(self, script: str, timeout: float = 60.0) -> list[str]:
+        """The lines that a script prints."""
+        return self.tcl(script, timeout).stdout.splitlines()
+
+    def reset(self) -> None:
+        """Stop what the components do, so that the next test finds them idle."""
+        for component in ("rosAFE", "bass"):
+            self.http.call(f"{component}/Stop")
+
+
+def port_of(process: harness.Process) -> int:
+    """The port on which a genomixd started with -v serves, once it does."""
+
+    def said() -> re.Match[str] | None:
+        assert process.alive, process
+        return re.search(r"serving http://[^ ]*:(\d+)", process.err)
+
+    return int(harness.wait_for(said, harness.UP_SECONDS, lambda: f"start of {process}")[1])
+
+
+@contextmanager
+def genomixd(graph: harness.Graph, *arguments: str) -> Iterator[tuple[harness.Process, int]]:
+    """A genomixd on a free port."""
+    with graph.start(str(harness.SCRIPTS / "genomixd"), "-v", "-p", "0", *arguments) as process:
+        yield process, port_of(process)
+
+
+@contextmanager
+def world(home: Path, nodes: bool = True) -> Iterator[World]:
+    """A new graph with genomixd and, unless told not to, bass-ros and rosAFE-ros."""
+    with harness.private_graph(home) as (graph, master), genomixd(graph) as (server, port):
+        this = World(graph, master, server, port)
+        if not nodes:
+            yield this
+            return
+        with graph.node("bass-ros"), graph.node("rosAFE-ros"):
+            yield this
