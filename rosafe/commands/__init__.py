@@ -1,0 +1,17 @@
+"""The subcommands of `rosafe`, one module each; a module's name is the command's.
+
+A command is a module with a docstring, whose first line (less its full stop) is shown in `rosafe -h` and whose whole
+is the head of its own help, and two functions::
+
+    def configure(parser: argparse.ArgumentParser) -> None:   # adds arguments; may set `parser.epilog`
+    def run(options: argparse.Namespace) -> int:              # does it; returns the exit code
+
+`rosafe -h` imports them all, so numpy and rospy are imported in `run`. `run` may raise `Failure`. Modules whose names
+begin with _ are parts of commands.
+"""
+
+from __future__ import annotations
+
+
+class Failure(Exception):
+    """The command cannot do it: the text is the one line that the user gets, and the exit code is 1."""

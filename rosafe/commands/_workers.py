@@ -1,0 +1,147 @@
+"""Several pieces of work at once, each in a process of its own that tells how far it is."""
+
+from __future__ import annotations
+
+import multiprocessing
+import signal
+import time
+from collections import deque
+from collections.abc import Callable, Sequence
+from multiprocessing.connection import Connection, wait
+from typing import Any, NamedTuple, cast
+
+REPORT_SECONDS = 0.1  # at least, between two reports of one piece of work
+
+Progress = Callable[[int, int], None]
+Work = Callable[[Progress], Any]
+
+
+class Report(NamedTuple):
+    """How a piece of work stands: the part that is done, or (at its end) its result, or why it failed."""
+
+    part: float
+    result: Any = None
+    failure: str = ""
+
+    @property
+    def last(self) -> bool:
+        return self.result is not None or bool(self.failure)
+
+
+class Interrupted(SystemExit):
+    """A signal asks for the end; the exit code is the one that shells give it."""
+
+    def __init__(self, number: int) -> None:
+        super().__init__(128 + number)
+
+
+def raise_on_signals() -> None:
+    """Make the first SIGINT, SIGTERM or SIGHUP raise `Interrupted` in the main thread; more do nothing.
+
+    Processes that are forked from here do the same.
+    """
+    numbers = [signal.SIGINT, signal.SIGTERM]
+    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # nohup
+        numbers.append(signal.SIGHUP)
+
+    def interrupt(number: int, frame: object) -> None:
+        for each in numbers:
+            signal.signal(each, signal.SIG_IGN)  # the way out is under way and must not be disturbed
+        raise Interrupted(number)
+
+    for each in numbers:
+        signal.signal(each, interrupt)
+
+
+def run_together(
+    works: Sequence[Work],
+    jobs: int,
+    failures: tuple[type[Exception], ...],
+    report: Callable[[int, Report], None],
+) -> None:
+    """Run all `works`, at most `jobs` at a time, and wait for them; whatever ends this ends those that run, too.
+
+    Parameters
+    ----------
+    works : sequence of callable
+        Called in a process of its own with a function that takes (done, all); returns something that can be pickled.
+    jobs : int
+        Processes at a time.
+    failures : tuple of exception types
+        What a piece of work may fail with; the text of the exception is the report's.
+    report : callable
+        Called with the number of a piece of work and its `Report`: now and then, and once with its last.
+    """
+    waiting = deque(enumerate(works))
+    running: dict[Connection, tuple[int, multiprocessing.Process]] = {}
+    try:
+        while waiting or running:
+            while waiting and len(running) < jobs:
+                index, work = waiting.popleft()
+                connection, process = _start(work, failures, list(running))
+                running[connection] = index, process
+            for ready in wait(list(running)):
+                connection = cast(Connection, ready)
+                index, process = running[connection]
+                told = _receive(connection, process)
+                if told.last:
+                    del running[connection]
+                    process.join()
+                report(index, told)
+    finally:
+        for _, process in running.values():
+            process.terminate()
+        for _, process in running.values():
+            process.join()
+
+
+def _start(
+    work: Work, failures: tuple[type[Exception], ...], others: list[Connection]
+) -> tuple[Connection, multiprocessing.Process]:
+    context = multiprocessing.get_context("fork")  # no need to import everything again
+    reader, writer = context.Pipe(duplex=False)
+    process = context.Process(target=_work, args=(work, failures, writer, [reader, *others]))
+    process.start()
+    writer.close()
+    return reader, process  # type: ignore[return-value]  # a ForkProcess is a Process
+
+
+def _receive(connection: Connection, process: multiprocessing.Process) -> Report:
+    try:
+        told = connection.recv()
+        assert isinstance(told, Report)
+        return told
+    except EOFError:
+        process.join()
+        code = process.exitcode or 0
+        how = f"signal {-code}" if code < 0 else f"exit code {code}"
+        return Report(0.0, failure=f"ended too early, with {how}")
+
+
+def _work(work: Work, failures: tuple[type[Exception], ...], writer: Connection, readers: list[Connection]) -> None:
+    """What the process does. It ends at its next report where the one that started it is no longer there."""
+    for reader in readers:
+        reader.close()
+    due = 0.0
+
+    def progress(done: int, total: int) -> None:
+        nonlocal due
+        now = time.monotonic()
+        if now >= due:
+            due = now + REPORT_SECONDS
+            _send(writer, Report(done / total))
+
+    try:
+        last = Report(1.0, result=work(progress))
+    except failures as problem:
+        last = Report(0.0, failure=str(problem))
+    except MemoryError:
+        last = Report(0.0, failure="there is not enough memory")
+    _send(writer, last)
+
+
+def _send(writer: Connection, report: Report) -> None:
+    try:
+        writer.send(report)
+    except BrokenPipeError:
+        raise Interrupted(signal.SIGPIPE) from None

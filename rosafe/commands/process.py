@@ -1,0 +1,219 @@
+"""Compute auditory representations of sound files.
+
+Reads WAV (integer or float, any rate), FLAC and whatever else libsndfile reads, two channels: left and right ear.
+Writes an .npz for numpy.load beside each file, or where -o says, while it reads: neither has to fit into the memory.
+The numbers are those of the node on the same samples and blocks, bit for bit; so samples are taken as 32-bit integers
+(float files are scaled by 2^31-1 and rounded), and in_doNormalize is true unless told otherwise."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import textwrap
+import time
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from rosafe.commands import Failure
+from rosafe.commands._progress import Display, bytes_text
+from rosafe.commands._workers import Interrupted, Report, raise_on_signals, run_together
+from rosafe.interface import KINDS, ROSAFE, Parameter
+
+_BLOCK = ROSAFE.service("InputProc").parameter("nFramesPerBlock")
+_MAX_JOBS = 10_000
+
+# --- the command line -------------------------------------------------------------------------------------------
+
+
+class _Settings(argparse.Action):
+    """Words after --set: settings as far as they look so, the others are input files."""
+
+    def __call__(
+        self,
+        parser: argparse.ArgumentParser,
+        namespace: argparse.Namespace,
+        values: str | Sequence[Any] | None,
+        option_string: str | None = None,
+    ) -> None:
+        words = list(values or ())
+        if "=" not in words[0]:
+            parser.error(f"--set {words[0]}: wanted is NAME=VALUE")
+        namespace.settings = namespace.settings + [word for word in words if "=" in word]
+        namespace.more_inputs = namespace.more_inputs + [word for word in words if "=" not in word]
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments."""
+    parser.usage = (
+        "rosafe process IN [IN ...] [-o OUT] [--set NAME=VALUE ...] [--outputs NAME,...]\n"
+        "                      [--block N] [--jobs N] [--force] [--quiet]"
+    )
+    parser.add_argument("inputs", nargs="*", metavar="IN", help="sound file; several are processed at once")
+    parser.add_argument(
+        "-o",
+        "--output",
+        metavar="OUT",
+        help="output file, replaced where there is one; or the folder for all outputs, ending in / or there already "
+        "(default: beside each input); files in it are named as the inputs, with .npz",
+    )
+    parser.add_argument(
+        "--set",
+        dest="settings",
+        nargs="+",
+        action=_Settings,
+        default=[],
+        metavar="NAME=VALUE",
+        help="change parameters from their defaults; see below",
+    )
+    parser.add_argument(
+        "--outputs",
+        metavar="NAME,...",
+        help=f"what to keep of {', '.join(KINDS)} (default: all); what none of them needs is not computed",
+    )
+    parser.add_argument(
+        "--block",
+        type=partial(_count, maximum=_BLOCK.maximum),
+        default=_BLOCK.default,
+        metavar="N",
+        help=f"frames processed at a time, as the node's {_BLOCK.name} (default: {_BLOCK.default})",
+    )
+    parser.add_argument(
+        "--jobs",
+        type=partial(_count, maximum=_MAX_JOBS),
+        default=len(os.sched_getaffinity(0)),
+        metavar="N",
+        help="files processed at the same time (default: as many as there are processor cores)",
+    )
+    parser.add_argument("--force", action="store_true", help="replace outputs that -o does not name")
+    parser.add_argument("-q", "--quiet", action="store_true", help="say nothing unless something is wrong")
+    parser.epilog = _epilog()
+    parser.set_defaults(more_inputs=[], usage_error=parser.error)
+
+
+def _count(text: str, maximum: float) -> int:
+    if not (text.isascii() and text.isdigit()) or not 1 <= int(text[:20]) <= maximum:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 1 to {maximum:.0f}")
+    return int(text)
+
+
+def _epilog() -> str:
+    lines = [
+        "The .npz holds, as rosafe.process returns them: input, preProc (2, N); gammatone, ihc (2, C, N); ild (C, F);",
+        "ratemap (2, C, F); crossCorrelation (C, L, F); fb_cfHz (C,) in Hz; cc_lags (L,) in seconds; and the frame",
+        "rates ild_frameRate, ratemap_frameRate, crossCorrelation_frameRate in Hz. Besides: sample_rate in Hz,",
+        "block_frames, and parameters, all values in force as JSON.",
+        "",
+        "exit status: 0 all done, 1 something failed (the other files are done), 2 wrong command line, 130 interrupted",
+        "",
+        "examples:",
+        "  rosafe process speech.wav --outputs ild,ratemap --set fb_nChannels=64 ihc_method=bernstein",
+        "  rosafe process *.wav -o results/ --set fb_cfHz=500,1000,2000",
+        "",
+        "parameters, with their defaults:",
+    ]
+    for kind in KINDS.values():
+        lines.append(f"  {kind.kind}")
+        for parameter in kind.parameters:
+            lines += _parameter_lines(parameter)
+    return "\n".join(lines)
+
+
+def _parameter_lines(parameter: Parameter) -> list[str]:
+    default: Any = parameter.default
+    if isinstance(default, bool):
+        default = str(default).lower()
+    elif isinstance(default, tuple):
+        default = "{" + ",".join(map(str, default)) + "}"
+    limits = "true or false" if parameter.idl == "boolean" else parameter.range_text
+    if parameter.idl.startswith("sequence"):
+        limits = f"numbers, each {limits}"
+    return [
+        *textwrap.wrap(
+            f"{parameter.name}={default}  ({limits})", 100, initial_indent=" " * 4, subsequent_indent=" " * 8
+        ),
+        f"        {parameter.doc}",
+    ]
+
+
+# --- the work ---------------------------------------------------------------------------------------------------
+
+
+def run(options: argparse.Namespace) -> int:
+    """Process all files; 0 if all went well."""
+    inputs = [Path(name) for name in (*options.inputs, *options.more_inputs)]
+    if not inputs:
+        options.usage_error("no sound file is named")
+    targets, named = _targets(inputs, options.output)
+    raise_on_signals()
+    # Once, for all processes that are forked from this one.
+    from rosafe.audiofile import AudioFileError
+    from rosafe.chain import check_outputs, check_parameter
+    from rosafe.files import OutputError, process_file
+
+    try:
+        parameters = dict(check_parameter(*_name_and_value(setting), text=True) for setting in options.settings)
+        outputs = check_outputs(options.outputs.split(",") if options.outputs is not None else None)
+    except ValueError as problem:
+        raise Failure(str(problem)) from None
+    works = [
+        partial(process_file, source, target, parameters, options.block, outputs, named or options.force)
+        for source, target in zip(inputs, targets, strict=True)
+    ]
+    display = Display(sys.stderr, [_size(path) for path in inputs], options.quiet)
+    begun = time.monotonic()
+    failed = False
+
+    def report(index: int, told: Report) -> None:
+        nonlocal failed
+        if told.failure:
+            failed = True
+            text = told.failure if str(inputs[index]) in told.failure else f"{inputs[index]}: {told.failure}"
+            display.message(f"rosafe process: {text}")
+        elif told.last and not options.quiet:
+            seconds, size = told.result
+            passed = time.monotonic() - begun
+            display.message(
+                f"{inputs[index]} -> {targets[index]}: {seconds:.1f} s of sound, {bytes_text(size)}; "
+                f"{passed:.1f} s since the start"
+            )
+        display.update(index, 1.0 if told.last else told.part)
+
+    try:
+        run_together(works, options.jobs, (AudioFileError, OutputError, ValueError), report)
+    except Interrupted:
+        display.message("rosafe process: interrupted; what was not finished is removed")
+        raise
+    finally:
+        display.clear()
+    return 1 if failed else 0
+
+
+def _targets(inputs: list[Path], output: str | None) -> tuple[list[Path], bool]:
+    """Where the output of each input goes, and whether the user named that file; Failure where two go to one place."""
+    if output is None:
+        targets = [path.with_name(path.stem + ".npz") if path.name else path for path in inputs]
+    elif output.endswith("/") or Path(output).is_dir():
+        targets = [Path(output, path.stem + ".npz") for path in inputs]
+    elif len(inputs) == 1:
+        return [Path(output)], True
+    else:
+        raise Failure(f"-o {output}: for several files, wanted is a folder, ending in / or there already")
+    taken: dict[Path, Path] = {}
+    for path, target in zip(inputs, targets, strict=True):
+        other = taken.setdefault(target, path)
+        if other is not path:
+            raise Failure(f"{other} and {path} would both go to {target}")
+    return targets, False
+
+
+def _name_and_value(setting: str) -> tuple[str, str]:
+    name, _, value = setting.partition("=")
+    return name, value
+
+
+def _size(path: Path) -> float:
+    """How much a file counts in the display."""
+    return float(path.stat().st_size) if path.exists() else 0.0
