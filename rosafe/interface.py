@@ -440,7 +440,8 @@ GENOM_STATE_PORT = Port("genom_state", "::genom_state::component", "Tasks and li
 
 # --- rosAFE: parameters -----------------------------------------------------------------------------------------
 
-MAX_SECONDS = 600.0  # longest port window, history or analysis window
+MAX_SECONDS = 600.0  # longest port or history
+MAX_FRAME_SECONDS = 60.0  # longest analysis window, and longest step from one to the next
 MAX_BLOCK = 10_000_000  # frames
 
 _WINDOWS = ("hamming", "hanning", "hann", "blackman", "triang", "sqrt_win")
@@ -459,11 +460,11 @@ def _window(prefix: str) -> Parameter:
 
 
 def _window_size(prefix: str) -> Parameter:
-    return Parameter(f"{prefix}_wSizeSec", "double", 0.02, "Window duration (s)", 0.0, MAX_SECONDS, open_minimum=True)
+    return Parameter(f"{prefix}_wSizeSec", "double", 0.02, "Window duration (s)", 0.0, MAX_FRAME_SECONDS, True)
 
 
 def _hop_size(prefix: str) -> Parameter:
-    return Parameter(f"{prefix}_hSizeSec", "double", 0.01, "Window step size (s)", 0.0, MAX_SECONDS, open_minimum=True)
+    return Parameter(f"{prefix}_hSizeSec", "double", 0.01, "Window step size (s)", 0.0, MAX_FRAME_SECONDS, True)
 
 
 INPUT_PARAMETERS = (

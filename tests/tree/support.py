@@ -134,20 +134,22 @@ def use_plain_stages(patch: pytest.MonkeyPatch, **stages: type[Plain]) -> None:
         patch.setitem(STAGES, kind, stages.get(kind, Plain))  # type: ignore[misc]
 
 
-def default_tree(listener: Recorder, feed: Feed) -> Tree:
-    """The tree of the guide: one processor of each kind, called as its kind."""
-    tree = Tree(listener)
-    tree.add_input("input", feed, feed.frames, 1.0, 1.0)
-    for kind, parent in (
-        ("preProc", "input"),
-        ("gammatone", "preProc"),
-        ("ihc", "gammatone"),
-        ("ild", "ihc"),
-        ("ratemap", "ihc"),
-        ("crossCorrelation", "ihc"),
-    ):
-        tree.add(kind, kind, parent, {"fb_highFreqHz": 4000.0, "fb_nChannels": 5} if kind == "gammatone" else {})
-    return tree
+DEFAULT_TREE = (
+    ("preProc", "input"),
+    ("gammatone", "preProc"),
+    ("ihc", "gammatone"),
+    ("ild", "ihc"),
+    ("ratemap", "ihc"),
+    ("crossCorrelation", "ihc"),
+)
+CHANNELS = {"fb_highFreqHz": 4000.0, "fb_nChannels": 5}
+
+
+def grow(tree: Tree, feed: Feed) -> None:
+    """Make the tree of the guide: one processor of each kind, called as its kind. Samples are taken as they are."""
+    tree.add_input("input", feed, feed.frames, 1.0, 1.0, {"in_doNormalize": False})
+    for kind, parent in DEFAULT_TREE:
+        tree.add(kind, kind, parent, CHANNELS if kind == "gammatone" else {})
 
 
 def end(tree: Tree, listener: Recorder) -> None:

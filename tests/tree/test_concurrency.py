@@ -6,7 +6,6 @@ import contextlib
 import random
 import sys
 import threading
-from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -15,24 +14,12 @@ from rosafe.interface import ComponentError
 from rosafe.tree import State, Tree
 from tests.harness import wait_for
 
-from .support import RATE, WAIT_SECONDS, Feed, Plain, Recorder, end, use_plain_stages
-
-
-@pytest.fixture
-def listener() -> Recorder:
-    return Recorder()
+from .support import RATE, WAIT_SECONDS, Feed, Plain, Recorder, use_plain_stages
 
 
 @pytest.fixture
 def feed() -> Feed:
     return Feed(frames=1)
-
-
-@pytest.fixture
-def tree(listener: Recorder) -> Iterator[Tree]:
-    tree = Tree(listener)
-    yield tree
-    end(tree, listener)
 
 
 def test_siblings_work_at_the_same_time(

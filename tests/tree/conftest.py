@@ -1,0 +1,28 @@
+"""A tree under test: its listener, its source, and an end that leaves no thread behind."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from rosafe.tree import Tree
+
+from .support import Feed, Recorder, end
+
+
+@pytest.fixture
+def listener() -> Recorder:
+    return Recorder()
+
+
+@pytest.fixture
+def feed() -> Feed:
+    return Feed()
+
+
+@pytest.fixture
+def tree(listener: Recorder) -> Iterator[Tree]:
+    tree = Tree(listener)
+    yield tree
+    end(tree, listener)

@@ -1,0 +1,415 @@
+"""What users ask of the tree: errors and their order, names, removal, another input, stop, sizes, failures."""
+
+from __future__ import annotations
+
+import gc
+import threading
+import tracemalloc
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rosafe.dsp import STAGES
+from rosafe.interface import ComponentError
+from rosafe.tree import Processor, State, Tree
+from rosafe.tree.zone import Block
+from tests.harness import run_together, wait_for
+
+from .support import RATE, WAIT_SECONDS, Feed, Plain, Recorder, grow, use_plain_stages
+
+
+def refused(tree: Tree, ex: str, what: str, request: Any, *arguments: Any) -> None:
+    """`request` raises `::rosAFE::<ex>` with a text that holds `what`, and changes nothing."""
+    before = [(p, p.parent, p.state is State.REMOVED, p.parameters()) for p in tree.processors]
+    threads = threading.active_count()
+    with pytest.raises(ComponentError) as raised:
+        request(*arguments)
+    assert raised.value.ex == f"::rosAFE::{ex}"
+    assert what in str(raised.value)
+    assert [(p, p.parent, p.state is State.REMOVED, p.parameters()) for p in tree.processors] == before
+    assert threading.active_count() == threads
+
+
+# --- adding ---
+
+
+def test_the_tree_of_the_guide(tree: Tree, feed: Feed, listener: Recorder) -> None:
+    grow(tree, feed)
+    assert [p.name for p in tree.processors] == [p.kind for p in tree.processors] == list(STAGES)
+    assert tree.dependencies("ratemap") == ["input", "preProc", "gammatone", "ihc", "ratemap"]
+    assert tree.dependencies("input") == ["input"]
+    assert tree.input is tree.find("input")
+    rows = {p.kind: p.rows for p in tree.processors}
+    assert rows["input"] == rows["preProc"] == (2,)
+    assert rows["gammatone"] == rows["ihc"] == rows["ratemap"] == (2, 5)
+    assert (rows["ild"], rows["crossCorrelation"]) == ((5,), (5, 37))
+    assert [p.rate for p in tree.processors] == [RATE] * 4 + [100.0] * 3
+    feed.put(count=4)
+    for processor in tree.processors:
+        listener.wait_blocks(processor, 4)
+        assert listener.data(processor).shape == (*processor.rows, 640 if processor.rate == RATE else 3)
+        assert processor.next_index == 640
+
+
+def test_errors_of_a_processor_request_in_their_order(tree: Tree, feed: Feed) -> None:
+    refused(tree, "e_noUpperDependencie", "no processor 'input'", tree.add, "preProc", "preProc", "input")
+    grow(tree, feed)
+    bad = {"fb_highFreqHz": 1e5}
+    # an unknown parent comes before a name that is taken, that before a parent of the wrong type, that before values
+    refused(tree, "e_noUpperDependencie", "no processor 'none'", tree.add, "gammatone", "gammatone", "none", bad)
+    refused(tree, "e_existsAlready", "a ild 'ild'", tree.add, "gammatone", "ild", "ihc", bad)
+    refused(tree, "e_existsAlready", "a input 'input'", tree.add, "gammatone", "input", "preProc", bad)
+    refused(tree, "e_noUpperDependencie", "'ihc' is a ihc, wanted is a preProc", tree.add, "gammatone", "x", "ihc", bad)
+    refused(tree, "e_noUpperDependencie", "wanted is a ihc", tree.add, "ratemap", "x", "ild")
+    refused(tree, "e_badNewValue", "fb_highFreqHz", tree.add, "gammatone", "x", "preProc", bad)
+    refused(tree, "e_badNewValue", "ihc_method", tree.add, "ihc", "x", "gammatone", {"ihc_method": "unknown"})
+    for name in ("Ild", "", "ild "):  # names are taken literally
+        assert tree.add("ild", name, "ihc").name == name
+
+
+def test_unknown_names(tree: Tree, feed: Feed) -> None:
+    refused(tree, "e_noSuchProcessor", "no processor 'x'", tree.dependencies, "x")
+    grow(tree, feed)
+    for request, *arguments in ((tree.find,), (tree.dependencies,), (tree.remove,), (tree.modify, "fb_nERBs", "1")):
+        refused(tree, "e_noSuchProcessor", "no processor 'x'", request, "x", *arguments)
+
+
+def test_one_of_eight_gets_the_name(tree: Tree, feed: Feed) -> None:
+    tree.add_input("input", feed, 160, 1.0, 1.0)
+
+    def ask(user: int) -> str:
+        try:
+            return tree.add("preProc", "wanted", "input").name
+        except ComponentError as problem:
+            return problem.ex
+
+    answers = run_together(8, ask)
+    assert sorted(answers) == ["::rosAFE::e_existsAlready"] * 7 + ["wanted"]
+    assert len(tree.processors) == 2
+
+
+# --- removing ---
+
+
+def test_removal_takes_leaves_first_and_frees_the_names(tree: Tree, feed: Feed, listener: Recorder) -> None:
+    grow(tree, feed)
+    gone = tree.remove("gammatone")
+    assert [p.name for p in gone] == ["ild", "ratemap", "crossCorrelation", "ihc", "gammatone"]
+    assert listener.ends == gone
+    assert all(p.state is State.REMOVED and p.error is None for p in gone)
+    assert [p.name for p in tree.processors] == ["input", "preProc"]
+    refused(tree, "e_noSuchProcessor", "'ihc'", tree.remove, "ihc")
+    tree.add("preProc", "gammatone", "input")  # the name may be of another kind now
+    feed.put(count=2)
+    listener.wait_blocks(tree.find("gammatone"), 2)
+    assert [p.name for p in tree.processors] == ["input", "preProc", "gammatone"]
+
+
+def test_the_input_cannot_be_removed(tree: Tree, feed: Feed) -> None:
+    grow(tree, feed)
+    refused(tree, "e_noSuchProcessor", "call Stop", tree.remove, "input")
+
+
+def test_the_end_of_one_that_is_gone_already_changes_nothing(tree: Tree, feed: Feed) -> None:
+    tree.add_input("input", feed, 160, 1.0, 1.0)
+    old = tree.add("preProc", "a", "input")
+    tree.end(old)
+    new = tree.add("preProc", "a", "input")
+    tree.end(old)
+    assert tree.find("a") is new
+    tree.end(new)
+    assert [p.name for p in tree.processors] == ["input"]
+
+
+def test_stop_and_begin_anew(tree: Tree, listener: Recorder) -> None:
+    tree.stop()
+    for rate in (16000.0, 44100.0, 16000.0):
+        feed = Feed(rate)
+        grow(tree, feed)
+        feed.put(count=5)
+        listener.wait_blocks(tree.find("ild"), 5)
+        before = tree.processors
+        tree.stop()
+        assert feed.stopped
+        assert tree.processors == []
+        assert tree.input is None
+        assert all(p.join(WAIT_SECONDS) for p in before)
+    assert len(listener.ends) == 21
+
+
+# --- another input ---
+
+
+def test_children_go_on_with_the_new_input_and_what_they_held(tree: Tree, listener: Recorder) -> None:
+    """Filters and buffered samples are as if the two signals were one."""
+    noise = np.random.default_rng(1).standard_normal((2, 4 * 500))
+    first, second = Feed(frames=500), Feed(frames=500)
+    grow(tree, first)
+    tree.modify("preProc", "pp_bRemoveDC", "1")
+    old, leaves = tree.find("input"), [tree.find(kind) for kind in ("preProc", "ild", "ratemap")]
+    first.put(noise[:, :500], noise[:, 500:1000])
+    for leaf in leaves:
+        listener.wait_blocks(leaf, 2)
+    new = tree.add_input("another", second, 250, 2.0, 3.0, {"in_doNormalize": False})
+    assert listener.ends == [old]
+    assert first.stopped
+    assert [p.name for p in tree.processors][:2] == ["another", "preProc"]
+    assert tree.dependencies("ild") == ["another", "preProc", "gammatone", "ihc", "ild"]
+    assert (tree.port_seconds, tree.history_seconds) == (2.0, 3.0)
+    second.put(noise[:, 1000:1500], noise[:, 1500:])
+    listener.wait_blocks(new, 2)
+    whole = noise
+    for kind in ("preProc", "gammatone", "ihc"):
+        processor = tree.find(kind)
+        whole = STAGES[kind](RATE, **stage_parameters(processor)).process(whole)
+        listener.wait_blocks(processor, 4)
+        np.testing.assert_allclose(listener.data(processor), whole, rtol=0, atol=1e-12)
+    for leaf in leaves[1:]:
+        listener.wait_blocks(leaf, 4)
+        frames = STAGES[leaf.kind](RATE, **stage_parameters(leaf)).process(whole)
+        np.testing.assert_allclose(listener.data(leaf), frames, rtol=0, atol=1e-9)
+
+
+def stage_parameters(processor: Processor) -> dict[str, Any]:
+    return {k: v for k, v in processor.parameters().items() if k != "cc_lags"}
+
+
+def test_an_input_of_another_rate_or_a_taken_name_is_refused(tree: Tree, feed: Feed, listener: Recorder) -> None:
+    grow(tree, feed)
+    for ex, what, name, other in (
+        ("e_badNewValue", "the tree runs at 16000 Hz, Audio is at 44100 Hz", "input", Feed(44100.0)),
+        ("e_existsAlready", "'ild' is a ild", "ild", Feed()),
+    ):
+        refused(tree, ex, what, tree.add_input, name, other, 160, 1.0, 1.0)
+        assert other.stopped
+    assert not feed.stopped
+    feed.put(count=3)
+    listener.wait_blocks(tree.find("ild"), 3)
+
+
+def test_a_childless_input_gives_way_to_any_rate(tree: Tree, feed: Feed) -> None:
+    tree.add_input("input", feed, 160, 1.0, 1.0)
+    tree.add_input("input", Feed(44100.0), 160, 1.0, 1.0)
+    assert feed.stopped
+    assert tree.sample_rate == 44100.0
+    assert [p.rate for p in tree.processors] == [44100.0]
+
+
+def test_a_tree_whose_source_has_ended_goes_with_it(tree: Tree, feed: Feed, listener: Recorder) -> None:
+    grow(tree, feed)
+    before = tree.processors
+    feed.put(count=1)
+    feed.end()
+    for processor in before:
+        assert processor.join(WAIT_SECONDS)
+    tree.add_input("input", Feed(), 160, 1.0, 1.0)
+    names = ["ild", "ratemap", "crossCorrelation", "ihc", "gammatone", "preProc", "input"]
+    assert [p.name for p in listener.ends] == names
+    assert [p.name for p in tree.processors] == ["input"]
+
+
+# --- sizes ---
+
+
+def test_absurd_sizes_are_refused(tree: Tree, feed: Feed) -> None:
+    large = "MiB, more than 1024 MiB"
+    refused(tree, "e_badNewValue", large, tree.add_input, "input", Feed(1e9), 160, 600.0, 1.0)
+    grow(tree, feed)
+    tree.modify("gammatone", "fb_nChannels", "100")
+    for kind, parameters in (
+        ("ild", {"ild_wSizeSec": 60.0}),
+        ("ratemap", {"rm_wSizeSec": 50.0}),
+        ("crossCorrelation", {"cc_maxDelaySec": 10.0}),
+    ):
+        refused(tree, "e_badNewValue", large, tree.add, kind, "x", "ihc", parameters)
+    refused(tree, "e_badNewValue", "ild_wSizeSec: 60 s of 2x100 values", tree.modify, "ild", "ild_wSizeSec", "60")
+    refused(tree, "e_badNewValue", large, tree.modify, "crossCorrelation", "cc_maxDelaySec", "9")
+    refused(tree, "e_badNewValue", large, tree.add_input, "input", Feed(), 160, 500.0, 1.0)  # for those below
+    refused(tree, "e_badNewValue", large, tree.add_input, "input", Feed(), 10_000_000, 1.0, 1.0)
+    tree.modify("gammatone", "fb_nChannels", "5")
+    tree.modify("crossCorrelation", "cc_maxDelaySec", "0.5")
+    refused(tree, "e_badNewValue", large, tree.modify, "gammatone", "fb_nChannels", "1000")  # likewise
+
+
+def test_two_hundred_processors(tree: Tree, feed: Feed, listener: Recorder) -> None:
+    tree.add_input("input", feed, 160, 1.0, 1.0, {"in_doNormalize": False})
+    for index in range(200):
+        tree.add("preProc", f"p{index}", "input")
+    feed.put(count=3)
+    for processor in tree.processors:
+        listener.wait_blocks(processor, 3)
+        np.testing.assert_array_equal(listener.data(processor)[1], np.arange(480))
+
+
+def test_three_hundred_cycles_leave_nothing_behind(tree: Tree, feed: Feed, listener: Recorder) -> None:
+    tree.add_input("input", feed, 160, 1.0, 0.0)
+    threads = threading.active_count()
+
+    def cycle() -> None:
+        tree.add("preProc", "preProc", "input")
+        tree.add("gammatone", "gammatone", "preProc", {"fb_nChannels": 2, "fb_highFreqHz": 4000.0})
+        feed.put(count=1)
+        listener.wait_blocks(tree.find("gammatone"), 1)
+        for processor in tree.remove("preProc"):
+            assert processor.join(WAIT_SECONDS)
+        for record in (listener.blocks, listener.processors, listener.ends, listener.executed_blocks):
+            record.clear()
+        listener.blocks[tree.find("input")] = []
+
+    def memory() -> int:
+        gc.collect()
+        return tracemalloc.get_traced_memory()[0]
+
+    tracemalloc.start()
+    try:
+        for _ in range(30):
+            cycle()
+        before = memory()
+        for _ in range(270):
+            cycle()
+        assert memory() - before < 50_000
+    finally:
+        tracemalloc.stop()
+    assert threading.active_count() == threads
+    assert len(tree.processors) == 1
+
+
+# --- failures ---
+
+
+class Failing(Plain):
+    def process(self, block: np.ndarray) -> np.ndarray:
+        if self.parameters.get("fails") and block[0, 0] >= 160:
+            raise ArithmeticError("out of luck")
+        return block
+
+
+def test_a_failing_stage_ends_what_depends_on_it(
+    tree: Tree, feed: Feed, listener: Recorder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    use_plain_stages(monkeypatch, preProc=Failing)
+    root = tree.add_input("input", feed, 160, 1.0, 1.0)
+    failing = tree.add("preProc", "failing", "input", {"fails": True})
+    below = tree.add("gammatone", "below", "failing")
+    other = tree.add("preProc", "other", "input")
+    feed.put(count=4)
+    listener.wait(lambda: failing in listener.ends)
+    assert listener.ends == [below, failing]
+    assert isinstance(failing.error, ArithmeticError)
+    assert below.error is None
+    listener.wait_blocks(other, 4)
+    assert len(listener.blocks[failing]) == 1
+    wait_for(lambda: tree.processors == [root, other])
+    tree.add("preProc", "failing", "input")
+
+
+def test_a_failing_input_ends_everything(
+    tree: Tree, feed: Feed, listener: Recorder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    use_plain_stages(monkeypatch, input=Failing)
+    root = tree.add_input("input", feed, 160, 1.0, 1.0, {"fails": True})
+    tree.add("preProc", "below", "input")
+    feed.put(count=4)
+    wait_for(lambda: not tree.processors)
+    assert isinstance(root.error, ArithmeticError)
+    assert feed.stopped
+
+
+def test_bad_samples_end_the_input_with_a_reason(tree: Tree, feed: Feed, listener: Recorder) -> None:
+    grow(tree, feed)
+    root = tree.find("input")
+    block = np.ones((2, 160))
+    block[1, 80] = np.nan
+    feed.put(block)
+    wait_for(lambda: not tree.processors)
+    assert "not finite" in str(root.error)
+
+
+@pytest.mark.parametrize("when", ["added", "released"])
+def test_a_listener_that_fails(
+    tree: Tree, feed: Feed, listener: Recorder, when: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It costs the one processor that it failed for, which the tree then no longer holds."""
+    original = getattr(Recorder, when)
+
+    def fail(self: Recorder, processor: Processor, *block: Block) -> None:
+        if processor.name == "unlucky":
+            raise OSError("no space left on device")
+        original(self, processor, *block)
+
+    monkeypatch.setattr(Recorder, when, fail)
+    root = tree.add_input("input", feed, 160, 1.0, 1.0)
+    if when == "added":
+        with pytest.raises(OSError, match="no space"):
+            tree.add("preProc", "unlucky", "input")
+    else:
+        unlucky = tree.add("preProc", "unlucky", "input")
+        feed.put(count=1)
+        wait_for(lambda: tree.processors == [root])
+        assert isinstance(unlucky.error, OSError)
+    lucky = tree.add("preProc", "lucky", "input")
+    feed.put(count=3)
+    listener.wait_blocks(lucky, 3)
+    assert tree.processors == [root, lucky]
+
+
+def test_no_thread_to_be_had(tree: Tree, feed: Feed, listener: Recorder, monkeypatch: pytest.MonkeyPatch) -> None:
+    root = tree.add_input("input", feed, 160, 1.0, 1.0)
+    with monkeypatch.context() as patch:
+
+        def no_thread(self: threading.Thread) -> None:
+            raise RuntimeError("can't start new thread")
+
+        patch.setattr(threading.Thread, "start", no_thread)
+        with pytest.raises(RuntimeError, match="can't start"):
+            tree.add("preProc", "a", "input")
+        assert tree.processors == [root]
+    again = tree.add("preProc", "a", "input")
+    feed.put(count=2)
+    listener.wait_blocks(again, 2)
+
+
+# --- signals since the last call ---
+
+
+def test_signals_since_the_last_call(tree: Tree, feed: Feed, listener: Recorder) -> None:
+    tree.add_input("input", feed, 160, 1.0, 0.05, {"in_doNormalize": False})
+    assert tree.history_seconds == 0.05  # five blocks of 160 at 16 kHz
+    one = tree.add("preProc", "one", "input")
+    view, index, rate = one.take_signals()
+    assert (view.shape, index, rate) == ((2, 0), 0, RATE)
+    feed.put(count=2)
+    listener.wait_blocks(one, 2)
+    for expected in (np.arange(320), np.arange(0)):
+        view, index, rate = one.take_signals()
+        np.testing.assert_array_equal(view.array(), [expected, expected])
+        assert (index, rate) == (320, RATE)
+    feed.put(count=8)
+    listener.wait_blocks(one, 10)
+    view, index, rate = one.take_signals()
+    np.testing.assert_array_equal(view.array()[0], np.arange(1600 - 800, 1600))
+    assert index == 1600
+
+
+def test_histories_hold_two_blocks_at_least(tree: Tree, listener: Recorder) -> None:
+    feed = Feed(frames=1600)
+    tree.add_input("input", feed, 1600, 1.0, 0.01)
+    assert tree.history_seconds == 0.2
+    feed.put(count=3)
+    listener.wait_blocks(tree.find("input"), 3)
+    assert tree.find("input").take_signals()[0].frames == 3200
+
+
+def test_frames_of_two_rates_do_not_mix(tree: Tree, feed: Feed, listener: Recorder) -> None:
+    grow(tree, feed)
+    ild = tree.find("ild")
+    feed.put(count=5)
+    listener.wait_blocks(ild, 5)
+    tree.modify("ild", "ild_hSizeSec", "0.005")
+    assert ild.rate == 200.0
+    assert ild.take_signals()[2] == 100.0  # what is there was made before the change
+    feed.put(count=5)
+    listener.wait_blocks(ild, 10)
+    view, _, rate = ild.take_signals()
+    assert (view.shape, rate) == ((5, 9), 200.0)  # from sample 640 of 1600 on
