@@ -67,7 +67,6 @@ class Recorder:
     def __init__(self) -> None:
         self.processors: list[Processor] = []
         self.blocks: dict[Processor, list[Block]] = {}
-        self.executed_blocks: collections.Counter[Processor] = collections.Counter()
         self.ends: list[Processor] = []
         self.late: list[Processor] = []  # released something after their end
         self._turn = threading.Condition()
@@ -78,9 +77,7 @@ class Recorder:
             self.blocks[processor] = []
 
     def executed(self, processor: Processor, seconds: float) -> None:
-        with self._turn:
-            self.executed_blocks[processor] += 1
-            self._turn.notify_all()
+        pass
 
     def released(self, processor: Processor, block: Block) -> None:
         with self._turn:
@@ -93,6 +90,13 @@ class Recorder:
         with self._turn:
             self.ends.append(processor)
             self._turn.notify_all()
+
+    def forget(self) -> None:
+        """Remember nothing but those that have not ended."""
+        with self._turn:
+            self.processors = [processor for processor in self.processors if processor not in self.ends]
+            self.blocks = {processor: [] for processor in self.processors}
+            self.ends.clear()
 
     def wait(self, condition: Callable[[], Any]) -> None:
         """Wait until `condition()` holds after something that a processor did."""

@@ -253,9 +253,7 @@ def test_three_hundred_cycles_leave_nothing_behind(tree: Tree, feed: Feed, liste
         listener.wait_blocks(tree.find("gammatone"), 1)
         for processor in tree.remove("preProc"):
             assert processor.join(WAIT_SECONDS)
-        for record in (listener.blocks, listener.processors, listener.ends, listener.executed_blocks):
-            record.clear()
-        listener.blocks[tree.find("input")] = []
+        listener.forget()
 
     def memory() -> int:
         gc.collect()

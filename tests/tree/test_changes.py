@@ -1,0 +1,401 @@
+"""modifyParameter on a running tree: what it accepts, when it takes effect, and what it leaves alone."""
+
+from __future__ import annotations
+
+import threading
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rosafe.dsp import STAGES
+from rosafe.interface import KINDS, ComponentError
+from rosafe.tree import Processor, State, Tree
+from tests.dsp.bare import Chain, joined
+from tests.harness import run_together, wait_for
+
+from .support import CHANNELS, RATE, WAIT_SECONDS, Feed, Plain, Recorder, grow, use_plain_stages
+
+LEAVES = ("ild", "ratemap", "crossCorrelation")
+NOISE = np.random.default_rng(7).standard_normal((20, 2, 400))
+# A value of every parameter that is not the one in force, as text and as what getParameters then says
+CHANGES: dict[str, tuple[str, Any]] = {
+    "in_doNormalize": ("1", True),
+    "in_normalizeValue": ("32768", 32768),
+    "pp_bRemoveDC": ("true", True),
+    "pp_cutoffHzDC": ("50", 50.0),
+    "pp_bPreEmphasis": (" 1 ", True),
+    "pp_coefPreEmphasis": ("9.5e-1", 0.95),
+    "pp_bNormalizeRMS": ("1", True),
+    "pp_intTimeSecRMS": ("20E-3", 0.02),
+    "pp_bLevelScaling": ("1", True),
+    "pp_refSPLdB": ("94", 94.0),
+    "pp_bMiddleEarFiltering": ("1", True),
+    "pp_middleEarModel": ("lopezpoveda", "lopezpoveda"),
+    "pp_bUnityComp": ("1", True),
+    "fb_type": ("drnl", "drnl"),
+    "fb_lowFreqHz": ("100", 100.0),
+    "fb_highFreqHz": ("3000.5", 3000.5),
+    "fb_nERBs": ("2", 2.0),
+    "fb_nChannels": ("3", 3),
+    "fb_cfHz": ("{500, 1000}", [500.0, 1000.0]),
+    "fb_nGamma": ("3", 3),
+    "fb_bwERBs": ("1.3", 1.3),
+    "ihc_method": ("halfwave", "halfwave"),
+    "ild_wname": ("blackman", "blackman"),
+    "ild_wSizeSec": ("0.03", 0.03),
+    "ild_hSizeSec": ("0.005", 0.005),
+    "rm_wname": ("hamming", "hamming"),
+    "rm_wSizeSec": ("0.03", 0.03),
+    "rm_hSizeSec": ("0.02", 0.02),
+    "rm_scaling": ("magnitude", "magnitude"),
+    "rm_decaySec": ("0.02", 0.02),
+    "cc_wname": ("triang", "triang"),
+    "cc_wSizeSec": ("0.03", 0.03),
+    "cc_hSizeSec": ("0.02", 0.02),
+    "cc_maxDelaySec": ("0.002", 0.002),
+}
+OWNER = {p.name: kind.kind for kind in KINDS.values() for p in kind.parameters}
+
+
+def test_every_parameter_has_a_change_here() -> None:
+    assert list(CHANGES) == list(OWNER)
+
+
+def settle(tree: Tree, feed: Feed, listener: Recorder, *blocks: np.ndarray) -> None:
+    """Feed `blocks` and wait until all processors have released what they make of them."""
+    wanted = {p: len(listener.blocks[p]) + len(blocks) for p in tree.processors}
+    feed.put(*blocks)
+    for processor, count in wanted.items():
+        listener.wait_blocks(processor, count)
+
+
+def chain(**parameters: Any) -> Chain:
+    return Chain(RATE, {"in_doNormalize": False, **CHANNELS, **parameters})
+
+
+def assert_as(listener: Recorder, tree: Tree, kind: str, outputs: list[dict[str, np.ndarray]]) -> None:
+    """The processor called `kind` released, block by block, what the bare stages make."""
+    released = listener.blocks[tree.find(kind)]
+    assert len(released) == len(outputs)
+    for block, output in zip(released, outputs, strict=True):
+        assert block.data.shape == output[kind].shape
+        np.testing.assert_allclose(block.data, output[kind], rtol=1e-12, atol=1e-12)
+
+
+# --- what it takes ---
+
+
+@pytest.mark.parametrize("name", CHANGES)
+def test_a_change_of_each_parameter(tree: Tree, feed: Feed, listener: Recorder, name: str) -> None:
+    """It is in force from the next block on, for that processor alone; the bare stages say what that means."""
+    text, value = CHANGES[name]
+    grow(tree, feed)
+    processor = tree.find(OWNER[name])
+    assert processor.parameters()[name] != value
+    others = {p.name: p.parameters() for p in tree.processors if p is not processor}
+    settle(tree, feed, listener, *NOISE[:3])
+    tree.modify(OWNER[name], name, text)
+    assert processor.parameters()[name] == value
+    assert {p.name: p.parameters() for p in tree.processors if p is not processor} == others
+    settle(tree, feed, listener, *NOISE[3:6])
+    outputs = chain().run(list(NOISE[:6]), [(3, name, value)])
+    for kind in ("preProc", "gammatone", "ihc", *LEAVES):
+        assert_as(listener, tree, kind, outputs)
+    assert processor.parameters()[name] == value
+
+
+def test_values_that_are_refused(tree: Tree, feed: Feed) -> None:
+    grow(tree, feed)
+    refusals = {
+        "pp_bRemoveDC": ("2", "10", "TRUE", "True", "1.0", "yes", "", "0 1"),
+        "pp_cutoffHzDC": ("", "inf", "nan", "-inf", "0x10", "1,5", "12abc", "1e400", "0", "-1", "1 2", "."),
+        "pp_coefPreEmphasis": ("1.0001", "-2", "1_0"),
+        "pp_refSPLdB": ("1e9",),
+        "in_normalizeValue": ("0", "-1", "5.0", "1e3", "", "18446744073709551616", "0x10", "9" * 5000, "٣"),
+        "fb_nChannels": ("-1", "1e1", "1025", "4294967297", "+"),
+        "fb_cfHz": ("100 abc", "8000", "-5", "0 100", "nan", "1 " * 2000),
+        "fb_lowFreqHz": ("5000", "0"),
+        "fb_highFreqHz": ("50", "8001"),
+        "fb_nERBs": ("0", "1e-9"),
+        "fb_nGamma": ("0", "65"),
+        "fb_bwERBs": ("0",),
+        "ild_wSizeSec": ("0", "1e-9", "61", "-0.02"),
+        "rm_hSizeSec": ("0", "1e-9"),
+        "rm_decaySec": ("0", "-1"),
+        "cc_maxDelaySec": ("0", "11"),
+    }
+    for name, texts in refusals.items():
+        processor = tree.find(OWNER[name])
+        before = processor.parameters()
+        for text in texts:
+            with pytest.raises(ComponentError) as raised:
+                tree.modify(OWNER[name], name, text)
+            assert raised.value.ex == "::rosAFE::e_badNewValue", text
+            assert raised.value.detail["what"].startswith("fb_" if name.startswith("fb_") else name)
+            assert processor.parameters() == before
+
+
+def test_the_order_of_errors(tree: Tree, feed: Feed) -> None:
+    grow(tree, feed)
+    for name, parameter, ex in (
+        ("none", "none", "e_noSuchProcessor"),
+        ("input", "pp_bRemoveDC", "e_noSuchParameter"),  # the guide's own example
+        ("ild", "rm_wname", "e_noSuchParameter"),
+        ("ild", "", "e_noSuchParameter"),
+        ("ild", "ild_hSizeSec", "e_badNewValue"),
+    ):
+        with pytest.raises(ComponentError) as raised:
+            tree.modify(name, parameter, "bad")
+        assert raised.value.ex == f"::rosAFE::{ex}"
+
+
+def test_names_and_words_of_the_original(tree: Tree, feed: Feed) -> None:
+    """Its misspelt names work, and unknown words become the default, which getParameters then reports."""
+    grow(tree, feed)
+    for processor, parameter, text, name, value in (
+        ("ratemap", "set_rm_scailing", "_magnitude", "rm_scaling", "magnitude"),
+        ("ratemap", "set_rm_scailing", "_power", "rm_scaling", "power"),
+        ("ratemap", "set_rm_scailing", "magnitude", "rm_scaling", "magnitude"),
+        ("ratemap", "rm_scaling", "loud", "rm_scaling", "power"),
+        ("preProc", "pp_refSPLdBS", "94", "pp_refSPLdB", 94.0),
+        ("preProc", "pp_middleEarModel", "lopezpoveda", "pp_middleEarModel", "lopezpoveda"),
+        ("preProc", "pp_middleEarModel", "jespen", "pp_middleEarModel", "jepsen"),
+        ("ihc", "ihc_method", " halfwave ", "ihc_method", "halfwave"),
+        ("ihc", "ihc_method", "meddis", "ihc_method", "dau"),
+        ("ild", "ild_wname", "", "ild_wname", "hann"),
+        ("gammatone", "fb_type", "drnl", "fb_type", "drnl"),
+        ("gammatone", "fb_type", "string", "fb_type", "gammatone"),
+        ("gammatone", "fb_cfHz", "700", "fb_nChannels", 1),
+        ("gammatone", "fb_cfHz", "0", "fb_nChannels", 5),
+        ("gammatone", "fb_cfHz", "[300; 800 2000]", "fb_nChannels", 3),
+        ("gammatone", "fb_cfHz", "{}", "fb_nChannels", 5),
+        ("crossCorrelation", "cc_maxDelaySec", "0.00025", "cc_lags", [m / RATE for m in range(-4, 5)]),
+    ):
+        tree.modify(processor, parameter, text)
+        assert tree.find(processor).parameters()[name] == value, (parameter, text)
+
+
+# --- when and how ---
+
+
+def test_a_refused_change_does_not_touch_the_numbers(tree: Tree, feed: Feed, listener: Recorder) -> None:
+    """Not even one that a stage has made of itself already when the tree refuses it."""
+
+    def refuse(stage: Any) -> None:
+        raise ValueError("refused")
+
+    grow(tree, feed)
+    settle(tree, feed, listener, *NOISE[:2])
+    for name, (_, value) in CHANGES.items():
+        with pytest.raises(ValueError, match="refused"):
+            tree.find(OWNER[name]).change(name, value, refuse)
+    settle(tree, feed, listener, *NOISE[2:4])
+    outputs = chain().run(list(NOISE[:4]))
+    for kind in STAGES:
+        assert_as(listener, tree, kind, outputs)
+
+
+def test_changes_pile_up_until_the_next_block(tree: Tree, feed: Feed, listener: Recorder) -> None:
+    grow(tree, feed)
+    settle(tree, feed, listener, *NOISE[:2])
+    changes = [("fb_nERBs", "3"), ("fb_bwERBs", "1.5"), ("fb_nChannels", "4"), ("fb_highFreqHz", "3000")]
+    for name, text in changes:
+        tree.modify("gammatone", name, text)
+    with pytest.raises(ComponentError):
+        tree.modify("gammatone", "fb_lowFreqHz", "3500")  # refused for a change that no block has seen yet
+    settle(tree, feed, listener, *NOISE[2:4])
+    outputs = chain().run(list(NOISE[:4]), [(2, name, float(text)) for name, text in changes])
+    assert_as(listener, tree, "gammatone", outputs)
+    assert_as(listener, tree, "crossCorrelation", outputs)
+
+
+def test_a_change_waits_for_no_block_and_never_meets_one_half_way(
+    tree: Tree, feed: Feed, listener: Recorder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    working, go_on = threading.Event(), threading.Event()
+
+    class Slow(Plain):
+        def process(self, block: np.ndarray) -> np.ndarray:
+            before = dict(self.parameters)
+            working.set()
+            assert go_on.wait(WAIT_SECONDS)
+            assert self.parameters == before
+            return block * (1.0 + self.parameters.get("rm_decaySec", 0.0))
+
+    use_plain_stages(monkeypatch, ratemap=Slow)
+    grow(tree, feed)
+    feed.put(*np.ones((2, 2, 10)))
+    assert working.wait(WAIT_SECONDS)
+    tree.modify("ratemap", "rm_decaySec", "2")
+    ratemap = tree.find("ratemap")
+    assert ratemap.state is State.EXEC
+    assert ratemap.parameters()["rm_decaySec"] == 2.0
+    go_on.set()
+    listener.wait_blocks(ratemap, 2)
+    assert [block.data[0, 0] for block in listener.blocks[ratemap]] == [1.0, 3.0]
+
+
+def test_what_is_asked_while_others_change_it_fits_together(tree: Tree, feed: Feed) -> None:
+    grow(tree, feed)
+    correlation = tree.find("crossCorrelation")
+
+    def work(user: int) -> bool:
+        for step in range(200):
+            if user < 2:
+                tree.modify("crossCorrelation", "cc_maxDelaySec", str(0.001 * (1 + (user + step) % 3)))
+            else:
+                values = correlation.parameters()
+                if values["cc_lags"][-1] != np.ceil(values["cc_maxDelaySec"] * RATE) / RATE:
+                    return False
+        return True
+
+    feed.put(*NOISE)
+    assert all(run_together(4, work))
+
+
+def test_another_number_of_channels_reaches_the_leaves(tree: Tree, feed: Feed, listener: Recorder) -> None:
+    grow(tree, feed)
+    settle(tree, feed, listener, *NOISE[:2])
+    tree.modify("gammatone", "fb_nChannels", "9")
+    assert {p.kind: p.rows for p in tree.processors if p.kind in LEAVES} == {
+        "ild": (9,),
+        "ratemap": (2, 9),
+        "crossCorrelation": (9, 37),
+    }
+    settle(tree, feed, listener, *NOISE[2:5])
+    assert [block.data.shape[1] for block in listener.blocks[tree.find("ratemap")]] == [5, 5, 9, 9, 9]
+
+
+# --- the envelope, which the filterbank computes only where it is asked to ---
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
+    """Whether the filterbank computed the envelope, block by block."""
+    answers: list[bool] = []
+    original = STAGES["gammatone"].process
+
+    def process(self: Any, block: np.ndarray) -> np.ndarray:
+        answers.append(self.provide_envelope)
+        return original(self, block)
+
+    monkeypatch.setattr(STAGES["gammatone"], "process", process)
+    return answers
+
+
+def suffix(listener: Recorder, processor: Processor, whole: np.ndarray) -> int:
+    """The processor released the end of `whole`; the number of blocks of 400 that are missing before."""
+    released = listener.data(processor)
+    start = whole.shape[-1] - released.shape[-1]
+    np.testing.assert_allclose(released, whole[..., start:], rtol=0, atol=1e-12)
+    assert start % 400 == 0
+    return start // 400
+
+
+def test_the_envelope_is_computed_only_while_somebody_wants_it(
+    tree: Tree, feed: Feed, listener: Recorder, asked: list[bool]
+) -> None:
+    grow(tree, feed)
+    settle(tree, feed, listener, *NOISE[:3])
+    late = tree.add("ihc", "late", "gammatone", {"ihc_method": "hilbert"})
+    wait_for(lambda: late.blocks == 1)  # it has seen the last block, which had none
+    assert listener.blocks[late] == []
+    settle(tree, feed, listener, NOISE[3])
+    settle(tree, feed, listener, *NOISE[4:6])
+    tree.remove("late")
+    settle(tree, feed, listener, *NOISE[6:8])
+    assert asked == [False] * 3 + [True] * 3 + [False] * 2
+    outputs = joined(chain(ihc_method="hilbert").run(list(NOISE[:6])))
+    assert suffix(listener, late, outputs["ihc"]) == 3
+    assert_as(listener, tree, "ihc", chain().run(list(NOISE[:8])))
+
+
+@pytest.mark.parametrize("method", ["hilbert", "joergensen", "bernstein"])
+def test_a_late_child_never_works_without_the_envelope(tree: Tree, feed: Feed, listener: Recorder, method: str) -> None:
+    """While blocks flow, it begins one to three blocks later and then misses none."""
+    grow(tree, feed)
+    feed.put(*NOISE[:8])
+    listener.wait_blocks(tree.find("gammatone"), 2)
+    late = tree.add("ihc", "late", "gammatone", {"ihc_method": method})
+    below = tree.add("ild", "below", "late")
+    feed.put(*NOISE[8:])
+    listener.wait_blocks(tree.find("gammatone"), 20)
+    listener.wait(lambda: listener.blocks[below] and listener.blocks[below][-1].number == 19)
+    numbers = [block.number for block in listener.blocks[late]]
+    assert numbers == list(range(numbers[0], 20))
+    assert [block.number for block in listener.blocks[below]][-3:] == [17, 18, 19]
+    # from where it began, the filter after the envelope begins at rest
+    filterbank = chain().stages["gammatone"]
+    hair_cell = STAGES["ihc"](RATE, ihc_method=method)
+    for number, block in enumerate(NOISE):
+        filterbank.provide_envelope = True  # type: ignore[attr-defined]
+        data = filterbank.process(block)
+        if number >= numbers[0]:
+            expected = hair_cell.process(data, filterbank.envelope)  # type: ignore[attr-defined,call-arg]
+            got = listener.blocks[late][number - numbers[0]].data
+            np.testing.assert_allclose(got, expected, rtol=0, atol=1e-12)
+
+
+def test_a_live_switch_to_the_envelope_and_back_loses_no_block(
+    tree: Tree, feed: Feed, listener: Recorder, asked: list[bool]
+) -> None:
+    grow(tree, feed)
+    settle(tree, feed, listener, *NOISE[:3])
+    tree.modify("ihc", "ihc_method", "hilbert")
+    assert tree.find("ihc").parameters() == {"ihc_method": "hilbert"}
+    settle(tree, feed, listener, *NOISE[3:6])
+    tree.modify("ihc", "ihc_method", "fullwave")
+    settle(tree, feed, listener, *NOISE[6:8])
+    assert asked == [False] * 3 + [True] * 3 + [False] * 2
+    changes = [(3, "ihc_method", "hilbert"), (6, "ihc_method", "fullwave")]
+    outputs = chain().run(list(NOISE[:8]), changes)
+    for kind in ("ihc", *LEAVES):
+        assert_as(listener, tree, kind, outputs)
+
+
+def test_a_switch_while_blocks_are_on_their_way(tree: Tree, feed: Feed, listener: Recorder) -> None:
+    """Every block is either wholly the old method's or the new one's, none is missing, and the last word counts."""
+    grow(tree, feed)
+    ihc = tree.find("ihc")
+    feed.put(*NOISE[:15])
+    for number, method in enumerate(("hilbert", "none", "hilbert", "none", "hilbert", "fullwave", "hilbert")):
+        listener.wait_blocks(ihc, 1 + 2 * number)
+        tree.modify("ihc", "ihc_method", method)
+    listener.wait_blocks(ihc, 15)
+    settle(tree, feed, listener, *NOISE[15:])
+    methods = ("dau", "hilbert", "none", "fullwave")
+    outputs = {method: chain(ihc_method=method).run(list(NOISE)) for method in methods}
+    names = []
+    for number, block in enumerate(listener.blocks[ihc]):
+        fits = [m for m in methods[1:] if np.allclose(block.data, outputs[m][number]["ihc"], rtol=0, atol=1e-12)]
+        names += fits or ["dau"]
+    assert names[0] == "dau"
+    assert names[-5:] == ["hilbert"] * 5
+    assert len(names) == 20
+
+
+def test_a_switch_there_and_back_before_any_block_is_none(
+    tree: Tree, feed: Feed, listener: Recorder, asked: list[bool]
+) -> None:
+    grow(tree, feed)
+    settle(tree, feed, listener, *NOISE[:2])
+    tree.modify("ihc", "ihc_method", "hilbert")
+    tree.modify("ihc", "ihc_method", "fullwave")
+    settle(tree, feed, listener, *NOISE[2:5])
+    assert asked == [False] * 5
+    assert_as(listener, tree, "ihc", chain().run(list(NOISE[:5]), [(2, "ihc_method", "fullwave")]))
+
+
+def test_two_hair_cells_of_which_one_wants_the_envelope(tree: Tree, feed: Feed, listener: Recorder) -> None:
+    grow(tree, feed)
+    other = tree.add("ihc", "other", "gammatone", {"ihc_method": "hilbert"})
+    settle(tree, feed, listener, *NOISE[:3])
+    tree.modify("gammatone", "fb_type", "drnl")
+    tree.modify("gammatone", "fb_nChannels", "4")
+    settle(tree, feed, listener, *NOISE[3:6])
+    changes = [(3, "fb_type", "drnl"), (3, "fb_nChannels", 4)]
+    assert_as(listener, tree, "ihc", chain().run(list(NOISE[:6]), changes))
+    expected = chain(ihc_method="hilbert").run(list(NOISE[:6]), changes)
+    for block, output in zip(listener.blocks[other], expected, strict=True):
+        np.testing.assert_allclose(block.data, output["ihc"], rtol=0, atol=1e-12)
