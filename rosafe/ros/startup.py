@@ -62,7 +62,8 @@ def run_server(component: interface.Component, build: Callable[[str], Node], arg
         return told.wait()
     received: list[int] = []
     for number in SIGNALS:
-        signal.signal(number, lambda number, frame: received.append(number))
+        if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # nohup's wish counts
+            signal.signal(number, lambda number, frame: received.append(number))
     try:
         node = _start(component, build, options.instance, remappings, received)
     except (_Failure, generate.GenerationError, master.MasterError, interface.ComponentError, OSError) as problem:

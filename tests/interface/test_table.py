@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
 
-from rosafe import interface
+from rosafe import __version__, interface
 from rosafe.interface import BASS, ROSAFE, Component, Service
 from tests import harness
 
@@ -142,3 +143,10 @@ def test_exceptions() -> None:
             _, owner, short = thrown.split("::")
             known = interface.GENOM_EXCEPTIONS if owner == "genom" else component.exceptions
             assert short in known, f"{service.name} throws {thrown}"
+
+
+@COMPONENTS
+def test_version_is_that_of_the_package(component: Component) -> None:
+    manifest = ElementTree.parse(FOLDERS[component.name] / "package.xml")
+    assert manifest.findtext("version") == __version__
+    assert manifest.findtext("name") == component.name

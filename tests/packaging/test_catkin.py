@@ -100,6 +100,20 @@ def test_tcl_package(workspace: Path) -> None:
     assert str(workspace / "install" / "lib" / "tcltk" / "genomix") in shown
 
 
+def test_environment_for_children(workspace: Path) -> None:
+    install = workspace / "install"
+    python = install / "lib" / "python3" / "dist-packages"
+    command = [PYTHON, "-m", "rosafe.ros.generate", "--shell"]
+    exports = dict(
+        line.removeprefix("export ").split("=", 1)
+        for line in printed(run(*command, env=environment(PYTHONPATH=str(python)), cwd=Path("/"))).splitlines()
+    )
+    assert exports["PATH"].split(":")[0] == str(install / "bin")
+    assert exports["PYTHONPATH"].split(":")[0] == str(python)
+    assert exports["ROS_PACKAGE_PATH"] == str(install / "share")
+    assert exports["TCLLIBPATH"] == str(install / "lib" / "tcltk")
+
+
 def test_setup_twice_is_once(workspace: Path) -> None:
     again = f". {workspace}/install/setup.bash && echo $TCLLIBPATH"
     assert printed(sourced(workspace, again)).strip() == str(workspace / "install" / "lib" / "tcltk")

@@ -144,6 +144,16 @@ def test_rosnode_kill_ends_it(graph: Graph) -> None:
         assert node.wait(5) == 0
 
 
+def test_nohup_is_respected(graph: Graph) -> None:
+    with graph.start("nohup", "bass-ros", "-i", "lasting") as node:
+        wait_for(lambda: "/lasting/kill" in graph.services(), 20, lambda: str(node))
+        wait_for(lambda: "/lasting/Acquire/cancel" in graph.run("rostopic", "list").stdout)
+        os.kill(node.pid, signal.SIGHUP)
+        assert graph.call("/lasting/Stop").genom_success
+        assert node.alive
+        assert node.stop(signal.SIGTERM) == 0
+
+
 def test_the_shells_process_is_the_node(graph: Graph) -> None:
     with graph.node("bass-ros") as node:
         assert f"Pid: {node.pid}\n" in graph.run("rosnode", "info", "/bass").stdout
@@ -229,6 +239,13 @@ def test_background_keeps_writing_to_a_file(graph: Graph, tmp_path: Path) -> Non
 
 
 # --- surroundings -----------------------------------------------------------------------------------------------
+
+
+def test_a_package_that_is_missing_is_named(graph: Graph, tmp_path: Path) -> None:
+    (tmp_path / "rospy.py").write_text("raise ModuleNotFoundError('none', name='rospy')")
+    done = graph.run("bass-ros", check=False, PYTHONPATH=str(tmp_path))
+    assert done.returncode == 1
+    assert done.stderr == "bass-ros: the Python package rospy is not installed; run scripts/install\n"
 
 
 def test_symbolic_link_elsewhere(graph: Graph, tmp_path: Path) -> None:
