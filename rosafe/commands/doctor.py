@@ -1,0 +1,204 @@
+"""Tell what is there of all that running needs, and what to do about what is missing.
+
+One line for each thing: `ok`, `note` (not needed by everything, or not now) or `MISSING`."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import importlib.util
+import json
+import os
+import platform
+import shutil
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+from rosafe.interface import ComponentError
+from rosafe.ros import generate, master, paths
+
+OK, NOTE, MISSING = "ok", "note", "MISSING"
+
+PYTHON = "/usr/bin/python3"  # the one that Debian's ROS packages are for
+# What scripts/install brings: Python module -> Debian package.
+_ROS = {
+    "rospy": "python3-rospy",
+    "rosgraph": "python3-rosgraph",
+    "genpy": "python3-genpy",
+    "genmsg": "python3-genmsg",
+    "actionlib": "python3-actionlib",
+    "rosbag": "python3-rosbag",
+    "diagnostic_updater": "python3-diagnostic-updater",
+    "std_msgs.msg": "python3-std-msgs",
+    "actionlib_msgs.msg": "python3-actionlib-msgs",
+    "diagnostic_msgs.msg": "python3-diagnostic-msgs",
+}
+_ROS_COMMANDS = {
+    "roscore": "python3-roslaunch",
+    "rosservice": "python3-rosservice",
+    "rostopic": "python3-rostopic",
+    "rosmsg": "python3-rosmsg",
+    "rosnode": "python3-rosnode",
+}
+_NUMBERS = {"numpy": "python3-numpy", "scipy.signal": "python3-scipy"}
+_SOUND_FILES = {"soundfile": "python3-soundfile"}
+_PLOTS = {"matplotlib": "python3-matplotlib"}
+_HTTP = {"aiohttp": "python3-aiohttp"}
+_TCL = {"tkinter": "python3-tk"}
+_TCL_COMMANDS = {"tclsh": "tcl"}
+
+
+class Finding(NamedTuple):
+    """How one thing stands, and what to do about it (empty where there is nothing to do)."""
+
+    state: str
+    detail: str
+    todo: str = ""
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments."""
+    parser.add_argument("--json", action="store_true", help="the same as JSON, for programs")
+    parser.epilog = "exit status: 0 if all that running needs is there, 1 if something is missing"
+
+
+def run(options: argparse.Namespace) -> int:
+    """Look at everything and print it; 0 if nothing is missing."""
+    findings = {name: _examine(check) for name, check in CHECKS.items()}
+    missing = any(finding.state == MISSING for finding in findings.values())
+    if options.json:
+        checks = [{"name": name, **finding._asdict()} for name, finding in findings.items()]
+        print(json.dumps({"ok": not missing, "checks": checks}, indent=2))
+    else:
+        width = max(map(len, findings))
+        for name, (state, detail, todo) in findings.items():
+            print(f"{state:8}{name:{width}}  {detail}" + (f"  ->  {todo}" if todo else ""))
+    return 1 if missing else 0
+
+
+def _examine(check: Callable[[], Finding]) -> Finding:
+    try:
+        return check()
+    except Exception as problem:  # whatever is broken here is what the user wants to know of
+        return Finding(MISSING, f"cannot tell: {type(problem).__name__}: {' '.join(str(problem).split())}")
+
+
+# --- the checks -------------------------------------------------------------------------------------------------
+
+
+def _install_command() -> str:
+    root = paths.source_root()
+    return "run " + ("scripts/install of a checkout" if root is None else str(root / "scripts" / "install"))
+
+
+def _needs(modules: dict[str, str], commands: dict[str, str] | None = None) -> Finding:
+    """Whether modules can be imported and commands found, each with the Debian package that brings it."""
+    found, wrong = [], []
+    for name, package in modules.items():
+        try:
+            importlib.import_module(name)
+        except Exception as problem:  # a module may fail with anything where something below it is broken
+            wrong.append(f"{name} ({package}): {' '.join(str(problem).split())}")
+        else:
+            top = name.partition(".")[0]
+            version = getattr(sys.modules[top], "__version__", "")
+            found.append(f"{top} {version}".rstrip())
+    for name, package in (commands or {}).items():
+        if shutil.which(name, path=f"{os.environ.get('PATH', '')}:/usr/bin"):
+            found.append(name)
+        else:
+            wrong.append(f"{name} ({package})")
+    if wrong:
+        return Finding(MISSING, "; ".join(wrong), _install_command())
+    return Finding(OK, ", ".join(found))
+
+
+def _python() -> Finding:
+    text = f"Python {platform.python_version()}, {sys.executable}"
+    if os.path.realpath(sys.executable) != os.path.realpath(PYTHON):
+        return Finding(MISSING, text, f"run it with {PYTHON}, which Debian's ROS packages are for")
+    return Finding(OK, text)
+
+
+def _messages() -> Finding:
+    stale = _stale_in_shell()
+    try:
+        generate.ensure_messages()
+    except generate.GenerationError as problem:
+        return Finding(MISSING, f"the messages cannot be generated: {problem}")
+    for package in generate.PACKAGES:
+        module = importlib.import_module(f"{package}.msg")
+    where = Path(str(module.__file__)).parents[2]
+    if stale:
+        return Finding(NOTE, f"fresh in {where}, but {stale}", f". {paths.CODE_DIR}/scripts/env.sh")
+    return Finding(OK, f"fresh, in {where}")
+
+
+def _stale_in_shell() -> str:
+    """What is wrong with the messages that rostopic and its like find in this shell; empty where nothing is."""
+    if paths.source_root() is None:
+        return ""
+    entries = [entry for entry in os.environ.get("PYTHONPATH", "").split(":") if entry]
+    first = next((Path(entry) for entry in entries if Path(entry, "rosAFE", "msg").is_dir()), None)
+    if first is None:
+        return "rostopic and its like do not find them in this shell"
+    wanted = generate.environment()["PYTHONPATH"].split(":")[0]
+    return "" if os.path.realpath(first) == os.path.realpath(wanted) else f"this shell has others, in {first}"
+
+
+def _alsaaudio() -> Finding:
+    from rosafe.bass.sources.libasound import load_alsaaudio
+
+    paths.prefer_pypi_packages()
+    try:
+        module = load_alsaaudio()
+    except ComponentError as problem:
+        return Finding(MISSING, str(problem), _install_command())
+    return Finding(OK, f"pyalsaaudio with ALSA {module.asoundlib_version()}, {module.__file__}")
+
+
+def _devices() -> Finding:
+    from rosafe.bass.sources.libasound import capture_devices
+
+    try:
+        devices = capture_devices()
+    except ComponentError as problem:
+        return Finding(NOTE, str(problem), "the devices file: and scene: need none")
+    if not devices:
+        return Finding(NOTE, "no sound card here can capture", "the devices file: and scene: need none")
+    return Finding(OK, ", ".join(f"hw:{card},{device} [{pcm}]" for card, device, _, pcm in devices))
+
+
+def _kernels() -> Finding:
+    if importlib.util.find_spec("rosafe.dsp.kernels") is None:
+        return Finding(NOTE, "there are no compiled kernels; numpy and scipy do the work")
+    return Finding(OK, str(importlib.import_module("rosafe.dsp.kernels").status()))
+
+
+def _master() -> Finding:
+    environ = dict(os.environ)
+    master.set_local_defaults(environ)
+    uri = environ["ROS_MASTER_URI"]
+    try:
+        master.check_master(uri)
+    except master.MasterError as problem:
+        return Finding(NOTE, str(problem))
+    return Finding(OK, f"answers at {uri}")
+
+
+CHECKS: dict[str, Callable[[], Finding]] = {
+    "python": _python,
+    "numbers": lambda: _needs(_NUMBERS),
+    "kernels": _kernels,
+    "sound files": lambda: _needs(_SOUND_FILES),
+    "ROS": lambda: _needs(_ROS, _ROS_COMMANDS),
+    "messages": _messages,
+    "master": _master,
+    "alsaaudio": _alsaaudio,
+    "sound devices": _devices,
+    "HTTP server": lambda: _needs(_HTTP),
+    "Tcl": lambda: _needs(_TCL, _TCL_COMMANDS),
+    "plots": lambda: _needs(_PLOTS),
+}
