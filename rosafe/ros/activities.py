@@ -22,7 +22,7 @@ class Activity:
     `stop_requested`, returns for a normal end and raises ComponentError for any other.
     """
 
-    def __init__(self, number: int, service: Service, others: Callable[[Activity], None]) -> None:
+    def __init__(self, number: int, service: Service, replaced: Callable[[Activity], list[Activity]]) -> None:
         self.id = number
         self.service = service
         self.stop_requested = threading.Event()
@@ -30,7 +30,7 @@ class Activity:
         self.error: ComponentError | None = None
         self.begun = threading.Event()  # running, or ended without (`error` tells why)
         self.ended = threading.Event()
-        self._others = others
+        self._replaced = replaced
 
     def running(self) -> None:
         """Tell those who wait for it that the activity does what was asked for."""
@@ -42,9 +42,19 @@ class Activity:
             self.stopped_by = by
             self.stop_requested.set()
 
+    def interrupt_waiting(self) -> None:
+        """Interrupt those activities that this one replaces which do not run yet."""
+        for activity in self._replaced(self):
+            if not activity.begun.is_set():
+                activity.interrupt(self.service.name)
+
     def interrupt_others(self) -> None:
-        """End the running activities that this request replaces, and wait until they have ended."""
-        self._others(self)
+        """End all activities that this one replaces, and wait until they have ended."""
+        replaced = self._replaced(self)
+        for activity in replaced:
+            activity.interrupt(self.service.name)
+        for activity in replaced:
+            activity.ended.wait()
 
     def raise_if_interrupted(self) -> None:
         """For handlers that have not come to `running` yet: ``::genom::interrupted`` where they were told to end."""
@@ -134,7 +144,7 @@ class Activities:
         with self._lock:
             if self._full(service):
                 raise ComponentError("::genom::too_many_activities")
-            activity = Activity(next(self._numbers) % 2**32, service, self._interrupt_replaced)
+            activity = Activity(next(self._numbers) % 2**32, service, self._replaced)
             self._live[activity.id] = activity
         thread = threading.Thread(
             target=self._run,
@@ -184,11 +194,8 @@ class Activities:
             activity.ended.set()
             self._changed()
 
-    def _interrupt_replaced(self, newcomer: Activity) -> None:
-        replaced = [a for a in self.live() if a.id < newcomer.id and a.service.name in newcomer.service.interrupts]
-        self.interrupt(replaced, newcomer.service.name)
-        for activity in replaced:
-            activity.ended.wait()
+    def _replaced(self, newcomer: Activity) -> list[Activity]:
+        return [a for a in self.live() if a.id < newcomer.id and a.service.name in newcomer.service.interrupts]
 
     def live(self) -> list[Activity]:
         """The live activities in the order of their numbers."""

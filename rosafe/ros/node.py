@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import threading
 from typing import Any
 
 import rospy
@@ -34,6 +35,7 @@ class RosafeNode:
         self._audio_topic = ""
         self._ports: dict[Processor, OutputPort] = {}
         self._ends: dict[Processor, Activity] = {}
+        self._starting = threading.Lock()  # an InputProc that a newer one has interrupted must not replace that one's
         self._data_object = self._node.advertise("dataObj", wire.message_class("rosAFE", "::rosAFE::dataObjSt"))
         self._input_port = self._advertise("input")
 
@@ -83,16 +85,23 @@ class RosafeNode:
     # --- processors ---
 
     def _input_proc(self, activity: Activity, values: dict[str, Any]) -> None:
-        name, frames = values["name"], values["nFramesPerBlock"]
         if self._audio is None:
             raise ROSAFE.error("e_noData", "the Audio port is not connected: call connect_port first")
+        activity.interrupt_waiting()
+        frames = values["nFramesPerBlock"]
         reader = self._ring.open_reader(frames, FIRST_AUDIO_SECONDS, activity.stop_requested.is_set)
         if reader is None:
             activity.raise_if_interrupted()
             raise ROSAFE.error("e_noData", f"nothing has come from {self._audio_topic}: is bass acquiring?")
-        processor = self._tree.add_input(
-            name, reader, frames, values["bufferSize_s_port"], values["bufferSize_s_getSignal"]
-        )
+        try:
+            with self._starting:
+                activity.raise_if_interrupted()
+                processor = self._tree.add_input(
+                    values["name"], reader, frames, values["bufferSize_s_port"], values["bufferSize_s_getSignal"]
+                )
+        except BaseException:
+            reader.stop()
+            raise
         activity.interrupt_others()
         self._live(activity, processor)
 

@@ -80,7 +80,7 @@ def _write_signal(out: io.BytesIO, levels: int, value: Any) -> None:
         out.write(_COUNT.pack(0))
         return
     if len(view.shape) != levels:
-        raise genpy.SerializationError(f"a signal of shape {view.shape} where {levels} dimensions are wanted")
+        raise ValueError(f"a signal of shape {view.shape} where {levels} dimensions are wanted")
     out.write(_pack_nested(view))
 
 

@@ -1,0 +1,304 @@
+"""What the tests of the node share: a microphone of their own, requests, goals, ports and what these must hold."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+import actionlib
+import numpy as np
+import rosAFE.msg
+import rospy
+from actionlib import CommState
+
+from rosafe import process
+from rosafe.interface import KINDS, ROSAFE
+from rosafe.ros import wire
+from tests.harness import Graph, Process, wait_for
+
+RATE = 20000  # Hz; cheap, and all default channels lie below half of it
+_topics = itertools.count(1)
+
+
+def noise(frames: int, seed: int = 1) -> np.ndarray:
+    """A binaural int32 signal, (2, frames)."""
+    return np.random.default_rng(seed).integers(-(2**30), 2**30, (2, frames)).astype(np.int32)
+
+
+class Microphone:
+    """Publishes what bass would: a window that slides over a signal, chunk by chunk, beginning full of zeros."""
+
+    def __init__(
+        self, graph: Graph, sample_rate: int = RATE, chunk: int = 400, chunks: int = 10, topic: str = ""
+    ) -> None:
+        graph.client()
+        self.topic = topic or f"/microphone{next(_topics)}/Audio"
+        self.sample_rate, self.chunk, self.chunks = sample_rate, chunk, chunks
+        self.index = 0  # of the newest frame
+        self._message = wire.message_class("bass", "::binaudio::portStruct")
+        self._window = np.zeros((2, chunk * chunks), np.int32)
+        self._publisher = rospy.Publisher(self.topic, self._message, latch=True, queue_size=0, tcp_nodelay=True)
+        self.publish()
+
+    def publish(self) -> None:
+        """Send the window as it is."""
+        self._publisher.publish(
+            self._message(
+                sampleRate=self.sample_rate,
+                nChunksOnPort=self.chunks,
+                nFramesPerChunk=self.chunk,
+                lastFrameIndex=self.index,
+                left=self._window[0].copy(),
+                right=self._window[1].copy(),
+                stamp={"sec": 0, "nsec": 0},
+            )
+        )
+
+    def publish_bytes(self, data: bytes) -> None:
+        """Send anything at all in place of a message."""
+        message = self._message()
+        message.serialize = lambda out: out.write(data)
+        self._publisher.publish(message)
+
+    def play(self, signal: np.ndarray) -> None:
+        """Go on with `signal`, (2, n), in chunks; the last one may be shorter."""
+        for start in range(0, signal.shape[1], self.chunk):
+            self.lose(signal[:, start : start + self.chunk])
+            self.publish()
+
+    def lose(self, signal: np.ndarray) -> None:
+        """Go on with `signal` and do not tell; what the window still holds comes with the next message."""
+        joined = np.concatenate((self._window, signal), axis=1)
+        self._window = joined[:, -self._window.shape[1] :]
+        self.index += signal.shape[1]
+
+    @property
+    def heard(self) -> bool:
+        """Whether anybody is connected."""
+        return self._publisher.get_num_connections() > 0
+
+    def close(self) -> None:
+        """End as a publisher that leaves."""
+        self._publisher.unregister()
+
+
+class Session:
+    """One node under test, with a microphone; most tests get it from the fixture `afe`."""
+
+    def __init__(self, graph: Graph, process: Process, name: str = "rosAFE") -> None:
+        self.graph = graph
+        self.process = process
+        self.name = name
+        self._clients: dict[str, actionlib.ActionClient] = {}
+        self.microphone: Microphone | None = None
+
+    # --- requests ---
+
+    def call(self, service: str, **fields: Any) -> Any:
+        """The response of a plain service."""
+        return self.graph.call(f"/{self.name}/{service}", **fields)
+
+    def ok(self, service: str, **fields: Any) -> Any:
+        """The response of a request that succeeds."""
+        response = self.call(service, **fields)
+        assert response.genom_success, response.genom_exdetail
+        assert response.genom_exdetail == ""
+        return response
+
+    def refused(self, service: str, **fields: Any) -> tuple[str, Mapping[str, Any]]:
+        """Exception and detail of a request that fails."""
+        response = self.call(service, **fields)
+        assert not response.genom_success
+        return told(response)
+
+    # --- audio and processors ---
+
+    def listen(self, **options: Any) -> Microphone:
+        """A new microphone, connected to the Audio port."""
+        if self.microphone is not None:
+            self.microphone.close()
+        self.microphone = Microphone(self.graph, **options)
+        self.ok("connect_port", local="Audio", remote=self.microphone.topic)
+        return self.microphone
+
+    def build(self, *requests: str, block: int = 1600, **values: Any) -> Microphone:
+        """A microphone and an input, and then `requests` with `values` where they have such a parameter."""
+        microphone = self.microphone if self.microphone is not None else self.listen()
+        for request in ("InputProc", *requests):
+            names = {p.name for p in ROSAFE.service(request).parameters}
+            fields = {"nFramesPerBlock": block, **values}
+            self.ok(request, **{k: v for k, v in fields.items() if k in names})
+        return microphone
+
+    def processors(self) -> dict[str, list[str]]:
+        """The names of all processors by kind, as getParameters tells them."""
+        parameters = self.ok("getParameters").parameters
+        return {kind: [p.name for p in getattr(parameters, kind)] for kind in KINDS if getattr(parameters, kind)}
+
+    # --- ports ---
+
+    def topic(self, kind: str, name: str = "") -> str:
+        """The topic of a processor; `name` by default as the request's."""
+        port = ROSAFE.port(KINDS[kind].port)
+        element = name or ROSAFE.service(KINDS[kind].request).parameter("name").default
+        return f"/{self.name}/{port.name}" + (f"/{element}" if port.multiple else "")
+
+    def read(self, kind: str, index: int | None = None, name: str = "", timeout: float = 15.0) -> Any:
+        """The newest message of a port, with arrays; the one with lastFrameIndex `index` where that is given."""
+        return self.graph.message(
+            self.topic(kind, name),
+            wire.message_class("rosAFE", ROSAFE.port(KINDS[kind].port).idl),
+            accept=lambda message: index is None or message.lastFrameIndex == index,
+            timeout=timeout,
+        )
+
+    @contextmanager
+    def follow(self, kind: str, name: str = "") -> Iterator[list[Any]]:
+        """All messages of a port, from the latched one on."""
+        message_class = wire.message_class("rosAFE", ROSAFE.port(KINDS[kind].port).idl)
+        with self.graph.collect(self.topic(kind, name), message_class) as messages:
+            wait_for(lambda: messages, what=f"a message on {self.topic(kind, name)}")
+            yield messages
+
+    # --- state ---
+
+    def activities(self) -> dict[int, str]:
+        """Id and name of all live activities, from a fresh genom_state."""
+        state = self.graph.message(f"/{self.name}/genom_state", rosAFE.msg.genom_state_component)
+        return {activity.id: activity.name for task in state.task for activity in task.activity}
+
+    def wait_activities(self, names: list[str]) -> dict[int, str]:
+        """The live activities once their names are those of `names`."""
+        with self.graph.collect(f"/{self.name}/genom_state", rosAFE.msg.genom_state_component) as messages:
+
+            def live() -> dict[int, str]:
+                return {a.id: a.name for task in messages[-1].task for a in task.activity} if messages else {-1: "none"}
+
+            wait_for(lambda: sorted(live().values()) == sorted(names), what=lambda: f"{names}, there are {live()}")
+            return live()
+
+    def health(self, accept: Callable[[dict[str, str]], bool], part: str = "audio") -> dict[str, str]:
+        """The entries of /diagnostics once `accept` takes them; level and message are among them."""
+        from diagnostic_msgs.msg import DiagnosticArray
+
+        with self.graph.collect("/diagnostics", DiagnosticArray) as messages:
+            seen: list[dict[str, str]] = []
+
+            def accepted() -> dict[str, str] | None:
+                statuses = [s for m in list(messages) for s in m.status if s.name == f"{self.name}: {part}"]
+                seen[:] = [
+                    {**{v.key: v.value for v in s.values}, "level": str(s.level), "message": s.message}
+                    for s in statuses
+                ]
+                return next((entries for entries in seen if accept(entries)), None)
+
+            result = wait_for(accepted, what=lambda: f"a state of health, last: {seen[-1:]}")
+        assert result is not None
+        return result
+
+    # --- goals ---
+
+    def goal(self, service: str, **fields: Any) -> Goal:
+        """Send a goal to the action of that name."""
+        client = self._clients.get(service)
+        if client is None:
+            action = getattr(rosAFE.msg, f"{service}Action")
+            client = self._clients[service] = actionlib.ActionClient(f"/{self.name}/{service}", action)
+            assert client.wait_for_server(rospy.Duration(15))
+        return Goal(client, getattr(rosAFE.msg, f"{service}Goal")(**fields))
+
+    def close(self) -> None:
+        """Leave all topics."""
+        for client in self._clients.values():
+            client.stop()
+        if self.microphone is not None:
+            self.microphone.close()
+
+
+@contextmanager
+def own_node(graph: Graph, *arguments: str, name: str = "own") -> Iterator[Session]:
+    """A node of the test's own, for what must not happen to the one that the module shares."""
+    with graph.node("rosAFE-ros", "-i", name, *arguments) as process:
+        session = Session(graph, process, name)
+        yield session
+        session.close()
+
+
+class Goal:
+    """A goal that was sent, and what the client saw of it."""
+
+    def __init__(self, client: actionlib.ActionClient, goal: Any) -> None:
+        self.states: list[int] = []
+        self._active, self._done = threading.Event(), threading.Event()
+        self.handle = client.send_goal(goal, transition_cb=self._transition)
+
+    def _transition(self, handle: Any) -> None:
+        state = handle.get_comm_state()
+        self.states.append(state)
+        if state in (CommState.ACTIVE, CommState.PREEMPTING):
+            self._active.set()
+        if state == CommState.DONE:
+            self._done.set()
+
+    def active(self, timeout: float = 10.0) -> Goal:
+        """Wait until it is accepted."""
+        assert self._active.wait(timeout), f"not accepted, but {self.states}"
+        return self
+
+    @property
+    def running(self) -> bool:
+        return self._active.is_set() and not self._done.is_set()
+
+    def result(self, timeout: float = 10.0) -> Any:
+        """Wait for the result."""
+        assert self._done.wait(timeout), f"no result, but {self.states}"
+        return self.handle.get_result()
+
+    def status(self) -> int:
+        """The terminal state (actionlib_msgs/GoalStatus)."""
+        return int(self.handle.get_goal_status())
+
+
+def told(response: Any) -> tuple[str, Mapping[str, Any]]:
+    """Exception and detail of a failed response or result, from its JSON text."""
+    body = json.loads(response.genom_exdetail)
+    assert set(body) <= {"ex", "detail"}
+    assert response.genom_exdetail == json.dumps(body, separators=(",", ":"), ensure_ascii=False)
+    return body["ex"], body.get("detail", {})
+
+
+# --- what a port must hold ---------------------------------------------------------------------------------------
+
+
+def expected(signal: np.ndarray, block: int, parameters: Mapping[str, Any] | None = None, rate: int = RATE) -> Any:
+    """`rosafe.process` of `signal` on the same blocks."""
+    return process(signal, rate, parameters, block_frames=block)
+
+
+def windowed(values: np.ndarray, seconds: float, rate: float) -> np.ndarray:
+    """The newest `seconds` of (..., frames), zeros before the beginning."""
+    frames = int(np.floor(seconds * rate + 1e-9))
+    padded = np.concatenate((np.zeros((*values.shape[:-1], frames)), values), axis=-1)
+    return padded[..., padded.shape[-1] - frames :]
+
+
+def ears(kind: str, values: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+    """`left` and `right` of a message, from an output of `rosafe.process`; None where there is no `right`."""
+    if kind == "ild":
+        return values, np.zeros((0, 0))
+    if kind == "crossCorrelation":
+        return values.swapaxes(0, 1), None
+    return values[0], values[1]
+
+
+def assert_holds(message: Any, kind: str, values: np.ndarray) -> None:
+    """The samples of a message are bit for bit `values`, an output of `rosafe.process` cut to length."""
+    left, right = ears(kind, values)
+    assert message.framesOnPort == values.shape[-1]
+    np.testing.assert_array_equal(message.left, left)
+    if right is not None:
+        np.testing.assert_array_equal(message.right, right)

@@ -1,0 +1,404 @@
+"""The audio ring against a simple model of its rules, and the threads that meet at it."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
+
+from rosafe.ros.audio import MAX_RATE, RING_SECONDS, AudioReader, AudioRing
+from tests.harness import wait_for
+
+RATE = 8  # Hz: the ring holds 80 frames
+CAPACITY = int(RING_SECONDS * RATE)
+
+
+@dataclass
+class Source:
+    """A stream whose samples tell which stream and which frame they are."""
+
+    rate: int = RATE
+    window: int = 12
+    index: int = 0
+    number: int = 1
+
+    def sample(self, frame: int) -> int:
+        return self.number * 100_000 + frame % 99_991 if frame > 0 else 0
+
+    def message(self) -> Any:
+        left = np.array([self.sample(f) for f in range(self.index - self.window + 1, self.index + 1)], np.int32)
+        return message(self.rate, self.index, left)
+
+
+def message(rate: int, index: int, left: np.ndarray, right: np.ndarray | None = None) -> Any:
+    return SimpleNamespace(
+        sampleRate=rate, lastFrameIndex=index, left=left, right=-left if right is None else right, problem=""
+    )
+
+
+def opened(ring: AudioRing, block: int) -> AudioReader:
+    reader = ring.open_reader(block, 0.0, lambda: False)
+    assert reader is not None
+    return reader
+
+
+class Model:
+    """The rules at the head of rosafe/ros/audio.py, on a dict from frame number to sample."""
+
+    def __init__(self) -> None:
+        self.rate = self.window = self.newest = 0
+        self.capacity = 0
+        self.frames: dict[int, int] = {}
+        self.lost = self.gaps = self.streams = self.dropped = self.breaks = self.messages = self.refused = 0
+        self.position = 0
+        self.block = 0
+        self.reader_rate = 0
+
+    @property
+    def unread(self) -> int:
+        if not self.block or self.reader_rate != self.rate:
+            return 0
+        return sum(frame >= self.position for frame in self.frames)
+
+    def feed(self, source: Source) -> None:
+        self.messages += 1
+        index, window = source.index, source.window
+        jump = index - self.newest > max(self.capacity, window)
+        if self.rate == 0 or source.rate != self.rate or index < self.newest or jump:
+            if self.rate == source.rate and index > self.newest:
+                self.lost += index - self.newest - window
+                self.gaps += 1
+            self.dropped += self.unread
+            self.streams += 1
+            self.rate = source.rate
+            self.capacity = max(int(RING_SECONDS * source.rate), window, 2 * self.block)
+            self.frames = {}
+            self.newest = max(0, index - window)
+            self.position = self.newest + 1
+        self.capacity = max(self.capacity, window)
+        self.window = window
+        known = range(max(index - window, 0) + 1, self.newest + 1)
+        if any(self.frames.get(f, source.sample(f)) != source.sample(f) for f in known):
+            self.breaks += 1
+        missing = range(self.newest + 1, index - window + 1)
+        if missing:
+            self.lost += len(missing)
+            self.gaps += 1
+        for frame in range(self.newest + 1, index + 1):
+            self.frames[frame] = 0 if frame in missing else source.sample(frame)
+        self.newest = max(self.newest, index)
+        for frame in [f for f in self.frames if f <= self.newest - self.capacity]:
+            del self.frames[frame]
+
+    def read(self) -> tuple[list[int], int]:
+        oldest = min(self.frames)
+        if self.position < oldest:
+            self.lost += oldest - self.position
+            self.gaps += 1
+            self.position = oldest
+        block = [self.frames[f] for f in range(self.position, self.position + self.block)]
+        self.position += self.block
+        return block, self.position
+
+
+class RingMachine(RuleBasedStateMachine):
+    """Whatever comes in, the ring and the model tell the same."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.lines: list[str] = []
+        self.ring = AudioRing(self.lines.append)
+        self.feed = self.ring.connect()
+        self.source = Source()
+        self.model = Model()
+        self.reader: AudioReader | None = None
+
+    def send(self) -> None:
+        self.feed(self.source.message())
+        self.model.feed(self.source)
+
+    @rule(frames=st.integers(0, 30))
+    def play(self, frames: int) -> None:
+        self.source.index += frames
+        self.send()
+
+    @rule(frames=st.sampled_from([1, 11, 13, 40, 79, 80, 81, 92, 93, 500, 10**9, 2**62]))
+    def lose(self, frames: int) -> None:
+        if self.source.index + frames < 2**63:
+            self.source.index += frames
+            self.send()
+
+    @rule()
+    def send_again(self) -> None:
+        self.send()
+
+    @rule(index=st.integers(0, 60), zeros_first=st.booleans())
+    def restart(self, index: int, zeros_first: bool) -> None:
+        self.source = Source(self.source.rate, self.source.window, 0, self.source.number + 1)
+        if zeros_first:
+            self.send()
+        self.source.index = index
+        self.send()
+
+    @rule(rate=st.sampled_from([RATE, RATE, 2 * RATE]))
+    def change_rate(self, rate: int) -> None:
+        if rate != self.source.rate:
+            self.source = Source(rate, self.source.window, self.source.index, self.source.number + 1)
+        self.send()
+
+    @rule(window=st.sampled_from([1, 5, 12, 60, 200]))
+    def change_window(self, window: int) -> None:
+        self.source.window = window
+        self.send()
+
+    @rule()
+    def garbage(self) -> None:
+        self.feed(message(RATE, 5, np.zeros(3, np.int32), np.zeros(2, np.int32)))
+        self.model.messages += 1
+        self.model.refused += 1
+
+    @precondition(lambda self: self.ring.sample_rate)
+    @rule(block=st.sampled_from([1, 4, 10, 50]))
+    def open(self, block: int) -> None:
+        if self.reader is not None:
+            self.reader.stop()
+            assert self.reader.read() is None
+        self.reader = opened(self.ring, block)
+        self.model.block, self.model.reader_rate = block, self.model.rate
+        self.model.capacity = max(self.model.capacity, 2 * block)
+        self.model.position = self.model.newest + 1
+
+    @precondition(lambda self: self.model.unread >= self.model.block > 0)
+    @rule()
+    def read(self) -> None:
+        assert self.reader is not None
+        read = self.reader.read()
+        assert read is not None
+        block, position = self.model.read()
+        assert read[0].dtype == np.int32
+        np.testing.assert_array_equal(read[0], [block, [-value for value in block]])
+        assert read[1] == position
+
+    @invariant()
+    def agree(self) -> None:
+        counters, model = self.ring.counters, self.model
+        assert self.ring.sample_rate == model.rate
+        assert self.ring.behind == model.unread
+        for name in ("messages", "refused", "lost", "gaps", "streams", "dropped", "breaks"):
+            assert getattr(counters, name) == getattr(model, name), name
+
+
+RingMachine.TestCase.settings = settings(max_examples=150, stateful_step_count=30, deadline=None)
+TestRing = RingMachine.TestCase
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    chunks=st.lists(st.integers(1, 12), min_size=1, max_size=30),
+    block=st.integers(1, 40),
+    late=st.integers(0, 50),
+    repeats=st.integers(1, 2),
+)
+def test_any_chunks_give_the_same_blocks(chunks: list[int], block: int, late: int, repeats: int) -> None:
+    ring = AudioRing(lambda line: pytest.fail(line))
+    feed = ring.connect()
+    source = Source(rate=1000, index=late)
+    feed(source.message())
+    reader = opened(ring, block)
+    for chunk in chunks:
+        source.index += chunk
+        for _ in range(repeats):
+            feed(source.message())
+    came = []
+    while ring.behind >= block:
+        samples, position = reader.read() or (np.zeros((2, 0)), 0)
+        came.extend(samples[0])
+        assert position == late + len(came) + 1
+    assert came == [source.sample(f) for f in range(late + 1, late + 1 + len(came))]
+    assert len(came) == sum(chunks) // block * block
+    assert ring.counters.lost == ring.counters.breaks == 0
+
+
+@pytest.mark.parametrize(
+    ("bad", "why"),
+    [
+        (message(RATE, 5, np.zeros(3, np.int32), np.zeros(2, np.int32)), "3 left and 2 right"),
+        (message(RATE, 5, np.zeros(0, np.int32)), "0 samples"),
+        (message(0, 5, np.zeros(3, np.int32)), "0 Hz"),
+        (message(MAX_RATE + 1, 5, np.zeros(3, np.int32)), f"{MAX_RATE + 1} Hz"),
+        (message(2**32 - 1, 5, np.zeros(3, np.int32)), "4294967295 Hz"),
+        (message(RATE, 2**63, np.zeros(3, np.int32)), "9223372036854775808"),
+        (message(RATE, 2**64 - 1, np.zeros(3, np.int32)), "18446744073709551615"),
+    ],
+)
+def test_malformed_messages_change_nothing_and_are_told_once(bad: Any, why: str) -> None:
+    lines: list[str] = []
+    ring = AudioRing(lines.append)
+    feed = ring.connect()
+    source = Source(index=20)
+    feed(source.message())
+    reader = opened(ring, 4)
+    feed(bad)
+    feed(bad)
+    assert ring.counters.refused == 2
+    assert len(lines) == 1 and why in lines[0]
+    source.index += 4
+    feed(source.message())
+    assert reader.read() is not None
+    assert ring.counters.lost == ring.counters.dropped == 0
+    feed(bad)
+    assert len(lines) == 2, "another event, told again"
+
+
+def test_a_window_beyond_all_reason_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rosafe.ros.audio.MAX_WINDOW", 100)
+    lines: list[str] = []
+    feed = AudioRing(lines.append).connect()
+    feed(message(RATE, 5, np.zeros(101, np.int32)))
+    assert "101 samples" in lines[0]
+
+
+def test_losses_are_located_and_timed() -> None:
+    lines: list[str] = []
+    ring = AudioRing(lines.append)
+    feed = ring.connect()
+    source = Source(index=100)
+    feed(source.message())
+    opened(ring, 4)
+    source.index += 20  # of which the window holds 12
+    feed(source.message())
+    assert ring.counters.last_loss == "8 frames from frame 101 on"
+    assert lines == ["Audio: lost 8 frames from frame 101 on (1.000 s)"]
+
+
+def test_events_are_told_in_words() -> None:
+    lines: list[str] = []
+    ring = AudioRing(lines.append)
+    feed = ring.connect()
+    source = Source(index=50)
+    feed(source.message())
+    opened(ring, 4)
+    assert lines == []
+    source.index += 3
+    feed(source.message())
+    feed(Source(index=2, number=2).message())
+    assert lines == [
+        "Audio: 3 unread frames of the old stream are dropped",
+        "Audio: a new stream at 8 Hz, frame 2 (its index fell from 53 to 2)",
+    ]
+    lines.clear()
+    feed(Source(index=8, number=3).message())
+    feed(Source(index=8, number=2).message())
+    feed(Source(index=9, number=3).message())
+    assert len(lines) == 1 and "another stream began" in lines[0], "once, as long as it does not fit"
+    lines.clear()
+    feed(Source(rate=16, index=9).message())
+    assert "8 unread frames" not in lines[0]
+    assert lines[-2:] == [
+        "Audio: a new stream at 16 Hz, frame 9 (it was at 8 Hz)",
+        "Audio: the tree runs at 8 Hz and takes nothing of this stream; call Stop",
+    ]
+
+
+def test_a_new_connection_begins_anew_and_the_old_one_is_deaf() -> None:
+    lines: list[str] = []
+    ring = AudioRing(lines.append)
+    old = ring.connect()
+    old(Source(index=50).message())
+    reader = opened(ring, 2)
+    old(Source(index=53).message())
+    new = ring.connect()
+    assert ring.counters.dropped == 3 and ring.behind == 0
+    assert ring.open_reader(4, 0.0, lambda: False) is None, "nothing has come on the new connection"
+    old(Source(index=60).message())
+    assert ring.sample_rate == 0
+    new(Source(index=5, number=2).message())
+    assert ring.counters.dropped == 3 and ring.counters.streams == 2
+    read = reader.read()
+    assert read is not None and list(read[0][0]) == [200_001, 200_002]
+
+
+def test_waiting_for_the_first_message() -> None:
+    ring = AudioRing(lambda line: None)
+    feed = ring.connect()
+    assert ring.open_reader(4, 0.0, lambda: False) is None
+    assert ring.open_reader(4, 60.0, lambda: True) is None, "told to give up"
+    found: list[Any] = []
+    waiting = threading.Thread(target=lambda: found.append(ring.open_reader(4, 60.0, lambda: False)))
+    waiting.start()
+    feed(Source(index=7).message())
+    waiting.join(10)
+    assert found[0].position == 8 and found[0].sample_rate == RATE
+
+
+def test_a_blocked_reader_wakes_for_a_block_and_for_stop() -> None:
+    ring = AudioRing(lambda line: None)
+    feed = ring.connect()
+    source = Source()
+    feed(source.message())
+    reader = opened(ring, 6)
+    came: list[Any] = []
+
+    def work() -> None:
+        while (block := reader.read()) is not None:
+            came.append(block[1])
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    for _ in range(12):
+        source.index += 1
+        feed(source.message())
+    wait_for(lambda: came == [7, 13], what=lambda: str(came))
+    reader.stop()
+    thread.join(10)
+    assert not thread.is_alive()
+    assert reader.read() is None
+
+
+def test_two_readers_at_a_replacement() -> None:
+    ring = AudioRing(lambda line: None)
+    feed = ring.connect()
+    source = Source()
+    feed(source.message())
+    old = opened(ring, 4)
+    source.index += 6
+    feed(source.message())
+    new = opened(ring, 5)
+    source.index += 6
+    feed(source.message())
+    assert ring.behind == 12, "of the one that is farthest behind"
+    first, second = old.read(), new.read()
+    assert first is not None and list(first[0][0]) == [source.sample(f) for f in (1, 2, 3, 4)]
+    assert second is not None and list(second[0][0]) == [source.sample(f) for f in (7, 8, 9, 10, 11)]
+    old.stop()
+    assert ring.behind == 1
+
+
+def test_a_block_longer_than_the_ring_makes_room() -> None:
+    ring = AudioRing(lambda line: pytest.fail(line))
+    feed = ring.connect()
+    source = Source(index=40)
+    feed(source.message())
+    reader = opened(ring, 3 * CAPACITY)
+    for _ in range(3 * CAPACITY // 10):
+        source.index += 10
+        feed(source.message())
+    read = reader.read()
+    assert read is not None and list(read[0][0]) == [source.sample(f) for f in range(41, 41 + 3 * CAPACITY)]
+
+
+def test_plain_messages_with_lists_do_as_well() -> None:
+    ring = AudioRing(lambda line: pytest.fail(line))
+    feed = ring.connect()
+    feed(message(RATE, 4, (1, 2, 3, 4), (5, 6, 7, 8)))  # type: ignore[arg-type]
+    reader = opened(ring, 2)
+    feed(message(RATE, 6, (3, 4, 9, 10), (7, 8, 11, 12)))  # type: ignore[arg-type]
+    read = reader.read()
+    assert read is not None and read[0].tolist() == [[9, 10], [11, 12]]

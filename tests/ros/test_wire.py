@@ -1,0 +1,269 @@
+"""The wire format: the same bytes as the generated classes, arrays instead of lists, clean errors for garbage."""
+
+from __future__ import annotations
+
+import io
+import time
+from typing import Any
+
+import genpy
+import numpy as np
+import pytest
+import rosAFE.msg
+import rosAFE.srv
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import bass.msg
+from rosafe import interface
+from rosafe.interface import ROSAFE
+from rosafe.ros import wire
+from rosafe.tree.window import SlidingWindow, WindowView
+
+TIME_DOMAIN = "::rosAFE::TimeDomainSignalPortStruct"
+TIME_FREQUENCY = "::rosAFE::TimeFrequencySignalPortStruct"
+CROSS_CORRELATION = "::rosAFE::CrossCorrelationSignalPortStruct"
+AUDIO = "::binaudio::portStruct"
+LEVELS = {TIME_DOMAIN: 1, TIME_FREQUENCY: 2, CROSS_CORRELATION: 3}
+HEADS: dict[str, dict[str, int]] = {
+    TIME_DOMAIN: {"sampleRate": 44100, "lastFrameIndex": 2**40, "framesOnPort": 7},
+    TIME_FREQUENCY: {"sampleRate": 100, "lastFrameIndex": 1, "framesOnPort": 7, "numberOfChannels": 31},
+    CROSS_CORRELATION: {
+        "sampleRate": 100,
+        "lastFrameIndex": 0,
+        "framesOnPort": 7,
+        "numberOfLags": 99,
+        "numberOfChannels": 31,
+    },
+}
+
+
+def plain_class(idl: str) -> Any:
+    return getattr(rosAFE.msg, interface.ros_type(idl))
+
+
+def serialized(message: Any) -> bytes:
+    out = io.BytesIO()
+    message.serialize(out)
+    return out.getvalue()
+
+
+def _nested(values: Any, depth: int) -> Any:
+    """The generated classes' form of nested lists."""
+    if depth == 1:
+        return rosAFE.msg.rosAFE_signalOneD(data=values)
+    if depth == 2:
+        return rosAFE.msg.rosAFE_signalND(dataN=[_nested(v, 1) for v in values])
+    return rosAFE.msg.rosAFE_signalNxND(dataNxN=[_nested(v, 2) for v in values])
+
+
+def ours_and_plain(idl: str, left: np.ndarray, right: np.ndarray | None = None) -> tuple[Any, Any]:
+    """The same message in our class and in the generated one."""
+    signals = {"left": left} if idl == CROSS_CORRELATION else {"left": left, "right": left if right is None else right}
+    lists = {name: _nested(array.tolist(), LEVELS[idl]) for name, array in signals.items()}
+    return (
+        wire.message_class("rosAFE", idl)(**HEADS[idl], **signals),
+        plain_class(idl)(**HEADS[idl], **lists),
+    )
+
+
+@settings(deadline=None, max_examples=80)
+@given(data=st.data(), idl=st.sampled_from(sorted(LEVELS)))
+def test_bytes_are_those_of_the_generated_class(data: st.DataObject, idl: str) -> None:
+    shape = data.draw(st.tuples(*[st.integers(1, 5)] * (LEVELS[idl] - 1), st.integers(0, 6)))
+    values = np.random.default_rng(data.draw(st.integers(0, 99))).normal(size=shape)
+    ours, plain = ours_and_plain(idl, values, 2 * values)
+    sent = serialized(plain)
+    assert serialized(ours) == sent
+    back = wire.message_class("rosAFE", idl)().deserialize(sent)
+    np.testing.assert_array_equal(back.left, values)
+    assert back.left.shape == shape
+    assert {name: getattr(back, name) for name in HEADS[idl]} == HEADS[idl]
+    assert serialized(plain_class(idl)().deserialize(serialized(ours))) == sent
+    assert serialized(back) == sent, "what was received can be sent on"
+
+
+@pytest.mark.parametrize("idl", sorted(LEVELS))
+def test_types_are_those_of_the_generated_class(idl: str) -> None:
+    ours, plain = wire.message_class("rosAFE", idl), plain_class(idl)
+    assert (ours._md5sum, ours._type, ours._full_text) == (plain._md5sum, plain._type, plain._full_text)
+    assert issubclass(ours, plain)
+    assert wire.message_class("rosAFE", idl) is ours
+
+
+@pytest.mark.parametrize("idl", sorted(LEVELS))
+def test_a_message_made_without_arrays_can_be_sent(idl: str) -> None:
+    assert serialized(wire.message_class("rosAFE", idl)()) == serialized(plain_class(idl)())
+
+
+def test_the_pieces_of_a_window_are_sent_as_one() -> None:
+    window = SlidingWindow((2, 3), 7)
+    for size in (4, 2, 3):
+        window.append(np.random.default_rng(size).normal(size=(2, 3, size)))
+    view, array = window.view(), window.view().array()
+    ours, plain = ours_and_plain(TIME_FREQUENCY, *array)
+    ours.left, ours.right = view.select(0), view.select(1)
+    assert serialized(ours) == serialized(plain)
+    ours, plain = ours_and_plain(CROSS_CORRELATION, array.swapaxes(0, 1))
+    ours.left = view.swap_rows()
+    assert serialized(ours) == serialized(plain)
+
+
+def test_an_absent_signal_has_no_channels() -> None:
+    message = wire.message_class("rosAFE", TIME_FREQUENCY)(**HEADS[TIME_FREQUENCY], left=np.ones((3, 2)), right=[])
+    received = plain_class(TIME_FREQUENCY)().deserialize(serialized(message))
+    assert received.right.dataN == [] and len(received.left.dataN) == 3
+    assert wire.message_class("rosAFE", TIME_FREQUENCY)().deserialize(serialized(message)).right.shape == (0, 0)
+
+
+def test_ragged_signals_are_lists_of_arrays() -> None:
+    plain = plain_class(TIME_FREQUENCY)(
+        left=_nested([[1.0, 2.0], [3.0]], 2), right=_nested([[], [1.0]], 2), **HEADS[TIME_FREQUENCY]
+    )
+    received = wire.message_class("rosAFE", TIME_FREQUENCY)().deserialize(serialized(plain))
+    assert [row.tolist() for row in received.left] == [[1.0, 2.0], [3.0]]
+    assert [row.tolist() for row in received.right] == [[], [1.0]]
+
+
+def test_audio_is_int32_and_its_stamp_a_struct() -> None:
+    left = np.array([-(2**31), -1, 0, 2**31 - 1], np.int32)
+    plain = bass.msg.binaudio_portStruct(
+        sampleRate=44100,
+        nChunksOnPort=2,
+        nFramesPerChunk=2,
+        lastFrameIndex=2**40,
+        left=left.tolist(),
+        right=left[::-1].tolist(),
+        stamp=bass.msg.binaudio_timestamp(sec=3, nsec=4),
+    )
+    ours = wire.message_class("bass", AUDIO)(
+        sampleRate=44100,
+        nChunksOnPort=2,
+        nFramesPerChunk=2,
+        lastFrameIndex=2**40,
+        left=left,
+        right=left[::-1],
+        stamp={"sec": 3, "nsec": 4},
+    )
+    assert serialized(ours) == serialized(plain)
+    received = wire.message_class("rosAFE", AUDIO)().deserialize(serialized(plain))
+    assert received.left.dtype == np.int32 and received.left.tolist() == left.tolist()
+    assert not received.left.flags.writeable
+    assert (received.stamp.sec, received.stamp["nsec"]) == (3, 4)
+    with pytest.raises(AttributeError):
+        _ = received.stamp.minutes
+    assert serialized(received) == serialized(plain)
+
+
+def test_signals_of_all_processors_in_one_response() -> None:
+    one, many = np.arange(4.0), np.arange(6.0).reshape(2, 3)
+    time_domain, plain_time = ours_and_plain(TIME_DOMAIN, one)
+    frequency, plain_frequency = ours_and_plain(TIME_FREQUENCY, many)
+    arrays: dict[str, list[Any]] = {name: [] for name, _ in ROSAFE.structs["::rosAFE::dataObjSt"]}
+    plain_arrays = {name: list(items) for name, items in arrays.items()}
+    arrays["input"], plain_arrays["input"] = [time_domain], [plain_time]
+    arrays["ihc"], plain_arrays["ihc"] = [frequency, frequency], [plain_frequency, plain_frequency]
+    ours = wire.response_class("rosAFE", "getSignals")(genom_success=True, genom_exdetail="", signals=arrays)
+    plain = rosAFE.srv.getSignalsResponse(True, "", rosAFE.msg.rosAFE_dataObjSt(**plain_arrays))
+    assert serialized(ours) == serialized(plain)
+    received = wire.response_class("rosAFE", "getSignals")().deserialize(serialized(plain))
+    assert received.genom_success is True
+    np.testing.assert_array_equal(received.signals.ihc[1].left, many)
+    assert received.signals["input"][0]["lastFrameIndex"] == 2**40
+
+
+# --- what cannot be read ----------------------------------------------------------------------------------------
+
+
+def audio_bytes() -> bytes:
+    return serialized(bass.msg.binaudio_portStruct(sampleRate=8, left=[1, 2, 3], right=[4, 5, 6]))
+
+
+@pytest.mark.parametrize("idl", [*sorted(LEVELS), AUDIO])
+def test_truncated_messages_are_refused_wherever_they_end(idl: str) -> None:
+    whole = audio_bytes() if idl == AUDIO else serialized(ours_and_plain(idl, np.ones((2, 3, 4)[3 - LEVELS[idl] :]))[1])
+    for length in range(len(whole)):
+        with pytest.raises(genpy.DeserializationError):
+            wire.message_class("rosAFE", idl)().deserialize(whole[:length])
+
+
+@settings(deadline=None, max_examples=200)
+@given(idl=st.sampled_from([*sorted(LEVELS), AUDIO]), data=st.binary(max_size=120))
+def test_garbage_is_refused_or_read_and_nothing_else(idl: str, data: bytes) -> None:
+    lenient = wire.lenient_class("rosAFE", idl)().deserialize(data)
+    try:
+        wire.message_class("rosAFE", idl)().deserialize(data)
+    except genpy.DeserializationError as problem:
+        assert lenient.problem == str(problem) != ""
+    else:
+        assert lenient.problem == ""
+
+
+@pytest.mark.parametrize("idl", sorted(LEVELS))
+def test_counts_beyond_the_message_cost_nothing(idl: str) -> None:
+    message_class = wire.message_class("rosAFE", idl)
+    head = serialized(plain_class(idl)())[: {TIME_DOMAIN: 20, TIME_FREQUENCY: 24, CROSS_CORRELATION: 32}[idl]]
+    huge = (2**32 - 1).to_bytes(4, "little")
+    for counts in range(1, 4):
+        with pytest.raises(genpy.DeserializationError, match="message ends at"):
+            message_class().deserialize(head + huge * counts)
+    with pytest.raises(genpy.DeserializationError):
+        message_class().deserialize(head + huge + bytes(1000))
+
+
+# --- what cannot be written -------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("sampleRate", -1),
+        ("sampleRate", 2**32),
+        ("sampleRate", "44100"),
+        ("lastFrameIndex", 1.5),
+        ("left", np.ones((2, 2), np.int32)),
+        ("left", [1.5]),
+        ("left", [2**31]),
+        ("left", ["a"]),
+        ("left", 3),
+        ("stamp", {"sec": 1}),
+        ("stamp", 5),
+    ],
+)
+def test_what_does_not_fit_is_refused_and_named(field: str, value: Any) -> None:
+    message = wire.message_class("bass", AUDIO)(**{field: value})
+    with pytest.raises(genpy.SerializationError, match=field):
+        serialized(message)
+
+
+def test_signals_of_the_wrong_shape_are_refused() -> None:
+    for idl, levels in LEVELS.items():
+        for shape in {1: (2, 2), 2: (3,), 3: (2, 2)}[levels], (1, 1, 1, 1):
+            with pytest.raises(genpy.SerializationError, match="left"):
+                serialized(wire.message_class("rosAFE", idl)(left=np.ones(shape)))
+    with pytest.raises(genpy.SerializationError, match="left"):
+        serialized(wire.message_class("rosAFE", TIME_FREQUENCY)(left=[[1.0, 2.0], [3.0]]))
+
+
+# --- large messages ---------------------------------------------------------------------------------------------
+
+
+def test_a_port_of_22_megabytes(record_property: Any) -> None:
+    """How long it takes is on record (pytest --junitxml), not asserted: machines differ."""
+    values = np.random.default_rng(1).normal(size=(2, 31, 44100))
+    pieces = tuple(values[..., start : start + 12000] for start in range(0, 44100, 12000))
+    view = WindowView(pieces)
+    message = wire.message_class("rosAFE", TIME_FREQUENCY)(
+        **HEADS[TIME_FREQUENCY], left=view.select(0), right=view.select(1)
+    )
+    begun = time.perf_counter()
+    data = serialized(message)
+    written = time.perf_counter()
+    received = wire.message_class("rosAFE", TIME_FREQUENCY)().deserialize(data)
+    read = time.perf_counter()
+    record_property("serialize_ms", 1000 * (written - begun))
+    record_property("deserialize_ms", 1000 * (read - written))
+    assert len(data) == 24 + 2 * (4 + 31 * (4 + 44100 * 8))
+    np.testing.assert_array_equal(received.left, values[0])
+    np.testing.assert_array_equal(received.right, values[1])
+    assert np.shares_memory(received.left, np.frombuffer(data, np.uint8)), "a view of what was received, no copy"
