@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import tempfile
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
 
@@ -72,7 +73,7 @@ def draw(
     """
     if len(shown.times) < 2:
         raise ValueError(f"{len(shown.times)} frames are too few for a picture")
-    with matplotlib.style.context(["default", _STYLE]):
+    with _style():
         figure = Figure(figsize=SIZE, dpi=DPI)
         FigureCanvasAgg(figure)
         figure.text(0.063, 0.972, title, fontsize=16, fontweight="bold", va="baseline")
@@ -100,13 +101,18 @@ def save(figure: Figure, path: Path) -> None:
     """Write the picture as PNG: the whole file, or none (OSError)."""
     handle, name = tempfile.mkstemp(prefix=".", suffix=".png", dir=path.parent)
     try:
-        with os.fdopen(handle, "wb") as stream:
+        with os.fdopen(handle, "wb") as stream, _style():  # some settings matter only now
             figure.savefig(stream, format="png", metadata={"Software": "rosAFE"})
         os.chmod(name, 0o666 & ~_umask())
         os.replace(name, path)
     except BaseException:
         os.unlink(name)
         raise
+
+
+def _style() -> AbstractContextManager[None]:
+    """The picture's own settings, whatever the user's are."""
+    return matplotlib.style.context(["default", _STYLE])
 
 
 def _umask() -> int:
