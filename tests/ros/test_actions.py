@@ -100,7 +100,6 @@ def test_an_input_that_still_waits_is_interrupted(afe: Session, by: str) -> None
         afe.ok("abort_activity", activity=number)
     elif by == "Stop":
         afe.ok("Stop")
-        assert not goal.running, "Stop has waited for it"
     else:
         newer = afe.goal("InputProc", name="newer").active()
         afe.listen()
@@ -112,12 +111,13 @@ def test_an_input_that_still_waits_is_interrupted(afe: Session, by: str) -> None
 
 def test_many_goals_of_one_kind_at_once(afe: Session) -> None:
     build(afe, "PreProc", "GammatoneProc", "IhcProc")
-    goals = [afe.goal("IldProc", name=f"ild{number}") for number in range(12)]
+    names = [f"ild{number}" for number in range(8)]  # actionlib's client queues no more than ten
+    goals = [afe.goal("IldProc", name=name) for name in names]
     for goal in goals:
         goal.active()
-    assert afe.processors()["ild"] == [f"ild{number}" for number in range(12)]
-    ids = afe.wait_activities(["InputProc", "PreProc", "GammatoneProc", "IhcProc"] + ["IldProc"] * 12)
-    assert len(ids) == 16
+    assert afe.processors()["ild"] == names
+    ids = afe.wait_activities(["InputProc", "PreProc", "GammatoneProc", "IhcProc"] + ["IldProc"] * 8)
+    assert len(ids) == 12
     goals[5].handle.cancel()
     succeeded(goals[5])
     wait_for(lambda: "ild5" not in afe.processors()["ild"])

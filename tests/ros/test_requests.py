@@ -208,7 +208,7 @@ def test_a_list_of_zero_is_no_list(afe: Session) -> None:
 
 def test_parameters_come_back_exactly(afe: Session) -> None:
     afe.build("PreProc")
-    given = {
+    given: dict[str, dict[str, Any]] = {
         "PreProc": {
             "pp_bRemoveDC": True,
             "pp_cutoffHzDC": 20.000000000000004,
