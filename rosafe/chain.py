@@ -37,8 +37,8 @@ def check_parameter(name: Any, value: Any, text: bool = False) -> tuple[str, Any
         raise ValueError(f"unknown parameter {name!r}; there are: {known}")
     parameter = _PARAMETERS[name]
     checked = parameter.parse(value) if text else parameter.check(value)
-    if checked == "jespen":  # the guide's slip for jepsen
-        checked = parameter.known_word(checked)
+    if checked == "jespen" and "jepsen" in parameter.choices:  # the guide's slip
+        checked = "jepsen"
     if parameter.choices and checked not in parameter.choices:
         raise ValueError(f"{name}: {checked!r} is not {parameter.range_text}")
     return parameter.name, checked
@@ -218,10 +218,6 @@ class Chain:
             if kind == "crossCorrelation":
                 described["cc_lags"] = lags(processor.rows[1], self.sample_rate)
         return described
-
-    def parameters(self) -> dict[str, Any]:
-        """All parameters in force, by name."""
-        return {name: value for p in self._processors.values() for name, value in p.stage.parameters.items()}
 
 
 def _needed(outputs: Iterable[str]) -> set[str]:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import itertools
 import json
 import math
-import numbers
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -85,6 +84,11 @@ def ros_type(idl: str) -> str:
     return ROS_TYPES[idl]
 
 
+def _plain(value: Any) -> Any:
+    """A number of numpy's, or an array without dimensions, as Python's own type."""
+    return value.item() if hasattr(value, "item") and getattr(value, "ndim", 1) == 0 else value
+
+
 @dataclass(frozen=True)
 class Parameter:
     """One member of a request, or one parameter of a processor.
@@ -143,12 +147,12 @@ class Parameter:
         if isinstance(value, (str, bytes, Mapping)):
             raise self._refuse(value, f"a list of {element}")
         try:
-            items = list(itertools.islice(value, MAX_SEQUENCE + 1))
+            items = [_plain(item) for item in itertools.islice(value, MAX_SEQUENCE + 1)]
         except TypeError:  # a single number is a list of one: MATLAB users write 0 for "no list"
-            items = [value]
+            items = [_plain(value)]
         if len(items) > MAX_SEQUENCE:
             raise ValueError(f"{self.name}: too many values, at most {MAX_SEQUENCE}")
-        if len(items) == 1 and isinstance(items[0], numbers.Real) and items[0] == 0:  # [0] is "no list" likewise
+        if len(items) == 1 and isinstance(items[0], (int, float)) and items[0] == 0:  # [0] is "no list" likewise
             return []
         return [self._check_scalar(element, item) for item in items]
 
@@ -159,8 +163,7 @@ class Parameter:
             if len(value) > MAX_STRING or "\0" in value:
                 raise self._refuse(value, f"a text of at most {MAX_STRING} characters")
             return value
-        if hasattr(value, "item") and getattr(value, "ndim", 1) == 0:  # numpy's scalars
-            value = value.item()
+        value = _plain(value)
         if idl == "boolean":
             if isinstance(value, (bool, int, float)) and value in (0, 1):
                 return bool(value)

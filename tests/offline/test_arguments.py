@@ -1,0 +1,163 @@
+"""What `rosafe.process` refuses: a ValueError with a line that helps, before anything runs."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+import rosafe
+from rosafe import offline
+
+GOOD = np.zeros((2, 100))
+RATE = 16000
+
+
+@pytest.fixture(autouse=True)
+def nothing_runs(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    def run(self: Any) -> None:
+        raise AssertionError("it went as far as that")
+
+    monkeypatch.setattr(offline.Chain, "run", run)
+    yield
+
+
+def refused(match: str, *arguments: Any, **named: Any) -> None:
+    with pytest.raises(ValueError, match=match) as raised:
+        rosafe.process(*arguments, **named)
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("signal", "match"),
+    [
+        (np.zeros(100), r"shape \(100,\), wanted is \(2, frames\)"),
+        (np.zeros((1, 100)), r"shape \(1, 100\)"),
+        (np.zeros((100, 2)), r"shape \(100, 2\)"),
+        (np.zeros((2, 2, 100)), "shape"),
+        (np.float64(0), "shape"),
+        ([], "shape"),
+        (None, "shape"),
+        ("sound.wav", "shape"),
+        ([[1.0, 2.0], [3.0]], "signal is no array"),
+        (np.zeros((2, 10), np.int16), "type int16, wanted is a float type or int32"),
+        (np.zeros((2, 10), np.int64), "type int64"),
+        (np.zeros((2, 10), np.uint32), "type uint32"),
+        (np.zeros((2, 10), bool), "type bool"),
+        (np.zeros((2, 10), complex), "type complex128"),
+        (np.zeros((2, 10), object), "type object"),
+        (np.array([["a"], ["b"]]), "type <U1"),
+        (np.array([[0.0, np.nan], [0.0, 0.0]]), "NaN or infinite"),
+        (np.array([[0.0, 0.0], [0.0, -np.inf]]), "NaN or infinite"),
+        (np.full((2, 1), np.finfo(np.longdouble).max), "NaN or infinite"),
+    ],
+)
+def test_signals(signal: Any, match: str) -> None:
+    refused(match, signal, RATE)
+
+
+@pytest.mark.parametrize("rate", [0, -1, np.nan, np.inf, 1e30, None, "16000", True, [16000], 16000j, 10**400])
+def test_sample_rates(rate: Any) -> None:
+    refused("^sample_rate: ", GOOD, rate)
+
+
+def test_a_sample_rate_that_is_too_low_for_the_channels() -> None:
+    refused("fb_highFreqHz: a channel at .* Hz is not below half the sample rate", GOOD, 8000)
+
+
+@pytest.mark.parametrize(
+    ("parameters", "match"),
+    [
+        ({"fb_nErbs": 1}, "unknown parameter 'fb_nErbs'; there are: in_doNormalize, "),
+        ({"name": "x"}, "unknown parameter 'name'"),
+        ({"set_rm_scailing": "_power"}, "unknown parameter"),
+        ({5: 1}, "unknown parameter 5"),
+        ([("fb_nERBs", 1)], "parameters: list is not a dict"),
+        ("fb_nERBs", "parameters: str is not a dict"),
+        ({"fb_nERBs": np.nan}, "fb_nERBs: nan is not a finite number"),
+        ({"fb_nERBs": "1"}, "fb_nERBs: '1' is not a finite number"),
+        ({"fb_nERBs": None}, "fb_nERBs: None is not"),
+        ({"fb_nERBs": True}, "fb_nERBs: True is not"),
+        ({"fb_nERBs": 0}, "fb_nERBs: 0 is out of range, allowed is more than 0 to 100"),
+        ({"fb_nERBs": 1e-3}, "fb_nERBs: .* too many channels"),
+        ({"fb_nChannels": 1.5}, "fb_nChannels: 1.5 is not a whole number"),
+        ({"fb_nChannels": -1}, "fb_nChannels: -1 is not in the range"),
+        ({"fb_lowFreqHz": 9000.0}, "fb_lowFreqHz: 9000 Hz is not below fb_highFreqHz"),
+        ({"fb_cfHz": [100.0, np.inf]}, "fb_cfHz: inf is not a finite number"),
+        ({"fb_cfHz": [[100.0]]}, r"fb_cfHz: \[100.0\] is not"),
+        ({"fb_cfHz": "100"}, "fb_cfHz: '100' is not a list"),
+        ({"fb_cfHz": itertools.count(1)}, "fb_cfHz: too many values, at most 1024"),
+        ({"fb_cfHz": [8000.0]}, "fb_cfHz: a channel at 8000 Hz"),
+        ({"pp_bRemoveDC": "yes"}, "pp_bRemoveDC: 'yes' is not a boolean"),
+        ({"pp_bRemoveDC": 2}, "pp_bRemoveDC: 2 is not a boolean"),
+        ({"pp_bRemoveDC": True, "pp_cutoffHzDC": 8000}, "pp_cutoffHzDC: 8000 Hz is not below half the sample rate"),
+        ({"pp_middleEarModel": "human"}, "pp_middleEarModel: 'human' is not one of jepsen, lopezpoveda"),
+        ({"ihc_method": "Dau"}, "ihc_method: 'Dau' is not one of none, halfwave"),
+        ({"ihc_method": "jespen"}, "ihc_method: 'jespen' is not one of"),
+        ({"ild_wname": 5}, "ild_wname: 5 is not a string"),
+        ({"ild_wSizeSec": 1e-6}, "ild_wSizeSec: too short"),
+        ({"ild_wSizeSec": 1e6}, "ild_wSizeSec: 1000000 is out of range"),
+        ({"rm_decaySec": 0}, "rm_decaySec: 0 is out of range"),
+        ({"cc_maxDelaySec": -1e-3}, "cc_maxDelaySec: -0.001 is out of range"),
+        ({"in_normalizeValue": 0}, "in_normalizeValue: 0 is out of range"),
+    ],
+)
+def test_parameters(parameters: Any, match: str) -> None:
+    refused(match, GOOD, RATE, parameters)
+
+
+@pytest.mark.parametrize(
+    "block_frames",
+    [0, -1, 1.5, 12000.0, np.nan, None, True, "100", b"100", [], (), [100, 0], [100, -1], [100, "1"], [[1, 2]], {1: 2}],
+)
+def test_block_sizes(block_frames: Any) -> None:
+    refused("^block_frames: .* is not a positive whole number, or a sequence of such$", GOOD, RATE, None, block_frames)
+
+
+@pytest.mark.parametrize(
+    ("modifications", "match"),
+    [
+        (5, "wanted is a sequence of"),
+        (None, "wanted is a sequence of"),
+        ("abc", "wanted is a sequence of"),
+        ([5], "wanted is a sequence of"),
+        ([()], "wanted is a sequence of"),
+        ([(0, "fb_nERBs")], "wanted is a sequence of"),
+        ((0, "fb_nERBs", 2), "wanted is a sequence of"),
+        ([(-1, "fb_nERBs", 2)], "-1 is not a block number"),
+        ([(1.0, "fb_nERBs", 2)], "1.0 is not a block number"),
+        ([(True, "fb_nERBs", 2)], "True is not a block number"),
+        ([("0", "fb_nERBs", 2)], "'0' is not a block number"),
+        ([(0, "fb_nErbs", 2)], "unknown parameter 'fb_nErbs'"),
+        ([(0, "fb_nERBs", 0)], "fb_nERBs: 0 is out of range"),
+        ([(99, "fb_nERBs", 0)], "fb_nERBs: 0 is out of range"),
+        ([(0, "ihc_method", "none"), (0, "ihc_method", "nothing")], "ihc_method: 'nothing' is not one of"),
+        ([(9, "fb_highFreqHz", 9000.0)], "fb_highFreqHz: a channel at .* is not below half the sample rate"),
+        ([(3, "fb_highFreqHz", 100.0), (2, "fb_lowFreqHz", 200.0)], "fb_lowFreqHz: 200 Hz is not below"),
+        ([(0, "ild_wSizeSec", 1e-6)], "ild_wSizeSec: too short"),
+    ],
+)
+def test_modifications(modifications: Any, match: str) -> None:
+    refused(match, GOOD, RATE, None, 10, modifications)
+
+
+@pytest.mark.parametrize(
+    ("outputs", "match"),
+    [
+        ("crosscorrelation", "unknown output 'crosscorrelation'; there are: input, preProc, "),
+        (["ild", "ILD"], "unknown output 'ILD'"),
+        ([5], "unknown output 5"),
+        ([["ild"]], "unknown output"),
+        (5, "outputs: 5 is not a sequence of names"),
+    ],
+)
+def test_outputs(outputs: Any, match: str) -> None:
+    refused(match, GOOD, RATE, outputs=outputs)
+
+
+def test_sizes_that_fill_the_memory() -> None:
+    refused("ild_wSizeSec: 60 s of .* MiB, more than 1024 MiB", GOOD, 96000, {"ild_wSizeSec": 60.0})
+    refused("more than 1024 MiB", GOOD, 96000, modifications=[(0, "ild_wSizeSec", 60.0)])

@@ -1,0 +1,354 @@
+"""What `rosafe.process` computes: reference vectors, any cut into blocks, parts of the outputs, odd signals."""
+
+from __future__ import annotations
+
+import tracemalloc
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+import rosafe
+from rosafe import chain
+from rosafe.audiofile import AudioFile
+from rosafe.dsp import STAGES, InnerHairCell
+from rosafe.interface import KINDS
+from tests import harness
+from tests.dsp.bare import Chain, cut
+from tests.dsp.test_vectors import CASES, assert_reference, load, parameters
+
+RATE = 16000.0
+FEW = {"fb_nChannels": 4, "fb_highFreqHz": 4000.0}
+SOUND = 0.1 * np.random.default_rng(0).standard_normal((2, 3000))
+FRAMED = ("ild", "ratemap", "crossCorrelation")
+
+
+def noise(frames: int, seed: int = 1) -> NDArray[np.float64]:
+    return 0.1 * np.random.default_rng(seed).standard_normal((2, frames))
+
+
+def assert_same(got: dict[str, Any], wanted: dict[str, Any], tolerance: float = 1e-12) -> None:
+    assert got.keys() == wanted.keys()
+    for name in wanted:
+        np.testing.assert_allclose(got[name], wanted[name], rtol=0, atol=tolerance, err_msg=name)
+
+
+# --- numbers ---
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_reference_vectors(name: str) -> None:
+    """Through the tree, with the changes on the way."""
+    case, expected = load(name)
+    results = rosafe.process(
+        expected["signal"], case["fs"], parameters(case), block_frames=case["chunks"], modifications=case["mods"]
+    )
+    assert_reference(case, results, expected)
+
+
+def test_speech_comes_from_one_side() -> None:
+    """Level and time differences agree on it."""
+    file = AudioFile(harness.shared("audio", "speech_anechoic_16k.wav"))
+    results = rosafe.process(file.read(2 * file.sample_rate), file.sample_rate, outputs=FRAMED)
+    file.close()
+    loud = results["ratemap"].sum(axis=0)
+    loud = loud > 0.05 * loud.max()
+    level = np.median(results["ild"][loud])
+    lag = results["cc_lags"][results["crossCorrelation"].mean(axis=0)[:, loud.any(axis=0)].mean(axis=1).argmax()]
+    assert abs(level) > 2
+    assert abs(lag) > 1e-4
+    assert (level > 0) == (lag > 0)
+
+
+def test_what_is_returned() -> None:
+    frames = 16000
+    results = rosafe.process(noise(frames), RATE)
+    channels = len(results["fb_cfHz"])
+    shapes = {name: np.shape(value) for name, value in results.items()}
+    assert shapes == {
+        "input": (2, frames),
+        "preProc": (2, frames),
+        "gammatone": (2, channels, frames),
+        "fb_cfHz": (31,),
+        "ihc": (2, channels, frames),
+        "ild": (channels, 99),
+        "ild_frameRate": (),
+        "ratemap": (2, channels, 99),
+        "ratemap_frameRate": (),
+        "crossCorrelation": (channels, 37, 99),
+        "crossCorrelation_frameRate": (),
+        "cc_lags": (37,),
+    }
+    assert all(np.asarray(value).dtype == np.float64 for value in results.values())
+    np.testing.assert_allclose(results["cc_lags"], np.arange(-18, 19) / RATE)
+    assert [results[f"{kind}_frameRate"] for kind in FRAMED] == [100.0] * 3
+
+
+def test_frame_rates_are_the_true_ones() -> None:
+    results = rosafe.process(noise(4410), 44100, {"ild_hSizeSec": 0.0125, "rm_hSizeSec": 0.003, "cc_hSizeSec": 0.007})
+    assert [results[f"{kind}_frameRate"] for kind in FRAMED] == [44100 / 551, 44100 / 132, 44100 / 309]
+
+
+@settings(deadline=None, max_examples=20)
+@given(st.lists(st.one_of(st.integers(20, 400), st.integers(1, 2000)), min_size=1, max_size=6))
+def test_blocks_of_any_size_give_the_same_numbers(sizes: list[int]) -> None:
+    sizes.append(max(sizes) + 100)
+    sound = SOUND[:, :1500]
+    whole = rosafe.process(sound, RATE, FEW, block_frames=1500)
+    assert_same(rosafe.process(sound, RATE, FEW, block_frames=sizes), whole)
+
+
+def test_blocks_of_one_frame() -> None:
+    sound = SOUND[:, :500]
+    assert_same(rosafe.process(sound, RATE, FEW, block_frames=1), rosafe.process(sound, RATE, FEW))
+
+
+def test_integers_are_normalised_and_floats_are_not() -> None:
+    whole = (noise(2000) * 2**30).astype(np.int32)
+    float_input = rosafe.process(whole.astype(float), RATE, outputs=["input"])["input"]
+    np.testing.assert_array_equal(float_input, whole)
+    cases: list[tuple[NDArray[Any], dict[str, Any], int]] = [
+        (whole, {}, 2**31 - 1),
+        (whole.astype(">i4"), {}, 2**31 - 1),
+        (whole, {"in_normalizeValue": 1000}, 1000),
+        (whole, {"in_doNormalize": False}, 1),
+        (whole.astype(float), {"in_doNormalize": True}, 2**31 - 1),
+        (whole.astype(float), {"in_normalizeValue": 1000}, 1),
+    ]
+    for signal, values, divisor in cases:
+        got = rosafe.process(signal, RATE, values, outputs=["input"])["input"]
+        np.testing.assert_array_equal(got, whole / divisor)
+    full_scale = rosafe.process(np.array([[-(2**31)], [2**31 - 1]], np.int32), RATE, outputs=["input"])
+    np.testing.assert_array_equal(full_scale["input"], [[-1.0000000004656613], [1.0]])
+
+
+def test_the_slip_of_the_guide() -> None:
+    got, wanted = (
+        rosafe.process(SOUND, RATE, {"pp_bMiddleEarFiltering": True, "pp_middleEarModel": word}, outputs=["preProc"])
+        for word in ("jespen", "jepsen")
+    )
+    assert_same(got, wanted, tolerance=0)
+
+
+@pytest.mark.parametrize("kind", [np.float16, np.float32, np.longdouble])
+def test_other_floats(kind: Any) -> None:
+    signal = noise(500).astype(kind)
+    assert_same(rosafe.process(signal, RATE, FEW), rosafe.process(signal.astype(float), RATE, FEW), tolerance=0)
+
+
+def test_any_memory_layout_and_lists() -> None:
+    signal = noise(600)
+    wanted = rosafe.process(signal, RATE, FEW)
+    backwards = signal[:, ::-1].copy()[:, ::-1]
+    for same in (np.asfortranarray(signal), backwards, signal.tolist(), signal.T.copy().T):
+        assert_same(rosafe.process(same, RATE, FEW), wanted, tolerance=0)
+
+
+def test_the_signal_stays_as_it_is_and_apart_from_the_results() -> None:
+    signal = noise(600)
+    before = signal.copy()
+    results = rosafe.process(signal, RATE, FEW)
+    np.testing.assert_array_equal(signal, before)
+    arrays = [value for value in results.values() if isinstance(value, np.ndarray)]
+    assert not any(np.shares_memory(signal, array) for array in arrays)
+    assert all(array.flags.writeable for array in arrays)
+
+
+# --- odd signals ---
+
+
+@pytest.mark.parametrize("frames", [0, 1, 159, 319])
+@pytest.mark.parametrize("block", [1, 100, 12000])
+def test_less_than_a_window(frames: int, block: int) -> None:
+    results = rosafe.process(noise(frames), RATE, FEW, block_frames=block, outputs=[*FRAMED, "ihc", "input"])
+    assert {name: np.shape(results[name]) for name in ("input", "ihc", *FRAMED)} == {
+        "input": (2, frames),
+        "ihc": (2, 4, frames),
+        "ild": (4, 0),
+        "ratemap": (2, 4, 0),
+        "crossCorrelation": (4, 37, 0),
+    }
+    assert len(results["cc_lags"]) == 37
+    assert len(results["fb_cfHz"]) == 4
+    assert results["ild_frameRate"] == 100.0
+
+
+def test_one_whole_window() -> None:
+    assert rosafe.process(noise(320), RATE, FEW)["ild"].shape == (4, 1)
+
+
+def test_silence() -> None:
+    results = rosafe.process(np.zeros((2, 3000)), RATE, {**FEW, "pp_bNormalizeRMS": True, "ihc_method": "bernstein"})
+    for name in ("preProc", "gammatone", "ihc", *FRAMED):
+        assert not results[name].any(), name
+
+
+# --- parts of the outputs ---
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_nothing_depends_on_is_not_computed(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = rosafe.process(SOUND, RATE, FEW)
+    needed = [kind]
+    while parent := KINDS[needed[-1]].parent:
+        needed.append(parent)
+
+    def refuse(*arguments: Any, **parameters: Any) -> None:
+        raise AssertionError("not asked for")
+
+    for other in set(STAGES) - set(needed):
+        monkeypatch.setitem(STAGES, other, refuse)  # type: ignore[misc]
+    results = rosafe.process(SOUND, RATE, FEW, outputs=[kind])
+    beside = {"fb_cfHz"} if "gammatone" in needed else set()
+    if kind in FRAMED:
+        beside.add(f"{kind}_frameRate")
+    if kind == "crossCorrelation":
+        beside.add("cc_lags")
+    assert set(results) == {kind} | beside
+    assert_same(results, {name: whole[name] for name in results}, tolerance=0)
+
+
+def test_outputs_in_any_form() -> None:
+    assert set(rosafe.process(SOUND, RATE, FEW, outputs="preProc")) == {"preProc"}
+    assert set(rosafe.process(SOUND, RATE, FEW, outputs=("preProc", "input", "input"))) == {"preProc", "input"}
+    assert rosafe.process(SOUND, RATE, FEW, outputs=[]) == {}
+
+
+def test_what_is_not_asked_for_is_not_stored() -> None:
+    """Twice the signal takes no more memory, but for a few frames of ILD."""
+
+    def peak(frames: int) -> int:
+        signal = noise(frames)
+        tracemalloc.start()
+        try:
+            rosafe.process(signal, RATE, FEW, block_frames=1000, outputs=["ild"])
+            return tracemalloc.get_traced_memory()[1]
+        finally:
+            tracemalloc.stop()
+
+    gammatone_bytes = 2 * 4 * 8 * 40_000
+    assert peak(80_000) - peak(40_000) < 0.1 * gammatone_bytes
+
+
+# --- changes on the way ---
+
+
+def test_changes_before_their_blocks() -> None:
+    """Whatever order they come in, those for one block are made in turn; those for blocks that never come are not."""
+    changes = [
+        (5, "ihc_method", "dau"),
+        (2, "fb_bwERBs", 1.3),
+        (2, "ihc_method", "hilbert"),
+        (0, "pp_bRemoveDC", True),
+        (3, "ild_hSizeSec", 0.005),
+        (2, "fb_bwERBs", 1.2),
+        (1, "pp_refSPLdBS", 90),
+        (1, "pp_bLevelScaling", 1),
+        (6, "rm_scaling", "magnitude"),
+        (99, "ild_wSizeSec", 0.04),
+        (99, "fb_highFreqHz", 9999.0),
+    ]
+    results = rosafe.process(SOUND, RATE, FEW, block_frames=500, modifications=changes)
+    stages = Chain(RATE, {**FEW, "in_doNormalize": False})
+    made = [(at, name.replace("BS", "B"), value) for at, name, value in changes if at < 6]
+    outputs = stages.run(cut(SOUND, 500), sorted(made, key=lambda change: change[0]))
+    for kind in STAGES:
+        wanted = np.concatenate([output[kind] for output in outputs], axis=-1)
+        np.testing.assert_allclose(results[kind], wanted, rtol=0, atol=1e-12, err_msg=kind)
+    assert results["ild_frameRate"] == 200.0
+    assert results["fb_cfHz"][-1] == 4000.0
+
+
+def test_changes_of_what_is_not_computed_are_none() -> None:
+    with_changes = rosafe.process(SOUND, RATE, FEW, modifications=[(0, "ild_wname", "hamming")], outputs=["preProc"])
+    assert_same(with_changes, rosafe.process(SOUND, RATE, FEW, outputs=["preProc"]), tolerance=0)
+
+
+def test_lags_and_channels_that_change_leave_zeros_outside() -> None:
+    """Lags are centred on lag zero, channels begin at the first."""
+    changes = [(1, "cc_maxDelaySec", 0.002), (2, "fb_nChannels", 6), (3, "cc_maxDelaySec", 0.0005)]
+    results = rosafe.process(SOUND, RATE, FEW, block_frames=750, modifications=changes)
+    outputs = Chain(RATE, {**FEW, "in_doNormalize": False}).run(cut(SOUND, 750), changes)
+    assert results["crossCorrelation"].shape[:2] == (6, 65)
+    assert results["ihc"].shape == (2, 6, 3000)
+    assert results["ild"].shape[0] == 6
+    np.testing.assert_allclose(results["cc_lags"], np.arange(-32, 33) / RATE)
+    assert len(results["fb_cfHz"]) == 6
+    at = 0
+    for number, (channels, reach) in enumerate(((4, 18), (4, 32), (6, 32), (6, 8))):
+        wanted = outputs[number]["crossCorrelation"]
+        got = results["crossCorrelation"][..., at : at + wanted.shape[-1]].copy()
+        inner = got[:channels, 32 - reach : 32 + reach + 1]
+        np.testing.assert_allclose(inner, wanted, rtol=0, atol=1e-12)
+        inner[:] = 0
+        assert not got.any()
+        at += wanted.shape[-1]
+        block = results["ihc"][..., number * 750 : (number + 1) * 750]
+        np.testing.assert_allclose(block[:, :channels], outputs[number]["ihc"], rtol=0, atol=1e-12)
+        assert not block[:, channels:].any()
+    assert at == results["crossCorrelation"].shape[-1]
+
+
+def test_a_change_in_every_block() -> None:
+    """A thousand of them are checked in a moment."""
+    changes = [(block, "rm_decaySec", 0.001 + 1e-5 * block) for block in range(1000)]
+    results = rosafe.process(noise(1000), RATE, FEW, block_frames=1, modifications=changes, outputs=["ratemap"])
+    assert results["ratemap"].shape == (2, 4, 5)
+
+
+# --- several at once, and ends before the end ---
+
+
+def test_several_calls_at_once() -> None:
+    signals = [noise(4000, seed) for seed in range(4)]
+    alone = [rosafe.process(signal, RATE, FEW) for signal in signals]
+    for got, wanted in zip(
+        harness.run_together(4, lambda user: rosafe.process(signals[user], RATE, FEW, block_frames=333)),
+        alone,
+        strict=True,
+    ):
+        assert_same(got, wanted)
+
+
+class Blown(Exception):
+    pass
+
+
+def test_an_error_on_the_way_ends_it_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    processed = []
+
+    class Fuse(InnerHairCell):
+        def process(self, block: Any, envelope: Any = None) -> Any:
+            processed.append(block)
+            if len(processed) == 3:
+                raise Blown("in the third block")
+            return super().process(block, envelope)
+
+    monkeypatch.setitem(STAGES, "ihc", Fuse)
+    read = []
+    original = chain._GatedSource.read
+
+    def counting(self: Any) -> Any:
+        read.append(self)
+        return original(self)
+
+    monkeypatch.setattr(chain._GatedSource, "read", counting)
+    with pytest.raises(Blown, match="third"):
+        rosafe.process(noise(100_000), RATE, FEW, block_frames=10)
+    assert len(processed) == 3
+    assert len(read) < 5000  # of 10000: the tree notices with a few blocks under way
+
+
+def test_an_interrupt_from_the_keyboard(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In the middle of the work."""
+
+    def interrupt(self: chain.Chain) -> None:
+        self._source.open()
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(chain.Chain, "run", interrupt)
+    with pytest.raises(KeyboardInterrupt):
+        rosafe.process(noise(100_000), RATE, FEW, block_frames=10)
