@@ -170,9 +170,8 @@ class Recorder:
 
     @property
     def position(self) -> tuple[int, int]:
-        """How far the input has come: how often the sound began, and its newest audio frame."""
-        follower = self.ports["input"]
-        return follower.beginnings, follower.index
+        """How far the last of the ports has come: how often the sound began, and its newest audio frame."""
+        return min((follower.beginnings, follower.index) for follower in self.ports.values())
 
     def stop(self) -> None:
         """Take nothing of the ports any more."""

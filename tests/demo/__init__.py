@@ -1,0 +1,1 @@
+"""Tests of the demonstration, the README and the documents."""

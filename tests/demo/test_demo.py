@@ -1,0 +1,152 @@
+"""scripts/demo from end to end: the built-in scene, real speech, and what must be refused."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+from pathlib import Path
+
+import matplotlib.image
+import numpy as np
+import pytest
+
+from tests.demo.running import DEMO_SECONDS, PORTS, Demo, demo, path, table
+from tests.demo.test_sound import wav
+from tests.harness import SCRIPTS, shared
+
+
+def finished(running: Demo) -> str:
+    """What it printed, once it has ended well and left nothing."""
+    assert running.wait(DEMO_SECONDS) == 0, running
+    assert running.err == ""
+    running.assert_gone()
+    return running.out
+
+
+def check_table(text: str, sample_rate: int, block: int, seconds: float) -> None:
+    """Seven ports, nothing lost, and as much of everything as the time allows."""
+    rows = table(text)
+    assert {topic: row[0] for topic, row in rows.items()} == PORTS
+    for topic, (_, message_rate, frames, frame_rate, lost) in rows.items():
+        framed = topic.split("Port")[0] in ("ild", "ratemap", "crossCorrelation")
+        assert frame_rate == (100 if framed else sample_rate), topic
+        assert lost == 0, topic
+        # It ends when the last of the stages has come so far; the first ones may be some blocks ahead.
+        assert seconds - 0.1 < frames / frame_rate < seconds + 10 * block / sample_rate
+        assert message_rate == pytest.approx(sample_rate / block, rel=0.25), topic
+    assert re.search(r"^by their own count bass lost 0 frames \(0 overruns\) and rosAFE 0 \(0 gaps\)$", text, re.M)
+
+
+def check_picture(file: Path) -> None:
+    """A picture of decent size with something on it."""
+    image = matplotlib.image.imread(file)[..., :3]
+    assert image.shape[0] > 800 and image.shape[1] > 1000
+    assert 20_000 < file.stat().st_size < 2_000_000
+    assert len(np.unique((image * 255).astype(np.uint8).reshape(-1, 3), axis=0)) > 500
+
+
+def test_scene(tmp_path: Path) -> None:
+    """Seven ports, nothing lost, a source that goes from left to right, a picture in ./rosafe-demo."""
+    with demo(cwd=tmp_path, ROS_MASTER_URI="http://192.0.2.1:11311", ROS_NAMESPACE="/elsewhere") as running:
+        text = finished(running)
+    check_table(text, 44100, 12000, 10.0)
+    course = np.array(path(text))
+    assert len(course) >= 19
+    for estimate in course[:, 1:3].T:
+        assert estimate[0] < -75 and estimate[-1] > 75
+        assert (np.diff(estimate) > -5).all()
+        assert np.abs(estimate - course[:, 3]).max() < 8
+    assert "agree on the side in 100 % of the frames" in text
+    assert [entry.name for entry in (tmp_path / "rosafe-demo").iterdir()] == ["rosafe-demo.png"]
+    check_picture(tmp_path / "rosafe-demo" / "rosafe-demo.png")
+    commands = re.findall(r"^\$ rosservice call (\S+) \"(.*)\"$", text, re.M)
+    assert [service for service, _ in commands[:3]] == ["/rosAFE/connect_port", "/bass/Acquire", "/rosAFE/InputProc"]
+    assert commands[0][1] == "{local: Audio, remote: bass/Audio}"
+
+
+def test_speech(tmp_path: Path) -> None:
+    """The shared speech, through bass-ros and rosAFE-ros: both cues say right, all of it, to its end."""
+    speech = shared("audio", "speech_anechoic_16k.wav")
+    with demo(speech, "--out", tmp_path / "new" / "folder") as running:
+        text = finished(running)
+    check_table(text, 16000, 4000, 2.5)
+    course = np.array(path(text))
+    assert (course[:, 1:3] > 15).all()
+    assert np.abs(course[:, 1] - course[:, 2]).max() < 10
+    check_picture(tmp_path / "new" / "folder" / "rosafe-demo.png")
+
+
+def test_telephone_quality_without_home(tmp_path: Path) -> None:
+    """8 kHz is too low for the guide's channels; no home and no terminal are no hindrance."""
+    file = wav(tmp_path / "it's a call.wav", 8000, 2.2)
+    with demo(file, "--out", tmp_path, HOME="/proc/none", XDG_CACHE_HOME="", LC_ALL="C") as running:
+        text = finished(running)
+    assert "fb_highFreqHz 3600" in text and "fb_highFreqHz: 3600" in text
+    check_table(text, 8000, 2000, 2.0)
+
+
+def test_through_a_link_with_a_dead_reader(tmp_path: Path) -> None:
+    """A reader that goes away ends it, and everything that it has started."""
+    link = tmp_path / "show"
+    link.symlink_to(SCRIPTS / "demo")
+    running = Demo("--out", tmp_path / "out", cwd=tmp_path, script=Path("/bin/sh"))
+    running.close()
+    reader, writer = os.pipe()
+    process = subprocess.Popen(
+        [str(link), "--out", str(tmp_path / "out")],
+        stdout=writer,
+        stderr=subprocess.PIPE,
+        env={**os.environ, running.mark: "1"},
+        text=True,
+    )
+    os.close(writer)
+    with os.fdopen(reader) as stream:
+        while "Acquire" not in stream.readline():
+            pass
+    _, err = process.communicate(timeout=DEMO_SECONDS)
+    assert process.returncode == 1 and err == ""
+    running.assert_gone()
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    "arguments, why, code",
+    [
+        (["missing.wav"], "missing.wav: No such file", 1),
+        (["mono.wav"], "1 channel, two are needed", 1),
+        (["short.wav"], "too short", 1),
+        (["scene:?speed=2"], "no option 'speed'", 1),
+        (["--out", "mono.wav"], "cannot write to mono.wav", 1),
+        (["--out", "/proc/none/there"], "cannot write to /proc/none/there", 1),
+        (["--seconds", "0"], "'0' is no number of seconds from 2 to 600", 2),
+        (["--seconds", "nan"], "'nan' is no number of seconds", 2),
+        (["--seconds", "ten"], "'ten' is no number of seconds", 2),
+        (["--seconds", "1e9"], "'1e9' is no number of seconds", 2),
+        (["scene:", "scene:"], "unrecognized arguments", 2),
+        (["--sceonds", "3"], "unrecognized arguments", 2),
+    ],
+)
+def test_refused_in_one_line(arguments: list[str], why: str, code: int, tmp_path: Path) -> None:
+    wav(tmp_path / "mono.wav", channels=1)
+    wav(tmp_path / "short.wav", seconds=0.1)
+    before = sorted(tmp_path.rglob("*"))
+    with demo(*arguments, cwd=tmp_path) as running:
+        assert running.wait() == code
+        assert len(running.err.splitlines()) == 1 and why in running.err
+        running.assert_gone()
+    assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_unknown_device_says_so_and_leaves_nothing(tmp_path: Path) -> None:
+    with demo("hw:77,7", "--out", tmp_path / "out") as running:
+        assert running.wait(DEMO_SECONDS) == 1
+        assert running.err.startswith("demo: /bass/Acquire was refused: ::bass::e_device: ")
+        assert "hw:77,7" in running.err and len(running.err.splitlines()) == 1
+        running.assert_gone()
+    assert not (tmp_path / "out").exists()
+
+
+def test_help_names_the_arguments() -> None:
+    text = subprocess.run([SCRIPTS / "demo", "-h"], check=True, capture_output=True, text=True).stdout
+    assert "[--seconds N] [--out DIR]" in text and "WAV or ALSA device" in text

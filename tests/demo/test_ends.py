@@ -1,0 +1,100 @@
+"""However scripts/demo ends, nothing of it stays: signals at every stage, a kill, a crash of a node."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+from pathlib import Path
+
+import pytest
+
+from tests.demo.running import Demo, demo
+from tests.harness import ROOT, wait_for
+
+STAGES = {
+    "start": "starting bass-ros and rosAFE-ros",
+    "requests": "rosservice call /rosAFE/GammatoneProc",
+    "recording": "source",
+    "picture": "where the source was",
+}
+
+
+@pytest.mark.parametrize(
+    "stage, number",
+    [*((stage, signal.SIGINT) for stage in STAGES), ("recording", signal.SIGTERM), ("start", signal.SIGHUP)],
+)
+def test_signal(stage: str, number: signal.Signals, tmp_path: Path) -> None:
+    with demo("--seconds", "2", "--out", tmp_path / "out") as running:
+        running.says(STAGES[stage])
+        assert running.stop(number) == 128 + number
+        assert running.err == ""
+        running.assert_gone()
+    assert not (tmp_path / "out").exists()
+
+
+def test_ctrl_c_of_a_terminal_goes_to_the_whole_group(tmp_path: Path) -> None:
+    with demo("--seconds", "2", "--out", tmp_path / "out") as running:
+        running.says(STAGES["requests"])
+        os.killpg(running.pid, signal.SIGINT)
+        assert running.wait() == 130
+        running.assert_gone()
+
+
+def test_many_signals_at_once_cut_nothing_short(tmp_path: Path) -> None:
+    with demo("--seconds", "2", "--out", tmp_path / "out") as running:
+        running.says(STAGES["requests"])
+        for _ in range(50):
+            os.kill(running.pid, signal.SIGINT)
+        assert running.wait() == 130
+        assert running.err == ""
+        running.assert_gone()
+
+
+@pytest.mark.parametrize("stage", ["start", "recording"])
+def test_kill_takes_the_children_along(stage: str, tmp_path: Path) -> None:
+    with demo("--seconds", "2", "--out", tmp_path / "out") as running:
+        running.says(STAGES[stage])
+        running.stop(signal.SIGKILL)
+        running.assert_gone()
+
+
+@pytest.mark.parametrize("node, stage", [("bass-ros", "requests"), ("rosAFE-ros", "recording")])
+def test_a_node_that_crashes_ends_it(node: str, stage: str, tmp_path: Path) -> None:
+    with demo("--out", tmp_path / "out") as running:
+        running.says(STAGES[stage])
+        victim = next(pid for pid, command in running.family().items() if command.endswith(f"/{node} "))
+        os.kill(victim, signal.SIGKILL)
+        assert running.wait() == 1
+        assert running.err.startswith(f"demo: {node} was killed by signal 9")
+        running.assert_gone()
+    assert not (tmp_path / "out").exists()
+
+
+def checkout_with_install(tmp_path: Path, install: str) -> Path:
+    """A checkout whose scripts/install is another; its scripts/demo."""
+    (tmp_path / "scripts").mkdir()
+    (tmp_path / "rosafe").symlink_to(ROOT / "rosafe")
+    shutil.copy(ROOT / "scripts" / "demo", tmp_path / "scripts")
+    script = tmp_path / "scripts" / "install"
+    script.write_text(f"#!/bin/bash\n{install}\n")
+    script.chmod(0o755)
+    return tmp_path / "scripts" / "demo"
+
+
+def test_ctrl_c_while_it_installs(tmp_path: Path) -> None:
+    script = checkout_with_install(tmp_path, "echo installing; sleep 100; echo never")
+    with Demo(script=script, cwd=tmp_path) as running:
+        running.says("installing")
+        wait_for(lambda: any(command.startswith("sleep") for command in running.family().values()))
+        os.killpg(running.pid, signal.SIGINT)
+        assert running.wait() == 130
+        assert running.out == "installing\n"
+        running.assert_gone()
+
+
+def test_failed_installation_ends_it(tmp_path: Path) -> None:
+    script = checkout_with_install(tmp_path, "echo 'scripts/install: no network' >&2; exit 1")
+    with Demo(script=script, cwd=tmp_path) as running:
+        assert running.wait() == 1
+        assert (running.out, running.err) == ("", "scripts/install: no network\n")

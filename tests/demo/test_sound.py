@@ -1,0 +1,107 @@
+"""What the user's argument means, and what is refused before anything starts."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+
+from rosafe.audiofile import AudioFileError
+from rosafe.demo import session
+from rosafe.demo.sound import Sound, choose
+from rosafe.interface import ComponentError
+
+
+def wav(path: Path, sample_rate: int = 16000, seconds: float = 3.0, channels: int = 2) -> Path:
+    """A file of noise."""
+    samples = np.random.default_rng(0).normal(0, 0.1, (round(seconds * sample_rate), channels))
+    soundfile.write(path, samples, sample_rate, subtype="PCM_16")
+    return path
+
+
+def test_default_is_the_guides() -> None:
+    sound = choose("scene:")
+    assert (sound.device, sound.asked_rate, sound.sample_rate) == ("scene:", 44100, 44100)
+    assert (sound.frames_per_block, sound.frames_per_chunk, sound.highest_frequency) == (12000, 2205, 8000)
+    assert sound.true_azimuth is not None and sound.true_azimuth(np.array([0.0, 5.0, 10.0])).tolist() == [-90, 0, 90]
+
+
+def test_scene_with_options() -> None:
+    sound = choose("scene:?level=-20&seconds=4")
+    assert sound.true_azimuth is not None and sound.true_azimuth(np.array([4.0])) == 90
+
+
+def test_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = wav(tmp_path / "my sound.wav")
+    monkeypatch.chdir(tmp_path)
+    for argument in ("my sound.wav", "./my sound.wav", str(path)):
+        sound = choose(argument)
+        assert (sound.device, sound.asked_rate, sound.sample_rate) == (f"file:{path}", 0, 16000)
+        assert (sound.title, sound.true_azimuth, sound.highest_frequency) == ("my sound.wav", None, 8000)
+        assert sound.seconds_to_follow(10) == 3.0 and sound.seconds_to_follow(2) == 2
+
+
+def test_low_sample_rate_lowers_the_highest_channel(tmp_path: Path) -> None:
+    sound = choose(str(wav(tmp_path / "telephone.wav", 8000)))
+    assert sound.highest_frequency == 3600 and "fb_highFreqHz 3600" in sound.note
+    assert dict(session.requests(sound))["/rosAFE/GammatoneProc"]["fb_highFreqHz"] == 3600
+
+
+def test_any_suffix_or_none_will_do_for_a_file_that_is_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    wav(tmp_path / "sound.wav").rename(tmp_path / "default")
+    monkeypatch.chdir(tmp_path)
+    assert choose("default").device == f"file:{tmp_path}/default"
+
+
+@pytest.mark.parametrize("name", ["hw:1,0", "plughw:CARD=PCH,DEV=0", "default", "pulse", "plug:'dmix:0'"])
+def test_everything_else_is_a_device(name: str) -> None:
+    sound = choose(name)
+    assert (sound.device, sound.asked_rate, sound.has_beginning) == (name, 44100, False)
+
+
+@pytest.mark.parametrize(
+    "argument, why",
+    [
+        ("missing.wav", "No such file"),
+        ("no/such/folder/x", "No such file"),
+        ("mono.wav", "1 channel"),
+        ("empty.wav", "is empty"),
+        ("text.wav", "not a sound file"),
+        ("folder/", "not a regular file"),
+        ("file:missing", "No such file"),
+        ("scene:?speed=3", "no option 'speed'"),
+        ("scene:fast", "question mark"),
+    ],
+)
+def test_refused_with_one_line(argument: str, why: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    wav(tmp_path / "mono.wav", channels=1)
+    (tmp_path / "empty.wav").touch()
+    (tmp_path / "text.wav").write_text("no sound")
+    (tmp_path / "folder").mkdir()
+    with pytest.raises((AudioFileError, ComponentError), match=why) as refused:
+        choose(argument)
+    assert "\n" not in str(refused.value)
+
+
+def test_commands_can_be_copied_into_a_shell() -> None:
+    """Names with quotes and blanks reach rosservice as they are."""
+    import shlex
+
+    import yaml  # type: ignore[import]
+
+    for device in (
+        "scene:",
+        "file:/tmp/it's a file.wav",
+        'file:/tmp/a "b" $c `d` \\e!.wav',
+        "hw:1,0",
+        "file:/ü/{x}, y: z",
+    ):
+        sound = Sound(device, 0, 44100, "x")
+        for service, arguments in session.requests(sound):
+            command = session.command_line(service, arguments)
+            assert shlex.split(session.shown(command)) == command
+            assert command[:3] == ["rosservice", "call", service]
+            assert yaml.safe_load(command[3]) == arguments
