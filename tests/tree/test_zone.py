@@ -30,24 +30,19 @@ class Node:
     seen: list[int] = field(default_factory=list)
     zone: SharedZone = field(default_factory=SharedZone)
 
+    def copy(self) -> Node:
+        twin, zone = copy.copy(self), copy.copy(self.zone)
+        for group in ("_children", "_fresh", "_held"):
+            setattr(zone, group, set(getattr(zone, group)))
+        twin.seen, twin.zone = list(self.seen), zone
+        return twin
+
 
 class World:
     """A root with two children, one of which has a child of its own; all but the root may come and go."""
 
-    def __init__(self) -> None:
-        self.nodes = {node.name: node for node in (Node("root"), Node("a", "root"), Node("b", "root"), Node("c", "a"))}
-        self.nodes["root"].attached = True
-
-    def copy(self) -> World:
-        other = World()
-        for name, node in self.nodes.items():
-            twin = copy.copy(node)
-            twin.seen = list(node.seen)
-            twin.zone = copy.copy(node.zone)
-            for group in ("_children", "_fresh", "_held"):
-                setattr(twin.zone, group, set(getattr(node.zone, group)))
-            other.nodes[name] = twin
-        return other
+    def __init__(self, nodes: dict[str, Node]) -> None:
+        self.nodes = nodes
 
     def fingerprint(self) -> tuple[object, ...]:
         return tuple(
@@ -67,9 +62,13 @@ class World:
                     yield name, step
 
     def after(self, name: str, step: str) -> World:
-        """The world after that step."""
-        world = self.copy()
-        getattr(world, step)(world.nodes[name])
+        """The world after that step. What the step does not touch is shared."""
+        nodes = dict(self.nodes)
+        for node in self.nodes.values():
+            if name in (node.name, node.parent) or node.name == nodes[name].parent:
+                nodes[node.name] = node.copy()
+        world = World(nodes)
+        getattr(world, step)(nodes[name])
         return world
 
     def above(self, node: Node) -> SharedZone:
@@ -168,7 +167,8 @@ def test_every_order_of_steps() -> None:
 
     The ends are those states in which nobody else comes or goes and all that is left to do is done.
     """
-    start = World()
+    nodes = (Node("root", attached=True), Node("a", "root"), Node("b", "root"), Node("c", "a"))
+    start = World({node.name: node for node in nodes})
     known = {start.fingerprint()}
     unexplored = [start]
     ends = 0
