@@ -63,6 +63,7 @@ class AudioRing:
         self._window = 0  # frames in the last message
         self._newest = 0  # number of the newest frame
         self._oldest = 1  # number of the oldest frame that the ring holds
+        self._joint = 1  # number of the first frame after the last break
         self._readers: list[AudioReader] = []
         self._connection: object = None
         self._refusing = self._breaking = False  # told the log so already
@@ -144,7 +145,7 @@ class AudioRing:
         self._drop_unread()
         self._samples = np.zeros((2, capacity), np.int32)
         self._newest = max(0, newest - window)
-        self._oldest = self._newest + 1
+        self._oldest = self._joint = self._newest + 1
         self.sample_rate, self._window = sample_rate, window
         self.counters.streams += 1
         for reader in self._readers:
@@ -160,13 +161,14 @@ class AudioRing:
 
     def _compare(self, message: Any, known: int) -> None:
         """Look whether the first `known` samples of a window are those that came before; few of them tell."""
-        count = min(known, self._newest + 1 - self._oldest, COMPARED)
+        count = min(known, self._newest + 1 - max(self._oldest, self._joint), COMPARED)
         held = self._copy(self._newest + 1 - count, count)
         fits = all(
             np.array_equal(ear, came[known - count : known])
             for ear, came in zip(held, (message.left, message.right), strict=True)
         )
         if not fits:
+            self._joint = self._newest + 1
             self.counters.breaks += 1
             if not self._breaking:
                 self._report(

@@ -76,6 +76,14 @@ class Microphone:
         self._window = joined[:, -self._window.shape[1] :]
         self.index += signal.shape[1]
 
+    def resize(self, chunks: int) -> None:
+        """Let the window hold so many chunks from now on; what is older than the window so far is zeros."""
+        self.chunks = chunks
+        longer = np.zeros((2, chunks * self.chunk), np.int32)
+        kept = self._window[:, -longer.shape[1] :]
+        longer[:, longer.shape[1] - kept.shape[1] :] = kept
+        self._window = longer
+
     @property
     def heard(self) -> bool:
         """Whether anybody is connected."""

@@ -57,6 +57,7 @@ class Model:
         self.capacity = 0
         self.frames: dict[int, int] = {}
         self.lost = self.gaps = self.streams = self.dropped = self.breaks = self.messages = self.refused = 0
+        self.joint = 1
         self.position = 0
         self.block = 0
         self.reader_rate = 0
@@ -81,12 +82,13 @@ class Model:
             self.capacity = max(int(RING_SECONDS * source.rate), window, 2 * self.block)
             self.frames = {}
             self.newest = max(0, index - window)
-            self.position = self.newest + 1
+            self.position = self.joint = self.newest + 1
         self.capacity = max(self.capacity, window)
         self.window = window
-        known = range(max(index - window, 0) + 1, self.newest + 1)
+        known = range(max(index - window + 1, self.joint), self.newest + 1)
         if any(self.frames.get(f, source.sample(f)) != source.sample(f) for f in known):
             self.breaks += 1
+            self.joint = self.newest + 1
         missing = range(self.newest + 1, index - window + 1)
         if missing:
             self.lost += len(missing)

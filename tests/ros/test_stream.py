@@ -1,0 +1,193 @@
+"""Audio that is not what it should be, through the node: gaps, restarts, garbage, other rates; what is told of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from tests.harness import Graph, wait_for
+from tests.ros.session import RATE, Session, assert_holds, expected, noise, own_node, windowed
+
+BLOCK = 2000
+CHAIN = ("PreProc", "GammatoneProc", "IhcProc", "IldProc")
+
+
+@pytest.fixture
+def fresh(graph: Graph) -> Iterator[Session]:
+    """A node of the test's own, whose counters are at zero."""
+    with own_node(graph) as afe:
+        yield afe
+        assert afe.process.alive
+        assert "Traceback" not in afe.process.err, afe.process.err
+
+
+def normal(signal: np.ndarray) -> np.ndarray:
+    return signal / (2**31 - 1)
+
+
+def test_a_gap_is_zeros_in_place_counted_and_located(fresh: Session) -> None:
+    microphone = fresh.build(*CHAIN, block=BLOCK, fb_nChannels=2)
+    signal = noise(5 * BLOCK)
+    microphone.play(signal[:, :3000])
+    microphone.lose(signal[:, 3000:8200])  # all but the newest 4000 - 200 frames come with the next message
+    microphone.play(signal[:, 8200:])
+    heard = signal.copy()
+    heard[:, 3000 : 8200 + 400 - 4000] = 0
+    truth = expected(heard, BLOCK, {"fb_nChannels": 2})
+    for kind in ("input", "preProc", "gammatone", "ihc", "ild"):
+        message = fresh.read(kind, 5 * BLOCK + 1)
+        rate = truth["ild_frameRate"] if kind == "ild" else RATE
+        assert_holds(message, kind, windowed(truth[kind], 1.0, rate))
+    health = fresh.health(lambda entries: entries["lost"] != "0")
+    assert (health["lost"], health["gaps"]) == ("1600", "1")
+    assert health["last loss"] == "1600 frames from frame 3001 on"
+    assert health["level"] == "1" and "1600 frames lost in 1 gaps" in health["message"]
+    assert fresh.process.err.count("lost 1600 frames from frame 3001 on") == 1
+
+
+def test_nothing_is_lost_where_nothing_is_lost(fresh: Session) -> None:
+    microphone = fresh.listen(chunk=441, chunks=1)
+    fresh.ok("InputProc", nFramesPerBlock=882)
+    fresh.ok("PreProc")
+    signal = noise(882 * 20)
+    microphone.play(signal)  # windows of one chunk, as fast as they go
+    for _ in range(3):
+        microphone.publish()  # the same once more
+    assert_holds(fresh.read("preProc", 882 * 20 + 1), "preProc", windowed(normal(signal), 1.0, RATE))
+    health = fresh.health(lambda entries: entries["messages"] == "44")
+    assert {health[name] for name in ("lost", "gaps", "dropped", "breaks", "refused")} == {"0"}
+    assert (health["level"], health["message"], health["streams"]) == ("0", "no frames lost", "1")
+    assert health["topic"] == microphone.topic and health["sample rate (Hz)"] == str(RATE)
+
+
+def test_a_publisher_that_dies_and_comes_back_is_picked_up(fresh: Session) -> None:
+    first = fresh.build("PreProc", block=BLOCK)
+    first.play(noise(BLOCK + 700, 1))
+    fresh.read("preProc", BLOCK + 1)
+    first.close()
+    second = fresh.microphone = type(first)(fresh.graph, topic=first.topic)  # begins at 0 again
+    wait_for(lambda: second.heard)
+    signal = noise(2 * BLOCK, 2)
+    second.play(signal)
+    message = fresh.read("preProc", 2 * BLOCK + 1)
+    np.testing.assert_array_equal(message.left[-2 * BLOCK :], normal(signal)[0])
+    health = fresh.health(lambda entries: entries["streams"] == "2")
+    assert (health["dropped"], health["lost"]) == ("700", "0")
+    assert "a new stream" in fresh.process.err and "700 unread frames" in fresh.process.err
+
+
+def test_an_index_that_falls_and_one_that_leaps(fresh: Session) -> None:
+    microphone = fresh.build("PreProc", block=BLOCK)
+    microphone.play(noise(2 * BLOCK, 1))
+    fresh.read("preProc", 2 * BLOCK + 1)
+    microphone.index = 0
+    back = noise(4000, 2)
+    microphone.play(back)
+    np.testing.assert_array_equal(fresh.read("preProc", 4001).left[-4000:], normal(back)[0])
+    microphone.index += 10**12
+    far = noise(4400, 3)
+    microphone.play(far)  # the window of its first message holds 3600 frames more
+    message = fresh.read("preProc", 10**12 + 8401)
+    np.testing.assert_array_equal(message.left[-4400:], normal(far)[0])
+    health = fresh.health(lambda entries: entries["streams"] == "3")
+    assert health["gaps"] == "1" and int(health["lost"]) > 10**11
+
+
+def test_garbage_is_refused_and_the_connection_stands(fresh: Session) -> None:
+    microphone = fresh.build("PreProc", block=BLOCK)
+    signal = noise(2 * BLOCK)
+    microphone.play(signal[:, :BLOCK])
+    bad = [b"", b"\1\2\3", bytes(35), b"\xff" * 100, bytes(20) + b"\xff\xff\xff\xff" + bytes(64), bytes(10**6)]
+    for data in bad:
+        microphone.publish_bytes(data)
+    rate, window = microphone.sample_rate, microphone._window
+    microphone.sample_rate = 2**32 - 1
+    microphone.publish()
+    microphone.sample_rate, microphone._window = rate, window[:, :0]
+    microphone.publish()
+    microphone._window = window
+    microphone.play(signal[:, BLOCK:])
+    assert_holds(fresh.read("preProc", 2 * BLOCK + 1), "preProc", windowed(normal(signal), 1.0, RATE))
+    health = fresh.health(lambda entries: entries["refused"] == str(len(bad) + 2))
+    assert (health["lost"], health["streams"], health["level"]) == ("0", "1", "1")
+    assert fresh.process.err.count("malformed messages are ignored") == 1, "told once"
+
+
+def test_another_rate_is_not_given_to_the_tree(fresh: Session) -> None:
+    microphone = fresh.build("PreProc", block=BLOCK)
+    signal = noise(2 * BLOCK)
+    microphone.play(signal[:, :BLOCK])
+    fresh.read("preProc", BLOCK + 1)
+    microphone.sample_rate, microphone.index = 2 * RATE, 0
+    microphone.play(noise(3 * BLOCK, 2))
+    health = fresh.health(lambda entries: entries["level"] == "2")
+    assert str(2 * RATE) in health["message"] and "call Stop" in health["message"]
+    assert health["frames waiting"] == "0", "the tree does not wait for these"
+    assert fresh.read("preProc").lastFrameIndex == BLOCK + 1
+    microphone.sample_rate, microphone.index = RATE, 0
+    microphone.play(signal)
+    message = fresh.read("preProc", 2 * BLOCK + 1)
+    np.testing.assert_array_equal(message.left[-2 * BLOCK :], normal(signal)[0])
+    fresh.ok("Stop")
+    microphone.sample_rate, microphone.index = 2 * RATE, 0
+    microphone.publish()
+    wait_for(lambda: fresh.health(lambda entries: entries["sample rate (Hz)"] == str(2 * RATE)))
+    fresh.ok("InputProc", nFramesPerBlock=BLOCK)
+    assert fresh.read("input", 0).sampleRate == 2 * RATE
+
+
+def test_a_window_that_changes_on_the_way(fresh: Session) -> None:
+    microphone = fresh.build("PreProc", block=BLOCK)
+    signal = noise(3 * BLOCK)
+    microphone.play(signal[:, :BLOCK])
+    for chunks, end in ((25, 2 * BLOCK), (2, 3 * BLOCK)):
+        microphone.resize(chunks)
+        microphone.play(signal[:, end - BLOCK : end])
+    assert_holds(fresh.read("preProc", 3 * BLOCK + 1), "preProc", windowed(normal(signal), 1.0, RATE))
+    assert "the window changed from 4000 to 10000 frames" in fresh.process.err
+    health = fresh.health(lambda entries: True)
+    assert (health["lost"], health["streams"], health["breaks"]) == ("0", "1", "0")
+
+
+def test_another_stream_under_the_same_index_does_not_pass_unnoticed(fresh: Session) -> None:
+    microphone = fresh.build("PreProc", block=BLOCK)
+    microphone.play(noise(BLOCK, 1))
+    microphone._window = noise(microphone._window.shape[1], 2)
+    microphone.play(noise(BLOCK, 3))
+    fresh.read("preProc", 2 * BLOCK + 1)
+    health = fresh.health(lambda entries: entries["breaks"] == "1")
+    assert health["level"] == "1" and "another stream began" in fresh.process.err
+
+
+def test_a_tree_that_falls_behind_loses_frames_and_says_so(fresh: Session) -> None:
+    """A minute of sound in a moment: what is not computed is counted, to the frame."""
+    microphone = fresh.listen(chunk=4000, chunks=2)
+    for request in ("InputProc", *CHAIN):
+        fresh.ok(request)
+    total = 60 * RATE
+    signal = noise(RATE)
+    for _ in range(total // RATE):
+        microphone.play(signal)
+    health = fresh.health(
+        lambda entries: int(entries["messages"]) == total // 4000 + 1 and int(entries["frames waiting"]) < 12000
+    )
+    assert int(health["lost"]) > 0 and health["level"] == "1"
+    blocks = int(fresh.health(lambda entries: True, "processors")["input"].split(", ")[2].split()[0])
+    assert int(health["lost"]) + blocks * 12000 + int(health["frames waiting"]) == total
+    assert fresh.read("ild").lastFrameIndex + int(health["frames waiting"]) == total + 1
+    assert f"Audio: lost {health['last loss']}" in fresh.process.err
+
+
+def test_connecting_to_another_publisher_begins_anew(fresh: Session) -> None:
+    first = fresh.build("PreProc", block=BLOCK)
+    first.play(noise(BLOCK + 300, 1))
+    fresh.read("preProc", BLOCK + 1)
+    second = fresh.listen()
+    wait_for(lambda: second.heard)
+    signal = noise(2 * BLOCK, 2)
+    second.play(signal)
+    message = fresh.read("preProc", 2 * BLOCK + 1)
+    np.testing.assert_array_equal(message.left[-2 * BLOCK :], normal(signal)[0])
+    assert fresh.health(lambda entries: entries["streams"] == "2")["dropped"] == "300"
