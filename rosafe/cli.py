@@ -23,7 +23,9 @@ def main(argv: list[str] | None = None) -> int:
     name = "rosafe"
     try:
         try:
-            options = _parser().parse_args(argv)
+            options, rest = _parser().parse_known_args(argv)
+            if rest:
+                options.usage_error(f"unrecognized arguments: {' '.join(rest)}")
             name = f"rosafe {options.command}"
             return int(options.run(options))
         finally:
@@ -65,5 +67,5 @@ def _add(subparsers: argparse._SubParsersAction[Parser], name: str) -> None:
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
-    subparser.set_defaults(run=module.run)
+    subparser.set_defaults(run=module.run, usage_error=subparser.error)
     module.configure(subparser)

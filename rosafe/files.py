@@ -17,10 +17,12 @@ import numpy as np
 
 from rosafe.audiofile import AudioFile, AudioFileError
 from rosafe.chain import Chain, check_outputs, check_parameters
+from rosafe.interface import KINDS
 from rosafe.npz import NpzWriter
 from rosafe.offline import DEFAULT_BLOCK
 from rosafe.tree.zone import Block
 
+_DEFAULTS = {parameter.name: parameter.default for kind in KINDS.values() for parameter in kind.parameters}
 PART = ".part"  # what the name of an unfinished output ends with
 
 
@@ -41,7 +43,8 @@ def process_file(
 
     The numbers are those of `rosafe.process` on the file's int32 samples, and of the node on the same samples and
     blocks, bit for bit. The .npz holds what that returns, and `sample_rate` (Hz), `block_frames` and `parameters` (all
-    values in force, as a JSON object). Nothing of the name `target` is there before it is complete.
+    of them with their values, as a JSON object that `rosafe.process` takes).
+    Nothing of the name `target` is there before it is complete.
 
     Parameters
     ----------
@@ -109,7 +112,7 @@ def _stream(
             {
                 "sample_rate": file.sample_rate,
                 "block_frames": block_frames,
-                "parameters": json.dumps(chain.parameters()),
+                "parameters": json.dumps({**_DEFAULTS, **values}),
                 **chain.describe(),
             },
             {kind: chain.shape(kind, file.frames) for kind in wanted},

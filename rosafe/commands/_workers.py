@@ -7,9 +7,11 @@ import signal
 import time
 from collections import deque
 from collections.abc import Callable, Sequence
+from functools import partial
 from multiprocessing.connection import Connection, wait
 from typing import Any, NamedTuple, cast
 
+SIGNAL_SECONDS = 0.1  # at most, until a signal is seen
 REPORT_SECONDS = 0.1  # at least, between two reports of one piece of work
 
 Progress = Callable[[int, int], None]
@@ -35,22 +37,27 @@ class Interrupted(SystemExit):
         super().__init__(128 + number)
 
 
-def raise_on_signals() -> None:
-    """Make the first SIGINT, SIGTERM or SIGHUP raise `Interrupted` in the main thread; more do nothing.
+class Signals:
+    """Notes the first SIGINT, SIGTERM or SIGHUP, here and in processes that are forked from here.
 
-    Processes that are forked from here do the same.
+    It is raised by those who ask. An exception out of the handler itself could come anywhere: in Thread.join, it makes
+    Python 3.11 believe that the thread has ended.
     """
-    numbers = [signal.SIGINT, signal.SIGTERM]
-    if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # nohup
-        numbers.append(signal.SIGHUP)
 
-    def interrupt(number: int, frame: object) -> None:
-        for each in numbers:
-            signal.signal(each, signal.SIG_IGN)  # the way out is under way and must not be disturbed
-        raise Interrupted(number)
+    def __init__(self) -> None:
+        self._received = 0
+        signal.signal(signal.SIGINT, self._note)
+        signal.signal(signal.SIGTERM, self._note)
+        if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # nohup
+            signal.signal(signal.SIGHUP, self._note)
 
-    for each in numbers:
-        signal.signal(each, interrupt)
+    def _note(self, number: int, frame: object) -> None:
+        self._received = self._received or number
+
+    def check(self) -> None:
+        """Raise `Interrupted` if there was a signal."""
+        if self._received:
+            raise Interrupted(self._received)
 
 
 def run_together(
@@ -58,29 +65,34 @@ def run_together(
     jobs: int,
     failures: tuple[type[Exception], ...],
     report: Callable[[int, Report], None],
+    signals: Signals,
 ) -> None:
     """Run all `works`, at most `jobs` at a time, and wait for them; whatever ends this ends those that run, too.
 
     Parameters
     ----------
     works : sequence of callable
-        Called in a process of its own with a function that takes (done, all); returns something that can be pickled.
+        Called in a process of its own with a function that takes (done, all), to be called often: it ends the work by
+        an exception once a signal has come. Returns something that can be pickled.
     jobs : int
         Processes at a time.
     failures : tuple of exception types
         What a piece of work may fail with; the text of the exception is the report's.
     report : callable
         Called with the number of a piece of work and its `Report`: now and then, and once with its last.
+    signals : Signals
+        What ends it by `Interrupted`.
     """
     waiting = deque(enumerate(works))
     running: dict[Connection, tuple[int, multiprocessing.Process]] = {}
     try:
         while waiting or running:
+            signals.check()
             while waiting and len(running) < jobs:
                 index, work = waiting.popleft()
-                connection, process = _start(work, failures, list(running))
+                connection, process = _start(partial(_work, work, failures, signals), list(running))
                 running[connection] = index, process
-            for ready in wait(list(running)):
+            for ready in wait(list(running), SIGNAL_SECONDS):
                 connection = cast(Connection, ready)
                 index, process = running[connection]
                 told = _receive(connection, process)
@@ -95,12 +107,17 @@ def run_together(
             process.join()
 
 
-def _start(
-    work: Work, failures: tuple[type[Exception], ...], others: list[Connection]
-) -> tuple[Connection, multiprocessing.Process]:
+def _start(work: Callable[[Connection], None], others: list[Connection]) -> tuple[Connection, multiprocessing.Process]:
+    """The new process, and where its reports come."""
     context = multiprocessing.get_context("fork")  # no need to import everything again
     reader, writer = context.Pipe(duplex=False)
-    process = context.Process(target=_work, args=(work, failures, writer, [reader, *others]))
+
+    def child() -> None:
+        for connection in (reader, *others):  # a pipe that nobody else reads tells when the one who does is gone
+            connection.close()
+        work(writer)
+
+    process = context.Process(target=child)
     process.start()
     writer.close()
     return reader, process  # type: ignore[return-value]  # a ForkProcess is a Process
@@ -118,14 +135,13 @@ def _receive(connection: Connection, process: multiprocessing.Process) -> Report
         return Report(0.0, failure=f"ended too early, with {how}")
 
 
-def _work(work: Work, failures: tuple[type[Exception], ...], writer: Connection, readers: list[Connection]) -> None:
-    """What the process does. It ends at its next report where the one that started it is no longer there."""
-    for reader in readers:
-        reader.close()
+def _work(work: Work, failures: tuple[type[Exception], ...], signals: Signals, writer: Connection) -> None:
+    """What a process does. It ends at its next report where the one that started it is no longer there."""
     due = 0.0
 
     def progress(done: int, total: int) -> None:
         nonlocal due
+        signals.check()
         now = time.monotonic()
         if now >= due:
             due = now + REPORT_SECONDS

@@ -19,7 +19,7 @@ from typing import Any
 
 from rosafe.commands import Failure
 from rosafe.commands._progress import Display, bytes_text
-from rosafe.commands._workers import Interrupted, Report, raise_on_signals, run_together
+from rosafe.commands._workers import Interrupted, Report, Signals, run_together
 from rosafe.interface import KINDS, ROSAFE, Parameter
 
 _BLOCK = ROSAFE.service("InputProc").parameter("nFramesPerBlock")
@@ -90,7 +90,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--force", action="store_true", help="replace outputs that -o does not name")
     parser.add_argument("-q", "--quiet", action="store_true", help="say nothing unless something is wrong")
     parser.epilog = _epilog()
-    parser.set_defaults(more_inputs=[], usage_error=parser.error)
+    parser.set_defaults(more_inputs=[])
 
 
 def _count(text: str, maximum: float) -> int:
@@ -104,7 +104,7 @@ def _epilog() -> str:
         "The .npz holds, as rosafe.process returns them: input, preProc (2, N); gammatone, ihc (2, C, N); ild (C, F);",
         "ratemap (2, C, F); crossCorrelation (C, L, F); fb_cfHz (C,) in Hz; cc_lags (L,) in seconds; and the frame",
         "rates ild_frameRate, ratemap_frameRate, crossCorrelation_frameRate in Hz. Besides: sample_rate in Hz,",
-        "block_frames, and parameters, all values in force as JSON.",
+        "block_frames, and parameters, all of them with their values as JSON.",
         "",
         "exit status: 0 all done, 1 something failed (the other files are done), 2 wrong command line, 130 interrupted",
         "",
@@ -147,7 +147,7 @@ def run(options: argparse.Namespace) -> int:
     if not inputs:
         options.usage_error("no sound file is named")
     targets, named = _targets(inputs, options.output)
-    raise_on_signals()
+    signals = Signals()
     # Once, for all processes that are forked from this one.
     from rosafe.audiofile import AudioFileError
     from rosafe.chain import check_outputs, check_parameter
@@ -182,7 +182,7 @@ def run(options: argparse.Namespace) -> int:
         display.update(index, 1.0 if told.last else told.part)
 
     try:
-        run_together(works, options.jobs, (AudioFileError, OutputError, ValueError), report)
+        run_together(works, options.jobs, (AudioFileError, OutputError, ValueError), report, signals)
     except Interrupted:
         display.message("rosafe process: interrupted; what was not finished is removed")
         raise
@@ -195,7 +195,7 @@ def _targets(inputs: list[Path], output: str | None) -> tuple[list[Path], bool]:
     """Where the output of each input goes, and whether the user named that file; Failure where two go to one place."""
     if output is None:
         targets = [path.with_name(path.stem + ".npz") if path.name else path for path in inputs]
-    elif output.endswith("/") or Path(output).is_dir():
+    elif output.endswith("/") or os.path.isdir(output):
         targets = [Path(output, path.stem + ".npz") for path in inputs]
     elif len(inputs) == 1:
         return [Path(output)], True
@@ -216,4 +216,4 @@ def _name_and_value(setting: str) -> tuple[str, str]:
 
 def _size(path: Path) -> float:
     """How much a file counts in the display."""
-    return float(path.stat().st_size) if path.exists() else 0.0
+    return float(os.path.getsize(path)) if os.path.isfile(path) else 0.0

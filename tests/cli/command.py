@@ -1,0 +1,69 @@
+"""What the tests of the command share: running it, sound files, what they hold, and what must be left over."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import soundfile
+
+from tests.harness import SCRIPTS, Process
+
+ROSAFE = SCRIPTS / "rosafe"
+SMALL = ("--set", "fb_cfHz=200,800,2000")  # a cheap chain, also at low sample rates
+SMALL_PARAMETERS = {"fb_cfHz": [200.0, 800.0, 2000.0]}
+
+
+def environment(**changes: str) -> dict[str, str]:
+    """A shell's environment without anything of ROS or Python in it."""
+    env = {k: v for k, v in os.environ.items() if not k.startswith(("ROS_", "PYTHON"))}
+    return {**env, "PATH": "/usr/local/bin:/usr/bin:/bin", **changes}
+
+
+def rosafe(
+    *arguments: str | Path, cwd: Path | None = None, timeout: float = 60.0, program: Path = ROSAFE, **env: str
+) -> subprocess.CompletedProcess[str]:
+    """Run the command to its end."""
+    return subprocess.run(
+        [str(program), *map(str, arguments)],
+        cwd=cwd,
+        env=environment(**env),
+        text=True,
+        capture_output=True,
+        stdin=subprocess.DEVNULL,
+        timeout=timeout,
+        check=False,
+    )
+
+
+def start(*arguments: str | Path, cwd: Path) -> Process:
+    """Start the command; use it in a `with`."""
+    return Process([str(ROSAFE), *map(str, arguments)], environment(), cwd)
+
+
+def noise(frames: int, seed: int = 1) -> np.ndarray:
+    """Binaural noise, (2, frames), within ±1: exactly what 16 bits hold."""
+    return np.random.default_rng(seed).integers(-(2**15), 2**15, (2, frames)) / 2.0**15
+
+
+def as_int32(signal: np.ndarray) -> np.ndarray:
+    """The int32 samples of integer files."""
+    return (signal * 2.0**31).astype(np.int64).astype(np.int32)
+
+
+def write(path: Path, signal: np.ndarray, rate: int = 16000, subtype: str = "PCM_16") -> Path:
+    """A sound file of the kind that the name says."""
+    soundfile.write(path, signal.T, rate, subtype=subtype)
+    return path
+
+
+def refused(done: subprocess.CompletedProcess[str], *words: str, code: int = 1) -> None:
+    """It has failed with this code and one line on stderr in which the words are."""
+    assert done.returncode == code, done
+    assert done.stdout == ""
+    assert done.stderr.count("\n") == 1 and done.stderr.endswith("\n"), done.stderr
+    assert done.stderr.startswith("rosafe"), done.stderr
+    for word in words:
+        assert word in done.stderr, done.stderr

@@ -1,0 +1,217 @@
+"""What `rosafe process` refuses: one clear line, the right exit code, nothing left behind, nothing lost."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.cli.command import ROSAFE, SMALL, environment, noise, refused, rosafe, write
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A folder with a sound file in.wav."""
+    write(tmp_path / "in.wav", noise(3000))
+    return tmp_path
+
+
+def assert_untouched(folder: Path, *others: str) -> None:
+    assert {path.name for path in folder.iterdir()} == {"in.wav", *others}
+
+
+# --- the input ---
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"", ["is empty"]),
+        (b"no sound at all " * 50, ["is not a sound file"]),
+        (b"RIFF\xff\xff\xff\xffWAVE", ["not a sound file"]),
+    ],
+)
+def test_what_is_no_sound_file(folder: Path, content: bytes, words: list[str]) -> None:
+    (folder / "bad.wav").write_bytes(content)
+    refused(rosafe("process", "bad.wav", cwd=folder), "bad.wav", *words)
+    assert_untouched(folder, "bad.wav")
+
+
+@pytest.mark.parametrize("channels", [1, 3, 8])
+def test_other_than_two_channels(folder: Path, channels: int) -> None:
+    write(folder / "bad.wav", np.zeros((channels, 500)))
+    refused(rosafe("process", "bad.wav", cwd=folder), "bad.wav", "two: left and right ear")
+    assert_untouched(folder, "bad.wav")
+
+
+def test_no_samples(folder: Path) -> None:
+    write(folder / "bad.wav", np.zeros((2, 0)))
+    refused(rosafe("process", "bad.wav", cwd=folder), "bad.wav holds no samples")
+    assert_untouched(folder, "bad.wav")
+
+
+@pytest.mark.parametrize("name", ["bad.wav", "bad.flac", "bad.aiff"])
+def test_cut_off(folder: Path, name: str) -> None:
+    whole = write(folder / name, noise(50000)).read_bytes()
+    (folder / name).write_bytes(whole[: len(whole) // 2])
+    refused(rosafe("process", name, cwd=folder), name, "cut off")
+    assert_untouched(folder, name)
+
+
+def test_damaged_in_the_middle(folder: Path) -> None:
+    """The damage shows when half of the output is written already."""
+    content = bytearray(write(folder / "bad.flac", noise(200000)).read_bytes())
+    middle = len(content) // 2
+    content[middle : middle + 30000] = bytes(30000)
+    (folder / "bad.flac").write_bytes(content)
+    refused(rosafe("process", "bad.flac", *SMALL, "--outputs", "ild", cwd=folder), "bad.flac")
+    assert_untouched(folder, "bad.flac")
+
+
+def test_missing_folder_and_unreadable(folder: Path) -> None:
+    refused(rosafe("process", "nothing.wav", cwd=folder), "nothing.wav", "No such file")
+    refused(rosafe("process", ".", cwd=folder), "not a regular file")
+    refused(rosafe("process", "/dev/zero", "-o", "x", cwd=folder), "/dev/zero", "not a regular file")
+    assert_untouched(folder)
+
+
+# --- parameters and outputs ---
+
+
+@pytest.mark.parametrize(
+    ("setting", "words"),
+    [
+        ("fb_nChanels=64", ["unknown parameter 'fb_nChanels'", "fb_nChannels"]),
+        ("fb_nChannels=", ["fb_nChannels", "whole number"]),
+        ("fb_nChannels=-3", ["fb_nChannels"]),
+        ("fb_nChannels=2.5", ["fb_nChannels", "whole number"]),
+        ("fb_nChannels=99999", ["fb_nChannels", "1024"]),
+        ("fb_lowFreqHz=nan", ["fb_lowFreqHz", "number"]),
+        ("fb_lowFreqHz=0", ["fb_lowFreqHz", "out of range"]),
+        ("fb_highFreqHz=9000", ["fb_highFreqHz", "half the sample rate"]),  # the file is at 16 kHz
+        ("fb_highFreqHz=50", ["fb_highFreqHz"]),  # below fb_lowFreqHz
+        ("fb_cfHz=100,abc", ["fb_cfHz", "abc"]),
+        ("ihc_method=meddis", ["ihc_method", "one of none, halfwave"]),
+        ("pp_bRemoveDC=maybe", ["pp_bRemoveDC", "boolean"]),
+        ("ild_wSizeSec=0.00001", ["ild_wSizeSec"]),
+        ("ild_wSizeSec=1e9", ["ild_wSizeSec"]),
+    ],
+)
+def test_parameters(folder: Path, setting: str, words: list[str]) -> None:
+    refused(rosafe("process", "in.wav", "--set", setting, cwd=folder), *words)
+    assert_untouched(folder)
+
+
+@pytest.mark.parametrize("outputs", ["ild,rms", "", "ILD", "ild,,ratemap"])
+def test_outputs(folder: Path, outputs: str) -> None:
+    refused(rosafe("process", "in.wav", "--outputs", outputs, cwd=folder), "unknown output", "ratemap")
+    assert_untouched(folder)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        [],
+        ["--block", "0", "in.wav"],
+        ["--block", "1e3", "in.wav"],
+        ["--block", "10000001", "in.wav"],
+        ["--jobs", "0", "in.wav"],
+        ["--jobs", "-1", "in.wav"],
+        ["in.wav", "--set"],
+        ["in.wav", "--set", "fb_nChannels"],
+        ["in.wav", "--nonsense"],
+        ["in.wav", "--out"],
+    ],
+)
+def test_usage(folder: Path, arguments: list[str]) -> None:
+    refused(rosafe("process", *arguments, cwd=folder), "rosafe process", "-h shows", code=2)
+    assert_untouched(folder)
+
+
+# --- the output ---
+
+
+def test_output_beside_the_input_is_not_replaced_unless_forced(folder: Path) -> None:
+    (folder / "in.npz").write_text("precious")
+    refused(rosafe("process", "in.wav", *SMALL, cwd=folder), "in.npz is there already", "--force")
+    (folder / "results").mkdir()
+    (folder / "results" / "in.npz").write_text("precious")
+    refused(rosafe("process", "in.wav", *SMALL, "-o", "results", cwd=folder), "in.npz is there already", "--force")
+    assert (folder / "in.npz").read_text() == (folder / "results" / "in.npz").read_text() == "precious"
+    assert rosafe("process", "in.wav", *SMALL, "--force", cwd=folder).returncode == 0
+    with np.load(folder / "in.npz") as loaded:
+        assert "ild" in loaded
+    assert_untouched(folder, "in.npz", "results")
+
+
+def test_a_failure_leaves_the_old_output(folder: Path) -> None:
+    (folder / "out.npz").write_text("precious")
+    refused(rosafe("process", "in.wav", "-o", "out.npz", "--set", "fb_highFreqHz=9000", cwd=folder), "fb_highFreqHz")
+    assert (folder / "out.npz").read_text() == "precious"
+    assert_untouched(folder, "out.npz")
+
+
+def test_places_that_cannot_be_written(folder: Path) -> None:
+    content = (folder / "in.wav").read_bytes()
+    for out, words in {
+        "nowhere/out.npz": ["nowhere/out.npz", "No such file"],
+        "nowhere/": ["nowhere/in.npz", "No such file"],
+        "in.wav/out.npz": ["in.wav/out.npz", "Not a directory"],
+        "/dev/null": ["/dev/null", "not a regular file"],
+        "in.wav": ["in.wav is the input itself"],
+        "./in.wav": ["in.wav is the input itself"],
+        "x" * 300: ["File name too long"],
+    }.items():
+        refused(rosafe("process", "in.wav", *SMALL, "--force", "-o", out, cwd=folder), *words)
+    assert (folder / "in.wav").read_bytes() == content
+    assert_untouched(folder)
+
+
+def test_two_outputs_in_one_place(folder: Path) -> None:
+    write(folder / "in.flac", noise(100))
+    refused(rosafe("process", "in.wav", "in.flac", cwd=folder), "in.wav and in.flac would both go to in.npz")
+    refused(rosafe("process", "in.wav", "in.wav", cwd=folder), "in.npz")
+    refused(rosafe("process", "in.wav", "in.flac", "-o", "out.npz", cwd=folder), "-o out.npz", "folder")
+    assert_untouched(folder, "in.flac")
+
+
+def test_no_room_is_told_before_the_work(folder: Path) -> None:
+    """2000 s at 192 kHz with 1000 channels: terabytes. The file itself is a hole."""
+    write(folder / "in.wav", np.zeros((2, 10)), 192000, "PCM_U8")
+    head = (folder / "in.wav").read_bytes()[:-20]
+    size = 2 * 192000 * 2000
+    with open(folder / "in.wav", "wb") as file:
+        file.write(head[:4] + (36 + size).to_bytes(4, "little") + head[8:40] + size.to_bytes(4, "little"))
+        file.truncate(len(head) + size)
+    done = rosafe("process", "in.wav", "--set", "fb_nChannels=1000", cwd=folder)
+    refused(done, "in.wav", "GB are free", "--outputs")
+    assert_untouched(folder)
+
+
+def test_full_disk(folder: Path) -> None:
+    """A limit on the size of files stands for a disk that fills up on the way."""
+    done = subprocess.run(
+        ["/bin/bash", "-c", f"ulimit -f 100; exec {ROSAFE} process in.wav"],
+        cwd=folder,
+        env=environment(),
+        text=True,
+        capture_output=True,
+        timeout=60,
+        check=False,
+    )
+    refused(done, "in.npz", "File too large")
+    assert_untouched(folder)
+
+
+@pytest.mark.skipif(os.getuid() == 0, reason="root may read and write everywhere")
+def test_permissions(folder: Path) -> None:
+    (folder / "in.wav").chmod(0)
+    refused(rosafe("process", "in.wav", cwd=folder), "in.wav", "Permission denied")
+    (folder / "in.wav").chmod(0o600)
+    folder.chmod(0o500)
+    refused(rosafe("process", "in.wav", *SMALL, cwd=folder), "in.npz", "Permission denied")
+    folder.chmod(0o700)
+    assert_untouched(folder)

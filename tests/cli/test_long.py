@@ -1,0 +1,222 @@
+"""`rosafe process` on long files: memory that does not grow with them, progress, and the end in the middle."""
+
+from __future__ import annotations
+
+import os
+import pty
+import select
+import signal
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+
+from rosafe import process
+from rosafe.npz import memory_map
+from tests.cli.command import ROSAFE, environment, noise, rosafe, start, write
+from tests.harness import wait_for
+
+RATE = 16000
+ONE_CHANNEL = ("--set", "fb_cfHz=1000")
+OUTPUTS = ("--outputs", "input,ihc,ild")  # of one channel: 32 bytes per frame
+
+
+def write_long(path: Path, seconds: int) -> Path:
+    """Noise that is the same every second."""
+    second = np.int16(noise(RATE).T * 2**15)
+    with soundfile.SoundFile(path, "w", RATE, 2, "PCM_16") as file:
+        for _ in range(seconds):
+            file.write(second)
+    return path
+
+
+def peak_kilobytes(*arguments: str | Path) -> int:
+    """The most memory that the command or a child of it had at any time."""
+    program = (
+        "import resource, subprocess, sys; subprocess.run(sys.argv[1:], check=True);"
+        "print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)"
+    )
+    done = subprocess.run(
+        ["/usr/bin/python3", "-c", program, str(ROSAFE), *map(str, arguments)],
+        env=environment(),
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=120,
+    )
+    return int(done.stdout)
+
+
+def test_memory_does_not_grow_with_the_file(tmp_path: Path) -> None:
+    """Ten minutes take what ten seconds take, though the output is 300 MB."""
+    short, long = (write_long(tmp_path / f"{seconds}.wav", seconds) for seconds in (10, 600))
+    peaks = {path: peak_kilobytes("process", "-q", path, *ONE_CHANNEL, *OUTPUTS) for path in (short, long)}
+    assert long.with_suffix(".npz").stat().st_size > 300e6
+    assert peaks[long] < peaks[short] + 25_000, peaks
+    assert peaks[long] < 350_000, peaks
+
+    # and the numbers are right at both ends of it, whatever came between
+    mapped = memory_map(long.with_suffix(".npz"))
+    assert mapped["ihc"].shape == (2, 1, 600 * RATE)
+    assert mapped["ild"].shape == (1, 600 * 100 - 1)
+    with np.load(short.with_suffix(".npz")) as loaded:
+        np.testing.assert_array_equal(mapped["ihc"][..., : 10 * RATE], loaded["ihc"])
+        np.testing.assert_array_equal(mapped["ild"][:, :999], loaded["ild"])
+    second = soundfile.read(short, RATE, dtype="int32")[0].T
+    np.testing.assert_array_equal(mapped["input"][:, -RATE:], second / (2**31 - 1))
+    # A filter that has run for ten minutes is where it was after ten seconds, if the signal repeats.
+    np.testing.assert_allclose(mapped["ihc"][..., -RATE:], mapped["ihc"][..., 9 * RATE : 10 * RATE], rtol=0, atol=1e-12)
+    expected = process(np.tile(second, 2), RATE, {"fb_cfHz": [1000.0]}, outputs=["ihc"])["ihc"]
+    np.testing.assert_array_equal(mapped["ihc"][..., : 2 * RATE], expected)
+    for path in tmp_path.iterdir():
+        path.unlink()  # pytest keeps folders
+
+
+# --- the end in the middle ---
+
+
+@pytest.fixture
+def long_file(tmp_path: Path) -> Path:
+    """Half an hour, most of it a hole: nobody waits for its end."""
+    path = write(tmp_path / "in.wav", noise(RATE))
+    head = path.read_bytes()[:44]
+    size = 4 * RATE * 1800
+    with open(path, "r+b") as file:
+        file.write(head[:4] + (36 + size).to_bytes(4, "little") + head[8:40] + size.to_bytes(4, "little"))
+        file.truncate(44 + size)
+    return path
+
+
+def begun(part: Path) -> Callable[[], bool]:
+    """Whether there is data in an unfinished output."""
+    return lambda: part.exists() and part.stat().st_blocks > 0
+
+
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+def test_a_signal_to_the_command(long_file: Path, number: int, code: int) -> None:
+    with start("process", long_file.name, "--outputs", "ild", cwd=long_file.parent) as command:
+        wait_for(begun(long_file.with_name("in.npz.part")), what=lambda: str(command))
+        assert command.stop(number) == code
+        assert command.err == "rosafe process: interrupted; what was not finished is removed\n"
+    assert [path.name for path in long_file.parent.iterdir()] == ["in.wav"]
+
+
+def test_ctrl_c_at_the_terminal(long_file: Path) -> None:
+    """The terminal sends it to the command and to all that it has started; several files; a key pressed twice."""
+    for name in ("b", "c"):
+        os.link(long_file, long_file.with_name(f"{name}.wav"))
+    here = long_file.parent
+    with start("process", "in.wav", "b.wav", "c.wav", "--jobs", "2", "--outputs", "ild", cwd=here) as command:
+        wait_for(lambda: begun(here / "in.npz.part")() and begun(here / "b.npz.part")(), what=lambda: str(command))
+        children = _children(command.pid)
+        assert len(children) == 2
+        for _ in range(2):
+            os.killpg(command.pid, signal.SIGINT)
+        assert command.wait() == 130
+        assert command.err == "rosafe process: interrupted; what was not finished is removed\n"
+    assert {path.name for path in here.iterdir()} == {"in.wav", "b.wav", "c.wav"}
+    assert not any(Path(f"/proc/{child}").exists() for child in children)
+
+
+def test_killed(long_file: Path) -> None:
+    """Whoever is left without the command ends too; what they leave is no hindrance."""
+    here, part = long_file.parent, long_file.with_name("in.npz.part")
+    with start("process", "in.wav", "--outputs", "ild", cwd=here) as command:
+        wait_for(begun(part), what=lambda: str(command))
+        (child,) = _children(command.pid)
+        command.stop(signal.SIGKILL)
+        wait_for(lambda: not Path(f"/proc/{child}").exists(), what="end of the child")
+    assert not (here / "in.npz").exists()
+    part.write_bytes(b"left by one that could not clean up" * 1000)
+    write(long_file, noise(3000))
+    assert rosafe("process", "in.wav", *ONE_CHANNEL, cwd=here).returncode == 0
+    assert {path.name for path in here.iterdir()} == {"in.wav", "in.npz"}
+    with np.load(here / "in.npz") as loaded:
+        assert loaded["input"].shape == (2, 3000)
+
+
+def test_a_killed_child_is_told(long_file: Path) -> None:
+    here = long_file.parent
+    with start("process", "in.wav", "--outputs", "ild", cwd=here) as command:
+        wait_for(begun(here / "in.npz.part"), what=lambda: str(command))
+        (child,) = _children(command.pid)
+        os.kill(child, signal.SIGKILL)
+        assert command.wait() == 1
+        assert command.err == "rosafe process: in.wav: ended too early, with signal 9\n"
+    assert not (here / "in.npz").exists()
+
+
+def test_two_for_one_place(long_file: Path) -> None:
+    here, part = long_file.parent, long_file.with_name("in.npz.part")
+    with start("process", "in.wav", "--outputs", "ild", cwd=here) as command:
+        wait_for(begun(part), what=lambda: str(command))
+        done = rosafe("process", "in.wav", "--outputs", "ild", cwd=here)
+        assert done.returncode == 1
+        assert done.stderr == f"rosafe process: in.wav: cannot write {here}/in.npz: another process is writing it\n"
+        assert command.alive and part.exists()
+        command.stop(signal.SIGINT)
+
+
+def _children(pid: int) -> list[int]:
+    return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+
+
+# --- progress ---
+
+
+def test_a_terminal_shows_one_live_line(long_file: Path) -> None:
+    ours, theirs = pty.openpty()
+    command = [str(ROSAFE), "process", "in.wav", "--outputs", "ild"]
+    with subprocess.Popen(
+        command, cwd=long_file.parent, env=environment(), stderr=theirs, stdout=theirs, stdin=theirs
+    ) as shown:
+        os.close(theirs)
+        text = ""
+
+        def told() -> bool:
+            nonlocal text
+            if select.select([ours], [], [], 0)[0]:
+                text += os.read(ours, 4096).decode()
+            return "left" in text
+
+        try:
+            wait_for(told, 30, lambda: f"time left in {text!r}")
+        finally:
+            shown.send_signal(signal.SIGINT)
+            assert shown.wait(20) == 130
+    os.close(ours)
+    assert "\n" not in text
+    line = text.split("\r")[-1]
+    assert line.startswith("\x1b[K[") and " % " in line and "left" in line
+    assert max(len(line) for line in text.split("\r")) < 90
+
+
+def test_elsewhere_lines_are_few(tmp_path: Path) -> None:
+    path = write(tmp_path / "a.wav", noise(5 * RATE))
+    done = rosafe("process", path, "--block", "100", *ONE_CHANNEL, "--outputs", "ild")
+    assert done.returncode == 0
+    assert "\r" not in done.stderr and "\x1b" not in done.stderr
+    assert done.stderr.startswith(f"{path} -> {path.with_suffix('.npz')}: 5.0 s of sound, ")
+    assert done.stderr.count("\n") <= 3
+
+
+def test_reader_of_messages_leaves(long_file: Path) -> None:
+    """`rosafe process ... 2>&1 | head`: no traceback, no leftovers."""
+    read, write_end = os.pipe()
+    os.close(read)
+    short = write(long_file.with_name("short.wav"), noise(3000))
+    process_ = subprocess.run(
+        [str(ROSAFE), "process", "in.wav", short.name, "--outputs", "ild"],
+        cwd=long_file.parent,
+        env=environment(),
+        stderr=write_end,
+        stdout=write_end,
+        timeout=60,
+        check=False,
+    )
+    os.close(write_end)
+    assert process_.returncode == 141
+    assert not list(long_file.parent.glob("*.part"))
