@@ -98,7 +98,8 @@ class ActionClient:
 
     async def close(self) -> None:
         """Leave the action's topics; goals that are under way end with an error."""
-        self.lost(middleware_error(f"{self._instance} was unloaded"))
+        for goal in self.goals():
+            goal.end(middleware_error(f"{self._instance} was unloaded"))
         topics = [*self._subscribers, *self._publishers.values()]
         await asyncio.gather(*(asyncio.to_thread(topic.unregister) for topic in topics))
 
@@ -140,11 +141,9 @@ class ActionClient:
         """Follow the activity no further."""
         self._goals.pop(goal.id, None)
 
-    def lost(self, problem: ComponentError) -> None:
-        """End all goals with an error: the component is gone."""
-        for goal in list(self._goals.values()):
-            goal.end(problem)
-        self._goals.clear()
+    def goals(self) -> list[Goal]:
+        """Those that are under way."""
+        return list(self._goals.values())
 
     def _on_status(self, message: Any) -> None:
         for status in message.status_list:

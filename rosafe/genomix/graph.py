@@ -99,12 +99,16 @@ class Graph:
 
     # --- our node ---
 
-    async def become_node(self) -> None:
-        """Have a rospy node in this process, which actions need; ComponentError where there is no master."""
+    def prepare(self) -> asyncio.Task[None]:
+        """Begin to become a node, which takes a moment, unless that is under way or done."""
         if self._node is None or (self._node.done() and (self._node.cancelled() or self._node.exception())):
             self._node = asyncio.create_task(self._start_node())
+        return self._node
+
+    async def become_node(self) -> None:
+        """Have a rospy node in this process, which actions need; ComponentError where there is no master."""
         try:
-            await asyncio.wait_for(asyncio.shield(self._node), NODE_SECONDS)
+            await asyncio.wait_for(asyncio.shield(self.prepare()), NODE_SECONDS)
         except TimeoutError:
             raise middleware_error(f"cannot become a node of the graph at {self.uri} in {NODE_SECONDS:g} s") from None
 
@@ -152,5 +156,5 @@ def _address(uri: str) -> tuple[str, int]:
 def _reason(problem: BaseException) -> str:
     if isinstance(problem, asyncio.TimeoutError):
         return "no answer"
-    cause = getattr(problem, "os_error", problem)
-    return getattr(cause, "strerror", None) or type(problem).__name__
+    number = getattr(problem, "errno", None)
+    return os.strerror(number) if number else type(problem).__name__

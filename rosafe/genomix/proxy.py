@@ -67,29 +67,19 @@ class Proxy:
         self._pending = 0
 
     @classmethod
-    async def load(cls, graph: Graph, name: str, instance: str) -> Proxy:
-        """The proxy of a component that runs, or ComponentError.
-
-        Parameters
-        ----------
-        graph : Graph
-        name : str
-            Of the component, or of an instance; a path to a plugin (``/opt/lib/rosAFE.so``) counts by its last part.
-        instance : str
-            Name of the node; empty: as `name`.
-        """
-        name = name.rstrip("/").rsplit("/", 1)[-1].removesuffix(".so")
-        instance = instance.strip("/") or name
-        for word in (name, instance):
-            if not rosgraph.names.is_legal_base_name(word):
-                raise ComponentError("::genomix::e_load", what=f"{word!r} is no name of a component or instance")
+    async def load(cls, graph: Graph, instance: str) -> Proxy:
+        """The proxy of a component that runs, or that appears within a moment, or ComponentError."""
         package = await _package(graph, instance)
         if package not in COMPONENTS:
             known = ", ".join(COMPONENTS)
-            raise ComponentError("::genomix::e_load", what=f"/{instance} is a {package}; genomixd knows {known}")
-        if name not in (package, instance):
-            raise ComponentError("::genomix::e_load", what=f"/{instance} is a {package}, and no {name}")
+            raise _cannot_load(f"/{instance} is a {package}; genomixd knows {known}")
         return cls(graph, COMPONENTS[package], instance)
+
+    async def check(self, name: str) -> None:
+        """Return if the component runs still and may be called `name`, else raise ComponentError."""
+        if name not in (self.component.name, self.instance):
+            raise _cannot_load(f"/{self.instance} is a {self.component.name}, and no {name}")
+        await self._client("connect_port").check()
 
     async def close(self) -> None:
         """Let go of all connections; activities go on."""
@@ -97,11 +87,10 @@ class Proxy:
             self._link.cancel()
         for service in self._services.values():
             service.close()
+        for client in self._made_actions():
+            await client.close()
         for task in self._actions.values():
-            if task.done() and not task.cancelled() and task.exception() is None:
-                await task.result().close()
-            else:
-                task.cancel()
+            task.cancel()  # those that are still being made
 
     # --- requests ---
 
@@ -163,11 +152,14 @@ class Proxy:
             await connection.closed()
         finally:
             connection.close()
+        concerned = [goal for client in self._made_actions() for goal in client.goals()]
         await asyncio.sleep(LATE_SECONDS)
-        problem = middleware_error(f"{self.instance} ended before its activity did")
-        for task in self._actions.values():
-            if task.done() and not task.cancelled() and task.exception() is None:
-                task.result().lost(problem)
+        for goal in concerned:
+            goal.end(middleware_error(f"{self.instance} ended before its activity did"))
+
+    def _made_actions(self) -> list[ActionClient]:
+        tasks = self._actions.values()
+        return [task.result() for task in tasks if task.done() and not task.cancelled() and task.exception() is None]
 
     # --- ports ---
 
@@ -244,6 +236,30 @@ class Proxy:
         }
 
 
+def names(component: str, instance: str) -> tuple[str, str]:
+    """Name and instance that `load` means.
+
+    Parameters
+    ----------
+    component : str
+        The name of the component, or of an instance; a path to a plugin (``/opt/lib/rosAFE.so``) counts by its last
+        part.
+    instance : str
+        Name of the node; empty: as the component.
+
+    Raises
+    ------
+    ComponentError
+        ``::genomix::e_load`` where one of them is no name.
+    """
+    name = component.rstrip("/").rsplit("/", 1)[-1].removesuffix(".so")
+    instance = instance.strip("/") or name
+    for word in (name, instance):
+        if not rosgraph.names.is_legal_base_name(word):
+            raise _cannot_load(f"{word[:80]!r} is no name of a component or instance")
+    return name, instance
+
+
 async def _package(graph: Graph, instance: str) -> str:
     """The ROS package of the component that runs as `instance`, asked of the component itself."""
     name = f"/{instance}/connect_port"
@@ -264,6 +280,10 @@ async def _package(graph: Graph, instance: str) -> str:
         if asyncio.get_running_loop().time() > deadline:
             raise problem
         await asyncio.sleep(POLL_SECONDS)
+
+
+def _cannot_load(what: str) -> ComponentError:
+    return ComponentError("::genomix::e_load", what=what)
 
 
 def _no_port(what: str) -> ComponentError:

@@ -9,7 +9,7 @@ from collections.abc import Awaitable, Callable, Iterator
 from typing import Any, TypeVar
 
 from rosafe.genomix.graph import Graph
-from rosafe.genomix.proxy import NOTHING, Proxy, Value
+from rosafe.genomix.proxy import NOTHING, Proxy, Value, names
 from rosafe.genomix.syntax import Syntax, plain
 from rosafe.genomix.values import complete
 from rosafe.interface import ComponentError
@@ -20,6 +20,7 @@ MAX_LISTENERS = 8  # per session
 MAX_EVENTS = 10_000  # waiting for one listener
 MAX_KEPT = 512 * 2**20  # bytes of results kept per session
 MAX_COMPONENTS = 64  # per session
+MAX_LOADING = 8  # at the same time
 IDLE_SECONDS = 600.0  # a session without a listener ends so long after its last request
 LINGER_SECONDS = 10.0  # a session that lost its last listener ends so long after
 SWEEP_SECONDS = 1.0
@@ -202,7 +203,7 @@ class Session:
         request.finish(value, error)
         if request.id in self.requests:
             self.tell("request", request)
-            self._drop_large()
+            self.drop_large()
 
     async def _reading(self, request: Request, proxy: Proxy, port: Any, element: str) -> Value:
         return await proxy.read(port, element)
@@ -266,8 +267,8 @@ class Session:
                 raise too_many(f"a session has at most {MAX_REQUESTS} requests under way")
             del self.requests[oldest]
 
-    def _drop_large(self) -> None:
-        """Forget the oldest large results where all together are too large."""
+    def drop_large(self) -> None:
+        """Forget the oldest results where all together are too large."""
         large = [(r, r.value.size) for r in self.requests.values() if r.value is not NOTHING]
         excess = sum(size for _, size in large) - MAX_KEPT
         for request, size in large[:-1]:
@@ -305,6 +306,7 @@ class Sessions:
         self.numbers = itertools.count(1)
         self._sessions: dict[str, Session] = {}
         self._proxies: dict[str, Proxy] = {}
+        self._loading = asyncio.Semaphore(MAX_LOADING)
         self._tasks: set[asyncio.Task[Any]] = set()
         self.keep(asyncio.create_task(self._sweep()))
 
@@ -329,11 +331,15 @@ class Sessions:
 
     async def proxy(self, component: str, instance: str) -> Proxy:
         """The proxy of a component that runs; the one that is in use, if there is one for the instance."""
-        fresh = await Proxy.load(self.graph, component, instance)
-        used = self._proxies.get(fresh.instance)
-        if used is None or used.component is not fresh.component:
-            self._proxies[fresh.instance] = fresh
-        return self._proxies[fresh.instance]
+        name, instance = names(component, instance)
+        if instance not in self._proxies:
+            async with self._loading:
+                if instance not in self._proxies:
+                    self._proxies[instance] = await Proxy.load(self.graph, instance)
+        proxy = self._proxies[instance]
+        await proxy.check(name)
+        self.graph.prepare()
+        return proxy
 
     async def release(self) -> None:
         """Close the proxies that no session has loaded any more."""

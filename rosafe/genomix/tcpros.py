@@ -10,6 +10,7 @@ import asyncio
 import importlib
 import io
 import json
+import os
 import socket
 import struct
 from collections.abc import Mapping
@@ -22,7 +23,7 @@ from rosafe.interface import ComponentError
 from rosafe.ros import wire
 
 CONNECT_SECONDS = 3.0
-IDLE_CONNECTIONS = 4  # kept per service
+CONNECTIONS = 4  # at once per service or type of topic; rospy's nodes take few new ones at a time
 MAX_MESSAGE = 2**30  # bytes
 SAMPLE_SECONDS = 0.3  # a latched message comes at once; where none comes there is none yet
 MESSAGE_SECONDS = 30.0  # for the rest of it
@@ -149,7 +150,13 @@ class ServiceClient:
             "callerid": graph.name,
             "persistent": "1",
         }
+        self._slots = asyncio.Semaphore(CONNECTIONS)
         self._idle: list[Connection] = []
+
+    async def check(self) -> None:
+        """Return if the component can be reached, else raise ComponentError."""
+        async with self._slots:
+            self._keep(await self.connect())
 
     async def connect(self) -> Connection:
         """A connection to the service; ComponentError where the component cannot be reached."""
@@ -167,13 +174,14 @@ class ServiceClient:
         except TimeoutError:
             raise middleware_error(f"{self._instance} does not answer: no connection to {self.name}") from None
         except OSError as problem:
+            why = os.strerror(problem.errno or 0)
             raise middleware_error(
-                f"{self._instance} is not running any more, though the master still lists it ({problem.strerror})"
+                f"{self._instance} is not running any more, though the master still lists it ({why})"
             ) from None
 
-    def keep(self, connection: Connection) -> None:
+    def _keep(self, connection: Connection) -> None:
         """Take back a connection that is fit for another call."""
-        if connection.open_still and len(self._idle) < IDLE_CONNECTIONS:
+        if connection.open_still:
             self._idle.append(connection)
         else:
             connection.close()
@@ -185,23 +193,27 @@ class ServiceClient:
         """
         buffer = io.BytesIO()
         self._request_class(**values).serialize(buffer)
-        connection = await self.connect()
         try:
-            answer = await asyncio.wait_for(connection.request(buffer.getvalue()), timeout)
-        except BaseException as problem:
-            connection.close()
-            raise self._failure(problem, timeout) from None
-        self.keep(connection)
-        return self._response_class().deserialize(answer)
+            return self._response_class().deserialize(await asyncio.wait_for(self._ask(buffer.getvalue()), timeout))
+        except TimeoutError:
+            raise middleware_error(f"{self._instance} did not answer {self.name} within {timeout:g} s") from None
 
-    def _failure(self, problem: BaseException, timeout: float) -> BaseException:
-        if isinstance(problem, asyncio.TimeoutError):
-            return middleware_error(f"{self._instance} did not answer {self.name} within {timeout:g} s")
-        if isinstance(problem, Refused):
-            return middleware_error(f"{self.name}: {problem}")
-        if isinstance(problem, (asyncio.IncompleteReadError, OSError)):
-            return middleware_error(f"{self._instance} ended before it answered {self.name}")
-        return problem
+    async def _ask(self, request: bytes) -> bytearray:
+        async with self._slots:
+            connection = await self.connect()
+            try:
+                answer = await connection.request(request)
+            except Refused as problem:
+                connection.close()
+                raise middleware_error(f"{self.name}: {problem}") from None
+            except (asyncio.IncompleteReadError, OSError):
+                connection.close()
+                raise middleware_error(f"{self._instance} ended before it answered {self.name}") from None
+            except BaseException:
+                connection.close()
+                raise
+            self._keep(connection)
+            return answer
 
     def close(self) -> None:
         for connection in self._idle:
@@ -219,6 +231,7 @@ class TopicReader:
         self._graph = graph
         self._node = f"/{instance}"
         self._class = message_class
+        self._slots = asyncio.Semaphore(CONNECTIONS)
         self._address: tuple[str, int] | None = None  # one node gives out all its topics at one address
 
     async def read(self, topic: str) -> Any:
@@ -246,11 +259,12 @@ class TopicReader:
             "tcp_nodelay": "1",
             "message_definition": self._class._full_text,
         }
-        connection = await Connection.open(address, header)
-        try:
-            data = await connection.message()
-        finally:
-            connection.close()
+        async with self._slots:
+            connection = await Connection.open(address, header)
+            try:
+                data = await connection.message()
+            finally:
+                connection.close()
         return None if data is None else self._class().deserialize(data)
 
 

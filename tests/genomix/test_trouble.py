@@ -1,0 +1,132 @@
+"""Components and masters that are not there, die, hang or come back: clear errors, and recovery without a restart."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from pathlib import Path
+
+import pytest
+
+from tests import harness
+from tests.genomix import world as worlds
+from tests.genomix.world import HttpError, World
+
+pytestmark = pytest.mark.ros
+
+
+def problem(world: World, target: str, given: object = None) -> str:
+    with pytest.raises(HttpError) as caught:
+        world.http.call(target, given)
+    assert (caught.value.status, caught.value.ex) == (502, "::genom::mwerr")
+    return caught.value.what
+
+
+def test_a_component_that_comes_goes_and_comes_back(empty_world: World) -> None:
+    world = empty_world
+    assert "bass is not running" in problem(world, "bass/Stop")
+    with world.graph.node("bass-ros") as bass:
+        world.http.get("/load/bass", s="t")
+        number = world.http.send("bass/Acquire", {"device": "scene:"}, ack=1)
+        waiting = world.http.send("bass/DedicatedSocket", s="u")
+        bass.stop(signal.SIGKILL)
+        assert "bass ended before its activity did" in world.http.wait(number, "error")["exception"]["detail"]["what"]
+        assert world.http.status(waiting, s="u")["status"] in ("error", "sent")
+    assert "bass is not running" in problem(world, "bass/Stop")
+    assert "bass is not running" in problem(world, "bass/Audio")
+    failed = world.http.send("bass/Acquire", {"device": "scene:"})
+    assert "bass is not running" in world.http.wait(failed, "error")["exception"]["detail"]["what"]
+    with world.graph.node("bass-ros"):
+        assert world.http.call("bass/Stop", s="t") == {}
+        number = world.http.send("bass/Acquire", {"device": "scene:"}, ack=1)
+        assert world.http.status(number)["status"] == "sent"
+        harness.wait_for(lambda: world.http.call("bass/Audio")["Audio"]["lastFrameIndex"] > 0)
+        world.http.call("bass/kill")
+        assert world.http.wait(number, "done")["output"] == {}
+
+
+def test_a_registration_that_a_killed_node_left(empty_world: World) -> None:
+    world = empty_world
+    with world.graph.node("bass-ros") as bass:
+        world.http.call("bass/Stop")
+        bass.stop(signal.SIGKILL)
+        assert "/bass/Stop" in world.graph.services()
+        assert "bass is not running any more, though the master still lists it" in problem(world, "bass/Stop")
+
+
+def test_a_component_that_hangs_keeps_others_out_of_it(empty_world: World) -> None:
+    world = empty_world
+    with world.graph.node("bass-ros") as bass, world.graph.node("rosAFE-ros"):
+        world.http.call("bass/Stop")
+        bass_signal(bass, signal.SIGSTOP)
+        answers: list[object] = []
+        caller = threading.Thread(target=lambda: answers.append(world.http.call("bass/Stop")))
+        caller.start()
+        parameters = world.http.call("rosAFE/getParameters")["parameters"]
+        assert parameters["input"] == []
+        assert answers == []
+        bass_signal(bass, signal.SIGCONT)
+        caller.join(20)
+        assert answers == [{}]
+
+
+def bass_signal(process: harness.Process, number: int) -> None:
+    os.kill(process.pid, number)
+
+
+def test_a_master_that_dies_and_comes_back(empty_world: World) -> None:
+    world = empty_world
+    with world.graph.node("bass-ros"):
+        number = world.http.send("bass/Acquire", {"device": "scene:"}, ack=1)
+        world.http.call("bass/Audio")
+        world.master.kill()
+        # What is connected goes on without a master; what is new says what is missing.
+        assert world.http.call("bass/Audio")["Audio"]["sampleRate"] == 44100
+        assert "no ROS master at" in problem(world, "rosAFE/Stop")
+        world.http.get("/request/abort", id=number, s="t")
+        world.http.wait(number, "done")
+        world.master.start(world.graph.env)
+        assert "bass is not running" in problem(world, "bass/connect_service", ["a", "b"])
+    with world.graph.node("bass-ros"):
+        assert world.http.call("bass/Stop") == {}
+        number = world.http.send("bass/Acquire", {"device": "scene:"}, ack=1)
+        assert world.http.status(number) == {"id": number, "status": "sent"}
+        world.http.call("bass/Stop")
+        world.http.wait(number, "done")
+
+
+def test_a_master_that_is_not_there_yet(tmp_path: Path) -> None:
+    master = harness.MasterProcess()
+    graph = harness.Graph(master.uri, tmp_path)
+    with worlds.genomixd(graph) as (server, port):
+        world = World(graph, master, server, port)
+        assert f"no ROS master at {master.uri}" in problem(world, "bass/Stop")
+        failed = world.http.raw("/load/bass")
+        assert failed[0] == 502
+        master.start(graph.env)
+        try:
+            with graph.node("bass-ros"):
+                assert world.http.call("bass/Stop") == {}
+                number = world.http.send("bass/Acquire", {"device": "scene:"}, ack=1)
+                world.http.call("bass/Stop")
+                world.http.wait(number, "done")
+        finally:
+            master.kill()
+
+
+def test_load_waits_for_a_component_that_is_starting(empty_world: World) -> None:
+    world = empty_world
+    with world.graph.start(str(harness.SCRIPTS / "bass-ros")):
+        assert world.http.get("/load/bass")["component"] == "bass"
+
+
+def test_stop_everything_at_once(empty_world: World) -> None:
+    """A component killed by its own request, with clients waiting."""
+    world = empty_world
+    with world.graph.node("bass-ros") as bass:
+        number = world.http.send("bass/Acquire", {"device": "scene:"}, ack=1)
+        assert world.http.call("bass/kill") == {}
+        assert bass.wait() == 0
+        assert world.http.wait(number, "done")["output"] == {}
+    assert "bass is not running" in problem(world, "bass/Stop")
