@@ -24,10 +24,13 @@ namespace eval ::genomix {
 
 # genomix::connect ?host?:port??
 #
-# Connect to a genomixd, by default that on localhost:8080, and return a handle: a command with the methods
-# load, unload, rpath and destroy.
-proc ::genomix::connect {{address localhost:8080}} {
+# Connect to a genomixd and return a handle: a command with the methods load, unload, rpath and destroy. The default
+# address is that of the environment variable GENOMIXD, or localhost:8080.
+proc ::genomix::connect {{address ""}} {
     variable clients
+    if {$address eq "" && [info exists ::env(GENOMIXD)]} {
+        set address $::env(GENOMIXD)
+    }
     if {![regexp {^(\[[^]]+\]|[^:]*)(:(\d+))?$} $address -> host - port]} {
         ::genomix::Refuse "address \"$address\" is not host, host:port or :port"
     }

@@ -1,0 +1,566 @@
+"""The Tcl package in tclsh, with a real genomixd and real nodes."""
+
+from __future__ import annotations
+
+import subprocess
+
+import pytest
+
+from tests import harness
+from tests.genomix import world as worlds
+from tests.genomix.world import World
+
+pytestmark = pytest.mark.ros
+
+LOAD = """
+set g [genomix::connect $address]
+$g load bass
+$g load rosAFE
+rosAFE::connect_port Audio bass/Audio
+"""
+TREE = (
+    LOAD
+    + """
+bass::Acquire scene:
+rosAFE::InputProc
+rosAFE::PreProc
+rosAFE::GammatoneProc {fb_nChannels 4}
+"""
+)
+
+
+# --- connections and components ---------------------------------------------------------------------------------
+
+
+def test_the_package_says_its_version_and_does_nothing_at_load(world: World) -> None:
+    script = """
+        show [package require genomix] [namespace exists ::rosAFE] [after info] [lsort [file channels]]
+        namespace import ::genomix::*
+        show [namespace origin connect] [namespace origin localhost]
+    """
+    assert world.lines(script) == [
+        "1.8|0||stderr stdin stdout",
+        "::genomix::connect|::genomix::localhost",
+    ]
+
+
+def test_handles_are_commands_by_their_literal_names(world: World) -> None:
+    script = """
+        genomix::connect $address
+        show [set second [genomix::connect $address]]
+        show [genomix1 load bass] [$second load /opt/openrobots/lib/genom/ros/plugins/rosAFE.so]
+        genomix1 rpath ~/openrobots/lib/genom/ros/plugins/
+        show [bass::Stop] [info commands ::rosAFE::getSignals]
+        $second unload rosAFE
+        show [namespace exists ::rosAFE] [namespace exists ::bass]
+        genomix1 destroy
+        show [namespace exists ::bass] [info commands genomix1]
+    """
+    assert world.lines(script) == ["genomix2", "bass|rosAFE", "|::rosAFE::getSignals", "0|1", "0|"]
+
+
+def test_instances_and_aliases(world: World) -> None:
+    with world.graph.node("bass-ros", "-i", "left"):
+        script = """
+            set g [genomix::connect $address]
+            show [$g load bass -i left] [$g load bass -i left as ears] [$g load bass as right]
+            left::Acquire {device scene: nFramesPerChunk 700}
+            show [dict get [ears::Audio] Audio nFramesPerChunk] [dict get [left::Audio] Audio nFramesPerChunk]
+            show [dict exists [right::Audio] Audio]
+            left::kill
+        """
+        assert world.lines(script) == ["left|ears|right", "700|700", "1"]
+
+
+def test_every_service_and_port_is_a_command(world: World) -> None:
+    script = (
+        LOAD
+        + """
+        foreach name {InputProc getSignals getSignal Gammatone Ratemap CrossCorrelation kill abort_activity connect_service
+                ratemapProcPort genom_state Audio dataObj crossCorrelationPort} {
+            if {[info commands ::rosAFE::$name] eq ""} {error "no $name"}
+        }
+        show [dict get [rosAFE::genom_state] genom_state task 0 name]
+    """
+    )
+    assert world.lines(script) == ["init"]
+
+
+def test_mistakes_at_connecting_and_loading(world: World) -> None:
+    port = harness.free_port()
+    script = f"""
+        show {{*}}[failure {{genomix::connect 127.0.0.1:{port}}}]
+        show [lindex [failure {{genomix::connect a:b:c}}] 1 1]
+        set g [genomix::connect $address]
+        show {{*}}[failure {{$g load nobody}}]
+        show [lindex [failure {{$g load bass -x y}}] 0]
+        show [lindex [failure {{$g load bass as genomix}}] 0]
+        show [lindex [failure {{$g load bass as {{a b}}}}] 0]
+        show [lindex [failure {{$g unload bass}}] 0]
+        show [lindex [failure {{bass::Stop}}] 0]
+    """
+    lines = world.lines(script)
+    what = f"no genomixd at 127.0.0.1:{port} (couldn't open socket: connection refused)"
+    assert lines[0] == f"ex ::genom::mwerr detail {{what {{{what}}}}}|GENOM ::genom::mwerr {{what {{{what}}}}}"
+    assert lines[1] == "::genom::serialization"
+    assert "GENOM ::genom::mwerr {what {nobody is not running: nobody serves /nobody/connect_port}}" in lines[2]
+    assert 'unknown option "-x"' in lines[3]
+    assert '"genomix" cannot be the name' in lines[4]
+    assert "as: letters, digits and _ only" in lines[5]
+    assert '"bass" is not loaded' in lines[6]
+    assert "invalid command name" in lines[7]
+
+
+# --- arguments --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("arguments", "name", "channels"),
+    [
+        ("{name g fb_nChannels 3}", "g", "3"),
+        ("{fb_nChannels 3\n    name   g}", "g", "3"),
+        ("g", "g", "31"),
+        ("g preProc", "g", "31"),
+        ("g preProc gammatone 80 8000 1 3", "g", "3"),
+        ("-- g preProc gammatone 80 8000 1 3", "g", "3"),
+        ("{}", "gammatone", "31"),
+        ("", "gammatone", "31"),
+        ("[dict create name g fb_nChannels 3]", "g", "3"),
+        ("[subst {name g fb_nChannels [expr {1+2}]}]", "g", "3"),
+        ("{fb_cfHz {100 200 300}}", "gammatone", "3"),
+        ("{fb_cfHz {0 100 1 200 2 300}}", "gammatone", "3"),
+        ("{fb_cfHz {2 300 0 100 1 200}}", "gammatone", "3"),
+        ("{fb_cfHz 440}", "gammatone", "1"),
+        ("{fb_cfHz {} fb_nChannels 3}", "gammatone", "3"),
+        ("g preProc gammatone 80 8000 1 0 {0 100 1 200 2 300}", "g", "3"),
+        ("g preProc gammatone 80 8000 1 0 {100 200 300} 4 1.018", "g", "3"),
+    ],
+)
+def test_argument_forms(world: World, arguments: str, name: str, channels: str) -> None:
+    script = (
+        LOAD
+        + f"""
+        bass::Acquire scene:
+        rosAFE::InputProc
+        rosAFE::PreProc
+        rosAFE::GammatoneProc {arguments}
+        set made [dict get [rosAFE::getParameters] parameters gammatone 0]
+        show [dict get $made name] [dict get $made fb_nChannels]
+    """
+    )
+    assert world.lines(script) == [f"{name}|{channels}"]
+
+
+@pytest.mark.parametrize(("text", "value"), [("0", "0"), ("1", "1"), ("true", "1"), ("no", "0"), ("F", "0")])
+def test_booleans(world: World, text: str, value: str) -> None:
+    script = (
+        LOAD
+        + f"""
+        bass::Acquire scene:
+        rosAFE::InputProc
+        rosAFE::PreProc {{pp_bRemoveDC {text}}}
+        show [dict get [rosAFE::getParameters] parameters preProc 0 pp_bRemoveDC]
+    """
+    )
+    assert world.lines(script) == [value]
+
+
+def test_the_result_of_one_call_is_the_argument_of_another(world: World) -> None:
+    script = (
+        TREE
+        + """
+        set parameters [dict get [rosAFE::getParameters] parameters gammatone 0]
+        dict set parameters name again
+        rosAFE::GammatoneProc $parameters
+        set both [dict get [rosAFE::getParameters] parameters gammatone]
+        show [dict size $both] [expr {[dict get $both 0 fb_cfHz] eq [dict get $both 1 fb_cfHz]}]
+    """
+    )
+    assert world.lines(script) == ["2|1"]
+
+
+@pytest.mark.parametrize(
+    ("command", "told"),
+    [
+        (
+            "GammatoneProc {name g bogus 1}",
+            "unknown parameter 'bogus'; GammatoneProc takes name (string), upperDepName",
+        ),
+        ("GammatoneProc {bogus 1}", "unknown parameter 'bogus'"),
+        (
+            "GammatoneProc {fb_nERBs abc}",
+            "fb_nERBs: 'abc' is not a finite number (fb_nERBs is a double; more than 0 to 100)",
+        ),
+        ("GammatoneProc {fb_cfHz {1 x}}", "fb_cfHz is a sequence<double>"),
+        ("GammatoneProc {fb_nChannels 1.5}", "fb_nChannels: 1.5 is not a whole number"),
+        ("PreProc {pp_bRemoveDC 2}", "pp_bRemoveDC: '2' is not a boolean"),
+        ("GammatoneProc {name g fb_nERBs}", "fb_nERBs has no value in"),
+        ("getDependencies a b c", "3 arguments are too many; it takes nameProc"),
+        ("Stop now", "1 arguments are too many; it takes no parameters"),
+        ("connect_port", "local is missing; connect_port takes local (string), remote (string)"),
+        ("connect_port Audio", "remote is missing"),
+        ("abort_activity -1x", 'unknown switch "-1x"; there are: -help, -send, -ack, -oneway, --'),
+        ("abort_activity -- -1", "activity: -1 is not in the range of unsigned long"),
+        ("abort_activity -1", "activity: -1 is not in the range of unsigned long"),
+        ("GammatoneProc -what g", 'unknown switch "-what"'),
+        ("ildPort a b", "takes one element, and not 2 arguments"),
+    ],
+)
+def test_refused_arguments_are_named(world: World, command: str, told: str) -> None:
+    script = (
+        LOAD
+        + f"""
+        lassign [failure {{rosAFE::{command}}}] message code
+        show [dict get $message ex]
+        show [dict get $message detail what]
+        show [expr {{$code eq [list GENOM [dict get $message ex] [dict get $message detail]]}}]
+        lassign [failure {{rosAFE::{command} &}}] message code
+        show [dict get $message detail what]
+    """
+    )
+    ex, what, same, background = world.lines(script)
+    assert ex == "::genom::serialization"
+    assert told in what
+    assert same == "1"
+    assert told in background
+
+
+def test_awkward_texts_arrive_as_they_are_and_nothing_is_evaluated(world: World) -> None:
+    script = (
+        LOAD
+        + r"""
+        foreach text [list {[exit 3]} "a\nb" "quote\"d" {\\} "t\tab" "\u00e9\u4e2d" {$x} "{" "}" { lead} "\x01"] {
+            lassign [failure {bass::Acquire [dict create device $text]}] message
+            show [dict get $message ex] [lindex [failure {rosAFE::getDependencies [list nameProc $text]}] 1 1]
+        }
+        bass::Acquire scene:
+        rosAFE::InputProc
+        lassign [failure {rosAFE::modifyParameter {nameProc input nameParam in_doNormalize newValue {[exit 3]}}}] message
+        show [dict get $message ex] [string match {*\[exit 3\]*} [dict get $message detail what]]
+    """
+    )
+    lines = world.lines(script)
+    assert lines[:-1] == ["::bass::e_device|::rosAFE::e_noSuchProcessor"] * 11
+    assert lines[-1] == "::rosAFE::e_badNewValue|1"
+
+
+# --- results and errors -----------------------------------------------------------------------------------------
+
+
+def test_results_are_dicts_with_indexed_sequences(world: World) -> None:
+    script = (
+        TREE
+        + """
+        show [rosAFE::getDependencies gammatone]
+        show [rosAFE::Stop] [bass::Stop]
+        show [dict keys [rosAFE::getSignals {}]] [dict keys [dict get [rosAFE::getSignal] signals]]
+        show [rosAFE::dataObj]
+    """
+    )
+    assert world.lines(script) == [
+        "dependencies {0 input 1 preProc 2 gammatone}",
+        "|",
+        "signals|input preProc gammatone ihc ild ratemap crossCorrelation",
+        "dataObj {input {} preProc {} gammatone {} ihc {} ild {} ratemap {} crossCorrelation {}}",
+    ]
+
+
+def test_numbers_are_those_of_the_node(world: World) -> None:
+    """A port read in Tcl and one read with JSON hold the same numbers."""
+    script = (
+        TREE
+        + """
+        while {[dict get [rosAFE::preProcPort preProc] preProcPort lastFrameIndex] == 0} {after 20}
+        bass::Stop
+        set port [dict get [rosAFE::gammatonePort gammatone] gammatonePort]
+        show [dict get $port numberOfChannels] [dict size [dict get $port left dataN 0 data]]
+        show {*}[lrange [dict values [dict get $port right dataN 3 data]] end-99 end]
+    """
+    )
+    head, numbers = world.lines(script)
+    assert head == "4|44100"
+    port = world.http.call("rosAFE/gammatonePort/gammatone")["gammatonePort"]
+    expected = port["right"]["dataN"][3]["data"][-100:]
+    assert [float(number) for number in numbers.split("|")] == expected
+    assert any(expected)
+
+
+def test_errors_of_the_component(world: World) -> None:
+    script = (
+        TREE
+        + """
+        show {*}[failure {rosAFE::removeProcessor nobody}]
+        lassign [failure {rosAFE::GammatoneProc {name h fb_nERBs -1}}] message code
+        show [dict get $message ex] [dict get $message detail what] [lrange $code 0 1]
+        try {rosAFE::PreProc} trap {GENOM ::rosAFE::e_existsAlready} message {show trapped $message}
+    """
+    )
+    assert world.lines(script) == [
+        "ex ::rosAFE::e_noSuchProcessor|GENOM ::rosAFE::e_noSuchProcessor {}",
+        "::rosAFE::e_badNewValue|fb_nERBs: -1 is out of range, allowed is more than 0 to 100|GENOM ::rosAFE::e_badNewValue",
+        "trapped|ex ::rosAFE::e_existsAlready",
+    ]
+
+
+# --- requests in the background ---------------------------------------------------------------------------------
+
+
+def test_a_request_lives_as_its_activity(world: World) -> None:
+    script = (
+        LOAD
+        + """
+        set r [bass::Acquire {device scene:} &]
+        show [string match bass::* [$r id]] [$r status] [$r wait 300]
+        show [lindex [failure {$r result}] 1 1]
+        bass::Stop
+        show [$r wait] [$r status] [$r result]
+        $r clean
+        show [info commands $r]
+    """
+    )
+    assert world.lines(script) == ["1|sent|sent", "::genomix::e_notDone", "done|done|", ""]
+
+
+def test_abort(world: World) -> None:
+    script = (
+        LOAD
+        + """
+        set r [bass::Acquire -ack scene:]
+        show [$r status]
+        $r abort
+        show [$r wait 5000]
+        $r abort
+        show [$r status]
+    """
+    )
+    assert world.lines(script) == ["sent", "done", "done"]
+
+
+def test_a_request_that_fails(world: World) -> None:
+    script = (
+        LOAD
+        + """
+        set r [bass::Acquire {device file:/none.wav} &]
+        show [$r wait]
+        lassign [failure {$r result}] message code
+        show [dict get $message ex] [lrange $code 0 1]
+        set r [rosAFE::GammatoneProc -ack {}]
+        show [$r status] [dict get [lindex [failure {$r result}] 0] ex]
+    """
+    )
+    assert world.lines(script) == [
+        "error",
+        "::bass::e_device|GENOM ::bass::e_device",
+        "error|::rosAFE::e_noUpperDependencie",
+    ]
+
+
+def test_callbacks_on_success_and_error_in_the_event_loop(world: World) -> None:
+    script = (
+        LOAD
+        + """
+        proc done {args} {
+            set request [lindex $args end]
+            lappend ::log [lrange $args 0 end-1] [$request status] [catch {$request result} result] [dict get $result {*}$::key]
+            incr ::count
+        }
+        proc bgerror {message} {lappend ::log $message; incr ::count}
+        set count 0
+        set key dependencies
+        bass::Acquire scene: &
+        rosAFE::InputProc
+        rosAFE::getDependencies input & done first {second arg}
+        show [info exists log]
+        while {$count < 1} {vwait count}
+        show $log
+        set log {}
+        set key ex
+        set r [rosAFE::removeProcessor nobody & done]
+        while {[$r status] eq "sent"} {after 10}
+        show [info exists ::result] $count
+        update
+        show $log
+        set log {}
+        rosAFE::getDependencies input & error oops
+        while {$count < 3} {vwait count}
+        show [string match "*wrong # args*" $log]
+        rosAFE::inputProcPort & done
+        while {$count < 4} {vwait count}
+    """
+    )
+    assert world.lines(script) == [
+        "0",
+        "{first {second arg}} done 0 {0 input}",
+        "0|1",
+        "{} error 1 ::rosAFE::e_noSuchProcessor",
+        "0",
+    ]
+
+
+def test_background_everywhere(world: World) -> None:
+    script = (
+        TREE
+        + """
+        foreach command {
+            {rosAFE::getParameters &}
+            {::rosAFE::getDependencies {nameProc gammatone} &}
+            {::rosAFE::getSignals {} &}
+            {::rosAFE::preProcPort preProc &}
+            {rosAFE::genom_state -s &}
+            {rosAFE::getDependencies -s {nameProc input} &}
+            {rosAFE::getDependencies -s {nameProc input}}
+            {rosAFE::getParameters -ack}
+            {rosAFE::getParameters -a}
+        } {
+            set r [eval $command]
+            show [$r wait] [dict keys [$r result]]
+        }
+        show [rosAFE::removeProcessor -oneway gammatone] [rosAFE::Stop -o]
+    """
+    )
+    assert world.lines(script) == [
+        "done|parameters",
+        "done|dependencies",
+        "done|signals",
+        "done|preProcPort",
+        "done|genom_state",
+        "done|dependencies",
+        "done|dependencies",
+        "done|parameters",
+        "done|parameters",
+        "|",
+    ]
+
+
+def test_requests_go_in_order(world: World) -> None:
+    """A tree asked for in one breath, as scripts without pauses do."""
+    script = (
+        LOAD
+        + """
+        bass::Acquire scene: &
+        rosAFE::InputProc &
+        rosAFE::PreProc &
+        rosAFE::GammatoneProc {fb_nChannels 2} &
+        rosAFE::IhcProc &
+        set last [rosAFE::IldProc -ack]
+        show [$last status] [rosAFE::getDependencies ild]
+    """
+    )
+    assert world.lines(script) == ["sent|dependencies {0 input 1 preProc 2 gammatone 3 ihc 4 ild}"]
+
+
+def test_a_script_that_ends_does_not_hang(world: World) -> None:
+    script = LOAD + "bass::Acquire scene: & \nrosAFE::getParameters &\nset r [bass::Stop &]\n"
+    assert world.tcl(script, timeout=10).returncode == 0
+    done = world.tcl(LOAD + "bass::Acquire {device none}\n", timeout=10, check=False)
+    assert done.returncode == 1
+    assert "ex ::bass::e_device" in done.stderr
+
+
+def test_a_server_that_goes_away_and_comes_back(world: World) -> None:
+    script = world.graph.home / "gone.tcl"
+    script.write_text("""
+        package require genomix
+        set g [genomix::connect [lindex $argv 0]]
+        $g load bass as ears
+        set r [ears::Acquire -ack scene:]
+        proc say {args} {puts [join $args |]; flush stdout; gets stdin}
+        say ready
+        say [$r wait 20000] [catch {$r result} message] $message
+        say [catch {ears::Stop} message] $message
+        say back [ears::Stop] [[ears::genom_state &] wait]
+    """)
+    with worlds.genomixd(world.graph) as (process, port):
+        command = ["tclsh", str(script), f"127.0.0.1:{port}"]
+        with subprocess.Popen(
+            command, env=world.graph.env, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+        ) as client:
+            assert client.stdin is not None
+            assert client.stdout is not None
+            assert client.stdout.readline() == "ready\n"
+            process.stop()
+            print(file=client.stdin, flush=True)
+            lost = client.stdout.readline()
+            assert lost.startswith("error|1|ex ::genom::mwerr detail {what {the connection to genomixd at")
+            print(file=client.stdin, flush=True)
+            assert client.stdout.readline().startswith("1|ex ::genom::mwerr detail {what {no genomixd at 127.0.0.1:")
+            with world.graph.start(str(harness.SCRIPTS / "genomixd"), "-v", "-p", str(port)) as again:
+                assert worlds.port_of(again) == port
+                print(file=client.stdin, flush=True)
+                assert client.stdout.readline() == "back||done\n"
+                client.stdin.close()
+                assert client.wait(10) == 0
+
+
+def test_localhost_is_a_private_server_that_dies_with_us(world: World) -> None:
+    script = """
+        set g [genomix::localhost]
+        set h [genomix::localhost]
+        show $g $h [$g load bass] [bass::Stop] [pid [lindex $genomix::private 0]]
+        set r [bass::Acquire scene: &]
+        show [$r wait 100]
+    """
+    first, second = world.lines(script)
+    assert first.startswith("genomix1|genomix2|bass||")
+    assert second == "sent"
+    pid = int(first.rsplit("|", 1)[1])
+    harness.wait_for(lambda: not harness.Path(f"/proc/{pid}").exists(), what=f"end of the private server {pid}")
+
+
+# --- help -------------------------------------------------------------------------------------------------------
+
+
+def test_help_tells_types_defaults_ranges_and_texts(world: World) -> None:
+    script = (
+        LOAD
+        + "puts [rosAFE::PreProc -h]\nputs [rosAFE::connect_port -help]\nputs [rosAFE::ildPort -h]\nputs [bass::Stop -h]\n"
+    )
+    told = world.tcl(script).stdout
+    for line in (
+        "rosAFE::PreProc: Condition the input",
+        "  pp_bRemoveDC (boolean, default 0): Flag to activate the DC-removal high-pass filter",
+        "  pp_refSPLdB (double, default 100.0, from -200 to 400): Reference dB SPL value",
+        "  pp_middleEarModel (string, default jepsen, one of jepsen, lopezpoveda):",
+        "  may fail with ::rosAFE::e_noUpperDependencie",
+        "  local (string, no default): Name of this component's input port",
+        "rosAFE::ildPort element: Interaural level differences",
+        "bass::Stop: Stop the acquisition\n  no parameters",
+    ):
+        assert line in told
+    assert "invalid command name" in world.lines(LOAD + "show [lindex [failure {rosAFE::noSuch -h}] 0]\n")[0]
+
+
+# --- the slips of the guide -------------------------------------------------------------------------------------
+
+
+def test_slips_of_the_guide_are_accepted(world: World) -> None:
+    script = (
+        LOAD
+        + """
+        bass::Acquire scene:
+        rosAFE::InputProc
+        rosAFE::PreProc {pp_refSPLdBS 90 pp_middleEarModel jespen}
+        rosAFE::Gammatone {fb_nChannels 2}
+        rosAFE::IhcProc
+        rosAFE::Ratemap
+        rosAFE::CrossCorrelation
+        set made [dict get [rosAFE::getParameters] parameters]
+        show [dict get $made preProc 0 pp_refSPLdB] [dict get $made preProc 0 pp_middleEarModel]
+        show [dict keys [rosAFE::getSignal]] [dict keys [rosAFE::ratemapProcPort ratemap]]
+        show [dict keys [rosAFE::inputProcPort input]] [dict keys [rosAFE::crossCorrelationPort crossCorrelation]]
+        :: rosAFE :: modifyParameter {nameProc preProc nameParam pp_bRemoveDC newValue 1}
+        show [dict get [rosAFE::getParameters] parameters preProc 0 pp_bRemoveDC]
+        rosAFE::removeProcessor {nameProc ratemap}
+        rosAFE::removeProcessor {name ihc}
+        show [dict size [dict get [rosAFE::getParameters] parameters ihc]]
+        show [lindex [failure {:: nobody :: here}] 0]
+    """
+    )
+    assert world.lines(script) == [
+        "90.0|jepsen",
+        "signals|ratemapPort",
+        "inputProcPort|crossCorrelationPort",
+        "1",
+        "0",
+        'invalid command name "::"',
+    ]
