@@ -1,6 +1,6 @@
-"""Tell what is there of all that running needs, and what to do about what is missing.
+"""Tell what is there of all that running needs.
 
-One line for each thing: `ok`, `note` (not needed by everything, or not now) or `MISSING`."""
+With what to do about the rest. One line for each thing: `ok`, `note` (not needed by everything, or not now) or `MISSING`."""
 
 from __future__ import annotations
 

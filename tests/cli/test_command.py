@@ -1,0 +1,122 @@
+"""The command itself: help, version, usage, where it may lie, and how a command is added."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from rosafe import __version__
+from rosafe.interface import KINDS
+from tests.cli.command import ROSAFE, environment, refused, rosafe
+from tests.harness import ROOT
+
+
+def test_version() -> None:
+    done = rosafe("--version")
+    assert (done.returncode, done.stdout, done.stderr) == (0, f"rosafe {__version__}\n", "")
+
+
+def test_help_shows_the_commands_and_an_example() -> None:
+    done = rosafe("-h")
+    assert (done.returncode, done.stderr) == (0, "")
+    for words in ("process  ", "doctor  ", "example", "rosafe process speech.wav"):
+        assert words in done.stdout
+    assert done.stdout == rosafe("--help").stdout
+
+
+@pytest.mark.parametrize(
+    "arguments", [[], ["frobnicate"], ["--nonsense"], ["-x", "process"], ["doctor", "too", "much"]]
+)
+def test_usage(arguments: list[str]) -> None:
+    refused(rosafe(*arguments), "-h shows", code=2)
+
+
+def test_help_of_process_lists_every_parameter() -> None:
+    done = rosafe("process", "--help")
+    assert (done.returncode, done.stderr) == (0, "")
+    text = " ".join(done.stdout.split())
+    for kind in KINDS.values():
+        assert kind.kind in text
+        for parameter in kind.parameters:
+            assert f" {parameter.name}=" in text
+            assert parameter.doc in text
+            assert parameter.range_text in text
+    for shown in ("fb_nERBs=1.0 (more than 0 to 100)", "in_doNormalize=true", "fb_cfHz={}", "ihc_method=dau"):
+        assert shown in text
+    assert max(map(len, done.stdout.splitlines())) <= 120
+
+
+def test_help_into_a_pipe_that_closes() -> None:
+    done = subprocess.run(
+        ["/bin/bash", "-o", "pipefail", "-c", f"{ROSAFE} process -h | true"],
+        env=environment(),
+        capture_output=True,
+        text=True,
+        timeout=30,
+        check=False,
+    )
+    assert done.stderr == ""
+    assert done.returncode in (0, 141)  # whoever comes first
+
+
+def test_through_a_link(tmp_path: Path) -> None:
+    (tmp_path / "there").symlink_to(ROSAFE)
+    assert rosafe("--version", program=tmp_path / "there", cwd=tmp_path).stdout == f"rosafe {__version__}\n"
+
+
+@pytest.mark.parametrize("place", ["bin", "lib/rosAFE"])
+def test_in_an_install_space(tmp_path: Path, place: str) -> None:
+    (tmp_path / place).mkdir(parents=True)
+    program = tmp_path / place / "rosafe"
+    shutil.copy(ROSAFE, program)
+    packages = tmp_path / "lib/python3/dist-packages"
+    shutil.copytree(ROOT / "rosafe", packages / "rosafe", ignore=shutil.ignore_patterns("__pycache__"))
+    done = rosafe("--version", program=program, cwd=tmp_path, PYTHONDONTWRITEBYTECODE="1")
+    assert done.stdout == f"rosafe {__version__}\n", done
+
+
+def test_a_module_is_all_that_a_command_takes(tmp_path: Path) -> None:
+    (tmp_path / "say_hello.py").write_text(
+        '"""Say hello to somebody."""\n'
+        "from rosafe.commands import Failure\n"
+        "def configure(parser):\n    parser.add_argument('name')\n"
+        "def run(options):\n"
+        "    if options.name == 'nobody':\n        raise Failure('there is nobody')\n"
+        "    print('hello', options.name)\n    return 3\n"
+    )
+    (tmp_path / "_part.py").write_text("raise RuntimeError('not a command')\n")
+    program = "import sys, rosafe.commands, rosafe.cli; rosafe.commands.__path__.append(sys.argv.pop(1));"
+
+    def run(*arguments: str) -> subprocess.CompletedProcess[str]:
+        return subprocess.run(
+            ["/usr/bin/python3", "-c", program + "sys.exit(rosafe.cli.main())", str(tmp_path), *arguments],
+            env=environment(PYTHONPATH=str(ROOT)),
+            capture_output=True,
+            text=True,
+            timeout=30,
+            check=False,
+        )
+
+    assert "say-hello Say hello to somebody" in " ".join(run("-h").stdout.split())
+    done = run("say-hello", "world")
+    assert (done.returncode, done.stdout) == (3, "hello world\n")
+    done = run("say-hello", "nobody")
+    assert (done.returncode, done.stdout, done.stderr) == (1, "", "rosafe say-hello: there is nobody\n")
+    refused(run("say-hello"), "rosafe say-hello", "name", code=2)
+
+
+def test_help_needs_nothing_but_python() -> None:
+    """Without Debian's packages (-S) help still comes."""
+    done = subprocess.run(
+        ["/usr/bin/python3", "-S", str(ROSAFE), "process", "-h"],
+        env=environment(),
+        capture_output=True,
+        text=True,
+        timeout=30,
+        check=False,
+    )
+    assert done.returncode == 0, done
+    assert "fb_nERBs" in done.stdout

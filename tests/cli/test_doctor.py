@@ -1,0 +1,130 @@
+"""`rosafe doctor`: what it finds on a machine that has everything, and on some that have not."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from pathlib import Path
+from typing import Any
+
+from rosafe.ros import paths
+from tests.cli.command import ROSAFE, environment, rosafe
+from tests.harness import ROOT, Graph, free_port
+
+EVERYTHING = ["python", "numbers", "kernels", "sound files", "ROS", "messages", "master", "alsaaudio"]
+EVERYTHING += ["sound devices", "HTTP server", "Tcl", "plots"]
+
+
+def findings(done: subprocess.CompletedProcess[str]) -> dict[str, dict[str, str]]:
+    """The checks by name; the exit code fits them."""
+    told: dict[str, Any] = json.loads(done.stdout)
+    assert told["ok"] == (done.returncode == 0) == all(check["state"] != "MISSING" for check in told["checks"])
+    return {check["name"]: check for check in told["checks"]}
+
+
+def python(program: str, *options: str, **env: str) -> subprocess.CompletedProcess[str]:
+    """Run a Python program that has the checkout on its path."""
+    return subprocess.run(
+        ["/usr/bin/python3", *options, "-c", program],
+        env=environment(PYTHONPATH=str(ROOT), **env),
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+
+
+def test_all_is_there() -> None:
+    done = rosafe("doctor", "--json", ROS_MASTER_URI=f"http://127.0.0.1:{free_port()}")
+    assert done.returncode == 0, done
+    found = findings(done)
+    assert list(found) == EVERYTHING
+    assert "3.11" in found["python"]["detail"] and "/usr/bin/python3" in found["python"]["detail"]
+    assert "numpy" in found["numbers"]["detail"] and "scipy" in found["numbers"]["detail"]
+    assert found["alsaaudio"]["state"] == "ok" and str(paths.PYPI_DIR) in found["alsaaudio"]["detail"]
+    assert found["master"]["state"] == "note" and "roscore" in found["master"]["detail"]
+
+
+def test_one_line_each() -> None:
+    done = rosafe("doctor", ROS_MASTER_URI=f"http://127.0.0.1:{free_port()}")
+    lines = done.stdout.splitlines()
+    assert (done.returncode, done.stderr, len(lines)) == (0, "", len(EVERYTHING))
+    for name, line in zip(EVERYTHING, lines, strict=True):
+        state, rest = line.split(maxsplit=1)
+        assert state in ("ok", "note")
+        assert rest.startswith(name)
+
+
+def test_master_is_there(graph: Graph) -> None:
+    found = findings(rosafe("doctor", "--json", ROS_MASTER_URI=graph.uri))
+    assert (found["master"]["state"], found["master"]["detail"]) == ("ok", f"answers at {graph.uri}")
+
+
+def test_messages_of_this_shell(graph: Graph, tmp_path: Path) -> None:
+    """As env.sh sets it up, as a bare shell is, and as another checkout would set it up."""
+    paths_of_env = graph.env["PYTHONPATH"]
+    found = findings(rosafe("doctor", "--json", PYTHONPATH=paths_of_env))["messages"]
+    assert found["state"] == "ok" and found["detail"].startswith("fresh")
+    found = findings(rosafe("doctor", "--json"))["messages"]
+    assert found["state"] == "note" and found["todo"] == f". {ROOT}/scripts/env.sh"
+    (tmp_path / "rosAFE" / "msg").mkdir(parents=True)
+    (tmp_path / "rosAFE" / "msg" / "__init__.py").touch()
+    found = findings(rosafe("doctor", "--json", PYTHONPATH=f"{tmp_path}:{paths_of_env}"))["messages"]
+    assert found["state"] == "note" and f"this shell has others, in {tmp_path}" in found["detail"]
+
+
+def test_nothing_is_there() -> None:
+    """Python without Debian's packages, where also nothing can be generated."""
+    done = subprocess.run(
+        ["/usr/bin/python3", "-S", str(ROSAFE), "doctor", "--json"],
+        env=environment(),
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 1, done
+    found = findings(done)
+    assert list(found) == EVERYTHING
+    for name, package in {
+        "numbers": "python3-numpy",
+        "sound files": "python3-soundfile",
+        "ROS": "python3-rospy",
+        "HTTP server": "python3-aiohttp",
+        "plots": "python3-matplotlib",
+    }.items():
+        assert found[name]["state"] == "MISSING"
+        assert package in found[name]["detail"]
+        assert found[name]["todo"] == f"run {ROOT}/scripts/install"
+    assert found["messages"]["state"] == "MISSING"
+    assert "Traceback" not in done.stderr
+
+
+def test_alsaaudio_of_debian_cannot_capture(tmp_path: Path) -> None:
+    (tmp_path / "alsaaudio.py").write_text("PCM_CAPTURE = 1\n")
+    program = (
+        "import pathlib, sys; from rosafe import cli; from rosafe.ros import paths;"
+        f"paths.PYPI_DIR = pathlib.Path({str(tmp_path)!r}); sys.exit(cli.main(['doctor', '--json']))"
+    )
+    done = python(program)
+    assert done.returncode == 1, done
+    found = findings(done)["alsaaudio"]
+    assert found["state"] == "MISSING" and "0.8, which cannot capture" in found["detail"]
+    assert "scripts/install" in found["todo"]
+
+
+def test_a_package_that_is_broken(tmp_path: Path) -> None:
+    (tmp_path / "soundfile.py").write_text("raise OSError('sndfile library\\nnot found')\n")
+    done = rosafe("doctor", "--json", PYTHONPATH=str(tmp_path))
+    assert done.returncode == 1, done
+    found = findings(done)["sound files"]
+    assert found["detail"] == "soundfile (python3-soundfile): sndfile library not found"
+
+
+def test_another_python(tmp_path: Path) -> None:
+    program = (
+        "import sys; sys.executable = '/opt/python3.13'; from rosafe import cli;"
+        "sys.exit(cli.main(['doctor', '--json']))"
+    )
+    found = findings(python(program))["python"]
+    assert found["state"] == "MISSING" and "/usr/bin/python3" in found["todo"]
