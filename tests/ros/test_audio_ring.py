@@ -197,7 +197,7 @@ class RingMachine(RuleBasedStateMachine):
             assert getattr(counters, name) == getattr(model, name), name
 
 
-RingMachine.TestCase.settings = settings(max_examples=150, stateful_step_count=30, deadline=None)
+RingMachine.TestCase.settings = settings(max_examples=80, stateful_step_count=30, deadline=None)
 TestRing = RingMachine.TestCase
 
 

@@ -80,8 +80,8 @@ def test_a_publisher_that_dies_and_comes_back_is_picked_up(fresh: Session) -> No
 
 def test_an_index_that_falls_and_one_that_leaps(fresh: Session) -> None:
     microphone = fresh.build("PreProc", block=BLOCK)
-    microphone.play(noise(2 * BLOCK, 1))
-    fresh.read("preProc", 2 * BLOCK + 1)
+    microphone.play(noise(3 * BLOCK, 1))
+    fresh.read("preProc", 3 * BLOCK + 1)
     microphone.index = 0
     back = noise(4000, 2)
     microphone.play(back)

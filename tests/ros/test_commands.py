@@ -1,0 +1,167 @@
+"""ROS' own commands on the node, as a user types them: rosservice, rostopic, rosnode, rosmsg; bass plays its scene."""
+
+from __future__ import annotations
+
+import re
+import signal
+from collections.abc import Iterator
+
+import pytest
+
+from rosafe.interface import KINDS, ROSAFE, ros_type
+from tests.harness import Graph, run_together, wait_for
+
+PORTS = {
+    f"/rosAFE/{port.name}" + ("/" + ROSAFE.service(kind.request).parameter("name").default if port.multiple else ""): (
+        "rosAFE/" + ros_type(port.idl)
+    )
+    for kind in KINDS.values()
+    for port in [ROSAFE.port(kind.port)]
+}
+
+
+@pytest.fixture(scope="module")
+def session(graph: Graph) -> Iterator[Graph]:
+    """The guide's session, made with `rosservice call`: bass plays its scene, and all seven kinds of processors run."""
+    with graph.node("bass-ros"), graph.node("rosAFE-ros") as process:
+        call(graph, "/rosAFE/connect_port", "{local: Audio, remote: bass/Audio}")
+        call(graph, "/bass/Acquire", "{device: 'scene:', sampleRate: 20000, nFramesPerChunk: 1000}")
+        call(graph, "/rosAFE/InputProc", "{nFramesPerBlock: 2000}")
+        call(graph, "/rosAFE/PreProc", "{name: preProc, upperDepName: input, pp_middleEarModel: jespen}")
+        call(graph, "/rosAFE/GammatoneProc", "{name: gammatone, upperDepName: preProc, fb_nChannels: 4}")
+        call(graph, "/rosAFE/IhcProc", "{}")
+        for request in ("IldProc", "RatemapProc", "CrossCorrelationProc"):
+            call(graph, f"/rosAFE/{request}", "{}")
+        yield graph
+        assert "Traceback" not in process.err
+
+
+def call(graph: Graph, service: str, values: str) -> str:
+    """What `rosservice call` prints for a request that succeeds."""
+    said = graph.run("rosservice", "call", service, values).stdout
+    assert "genom_success: True" in said, said
+    return said
+
+
+def follow(graph: Graph, pattern: str, *command: str) -> str:
+    """The first line of an endless command that fits `pattern`; then it is interrupted, as with Ctrl-C."""
+    with graph.start(*command, PYTHONUNBUFFERED="1") as process:
+
+        def found() -> re.Match[str] | None:
+            return re.search(pattern, process.out)
+
+        wait_for(found, 30, lambda: str(process))
+        process.stop(signal.SIGINT)
+        line = found()
+    assert line is not None
+    return line[0]
+
+
+def test_rosservice_list_type_info_find_args(session: Graph) -> None:
+    def run(*arguments: str) -> list[str]:
+        return session.run("rosservice", *arguments).stdout.split("\n")
+
+    services = [f"/rosAFE/{service.name}" for service in ROSAFE.services]
+    assert set(services) <= set(run("list"))
+    assert run("type", "/rosAFE/GammatoneProc")[0] == "rosAFE/GammatoneProc"
+    assert "/rosAFE/IldProc" in run("find", "rosAFE/IldProc")
+    information = run("info", "/rosAFE/IldProc")
+    assert {"Node: /rosAFE", "Type: rosAFE/IldProc"} <= set(information)
+    assert "Args: name upperDepName ild_wname ild_wSizeSec ild_hSizeSec" in information
+
+
+def test_rosservice_call_shows_parameters_and_refusals(session: Graph) -> None:
+    said = call(session, "/rosAFE/getParameters", "{}")
+    assert "fb_nChannels: 4" in said and 'pp_middleEarModel: "jepsen"' in said
+    said = call(session, "/rosAFE/getDependencies", "{nameProc: ratemap}")
+    assert re.findall(r"- (\w+)", said.replace('"', "")) == ["input", "preProc", "gammatone", "ihc", "ratemap"]
+    for values, ex in (
+        ("{name: again, upperDepName: nobody}", "e_noUpperDependencie"),
+        ("{}", "e_existsAlready"),
+    ):
+        said = session.run("rosservice", "call", "/rosAFE/IldProc", values).stdout
+        assert "genom_success: False" in said and f"::rosAFE::{ex}" in said
+
+
+def test_rostopic_list_type_info_find(session: Graph) -> None:
+    listed = session.run("rostopic", "list").stdout.split()
+    assert set(PORTS) <= set(listed)
+    assert {f"/rosAFE/IldProc/{part}" for part in ("goal", "cancel", "status", "feedback", "result")} <= set(listed)
+    types = run_together(len(PORTS), lambda i: session.run("rostopic", "type", list(PORTS)[i]).stdout.strip())
+    assert types == list(PORTS.values())
+    information = session.run("rostopic", "info", "/rosAFE/ildPort/ild").stdout
+    assert "Type: rosAFE/rosAFE_TimeFrequencySignalPortStruct" in information and "/rosAFE (http" in information
+    found = session.run("rostopic", "find", "rosAFE/rosAFE_CrossCorrelationSignalPortStruct").stdout.split()
+    assert found == ["/rosAFE/crossCorrelationPort/crosscorrelation"]
+
+
+def test_rostopic_echo(session: Graph) -> None:
+    said = session.run("rostopic", "echo", "-n", "1", "--noarr", "/rosAFE/ildPort/ild").stdout
+    assert "sampleRate: 100\n" in said and "framesOnPort: 100\n" in said and "numberOfChannels: 4\n" in said
+    index = session.run("rostopic", "echo", "-n", "1", "/rosAFE/inputProcPort/lastFrameIndex").stdout
+    assert int(index.split()[0]) % 1000 == 1
+    whole = session.run("rostopic", "echo", "-n", "1", "/rosAFE/ildPort/ild/left/dataN[0]/data").stdout
+    assert whole.count(",") == 99
+
+
+def test_rostopic_hz_and_bw_on_every_port(session: Graph) -> None:
+    """Ten blocks a second: hz must have seen about that; bw must have seen whole messages."""
+
+    def watch(index: int) -> tuple[str, str]:
+        topic = list(PORTS)[index]
+        return topic, follow(session, r"average rate: [\d.]+", "rostopic", "hz", "-w", "20", topic)
+
+    for topic, line in run_together(len(PORTS), watch):
+        assert 5 < float(line.split()[-1]) < 20, topic
+    bandwidth = follow(session, r"average: [\d.]+[KM]?B/s", "rostopic", "bw", "/rosAFE/gammatonePort/gammatone")
+    assert bandwidth.endswith("MB/s")
+
+
+def test_rosnode(session: Graph) -> None:
+    assert {"/rosAFE", "/bass"} <= set(session.run("rosnode", "list").stdout.split())
+    information = session.run("rosnode", "info", "/rosAFE").stdout
+    for name in (*PORTS, "/rosAFE/IldProc/goal", "/bass/Audio", "/rosAFE/kill"):
+        assert f" * {name}" in information
+    assert "xmlrpc reply" in session.run("rosnode", "ping", "-c", "1", "/rosAFE").stdout
+
+
+def test_rosmsg_and_rossrv_know_the_types(session: Graph) -> None:
+    shown = session.run("rosmsg", "show", "rosAFE/rosAFE_TimeFrequencySignalPortStruct").stdout
+    assert shown.splitlines()[:4] == [
+        "uint32 sampleRate",
+        "uint64 lastFrameIndex",
+        "uint64 framesOnPort",
+        "uint32 numberOfChannels",
+    ]
+    shown = session.run("rossrv", "show", "rosAFE/IhcProc").stdout
+    assert shown.strip().splitlines() == [
+        "string name",
+        "string upperDepName",
+        "string ihc_method",
+        "---",
+        "bool genom_success",
+        "string genom_exdetail",
+    ]
+
+
+def test_goals_from_the_shell(session: Graph) -> None:
+    """A goal is a message like any other: rostopic pub starts a processor, and another one cancels it."""
+    goal = "{goal_id: {id: shell}, goal: {name: from_shell, upperDepName: ihc}}"
+    with session.start("rostopic", "pub", "-l", "/rosAFE/IldProc/goal", "rosAFE/IldProcActionGoal", goal):
+        wait_for(lambda: "/rosAFE/ildPort/from_shell" in session.topics(), 20)
+        session.run("rostopic", "pub", "-1", "/rosAFE/IldProc/cancel", "actionlib_msgs/GoalID", "{id: shell}")
+        wait_for(lambda: "/rosAFE/ildPort/from_shell" not in session.topics(), 20)
+
+
+def test_rosnode_kill(graph: Graph) -> None:
+    with graph.node("rosAFE-ros", "-i", "victim") as process:
+        graph.run("rosnode", "kill", "/victim")
+        assert process.wait(8.0) == 0
+        assert "Traceback" not in process.err
+        assert "/victim" not in graph.nodes()
+
+
+def test_the_kill_request(graph: Graph) -> None:
+    with graph.node("rosAFE-ros", "-i", "victim") as process:
+        call(graph, "/victim/kill", "{}")
+        assert process.wait(5.0) == 0
