@@ -1,6 +1,7 @@
 """Tell what is there of all that running needs.
 
-With what to do about the rest. One line for each thing: `ok`, `note` (not needed by everything, or not now) or `MISSING`."""
+With what to do about the rest. One line for each thing: `ok`, `note` (not needed by everything, or not now), or
+`MISSING`."""
 
 from __future__ import annotations
 
