@@ -26,11 +26,11 @@ def copy() -> Iterator[Path]:
 
 
 def sourced(
-    shell: str, commands: str, cwd: Path = Path("/"), env: dict[str, str] | None = None
+    shell: str, commands: str, cwd: Path = Path("/"), env: dict[str, str] | None = None, within: bool = False
 ) -> subprocess.CompletedProcess[str]:
     if shutil.which(shell) is None:
         pytest.skip(f"{shell} is not installed; scripts/install --tests brings it")
-    if shell == "dash" and cwd == Path("/") and not Path("/proc/self/fd").exists():
+    if shell == "dash" and not within and not Path("/proc/self/fd").exists():
         pytest.skip("without /proc, dash finds env.sh only from within the checkout")
     return run(shell, "-c", commands, env=env or environment(), cwd=cwd)
 
@@ -78,7 +78,8 @@ def test_twice_is_once(copy: Path, shell: str) -> None:
     ],
 )
 def test_from_anywhere(copy: Path, shell: str, folder: str, command: str) -> None:
-    done = sourced(shell, command.replace("{show}", SHOW) + ("" if "{show}" in command else f"; {SHOW}"), copy / folder)
+    commands = command.replace("{show}", SHOW) if "{show}" in command else f"{command}; {SHOW}"
+    done = sourced(shell, commands, copy / folder, within=True)
     assert variables(done)["PATH"].split(":")[0] == f"{copy}/scripts"
 
 
