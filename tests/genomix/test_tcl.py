@@ -76,8 +76,10 @@ def test_every_service_and_port_is_a_command(world: World) -> None:
     script = (
         LOAD
         + """
-        foreach name {InputProc getSignals getSignal Gammatone Ratemap CrossCorrelation kill abort_activity connect_service
-                ratemapProcPort genom_state Audio dataObj crossCorrelationPort} {
+        foreach name {
+            InputProc getSignals getSignal Gammatone Ratemap CrossCorrelation kill abort_activity connect_service
+            ratemapProcPort genom_state Audio dataObj crossCorrelationPort
+        } {
             if {[info commands ::rosAFE::$name] eq ""} {error "no $name"}
         }
         show [dict get [rosAFE::genom_state] genom_state task 0 name]
@@ -235,7 +237,8 @@ def test_awkward_texts_arrive_as_they_are_and_nothing_is_evaluated(world: World)
         }
         bass::Acquire scene:
         rosAFE::InputProc
-        lassign [failure {rosAFE::modifyParameter {nameProc input nameParam in_doNormalize newValue {[exit 3]}}}] message
+        set change {nameProc input nameParam in_doNormalize newValue {[exit 3]}}
+        lassign [failure {rosAFE::modifyParameter $change}] message
         show [dict get $message ex] [string match {*\[exit 3\]*} [dict get $message detail what]]
     """
     )
@@ -291,13 +294,15 @@ def test_errors_of_the_component(world: World) -> None:
         + """
         show {*}[failure {rosAFE::removeProcessor nobody}]
         lassign [failure {rosAFE::GammatoneProc {name h fb_nERBs -1}}] message code
-        show [dict get $message ex] [dict get $message detail what] [lrange $code 0 1]
+        show [dict get $message ex] [dict get $message detail what]
+        show [lrange $code 0 1]
         try {rosAFE::PreProc} trap {GENOM ::rosAFE::e_existsAlready} message {show trapped $message}
     """
     )
     assert world.lines(script) == [
         "ex ::rosAFE::e_noSuchProcessor|GENOM ::rosAFE::e_noSuchProcessor {}",
-        "::rosAFE::e_badNewValue|fb_nERBs: -1 is out of range, allowed is more than 0 to 100|GENOM ::rosAFE::e_badNewValue",
+        "::rosAFE::e_badNewValue|fb_nERBs: -1 is out of range, allowed is more than 0 to 100",
+        "GENOM ::rosAFE::e_badNewValue",
         "trapped|ex ::rosAFE::e_existsAlready",
     ]
 
@@ -361,7 +366,8 @@ def test_callbacks_on_success_and_error_in_the_event_loop(world: World) -> None:
         + """
         proc done {args} {
             set request [lindex $args end]
-            lappend ::log [lrange $args 0 end-1] [$request status] [catch {$request result} result] [dict get $result {*}$::key]
+            lappend ::log [lrange $args 0 end-1] [$request status] [catch {$request result} result]
+            lappend ::log [dict get $result {*}$::key]
             incr ::count
         }
         proc bgerror {message} {lappend ::log $message; incr ::count}
@@ -513,7 +519,12 @@ def test_localhost_is_a_private_server_that_dies_with_us(world: World) -> None:
 def test_help_tells_types_defaults_ranges_and_texts(world: World) -> None:
     script = (
         LOAD
-        + "puts [rosAFE::PreProc -h]\nputs [rosAFE::connect_port -help]\nputs [rosAFE::ildPort -h]\nputs [bass::Stop -h]\n"
+        + """
+        puts [rosAFE::PreProc -h]
+        puts [rosAFE::connect_port -help]
+        puts [rosAFE::ildPort -h]
+        puts [bass::Stop -h]
+    """
     )
     told = world.tcl(script).stdout
     for line in (
