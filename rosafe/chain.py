@@ -15,53 +15,10 @@ from rosafe.interface import KINDS, ComponentError
 from rosafe.tree import Processor, Tree
 from rosafe.tree.zone import Block
 
-_PARAMETERS = {name: p for kind in KINDS.values() for p in kind.parameters for name in (p.name, *p.aliases)}
-
-
-# --- arguments ---
-
-
-def check_parameters(parameters: Any) -> dict[str, Any]:
-    """Real names and checked values of a dict of parameters (None: an empty one), or ValueError."""
-    if parameters is None:
-        return {}
-    if not isinstance(parameters, Mapping):
-        raise ValueError(f"parameters: {type(parameters).__name__} is not a dict of names and values")
-    return dict(check_parameter(name, value) for name, value in parameters.items())
-
-
-def check_parameter(name: Any, value: Any, text: bool = False) -> tuple[str, Any]:
-    """The real name and the checked value of one parameter, or ValueError; `value` may be given as `text`."""
-    if not isinstance(name, str) or name not in _PARAMETERS:
-        known = ", ".join(p.name for kind in KINDS.values() for p in kind.parameters)
-        raise ValueError(f"unknown parameter {name!r}; there are: {known}")
-    parameter = _PARAMETERS[name]
-    checked = parameter.parse(value) if text else parameter.check(value)
-    if checked == "jespen" and "jepsen" in parameter.choices:  # the guide's slip
-        checked = "jepsen"
-    if parameter.choices and checked not in parameter.choices:
-        raise ValueError(f"{name}: {checked!r} is not {parameter.range_text}")
-    return parameter.name, checked
-
-
-def check_outputs(outputs: Any) -> list[str]:
-    """The outputs to keep, each once, in the order of the chain (None: all), or ValueError."""
-    try:
-        wanted = [outputs] if isinstance(outputs, str) else list(KINDS if outputs is None else outputs)
-    except TypeError:
-        raise ValueError(f"outputs: {outputs!r} is not a sequence of names") from None
-    for name in wanted:
-        if not isinstance(name, str) or name not in KINDS:
-            raise ValueError(f"unknown output {name!r}; there are: {', '.join(KINDS)}")
-    return [kind for kind in KINDS if kind in wanted]
-
 
 def lags(count: int, sample_rate: float) -> np.ndarray:
     """The `count` lags of a cross-correlation, (count,) in seconds, zero in the middle."""
     return np.arange(-(count // 2), count // 2 + 1) / sample_rate
-
-
-# --- the tree ---
 
 
 class _GatedSource:
@@ -126,9 +83,9 @@ class Chain:
     sample_rate : float
         In Hz.
     parameters : mapping
-        From `check_parameters`.
+        From `rosafe.arguments.check_parameters`.
     outputs : sequence of str
-        From `check_outputs`.
+        From `rosafe.arguments.check_outputs`.
     keep : callable
         Called with the output's name and each block of it, on a thread of that output's own, while the chain goes on
         with the next block; it does not go on beyond that, so memory is bounded. What it raises ends the run.

@@ -15,8 +15,9 @@ from typing import Any
 
 import numpy as np
 
+from rosafe.arguments import check_outputs, check_parameters
 from rosafe.audiofile import AudioFile, AudioFileError
-from rosafe.chain import Chain, check_outputs, check_parameters
+from rosafe.chain import Chain
 from rosafe.interface import KINDS
 from rosafe.npz import NpzWriter
 from rosafe.offline import DEFAULT_BLOCK

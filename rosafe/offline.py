@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from rosafe.chain import Chain, check_outputs, check_parameter, check_parameters, lags
+from rosafe.arguments import check_outputs, check_parameter, check_parameters
+from rosafe.chain import Chain, lags
 from rosafe.interface import REQUIRED, Parameter
 from rosafe.tree.zone import Block
 

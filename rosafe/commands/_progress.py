@@ -53,7 +53,8 @@ class Display:
         """A line that stays."""
         self.clear()
         self._write(text + "\n")
-        self._due = min(self._due, time.monotonic()) if self._live else self._due
+        if self._live:
+            self._due = 0.0  # draw it again at once
 
     def clear(self) -> None:
         """Take the live line away."""

@@ -173,7 +173,8 @@ def _devices() -> Finding:
 
 
 def _kernels() -> Finding:
-    if importlib.util.find_spec("rosafe.dsp.kernels") is None:
+    spec = importlib.util.find_spec("rosafe.dsp.kernels")
+    if spec is None or spec.origin is None:
         return Finding(NOTE, "there are no compiled kernels; numpy and scipy do the work")
     return Finding(OK, str(importlib.import_module("rosafe.dsp.kernels").status()))
 

@@ -17,6 +17,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from rosafe.arguments import check_outputs, check_parameter
 from rosafe.commands import Failure
 from rosafe.commands._progress import Display, bytes_text
 from rosafe.commands._workers import Interrupted, Report, Signals, run_together
@@ -147,17 +148,16 @@ def run(options: argparse.Namespace) -> int:
     if not inputs:
         options.usage_error("no sound file is named")
     targets, named = _targets(inputs, options.output)
+    try:
+        parameters = dict(check_parameter(*_name_and_value(setting), text=True) for setting in options.settings)
+        outputs = check_outputs(_words(options.outputs) if options.outputs is not None else None)
+    except ValueError as problem:
+        raise Failure(str(problem)) from None
     signals = Signals()
     # Once, for all processes that are forked from this one.
     from rosafe.audiofile import AudioFileError
-    from rosafe.chain import check_outputs, check_parameter
     from rosafe.files import OutputError, process_file
 
-    try:
-        parameters = dict(check_parameter(*_name_and_value(setting), text=True) for setting in options.settings)
-        outputs = check_outputs(options.outputs.split(",") if options.outputs is not None else None)
-    except ValueError as problem:
-        raise Failure(str(problem)) from None
     works = [
         partial(process_file, source, target, parameters, options.block, outputs, named or options.force)
         for source, target in zip(inputs, targets, strict=True)
@@ -212,6 +212,10 @@ def _targets(inputs: list[Path], output: str | None) -> tuple[list[Path], bool]:
 def _name_and_value(setting: str) -> tuple[str, str]:
     name, _, value = setting.partition("=")
     return name, value
+
+
+def _words(text: str) -> list[str]:
+    return [word.strip() for word in text.split(",")]
 
 
 def _size(path: Path) -> float:
