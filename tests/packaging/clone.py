@@ -33,10 +33,17 @@ def environment(**more: str) -> dict[str, str]:
     return {"PATH": "/usr/local/bin:/usr/bin:/bin", "HOME": "/nonexistent", **more}
 
 
-def run(*command: str | Path, env: dict[str, str], cwd: Path = Path("/")) -> subprocess.CompletedProcess[str]:
+def run(
+    *command: str | Path, env: dict[str, str], cwd: Path = Path("/"), seconds: int = 120
+) -> subprocess.CompletedProcess[str]:
     """Run a command to its end, whatever that is."""
     return subprocess.run(
-        ["/usr/bin/timeout", "120", *map(str, command)], env=env, cwd=cwd, text=True, capture_output=True, check=False
+        ["/usr/bin/timeout", str(seconds), *map(str, command)],
+        env=env,
+        cwd=cwd,
+        text=True,
+        capture_output=True,
+        check=False,
     )
 
 

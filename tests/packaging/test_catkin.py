@@ -16,6 +16,7 @@ from rosafe.ros import generate
 from tests.harness import PYTHON, Graph, MasterProcess, wait_for
 from tests.packaging.clone import environment, fresh_copy, run
 
+pytestmark = pytest.mark.timeout(400)  # the build, where the processors have other work
 NEEDED = ("catkin_make", "cmake", "make", "cc")
 
 
@@ -35,6 +36,7 @@ def workspace() -> Iterator[Path]:
             *("catkin_make", "-C", folder, "install", f"-DPYTHON_EXECUTABLE={PYTHON}"),
             env=environment(HOME=str(folder), ROS_LANG_DISABLE="genlisp:gencpp"),
             cwd=folder,
+            seconds=360,
         )
         assert done.returncode == 0, done.stdout[-5000:] + done.stderr[-5000:]
         assert "CMake Warning" not in done.stderr.replace("CMake Deprecation Warning", ""), done.stderr

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.harness import PYTHON, ROOT, Graph, run_together, wait_for
+from tests.harness import PYTHON, ROOT, Graph, run_together
 from tests.packaging.clone import environment, fresh_copy, generate, run, without_rights
 
 IMPORT = (
@@ -237,8 +237,3 @@ def test_quick_when_fresh(copy: Path) -> None:
     assert run(*generate(copy), env=environment()).returncode == 0
     code = "import sys; from rosafe.ros import generate; generate.ensure_messages(); print('genpy' in sys.modules)"
     assert run(PYTHON, "-c", code, env=environment(PYTHONPATH=str(copy))).stdout == "False\n"
-
-
-def test_wait_for_is_bounded() -> None:
-    with pytest.raises(AssertionError, match="not within 0"):
-        wait_for(lambda: False, 0.05, "never")

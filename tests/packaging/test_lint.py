@@ -78,10 +78,3 @@ def test_every_python_file_says_what_lives_there() -> None:
     for path in tracked():
         if path.suffix == ".py":
             assert first_line(path).startswith('"""'), path
-
-
-def test_no_private_names_of_a_machine() -> None:
-    for path in tracked():
-        if path.suffix in (".py", ".sh", ".md", ".toml", ".xml", ".txt", ".tcl", "") and path.name != "test_lint.py":
-            text = path.read_text("utf-8", "replace")
-            assert not any(word in text for word in ("/work/main", "/work/shared", "/root/.pyenv")), path
