@@ -21,12 +21,14 @@ import diagnostic_updater
 import rosgraph
 import rospy
 from actionlib_msgs.msg import GoalStatus
+from rospy.impl import tcpros_base
 
 from rosafe import __version__, interface
 from rosafe.interface import ComponentError
 from rosafe.ros.activities import Activities, Activity, Handler, TaskMeter
 from rosafe.ros.master import MasterError, check_master
 
+BACKLOG = 128  # connections that wait to be accepted
 STATE_PERIOD = 0.9  # seconds between two genom_state messages at the most; the contract is 1
 BURST_SECONDS = 0.005  # what changes within this makes one message, not one each
 DIAGNOSTICS_PERIOD = 1.0
@@ -64,6 +66,7 @@ class ComponentNode:
         self._turn = threading.Event()
         self._keep: list[Any] = []  # services and action servers, alive as long as the node
         self._digest = _digest(component)
+        _lengthen_backlog()
         rospy.set_param(f"{self.name}/actionlib_status_frequency", 0)  # status is published on change only
         self.function("connect_port", self._connect_port)
         self.function("connect_service", self._connect_service)
@@ -304,6 +307,13 @@ _DATE = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(os.path.getmtime(interfa
 def _digest(component: interface.Component) -> str:
     """A fingerprint of the interface, 32 hex digits."""
     return hashlib.md5(re.sub(r" at 0x\w+", "", repr(component)).encode()).hexdigest()
+
+
+def _lengthen_backlog() -> None:
+    """Let more clients connect at the same time than rospy's five: TCP tries again only after a whole second."""
+    server = tcpros_base.init_tcpros_server().tcp_ros_server
+    if server is not None:
+        server.server_sock.listen(BACKLOG)
 
 
 def _check_master() -> None:

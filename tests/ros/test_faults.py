@@ -4,12 +4,21 @@ from __future__ import annotations
 
 import json
 import os
+import random
 import signal
+import socket
+import xmlrpc.client
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
-from tests.harness import PYTHON, ROOT, Graph, MasterProcess, Process, wait_for
-from tests.ros.session import Session, noise, own_node
+import rosgraph
+import rosservice
+
+from rosafe.interface import KINDS
+from tests.harness import PYTHON, ROOT, Graph, MasterProcess, Process, run_together, wait_for
+from tests.ros.session import Session, noise, own_node, told
 
 BLOCK = 2000
 
@@ -29,6 +38,11 @@ def reader(graph: Graph, topic: str) -> Process:
     return process
 
 
+def reads(process: Process, index: int) -> None:
+    """Wait until a reader has got the message with that index."""
+    wait_for(lambda: str(index) in process.out.split(), what=lambda: f"{index} in {process.out}")
+
+
 def test_a_subscriber_that_stops_reading_holds_nobody_up(afe: Session) -> None:
     """It is stopped amid messages of 5 MB; the tree, another subscriber and all requests go on; then it is killed."""
     microphone = afe.build("PreProc", "GammatoneProc", block=BLOCK, fb_nChannels=16)
@@ -37,29 +51,24 @@ def test_a_subscriber_that_stops_reading_holds_nobody_up(afe: Session) -> None:
         os.kill(stuck.pid, signal.SIGSTOP)
         for block in range(1, 13):
             microphone.play(noise(BLOCK))
-            wait_for(lambda index=str(block * BLOCK + 1): index in well.out.split(), what=lambda: well.out)
+            reads(well, block * BLOCK + 1)
         afe.ok("removeProcessor", name="gammatone")
         assert topic not in afe.graph.topics()
         afe.ok("GammatoneProc", fb_nChannels=16)
         microphone.play(noise(BLOCK))
-        wait_for(lambda: str(13 * BLOCK + 1) in well.out.split(), what="the new processor, to the one that reads")
+        reads(well, 13 * BLOCK + 1)
         os.kill(stuck.pid, signal.SIGKILL)
         microphone.play(noise(BLOCK))
-        wait_for(lambda: str(14 * BLOCK + 1) in well.out.split())
+        reads(well, 14 * BLOCK + 1)
 
 
 def test_a_subscriber_that_is_killed_is_forgotten(afe: Session) -> None:
     microphone = afe.build("PreProc", "GammatoneProc", block=BLOCK, fb_nChannels=16)
 
     def connections() -> int:
-        """TCP connections to this topic, as the node itself tells (getBusInfo)."""
-        import xmlrpc.client
-
-        import rosgraph
-
-        address = rosgraph.Master("/harness").lookupNode("/rosAFE")
-        info = xmlrpc.client.ServerProxy(address).getBusInfo("/harness")[2]  # type: ignore[index]
-        return sum(entry[4] == afe.topic("gammatone") for entry in info)
+        """TCP connections to this topic, as the node itself tells."""
+        node: Any = xmlrpc.client.ServerProxy(rosgraph.Master("/harness").lookupNode("/rosAFE"))
+        return sum(entry[4] == afe.topic("gammatone") for entry in node.getBusInfo("/harness")[2])
 
     with reader(afe.graph, afe.topic("gammatone")) as process:
         assert connections() == 1
@@ -83,10 +92,8 @@ def test_bass_is_killed_and_comes_back(graph: Graph) -> None:
         before = afe.read("preProc").lastFrameIndex
         with graph.node("bass-ros"):
             assert graph.call("/bass/Acquire", device="scene:", sampleRate=20000, nFramesPerChunk=1000).genom_success
-            message = wait_for(
-                lambda: next((m for m in [afe.read("preProc")] if 0 < m.lastFrameIndex < before), None), timeout=20
-            )
-            assert (message.lastFrameIndex - 1) % BLOCK == 0
+            wait_for(lambda: 1 < afe.read("preProc").lastFrameIndex < before, timeout=20)
+            assert (afe.read("preProc").lastFrameIndex - 1) % BLOCK == 0
             health = afe.health(lambda entries: int(entries["streams"]) > 1)
             assert health["lost"] == "0"
         assert "Traceback" not in afe.process.err
@@ -147,6 +154,59 @@ def test_cycles_of_creation_and_removal_leave_nothing(afe: Session) -> None:
     assert threads_and_memory(afe.process.pid)[1] < memory + 2**24
     microphone.play(noise(BLOCK))
     afe.read("preProc", 2 * BLOCK + 1)
+
+
+def test_anything_at_all_from_eight_clients(afe: Session) -> None:
+    """Random requests at the same time; in the end, processors, activities and ports still tell the same."""
+    microphone = afe.listen()
+    names = [f"n{number}" for number in range(6)]
+    changes = [("ihc_method", "hilbert"), ("ild_hSizeSec", "0.005"), ("fb_nChannels", "3"), ("pp_bRemoveDC", "1")]
+
+    def work(number: int) -> None:
+        chance = random.Random(number)
+        for _ in range(60):
+            name, other = chance.choice(names), chance.choice(names)
+            parameter, value = chance.choice(changes)
+            requests: list[tuple[str, dict[str, Any]]] = [
+                ("InputProc", {"name": name, "nFramesPerBlock": chance.choice([500, BLOCK])}),
+                ("GammatoneProc", {"name": name, "upperDepName": other, "fb_nChannels": 2}),
+                *((r, {"name": name, "upperDepName": other}) for r in ("PreProc", "IhcProc", "IldProc", "RatemapProc")),
+                ("modifyParameter", {"nameProc": name, "nameParam": parameter, "newValue": value}),
+                ("removeProcessor", {"name": name}),
+                ("getDependencies", {"nameProc": name}),
+                ("abort_activity", {"activity": chance.randrange(1, 200)}),
+                ("getSignals", {}),
+                ("getParameters", {}),
+                ("Stop", {}),
+            ]
+            request, fields = chance.choice(requests)
+            response = afe.call(request, **fields)
+            if not response.genom_success:
+                told(response)
+        microphone.play(noise(500, number))
+
+    run_together(8, work)
+    there = afe.processors()
+    afe.wait_activities([KINDS[kind].request for kind, members in there.items() for _ in members])
+    topics = {afe.topic(kind, name) for kind, members in there.items() for name in members if kind != "input"}
+    assert {t for t in afe.graph.topics() if "Port/" in t and t.startswith("/rosAFE/")} == topics
+    for members in there.values():
+        for name in members:
+            chain = afe.ok("getDependencies", nameProc=name).dependencies
+            assert chain[-1] == name and chain[0] == there["input"][0]
+
+
+def test_many_clients_may_connect_at_once(afe: Session) -> None:
+    """While the node is too busy to accept them (here: stopped), the system completes their connections."""
+    address = urlsplit(rosservice.get_service_uri("/rosAFE/getParameters"))
+    os.kill(afe.process.pid, signal.SIGSTOP)
+    try:
+        with ExitStack() as stack:
+            for _ in range(40):  # the sixth would have to try again after a second, with rospy's own backlog
+                stack.enter_context(socket.create_connection((address.hostname, address.port), timeout=0.9))
+    finally:
+        os.kill(afe.process.pid, signal.SIGCONT)
+    afe.build("PreProc")
 
 
 def test_all_slots_full_and_empty_again(afe: Session) -> None:
