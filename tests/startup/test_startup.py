@@ -270,8 +270,8 @@ def test_home_that_cannot_be_written(graph: Graph) -> None:
         temporary.mkdir()
         temporary.chmod(0o1777)
         command = [str(word) for word in without_rights(copy / "scripts" / "bass-ros", "-i", "poor")]
-        nowhere = {"HOME": "/nonexistent", "ROS_HOME": "/nonexistent/.ros", "TMPDIR": str(temporary), "PYTHONPATH": ""}
-        with graph.start(*command, **nowhere) as node:
+        poor = {"HOME": "/nonexistent", "ROS_HOME": "/nonexistent/.ros", "TMPDIR": str(temporary), "PYTHONPATH": ""}
+        with Process(command, {**graph.env, **poor}) as node:
             wait_for(lambda: "/poor/kill" in graph.services(), 20, lambda: str(node))
             assert "WARNING" not in node.err
             assert node.stop() == 0
