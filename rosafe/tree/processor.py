@@ -204,7 +204,7 @@ class Processor:
             self._listener.ended(self)
 
     def adopt(self, child: Processor) -> None:
-        """Take over a child of another processor: it finishes the block it works on, then waits for one from here."""
+        """Before the start: take over a child of another processor, from the next block that the child takes."""
         with self.turn:
             assert child.parent is not None
             child.parent.zone.detach(child)
@@ -212,7 +212,6 @@ class Processor:
             child.parent = self
             self.children.append(child)
             self.zone.attach(child)
-            child.turn.notify_all()
 
     def join(self, timeout: float | None = None) -> bool:
         """Wait for its thread; whether that has ended."""
@@ -233,9 +232,6 @@ class Processor:
         with self.turn:
             self._enter(State.DONE)
             self.zone.close()
-            if self.parent is not None:
-                self.parent.zone.detach(self)
-                self.parent.turn.notify_all()
             for child in self.children:
                 child.turn.notify_all()
         if self.error is not None:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from rosafe.dsp import STAGES
+from rosafe.interface import KINDS
 from rosafe.tree import Processor, Tree
 from rosafe.tree.zone import Block
 
@@ -130,6 +131,11 @@ class Plain:
     def process(self, block: np.ndarray) -> np.ndarray:
         self.work(block)
         return block
+
+
+def tree_threads() -> set[threading.Thread]:
+    """The threads of all processors of all trees, and of nobody else."""
+    return {thread for thread in threading.enumerate() if thread.name.split(":")[0] in KINDS}
 
 
 def use_plain_stages(patch: pytest.MonkeyPatch, **stages: type[Plain]) -> None:

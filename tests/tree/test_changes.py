@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rosafe.dsp import STAGES
+from rosafe.dsp import STAGES, InnerHairCell
 from rosafe.interface import KINDS, ComponentError
 from rosafe.tree import Processor, State, Tree
 from tests.dsp.bare import Chain, joined
@@ -362,6 +362,62 @@ def test_a_live_switch_to_the_envelope_and_back_loses_no_block(
     outputs = chain().run(list(NOISE[:8]), changes)
     for kind in ("ihc", *LEAVES):
         assert_as(listener, tree, kind, outputs)
+
+
+def test_a_block_that_is_on_its_way_without_the_envelope_goes_the_old_way(
+    tree: Tree, feed: Feed, listener: Recorder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The filterbank has computed the next block already when the method changes."""
+    working, go_on = threading.Event(), threading.Event()
+    original = InnerHairCell.process
+
+    def process(self: InnerHairCell, block: np.ndarray, *envelope: np.ndarray) -> np.ndarray:
+        working.set()
+        assert go_on.wait(WAIT_SECONDS)
+        return original(self, block, *envelope)
+
+    monkeypatch.setattr(InnerHairCell, "process", process)
+    grow(tree, feed)
+    filterbank, ihc = tree.find("gammatone"), tree.find("ihc")
+    feed.put(*NOISE[:2])
+    assert working.wait(WAIT_SECONDS)
+    wait_for(lambda: filterbank.state is State.WAIT_RELEASE)
+    tree.modify("ihc", "ihc_method", "hilbert")
+    feed.put(*NOISE[2:4])
+    go_on.set()
+    listener.wait_blocks(ihc, 4)
+    assert_as(listener, tree, "ihc", chain().run(list(NOISE[:4]), [(2, "ihc_method", "hilbert")]))
+
+
+def test_a_block_without_the_envelope_after_all_is_no_gap(
+    tree: Tree, feed: Feed, listener: Recorder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The filterbank has computed it for a method that then was not to be."""
+    working, go_on = threading.Event(), threading.Event()
+    original = InnerHairCell.process
+
+    def process(self: InnerHairCell, block: np.ndarray, *envelope: np.ndarray) -> np.ndarray:
+        if block[0, 0, 0] == first[0, 0, 0]:
+            working.set()
+            assert go_on.wait(WAIT_SECONDS)
+        return original(self, block, *envelope)
+
+    first = chain().run([NOISE[0]])[0]["gammatone"]
+    monkeypatch.setattr(InnerHairCell, "process", process)
+    grow(tree, feed)
+    filterbank, ihc = tree.find("gammatone"), tree.find("ihc")
+    tree.modify("ihc", "ihc_method", "hilbert")
+    feed.put(NOISE[0])
+    assert working.wait(WAIT_SECONDS)
+    tree.modify("ihc", "ihc_method", "fullwave")
+    feed.put(NOISE[1])
+    wait_for(lambda: filterbank.state is State.WAIT_RELEASE)
+    tree.modify("ihc", "ihc_method", "hilbert")
+    feed.put(NOISE[2])
+    go_on.set()
+    listener.wait_blocks(ihc, 3)
+    changes = [(0, "ihc_method", "hilbert"), (1, "ihc_method", "fullwave"), (2, "ihc_method", "hilbert")]
+    assert_as(listener, tree, "ihc", chain().run(list(NOISE[:3]), changes))
 
 
 def test_a_switch_while_blocks_are_on_their_way(tree: Tree, feed: Feed, listener: Recorder) -> None:

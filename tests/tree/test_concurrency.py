@@ -136,12 +136,16 @@ def test_nobody_waits_for_a_removed_child(
     other = tree.add("preProc", "other", "input")
     feed.put(count=5)
     assert working.wait(WAIT_SECONDS)
+    listener.wait_blocks(other, 1)
+    wait_for(lambda: (root.state, other.state) == (State.WAIT_RELEASE, State.WAIT_EXEC))
+    assert len(listener.blocks[root]) == 1
     assert tree.remove("slow") == [below, slow]
     assert listener.ends == [below, slow]
-    again = tree.add("preProc", "slow", "input")
     listener.wait_blocks(other, 5)
-    listener.wait_blocks(again, 4)
     assert len(listener.blocks[root]) == 5
+    again = tree.add("preProc", "slow", "input")
+    feed.put(count=1)
+    listener.wait_blocks(again, 2)
     assert not slow.join(0.0)
     go_on.set()
     assert slow.join(WAIT_SECONDS)

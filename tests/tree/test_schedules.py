@@ -126,6 +126,22 @@ def shrink(scheduler: Scheduler) -> Callable[[], None]:
     return check
 
 
+def leave(scheduler: Scheduler) -> Callable[[], None]:
+    """The only child goes: the input does not wait for it."""
+    log = Log()
+    tree = Tree(log)
+    root = tree.add_input("input", Numbers(scheduler, range(3)), 1, 0.0, 0.0)
+    child = tree.add("preProc", "child", "input")
+    tree.remove("child")
+
+    def check() -> None:
+        assert log.ends == [child]
+        log.assert_run(root, 0, 2)
+        log.assert_run(child, None, None)
+
+    return check
+
+
 def replace_input(scheduler: Scheduler) -> Callable[[], None]:
     """A new input takes over the tree: the child misses nothing of it, whatever it did for the old one."""
     log = Log()
@@ -188,7 +204,7 @@ def fail(scheduler: Scheduler) -> Callable[[], None]:
     return check
 
 
-@pytest.mark.parametrize(("scenario", "delays"), [(grow, 1), (shrink, 2), (replace_input, 2), (stop, 2)])
+@pytest.mark.parametrize(("scenario", "delays"), [(grow, 1), (shrink, 2), (leave, 2), (replace_input, 2), (stop, 2)])
 def test_any_order_of_events(scenario: Scenario, delays: int, use: Callable[[Any], None]) -> None:
     assert explore(scenario, use, delays, WALKS) > WALKS + 50
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -23,6 +23,7 @@ def numbered(rows: tuple[int, ...], sizes: list[int]) -> list[NDArray[np.float64
 
 @settings(deadline=None)
 @given(ROWS, st.integers(0, 80), SIZES)
+@example((2,), 70, [1] * (2 * MAX_PIECES + 10))
 def test_a_window_is_the_newest_frames_after_zeros(rows: tuple[int, ...], frames: int, sizes: list[int]) -> None:
     window = SlidingWindow(rows, frames)
     model = np.zeros((*rows, frames))
@@ -40,6 +41,7 @@ def test_a_window_is_the_newest_frames_after_zeros(rows: tuple[int, ...], frames
 
 @settings(deadline=None)
 @given(ROWS, st.integers(0, 80), st.lists(st.one_of(st.none(), st.integers(0, 40)), max_size=3 * MAX_PIECES))
+@example((2,), 70, [1] * (2 * MAX_PIECES + 10))
 def test_a_history_is_what_came_since_it_was_taken(
     rows: tuple[int, ...], capacity: int, steps: list[int | None]
 ) -> None:
@@ -60,6 +62,7 @@ def test_a_history_is_what_came_since_it_was_taken(
             model = model[..., max(0, model.shape[-1] - capacity) :]
     for view, expected in taken:
         assert view.shape == expected.shape
+        assert len(view.pieces) <= MAX_PIECES
         np.testing.assert_array_equal(view.array(), expected)
 
 
