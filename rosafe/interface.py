@@ -42,7 +42,9 @@ class ComponentError(Exception):
         body: dict[str, Any] = {"ex": self.ex}
         if self.detail:
             body["detail"] = self.detail
-        return json.dumps(body, separators=(",", ":"), ensure_ascii=False)
+        text = json.dumps(body, separators=(",", ":"), ensure_ascii=False)
+        # Half a surrogate pair has no UTF-8; as an escape it is valid JSON.
+        return text.encode("utf-8", "backslashreplace").decode()
 
 
 # --- vocabulary -------------------------------------------------------------------------------------------------

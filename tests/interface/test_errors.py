@@ -96,3 +96,8 @@ def test_parse_never_fails_in_another_way(text: str) -> None:
 @given(st.floats(1e-6, 60))
 def test_parse_reads_back_what_repr_writes(value: float) -> None:
     assert KINDS["ild"].parameter("ild_wSizeSec").parse(f" {value!r} ") == value
+
+
+def test_half_a_surrogate_pair_crosses_the_wire() -> None:
+    text = ROSAFE.error("e_badNewValue", what="\udc80 ü").exdetail
+    assert json.loads(text.encode().decode())["detail"]["what"] == "\udc80 ü"
