@@ -180,7 +180,11 @@ class Recorder:
 
     def representations(self) -> Representations:
         """What came so far, on one time axis: seconds of the audio stream."""
-        series = {kind: self.ports[kind].series() for kind in FRAMED}
+        series = {}
+        for kind in FRAMED:
+            times, data = self.ports[kind].series()
+            inside = times >= 1.5 / max(1, self.ports[kind].frame_rate)  # a window before that reaches before frame 1
+            series[kind] = times[inside], data[..., inside]
         return Representations.aligned(
             self.center_frequencies,
             self.lags,

@@ -1,0 +1,24 @@
+"""The documents agree with the code that they describe."""
+
+from __future__ import annotations
+
+import dataclasses
+
+from rosafe.ros.audio import RING_SECONDS, Counters
+from rosafe.view import reference
+from tests.harness import ROOT
+
+DOCS = ROOT / "docs"
+
+
+def test_parameters_are_those_of_the_interface_table() -> None:
+    current = (DOCS / "parameters.md").read_text("utf-8")
+    assert current == reference.markdown(), "run: python3 -m rosafe.view.reference > docs/parameters.md"
+
+
+def test_counters_of_the_audio_are_explained() -> None:
+    text = (DOCS / "audio-stream.md").read_text("utf-8")
+    for counter in dataclasses.fields(Counters):
+        if counter.name not in ("messages", "last_loss"):
+            assert f"`{counter.name}`" in text, counter.name
+    assert f"a ring of {RING_SECONDS:g} s" in text
