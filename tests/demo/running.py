@@ -23,6 +23,23 @@ PORTS = {
 }
 
 
+def new_mark() -> str:
+    """The name of an environment variable by which a process and all its descendants can be known."""
+    return f"ROSAFE_TEST_{uuid.uuid4().hex}"
+
+
+def family(mark: str) -> dict[int, str]:
+    """All living processes with this mark: number and command line."""
+    found = {}
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            if mark.encode() in (folder / "environ").read_bytes():
+                found[int(folder.name)] = (folder / "cmdline").read_text().replace("\0", " ")
+        except OSError:  # it has ended meanwhile, or is another user's
+            continue
+    return found
+
+
 class Demo(Process):
     """A running demonstration; its environment carries a mark by which its children are known."""
 
@@ -33,7 +50,7 @@ class Demo(Process):
         script: Path = SCRIPTS / "demo",
         env: dict[str, str] | None = None,
     ) -> None:
-        self.mark = f"ROSAFE_TEST_{uuid.uuid4().hex}"
+        self.mark = new_mark()
         base = {k: v for k, v in os.environ.items() if not k.startswith("ROS_") and k != "DISPLAY"}
         super().__init__([str(script), *map(str, arguments)], {**base, **(env or {}), self.mark: "1"}, cwd)
 
@@ -42,14 +59,7 @@ class Demo(Process):
 
     def family(self) -> dict[int, str]:
         """All living processes that descend from it, itself included: number and command line."""
-        found = {}
-        for folder in Path("/proc").glob("[0-9]*"):
-            try:
-                if self.mark.encode() in (folder / "environ").read_bytes():
-                    found[int(folder.name)] = (folder / "cmdline").read_text().replace("\0", " ")
-            except OSError:  # it has ended meanwhile, or is another user's
-                continue
-        return found
+        return family(self.mark)
 
     def says(self, words: str, timeout: float = DEMO_SECONDS) -> None:
         """Wait until it has printed `words`."""

@@ -5,12 +5,14 @@ from __future__ import annotations
 import os
 import re
 import shlex
+import signal
 from pathlib import Path
 
 import pytest
 
 from rosafe.ros.master import is_local
-from tests.harness import PYTHON, ROOT, SCRIPTS, Process, free_port
+from tests.demo.running import family, new_mark
+from tests.harness import PYTHON, ROOT, SCRIPTS, Process, free_port, wait_for
 
 README = (ROOT / "README.md").read_text("utf-8")
 WHOLE_SUITE = "scripts/test"  # is what runs this; .ci/run runs it from a clean clone
@@ -58,12 +60,17 @@ def test_every_command_of_the_shell(tmp_path: Path) -> None:
     commands = [line for block in blocks("sh") for line in block.splitlines() if line != WHOLE_SUITE]
     assert commands[0] == "scripts/demo" and WHOLE_SUITE in README
     assert ". scripts/env.sh" in commands and "roscore & bass-ros & rosAFE-ros &" in commands
-    env = place_like_the_checkout(tmp_path)
-    with Process(["bash", "-c", "\n".join(["set -e", *map(_announced, commands), "wait"])], env, tmp_path) as shell:
-        code = shell.wait(SESSION_SECONDS)
-        said = shell.out
-        last = said.rpartition("+ ")[2].splitlines()[0]
-        assert code == 0, f"exit {code} at or after {last!r}: {shell}"
+    mark = new_mark()
+    env = {**place_like_the_checkout(tmp_path), mark: "1"}
+    try:
+        with Process(["bash", "-c", "\n".join(["set -e", *map(_announced, commands), "wait"])], env, tmp_path) as shell:
+            code, said = shell.wait(SESSION_SECONDS), shell.out
+            last = said.rpartition("+ ")[2].splitlines()[0]
+            assert code == 0, f"exit {code} at or after {last!r}: {shell}"
+        wait_for(lambda: not family(mark), what=lambda: f"end of {family(mark)}")
+    finally:
+        for pid in family(mark):  # a master has a session of its own
+            os.kill(pid, signal.SIGKILL)
     assert (tmp_path / "rosafe-demo" / "rosafe-demo.png").stat().st_size > 20_000
     calls = [command for command in commands if command.startswith("rosservice call")]
     by_hand = said.partition(f"+ {calls[0]}")[2]
