@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import threading
 import tracemalloc
+from signal import SIGINT, pthread_kill
 from typing import Any
 
 import numpy as np
@@ -19,6 +21,7 @@ from rosafe.interface import KINDS
 from tests import harness
 from tests.dsp.bare import Chain, cut
 from tests.dsp.test_vectors import CASES, assert_reference, load, parameters
+from tests.tree.support import tree_threads
 
 RATE = 16000.0
 FEW = {"fb_nChannels": 4, "fb_highFreqHz": 4000.0}
@@ -343,12 +346,18 @@ def test_an_error_on_the_way_ends_it_at_once(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_an_interrupt_from_the_keyboard(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In the middle of the work."""
+    """In the middle of the work, which ends with all its threads."""
+    processed = []
 
-    def interrupt(self: chain.Chain) -> None:
-        self._source.open()
-        raise KeyboardInterrupt
+    class Interrupting(InnerHairCell):
+        def process(self, block: Any, envelope: Any = None) -> Any:
+            processed.append(block)
+            if len(processed) == 3:
+                pthread_kill(threading.main_thread().ident or 0, SIGINT)
+            return super().process(block, envelope)
 
-    monkeypatch.setattr(chain.Chain, "run", interrupt)
+    monkeypatch.setitem(STAGES, "ihc", Interrupting)
     with pytest.raises(KeyboardInterrupt):
-        rosafe.process(noise(100_000), RATE, FEW, block_frames=10)
+        rosafe.process(noise(200_000), RATE, FEW, block_frames=10)
+    assert tree_threads() == set()
+    assert len(processed) < 10_000
