@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import itertools
 import threading
 import time
@@ -137,9 +138,10 @@ class Activities:
     def start(
         self, service: Service, handler: Handler, values: dict[str, Any], on_end: Callable[[Activity], None] | None
     ) -> Activity:
-        """Begin an activity; raises ``::genom::too_many_activities`` where its task has no slot left.
+        """Begin an activity; its thread calls `on_end` at its end, before anybody who waits for that goes on.
 
-        Its thread calls `on_end` when it has ended, before anybody who waits for that goes on.
+        Raises ``::genom::too_many_activities`` where its task has no slot left, and ``::genom::syserr`` (EAGAIN) where
+        the system has no thread left.
         """
         with self._lock:
             if self._full(service):
@@ -152,7 +154,12 @@ class Activities:
             name=f"{service.name}-{activity.id}",
             daemon=True,
         )
-        thread.start()
+        try:
+            thread.start()
+        except RuntimeError as problem:
+            with self._lock:
+                del self._live[activity.id]
+            raise ComponentError("::genom::syserr", str(problem), code=errno.EAGAIN) from None
         return activity
 
     def _full(self, service: Service) -> bool:
@@ -179,7 +186,7 @@ class Activities:
             error = problem
         except MemoryError as problem:
             self._crashed(activity, problem)
-            error = ComponentError("::genom::syserr", code=12)  # ENOMEM
+            error = ComponentError("::genom::syserr", code=errno.ENOMEM)
         except Exception as problem:  # a fault of ours: the node lives on, the requester and the log are told
             self._crashed(activity, problem)
             error = ComponentError("::genom::unkex", what=f"{type(problem).__name__}: {problem}"[:127])

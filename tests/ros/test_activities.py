@@ -101,6 +101,20 @@ def test_failures_have_a_name(board: Board, problem: BaseException, exdetail: st
     assert board.activities.live() == []
 
 
+def test_no_thread_left(board: Board, monkeypatch: pytest.MonkeyPatch) -> None:
+    with monkeypatch.context() as patch:
+        patch.setattr(threading.Thread, "start", raising_start)
+        with pytest.raises(ComponentError) as caught:
+            board.start()
+    assert caught.value.exdetail == '{"ex":"::genom::syserr","detail":{"code":11}}'
+    assert board.activities.live() == []
+    assert board.start().begun.wait(10)
+
+
+def raising_start(thread: threading.Thread) -> None:
+    raise RuntimeError("can't start new thread")
+
+
 def test_the_requester_is_told_before_anybody_who_waits(board: Board) -> None:
     seen: list[Any] = []
     activity = board.start(on_end=lambda a: seen.append((a.begun.is_set(), a.ended.is_set(), board.activities.live())))
