@@ -53,7 +53,7 @@ def test_many_signals_at_once_cut_nothing_short(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("stage", ["start", "recording"])
 def test_kill_takes_the_children_along(stage: str, tmp_path: Path) -> None:
-    with demo("--seconds", "2", "--out", tmp_path / "out") as running:
+    with demo("--seconds", "2", "--out", tmp_path / "out", TMPDIR=str(tmp_path)) as running:
         running.says(STAGES[stage])
         running.stop(signal.SIGKILL)
         running.assert_gone()
