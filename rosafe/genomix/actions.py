@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import functools
 import importlib
 import itertools
@@ -116,20 +117,26 @@ class ActionClient:
         message.goal_id.id = goal.id
         for name, value in values.items():
             setattr(message.goal, name, value)
-        deadline = self._loop.time() + ANSWER_SECONDS
+        try:
+            await asyncio.wait_for(self._hand_over(goal, message), ANSWER_SECONDS)
+        except TimeoutError:
+            self.cancel(goal)  # should it arrive after all
+            self.forget(goal)
+            raise middleware_error(
+                f"{self._instance} did not answer {self._name} within {ANSWER_SECONDS:g} s"
+            ) from None
+        except BaseException:
+            self.forget(goal)
+            raise
+        return goal
+
+    async def _hand_over(self, goal: Goal, message: Any) -> None:
         while not goal.seen.is_set():
-            if self._loop.time() > deadline:
-                del self._goals[goal.id]
-                self.cancel(goal)  # should it arrive after all
-                raise middleware_error(f"{self._instance} did not answer {self._name} within {ANSWER_SECONDS:g} s")
             # Not before the way back is there: a result is sent once, and not to those who come later.
             if all(topic.get_num_connections() for topic in (*self._subscribers, self._publishers["goal"])):
                 self._publishers["goal"].publish(message)
-            try:
+            with contextlib.suppress(TimeoutError):
                 await asyncio.wait_for(goal.seen.wait(), REPEAT_SECONDS)
-            except TimeoutError:
-                continue
-        return goal
 
     def cancel(self, goal: Goal) -> None:
         """Ask the component to end the activity."""

@@ -16,6 +16,7 @@ from urllib.parse import urlsplit
 import aiohttp
 
 from rosafe.interface import ComponentError
+from rosafe.ros import startup
 
 RPC_SECONDS = 3.0  # for one call of the master or of a node
 CHECK_SECONDS = 1.0  # between two looks whether the master still knows our node
@@ -118,6 +119,7 @@ class Graph:
 
         loop = asyncio.get_running_loop()
         await asyncio.to_thread(rospy.init_node, self.name[1:], argv=["genomixd"], disable_signals=True)
+        startup.log_to_stderr()
         rospy.on_shutdown(lambda: loop.is_closed() or loop.call_soon_threadsafe(self.gone.set))
         self._watch = asyncio.create_task(self._keep_registered())
 

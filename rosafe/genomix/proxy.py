@@ -64,7 +64,7 @@ class Proxy:
         self._actions: dict[str, asyncio.Task[ActionClient]] = {}
         self._readers: dict[str, TopicReader] = {}
         self._link: asyncio.Task[None] | None = None
-        self._pending = 0
+        self.pending = 0  # requests that are not answered yet
 
     @classmethod
     async def load(cls, graph: Graph, instance: str) -> Proxy:
@@ -121,13 +121,13 @@ class Proxy:
 
     @contextlib.contextmanager
     def _one_more(self) -> Iterator[None]:
-        if self._pending >= MAX_PENDING:
+        if self.pending >= MAX_PENDING:
             raise ComponentError("::genomix::e_tooMany", what=f"{self.instance}: {MAX_PENDING} requests are waiting")
-        self._pending += 1
+        self.pending += 1
         try:
             yield
         finally:
-            self._pending -= 1
+            self.pending -= 1
 
     def _client(self, service: str) -> ServiceClient:
         if service not in self._services:

@@ -9,7 +9,6 @@ import ipaddress
 import logging
 import re
 import socket
-import time
 from collections.abc import Awaitable, Callable, Iterator
 from typing import Any
 
@@ -26,6 +25,7 @@ MAX_CONNECTIONS = 2000
 MAX_URL = 256 * 1024  # bytes of a request line: a list of 1024 numbers fits, percent signs and all
 MAX_WAIT_MS = 3_600_000
 BATCH = 128 * 1024  # characters written at a time
+REFUSAL_SECONDS = 0.05
 HEARTBEAT_SECONDS = 15.0  # between two signs of life to a listener
 LAST_WORDS_SECONDS = 1.0  # that answers under way have at the end
 IDLE_SECONDS = 3600.0  # a connection without requests is closed after
@@ -73,31 +73,29 @@ class Server:
     def __init__(self, sessions: Sessions, hosts: set[str]) -> None:
         self._sessions = sessions
         self._hosts = {"localhost", *(host.lower() for host in hosts)}
-        self._started = time.monotonic()
         app = web.Application(middlewares=[self._guard])
-        app.add_routes(
-            [
-                web.get("/", self._help),
-                web.get("/session/start", self._session_start),
-                web.get("/session/stop", self._session_stop),
-                web.get("/session/listen", self._session_listen),
-                web.get("/load/{component:.+}", self._load),
-                web.get("/unload/{name}", self._unload),
-                web.get("/describe/{name}", self._describe),
-                web.get("/components", self._components),
-                web.get("/rpath", self._rpath),
-                web.get("/call/{name}/{service}", self._call),
-                web.get("/call/{name}/{service}/{element:.+}", self._call),
-                web.get("/send/{name}/{service}", self._send),
-                web.get("/send/{name}/{service}/{element:.+}", self._send),
-                web.get("/request/status", self._request_status),
-                web.get("/request/result", self._request_result),
-                web.get("/request/wait", self._request_wait),
-                web.get("/request/abort", self._request_abort),
-                web.get("/request/clean", self._request_clean),
-                web.get("/requests", self._requests),
-            ]
-        )
+        for path, handler in (
+            ("/", self._help),
+            ("/session/start", self._session_start),
+            ("/session/stop", self._session_stop),
+            ("/session/listen", self._session_listen),
+            ("/load/{component:.+}", self._load),
+            ("/unload/{name}", self._unload),
+            ("/describe/{name}", self._describe),
+            ("/components", self._components),
+            ("/rpath", self._rpath),
+            ("/call/{name}/{service}", self._call),
+            ("/call/{name}/{service}/{element:.+}", self._call),
+            ("/send/{name}/{service}", self._send),
+            ("/send/{name}/{service}/{element:.+}", self._send),
+            ("/request/status", self._request_status),
+            ("/request/result", self._request_result),
+            ("/request/wait", self._request_wait),
+            ("/request/abort", self._request_abort),
+            ("/request/clean", self._request_clean),
+            ("/requests", self._requests),
+        ):
+            app.router.add_get(path, handler, allow_head=False)
         self._runner = web.AppRunner(
             app,
             access_log=log if log.isEnabledFor(logging.DEBUG) else None,
@@ -258,6 +256,8 @@ class Server:
             return _small(request, {})
         if _flag(request, "ack"):
             await sent.acknowledged.wait()
+            with contextlib.suppress(TimeoutError):  # a refusal is acknowledged and then told, at once
+                await asyncio.wait_for(sent.finished.wait(), REFUSAL_SECONDS)
         return await _status(request, sent)
 
     def _known(self, request: web.Request) -> Request:
@@ -282,7 +282,7 @@ class Server:
 
     async def _request_abort(self, request: web.Request) -> web.StreamResponse:
         known = self._known(request)
-        self._session(request).abort(known.id)
+        known.abort()
         return await _status(request, known)
 
     async def _request_clean(self, request: web.Request) -> web.StreamResponse:

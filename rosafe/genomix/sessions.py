@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import itertools
 import logging
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterator, Mapping
 from typing import Any, TypeVar
 
+from rosafe.genomix.actions import Goal
 from rosafe.genomix.graph import Graph
 from rosafe.genomix.proxy import NOTHING, Proxy, Value, names
 from rosafe.genomix.syntax import Syntax, plain
 from rosafe.genomix.values import complete
-from rosafe.interface import ComponentError
+from rosafe.interface import ComponentError, Service
 
 MAX_SESSIONS = 1000
 MAX_REQUESTS = 1000  # kept per session
@@ -32,17 +34,43 @@ T = TypeVar("T")
 
 
 class Request:
-    """One request that a client follows by its id. `status` is ``sent``, ``done`` or ``error``."""
+    """One request that a client follows by its id. `status` is ``sent``, ``done`` or ``error``.
 
-    def __init__(self, number: str) -> None:
+    `abortable` are activities only.
+    """
+
+    def __init__(self, number: str, abortable: bool = False) -> None:
         self.id = number
         self.status = "sent"
         self.value: Value = NOTHING
         self.error: ComponentError | None = None
         self.acknowledged = asyncio.Event()
         self.finished = asyncio.Event()
-        self.abort: Callable[[], None] | None = None
-        self.task: asyncio.Task[None] | None = None
+        self.forgotten = asyncio.Event()  # nobody is interested in its end
+        self._abortable = abortable
+        self._aborted = False
+        self._goal: Goal | None = None
+
+    def abort(self) -> None:
+        """Ask the activity to end, or not to begin; ``::genom::syserr`` (EAGAIN) for a function under way."""
+        if self.finished.is_set():
+            return
+        if not self._abortable:
+            raise ComponentError("::genom::syserr", code=errno.EAGAIN)
+        self._aborted = True
+        if self._goal is not None:
+            self._goal.cancel()
+
+    def may_begin(self) -> None:
+        """Raise ``::genom::interrupted`` where the request was aborted before it was sent."""
+        if self._aborted:
+            raise ComponentError("::genom::interrupted", by="client")
+
+    def begun(self, goal: Goal) -> None:
+        """It is in the component's hands."""
+        self._goal = goal
+        if self._aborted:
+            goal.cancel()
 
     def finish(self, value: Value, error: ComponentError | None) -> None:
         """Record the end."""
@@ -130,8 +158,7 @@ class Session:
         """End the session. Activities that it began go on."""
         self.tell("quit", "")
         for request in self.requests.values():
-            if request.task is not None:
-                request.task.cancel()
+            request.forgotten.set()
         for name in list(self.components):
             await self.unload(name)
 
@@ -176,19 +203,25 @@ class Session:
     def send(self, component: str, proxy: Proxy, name: str, given: Any, element: str, keep: bool) -> Request:
         """Make a request that the client follows by its id, unless it does not want to `keep` it."""
         port = proxy.port(name)
-        request = Request(f"{component}::{next(self._sessions.numbers)}")
+        number = f"{component}::{next(self._sessions.numbers)}"
+        work: Awaitable[Value]
         if port is not None:
-            work = self._reading(request, proxy, port, element)
+            request = Request(number)
+            work = proxy.read(port, element)
         else:
             service = proxy.service(name)
             values = complete(service, given)
-            steps = self._activity if service.activity else self._function
-            work = self._in_turn(lambda turn: steps(request, proxy, service, values, turn))
+            request = Request(number, service.activity)
+            if service.activity:
+                work = self._in_turn(lambda turn: self._activity(request, proxy, service, values, turn))
+            else:
+                work = self._in_turn(lambda _: proxy.call(service, values))
         if keep:
             self._make_room()
             self.requests[request.id] = request
-        request.task = asyncio.create_task(self._follow(request, work))
-        self._sessions.keep(request.task)
+        else:
+            request.forgotten.set()
+        self._sessions.keep(asyncio.create_task(self._follow(request, work)))
         return request
 
     async def _follow(self, request: Request, work: Awaitable[Value]) -> None:
@@ -205,22 +238,19 @@ class Session:
             self.tell("request", request)
             self.drop_large()
 
-    async def _reading(self, request: Request, proxy: Proxy, port: Any, element: str) -> Value:
-        return await proxy.read(port, element)
-
-    async def _function(self, request: Request, proxy: Proxy, service: Any, values: Any, turn: _Turn) -> Value:
-        return await proxy.call(service, values)
-
-    async def _activity(self, request: Request, proxy: Proxy, service: Any, values: Any, turn: _Turn) -> Value:
+    async def _activity(
+        self, request: Request, proxy: Proxy, service: Service, values: Mapping[str, Any], turn: _Turn
+    ) -> Value:
+        request.may_begin()
         goal = await proxy.start(service, values)
+        request.begun(goal)
         try:
-            request.abort = goal.cancel
             await goal.acknowledged.wait()
             request.acknowledged.set()
             turn.over()
-            if not goal.ended.is_set():
+            if not goal.ended.is_set() and request.id in self.requests:
                 self.tell("request", request)
-            await goal.ended.wait()
+            await _first(goal.ended, request.forgotten)
         finally:
             goal.forget()
         if goal.error is not None:
@@ -244,21 +274,10 @@ class Session:
         except KeyError:
             raise ComponentError("::genomix::e_noSuchRequest", what=f"no request {number[:80]!r}") from None
 
-    def abort(self, number: str) -> None:
-        """Ask an activity to end; ``::genom::syserr`` (EAGAIN) while it is not in the component's hands."""
-        request = self.request(number)
-        if request.finished.is_set():
-            return
-        if request.abort is None:
-            raise ComponentError("::genom::syserr", code=11)
-        request.abort()
-
     def clean(self, number: str) -> None:
         """Forget a request; what it started goes on."""
-        request = self.request(number)
+        self.request(number).forgotten.set()
         del self.requests[number]
-        if request.task is not None:
-            request.task.cancel()
 
     def _make_room(self) -> None:
         while len(self.requests) >= MAX_REQUESTS:
@@ -276,6 +295,16 @@ class Session:
                 return
             del self.requests[request.id]
             excess -= size
+
+
+async def _first(*events: asyncio.Event) -> None:
+    """Wait until one of the events is set."""
+    waits = [asyncio.create_task(event.wait()) for event in events]
+    try:
+        await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        for task in waits:
+            task.cancel()
 
 
 class _Turn:
@@ -342,10 +371,10 @@ class Sessions:
         return proxy
 
     async def release(self) -> None:
-        """Close the proxies that no session has loaded any more."""
+        """Close the proxies that no session has loaded any more, once their last requests are answered."""
         used = {proxy for session in self._sessions.values() for proxy in session.components.values()}
         for instance, proxy in list(self._proxies.items()):
-            if proxy not in used:  # those of sessions that are just loading are made again if need be
+            if proxy not in used and not proxy.pending:
                 del self._proxies[instance]
                 await proxy.close()
 
@@ -363,3 +392,4 @@ class Sessions:
             for name, session in list(self._sessions.items()):
                 if session.over:
                     await self.stop(name)
+            await self.release()

@@ -90,9 +90,11 @@ proc ::genomix::Refuse {what {ex ::genom::serialization}} {
     return -code error -level 2 -errorcode [list GENOM $ex $detail] [dict create ex $ex detail $detail]
 }
 
-foreach part {http client request command arguments help} {
-    source -encoding utf-8 [file join $::genomix::root $part.tcl]
-}
-unset part
+apply {{} {
+    variable root
+    foreach part {http client request command arguments help} {
+        uplevel #0 [list source -encoding utf-8 [file join $root $part.tcl]]
+    }
+} ::genomix}
 
 package provide genomix 1.8

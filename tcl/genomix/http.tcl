@@ -2,16 +2,16 @@
 
 namespace eval ::genomix::http {
     variable encoded ;# what each byte becomes in a URL
+}
+
+apply {{} {
+    variable encoded
     for {set byte 0} {$byte < 256} {incr byte} {
         set character [format %c $byte]
-        if {[string match {[A-Za-z0-9_.~-]} $character]} {
-            set encoded($character) $character
-        } else {
-            set encoded($character) [format %%%02X $byte]
-        }
+        set plain [string match {[A-Za-z0-9_.~-]} $character]
+        set encoded($character) [expr {$plain ? $character : [format %%%02X $byte]}]
     }
-    unset byte character
-}
+} ::genomix::http}
 
 # A text as part of a URL.
 proc ::genomix::http::encode {text} {

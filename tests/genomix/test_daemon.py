@@ -45,7 +45,8 @@ def test_a_wrong_command_line_is_one_line(home_graph: harness.Graph, arguments: 
 def test_a_taken_port_is_one_line(home_graph: harness.Graph) -> None:
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
-        for background in ([], ["-b"]):
+        backgrounds: tuple[list[str], ...] = ([], ["-b"])
+        for background in backgrounds:
             done = home_graph.run(GENOMIXD, "-p", str(port), *background, check=False)
             assert done.returncode == 1
             assert done.stderr.splitlines() == [

@@ -210,6 +210,26 @@ def test_abort_ends_the_activity(world: World) -> None:
     harness.wait_for(lambda: not live_activities(world, "bass"), what=lambda: str(tasks))
 
 
+def test_abort_of_what_is_on_its_way(world: World) -> None:
+    """An activity may be aborted before the component has it."""
+    for _ in range(10):
+        number = world.http.send("bass/Acquire", {"device": "scene:"}, s="order")
+        world.http.get("/request/abort", id=number, s="order")
+        status = world.http.get("/request/wait", id=number, s="order", ms=9000)
+        assert status["status"] == "done" or status["exception"]["ex"] == "::genom::interrupted"
+    harness.wait_for(lambda: not live_activities(world, "bass"))
+
+
+def test_what_a_session_asked_for_is_done_after_its_end(world: World) -> None:
+    world.http.call("rosAFE/connect_port", ["Audio", "bass/Audio"])
+    for target in ("bass/Acquire", "rosAFE/InputProc", "rosAFE/PreProc"):
+        number = world.http.send(target, ["scene:"] if target == "bass/Acquire" else None, s="brief")
+    world.http.get("/request/clean", id=number, s="brief")
+    world.http.raw("/session/stop?s=brief")
+    harness.wait_for(lambda: live_activities(world, "rosAFE") == ["InputProc", "PreProc"])
+    assert live_activities(world, "bass") == ["Acquire"]
+
+
 def live_activities(world: World, component: str) -> list[str]:
     tasks = world.http.call(f"{component}/genom_state")["genom_state"]["task"]
     return [activity["name"] for task in tasks for activity in task["activity"]]

@@ -34,12 +34,19 @@ rosAFE::GammatoneProc {fb_nChannels 4}
 
 def test_the_package_says_its_version_and_does_nothing_at_load(world: World) -> None:
     script = """
+        foreach name {byte character plain part root clients encoded} {set $name mine}
+        set before ""
+        set before [lsort [info globals]]
+        package forget genomix
+        namespace delete genomix
         show [package require genomix] [namespace exists ::rosAFE] [after info] [lsort [file channels]]
+        show $byte $character $plain $part $root $clients $encoded [expr {[lsort [info globals]] eq $before}]
         namespace import ::genomix::*
         show [namespace origin connect] [namespace origin localhost]
     """
     assert world.lines(script) == [
         "1.8|0||stderr stdin stdout",
+        "mine|mine|mine|mine|mine|mine|mine|1",
         "::genomix::connect|::genomix::localhost",
     ]
 

@@ -66,6 +66,10 @@ def test_a_component_that_hangs_keeps_others_out_of_it(empty_world: World) -> No
         parameters = world.http.call("rosAFE/getParameters")["parameters"]
         assert parameters["input"] == []
         assert answers == []
+        number = world.http.send("bass/Stop")
+        with pytest.raises(HttpError) as caught:
+            world.http.get("/request/abort", id=number, s="t")
+        assert (caught.value.ex, caught.value.status) == ("::genom::syserr", 422)
         bass_signal(bass, signal.SIGCONT)
         caller.join(20)
         assert answers == [{}]

@@ -139,11 +139,12 @@ class World:
 def port_of(process: harness.Process) -> int:
     """The port on which a genomixd started with -v serves, once it does."""
 
-    def said() -> re.Match[str] | None:
+    def said() -> str:
         assert process.alive, process
-        return re.search(r"serving http://[^ ]*:(\d+)", process.err)
+        found = re.search(r"serving http://[^ ]*:(\d+)", process.err)
+        return found[1] if found else ""
 
-    return int(harness.wait_for(said, harness.UP_SECONDS, lambda: f"start of {process}")[1])
+    return int(harness.wait_for(said, harness.UP_SECONDS, lambda: f"start of {process}"))
 
 
 @contextmanager
