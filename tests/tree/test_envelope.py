@@ -1,0 +1,204 @@
+"""The filterbank's envelope: computed only while a hair cell wants it, and never missing where one works with it."""
+
+from __future__ import annotations
+
+import threading
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rosafe.dsp import STAGES, InnerHairCell
+from rosafe.tree import Processor, State, Tree
+from tests.dsp.bare import joined
+from tests.harness import wait_for
+
+from .support import RATE, WAIT_SECONDS, Feed, Recorder, grow
+from .test_changes import LEAVES, NOISE, assert_as, chain, settle
+
+
+@pytest.fixture
+def asked(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
+    """Whether the filterbank computed the envelope, block by block."""
+    answers: list[bool] = []
+    original = STAGES["gammatone"].process
+
+    def process(self: Any, block: np.ndarray) -> np.ndarray:
+        answers.append(self.provide_envelope)
+        return original(self, block)
+
+    monkeypatch.setattr(STAGES["gammatone"], "process", process)
+    return answers
+
+
+def suffix(listener: Recorder, processor: Processor, whole: np.ndarray) -> int:
+    """The processor released the end of `whole`; the number of blocks of 400 that are missing before."""
+    released = listener.data(processor)
+    start = whole.shape[-1] - released.shape[-1]
+    np.testing.assert_allclose(released, whole[..., start:], rtol=0, atol=1e-12)
+    assert start % 400 == 0
+    return start // 400
+
+
+def test_the_envelope_is_computed_only_while_somebody_wants_it(
+    tree: Tree, feed: Feed, listener: Recorder, asked: list[bool]
+) -> None:
+    grow(tree, feed)
+    settle(tree, feed, listener, *NOISE[:3])
+    late = tree.add("ihc", "late", "gammatone", {"ihc_method": "hilbert"})
+    wait_for(lambda: late.blocks == 1)  # it has seen the last block, which had none
+    assert listener.blocks[late] == []
+    settle(tree, feed, listener, NOISE[3])
+    settle(tree, feed, listener, *NOISE[4:6])
+    tree.remove("late")
+    settle(tree, feed, listener, *NOISE[6:8])
+    assert asked == [False] * 3 + [True] * 3 + [False] * 2
+    outputs = joined(chain(ihc_method="hilbert").run(list(NOISE[:6])))
+    assert suffix(listener, late, outputs["ihc"]) == 3
+    assert_as(listener, tree, "ihc", chain().run(list(NOISE[:8])))
+
+
+@pytest.mark.parametrize("method", ["hilbert", "joergensen", "bernstein"])
+def test_a_late_child_never_works_without_the_envelope(tree: Tree, feed: Feed, listener: Recorder, method: str) -> None:
+    """While blocks flow, it begins one to three blocks later and then misses none."""
+    grow(tree, feed)
+    feed.put(*NOISE[:8])
+    listener.wait_blocks(tree.find("gammatone"), 2)
+    late = tree.add("ihc", "late", "gammatone", {"ihc_method": method})
+    below = tree.add("ild", "below", "late")
+    feed.put(*NOISE[8:])
+    listener.wait_blocks(tree.find("gammatone"), 20)
+    listener.wait(lambda: listener.blocks[below] and listener.blocks[below][-1].number == 19)
+    numbers = [block.number for block in listener.blocks[late]]
+    assert numbers == list(range(numbers[0], 20))
+    assert [block.number for block in listener.blocks[below]][-3:] == [17, 18, 19]
+    # from where it began, the filter after the envelope begins at rest
+    filterbank = chain().stages["gammatone"]
+    hair_cell = STAGES["ihc"](RATE, ihc_method=method)
+    for number, block in enumerate(NOISE):
+        filterbank.provide_envelope = True  # type: ignore[attr-defined]
+        data = filterbank.process(block)
+        if number >= numbers[0]:
+            expected = hair_cell.process(data, filterbank.envelope)  # type: ignore[attr-defined,call-arg]
+            got = listener.blocks[late][number - numbers[0]].data
+            np.testing.assert_allclose(got, expected, rtol=0, atol=1e-12)
+
+
+def test_a_live_switch_to_the_envelope_and_back_loses_no_block(
+    tree: Tree, feed: Feed, listener: Recorder, asked: list[bool]
+) -> None:
+    grow(tree, feed)
+    settle(tree, feed, listener, *NOISE[:3])
+    tree.modify("ihc", "ihc_method", "hilbert")
+    assert tree.find("ihc").parameters() == {"ihc_method": "hilbert"}
+    settle(tree, feed, listener, *NOISE[3:6])
+    tree.modify("ihc", "ihc_method", "fullwave")
+    settle(tree, feed, listener, *NOISE[6:8])
+    assert asked == [False] * 3 + [True] * 3 + [False] * 2
+    changes = [(3, "ihc_method", "hilbert"), (6, "ihc_method", "fullwave")]
+    outputs = chain().run(list(NOISE[:8]), changes)
+    for kind in ("ihc", *LEAVES):
+        assert_as(listener, tree, kind, outputs)
+
+
+def test_a_block_that_is_on_its_way_without_the_envelope_goes_the_old_way(
+    tree: Tree, feed: Feed, listener: Recorder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The filterbank has computed the next block already when the method changes."""
+    working, go_on = threading.Event(), threading.Event()
+    original = InnerHairCell.process
+
+    def process(self: InnerHairCell, block: np.ndarray, *envelope: np.ndarray) -> np.ndarray:
+        working.set()
+        assert go_on.wait(WAIT_SECONDS)
+        return original(self, block, *envelope)
+
+    monkeypatch.setattr(InnerHairCell, "process", process)
+    grow(tree, feed)
+    filterbank, ihc = tree.find("gammatone"), tree.find("ihc")
+    feed.put(*NOISE[:2])
+    assert working.wait(WAIT_SECONDS)
+    wait_for(lambda: filterbank.state is State.WAIT_RELEASE)
+    tree.modify("ihc", "ihc_method", "hilbert")
+    feed.put(*NOISE[2:4])
+    go_on.set()
+    listener.wait_blocks(ihc, 4)
+    assert_as(listener, tree, "ihc", chain().run(list(NOISE[:4]), [(2, "ihc_method", "hilbert")]))
+
+
+def test_a_block_without_the_envelope_after_all_is_no_gap(
+    tree: Tree, feed: Feed, listener: Recorder, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The filterbank has computed it for a method that then was not to be."""
+    working, go_on = threading.Event(), threading.Event()
+    original = InnerHairCell.process
+
+    def process(self: InnerHairCell, block: np.ndarray, *envelope: np.ndarray) -> np.ndarray:
+        if block[0, 0, 0] == first[0, 0, 0]:
+            working.set()
+            assert go_on.wait(WAIT_SECONDS)
+        return original(self, block, *envelope)
+
+    first = chain().run([NOISE[0]])[0]["gammatone"]
+    monkeypatch.setattr(InnerHairCell, "process", process)
+    grow(tree, feed)
+    filterbank, ihc = tree.find("gammatone"), tree.find("ihc")
+    tree.modify("ihc", "ihc_method", "hilbert")
+    feed.put(NOISE[0])
+    assert working.wait(WAIT_SECONDS)
+    tree.modify("ihc", "ihc_method", "fullwave")
+    feed.put(NOISE[1])
+    wait_for(lambda: filterbank.state is State.WAIT_RELEASE)
+    tree.modify("ihc", "ihc_method", "hilbert")
+    feed.put(NOISE[2])
+    go_on.set()
+    listener.wait_blocks(ihc, 3)
+    changes = [(0, "ihc_method", "hilbert"), (1, "ihc_method", "fullwave"), (2, "ihc_method", "hilbert")]
+    assert_as(listener, tree, "ihc", chain().run(list(NOISE[:3]), changes))
+
+
+def test_a_switch_while_blocks_are_on_their_way(tree: Tree, feed: Feed, listener: Recorder) -> None:
+    """Every block is either wholly the old method's or the new one's, none is missing, and the last word counts."""
+    grow(tree, feed)
+    ihc = tree.find("ihc")
+    feed.put(*NOISE[:15])
+    for number, method in enumerate(("hilbert", "none", "hilbert", "none", "hilbert", "fullwave", "hilbert")):
+        listener.wait_blocks(ihc, 1 + 2 * number)
+        tree.modify("ihc", "ihc_method", method)
+    listener.wait_blocks(ihc, 15)
+    settle(tree, feed, listener, *NOISE[15:])
+    methods = ("dau", "hilbert", "none", "fullwave")
+    outputs = {method: chain(ihc_method=method).run(list(NOISE)) for method in methods}
+    names = []
+    for number, block in enumerate(listener.blocks[ihc]):
+        fits = [m for m in methods[1:] if np.allclose(block.data, outputs[m][number]["ihc"], rtol=0, atol=1e-12)]
+        names += fits or ["dau"]
+    assert names[0] == "dau"
+    assert names[-5:] == ["hilbert"] * 5
+    assert len(names) == 20
+
+
+def test_a_switch_there_and_back_before_any_block_is_none(
+    tree: Tree, feed: Feed, listener: Recorder, asked: list[bool]
+) -> None:
+    grow(tree, feed)
+    settle(tree, feed, listener, *NOISE[:2])
+    tree.modify("ihc", "ihc_method", "hilbert")
+    tree.modify("ihc", "ihc_method", "fullwave")
+    settle(tree, feed, listener, *NOISE[2:5])
+    assert asked == [False] * 5
+    assert_as(listener, tree, "ihc", chain().run(list(NOISE[:5]), [(2, "ihc_method", "fullwave")]))
+
+
+def test_two_hair_cells_of_which_one_wants_the_envelope(tree: Tree, feed: Feed, listener: Recorder) -> None:
+    grow(tree, feed)
+    other = tree.add("ihc", "other", "gammatone", {"ihc_method": "hilbert"})
+    settle(tree, feed, listener, *NOISE[:3])
+    tree.modify("gammatone", "fb_type", "drnl")
+    tree.modify("gammatone", "fb_nChannels", "4")
+    settle(tree, feed, listener, *NOISE[3:6])
+    changes = [(3, "fb_type", "drnl"), (3, "fb_nChannels", 4)]
+    assert_as(listener, tree, "ihc", chain().run(list(NOISE[:6]), changes))
+    expected = chain(ihc_method="hilbert").run(list(NOISE[:6]), changes)
+    for block, output in zip(listener.blocks[other], expected, strict=True):
+        np.testing.assert_allclose(block.data, output["ihc"], rtol=0, atol=1e-12)
