@@ -117,7 +117,10 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         options = _parse(arguments)
         try:
-            with _folder(options.out, signals), tempfile.TemporaryDirectory(prefix="rosafe-demo-") as scratch:
+            with (
+                _without_empty_folders(options.out, signals),
+                tempfile.TemporaryDirectory(prefix="rosafe-demo-") as scratch,
+            ):
                 return _run(options, signals, scratch)
         except BrokenPipeError:  # nobody reads what is printed: `scripts/demo | head`
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what Python still has to flush
@@ -129,15 +132,15 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 @contextlib.contextmanager
-def _folder(path: Path, signals: _Signals) -> Iterator[None]:
-    """Make the folder `path`; it goes again where nothing was put into it."""
-    made = [folder for folder in (path, *path.parents) if not folder.exists()]
+def _without_empty_folders(path: Path, signals: _Signals) -> Iterator[None]:
+    """Take `path` and its parents away again at the end, those that were not there before and that hold nothing."""
+    made = [folder for folder in (path, *path.parents) if not os.path.exists(folder)]
     try:
         yield
     finally:
         signals.defer()
         for folder in made:
-            if folder.is_dir() and not any(folder.iterdir()):
+            if os.path.isdir(folder) and not any(folder.iterdir()):
                 folder.rmdir()
 
 

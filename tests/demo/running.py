@@ -11,7 +11,7 @@ from pathlib import Path
 
 from tests.harness import SCRIPTS, Process, wait_for
 
-DEMO_SECONDS = 90.0  # all of it, on a busy machine
+DEMO_SECONDS = 120.0  # all of it, on a busy machine
 PORTS = {
     "inputProcPort": "TimeDomain",
     "preProcPort/preProc": "TimeDomain",
