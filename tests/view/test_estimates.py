@@ -70,9 +70,9 @@ def test_level_of_the_sound_does_not_matter(gain: float) -> None:
 def test_silence_holds_no_source() -> None:
     shown = represented(np.zeros((2, 16000)), 16000)
     assert len(shown.times) > 90
-    assert np.isnan(estimates.azimuth_from_ild(shown)).all()
-    assert np.isnan(estimates.azimuth_from_correlation(shown)).all()
-    assert np.isnan(estimates.agreement(*[estimates.azimuth_from_ild(shown)] * 2))
+    from_ild, from_correlation = estimates.azimuth_from_ild(shown), estimates.azimuth_from_correlation(shown)
+    assert np.isnan(from_ild).all() and np.isnan(from_correlation).all()
+    assert np.isnan(estimates.agreement(from_ild, from_correlation))
 
 
 def test_pauses_hold_no_source() -> None:
