@@ -71,12 +71,9 @@ class ActionClient:
     async def create(cls, graph: Graph, package: str, instance: str, action: str) -> ActionClient:
         """A client that is registered with the master; ComponentError where there is none."""
         await graph.become_node()
+        await graph.master("getPid")  # rospy would wait for the master without end
         client = cls(graph, package, instance, action)
-        try:
-            await asyncio.to_thread(client._register)
-        except OSError as problem:
-            await client.close()
-            raise middleware_error(f"no ROS master at {graph.uri} ({problem.strerror})") from None
+        await asyncio.to_thread(client._register)
         return client
 
     def _register(self) -> None:

@@ -11,6 +11,7 @@ import resource
 import signal
 import sys
 import threading
+from concurrent.futures import ThreadPoolExecutor
 
 from rosafe import __version__
 from rosafe.genomix.graph import Graph
@@ -20,7 +21,7 @@ from rosafe.ros import generate, master, startup
 
 DEFAULT_PORT = 8080
 DEFAULT_HOST = "127.0.0.1"
-THREADS = 16  # that format results and talk to rospy
+THREADS = 16  # that wait for rospy
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -94,6 +95,7 @@ async def _serve(options: argparse.Namespace, told: startup.Background | None) -
     for number in startup.SIGNALS:
         loop.add_signal_handler(number, end.set)
     signal.signal(signal.SIGPIPE, signal.SIG_IGN)
+    loop.set_default_executor(ThreadPoolExecutor(THREADS, "rospy"))
     _allow_many_files()
     sys.setswitchinterval(startup.SWITCH_SECONDS)
     graph = Graph(os.environ["ROS_MASTER_URI"])

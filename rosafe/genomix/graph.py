@@ -7,11 +7,13 @@ nothing more.
 from __future__ import annotations
 
 import asyncio
+import errno
 import os
 import time
 import xmlrpc.client
 from typing import Any
 from urllib.parse import urlsplit
+from xml.parsers.expat import ExpatError
 
 import aiohttp
 
@@ -21,6 +23,9 @@ from rosafe.ros import startup
 RPC_SECONDS = 3.0  # for one call of the master or of a node
 CHECK_SECONDS = 1.0  # between two looks whether the master still knows our node
 NODE_SECONDS = 15.0  # for becoming a node of the graph
+
+
+_FAILURES = (OSError, aiohttp.ClientError, ValueError)  # TimeoutError is an OSError
 
 
 class Unknown(Exception):
@@ -63,7 +68,7 @@ class Graph:
         """The value of the master's `method`; Unknown where it has none, ComponentError where it does not answer."""
         try:
             return await self.node(self.uri, method, *arguments)
-        except (TimeoutError, OSError, aiohttp.ClientError, xmlrpc.client.Error, ValueError) as problem:
+        except _FAILURES as problem:
             raise middleware_error(
                 f"no ROS master at {self.uri} ({_reason(problem)}): start roscore first, or set ROS_MASTER_URI"
             ) from None
@@ -73,8 +78,11 @@ class Graph:
         body = xmlrpc.client.dumps((self.name, *arguments), method)
         async with self._http.post(uri, data=body.encode(), headers={"Content-Type": "text/xml"}) as response:
             text = await response.text()
-        values: Any = xmlrpc.client.loads(text)[0]
-        code, message, value = values[0]
+        try:
+            values: Any = xmlrpc.client.loads(text)[0]
+            code, message, value = values[0]
+        except (ExpatError, xmlrpc.client.Error, ValueError, TypeError, IndexError):
+            raise OSError(errno.EPROTO, os.strerror(errno.EPROTO)) from None
         if code != 1:
             raise Unknown(message)
         return value
@@ -92,7 +100,7 @@ class Graph:
         uri = await self.master("lookupNode", node)
         try:
             protocol = await self.node(uri, "requestTopic", topic, [["TCPROS"]])
-        except (TimeoutError, OSError, aiohttp.ClientError, xmlrpc.client.Error) as problem:
+        except _FAILURES as problem:
             raise middleware_error(f"{node} does not answer ({_reason(problem)})") from None
         if len(protocol) != 3 or protocol[0] != "TCPROS":
             raise Unknown(f"{node} does not give out {topic}")
@@ -149,10 +157,14 @@ class Graph:
 
 
 def _address(uri: str) -> tuple[str, int]:
-    parts = urlsplit(uri)
-    if parts.hostname is None or parts.port is None:
-        raise Unknown(f"{uri!r} is no service address")
-    return parts.hostname, parts.port
+    try:
+        parts = urlsplit(uri)
+        host, port = parts.hostname, parts.port
+    except ValueError:
+        host = port = None
+    if host is None or port is None:
+        raise Unknown(f"{uri!r} is no address of a service")
+    return host, port
 
 
 def _reason(problem: BaseException) -> str:

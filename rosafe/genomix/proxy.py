@@ -20,6 +20,7 @@ from rosafe.ros import wire
 CALL_SECONDS = 60.0  # for the answer to one request
 APPEAR_SECONDS = 2.0  # that `load` waits for a component that is just starting
 POLL_SECONDS = 0.05
+REGISTER_SECONDS = 20.0  # for becoming a client of an action, the first time for becoming a node too
 LATE_SECONDS = 0.5  # results that a component sent before it ended arrive within
 MAX_PENDING = 1000  # requests to one component that are not answered yet
 
@@ -79,7 +80,8 @@ class Proxy:
         """Return if the component runs still and may be called `name`, else raise ComponentError."""
         if name not in (self.component.name, self.instance):
             raise _cannot_load(f"/{self.instance} is a {self.component.name}, and no {name}")
-        await self._client("connect_port").check()
+        with self._one_more():
+            await self._client("connect_port").check()
 
     async def close(self) -> None:
         """Let go of all connections; activities go on."""
@@ -139,7 +141,10 @@ class Proxy:
         if task is None or (task.done() and (task.cancelled() or task.exception() is not None)):
             made = ActionClient.create(self._graph, self.component.name, self.instance, action)
             task = self._actions[action] = asyncio.create_task(made)
-        return await asyncio.shield(task)
+        try:
+            return await asyncio.wait_for(asyncio.shield(task), REGISTER_SECONDS)
+        except TimeoutError:  # rospy tries on until the master answers, and a later request finds it done
+            raise middleware_error(f"the ROS master at {self._graph.uri} does not answer") from None
 
     async def _watch(self) -> None:
         """Have a connection to the component whose end tells that the component has ended."""
@@ -152,7 +157,7 @@ class Proxy:
             await connection.closed()
         finally:
             connection.close()
-        concerned = [goal for client in self._made_actions() for goal in client.goals()]
+        concerned = [goal for client in self._made_actions() for goal in client.goals() if goal.seen.is_set()]
         await asyncio.sleep(LATE_SECONDS)
         for goal in concerned:
             goal.end(middleware_error(f"{self.instance} ended before its activity did"))

@@ -10,6 +10,7 @@ import logging
 import re
 import socket
 from collections.abc import Awaitable, Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 from aiohttp import web
@@ -24,6 +25,7 @@ from rosafe.interface import ComponentError
 MAX_CONNECTIONS = 2000
 MAX_URL = 256 * 1024  # bytes of a request line: a list of 1024 numbers fits, percent signs and all
 MAX_WAIT_MS = 3_600_000
+FORMATTERS = 4  # threads
 BATCH = 128 * 1024  # characters written at a time
 REFUSAL_SECONDS = 0.05
 HEARTBEAT_SECONDS = 15.0  # between two signs of life to a listener
@@ -103,6 +105,8 @@ class Server:
             max_line_size=MAX_URL,
         )
         self._listener: asyncio.AbstractServer | None = None
+        # A few threads for all results: more would only fight for the interpreter.
+        self._formatters = ThreadPoolExecutor(FORMATTERS, "format")
 
     async def start(self, host: str, port: int) -> int:
         """Listen and return the port; OSError where that cannot be."""
@@ -120,6 +124,7 @@ class Server:
         if self._runner.server is not None:
             await self._runner.server.shutdown(LAST_WORDS_SECONDS)
         await self._runner.cleanup()
+        self._formatters.shutdown(wait=False, cancel_futures=True)
 
     # --- who may ---
 
@@ -246,7 +251,7 @@ class Server:
 
     async def _call(self, request: web.Request) -> web.StreamResponse:
         session, proxy, name, given, element = await self._target(request)
-        return await _stream(request, await session.call(proxy, name, given, element))
+        return await self._stream(request, await session.call(proxy, name, given, element))
 
     async def _send(self, request: web.Request) -> web.StreamResponse:
         session, proxy, name, given, element = await self._target(request)
@@ -258,13 +263,13 @@ class Server:
             await sent.acknowledged.wait()
             with contextlib.suppress(TimeoutError):  # a refusal is acknowledged and then told, at once
                 await asyncio.wait_for(sent.finished.wait(), REFUSAL_SECONDS)
-        return await _status(request, sent)
+        return _status(request, sent)
 
     def _known(self, request: web.Request) -> Request:
         return self._session(request).request(request.query.get("id", ""))
 
     async def _request_status(self, request: web.Request) -> web.StreamResponse:
-        return await _status(request, self._known(request))
+        return _status(request, self._known(request))
 
     async def _request_result(self, request: web.Request) -> web.StreamResponse:
         known = self._known(request)
@@ -272,18 +277,18 @@ class Server:
             raise known.error
         if known.status == "sent":
             raise ComponentError("::genomix::e_notDone", what=f"{known.id} is not done yet")
-        return await _stream(request, known.value)
+        return await self._stream(request, known.value)
 
     async def _request_wait(self, request: web.Request) -> web.StreamResponse:
         known = self._known(request)
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(known.finished.wait(), _milliseconds(request) / 1000)
-        return await _status(request, known)
+        return _status(request, known)
 
     async def _request_abort(self, request: web.Request) -> web.StreamResponse:
         known = self._known(request)
         known.abort()
-        return await _status(request, known)
+        return _status(request, known)
 
     async def _request_clean(self, request: web.Request) -> web.StreamResponse:
         self._session(request).clean(request.query.get("id", ""))
@@ -291,6 +296,20 @@ class Server:
 
     async def _requests(self, request: web.Request) -> web.StreamResponse:
         return _small(request, {r.id: r.status for r in self._session(request).requests.values()})
+
+    async def _stream(self, request: web.Request, value: Value) -> web.StreamResponse:
+        """Send a value, however large, in pieces that are made in another thread as fast as the client takes them."""
+        form = _syntax(request)
+        pieces = _unwrapped(form, value.pieces(form))
+        if value.size <= BATCH // 8:
+            return _respond(form, "".join(pieces))
+        response = web.StreamResponse(headers={"Content-Type": f"{form.media_type}; charset=utf-8", **_HEADERS})
+        await response.prepare(request)
+        loop = asyncio.get_running_loop()
+        while batch := await loop.run_in_executor(self._formatters, _batch, pieces):
+            await response.write(batch)
+        await response.write_eof()
+        return response
 
 
 # --- reading ----------------------------------------------------------------------------------------------------
@@ -362,38 +381,24 @@ def _unwrapped(form: Syntax, pieces: Iterator[str]) -> Iterator[str]:
     yield held[:-1]
 
 
-def _respond(request: web.Request, form: Syntax, text: str, status: int = 200) -> web.Response:
+def _respond(form: Syntax, text: str, status: int = 200) -> web.Response:
     return web.Response(text=text, status=status, content_type=form.media_type, charset="utf-8", headers=_HEADERS)
 
 
 def _small(request: web.Request, value: Any) -> web.Response:
     form = _syntax(request)
-    return _respond(request, form, "".join(_unwrapped(form, iter((plain(form, value),)))))
+    return _respond(form, "".join(_unwrapped(form, iter((plain(form, value),)))))
 
 
 def _error(request: web.Request, error: ComponentError, status: int = 0) -> web.Response:
     form = SYNTAXES.get(request.query.get("syntax", "json"), SYNTAXES["json"])
     text = "".join(_unwrapped(form, iter((plain(form, error_body(error)),))))
-    return _respond(request, form, text, status or _STATUS.get(error.ex, _COMPONENT_ERROR))
+    return _respond(form, text, status or _STATUS.get(error.ex, _COMPONENT_ERROR))
 
 
-async def _status(request: web.Request, known: Request) -> web.StreamResponse:
+def _status(request: web.Request, known: Request) -> web.Response:
     form = _syntax(request)
-    return _respond(request, form, "".join(_unwrapped(form, known.pieces(form))))
-
-
-async def _stream(request: web.Request, value: Value) -> web.StreamResponse:
-    """Send a value, however large, in pieces that are made in another thread as fast as the client takes them."""
-    form = _syntax(request)
-    pieces = _unwrapped(form, value.pieces(form))
-    if value.size <= BATCH // 8:
-        return _respond(request, form, "".join(pieces))
-    response = web.StreamResponse(headers={"Content-Type": f"{form.media_type}; charset=utf-8", **_HEADERS})
-    await response.prepare(request)
-    while batch := await asyncio.to_thread(_batch, pieces):
-        await response.write(batch)
-    await response.write_eof()
-    return response
+    return _respond(form, "".join(_unwrapped(form, known.pieces(form))))
 
 
 def _batch(pieces: Iterator[str]) -> bytes:

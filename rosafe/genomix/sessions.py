@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import errno
+import functools
 import itertools
 import logging
 from collections.abc import Awaitable, Callable, Iterator, Mapping
@@ -203,24 +204,21 @@ class Session:
     def send(self, component: str, proxy: Proxy, name: str, given: Any, element: str, keep: bool) -> Request:
         """Make a request that the client follows by its id, unless it does not want to `keep` it."""
         port = proxy.port(name)
-        number = f"{component}::{next(self._sessions.numbers)}"
-        work: Awaitable[Value]
-        if port is not None:
-            request = Request(number)
-            work = proxy.read(port, element)
-        else:
-            service = proxy.service(name)
-            values = complete(service, given)
-            request = Request(number, service.activity)
-            if service.activity:
-                work = self._in_turn(lambda turn: self._activity(request, proxy, service, values, turn))
-            else:
-                work = self._in_turn(lambda _: proxy.call(service, values))
+        service = None if port is not None else proxy.service(name)
+        values = {} if service is None else complete(service, given)
         if keep:
             self._make_room()
+        request = Request(f"{component}::{next(self._sessions.numbers)}", service is not None and service.activity)
+        if keep:
             self.requests[request.id] = request
         else:
             request.forgotten.set()
+        work: Awaitable[Value]
+        if service is not None:
+            work = self._in_turn(functools.partial(self._serve, request, proxy, service, values))
+        else:
+            assert port is not None
+            work = proxy.read(port, element)
         self._sessions.keep(asyncio.create_task(self._follow(request, work)))
         return request
 
@@ -238,9 +236,11 @@ class Session:
             self.tell("request", request)
             self.drop_large()
 
-    async def _activity(
+    async def _serve(
         self, request: Request, proxy: Proxy, service: Service, values: Mapping[str, Any], turn: _Turn
     ) -> Value:
+        if not service.activity:
+            return await proxy.call(service, values)
         request.may_begin()
         goal = await proxy.start(service, values)
         request.begun(goal)

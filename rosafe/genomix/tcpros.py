@@ -16,6 +16,7 @@ import struct
 from collections.abc import Mapping
 from typing import Any
 
+import genpy
 import rosgraph.network
 
 from rosafe.genomix.graph import Graph, Unknown, middleware_error
@@ -197,6 +198,8 @@ class ServiceClient:
             return self._response_class().deserialize(await asyncio.wait_for(self._ask(buffer.getvalue()), timeout))
         except TimeoutError:
             raise middleware_error(f"{self._instance} did not answer {self.name} within {timeout:g} s") from None
+        except genpy.DeserializationError as problem:
+            raise middleware_error(f"{self.name} answers garbage: {problem}") from None
 
     async def _ask(self, request: bytes) -> bytearray:
         async with self._slots:
@@ -244,7 +247,7 @@ class TopicReader:
         try:
             self._address = await self._graph.topic_address(topic, self._node)
             return await self._read(self._address, topic)
-        except Refused as problem:
+        except (Refused, genpy.DeserializationError) as problem:
             raise middleware_error(f"{topic}: {problem}") from None
         except (TimeoutError, OSError, asyncio.IncompleteReadError) as problem:
             why = type(problem).__name__
