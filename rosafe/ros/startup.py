@@ -193,12 +193,15 @@ def _serve(node: Node, received: list[int]) -> None:
     import rospy
 
     rospy.on_shutdown(lambda: node.shutdown("kill"))  # rosnode kill, or a new node of the same name
+    over = threading.Event()
+    rospy.core.add_shutdown_hook(lambda reason: over.set())  # after rospy's own, which tell the master
     # An Event must not be set from a signal handler, which may interrupt the wait while that holds its lock.
     while not received and not rospy.is_shutdown() and not node.finished.wait(0.1):
         pass
     watchdog(END_SECONDS, 0)
     node.shutdown("kill")
     rospy.signal_shutdown("signal" if received else "kill")
+    over.wait()  # another thread may be at it already; the watchdog bounds this
 
 
 def watchdog(seconds: float, code: int, message: str = "") -> threading.Timer:
