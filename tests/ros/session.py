@@ -40,7 +40,7 @@ class Microphone:
         self.sample_rate, self.chunk, self.chunks = sample_rate, chunk, chunks
         self.index = 0  # of the newest frame
         self._message = wire.message_class("bass", "::binaudio::portStruct")
-        self._window = np.zeros((2, chunk * chunks), np.int32)
+        self.window = np.zeros((2, chunk * chunks), np.int32)
         self._publisher = rospy.Publisher(self.topic, self._message, latch=True, queue_size=0, tcp_nodelay=True)
         self.publish()
 
@@ -52,8 +52,8 @@ class Microphone:
                 nChunksOnPort=self.chunks,
                 nFramesPerChunk=self.chunk,
                 lastFrameIndex=self.index,
-                left=self._window[0].copy(),
-                right=self._window[1].copy(),
+                left=self.window[0].copy(),
+                right=self.window[1].copy(),
                 stamp={"sec": 0, "nsec": 0},
             )
         )
@@ -72,17 +72,17 @@ class Microphone:
 
     def lose(self, signal: np.ndarray) -> None:
         """Go on with `signal` and do not tell; what the window still holds comes with the next message."""
-        joined = np.concatenate((self._window, signal), axis=1)
-        self._window = joined[:, -self._window.shape[1] :]
+        joined = np.concatenate((self.window, signal), axis=1)
+        self.window = joined[:, -self.window.shape[1] :]
         self.index += signal.shape[1]
 
     def resize(self, chunks: int) -> None:
         """Let the window hold so many chunks from now on; what is older than the window so far is zeros."""
         self.chunks = chunks
         longer = np.zeros((2, chunks * self.chunk), np.int32)
-        kept = self._window[:, -longer.shape[1] :]
+        kept = self.window[:, -longer.shape[1] :]
         longer[:, longer.shape[1] - kept.shape[1] :] = kept
-        self._window = longer
+        self.window = longer
 
     @property
     def heard(self) -> bool:

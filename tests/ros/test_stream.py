@@ -102,12 +102,12 @@ def test_garbage_is_refused_and_the_connection_stands(fresh: Session) -> None:
     bad = [b"", b"\1\2\3", bytes(35), b"\xff" * 100, bytes(20) + b"\xff\xff\xff\xff" + bytes(64), bytes(10**6)]
     for data in bad:
         microphone.publish_bytes(data)
-    rate, window = microphone.sample_rate, microphone._window
+    rate, window = microphone.sample_rate, microphone.window
     microphone.sample_rate = 2**32 - 1
     microphone.publish()
-    microphone.sample_rate, microphone._window = rate, window[:, :0]
+    microphone.sample_rate, microphone.window = rate, window[:, :0]
     microphone.publish()
-    microphone._window = window
+    microphone.window = window
     microphone.play(signal[:, BLOCK:])
     assert_holds(fresh.read("preProc", 2 * BLOCK + 1), "preProc", windowed(normal(signal), 1.0, RATE))
     health = fresh.health(lambda entries: entries["refused"] == str(len(bad) + 2))
@@ -154,7 +154,7 @@ def test_a_window_that_changes_on_the_way(fresh: Session) -> None:
 def test_another_stream_under_the_same_index_does_not_pass_unnoticed(fresh: Session) -> None:
     microphone = fresh.build("PreProc", block=BLOCK)
     microphone.play(noise(BLOCK, 1))
-    microphone._window = noise(microphone._window.shape[1], 2)
+    microphone.window = noise(microphone.window.shape[1], 2)
     microphone.play(noise(BLOCK, 3))
     fresh.read("preProc", 2 * BLOCK + 1)
     health = fresh.health(lambda entries: entries["breaks"] == "1")
