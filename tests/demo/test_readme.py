@@ -12,6 +12,7 @@ import pytest
 
 from rosafe.ros.master import is_local
 from tests.demo.running import family, new_mark
+from tests.genomix import world as worlds
 from tests.harness import PYTHON, ROOT, SCRIPTS, Process, free_port, wait_for
 
 README = (ROOT / "README.md").read_text("utf-8")
@@ -109,6 +110,13 @@ def test_python(tmp_path: Path) -> None:
         assert done.out.startswith("(16, 99) [  80.  ") and done.err == ""
     statements = [line for line in code.splitlines() if line]
     assert len(statements) == 5
+
+
+def test_tcl(tmp_path: Path) -> None:
+    """The example as a script, with a genomixd on a port that is free."""
+    (script,) = blocks("tcl")
+    with worlds.world(tmp_path) as world:
+        assert world.lines(f"set env(GENOMIXD) $address\n{script}")[-1] == "dependencies {0 input 1 preProc 2 gammatone}"
 
 
 def test_links_lead_somewhere() -> None:
