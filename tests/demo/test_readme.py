@@ -116,7 +116,8 @@ def test_tcl(tmp_path: Path) -> None:
     """The example as a script, with a genomixd on a port that is free."""
     (script,) = blocks("tcl")
     with worlds.world(tmp_path) as world:
-        assert world.lines(f"set env(GENOMIXD) $address\n{script}")[-1] == "dependencies {0 input 1 preProc 2 gammatone}"
+        printed = world.lines(f"set env(GENOMIXD) $address\n{script}")
+        assert printed[-1] == "dependencies {0 input 1 preProc 2 gammatone}"
 
 
 def test_links_lead_somewhere() -> None:
