@@ -28,15 +28,21 @@ class Cascade:
         """Back to rest."""
         self.state = None
 
-    def process(self, block: NDArray[Any]) -> NDArray[Any]:
-        """Filter (*rows, N) along its last axis. Other rows than in the last block mean a start from rest."""
-        shape = (len(self.sections), *block.shape[:-1], 2)
-        kind = np.result_type(self.sections, block)
+    def started(self, rows: tuple[int, ...]) -> NDArray[Any]:
+        """The state for a block of `rows`. Other rows than in the last block mean a start from rest."""
+        shape = (len(self.sections), *rows, 2)
         if self.state is None or self.state.shape != shape:
-            self.state = np.zeros(shape, kind)
+            self.state = np.zeros(shape, self.sections.dtype)
+        return self.state
+
+    def process(self, block: NDArray[Any]) -> NDArray[Any]:
+        """Filter (*rows, N) along its last axis; `block` itself where there are no sections."""
+        state = self.started(block.shape[:-1])
+        if len(self.sections) == 0:
+            return block
         if block.size == 0:
-            return np.zeros(block.shape, kind)
-        result, state = signal.sosfilt(self.sections, block, zi=self.state)
+            return np.zeros(block.shape, state.dtype)
+        result, state = signal.sosfilt(self.sections, block, zi=state)
         self.state = np.ascontiguousarray(state)
         flush(self.state)
         return result

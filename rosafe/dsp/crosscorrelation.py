@@ -8,6 +8,7 @@ from typing import Any, ClassVar
 import numpy as np
 from scipy import fft
 
+from . import kernels
 from .checks import MAX_SAMPLES, positive
 from .framing import FramedStage, frame_parameters
 from .guard import FloatArray, limited
@@ -37,32 +38,23 @@ class CrossCorrelation(FramedStage):
         return (rows[1], 2 * self._max_lag + 1)
 
     def process(self, block: FloatArray) -> FloatArray:
-        samples = self._buffer.append(limited(self._checked(block)))
-        frames = self._framing.frames(samples)  # (2, C, F, w)
-        channel_count, frame_count, size = frames.shape[1:]
-        reach = min(self._max_lag, size - 1)  # beyond, frames do not overlap
-        inner = slice(self._max_lag - reach, self._max_lag + reach + 1)
-        result = np.zeros((channel_count, 2 * self._max_lag + 1, frame_count))
-        transform = fft.next_fast_len(size + reach, real=True)
-        at_once = max(1, BATCH // transform)  # frames of one channel, or of as many channels as go with them
-        channels_at_once = max(1, at_once // max(1, frame_count))
-        for first in range(0, channel_count, channels_at_once):
-            channels = slice(first, first + channels_at_once)
-            for begin in range(0, frame_count, at_once):
-                part = slice(begin, begin + at_once)
-                correlations = self._correlate(frames[:, channels, part], reach, transform)
-                result[channels, inner, part] = correlations.swapaxes(1, 2)
-        self._buffer.drop(frame_count * self._framing.hop)
+        samples = self._checked(block)
+        reach = min(self._max_lag, len(self._framing.window) - 1)  # beyond, frames do not overlap
+        if kernels.compiled() and 2 * reach + 1 <= kernels.MOST_LAGS:
+            return self._by_kernel(samples, reach)
+        frames = self._framing.frames(self._buffer.append(limited(samples)))  # (2, C, F, w)
+        result = np.zeros((samples.shape[1], 2 * self._max_lag + 1, frames.shape[2]))
+        correlate_by_fft(frames, self._framing.window, reach, result)
+        self._buffer.drop(frames.shape[2] * self._framing.hop)
         return result
 
-    def _correlate(self, frames: FloatArray, reach: int, transform: int) -> FloatArray:
-        """Frames (2, C, F, w) of both ears to (C, F, 2 reach + 1)."""
-        left, right = frames * self._framing.window
-        energies = np.einsum("cfi,cfi->cf", left, left) * np.einsum("cfi,cfi->cf", right, right)
-        spectrum = fft.rfft(left, transform) * np.conj(fft.rfft(right, transform))
-        circular = fft.irfft(spectrum, transform)
-        lags = np.concatenate((circular[..., transform - reach :], circular[..., : reach + 1]), axis=-1)
-        return lags / np.sqrt(energies + EPSILON)[..., np.newaxis]
+    def _by_kernel(self, samples: FloatArray, reach: int) -> FloatArray:
+        taken = self._take(samples)
+        result = np.zeros((samples.shape[1], 2 * self._max_lag + 1, taken.frames))
+        window, hop = self._framing.window, self._framing.hop
+        kernels.correlations(taken.history, samples, taken.skip, window, hop, reach, EPSILON, result)
+        taken.keep(samples)
+        return result
 
     def _build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
         lag = values["cc_maxDelaySec"] * self.sample_rate
@@ -70,3 +62,29 @@ class CrossCorrelation(FramedStage):
             raise ValueError(f"cc_maxDelaySec: too long, {lag:.6g} samples")
         super()._build(values, changed)
         self._max_lag = math.ceil(lag)
+
+
+def correlate_by_fft(frames: FloatArray, window: FloatArray, reach: int, result: FloatArray) -> None:
+    """Frames (2, C, F, w) of both ears to the middle 2 reach + 1 lags of `result` (C, L, F)."""
+    channel_count, frame_count, size = frames.shape[1:]
+    middle = result.shape[1] // 2
+    inner = slice(middle - reach, middle + reach + 1)
+    transform = fft.next_fast_len(size + reach, real=True)
+    at_once = max(1, BATCH // transform)  # frames of one channel, or of as many channels as go with them
+    channels_at_once = max(1, at_once // max(1, frame_count))
+    for first in range(0, channel_count, channels_at_once):
+        channels = slice(first, first + channels_at_once)
+        for begin in range(0, frame_count, at_once):
+            part = slice(begin, begin + at_once)
+            correlations = _correlate(frames[:, channels, part] * window, reach, transform)
+            result[channels, inner, part] = correlations.swapaxes(1, 2)
+
+
+def _correlate(frames: FloatArray, reach: int, transform: int) -> FloatArray:
+    """Windowed frames (2, C, F, w) to (C, F, 2 reach + 1)."""
+    left, right = frames
+    energies = np.einsum("cfi,cfi->cf", left, left) * np.einsum("cfi,cfi->cf", right, right)
+    spectrum = fft.rfft(left, transform) * np.conj(fft.rfft(right, transform))
+    circular = fft.irfft(spectrum, transform)
+    lags = np.concatenate((circular[..., transform - reach :], circular[..., : reach + 1]), axis=-1)
+    return lags / np.sqrt(energies + EPSILON)[..., np.newaxis]

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from functools import cached_property
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
+from . import kernels
+from .cascade import Cascade
 from .checks import positive, sample_count, word
-from .guard import FloatArray
+from .guard import FloatArray, limited
 from .stage import Parameter, Stage
 from .windows import NAMES, window
 
@@ -49,61 +52,108 @@ class Framing:
             return np.empty((*samples.shape[:-1], 0, len(self.window)))
         return sliding_window_view(samples, len(self.window), axis=-1)[..., :: self.hop, :]
 
-    def means(self, samples: FloatArray) -> FloatArray:
-        """mean(window x) of each whole frame: (..., n) to (..., F)."""
-        return self._weighted_sums(samples, self.window / len(self.window))
+    def weights(self, squared: bool) -> FloatArray:
+        """What to multiply samples, or their squares, with for the mean of a windowed frame."""
+        return self._square_weights if squared else self._plain_weights
 
-    def mean_squares(self, samples: FloatArray) -> FloatArray:
-        """mean((window x)**2) of each whole frame: (..., n) to (..., F)."""
-        if self.complete(samples.shape[-1]) == 0:
-            return np.empty((*samples.shape[:-1], 0))  # saves squaring a long window that is not full yet
-        return self._weighted_sums(np.square(samples), np.square(self.window) / len(self.window))
+    @cached_property
+    def _plain_weights(self) -> FloatArray:
+        return self.window / len(self.window)
 
-    def _weighted_sums(self, samples: FloatArray, weights: FloatArray) -> FloatArray:
+    @cached_property
+    def _square_weights(self) -> FloatArray:
+        return np.square(self.window) / len(self.window)
+
+    def means(self, samples: FloatArray, squared: bool) -> FloatArray:
+        """mean(window x), or mean((window x)**2), of each whole frame: (..., n) to (..., F)."""
+        if squared and self.complete(samples.shape[-1]) > 0:  # else a long window that is not full yet
+            samples = np.square(samples)
         # Not a matrix product: OpenBLAS starts threads of its own for it, and two stages at work at the same time
         # then get in each other's way: several times slower than one alone.
-        return np.einsum("...fi,i->...f", self.frames(samples), weights)
+        return np.einsum("...fi,i->...f", self.frames(samples), self.weights(squared))
 
 
 class FrameBuffer:
-    """The samples from the start of the next frame on, in an array that grows at its end and is moved now and then."""
+    """The samples that later frames need, in an array that grows at its end and is moved now and then.
+
+    Samples are counted from the first one that is held on, through the next block: the next frame starts at `skip`,
+    which is 0 but where the hop is longer than the window and samples still to come lie between two frames.
+    """
 
     def __init__(self) -> None:
         self._store = np.empty((0, 0))
         self._start = self._stop = 0
-        self._skip = 0  # samples still to come before the next frame starts (hop longer than the window)
+        self.skip = 0
+
+    @property
+    def held(self) -> int:
+        """How many samples there are."""
+        return self._stop - self._start
+
+    def begin(self, rows: tuple[int, ...]) -> None:
+        """A block of `rows` is about to come. Other rows than before mean a new beginning."""
+        if rows != self._store.shape[:-1]:
+            self._store = np.empty((*rows, 0))
+            self._start = self._stop = self.skip = 0
+
+    def advance(self, arriving: int, count: int) -> tuple[FloatArray, FloatArray]:
+        """After a block of so many samples, the next frame is to start `count` samples later than it would have.
+
+        Returns the samples held till now, and room for those at the end of the block that will be held; the caller must
+        fill it. The room may lie where the samples were, then each row behind the place of its own old samples.
+        """
+        first = self.skip + count
+        total = self.held + arriving
+        self.skip = max(0, first - total)
+        if first < self.held:
+            self._make_room(total)
+            history = self._store[..., self._start : self._stop]
+            self._start, self._stop = self._start + first, self._stop + arriving
+            return history, self._store[..., self._stop - arriving : self._stop]
+        history = self._store[..., self._start : self._stop]
+        kept = max(0, total - first)
+        if kept > self._store.shape[-1]:
+            self._store = np.empty((*self._store.shape[:-1], 2 * kept))
+        self._start, self._stop = 0, kept
+        return history, self._store[..., :kept]
 
     def append(self, block: FloatArray) -> FloatArray:
-        """Take in (*rows, N); returns a view of all samples, valid until the next call.
-
-        Other rows than before mean a new beginning.
-        """
-        if block.shape[:-1] != self._store.shape[:-1]:
-            self._store = np.empty((*block.shape[:-1], 0))
-            self._start = self._stop = self._skip = 0
-        skipped = min(self._skip, block.shape[-1])
-        self._skip -= skipped
-        fresh = block[..., skipped:]
-        needed = self._stop - self._start + fresh.shape[-1]
-        if self._start + needed > self._store.shape[-1]:
-            self._make_room(needed)
-        stop = self._start + needed
-        self._store[..., self._stop : stop] = fresh
-        self._stop = stop
-        return self._store[..., self._start : stop]
+        """Take in (*rows, N); a view of all samples from the next frame's start on, valid until the next call."""
+        self.begin(block.shape[:-1])
+        _, room = self.advance(block.shape[-1], 0)
+        room[...] = _last(block, room.shape[-1])
+        return self._store[..., self._start : self._stop]
 
     def drop(self, count: int) -> None:
         """The next frame starts `count` samples later, be they here or still to come."""
-        here = min(count, self._stop - self._start)
-        self._start += here
-        self._skip += count - here
+        self.advance(0, count)
 
     def _make_room(self, needed: int) -> None:
+        if self._start + needed <= self._store.shape[-1]:
+            return
         kept = self._store[..., self._start : self._stop]
         if 2 * needed > self._store.shape[-1]:
             self._store = np.empty((*kept.shape[:-1], 2 * needed))
         self._store[..., : kept.shape[-1]] = kept
         self._start, self._stop = 0, kept.shape[-1]
+
+
+def _last(block: FloatArray, count: int) -> FloatArray:
+    """The last `count` samples of (..., N)."""
+    return block[..., block.shape[-1] - count :]
+
+
+class Taken(NamedTuple):
+    """Frames that lie in a history and a block behind it, without the two being joined."""
+
+    skip: int  # where the first frame starts
+    frames: int  # how many there are
+    history: FloatArray  # (*rows, T)
+    room: FloatArray  # (*rows, n), to be filled with what is kept for later frames, as `FrameBuffer.advance` says
+
+    def keep(self, block: FloatArray) -> None:
+        """Fill `room` from the end of the block, when nothing more is to be read from `history`."""
+        self.room[...] = _last(block, self.room.shape[-1])
 
 
 class FramedStage(Stage):
@@ -124,6 +174,42 @@ class FramedStage(Stage):
 
     def reset(self) -> None:
         self._buffer = FrameBuffer()
+
+    def _means(self, block: FloatArray, squared: bool, integrator: Cascade | None = None) -> FloatArray:
+        """The means of the frames that `block` (*rows, N) completes, (*rows, F): `Framing.means`.
+
+        Through an `integrator` of one section, the block goes first.
+        """
+        if not kernels.compiled():
+            samples = limited(block) if integrator is None else integrator.process(limited(block))
+            means = self._framing.means(self._buffer.append(samples), squared)
+            self._buffer.drop(means.shape[-1] * self._framing.hop)
+            return means
+        taken = self._take(block)
+        weights, hop = self._framing.weights(squared), self._framing.hop
+        if integrator is None:
+            means = kernels.frame_sums(taken.history, block, taken.skip, weights, hop, taken.frames, squared)
+            taken.keep(block)
+            return means
+        return kernels.integrated_frame_sums(
+            taken.history,
+            block,
+            taken.skip,
+            weights,
+            hop,
+            taken.frames,
+            squared,
+            integrator.sections,
+            integrator.started(block.shape[:-1]),
+            taken.room,
+        )
+
+    def _take(self, block: FloatArray) -> Taken:
+        """What a kernel needs to know to find the frames that `block` completes; they are then done with."""
+        self._buffer.begin(block.shape[:-1])
+        skip = self._buffer.skip
+        frames = self._framing.complete(self._buffer.held + block.shape[-1] - skip)
+        return Taken(skip, frames, *self._buffer.advance(block.shape[-1], frames * self._framing.hop))
 
     def _build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
         self._framing = Framing.design(self.sample_rate, self.PREFIX, values)

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import numpy as np
 from scipy import signal
 
+from . import kernels
 from .cascade import Cascade
 from .checks import word
 from .guard import LIMIT, FloatArray, limited
@@ -18,6 +20,20 @@ LOWPASS = {
     "dau": (2, 1000.0, 1),
     "breebart": (1, 2000.0, 5),
     "bernstein": (2, 425.0, 1),
+}
+# before the low-pass; "none" where it is not named
+RECTIFICATION = {
+    "halfwave": "halfwave",
+    "fullwave": "fullwave",
+    "square": "square",
+    "dau": "halfwave",
+    "breebart": "halfwave",
+}
+RECTIFIERS: dict[str, Callable[[FloatArray], FloatArray]] = {
+    "none": np.copy,
+    "halfwave": lambda samples: np.maximum(samples, 0.0),
+    "fullwave": np.abs,
+    "square": np.square,
 }
 ENVELOPE_METHODS = ("hilbert", "joergensen", "bernstein")
 METHODS = ("none", "halfwave", "fullwave", "square", "hilbert", "joergensen", "dau", "breebart", "bernstein")
@@ -48,42 +64,36 @@ class InnerHairCell(Stage):
 
     def process(self, block: FloatArray, envelope: FloatArray | None = None) -> FloatArray:
         """As `Stage.process`; `envelope` is that of `block`, of the same shape, for the methods that need it."""
-        samples = limited(self._checked(block))
+        samples = self._checked(block)
+        method = self._values["ihc_method"]
         if self.needs_envelope:
             if envelope is None or np.shape(envelope) != samples.shape:
-                raise ValueError(f"envelope: {self._values['ihc_method']} needs one of the shape of the block")
-            rectified = self._from_envelope(samples, limited(self._checked(envelope)))
-        else:
-            rectified = self._from_samples(samples)
-        return rectified if self._lowpass is None else self._lowpass.process(rectified)
+                raise ValueError(f"envelope: {method} needs one of the shape of the block")
+            envelope = self._checked(envelope)
+            samples = envelope if method != "bernstein" else _compressed(limited(samples), limited(envelope))
+        rectification = RECTIFICATION.get(method, "none")
+        if kernels.compiled():
+            state = self._lowpass.started(samples.shape[:-1])
+            return kernels.rectify_and_filter(rectification, samples, self._lowpass.sections, state)
+        return self._lowpass.process(RECTIFIERS[rectification](limited(samples)))
 
     def reset(self) -> None:
-        if self._lowpass is not None:
-            self._lowpass.reset()
+        self._lowpass.reset()
 
     def _build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
-        lowpass = None
-        if values["ihc_method"] in LOWPASS:
-            order, cutoff, times = LOWPASS[values["ihc_method"]]
+        method = values["ihc_method"]
+        sections = np.empty((0, 6))
+        if method in LOWPASS:
+            order, cutoff, times = LOWPASS[method]
             if cutoff >= self.sample_rate / 2:
-                raise ValueError(f"ihc_method: {values['ihc_method']} needs a sample rate above {2 * cutoff:.12g} Hz")
-            lowpass = Cascade(np.tile(signal.butter(order, cutoff, fs=self.sample_rate, output="sos"), (times, 1)))
-        self._lowpass = lowpass
+                raise ValueError(f"ihc_method: {method} needs a sample rate above {2 * cutoff:.12g} Hz")
+            sections = np.tile(signal.butter(order, cutoff, fs=self.sample_rate, output="sos"), (times, 1))
+        self._lowpass = Cascade(sections)
 
-    def _from_samples(self, samples: FloatArray) -> FloatArray:
-        method = self._values["ihc_method"]
-        if method == "none":
-            return samples.copy()
-        if method == "fullwave":
-            return np.abs(samples)
-        if method == "square":
-            return np.square(samples)
-        return np.maximum(samples, 0.0)
 
-    def _from_envelope(self, samples: FloatArray, envelope: FloatArray) -> FloatArray:
-        if self._values["ihc_method"] != "bernstein":
-            return envelope.copy()
-        compressed = np.power(envelope, -0.77, out=np.zeros_like(envelope), where=envelope > 0)
-        compressed *= samples
-        # the bound tells only where an envelope is smaller by far than the signal it is said to belong to
-        return np.square(np.clip(compressed, 0.0, LIMIT, out=compressed))
+def _compressed(samples: FloatArray, envelope: FloatArray) -> FloatArray:
+    """max(envelope**-0.77 samples, 0)**2."""
+    compressed = np.power(envelope, -0.77, out=np.zeros_like(envelope), where=envelope > 0)
+    compressed *= samples
+    # the bound tells only where an envelope is smaller by far than the signal it is said to belong to
+    return np.square(np.clip(compressed, 0.0, LIMIT, out=compressed))

@@ -7,7 +7,7 @@ from typing import ClassVar
 import numpy as np
 
 from .framing import FramedStage, frame_parameters
-from .guard import FloatArray, limited
+from .guard import FloatArray
 from .stage import ParameterTable
 
 EPSILON = 2.2204e-16  # the original's literal
@@ -26,7 +26,5 @@ class Ild(FramedStage):
         return rows[1:]
 
     def process(self, block: FloatArray) -> FloatArray:
-        samples = self._buffer.append(limited(self._checked(block)))
-        left, right = self._framing.mean_squares(samples)
-        self._buffer.drop(left.shape[-1] * self._framing.hop)
+        left, right = self._means(self._checked(block), squared=True)
         return 10 * np.log10((right + EPSILON) / (left + EPSILON))

@@ -9,7 +9,7 @@ import numpy as np
 from .cascade import Cascade, leaky_integrator
 from .checks import positive, word
 from .framing import FramedStage, frame_parameters
-from .guard import FloatArray, limited
+from .guard import FloatArray
 from .stage import Parameter, ParameterTable
 
 
@@ -29,11 +29,7 @@ class Ratemap(FramedStage):
     }
 
     def process(self, block: FloatArray) -> FloatArray:
-        samples = self._buffer.append(self._integrator.process(limited(self._checked(block))))
-        power = self._values["rm_scaling"] == "power"
-        rates = self._framing.mean_squares(samples) if power else self._framing.means(samples)
-        self._buffer.drop(rates.shape[-1] * self._framing.hop)
-        return rates
+        return self._means(self._checked(block), self._values["rm_scaling"] == "power", self._integrator)
 
     def reset(self) -> None:
         super().reset()

@@ -190,7 +190,8 @@ def _make_current(base: Path, name: str) -> None:
     new.symlink_to(name)
     new.rename(link)
     (base / name).touch()
-    old = sorted((p for p in base.iterdir() if p.is_dir() and not p.is_symlink()), key=lambda p: -p.stat().st_mtime)
+    generations = [p for p in base.iterdir() if (p / "python").is_dir() and not p.is_symlink()]  # not the kernels
+    old = sorted(generations, key=lambda p: -p.stat().st_mtime)
     for generation in old[KEPT:]:
         shutil.rmtree(generation)
 

@@ -1,0 +1,220 @@
+/* Cross-correlation of the two ears' frames over few lags, in the time domain.
+ *
+ * c[m] = sum_t l[t+m] r[t] for m from -reach to reach, over sqrt(sum l^2 sum r^2 + eps) (rosafe/dsp/crosscorrelation.py).
+ * Four frames, of any channels, are in the four lanes.
+ *
+ * With samples and lags split into even and odd ones, the sum is a product of a matrix of Toeplitz blocks and a vector,
+ *
+ *     c even = A r0 + B r1 = B (r0 + r1) + (A - B) r0      A: even samples of l, B: odd ones,
+ *     c odd  = B r0 + C r1 = B (r0 + r1) + (C - B) r1      C: even samples from the next one on,
+ *
+ * three products of a quarter of the size instead of four (Karatsuba's way, as in fast FIR filters: Z.-J. Mou and
+ * P. Duhamel (1991), IEEE Trans. Signal Processing 39). Applied up to three times; the phases of l, r and c that this
+ * takes apart lie apart from the start, so that only sums and differences are computed. What remains is done directly, up
+ * to 13 lags at a time with their sums in registers. */
+#include "vector.h"
+
+enum {
+    SPAN = 1024,        /* samples of a frame at a time: all of this stays in the second-level cache */
+    MOST_LAGS = 1024,   /* FFT is faster beyond */
+    MOST_HALVINGS = 3,
+    MOST_PHASES = 1 << MOST_HALVINGS,
+    LAGS_AT_ONCE = 13,  /* as many sums as registers leave room for */
+    LONGEST = SPAN + MOST_LAGS + MOST_PHASES * (MOST_HALVINGS + 2),
+};
+
+/* --- products --- */
+
+INLINE void some_lags(const int lags, const v4 *l, const v4 *r, int64_t n, v4 *c) {
+    v4 sum[LAGS_AT_ONCE];
+    UNROLL for (int m = 0; m < lags; m++) sum[m] = (v4){};
+    for (int64_t t = 0; t < n; t++) {
+        v4 x = r[t];
+        UNROLL for (int m = 0; m < lags; m++) sum[m] = fused(l[t + m], x, sum[m]);
+        __asm__ volatile(""); /* keeps the compiler from moving sums to memory */
+    }
+    UNROLL for (int m = 0; m < lags; m++) c[m] = sum[m];
+}
+
+/* c[m] = sum_t l[t+m] r[t], n samples and `lags` lags. */
+static void direct(const v4 *l, const v4 *r, int64_t n, int64_t lags, v4 *c) {
+    int64_t times = (lags + LAGS_AT_ONCE - 1) / LAGS_AT_ONCE, size = (lags + times - 1) / times;
+    for (int64_t first = 0; first < lags; first += size) {
+        int64_t m = least(first, lags - size); /* the last ones overlap those before */
+        switch (size) {
+#define CASE(size) case size: some_lags(size, l + m, r, n, c + m); break;
+        CASE(1) CASE(2) CASE(3) CASE(4) CASE(5) CASE(6) CASE(7) CASE(8) CASE(9) CASE(10) CASE(11) CASE(12) CASE(13)
+#undef CASE
+        }
+    }
+}
+
+INLINE void add(const v4 *a, const v4 *b, int64_t n, v4 *sum) {
+    _Pragma("GCC unroll 4") for (int64_t t = 0; t < n; t++) sum[t] = a[t] + b[t];
+}
+
+INLINE void subtract(const v4 *a, const v4 *b, int64_t n, v4 *difference) {
+    _Pragma("GCC unroll 4") for (int64_t t = 0; t < n; t++) difference[t] = a[t] - b[t];
+}
+
+/* The same of sequences in 2^halvings phases: r and c with n and `lags` elements in each, l with n + lags - 1 + halvings. */
+static void product(int halvings, const v4 *const *l, const v4 *const *r, int64_t n, int64_t lags, v4 *const *c,
+                    v4 *scratch) {
+    if (halvings == 0) {
+        direct(l[0], r[0], n, lags, c[0]);
+        return;
+    }
+    enum { MOST_HALF = MOST_PHASES / 2 };
+    const int half = 1 << (halvings - 1);
+    const int64_t length = n + lags - 1 + halvings - 1;
+    const v4 *odd[MOST_HALF], *sum[MOST_HALF], *difference[MOST_HALF] = {0}, *part[MOST_HALF] = {0};
+    v4 *common[MOST_HALF], *own[MOST_HALF];
+    for (int i = 0; i < half; i++) {
+        odd[i] = l[2 * i + 1];
+        common[i] = scratch;
+        own[i] = common[i] + lags;
+        add(r[2 * i], r[2 * i + 1], n, own[i] + lags);
+        sum[i] = own[i] + lags;
+        scratch = own[i] + lags + n;
+    }
+    product(halvings - 1, odd, sum, n, lags, common, scratch);
+    for (int parity = 0; parity < 2; parity++) {
+        v4 *free = scratch;
+        for (int i = 0; i < half; i++, free += length) {
+            int even = 2 * (i + parity); /* for odd lags, even samples from the next one on */
+            subtract(even < 2 * half ? l[even] : l[0] + 1, odd[i], length, free);
+            difference[i] = free;
+            part[i] = r[2 * i + parity];
+        }
+        product(halvings - 1, difference, part, n, lags, own, free);
+        for (int i = 0; i < half; i++) add(common[i], own[i], lags, c[2 * i + parity]);
+    }
+}
+
+/* How often to halve: where the arithmetic is least. */
+static int best_halvings(int64_t size, int64_t lags) {
+    int best = 0;
+    double least_cost = 1e300;
+    for (int halvings = 0; halvings <= MOST_HALVINGS; halvings++) {
+        int64_t phases = 1 << halvings, n = (size + phases - 1) / phases, m = (lags + phases - 1) / phases;
+        int64_t times = (m + LAGS_AT_ONCE - 1) / LAGS_AT_ONCE, computed = times * ((m + times - 1) / times);
+        double products = 1, cost = 0;
+        for (int64_t half = phases / 2; half > 0; half /= 2, products *= 3) cost += 1.5 * products * half * (3 * n + 2 * m);
+        cost += products * n * (computed + 2);
+        if (cost < least_cost) least_cost = cost, best = halvings;
+    }
+    return best;
+}
+
+/* --- frames --- */
+
+/* Samples in 2^halvings phases, `length` in each. */
+typedef struct {
+    v4 *samples;
+    int64_t halvings, length;
+} phases;
+
+INLINE v4 *at(phases to, int64_t t) {
+    return to.samples + (t & ((1 << to.halvings) - 1)) * to.length + (t >> to.halvings);
+}
+
+/* Samples from..until of four rows times `window` to `to` from t on; returns their energy. */
+static v4 put(const double *const rows[LANES], const double *window, int64_t from, int64_t until, phases to, int64_t t) {
+    v4 energy = {}, *place[MOST_PHASES]; /* of eight samples in turn; those of the next eight lie `advance` further */
+    for (int k = 0; k < MOST_PHASES; k++) place[k] = at(to, t + k);
+    int64_t i = from, advance = MOST_PHASES >> to.halvings, ahead = 0;
+    for (; i + MOST_PHASES <= until; i += MOST_PHASES, ahead += advance)
+        UNROLL for (int k = 0; k < MOST_PHASES; k += 2) {
+            v4 pair[2];
+            read_pair(rows, i + k, pair);
+            UNROLL for (int j = 0; j < 2; j++) {
+                v4 x = bounded(pair[j], -LIMIT, LIMIT) * all(window[i + k + j]);
+                energy = fused(x, x, energy);
+                place[k + j][ahead] = x;
+            }
+        }
+    for (int k = 0; i + k < until; k++) {
+        v4 x = bounded(gathered(rows, i + k), -LIMIT, LIMIT) * all(window[i + k]);
+        energy = fused(x, x, energy);
+        place[k][ahead] = x;
+    }
+    return energy;
+}
+
+static void put_zeros(phases to, int64_t t, int64_t until) {
+    for (; t < until; t++) *at(to, t) = (v4){};
+}
+
+typedef struct {
+    const double *history; /* of one row: `held` samples, and those of the block behind */
+    const double *block;
+    int64_t held;
+} row;
+
+/* Where samples from..from + n of the row lie; in `joined`, if they are apart. */
+static const double *find(row of, int64_t from, int64_t n, double *joined) {
+    if (from >= of.held) return of.block + (from - of.held);
+    if (from + n <= of.held) return of.history + from;
+    for (int64_t i = 0; i < n; i++)
+        joined[i] = from + i < of.held ? of.history[from + i] : of.block[from + i - of.held];
+    return joined;
+}
+
+/* The rows of history and block are (2, channels), those of the history history_stride apart; the first frame begins at
+ * sample `skip` of both joined, each next one `hop` later. output is (channels, 2 reach + 1, frames), the channels
+ * channel_stride apart. 2 reach + 1 is at most MOST_LAGS. */
+void rosafe_correlations(const double *history, int64_t history_stride, int64_t held, const double *block, int64_t n,
+                         int64_t channels, int64_t skip, const double *window, int64_t size, int64_t hop,
+                         int64_t frames, int64_t reach, double epsilon, double *output, int64_t channel_stride) {
+    uint32_t mode = denormals_off();
+    const int64_t lags = 2 * reach + 1, spans = (size + SPAN - 1) / SPAN, span = (size + spans - 1) / spans;
+    const int halvings = best_halvings(span, lags);
+    const int64_t count = 1 << halvings, n_r = (span + count - 1) / count, n_c = (lags + count - 1) / count;
+    const int64_t n_l = n_r + n_c - 1 + halvings;
+    v4 l_samples[LONGEST], r_samples[SPAN + MOST_PHASES], c_samples[MOST_LAGS + MOST_PHASES], scratch[3 * LONGEST];
+    const phases l = {l_samples, halvings, n_l}, r = {r_samples, halvings, n_r}, c = {c_samples, halvings, n_c};
+    const v4 *l_phases[MOST_PHASES], *r_phases[MOST_PHASES];
+    v4 *c_phases[MOST_PHASES];
+    for (int i = 0; i < count; i++)
+        l_phases[i] = l_samples + i * n_l, r_phases[i] = r_samples + i * n_r, c_phases[i] = c_samples + i * n_c;
+
+    for (int64_t first = 0; first < channels * frames; first += LANES) {
+        double joined[2][LANES][LONGEST];
+        v4 correlation[MOST_LAGS] = {}, energy[2] = {};
+        double *to[LANES];
+        int64_t channel[LANES], frame[LANES];
+        for (int k = 0; k < LANES; k++) { /* lanes without a frame do the last one once more */
+            int64_t number = least(first + k, channels * frames - 1);
+            channel[k] = number / frames;
+            frame[k] = number % frames;
+            to[k] = output + channel[k] * channel_stride + frame[k];
+        }
+        for (int64_t begin = 0; begin < size; begin += span) {
+            /* r from `begin` to `end`; of l, up to `reach` more on either side */
+            int64_t end = least(begin + span, size), l_begin = most(0, begin - reach), l_end = least(size, end + reach);
+            const double *rows[2][LANES];
+            for (int k = 0; k < LANES; k++)
+                for (int ear = 0; ear < 2; ear++) {
+                    int64_t number = ear * channels + channel[k], from = ear ? begin : l_begin;
+                    row of = {history + number * history_stride, block + number * n, held};
+                    rows[ear][k] = find(of, skip + frame[k] * hop + from, (ear ? end : l_end) - from, joined[ear][k]);
+                }
+            const int64_t before = begin - l_begin, inside = end - begin, all_l = l_end - l_begin, all_r = end - begin;
+            put_zeros(l, 0, reach - before);
+            put(rows[0], window + l_begin, 0, before, l, reach - before);
+            energy[0] += put(rows[0], window + l_begin, before, before + inside, l, reach);
+            put(rows[0], window + l_begin, before + inside, all_l, l, reach + inside);
+            put_zeros(l, reach - before + all_l, count * n_l);
+            energy[1] += put(rows[1], window + begin, 0, all_r, r, 0);
+            put_zeros(r, all_r, count * n_r);
+            product(halvings, l_phases, r_phases, n_r, n_c, c_phases, scratch);
+            for (int64_t m = 0; m < lags; m++) correlation[m] += *at(c, m);
+        }
+        v4 scale = all(1.0) / root(energy[0] * energy[1] + all(epsilon));
+        for (int64_t m = 0; m < lags; m++) {
+            v4 normalised = correlation[m] * scale;
+            UNROLL for (int k = 0; k < LANES; k++) to[k][m * frames] = normalised[k];
+        }
+    }
+    denormals_as(mode);
+}

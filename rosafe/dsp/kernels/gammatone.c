@@ -1,0 +1,104 @@
+/* The gammatone filterbank: per row (ear and channel) a cascade of equal complex one-pole filters.
+ *
+ * y[t] = x[t] + s, s = p y[t] with the complex pole p, `order` times; the input is scaled before every fourth pole. The
+ * output is the real part, the envelope the modulus. (V. Hohmann (2002), Acta Acustica united with Acustica 88; the same
+ * as direct form II transposed of rosafe/dsp/gammatone.py, operation by operation.)
+ *
+ * Four rows in the lanes. Up to four poles at a time have their states in registers; between them, spans of samples stay
+ * in the first-level cache, so that any order costs the same per pole. */
+#include "vector.h"
+
+enum { SPAN = 64, TOGETHER = 4, MOST_POLES = 64 };
+
+typedef struct {
+    v4 re, im;
+} complex4;
+
+/* n samples through `poles` poles; `real`: the imaginary part of the input is 0 and not read. */
+INLINE void run(const int poles, const int real, complex4 *samples, int64_t n, complex4 pole, complex4 *states) {
+    complex4 s[TOGETHER];
+    UNROLL for (int k = 0; k < poles; k++) s[k] = states[k];
+    for (int64_t t = 0; t < n; t++) {
+        v4 re = samples[t].re, im = real ? (v4){} : samples[t].im;
+        UNROLL for (int k = 0; k < poles; k++) {
+            re += s[k].re;
+            im = real && k == 0 ? s[k].im : im + s[k].im;
+            s[k].re = pole.re * re - pole.im * im;
+            s[k].im = pole.re * im + pole.im * re;
+        }
+        samples[t] = (complex4){re, im};
+    }
+    UNROLL for (int k = 0; k < poles; k++) states[k] = s[k];
+}
+
+static void run_some(int64_t poles, int real, complex4 *samples, int64_t n, complex4 pole, complex4 *states) {
+    switch (poles * 2 + real) {
+    case 9: run(4, 1, samples, n, pole, states); break;
+    case 8: run(4, 0, samples, n, pole, states); break;
+    case 7: run(3, 1, samples, n, pole, states); break;
+    case 6: run(3, 0, samples, n, pole, states); break;
+    case 5: run(2, 1, samples, n, pole, states); break;
+    case 4: run(2, 0, samples, n, pole, states); break;
+    case 3: run(1, 1, samples, n, pole, states); break;
+    case 2: run(1, 0, samples, n, pole, states); break;
+    }
+}
+
+/* Gain and pole of a section (complex b0, b1, b2, 1, a1, a2; the gain is real, b1, b2 and a2 are 0). */
+INLINE double gain_of(const double *sections, int64_t number) { return sections[12 * number]; }
+INLINE const double *minus_pole_of(const double *sections, int64_t number) { return sections + 12 * number + 8; }
+
+/* block (2, n), sections (channels, order, 6) complex, state (2, channels, order) complex, output (2, channels, n),
+ * envelope likewise or null. */
+void rosafe_gammatone(const double *block, int64_t n, int64_t channels, int64_t order, const double *sections,
+                      double *state, double *output, double *envelope) {
+    uint32_t mode = denormals_off();
+    for (int64_t first = 0; first < 2 * channels; first += LANES) {
+        int64_t row[LANES], channel[LANES]; /* lanes without a row do the last one once more */
+        complex4 pole, states[MOST_POLES], samples[SPAN];
+        v4 left, right; /* the first gain for one ear's lanes, 0 for the other's */
+        for (int k = 0; k < LANES; k++) {
+            row[k] = least(first + k, 2 * channels - 1);
+            channel[k] = row[k] % channels;
+            pole.re[k] = -minus_pole_of(sections, channel[k] * order)[0];
+            pole.im[k] = -minus_pole_of(sections, channel[k] * order)[1];
+            left[k] = row[k] < channels ? gain_of(sections, channel[k] * order) : 0;
+            right[k] = row[k] < channels ? 0 : gain_of(sections, channel[k] * order);
+            for (int64_t p = 0; p < order; p++) {
+                states[p].re[k] = state[2 * (row[k] * order + p)];
+                states[p].im[k] = state[2 * (row[k] * order + p) + 1];
+            }
+        }
+        for (int64_t at = 0; at < n; at += SPAN) {
+            int64_t count = least(SPAN, n - at);
+            for (int64_t t = 0; t < count; t++)
+                samples[t].re = all(block[at + t]) * left + all(block[n + at + t]) * right;
+            for (int64_t p = 0; p < order; p += TOGETHER) {
+                if (p > 0) {
+                    v4 gain;
+                    for (int k = 0; k < LANES; k++) gain[k] = gain_of(sections, channel[k] * order + p);
+                    for (int64_t t = 0; t < count; t++) {
+                        samples[t].re *= gain;
+                        samples[t].im *= gain;
+                    }
+                }
+                run_some(least(TOGETHER, order - p), p == 0, samples, count, pole, states + p);
+            }
+            double *to[LANES];
+            for (int k = 0; k < LANES; k++) to[k] = output + row[k] * n + at;
+            write_rows(&samples[0].re, 2, count, to);
+            if (envelope) {
+                for (int64_t t = 0; t < count; t++)
+                    samples[t].re = root(samples[t].re * samples[t].re + samples[t].im * samples[t].im);
+                for (int k = 0; k < LANES; k++) to[k] = envelope + row[k] * n + at;
+                write_rows(&samples[0].re, 2, count, to);
+            }
+        }
+        for (int k = 0; k < LANES; k++)
+            for (int64_t p = 0; p < order; p++) {
+                state[2 * (row[k] * order + p)] = flushed(states[p].re[k]);
+                state[2 * (row[k] * order + p) + 1] = flushed(states[p].im[k]);
+            }
+    }
+    denormals_as(mode);
+}

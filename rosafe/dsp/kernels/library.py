@@ -1,0 +1,55 @@
+"""Finds and loads the compiled library, or tells why numpy and scipy serve instead."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import os
+from pathlib import Path
+from typing import NamedTuple
+
+from . import build
+
+SWITCH = "ROSAFE_KERNELS"  # environment variable: 0 for numpy and scipy
+
+_INTEGER, _REAL, _ARRAY = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
+_SAMPLES = (_ARRAY, _INTEGER, _INTEGER, _ARRAY, _INTEGER)  # history, its stride and length; block and its length
+_FRAMES = (_INTEGER, _ARRAY, _INTEGER, _INTEGER, _INTEGER)  # skip, window, size, hop, frames
+_ARGUMENTS = {
+    "rosafe_gammatone": (_ARRAY, *[_INTEGER] * 3, *[_ARRAY] * 4),
+    "rosafe_biquads": (_INTEGER, _ARRAY, _INTEGER, _INTEGER, _ARRAY, _INTEGER, _ARRAY, _ARRAY),
+    "rosafe_frame_sums": (*_SAMPLES, _INTEGER, *_FRAMES, _INTEGER, _REAL, _ARRAY, _ARRAY, _INTEGER, _INTEGER, _ARRAY),
+    "rosafe_correlations": (*_SAMPLES, _INTEGER, *_FRAMES, _INTEGER, _REAL, _ARRAY, _INTEGER),
+}
+
+
+class Status(NamedTuple):
+    """Which implementation runs, and why."""
+
+    compiled: bool
+    detail: str
+
+
+@functools.cache  # without a lock: two threads at once do the same twice, to the same end
+def loaded() -> tuple[ctypes.CDLL | None, Status]:
+    """The library with its functions declared, or None; once found out, it stays so in this process.
+
+    Takes a fraction of a millisecond, and a second where the library must be built first.
+    """
+    if os.environ.get(SWITCH, "").strip() == "0":
+        return None, Status(False, f"numpy and scipy, as {SWITCH}=0 says")
+    try:
+        path = build.library()
+        return _open(path), Status(True, f"compiled, {path}")
+    except (build.BuildError, OSError) as problem:
+        return None, Status(False, f"numpy and scipy: {problem}")
+
+
+def _open(path: Path) -> ctypes.CDLL:
+    library = ctypes.CDLL(str(path))  # releases the interpreter lock during calls
+    if not library.rosafe_runs_here():
+        raise build.BuildError("the kernels need a processor with AVX2 and FMA (x86-64-v3)")
+    for name, arguments in _ARGUMENTS.items():
+        function = getattr(library, name)
+        function.argtypes, function.restype = arguments, None
+    return library
