@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import pty
 import signal
 import socket
 import subprocess
@@ -47,6 +48,21 @@ def shared(*parts: str) -> Path:
     if not path.exists():
         pytest.skip(f"no {'/'.join(('../shared', *parts))} beside this checkout")
     return path
+
+
+def proc(*parts: object) -> Path:
+    """A file or folder of /proc, which knows all processes; the test is skipped where a bare chroot lacks it."""
+    if not Path("/proc/self").exists():
+        pytest.skip("/proc is not mounted here")
+    return Path("/proc", *map(str, parts))
+
+
+def open_terminal() -> tuple[int, int]:
+    """Both ends of a new pseudoterminal, ours and the program's; the test is skipped where a bare chroot has none."""
+    try:
+        return pty.openpty()
+    except OSError as problem:
+        pytest.skip(f"no pseudoterminal here: {problem}")
 
 
 def wait_for(condition: Callable[[], T], timeout: float = 10.0, what: str | Callable[[], str] = "") -> T:

@@ -80,7 +80,7 @@ def test_speech(tmp_path: Path) -> None:
 def test_telephone_quality_without_home(tmp_path: Path) -> None:
     """8 kHz is too low for the guide's channels; no home and no terminal are no hindrance."""
     file = wav(tmp_path / "it's a call.wav", 8000, 2.2)
-    with demo(file, "--out", tmp_path, HOME="/proc/none", XDG_CACHE_HOME="", LC_ALL="C") as running:
+    with demo(file, "--out", tmp_path, HOME="/dev/null/none", XDG_CACHE_HOME="", LC_ALL="C") as running:
         text = finished(running)
     assert "fb_highFreqHz 3600" in text and "fb_highFreqHz: 3600" in text
     check_table(text, 8000, 2000, 2.0)
@@ -118,7 +118,7 @@ def test_through_a_link_with_a_dead_reader(tmp_path: Path) -> None:
         (["short.wav"], "too short", 1),
         (["scene:?speed=2"], "no option 'speed'", 1),
         (["--out", "mono.wav"], "cannot write to mono.wav", 1),
-        (["--out", "/proc/none/there"], "cannot write to /proc/none/there", 1),
+        (["--out", "/dev/null/there"], "cannot write to /dev/null/there", 1),
         (["--seconds", "0"], "'0' is no number of seconds from 2 to 600", 2),
         (["--seconds", "nan"], "'nan' is no number of seconds", 2),
         (["--seconds", "ten"], "'ten' is no number of seconds", 2),

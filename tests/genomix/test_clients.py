@@ -7,7 +7,6 @@ import json
 import signal
 import socket
 from collections.abc import Awaitable, Callable
-from pathlib import Path
 
 import aiohttp
 import numpy as np
@@ -178,11 +177,11 @@ def test_a_large_download_stalls_nobody(world: World) -> None:
 
 
 def open_files(pid: int) -> int:
-    return len(list(Path(f"/proc/{pid}/fd").iterdir()))
+    return len(list(harness.proc(pid, "fd").iterdir()))
 
 
 def threads(pid: int) -> int:
-    return len(list(Path(f"/proc/{pid}/task").iterdir()))
+    return len(list(harness.proc(pid, "task").iterdir()))
 
 
 def test_vanished_clients_leave_nothing(world: World) -> None:

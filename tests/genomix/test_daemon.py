@@ -8,7 +8,6 @@ import re
 import signal
 import socket
 import subprocess
-from pathlib import Path
 
 import pytest
 
@@ -62,10 +61,10 @@ def test_an_address_that_is_not_ours_is_one_line(home_graph: harness.Graph) -> N
 
 def test_it_listens_on_loopback_only_unless_told(home_graph: harness.Graph) -> None:
     with worlds.genomixd(home_graph) as (_, port):
-        sockets = Path("/proc/net/tcp").read_text()
+        sockets = harness.proc("net", "tcp").read_text()
         assert f"0100007F:{port:04X} 00000000:0000 0A" in sockets
     with worlds.genomixd(home_graph, "--host", "0.0.0.0") as (_, port):
-        assert f"00000000:{port:04X} 00000000:0000 0A" in Path("/proc/net/tcp").read_text()
+        assert f"00000000:{port:04X} 00000000:0000 0A" in harness.proc("net", "tcp").read_text()
         assert Http(port).raw("/")[0] == 200
 
 
@@ -87,7 +86,7 @@ def test_background_returns_once_it_serves(home_graph: harness.Graph) -> None:
     def servers() -> list[int]:
         ours = [GENOMIXD, "-b", "-p", port, ""]
         found = []
-        for path in Path("/proc").glob("[0-9]*/cmdline"):
+        for path in harness.proc().glob("[0-9]*/cmdline"):
             with contextlib.suppress(OSError):  # it has ended meanwhile
                 if path.read_text("utf-8", "replace").split("\0")[1:] == ours:
                     found.append(int(path.parent.name))
@@ -126,6 +125,6 @@ def test_verbosity(home_graph: harness.Graph) -> None:
 
 
 def test_a_directory_for_logs_that_cannot_be_written_is_no_error(home_graph: harness.Graph) -> None:
-    process = home_graph.start(GENOMIXD, "-v", "-p", "0", ROS_LOG_DIR="/proc/none", ROS_HOME="/proc/none")
+    process = home_graph.start(GENOMIXD, "-v", "-p", "0", ROS_LOG_DIR="/dev/null/none", ROS_HOME="/dev/null/none")
     with process:
         assert Http(worlds.port_of(process)).raw("/")[0] == 200

@@ -9,7 +9,6 @@ import http.client
 import json
 import os
 import time
-from pathlib import Path
 from urllib.parse import quote, quote_plus
 
 import pytest
@@ -18,6 +17,7 @@ from hypothesis import strategies as st
 
 from rosafe import interface
 from tests.genomix.world import World
+from tests.harness import proc
 
 pytestmark = pytest.mark.ros
 
@@ -102,12 +102,12 @@ def test_nonsense_is_told_to_be_nonsense(world: World) -> None:
 
 def open_files(pid: int) -> int:
     """How many files and sockets a process has open."""
-    return len(list(Path(f"/proc/{pid}/fd").iterdir()))
+    return len(list(proc(pid, "fd").iterdir()))
 
 
 def resident(pid: int) -> int:
     """Megabytes of memory of a process."""
-    for line in Path(f"/proc/{pid}/status").read_text().splitlines():
+    for line in proc(pid, "status").read_text().splitlines():
         if line.startswith("VmRSS:"):
             return int(line.split()[1]) // 1024
     raise AssertionError(f"no process {pid}")

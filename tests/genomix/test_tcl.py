@@ -517,7 +517,7 @@ def test_localhost_is_a_private_server_that_dies_with_us(world: World) -> None:
     assert first.startswith("genomix1|genomix2|bass||")
     assert second == "sent"
     pid = int(first.rsplit("|", 1)[1])
-    harness.wait_for(lambda: not harness.Path(f"/proc/{pid}").exists(), what=f"end of the private server {pid}")
+    harness.wait_for(lambda: not harness.proc(pid).exists(), what=f"end of the private server {pid}")
 
 
 # --- help -------------------------------------------------------------------------------------------------------

@@ -17,7 +17,7 @@ import rosgraph
 import rosservice
 
 from rosafe.interface import KINDS
-from tests.harness import PYTHON, ROOT, Graph, MasterProcess, Process, run_together, wait_for
+from tests.harness import PYTHON, ROOT, Graph, MasterProcess, Process, proc, run_together, wait_for
 from tests.ros.session import Session, noise, own_node, told
 
 BLOCK = 2000
@@ -128,7 +128,7 @@ def test_the_master_dies(private_graph: tuple[Graph, MasterProcess], tmp_path: P
 
 def threads_and_memory(pid: int) -> tuple[int, int]:
     """Threads and resident bytes of a process."""
-    status = dict(line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text().splitlines())
+    status = dict(line.split(":", 1) for line in proc(pid, "status").read_text().splitlines())
     return int(status["Threads"]), int(status["VmRSS"].split()[0]) * 1024
 
 
