@@ -96,6 +96,8 @@ def run_together(
                 connection = cast(Connection, ready)
                 index, process = running[connection]
                 told = _receive(connection, process)
+                if told.failure:
+                    signals.check()  # the same Ctrl-C may have ended the child sooner than us
                 if told.last:
                     del running[connection]
                     process.join()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import pty
 import select
 import signal
 import subprocess
@@ -17,7 +16,7 @@ import soundfile
 from rosafe import process
 from rosafe.npz import memory_map
 from tests.cli.command import ROSAFE, environment, noise, rosafe, start, write
-from tests.harness import wait_for
+from tests.harness import ROOT, open_terminal, proc, wait_for
 
 RATE = 16000
 ONE_CHANNEL = ("--set", "fb_cfHz=1000")
@@ -118,7 +117,24 @@ def test_ctrl_c_at_the_terminal(long_file: Path) -> None:
         assert command.wait() == 130
         assert command.err == "rosafe process: interrupted; what was not finished is removed\n"
     assert {path.name for path in here.iterdir()} == {"in.wav", "b.wav", "c.wav"}
-    assert not any(Path(f"/proc/{child}").exists() for child in children)
+    assert not any(proc(child).exists() for child in children)
+
+
+def test_a_child_that_ends_first_of_the_same_signal_has_not_failed() -> None:
+    program = """
+import os, signal
+from rosafe.commands._workers import Interrupted, Signals, run_together
+
+def work(progress):
+    os.kill(os.getppid(), signal.SIGINT)
+    raise Interrupted(signal.SIGINT)
+
+run_together([work], 1, (), lambda index, told: print(told), Signals())
+"""
+    done = subprocess.run(
+        ["/usr/bin/python3", "-c", program], env=environment(), cwd=ROOT, capture_output=True, text=True, timeout=60
+    )
+    assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
 
 
 def test_killed(long_file: Path) -> None:
@@ -128,7 +144,7 @@ def test_killed(long_file: Path) -> None:
         wait_for(begun(part), what=lambda: str(command))
         (child,) = _children(command.pid)
         command.stop(signal.SIGKILL)
-        wait_for(lambda: not Path(f"/proc/{child}").exists(), what="end of the child")
+        wait_for(lambda: not proc(child).exists(), what="end of the child")
     assert not (here / "in.npz").exists()
     part.write_bytes(b"left by one that could not clean up" * 1000)
     write(long_file, noise(3000))
@@ -161,14 +177,14 @@ def test_two_for_one_place(long_file: Path) -> None:
 
 
 def _children(pid: int) -> list[int]:
-    return [int(child) for child in Path(f"/proc/{pid}/task/{pid}/children").read_text().split()]
+    return [int(child) for child in proc(pid, "task", pid, "children").read_text().split()]
 
 
 # --- progress ---
 
 
 def test_a_terminal_shows_one_live_line(long_file: Path) -> None:
-    ours, theirs = pty.openpty()
+    ours, theirs = open_terminal()
     command = [str(ROSAFE), "process", "in.wav", "--outputs", "ild"]
     with subprocess.Popen(
         command, cwd=long_file.parent, env=environment(), stderr=theirs, stdout=theirs, stdin=theirs
