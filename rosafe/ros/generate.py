@@ -196,6 +196,11 @@ def _make_current(base: Path, name: str) -> None:
         shutil.rmtree(generation)
 
 
+def _is_readable(generation: Path) -> bool:
+    """Whether it is there, and not for another user's eyes only, whose umask says so."""
+    return os.access(generation / "python" / "rosAFE" / "__init__.py", os.R_OK)
+
+
 def _is_current(base: Path, name: str) -> bool:
     link = base / "current"
     return link.is_symlink() and os.readlink(link) == name and (base / name).is_dir()
@@ -210,7 +215,7 @@ def _generation() -> Path | None:
     name = digest(root)
     places = (root / ".generated", paths.user_cache() / "messages")
     for base in places:
-        if (base / name).is_dir() and (_is_current(base, name) or not paths.writable(base)):
+        if _is_readable(base / name) and (_is_current(base, name) or not paths.writable(base)):
             return base / name
     try:
         writable = [base for base in places if paths.writable(base)]

@@ -177,6 +177,20 @@ def test_read_only_tree_and_home_use_a_private_folder(copy: Path) -> None:
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="making another user's folder takes root")
+@pytest.mark.parametrize("outer", [0o700, 0o755])
+def test_messages_that_only_their_maker_can_read(copy: Path, outer: int) -> None:
+    """Root, whose umask is 077, came first; others have their own then."""
+    (copy / ".generated").mkdir(mode=outer)
+    assert run("sh", "-c", 'umask 077; exec "$@"', "-", *generate(copy), env=environment()).returncode == 0
+    home = copy.with_name("home")
+    home.mkdir()
+    home.chmod(0o777)
+    command = without_rights("env", f"PYTHONPATH={copy}", PYTHON, "-c", IMPORT)
+    place = imported(copy, run(*command, env=environment(HOME=str(home))))
+    assert place.is_relative_to(home / ".cache" / "rosafe" / "messages")
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="making another user's folder takes root")
 def test_private_folder_that_somebody_else_made_is_refused(copy: Path) -> None:
     temporary = copy.with_name("tmp")
     temporary.mkdir()
