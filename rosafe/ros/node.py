@@ -10,6 +10,7 @@ import rospy
 from diagnostic_msgs.msg import DiagnosticStatus
 
 from rosafe import interface
+from rosafe.dsp import kernels
 from rosafe.interface import KINDS, ROSAFE, ComponentError, ProcessorKind
 from rosafe.ros import wire
 from rosafe.ros.activities import Activity
@@ -27,6 +28,7 @@ class RosafeNode:
     """The component `rosAFE`. Make it after `rospy.init_node`."""
 
     def __init__(self, instance: str) -> None:
+        kernels.compiled()  # where they must be built first, that takes a second, which no block should wait for
         self._node = ComponentNode(ROSAFE, lambda problem: ROSAFE.error("e_badNewValue", what=str(problem)))
         self.finished = self._node.finished
         self._tree = Tree(self)
