@@ -73,7 +73,7 @@ class Tree:
         with self._requests:
             holder = self._processors.get(name)
             if holder is not None and holder.parent is not None:
-                raise ROSAFE.error("e_existsAlready", f"{name!r} is a {holder.kind} processor")
+                raise ROSAFE.error("e_existsAlready", f"{name!r} exists already, of kind {holder.kind}")
             root = self.input
             if root is not None and root.children and sample_rate != self.sample_rate:
                 raise ROSAFE.error(
@@ -135,9 +135,11 @@ class Tree:
             if parent is None:
                 raise ROSAFE.error("e_noUpperDependencie", f"there is no processor {parent_name!r} to hang {name!r} on")
             if name in self._processors:
-                raise ROSAFE.error("e_existsAlready", f"there is a {self._processors[name].kind} {name!r} already")
+                raise ROSAFE.error("e_existsAlready", f"{name!r} exists already, of kind {self._processors[name].kind}")
             if parent.kind != wanted:
-                raise ROSAFE.error("e_noUpperDependencie", f"{parent_name!r} is a {parent.kind}, wanted is a {wanted}")
+                raise ROSAFE.error(
+                    "e_noUpperDependencie", f"{parent_name!r} is of kind {parent.kind}, wanted is {wanted}"
+                )
             return parent
 
     def add(self, kind: str, name: str, parent_name: str, parameters: Mapping[str, Any] | None = None) -> Processor:
@@ -242,7 +244,9 @@ def _parameter(kind: ProcessorKind, name: str) -> Parameter:
         return kind.parameter(name)
     except KeyError:
         known = ", ".join(p.name for p in kind.parameters)
-        raise ROSAFE.error("e_noSuchParameter", f"a {kind.kind} processor has no {name!r}, but: {known}") from None
+        raise ROSAFE.error(
+            "e_noSuchParameter", f"processors of kind {kind.kind} have no {name!r}, but: {known}"
+        ) from None
 
 
 @contextmanager

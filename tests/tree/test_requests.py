@@ -58,10 +58,14 @@ def test_errors_of_a_processor_request_in_their_order(tree: Tree, feed: Feed) ->
     bad = {"fb_highFreqHz": 1e5}
     # an unknown parent comes before a name that is taken, that before a parent of the wrong type, that before values
     refused(tree, "e_noUpperDependencie", "no processor 'none'", tree.add, "gammatone", "gammatone", "none", bad)
-    refused(tree, "e_existsAlready", "a ild 'ild'", tree.add, "gammatone", "ild", "ihc", bad)
-    refused(tree, "e_existsAlready", "a input 'input'", tree.add, "gammatone", "input", "preProc", bad)
-    refused(tree, "e_noUpperDependencie", "'ihc' is a ihc, wanted is a preProc", tree.add, "gammatone", "x", "ihc", bad)
-    refused(tree, "e_noUpperDependencie", "wanted is a ihc", tree.add, "ratemap", "x", "ild")
+    refused(tree, "e_existsAlready", "'ild' exists already, of kind ild", tree.add, "gammatone", "ild", "ihc", bad)
+    refused(
+        tree, "e_existsAlready", "'input' exists already, of kind input", tree.add, "gammatone", "input", "preProc", bad
+    )
+    refused(
+        tree, "e_noUpperDependencie", "'ihc' is of kind ihc, wanted is preProc", tree.add, "gammatone", "x", "ihc", bad
+    )
+    refused(tree, "e_noUpperDependencie", "'ild' is of kind ild, wanted is ihc", tree.add, "ratemap", "x", "ild")
     refused(tree, "e_badNewValue", "fb_highFreqHz", tree.add, "gammatone", "x", "preProc", bad)
     refused(tree, "e_badNewValue", "ihc_method", tree.add, "ihc", "x", "gammatone", {"ihc_method": "unknown"})
     for name in ("Ild", "", "ild "):  # names are taken literally
@@ -182,7 +186,7 @@ def test_an_input_of_another_rate_or_a_taken_name_is_refused(tree: Tree, feed: F
     grow(tree, feed)
     for ex, what, name, other in (
         ("e_badNewValue", "the tree runs at 16000 Hz, Audio is at 44100 Hz", "input", Feed(44100.0)),
-        ("e_existsAlready", "'ild' is a ild", "ild", Feed()),
+        ("e_existsAlready", "'ild' exists already, of kind ild", "ild", Feed()),
     ):
         refused(tree, ex, what, tree.add_input, name, other, 160, 1.0, 1.0)
         assert other.stopped
