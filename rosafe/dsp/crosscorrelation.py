@@ -49,11 +49,9 @@ class CrossCorrelation(FramedStage):
         return result
 
     def _by_kernel(self, samples: FloatArray, reach: int) -> FloatArray:
-        taken = self._take(samples)
-        result = np.zeros((samples.shape[1], 2 * self._max_lag + 1, taken.frames))
-        window, hop = self._framing.window, self._framing.hop
-        kernels.correlations(taken.history, samples, taken.skip, window, hop, reach, EPSILON, result)
-        taken.keep(samples)
+        frames = self._frames(samples, self._framing.window)
+        result = np.zeros((samples.shape[1], 2 * self._max_lag + 1, frames.number))
+        kernels.correlations(frames, reach, EPSILON, result)
         return result
 
     def _build(self, values: dict[str, Any], changed: frozenset[str]) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from scipy import signal
 
 from .cascade import Cascade
-from .guard import FloatArray
+from .guard import FloatArray, limited
 
 COMPRESSION = 10**-0.60206
 HIGHEST_FITTED = 1000.0  # Hz; above, the nonlinear path has the gains of CASP_GAIN_FREQUENCY
@@ -51,6 +51,7 @@ class DrnlBank:
 
     def process(self, block: FloatArray, with_envelope: bool) -> tuple[FloatArray, FloatArray | None]:
         """Filter (2, N): output (2, C, N), and the envelope of the same shape if wanted, else None."""
+        block = limited(block)
         output = np.empty((2, len(self.channels), block.shape[-1]))
         for index, channel in enumerate(self.channels):
             output[:, index] = channel.process(block)

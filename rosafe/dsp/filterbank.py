@@ -11,7 +11,7 @@ from .checks import not_negative, number, positive, whole, word
 from .drnl import DrnlBank
 from .erb import erb_rate, erb_rate_to_frequency
 from .gammatone import GammatoneBank
-from .guard import FloatArray, limited
+from .guard import FloatArray
 from .stage import Parameter, ParameterTable, Stage
 
 MAX_CHANNELS = 1024
@@ -73,7 +73,7 @@ class Filterbank(Stage):
         return (*rows, len(self._frequencies))
 
     def process(self, block: FloatArray) -> FloatArray:
-        output, self.envelope = self._bank.process(limited(self._checked(block)), self.provide_envelope)
+        output, self.envelope = self._bank.process(self._checked(block), self.provide_envelope)
         return output
 
     def reset(self) -> None:

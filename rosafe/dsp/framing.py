@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -113,7 +113,7 @@ class FrameBuffer:
         history = self._store[..., self._start : self._stop]
         kept = max(0, total - first)
         if kept > self._store.shape[-1]:
-            self._store = np.empty((*self._store.shape[:-1], 2 * kept))
+            self._store = np.empty((*self._store.shape[:-1], kept))
         self._start, self._stop = 0, kept
         return history, self._store[..., :kept]
 
@@ -143,19 +143,6 @@ def _last(block: FloatArray, count: int) -> FloatArray:
     return block[..., block.shape[-1] - count :]
 
 
-class Taken(NamedTuple):
-    """Frames that lie in a history and a block behind it, without the two being joined."""
-
-    skip: int  # where the first frame starts
-    frames: int  # how many there are
-    history: FloatArray  # (*rows, T)
-    room: FloatArray  # (*rows, n), to be filled with what is kept for later frames, as `FrameBuffer.advance` says
-
-    def keep(self, block: FloatArray) -> None:
-        """Fill `room` from the end of the block, when nothing more is to be read from `history`."""
-        self.room[...] = _last(block, self.room.shape[-1])
-
-
 class FramedStage(Stage):
     """A stage that works frame by frame.
 
@@ -163,6 +150,9 @@ class FramedStage(Stage):
     """
 
     PREFIX: ClassVar[str]
+
+    # Of the frames that have begun, the sums over what is held, (*rows, frames); None: to be computed anew
+    _begun: FloatArray | None
 
     def __init__(self, sample_rate: float, **parameters: Any) -> None:
         self._buffer = FrameBuffer()
@@ -184,32 +174,25 @@ class FramedStage(Stage):
             samples = limited(block) if integrator is None else integrator.process(limited(block))
             means = self._framing.means(self._buffer.append(samples), squared)
             self._buffer.drop(means.shape[-1] * self._framing.hop)
+            self._begun = None
             return means
-        taken = self._take(block)
-        weights, hop = self._framing.weights(squared), self._framing.hop
-        if integrator is None:
-            means = kernels.frame_sums(taken.history, block, taken.skip, weights, hop, taken.frames, squared)
-            taken.keep(block)
-            return means
-        return kernels.integrated_frame_sums(
-            taken.history,
-            block,
-            taken.skip,
-            weights,
-            hop,
-            taken.frames,
-            squared,
-            integrator.sections,
-            integrator.started(block.shape[:-1]),
-            taken.room,
-        )
+        frames = self._frames(block, self._framing.weights(squared))
+        section, state = None, None
+        if integrator is not None:
+            section, state = integrator.sections, integrator.started(block.shape[:-1])
+        known = self._begun if frames.history.shape[-1] else None
+        means, self._begun = kernels.frame_sums(frames, squared, section, state, known)
+        return means
 
-    def _take(self, block: FloatArray) -> Taken:
-        """What a kernel needs to know to find the frames that `block` completes; they are then done with."""
-        self._buffer.begin(block.shape[:-1])
+    def _frames(self, block: FloatArray, weights: FloatArray) -> kernels.Frames:
+        """The frames that `block` completes, for a kernel; the buffer has moved on then."""
+        rows, arriving, hop = block.shape[:-1], block.shape[-1], self._framing.hop
+        self._buffer.begin(rows)
         skip = self._buffer.skip
-        frames = self._framing.complete(self._buffer.held + block.shape[-1] - skip)
-        return Taken(skip, frames, *self._buffer.advance(block.shape[-1], frames * self._framing.hop))
+        count = self._framing.complete(self._buffer.held + arriving - skip)
+        history, room = self._buffer.advance(arriving, count * hop)
+        return kernels.Frames(history, block, room, skip, weights, hop, count)
 
     def _build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
         self._framing = Framing.design(self.sample_rate, self.PREFIX, values)
+        self._begun = None

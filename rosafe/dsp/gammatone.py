@@ -8,7 +8,7 @@ from scipy import signal
 
 from . import kernels
 from .erb import bandwidth
-from .guard import FloatArray, flush
+from .guard import FloatArray, flush, limited
 
 POLES_TOGETHER = 4
 
@@ -79,6 +79,7 @@ def filter_by_scipy(
     """
     if block.shape[-1] == 0:
         return
+    block = limited(block)
     for channel, cascade in enumerate(sections):
         before = np.zeros((len(cascade), 2, 2), np.complex128)
         before[..., 0] = state[:, channel].T

@@ -27,4 +27,6 @@ class Ild(FramedStage):
 
     def process(self, block: FloatArray) -> FloatArray:
         left, right = self._means(self._checked(block), squared=True)
-        return 10 * np.log10((right + EPSILON) / (left + EPSILON))
+        levels = np.log10((right + EPSILON) / (left + EPSILON))
+        levels *= 10
+        return levels

@@ -26,9 +26,11 @@ class Input(Stage):
     def process(self, block: Any) -> FloatArray:
         """(2, N) of int32 or float to (2, N); ValueError for NaN and infinities."""
         samples = self._checked(block)
-        if not np.isfinite(samples).all():
-            raise ValueError("block: there are samples that are not finite")
-        return limited(samples) / self._divisor
+        if np.asarray(block).dtype.kind == "f":  # of whole numbers, all are finite and within the limit
+            if not np.isfinite(samples).all():
+                raise ValueError("block: there are samples that are not finite")
+            samples = limited(samples)
+        return samples / self._divisor
 
     def reset(self) -> None:
         """Nothing: there is no state."""

@@ -1,8 +1,8 @@
 """The hot loops as compiled kernels; each has a twin in numpy and scipy, with the stage that uses it.
 
 A stage calls its kernel where `compiled()` says so, and the twin elsewhere: where there is no compiler, on other
-processors, and where the environment variable ROSAFE_KERNELS is 0. Both work on the same states and agree to 1e-11 of the
-largest number. Tests hold each kernel to its twin, which is the reference. Kernels release the interpreter lock.
+processors, and where the environment variable ROSAFE_KERNELS is 0. Both work on the same states and agree to 1e-11 of
+the largest number. Tests hold each kernel to its twin, which is the reference. Kernels release the interpreter lock.
 
 All arrays are of float64 or complex128 and C-contiguous, but for histories and tails, of which only rows are.
 """
@@ -10,7 +10,7 @@ All arrays are of float64 or complex128 and C-contiguous, but for histories and 
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,100 +70,66 @@ def rectify_and_filter(rectification: str, block: FloatArray, sections: FloatArr
     return output
 
 
+class Frames(NamedTuple):
+    """Frames over samples that lie in a history and a block behind it, without the two being joined.
+
+    Samples are counted from the first one of the history on.
+    """
+
+    history: FloatArray  # (*rows, T)
+    block: FloatArray  # (*rows, N)
+    tail: FloatArray  # (*rows, n), to be filled with the last samples; may lie where the history does
+    skip: int  # where the first frame starts
+    weights: FloatArray  # (w,), of the samples of a frame
+    hop: int  # from a frame's start to that of the next one
+    number: int  # of whole ones
+
+
 def frame_sums(
-    history: FloatArray, block: FloatArray, skip: int, weights: FloatArray, hop: int, frames: int, squared: bool
-) -> FloatArray:
-    """Weighted sums of the samples, or of their squares, in each of so many frames: (*rows, F).
-
-    The samples are those of `history` (*rows, T) and of `block` (*rows, N) behind it; the first frame starts at sample
-    `skip`, each next one `hop` later. The twin is `rosafe.dsp.framing.Framing.means`.
-    """
-    return _frame_sums(history, block, skip, weights, hop, frames, squared, 0.0, None, None)
-
-
-def integrated_frame_sums(
-    history: FloatArray,
-    block: FloatArray,
-    skip: int,
-    weights: FloatArray,
-    hop: int,
-    frames: int,
+    frames: Frames,
     squared: bool,
-    integrator: FloatArray,
-    state: FloatArray,
-    tail: FloatArray,
-) -> FloatArray:
-    """As `frame_sums`, of a block that goes through a leaky integrator first, as the history has already.
-
-    `integrator` (1, 6) is a section as of `rosafe.dsp.cascade.leaky_integrator`, `state` (1, *rows, 2) as in scipy; the
-    last integrated samples fill `tail` (*rows, n), which may lie where `history` does.
-    """
-    retention = -float(integrator[0, 4])
-    return _frame_sums(history, block, skip, weights, hop, frames, squared, retention, state, tail)
-
-
-def _frame_sums(
-    history: FloatArray,
-    block: FloatArray,
-    skip: int,
-    weights: FloatArray,
-    hop: int,
-    frames: int,
-    squared: bool,
-    retention: float,
+    integrator: FloatArray | None,
     state: FloatArray | None,
-    tail: FloatArray | None,
-) -> FloatArray:
-    sums = np.empty((*block.shape[:-1], frames))
-    kept: tuple[int | None, int, int] = (None, 0, 0)
-    if tail is not None:
-        kept = (_address(tail), _row_distance(tail), history.shape[-1] + block.shape[-1] - tail.shape[-1])
-    _function("rosafe_frame_sums")(
-        *_samples(history, block),
-        math.prod(block.shape[:-1]),
-        skip,
-        _address(weights),
-        len(weights),
-        hop,
-        frames,
-        squared,
-        retention,
-        None if state is None else _address(state),
-        *kept,
-        _address(sums),
-    )
-    return sums
+    begun: FloatArray | None,
+) -> tuple[FloatArray, FloatArray]:
+    """The weighted sum of the samples of each frame, or of their squares, (*rows, F), and sums to be completed later.
 
-
-def correlations(
-    history: FloatArray,
-    block: FloatArray,
-    skip: int,
-    window: FloatArray,
-    hop: int,
-    reach: int,
-    epsilon: float,
-    output: FloatArray,
-) -> None:
-    """Correlate the ears' frames in `history` (2, C, T) and `block` (2, C, N) behind it, over the lags up to `reach`.
-
-    They go to the middle lags of `output` (C, L, F); its first frame starts at sample `skip`. 2 reach + 1 is at most
-    `MOST_LAGS`. The twin is `rosafe.dsp.crosscorrelation.correlate_by_fft`.
+    The latter, (*rows, B), are those of frames that begin but do not end in the samples; as `begun`, they save the next
+    call the sums over its history. Through an `integrator` (1, 6), a section as of
+    `rosafe.dsp.cascade.leaky_integrator` with its `state` (1, *rows, 2), the block goes first, as the history has.
+    The twin is `rosafe.dsp.framing.Framing.means`.
     """
-    channels, lags, frames = output.shape
+    rows = frames.block.shape[:-1]
+    samples = frames.history.shape[-1] + frames.block.shape[-1]
+    have_begun = -(-max(0, samples - frames.skip) // frames.hop)
+    sums, sums_begun = np.empty((*rows, frames.number)), np.empty((*rows, have_begun - frames.number))
+    _function("rosafe_frame_sums")(
+        *_arguments(frames),
+        squared,
+        0.0 if integrator is None else -integrator[0, 4],
+        None if state is None else _address(state),
+        0 if begun is None else begun.shape[-1],
+        None if begun is None else _address(begun),
+        have_begun - frames.number,
+        _address(sums),
+        _address(sums_begun),
+    )
+    return sums, sums_begun
+
+
+def correlations(frames: Frames, reach: int, epsilon: float, output: FloatArray) -> None:
+    """Correlate the frames (2, C) of the two ears over the lags up to `reach`, into the middle of `output` (C, L, F).
+
+    2 reach + 1 is at most `MOST_LAGS`. The twin is `rosafe.dsp.crosscorrelation.correlate_by_fft`.
+    """
+    channels, lags, number = output.shape
     outside = lags // 2 - reach
     _function("rosafe_correlations")(
-        *_samples(history, block),
-        channels,
-        skip,
-        _address(window),
-        len(window),
-        hop,
-        frames,
+        *_arguments(frames, channels),
         reach,
         epsilon,
-        _address(output) + outside * frames * output.itemsize,
-        lags * frames,
+        _address(output) + outside * number * output.itemsize,
+        lags * number,
     )
 
 
@@ -175,14 +141,27 @@ def _function(name: str) -> Any:
 
 
 def _address(array: NDArray[Any]) -> int:
-    address: int = array.__array_interface__["data"][0]  # several times as fast as array.ctypes
+    address: int = array.ctypes.data
     return address
 
 
-def _row_distance(array: FloatArray) -> int:
-    """From one row to the next, in samples."""
-    return array.strides[-2] // array.itemsize
-
-
-def _samples(history: FloatArray, block: FloatArray) -> tuple[int, ...]:
-    return _address(history), _row_distance(history), history.shape[-1], _address(block), block.shape[-1]
+def _arguments(frames: Frames, rows: int | None = None) -> tuple[int, ...]:
+    """The arguments that both kernels of frames begin with; by default, the number of rows is that of the samples."""
+    history, block, tail, skip, weights, hop, number = frames
+    held, arriving = history.shape[-1], block.shape[-1]
+    return (
+        _address(history),
+        history.strides[-2] // history.itemsize,
+        held,
+        _address(block),
+        arriving,
+        _address(tail),
+        tail.strides[-2] // tail.itemsize,
+        held + arriving - tail.shape[-1],
+        math.prod(block.shape[:-1]) if rows is None else rows,
+        skip,
+        _address(weights),
+        len(weights),
+        hop,
+        number,
+    )

@@ -2,16 +2,16 @@
  *
  * Direct form II transposed, as scipy.signal.sosfilt: y = b0 x + s1, s1 = b1 x - a1 y + s2, s2 = b2 x - a2 y.
  *
- * A section's sample waits for the one before it, some ten cycles; sixteen rows at a time, four in each of four
- * registers, fill the wait. */
+ * A section's sample waits for the one before it, some ten cycles; sixteen rows at a time fill
+ * the wait. */
 #include "vector.h"
 
-enum { SPAN = 32, GROUPS = 4, ROWS = GROUPS * LANES, MOST_SECTIONS = 8 };
+enum { SPAN = 32, ROWS = 16, GROUPS = ROWS / LANES, MOST_SECTIONS = 8 };
 
 enum rectification { NONE, HALF_WAVE, FULL_WAVE, SQUARE };
 
-/* n samples of four rows, rectified. */
-INLINE void read_rectified(int64_t how, const double *const rows[LANES], int64_t n, v4 *samples) {
+/* n samples of one group of rows, rectified. */
+INLINE void read_rectified(int64_t how, const double *const rows[LANES], int64_t n, vec *samples) {
     read_rows(rows, n, how == HALF_WAVE ? 0.0 : -LIMIT, LIMIT, samples, GROUPS);
     if (how == FULL_WAVE)
         for (int64_t t = 0; t < n; t++) samples[t * GROUPS] = larger(samples[t * GROUPS], -samples[t * GROUPS]);
@@ -19,14 +19,14 @@ INLINE void read_rectified(int64_t how, const double *const rows[LANES], int64_t
         for (int64_t t = 0; t < n; t++) samples[t * GROUPS] *= samples[t * GROUPS];
 }
 
-INLINE void run(const int groups, const double *b0_b1_b2_1_a1_a2, v4 *samples, int64_t n, v4 *state) {
-    const v4 b0 = all(b0_b1_b2_1_a1_a2[0]), b1 = all(b0_b1_b2_1_a1_a2[1]), b2 = all(b0_b1_b2_1_a1_a2[2]);
-    const v4 minus_a1 = all(-b0_b1_b2_1_a1_a2[4]), minus_a2 = all(-b0_b1_b2_1_a1_a2[5]);
-    v4 s1[GROUPS], s2[GROUPS];
+INLINE void run(const int groups, const double *b0_b1_b2_1_a1_a2, vec *samples, int64_t n, vec *state) {
+    const vec b0 = all(b0_b1_b2_1_a1_a2[0]), b1 = all(b0_b1_b2_1_a1_a2[1]), b2 = all(b0_b1_b2_1_a1_a2[2]);
+    const vec minus_a1 = all(-b0_b1_b2_1_a1_a2[4]), minus_a2 = all(-b0_b1_b2_1_a1_a2[5]);
+    vec s1[GROUPS], s2[GROUPS];
     UNROLL for (int g = 0; g < groups; g++) s1[g] = state[g], s2[g] = state[GROUPS + g];
     for (int64_t t = 0; t < n; t++)
         UNROLL for (int g = 0; g < groups; g++) {
-            v4 x = samples[t * GROUPS + g], y = fused(b0, x, s1[g]);
+            vec x = samples[t * GROUPS + g], y = fused(b0, x, s1[g]);
             s1[g] = fused(minus_a1, y, fused(b1, x, s2[g]));
             s2[g] = fused(minus_a2, y, b2 * x);
             samples[t * GROUPS + g] = y;
@@ -41,7 +41,7 @@ void rosafe_biquads(int64_t how, const double *block, int64_t rows, int64_t n, c
     for (int64_t first = 0; first < rows; first += ROWS) {
         int64_t groups = least(GROUPS, (rows - first + LANES - 1) / LANES);
         int64_t row[ROWS]; /* lanes without a row do the last one once more */
-        v4 samples[SPAN * GROUPS], states[MOST_SECTIONS][2 * GROUPS];
+        vec samples[SPAN * GROUPS], states[MOST_SECTIONS][2 * GROUPS];
         for (int k = 0; k < ROWS; k++) {
             row[k] = least(first + k, rows - 1);
             for (int64_t s = 0; s < count; s++)

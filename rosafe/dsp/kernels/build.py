@@ -1,7 +1,10 @@
-"""Builds the kernels with one call of gcc, once: the library lies in a folder named after all that went into it.
+"""Builds the kernels with gcc, once: the libraries lie in a folder named after all that went into them.
+
+There is one for every x86-64 processor with AVX2 and FMA, and one for those with AVX-512, so that a folder serves any
+machine.
 
 Runs as a script too, without anything but Python: ``build.py`` builds where the kernels look for it, and
-``build.py FOLDER`` below FOLDER. It does nothing where the library is there already.
+``build.py FOLDER`` below FOLDER. It does nothing where they are there already.
 """
 
 from __future__ import annotations
@@ -20,20 +23,20 @@ HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[2]
 
 PROCESSOR = "x86_64"
+LEVELS = {3: "x86-64-v3", 4: "x86-64-v4"}  # of the processor, and their names for gcc
 # -O3 is slower: it unrolls what is unrolled already. Without -ffp-contract=off gcc fuses products and sums as it likes.
-FLAGS = ("-std=gnu11", "-O2", "-march=x86-64-v3", "-ffp-contract=off", "-fPIC", "-shared", "-Wall", "-Wextra")
-LIBRARY = "kernels.so"
+FLAGS = ("-std=gnu11", "-O2", "-ffp-contract=off", "-fPIC", "-shared", "-Wall", "-Wextra")
 PATIENCE = 120  # seconds for gcc, which takes about one
-KEPT = 3  # libraries that stay: programs of other versions may want theirs again
+KEPT = 3  # folders that stay: programs of other versions may want theirs again
 
 
 class BuildError(Exception):
-    """There is no library and none can be built; one line says why."""
+    """There are no libraries and none can be built; one line says why."""
 
 
 def digest() -> str:
-    """A name for what the sources, flags and processor of this machine give."""
-    sha = hashlib.sha256(f"{platform.machine()} {' '.join(FLAGS)}\0".encode())
+    """A name for what the sources and flags give."""
+    sha = hashlib.sha256(f"{LEVELS} {FLAGS}\0".encode())
     for source in sorted(HERE.glob("*.[ch]")):
         sha.update(f"{source.name}\0".encode())
         sha.update(source.read_bytes())
@@ -45,8 +48,8 @@ def place() -> Path:
     return ROOT / ".generated" if (ROOT / "pyproject.toml").is_file() else HERE
 
 
-def library(below: Path | None = None) -> Path:
-    """The path of the library, which is built if it is not there.
+def libraries(below: Path | None = None) -> dict[int, Path]:
+    """The library for each level of `LEVELS`. They are built if they are not there.
 
     Parameters
     ----------
@@ -56,22 +59,21 @@ def library(below: Path | None = None) -> Path:
     Raises
     ------
     BuildError
-        Where there is no library, and no gcc, no permission to write, or the wrong processor.
+        Where there are none, and no gcc, no permission to write, or the wrong processor.
     """
-    base = place() if below is None else below
-    wanted = base / f"kernels-{digest()}" / LIBRARY
-    if wanted.is_file():
-        return wanted
-    if platform.machine() != PROCESSOR:
-        raise BuildError(f"the kernels are for {PROCESSOR}, and this machine is {platform.machine()}")
-    try:
-        return _build(wanted)
-    except OSError as problem:
-        raise BuildError(f"the kernels cannot be built: {problem}") from problem
+    folder = (place() if below is None else below) / f"kernels-{digest()}"
+    if not folder.is_dir():
+        if platform.machine() != PROCESSOR:
+            raise BuildError(f"the kernels are for {PROCESSOR}, and this machine is {platform.machine()}")
+        try:
+            _build(folder)
+        except OSError as problem:
+            raise BuildError(f"the kernels cannot be built: {problem}") from problem
+    return {level: folder / f"{name}.so" for level, name in LEVELS.items()}
 
 
-def _build(wanted: Path) -> Path:
-    base = wanted.parents[1]
+def _build(folder: Path) -> None:
+    base = folder.parent
     gcc = shutil.which("gcc")
     if gcc is None:
         raise BuildError("the kernels are not built, and there is no gcc to build them; run scripts/install")
@@ -80,30 +82,39 @@ def _build(wanted: Path) -> Path:
         fcntl.flock(lock, fcntl.LOCK_EX)  # given back by the kernel even if this process is killed
         for orphan in base.glob("kernels-*.new-*"):  # nobody else builds now: left by one that was killed
             shutil.rmtree(orphan)
-        if not wanted.is_file():
-            workshop = Path(tempfile.mkdtemp(prefix=f"{wanted.parent.name}.new-", dir=base))
+        if not folder.is_dir():
+            workshop = Path(tempfile.mkdtemp(prefix=f"{folder.name}.new-", dir=base))
             try:
-                _compile(gcc, workshop / LIBRARY)
+                _compile(gcc, workshop)
                 workshop.chmod(0o755)
-                workshop.rename(wanted.parent)
+                workshop.rename(folder)
             except BaseException:
                 shutil.rmtree(workshop)
                 raise
         _discard_old(base)
-    return wanted
 
 
-def _compile(gcc: str, library: Path) -> None:
-    command = [gcc, *FLAGS, "-o", str(library), *sorted(map(str, HERE.glob("*.c")))]
+def _compile(gcc: str, workshop: Path) -> None:
+    """All libraries at once, each by a gcc of its own."""
+    sources = sorted(map(str, HERE.glob("*.c")))
     environment = {**os.environ, "LC_ALL": "C"}
+    running = []
     try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE, env=environment, check=False)
+        for name in LEVELS.values():
+            command = [gcc, *FLAGS, f"-march={name}", "-o", str(workshop / f"{name}.so"), *sources]
+            running.append(subprocess.Popen(command, stdin=subprocess.DEVNULL, stderr=subprocess.PIPE, env=environment))
+        for process in running:
+            _, said = process.communicate(timeout=PATIENCE)
+            if process.returncode != 0:
+                lines = said.decode(errors="replace").strip().splitlines()
+                errors = [line for line in lines if "error" in line] or lines or [f"status {process.returncode}"]
+                raise BuildError(f"gcc cannot build the kernels: {errors[0]}")
     except subprocess.TimeoutExpired as problem:
         raise BuildError(f"gcc took more than {PATIENCE} seconds for the kernels") from problem
-    if done.returncode != 0:
-        said = done.stderr.strip().splitlines()
-        errors = [line for line in said if "error" in line] or said or [f"exit status {done.returncode}"]
-        raise BuildError(f"gcc cannot build the kernels: {errors[0]}")
+    finally:
+        for process in running:
+            process.kill()  # one that is done already takes no notice
+            process.wait()
 
 
 def _discard_old(base: Path) -> None:
@@ -112,12 +123,13 @@ def _discard_old(base: Path) -> None:
 
 
 def main(arguments: list[str]) -> int:
-    """Build and print the path; 1 where that is impossible."""
+    """Build and print the paths; 1 where that is impossible."""
     if len(arguments) > 1 or arguments[:1] in (["-h"], ["--help"]):
         print("usage: build.py [FOLDER]", file=sys.stderr)
         return 2
     try:
-        print(library(Path(arguments[0]) if arguments else None))
+        for path in libraries(Path(arguments[0]) if arguments else None).values():
+            print(path)
     except BuildError as problem:
         print(f"rosafe: {problem}; numpy and scipy will serve", file=sys.stderr)
         return 1

@@ -1,99 +1,136 @@
 /* Sums over moving windows: of the squares for ILD, of the leaky integrator's output or its square for ratemap.
  *
- * s + (1 - r) x[t] = u[t], s = r u[t] (rosafe/dsp/ratemap.py), then per frame sum_t weight[t] u[t] or weight[t] u[t]^2, in
- * one pass: samples go in spans that stay in the first-level cache, and each frame that touches a span adds its part of
- * it. So any window and hop costs the same per product, and of what is integrated only the tail that the next frames begin
- * with goes to memory. Sixteen rows at a time, four in each of four registers. */
+ * u[t] = s + (1 - r) x[t], s = r u[t] (rosafe/dsp/ratemap.py), then per frame sum_t weight[t] u[t] or weight[t] u[t]^2, in
+ * one pass: samples go in spans that stay in the first-level cache, and each frame that touches a span adds its part of it.
+ * So any window and hop costs the same per product, every sample is read once, and of what is integrated only the tail that
+ * is kept goes to memory. */
 #include "vector.h"
 
-enum { SPAN = 64, GROUPS = 4, ROWS = GROUPS * LANES };
+enum { SPAN = 64, ROWS = 16, GROUPS = ROWS / LANES };
 
-INLINE void integrate(const int squared, v4 (*x)[GROUPS], int64_t n, double retention, v4 state[GROUPS]) {
-    v4 s[GROUPS];
-    UNROLL for (int g = 0; g < GROUPS; g++) s[g] = state[g];
+typedef vec sample[GROUPS]; /* of ROWS rows, or of LANES: then the other groups are not used */
+
+INLINE void integrate(const int groups, const int squared, sample *x, int64_t n, double retention, vec *state) {
+    vec s[GROUPS];
+    UNROLL for (int g = 0; g < groups; g++) s[g] = state[g];
     for (int64_t t = 0; t < n; t++)
-        UNROLL for (int g = 0; g < GROUPS; g++) {
-            v4 u = x[t][g] * all(1.0 - retention) + s[g]; /* not fused, which would take longer to wait for */
+        UNROLL for (int g = 0; g < groups; g++) {
+            vec u = x[t][g] * all(1.0 - retention) + s[g]; /* not fused, which would take longer to wait for */
             s[g] = u * all(retention);
             x[t][g] = squared ? u * u : u;
         }
-    UNROLL for (int g = 0; g < GROUPS; g++) state[g] = s[g];
+    UNROLL for (int g = 0; g < groups; g++) state[g] = s[g];
 }
 
-INLINE void square(v4 (*x)[GROUPS], int64_t n) {
+INLINE void square(const int groups, sample *x, int64_t n) {
     for (int64_t t = 0; t < n; t++)
-        UNROLL for (int g = 0; g < GROUPS; g++) x[t][g] *= x[t][g];
+        UNROLL for (int g = 0; g < groups; g++) x[t][g] *= x[t][g];
 }
 
-/* sum_t weights[t] x[t] of each row. */
-INLINE void weighted_sums(v4 (*x)[GROUPS], const double *weights, int64_t n, double sums[ROWS]) {
+INLINE void weighted_sum(const int groups, const sample *x, const double *weights, int64_t n, vec *total) {
     enum { CHAINS = 2 }; /* sums that do not wait for one another */
-    v4 sum[CHAINS][GROUPS] = {};
+    vec sum[CHAINS][GROUPS];
+    UNROLL for (int c = 0; c < CHAINS; c++)
+        UNROLL for (int g = 0; g < groups; g++) sum[c][g] = (vec){};
     int64_t t = 0;
     for (; t + CHAINS <= n; t += CHAINS)
         UNROLL for (int c = 0; c < CHAINS; c++)
-            UNROLL for (int g = 0; g < GROUPS; g++) sum[c][g] = fused(all(weights[t + c]), x[t + c][g], sum[c][g]);
-    for (; t < n; t++)
-        UNROLL for (int g = 0; g < GROUPS; g++) sum[0][g] = fused(all(weights[t]), x[t][g], sum[0][g]);
-    UNROLL for (int g = 0; g < GROUPS; g++) {
-        UNROLL for (int c = 1; c < CHAINS; c++) sum[0][g] += sum[c][g];
-        store(sums + g * LANES, sum[0][g]);
-    }
+            UNROLL for (int g = 0; g < groups; g++) sum[c][g] = fused(all(weights[t + c]), x[t + c][g], sum[c][g]);
+    if (t < n)
+        UNROLL for (int g = 0; g < groups; g++) sum[0][g] = fused(all(weights[t]), x[t][g], sum[0][g]);
+    UNROLL for (int g = 0; g < groups; g++) total[g] = sum[0][g] + sum[1][g];
 }
 
-/* The samples of a row are the `held` ones of `history` (rows history_stride apart) and the n of `block` (rows, n) behind
- * them; the first frame begins at `skip`, each next one `hop` later. Where `state` (rows, 2; the second of each belongs to
- * the twin's form) is given, the block is integrated first, as the history is already, and what lies from sample tail_from
- * on goes to `tail`, which may be where the history was. sums is (rows, frames). */
-void rosafe_frame_sums(const double *history, int64_t history_stride, int64_t held, const double *block, int64_t n,
-                       int64_t rows, int64_t skip, const double *weights, int64_t size, int64_t hop, int64_t frames,
-                       int64_t squared, double retention, double *state, double *tail, int64_t tail_stride,
-                       int64_t tail_from, double *sums) {
-    uint32_t mode = denormals_off();
-    for (int64_t i = 0; i < rows * frames; i++) sums[i] = 0.0;
-    for (int64_t first = 0; first < rows; first += ROWS) {
-        int64_t count = least(ROWS, rows - first), row[ROWS]; /* lanes without a row do the last one once more */
-        v4 states[GROUPS];
-        for (int k = 0; k < ROWS; k++) {
-            row[k] = least(first + k, rows - 1);
-            states[k / LANES][k % LANES] = state ? state[2 * row[k]] : 0.0;
-        }
-        for (int64_t at = 0, end; at < held + n; at = end) {
-            end = least(at + SPAN, at < held ? held : held + n);
-            int64_t frame = most(0, (at - skip - size + hop) / hop); /* the first that may end behind `at` */
-            int integrated = state && at >= held;
-            if (!integrated && (frame >= frames || skip + frame * hop >= end)) continue; /* between frames */
-            v4 x[SPAN][GROUPS];
-            for (int g = 0; g < GROUPS; g++) {
-                const double *from[LANES];
-                for (int k = 0; k < LANES; k++) {
-                    int64_t r = row[g * LANES + k];
-                    from[k] = at < held ? history + r * history_stride + at : block + r * n + at - held;
-                }
-                read_rows(from, end - at, -LIMIT, LIMIT, &x[0][g], GROUPS);
-            }
-            int64_t keep = integrated ? most(at, tail_from) : end;
-            if (integrated && squared && keep >= end) {
-                integrate(1, x, end - at, retention, states);
-            } else {
-                if (integrated) integrate(0, x, end - at, retention, states);
-                for (int g = 0; g < GROUPS && keep < end; g++) {
-                    double *kept[LANES];
-                    for (int k = 0; k < LANES; k++)
-                        kept[k] = tail + row[g * LANES + k] * tail_stride + keep - tail_from;
-                    write_rows(&x[keep - at][g], GROUPS, end - keep, kept);
-                }
-                if (squared) square(x, end - at);
-            }
-            for (; frame < frames && skip + frame * hop < end; frame++) {
-                int64_t start = skip + frame * hop, from = most(at, start), until = least(end, start + size);
-                double parts[ROWS];
-                if (from >= until) continue;
-                weighted_sums(x + (from - at), weights + (from - start), until - from, parts);
-                for (int64_t k = 0; k < count; k++) sums[row[k] * frames + frame] += parts[k];
-            }
-        }
-        for (int64_t k = 0; state && k < count; k++) state[2 * row[k]] = flushed(states[k / LANES][k % LANES]);
+typedef struct {
+    const double *history, *block; /* rows history_stride and n apart */
+    int64_t history_stride, held, n;
+    const double *weights;
+    int64_t skip, size, hop, whole, squared;
+    double retention, *state; /* (rows, 2), or null: nothing is integrated */
+    double *tail;
+    int64_t tail_stride, tail_from, from, known;
+    const double *begun;
+    int64_t begun_now;
+    double *sums, *sums_begun;
+} job;
+
+/* Where the sum of a frame is. */
+INLINE double *sum_of(const job *job, int64_t row, int64_t frame) {
+    return frame < job->whole ? job->sums + row * job->whole + frame
+                              : job->sums_begun + row * job->begun_now + frame - job->whole;
+}
+
+/* The rows from `first` on, `count` of them, and the `frames` that begin in these samples. */
+INLINE void run(const int groups, const job *job, int64_t first, int64_t count, int64_t frames) {
+    int64_t row[ROWS]; /* lanes without a row do the last one once more */
+    vec states[GROUPS];
+    for (int k = 0; k < groups * LANES; k++) {
+        row[k] = first + least(k, count - 1);
+        states[k / LANES][k % LANES] = job->state ? job->state[2 * row[k]] : 0.0;
     }
+    for (int64_t r = first; r < first + count; r++)
+        for (int64_t f = 0; f < frames; f++) *sum_of(job, r, f) = f < job->known ? job->begun[r * job->known + f] : 0.0;
+    const int64_t held = job->held, total = held + job->n;
+    for (int64_t at = job->from, end; at < total; at = end) {
+        end = least(at + SPAN, at < held ? held : total);
+        const int64_t n = end - at, kept_from = most(at, job->tail_from);
+        const int integrated = job->state && at >= held;
+        int64_t frame = most(0, (at - job->skip - job->size + job->hop) / job->hop); /* none before reaches so far */
+        int64_t begin = job->skip + frame * job->hop;
+        if (!integrated && kept_from >= end && (frame >= frames || begin >= end)) continue;
+
+        sample x[SPAN];
+        for (int g = 0; g < groups; g++) {
+            const double *from[LANES];
+            for (int k = 0; k < LANES; k++) {
+                int64_t r = row[g * LANES + k];
+                from[k] = at < held ? job->history + r * job->history_stride + at : job->block + r * job->n + at - held;
+            }
+            read_rows(from, n, -LIMIT, LIMIT, &x[0][g], GROUPS);
+        }
+        if (integrated && job->squared && kept_from >= end) {
+            integrate(groups, 1, x, n, job->retention, states);
+        } else {
+            if (integrated) integrate(groups, 0, x, n, job->retention, states);
+            for (int g = 0; g < groups && kept_from < end; g++) {
+                double *to[LANES];
+                for (int k = 0; k < LANES; k++)
+                    to[k] = job->tail + row[g * LANES + k] * job->tail_stride + kept_from - job->tail_from;
+                write_rows(&x[kept_from - at][g], GROUPS, end - kept_from, to);
+            }
+            if (job->squared) square(groups, x, n);
+        }
+        for (; frame < frames && begin < end; frame++, begin += job->hop) {
+            int64_t from = most(at, begin), until = least(end, begin + job->size);
+            if (from >= until) continue;
+            vec part[GROUPS];
+            weighted_sum(groups, x + (from - at), job->weights + (from - begin), until - from, part);
+            for (int64_t k = 0; k < count; k++) *sum_of(job, row[k], frame) += part[k / LANES][k % LANES];
+        }
+    }
+    for (int64_t k = 0; job->state && k < count; k++)
+        job->state[2 * row[k]] = flushed(states[k / LANES][k % LANES]);
+}
+
+/* The samples of a row are the `held` ones of `history` and the n of `block` behind them; the first frame begins at `skip`,
+ * each next one `hop` later. sums (rows, whole) are those of the frames that are complete, sums_begun (rows, begun_now) those
+ * of the frames that have begun behind them. Where `known` is not 0, begun (rows, known) are the latter ones of the call
+ * before, which lack no sample of the history; else all is summed. Where `state` (rows, 2; the second of each belongs to the
+ * twin's form) is given, the block is integrated first, as the history is already. Samples of the block from tail_from on go
+ * to `tail`, which may be where the history was. */
+void rosafe_frame_sums(const double *history, int64_t history_stride, int64_t held, const double *block, int64_t n,
+                       double *tail, int64_t tail_stride, int64_t tail_from, int64_t rows, int64_t skip,
+                       const double *weights, int64_t size, int64_t hop, int64_t whole, int64_t squared,
+                       double retention, double *state, int64_t known, const double *begun, int64_t begun_now,
+                       double *sums, double *sums_begun) {
+    const job job = {.history = history, .block = block, .history_stride = history_stride, .held = held, .n = n,
+                     .weights = weights, .skip = skip, .size = size, .hop = hop, .whole = whole, .squared = squared,
+                     .retention = retention, .state = state, .tail = tail, .tail_stride = tail_stride,
+                     .tail_from = tail_from, .from = known ? held : 0, .known = known, .begun = begun,
+                     .begun_now = begun_now, .sums = sums, .sums_begun = sums_begun};
+    uint32_t mode = denormals_off();
+    int64_t row = 0;
+    for (; row + ROWS <= rows; row += ROWS) run(GROUPS, &job, row, ROWS, whole + begun_now);
+    for (; row < rows; row += LANES) run(1, &job, row, least(LANES, rows - row), whole + begun_now);
     denormals_as(mode);
 }

@@ -1,37 +1,37 @@
 /* The gammatone filterbank: per row (ear and channel) a cascade of equal complex one-pole filters.
  *
  * y[t] = x[t] + s, s = p y[t] with the complex pole p, `order` times; the input is scaled before every fourth pole. The
- * output is the real part, the envelope the modulus. (V. Hohmann (2002), Acta Acustica united with Acustica 88; the same
- * as direct form II transposed of rosafe/dsp/gammatone.py, operation by operation.)
+ * output is the real part, the envelope the modulus. (V. Hohmann (2002), Acta Acustica united with Acustica 88; direct form
+ * II transposed, as in rosafe/dsp/gammatone.py.)
  *
- * Four rows in the lanes. Up to four poles at a time have their states in registers; between them, spans of samples stay
- * in the first-level cache, so that any order costs the same per pole. */
+ * A row in each lane. Up to four poles at a time have their states in registers; between them, spans of samples stay in the
+ * first-level cache, so that any order costs the same per pole. */
 #include "vector.h"
 
-enum { SPAN = 64, TOGETHER = 4, MOST_POLES = 64 };
+enum { SPAN = 32, TOGETHER = 4, MOST_POLES = 64 };
 
 typedef struct {
-    v4 re, im;
-} complex4;
+    vec re, im;
+} complexes;
 
 /* n samples through `poles` poles; `real`: the imaginary part of the input is 0 and not read. */
-INLINE void run(const int poles, const int real, complex4 *samples, int64_t n, complex4 pole, complex4 *states) {
-    complex4 s[TOGETHER];
+INLINE void run(const int poles, const int real, complexes *samples, int64_t n, complexes pole, complexes *states) {
+    complexes s[TOGETHER];
     UNROLL for (int k = 0; k < poles; k++) s[k] = states[k];
     for (int64_t t = 0; t < n; t++) {
-        v4 re = samples[t].re, im = real ? (v4){} : samples[t].im;
+        vec re = samples[t].re, im = real ? (vec){} : samples[t].im;
         UNROLL for (int k = 0; k < poles; k++) {
             re += s[k].re;
             im = real && k == 0 ? s[k].im : im + s[k].im;
-            s[k].re = pole.re * re - pole.im * im;
-            s[k].im = pole.re * im + pole.im * re;
+            s[k].re = fused(pole.re, re, -(pole.im * im));
+            s[k].im = fused(pole.re, im, pole.im * re);
         }
-        samples[t] = (complex4){re, im};
+        samples[t] = (complexes){re, im};
     }
     UNROLL for (int k = 0; k < poles; k++) states[k] = s[k];
 }
 
-static void run_some(int64_t poles, int real, complex4 *samples, int64_t n, complex4 pole, complex4 *states) {
+static void run_some(int64_t poles, int real, complexes *samples, int64_t n, complexes pole, complexes *states) {
     switch (poles * 2 + real) {
     case 9: run(4, 1, samples, n, pole, states); break;
     case 8: run(4, 0, samples, n, pole, states); break;
@@ -55,8 +55,8 @@ void rosafe_gammatone(const double *block, int64_t n, int64_t channels, int64_t 
     uint32_t mode = denormals_off();
     for (int64_t first = 0; first < 2 * channels; first += LANES) {
         int64_t row[LANES], channel[LANES]; /* lanes without a row do the last one once more */
-        complex4 pole, states[MOST_POLES], samples[SPAN];
-        v4 left, right; /* the first gain for one ear's lanes, 0 for the other's */
+        complexes pole, states[MOST_POLES], samples[SPAN];
+        vec left, right; /* the first gain for one ear's lanes, 0 for the other's */
         for (int k = 0; k < LANES; k++) {
             row[k] = least(first + k, 2 * channels - 1);
             channel[k] = row[k] % channels;
@@ -71,11 +71,18 @@ void rosafe_gammatone(const double *block, int64_t n, int64_t channels, int64_t 
         }
         for (int64_t at = 0; at < n; at += SPAN) {
             int64_t count = least(SPAN, n - at);
+            double ears[2][SPAN];
+            for (int ear = 0; ear < 2; ear++)
+                for (int64_t t = 0; t < count; t++) {
+                    double x = block[ear * n + at + t];
+                    x = x < LIMIT ? x : LIMIT;
+                    ears[ear][t] = x > -LIMIT ? x : -LIMIT;
+                }
             for (int64_t t = 0; t < count; t++)
-                samples[t].re = all(block[at + t]) * left + all(block[n + at + t]) * right;
+                samples[t].re = fused(all(ears[0][t]), left, all(ears[1][t]) * right);
             for (int64_t p = 0; p < order; p += TOGETHER) {
                 if (p > 0) {
-                    v4 gain;
+                    vec gain;
                     for (int k = 0; k < LANES; k++) gain[k] = gain_of(sections, channel[k] * order + p);
                     for (int64_t t = 0; t < count; t++) {
                         samples[t].re *= gain;
@@ -89,7 +96,7 @@ void rosafe_gammatone(const double *block, int64_t n, int64_t channels, int64_t 
             write_rows(&samples[0].re, 2, count, to);
             if (envelope) {
                 for (int64_t t = 0; t < count; t++)
-                    samples[t].re = root(samples[t].re * samples[t].re + samples[t].im * samples[t].im);
+                    samples[t].re = root(fused(samples[t].re, samples[t].re, samples[t].im * samples[t].im));
                 for (int k = 0; k < LANES; k++) to[k] = envelope + row[k] * n + at;
                 write_rows(&samples[0].re, 2, count, to);
             }

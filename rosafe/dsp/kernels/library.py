@@ -10,16 +10,16 @@ from typing import NamedTuple
 
 from . import build
 
-SWITCH = "ROSAFE_KERNELS"  # environment variable: 0 for numpy and scipy
+SWITCH = "ROSAFE_KERNELS"  # environment variable: 0 for numpy and scipy, 3 or 4 for at most that level of processor
 
 _INTEGER, _REAL, _ARRAY = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
-_SAMPLES = (_ARRAY, _INTEGER, _INTEGER, _ARRAY, _INTEGER)  # history, its stride and length; block and its length
-_FRAMES = (_INTEGER, _ARRAY, _INTEGER, _INTEGER, _INTEGER)  # skip, window, size, hop, frames
+# history, stride, length; block, length; tail, stride, start; rows; skip; window, size; hop; frames
+_FRAMES = (_ARRAY, _INTEGER, _INTEGER, _ARRAY, _INTEGER, _ARRAY, *[_INTEGER] * 4, _ARRAY, *[_INTEGER] * 3)
 _ARGUMENTS = {
     "rosafe_gammatone": (_ARRAY, *[_INTEGER] * 3, *[_ARRAY] * 4),
     "rosafe_biquads": (_INTEGER, _ARRAY, _INTEGER, _INTEGER, _ARRAY, _INTEGER, _ARRAY, _ARRAY),
-    "rosafe_frame_sums": (*_SAMPLES, _INTEGER, *_FRAMES, _INTEGER, _REAL, _ARRAY, _ARRAY, _INTEGER, _INTEGER, _ARRAY),
-    "rosafe_correlations": (*_SAMPLES, _INTEGER, *_FRAMES, _INTEGER, _REAL, _ARRAY, _INTEGER),
+    "rosafe_frame_sums": (*_FRAMES, _INTEGER, _REAL, _ARRAY, _INTEGER, _ARRAY, _INTEGER, _ARRAY, _ARRAY),
+    "rosafe_correlations": (*_FRAMES, _INTEGER, _REAL, _ARRAY, _INTEGER),
 }
 
 
@@ -36,19 +36,22 @@ def loaded() -> tuple[ctypes.CDLL | None, Status]:
 
     Takes a fraction of a millisecond, and a second where the library must be built first.
     """
-    if os.environ.get(SWITCH, "").strip() == "0":
+    switch = os.environ.get(SWITCH, "").strip()
+    if switch == "0":
         return None, Status(False, f"numpy and scipy, as {SWITCH}=0 says")
     try:
-        path = build.library()
-        return _open(path), Status(True, f"compiled, {path}")
+        paths = build.libraries()
+        # the lesser one can be asked on any processor
+        level = min(_open(paths[3]).rosafe_processor_level(), int(switch) if switch in ("3", "4") else 4)
+        if level not in paths:
+            raise build.BuildError("the kernels need a processor with AVX2 and FMA (x86-64-v3)")
+        return _open(paths[level]), Status(True, f"compiled for {build.LEVELS[level]}, {paths[level]}")
     except (build.BuildError, OSError) as problem:
         return None, Status(False, f"numpy and scipy: {problem}")
 
 
 def _open(path: Path) -> ctypes.CDLL:
     library = ctypes.CDLL(str(path))  # releases the interpreter lock during calls
-    if not library.rosafe_runs_here():
-        raise build.BuildError("the kernels need a processor with AVX2 and FMA (x86-64-v3)")
     for name, arguments in _ARGUMENTS.items():
         function = getattr(library, name)
         function.argtypes, function.restype = arguments, None

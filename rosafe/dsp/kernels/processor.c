@@ -1,7 +1,9 @@
-/* Whether this processor can run the other kernels, which take AVX2, FMA and what else makes up x86-64-v3. This file's one
- * function is compiled for any x86-64, so that it can be asked anywhere. */
+/* Which of the libraries the processor can run. This one function is compiled for any x86-64, so that it can be asked of
+ * the library for the lesser processors anywhere. */
 
-__attribute__((target("arch=x86-64"))) int rosafe_runs_here(void) {
+/* 4 or 3 for x86-64-v4 (AVX-512) or x86-64-v3 (AVX2, FMA), 0 for less. */
+__attribute__((target("arch=x86-64"))) int rosafe_processor_level(void) {
     __builtin_cpu_init();
-    return __builtin_cpu_supports("x86-64-v3") != 0;
+    if (__builtin_cpu_supports("x86-64-v4")) return 4;
+    return __builtin_cpu_supports("x86-64-v3") ? 3 : 0;
 }
