@@ -34,6 +34,10 @@ proc ::genomix::Service {client name service args} {
     if {[dict get $switches help]} {
         return [::genomix::ServiceHelp $name $service $about]
     }
+    set parameters [dict get $about parameters]
+    if {[::genomix::Asks $args $words $parameters]} {
+        set words [list [::genomix::Ask $parameters]]
+    }
     set query [dict create input [::genomix::Input $service $about $words]]
     tailcall ::genomix::Perform $client [list $name $service] $query $switches $background $callback
 }

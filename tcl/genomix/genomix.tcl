@@ -92,7 +92,7 @@ proc ::genomix::Refuse {what {ex ::genom::serialization}} {
 
 apply {{} {
     variable root
-    foreach part {http client request command arguments help} {
+    foreach part {http client request command arguments help terminal} {
         uplevel #0 [list source -encoding utf-8 [file join $root $part.tcl]]
     }
 } ::genomix}

@@ -15,6 +15,8 @@ from tests.genomix.world import World
 
 pytestmark = pytest.mark.ros
 
+in_both_shells = pytest.mark.parametrize("shell", ["tclsh", "eltclsh"])
+
 
 @pytest.fixture
 def fresh_world(tmp_path: Path) -> Iterator[World]:
@@ -31,15 +33,16 @@ def guide_commands() -> list[str]:
     return [command.replace("hw:1,0", "scene:") for command in commands]
 
 
-def run_tclsh(world: World, script: str, *arguments: str) -> subprocess.CompletedProcess[str]:
+def run_shell(world: World, shell: str, script: str) -> subprocess.CompletedProcess[str]:
     path = world.graph.home / "session.tcl"
     path.write_text(script, "utf-8")
     # `genomix::connect` without an address, as in the guide, but not on the port that everybody uses.
-    return world.graph.run("tclsh", str(path), *arguments, GENOMIXD=f"127.0.0.1:{world.port}")
+    return world.graph.run(shell, str(path), GENOMIXD=f"127.0.0.1:{world.port}")
 
 
-def test_the_guide_runs_as_a_script(fresh_world: World) -> None:
-    done = run_tclsh(fresh_world, "\n".join(guide_commands()) + "\n")
+@in_both_shells
+def test_the_guide_runs_as_a_script(fresh_world: World, shell: str) -> None:
+    done = run_shell(fresh_world, shell, "\n".join(guide_commands()) + "\n")
     assert (done.stdout, done.stderr) == ("", "")
     parameters = fresh_world.http.call("rosAFE/getParameters")["parameters"]
     # The script's last requests are still on their way when it ends; removeProcessor is among them.
@@ -47,7 +50,8 @@ def test_the_guide_runs_as_a_script(fresh_world: World) -> None:
     assert [p["name"] for p in parameters["input"]] == ["input"]
 
 
-def test_each_command_of_the_guide_does_what_it_says(fresh_world: World) -> None:
+@in_both_shells
+def test_each_command_of_the_guide_does_what_it_says(fresh_world: World, shell: str) -> None:
     commands = guide_commands()
     script = ["set results {}", "proc note {result} {lappend ::results $result}"]
     for command in commands[:-2]:
@@ -66,7 +70,7 @@ def test_each_command_of_the_guide_does_what_it_says(fresh_world: World) -> None
         script.append(f"set last [uplevel #0 {{{command}}}]")
         script.append("puts [list last [$last wait 10000] [catch {$last result} result] $result]")
     script.append("puts [list plain [lrange $results 0 3] [lrange $results 7 8]]")
-    lines = run_tclsh(fresh_world, "\n".join(script)).stdout.splitlines()
+    lines = run_shell(fresh_world, shell, "\n".join(script)).stdout.splitlines()
     assert lines[0] == "modify error 1 {ex ::rosAFE::e_noSuchParameter}"
     for part in (
         "pp_refSPLdB 100.0",
@@ -231,21 +235,23 @@ PATTERNS = {
 }
 
 
+@in_both_shells
 @pytest.mark.parametrize("pattern", PATTERNS)
-def test_usage_patterns_of_published_scripts(world: World, pattern: str) -> None:
+def test_usage_patterns_of_published_scripts(world: World, pattern: str, shell: str) -> None:
     """Each shows an empty line where all went well."""
     if "left" in PATTERNS[pattern]:
         with world.graph.node("bass-ros", "-i", "left"):
-            assert world.lines(PATTERNS[pattern]) == [""]
+            assert world.lines(PATTERNS[pattern], shell=shell) == [""]
     else:
-        assert world.lines(PATTERNS[pattern]) == [""]
+        assert world.lines(PATTERNS[pattern], shell=shell) == [""]
 
 
-def test_pattern_24_a_shell_script_that_execs_tclsh(world: World) -> None:
+@in_both_shells
+def test_pattern_24_a_shell_script_that_execs_a_tcl_shell(world: World, shell: str) -> None:
     """OPT, LER: stop scripts are executables of their own."""
     script = world.graph.home / "stop.tcl"
     script.write_text(
-        '#!/bin/sh\n# the next line restarts using tclsh \\\nexec tclsh "$0" ${1+"$@"}\n'
+        f'#!/bin/sh\n# the next line restarts using {shell} \\\nexec {shell} "$0" ${{1+"$@"}}\n'
         "package require genomix\nset g [genomix::connect [lindex $argv 0]]\n$g rpath /tmp\n$g load bass\n"
         "bass::Stop\nputs stopped\n"
     )

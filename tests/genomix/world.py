@@ -111,8 +111,10 @@ class World:
         self.port = port
         self.http = Http(port)
 
-    def tcl(self, script: str, timeout: float = 60.0, check: bool = True) -> subprocess.CompletedProcess[str]:
-        """Run a script in tclsh; ``$address`` is that of genomixd, and ``show`` prints a value on a line."""
+    def tcl(
+        self, script: str, timeout: float = 60.0, check: bool = True, shell: str = "tclsh"
+    ) -> subprocess.CompletedProcess[str]:
+        """Run a script in a Tcl shell; ``$address`` is that of genomixd, and ``show`` prints a value on a line."""
         prelude = f"""
             package require genomix
             set address 127.0.0.1:{self.port}
@@ -124,11 +126,11 @@ class World:
         """
         path = self.graph.home / "script.tcl"
         path.write_text(textwrap.dedent(prelude) + textwrap.dedent(script), "utf-8")
-        return self.graph.run("tclsh", str(path), timeout=timeout, check=check)
+        return self.graph.run(shell, str(path), timeout=timeout, check=check)
 
-    def lines(self, script: str, timeout: float = 60.0) -> list[str]:
+    def lines(self, script: str, timeout: float = 60.0, shell: str = "tclsh") -> list[str]:
         """The lines that a script prints."""
-        return self.tcl(script, timeout).stdout.splitlines()
+        return self.tcl(script, timeout, shell=shell).stdout.splitlines()
 
     def reset(self) -> None:
         """Stop what the components do, so that the next test finds them idle."""

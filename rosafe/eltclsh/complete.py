@@ -1,0 +1,197 @@
+"""What TAB offers: commands, what a component's command takes, subcommands and methods, variables, files."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterable
+from pathlib import Path
+
+from rosafe.eltclsh.interpreter import Interpreter
+from rosafe.eltclsh.words import Context, Word, scan
+
+_SPACE = " "  # after a word that is complete
+
+
+class Completer:
+    """Asks a Tcl interpreter what there is. A match is the whole of what replaces the word, with what follows it."""
+
+    def __init__(self, interpreter: Interpreter) -> None:
+        self._tcl = interpreter
+
+    def complete(self, before: str, word: str) -> list[str]:
+        """What `word` can become; `before` is all that was typed before it."""
+        variable = re.search(r"\$(\{?)(?:([\w:]+)\()?$", before)
+        if variable:
+            brace, array = variable.groups()
+            return self._array_elements(array, word) if array else self._variables(word, "}" if brace else _SPACE)
+        stack, _ = scan(before)
+        current = stack[-1]
+        if len(stack) > 1 and current.opener == "{":
+            inside = self._dict_members(stack[-2].words, current, word)
+            if inside is not None:
+                return inside
+        words = [self._value(w) for w in current.words]
+        for candidates in (self._by_patterns(words, word), self._by_command(words, word)):
+            if candidates is not None:
+                return candidates
+        return self._commands(word) if not words else sorted({*self._variables(word, _SPACE), *self._files(word)})
+
+    def _value(self, word: Word) -> str:
+        """The word, with the value of the variable that it may be."""
+        if word.text.startswith("$"):
+            return self._tcl.variable(word.text[1:].strip("{}")) or word.text
+        return word.bare
+
+    # --- commands ---
+
+    def _commands(self, word: str) -> list[str]:
+        found = [name + _SPACE for name in self._tcl.elements("info", "commands", _glob(word))]
+        return sorted({*_like(word, found), *self._namespaces(word)})
+
+    def _namespaces(self, word: str) -> list[str]:
+        parent = word.rpartition("::")[0]
+        return _like(word, (f"{name}::" for name in self._tcl.elements("namespace", "children", f"{parent}::")))
+
+    def _by_command(self, words: list[str], word: str) -> list[str] | None:
+        """What the command itself says it takes: components, ensembles and objects."""
+        if not words:
+            return None
+        kind, parameters, switches = self._about(words[0])
+        if kind:
+            if word.startswith("-"):
+                return _starting(word, switches)
+            given = [w for w in words[1:] if not w.startswith("-")]
+            # Members stand in braces, which a first word does not need to be typed with.
+            return _starting("{" + word, [f"{{{name}" for name in parameters]) if not given else None
+        if len(words) > 1:
+            return None
+        if self._tcl.elements("namespace", "ensemble", "exists", words[0]) == ["1"]:
+            ensemble = ("namespace", "ensemble", "configure", words[0])
+            return _starting(
+                word, self._tcl.elements(*ensemble, "-map")[::2] or self._tcl.elements(*ensemble, "-subcommands")
+            )
+        if self._tcl.elements("info", "object", "isa", "object", words[0]) == ["1"]:
+            return _starting(word, self._tcl.elements("info", "object", "methods", words[0], "-all"))
+        return None
+
+    def _about(self, command: str) -> tuple[str, list[str], list[str]]:
+        """Kind, parameters and switches of a component's command; empty for any other command."""
+        about = self._tcl.elements("::genomix::about", command)
+        if len(about) != 3:
+            return "", [], []
+        return (
+            about[0],
+            self._tcl.split(about[1]),
+            self._tcl.split(about[2]),
+        )
+
+    def _dict_members(self, words: list[Word], inside: Context, word: str) -> list[str] | None:
+        """Names of parameters inside the braces of a component's command; None where this is something else."""
+        if not words:
+            return None
+        kind, parameters, _ = self._about(self._value(words[0]))
+        given = [element.bare for element in inside.elements]
+        if not kind or any(not w.text.startswith("-") for w in words[1:]):
+            return None
+        return [] if len(given) % 2 else _starting(word, (name for name in parameters if name not in given[::2]))
+
+    # --- variables, files ---
+
+    def _variables(self, word: str, tail: str) -> list[str]:
+        found = self._tcl.elements("uplevel", "#0", ("info", "vars", _glob(word)))  # type: ignore[arg-type]
+        arrays = {
+            name for name in found if self._tcl.elements("array", "exists", f"::{name.removeprefix('::')}") == ["1"]
+        }
+        names = [name + ("(" if name in arrays else tail) for name in found]
+        return sorted({*_like(word, names), *self._namespaces(word)} if word else {*_like(word, names)})
+
+    def _array_elements(self, array: str, word: str) -> list[str]:
+        return _starting(word, self._tcl.elements("array", "names", f"::{array.removeprefix('::')}"), ")")
+
+    def _files(self, word: str, directories_only: bool = False) -> list[str]:
+        folder, _, name = word.rpartition("/")
+        base = Path(os.path.expanduser(f"{folder}/" if "/" in word else "."))
+        try:
+            entries = sorted(base.iterdir())
+        except OSError:  # there is no such folder, or not for us
+            return []
+        found = []
+        for entry in entries:
+            hidden = entry.name.startswith(".") and not name
+            if entry.name.startswith(name) and not hidden and (entry.is_dir() or not directories_only):
+                escaped = re.sub(r'([\s\\$"{}\[\];])', r"\\\1", entry.name)
+                found.append(word[: len(word) - len(name)] + escaped + ("/" if entry.is_dir() else _SPACE))
+        return found
+
+    # --- el::completionPatterns ---
+
+    def _by_patterns(self, words: list[str], word: str) -> list[str] | None:
+        """What the first rule says whose pattern matches the command and of which a part matches the place.
+
+        The variable is a list of rules ``{command {kind pattern action} ...}``: `p` matches the number of the word,
+        `c` and `C` the word itself (`C` completes what is behind the match), `n` and `N` the word before it or the one
+        before that.
+        """
+        for rule in self._tcl.elements("set", "::el::completionPatterns"):
+            command, *parts = self._tcl.split(rule)
+            if not re.search(command, words[0] if words else word):
+                continue
+            for part in parts:
+                kind, pattern, action = (*self._tcl.split(part), "", "", "")[:3]
+                skipped = self._skipped(kind, pattern, words, word)
+                if skipped is not None:
+                    return [word[:skipped] + match for match in self._act(action, word[skipped:])]
+            return None
+        return None
+
+    @staticmethod
+    def _skipped(kind: str, pattern: str, words: list[str], word: str) -> int | None:
+        """How much of the word stays as it is, None where the pattern is not for this place."""
+        if kind == "p":
+            return 0 if re.fullmatch(pattern, str(len(words))) else None
+        if kind in ("n", "N"):
+            back = 1 if kind == "n" else 2
+            return 0 if len(words) > back - 1 and re.search(pattern, words[-back]) else None
+        matches = list(re.finditer(pattern, word))
+        if not matches:
+            return None
+        return matches[-1].end() if kind == "C" else 0
+
+    def _act(self, action: str, word: str) -> list[str]:
+        match action:
+            case "v" | "A":
+                return self._variables(word, _SPACE)
+            case "c" | "C" | "N":
+                return self._commands(word)
+            case "p":
+                return _starting(word, self._tcl.elements("info", "procs", _glob(word)))
+            case "n":
+                return self._namespaces(word)
+            case "f" | "F":
+                return self._files(word)
+            case "d":
+                return self._files(word, directories_only=True)
+            case "k":
+                self._tcl.elements("eval", "{*}[package unknown] {} 0-")  # until it is asked, Tcl has not looked
+                return _starting(word, self._tcl.elements("package", "names"))
+            case "i":
+                return _starting(word, self._tcl.elements("interp", "slaves"))
+        if action.startswith("["):
+            return _starting(word, self._tcl.elements("uplevel", "#0", action[1:-1]))
+        return _starting(word, self._tcl.split(action))
+
+
+def _starting(word: str, names: Iterable[str], tail: str = _SPACE) -> list[str]:
+    return sorted({name + tail for name in names if name.startswith(word)})
+
+
+def _like(word: str, names: Iterable[str]) -> list[str]:
+    """Those that start with the word, written with or without ``::`` in front as the word is."""
+    absolute = word.startswith("::")
+    written = (("::" if absolute else "") + name.removeprefix("::") for name in names)
+    return [name for name in written if name.startswith(word)]
+
+
+def _glob(word: str) -> str:
+    return re.sub(r"([*?\[\]\\])", r"\\\1", word) + "*"

@@ -1,0 +1,113 @@
+"""The user's guide typed at the prompt of eltclsh, with real nodes: completion, questions, callbacks."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests import harness
+from tests.eltclsh.terminal import Terminal
+from tests.genomix import world as worlds
+from tests.genomix.test_guide import guide_commands
+
+pytestmark = pytest.mark.ros
+
+
+@pytest.fixture
+def guide(tmp_path: Path) -> Iterator[Terminal]:
+    """eltclsh at its prompt, beside a genomixd with new nodes."""
+    with worlds.world(tmp_path) as world:
+        env = {**world.graph.env, "GENOMIXD": f"127.0.0.1:{world.port}"}
+        with Terminal([str(harness.SCRIPTS / "eltclsh")], env) as terminal:
+            terminal.expect("eltclsh > ")
+            yield terminal
+
+
+def test_the_guide_typed_at_the_prompt(guide: Terminal) -> None:
+    shown = [guide.run(command) for command in guide_commands()]
+    assert shown[:4] == ["1.8", "genomix1", "rosAFE", ""]
+    requests = shown[4:7] + shown[9:]
+    assert requests == [f"::genomix::request{n}" for n in range(1, len(requests) + 1)]
+    assert shown[7:9] == ["", ""]
+    assert guide.run("::genomix::request7 wait 10000") == "error"  # the input has no pp_bRemoveDC
+    assert guide.run("::genomix::request8 wait 10000") == "done"
+    assert guide.run("::genomix::request9 wait 10000") == "done"
+    assert guide.run("::genomix::request8 result").startswith("parameters {input {0 {name input")
+    assert guide.run("catch {::genomix::request7 result} e; dict get $e ex") == "::rosAFE::e_noSuchParameter"
+    assert guide.run("::genomix::request9 result") == "dependencies {0 input 1 preProc 2 gammatone 3 ihc 4 ratemap}"
+    # removeProcessor takes the whole tree below preProc
+    guide.run("::genomix::request11 wait 10000")
+    assert guide.run("rosAFE::getDependencies preProc") == "ex ::rosAFE::e_noSuchProcessor"
+    assert guide.run("dict size [dict get [rosAFE::getParameters] parameters preProc]") == "0"
+
+
+def test_a_callback_comes_while_the_prompt_waits(guide: Terminal) -> None:
+    guide.run("package require genomix; [genomix::connect] load bass")
+    guide.run('proc told {request} {puts "[$request status]: [catch {$request result} e] [dict get $e ex]"}')
+    guide.press("bass::Acquire {device none} & told\r")
+    guide.expect("error: 1 ::bass::e_device\n")
+
+
+def test_what_is_missing_is_asked_for(guide: Terminal) -> None:
+    guide.run("package require genomix; set g [genomix::connect]; $g load bass; $g load rosAFE")
+    guide.press("rosAFE::connect_port\r")
+    guide.expect("\nstring local: Name of this component's input port > ")
+    guide.press("\r")
+    guide.expect("local has no default\n")
+    guide.expect("string local: ")
+    guide.press("Audio\r")
+    guide.expect("string remote: ")
+    guide.press("bass/Audio\r")
+    guide.expect("eltclsh > ")
+    guide.press("bass::Acquire &\r")
+    asked = guide.expect("(hw:1,0) > ")
+    assert "\nstring device: " in asked
+    guide.press("scene:\r")
+    for name, answer in (("sampleRate", "22050"), ("nFramesPerChunk", ""), ("nChunksOnPort", "")):
+        guide.expect(f"{name}: ")
+        guide.expect(") > ")
+        guide.press(f"{answer}\r")
+    guide.expect("::genomix::request1\n")
+    guide.expect("eltclsh > ")
+    assert guide.run("dict get [bass::Audio] Audio sampleRate") == "22050"
+    # Not asked: defaults by word, within a script or procedure, without parameters, or for help.
+    assert guide.run("rosAFE::InputProc --") == ""
+    assert guide.run("proc f {} {rosAFE::PreProc}; f") == ""
+    assert guide.run("rosAFE::GammatoneProc {}") == ""
+    assert guide.run("bass::Acquire -h").startswith("bass::Acquire: ")
+    guide.run("set f [open ~/s.tcl w]; puts $f rosAFE::IhcProc; close $f")
+    assert guide.run("source ~/s.tcl") == ""
+    assert guide.run("dict size [dict get [rosAFE::getParameters] parameters ihc]") == "1"
+    guide.press("rosAFE::IldProc\r")
+    guide.expect("string name: ")
+    guide.expect(") > ")
+    guide.press("\x04")
+    assert "no input" in guide.expect("eltclsh > ")
+    assert guide.run("dict size [dict get [rosAFE::getParameters] parameters ild]") == "0"
+
+
+def test_tab_knows_what_a_component_takes(guide: Terminal) -> None:
+    guide.run("package require genomix; set g [genomix::connect]; $g load rosAFE")
+    for typed, shown in (
+        ("rosAFE::Gammat\tP", "rosAFE::Gammatone"),
+        ("::rosAFE::getDep\t", "::rosAFE::getDependencies "),
+        ("puts [rosAFE::getPar\t", "puts [rosAFE::getParameters "),
+        ("rosAFE::GammatoneProc {fb_nC\t", "{fb_nChannels "),
+        ("rosAFE::GammatoneProc {name a upp\t", "{name a upperDepName "),
+        ("rosAFE::GammatoneProc -a\t{fb_nC\t", "-ack {fb_nChannels "),
+        ("rosAFE::GammatoneProc fb_nC\t", "{fb_nChannels "),
+        ("rosAFE::gammatonePort -h\t", "-help "),
+        ("$g unl\t", "$g unload "),
+    ):
+        guide.press(typed)
+        guide.expect(shown)
+        guide.press("\x15")
+    guide.press("rosAFE::IhcProc \t\t")
+    shown = guide.expect("rosAFE::IhcProc {")
+    shown += guide.expect("rosAFE::IhcProc {")
+    assert "name" in shown and "upperDepName" in shown and "ihc_method" in shown
+    guide.press("\x15rosAFE::IhcProc {name a \r upp\t")
+    guide.expect("upperDepName ")
+    guide.press("\x15}\r")
