@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import fcntl
 import os
-import pty
 import re
 import select
 import struct
@@ -22,7 +21,7 @@ class Terminal:
     """A program on a terminal of its own, 200 columns wide."""
 
     def __init__(self, command: list[str], env: dict[str, str]) -> None:
-        self._master, slave = pty.openpty()
+        self._master, slave = harness.open_terminal()
         fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", 50, 200, 0, 0))
         # setsid -c: the pty is the controlling terminal, so that Ctrl-C is a signal
         self._process = subprocess.Popen(
