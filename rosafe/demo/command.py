@@ -73,6 +73,12 @@ def _seconds(text: str) -> float:
     return seconds
 
 
+def _sound(text: str) -> str:
+    if not text.strip():
+        raise argparse.ArgumentTypeError("it is empty: name a sound file or a device, or leave it out for scene:")
+    return text
+
+
 def _parse(arguments: list[str] | None) -> argparse.Namespace:
     parser = _Parser(
         prog="scripts/demo",
@@ -86,6 +92,7 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
     )
     parser.add_argument(
         "sound",
+        type=_sound,
         nargs="?",
         default=DEFAULT_DEVICE,
         metavar="WAV or ALSA device",

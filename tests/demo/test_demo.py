@@ -119,6 +119,7 @@ def test_through_a_link_with_a_dead_reader(tmp_path: Path) -> None:
         (["scene:?speed=2"], "no option 'speed'", 1),
         (["--out", "mono.wav"], "cannot write to mono.wav", 1),
         (["--out", "/dev/null/there"], "cannot write to /dev/null/there", 1),
+        ([""], "it is empty", 2),
         (["--seconds", "0"], "'0' is no number of seconds from 2 to 600", 2),
         (["--seconds", "nan"], "'nan' is no number of seconds", 2),
         (["--seconds", "ten"], "'ten' is no number of seconds", 2),
