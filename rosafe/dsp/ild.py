@@ -26,7 +26,8 @@ class Ild(FramedStage):
         return rows[1:]
 
     def process(self, block: FloatArray) -> FloatArray:
-        left, right = self._means(self._checked(block), squared=True)
-        levels = np.log10((right + EPSILON) / (left + EPSILON))
+        energies = self._means(self._checked(block), squared=True)
+        energies += EPSILON
+        levels = np.log10(energies[1] / energies[0])
         levels *= 10
         return levels

@@ -29,6 +29,9 @@ class Status(NamedTuple):
     compiled: bool
     detail: str
 
+    def __str__(self) -> str:
+        return self.detail
+
 
 @functools.cache  # without a lock: two threads at once do the same twice, to the same end
 def loaded() -> tuple[ctypes.CDLL | None, Status]:
@@ -42,15 +45,16 @@ def loaded() -> tuple[ctypes.CDLL | None, Status]:
     try:
         paths = build.libraries()
         # the lesser one can be asked on any processor
-        level = min(_open(paths[3]).rosafe_processor_level(), int(switch) if switch in ("3", "4") else 4)
+        level = min(load(paths[3]).rosafe_processor_level(), int(switch) if switch in ("3", "4") else 4)
         if level not in paths:
             raise build.BuildError("the kernels need a processor with AVX2 and FMA (x86-64-v3)")
-        return _open(paths[level]), Status(True, f"compiled for {build.LEVELS[level]}, {paths[level]}")
+        return load(paths[level]), Status(True, f"compiled for {build.LEVELS[level]}, {paths[level]}")
     except (build.BuildError, OSError) as problem:
         return None, Status(False, f"numpy and scipy: {problem}")
 
 
-def _open(path: Path) -> ctypes.CDLL:
+def load(path: Path) -> ctypes.CDLL:
+    """The library with its functions declared."""
     library = ctypes.CDLL(str(path))  # releases the interpreter lock during calls
     for name, arguments in _ARGUMENTS.items():
         function = getattr(library, name)

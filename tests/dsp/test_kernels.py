@@ -1,0 +1,253 @@
+"""Each kernel against its twin, over all that can be configured; and one stream that goes through both."""
+
+from __future__ import annotations
+
+import subprocess
+import threading
+import time
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rosafe.dsp import STAGES, CrossCorrelation, Ild, InnerHairCell, Ratemap, Stage, kernels
+from rosafe.dsp.gammatone import GammatoneBank
+from rosafe.dsp.guard import LIMIT
+from rosafe.dsp.haircell import METHODS
+from rosafe.dsp.kernels import build
+from rosafe.dsp.windows import NAMES
+from tests.harness import ROOT
+
+from .bare import FloatArray, cut
+from .implementations import TWINS, levels, using
+
+RATE = 16000.0
+
+each_level = pytest.mark.parametrize("level", [3, 4])
+block_sizes = st.lists(st.one_of(st.sampled_from([0, 1, 2, 3, 64]), st.integers(0, 400)), min_size=1, max_size=8)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def implementation() -> None:
+    """Here, each test chooses for itself."""
+
+
+def signal(channels: int, samples: int, seed: int = 0) -> FloatArray:
+    """Noise with steps of level, some of it silent."""
+    rng = np.random.default_rng(seed)
+    levels = 10.0 ** rng.integers(-6, 3, samples // 100 + 1)
+    levels[rng.random(len(levels)) < 0.2] = 0
+    return rng.standard_normal((2, channels, samples)) * np.repeat(levels, 100)[:samples]
+
+
+def outputs(stage: Stage, blocks: Iterable[FloatArray], turns: Iterable[int]) -> list[FloatArray]:
+    """What `stage` makes of `blocks` on the implementations that have their turn."""
+    made = []
+    for block, level in zip(blocks, turns, strict=False):
+        with using(level):
+            if isinstance(stage, InnerHairCell) and stage.needs_envelope:
+                made.append(stage.process(block, np.abs(block) + 0.25 * np.abs(np.roll(block, 1))))
+            else:
+                made.append(stage.process(block))
+    return made
+
+
+def agree(got: Iterable[FloatArray], expected: Iterable[FloatArray], tolerance: float = 1e-11) -> None:
+    got, expected = np.concatenate([*got], axis=-1), np.concatenate([*expected], axis=-1)
+    assert got.shape == expected.shape
+    np.testing.assert_allclose(got, expected, rtol=0, atol=tolerance * np.abs(expected).max(initial=1e-290))
+
+
+def check(level: int, kind: str, parameters: dict[str, Any], blocks: list[FloatArray]) -> None:
+    """The kernels give what the twins give; so does a stage that goes back and forth between the two."""
+    expected = outputs(STAGES[kind](RATE, **parameters), blocks, [TWINS] * len(blocks))
+    agree(outputs(STAGES[kind](RATE, **parameters), blocks, [level] * len(blocks)), expected)
+    agree(outputs(STAGES[kind](RATE, **parameters), blocks, [level, TWINS, TWINS, level] * len(blocks)), expected)
+
+
+# --- the kernels ------------------------------------------------------------------------------------------------
+
+
+@each_level
+@given(
+    channels=st.integers(1, 11),
+    order=st.one_of(st.integers(1, 9), st.sampled_from([16, 63, 64])),
+    width=st.floats(0.05, 20),
+    sizes=block_sizes,
+    envelopes=st.lists(st.booleans(), min_size=8, max_size=8),
+)
+@settings(max_examples=60, deadline=None, database=None)
+def test_gammatone(
+    level: int, channels: int, order: int, width: float, sizes: list[int], envelopes: list[bool]
+) -> None:
+    frequencies = np.geomspace(60.0, 7900.0, channels)
+    blocks = [np.ascontiguousarray(block) for block in cut(signal(1, sum(sizes) + 50)[:, 0], [*sizes, 50])]
+    made: dict[int, list[FloatArray]] = {}
+    for choice in (TWINS, level):
+        bank = GammatoneBank(RATE, frequencies, order, width)
+        with using(choice):
+            pairs = [bank.process(block, env) for block, env in zip(blocks, envelopes, strict=False)]
+        made[choice] = [array for pair in pairs for array in pair if array is not None]
+    agree(made[level], made[TWINS])
+
+
+@each_level
+@given(method=st.sampled_from(METHODS), channels=st.integers(1, 11), sizes=block_sizes)
+@settings(max_examples=60, deadline=None, database=None)
+def test_hair_cell(level: int, method: str, channels: int, sizes: list[int]) -> None:
+    check(level, "ihc", {"ihc_method": method}, cut(signal(channels, sum(sizes) + 50), [*sizes, 50]))
+
+
+def framing(prefix: str) -> st.SearchStrategy[dict[str, Any]]:
+    """Windows of 2 to 300 samples, hops of 1 to 700."""
+    short, long = st.integers(1, 12), st.integers(1, 150)
+    return st.fixed_dictionaries(
+        {
+            f"{prefix}_wname": st.sampled_from(NAMES),
+            f"{prefix}_wSizeSec": st.one_of(short, long).map(lambda half: 2 * half / RATE),
+            f"{prefix}_hSizeSec": st.one_of(short, long, st.integers(1, 700)).map(lambda hop: hop / RATE),
+        }
+    )
+
+
+@each_level
+@given(parameters=framing("ild"), channels=st.integers(1, 11), sizes=block_sizes)
+@settings(max_examples=60, deadline=None, database=None)
+def test_ild(level: int, parameters: dict[str, Any], channels: int, sizes: list[int]) -> None:
+    check(level, "ild", parameters, cut(signal(channels, sum(sizes) + 500), [*sizes, 300]))
+
+
+@each_level
+@given(
+    parameters=framing("rm"),
+    scaling=st.sampled_from(["power", "magnitude"]),
+    decay=st.floats(1e-5, 10),
+    channels=st.integers(1, 11),
+    sizes=block_sizes,
+)
+@settings(max_examples=60, deadline=None, database=None)
+def test_ratemap(
+    level: int, parameters: dict[str, Any], scaling: str, decay: float, channels: int, sizes: list[int]
+) -> None:
+    parameters = {**parameters, "rm_scaling": scaling, "rm_decaySec": decay}
+    check(level, "ratemap", parameters, cut(signal(channels, sum(sizes) + 500), [*sizes, 300]))
+
+
+@each_level
+@given(
+    parameters=framing("cc"),
+    lag=st.one_of(st.integers(1, 12), st.integers(1, 320)),
+    channels=st.integers(1, 6),
+    sizes=block_sizes,
+)
+@settings(max_examples=80, deadline=None, database=None)
+def test_cross_correlation(level: int, parameters: dict[str, Any], lag: int, channels: int, sizes: list[int]) -> None:
+    parameters = {**parameters, "cc_maxDelaySec": (lag - 0.5) / RATE}
+    check(level, "crossCorrelation", parameters, cut(signal(channels, sum(sizes) + 500), [*sizes, 300]))
+
+
+@each_level
+@pytest.mark.parametrize(("size", "lag"), [(1024, 3), (1026, 100), (2050, 511), (3000, 400), (5002, 511), (1200, 512)])
+def test_cross_correlation_of_long_windows(level: int, size: int, lag: int) -> None:
+    """Windows that are taken in several spans, up to the most lags, and just beyond, where FFT takes over."""
+    parameters = {"cc_wSizeSec": size / RATE, "cc_hSizeSec": size / 3 / RATE, "cc_maxDelaySec": (lag - 0.5) / RATE}
+    check(level, "crossCorrelation", parameters, cut(signal(2, 12000), [5000, 100]))
+
+
+@each_level
+@pytest.mark.parametrize("kind", ["gammatone", "ihc", "ild", "ratemap", "crossCorrelation"])
+@pytest.mark.parametrize("value", [1e300, LIMIT, 1e-160, 5e-324])
+def test_far_beyond_sound(level: int, kind: str, value: float) -> None:
+    """Huge samples are bounded alike. Of tiny ones the kernels may make 0, which differs by less than anything."""
+    sound = np.sign(signal(3, 2000)) * value
+    blocks = cut(sound[:, 0] if kind == "gammatone" else sound, [700, 1, 600])
+    expected = outputs(STAGES[kind](RATE), blocks, [TWINS] * len(blocks))
+    got = outputs(STAGES[kind](RATE), blocks, [level] * len(blocks))
+    joined = np.concatenate(got, axis=-1)
+    assert np.isfinite(joined).all()
+    np.testing.assert_allclose(joined, np.concatenate(expected, axis=-1), rtol=1e-11, atol=1e-11 * min(value, 1.0))
+
+
+@each_level
+def test_changes_between_blocks(level: int) -> None:
+    """A new window takes what was held; the sums of frames that had begun are then of the new window."""
+    for stage_class, prefix in ((Ild, "ild"), (Ratemap, "rm"), (CrossCorrelation, "cc")):
+        made = {}
+        for choice in (TWINS, level):
+            stage = stage_class(RATE)
+            parts = outputs(stage, cut(signal(3, 1000), 300), [choice] * 4)
+            stage.configure(**{f"{prefix}_wSizeSec": 0.03, f"{prefix}_hSizeSec": 0.004, f"{prefix}_wname": "triang"})
+            parts += outputs(stage, cut(signal(3, 1000, seed=1), 300), [choice] * 4)
+            made[choice] = parts
+        agree(made[level], made[TWINS])
+
+
+@each_level
+def test_denormal_numbers_stay_a_matter_of_the_kernels(level: int) -> None:
+    """They are switched off inside; outside, arithmetic is as before."""
+    smallest = np.array([5e-324])
+    with using(level):
+        for kind, stage in STAGES.items():
+            stage(RATE).process(
+                np.ones((2, 100)) if kind in ("input", "preProc", "gammatone") else np.ones((2, 3, 100))
+            )
+            assert (smallest * 1.0)[0] == 5e-324, kind
+
+
+@each_level
+def test_the_interpreter_goes_on_meanwhile(level: int) -> None:
+    sound = signal(16, 200_000)
+    span: list[float] = []
+    ready = threading.Event()
+
+    def work() -> None:
+        stage = CrossCorrelation(RATE, cc_maxDelaySec=0.02)
+        ready.set()
+        span.append(time.perf_counter())
+        stage.process(sound)
+        span.append(time.perf_counter())
+
+    with using(level):
+        worker = threading.Thread(target=work)
+        worker.start()
+        ready.wait()
+        ticks = []
+        while worker.is_alive():
+            ticks.append(time.perf_counter())
+        worker.join()
+    begin, end = span
+    middle = [tick for tick in ticks if begin + (end - begin) / 4 < tick < end - (end - begin) / 4]
+    assert len(middle) > 10, f"{len(middle)} steps in the middle of a call of {end - begin:.3f} s"
+
+
+def test_constants_are_those_of_the_sources() -> None:
+    sources = {path.name: path.read_text() for path in (ROOT / "rosafe" / "dsp" / "kernels").glob("*.[ch]")}
+    assert f"MOST_POLES = {kernels.MOST_POLES} " in sources["gammatone.c"]
+    assert f"MOST_SECTIONS = {kernels.MOST_SECTIONS} " in sources["biquads.c"]
+    assert f"MOST_LAGS = {kernels.MOST_LAGS}," in sources["correlation.c"]
+    assert [name.upper().replace("WAVE", "_WAVE") for name in kernels.RECTIFICATIONS] == [
+        "NONE",
+        "HALF_WAVE",
+        "FULL_WAVE",
+        "SQUARE",
+    ]
+    assert "{ NONE, HALF_WAVE, FULL_WAVE, SQUARE }" in sources["biquads.c"]
+
+
+def test_the_processor_is_asked_without_its_newer_instructions() -> None:
+    """Else the question itself would be an illegal instruction on a processor that must answer no."""
+    if not levels():
+        pytest.skip("the kernels cannot be built here")
+    path = build.libraries()[3]
+    try:
+        command = ["objdump", "-d", "--no-show-raw-insn", "--disassemble=rosafe_processor_level", str(path)]
+        listing = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    except FileNotFoundError:
+        pytest.skip("no objdump here")
+    instructions = [line.split("\t")[1].split()[0] for line in listing.splitlines() if "\t" in line]
+    assert len(instructions) > 3
+    newer = {name for name in instructions if name.startswith("v") or name in ("andn", "bextr", "sarx", "shlx", "shrx")}
+    assert not newer
