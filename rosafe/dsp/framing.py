@@ -11,9 +11,8 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from . import kernels
-from .cascade import Cascade
 from .checks import positive, sample_count, word
-from .guard import FloatArray, limited
+from .guard import FloatArray
 from .stage import Parameter, Stage
 from .windows import NAMES, window
 
@@ -151,9 +150,6 @@ class FramedStage(Stage):
 
     PREFIX: ClassVar[str]
 
-    # Of the frames that have begun, the sums over what is held, (*rows, frames); None: to be computed anew
-    _begun: FloatArray | None
-
     def __init__(self, sample_rate: float, **parameters: Any) -> None:
         self._buffer = FrameBuffer()
         super().__init__(sample_rate, **parameters)
@@ -165,23 +161,10 @@ class FramedStage(Stage):
     def reset(self) -> None:
         self._buffer = FrameBuffer()
 
-    def _means(self, block: FloatArray, squared: bool, integrator: Cascade | None = None) -> FloatArray:
-        """The means of the frames that `block` (*rows, N) completes, (*rows, F): `Framing.means`.
-
-        Through an `integrator` of one section, the block goes first.
-        """
-        if not kernels.compiled():
-            samples = limited(block) if integrator is None else integrator.process(limited(block))
-            means = self._framing.means(self._buffer.append(samples), squared)
-            self._buffer.drop(means.shape[-1] * self._framing.hop)
-            self._begun = None
-            return means
-        frames = self._frames(block, self._framing.weights(squared))
-        section, state = None, None
-        if integrator is not None:
-            section, state = integrator.sections, integrator.started(block.shape[:-1])
-        known = self._begun if frames.history.shape[-1] else None
-        means, self._begun = kernels.frame_sums(frames, squared, section, state, known)
+    def _means(self, samples: FloatArray, squared: bool) -> FloatArray:
+        """`Framing.means` of the frames that `samples` (*rows, N) complete, (*rows, F), by numpy."""
+        means = self._framing.means(self._buffer.append(samples), squared)
+        self._buffer.drop(means.shape[-1] * self._framing.hop)
         return means
 
     def _frames(self, block: FloatArray, weights: FloatArray) -> kernels.Frames:
@@ -195,4 +178,3 @@ class FramedStage(Stage):
 
     def _build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
         self._framing = Framing.design(self.sample_rate, self.PREFIX, values)
-        self._begun = None

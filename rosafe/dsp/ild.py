@@ -6,8 +6,9 @@ from typing import ClassVar
 
 import numpy as np
 
+from . import kernels
 from .framing import FramedStage, frame_parameters
-from .guard import FloatArray
+from .guard import FloatArray, limited
 from .stage import ParameterTable
 
 EPSILON = 2.2204e-16  # the original's literal
@@ -26,7 +27,11 @@ class Ild(FramedStage):
         return rows[1:]
 
     def process(self, block: FloatArray) -> FloatArray:
-        energies = self._means(self._checked(block), squared=True)
+        samples = self._checked(block)
+        if kernels.compiled():
+            energies = kernels.energies(self._frames(samples, self._framing.weights(squared=True)))
+        else:
+            energies = self._means(limited(samples), squared=True)
         energies += EPSILON
         levels = np.log10(energies[1] / energies[0])
         levels *= 10

@@ -85,32 +85,38 @@ class Frames(NamedTuple):
     number: int  # of whole ones
 
 
-def frame_sums(
-    frames: Frames,
-    squared: bool,
-    integrator: FloatArray | None,
-    state: FloatArray | None,
-    begun: FloatArray | None,
-) -> tuple[FloatArray, FloatArray]:
-    """The weighted sum of the samples of each frame, or of their squares, (*rows, F), and sums to be completed later.
+def energies(frames: Frames) -> FloatArray:
+    """The weighted sum of the squares of each frame's samples, (*rows, F).
 
-    The latter, (*rows, B), are those of frames that begin but do not end in the samples; as `begun`, they save the next
-    call the sums over its history. Through an `integrator` (1, 6), a section as of
-    `rosafe.dsp.cascade.leaky_integrator` with its `state` (1, *rows, 2), the block goes first, as the history has.
     The twin is `rosafe.dsp.framing.Framing.means`.
+    """
+    sums = np.empty((*frames.block.shape[:-1], frames.number))
+    _function("rosafe_energies")(*_arguments(frames), _address(sums))
+    return sums
+
+
+def ratemap(
+    frames: Frames, squared: bool, section: FloatArray, state: FloatArray, begun: FloatArray | None
+) -> tuple[FloatArray, FloatArray]:
+    """Weighted sums of what a leaky integrator makes of each frame's samples, or of the squares of that, (*rows, F).
+
+    The integrator is `section` (1, 6), as of `rosafe.dsp.cascade.leaky_integrator`, with its `state` (1, *rows, 2). The
+    history of `frames` has been through it, the block goes now. Returned, too, are the sums of the frames that begin in
+    the samples but do not end there, (*rows, B); given as `begun`, they save the next call the sums over its history.
+    The twin is `rosafe.dsp.framing.Framing.means` after `rosafe.dsp.cascade.Cascade`.
     """
     rows = frames.block.shape[:-1]
     samples = frames.history.shape[-1] + frames.block.shape[-1]
-    have_begun = -(-max(0, samples - frames.skip) // frames.hop)
-    sums, sums_begun = np.empty((*rows, frames.number)), np.empty((*rows, have_begun - frames.number))
-    _function("rosafe_frame_sums")(
+    have_begun = -(-max(0, samples - frames.skip) // frames.hop) - frames.number
+    sums, sums_begun = np.empty((*rows, frames.number)), np.empty((*rows, have_begun))
+    _function("rosafe_ratemap")(
         *_arguments(frames),
         squared,
-        0.0 if integrator is None else -integrator[0, 4],
-        None if state is None else _address(state),
+        -section[0, 4],
+        _address(state),
         0 if begun is None else begun.shape[-1],
         None if begun is None else _address(begun),
-        have_begun - frames.number,
+        have_begun,
         _address(sums),
         _address(sums_begun),
     )

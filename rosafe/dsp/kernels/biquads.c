@@ -2,8 +2,8 @@
  *
  * Direct form II transposed, as scipy.signal.sosfilt: y = b0 x + s1, s1 = b1 x - a1 y + s2, s2 = b2 x - a2 y.
  *
- * A section's sample waits for the one before it, some ten cycles; sixteen rows at a time fill
- * the wait. */
+ * A section's sample waits for the one before it, some ten cycles; sixteen rows at a time fill the wait. More are slower,
+ * and so are longer spans: that many places in memory are read and written at the same time. */
 #include "vector.h"
 
 enum { SPAN = 32, ROWS = 16, GROUPS = ROWS / LANES, MOST_SECTIONS = 8 };

@@ -18,7 +18,8 @@ _FRAMES = (_ARRAY, _INTEGER, _INTEGER, _ARRAY, _INTEGER, _ARRAY, *[_INTEGER] * 4
 _ARGUMENTS = {
     "rosafe_gammatone": (_ARRAY, *[_INTEGER] * 3, *[_ARRAY] * 4),
     "rosafe_biquads": (_INTEGER, _ARRAY, _INTEGER, _INTEGER, _ARRAY, _INTEGER, _ARRAY, _ARRAY),
-    "rosafe_frame_sums": (*_FRAMES, _INTEGER, _REAL, _ARRAY, _INTEGER, _ARRAY, _INTEGER, _ARRAY, _ARRAY),
+    "rosafe_energies": (*_FRAMES, _ARRAY),
+    "rosafe_ratemap": (*_FRAMES, _INTEGER, _REAL, _ARRAY, _INTEGER, _ARRAY, _INTEGER, _ARRAY, _ARRAY),
     "rosafe_correlations": (*_FRAMES, _INTEGER, _REAL, _ARRAY, _INTEGER),
 }
 

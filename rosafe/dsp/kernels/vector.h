@@ -23,11 +23,13 @@ enum { LANES = 4 };
 #endif
 
 typedef double vec __attribute__((vector_size(8 * LANES)));
+typedef double vec_anywhere __attribute__((vector_size(8 * LANES), aligned(8), may_alias));
 typedef double duo __attribute__((vector_size(16), aligned(8), may_alias)); /* neighbours in memory */
 typedef double quartet __attribute__((vector_size(32)));
 
 INLINE int64_t least(int64_t a, int64_t b) { return a < b ? a : b; }
 INLINE int64_t most(int64_t a, int64_t b) { return a > b ? a : b; }
+INLINE vec load(const double *from) { return *(const vec_anywhere *)from; }
 INLINE double flushed(double state) { return state < TINY && state > -TINY ? 0.0 : state; }
 
 /* --- what takes the processor's own instructions --- */

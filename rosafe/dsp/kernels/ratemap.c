@@ -1,4 +1,4 @@
-/* Sums over moving windows: of the squares for ILD, of the leaky integrator's output or its square for ratemap.
+/* The ratemap: a leaky integrator, then sums over moving windows of its output or the square of that.
  *
  * u[t] = s + (1 - r) x[t], s = r u[t] (rosafe/dsp/ratemap.py), then per frame sum_t weight[t] u[t] or weight[t] u[t]^2, in
  * one pass: samples go in spans that stay in the first-level cache, and each frame that touches a span adds its part of it.
@@ -6,7 +6,7 @@
  * is kept goes to memory. */
 #include "vector.h"
 
-enum { SPAN = 64, ROWS = 16, GROUPS = ROWS / LANES };
+enum { SPAN = 64, GROUPS = 4, ROWS = GROUPS * LANES };
 
 typedef vec sample[GROUPS]; /* of ROWS rows, or of LANES: then the other groups are not used */
 
@@ -46,7 +46,7 @@ typedef struct {
     int64_t history_stride, held, n;
     const double *weights;
     int64_t skip, size, hop, whole, squared;
-    double retention, *state; /* (rows, 2), or null: nothing is integrated */
+    double retention, *state; /* (rows, 2), of which the second belongs to the twin's form */
     double *tail;
     int64_t tail_stride, tail_from, from, known;
     const double *begun;
@@ -66,7 +66,7 @@ INLINE void run(const int groups, const job *job, int64_t first, int64_t count, 
     vec states[GROUPS];
     for (int k = 0; k < groups * LANES; k++) {
         row[k] = first + least(k, count - 1);
-        states[k / LANES][k % LANES] = job->state ? job->state[2 * row[k]] : 0.0;
+        states[k / LANES][k % LANES] = job->state[2 * row[k]];
     }
     for (int64_t r = first; r < first + count; r++)
         for (int64_t f = 0; f < frames; f++) *sum_of(job, r, f) = f < job->known ? job->begun[r * job->known + f] : 0.0;
@@ -74,11 +74,9 @@ INLINE void run(const int groups, const job *job, int64_t first, int64_t count, 
     for (int64_t at = job->from, end; at < total; at = end) {
         end = least(at + SPAN, at < held ? held : total);
         const int64_t n = end - at, kept_from = most(at, job->tail_from);
-        const int integrated = job->state && at >= held;
+        const int fresh = at >= held;
         int64_t frame = most(0, (at - job->skip - job->size + job->hop) / job->hop); /* none before reaches so far */
         int64_t begin = job->skip + frame * job->hop;
-        if (!integrated && kept_from >= end && (frame >= frames || begin >= end)) continue;
-
         sample x[SPAN];
         for (int g = 0; g < groups; g++) {
             const double *from[LANES];
@@ -88,10 +86,10 @@ INLINE void run(const int groups, const job *job, int64_t first, int64_t count, 
             }
             read_rows(from, n, -LIMIT, LIMIT, &x[0][g], GROUPS);
         }
-        if (integrated && job->squared && kept_from >= end) {
+        if (fresh && job->squared && kept_from >= end) {
             integrate(groups, 1, x, n, job->retention, states);
         } else {
-            if (integrated) integrate(groups, 0, x, n, job->retention, states);
+            if (fresh) integrate(groups, 0, x, n, job->retention, states);
             for (int g = 0; g < groups && kept_from < end; g++) {
                 double *to[LANES];
                 for (int k = 0; k < LANES; k++)
@@ -108,21 +106,21 @@ INLINE void run(const int groups, const job *job, int64_t first, int64_t count, 
             for (int64_t k = 0; k < count; k++) *sum_of(job, row[k], frame) += part[k / LANES][k % LANES];
         }
     }
-    for (int64_t k = 0; job->state && k < count; k++)
+    for (int64_t k = 0; k < count; k++)
         job->state[2 * row[k]] = flushed(states[k / LANES][k % LANES]);
 }
 
-/* The samples of a row are the `held` ones of `history` and the n of `block` behind them; the first frame begins at `skip`,
- * each next one `hop` later. sums (rows, whole) are those of the frames that are complete, sums_begun (rows, begun_now) those
- * of the frames that have begun behind them. Where `known` is not 0, begun (rows, known) are the latter ones of the call
- * before, which lack no sample of the history; else all is summed. Where `state` (rows, 2; the second of each belongs to the
- * twin's form) is given, the block is integrated first, as the history is already. Samples of the block from tail_from on go
- * to `tail`, which may be where the history was. */
-void rosafe_frame_sums(const double *history, int64_t history_stride, int64_t held, const double *block, int64_t n,
-                       double *tail, int64_t tail_stride, int64_t tail_from, int64_t rows, int64_t skip,
-                       const double *weights, int64_t size, int64_t hop, int64_t whole, int64_t squared,
-                       double retention, double *state, int64_t known, const double *begun, int64_t begun_now,
-                       double *sums, double *sums_begun) {
+/* The samples of a row are the `held` ones of `history`, which are integrated already, and the n of `block` behind them,
+ * which are not; the first frame begins at `skip`, each next one `hop` later. Rows of the history lie history_stride apart.
+ * sums (rows, whole) are those of the frames that are complete, sums_begun (rows, begun_now) those of the frames that have
+ * begun behind them. Where `known` is not 0, begun (rows, known) are the latter ones of the call before, which lack no
+ * sample of the history; else all is summed. What is integrated goes to `tail` from tail_from on, which is in the block;
+ * `tail` may be where the history was. */
+void rosafe_ratemap(const double *history, int64_t history_stride, int64_t held, const double *block, int64_t n,
+                    double *tail, int64_t tail_stride, int64_t tail_from, int64_t rows, int64_t skip,
+                    const double *weights, int64_t size, int64_t hop, int64_t whole, int64_t squared, double retention,
+                    double *state, int64_t known, const double *begun, int64_t begun_now, double *sums,
+                    double *sums_begun) {
     const job job = {.history = history, .block = block, .history_stride = history_stride, .held = held, .n = n,
                      .weights = weights, .skip = skip, .size = size, .hop = hop, .whole = whole, .squared = squared,
                      .retention = retention, .state = state, .tail = tail, .tail_stride = tail_stride,
@@ -130,7 +128,7 @@ void rosafe_frame_sums(const double *history, int64_t history_stride, int64_t he
                      .begun_now = begun_now, .sums = sums, .sums_begun = sums_begun};
     uint32_t mode = denormals_off();
     int64_t row = 0;
-    for (; row + ROWS <= rows; row += ROWS) run(GROUPS, &job, row, ROWS, whole + begun_now);
-    for (; row < rows; row += LANES) run(1, &job, row, least(LANES, rows - row), whole + begun_now);
+    for (; row + LANES < rows; row += ROWS) run(GROUPS, &job, row, least(ROWS, rows - row), whole + begun_now);
+    if (row < rows) run(1, &job, row, rows - row, whole + begun_now);
     denormals_as(mode);
 }
