@@ -62,13 +62,13 @@ def libraries(below: Path | None = None) -> dict[int, Path]:
         Where there are none, and no gcc, no permission to write, or the wrong processor.
     """
     folder = (place() if below is None else below) / f"kernels-{digest()}"
-    if not folder.is_dir():
-        if platform.machine() != PROCESSOR:
-            raise BuildError(f"the kernels are for {PROCESSOR}, and this machine is {platform.machine()}")
-        try:
+    try:
+        if not folder.is_dir():
+            if platform.machine() != PROCESSOR:
+                raise BuildError(f"the kernels are for {PROCESSOR}, and this machine is {platform.machine()}")
             _build(folder)
-        except OSError as problem:
-            raise BuildError(f"the kernels cannot be built: {problem}") from problem
+    except OSError as problem:
+        raise BuildError(f"the kernels cannot be built: {problem}") from problem
     return {level: folder / f"{name}.so" for level, name in LEVELS.items()}
 
 
@@ -86,7 +86,8 @@ def _build(folder: Path) -> None:
             workshop = Path(tempfile.mkdtemp(prefix=f"{folder.name}.new-", dir=base))
             try:
                 _compile(gcc, workshop)
-                workshop.chmod(0o755)
+                for path in (workshop, *workshop.iterdir()):  # for other users, too, whatever this one's umask is
+                    path.chmod(0o755)
                 workshop.rename(folder)
             except BaseException:
                 shutil.rmtree(workshop)

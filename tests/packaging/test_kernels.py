@@ -1,0 +1,177 @@
+"""The kernels are built once, wherever that is possible; everywhere else numpy and scipy serve, and say why."""
+
+from __future__ import annotations
+
+import os
+import platform
+import signal
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from rosafe.dsp.kernels import build, library
+from tests.harness import PYTHON, run_together, wait_for
+from tests.packaging.clone import environment, fresh_copy, run, without_rights
+
+SHOW = (
+    "import numpy; from rosafe.dsp import Ild, kernels; "
+    "print(kernels.compiled(), kernels.status(), float(Ild(44100).process(numpy.ones((2, 1, 900)))[0, 0]), sep='|')"
+)
+
+pytestmark = pytest.mark.skipif(platform.machine() != "x86_64", reason="the kernels are for x86-64")
+
+
+@pytest.fixture
+def copy() -> Iterator[Path]:
+    with fresh_copy() as path:
+        yield path
+
+
+def shown(done: subprocess.CompletedProcess[str]) -> tuple[bool, str]:
+    """Whether a process that ran SHOW has used kernels, and its status."""
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""
+    compiled, status, level = done.stdout.strip().split("|")
+    assert float(level) == 0.0
+    return compiled == "True", status
+
+
+def show(copy: Path, **env: str) -> tuple[bool, str]:
+    return shown(run(PYTHON, "-c", SHOW, env=environment(PYTHONPATH=str(copy), **env)))
+
+
+def folders(copy: Path) -> list[str]:
+    return sorted(path.name for path in (copy / ".generated").glob("kernels-*"))
+
+
+def compiler(copy: Path, body: str) -> str:
+    """A PATH on which `gcc` is a script."""
+    folder = copy.with_name("bin")
+    folder.mkdir()
+    (folder / "gcc").write_text(f"#!/bin/sh\n{body}\n")
+    (folder / "gcc").chmod(0o755)
+    return f"{folder}:/usr/bin:/bin"
+
+
+def test_ten_at_once_on_a_fresh_tree(copy: Path) -> None:
+    results = set(run_together(10, lambda index: show(copy)))
+    assert len(results) == 1
+    compiled, status = results.pop()
+    assert compiled
+    assert f"{copy}/.generated/" in status
+    assert len(folders(copy)) == 1
+
+
+def test_built_once_and_again_when_a_source_changes(copy: Path) -> None:
+    _, first = show(copy)
+    times = {path: path.stat().st_mtime_ns for path in (copy / ".generated").rglob("*")}
+    assert show(copy)[1] == first
+    assert {path: path.stat().st_mtime_ns for path in (copy / ".generated").rglob("*")} == times
+    with (copy / "rosafe" / "dsp" / "kernels" / "vector.h").open("a") as header:
+        header.write("/* new */\n")
+    compiled, second = show(copy)
+    assert compiled
+    assert second != first
+
+
+def test_the_script_builds_where_it_is_told(copy: Path) -> None:
+    script, elsewhere = copy / "rosafe" / "dsp" / "kernels" / "build.py", copy.with_name("elsewhere")
+    done = run(PYTHON, script, elsewhere, env=environment())
+    paths = [Path(line) for line in done.stdout.splitlines()]
+    assert (done.returncode, done.stderr, len(paths)) == (0, "", 2)
+    assert all(path.is_relative_to(elsewhere) and path.is_file() for path in paths)
+    assert not (copy / ".generated").exists()
+    assert run(PYTHON, script, "a", "b", env=environment()).returncode == 2
+
+
+def test_no_compiler(copy: Path) -> None:
+    empty = copy.with_name("bin")
+    empty.mkdir()
+    compiled, status = show(copy, PATH=str(empty))
+    assert not compiled
+    assert status == (
+        "numpy and scipy: the kernels are not built, and there is no gcc to build them; run scripts/install"
+    )
+    done = run(PYTHON, copy / "rosafe" / "dsp" / "kernels" / "build.py", env=environment(PATH=str(empty)))
+    assert done.returncode == 1
+    assert done.stderr.count("\n") == 1
+    assert show(copy)[0], "a compiler has come"
+    assert show(copy, PATH=str(empty))[0], "what is built needs no compiler"
+
+
+def test_a_compiler_that_fails(copy: Path) -> None:
+    path = compiler(copy, 'echo "In file included from x.c:1:" >&2; echo "x.c:3: error: broken" >&2; exit 1')
+    compiled, status = show(copy, PATH=path)
+    assert not compiled
+    assert status == "numpy and scipy: gcc cannot build the kernels: x.c:3: error: broken"
+    assert folders(copy) == []
+
+
+def test_killed_half_way(copy: Path) -> None:
+    path = compiler(copy, "exec sleep 60")
+    env = environment(PYTHONPATH=str(copy), PATH=path)
+    with subprocess.Popen([PYTHON, "-c", SHOW], env=env, cwd="/", start_new_session=True) as killed:
+        wait_for(lambda: folders(copy), what="it has not begun")
+        os.killpg(killed.pid, signal.SIGKILL)
+    assert len(folders(copy)) == 1
+    assert show(copy)[0]
+    (left,) = folders(copy)
+    assert ".new-" not in left
+
+
+def test_read_only_tree(copy: Path) -> None:
+    """Nothing is built there, and what is built is used, by whoever it may be, under any home."""
+    command = without_rights("env", f"PYTHONPATH={copy}", PYTHON, "-c", SHOW)
+    copy.chmod(0o555)
+    try:
+        compiled, status = shown(run(*command, env=environment()))
+        assert not compiled
+        assert status.startswith("numpy and scipy: the kernels cannot be built: ")
+        assert not (copy / ".generated").exists()
+    finally:
+        copy.chmod(0o755)
+    builder = copy / "rosafe" / "dsp" / "kernels" / "build.py"
+    assert run("sh", "-c", 'umask 077; exec "$@"', "-", PYTHON, builder, env=environment()).returncode == 0
+    (copy / ".generated").chmod(0o555)
+    try:
+        assert shown(run(*command, env=environment()))[0]
+    finally:
+        (copy / ".generated").chmod(0o755)
+
+
+def test_the_switch(copy: Path) -> None:
+    assert show(copy, ROSAFE_KERNELS="0") == (False, "numpy and scipy, as ROSAFE_KERNELS=0 says")
+    assert not (copy / ".generated").exists()
+    compiled, status = show(copy, ROSAFE_KERNELS="3")
+    assert compiled
+    assert status.endswith("x86-64-v3.so")
+
+
+def test_other_machines(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(platform, "machine", lambda: "aarch64")
+    with pytest.raises(build.BuildError, match="for x86_64, and this machine is aarch64"):
+        build.libraries(tmp_path)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("level", [0, 3, 4])
+def test_no_more_than_the_processor_can(monkeypatch: pytest.MonkeyPatch, level: int) -> None:
+    """What is not for this processor is not even opened, but for the one that is asked."""
+    opened = []
+
+    class Library:
+        def rosafe_processor_level(self) -> int:
+            return level
+
+    def load(path: Path) -> Library:
+        opened.append(path.name)
+        return Library()
+
+    monkeypatch.setattr(library, "load", load)
+    monkeypatch.delenv(library.SWITCH, raising=False)
+    loaded, status = library.loaded.__wrapped__()
+    assert (loaded is not None) == status.compiled == (level > 0)
+    assert ("x86-64-v4.so" in opened) == (level == 4)
+    assert level or "AVX2" in status.detail
