@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import filecmp
 import os
+import platform
 import shutil
 import subprocess
 from collections.abc import Iterator
@@ -75,6 +76,15 @@ def test_python(workspace: Path) -> None:
     found = printed(sourced(workspace, f"{PYTHON} -c '{code}'")).split()
     packages = workspace / "install" / "lib" / "python3" / "dist-packages"
     assert found == [str(packages / "rosafe/__init__.py"), str(packages / "rosAFE/msg/__init__.py")]
+
+
+@pytest.mark.skipif(platform.machine() != "x86_64", reason="the kernels are for x86-64")
+def test_kernels(workspace: Path) -> None:
+    """Built with the workspace, and used where no compiler is found."""
+    show = f"PATH=/nonexistent {PYTHON} -c 'from rosafe.dsp import kernels; print(kernels.status())'"
+    said = printed(sourced(workspace, show))
+    assert said.startswith("compiled for x86-64-v")
+    assert f"{workspace}/install/lib/python3/dist-packages/rosafe/dsp/kernels/" in said
 
 
 @pytest.mark.parametrize("program", ["rosAFE-ros", "bass-ros"])
