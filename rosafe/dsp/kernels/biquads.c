@@ -2,70 +2,119 @@
  *
  * Direct form II transposed, as scipy.signal.sosfilt: y = b0 x + s1, s1 = b1 x - a1 y + s2, s2 = b2 x - a2 y.
  *
- * A section's sample waits for the one before it, some ten cycles; sixteen rows at a time fill the wait. More are slower,
- * and so are longer spans: that many places in memory are read and written at the same time. */
+ * A section's sample waits for the one before it, some ten cycles; sixteen rows at a time fill the wait. Reading, filtering
+ * and writing are one loop, so that they fill one another's waits too; where there are more sections, spans of samples
+ * stay in the first-level cache between them. */
 #include "vector.h"
 
 enum { SPAN = 32, ROWS = 16, GROUPS = ROWS / LANES, MOST_SECTIONS = 8 };
 
 enum rectification { NONE, HALF_WAVE, FULL_WAVE, SQUARE };
 
-/* n samples of one group of rows, rectified. */
-INLINE void read_rectified(int64_t how, const double *const rows[LANES], int64_t n, vec *samples) {
-    read_rows(rows, n, how == HALF_WAVE ? 0.0 : -LIMIT, LIMIT, samples, GROUPS);
-    if (how == FULL_WAVE)
-        for (int64_t t = 0; t < n; t++) samples[t * GROUPS] = larger(samples[t * GROUPS], -samples[t * GROUPS]);
-    if (how == SQUARE)
-        for (int64_t t = 0; t < n; t++) samples[t * GROUPS] *= samples[t * GROUPS];
+enum { READS = 1, FILTERS = 2, WRITES = 4 }; /* what a pass does; samples that it does not read or write are in the span */
+
+typedef struct {
+    const double *block;
+    double *output;
+    int64_t at[ROWS]; /* where each row begins in both */
+} places;
+
+INLINE vec rectified(int64_t how, vec x) {
+    x = bounded(x, how == HALF_WAVE ? 0.0 : -LIMIT, LIMIT);
+    if (how == FULL_WAVE) x = larger(x, -x);
+    return how == SQUARE ? x * x : x;
 }
 
-INLINE void run(const int groups, const double *b0_b1_b2_1_a1_a2, vec *samples, int64_t n, vec *state) {
-    const vec b0 = all(b0_b1_b2_1_a1_a2[0]), b1 = all(b0_b1_b2_1_a1_a2[1]), b2 = all(b0_b1_b2_1_a1_a2[2]);
-    const vec minus_a1 = all(-b0_b1_b2_1_a1_a2[4]), minus_a2 = all(-b0_b1_b2_1_a1_a2[5]);
-    vec s1[GROUPS], s2[GROUPS];
-    UNROLL for (int g = 0; g < groups; g++) s1[g] = state[g], s2[g] = state[GROUPS + g];
-    for (int64_t t = 0; t < n; t++)
-        UNROLL for (int g = 0; g < groups; g++) {
-            vec x = samples[t * GROUPS + g], y = fused(b0, x, s1[g]);
-            s1[g] = fused(minus_a1, y, fused(b1, x, s2[g]));
-            s2[g] = fused(minus_a2, y, b2 * x);
-            samples[t * GROUPS + g] = y;
+/* Samples t and t + 1, or t alone, of `groups` groups of rows. */
+INLINE void step(const int groups, const int does, const int samples, int64_t how, const places *rows, int64_t t, vec *span,
+                 const vec b[3], const vec minus_a[3], vec *s1, vec *s2) {
+    UNROLL for (int g = 0; g < groups; g++) {
+        vec pair[2];
+        if (does & READS) {
+            const double *from[LANES];
+            UNROLL for (int k = 0; k < LANES; k++) from[k] = rows->block + rows->at[g * LANES + k];
+            if (samples == 2)
+                read_pair(from, t, pair);
+            else
+                pair[0] = pair[1] = gathered(from, t);
+            UNROLL for (int i = 0; i < samples; i++) pair[i] = rectified(how, pair[i]);
+        } else {
+            UNROLL for (int i = 0; i < samples; i++) pair[i] = span[i * GROUPS + g];
         }
-    UNROLL for (int g = 0; g < groups; g++) state[g] = s1[g], state[GROUPS + g] = s2[g];
+        if (does & FILTERS)
+            UNROLL for (int i = 0; i < samples; i++) {
+                vec x = pair[i], y = fused(b[0], x, s1[g]);
+                s1[g] = fused(minus_a[1], y, fused(b[1], x, s2[g]));
+                s2[g] = fused(minus_a[2], y, b[2] * x);
+                pair[i] = y;
+            }
+        if (does & WRITES) {
+            double *to[LANES];
+            UNROLL for (int k = 0; k < LANES; k++) to[k] = rows->output + rows->at[g * LANES + k];
+            if (samples == 2)
+                write_pair(pair[0], pair[1], to, t);
+            else
+                UNROLL for (int k = 0; k < LANES; k++) to[k][t] = pair[0][k];
+        } else {
+            UNROLL for (int i = 0; i < samples; i++) span[i * GROUPS + g] = pair[i];
+        }
+    }
+}
+
+/* Samples from..until; state (2, GROUPS) of one section. */
+INLINE void pass(const int groups, const int does, int64_t how, const places *rows, int64_t from, int64_t until, vec *span,
+                 const double *b0_b1_b2_1_a1_a2, vec *state) {
+    vec b[3], minus_a[3], s1[GROUPS], s2[GROUPS];
+    if (does & FILTERS) {
+        UNROLL for (int i = 0; i < 3; i++) b[i] = all(b0_b1_b2_1_a1_a2[i]), minus_a[i] = all(-b0_b1_b2_1_a1_a2[3 + i]);
+        UNROLL for (int g = 0; g < groups; g++) s1[g] = state[g], s2[g] = state[GROUPS + g];
+    }
+    int64_t t = from;
+    for (; t + 2 <= until; t += 2, span += 2 * GROUPS) step(groups, does, 2, how, rows, t, span, b, minus_a, s1, s2);
+    if (t < until) step(groups, does, 1, how, rows, t, span, b, minus_a, s1, s2);
+    if (does & FILTERS)
+        UNROLL for (int g = 0; g < groups; g++) state[g] = s1[g], state[GROUPS + g] = s2[g];
+}
+
+INLINE void run(const int groups, int64_t how, const places *rows, int64_t n, const double *sections, int64_t count,
+                vec states[MOST_SECTIONS][2 * GROUPS]) {
+    if (count == 0) {
+        pass(groups, READS | WRITES, how, rows, 0, n, 0, 0, 0);
+    } else if (count == 1 && how == HALF_WAVE) { /* the default, known to the compiler */
+        pass(groups, READS | FILTERS | WRITES, HALF_WAVE, rows, 0, n, 0, sections, states[0]);
+    } else if (count == 1) {
+        pass(groups, READS | FILTERS | WRITES, how, rows, 0, n, 0, sections, states[0]);
+    } else {
+        vec span[SPAN * GROUPS];
+        for (int64_t from = 0; from < n; from += SPAN) {
+            int64_t until = least(from + SPAN, n), s = 0;
+            pass(groups, READS | FILTERS, how, rows, from, until, span, sections, states[s]);
+            for (s = 1; s < count - 1; s++) pass(groups, FILTERS, how, rows, from, until, span, sections + 6 * s, states[s]);
+            pass(groups, FILTERS | WRITES, how, rows, from, until, span, sections + 6 * s, states[s]);
+        }
+    }
 }
 
 /* block and output (rows, n), sections (count, 6), state (count, rows, 2). */
 void rosafe_biquads(int64_t how, const double *block, int64_t rows, int64_t n, const double *sections, int64_t count,
                     double *state, double *output) {
     uint32_t mode = denormals_off();
-    for (int64_t first = 0; first < rows; first += ROWS) {
-        int64_t groups = least(GROUPS, (rows - first + LANES - 1) / LANES);
+    /* From the end, which the filterbank has written last: in large blocks only that is in the cache still. */
+    for (int64_t first = (rows - 1) / ROWS * ROWS; first >= 0 && rows > 0; first -= ROWS) {
         int64_t row[ROWS]; /* lanes without a row do the last one once more */
-        vec samples[SPAN * GROUPS], states[MOST_SECTIONS][2 * GROUPS];
+        places places = {.block = block, .output = output};
+        vec states[MOST_SECTIONS][2 * GROUPS];
         for (int k = 0; k < ROWS; k++) {
             row[k] = least(first + k, rows - 1);
+            places.at[k] = row[k] * n;
             for (int64_t s = 0; s < count; s++)
                 for (int i = 0; i < 2; i++)
                     states[s][i * GROUPS + k / LANES][k % LANES] = state[2 * (s * rows + row[k]) + i];
         }
-        for (int64_t at = 0; at < n; at += SPAN) {
-            int64_t span = least(SPAN, n - at);
-            for (int64_t g = 0; g < groups; g++) {
-                const double *from[LANES];
-                for (int k = 0; k < LANES; k++) from[k] = block + row[g * LANES + k] * n + at;
-                read_rectified(how, from, span, samples + g);
-            }
-            for (int64_t s = 0; s < count; s++)
-                if (groups == GROUPS)
-                    run(GROUPS, sections + 6 * s, samples, span, states[s]);
-                else
-                    for (int64_t g = 0; g < groups; g++) run(1, sections + 6 * s, samples + g, span, states[s] + g);
-            for (int64_t g = 0; g < groups; g++) {
-                double *to[LANES];
-                for (int k = 0; k < LANES; k++) to[k] = output + row[g * LANES + k] * n + at;
-                write_rows(samples + g, GROUPS, span, to);
-            }
-        }
+        if (rows - first > LANES)
+            run(GROUPS, how, &places, n, sections, count, states);
+        else
+            run(1, how, &places, n, sections, count, states);
         for (int64_t k = 0; k < least(ROWS, rows - first); k++)
             for (int64_t s = 0; s < count; s++)
                 for (int i = 0; i < 2; i++)
