@@ -17,10 +17,9 @@ from __future__ import annotations
 
 import functools
 import importlib
-import io
 import struct
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
+from typing import Any, Protocol
 
 import genpy
 import numpy as np
@@ -47,6 +46,27 @@ _SAMPLES: dict[str, np.dtype[Any]] = {"double": np.dtype("<f8"), "long": np.dtyp
 _SIGNALS = {"::rosAFE::signalOneD": 1, "::rosAFE::signalND": 2, "::rosAFE::signalNxND": 3}
 _COUNT = struct.Struct("<I")
 _MAX_RECORD = 2**31 - 1  # bytes; numpy's layouts go no further
+ROW_BYTES = 4096  # rows of a window in pieces shorter than this are copied together: quicker than handling each
+
+
+class Writer(Protocol):
+    """Where messages are written to: a BytesIO, or `Gather`."""
+
+    def write(self, data: Any, /) -> Any:
+        """Append the bytes of a buffer."""
+
+
+class Gather:
+    """A written message in pieces that lie where they lay, for one `sendmsg`: what was written must not change."""
+
+    def __init__(self) -> None:
+        self.pieces: list[Any] = []
+        self.size = 0  # bytes
+
+    def write(self, data: Any, /) -> None:
+        """Append the bytes of a contiguous buffer."""
+        self.pieces.append(data)
+        self.size += data.nbytes if hasattr(data, "nbytes") else len(data)
 
 
 # --- writing ----------------------------------------------------------------------------------------------------
@@ -62,7 +82,7 @@ def nested_dtype(shape: tuple[int, ...]) -> np.dtype:
 
 def _pack_nested(view: WindowView) -> memoryview:
     """The bytes of a signal of shape (..., frames), each level preceded by its count."""
-    record = np.zeros((), nested_dtype(view.shape))
+    record = np.empty((), nested_dtype(view.shape))
     level = record
     for length in view.shape:
         level["n"] = length
@@ -71,7 +91,19 @@ def _pack_nested(view: WindowView) -> memoryview:
     return record.reshape(1).view(np.uint8).data
 
 
-def _write_signal(out: io.BytesIO, levels: int, value: Any) -> None:
+def _write_rows(out: Writer, pieces: Sequence[np.ndarray], frames: int) -> None:
+    """As `_pack_nested`, of arrays (..., n) that together make `frames`: row by row as they lie, without a copy."""
+    if pieces[0].ndim == 1:
+        out.write(_COUNT.pack(frames))
+        for piece in pieces:
+            out.write(np.ascontiguousarray(piece, _SAMPLES["double"]))
+    else:
+        out.write(_COUNT.pack(len(pieces[0])))
+        for rows in zip(*pieces, strict=True):
+            _write_rows(out, rows, frames)
+
+
+def _write_signal(out: Writer, levels: int, value: Any) -> None:
     if isinstance(value, genpy.Message):  # of the generated class, as in a message that was made without it
         value.serialize(out)
         return
@@ -81,7 +113,11 @@ def _write_signal(out: io.BytesIO, levels: int, value: Any) -> None:
         return
     if len(view.shape) != levels:
         raise ValueError(f"a signal of shape {view.shape} where {levels} dimensions are wanted")
-    out.write(_pack_nested(view))
+    pieces = view.trimmed()
+    if 8 * view.frames >= ROW_BYTES * len(pieces):
+        _write_rows(out, pieces, view.frames)
+    else:
+        out.write(_pack_nested(view))
 
 
 def _samples(value: Any, dtype: np.dtype) -> np.ndarray:
@@ -101,7 +137,7 @@ def _member(value: Any, name: str) -> Any:
     return value[name] if isinstance(value, dict) else getattr(value, name)
 
 
-def encode(out: io.BytesIO, component: interface.Component, idl: str, value: Any) -> None:
+def encode(out: Writer, component: interface.Component, idl: str, value: Any) -> None:
     """Append `value` (a message, or a dict by member name) of IDL type `idl` to `out`."""
     if idl in _SCALARS:
         out.write(struct.pack("<" + _SCALARS[idl], value))
@@ -210,8 +246,8 @@ def decode(reader: _Reader, component: interface.Component, idl: str) -> Any:
 
 def _codec(
     component: interface.Component, members: tuple[tuple[str, str], ...]
-) -> tuple[Callable[[Any, io.BytesIO], None], Callable[[Any, bytes], Any]]:
-    def serialize(self: Any, out: io.BytesIO) -> None:
+) -> tuple[Callable[[Any, Writer], None], Callable[[Any, bytes], Any]]:
+    def serialize(self: Any, out: Writer) -> None:
         try:
             for name, kind in members:
                 encode(out, component, kind, getattr(self, name))

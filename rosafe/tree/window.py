@@ -51,14 +51,16 @@ class WindowView:
         """The first two axes exchanged, such as [channel][lag] to the port's [lag][channel]."""
         return WindowView(tuple(piece.swapaxes(0, 1) for piece in self.pieces), self.skip)
 
+    def trimmed(self) -> list[np.ndarray]:
+        """The pieces without what lies outside, oldest first."""
+        return [self.pieces[0][..., self.skip :], *self.pieces[1:]]
+
     def copy_to(self, target: np.ndarray) -> None:
         """Write all frames into `target`, whose shape is `shape`."""
-        at, skip = 0, self.skip
-        for piece in self.pieces:
-            part = piece[..., skip:]
+        at = 0
+        for part in self.trimmed():
             target[..., at : at + part.shape[-1]] = part
             at += part.shape[-1]
-            skip = 0
 
     def array(self) -> np.ndarray:
         """All frames in one fresh array."""
@@ -81,7 +83,8 @@ class SlidingWindow:
     def __init__(self, rows: tuple[int, ...], frames: int) -> None:
         self.rows = rows
         self.frames = frames
-        self._pieces: list[np.ndarray] = [np.broadcast_to(np.float64(0.0), (*rows, frames))]
+        # rows of one row, which is nowhere before somebody writes to it
+        self._pieces: list[np.ndarray] = [np.broadcast_to(np.zeros(frames), (*rows, frames))]
         self._skip = 0
 
     def append(self, block: np.ndarray) -> None:
