@@ -88,7 +88,7 @@ class AudioRing:
             if connection is not self._connection:
                 return
             self.counters.messages += 1
-            problem = _problem(message)
+            problem = malformed(message)
             if problem:
                 self._refuse(problem)
                 return
@@ -272,7 +272,7 @@ class AudioRing:
             return self._unread()
 
 
-def _problem(message: Any) -> str:
+def malformed(message: Any) -> str:
     """What is wrong with a message; empty where it can be used."""
     left, right, rate, index = len(message.left), len(message.right), message.sampleRate, message.lastFrameIndex
     if left != right:

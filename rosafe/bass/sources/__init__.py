@@ -1,4 +1,4 @@
-"""Where sound comes from: `open_source` turns a device name into a source. No ROS in here."""
+"""Where sound comes from: `open_source` turns a device name into a source. No ROS in here but for bags."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ DEFAULT_RATE = 44100
 # What ListDevices says of the sources that need no hardware: name, contents.
 BUILT_IN = (
     ("file:PATH", "a sound file in real time; ?loop=1 repeats it, ?start=SECONDS skips its beginning"),
+    ("bag:PATH", "what rosbag recorded of a port Audio; ?topic=/bass/Audio, ?loop=1, ?start=SECONDS"),
     ("scene:", "a source that walks from far left to far right and back; ?seconds=10&level=-30&seed=0"),
 )
 
@@ -22,9 +23,10 @@ def open_source(device: str, sample_rate: int, frames_per_chunk: int, stopping: 
     Parameters
     ----------
     device : str
-        ``file:PATH``, ``scene:`` or the name of an ALSA capture device, each with options after a question mark.
+        ``file:PATH``, ``bag:PATH``, ``scene:`` or the name of an ALSA capture device, each with options after a
+        question mark.
     sample_rate : int
-        Hz; 0 is the file's own rate, or 44100 with other sources.
+        Hz; 0 is the file's or bag's own rate, or 44100 with other sources.
     frames_per_chunk : int
         Length of what `Source.read` returns.
     stopping : threading.Event
@@ -40,6 +42,10 @@ def open_source(device: str, sample_rate: int, frames_per_chunk: int, stopping: 
         from rosafe.bass.sources.file import FileSource
 
         return FileSource(device[len("file:") :], sample_rate, frames_per_chunk, stopping)
+    if device.startswith("bag:"):
+        from rosafe.bass.sources.bag import BagSource
+
+        return BagSource(device[len("bag:") :], sample_rate, frames_per_chunk, stopping)
     if device.startswith("scene:"):
         from rosafe.bass.sources.scene import SceneSource
 

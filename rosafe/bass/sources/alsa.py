@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from rosafe.bass.sources.base import Chunk, device_error, hwparams_error, parse_options
+from rosafe.bass.sources.base import Chunk, Chunker, device_error, hwparams_error, parse_options
 from rosafe.bass.sources.libasound import complaints, load_alsaaudio
 from rosafe.interface import ComponentError
 
@@ -64,10 +64,7 @@ class AlsaSource:
         self._pcm: Any = None
         self._width = 2
         self._open()
-        self._samples = np.zeros((2, frames_per_chunk), np.int32)
-        self._filled = 0
-        self._rest = np.zeros((2, 0), np.int32)  # read from the device beyond the end of a chunk
-        self._missing = 0  # lost frames that come next in the stream
+        self._chunks = Chunker(frames_per_chunk)
         self._heard: float | None = None  # when the newest frame that was read left the converter
         self._time = 0.0
         self._failures = 0  # attempts to reopen the device since it last gave sound
@@ -147,34 +144,13 @@ class AlsaSource:
 
     def read(self) -> Chunk | None:
         """The next chunk; None when told to stop, ``::bass::e_device`` when the device is gone."""
-        gap = 0
         with complaints():
-            while self._filled < self._frames_per_chunk:
+            while (chunk := self._chunks.take()) is None:
                 if self._stopping.is_set():
                     return None
-                if self._missing and self._filled == 0:
-                    gap += self._missing
-                    self._missing = 0
-                elif self._missing:
-                    zeros = min(self._missing, self._frames_per_chunk - self._filled)
-                    self._filled += zeros  # the chunk was made of zeros
-                    self._missing -= zeros
-                elif self._rest.shape[1]:
-                    self._put(self._rest)
-                else:
-                    self._read_some()
-        samples = self._samples
-        self._samples, self._filled = np.zeros_like(samples), 0
-        behind = (self._rest.shape[1] + self._missing) / self.sample_rate
-        self._time = max(self._time, (self._heard or 0.0) - behind)
-        return Chunk(samples, gap, self._time)
-
-    def _put(self, frames: np.ndarray) -> None:
-        """Add `frames` to the chunk; what does not fit stays for the next one."""
-        room = min(self._frames_per_chunk - self._filled, frames.shape[1])
-        self._samples[:, self._filled : self._filled + room] = frames[:, :room]
-        self._filled += room
-        self._rest = frames[:, room:]
+                self._read_some()
+        self._time = max(self._time, (self._heard or 0.0) - self._chunks.pending / self.sample_rate)
+        return Chunk(*chunk, self._time)
 
     def _read_some(self) -> None:
         """Take what the device has, which may be less than asked for; or wait a little; or note what was lost."""
@@ -189,7 +165,7 @@ class AlsaSource:
                 self._heard = time.monotonic() - behind / self.sample_rate
                 left, right = self._channels or (1, 2)
                 frames = np.frombuffer(data, "<i4").reshape(-1, self._width).T
-                self._put(frames[[left - 1, right - 1]])
+                self._chunks.add(frames[[left - 1, right - 1]])
                 self._failures = self._barren = 0
             elif count == 0:
                 self._wait_for_sound(before)
@@ -222,7 +198,7 @@ class AlsaSource:
         self._heard = now
         self.overruns += 1
         self.lost_frames += lost
-        self._missing += lost
+        self._chunks.lose(lost)
 
     def _reopen(self, problem: str) -> None:
         """Get a failed device back, or raise ``::bass::e_device`` after some attempts."""

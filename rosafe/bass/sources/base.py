@@ -1,9 +1,10 @@
-"""What all sources share: the protocol, errors, options in device names, and pacing in real time."""
+"""What all sources share: the protocol, errors, options in device names, cutting into chunks, pacing in real time."""
 
 from __future__ import annotations
 
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple, Protocol
 
@@ -80,6 +81,76 @@ def number(low: float, high: float) -> Callable[[str], float]:
         return value
 
     return convert
+
+
+def flag(text: str) -> bool:
+    """A converter for `parse_options`: 0 or 1."""
+    if text not in ("0", "1"):
+        raise ValueError("0 or 1")
+    return text == "1"
+
+
+class Chunker:
+    """Cuts a stream that comes in pieces of any length, with losses between them, into chunks.
+
+    A loss at the beginning of a chunk is the gap before it. One within a chunk fills that up with zeros, and what is
+    left of it is the gap before the next.
+    """
+
+    def __init__(self, frames_per_chunk: int) -> None:
+        self.pending = 0  # frames, lost ones included, that came and were not taken yet
+        self._length = frames_per_chunk
+        self._chunk = np.zeros((2, frames_per_chunk), np.int32)
+        self._filled = 0
+        self._gap = 0  # before the chunk at hand
+        self._queue: deque[np.ndarray | int] = deque()  # what is beyond it: samples, or how many frames were lost
+
+    def add(self, samples: np.ndarray) -> None:
+        """Frames that came, int32 (2, n)."""
+        self._push(samples, samples.shape[1])
+
+    def lose(self, frames: int) -> None:
+        """Frames that did not come."""
+        self._push(frames, frames)
+
+    def _push(self, piece: np.ndarray | int, frames: int) -> None:
+        if frames > 0:
+            self._queue.append(piece)
+            self.pending += frames
+            self._fill()
+
+    def _fill(self) -> None:
+        while self._queue and self._filled < self._length:
+            piece = self._queue.popleft()
+            room = self._length - self._filled
+            rest: np.ndarray | int
+            if isinstance(piece, np.ndarray):
+                taken = min(room, piece.shape[1])
+                self._chunk[:, self._filled : self._filled + taken] = piece[:, :taken]
+                rest = piece[:, taken:] if taken < piece.shape[1] else 0
+                self._filled += taken
+            elif self._filled:
+                taken = min(room, piece)
+                rest = piece - taken
+                self._filled += taken  # a chunk is made of zeros
+            else:
+                taken, rest = piece, 0
+                self._gap += taken
+            if isinstance(rest, np.ndarray) or rest:
+                self._queue.appendleft(rest)
+
+    def take(self, whole: bool = True) -> tuple[np.ndarray, int] | None:
+        """The next chunk, int32 (2, frames_per_chunk), and the gap before it; None where it is not complete.
+
+        With `whole` false, what has come of it, filled up with zeros; None where nothing has.
+        """
+        if self._filled < (self._length if whole else 1):
+            return None
+        taken = self._chunk, self._gap
+        self.pending -= self._gap + self._filled
+        self._chunk, self._filled, self._gap = np.zeros_like(self._chunk), 0, 0
+        self._fill()
+        return taken
 
 
 class Pacer:

@@ -8,24 +8,18 @@ import threading
 import numpy as np
 
 from rosafe.audiofile import AudioFile, AudioFileError
-from rosafe.bass.sources.base import Chunk, Pacer, device_error, hwparams_error, number, parse_options
+from rosafe.bass.sources.base import Chunk, Pacer, device_error, flag, hwparams_error, number, parse_options
 
 
-def _flag(text: str) -> bool:
-    if text not in ("0", "1"):
-        raise ValueError("0 or 1")
-    return text == "1"
-
-
-def _split(text: str) -> tuple[str, str]:
-    """Path and options of a device name."""
+def split_path(text: str) -> tuple[str, str]:
+    """Path and options of a device name; where all of it is the name of a file, a question mark belongs to that."""
     if "?" not in text or os.path.isfile(os.path.expanduser(text)):
         return text, ""
     path, _, options = text.rpartition("?")
     return path, options
 
 
-_OPTIONS = {"loop": _flag, "start": number(0, 1e9)}
+_OPTIONS = {"loop": flag, "start": number(0, 1e9)}
 
 
 class FileSource:
@@ -48,7 +42,7 @@ class FileSource:
 
     def __init__(self, text: str, sample_rate: int, frames_per_chunk: int, stopping: threading.Event) -> None:
         self.name = f"file:{text}"
-        path, options_text = _split(text)
+        path, options_text = split_path(text)
         options = parse_options(self.name, options_text, _OPTIONS)
         if not path:
             raise device_error("file: names no file; write file:PATH")
