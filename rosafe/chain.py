@@ -12,7 +12,8 @@ import numpy as np
 
 from rosafe.dsp.framing import FramedStage, Framing
 from rosafe.interface import KINDS, ComponentError
-from rosafe.tree import Processor, Tree
+from rosafe.tree.processor import Processor
+from rosafe.tree.tree import Tree
 from rosafe.tree.zone import Block
 
 

@@ -18,7 +18,8 @@ from rosafe.ros.audio import AudioRing
 from rosafe.ros.component import ComponentNode
 from rosafe.ros.ports import OutputPort, element, parameters_message, signal_fields
 from rosafe.ros.startup import run_server
-from rosafe.tree import Processor, Tree
+from rosafe.tree.processor import Processor
+from rosafe.tree.tree import Tree
 from rosafe.tree.zone import Block
 
 FIRST_AUDIO_SECONDS = 1.0  # how long InputProc waits for a first message

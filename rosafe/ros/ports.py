@@ -11,7 +11,7 @@ import rospy
 from rosafe import interface
 from rosafe.interface import KINDS, ROSAFE
 from rosafe.ros import wire
-from rosafe.tree import Processor
+from rosafe.tree.processor import Processor
 from rosafe.tree.window import SlidingWindow, WindowView, frames_in
 from rosafe.tree.zone import Block
 

@@ -192,16 +192,32 @@ def _serve(node: Node, received: list[int]) -> None:
     """Wait until `node` is to end (`received` is where the signals arrive) and end it."""
     import rospy
 
-    rospy.on_shutdown(lambda: node.shutdown("kill"))  # rosnode kill, or a new node of the same name
+    rospy.on_shutdown(lambda: node.shutdown("kill"))  # whoever ends rospy: we, rosnode kill, a new node of this name
+    _let_registration_end_at_once()
     over = threading.Event()
     rospy.core.add_shutdown_hook(lambda reason: over.set())  # after rospy's own, which tell the master
     # An Event must not be set from a signal handler, which may interrupt the wait while that holds its lock.
     while not received and not rospy.is_shutdown() and not node.finished.wait(0.1):
         pass
     watchdog(END_SECONDS, 0)
-    node.shutdown("kill")
     rospy.signal_shutdown("signal" if received else "kill")
     over.wait()  # another thread may be at it already; the watchdog bounds this
+
+
+def _let_registration_end_at_once() -> None:
+    """Wake rospy's registration thread, for which rospy waits at the end, once it can see that it is to end.
+
+    rospy itself wakes it before it raises the flag, and the thread then looks again half a second later.
+    """
+    import rospy
+    from rospy.impl import registration
+
+    def wake(manager: registration.RegManager) -> None:
+        with manager.cond:
+            manager.cond.notify_all()
+
+    for manager in registration.get_registration_listeners().listeners:
+        rospy.core.add_shutdown_hook(lambda reason, manager=manager: wake(manager))
 
 
 def watchdog(seconds: float, code: int, message: str = "") -> threading.Timer:

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from rosafe.tree import Tree
+from rosafe.tree.tree import Tree
 
 from .support import Feed, Recorder, end
 

@@ -12,7 +12,8 @@ import pytest
 
 from rosafe.dsp import STAGES
 from rosafe.interface import KINDS
-from rosafe.tree import Processor, Tree
+from rosafe.tree.processor import Processor
+from rosafe.tree.tree import Tree
 from rosafe.tree.zone import Block
 
 RATE = 16000.0

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from rosafe.interface import ComponentError
-from rosafe.tree import State, Tree
+from rosafe.tree.processor import State
+from rosafe.tree.tree import Tree
 from tests.harness import wait_for
 
 from .support import RATE, WAIT_SECONDS, Feed, Plain, Recorder, use_plain_stages

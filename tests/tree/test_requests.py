@@ -12,7 +12,8 @@ import pytest
 
 from rosafe.dsp import STAGES
 from rosafe.interface import ComponentError
-from rosafe.tree import Processor, State, Tree
+from rosafe.tree.processor import Processor, State
+from rosafe.tree.tree import Tree
 from rosafe.tree.zone import Block
 from tests.harness import run_together, wait_for
 

@@ -8,7 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rosafe.tree import Processor, Tree, processor, tree
+from rosafe.tree import processor, tree
+from rosafe.tree.processor import Processor
+from rosafe.tree.tree import Tree
 from rosafe.tree.zone import Block
 
 from .explorer import Scheduler, explore
