@@ -304,6 +304,7 @@ class ProcessorKind:
     parent: str  # the kind of processor it can hang on; empty for the input
     port: str
     parameters: tuple[Parameter, ...]  # in the order of the parameter structure
+    representation: str  # what the original's MATLAB client calls it, and its processors (`ild_0`)
     rename: Mapping[str, str] = field(default_factory=dict)  # names that modifyParameter accepts besides the real ones
 
     def parameter(self, name: str) -> Parameter:
@@ -326,6 +327,8 @@ class Component:
     tasks: tuple[str, ...]
     exceptions: Mapping[str, str]  # short name -> meaning
     structs: Mapping[str, tuple[tuple[str, str], ...]]  # IDL name -> (field, IDL type)
+    # What genomixd makes of several services, for its clients to call like one; not on the ROS graph.
+    composites: tuple[Service, ...] = ()
 
     def service(self, name: str) -> Service:
         """The service called `name` (aliases count), or KeyError."""
@@ -582,16 +585,27 @@ CROSSCORRELATION_PARAMETERS = (
 KINDS: dict[str, ProcessorKind] = {
     k.kind: k
     for k in (
-        ProcessorKind("input", "InputProc", "", "inputProcPort", INPUT_PARAMETERS),
-        ProcessorKind("preProc", "PreProc", "input", "preProcPort", PREPROC_PARAMETERS),
-        ProcessorKind("gammatone", "GammatoneProc", "preProc", "gammatonePort", GAMMATONE_PARAMETERS),
-        ProcessorKind("ihc", "IhcProc", "gammatone", "ihcPort", IHC_PARAMETERS),
-        ProcessorKind("ild", "IldProc", "ihc", "ildPort", ILD_PARAMETERS),
+        ProcessorKind("input", "InputProc", "", "inputProcPort", INPUT_PARAMETERS, "input"),
+        ProcessorKind("preProc", "PreProc", "input", "preProcPort", PREPROC_PARAMETERS, "time"),
+        ProcessorKind("gammatone", "GammatoneProc", "preProc", "gammatonePort", GAMMATONE_PARAMETERS, "filterbank"),
+        ProcessorKind("ihc", "IhcProc", "gammatone", "ihcPort", IHC_PARAMETERS, "innerhaircell"),
+        ProcessorKind("ild", "IldProc", "ihc", "ildPort", ILD_PARAMETERS, "ild"),
         ProcessorKind(
-            "ratemap", "RatemapProc", "ihc", "ratemapPort", RATEMAP_PARAMETERS, {"set_rm_scailing": "rm_scaling"}
+            "ratemap",
+            "RatemapProc",
+            "ihc",
+            "ratemapPort",
+            RATEMAP_PARAMETERS,
+            "ratemap",
+            {"set_rm_scailing": "rm_scaling"},
         ),
         ProcessorKind(
-            "crossCorrelation", "CrossCorrelationProc", "ihc", "crossCorrelationPort", CROSSCORRELATION_PARAMETERS
+            "crossCorrelation",
+            "CrossCorrelationProc",
+            "ihc",
+            "crossCorrelationPort",
+            CROSSCORRELATION_PARAMETERS,
+            "crosscorrelation",
         ),
     )
 }
@@ -668,6 +682,46 @@ _PROCESSOR_THROWS = (
     "::rosAFE::e_badNewValue",
 )
 
+_BLOCK_AND_BUFFERS = (
+    Parameter("nFramesPerBlock", "unsigned long", 12000, "Frames in one block", 1, MAX_BLOCK),
+    Parameter("bufferSize_s_port", "double", 1.0, "Seconds of signal on every output port", 0.0, MAX_SECONDS, True),
+    Parameter(
+        "bufferSize_s_getSignal",
+        "double",
+        1.0,
+        "Seconds of signal that getSignals can return; raised to two blocks where it is less",
+        0.0,
+        MAX_SECONDS,
+        True,
+    ),
+)
+REQUEST = Service(
+    "request",
+    "Build what a representation needs, or find it in the tree of processors",
+    (
+        Parameter(
+            "representation",
+            "string",
+            REQUIRED,
+            "What is wanted",
+            choices=tuple(kind.representation for kind in KINDS.values()),
+        ),
+        Parameter("connect", "string", "bass/Audio", "Topic for the Audio port, where a new input needs one"),
+        *_BLOCK_AND_BUFFERS,
+        *(parameter for kind in KINDS.values() for parameter in kind.parameters),
+    ),
+    outputs=(
+        ("name", "string"),
+        ("dependencies", "sequence<string>"),
+        ("created", "sequence<string>"),
+        ("reused", "sequence<string>"),
+        ("unused", "sequence<string>"),
+        ("port", "string"),
+        ("topic", "string"),
+    ),
+    throws=("::rosAFE::e_noData", "::rosAFE::e_noMemory", "::rosAFE::e_existsAlready", "::rosAFE::e_badNewValue"),
+)
+
 ROSAFE = Component(
     name="rosAFE",
     doc="The Two!Ears auditory front-end: a tree of processors that compute auditory representations",
@@ -675,22 +729,7 @@ ROSAFE = Component(
         Service(
             "InputProc",
             "Read the audio that comes in on the Audio port, block by block",
-            (
-                _name("input", "Name of the activity"),
-                Parameter("nFramesPerBlock", "unsigned long", 12000, "Frames in one block", 1, MAX_BLOCK),
-                Parameter(
-                    "bufferSize_s_port", "double", 1.0, "Seconds of signal on every output port", 0.0, MAX_SECONDS, True
-                ),
-                Parameter(
-                    "bufferSize_s_getSignal",
-                    "double",
-                    1.0,
-                    "Seconds of signal that getSignals can return; raised to two blocks where it is less",
-                    0.0,
-                    MAX_SECONDS,
-                    True,
-                ),
-            ),
+            (_name("input", "Name of the activity"), *_BLOCK_AND_BUFFERS),
             throws=(
                 "::rosAFE::e_noData",
                 "::rosAFE::e_noMemory",
@@ -848,6 +887,7 @@ ROSAFE = Component(
         "e_badNewValue": "a value of the wrong type or out of its range",
     },
     structs={**_ROSAFE_STRUCTS, **_BINAUDIO, **_GENOM_STATE},
+    composites=(REQUEST,),
 )
 
 # --- bass -------------------------------------------------------------------------------------------------------

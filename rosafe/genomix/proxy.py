@@ -9,12 +9,23 @@ from typing import Any
 
 import rosgraph.names
 
-from rosafe.genomix import syntax
+from rosafe.genomix import syntax, trees
 from rosafe.genomix.actions import ActionClient, Goal
 from rosafe.genomix.graph import Graph, Unknown, middleware_error
 from rosafe.genomix.syntax import Syntax
 from rosafe.genomix.tcpros import Connection, Refused, ServiceClient, TopicReader, component_exception
-from rosafe.interface import COMPONENTS, REQUIRED, Component, ComponentError, Parameter, Port, Service
+from rosafe.genomix.values import complete, partial
+from rosafe.interface import (
+    COMPONENTS,
+    REQUEST,
+    REQUIRED,
+    Component,
+    ComponentError,
+    Parameter,
+    Port,
+    Service,
+    ros_type,
+)
 from rosafe.ros import wire
 
 CALL_SECONDS = 60.0  # for the answer to one request
@@ -26,21 +37,21 @@ MAX_PENDING = 1000  # requests to one component that are not answered yet
 
 
 class Value:
-    """A result: members by name, with their IDL types, that can be written in any syntax, in pieces."""
+    """A result: members by name, with their IDL types, that can be written in any syntax or packed, in pieces."""
 
     def __init__(self, component: Component, members: tuple[tuple[str, str], ...], values: Mapping[str, Any]) -> None:
         self._component = component
         self._members = members
-        self._values = values
+        self.values = values
 
     def pieces(self, form: Syntax) -> Iterator[str]:
         """The text, as one nested value, in short pieces."""
-        return syntax.structure(form, self._component, self._members, self._values)
+        return syntax.structure(form, self._component, self._members, self.values)
 
     @property
     def size(self) -> int:
         """About how many bytes the value occupies."""
-        return _size(self._values)
+        return _size(self.values)
 
 
 NOTHING = Value(COMPONENTS["rosAFE"], (), {})
@@ -65,6 +76,7 @@ class Proxy:
         self._actions: dict[str, asyncio.Task[ActionClient]] = {}
         self._readers: dict[str, TopicReader] = {}
         self._link: asyncio.Task[None] | None = None
+        self._building = asyncio.Lock()  # one tree at a time
         self.pending = 0  # requests that are not answered yet
 
     @classmethod
@@ -97,17 +109,26 @@ class Proxy:
     # --- requests ---
 
     def service(self, name: str) -> Service:
-        """The service called `name` (aliases count), or ``::genom::no_such_service``."""
+        """The service or composite called `name` (aliases count), or ``::genom::no_such_service``."""
+        if name in (composite.name for composite in self.component.composites):
+            return REQUEST
         try:
             return self.component.service(name)
         except KeyError:
-            known = ", ".join(s.name for s in self.component.services)
+            known = ", ".join(s.name for s in (*self.component.services, *self.component.composites))
             what = f"{self.component.name} has no service {name[:80]!r}; it has {known}"
             raise ComponentError("::genom::no_such_service", what=what) from None
+
+    def arguments(self, service: Service, given: Any) -> dict[str, Any]:
+        """What `call` and `start` take, of what a client has `given`; ComponentError where that does not fit."""
+        return partial(given) if service in self.component.composites else complete(service, given)
 
     async def call(self, service: Service, values: Mapping[str, Any]) -> Value:
         """What a function returns; an activity returns nothing, as soon as it runs."""
         with self._one_more():
+            if service is REQUEST:
+                async with self._building:
+                    return Value(self.component, service.outputs, await trees.build(self, values))
             client = self._client(service.name)
             response = await client.call(values, CALL_SECONDS)
         if not response.genom_success:
@@ -120,6 +141,22 @@ class Proxy:
             await self._watch()
             client = await self._action(service.name)
             return await client.send(values)
+
+    async def outputs(self, service: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
+        """The values that a service returns."""
+        return (await self.call(self.service(service), values)).values
+
+    async def hears(self, port: str) -> bool:
+        """Whether an input port is connected, as the master knows: it subscribes to something of that type."""
+        kind = ros_type(self.component.port(port).idl)
+        _, subscribed, _ = await self._graph.master("getSystemState")
+        types = dict(await self._graph.master("getTopicTypes"))
+        topics = [topic for topic, nodes in subscribed if f"/{self.instance}" in nodes]
+        return any(types.get(topic, "").split("/")[-1] == kind for topic in topics)
+
+    async def published(self, topic: str) -> bool:
+        """Whether somebody publishes `topic`."""
+        return topic in await self._graph.topics()
 
     @contextlib.contextmanager
     def _one_more(self) -> Iterator[None]:
@@ -226,7 +263,10 @@ class Proxy:
             "component": component.name,
             "instance": self.instance,
             "doc": component.doc,
-            "services": {s.name: _describe_service(s) for s in component.services},
+            "services": {
+                **{s.name: _describe_service(s, composite=False) for s in component.services},
+                **{s.name: _describe_service(s, composite=True) for s in component.composites},
+            },
             "ports": {
                 p.name: {
                     "doc": p.doc,
@@ -305,10 +345,11 @@ def _zero(component: Component, idl: str) -> Any:
     return "" if idl == "string" else 0
 
 
-def _describe_service(service: Service) -> dict[str, Any]:
+def _describe_service(service: Service, composite: bool) -> dict[str, Any]:
     return {
         "doc": service.doc,
         "activity": service.activity,
+        "composite": composite,
         "aliases": list(service.aliases),
         "parameters": {p.name: _describe_parameter(p) for p in service.parameters},
         "outputs": dict(service.outputs),
@@ -324,5 +365,6 @@ def _describe_parameter(parameter: Parameter) -> dict[str, Any]:
         "required": required,
         "default": "" if required else parameter.default,
         "range": parameter.range_text,
+        "choices": list(parameter.choices),
         "aliases": list(parameter.aliases),
     }

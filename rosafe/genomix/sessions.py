@@ -10,11 +10,11 @@ import logging
 from collections.abc import Awaitable, Callable, Iterator, Mapping
 from typing import Any, TypeVar
 
+from rosafe.genomix import packed
 from rosafe.genomix.actions import Goal
 from rosafe.genomix.graph import Graph
 from rosafe.genomix.proxy import NOTHING, Proxy, Value, names
 from rosafe.genomix.syntax import Syntax, plain
-from rosafe.genomix.values import complete
 from rosafe.interface import ComponentError, Service
 
 MAX_SESSIONS = 1000
@@ -93,6 +93,19 @@ class Request:
             yield form.key(2, "large") + str(self.value.size)
         yield form.close("struct")
 
+    def packed(self) -> Iterator[bytes]:
+        """The status as `pieces` tells it, packed."""
+        yield packed.STRUCTURE
+        yield packed.member("id") + packed.plain(self.id) + packed.member("status") + packed.plain(self.status)
+        if self.error is not None:
+            yield packed.member("exception") + packed.plain(error_body(self.error))
+        elif self.status == "done" and self.value.size <= EVENT_BYTES:
+            yield packed.member("output")
+            yield from self.value.packed()
+        elif self.status == "done":
+            yield packed.member("large") + packed.plain(self.value.size)
+        yield packed.END
+
 
 def error_body(error: ComponentError) -> dict[str, Any]:
     """An exception as clients get it."""
@@ -128,8 +141,13 @@ class Session:
 
     @property
     def over(self) -> bool:
-        """Whether its client is gone, as far as one can tell."""
-        return not self.busy and not self.listeners and asyncio.get_running_loop().time() > self.ends_at
+        """Whether its client is gone, as far as one can tell.
+
+        One that asks for the status now and then, and never listens, may be quiet as long as an activity runs.
+        """
+        if self.busy or self.listeners or asyncio.get_running_loop().time() <= self.ends_at:
+            return False
+        return self._listened or all(request.finished.is_set() for request in self.requests.values())
 
     def listen(self) -> asyncio.Queue[tuple[str, Any]]:
         """A queue of all events from now on: (name, request or text)."""
@@ -198,14 +216,14 @@ class Session:
         if port is not None:
             return await proxy.read(port, element)
         service = proxy.service(name)
-        values = complete(service, given)
+        values = proxy.arguments(service, given)
         return await self._in_turn(lambda _: proxy.call(service, values))
 
     def send(self, component: str, proxy: Proxy, name: str, given: Any, element: str, keep: bool) -> Request:
         """Make a request that the client follows by its id, unless it does not want to `keep` it."""
         port = proxy.port(name)
         service = None if port is not None else proxy.service(name)
-        values = {} if service is None else complete(service, given)
+        values = {} if service is None else proxy.arguments(service, given)
         if keep:
             self._make_room()
         request = Request(f"{component}::{next(self._sessions.numbers)}", service is not None and service.activity)

@@ -8,13 +8,15 @@ import re
 from collections.abc import Mapping
 from typing import Any
 
-from rosafe.interface import REQUIRED, ComponentError, Parameter, Service
+from rosafe.interface import KINDS, REQUEST, REQUIRED, ComponentError, Parameter, Service
 
 _WORDS = {
     **dict.fromkeys(("1", "true", "yes", "on", "t"), True),
     **dict.fromkeys(("0", "false", "no", "off", "f"), False),
 }
 _WHOLE = re.compile(r"[+-]?[0-9]{1,30}")
+_STRUCTURES = {name for kind in KINDS.values() for name in (kind.kind, kind.representation)}
+_NO_PARAMETERS = {"name", "cc_lags"}  # members of those structures all the same
 
 
 def refused(what: str) -> ComponentError:
@@ -52,16 +54,55 @@ def complete(service: Service, given: Any) -> dict[str, Any]:
     ComponentError
         ``::genom::serialization`` whose `what` names the argument and says what is allowed.
     """
-    values = {}
-    for name, value in _named(service, given):
+    values = _converted(service, _named(service, given))
+    _require(service, values)
+    return {p.name: values.get(p.name, p.default) for p in service.parameters}
+
+
+def partial(given: Any) -> dict[str, Any]:
+    """The arguments of `interface.REQUEST` that are `given`, and no others.
+
+    An array may end with an object of further parameters. A structure of getParameters, or an array of one, stands for
+    its members. null stands for what is not given.
+
+    Raises
+    ------
+    ComponentError
+        As `complete`.
+    """
+    if isinstance(given, (list, tuple)) and given and isinstance(given[-1], Mapping):
+        pairs = [*_named(REQUEST, given[:-1]), *given[-1].items()]
+    else:
+        pairs = _named(REQUEST, given)
+    unfolded = [pair for name, value in pairs for pair in _unfolded(name, value)]
+    values = _converted(REQUEST, [(name, value) for name, value in unfolded if value is not None])
+    _require(REQUEST, values)
+    return values
+
+
+def _unfolded(name: str, value: Any) -> list[tuple[str, Any]]:
+    if name not in _STRUCTURES:
+        return [(name, value)]
+    structures = value if isinstance(value, list) else [value]
+    if len(structures) > 1 or not all(isinstance(structure, Mapping) for structure in structures):
+        raise refused(f"{name}: wanted is an object with parameters, as an element of getParameters")
+    return [pair for structure in structures for pair in structure.items() if pair[0] not in _NO_PARAMETERS]
+
+
+def _converted(service: Service, pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    values: dict[str, Any] = {}
+    for name, value in pairs:
         parameter = _parameter(service, name)
         if parameter.name in values:
             raise refused(f"{service.name}: {parameter.name} is given twice")
         values[parameter.name] = _convert(service, parameter, value)
+    return values
+
+
+def _require(service: Service, values: Mapping[str, Any]) -> None:
     missing = [p.name for p in service.parameters if p.default is REQUIRED and p.name not in values]
     if missing:
         raise refused(f"{service.name}: {missing[0]} is missing; {expected(service)}")
-    return {p.name: values.get(p.name, p.default) for p in service.parameters}
 
 
 def expected(service: Service) -> str:

@@ -1,0 +1,144 @@
+"""Makes whole trees of processors, as `rosafe.request` plans them, with the services of a component."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Collection, Mapping
+from typing import Any, Protocol, TypeVar
+
+from rosafe import request
+from rosafe.interface import COMMON_SERVICES, KINDS, REQUEST, ComponentError
+from rosafe.request import Found, Plan, Step, Wish
+
+TRIES = 20  # plans that others' changes of the tree may spoil before the error is told
+
+T = TypeVar("T")
+
+
+class Component(Protocol):
+    """A rosAFE, by its services."""
+
+    instance: str
+
+    async def outputs(self, service: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
+        """What a service returns; an activity, nothing, as soon as it runs. Raises ComponentError."""
+
+    async def hears(self, port: str) -> bool:
+        """Whether an input port is connected."""
+
+    async def published(self, topic: str) -> bool:
+        """Whether somebody publishes `topic`."""
+
+
+async def build(component: Component, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Make or find the processors that `values` (from `rosafe.genomix.values.partial`) ask for; REQUEST's outputs.
+
+    Where anything fails, or the task is cancelled, what was made is removed again, as far as nobody else uses it.
+    Two of these at a time, on one component, must be kept apart by the caller where both are his own; others' changes
+    are reckoned with.
+
+    Raises
+    ------
+    ComponentError
+        The component's own; ``::genom::serialization`` for an unknown representation.
+    """
+    given = dict(values)
+    try:
+        kind = request.kind_of(given.pop("representation"))
+    except ValueError as problem:
+        raise ComponentError("::genom::serialization", what=f"{REQUEST.name}: {problem}") from None
+    wish = await asyncio.to_thread(request.understand, kind, given)  # numpy's and scipy's work, and their import
+    made: list[str] = []
+    try:
+        dependencies = await _carry_out(component, wish, made)
+    except BaseException:
+        await _uncancelled(_remove(component, wish, made))
+        raise
+    return request.answer(wish, dependencies, made, component.instance)
+
+
+async def _carry_out(component: Component, wish: Wish, made: list[str]) -> list[str]:
+    for attempt in range(TRIES):
+        plan = request.plan(wish, await _look(component, wish.kinds))
+        try:
+            await _take_steps(component, wish, plan, made)
+        except ComponentError as problem:
+            if not request.is_race(problem) or attempt == TRIES - 1:
+                raise
+        else:
+            return plan.dependencies
+    raise AssertionError("the last attempt returns or raises")
+
+
+async def _take_steps(component: Component, wish: Wish, plan: Plan, made: list[str]) -> None:
+    if plan.steps and plan.steps[0].makes == plan.dependencies[0]:
+        await _connect(component, wish)
+    for step in plan.steps:
+        await _uncancelled(_take_step(component, step, made))
+
+
+async def _take_step(component: Component, step: Step, made: list[str]) -> None:
+    await component.outputs(step.service, step.values)
+    if step.makes:
+        made.append(step.makes)
+
+
+async def _uncancelled(work: Awaitable[T]) -> T:
+    """Do `work` to its end, also where the task is cancelled meanwhile: what a request made must be known."""
+    task = asyncio.ensure_future(work)
+    try:
+        return await asyncio.shield(task)
+    except asyncio.CancelledError:
+        await asyncio.wait([task])
+        raise
+
+
+async def _connect(component: Component, wish: Wish) -> None:
+    """Connect the Audio port to the topic that the client named, or to bass where it is not connected yet."""
+    topic = wish.connect
+    if not topic and not await component.hears("Audio"):
+        default = REQUEST.parameter("connect").default
+        topic = default if await component.published(f"/{default}") else ""
+    if topic:
+        connect_port = COMMON_SERVICES[0]
+        await component.outputs(connect_port.name, {"local": "Audio", "remote": topic})
+
+
+async def _look(component: Component, kinds: Collection[str]) -> list[Found]:
+    """All processors; the parents only of those of `kinds`."""
+    parameters = (await component.outputs("getParameters", {}))["parameters"]
+    found = []
+    for kind in KINDS:
+        for structure in parameters[kind]:
+            values = {name: _plain(value) for name, value in structure.items()}
+            name = values.pop("name")
+            parent = ""
+            if kind in kinds and KINDS[kind].parent:
+                try:
+                    parent = (await component.outputs("getDependencies", {"nameProc": name}))["dependencies"][-2]
+                except ComponentError as problem:
+                    if not request.is_race(problem):
+                        raise
+                    continue  # it is gone
+            found.append(Found(name, kind, parent, values))
+    return found
+
+
+def _plain(value: Any) -> Any:
+    return value.tolist() if hasattr(value, "tolist") else value
+
+
+async def _remove(component: Component, wish: Wish, made: list[str]) -> None:
+    """Remove what was made, leaves first, but nothing that others have come to use. Errors are told by what failed."""
+    try:
+        for name in reversed(made):
+            found = await _look(component, list(KINDS))
+            this = next((p for p in found if p.name == name), None)
+            if this is None or any(p.parent == name for p in found):
+                continue
+            if this.parent:
+                await component.outputs("removeProcessor", {"name": name})
+            elif len(found) == 1:
+                await component.outputs("Stop", {})
+    except ComponentError:
+        return
