@@ -27,6 +27,7 @@ from rosafe import __version__, interface
 from rosafe.interface import ComponentError
 from rosafe.ros.activities import Activities, Activity, Handler, TaskMeter
 from rosafe.ros.master import MasterError, check_master
+from rosafe.ros.publisher import Publisher
 
 BACKLOG = 128  # connections that wait to be accepted
 STATE_PERIOD = 0.9  # seconds between two genom_state messages at the most; the contract is 1
@@ -99,7 +100,7 @@ class ComponentNode:
         """
         topic = f"{self.name}/{self.component.port(port).name}" + (f"/{element}" if element else "")
         _check_master()
-        return rospy.Publisher(topic, message_class, latch=True, queue_size=1, tcp_nodelay=True)
+        return Publisher(topic, message_class)
 
     def start(self) -> None:
         """Offer all services and actions, and publish genom_state from now on."""

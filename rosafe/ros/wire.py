@@ -65,8 +65,10 @@ class Gather:
 
     def write(self, data: Any, /) -> None:
         """Append the bytes of a contiguous buffer."""
-        self.pieces.append(data)
-        self.size += data.nbytes if hasattr(data, "nbytes") else len(data)
+        size = data.nbytes if hasattr(data, "nbytes") else len(data)
+        if size:
+            self.pieces.append(data)
+            self.size += size
 
 
 # --- writing ----------------------------------------------------------------------------------------------------
