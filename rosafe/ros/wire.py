@@ -275,6 +275,29 @@ def message_class(package: str, idl: str) -> Any:
     return type(generated.__name__, (generated,), {"serialize": serialize, "deserialize": deserialize})
 
 
+def array_msg(generated: type) -> Any:
+    """The class to subscribe or publish with in place of a generated one: same type and md5, arrays instead of lists.
+
+    Parameters
+    ----------
+    generated : type
+        A class of `rosAFE.msg` or `bass.msg` that holds samples, such as `rosAFE_TimeFrequencySignalPortStruct`.
+
+    Raises
+    ------
+    TypeError
+        For anything else.
+    """
+    package, _, name = str(getattr(generated, "_type", "")).partition("/")
+    if package in interface.COMPONENTS:
+        for idl in interface.COMPONENTS[package].structs:
+            if interface.ros_type(idl) == name:
+                found = message_class(package, idl)
+                if found._md5sum == generated._md5sum:
+                    return found
+    raise TypeError(f"{generated!r} is no message class of rosAFE or bass that holds samples")
+
+
 @functools.cache
 def lenient_class(package: str, idl: str) -> Any:
     """As `message_class`, but what cannot be read becomes a message whose `problem` says why (else it is empty).

@@ -1,0 +1,95 @@
+"""A real graph for benchmarks: a private master, both nodes, the default tree, and subscribers in other processes."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import tempfile
+import xmlrpc.client
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+HERE = Path(__file__).resolve().parent
+sys.path.insert(0, str(HERE.parent))
+
+from rosafe.demo.processes import Child, Children  # noqa: E402
+from rosafe.demo.session import NAMES, Session  # noqa: E402
+from rosafe.interface import KINDS, ROSAFE  # noqa: E402
+
+PYTHON = "/usr/bin/python3"
+AUDIO = "/bass/Audio"
+RATE = 44100
+UP_SECONDS = 20.0
+
+
+def topic(kind: str) -> str:
+    """The topic of the default tree's processor of a kind."""
+    port = ROSAFE.port(KINDS[kind].port)
+    return f"/rosAFE/{port.name}" + (f"/{NAMES[kind]}" if port.multiple else "")
+
+
+class Subscriber:
+    """A process that subscribes to some topics with the zero-copy classes; what came is there after `close`."""
+
+    def __init__(self, children: Children, folder: str, topics: Iterable[str]) -> None:
+        self._result = Path(tempfile.mkdtemp(dir=folder)) / "result.json"
+        self.child: Child = children.start(PYTHON, str(HERE / "subscriber.py"), str(self._result), *topics)
+
+    def close(self) -> dict[str, Any]:
+        """End it: `came`, by topic a list of [lastFrameIndex, monotonic seconds], and `memory` in MB by the second."""
+        self.child.process.terminate()
+        if self.child.process.wait(UP_SECONDS) != 0:
+            raise RuntimeError(f"the subscriber has failed: {self.child.err}")
+        return json.loads(self._result.read_text())
+
+
+class Bench:
+    """The running nodes; `bench` makes one."""
+
+    def __init__(self, session: Session, children: Children, folder: str) -> None:
+        self.session = session
+        self._children = children
+        self._folder = folder
+
+    def call(self, service: str, **fields: Any) -> None:
+        """Make one request that must succeed."""
+        import rospy
+        import rosservice
+
+        answer = rospy.ServiceProxy(service, rosservice.get_service_class_by_name(service))(**fields)
+        if not answer.genom_success:
+            raise RuntimeError(f"{service}: {answer.genom_exdetail}")
+
+    def build(self, block: int, port_seconds: float, chunk: int, device: str = "scene:") -> None:
+        """Start the sound, in chunks of so many frames, and all seven processors on blocks of so many."""
+        self.call("/rosAFE/connect_port", local="Audio", remote=AUDIO)
+        self.call("/bass/Acquire", device=device, sampleRate=RATE, nFramesPerChunk=chunk, nChunksOnPort=20)
+        self.call("/rosAFE/InputProc", nFramesPerBlock=block, bufferSize_s_port=port_seconds)
+        for kind in KINDS.values():
+            if kind.parent:
+                self.call(f"/rosAFE/{kind.request}", name=NAMES[kind.kind], upperDepName=NAMES[kind.parent])
+
+    def subscribe(self, topics: Iterable[str]) -> Subscriber:
+        """Subscribe from another process."""
+        return Subscriber(self._children, self._folder, topics)
+
+    @property
+    def node(self) -> int:
+        """Process id of the rosAFE node."""
+        import rosgraph
+
+        address = rosgraph.Master("/benchmark").lookupNode("/rosAFE")
+        return int(xmlrpc.client.ServerProxy(address).getPid("/benchmark")[2])
+
+
+@contextmanager
+def bench() -> Iterator[Bench]:
+    """Both nodes on a private master; everything ends with it."""
+    with tempfile.TemporaryDirectory() as folder, Session(folder, lambda: None) as session:
+        session.start_nodes()
+        session.join()
+        with Children(os.environ) as children:
+            yield Bench(session, children, folder)
