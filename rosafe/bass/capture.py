@@ -11,7 +11,7 @@ import numpy as np
 
 from rosafe import interface
 from rosafe.bass.sources import Source
-from rosafe.bass.sources.base import hwparams_error
+from rosafe.bass.sources.base import hwparams_error, wall_time_ns
 
 MAX_WINDOW = 2**24  # frames on the port, 380 s at 44.1 kHz; what goes beyond is a slip of the finger
 LATE_CHUNKS = 2  # behind the clock by more than this, chunks are published together
@@ -132,8 +132,7 @@ class Capture:
             new = chunk.gap + chunk.samples.shape[1]
             self.last_frame_index += new
             self._unpublished += new
-            # The wall clock as it is now; a clock that somebody sets shows in the stamps, as it should.
-            self._time_ns = time.time_ns() - int((time.monotonic() - chunk.time) * 1e9)
+            self._time_ns = wall_time_ns(chunk.time)
             if self.source.overruns != overruns:
                 overruns = self.source.overruns
                 self._report(

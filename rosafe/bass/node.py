@@ -10,9 +10,8 @@ from diagnostic_msgs.msg import DiagnosticStatus
 
 from rosafe.bass.capture import Capture, Snapshot, check_window
 from rosafe.bass.socket_server import DEFAULT_HOST, DEFAULT_PORT, DedicatedSocket
-from rosafe.bass.sources import BUILT_IN, Source, open_source
+from rosafe.bass.sources import Source, device_lines, open_source
 from rosafe.bass.sources.alsa import AlsaSource, DeviceBusyError
-from rosafe.bass.sources.libasound import capture_devices
 from rosafe.interface import BASS, ComponentError
 from rosafe.ros import wire
 from rosafe.ros.activities import Activity
@@ -105,12 +104,9 @@ class BassNode:
     # --- the other requests ---
 
     def _list_devices(self, _: dict[str, Any]) -> None:
-        """Print the built-in sources, then a line for each capture PCM as the original does."""
         with self._printing:
-            for name, contents in BUILT_IN:
-                print(f"{name} [{contents}]", flush=True)
-            for card, device, card_id, pcm_id in capture_devices():
-                print(f"hw:{card},{device} [{card_id}] [{pcm_id}]", flush=True)
+            for line in device_lines():
+                print(line, flush=True)
 
     def _dedicated_socket(self, activity: Activity, _: dict[str, Any]) -> None:
         activity.interrupt_others()  # it has the address

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Iterator
 
 from rosafe.bass.sources.base import Chunk, Source
 
-__all__ = ["BUILT_IN", "Chunk", "Source", "open_source"]
+__all__ = ["Chunk", "Source", "device_lines", "open_source"]
 
 DEFAULT_RATE = 44100
 # What ListDevices says of the sources that need no hardware: name, contents.
@@ -15,6 +16,19 @@ BUILT_IN = (
     ("bag:PATH", "what rosbag recorded of a port Audio; ?topic=/bass/Audio, ?loop=1, ?start=SECONDS"),
     ("scene:", "a source that walks from far left to far right and back; ?seconds=10&level=-30&seed=0"),
 )
+
+
+def device_lines() -> Iterator[str]:
+    """What ListDevices prints: the built-in sources, then a line for each capture PCM as the original does.
+
+    Raises ``::bass::e_nodevice`` after the built-in ones where there is no sound card at all.
+    """
+    from rosafe.bass.sources.libasound import capture_devices
+
+    for name, contents in BUILT_IN:
+        yield f"{name} [{contents}]"
+    for card, device, card_id, pcm_id in capture_devices():
+        yield f"hw:{card},{device} [{card_id}] [{pcm_id}]"
 
 
 def open_source(device: str, sample_rate: int, frames_per_chunk: int, stopping: threading.Event) -> Source:

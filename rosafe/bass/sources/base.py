@@ -22,6 +22,14 @@ class Chunk(NamedTuple):
     time: float  # when its last frame was acquired, on time.monotonic's clock
 
 
+def wall_time_ns(moment: float) -> int:
+    """A moment of time.monotonic's clock as ns since 1970, by the wall clock as it is now.
+
+    A clock that somebody sets shows in the result, as it should.
+    """
+    return time.time_ns() - int((time.monotonic() - moment) * 1e9)
+
+
 class Source(Protocol):
     """Something to read sound from, already open."""
 

@@ -1,0 +1,142 @@
+"""A source that listens: what a running bass, or `rosbag play`, publishes on a port Audio."""
+
+from __future__ import annotations
+
+import os
+import queue
+import threading
+import time
+from typing import Any
+
+import numpy as np
+import rospy
+
+from rosafe.bass.sources.base import Chunk, device_error, hwparams_error
+from rosafe.bass.windows import WindowStream
+from rosafe.interface import BASS, ComponentError
+from rosafe.ros import wire
+from rosafe.ros.audio import malformed
+
+FIRST_SECONDS = 5.0  # for a first message
+STALL_SECONDS = 5.0  # without anything new, the stream counts as ended; besides a chunk's own length
+POLL_SECONDS = 0.1
+
+
+class TopicSource:
+    """The frames that are new on a topic from now on. Make it after `rospy.init_node`.
+
+    Parameters
+    ----------
+    topic : str
+        Such as ``/bass/Audio``.
+    sample_rate : int
+        Hz; must be the stream's own, or 0.
+
+    Attributes
+    ----------
+    newest : int
+        Number of the frame before the first one that is read.
+    frames_per_chunk : int
+        As the first message says.
+
+    Raises
+    ------
+    ComponentError
+        ``::bass::e_device`` where nothing comes, or something else than sound; ``::bass::e_hwparams`` for another
+        sample rate.
+    """
+
+    def __init__(self, topic: str, sample_rate: int, stopping: threading.Event) -> None:
+        self.name = topic
+        self.overruns = 0
+        self.lost_frames = 0
+        self._stopping = stopping
+        self._stream = WindowStream(with_first=False)
+        self._news: queue.SimpleQueue[Any] = queue.SimpleQueue()  # (gap, samples, time), or why the stream has ended
+        self._begun = False
+        self._first: Any = None
+        self._arrived = threading.Event()
+        message_class = wire.lenient_class("bass", BASS.port("Audio").idl)
+        kinds = dict(rospy.get_published_topics())
+        kind = kinds.get(rospy.resolve_name(topic))
+        if kind is not None and kind.rpartition("/")[2] != message_class.__name__:
+            raise device_error(f"{topic} is no port Audio, but of type {kind}")
+        self._subscriber = rospy.Subscriber(topic, message_class, self._hear, buff_size=2**24, tcp_nodelay=True)
+        try:
+            self._await_first(kind is not None)
+            self.sample_rate = int(self._first.sampleRate)
+            self.newest = int(self._first.lastFrameIndex)
+            self.frames_per_chunk = max(1, int(self._first.nFramesPerChunk))
+            if sample_rate not in (0, self.sample_rate):
+                raise hwparams_error(
+                    f"{topic} has a sample rate of {self.sample_rate} Hz, asked for were {sample_rate}"
+                )
+        except ComponentError:
+            self.close()
+            raise
+        self._patience = STALL_SECONDS + self.frames_per_chunk / self.sample_rate
+
+    def _await_first(self, published: bool) -> None:
+        end = time.monotonic() + FIRST_SECONDS
+        while not self._arrived.wait(POLL_SECONDS) and not self._stopping.is_set():
+            if time.monotonic() > end:
+                what = "has published nothing: call Acquire" if published else "is published by nobody: start bass-ros"
+                raise device_error(f"{self.name} {what}, or record a --device without ROS")
+        if self._first is None:
+            raise device_error(f"{self.name}: interrupted before a first message came")
+
+    def _hear(self, message: Any) -> None:
+        if message.problem or malformed(message):
+            return  # the next window shows what it would have shown
+        if self._first is None:
+            self._first = message
+            self._stream.fresh(message)
+            self._arrived.set()
+        elif why := self._stream.joint(message):
+            self._news.put(f"{self.name}: a new stream begins ({why})")
+        else:
+            stamp = message.stamp["sec"] + message.stamp["nsec"] * 1e-9
+            gap, samples = self._stream.fresh(message)
+            if samples.shape[1]:
+                self._news.put((gap, samples, time.monotonic() - (time.time() - stamp)))
+
+    def read(self) -> Chunk | None:
+        """What is new, of any length; None once nothing new has come for some seconds.
+
+        Raises ``::bass::e_device`` where another stream begins, or none was there at all.
+        """
+        end = time.monotonic() + self._patience
+        while not self._stopping.is_set():
+            try:
+                news = self._news.get(timeout=POLL_SECONDS)
+            except queue.Empty:
+                if time.monotonic() < end:
+                    continue
+                if not self._begun:
+                    raise device_error(
+                        f"{self.name} shows old sound only, nothing new has come for {STALL_SECONDS:g} s: call Acquire"
+                    ) from None
+                return None
+            if isinstance(news, str):
+                raise device_error(news)
+            gap, samples, moment = news
+            self._begun = True
+            self.overruns += gap > 0
+            self.lost_frames += gap
+            return Chunk(np.asarray(samples), gap, moment)
+        return None
+
+    def close(self) -> None:
+        """Listen no more."""
+        self._subscriber.unregister()
+
+
+def become_node(name: str) -> None:
+    """Make this process a node of the graph; MasterError where there is no master."""
+    from rosafe.ros import master, startup
+
+    master.set_local_defaults()
+    master.check_master(os.environ["ROS_MASTER_URI"])
+    startup.ensure_log_directory()
+    rospy.init_node(name, argv=[], anonymous=True, disable_signals=True)
+    startup.log_to_stderr()

@@ -1,0 +1,257 @@
+"""Record sound to a WAV or a bag, with a level meter; without an output, only the meter.
+
+The sound is that of a running bass (the topic /bass/Audio), or of a --device without ROS: a sound card, file:PATH,
+bag:PATH or scene:, named as for bass's Acquire. OUT.wav holds the exact samples, 32 bits wide; from 4 GiB on it is an
+RF64, which libsndfile reads like any WAV. OUT.bag is for `rosbag play` and the device bag:. What was lost on the way
+is silence in its place, and reported. Ctrl-C ends it, with a file that is complete."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from rosafe.commands import Failure
+from rosafe.commands._workers import Interrupted, Signals
+from rosafe.interface import BASS, ComponentError
+
+if TYPE_CHECKING:
+    from rosafe.bass.recording.outputs import Output
+    from rosafe.bass.recording.recorder import Recorder
+    from rosafe.bass.sources import Source
+
+_TOPIC = "/bass/Audio"
+_EARS = ("left", "right")
+_ACQUIRE = BASS.service("Acquire")
+_MAX_SECONDS = 1e7
+
+# --- the command line -------------------------------------------------------------------------------------------
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments."""
+    parser.usage = (
+        "rosafe record [OUT.wav|OUT.bag] [--device NAME | --topic NAME | --socket HOST:PORT]\n"
+        "                     [--rate HZ] [--seconds S] [--chunk N] [--force] [--quiet]\n"
+        "       rosafe record --list"
+    )
+    parser.add_argument("output", nargs="?", metavar="OUT", help="file to write, ending in .wav or .bag")
+    source = parser.add_mutually_exclusive_group()
+    source.add_argument("--device", metavar="NAME", help="record from there without ROS; see --list")
+    source.add_argument("--topic", metavar="NAME", help=f"the port Audio to listen to (default: {_TOPIC})")
+    source.add_argument(
+        "--socket", type=_address, metavar="HOST:PORT", help="ask a bass's DedicatedSocket; needs --rate"
+    )
+    parser.add_argument("--list", action="store_true", help="say which devices there are, and end")
+    parser.add_argument(
+        "--rate",
+        type=_count(768_000),
+        default=0,
+        metavar="HZ",
+        help="sample rate; nothing is resampled (default: the source's own; 44100 for sound cards and scene:)",
+    )
+    parser.add_argument("--seconds", type=_seconds, metavar="S", help="end after so much sound (default: at Ctrl-C)")
+    parser.add_argument(
+        "--chunk",
+        type=_count(1_000_000),
+        default=_ACQUIRE.parameter("nFramesPerChunk").default,
+        metavar="N",
+        help="frames that a --device gives at a time (default: %(default)s)",
+    )
+    parser.add_argument("--force", action="store_true", help="replace OUT where it is there already")
+    parser.add_argument("-q", "--quiet", action="store_true", help="no meter; losses and the summary only")
+    parser.epilog = (
+        "The meter shows, for each ear, the highest sample and the root mean square in dB below full scale, CLIP\n"
+        "where samples were at the end of the scale, and the frames lost so far: on a terminal as one live line,\n"
+        "else as a line for each second.\n\n"
+        "exit status: 0 recorded, 1 something failed (what was recorded until then is kept), 2 wrong command line\n\n"
+        "examples:\n"
+        "  rosafe record --device plughw:1,0              # check the levels of a sound card\n"
+        "  rosafe record speech.wav --device plughw:1,0   # until Ctrl-C\n"
+        "  rosafe record speech.bag --seconds 60          # what a running bass captures"
+    )
+
+
+def _count(maximum: int) -> Any:
+    def convert(text: str) -> int:
+        if not (text.isascii() and text.isdigit() and 1 <= int(text[:20]) <= maximum):
+            raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 1 to {maximum}")
+        return int(text)
+
+    return convert
+
+
+def _seconds(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = 0.0
+    if not 0 < value <= _MAX_SECONDS:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a number of seconds above 0, up to {_MAX_SECONDS:.0f}")
+    return value
+
+
+def _address(text: str) -> tuple[str, int]:
+    host, _, port = text.rpartition(":")
+    if not (host and port.isascii() and port.isdigit() and 0 < int(port[:6]) < 65536):
+        raise argparse.ArgumentTypeError(f"{text!r} is not HOST:PORT, such as 127.0.0.1:8081")
+    return host.strip("[]"), int(port)
+
+
+# --- the work ---------------------------------------------------------------------------------------------------
+
+
+def run(options: argparse.Namespace) -> int:
+    """Record; 0 if all went well."""
+    if options.list:
+        return _list()
+    path = _checked_output(options)
+    signals, stopping = Signals(), threading.Event()
+    outcome: list[int | BaseException] = []
+
+    def work() -> None:
+        try:
+            outcome.append(_record(path, options, stopping))
+        except BaseException as problem:  # for the main thread, which alone sees signals
+            outcome.append(problem)
+
+    thread = threading.Thread(target=work, daemon=True)
+    thread.start()
+    while thread.is_alive():
+        thread.join(0.1)
+        try:
+            signals.check()
+        except Interrupted:
+            stopping.set()
+    if isinstance(outcome[0], BaseException):
+        raise outcome[0]
+    return outcome[0]
+
+
+def _list() -> int:
+    """As bass's ListDevices; a machine without a sound card is no failure here."""
+    from rosafe.bass.sources import device_lines
+
+    try:
+        for line in device_lines():
+            print(line)
+    except ComponentError as problem:
+        print(f"rosafe record: {problem.why}", file=sys.stderr)
+    return 0
+
+
+def _checked_output(options: argparse.Namespace) -> Path | None:
+    if options.socket and not options.rate:
+        options.usage_error("--socket needs --rate: the protocol does not tell the sample rate")
+    if options.output is None:
+        return None
+    path = Path(os.path.expanduser(options.output))
+    if path.suffix.lower() not in (".wav", ".bag"):
+        options.usage_error(f"{options.output}: wanted is a name that ends in .wav or .bag")
+    if os.path.lexists(path):
+        if not path.is_file():
+            raise Failure(f"{path} is not a regular file")
+        if not options.force:
+            raise Failure(f"{path} is there already; --force replaces it")
+        if _is_input(path, options.device or ""):
+            raise Failure(f"{path} is the input itself")
+    elif not path.parent.is_dir():
+        raise Failure(f"cannot write {path}: there is no folder {path.parent}")
+    return path
+
+
+def _is_input(path: Path, device: str) -> bool:
+    kind, _, rest = device.partition(":")
+    names = (rest, rest.rpartition("?")[0]) if kind in ("file", "bag") else ()
+    return any(os.path.exists(os.path.expanduser(n)) and os.path.samefile(os.path.expanduser(n), path) for n in names)
+
+
+def _open_source(options: argparse.Namespace, stopping: threading.Event) -> Source:
+    try:
+        if options.device is not None:
+            from rosafe.bass.sources import open_source
+            from rosafe.ros.paths import prefer_pypi_packages
+
+            prefer_pypi_packages()
+            return open_source(options.device, options.rate, options.chunk, stopping)
+        if options.socket:
+            from rosafe.bass.recording.remote import SocketSource
+
+            host, port = options.socket
+            return SocketSource(host, port, options.rate, stopping)
+        from rosafe.bass.recording.topic import TopicSource, become_node
+        from rosafe.ros.master import MasterError
+
+        try:
+            become_node("rosafe_record")
+        except MasterError as problem:
+            raise Failure(f"{problem}; or record a --device without ROS") from None
+        return TopicSource(options.topic or _TOPIC, options.rate, stopping)
+    except ComponentError as problem:
+        raise Failure(problem.why) from None
+
+
+def _record(path: Path | None, options: argparse.Namespace, stopping: threading.Event) -> int:
+    from rosafe.bass.recording.recorder import Recorder
+    from rosafe.commands._meter import Meter
+
+    source = _open_source(options, stopping)
+    try:
+        meter = Meter(sys.stdout, source.sample_rate, options.quiet)
+        limit = None if options.seconds is None else max(1, round(options.seconds * source.sample_rate))
+        with _opened(path, options, source) as output:
+            recorder = Recorder(source, output, limit, meter.show, meter.message)
+            try:
+                ended = recorder.run(stopping)
+            except ComponentError as problem:
+                raise Failure(problem.why) from None
+            finally:
+                meter.clear()
+                if recorder.frames:
+                    meter.message(_summary(recorder, str(path or "heard"), source.sample_rate))
+        if ended:
+            meter.message(f"{source.name} has ended")
+        return 0
+    finally:
+        source.close()
+
+
+@contextmanager
+def _opened(path: Path | None, options: argparse.Namespace, source: Source) -> Iterator[Output | None]:
+    """The output, if one is wanted; complete at the end, whatever happens. Failure where it cannot be written."""
+    if path is None:
+        yield None
+        return
+    try:
+        output = _open_output(path, options, source)
+        try:
+            yield output
+        finally:
+            output.close()
+    except BrokenPipeError:  # nobody reads the meter any more
+        raise
+    except OSError as problem:
+        raise Failure(f"cannot write {path}: {problem.strerror or problem}") from None
+
+
+def _open_output(path: Path, options: argparse.Namespace, source: Source) -> Output:
+    from rosafe.bass.recording.outputs import BagFile, WavFile
+
+    if path.suffix.lower() == ".wav":
+        return WavFile(path, source.sample_rate)
+    chunk, newest = getattr(source, "frames_per_chunk", options.chunk), getattr(source, "newest", 0)
+    return BagFile(path, source.sample_rate, chunk, options.topic or _TOPIC, newest)
+
+
+def _summary(recorder: Recorder, name: str, sample_rate: int) -> str:
+    levels = recorder.levels
+    peaks = ", ".join(f"{ear} {levels.peak(index):.1f}" for index, ear in enumerate(_EARS))
+    return (
+        f"{name}: {recorder.frames / sample_rate:.3f} s at {sample_rate} Hz, highest peaks {peaks} dBFS, "
+        f"{sum(levels.clipped)} samples clipped, {recorder.lost} frames lost"
+    )
