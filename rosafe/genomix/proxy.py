@@ -9,7 +9,7 @@ from typing import Any
 
 import rosgraph.names
 
-from rosafe.genomix import syntax, trees
+from rosafe.genomix import packed, syntax, trees
 from rosafe.genomix.actions import ActionClient, Goal
 from rosafe.genomix.graph import Graph, Unknown, middleware_error
 from rosafe.genomix.syntax import Syntax
@@ -47,6 +47,10 @@ class Value:
     def pieces(self, form: Syntax) -> Iterator[str]:
         """The text, as one nested value, in short pieces."""
         return syntax.structure(form, self._component, self._members, self.values)
+
+    def packed(self) -> Iterator[bytes]:
+        """The bytes of the packed form, in pieces."""
+        return packed.structure(self._component, self._members, self.values)
 
     @property
     def size(self) -> int:

@@ -16,6 +16,7 @@ from typing import Any
 from aiohttp import web
 
 from rosafe import __version__
+from rosafe.genomix import packed
 from rosafe.genomix.proxy import Proxy, Value
 from rosafe.genomix.sessions import Request, Session, Sessions, error_body, too_many
 from rosafe.genomix.syntax import SYNTAXES, TCL, Syntax, plain
@@ -49,7 +50,9 @@ _STATUS = {
 }
 _COMPONENT_ERROR = 422  # the request was understood, sent and refused
 _SESSION_NAME = re.compile(r"[\w.:@-]{1,100}")
-_HELP = """genomixd {version}: components of the ROS graph by HTTP GET. Answers are JSON, or Tcl dicts with syntax=tcl.
+_PACKED = "packed"  # the one syntax that is not text
+_HELP = """genomixd {version}: components of the ROS graph by HTTP GET.
+Answers are JSON, with syntax=tcl Tcl dicts, with syntax=packed bytes for MATLAB and Octave.
 /session/start?s=NAME  /session/stop?s=NAME  /session/listen?s=NAME (server-sent events: request, unload, quit)
 /load/COMPONENT[?i=INSTANCE][&as=NAME]  /unload/NAME  /describe/NAME  /components  /rpath?dir=DIR
 /call/NAME/SERVICE[?input=JSON]  /call/NAME/PORT[/ELEMENT]      waits for the result; an activity returns once it runs
@@ -134,7 +137,8 @@ class Server:
         session: Session | None = None
         try:
             self._refuse_web_pages(request)
-            _syntax(request)
+            if not _is_packed(request):
+                _syntax(request)
             if not request.path.startswith("/session/"):
                 session = self._session(request)
                 session.busy += 1
@@ -299,11 +303,10 @@ class Server:
 
     async def _stream(self, request: web.Request, value: Value) -> web.StreamResponse:
         """Send a value, however large, in pieces that are made in another thread as fast as the client takes them."""
-        form = _syntax(request)
-        pieces = _unwrapped(form, value.pieces(form))
+        pieces = _encoded(request, value)
         if value.size <= BATCH // 8:
-            return _respond(form, "".join(pieces))
-        response = web.StreamResponse(headers={"Content-Type": f"{form.media_type}; charset=utf-8", **_HEADERS})
+            return _respond(request, b"".join(pieces))
+        response = web.StreamResponse(headers={"Content-Type": _media_type(request), **_HEADERS})
         await response.prepare(request)
         loop = asyncio.get_running_loop()
         while batch := await loop.run_in_executor(self._formatters, _batch, pieces):
@@ -315,11 +318,20 @@ class Server:
 # --- reading ----------------------------------------------------------------------------------------------------
 
 
+def _is_packed(request: web.Request) -> bool:
+    return request.query.get("syntax") == _PACKED
+
+
 def _syntax(request: web.Request) -> Syntax:
     name = request.query.get("syntax", "json")
     if name not in SYNTAXES:
-        raise refused(f"syntax: {name[:20]!r} is not one of {', '.join(SYNTAXES)}")
+        raise refused(f"syntax: {name[:20]!r} is not one of {', '.join((*SYNTAXES, _PACKED))}")
     return SYNTAXES[name]
+
+
+def _written_in(request: web.Request) -> Syntax:
+    """The syntax of an answer; JSON where what is asked for is none, which is an error to be told."""
+    return SYNTAXES.get(request.query.get("syntax", "json"), SYNTAXES["json"])
 
 
 def _flag(request: web.Request, name: str) -> bool:
@@ -381,35 +393,51 @@ def _unwrapped(form: Syntax, pieces: Iterator[str]) -> Iterator[str]:
     yield held[:-1]
 
 
-def _respond(form: Syntax, text: str, status: int = 200) -> web.Response:
-    return web.Response(text=text, status=status, content_type=form.media_type, charset="utf-8", headers=_HEADERS)
+def _encoded(request: web.Request, value: Value | Request) -> Iterator[bytes]:
+    if _is_packed(request):
+        return value.packed()
+    form = _syntax(request)
+    return (piece.encode() for piece in _unwrapped(form, value.pieces(form)))
+
+
+def _media_type(request: web.Request) -> str:
+    if _is_packed(request):
+        return "application/octet-stream"
+    return f"{_written_in(request).media_type}; charset=utf-8"
+
+
+def _respond(request: web.Request, body: bytes, status: int = 200) -> web.Response:
+    return web.Response(body=body, status=status, headers={"Content-Type": _media_type(request), **_HEADERS})
 
 
 def _small(request: web.Request, value: Any) -> web.Response:
+    if _is_packed(request):
+        return _respond(request, packed.plain(value))
     form = _syntax(request)
-    return _respond(form, "".join(_unwrapped(form, iter((plain(form, value),)))))
+    return _respond(request, "".join(_unwrapped(form, iter((plain(form, value),)))).encode())
 
 
 def _error(request: web.Request, error: ComponentError, status: int = 0) -> web.Response:
-    form = SYNTAXES.get(request.query.get("syntax", "json"), SYNTAXES["json"])
+    if _is_packed(request):  # MATLAB and Octave lose the body of an answer with any other status
+        return _respond(request, packed.error(error_body(error)))
+    form = _written_in(request)
     text = "".join(_unwrapped(form, iter((plain(form, error_body(error)),))))
-    return _respond(form, text, status or _STATUS.get(error.ex, _COMPONENT_ERROR))
+    return _respond(request, text.encode(), status or _STATUS.get(error.ex, _COMPONENT_ERROR))
 
 
 def _status(request: web.Request, known: Request) -> web.Response:
-    form = _syntax(request)
-    return _respond(form, "".join(_unwrapped(form, known.pieces(form))))
+    return _respond(request, b"".join(_encoded(request, known)))
 
 
-def _batch(pieces: Iterator[str]) -> bytes:
-    parts: list[str] = []
+def _batch(pieces: Iterator[bytes]) -> bytes:
+    parts: list[bytes] = []
     size = 0
     for piece in pieces:
         parts.append(piece)
         size += len(piece)
         if size >= BATCH:
             break
-    return "".join(parts).encode()
+    return b"".join(parts)
 
 
 def _connect(server: web.Server) -> asyncio.Protocol:
