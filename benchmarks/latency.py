@@ -3,8 +3,8 @@
 ``/usr/bin/python3 benchmarks/latency.py`` starts real nodes on a master of its own, builds the default tree and
 measures with only the ILD port subscribed, and then with all ports subscribed from a third process. A block is computed
 when its last chunk is there: of the message with `lastFrameIndex` L the newest frame is number L - 1, which came with
-that chunk. Times count from the chunk's arrival in the measuring process, and, which is longer by what bass and ROS take
-to deliver it, from the moment that bass had it.
+that chunk. Times count from its arrival in the measuring process, and, which is longer by what bass and ROS take to
+deliver it, from the moment that bass had it.
 """
 
 from __future__ import annotations

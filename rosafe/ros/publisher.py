@@ -1,9 +1,9 @@
-"""Latched topics whose subscribers get the newest message, each at its own pace, while the publisher goes on.
+"""Latched topics whose subscribers take messages at their own pace, while the publisher goes on.
 
-rospy's own publisher serialises in `publish`, in the caller's thread, before it knows whether a subscriber can take the
-message. Here each subscriber has a thread that takes the newest message when the last one is sent: a message of which
-nobody will see anything costs nothing, a subscriber that reads slowly or not at all misses messages and holds up
-nobody, and the samples go from the processors' blocks into the socket without a copy in between.
+rospy's own publisher copies every message into a buffer of its own, and its queue is one message for all topics alike.
+Here a message is gathered once for all subscribers, without copying samples, and only where there is a subscriber. Each
+subscriber has a thread that sends, straight from the processors' blocks into the socket. What waits for a subscriber
+is bounded: one that reads slowly or not at all misses old messages and holds up nobody.
 """
 
 from __future__ import annotations
@@ -12,16 +12,20 @@ import os
 import socket
 import struct
 import threading
+from collections import deque
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import genpy
 import rospy
 from rospy import topics
 from rospy.impl.registration import Registration, get_topic_manager
 
 from rosafe.ros.wire import Gather
 
+# What may wait for one subscriber besides what is on its way. Windows overlap, so that a message of a long port is made
+# up for by the next one, and the newest is enough; messages of short ports are small, and several can wait.
+MAX_WAITING = 16
+MAX_WAITING_BYTES = 4_000_000
 _LENGTH = struct.Struct("<I")
 _MAX_PIECES = os.sysconf("SC_IOV_MAX")  # of one sendmsg
 
@@ -49,7 +53,7 @@ class _Topic(topics._PublisherImpl):
     """What rospy has behind a Publisher, with senders for connections."""
 
     def set_queue_size(self, queue_size: int) -> None:
-        """Have no queue: every sender has room for the newest message, and rospy adds no thread of its own to it."""
+        """Have no queue of rospy's, with a thread of its own: the senders have theirs."""
 
     def add_connection(self, connection: Any) -> bool:
         """Take on a subscriber; it gets the latched message."""
@@ -58,23 +62,27 @@ class _Topic(topics._PublisherImpl):
         return super().add_connection(_Sender(connection))
 
     def publish(self, message: Any, connection_override: Any = None) -> None:
-        """Keep `message` for those who come later, and offer it to those who are here (or to one connection)."""
+        """Keep `message` for those who come later, and send it to those who are here (or to one connection)."""
         if self.closed:
             if rospy.is_shutdown():
                 return
             raise rospy.ROSException(f"publish() to {self.resolved_name}, which is closed")
         self.latch = message
-        for sender in self.connections if connection_override is None else [connection_override]:
-            sender.offer(message)
+        senders = self.connections if connection_override is None else [connection_override]
+        if senders:
+            written = Gather()
+            message.serialize(written)
+            for sender in senders:
+                sender.offer(written)
 
 
 class _Sender:
-    """The connection to one subscriber, and the thread that sends it what is newest."""
+    """The connection to one subscriber, and the thread that sends to it."""
 
     def __init__(self, connection: Any) -> None:
         self._connection = connection
         self._turn = threading.Condition()
-        self._newest: Any = None
+        self._waiting: deque[Gather] = deque(maxlen=MAX_WAITING)
         threading.Thread(target=self._run, name=f"to {connection.endpoint_id}", daemon=True).start()
 
     def __getattr__(self, name: str) -> Any:
@@ -90,34 +98,35 @@ class _Sender:
 
         self._connection.set_cleanup_callback(closed)
 
-    def offer(self, message: Any) -> None:
-        """Send `message` when there is time, unless a newer one comes before."""
+    def offer(self, written: Gather) -> None:
+        """Send a message when there is time, unless too many newer ones come before."""
         with self._turn:
-            self._newest = message
+            self._waiting.append(written)
+            while len(self._waiting) > 1 and sum(w.size for w in self._waiting) > MAX_WAITING_BYTES:
+                self._waiting.popleft()
             self._turn.notify()
 
     def _run(self) -> None:
         while True:
             with self._turn:
-                self._turn.wait_for(lambda: self._newest is not None or self._connection.done)
-                message, self._newest = self._newest, None
-            sock = self._connection.socket  # None once it is closed
-            if self._connection.done or sock is None:
-                return
+                self._turn.wait_for(lambda: self._waiting or self._connection.done)
+                if self._connection.done:
+                    self._waiting.clear()
+                    return
+                written = self._waiting.popleft()
             try:
-                self._send(sock, message)
-            except genpy.SerializationError as problem:
-                rospy.logerr(f"{self._connection.name}: {problem}")
+                self._send(written)
             except OSError as problem:
                 rospy.logdebug(f"{self._connection.name}: {self._connection.endpoint_id} has left: {problem}")
                 self._connection.close()
-            del message  # it holds on to blocks
+            del written  # it holds on to blocks
 
-    def _send(self, sock: socket.socket, message: Any) -> None:
-        out = Gather()
-        message.serialize(out)
-        send_pieces(sock, [_LENGTH.pack(out.size), *out.pieces])
-        self._connection.stat_bytes += _LENGTH.size + out.size
+    def _send(self, written: Gather) -> None:
+        sock = self._connection.socket
+        if sock is None:  # closed meanwhile
+            return
+        send_pieces(sock, [_LENGTH.pack(written.size), *written.pieces])
+        self._connection.stat_bytes += _LENGTH.size + written.size
         self._connection.stat_num_msg += 1
 
 

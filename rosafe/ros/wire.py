@@ -275,7 +275,7 @@ def message_class(package: str, idl: str) -> Any:
     return type(generated.__name__, (generated,), {"serialize": serialize, "deserialize": deserialize})
 
 
-def array_msg(generated: type) -> Any:
+def array_msg(generated: Any) -> Any:
     """The class to subscribe or publish with in place of a generated one: same type and md5, arrays instead of lists.
 
     Parameters

@@ -1,0 +1,188 @@
+"""What the output ports can carry: serialising and reading the large message, and all ports subscribed for a while.
+
+``/usr/bin/python3 benchmarks/ports.py`` prints the times for the message of the gammatone port, one second of 31
+channels for two ears, which is 22 MB. Then it starts real nodes on a master of its own and subscribes to all seven
+ports of the default tree from another process: blocks of 12000 with ports of one second, and blocks of 882 with short
+ones. It counts what came on every port against what the audio says there must be, and the memory of both processes.
+The exit code is 1 where anything was lost, or where a process has grown.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import socket
+import sys
+import threading
+import time
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import graph
+import numpy as np
+from subscriber import resident
+
+from rosafe.interface import KINDS
+from rosafe.ros import generate
+
+SETTLED = 5  # seconds until memory counts: the windows and buffers are full by then
+GROWTH = 64.0  # MB; a leak of one window in the time would be as much as that
+
+
+# --- one large message ------------------------------------------------------------------------------------------
+
+
+def times(count: int = 20) -> dict[str, float]:
+    """Median ms of each step in the life of a 22 MB message, on this machine."""
+    generate.ensure_messages()
+    from rosAFE.msg import rosAFE_TimeFrequencySignalPortStruct
+
+    from rosafe.ros import array_msg
+    from rosafe.ros.publisher import send_pieces
+    from rosafe.ros.wire import Gather
+    from rosafe.tree.window import SlidingWindow
+
+    window = SlidingWindow((2, 31), graph.RATE)
+    for seed in range(6):
+        window.append(np.random.default_rng(seed).normal(size=(2, 31, 12000)))
+    view = window.view()
+    data_class = array_msg(rosAFE_TimeFrequencySignalPortStruct)
+    message = data_class(numberOfChannels=31, framesOnPort=graph.RATE, left=view.select(0), right=view.select(1))
+
+    def into_memory() -> None:
+        message.serialize(io.BytesIO())
+
+    def for_the_socket() -> None:
+        message.serialize(Gather())
+
+    out = io.BytesIO()
+    message.serialize(out)
+    data = out.getvalue()
+    ours, theirs = socket.socketpair()
+    drain = threading.Thread(target=_drain, args=(theirs,))
+    drain.start()
+
+    def through_a_socket() -> None:
+        out = Gather()
+        message.serialize(out)
+        send_pieces(ours, out.pieces)
+
+    found = {
+        "serialise into memory (rospy's way)": _median(into_memory, count),
+        "serialise for the socket (the node's way)": _median(for_the_socket, count),
+        "serialise and send to another thread": _median(through_a_socket, count),
+        "read": _median(lambda: data_class().deserialize(data), count),
+        "for comparison: copy the bytes": _median(lambda: bytearray(data), count),
+    }
+    ours.close()
+    drain.join()
+    theirs.close()
+    return found
+
+
+def _drain(sock: socket.socket) -> None:
+    room = bytearray(2**20)
+    while sock.recv_into(room):
+        continue
+
+
+def _median(function: Callable[[], Any], count: int) -> float:
+    spent = []
+    for _ in range(count + 3):
+        begin = time.perf_counter()
+        function()
+        spent.append(time.perf_counter() - begin)
+    return 1000 * float(np.median(spent[3:]))
+
+
+# --- all ports for a while --------------------------------------------------------------------------------------
+
+
+class Port(NamedTuple):
+    """What came on one port."""
+
+    topic: str
+    came: int  # messages
+    expected: int
+    lost: int  # messages that there must have been between the first and the last that came
+
+
+def count(topic: str, indexes: list[int], block: int) -> Port:
+    """Messages against blocks: on every port `lastFrameIndex` goes on by one block per message."""
+    seen = sorted({index for index in indexes if index})
+    expected = (seen[-1] - seen[0]) // block + 1 if seen else 0
+    return Port(topic, len(seen), expected, expected - len(seen))
+
+
+class Run(NamedTuple):
+    """The result of one run; memory in MB, from when it had settled to the end."""
+
+    ports: list[Port]
+    seconds: float
+    node: tuple[float, float]
+    subscriber: tuple[float, float]
+
+    @property
+    def lost(self) -> int:
+        """Messages lost on all ports; a port on which nothing came counts as one."""
+        return sum(port.lost for port in self.ports) + sum(port.came == 0 for port in self.ports)
+
+    @property
+    def growth(self) -> float:
+        """MB by which a process has grown, the one that grew more."""
+        return max(last - first for first, last in (self.node, self.subscriber))
+
+
+def run(bench: graph.Bench, block: int, seconds: float) -> Run:
+    """Subscribe to all ports from another process for so long; the tree is there and runs on blocks of `block`."""
+    topics = [graph.topic(kind) for kind in KINDS]
+    taker = bench.subscribe(topics)
+    time.sleep(min(SETTLED, seconds / 2))
+    settled = resident(bench.node)
+    begin = time.monotonic()
+    time.sleep(max(0.0, seconds - SETTLED))
+    node = settled, resident(bench.node)
+    found = taker.close()
+    memory = found["memory"]
+    return Run(
+        [count(topic, [index for index, _ in found["came"][topic]], block) for topic in topics],
+        time.monotonic() - begin,
+        node,
+        (memory[min(SETTLED, len(memory) - 1)], memory[-1]),
+    )
+
+
+def report(result: Run) -> None:
+    """Print one run."""
+    print(f"{'port':45} {'came':>6} {'expected':>8} {'lost':>6}")
+    for port in result.ports:
+        print(f"{port.topic:45} {port.came:6d} {port.expected:8d} {port.lost:6d}")
+    for name, (first, last) in (("node", result.node), ("subscriber", result.subscriber)):
+        print(f"memory of the {name}: {first:.0f} MB after {SETTLED} s, {last:.0f} MB at the end")
+
+
+def main() -> int:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description="Serialisation of large ports, and all ports subscribed for a while.")
+    parser.add_argument("--seconds", type=float, default=60.0, help="of each run (default %(default)s)")
+    options = parser.parse_args()
+    print("22 MB message, median ms")
+    for what, spent in times().items():
+        print(f"{what:45} {spent:8.2f}")
+    lost = 0
+    with graph.bench() as bench:
+        for block, port_seconds, chunk in ((12000, 1.0, 2205), (882, 0.02, 882)):
+            print(f"\nblocks of {block}, ports of {port_seconds:g} s, {options.seconds:g} s", flush=True)
+            bench.build(block, port_seconds, chunk)
+            result = run(bench, block, options.seconds)
+            report(result)
+            lost += result.lost
+            if result.growth > GROWTH:
+                print(f"grown by {result.growth:.0f} MB")
+                lost += 1
+            bench.call("/rosAFE/Stop")
+    return 1 if lost else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
