@@ -1,0 +1,120 @@
+"""What `rosbag record` kept of a live run gives the same representations again: played by rosbag, and through bass."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+import soundfile
+
+from rosafe.interface import KINDS
+from rosafe.ros import wire
+from tests.bass import bags
+from tests.harness import Graph, wait_for
+from tests.ros.session import RATE, Session, assert_holds, expected, noise, own_node, windowed
+
+CHUNK, CHUNKS, BLOCK, FRAMES = RATE // 20, 20, RATE // 4, 3 * RATE // 2
+SECONDS = FRAMES / RATE
+VALUES = {"fb_nERBs": 3.0, "pp_bRemoveDC": True}
+REQUESTS = [kind.request for kind in KINDS.values() if kind.parent]
+
+
+class Recorded(NamedTuple):
+    """A live run."""
+
+    bag: Path
+    signal: np.ndarray  # int32, (2, FRAMES)
+    result: Any  # of rosafe.process
+
+
+def prepare(node: Session, topic: str, *requests: str) -> None:
+    """Build a tree at leisure, on a stream of which nothing comes, and connect it with the one that is to come."""
+    node.build(*requests, block=BLOCK, bufferSize_s_port=SECONDS, **VALUES)
+    node.ok("connect_port", local="Audio", remote=topic)
+
+
+def assert_same(node: Session, recorded: Recorded) -> None:
+    """All ports hold, bit for bit, what comes of the whole signal, and under the same frame numbers."""
+    for kind in KINDS:
+        rate = float(recorded.result.get(f"{kind}_frameRate", RATE))
+        message = node.read(kind, index=FRAMES + 1)
+        assert_holds(message, kind, windowed(recorded.result[kind], SECONDS, rate))
+
+
+def acquire(graph: Graph, device: str) -> None:
+    answer = graph.call("/bass/Acquire", device=device, sampleRate=RATE, nFramesPerChunk=CHUNK, nChunksOnPort=CHUNKS)
+    assert answer.genom_success
+
+
+@pytest.fixture(scope="module")
+def recorded(graph: Graph, tmp_path_factory: pytest.TempPathFactory) -> Recorded:
+    """A file through bass and rosAFE, while `rosbag record` listens."""
+    folder = tmp_path_factory.mktemp("replay")
+    signal = noise(FRAMES)
+    soundfile.write(folder / "a.wav", signal.T, RATE, subtype="PCM_32")
+    recorded = Recorded(folder / "live.bag", signal, expected(signal, BLOCK, VALUES))
+    with (
+        graph.node("bass-ros"),
+        own_node(graph, name="live") as node,
+        graph.start("rosbag", "record", "-O", str(recorded.bag), "/bass/Audio", "__name:=recorder") as recorder,
+    ):
+        prepare(node, "bass/Audio", *REQUESTS)
+        wait_for(
+            lambda: "* /recorder " in graph.run("rostopic", "info", "/bass/Audio").stdout, what=lambda: str(recorder)
+        )
+        acquire(graph, f"file:{folder / 'a.wav'}")
+        assert_same(node, recorded)
+        graph.run("rosnode", "kill", "/recorder")
+        recorder.wait()
+    return recorded
+
+
+@contextmanager
+def replay(graph: Graph, bag: Path, name: str, requests: list[str], *options: str) -> Iterator[Session]:
+    """A new rosAFE, connected with what `rosbag play` plays; that waits for it, and comes to its end after the test."""
+    topic = f"/{name}/Audio"
+    command = ("rosbag", "play", "--wait-for-subscribers", *options, str(bag), f"/bass/Audio:={topic}")
+    with own_node(graph, name=name) as node, graph.start(*command) as player:
+        wait_for(lambda: topic in graph.topics(), what=lambda: str(player))
+        prepare(node, topic, *requests)
+        yield node
+        assert player.wait() == 0, player
+
+
+def test_played_by_rosbag_without_bass(graph: Graph, recorded: Recorded) -> None:
+    with replay(graph, recorded.bag, "replayed", REQUESTS, "--clock") as node:
+        assert_same(node, recorded)
+
+
+def test_played_from_the_middle_and_with_a_loss(graph: Graph, recorded: Recorded, tmp_path: Path) -> None:
+    """Frames keep their numbers; what no window shows is zeros."""
+    # The windows that would show frames 14001 to 18000 are not there, and the recording begins with frame 4001.
+    windows = 4 * CHUNK
+    indexes = [i for i in range(4 * CHUNK + windows, FRAMES + 1, CHUNK) if not 14000 < i < 18000 + windows]
+    messages = [bags.message(recorded.signal, i, windows, RATE, CHUNK) for i in indexes]
+    gap = bags.write(tmp_path / "gap.bag", messages)
+    with replay(graph, gap, "gap", []) as node:
+        message = node.read("input", index=FRAMES - (FRAMES - 4000) % BLOCK + 1)
+        entries = node.health(lambda entries: int(entries["lost"]) > 0)
+    assert entries["lost"] == "4000" and entries["gaps"] == "1"
+    heard = recorded.signal.copy()
+    heard[:, 14000:18000] = 0
+    wanted = expected(heard[:, 4000 : FRAMES - (FRAMES - 4000) % BLOCK], BLOCK, VALUES)["input"]
+    np.testing.assert_array_equal(np.stack((message.left, message.right))[:, -wanted.shape[1] :], wanted)
+
+
+def test_source_of_bass(graph: Graph, recorded: Recorded) -> None:
+    """`bag:` publishes the recorded frames under their numbers."""
+    audio = wire.message_class("bass", "::binaudio::portStruct")
+    with graph.node("bass-ros"), graph.collect("/bass/Audio", audio) as messages:
+        acquire(graph, f"bag:{recorded.bag}")
+        wait_for(lambda: messages and messages[-1].lastFrameIndex == FRAMES, 20)
+    assert messages[0].lastFrameIndex == 0
+    padded = np.concatenate((np.zeros((2, CHUNK * CHUNKS), np.int32), recorded.signal), axis=1)
+    for message in messages:
+        window = padded[:, message.lastFrameIndex : message.lastFrameIndex + CHUNK * CHUNKS]
+        assert np.array_equal(message.left, window[0]) and np.array_equal(message.right, window[1])
