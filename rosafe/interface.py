@@ -381,7 +381,7 @@ GENOM_EXCEPTIONS: dict[str, tuple[tuple[str, str], ...]] = {
     "syserr": (("code", "long"),),
 }
 
-MAX_ACTIVITIES = 32  # per task, its permanent one included
+MAX_ACTIVITIES = 256  # per task, its permanent one included; the original takes 32
 
 _PORT_NAMES = (
     Parameter("local", "string", REQUIRED, "Name of this component's input port"),

@@ -233,6 +233,10 @@ class Graph:
         """All topics that somebody publishes."""
         return {name for name, _ in self._state()[0]}
 
+    def readers(self) -> set[tuple[str, str]]:
+        """Which node subscribes to which topic: (topic, node)."""
+        return {(topic, node) for topic, nodes in self._state()[1] for node in nodes}
+
     def nodes(self) -> set[str]:
         """All nodes that publish, subscribe or serve anything."""
         return {node for kind in self._state() for _, nodes in kind for node in nodes}

@@ -16,6 +16,7 @@ from rosafe.interface import BASS, ComponentError
 from rosafe.ros import wire
 from rosafe.ros.activities import Activity
 from rosafe.ros.component import ComponentNode
+from rosafe.ros.events import EventLog
 from rosafe.ros.startup import run_server
 
 
@@ -56,7 +57,7 @@ class BassNode:
         # Whatever can fail comes before the running acquisition ends, so that a mistake leaves that as it is.
         source = self._open(activity, device, values["sampleRate"], frames_per_chunk)
         try:
-            capture = Capture(source, frames_per_chunk, chunks, self._publish, rospy.logwarn)
+            capture = Capture(source, frames_per_chunk, chunks, self._publish, EventLog(rospy.logwarn))
             activity.interrupt_others()
             activity.raise_if_interrupted()
             self._source = source

@@ -21,7 +21,6 @@ from rosafe.interface import ComponentError
 from rosafe.ros import startup
 
 RPC_SECONDS = 3.0  # for one call of the master or of a node
-CHECK_SECONDS = 1.0  # between two looks whether the master still knows our node
 NODE_SECONDS = 15.0  # for becoming a node of the graph
 
 
@@ -49,14 +48,13 @@ class Graph:
             timeout=aiohttp.ClientTimeout(total=RPC_SECONDS),
         )
         self._node: asyncio.Task[None] | None = None
-        self._watch: asyncio.Task[None] | None = None
+        self._is_node = False
 
     async def close(self) -> None:
         """Leave the graph."""
-        for task in (self._watch, self._node):
-            if task is not None:
-                task.cancel()
-        if self._watch is not None:
+        if self._node is not None:
+            self._node.cancel()
+        if self._is_node:
             import rospy
 
             await asyncio.to_thread(rospy.signal_shutdown, "genomixd ends")
@@ -125,35 +123,14 @@ class Graph:
         await self.master("getPid")  # rospy would wait for the master without end
         import rospy
 
+        from rosafe.ros import registration
+
         loop = asyncio.get_running_loop()
-        await asyncio.to_thread(rospy.init_node, self.name[1:], argv=["genomixd"], disable_signals=True)
+        registrar = await asyncio.to_thread(registration.init_node, self.name[1:], ["genomixd"])
+        self._is_node = True
         startup.log_to_stderr()
+        rospy.on_shutdown(registrar.end)
         rospy.on_shutdown(lambda: loop.is_closed() or loop.call_soon_threadsafe(self.gone.set))
-        self._watch = asyncio.create_task(self._keep_registered())
-
-    async def _keep_registered(self) -> None:
-        """Make a master that was restarted know our node again, as it knew it before."""
-        while True:
-            await asyncio.sleep(CHECK_SECONDS)
-            try:
-                await self.master("lookupNode", self.name)
-            except Unknown:
-                await self._register_again()
-            except ComponentError:
-                continue  # no master for now; requests say so
-
-    async def _register_again(self) -> None:
-        import rospy
-
-        own = rospy.get_node_uri()
-        try:
-            for topic, kind in await self.node(own, "getSubscriptions"):
-                publishers = await self.master("registerSubscriber", topic, kind, own)
-                await self.node(own, "publisherUpdate", topic, publishers)
-            for topic, kind in await self.node(own, "getPublications"):
-                await self.master("registerPublisher", topic, kind, own)
-        except (TimeoutError, ComponentError, Unknown, OSError, aiohttp.ClientError) as problem:
-            rospy.logwarn(f"genomixd: cannot register with the new master yet: {problem}")
 
 
 def _address(uri: str) -> tuple[str, int]:

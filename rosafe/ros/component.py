@@ -14,6 +14,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from typing import Any
 
 import actionlib
@@ -25,16 +26,17 @@ from rospy.impl import tcpros_base
 
 from rosafe import __version__, interface
 from rosafe.interface import ComponentError
+from rosafe.ros import master, registration
 from rosafe.ros.activities import Activities, Activity, Handler, TaskMeter
-from rosafe.ros.master import MasterError, check_master
 from rosafe.ros.publisher import Publisher
 
 BACKLOG = 128  # connections that wait to be accepted
 STATE_PERIOD = 0.9  # seconds between two genom_state messages at the most; the contract is 1
 BURST_SECONDS = 0.005  # what changes within this makes one message, not one each
 DIAGNOSTICS_PERIOD = 1.0
+UP_SECONDS = 10.0  # until the master knows a node that starts
 STOP_WAIT = 2.0  # seconds that Stop waits for what it ends
-ACCEPT_SECONDS = 0.2  # a goal is accepted once its activity runs, or after this
+ACCEPT_SECONDS = 0.5  # a goal is accepted once its activity runs, or after this
 SEND_SECONDS = 0.1  # rospy sends answers and results on threads of its own, and does not tell when it has
 
 
@@ -63,13 +65,17 @@ class ComponentNode:
         self._handlers: dict[str, Callable[..., Any]] = {}
         self._validators: dict[str, Callable[[dict[str, Any]], None]] = {}
         self._connectors: dict[str, Callable[[str], None]] = {}
+        self._registrar = registration.registrar()
+        self._turns: dict[str, AbstractContextManager[Any]] = {}  # of each function
         self._control = threading.Lock()
+        self._connecting = threading.Lock()
         self._turn = threading.Event()
         self._keep: list[Any] = []  # services and action servers, alive as long as the node
         self._digest = _digest(component)
         _lengthen_backlog()
-        rospy.set_param(f"{self.name}/actionlib_status_frequency", 0)  # status is published on change only
-        self.function("connect_port", self._connect_port)
+        self._set_parameters()
+        self._registrar.on_new_master(self._set_parameters)
+        self.function("connect_port", self._connect_port, waits=True)
         self.function("connect_service", self._connect_service)
         self.function("abort_activity", self._abort_activity)
         self.function("kill", self._kill)
@@ -85,9 +91,17 @@ class ComponentNode:
         if validate is not None:
             self._validators[self.component.service(name).name] = validate
 
-    def function(self, name: str, handler: Callable[[dict[str, Any]], dict[str, Any] | None]) -> None:
-        """Let `handler(values)` serve the function `name`; it returns the outputs by name."""
+    def function(
+        self, name: str, handler: Callable[[dict[str, Any]], dict[str, Any] | None], waits: bool = False
+    ) -> None:
+        """Let `handler(values)` serve the function `name`; it returns the outputs by name.
+
+        Functions run one at a time, but for those that `waits` for others, such as the master: nobody waits for them.
+        """
         self._handlers[self.component.service(name).name] = handler
+        self._turns[name] = self._control
+        if waits:
+            self._turns[name] = nullcontext()
 
     def input_port(self, name: str, connect: Callable[[str], None]) -> None:
         """Let `connect(topic)` take the input port `name` to a topic that is known to be published."""
@@ -96,11 +110,14 @@ class ComponentNode:
     def advertise(self, port: str, message_class: Any, element: str = "") -> rospy.Publisher:
         """The latched publisher of an output port, or of one element of a multiple port.
 
-        Raises ComponentError where the master does not answer.
+        The master is told of it by and by: see `settle`.
         """
         topic = f"{self.name}/{self.component.port(port).name}" + (f"/{element}" if element else "")
-        _check_master()
         return Publisher(topic, message_class)
+
+    def settle(self) -> None:
+        """Wait until the master knows what was advertised and withdrawn, but not long, and not for a dead one."""
+        self._registrar.settle()
 
     def start(self) -> None:
         """Offer all services and actions, and publish genom_state from now on."""
@@ -121,6 +138,7 @@ class ComponentNode:
                 self._keep.append(self._action_server(service))
         for task in (self._publish_state, self._publish_diagnostics):
             threading.Thread(target=task, name=task.__name__, daemon=True).start()
+        self._registrar.settle(UP_SECONDS)
 
     def shutdown(self, by: str) -> None:
         """End all activities and wait for them (bounded); `by` is what their exceptions name."""
@@ -128,6 +146,8 @@ class ComponentNode:
         self._turn.set()
         self.activities.interrupt_named((s.name for s in self.component.activities), by, wait=STOP_WAIT)
         time.sleep(SEND_SECONDS)
+        self._registrar.settle()
+        self._registrar.end()
 
     # --- requests ---
 
@@ -160,7 +180,8 @@ class ComponentNode:
 
     def _serve_function(self, service: interface.Service, request: Any) -> Any:
         response = getattr(self._srv, f"{service.name}Response")
-        with self._control:
+        changes = self._registrar.changes
+        with self._turns[service.name]:
             try:
                 outputs = self._handlers[service.name](self._values(service, request)) or {}
             except ComponentError as problem:
@@ -171,6 +192,8 @@ class ComponentNode:
                 return response(genom_success=False, genom_exdetail=error.exdetail)
         if service.interrupts:
             self.activities.interrupt_named(service.interrupts, service.name, wait=STOP_WAIT)
+        if self._registrar.changes != changes:
+            self._registrar.settle()
         self._state_changed()
         whole = outputs.pop("response", None)  # a handler may bring a response of its own, with arrays in it
         return whole if whole is not None else response(genom_success=True, genom_exdetail="", **outputs)
@@ -240,14 +263,17 @@ class ComponentNode:
         if not remote or not rosgraph.names.is_legal_name(remote):
             raise ComponentError("::genom::no_such_outport", f"{remote!r} is no topic name")
         topic = rospy.resolve_name(remote)
-        _check_master()
-        published = dict(rosgraph.Master(self.name).getPublishedTopics(""))
+        try:
+            published = master.published_topics(master.uri(), self.name)
+        except master.MasterError as problem:
+            raise ComponentError("::genom::port_io", str(problem)) from None
         if topic not in published:
             raise ComponentError("::genom::no_such_outport", f"nobody publishes {topic}; see `rostopic list`")
         wanted = interface.ros_type(self.component.port(local).idl)
         if published[topic].split("/")[-1] not in (wanted, "*"):
             raise ComponentError("::genom::port_io", f"{topic} is a {published[topic]}, {local} takes {wanted}")
-        self._connectors[local](topic)
+        with self._connecting:
+            self._connectors[local](topic)
 
     def _connect_service(self, values: dict[str, Any]) -> None:
         raise ComponentError("::genom::no_such_remote", f"{self.component.name} has no remote services")
@@ -259,6 +285,9 @@ class ComponentNode:
         threading.Timer(SEND_SECONDS, self.finished.set).start()
 
     # --- genom_state and diagnostics ---
+
+    def _set_parameters(self) -> None:
+        rospy.set_param(f"{self.name}/actionlib_status_frequency", 0)  # status is published on change only
 
     def _state_changed(self) -> None:
         self._turn.set()
@@ -315,11 +344,3 @@ def _lengthen_backlog() -> None:
     server = tcpros_base.init_tcpros_server().tcp_ros_server
     if server is not None:
         server.server_sock.listen(BACKLOG)
-
-
-def _check_master() -> None:
-    """Raise ``::genom::port_io`` where the master does not answer: rospy would wait for it without end."""
-    try:
-        check_master(rosgraph.get_master_uri())
-    except MasterError as problem:
-        raise ComponentError("::genom::port_io", str(problem)) from None

@@ -7,11 +7,13 @@ import os
 import threading
 import xmlrpc.client
 from collections.abc import MutableMapping
+from typing import cast
 from urllib.parse import urlsplit
 
 DEFAULT_URI = "http://127.0.0.1:11311"
 PROBE_SECONDS = 3.0
 RESOLVE_SECONDS = 5.0  # the whole probe; a name server that is silent is not bound by the socket's timeout
+FAILURES = (OSError, xmlrpc.client.Error, http.client.HTTPException, ValueError, SyntaxError)  # of a call, see `reason`
 
 
 class MasterError(Exception):
@@ -59,26 +61,56 @@ def check_master(uri: str) -> None:
     asking.join(RESOLVE_SECONDS)
     problem = outcome[0] if outcome else "no answer"
     if problem:
-        raise MasterError(
-            f"no ROS master at {uri} ({problem}): start roscore first, or set ROS_MASTER_URI to where it runs"
-        )
+        raise _error(uri, problem)
+
+
+def _error(uri: str, problem: str) -> MasterError:
+    return MasterError(
+        f"no ROS master at {uri} ({problem}): start roscore first, or set ROS_MASTER_URI to where it runs"
+    )
 
 
 def _ask(uri: str) -> str:
     """What is wrong with the master at `uri`; empty where it answers."""
     try:
-        with xmlrpc.client.ServerProxy(uri, transport=_Transport()) as master:
+        with proxy(uri) as master:
             master.getPid("/rosafe_probe")
-    except TimeoutError:
-        return "no answer"
-    except OSError as error:
-        return error.strerror or str(error)
-    except (xmlrpc.client.Error, http.client.HTTPException, ValueError, SyntaxError) as error:
-        return f"not a ROS master: {type(error).__name__}"
+    except FAILURES as problem:
+        return reason(problem)
     return ""
 
 
-class _Transport(xmlrpc.client.Transport):
+def published_topics(uri: str, caller: str) -> dict[str, str]:
+    """All topics that somebody publishes, with their types; MasterError where the master does not answer."""
+    check_master(uri)
+    try:
+        with proxy(uri) as master:
+            _, _, topics = cast(tuple[int, str, list[list[str]]], master.getPublishedTopics(caller, ""))
+    except FAILURES as problem:
+        raise _error(uri, reason(problem)) from None
+    return dict(topics)
+
+
+def reason(problem: Exception) -> str:
+    """In a few words, why a call of the master came to nothing."""
+    if isinstance(problem, TimeoutError):
+        return "no answer"
+    if isinstance(problem, OSError):
+        return problem.strerror or str(problem)
+    return f"not a ROS master: {type(problem).__name__}"
+
+
+def uri() -> str:
+    """Where the master is, as the environment says."""
+    return os.environ.get("ROS_MASTER_URI") or DEFAULT_URI
+
+
+def proxy(uri: str) -> xmlrpc.client.ServerProxy:
+    """The master at `uri`, or another XML-RPC server, with calls that end within `PROBE_SECONDS`."""
+    return xmlrpc.client.ServerProxy(uri, transport=Transport())
+
+
+class Transport(xmlrpc.client.Transport):
     """HTTP that gives up."""
 
     def make_connection(self, host: object) -> http.client.HTTPConnection:

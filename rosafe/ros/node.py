@@ -16,6 +16,7 @@ from rosafe.ros import wire
 from rosafe.ros.activities import Activity
 from rosafe.ros.audio import AudioRing
 from rosafe.ros.component import ComponentNode
+from rosafe.ros.events import EventLog
 from rosafe.ros.ports import OutputPort, element, parameters_message, signal_fields
 from rosafe.ros.startup import run_server
 from rosafe.tree.processor import Processor
@@ -33,7 +34,7 @@ class RosafeNode:
         self._node = ComponentNode(ROSAFE, lambda problem: ROSAFE.error("e_badNewValue", what=str(problem)))
         self.finished = self._node.finished
         self._tree = Tree(self)
-        self._ring = AudioRing(rospy.logwarn)
+        self._ring = AudioRing(EventLog(rospy.logwarn))
         self._audio: rospy.Subscriber | None = None
         self._audio_topic = ""
         self._ports: dict[Processor, OutputPort] = {}
@@ -130,10 +131,12 @@ class RosafeNode:
         self._ends[processor] = activity
         if processor not in self._tree.processors:  # it may have ended before its activity was known
             activity.interrupt("")
+        self._node.settle()
         activity.running()
         activity.stop_requested.wait()
         self._ends.pop(processor, None)
         self._tree.end(processor)
+        self._node.settle()
         if processor.error is not None:
             raise ComponentError("::genom::unkex", what=f"{type(processor.error).__name__}: {processor.error}"[:127])
 

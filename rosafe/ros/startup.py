@@ -141,8 +141,10 @@ def _start(
     sys.setswitchinterval(SWITCH_SECONDS)
     import rospy
 
+    from rosafe.ros import registration
+
     try:
-        rospy.init_node(instance, argv=[f"{component.name}-ros", *remappings], disable_signals=True)
+        registration.init_node(instance, [f"{component.name}-ros", *remappings])
     except (rospy.ROSException, ValueError) as problem:
         raise _Failure(f"cannot start the node: {problem}") from problem
     log_to_stderr()
@@ -210,14 +212,16 @@ def _let_registration_end_at_once() -> None:
     rospy itself wakes it before it raises the flag, and the thread then looks again half a second later.
     """
     import rospy
-    from rospy.impl import registration
 
-    def wake(manager: registration.RegManager) -> None:
-        with manager.cond:
-            manager.cond.notify_all()
+    from rosafe.ros import registration
 
-    for manager in registration.get_registration_listeners().listeners:
-        rospy.core.add_shutdown_hook(lambda reason, manager=manager: wake(manager))
+    turn = registration.registrar().manager.cond
+
+    def wake(reason: str) -> None:
+        with turn:
+            turn.notify_all()
+
+    rospy.core.add_shutdown_hook(wake)
 
 
 def watchdog(seconds: float, code: int, message: str = "") -> threading.Timer:

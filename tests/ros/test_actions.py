@@ -11,7 +11,7 @@ import rospy
 from actionlib import CommState
 from actionlib_msgs.msg import GoalStatus
 
-from rosafe.interface import KINDS, MAX_ACTIVITIES, ROSAFE
+from rosafe.interface import KINDS, ROSAFE
 from tests.harness import Graph, wait_for
 from tests.ros.session import Goal, Session, noise, own_node, told
 
@@ -126,20 +126,6 @@ def test_many_goals_of_one_kind_at_once(afe: Session) -> None:
     for number, goal in enumerate(goals):
         if number != 5:
             succeeded(goal)
-
-
-def test_a_task_takes_31_goals_and_rejects_more(afe: Session) -> None:
-    build(afe, "PreProc", "GammatoneProc", "IhcProc")
-    limit = MAX_ACTIVITIES - 1
-    goals = [afe.goal("IldProc", name=f"ild{number}").active() for number in range(limit)]
-    one_more = afe.goal("IldProc", name="ild_more")
-    one_more.result()
-    assert one_more.status() == GoalStatus.REJECTED
-    assert afe.refused("IldProc", name="ild_more") == ("::genom::too_many_activities", {})
-    afe.ok("removeProcessor", name="ild0")
-    succeeded(goals[0])
-    afe.ok("IldProc", name="ild_more")
-    assert len(afe.processors()["ild"]) == limit
 
 
 def test_cancel_is_a_normal_end_and_takes_what_hangs_below(afe: Session) -> None:

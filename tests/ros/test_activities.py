@@ -69,7 +69,7 @@ def test_ids_grow_over_all_kinds_and_the_ended_leave(board: Board) -> None:
     assert board.changes >= 5
 
 
-def test_a_task_takes_31_activities(board: Board) -> None:
+def test_a_task_takes_so_many_activities_and_no_more(board: Board) -> None:
     for _ in range(MAX_ACTIVITIES - 1):
         board.start()
     assert board.activities.full(IHC) and not board.activities.full(INPUT)

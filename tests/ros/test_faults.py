@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-import json
 import os
 import random
 import signal
 import socket
 import xmlrpc.client
 from contextlib import ExitStack
-from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
 import rosgraph
 import rosservice
+from actionlib_msgs.msg import GoalStatus
 
-from rosafe.interface import KINDS
-from tests.harness import PYTHON, ROOT, Graph, MasterProcess, Process, proc, run_together, wait_for
+from rosafe.interface import KINDS, MAX_ACTIVITIES
+from tests.harness import PYTHON, Graph, Process, proc, run_together, wait_for
 from tests.ros.session import Session, noise, own_node, told
 
 BLOCK = 2000
@@ -97,33 +96,6 @@ def test_bass_is_killed_and_comes_back(graph: Graph) -> None:
             health = afe.health(lambda entries: int(entries["streams"]) > 1)
             assert health["lost"] == "0"
         assert "Traceback" not in afe.process.err
-
-
-def test_the_master_dies(private_graph: tuple[Graph, MasterProcess], tmp_path: Path) -> None:
-    """Who is connected is served; what needs the master is refused at once; the node ends cleanly."""
-    graph, master = private_graph
-    dead = tmp_path / "dead"
-    path = f"{ROOT}:{graph.env['PYTHONPATH']}"
-    with graph.node("rosAFE-ros") as node:
-        command = [PYTHON, "-m", "tests.ros.lonely_client", "/rosAFE", str(dead)]
-        with graph.start(*command, cwd=ROOT, PYTHONPATH=path) as client:
-            wait_for(lambda: "ready" in client.out or not client.alive, 30, lambda: str(client))
-            master.kill()
-            dead.touch()
-            wait_for(lambda: not client.alive or "{" in client.out, 30, lambda: f"{client} {node}")
-            seen: dict[str, Any] = json.loads(client.out.split("ready", 1)[-1] or "{}")
-            assert seen == {
-                "flows": True,
-                "GammatoneProc": "::genom::port_io",
-                "connect_port": "::genom::port_io",
-                "processors": [1, 1, 0],
-                "states": True,
-                "removed": True,
-                "left": [1, 0],
-            }, client
-            assert node.alive
-            assert node.stop(signal.SIGTERM) == 0
-            assert "Traceback" not in node.err, node.err
 
 
 def threads_and_memory(pid: int) -> tuple[int, int]:
@@ -209,20 +181,34 @@ def test_many_clients_may_connect_at_once(afe: Session) -> None:
     afe.build("PreProc")
 
 
-def test_all_slots_full_and_empty_again(afe: Session) -> None:
-    """31 processors of each kind but the input: 187 in all, then one removal takes 186 of them."""
+def test_all_slots_of_a_task_are_full_and_empty_again(afe: Session) -> None:
+    """As many processors of one kind as there are activities; all work, one more is refused, none stays."""
     microphone = afe.build("PreProc", "GammatoneProc", "IhcProc", block=BLOCK, fb_nChannels=2)
-    for number in range(30):
-        for request in ("PreProc", "GammatoneProc", "IhcProc"):
-            fields = {"fb_nChannels": 2} if request == "GammatoneProc" else {}
-            afe.ok(request, name=f"{request}{number}", **fields)
-    for number in range(31):
-        for request in ("IldProc", "RatemapProc", "CrossCorrelationProc"):
-            afe.ok(request, name=f"{request}{number}")
-    assert sum(map(len, afe.processors().values())) == 187
+    afe.wait_activities(["InputProc", "PreProc", "GammatoneProc", "IhcProc"])
+    threads, memory = threads_and_memory(afe.process.pid)
+    limit = MAX_ACTIVITIES - 1
+    share = (limit + 7) // 8
+
+    def fill(client: int) -> None:
+        for number in range(client * share, min(limit, (client + 1) * share)):
+            afe.ok("IldProc", name=f"ild{number}")
+
+    run_together(8, fill)
+    assert len(afe.processors()["ild"]) == limit >= 200
+    assert afe.refused("IldProc", name="more") == ("::genom::too_many_activities", {})
+    goal = afe.goal("IldProc", name="more")
+    goal.result()
+    assert goal.status() == GoalStatus.REJECTED
+    afe.ok("RatemapProc")  # another task has slots
     microphone.play(noise(BLOCK))
-    afe.read("crossCorrelation", BLOCK + 1, name="CrossCorrelationProc30", timeout=30)
-    assert len(afe.ok("getSignals").signals.crossCorrelation) == 31
+    for name in ("ild0", f"ild{limit - 1}"):
+        assert afe.read("ild", BLOCK + 1, name=name, timeout=30).framesOnPort == 100
+    wait_for(lambda: {len(s.left.dataN) for s in afe.ok("getSignals").signals.ild} == {2})
+    assert threads_and_memory(afe.process.pid)[0] <= threads + 2 * (limit + 1) + 16, "two for each processor"
+    afe.ok("removeProcessor", name="ild7")
+    afe.ok("IldProc", name="more")
     afe.ok("Stop")
     assert afe.processors() == {}
     assert not [t for t in afe.graph.topics() if t.startswith("/rosAFE/ildPort/")]
+    wait_for(lambda: threads_and_memory(afe.process.pid)[0] <= threads, what="threads end")
+    assert threads_and_memory(afe.process.pid)[1] < memory + 2**26

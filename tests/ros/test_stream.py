@@ -47,6 +47,22 @@ def test_a_gap_is_zeros_in_place_counted_and_located(fresh: Session) -> None:
     assert fresh.process.err.count("lost 1600 frames from frame 3001 on") == 1
 
 
+def test_a_storm_of_gaps_is_a_few_lines_and_every_frame_is_counted(fresh: Session) -> None:
+    microphone = fresh.listen(chunk=1, chunks=1)
+    fresh.ok("InputProc", nFramesPerBlock=BLOCK)
+    signal = noise(2 * BLOCK)
+    for frame in range(0, 2 * BLOCK, 2):
+        microphone.lose(signal[:, frame : frame + 2])  # the window holds the second of both
+        microphone.publish()
+    heard = signal.copy()
+    heard[:, ::2] = 0
+    assert_holds(fresh.read("input", 2 * BLOCK + 1), "input", windowed(normal(heard), 1.0, RATE))
+    health = fresh.health(lambda entries: entries["gaps"] == str(BLOCK))
+    assert health["lost"] == str(BLOCK)
+    lines = [line for line in fresh.process.err.splitlines() if "Audio: lost 1 frames" in line]
+    assert 1 <= len(lines) < BLOCK / 20
+
+
 def test_nothing_is_lost_where_nothing_is_lost(fresh: Session) -> None:
     microphone = fresh.listen(chunk=441, chunks=1)
     fresh.ok("InputProc", nFramesPerBlock=882)

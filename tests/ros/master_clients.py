@@ -1,0 +1,113 @@
+"""Client processes of a node whose master is lost and comes back; they print what they see. Run by test_master.py."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import rospy
+
+from rosafe.ros import generate
+from tests.harness import wait_for
+
+generate.ensure_messages()
+
+import rosAFE.msg  # noqa: E402
+import rosAFE.srv  # noqa: E402
+
+import bass.srv  # noqa: E402
+from tests.ros.session import Microphone, noise  # noqa: E402
+
+BLOCK = 2000
+REQUESTS = ("connect_port", "InputProc", "PreProc", "GammatoneProc", "getParameters", "removeProcessor", "Stop")
+
+
+class LonelyGraph:
+    """What Microphone needs of a graph."""
+
+    def client(self) -> None:
+        """This process is a node already."""
+
+
+def calls(node: str) -> dict[str, Any]:
+    """Proxies with connections of their own, which need no master any more once they have been used."""
+    proxies = {}
+    for name in REQUESTS:
+        proxies[name] = rospy.ServiceProxy(f"{node}/{name}", getattr(rosAFE.srv, name), persistent=True)
+        proxies[name].wait_for_service(10)
+    return proxies
+
+
+def names(call: dict[str, Any]) -> list[str]:
+    """The names of all processors of the kinds that are used here."""
+    parameters = call["getParameters"]().parameters
+    return [p.name for p in (*parameters.input, *parameters.preProc, *parameters.gammatone)]
+
+
+def stay(node: str, master_is_lost: Path) -> None:
+    """Build a tree, wait until the file says that the master is lost, and go on with what is connected."""
+    microphone = Microphone(LonelyGraph())  # type: ignore[arg-type]
+    acquire = rospy.ServiceProxy("/bass/Acquire", bass.srv.Acquire)
+    assert acquire(device="scene:", sampleRate=microphone.sample_rate, nFramesPerChunk=1000).genom_success
+    call = calls(node)
+    assert call["connect_port"](local="Audio", remote=microphone.topic).genom_success
+    assert call["InputProc"](nFramesPerBlock=BLOCK).genom_success
+    assert call["PreProc"]().genom_success
+    assert call["GammatoneProc"](fb_nChannels=2, name="first").genom_success
+    assert call["removeProcessor"](name="first").genom_success
+    assert names(call) == ["input", "preProc"]
+    assert call["Stop"]().genom_success  # every connection has been used
+    assert call["InputProc"](nFramesPerBlock=BLOCK).genom_success
+    assert call["PreProc"]().genom_success
+    assert call["PreProc"](name="other").genom_success
+    messages: list[Any] = []
+    states: list[Any] = []
+    rospy.Subscriber(
+        f"{node}/preProcPort/preProc", rosAFE.msg.rosAFE_TimeDomainSignalPortStruct, messages.append, buff_size=2**22
+    )
+    rospy.Subscriber(f"{node}/genom_state", rosAFE.msg.genom_state_component, states.append)
+    microphone.play(noise(BLOCK))
+    wait_for(lambda: messages and messages[-1].lastFrameIndex == BLOCK + 1 and states)
+    print("ready", flush=True)
+
+    wait_for(master_is_lost.exists, 30)
+    microphone.play(noise(BLOCK))
+    wait_for(lambda: messages[-1].lastFrameIndex == 2 * BLOCK + 1)
+    seen: dict[str, Any] = {"GammatoneProc": call["GammatoneProc"](fb_nChannels=2, name="late").genom_success}
+    refused = call["connect_port"](local="Audio", remote="bass/Audio")
+    seen["connect_port"] = json.loads(refused.genom_exdetail)["ex"]
+    seen["processors"] = names(call)
+    told = len(states)
+    wait_for(lambda: len(states) >= told + 2, what="genom_state")
+    seen["removed"] = call["removeProcessor"](name="other").genom_success
+    seen["left"] = names(call)
+    microphone.play(noise(BLOCK))
+    wait_for(lambda: messages[-1].lastFrameIndex == 3 * BLOCK + 1)
+    print(json.dumps(seen), flush=True)
+
+
+def come(node: str) -> None:
+    """Use everything anew, through the master that is back."""
+    call = calls(node)
+    seen: dict[str, Any] = {"processors": names(call)}
+    assert call["connect_port"](local="Audio", remote="bass/Audio").genom_success
+    messages: list[Any] = []
+    rospy.Subscriber(
+        f"{node}/gammatonePort/late", rosAFE.msg.rosAFE_TimeFrequencySignalPortStruct, messages.append, buff_size=2**22
+    )
+    wait_for(lambda: len(messages) > 3 and messages[-1].lastFrameIndex > 4 * BLOCK, 20, "audio from bass")
+    seen["topics"] = sorted(name for name, _ in rospy.get_published_topics(node) if "Port/" in name)
+    seen["removed"] = call["removeProcessor"](name="preProc").genom_success
+    seen["left"] = sorted(name for name, _ in rospy.get_published_topics(node) if "Port/" in name)
+    seen["parameter"] = rospy.get_param(f"{node}/actionlib_status_frequency")
+    print(json.dumps(seen), flush=True)
+
+
+if __name__ == "__main__":
+    rospy.init_node(f"client_{sys.argv[1]}", disable_signals=True)
+    if sys.argv[1] == "stay":
+        stay(sys.argv[2], Path(sys.argv[3]))
+    else:
+        come(sys.argv[2])

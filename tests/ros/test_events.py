@@ -1,0 +1,48 @@
+"""The log of events: the first at once, a storm as one line with a count, nothing uncounted."""
+
+from __future__ import annotations
+
+import re
+
+from rosafe.ros.events import EventLog
+from tests.harness import run_together, wait_for
+
+
+def told(lines: list[str]) -> int:
+    """The number of events that the lines tell of."""
+    counts = [re.search(r"\((\d+) like it in", line) for line in lines]
+    return sum(int(count[1]) if count else 1 for count in counts)
+
+
+def test_kinds_do_not_hide_each_other() -> None:
+    lines: list[str] = []
+    log = EventLog(lines.append, period=60.0)
+    for number in range(3):
+        log(f"lost {number} frames ({number / 7:.3f} s)")
+        log(f"a new stream at {number} Hz")
+    assert lines == ["lost 0 frames (0.000 s)", "a new stream at 0 Hz"]
+
+
+def test_a_storm_is_one_line_a_period_with_the_last_of_it() -> None:
+    lines: list[str] = []
+    log = EventLog(lines.append, period=0.2)
+    for number in range(1000):
+        log(f"lost frame {number}")
+    wait_for(lambda: told(lines) == 1000)
+    assert lines[0] == "lost frame 0" and lines[-1].startswith("lost frame 999 (")
+    assert len(lines) < 100
+    wait_for(lambda: not log._held)
+    log("lost frame 1000")
+    assert lines[-1] == "lost frame 1000", "at once again"
+
+
+def test_events_from_many_threads_are_all_counted() -> None:
+    lines: list[str] = []
+    log = EventLog(lines.append, period=0.05)
+    run_together(8, lambda thread: storm(log))
+    wait_for(lambda: told(lines) == 4000, what=lambda: str(told(lines)))
+
+
+def storm(log: EventLog) -> None:
+    for number in range(500):
+        log(f"event {number}")
