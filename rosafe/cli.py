@@ -24,6 +24,9 @@ def main(argv: list[str] | None = None) -> int:
     try:
         try:
             options, rest = _parser().parse_known_args(argv)
+            if hasattr(options, "interspersed"):
+                options.interspersed = [word for word in rest if not word.startswith("-")]
+                rest = [word for word in rest if word.startswith("-")]
             if rest:
                 options.usage_error(f"unrecognized arguments: {' '.join(rest)}")
             name = f"rosafe {options.command}"

@@ -6,17 +6,19 @@ makes them; docs/request.md has the rules.
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from rosafe.arguments import check_parameter
-from rosafe.dsp import STAGES
 from rosafe.interface import BASS, KINDS, REQUEST, ROSAFE, ComponentError, Parameter, ProcessorKind
 
 HIGHEST_RATE = BASS.service("Acquire").parameter("sampleRate").maximum  # Hz; what is wrong there is wrong at any
-_OF_THE_INPUT = ("connect", *(p.name for p in ROSAFE.service("InputProc").parameters[1:]))  # without its name
+ALMOST_ZERO = math.ulp(0.0)
+# What only the making of an input needs: the topic, and InputProc's parameters without its name.
+OF_THE_INPUT = ("connect", *(p.name for p in ROSAFE.service("InputProc").parameters[1:]))
 
 
 class Found(NamedTuple):
@@ -63,6 +65,7 @@ class Level:
         it names would tell otherwise of how its channels were chosen.
         """
         told = {name: found.values[name] for name in self.in_force}
+        told.update({name: 0.0 for name, value in told.items() if value == ALMOST_ZERO})  # will be in a moment
         return told in (self.in_force, {**self.in_force, **self.given})
 
 
@@ -100,6 +103,11 @@ def kind_of(representation: str) -> ProcessorKind:
     raise ValueError(f"representation: {representation[:80]!r} is not {known}")
 
 
+def chain(kind: ProcessorKind) -> list[ProcessorKind]:
+    """The kinds of processors from the input down to `kind`."""
+    return [*(chain(KINDS[kind.parent]) if kind.parent else ()), kind]
+
+
 def understand(kind: ProcessorKind, given: Mapping[str, Any]) -> Wish:
     """The checked request for a processor of `kind`.
 
@@ -115,16 +123,15 @@ def understand(kind: ProcessorKind, given: Mapping[str, Any]) -> Wish:
     ComponentError
         ``::rosAFE::e_badNewValue``, as the component itself would, for what no sample rate makes possible.
     """
-    chain = [kind]
-    while chain[0].parent:
-        chain.insert(0, KINDS[chain[0].parent])
+    if given.get("fb_cfHz") and given.get("fb_nERBs") == 0:  # so getParameters tells of a filterbank with a list
+        given = {name: value for name, value in given.items() if name != "fb_nERBs"}
     try:
-        for name in _OF_THE_INPUT:
+        for name in OF_THE_INPUT:
             if name in given:
                 REQUEST.parameter(name).check(given[name])
         # What belongs to none of them has no effect, and is checked all the same.
-        checked = dict(check_parameter(name, value) for name, value in given.items() if name not in _OF_THE_INPUT)
-        levels = tuple(_level(kind, checked) for kind in chain)
+        checked = dict(check_parameter(name, value) for name, value in given.items() if name not in OF_THE_INPUT)
+        levels = tuple(_level(above, checked) for above in chain(kind))
     except ValueError as problem:
         raise ROSAFE.error("e_badNewValue", what=str(problem)) from None
     input_values = {p.name: given.get(p.name, p.default) for p in ROSAFE.service("InputProc").parameters[1:]}
@@ -132,6 +139,8 @@ def understand(kind: ProcessorKind, given: Mapping[str, Any]) -> Wish:
 
 
 def _level(kind: ProcessorKind, checked: Mapping[str, Any]) -> Level:
+    from rosafe.dsp import STAGES  # numpy and scipy, which genomixd and the command line can do without until now
+
     given = {p.name: checked[p.name] for p in kind.parameters if p.name in checked}
     values = {p.name: p.check(p.default) for p in kind.parameters} | given
     assert HIGHEST_RATE is not None
@@ -201,11 +210,13 @@ def free_name(kind: ProcessorKind, names: Collection[str]) -> str:
 def _making(wish: Wish, level: Level, name: str, parent: str) -> list[Step]:
     """The requests for one processor. What its own request cannot carry is set before anything hangs on it."""
     if level.kind.parent:
-        step = Step(level.kind.request, {"name": name, "upperDepName": parent, **level.values}, name)
         unsaid = [p for p in level.kind.parameters if _reads_as_default(p, level.values[p.name])]
+        # Until then, nobody who looks may take it for one with the defaults.
+        sent = {**level.values, **{p.name: ALMOST_ZERO for p in unsaid}}
+        step = Step(level.kind.request, {"name": name, "upperDepName": parent, **sent}, name)
     else:
-        step = Step(level.kind.request, {"name": name, **wish.input_values}, name)
         unsaid = [p for p in level.kind.parameters if level.values[p.name] != p.default]
+        step = Step(level.kind.request, {"name": name, **wish.input_values}, name)
     return [
         step,
         *(
@@ -231,7 +242,7 @@ def answer(wish: Wish, dependencies: Sequence[str], created: Collection[str], in
     """The outputs of `interface.REQUEST`, once the processors `dependencies` are there."""
     own = {p.name for level in wish.levels for p in level.kind.parameters}
     if dependencies[0] in created:
-        own.update(_OF_THE_INPUT)
+        own.update(OF_THE_INPUT)
     return {
         "name": dependencies[-1],
         "dependencies": list(dependencies),

@@ -6,6 +6,9 @@ is the head of its own help, and two functions::
     def configure(parser: argparse.ArgumentParser) -> None:   # adds arguments; may set `parser.epilog`
     def run(options: argparse.Namespace) -> int:              # does it; returns the exit code
 
+`configure` may call `parser.set_defaults(interspersed=[])`: `run` finds there the words that stand behind an option,
+for which argparse has no place.
+
 `rosafe -h` imports them all, so numpy and rospy are imported in `run`. `run` may raise `Failure`, and
 call `options.usage_error(text)`, which exits with 2. Modules whose names
 begin with _ are parts of commands.

@@ -57,13 +57,15 @@ class Completer:
         """What the command itself says it takes: components, ensembles and objects."""
         if not words:
             return None
-        kind, parameters, switches = self._about(words[0])
+        kind, parameters, switches, values = self._about(words[0])
         if kind:
             if word.startswith("-"):
                 return _starting(word, switches)
             given = [w for w in words[1:] if not w.startswith("-")]
+            if values and not given:
+                return _starting(word, values)
             # Members stand in braces, which a first word does not need to be typed with.
-            return _starting("{" + word, [f"{{{name}" for name in parameters]) if not given else None
+            return _starting("{" + word, [f"{{{name}" for name in parameters]) if len(given) == bool(values) else None
         if len(words) > 1:
             return None
         if self._tcl.elements("namespace", "ensemble", "exists", words[0]) == ["1"]:
@@ -75,24 +77,22 @@ class Completer:
             return _starting(word, self._tcl.elements("info", "object", "methods", words[0], "-all"))
         return None
 
-    def _about(self, command: str) -> tuple[str, list[str], list[str]]:
-        """Kind, parameters and switches of a component's command; empty for any other command."""
+    def _about(self, command: str) -> tuple[str, list[str], list[str], list[str]]:
+        """Kind, parameters, switches and values for the first word of a component's command; empty for any other."""
         about = self._tcl.elements("::genomix::about", command)
-        if len(about) != 3:
-            return "", [], []
-        return (
-            about[0],
-            self._tcl.split(about[1]),
-            self._tcl.split(about[2]),
-        )
+        if len(about) != 4:
+            return "", [], [], []
+        kind, *lists = about
+        parameters, switches, values = map(self._tcl.split, lists)
+        return kind, parameters, switches, values
 
     def _dict_members(self, words: list[Word], inside: Context, word: str) -> list[str] | None:
         """Names of parameters inside the braces of a component's command; None where this is something else."""
         if not words:
             return None
-        kind, parameters, _ = self._about(self._value(words[0]))
+        kind, parameters, _, values = self._about(self._value(words[0]))
         given = [element.bare for element in inside.elements]
-        if not kind or any(not w.text.startswith("-") for w in words[1:]):
+        if not kind or sum(not w.text.startswith("-") for w in words[1:]) > bool(values):
             return None
         return [] if len(given) % 2 else _starting(word, (name for name in parameters if name not in given[::2]))
 

@@ -15,6 +15,7 @@ _WORDS = {
     **dict.fromkeys(("0", "false", "no", "off", "f"), False),
 }
 _WHOLE = re.compile(r"[+-]?[0-9]{1,30}")
+MANY = 20  # parameters in one line
 _STRUCTURES = {name for kind in KINDS.values() for name in (kind.kind, kind.representation)}
 _NO_PARAMETERS = {"name", "cc_lags"}  # members of those structures all the same
 
@@ -100,15 +101,17 @@ def _converted(service: Service, pairs: list[tuple[str, Any]]) -> dict[str, Any]
 
 
 def _require(service: Service, values: Mapping[str, Any]) -> None:
-    missing = [p.name for p in service.parameters if p.default is REQUIRED and p.name not in values]
-    if missing:
-        raise refused(f"{service.name}: {missing[0]} is missing; {expected(service)}")
+    missing = next((p for p in service.parameters if p.default is REQUIRED and p.name not in values), None)
+    if missing is not None:
+        raise refused(f"{service.name}: {missing.name} is missing; {missing.range_text or expected(service)}")
 
 
 def expected(service: Service) -> str:
-    """One line with the names and types of the parameters."""
+    """One line with the names of the parameters, and with their types unless they are many."""
     if not service.parameters:
         return f"{service.name} takes no parameters"
+    if len(service.parameters) > MANY:
+        return f"{service.name} takes " + ", ".join(p.name for p in service.parameters)
     return f"{service.name} takes " + ", ".join(f"{p.name} ({p.idl})" for p in service.parameters)
 
 

@@ -1,9 +1,12 @@
 # The arguments of a service as JSON. The server checks names and types; here is only what Tcl's syntax leaves open.
 
-# The JSON object for the words of a call: nothing, one dict of parameters, or values by position.
+# The JSON object for the words of a call: nothing, one dict of parameters, or values by position; for a composite, the
+# first value and a dict of all others.
 proc ::genomix::Input {service about words} {
     set parameters [dict get $about parameters]
-    if {[llength $words] == 1 && [::genomix::IsDict $service $parameters [lindex $words 0]]} {
+    if {[dict get $about composite] && [llength $words] > 1} {
+        set pairs [::genomix::FirstAndDict $service $parameters $words]
+    } elseif {[llength $words] == 1 && [::genomix::IsDict $service $parameters [lindex $words 0]]} {
         set pairs [lindex $words 0]
     } else {
         if {[llength $words] > [dict size $parameters]} {
@@ -20,6 +23,16 @@ proc ::genomix::Input {service about words} {
         lappend members [::genomix::JsonString $name]:[::genomix::JsonValue $parameters $name $value]
     }
     return "{[join $members ,]}"
+}
+
+# The pairs of names and values of the words `first {name value ...}`.
+proc ::genomix::FirstAndDict {service parameters words} {
+    lassign $words first others
+    set name [lindex $parameters 0]
+    if {[llength $words] > 2 || [catch {dict size $others}]} {
+        ::genomix::Refuse "$service: after $name comes a dict of parameters, and not \"[lrange $words 1 end]\""
+    }
+    return [list $name $first {*}$others]
 }
 
 # Whether the only word of a call is a dict of parameters, and not the value of the first one: its keys are names of

@@ -36,7 +36,7 @@ proc ::genomix::Service {client name service args} {
     }
     set parameters [dict get $about parameters]
     if {[::genomix::Asks $args $words $parameters]} {
-        set words [list [::genomix::Ask $parameters]]
+        set words [list [::genomix::Ask $about]]
     }
     set query [dict create input [::genomix::Input $service $about $words]]
     tailcall ::genomix::Perform $client [list $name $service] $query $switches $background $callback

@@ -5,6 +5,7 @@
 #   $g load rosAFE
 #   rosAFE::GammatoneProc {name left fb_nChannels 32}
 #   puts [rosAFE::getParameters]
+#   puts [rosAFE::request ild {fb_nChannels 16}]      ;# all that the representation needs; docs/request.md
 #   set request [rosAFE::getSignals &]; $request wait; puts [$request result]
 #   rosAFE::GammatoneProc -h                  ;# tells parameters, types, defaults and ranges
 #

@@ -2,7 +2,8 @@
 
 # genomix::about command
 #
-# {service parameters switches} or {port {} switches} for a command of a component, empty for any other.
+# {service parameters switches values} or {port {} switches {}} for a command of a component, empty for any other; of a
+# composite, values are what its first word can be, after which comes the dict of parameters.
 proc ::genomix::about {command} {
     set name [namespace eval :: [list namespace which -command $command]]
     if {$name eq "" || [catch {interp alias {} $name} alias]} {
@@ -13,10 +14,15 @@ proc ::genomix::about {command} {
     switch -- $kind {
         ::genomix::Service {
             set about [dict get [$client description $component] services $entry]
-            return [list service [dict keys [dict get $about parameters]] $switches]
+            set parameters [dict get $about parameters]
+            set values {}
+            if {[dict get $about composite]} {
+                set values [dict values [dict get $parameters [lindex $parameters 0] choices]]
+            }
+            return [list service [dict keys $parameters] $switches $values]
         }
         ::genomix::Port {
-            return [list port {} $switches]
+            return [list port {} $switches {}]
         }
     }
     return
@@ -31,10 +37,14 @@ proc ::genomix::Asks {arguments words parameters} {
     }]
 }
 
-# A dict of what the user types for each parameter; nothing typed means the default.
-proc ::genomix::Ask {parameters} {
+# A dict of what the user types for each parameter, of a composite only for those without a default; nothing typed means
+# the default.
+proc ::genomix::Ask {service} {
     set given {}
-    dict for {name about} $parameters {
+    dict for {name about} [dict get $service parameters] {
+        if {[dict get $service composite] && ![dict get $about required]} {
+            continue
+        }
         set doc [dict get $about doc]
         set prompt "[dict get $about type] $name[expr {$doc ne "" ? ": $doc" : ""}]"
         if {![dict get $about required]} {

@@ -1,0 +1,146 @@
+"""Build what a representation needs in a running rosAFE, or find it there.
+
+A representation is time, filterbank, innerhaircell, ild, ratemap, crosscorrelation or input; NAME=VALUE are parameters
+of it or of anything above it, and what is not given has its default. Processors of the tree whose parameters are the
+same are used; the others are made, as ild_0, ild_1, ... If something fails, what was made is removed again.
+
+Prints a line for each processor, from the input to the wanted one: created or reused, its name, its topic."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import os
+import sys
+from collections.abc import Mapping
+from typing import Any
+
+from rosafe import request
+from rosafe.arguments import check_parameter
+from rosafe.commands import Failure
+from rosafe.interface import REQUEST, ROSAFE, ComponentError, ProcessorKind
+
+_SETTINGS = [p for p in REQUEST.parameters if p.name not in ("representation", "connect")]  # those have other places
+_HOW_TO_START_SOUND = "rosservice call /bass/Acquire \"{device: 'scene:'}\""
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments."""
+    parser.usage = (
+        "rosafe request REPRESENTATION [NAME=VALUE ...] [--connect TOPIC] [-i INSTANCE] [--json]\n"
+        "       rosafe request -h"
+    )
+    parser.add_argument("representation", metavar="REPRESENTATION", help="what is wanted")
+    parser.add_argument(
+        "settings", nargs="*", default=[], metavar="NAME=VALUE", help="a parameter; docs/parameters.md has all"
+    )
+    parser.add_argument(
+        "--connect",
+        metavar="TOPIC",
+        help="the sound of a new input (default: bass/Audio, unless the Audio port is connected already)",
+    )
+    parser.add_argument(
+        "-i",
+        "--instance",
+        default=ROSAFE.name,
+        metavar="INSTANCE",
+        help=f"name of the node (default: {ROSAFE.name})",
+    )
+    parser.add_argument("--json", action="store_true", help="print the answer as genomixd gives it, as JSON")
+    parser.set_defaults(interspersed=[])
+    parser.epilog = (
+        "exit status: 0 it runs, 1 it does not, 2 wrong command line\n\n"
+        "examples:\n"
+        "  rosafe request ild\n"
+        "  rosafe request ratemap fb_nChannels=64 rm_wSizeSec=0.03 nFramesPerBlock=4410\n"
+        "  rosafe request filterbank fb_cfHz=500,1000,2000 --json"
+    )
+
+
+def run(options: argparse.Namespace) -> int:
+    """Make the request and print what has come of it."""
+    try:
+        kind = request.kind_of(options.representation)
+        values = {
+            "representation": kind.representation,
+            **dict(map(_parameter, [*options.settings, *options.interspersed])),
+        }
+    except ValueError as problem:
+        raise Failure(str(problem)) from None
+    if options.connect is not None:
+        values["connect"] = options.connect
+    from rosafe.ros import generate, master
+
+    master.set_local_defaults()
+    try:
+        generate.ensure_messages()
+        master.check_master(os.environ["ROS_MASTER_URI"])
+    except (generate.GenerationError, master.MasterError) as problem:
+        raise Failure(str(problem)) from None
+    answer = asyncio.run(_make(options.instance, values))
+    if options.json:
+        print(json.dumps(answer, indent=2))
+    else:
+        _show(answer, kind, options.instance)
+    return 0
+
+
+def _parameter(setting: str) -> tuple[str, Any]:
+    name, equals, text = setting.partition("=")
+    if not equals:
+        raise ValueError(f"{setting}: wanted is NAME=VALUE")
+    parameter = next((p for p in _SETTINGS if name in (p.name, *p.aliases)), None)
+    if parameter is None:
+        raise ValueError(f"unknown parameter {name!r}; there are: {', '.join(p.name for p in _SETTINGS)}")
+    if name in request.OF_THE_INPUT:
+        return name, parameter.parse(text)
+    return check_parameter(name, text, text=True)
+
+
+async def _make(instance: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
+    """What the component's genomixd would answer; Failure, with what to do next, where it is refused."""
+    from rosafe.genomix.graph import Graph
+    from rosafe.genomix.proxy import Proxy, names
+
+    graph = Graph(os.environ["ROS_MASTER_URI"])
+    try:
+        try:
+            proxy = await Proxy.load(graph, names(ROSAFE.name, instance)[1])
+            await proxy.check(ROSAFE.name)
+        except ComponentError as problem:
+            named = "" if instance == ROSAFE.name else f" -i {instance}"
+            hint = f"; start it with: rosAFE-ros{named}" if problem.ex == "::genom::mwerr" else ""
+            raise Failure(_told(problem) + hint) from None
+        try:
+            return await proxy.outputs(REQUEST.name, values)
+        except ComponentError as problem:
+            hint = ""
+            if problem.ex == "::rosAFE::e_noData":
+                bass = "" if await proxy.published("/bass/Audio") else "bass-ros -b; "
+                hint = f"; start the sound first: {bass}{_HOW_TO_START_SOUND}"
+            raise Failure(_told(problem) + hint) from None
+        finally:
+            await proxy.close()
+    finally:
+        await graph.close()
+
+
+def _told(problem: ComponentError) -> str:
+    """The exception in one line: its name, and what it is about."""
+    what = problem.detail.get("what") or ROSAFE.exceptions.get(problem.ex.rpartition("::")[2], "")
+    return problem.ex + (f": {what}" if what else "")
+
+
+def _show(answer: Mapping[str, Any], kind: ProcessorKind, instance: str) -> None:
+    """A line for each processor, and on stderr one for each parameter that was given in vain."""
+    width = max(map(len, answer["dependencies"]))
+    for name, kind_there in zip(answer["dependencies"], request.chain(kind), strict=True):
+        how = "created" if name in answer["created"] else "reused"
+        print(f"{how:7}  {name:{width}}  {request.topic(instance, kind_there, name)}")
+    for name in answer["unused"]:
+        print(f"rosafe request: {name} has no effect{_why_unused(name)}", file=sys.stderr)
+
+
+def _why_unused(name: str) -> str:
+    return ": the input is there already" if name in request.OF_THE_INPUT else " on this representation"

@@ -1,0 +1,137 @@
+"""A rosAFE in this process, as `rosafe.genomix.trees` sees one: services that answer as the node's, without sound."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any
+
+from rosafe.dsp import STAGES, Stage
+from rosafe.interface import KINDS, ROSAFE, ComponentError
+
+RATE = 44100.0
+KIND_OF_SERVICE = {kind.request: kind for kind in KINDS.values()}
+
+
+@dataclass
+class Processor:
+    """One processor of the model."""
+
+    kind: str
+    parent: str
+    stage: Stage
+
+
+class Model:
+    """The processors by name, and what was asked for. `fail` makes the call of that number fail."""
+
+    def __init__(self, audio: bool = True) -> None:
+        self.instance = "rosAFE"
+        self.processors: dict[str, Processor] = {}
+        self.calls: list[str] = []
+        self.connected = ""
+        self.audio = audio
+        self.fail: dict[int, ComponentError] = {}
+        self.cancel: dict[int, asyncio.Task[Any]] = {}  # to cancel during the call of that number
+
+    # --- as a component ---
+
+    async def outputs(self, service: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
+        number = len(self.calls)
+        self.calls.append(service)
+        if number in self.cancel:
+            self.cancel[number].cancel()
+        await asyncio.sleep(0)  # others have their turn
+        if number in self.fail:
+            raise self.fail[number]
+        result: Mapping[str, Any] = getattr(self, f"_{service}", self._make)(service, values)
+        await asyncio.sleep(0)
+        return result
+
+    async def hears(self, port: str) -> bool:
+        assert port == "Audio"
+        return bool(self.connected)
+
+    async def published(self, topic: str) -> bool:
+        return topic in ("/bass/Audio", "/left/Audio")
+
+    # --- its services ---
+
+    def _connect_port(self, _: str, values: Mapping[str, Any]) -> dict[str, Any]:
+        self.connected = values["remote"]
+        return {}
+
+    def _make(self, service: str, values: Mapping[str, Any]) -> dict[str, Any]:
+        # As the node reads a ROS request: 0, "" and [] are the default.
+        values = ROSAFE.service(service).from_ros(SimpleNamespace(**values))
+        kind, name, parent = KIND_OF_SERVICE[service], values.pop("name"), values.pop("upperDepName", "")
+        if not parent:
+            if not (self.audio and self.connected):
+                raise ROSAFE.error("e_noData")
+            self._replace_input(name)
+            values = {}
+        elif getattr(self.processors.get(parent), "kind", "") != kind.parent:
+            raise ROSAFE.error("e_noUpperDependencie")
+        if name in self.processors:
+            raise ROSAFE.error("e_existsAlready")
+        try:
+            checked = {p.name: p.check(values[p.name]) for p in kind.parameters if p.name in values}
+            self.processors[name] = Processor(kind.kind, parent, STAGES[kind.kind](RATE, **checked))
+        except ValueError as problem:
+            raise ROSAFE.error("e_badNewValue", what=str(problem)) from None
+        return {}
+
+    def _replace_input(self, name: str) -> None:
+        """What hangs on the input that there is, if there is one, will hang on the new one."""
+        for old in [other for other, processor in self.processors.items() if not processor.parent]:
+            del self.processors[old]
+            for processor in self.processors.values():
+                processor.parent = name if processor.parent == old else processor.parent
+
+    def _getParameters(self, _: str, values: Mapping[str, Any]) -> dict[str, Any]:
+        arrays: dict[str, list[Any]] = {kind: [] for kind in KINDS}
+        for name, processor in self.processors.items():
+            arrays[processor.kind].append({"name": name, **processor.stage.parameters})
+        return {"parameters": arrays}
+
+    def _getDependencies(self, _: str, values: Mapping[str, Any]) -> dict[str, Any]:
+        return {"dependencies": list(self.line(values["nameProc"]))[::-1]}
+
+    def _modifyParameter(self, _: str, values: Mapping[str, Any]) -> dict[str, Any]:
+        processor = self._find(values["nameProc"])
+        parameter = KINDS[processor.kind].parameter(values["nameParam"])
+        try:
+            processor.stage.configure(**{parameter.name: parameter.parse(values["newValue"])})
+        except ValueError as problem:
+            raise ROSAFE.error("e_badNewValue", what=str(problem)) from None
+        return {}
+
+    def _removeProcessor(self, _: str, values: Mapping[str, Any]) -> dict[str, Any]:
+        assert self._find(values["name"]).parent
+        gone = [name for name in self.processors if values["name"] in self.line(name)]
+        for name in gone:
+            del self.processors[name]
+        return {}
+
+    def _Stop(self, _: str, values: Mapping[str, Any]) -> dict[str, Any]:
+        self.processors.clear()
+        return {}
+
+    # --- looking at it ---
+
+    def _find(self, name: str) -> Processor:
+        if name not in self.processors:
+            raise ROSAFE.error("e_noSuchProcessor")
+        return self.processors[name]
+
+    def line(self, name: str) -> Iterator[str]:
+        """The names from a processor up to the input."""
+        while name:
+            yield name
+            name = self._find(name).parent
+
+    def state(self) -> dict[str, tuple[str, str, dict[str, Any]]]:
+        """All there is, to be compared."""
+        return {name: (p.kind, p.parent, p.stage.parameters) for name, p in self.processors.items()}

@@ -1,0 +1,378 @@
+"""What a request for a tree makes, reuses and removes, on a tree in this process that others change too."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Mapping
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rosafe import interface, request
+from rosafe.dsp import STAGES
+from rosafe.genomix import trees
+from rosafe.genomix.values import partial
+from rosafe.interface import KINDS, ROSAFE, ComponentError
+from tests.request.model import RATE, Model
+
+REPRESENTATIONS = [kind.representation for kind in KINDS.values()]
+# Few values of each, so that requests coincide often; among them the default, and values that the node reads as such.
+VALUES: dict[str, list[Any]] = {
+    "pp_bRemoveDC": [False, True],
+    "pp_coefPreEmphasis": [0.97, 0.0],
+    "fb_nChannels": [0, 4],
+    "fb_nERBs": [1.0, 2.0],
+    "fb_cfHz": [[], [0], [500.0, 1000.0]],
+    "fb_highFreqHz": [8000.0, 4000.0],
+    "ihc_method": ["dau", "none"],
+    "ild_hSizeSec": [0.01, 0.005],
+    "rm_scaling": ["power", "magnitude"],
+    "cc_wname": ["hann", "hamming"],
+}
+_ALWAYS: dict[str, st.SearchStrategy[Any]] = {}
+PARAMETERS = st.fixed_dictionaries(_ALWAYS, optional={name: st.sampled_from(values) for name, values in VALUES.items()})
+REQUESTS = st.tuples(st.sampled_from(REPRESENTATIONS), PARAMETERS)
+CHANGES = st.tuples(st.integers(0, 10**6), st.sampled_from(["remove", "stop", *VALUES]))
+
+
+def build(model: Model, representation: str, **parameters: Any) -> dict[str, Any]:
+    """The answer to one request."""
+    return asyncio.run(trees.build(model, {"representation": representation, **parameters}))
+
+
+def in_force(kind: str, parameters: Mapping[str, Any]) -> dict[str, Any]:
+    """What a processor made with these parameters of the chain reports."""
+    own = {p.name: parameters[p.name] for p in KINDS[kind].parameters if p.name in parameters}
+    return STAGES[kind](RATE, **own).parameters
+
+
+def check(model: Model, before: Mapping[str, Any], wanted: tuple[str, Mapping[str, Any]], told: dict[str, Any]) -> None:
+    """The tree is what was asked for, and no more was made than what was not there."""
+    representation, parameters = wanted
+    names, state = told["dependencies"], model.state()
+    assert names == list(model.line(told["name"]))[::-1]
+    assert [state[name][0] for name in names] == [k.kind for k in request.chain(request.kind_of(representation))]
+    for name in names:
+        kind, _, values = state[name]
+        assert values == in_force(kind, parameters), name
+    assert told["created"] == [name for name in names if name not in before]
+    assert told["reused"] == [name for name in names if name in before]
+    assert {name: state[name] for name in before} == before and set(state) == {*before, *names}
+    for name in told["created"]:
+        kind, parent, values = state[name]
+        twins = [other for other, known in before.items() if known == (kind, parent, values)]
+        assert not twins, f"{name} is {twins} once more"
+
+
+def disturb(model: Model, number: int, what: str) -> None:
+    """What others do: remove or change one of the processors, or all."""
+    names = [name for name, processor in model.processors.items() if processor.parent]
+    if what == "stop":
+        model.processors.clear()
+    elif names and what == "remove":
+        model._removeProcessor("", {"name": names[number % len(names)]})
+    for name in names:
+        if what in VALUES and what in (p.name for p in KINDS[model.processors[name].kind].parameters):
+            model.processors[name].stage.configure(**{what: VALUES[what][number % len(VALUES[what])]})
+            return
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.lists(st.one_of(REQUESTS, CHANGES), max_size=8))
+def test_any_sequence_of_requests_and_changes(acts: list[tuple[Any, Any]]) -> None:
+    model = Model()
+    for act in acts:
+        if isinstance(act[0], int):
+            disturb(model, *act)
+            continue
+        before = model.state()
+        told = build(model, act[0], **act[1])
+        check(model, before, act, told)
+        again = build(model, act[0], **act[1])
+        assert (again["dependencies"], again["created"]) == (told["dependencies"], [])
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(REQUESTS, min_size=2, max_size=5))
+def test_clients_that_do_not_know_of_each_other(wanted: list[tuple[str, dict[str, Any]]]) -> None:
+    """All at once, and no lock: everybody gets what he asked for, and nothing is there twice."""
+    model = Model()
+
+    async def all_at_once() -> list[dict[str, Any]]:
+        return await asyncio.gather(*(trees.build(model, {"representation": r, **p}) for r, p in wanted))
+
+    answers = asyncio.run(all_at_once())
+    for (representation, parameters), told in zip(wanted, answers, strict=True):
+        assert [model.processors[name].kind for name in told["dependencies"]] == [
+            k.kind for k in request.chain(request.kind_of(representation))
+        ]
+        for name in told["dependencies"]:
+            processor = model.processors[name]
+            assert processor.stage.parameters == in_force(processor.kind, parameters)
+    for name, one in model.state().items():
+        assert [other for other, state in model.state().items() if state == one] == [name]
+
+
+@settings(max_examples=60, deadline=None)
+@given(REQUESTS, REQUESTS, st.integers(0, 20), st.booleans())
+def test_nothing_is_left_of_what_fails(
+    first: tuple[str, dict[str, Any]], wanted: tuple[str, dict[str, Any]], at: int, cancelled: bool
+) -> None:
+    model = Model()
+    build(model, first[0], **first[1])
+    before, number = model.state(), len(model.calls) + at
+    error = ComponentError("::genom::syserr", code=12)
+
+    async def go() -> dict[str, Any]:
+        task = asyncio.create_task(trees.build(model, {"representation": wanted[0], **wanted[1]}))
+        if cancelled:
+            model.cancel[number] = task
+        else:
+            model.fail[number] = error
+        return await task
+
+    try:
+        asyncio.run(go())
+    except (ComponentError, asyncio.CancelledError) as problem:
+        assert isinstance(problem, asyncio.CancelledError) if cancelled else problem is error
+        assert model.state() == before
+    else:
+        assert len(model.calls) <= number + 1
+
+
+# --- one by one -------------------------------------------------------------------------------------------------
+
+
+def test_names_are_those_of_the_original_client() -> None:
+    model = Model()
+    told = build(model, "ild")
+    chain = ["input_0", "time_0", "filterbank_0", "innerhaircell_0", "ild_0"]
+    assert told["dependencies"] == told["created"] == chain
+    assert (told["name"], told["port"], told["topic"]) == ("ild_0", "ildPort", "/rosAFE/ildPort/ild_0")
+    assert told["reused"] == told["unused"] == []
+    assert build(model, "ratemap")["created"] == ["ratemap_0"]
+    assert build(model, "crosscorrelation", cc_maxDelaySec=0.002)["created"] == ["crosscorrelation_0"]
+    told = build(model, "input")
+    assert (told["dependencies"], told["port"], told["topic"]) == (
+        ["input_0"],
+        "inputProcPort",
+        "/rosAFE/inputProcPort",
+    )
+
+
+def test_every_name_of_a_representation() -> None:
+    for kind in KINDS.values():
+        for name in (kind.kind, kind.representation, kind.representation.upper()):
+            assert request.kind_of(name) is kind
+    with pytest.raises(ComponentError, match=r"'spikes' is not one of input, time, filterbank") as refused:
+        build(Model(), "spikes")
+    assert refused.value.ex == "::genom::serialization"
+
+
+def test_a_number_is_not_given_twice_after_a_removal() -> None:
+    """The original counted what was there, and came to a name that was there."""
+    model = Model()
+    for hop in (0.01, 0.02, 0.03):
+        build(model, "ild", ild_hSizeSec=hop)
+    model._removeProcessor("", {"name": "ild_0"})
+    assert build(model, "ild", ild_hSizeSec=0.04)["name"] == "ild_3"
+    assert build(model, "ild", ild_hSizeSec=0.01)["name"] == "ild_4"
+
+
+def test_names_that_others_have_taken() -> None:
+    free = request.free_name
+    ild = KINDS["ild"]
+    assert free(ild, ["ild", "ild_x", "ild_-1", "child_7", "ild_7a"]) == "ild_0"
+    assert free(ild, ["ild_5", "ild_007"]) == "ild_8"
+    assert free(ild, ["ild_999999999", "ild_1000000000"]) == "ild_1000000001"
+    assert free(ild, ["ild_" + "9" * 4000]) == "ild_0"
+
+
+def test_the_tree_of_a_user_is_used() -> None:
+    """Also where a shorter line would fit as well: nothing is made that is there."""
+    model = Model()
+    build(model, "input")
+    mine: list[tuple[str, dict[str, Any]]] = [
+        ("PreProc", {"name": "bare", "upperDepName": "input_0"}),
+        ("PreProc", {"name": "preProc", "upperDepName": "input_0"}),
+        ("GammatoneProc", {"name": "gammatone", "upperDepName": "preProc", "fb_nChannels": 8}),
+    ]
+    for service, values in mine:
+        defaults = {p.name: p.default for p in ROSAFE.service(service).parameters}
+        asyncio.run(model.outputs(service, {**defaults, **values}))
+    told = build(model, "innerhaircell", fb_nChannels=8)
+    assert told["dependencies"] == ["input_0", "preProc", "gammatone", "innerhaircell_0"]
+    assert build(model, "time")["name"] == "bare"
+
+
+@pytest.mark.parametrize(
+    "values",
+    [{}, {"fb_nChannels": 7}, {"fb_cfHz": [200, 1000]}, {"fb_nERBs": 3.0, "fb_highFreqHz": 5000.0}, {"fb_nGamma": 2}],
+)
+def test_a_structure_of_getparameters_means_the_processor_that_it_describes(values: dict[str, Any]) -> None:
+    model = Model()
+    build(model, "filterbank", fb_type="drnl")
+    build(model, "filterbank", **values)
+    told = asyncio.run(model.outputs("getParameters", {}))["parameters"]["gammatone"][1]
+    assert told["name"] == "filterbank_1"
+    for structure in ({"filterbank": told}, {"gammatone": [told]}):
+        wanted = partial({"representation": "ratemap", **structure})
+        assert asyncio.run(trees.build(model, wanted))["dependencies"][2] == "filterbank_1"
+    if not values:
+        assert build(model, "ratemap", fb_nChannels=31)["dependencies"][2] == "filterbank_2"
+
+
+def test_after_modify_parameter() -> None:
+    model = Model()
+    build(model, "ild")
+    model._modifyParameter("", {"nameProc": "time_0", "nameParam": "pp_bRemoveDC", "newValue": "1"})
+    assert build(model, "ild")["reused"] == ["input_0"]
+    assert build(model, "ild", pp_bRemoveDC=True)["created"] == []
+
+
+def test_literal_zeros_are_set_before_anything_hangs_on_the_processor() -> None:
+    model = Model()
+    build(model, "filterbank", pp_coefPreEmphasis=0.0, pp_refSPLdB=0.0, in_doNormalize=False)
+    made = [call for call in model.calls if not call.startswith("get")]
+    assert made == [
+        "connect_port",
+        "InputProc",
+        "modifyParameter",
+        "PreProc",
+        *["modifyParameter"] * 2,
+        "GammatoneProc",
+    ]
+    assert model.state()["time_0"][2]["pp_refSPLdB"] == 0.0
+    assert model.state()["input_0"][2]["in_doNormalize"] is False
+
+
+def test_the_one_input() -> None:
+    model = Model()
+    assert build(model, "time", nFramesPerBlock=4410, rm_decaySec=0.1)["unused"] == ["rm_decaySec"]
+    told = build(model, "time", nFramesPerBlock=2205, bufferSize_s_port=2.0, connect="left/Audio")
+    assert told["created"] == []
+    assert told["unused"] == ["nFramesPerBlock", "bufferSize_s_port", "connect"]
+    with pytest.raises(ComponentError, match="in_normalizeValue 2147483647, which modifyParameter") as refused:
+        build(model, "time", in_normalizeValue=1)
+    assert refused.value.ex == "::rosAFE::e_existsAlready"
+    model._modifyParameter("", {"nameProc": "input_0", "nameParam": "in_normalizeValue", "newValue": "1"})
+    assert build(model, "time")["created"] == build(model, "time", in_normalizeValue=1)["created"] == []
+
+
+def test_the_sound() -> None:
+    for named, there, wanted in (
+        ("", "", "bass/Audio"),
+        ("", "left/Audio", "left/Audio"),
+        ("x/y", "left/Audio", "x/y"),
+    ):
+        model = Model()
+        model.connected = there
+        build(model, "input", **({"connect": named} if named else {}))
+        assert model.connected == wanted
+    silent = Model(audio=False)
+    with pytest.raises(ComponentError) as refused:
+        build(silent, "ild")
+    assert refused.value.ex == "::rosAFE::e_noData" and not silent.processors
+
+
+@pytest.mark.parametrize(
+    ("values", "what"),
+    [
+        ({"fb_nChannels": 5000}, "fb_nChannels: 5000 is out of range"),
+        ({"fb_lowFreqHz": 9000.0}, "is not below fb_highFreqHz"),
+        ({"fb_nERBs": 0.001}, "too many channels"),
+        ({"fb_highFreqHz": 0.0}, "fb_highFreqHz: 0 is out of range"),
+        ({"ihc_method": "hilbrt"}, "ihc_method: 'hilbrt' is not one of none"),
+        ({"ild_wSizeSec": 1e-9}, "ild_wSizeSec"),
+        ({"rm_decaySec": -1.0}, "rm_decaySec: -1 is out of range"),
+        ({"nFramesPerBlock": 0}, "nFramesPerBlock: 0 is out of range"),
+        ({"bufferSize_s_port": 1e9}, "bufferSize_s_port"),
+    ],
+)
+def test_what_no_sample_rate_makes_possible_is_refused_before_anything_is_asked(
+    values: dict[str, Any], what: str
+) -> None:
+    model = Model()
+    with pytest.raises(ComponentError, match=what) as refused:
+        build(model, "ild", **values)
+    assert refused.value.ex == "::rosAFE::e_badNewValue"
+    assert what in refused.value.detail["what"]
+    assert model.calls == []
+
+
+def test_what_this_sample_rate_makes_impossible_leaves_nothing() -> None:
+    model = Model()
+    with pytest.raises(ComponentError, match="not below half the sample rate"):
+        build(model, "ild", fb_highFreqHz=30000.0)
+    assert not model.processors
+    build(model, "time")
+    before = model.state()
+    with pytest.raises(ComponentError, match="not below half the sample rate"):
+        build(model, "ild", fb_highFreqHz=30000.0, pp_bRemoveDC=True)
+    assert model.state() == before
+
+
+def test_what_others_have_come_to_use_stays() -> None:
+    model = Model()
+
+    async def go() -> None:
+        failing = asyncio.create_task(trees.build(model, {"representation": "ild", "fb_highFreqHz": 30000.0}))
+        while "time_0" not in model.processors:
+            await asyncio.sleep(0)
+        defaults = {p.name: p.default for p in ROSAFE.service("GammatoneProc").parameters}
+        model._make("GammatoneProc", {**defaults, "name": "mine", "upperDepName": "time_0"})
+        with pytest.raises(ComponentError, match="half the sample rate"):
+            await failing
+
+    asyncio.run(go())
+    assert list(model.processors) == ["input_0", "time_0", "mine"]
+
+
+def test_words_that_the_guide_misspells() -> None:
+    model = Model()
+    assert build(model, "time", pp_middleEarModel="jespen")["created"] == ["input_0", "time_0"]
+    assert build(model, "time")["created"] == []
+
+
+# --- arguments --------------------------------------------------------------------------------------------------
+
+
+def test_arguments_by_name_position_and_structure() -> None:
+    wanted: dict[str, Any] = {"representation": "ild", "fb_nChannels": 16, "fb_cfHz": [100.0, 200.0]}
+    for form in (
+        wanted,
+        ["ild", {"fb_nChannels": "16", "fb_cfHz": {"0": 100, "1": "200"}}],
+        {"representation": "ild", "gammatone": {"name": "x", "fb_nChannels": 16}, "fb_cfHz": [100, 200]},
+        {"representation": "ild", "filterbank": [{"fb_nChannels": 16, "fb_cfHz": [100, 200]}], "ild": [], "ihc": {}},
+        {**wanted, "fb_nERBs": None, "connect": None},
+    ):
+        assert partial(form) == wanted, form
+    assert partial(["ild", "x/y", 4410])["nFramesPerBlock"] == 4410
+    assert partial({"representation": "cc", "pp_refSPLdBS": 90}) == {"representation": "cc", "pp_refSPLdB": 90.0}
+    assert {p.name for p in interface.REQUEST.parameters} > {"representation", "connect", *VALUES}
+
+
+@pytest.mark.parametrize(
+    ("given", "what"),
+    [
+        ({}, "representation is missing; one of input, time"),
+        ([], "representation is missing"),
+        ([{}], "representation is missing"),
+        ("ild", "neither an object nor an array"),
+        (["ild", {"fb_nERB": 1}], "unknown parameter 'fb_nERB'; request takes representation, connect"),
+        (["ild", {"name": "x"}], "unknown parameter 'name'"),
+        (["ild", {"fb_nChannels": [1]}], "fb_nChannels"),
+        (["ild", {"fb_nChannels": float("nan")}], "fb_nChannels"),
+        (["ild", {"fb_nChannels": 1, "gammatone": {"fb_nChannels": 1}}], "fb_nChannels is given twice"),
+        (["ild", {"gammatone": [{}, {}]}], "gammatone: wanted is an object"),
+        (["ild", {"gammatone": 1}], "gammatone: wanted is an object"),
+        ([7], "representation"),
+        (["ild", "x"] + [0] * 100, "too many"),
+    ],
+)
+def test_arguments_that_are_refused(given: Any, what: str) -> None:
+    with pytest.raises(ComponentError, match=what) as refused:
+        partial(given)
+    assert refused.value.ex == "::genom::serialization"
