@@ -7,7 +7,7 @@ import enum
 import itertools
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -55,6 +55,10 @@ class Listener(Protocol):
         """The processor is gone; `processor.error` tells why where it was not asked to."""
 
 
+# Gets (processor, state that it enters, number of the block at hand or None). Called under the tree's lock: no waiting.
+Observer = Callable[["Processor", State, "int | None"], None]
+
+
 class Change(NamedTuple):
     """A parameter change that waits for the processor's next block, or for a later one."""
 
@@ -80,6 +84,8 @@ class Processor:
         The tree's lock, which guards all tokens.
     failed : callable
         Called at the end of its thread where `error` is set.
+    observers : sequence of Observer
+        The tree's, as they come and go.
     """
 
     def __init__(
@@ -93,6 +99,7 @@ class Processor:
         listener: Listener,
         history_seconds: float,
         failed: Callable[[Processor], None],
+        observers: Sequence[Observer] = (),
     ) -> None:
         self.name = name
         self.kind = kind
@@ -110,6 +117,7 @@ class Processor:
         self._source = source
         self._listener = listener
         self._failed = failed
+        self._observers = observers
         self._reading: Processor | None = None  # the parent whose block it holds: the input may be replaced meanwhile
         self._changing = threading.Lock()  # guards _changes, and the exchange of _stage
         self._changes: list[Change] = []
@@ -191,7 +199,7 @@ class Processor:
     def remove(self) -> None:
         """Take it out of the tree at once: its parent no longer waits for it and it will release nothing more."""
         with self.turn:
-            self.state = State.REMOVED
+            self._enter(State.REMOVED)
             if self.parent is not None:
                 self.parent.zone.detach(self)
                 if self in self.parent.children:
@@ -245,7 +253,7 @@ class Processor:
         taken = self._wait_exec() if self._source is None else self._read(self._source)
         if taken is None:
             return False
-        self._enter(State.EXEC)
+        self._enter(State.EXEC, taken.number)
         begun = time.perf_counter()
         private = self._exec(taken)
         seconds = time.perf_counter() - begun
@@ -255,10 +263,12 @@ class Processor:
             self._publish(private)
         return True
 
-    def _enter(self, state: State) -> None:
+    def _enter(self, state: State, block: int | None = None) -> None:
         with self.turn:
             if not self._gone:
                 self.state = state
+                for observer in self._observers:
+                    observer(self, state, block)
 
     def _read(self, source: Source) -> Block | None:
         got = source.read()
@@ -308,11 +318,11 @@ class Processor:
     def _wait_release(self, private: Block) -> bool:
         """Wait until no child holds the last block, and release `private`; False where it was removed instead."""
         with self.turn:
-            self._enter(State.WAIT_RELEASE)
+            self._enter(State.WAIT_RELEASE, private.number)
             while not self._gone:
                 if self.zone.free:
                     # in one go with the look at the tokens: a child that comes now takes this block, not the last one
-                    self._enter(State.RELEASE)
+                    self._enter(State.RELEASE, private.number)
                     self.zone.release(private)
                     for child in self.children:
                         child.turn.notify_all()

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
 from rosafe.dsp import STAGES
 from rosafe.interface import KINDS, ROSAFE, ComponentError, Parameter, ProcessorKind
-from rosafe.tree.processor import Listener, Processor, Source, State, subtree
+from rosafe.tree.processor import Listener, Observer, Processor, Source, State, subtree
 
 MAX_BYTES = 2**30  # of one output port, of one processor's history, and of the samples that it keeps for a frame
 
@@ -31,6 +31,7 @@ class Tree:
         self._processors: dict[str, Processor] = {}  # in the order of creation, as getParameters reports them
         self._lock = threading.RLock()  # guards all tokens
         self._requests = threading.RLock()  # one request at a time; taken before _lock
+        self._observers: list[Observer] = []
         self.sample_rate = 0.0
         self.port_seconds = 1.0
         self.history_seconds = 1.0
@@ -65,6 +66,19 @@ class Tree:
                 chain.append(processor.name)
                 processor = processor.parent
             return chain[::-1]
+
+    def observe(self, observer: Observer) -> Callable[[], None]:
+        """Tell `observer` the state of every processor, and from now on each that one enters; returns what ends it."""
+        with self._requests, self._lock:
+            for processor in self._processors.values():
+                observer(processor, processor.state, None)
+            self._observers.append(observer)
+
+        def end() -> None:
+            with self._lock:
+                self._observers.remove(observer)
+
+        return end
 
     # --- building ---
 
@@ -157,7 +171,16 @@ class Tree:
         self, name: str, kind: str, stage: Any, parent: Processor | None, source: Source | None
     ) -> Processor:
         return Processor(
-            name, kind, stage, parent, source, self._lock, self._listener, self.history_seconds, failed=self.end
+            name,
+            kind,
+            stage,
+            parent,
+            source,
+            self._lock,
+            self._listener,
+            self.history_seconds,
+            failed=self.end,
+            observers=self._observers,
         )
 
     def _begin(self, processor: Processor) -> None:
