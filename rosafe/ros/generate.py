@@ -239,16 +239,18 @@ def ensure_messages() -> None:
 def environment() -> dict[str, str]:
     """The environment variables by which child processes find the executables, `rosafe`, the messages and genomix.
 
-    PATH, PYTHONPATH, ROS_PACKAGE_PATH and TCLLIBPATH; what they hold now is kept behind. Raises GenerationError.
+    PATH, PYTHONPATH, ROS_PACKAGE_PATH, TCLLIBPATH, OCTAVE_PATH and MATLABPATH; what they hold now is kept behind.
+    Raises GenerationError.
     """
     generation = _generation()
     if generation is None:  # <prefix>/lib/python3/dist-packages
         prefix = paths.CODE_DIR.parents[2]
-        programs, python, share, tcl = prefix / "bin", [], prefix / "share", prefix / "lib" / "tcltk"
+        programs, python, share = prefix / "bin", [], prefix / "share"
+        tcl, matlab = prefix / "lib" / "tcltk", prefix / "lib" / "matlab"
     else:
         if _is_current(generation.parent, generation.name):  # the name that stays when the sources change
             generation = generation.parent / "current"
-        programs, tcl = paths.CODE_DIR / "scripts", paths.CODE_DIR / "tcl"
+        programs, tcl, matlab = (paths.CODE_DIR / folder for folder in ("scripts", "tcl", "matlab"))
         python, share = [generation / "python"], generation / "share"
     python.append(paths.CODE_DIR)
     if paths.PYPI_DIR.is_dir():
@@ -258,6 +260,8 @@ def environment() -> dict[str, str]:
         "PYTHONPATH": _ahead(":", "PYTHONPATH", python),
         "ROS_PACKAGE_PATH": _ahead(":", "ROS_PACKAGE_PATH", [share]),
         "TCLLIBPATH": _ahead(" ", "TCLLIBPATH", [tcl]),  # a Tcl list
+        "OCTAVE_PATH": _ahead(":", "OCTAVE_PATH", [matlab]),
+        "MATLABPATH": _ahead(":", "MATLABPATH", [matlab]),
     }
 
 

@@ -124,6 +124,7 @@ def test_environment_for_children(workspace: Path) -> None:
     assert exports["PYTHONPATH"].split(":")[0] == str(python)
     assert exports["ROS_PACKAGE_PATH"] == str(install / "share")
     assert exports["TCLLIBPATH"] == str(install / "lib" / "tcltk")
+    assert exports["OCTAVE_PATH"] == exports["MATLABPATH"] == str(install / "lib" / "matlab")
 
 
 def test_setup_twice_is_once(workspace: Path) -> None:

@@ -15,7 +15,8 @@ from tests.harness import Graph
 from tests.packaging.clone import environment, fresh_copy, run
 
 SHELLS = pytest.mark.parametrize("shell", ["bash", "dash", "zsh"])
-VARIABLES = ("PATH", "PYTHONPATH", "ROS_PACKAGE_PATH", "TCLLIBPATH", "ROS_MASTER_URI", "ROS_IP", "ROS_HOSTNAME")
+VARIABLES = ("PATH", "PYTHONPATH", "ROS_PACKAGE_PATH", "TCLLIBPATH", "OCTAVE_PATH", "MATLABPATH")
+VARIABLES += ("ROS_MASTER_URI", "ROS_IP", "ROS_HOSTNAME")
 SHOW = "; ".join(f'echo "${{{name}-unset}}"' for name in VARIABLES)
 
 
@@ -53,6 +54,7 @@ def test_sets_the_paths(copy: Path, shell: str) -> None:
     assert found["PYTHONPATH"].split(":")[:2] == [f"{generated}/python", str(copy)]
     assert found["ROS_PACKAGE_PATH"] == f"{generated}/share"
     assert found["TCLLIBPATH"] == f"{{{copy}/tcl}}"  # a Tcl list, and the path has a blank
+    assert found["OCTAVE_PATH"] == found["MATLABPATH"] == f"{copy}/matlab"
     assert found["ROS_MASTER_URI"] == "http://127.0.0.1:11311"
     assert found["ROS_IP"] == "127.0.0.1"
     assert found["ROS_HOSTNAME"] == "unset"

@@ -1,0 +1,51 @@
+function text = encode(value)
+%ENCODE  An argument of a request as JSON.
+%
+%   Numbers, logicals, texts, cell arrays and matrices (as sequences), and structs (as objects). Anything else raises
+%   the error genomix:argument.
+
+if isa(value, 'string') && isscalar(value)
+    value = char(value);
+end
+if ischar(value) && (isrow(value) || isempty(value))
+    text = quoted(value);
+elseif iscell(value)
+    items = cellfun(@genomix.wire.encode, value(:).', 'UniformOutput', false);
+    text = ['[' strjoin(items, ',') ']'];
+elseif isstruct(value) && isscalar(value)
+    names = fieldnames(value);
+    items = cell(1, numel(names));
+    for k = 1:numel(names)
+        items{k} = [quoted(names{k}) ':' genomix.wire.encode(value.(names{k}))];
+    end
+    text = ['{' strjoin(items, ',') '}'];
+elseif (isnumeric(value) || islogical(value)) && isreal(value)
+    items = arrayfun(@number, value(:).', 'UniformOutput', false);
+    text = strjoin(items, ',');
+    if ~isscalar(value)
+        text = ['[' text ']'];
+    end
+else
+    error('genomix:argument', 'an argument of class %s (%s) cannot be sent', class(value), ...
+        strjoin(arrayfun(@int2str, size(value), 'UniformOutput', false), 'x'));
+end
+end
+
+function text = number(value)
+if isinteger(value) || islogical(value)
+    text = sprintf('%d', value);
+elseif isinf(value)
+    signs = {'-', ''};
+    text = [signs{1 + (value > 0)} 'Infinity'];
+else
+    text = sprintf('%.17g', value);
+end
+end
+
+function text = quoted(value)
+value = strrep(strrep(value, '\', '\\'), '"', '\"');
+for code = unique(double(value(value < ' ')))
+    value = strrep(value, char(code), sprintf('\\u%04x', code));
+end
+text = ['"' value '"'];
+end

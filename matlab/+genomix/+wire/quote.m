@@ -1,0 +1,14 @@
+function text = quote(text)
+%QUOTE  A text as a part of a URL: what is no letter, digit or one of -_.~ becomes a percent sign and two hex digits.
+
+bytes = unicode2native(text, 'UTF-8');
+plain = (bytes >= 'a' & bytes <= 'z') | (bytes >= 'A' & bytes <= 'Z') | (bytes >= '0' & bytes <= '9') | ...
+    ismember(bytes, uint8('-_.~'));
+pieces = cell(1, numel(bytes));
+pieces(plain) = num2cell(char(bytes(plain)));
+pieces(~plain) = arrayfun(@(byte) sprintf('%%%02X', byte), bytes(~plain), 'UniformOutput', false);
+text = [pieces{:}];
+if isempty(text)
+    text = '';
+end
+end

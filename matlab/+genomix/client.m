@@ -1,0 +1,82 @@
+classdef client < handle
+%CLIENT  A connection to genomixd, through which the components of the ROS graph are used.
+%
+%   client = genomix.client                   % the genomixd of this machine (or of the environment's GENOMIXD)
+%   client = genomix.client('host:8080')      % that of another one; 8080 is the port unless another is given
+%   rosAFE = client.load('rosAFE')            % a genomix.component
+%   left = client.load('rosAFE', '-i', 'left')
+%   delete(client)                            % activities go on
+%
+%   See docs/matlab.md.
+
+    properties (SetAccess = private)
+        address  % host:port of genomixd
+        session  % the name under which genomixd knows this client
+    end
+
+    methods
+        function obj = client(address)
+            if nargin == 0
+                address = getenv('GENOMIXD');
+            end
+            obj.address = full_address(address);
+            [~, obj.session] = fileparts(tempname()); % MATLAB's rand begins alike in every process
+            obj.get('/components', {}, false);
+        end
+
+        function component = load(obj, component, varargin)
+            %LOAD  A component that runs, as an object with its services and ports: load(name), load(name, '-i', instance)
+            if nargin < 2 || ~ischar(component) || isempty(component)
+                error('genomix:load', 'load takes the name of a component, such as ''rosAFE''');
+            end
+            [~, name] = fileparts(component); % the original takes paths of plug-ins, too
+            query = {};
+            if numel(varargin) == 2 && strcmp(varargin{1}, '-i') && ischar(varargin{2})
+                query = {'i', varargin{2}};
+            elseif ~isempty(varargin)
+                error('genomix:load', 'after the name of a component there may be only: ''-i'', ''instance''');
+            end
+            [about, failed] = obj.get(['/load/' genomix.wire.quote(name)], query, false);
+            if failed
+                error('genomix:load', 'load %s: %s', component, genomix.request.explain(about));
+            end
+            component = genomix.component(obj, about);
+        end
+
+        function rpath(~, ~)
+            %RPATH  Accepted for the original's scripts: components are found on the graph, there are no plug-ins.
+        end
+
+        function [answer, failed] = get(obj, path, query, matrices)
+            %GET  The answer of genomixd to a URL of this session; see genomix.wire.fetch.
+            [answer, failed] = genomix.wire.fetch(obj.address, path, [{'s', obj.session}; query], matrices);
+        end
+
+        function delete(obj)
+            %DELETE  End the session. Activities go on.
+            if isempty(obj.session)
+                return % the constructor has failed, or this is the second time
+            end
+            try
+                obj.get('/session/stop', {}, false);
+            catch
+                % Then the server is gone, and the session with it.
+            end
+            obj.session = '';
+        end
+
+        function disp(obj)
+            fprintf('  genomix.client of genomixd at %s\n', obj.address);
+        end
+    end
+end
+
+function address = full_address(address)
+address = regexprep(address, '^http://|/+$', '');
+if isempty(address)
+    address = '127.0.0.1';
+end
+if isempty(regexp(address, ':\d+$', 'once'))
+    address = [address ':8080'];
+end
+end

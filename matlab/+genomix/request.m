@@ -1,0 +1,153 @@
+classdef request < handle
+%REQUEST  What became of a service that was called.
+%
+%   r.status      'sent', 'done' or 'error', as it is now
+%   r.result      a struct with the service's outputs, [] before it is done
+%   r.exception   a struct with the name of the exception in field ex and, for some, its members in detail; [] for none
+%   r.wait(s)     waits until it is no longer 'sent', or for s seconds, and returns the status
+%   r.abort()     asks the activity to end
+%
+%   A refusal raises no error: scripts look at status. A lost connection to genomixd does raise one.
+
+    properties (Access = private)
+        client
+        matrices
+        told  % as genomixd tells it: status and, in time, output, large or exception
+    end
+
+    methods
+        function obj = request(client, told, matrices)
+            obj.client = client;
+            obj.told = told;
+            obj.matrices = matrices;
+        end
+
+        function varargout = subsref(obj, s)
+            if ~strcmp(s(1).type, '.')
+                error('genomix:request', 'a request has status, result and exception');
+            end
+            rest = s(2:end);
+            arguments = {};
+            if any(strcmp(s(1).subs, {'wait', 'abort'})) && ~isempty(rest) && strcmp(rest(1).type, '()')
+                arguments = rest(1).subs;
+                rest(1) = [];
+            end
+            switch s(1).subs
+                case 'status'
+                    refresh(obj, 0);
+                    value = obj.told.status;
+                case 'result'
+                    value = result(obj);
+                case 'exception'
+                    refresh(obj, 0);
+                    value = [];
+                    if strcmp(obj.told.status, 'error')
+                        value = obj.told.exception;
+                    end
+                case 'wait'
+                    value = wait(obj, arguments{:});
+                case 'abort'
+                    abort(obj);
+                    return
+                otherwise
+                    % Such as the name of a port that could not be read.
+                    if strcmp(obj.told.status, 'error')
+                        error('genomix:request', '%s', genomix.request.explain(obj.told.exception));
+                    end
+                    error('genomix:request', 'a request has status, result and exception, and no %s', s(1).subs);
+            end
+            if ~isempty(rest)
+                value = subsref(value, rest);
+            end
+            varargout = {value};
+        end
+
+        function status = wait(obj, seconds)
+            %WAIT  The status once it is no longer 'sent', or after some seconds (for ever by default).
+            if nargin < 2
+                seconds = Inf;
+            end
+            while strcmp(obj.told.status, 'sent') && seconds >= 0
+                % In short steps, so that Ctrl-C interrupts it.
+                refresh(obj, min(seconds, 0.5));
+                seconds = seconds - 0.5;
+            end
+            status = obj.told.status;
+        end
+
+        function abort(obj)
+            %ABORT  Ask the activity to end; what has ended already stays as it is.
+            if strcmp(obj.told.status, 'sent')
+                [answer, failed] = obj.client.get('/request/abort', {'id', obj.told.id}, false);
+                if failed
+                    error('genomix:request', 'abort: %s', genomix.request.explain(answer));
+                end
+            end
+        end
+
+        function disp(obj)
+            refresh(obj, 0);
+            fprintf('  genomix.request: %s\n', obj.told.status);
+            if strcmp(obj.told.status, 'error')
+                fprintf('    exception: %s\n', genomix.request.explain(obj.told.exception));
+            elseif strcmp(obj.told.status, 'done')
+                outputs = result(obj);
+                if ~isempty(fieldnames(outputs))
+                    fprintf('    result.%s\n', strjoin(fieldnames(outputs).', ', result.'));
+                end
+            end
+        end
+    end
+
+    methods (Access = private)
+        function refresh(obj, seconds)
+            % Ask genomixd what has become of it, and wait some seconds for an end.
+            if ~strcmp(obj.told.status, 'sent')
+                return
+            end
+            query = {'id', obj.told.id};
+            if seconds > 0
+                [answer, failed] = obj.client.get('/request/wait', ...
+                    [query; {'ms', sprintf('%.0f', 1000 * seconds)}], obj.matrices);
+            else
+                [answer, failed] = obj.client.get('/request/status', query, obj.matrices);
+            end
+            if failed % genomixd has forgotten it: perhaps it is another one by now
+                answer = struct('status', 'error', 'exception', answer);
+            end
+            obj.told = answer;
+        end
+
+        function value = result(obj)
+            refresh(obj, 0);
+            value = [];
+            if ~strcmp(obj.told.status, 'done')
+                return
+            end
+            if ~isfield(obj.told, 'output')
+                [answer, failed] = obj.client.get('/request/result', {'id', obj.told.id}, obj.matrices);
+                if failed
+                    error('genomix:request', 'the result is lost: %s', genomix.request.explain(answer));
+                end
+                obj.told.output = answer;
+            end
+            value = obj.told.output;
+        end
+    end
+
+    methods (Static)
+        function obj = failure(ex, what)
+            %FAILURE  A request that was never sent, and why.
+            exception = struct('ex', ex, 'detail', struct('what', what));
+            obj = genomix.request([], struct('status', 'error', 'exception', exception), false);
+        end
+
+        function text = explain(exception)
+            %EXPLAIN  One line that tells an exception.
+            text = exception.ex;
+            if isfield(exception, 'detail') && isfield(exception.detail, 'what')
+                text = [text ': ' exception.detail.what];
+            end
+        end
+    end
+end
