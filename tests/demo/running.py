@@ -1,4 +1,4 @@
-"""Running scripts/demo, reading what it prints, and finding every process that it has left."""
+"""Running scripts/demo, reading and checking what it prints, and finding every process that it has left."""
 
 from __future__ import annotations
 
@@ -8,6 +8,10 @@ import uuid
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+
+import matplotlib.image
+import numpy as np
+import pytest
 
 from tests.harness import SCRIPTS, Process, proc, wait_for
 
@@ -97,3 +101,40 @@ def azimuth(words: str) -> float:
         return 0.0 if words == "ahead" else float("nan")
     degrees, _, side = words.split()
     return float(degrees) * {"left": -1, "right": 1}[side]
+
+
+def check_table(text: str, sample_rate: int, block: int, seconds: float) -> None:
+    """Seven ports, nothing lost, and as much of everything as the time allows."""
+    rows = table(text)
+    assert {topic: row[0] for topic, row in rows.items()} == PORTS
+    for topic, (_, message_rate, frames, frame_rate, lost) in rows.items():
+        framed = topic.split("Port")[0] in ("ild", "ratemap", "crossCorrelation")
+        assert frame_rate == (100 if framed else sample_rate), topic
+        assert lost == 0, topic
+        # It ends when the last of the stages has come so far; the first ones may be some blocks ahead.
+        assert seconds - 0.1 < frames / frame_rate < seconds + 10 * block / sample_rate
+        assert message_rate == pytest.approx(sample_rate / block, rel=0.25), topic
+    assert re.search(r"^by their own count bass lost 0 frames \(0 overruns\) and rosAFE 0 \(0 gaps\)$", text, re.M)
+
+
+def check_picture(file: Path) -> None:
+    """A picture of decent size with something on it."""
+    image = matplotlib.image.imread(file)[..., :3]
+    assert image.shape[0] > 800 and image.shape[1] > 1000
+    assert 20_000 < file.stat().st_size < 2_000_000
+    assert len(np.unique((image * 255).astype(np.uint8).reshape(-1, 3), axis=0)) > 500
+
+
+def check_walk(text: str) -> None:
+    """The built-in scene from its beginning to its end, 10 s: both cues see a source that goes from left to right."""
+    check_table(text, 44100, 12000, 10.0)
+    course = np.array(path(text))
+    assert len(course) >= 19
+    for estimate in course[:, 1:3].T:
+        assert estimate[0] < -75 and estimate[-1] > 75
+        assert (np.diff(estimate) > -5).all()
+        assert np.abs(estimate - course[:, 3]).max() < 8
+    assert "agree on the side in 100 % of the frames" in text
+    commands = re.findall(r"^\$ rosservice call (\S+) \"(.*)\"$", text, re.M)
+    assert [service for service, _ in commands[:3]] == ["/rosAFE/connect_port", "/bass/Acquire", "/rosAFE/InputProc"]
+    assert commands[0][1] == "{local: Audio, remote: bass/Audio}"

@@ -1,17 +1,15 @@
-"""scripts/demo from end to end: the built-in scene, real speech, and what must be refused."""
+"""scripts/demo from end to end: speech, telephone quality, and what must be refused. test_readme.py runs the scene."""
 
 from __future__ import annotations
 
 import os
-import re
 import subprocess
 from pathlib import Path
 
-import matplotlib.image
 import numpy as np
 import pytest
 
-from tests.demo.running import DEMO_SECONDS, PORTS, Demo, demo, path, table
+from tests.demo.running import DEMO_SECONDS, Demo, check_picture, check_table, demo, path
 from tests.demo.test_sound import wav
 from tests.harness import SCRIPTS, shared
 
@@ -24,57 +22,20 @@ def finished(running: Demo) -> str:
     return running.out
 
 
-def check_table(text: str, sample_rate: int, block: int, seconds: float) -> None:
-    """Seven ports, nothing lost, and as much of everything as the time allows."""
-    rows = table(text)
-    assert {topic: row[0] for topic, row in rows.items()} == PORTS
-    for topic, (_, message_rate, frames, frame_rate, lost) in rows.items():
-        framed = topic.split("Port")[0] in ("ild", "ratemap", "crossCorrelation")
-        assert frame_rate == (100 if framed else sample_rate), topic
-        assert lost == 0, topic
-        # It ends when the last of the stages has come so far; the first ones may be some blocks ahead.
-        assert seconds - 0.1 < frames / frame_rate < seconds + 10 * block / sample_rate
-        assert message_rate == pytest.approx(sample_rate / block, rel=0.25), topic
-    assert re.search(r"^by their own count bass lost 0 frames \(0 overruns\) and rosAFE 0 \(0 gaps\)$", text, re.M)
-
-
-def check_picture(file: Path) -> None:
-    """A picture of decent size with something on it."""
-    image = matplotlib.image.imread(file)[..., :3]
-    assert image.shape[0] > 800 and image.shape[1] > 1000
-    assert 20_000 < file.stat().st_size < 2_000_000
-    assert len(np.unique((image * 255).astype(np.uint8).reshape(-1, 3), axis=0)) > 500
-
-
-def test_scene(tmp_path: Path) -> None:
-    """Seven ports, nothing lost, a source that goes from left to right, a picture in ./rosafe-demo."""
-    with demo(cwd=tmp_path, ROS_MASTER_URI="http://192.0.2.1:11311", ROS_NAMESPACE="/elsewhere") as running:
-        text = finished(running)
-    check_table(text, 44100, 12000, 10.0)
-    course = np.array(path(text))
-    assert len(course) >= 19
-    for estimate in course[:, 1:3].T:
-        assert estimate[0] < -75 and estimate[-1] > 75
-        assert (np.diff(estimate) > -5).all()
-        assert np.abs(estimate - course[:, 3]).max() < 8
-    assert "agree on the side in 100 % of the frames" in text
-    assert [entry.name for entry in (tmp_path / "rosafe-demo").iterdir()] == ["rosafe-demo.png"]
-    check_picture(tmp_path / "rosafe-demo" / "rosafe-demo.png")
-    commands = re.findall(r"^\$ rosservice call (\S+) \"(.*)\"$", text, re.M)
-    assert [service for service, _ in commands[:3]] == ["/rosAFE/connect_port", "/bass/Acquire", "/rosAFE/InputProc"]
-    assert commands[0][1] == "{local: Audio, remote: bass/Audio}"
-
-
 def test_speech(tmp_path: Path) -> None:
-    """The shared speech, through bass-ros and rosAFE-ros: both cues say right, all of it, to its end."""
+    """The shared speech, through bass-ros and rosAFE-ros: both cues say right, all of it, to its end.
+
+    The graph that the user works on is another.
+    """
     speech = shared("audio", "speech_anechoic_16k.wav")
-    with demo(speech, "--out", tmp_path / "new" / "folder") as running:
+    out = tmp_path / "new" / "folder"
+    with demo(speech, "--out", out, ROS_MASTER_URI="http://192.0.2.1:11311", ROS_NAMESPACE="/elsewhere") as running:
         text = finished(running)
     check_table(text, 16000, 4000, 2.5)
     course = np.array(path(text))
     assert (course[:, 1:3] > 15).all()
     assert np.abs(course[:, 1] - course[:, 2]).max() < 10
-    check_picture(tmp_path / "new" / "folder" / "rosafe-demo.png")
+    check_picture(out / "rosafe-demo.png")
 
 
 def test_telephone_quality_without_home(tmp_path: Path) -> None:

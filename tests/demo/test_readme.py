@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from rosafe.ros.master import is_local
-from tests.demo.running import family, new_mark
+from tests.demo.running import check_picture, check_walk, family, new_mark
 from tests.genomix import world as worlds
 from tests.harness import PYTHON, ROOT, SCRIPTS, Process, free_port, wait_for
 
@@ -72,7 +72,9 @@ def test_every_command_of_the_shell(tmp_path: Path) -> None:
     finally:
         for pid in family(mark):  # a master has a session of its own
             os.kill(pid, signal.SIGKILL)
-    assert (tmp_path / "rosafe-demo" / "rosafe-demo.png").stat().st_size > 20_000
+    check_walk(said.partition("+ . scripts/env.sh")[0])
+    assert [entry.name for entry in (tmp_path / "rosafe-demo").iterdir()] == ["rosafe-demo.png"]
+    check_picture(tmp_path / "rosafe-demo" / "rosafe-demo.png")
     calls = [command for command in commands if command.startswith("rosservice call")]
     by_hand = said.partition(f"+ {calls[0]}")[2]
     assert by_hand.count("genom_success: True") == len(calls) >= 12
