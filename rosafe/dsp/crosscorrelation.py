@@ -50,7 +50,8 @@ class CrossCorrelation(FramedStage):
 
     def _by_kernel(self, samples: FloatArray, reach: int) -> FloatArray:
         frames = self._frames(samples, self._framing.window)
-        result = np.zeros((samples.shape[1], 2 * self._max_lag + 1, frames.number))
+        shape = (samples.shape[1], 2 * self._max_lag + 1, frames.number)
+        result = np.empty(shape) if reach == self._max_lag else np.zeros(shape)
         kernels.correlations(frames, reach, EPSILON, result)
         return result
 

@@ -95,7 +95,7 @@ class FrameBuffer:
             self._store = np.empty((*rows, 0))
             self._start = self._stop = self.skip = 0
 
-    def advance(self, arriving: int, count: int) -> tuple[FloatArray, FloatArray]:
+    def advance(self, arriving: int, count: int) -> tuple[kernels.Span, kernels.Span]:
         """After a block of so many samples, the next frame is to start `count` samples later than it would have.
 
         Returns the samples held till now, and room for those at the end of the block that will be held; the caller must
@@ -106,21 +106,21 @@ class FrameBuffer:
         self.skip = max(0, first - total)
         if first < self.held:
             self._make_room(total)
-            history = self._store[..., self._start : self._stop]
+            history = kernels.Span(self._store, self._start, self._stop)
             self._start, self._stop = self._start + first, self._stop + arriving
-            return history, self._store[..., self._stop - arriving : self._stop]
-        history = self._store[..., self._start : self._stop]
+            return history, kernels.Span(self._store, self._stop - arriving, self._stop)
+        history = kernels.Span(self._store, self._start, self._stop)
         kept = max(0, total - first)
         if kept > self._store.shape[-1]:
             self._store = np.empty((*self._store.shape[:-1], kept))
         self._start, self._stop = 0, kept
-        return history, self._store[..., :kept]
+        return history, kernels.Span(self._store, 0, kept)
 
     def append(self, block: FloatArray) -> FloatArray:
         """Take in (*rows, N); a view of all samples from the next frame's start on, valid until the next call."""
         self.begin(block.shape[:-1])
         _, room = self.advance(block.shape[-1], 0)
-        room[...] = _last(block, room.shape[-1])
+        room.samples[...] = _last(block, room.length)
         return self._store[..., self._start : self._stop]
 
     def drop(self, count: int) -> None:
@@ -150,6 +150,8 @@ class FramedStage(Stage):
 
     PREFIX: ClassVar[str]
 
+    _begun: kernels.Sums | None  # over what is held, where a kernel has made them
+
     def __init__(self, sample_rate: float, **parameters: Any) -> None:
         self._buffer = FrameBuffer()
         super().__init__(sample_rate, **parameters)
@@ -160,17 +162,21 @@ class FramedStage(Stage):
 
     def reset(self) -> None:
         self._buffer = FrameBuffer()
+        self._begun = None
 
     def _means(self, samples: FloatArray, squared: bool) -> FloatArray:
         """`Framing.means` of the frames that `samples` (*rows, N) complete, (*rows, F), by numpy."""
+        self._begun = None
         means = self._framing.means(self._buffer.append(samples), squared)
         self._buffer.drop(means.shape[-1] * self._framing.hop)
         return means
 
     def _frames(self, block: FloatArray, weights: FloatArray) -> kernels.Frames:
         """The frames that `block` completes, for a kernel; the buffer has moved on then."""
-        rows, arriving, hop = block.shape[:-1], block.shape[-1], self._framing.hop
-        self._buffer.begin(rows)
+        arriving, hop = block.shape[-1], self._framing.hop
+        self._buffer.begin(block.shape[:-1])
+        if self._buffer.held == 0:
+            self._begun = None
         skip = self._buffer.skip
         count = self._framing.complete(self._buffer.held + arriving - skip)
         history, room = self._buffer.advance(arriving, count * hop)
@@ -178,3 +184,4 @@ class FramedStage(Stage):
 
     def _build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
         self._framing = Framing.design(self.sample_rate, self.PREFIX, values)
+        self._begun = None

@@ -29,10 +29,8 @@ class Ild(FramedStage):
     def process(self, block: FloatArray) -> FloatArray:
         samples = self._checked(block)
         if kernels.compiled():
-            energies = kernels.energies(self._frames(samples, self._framing.weights(squared=True)))
-        else:
-            energies = self._means(limited(samples), squared=True)
-        energies += EPSILON
-        levels = np.log10(energies[1] / energies[0])
-        levels *= 10
-        return levels
+            frames = self._frames(samples, self._framing.weights(squared=True))
+            levels, self._begun = kernels.levels(frames, self._begun, EPSILON)
+            return levels
+        energies = self._means(limited(samples), squared=True) + EPSILON
+        return 10 * np.log10(energies[1] / energies[0])

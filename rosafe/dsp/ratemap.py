@@ -29,18 +29,14 @@ class Ratemap(FramedStage):
         "rm_decaySec": Parameter(0.008, positive),
     }
 
-    _begun: FloatArray | None  # sums over what is held of the frames that have begun, where they are known
-
     def process(self, block: FloatArray) -> FloatArray:
         samples = self._checked(block)
         power = self._values["rm_scaling"] == "power"
         if not kernels.compiled():
-            self._begun = None
             return self._means(self._integrator.process(limited(samples)), power)
         frames = self._frames(samples, self._framing.weights(squared=power))
-        known = self._begun if frames.history.shape[-1] else None
         state = self._integrator.started(samples.shape[:-1])
-        rates, self._begun = kernels.ratemap(frames, power, self._integrator.sections, state, known)
+        rates, self._begun = kernels.ratemap(frames, self._begun, power, self._integrator.sections, state)
         return rates
 
     def reset(self) -> None:
@@ -49,7 +45,6 @@ class Ratemap(FramedStage):
 
     def _build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
         super()._build(values, changed)
-        self._begun = None
         if changed & {"rm_decaySec", "rm_scaling"}:
             retention = float(np.exp(-1 / (self.sample_rate * values["rm_decaySec"])))
             self._integrator = Cascade(leaky_integrator(retention))

@@ -18,6 +18,8 @@ class Parameter(NamedTuple):
     check: Check
 
 
+FLOAT64 = np.dtype(np.float64)
+
 ParameterTable = Mapping[str, Parameter]
 
 
@@ -96,6 +98,8 @@ class Stage:
     def _checked(self, block: Any) -> FloatArray:
         """`block` as contiguous float64 of the right shape, or ValueError."""
         array = np.asarray(block)
+        if array.dtype is FLOAT64 and array.ndim == len(self.BLOCK) and len(array) == 2 and array.flags.c_contiguous:
+            return array  # what comes from a stage: no time is lost on the rest
         if array.dtype.kind not in "iuf" or array.ndim != len(self.BLOCK) or array.shape[0] != 2:
             raise ValueError(f"block: {array.dtype} of shape {array.shape} is not numbers in ({', '.join(self.BLOCK)})")
         return np.asarray(array, np.float64, order="C")

@@ -4,11 +4,12 @@ A stage calls its kernel where `compiled()` says so, and the twin elsewhere: whe
 processors, and where the environment variable ROSAFE_KERNELS is 0. Both work on the same states and agree to 1e-11 of
 the largest number. Tests hold each kernel to its twin, which is the reference. Kernels release the interpreter lock.
 
-All arrays are of float64 or complex128 and C-contiguous, but for histories and tails, of which only rows are.
+All arrays are of float64 or complex128 and C-contiguous.
 """
 
 from __future__ import annotations
 
+import ctypes
 import math
 from typing import Any, NamedTuple
 
@@ -22,6 +23,8 @@ FloatArray = NDArray[np.float64]
 MOST_POLES = 64  # of a gammatone filter
 MOST_SECTIONS = 8  # of a low-pass
 MOST_LAGS = 1024  # of a correlation; FFT is faster beyond
+
+REAL_SIZE = 8  # bytes of a float64
 
 RECTIFICATIONS = ("none", "halfwave", "fullwave", "square")
 
@@ -70,57 +73,87 @@ def rectify_and_filter(rectification: str, block: FloatArray, sections: FloatArr
     return output
 
 
+class Span(NamedTuple):
+    """Samples `start` to `stop` of each row of a store (*rows, T)."""
+
+    store: FloatArray
+    start: int
+    stop: int
+
+    @property
+    def length(self) -> int:
+        """How many samples of each row."""
+        return self.stop - self.start
+
+    @property
+    def samples(self) -> FloatArray:
+        """A view of them, (*rows, length)."""
+        return self.store[..., self.start : self.stop]
+
+
 class Frames(NamedTuple):
     """Frames over samples that lie in a history and a block behind it, without the two being joined.
 
     Samples are counted from the first one of the history on.
     """
 
-    history: FloatArray  # (*rows, T)
+    history: Span
     block: FloatArray  # (*rows, N)
-    tail: FloatArray  # (*rows, n), to be filled with the last samples; may lie where the history does
+    tail: Span  # to be filled with the last samples; may lie where the history does
     skip: int  # where the first frame starts
     weights: FloatArray  # (w,), of the samples of a frame
     hop: int  # from a frame's start to that of the next one
     number: int  # of whole ones
 
 
-def energies(frames: Frames) -> FloatArray:
-    """The weighted sum of the squares of each frame's samples, (*rows, F).
+class Sums(NamedTuple):
+    """Of the frames that begin in a call's samples, (*rows, F): first the `whole` ones, then those that go on.
 
-    The twin is `rosafe.dsp.framing.Framing.means`.
+    Given to the next call, the latter save it the sums over its history.
     """
-    sums = np.empty((*frames.block.shape[:-1], frames.number))
-    _function("rosafe_energies")(*_arguments(frames), _address(sums))
-    return sums
+
+    sums: FloatArray
+    whole: int
+
+
+def levels(frames: Frames, begun: Sums | None, epsilon: float) -> tuple[FloatArray, Sums]:
+    """10 log10((R + epsilon) / (L + epsilon)) of the two ears' energies of each frame, (2, C, N) to (C, F).
+
+    Energies are weighted sums of squares. The twin is `rosafe.dsp.framing.Framing.means` with `rosafe.dsp.ild.Ild`.
+    """
+    sums, arguments = _sums(frames, begun)
+    result = np.empty((frames.block.shape[1], frames.number))
+    _function("rosafe_levels")(*_arguments(frames), *arguments, epsilon, _address(result))
+    return result, sums
 
 
 def ratemap(
-    frames: Frames, squared: bool, section: FloatArray, state: FloatArray, begun: FloatArray | None
-) -> tuple[FloatArray, FloatArray]:
+    frames: Frames, begun: Sums | None, squared: bool, section: FloatArray, state: FloatArray
+) -> tuple[FloatArray, Sums]:
     """Weighted sums of what a leaky integrator makes of each frame's samples, or of the squares of that, (*rows, F).
 
     The integrator is `section` (1, 6), as of `rosafe.dsp.cascade.leaky_integrator`, with its `state` (1, *rows, 2). The
-    history of `frames` has been through it, the block goes now. Returned, too, are the sums of the frames that begin in
-    the samples but do not end there, (*rows, B); given as `begun`, they save the next call the sums over its history.
-    The twin is `rosafe.dsp.framing.Framing.means` after `rosafe.dsp.cascade.Cascade`.
+    history of `frames` has been through it, the block goes now. The twin is `rosafe.dsp.framing.Framing.means` after
+    `rosafe.dsp.cascade.Cascade`.
     """
-    rows = frames.block.shape[:-1]
-    samples = frames.history.shape[-1] + frames.block.shape[-1]
-    have_begun = -(-max(0, samples - frames.skip) // frames.hop) - frames.number
-    sums, sums_begun = np.empty((*rows, frames.number)), np.empty((*rows, have_begun))
+    sums, arguments = _sums(frames, begun)
+    rates = np.empty((*frames.block.shape[:-1], frames.number))
     _function("rosafe_ratemap")(
-        *_arguments(frames),
-        squared,
-        -section[0, 4],
-        _address(state),
-        0 if begun is None else begun.shape[-1],
-        None if begun is None else _address(begun),
-        have_begun,
-        _address(sums),
-        _address(sums_begun),
+        *_arguments(frames), *arguments, squared, -section[0, 4], _address(state), _address(rates)
     )
-    return sums, sums_begun
+    return rates, sums
+
+
+def _sums(frames: Frames, begun: Sums | None) -> tuple[Sums, tuple[int | None, ...]]:
+    """Room for the sums of `frames`, and the arguments that tell of it and of the sums known already."""
+    samples = frames.history.length + frames.block.shape[-1]
+    number = max(0, -((frames.skip - samples) // frames.hop))
+    sums = Sums(np.empty((*frames.block.shape[:-1], number)), frames.number)
+    if begun is None:
+        return sums, (number, None, 0, 0, _address(sums.sums))
+    stride = begun.sums.shape[-1]
+    first = _address(begun.sums) + begun.whole * REAL_SIZE
+    return sums, (number, first, stride, stride - begun.whole, _address(sums.sums))
 
 
 def correlations(frames: Frames, reach: int, epsilon: float, output: FloatArray) -> None:
@@ -146,24 +179,29 @@ def _function(name: str) -> Any:
     return getattr(library, name)
 
 
+_ANYTHING = ctypes.c_char * 0
+
+
 def _address(array: NDArray[Any]) -> int:
+    if array.flags.writeable:
+        return ctypes.addressof(_ANYTHING.from_buffer(array))  # takes a third of the time of the other way
     address: int = array.ctypes.data
     return address
 
 
 def _arguments(frames: Frames, rows: int | None = None) -> tuple[int, ...]:
-    """The arguments that both kernels of frames begin with; by default, the number of rows is that of the samples."""
+    """The arguments that all kernels of frames begin with; by default, the number of rows is that of the samples."""
     history, block, tail, skip, weights, hop, number = frames
-    held, arriving = history.shape[-1], block.shape[-1]
+    held, arriving = history.stop - history.start, block.shape[-1]
     return (
-        _address(history),
-        history.strides[-2] // history.itemsize,
+        _address(history.store) + history.start * REAL_SIZE,
+        history.store.shape[-1],
         held,
         _address(block),
         arriving,
-        _address(tail),
-        tail.strides[-2] // tail.itemsize,
-        held + arriving - tail.shape[-1],
+        _address(tail.store) + tail.start * REAL_SIZE,
+        tail.store.shape[-1],
+        held + arriving - (tail.stop - tail.start),
         math.prod(block.shape[:-1]) if rows is None else rows,
         skip,
         _address(weights),

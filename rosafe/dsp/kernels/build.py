@@ -102,7 +102,7 @@ def _compile(gcc: str, workshop: Path) -> None:
     running = []
     try:
         for name in LEVELS.values():
-            command = [gcc, *FLAGS, f"-march={name}", "-o", str(workshop / f"{name}.so"), *sources]
+            command = [gcc, *FLAGS, f"-march={name}", "-o", str(workshop / f"{name}.so"), *sources, "-lm"]
             running.append(subprocess.Popen(command, stdin=subprocess.DEVNULL, stderr=subprocess.PIPE, env=environment))
         for process in running:
             _, said = process.communicate(timeout=PATIENCE)

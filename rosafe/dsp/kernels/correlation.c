@@ -151,19 +151,29 @@ static void put_zeros(phases to, int64_t t, int64_t until) {
     for (; t < until; t++) *at(to, t) = (vec){};
 }
 
+/* Where the samples of each lane's frame are: those before the border in the history, the others in the block. */
 typedef struct {
-    const double *history; /* of one row: `held` samples, and those of the block behind */
-    const double *block;
-    int64_t held;
-} row;
+    const double *old[LANES], *new[LANES];
+    int64_t border;
+} frames;
 
-/* Where samples from..from + n of the row lie; in `joined`, if they are apart. */
-static const double *find(row of, int64_t from, int64_t n, double *joined) {
-    if (from >= of.held) return of.block + (from - of.held);
-    if (from + n <= of.held) return of.history + from;
-    for (int64_t i = 0; i < n; i++)
-        joined[i] = from + i < of.held ? of.history[from + i] : of.block[from + i - of.held];
-    return joined;
+/* As `put`. */
+INLINE vec put_both(const frames *of, const double *window, int64_t from, int64_t until, phases to, int64_t t) {
+    const int64_t middle = most(from, least(until, of->border));
+    vec energy = put(of->old, window, from, middle, to, t);
+    return energy + put(of->new, window, middle, until, to, t + middle - from);
+}
+
+/* Samples from..until of frames that begin at different samples are joined: their borders lie apart. */
+static void join(frames *of, const int64_t starts[LANES], int64_t held, int64_t from, int64_t until,
+                 double joined[LANES][LONGEST]) {
+    for (int k = 0; k < LANES; k++) {
+        int64_t middle = most(from, least(until, held - starts[k]));
+        memcpy(joined[k], of->old[k] + from, (middle - from) * sizeof(double));
+        memcpy(joined[k] + middle - from, of->new[k] + middle, (until - middle) * sizeof(double));
+        of->new[k] = joined[k] - from;
+    }
+    of->border = from;
 }
 
 /* The samples of a row are the `held` ones of `history` and the n of `block` behind them; the first frame begins at `skip`,
@@ -172,7 +182,7 @@ static const double *find(row of, int64_t from, int64_t n, double *joined) {
  * frames), the channels channel_stride apart. 2 reach + 1 is at most MOST_LAGS. */
 void rosafe_correlations(const double *history, int64_t history_stride, int64_t held, const double *block, int64_t n,
                          double *tail, int64_t tail_stride, int64_t tail_from, int64_t channels, int64_t skip,
-                         const double *window, int64_t size, int64_t hop, int64_t frames, int64_t reach, double epsilon,
+                         const double *window, int64_t size, int64_t hop, int64_t number, int64_t reach, double epsilon,
                          double *output, int64_t channel_stride) {
     uint32_t mode = denormals_off();
     const int64_t lags = 2 * reach + 1, spans = (size + SPAN - 1) / SPAN, span = (size + spans - 1) / spans;
@@ -186,42 +196,48 @@ void rosafe_correlations(const double *history, int64_t history_stride, int64_t 
     for (int i = 0; i < count; i++)
         l_phases[i] = l_samples + i * n_l, r_phases[i] = r_samples + i * n_r, c_phases[i] = c_samples + i * n_c;
 
-    for (int64_t first = 0; first < channels * frames; first += LANES) {
-        double joined[2][LANES][LONGEST];
-        vec correlation[MOST_LAGS] = {}, energy[2] = {};
+    for (int64_t first = 0; first < channels * number; first += LANES) {
+        vec correlation[MOST_LAGS], energy[2] = {};
         double *to[LANES];
-        int64_t channel[LANES], frame[LANES];
+        int64_t channel[LANES], start[LANES];
+        for (int64_t m = 0; m < lags; m++) correlation[m] = (vec){};
         for (int k = 0; k < LANES; k++) { /* lanes without a frame do the last one once more */
-            int64_t number = least(first + k, channels * frames - 1);
-            channel[k] = number / frames;
-            frame[k] = number % frames;
-            to[k] = output + channel[k] * channel_stride + frame[k];
+            int64_t which = least(first + k, channels * number - 1);
+            channel[k] = which % channels;
+            start[k] = skip + which / channels * hop;
+            to[k] = output + channel[k] * channel_stride + which / channels;
         }
         for (int64_t begin = 0; begin < size; begin += span) {
             /* r from `begin` to `end`; of l, up to `reach` more on either side */
             int64_t end = least(begin + span, size), l_begin = most(0, begin - reach), l_end = least(size, end + reach);
-            const double *rows[2][LANES];
-            for (int k = 0; k < LANES; k++)
-                for (int ear = 0; ear < 2; ear++) {
-                    int64_t number = ear * channels + channel[k], from = ear ? begin : l_begin;
-                    row of = {history + number * history_stride, block + number * n, held};
-                    rows[ear][k] = find(of, skip + frame[k] * hop + from, (ear ? end : l_end) - from, joined[ear][k]);
+            for (int ear = 0; ear < 2; ear++) {
+                double joined[LANES][LONGEST];
+                frames mine = {.border = held - start[0]};
+                for (int k = 0; k < LANES; k++) {
+                    int64_t row = ear * channels + channel[k];
+                    mine.old[k] = history + row * history_stride + start[k];
+                    mine.new[k] = block + row * n + start[k] - held;
                 }
-            const int64_t before = begin - l_begin, inside = end - begin, all_l = l_end - l_begin, all_r = end - begin;
-            put_zeros(l, 0, reach - before);
-            put(rows[0], window + l_begin, 0, before, l, reach - before);
-            energy[0] += put(rows[0], window + l_begin, before, before + inside, l, reach);
-            put(rows[0], window + l_begin, before + inside, all_l, l, reach + inside);
-            put_zeros(l, reach - before + all_l, count * n_l);
-            energy[1] += put(rows[1], window + begin, 0, all_r, r, 0);
-            put_zeros(r, all_r, count * n_r);
+                if (start[0] != start[LANES - 1])
+                    join(&mine, start, held, ear ? begin : l_begin, ear ? end : l_end, joined);
+                if (ear == 0) {
+                    put_zeros(l, 0, reach - (begin - l_begin));
+                    put_both(&mine, window, l_begin, begin, l, reach - (begin - l_begin));
+                    energy[0] += put_both(&mine, window, begin, end, l, reach);
+                    put_both(&mine, window, end, l_end, l, reach + end - begin);
+                    put_zeros(l, reach + l_end - begin, count * n_l);
+                } else {
+                    energy[1] += put_both(&mine, window, begin, end, r, 0);
+                    put_zeros(r, end - begin, count * n_r);
+                }
+            }
             product(halvings, l_phases, r_phases, n_r, n_c, c_phases, scratch);
             for (int64_t m = 0; m < lags; m++) correlation[m] += *at(c, m);
         }
         vec scale = all(1.0) / root(energy[0] * energy[1] + all(epsilon));
         for (int64_t m = 0; m < lags; m++) {
             vec normalised = correlation[m] * scale;
-            UNROLL for (int k = 0; k < LANES; k++) to[k][m * frames] = normalised[k];
+            UNROLL for (int k = 0; k < LANES; k++) to[k][m * number] = normalised[k];
         }
     }
     for (int64_t i = 0; i < 2 * channels; i++)

@@ -15,11 +15,13 @@ SWITCH = "ROSAFE_KERNELS"  # environment variable: 0 for numpy and scipy, 3 or 4
 _INTEGER, _REAL, _ARRAY = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
 # history, stride, length; block, length; tail, stride, start; rows; skip; window, size; hop; frames
 _FRAMES = (_ARRAY, _INTEGER, _INTEGER, _ARRAY, _INTEGER, _ARRAY, *[_INTEGER] * 4, _ARRAY, *[_INTEGER] * 3)
+# frames that begin; sums of those that had begun, stride, how many are known; sums
+_SUMS = (_INTEGER, _ARRAY, _INTEGER, _INTEGER, _ARRAY)
 _ARGUMENTS = {
     "rosafe_gammatone": (_ARRAY, *[_INTEGER] * 3, *[_ARRAY] * 4),
     "rosafe_biquads": (_INTEGER, _ARRAY, _INTEGER, _INTEGER, _ARRAY, _INTEGER, _ARRAY, _ARRAY),
-    "rosafe_energies": (*_FRAMES, _ARRAY),
-    "rosafe_ratemap": (*_FRAMES, _INTEGER, _REAL, _ARRAY, _INTEGER, _ARRAY, _INTEGER, _ARRAY, _ARRAY),
+    "rosafe_levels": (*_FRAMES, *_SUMS, _REAL, _ARRAY),
+    "rosafe_ratemap": (*_FRAMES, *_SUMS, _INTEGER, _REAL, _ARRAY, _ARRAY),
     "rosafe_correlations": (*_FRAMES, _INTEGER, _REAL, _ARRAY, _INTEGER),
 }
 

@@ -17,13 +17,14 @@
 #define TINY 1e-200
 
 #ifdef __AVX512F__
-enum { LANES = 8 };
+enum { LANES = 8, STEPS = 3 /* of doubling, from 1 to LANES */ };
 #else
-enum { LANES = 4 };
+enum { LANES = 4, STEPS = 2 };
 #endif
 
 typedef double vec __attribute__((vector_size(8 * LANES)));
 typedef double vec_anywhere __attribute__((vector_size(8 * LANES), aligned(8), may_alias));
+typedef int64_t mask __attribute__((vector_size(8 * LANES)));
 typedef double duo __attribute__((vector_size(16), aligned(8), may_alias)); /* neighbours in memory */
 typedef double quartet __attribute__((vector_size(32)));
 
@@ -48,6 +49,17 @@ INLINE vec odds(vec a, vec b) { return __builtin_shufflevector(a, b, 1, 9, 3, 11
 INLINE vec every_second(const duo row[LANES]) {
     return __builtin_shufflevector(together(row[0], row[2]), together(row[4], row[6]), 0, 1, 2, 3, 4, 5, 6, 7);
 }
+INLINE vec last(vec a) { return __builtin_shufflevector(a, a, 7, 7, 7, 7, 7, 7, 7, 7); }
+/* Lane k + 2^step has what lane k had; 0 in the first ones. */
+INLINE vec delayed(vec a, const int step) {
+    return step == 0   ? __builtin_shufflevector(a, (vec){}, 8, 0, 1, 2, 3, 4, 5, 6)
+           : step == 1 ? __builtin_shufflevector(a, (vec){}, 8, 9, 0, 1, 2, 3, 4, 5)
+                       : __builtin_shufflevector(a, (vec){}, 8, 9, 10, 11, 0, 1, 2, 3);
+}
+/* At most LANES doubles, 0 in the lanes behind them; what lies there is not touched. */
+INLINE vec load_first(const double *from, int64_t n) {
+    return __builtin_ia32_loadupd512_mask(from, (vec){}, n < LANES ? (1 << n) - 1 : EVERY_LANE);
+}
 #else
 INLINE vec all(double x) { return (vec){x, x, x, x}; }
 INLINE vec fused(vec a, vec b, vec c) { return __builtin_ia32_vfmaddpd256(a, b, c); } /* a b + c */
@@ -57,7 +69,20 @@ INLINE vec root(vec a) { return __builtin_ia32_sqrtpd256(a); }
 INLINE vec evens(vec a, vec b) { return __builtin_shufflevector(a, b, 0, 4, 2, 6); }
 INLINE vec odds(vec a, vec b) { return __builtin_shufflevector(a, b, 1, 5, 3, 7); }
 INLINE vec every_second(const duo row[LANES]) { return together(row[0], row[2]); }
+INLINE vec last(vec a) { return __builtin_shufflevector(a, a, 3, 3, 3, 3); }
+INLINE vec delayed(vec a, const int step) {
+    return step == 0 ? __builtin_shufflevector(a, (vec){}, 4, 0, 1, 2) : __builtin_shufflevector(a, (vec){}, 4, 5, 0, 1);
+}
+INLINE vec load_first(const double *from, int64_t n) {
+    return __builtin_ia32_maskloadpd256((const vec *)from, (mask){0, 1, 2, 3} < n);
+}
 #endif
+
+INLINE double total(vec x) {
+    double sum = 0.0;
+    UNROLL for (int k = 0; k < LANES; k++) sum += x[k];
+    return sum;
+}
 
 INLINE vec bounded(vec x, double low, double high) { return larger(smaller(x, all(high)), all(low)); }
 
