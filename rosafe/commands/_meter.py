@@ -50,7 +50,7 @@ class Meter:
         self._recent.add(samples)
         if not self._live:
             if self._recent.frames >= PLAIN_SECONDS * self._rate:
-                self._write(self._text(lost, self._recent) + "\n")
+                self._write(self._plain(lost) + "\n")
                 self._recent = Levels()
             return
         now = time.monotonic()
@@ -59,35 +59,39 @@ class Meter:
         self._held[1].add(samples)
         if now >= self._due:
             self._due = now + LIVE_SECONDS
-            self._write(_CLEAR + self._text(lost, self._recent)[: shutil.get_terminal_size().columns - 1])
+            self._write(_CLEAR + self._look(lost))
             self._recent = Levels()
 
     def message(self, text: str) -> None:
-        """A line that stays."""
-        self.clear()
-        self._write(text + "\n")
-
-    def clear(self) -> None:
-        """Take the live line away."""
-        if self._live and not self._quiet:
-            self._write(_CLEAR)
+        """A line that stays, in the place of the live one."""
+        self._write((_CLEAR if self._live and not self._quiet else "") + text + "\n")
 
     def _write(self, text: str) -> None:
         self._stream.write(text)
         self._stream.flush()
 
-    def _text(self, lost: int, levels: Levels) -> str:
-        parts = [f"{clock(self._frames / self._rate):>5}"]
-        for ear, name in enumerate(EARS):
-            bar = f" [{self._bar(levels, ear)}]" if self._live else ""
-            clipped = any(held.clipped[ear] for held in (*self._held, levels))
-            mark = " CLIP" if clipped else "     " * self._live
-            parts.append(f"{name}{bar} peak {decibel_text(levels.peak(ear))} rms {decibel_text(levels.rms(ear))}{mark}")
-        return "  ".join(parts) + f"  lost {lost}"
+    def _plain(self, lost: int) -> str:
+        ears = [
+            f"{name} peak {self._recent.peak(ear):6.1f} rms {self._recent.rms(ear):6.1f}{_mark([self._recent], ear)}"
+            for ear, name in enumerate(EARS)
+        ]
+        return "  ".join((clock(self._frames / self._rate).rjust(5), *ears, f"lost {lost}"))
 
-    def _bar(self, levels: Levels, ear: int) -> str:
-        width = max(6, min(30, (shutil.get_terminal_size().columns - 80) // 2))
-        full = _place(levels.rms(ear), width)
+    def _look(self, lost: int) -> str:
+        """Bars of the RMS with the highest peak of late, and peak/RMS as numbers, in the terminal's width."""
+        looks = [
+            f"{self._recent.peak(ear):6.1f}/{self._recent.rms(ear):6.1f}{_mark(self._held, ear):5}" for ear in range(2)
+        ]
+        head, tail = clock(self._frames / self._rate).rjust(5), f"lost {lost}"
+        columns = shutil.get_terminal_size().columns - 1
+        width = (columns - len("  ".join((head, *looks, tail))) - len("L [] R [] ")) // 2
+        ears = [
+            f"{name} [{self._bar(ear, width)}] {look}" for ear, (name, look) in enumerate(zip(EARS, looks, strict=True))
+        ]
+        return "  ".join((head, *ears, tail))[:columns]
+
+    def _bar(self, ear: int, width: int) -> str:
+        full = _place(self._recent.rms(ear), width)
         held = _place(max(part.peak(ear) for part in self._held), width)
         bar = ["#"] * full + ["-"] * (width - full)
         if held:
@@ -95,10 +99,10 @@ class Meter:
         return "".join(bar)
 
 
+def _mark(parts: list[Levels], ear: int) -> str:
+    return " CLIP" if any(part.clipped[ear] for part in parts) else ""
+
+
 def _place(decibels: float, width: int) -> int:
+    """How many of a bar's `width` characters are filled."""
     return max(0, min(width, round((decibels - FLOOR_DB) / -FLOOR_DB * width))) if decibels > FLOOR_DB else 0
-
-
-def decibel_text(value: float) -> str:
-    """``-12.3`` or ``-inf``, always as wide."""
-    return f"{value:6.1f}"

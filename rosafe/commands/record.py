@@ -66,9 +66,9 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--force", action="store_true", help="replace OUT where it is there already")
     parser.add_argument("-q", "--quiet", action="store_true", help="no meter; losses and the summary only")
     parser.epilog = (
-        "The meter shows, for each ear, the highest sample and the root mean square in dB below full scale, CLIP\n"
-        "where samples were at the end of the scale, and the frames lost so far: on a terminal as one live line,\n"
-        "else as a line for each second.\n\n"
+        "The meter shows, for each ear, the highest sample (peak) and the root mean square (rms) in dB below full\n"
+        "scale, CLIP where samples were at the end of the scale, and the frames lost so far. On a terminal that is\n"
+        "one live line, with peak/rms behind bars of the rms; else a line for each second.\n\n"
         "exit status: 0 recorded, 1 something failed (what was recorded until then is kept), 2 wrong command line\n\n"
         "examples:\n"
         "  rosafe record --device plughw:1,0              # check the levels of a sound card\n"
@@ -211,7 +211,6 @@ def _record(path: Path | None, options: argparse.Namespace, stopping: threading.
             except ComponentError as problem:
                 raise Failure(problem.why) from None
             finally:
-                meter.clear()
                 if recorder.frames:
                     meter.message(_summary(recorder, str(path or "heard"), source.sample_rate))
         if ended:
@@ -244,8 +243,9 @@ def _open_output(path: Path, options: argparse.Namespace, source: Source) -> Out
 
     if path.suffix.lower() == ".wav":
         return WavFile(path, source.sample_rate)
+    # A stream that others hear too keeps its numbers and its name.
     chunk, newest = getattr(source, "frames_per_chunk", options.chunk), getattr(source, "newest", 0)
-    return BagFile(path, source.sample_rate, chunk, options.topic or _TOPIC, newest)
+    return BagFile(path, source.sample_rate, chunk, source.name if options.topic else _TOPIC, newest)
 
 
 def _summary(recorder: Recorder, name: str, sample_rate: int) -> str:

@@ -40,3 +40,11 @@ def write(path: Path, messages: Iterable[Any], topic: str = "/bass/Audio", **opt
         for count, item in enumerate(messages):
             bag.write(topic, item, genpy.Time(1000 + count // 100, count % 100 * 10_000_000))
     return path
+
+
+def read(path: Path, topic: str) -> list[Any]:
+    """The messages of a topic, as rosbag gives them."""
+    import rosbag
+
+    with rosbag.Bag(str(path)) as bag:
+        return [message for _, message, _ in bag.read_messages(topics=[topic])]

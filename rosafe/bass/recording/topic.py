@@ -17,7 +17,7 @@ from rosafe.interface import BASS, ComponentError
 from rosafe.ros import wire
 from rosafe.ros.audio import malformed
 
-FIRST_SECONDS = 5.0  # for a first message
+FIRST_SECONDS = 3.0  # for a first message
 STALL_SECONDS = 5.0  # without anything new, the stream counts as ended; besides a chunk's own length
 POLL_SECONDS = 0.1
 
@@ -47,7 +47,7 @@ class TopicSource:
     """
 
     def __init__(self, topic: str, sample_rate: int, stopping: threading.Event) -> None:
-        self.name = topic
+        self.name = topic = rospy.resolve_name(topic)
         self.overruns = 0
         self.lost_frames = 0
         self._stopping = stopping
@@ -58,7 +58,7 @@ class TopicSource:
         self._arrived = threading.Event()
         message_class = wire.lenient_class("bass", BASS.port("Audio").idl)
         kinds = dict(rospy.get_published_topics())
-        kind = kinds.get(rospy.resolve_name(topic))
+        kind = kinds.get(topic)
         if kind is not None and kind.rpartition("/")[2] != message_class.__name__:
             raise device_error(f"{topic} is no port Audio, but of type {kind}")
         self._subscriber = rospy.Subscriber(topic, message_class, self._hear, buff_size=2**24, tcp_nodelay=True)

@@ -1,0 +1,257 @@
+"""`rosafe record` as a command: from devices without ROS, from a running bass, and how it ends."""
+
+from __future__ import annotations
+
+import os
+import re
+import select
+import signal
+import subprocess
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import soundfile
+
+from rosafe.bass.sources.scene import Scene
+from tests.bass import bags
+from tests.cli.command import ROSAFE, environment, refused, rosafe, start
+from tests.harness import Graph, Process, free_port, open_terminal, wait_for
+
+RATE = 8000
+
+
+def samples_of(path: Path) -> np.ndarray:
+    return np.asarray(soundfile.read(path, dtype="int32")[0].T)
+
+
+def wait_for_sound(path: Path, recording: Process) -> None:
+    """Until some sound is in the file."""
+    wait_for(lambda: path.exists() and path.stat().st_size > 4000, 20, lambda: str(recording))
+
+
+def number(pattern: str, text: str) -> float:
+    found = re.search(pattern, text)
+    assert found, text
+    return float(found[1])
+
+
+# --- without ROS ---
+
+
+@pytest.fixture(scope="module")
+def wav(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A quarter of a second of full-range noise."""
+    path = tmp_path_factory.mktemp("in") / "in.wav"
+    soundfile.write(path, bags.stream(2000).T, RATE, subtype="PCM_32")
+    return path
+
+
+def test_through_a_bag_into_a_wav(wav: Path, tmp_path: Path) -> None:
+    """Whatever the chunks: the same samples, the last chunk filled up."""
+    done = rosafe("record", "a.bag", "--device", f"file:{wav}", "--chunk", "300", cwd=tmp_path)
+    assert done.returncode == 0 and done.stderr == "", done
+    assert done.stdout.startswith("a.bag: 0.263 s at 8000 Hz, highest peaks left -0.0, right ")
+    done = rosafe("record", "a.wav", "--device", "bag:a.bag", "--seconds", "0.25", cwd=tmp_path)
+    assert done.returncode == 0 and done.stderr == "", done
+    assert np.array_equal(samples_of(tmp_path / "a.wav"), samples_of(wav))
+
+
+def test_loss_is_told_with_its_place(tmp_path: Path) -> None:
+    samples = bags.stream(3000)
+    messages = [bags.message(samples, index, 400, RATE, 200) for index in (0, 200, 400, 1600, 2000)]
+    bags.write(tmp_path / "a.bag", messages)
+    done = rosafe("record", "a.wav", "--device", "bag:a.bag", "--chunk", "200", cwd=tmp_path)
+    assert done.returncode == 0, done
+    assert "lost 800 frames (0.100 s) at 0.05 s\n" in done.stdout and "800 frames lost\n" in done.stdout
+    samples[:, 400:1200] = 0
+    assert np.array_equal(samples_of(tmp_path / "a.wav"), samples[:, :2000])
+
+
+def test_levels_without_output(tmp_path: Path) -> None:
+    tone = np.sin(2 * np.pi * 100 * np.arange(RATE) / RATE)
+    soundfile.write(tmp_path / "a.wav", np.stack((0.5 * tone, 1.5 * tone), axis=1), RATE, subtype="PCM_16")
+    done = rosafe("record", "--device", "file:a.wav", "--chunk", "400", cwd=tmp_path)
+    line, summary, end = done.stdout.splitlines()
+    assert done.returncode == 0 and end == "file:a.wav has ended"
+    clipped = 10 * np.log10(np.mean(np.clip(1.5 * tone, -1, 1) ** 2))
+    assert re.sub(" +", " ", line) == f" 0:01 L peak -6.0 rms -9.0 R peak 0.0 rms {clipped:.1f} CLIP lost 0"
+    assert summary.startswith("heard: 1.000 s at 8000 Hz") and number(r"(\d+) samples clipped", summary) > 4000
+    assert os.listdir(tmp_path) == ["a.wav"]
+
+
+def test_mistakes_change_nothing(wav: Path, tmp_path: Path) -> None:
+    kept = tmp_path / "kept.wav"
+    kept.write_text("precious")
+    (tmp_path / "folder.wav").mkdir()
+    device = ("--device", f"file:{wav}")
+    refused(rosafe("record", kept, *device), "is there already; --force replaces it")
+    refused(rosafe("record", kept, "--force", "--device", "file:missing.wav"), "missing.wav: No such file")
+    refused(rosafe("record", kept, "--force", *device, "--rate", "44100"), "8000 Hz, asked for were 44100")
+    refused(rosafe("record", kept, "--force", "--device", f"file:{kept}?loop=1"), "is the input itself")
+    assert kept.read_text() == "precious"
+    refused(rosafe("record", tmp_path / "folder.wav", "--force", *device), "not a regular file")
+    refused(rosafe("record", tmp_path / "no" / "a.wav", *device), "there is no folder")
+    refused(rosafe("record", "a.mp3", *device, cwd=tmp_path), "ends in .wav or .bag", code=2)
+    refused(rosafe("record", *device, "--seconds", "nan"), "'nan' is not a number of seconds", code=2)
+    refused(rosafe("record", *device, "--rate", "-5"), "'-5' is not a whole number", code=2)
+    refused(rosafe("record", *device, "--topic", "/x"), "not allowed with", code=2)
+    refused(rosafe("record", "--socket", "nowhere"), "is not HOST:PORT", code=2)
+    refused(rosafe("record", "--socket", "127.0.0.1:9"), "needs --rate", code=2)
+    refused(rosafe("record", "--socket", f"127.0.0.1:{free_port()}", "--rate", "8000"), "Connection refused")
+    uri = f"http://127.0.0.1:{free_port()}"
+    refused(rosafe("record", ROS_MASTER_URI=uri), f"no ROS master at {uri}", "or record a --device without ROS")
+    assert sorted(os.listdir(tmp_path)) == ["folder.wav", "kept.wav"]
+    done = rosafe("record", kept, "--force", "-q", *device)
+    assert done.returncode == 0 and samples_of(kept).shape[1] >= 2000
+
+
+def test_list(tmp_path: Path) -> None:
+    done = rosafe("record", "--list")
+    assert done.returncode == 0
+    assert [line.split()[0] for line in done.stdout.splitlines()][:3] == ["file:PATH", "bag:PATH", "scene:"]
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
+def test_a_signal_ends_it_with_a_complete_file(tmp_path: Path, number: int) -> None:
+    with start("record", "a.wav", "--device", "scene:", "--rate", str(RATE), cwd=tmp_path) as recording:
+        wait_for_sound(tmp_path / "a.wav", recording)
+        assert recording.stop(number) == 0
+        assert re.search(r"^a\.wav: [\d.]+ s at 8000 Hz, ", recording.out, re.MULTILINE) and recording.err == ""
+    samples = samples_of(tmp_path / "a.wav")
+    assert samples.shape[1] >= 500 and np.array_equal(samples, Scene(RATE).frames(samples.shape[1]))
+
+
+def test_killed(tmp_path: Path) -> None:
+    with start("record", "a.wav", "--device", "scene:", "--rate", str(RATE), cwd=tmp_path) as recording:
+        wait_for(lambda: "L peak" in recording.out, 20, lambda: str(recording))
+        recording.stop(signal.SIGKILL)
+    samples = samples_of(tmp_path / "a.wav")
+    assert samples.shape[1] >= RATE and np.array_equal(samples, Scene(RATE).frames(samples.shape[1]))
+
+
+def test_full_disk(wav: Path, tmp_path: Path) -> None:
+    """As with a limit of the file's size; what fits is kept."""
+    done = subprocess.run(
+        ["prlimit", "--fsize=10003", str(ROSAFE), "record", "a.wav", "--device", f"file:{wav}", "--chunk", "100"],
+        cwd=tmp_path,
+        env=environment(),
+        capture_output=True,
+        text=True,
+        timeout=60,
+        check=False,
+    )
+    assert done.returncode == 1 and done.stderr == "rosafe record: cannot write a.wav: File too large\n"
+    samples = samples_of(tmp_path / "a.wav")
+    assert samples.shape[1] == (10003 - 80) // 8 and np.array_equal(samples, samples_of(wav)[:, : samples.shape[1]])
+
+
+def test_live_line_on_a_terminal(tmp_path: Path) -> None:
+    ours, theirs = open_terminal()
+    command = [str(ROSAFE), "record", "a.wav", "--device", "scene:", "--seconds", "1", "--chunk", "441"]
+    with subprocess.Popen(command, cwd=tmp_path, env=environment(COLUMNS="80"), stdout=theirs, stdin=theirs) as shown:
+        os.close(theirs)
+        text = ""
+
+        def told() -> bool:
+            nonlocal text
+            if select.select([ours], [], [], 0)[0]:
+                text += os.read(ours, 4096).decode()
+            return "frames lost" in text
+
+        wait_for(told, 30, lambda: repr(text))
+        assert shown.wait(20) == 0
+    os.close(ours)
+    looks = text.split("\r\x1b[K")
+    assert len(looks) > 4
+    assert re.search(r"0:01  L \[#+-*\|?-*\] +-[\d.]+/ *-[\d.]+ +R \[.*\] .*  lost 0$", looks[-2])
+    assert max(map(len, looks[:-1])) == 79 and looks[-1].startswith("a.wav: 1.000 s")
+
+
+def test_reader_of_the_meter_leaves(tmp_path: Path) -> None:
+    read, write = os.pipe()
+    os.close(read)
+    command = [str(ROSAFE), "record", "a.wav", "--device", "scene:", "--rate", str(RATE), "--chunk", "400"]
+    done = subprocess.run(
+        command, cwd=tmp_path, env=environment(), stdout=write, stderr=subprocess.PIPE, timeout=60, check=False
+    )
+    os.close(write)
+    assert done.returncode == 141 and done.stderr == b""
+    assert samples_of(tmp_path / "a.wav").shape[1] == RATE  # until the first line
+
+
+# --- from a running bass ---
+
+
+@pytest.fixture(scope="module")
+def capturing(graph: Graph) -> Iterator[Process]:
+    with graph.node("bass-ros", "-i", "heard") as bass:
+        yield bass
+
+
+def acquire(graph: Graph, device: str = "scene:") -> None:
+    assert graph.call("/heard/Acquire", device=device, sampleRate=RATE, nFramesPerChunk=400).genom_success
+
+
+def find(samples: np.ndarray) -> int:
+    """Where the scene has these samples."""
+    scene = Scene(RATE).frames(60 * RATE)
+    (places,) = np.nonzero(scene[0, : -samples.shape[1]] == samples[0, 0])
+    return next(int(at) for at in places if np.array_equal(scene[:, at : at + samples.shape[1]], samples))
+
+
+def test_topic_to_wav_and_bag(graph: Graph, capturing: Process, tmp_path: Path) -> None:
+    acquire(graph)
+    to_wav = (str(ROSAFE), "record", "a.wav", "--topic", "/heard/Audio", "--seconds", "0.5")
+    to_bag = (str(ROSAFE), "record", "a.bag", "--topic", "heard/Audio", "--seconds", "0.5")
+    with graph.start(*to_wav, cwd=tmp_path) as wav, graph.start(*to_bag, cwd=tmp_path) as bag:
+        assert wav.wait() == 0 and bag.wait() == 0, (wav, bag)
+        assert "a.wav: 0.500 s at 8000 Hz" in wav.out and "0 frames lost" in wav.out and wav.err == ""
+    assert find(samples_of(tmp_path / "a.wav")) % 400 == 0
+    messages = bags.read(tmp_path / "a.bag", "/heard/Audio")
+    newest = [int(message.lastFrameIndex) for message in messages]
+    at = find(np.stack([messages[-1].left[-400:], messages[-1].right[-400:]]))
+    assert newest[-1] == at + 400 and np.all(np.diff(newest) == 400)  # the numbers are those of the stream
+
+
+def test_dedicated_socket_to_wav(graph: Graph, capturing: Process, tmp_path: Path) -> None:
+    import rospy
+
+    graph.client()
+    port = free_port()
+    rospy.set_param("/heard/socket_port", port)
+    acquire(graph)
+    assert graph.call("/heard/DedicatedSocket").genom_success
+    address = ("--socket", f"127.0.0.1:{port}", "--rate", str(RATE))
+    done = rosafe("record", "a.wav", *address, "--seconds", "0.3", cwd=tmp_path)
+    assert done.returncode == 0 and "0 frames lost" in done.stdout, done
+    find(samples_of(tmp_path / "a.wav"))
+    with start("record", "b.wav", *address, "-q", cwd=tmp_path) as recording:
+        wait_for_sound(tmp_path / "b.wav", recording)
+        assert graph.call("/heard/CloseSocket").genom_success
+        assert recording.wait() == 1
+        assert recording.err == f"rosafe record: 127.0.0.1:{port}: bass has closed the connection\n"
+    find(samples_of(tmp_path / "b.wav"))
+
+
+def test_new_acquisition_ends_the_recording(graph: Graph, capturing: Process, tmp_path: Path) -> None:
+    """Two streams are not spliced; what there was of the first is kept."""
+    acquire(graph)
+    with graph.start(str(ROSAFE), "record", "a.wav", "--topic", "/heard/Audio", "-q", cwd=tmp_path) as recording:
+        wait_for_sound(tmp_path / "a.wav", recording)
+        acquire(graph)
+        assert recording.wait() == 1
+        assert recording.err.startswith("rosafe record: /heard/Audio: a new stream begins (its index falls from ")
+    find(samples_of(tmp_path / "a.wav"))
+
+
+def test_nothing_to_hear(graph: Graph, capturing: Process, tmp_path: Path) -> None:
+    topics = {
+        "/heard/genom_state": "/heard/genom_state is no port Audio, but of type bass/genom_state_component",
+        "/nobody/Audio": "/nobody/Audio is published by nobody: start bass-ros",
+    }
+    for topic, why in topics.items():
+        done = graph.run(str(ROSAFE), "record", str(tmp_path / "a.wav"), "--topic", topic, check=False)
+        refused(done, why)
+    assert not os.listdir(tmp_path)
