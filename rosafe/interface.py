@@ -900,12 +900,12 @@ BASS = Component(
             "Acquire",
             "Capture from a device and publish on Audio until stopped",
             (
-                Parameter("device", "string", "hw:1,0", "ALSA name of the sound device, file:PATH or scene:"),
+                Parameter("device", "string", "hw:1,0", "ALSA name of the sound device, file:PATH, bag:PATH or scene:"),
                 Parameter(
                     "sampleRate",
                     "unsigned long",
                     44100,
-                    "Sample rate (Hz); 0: the file's own rate with file:, else 44100",
+                    "Sample rate (Hz); 0: the source's own with file: and bag:, else 44100",
                     0,
                     768000,
                     zero_is_default=False,

@@ -85,9 +85,8 @@ class Meter:
         head, tail = clock(self._frames / self._rate).rjust(5), f"lost {lost}"
         columns = shutil.get_terminal_size().columns - 1
         width = (columns - len("  ".join((head, *looks, tail))) - len("L [] R [] ")) // 2
-        ears = [
-            f"{name} [{self._bar(ear, width)}] {look}" for ear, (name, look) in enumerate(zip(EARS, looks, strict=True))
-        ]
+        bars = [f" [{self._bar(ear, width)}]" if width >= 4 else "" for ear in range(2)]
+        ears = [f"{name}{bar} {look}" for name, bar, look in zip(EARS, bars, looks, strict=True)]
         return "  ".join((head, *ears, tail))[:columns]
 
     def _bar(self, ear: int, width: int) -> str:

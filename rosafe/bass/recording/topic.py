@@ -18,6 +18,7 @@ from rosafe.ros import wire
 from rosafe.ros.audio import malformed
 
 FIRST_SECONDS = 3.0  # for a first message
+NOBODY_SECONDS = 1.0  # for one where nobody publishes the topic
 STALL_SECONDS = 5.0  # without anything new, the stream counts as ended; besides a chunk's own length
 POLL_SECONDS = 0.1
 
@@ -77,7 +78,7 @@ class TopicSource:
         self._patience = STALL_SECONDS + self.frames_per_chunk / self.sample_rate
 
     def _await_first(self, published: bool) -> None:
-        end = time.monotonic() + FIRST_SECONDS
+        end = time.monotonic() + (FIRST_SECONDS if published else NOBODY_SECONDS)
         while not self._arrived.wait(POLL_SECONDS) and not self._stopping.is_set():
             if time.monotonic() > end:
                 what = "has published nothing: call Acquire" if published else "is published by nobody: start bass-ros"
