@@ -8,6 +8,7 @@ from typing import Any
 from rosafe.interface import KINDS
 
 _PARAMETERS = {name: p for kind in KINDS.values() for p in kind.parameters for name in (p.name, *p.aliases)}
+_MISSPELT = {wrong: right for kind in KINDS.values() for wrong, right in kind.rename.items()}
 
 
 def check_parameters(parameters: Any) -> dict[str, Any]:
@@ -31,6 +32,17 @@ def check_parameter(name: Any, value: Any, text: bool = False) -> tuple[str, Any
     if parameter.choices and checked not in parameter.choices:
         raise ValueError(f"{name}: {checked!r} is not {parameter.range_text}")
     return parameter.name, checked
+
+
+def check_change(name: Any, value: Any) -> tuple[str, Any]:
+    """As `check_parameter`, for a change on the way: also under the original's misspelt name of modifyParameter.
+
+    With that (`set_rm_scailing`) go its misspelt values (`_power`).
+    """
+    if isinstance(name, str) and name in _MISSPELT:
+        name = _MISSPELT[name]
+        value = value.removeprefix("_") if isinstance(value, str) else value
+    return check_parameter(name, value)
 
 
 def check_outputs(outputs: Any) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -12,7 +13,7 @@ import numpy as np
 
 from rosafe.dsp.framing import FramedStage, Framing
 from rosafe.interface import KINDS, ComponentError
-from rosafe.tree.processor import Processor
+from rosafe.tree.processor import Observer, Processor
 from rosafe.tree.tree import Tree
 from rosafe.tree.zone import Block
 
@@ -130,6 +131,10 @@ class Chain:
         with _as_value_error():
             self._tree.schedule(block, name, value)
 
+    def observe(self, observer: Observer) -> None:
+        """Tell `observer` of every state that a processor enters."""
+        self._tree.observe(observer)
+
     def run(self) -> None:
         """Let the signal flow and wait for its end; raises what the first processor failed with."""
         self._source.open()
@@ -164,6 +169,16 @@ class Chain:
         if isinstance(stage, FramedStage):
             frames = Framing.design(stage.sample_rate, stage.PREFIX, stage.parameters).complete(frames)
         return (*self.rows(output), frames)
+
+    def largest_block(self, frames: int) -> tuple[str, int]:
+        """Which processor puts out most for one block of so many frames, and how many bytes that can be."""
+        sizes = {}
+        for kind, processor in self._processors.items():
+            stage = processor.stage
+            hop = stage.sample_rate / stage.output_rate
+            sizes[kind] = 8 * math.prod(processor.rows) * math.ceil(frames / hop)
+        kind = max(sizes, key=lambda kind: sizes[kind])
+        return kind, sizes[kind]
 
     def describe(self) -> dict[str, Any]:
         """Axes and rates of what runs: `fb_cfHz` (Hz), `cc_lags` (s), `ild_frameRate` and its like (Hz)."""

@@ -21,6 +21,7 @@ from rosafe.chain import Chain
 from rosafe.interface import KINDS
 from rosafe.npz import NpzWriter
 from rosafe.offline import DEFAULT_BLOCK
+from rosafe.tree.tree import MAX_BYTES
 from rosafe.tree.zone import Block
 
 _DEFAULTS = {parameter.name: parameter.default for kind in KINDS.values() for parameter in kind.parameters}
@@ -56,7 +57,7 @@ def process_file(
     parameters, outputs
         As of `rosafe.process`; `in_doNormalize` is True by default.
     block_frames : int
-        Frames that are read and processed at a time.
+        Frames that are read and processed at a time; the output for them takes at most 1 GiB.
     progress : callable
         Called now and then with the frames that are done and those that there are. What it raises ends the work.
 
@@ -108,6 +109,7 @@ def _stream(
             progress(min(done.values()), file.frames)
 
     with Chain(_blocks(file, block_frames), file.sample_rate, values, wanted, keep) as chain:
+        _check_memory(*chain.largest_block(min(block_frames, file.frames)))
         writer = NpzWriter(
             descriptor,
             {
@@ -131,6 +133,15 @@ def _blocks(file: AudioFile, block_frames: int) -> Iterator[np.ndarray]:
         if block.shape[1] != wanted:
             raise AudioFileError(f"{file.path} is cut off: {at + block.shape[1]} of {file.frames} frames are there")
         yield block
+
+
+def _check_memory(kind: str, size: int) -> None:
+    """ValueError where one block of output would fill the memory; several are under way at the same time."""
+    if size > MAX_BYTES:
+        raise ValueError(
+            f"{kind}: one block of output would take {size / 1e9:.1f} GB, allowed are {MAX_BYTES / 1e9:.1f} GB; "
+            "take fewer channels or lags, or a smaller --block"
+        )
 
 
 # --- the output -------------------------------------------------------------------------------------------------

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import itertools
+import math
+import os
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from rosafe.arguments import check_outputs, check_parameter, check_parameters
+from rosafe.arguments import check_change, check_outputs, check_parameters
 from rosafe.chain import Chain, lags
 from rosafe.interface import REQUIRED, Parameter
 from rosafe.tree.zone import Block
@@ -42,7 +44,7 @@ def process(
         (`pp_bNormalizeRMS`) starts do the numbers depend on it.
     modifications : sequence of (block, name, value)
         Parameter changes, each made before the block of that number (from 0); several for one block are made in the
-        order given. Those for blocks that never come are ignored.
+        order given. Those for blocks that never come are ignored. The original's `set_rm_scailing` is known here too.
     outputs : sequence of str, optional
         The representations to return, of `input`, `preProc`, `gammatone`, `ihc`, `ild`, `ratemap`,
         `crossCorrelation`. All by default. What none of them depends on is not computed.
@@ -75,9 +77,12 @@ def process(
 
     blocks = (samples[:, first:end] for first, end in itertools.pairwise((0, *ends)))
     with Chain(blocks, rate, values, wanted, keep) as chain:
+        sizes = [_size(chain, wanted, ends)]
         for block, name, value in changes:
             if block < len(ends):
                 chain.schedule(block, name, value)
+                sizes.append(_size(chain, wanted, ends))
+        _check_memory(max(sizes))
         chain.run()
         results: dict[str, Any] = {}
         for kind in wanted:
@@ -133,11 +138,29 @@ def _checked_modifications(modifications: Any) -> list[tuple[int, str, Any]]:
         block, name, value = change
         if isinstance(block, bool) or not isinstance(block, (int, np.integer)) or block < 0:
             raise ValueError(f"modifications: {block!r} is not a block number")
-        changes.append((int(block), *check_parameter(name, value)))
+        changes.append((int(block), *check_change(name, value)))
     return sorted(changes, key=lambda change: change[0])
 
 
 # --- what comes out ---
+
+
+def _size(chain: Chain, wanted: list[str], ends: list[int]) -> int:
+    """Bytes of the largest thing there will be at a time: all results, or one block of what is not kept."""
+    frames = ends[-1] if ends else 0
+    largest_block = max((end - first for first, end in itertools.pairwise((0, *ends))), default=0)
+    results = sum(8 * math.prod(chain.shape(kind, frames)) for kind in wanted)
+    return max(results, chain.largest_block(largest_block)[1])
+
+
+def _check_memory(size: int) -> None:
+    """ValueError where `size` bytes are more than the machine has: there the kernel would end the process."""
+    memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    if size > memory:
+        raise ValueError(
+            f"outputs: they would take {size / 1e9:.1f} GB of memory, this machine has {memory / 1e9:.1f} GB; "
+            "name fewer outputs, or take fewer channels or lags"
+        )
 
 
 def _join(kind: str, blocks: list[np.ndarray], rows: tuple[int, ...]) -> np.ndarray:

@@ -201,9 +201,9 @@ def _targets(inputs: list[Path], output: str | None) -> tuple[list[Path], bool]:
         return [Path(output)], True
     else:
         raise Failure(f"-o {output}: for several files, wanted is a folder, ending in / or there already")
-    taken: dict[Path, Path] = {}
+    taken: dict[str, Path] = {}
     for path, target in zip(inputs, targets, strict=True):
-        other = taken.setdefault(target, path)
+        other = taken.setdefault(os.path.realpath(target), path)
         if other is not path:
             raise Failure(f"{other} and {path} would both go to {target}")
     return targets, False

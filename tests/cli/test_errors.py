@@ -174,6 +174,9 @@ def test_two_outputs_in_one_place(folder: Path) -> None:
     write(folder / "in.flac", noise(100))
     refused(rosafe("process", "in.wav", "in.flac", cwd=folder), "in.wav and in.flac would both go to in.npz")
     refused(rosafe("process", "in.wav", "in.wav", cwd=folder), "in.npz")
+    (folder / "link").symlink_to(folder)
+    refused(rosafe("process", "in.wav", "link/in.wav", cwd=folder), "in.wav and link/in.wav would both go to link/in")
+    (folder / "link").unlink()
     refused(rosafe("process", "in.wav", "in.flac", "-o", "out.npz", cwd=folder), "-o out.npz", "folder")
     assert_untouched(folder, "in.flac")
 
@@ -188,6 +191,18 @@ def test_no_room_is_told_before_the_work(folder: Path) -> None:
         file.truncate(len(head) + size)
     done = rosafe("process", "in.wav", "--set", "fb_nChannels=1000", cwd=folder)
     refused(done, "in.wav", "GB are free", "--outputs")
+    assert_untouched(folder)
+
+
+@pytest.mark.parametrize(
+    "settings", [["cc_maxDelaySec=10", "--block", "3000"], ["fb_nChannels=1024", "fb_cfHz=" + "100," * 1024]]
+)
+def test_blocks_that_would_fill_the_memory(folder: Path, settings: list[str]) -> None:
+    write(folder / "in.wav", np.zeros((2, 100_000)))
+    done = rosafe(
+        "process", "in.wav", "--block", "10000000", "--outputs", "crossCorrelation", "--set", *settings, cwd=folder
+    )
+    refused(done, "in.wav: ", "one block of output would take", "allowed are 1.1 GB", "--block")
     assert_untouched(folder)
 
 

@@ -55,6 +55,17 @@ def test_integer_files(tmp_path: Path, name: str, subtype: str, bits: int) -> No
     assert_equal(tmp_path / "in.npz", process(samples, 16000, SMALL_PARAMETERS, outputs=["input", "ild"]))
 
 
+@pytest.mark.parametrize("subtype", ["PCM_U8", "PCM_24", "FLOAT", "DOUBLE"])
+def test_extensible_header(tmp_path: Path, subtype: str) -> None:
+    """WAVE_FORMAT_EXTENSIBLE, as many programs write it."""
+    signal = np.random.default_rng(9).integers(-128, 128, (2, 5000)) / 128
+    for name, form in (("plain.wav", "WAV"), ("extensible.wav", "WAVEX")):
+        soundfile.write(tmp_path / name, signal.T, 16000, subtype, format=form)
+    assert rosafe("process", "plain.wav", "extensible.wav", *SMALL, "--outputs", "input", cwd=tmp_path).returncode == 0
+    with np.load(tmp_path / "plain.npz") as plain, np.load(tmp_path / "extensible.npz") as extensible:
+        np.testing.assert_array_equal(plain["input"], extensible["input"])
+
+
 @pytest.mark.parametrize("subtype", ["FLOAT", "DOUBLE"])
 def test_float_files(tmp_path: Path, subtype: str) -> None:
     signal = np.random.default_rng(5).normal(0, 0.3, (2, 5000)).astype(np.float32).astype(np.float64)

@@ -132,6 +132,9 @@ def test_block_sizes(block_frames: Any) -> None:
         ([(True, "fb_nERBs", 2)], "True is not a block number"),
         ([("0", "fb_nERBs", 2)], "'0' is not a block number"),
         ([(0, "fb_nErbs", 2)], "unknown parameter 'fb_nErbs'"),
+        ([(0, ["fb_nERBs"], 2)], r"unknown parameter \['fb_nERBs'\]"),
+        ([(0, "set_rm_scailing", "_log")], "rm_scaling: 'log' is not one of power, magnitude"),
+        ([(0, "set_rm_scailing", 1)], "rm_scaling: 1 is not a string"),
         ([(0, "fb_nERBs", 0)], "fb_nERBs: 0 is out of range"),
         ([(99, "fb_nERBs", 0)], "fb_nERBs: 0 is out of range"),
         ([(0, "ihc_method", "none"), (0, "ihc_method", "nothing")], "ihc_method: 'nothing' is not one of"),
@@ -161,3 +164,19 @@ def test_outputs(outputs: Any, match: str) -> None:
 def test_sizes_that_fill_the_memory() -> None:
     refused("ild_wSizeSec: 60 s of .* MiB, more than 1024 MiB", GOOD, 96000, {"ild_wSizeSec": 60.0})
     refused("more than 1024 MiB", GOOD, 96000, modifications=[(0, "ild_wSizeSec", 60.0)])
+
+
+def test_results_larger_than_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(offline.os, "sysconf", lambda name: 2**12)  # 16 MiB
+    sound, lags = np.zeros((2, 4000)), {"cc_maxDelaySec": 1.0}
+    refused("outputs: they would take .* GB of memory, this machine has", sound, RATE, lags)
+    refused("outputs: they would take", sound, RATE, modifications=[(0, *change) for change in lags.items()])
+    at_the_end = [(3, "cc_maxDelaySec", 1e-3)]  # smaller again, but not before it was too large
+    refused("outputs: they would take", sound, RATE, lags, 1000, at_the_end)
+    hidden = {
+        "fb_nChannels": 500,
+        "fb_highFreqHz": 4000.0,
+    }  # the filterbank is not kept, but all of it comes in one block
+    refused("outputs: they would take", sound, RATE, hidden, outputs=["ild"])
+    with pytest.raises(AssertionError, match="it went as far as that"):
+        rosafe.process(sound, RATE, hidden, 100, outputs=["ild"])

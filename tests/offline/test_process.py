@@ -265,6 +265,22 @@ def test_changes_before_their_blocks() -> None:
     assert results["fb_cfHz"][-1] == 4000.0
 
 
+def test_misspelt_names_of_changes() -> None:
+    """What the original's modifyParameter calls them works too."""
+    for wrong, right in (
+        (("set_rm_scailing", "_magnitude"), ("rm_scaling", "magnitude")),
+        (("set_rm_scailing", "magnitude"), ("rm_scaling", "magnitude")),
+        (("pp_refSPLdBS", 60.0), ("pp_refSPLdB", 60.0)),
+    ):
+        got, wanted = (
+            rosafe.process(SOUND, RATE, {**FEW, "pp_bLevelScaling": True}, 1000, [(1, *change)], ["preProc", "ratemap"])
+            for change in (wrong, right)
+        )
+        unchanged = rosafe.process(SOUND, RATE, {**FEW, "pp_bLevelScaling": True}, 1000, (), ["preProc", "ratemap"])
+        assert_same(got, wanted, tolerance=0)
+        assert not np.array_equal(got["ratemap"], unchanged["ratemap"])
+
+
 def test_changes_of_what_is_not_computed_are_none() -> None:
     with_changes = rosafe.process(SOUND, RATE, FEW, modifications=[(0, "ild_wname", "hamming")], outputs=["preProc"])
     assert_same(with_changes, rosafe.process(SOUND, RATE, FEW, outputs=["preProc"]), tolerance=0)
