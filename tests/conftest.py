@@ -9,6 +9,7 @@ import pytest
 
 from rosafe.ros import generate
 from tests import harness
+from tests.bass.pulse import PulseServer
 
 generate.ensure_messages()  # test modules import rosAFE.msg and bass.msg at their top
 
@@ -39,6 +40,15 @@ def rosafe_node(graph: harness.Graph) -> Iterator[harness.Process]:
     """A running rosAFE-ros, new for the test."""
     with graph.node("rosAFE-ros") as process:
         yield process
+
+
+@pytest.fixture
+def pulse(tmp_path: Path) -> Iterator[PulseServer]:
+    """A sound card: a PulseAudio server of the test's own, which may be killed and started again."""
+    server = PulseServer(tmp_path)
+    server.start()
+    yield server
+    server.kill()
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from rosafe.ros import paths
 from tests.harness import Process, wait_for
 
 
@@ -18,6 +19,8 @@ class PulseServer:
     def __init__(self, folder: Path) -> None:
         if shutil.which("pulseaudio") is None:
             pytest.skip("no pulseaudio here: scripts/install --tests brings it")
+        if not (paths.PYPI_DIR / "pyalsaaudio-0.11.0.dist-info").is_dir():
+            pytest.skip("pyalsaaudio is not here: scripts/install brings it")
         self.folder = folder
         self._socket = folder / "pulse.sock"
         self.env: dict[str, Any] = {

@@ -349,6 +349,10 @@ def real_alsa(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "asound.conf").write_text(
         f"""</usr/share/alsa/alsa.conf>
 pcm.recorded {{ type file slave.pcm "null" file /dev/null infile "{tmp_path}/samples.raw" format raw }}
+pcm.nothing {{ type nosuch }}
+pcm.swapped {{ type route slave.pcm "recorded" ttable {{ 0.1 1 1.0 1 }} }}
+pcm.microphone {{ type speex slave.pcm "null" }}
+pcm.sixteen {{ type upmix slave.pcm "null" }}
 pcm.floating {{ type lfloat slave {{ pcm "null" format S32_LE }} }}
 pcm.four {{
     type multi
@@ -377,9 +381,19 @@ def test_plug_and_channel_options_work(real_alsa: Path) -> None:
     chunk = source.read()
     source.close()
     assert chunk is not None and np.array_equal(chunk.samples, samples[[3, 1], :500])
-    source = open_source("plug:recorded", 44100, 500, threading.Event())
-    assert source.read() is not None
+    for device in ("plug:recorded", "plug:microphone"):
+        source = open_source(device, 44100, 500, threading.Event())
+        assert source.read() is not None
+        source.close()
+
+
+def test_route_plugin_swaps_the_ears(real_alsa: Path) -> None:
+    samples = np.random.default_rng(3).integers(-(2**31), 2**31, (2, 1000)).astype("<i4")
+    samples.T.tofile(real_alsa / "samples.raw")
+    source = open_source("swapped", 44100, 1000, threading.Event())
+    chunk = source.read()
     source.close()
+    assert chunk is not None and np.array_equal(chunk.samples, samples[::-1])
 
 
 @pytest.mark.parametrize(
@@ -390,6 +404,9 @@ def test_plug_and_channel_options_work(real_alsa: Path) -> None:
         ("file", "e_device", "file is not defined"),
         ("", "e_device", "No such file"),
         ("floating", "e_hwparams", "no format S32_LE, it offers FLOAT64_BE, FLOAT64_LE, FLOAT_BE, FLOAT_LE: plug:f"),
+        ("sixteen", "e_hwparams", "sixteen: no format S32_LE, it offers S16_LE: plug:sixteen converts"),
+        ("microphone", "e_hwparams", "it opens with 1: pick two with ?channels=1,2, or 1,1 for both ears"),
+        ("nothing", "e_device", "Cannot open shared library libasound_module_pcm_nosuch.so"),
         ("four", "e_hwparams", "not 2 channels, it opens with 4"),
     ],
 )

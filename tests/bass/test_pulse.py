@@ -2,27 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 import soundfile
 
-from rosafe.ros import paths, wire
+from rosafe.ros import wire
 from tests.bass.pulse import PulseServer
 from tests.harness import Graph, Process, wait_for
-
-
-@pytest.fixture
-def pulse(tmp_path: Path) -> Iterator[PulseServer]:
-    if not (paths.PYPI_DIR / "pyalsaaudio-0.11.0.dist-info").is_dir():
-        pytest.skip("pyalsaaudio is not here: scripts/install brings it")
-    server = PulseServer(tmp_path)
-    server.start()
-    yield server
-    server.kill()
 
 
 def played_as_captured(pulse: PulseServer, messages: list[Any], samples: np.ndarray, bass: Process) -> bool:

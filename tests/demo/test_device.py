@@ -2,26 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
-import pytest
 import soundfile
 
-from rosafe.ros import paths
 from tests.bass.pulse import PulseServer
 from tests.demo.running import DEMO_SECONDS, PORTS, demo, path, table
-
-
-@pytest.fixture
-def pulse(tmp_path: Path) -> Iterator[PulseServer]:
-    if not (paths.PYPI_DIR / "pyalsaaudio-0.11.0.dist-info").is_dir():
-        pytest.skip("pyalsaaudio is not here: scripts/install brings it")
-    server = PulseServer(tmp_path)
-    server.start()
-    yield server
-    server.kill()
 
 
 def test_device(pulse: PulseServer, tmp_path: Path) -> None:
