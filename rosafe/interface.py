@@ -703,7 +703,7 @@ REQUEST = Service(
             "representation",
             "string",
             REQUIRED,
-            "What is wanted",
+            "What is wanted, such as ild",
             choices=tuple(kind.representation for kind in KINDS.values()),
         ),
         Parameter("connect", "string", "bass/Audio", "Topic for the Audio port, where a new input needs one"),

@@ -22,7 +22,6 @@ from rosafe.commands import Failure
 from rosafe.interface import REQUEST, ROSAFE, ComponentError, ProcessorKind
 
 _SETTINGS = [p for p in REQUEST.parameters if p.name not in ("representation", "connect")]  # those have other places
-_HOW_TO_START_SOUND = "rosservice call /bass/Acquire \"{device: 'scene:'}\""
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -115,11 +114,12 @@ async def _make(instance: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
         try:
             return await proxy.outputs(REQUEST.name, values)
         except ComponentError as problem:
-            hint = ""
-            if problem.ex == "::rosAFE::e_noData":
-                bass = "" if await proxy.published("/bass/Audio") else "bass-ros -b; "
-                hint = f"; start the sound first: {bass}{_HOW_TO_START_SOUND}"
-            raise Failure(_told(problem) + hint) from None
+            if problem.ex != "::rosAFE::e_noData":
+                raise Failure(_told(problem)) from None
+            topic = "/" + str(values.get("connect", REQUEST.parameter("connect").default)).lstrip("/")
+            start = "" if await proxy.published(topic) else "bass-ros -b; "
+            acquire = f"rosservice call {topic.rpartition('/')[0]}/Acquire \"{{device: 'scene:'}}\""
+            raise Failure(f"{_told(problem)}; start the sound first: {start}{acquire}") from None
         finally:
             await proxy.close()
     finally:

@@ -7,7 +7,7 @@ from collections.abc import Awaitable, Collection, Mapping
 from typing import Any, Protocol, TypeVar
 
 from rosafe import request
-from rosafe.interface import COMMON_SERVICES, KINDS, REQUEST, ComponentError
+from rosafe.interface import KINDS, REQUEST, ComponentError
 from rosafe.request import Found, Plan, Step, Wish
 
 TRIES = 20  # plans that others' changes of the tree may spoil before the error is told
@@ -33,9 +33,9 @@ class Component(Protocol):
 async def build(component: Component, values: Mapping[str, Any]) -> dict[str, Any]:
     """Make or find the processors that `values` (from `rosafe.genomix.values.partial`) ask for; REQUEST's outputs.
 
-    Where anything fails, or the task is cancelled, what was made is removed again, as far as nobody else uses it.
-    Two of these at a time, on one component, must be kept apart by the caller where both are his own; others' changes
-    are reckoned with.
+    Where anything fails, or the task is cancelled, what was made is removed again, as far as nothing of others hangs on
+    it. Others may change the tree meanwhile; a caller keeps his own requests apart, so that what one has found is not
+    removed by another that fails.
 
     Raises
     ------
@@ -89,7 +89,7 @@ async def _uncancelled(work: Awaitable[T]) -> T:
     try:
         return await asyncio.shield(task)
     except asyncio.CancelledError:
-        await asyncio.wait([task])
+        await asyncio.gather(task, return_exceptions=True)  # how it ends is of no interest any more
         raise
 
 
@@ -100,8 +100,7 @@ async def _connect(component: Component, wish: Wish) -> None:
         default = REQUEST.parameter("connect").default
         topic = default if await component.published(f"/{default}") else ""
     if topic:
-        connect_port = COMMON_SERVICES[0]
-        await component.outputs(connect_port.name, {"local": "Audio", "remote": topic})
+        await component.outputs("connect_port", {"local": "Audio", "remote": topic})
 
 
 async def _look(component: Component, kinds: Collection[str]) -> list[Found]:

@@ -71,6 +71,7 @@ def test_what_is_missing_is_asked_for(guide: Terminal) -> None:
         guide.press(f"{answer}\r")
     guide.expect("::genomix::request1\n")
     guide.expect("eltclsh > ")
+    guide.run("while {[dict get [bass::Audio] Audio sampleRate] == 0} {after 20}")  # it answers before it captures
     assert guide.run("dict get [bass::Audio] Audio sampleRate") == "22050"
     # Not asked: defaults by word, within a script or procedure, without parameters, or for help.
     assert guide.run("rosAFE::InputProc --") == ""
@@ -80,6 +81,10 @@ def test_what_is_missing_is_asked_for(guide: Terminal) -> None:
     guide.run("set f [open ~/s.tcl w]; puts $f rosAFE::IhcProc; close $f")
     assert guide.run("source ~/s.tcl") == ""
     assert guide.run("dict size [dict get [rosAFE::getParameters] parameters ihc]") == "1"
+    guide.press("rosAFE::request\r")  # only for what has no default
+    guide.expect("\nstring representation: What is wanted, such as ild > ")
+    guide.press("ihc\r")
+    assert "\nname ihc dependencies {0 input 1 preProc 2 gammatone 3 ihc} created {} " in guide.expect("eltclsh > ")
     guide.press("rosAFE::IldProc\r")
     guide.expect("string name: ")
     guide.expect(") > ")
@@ -99,6 +104,10 @@ def test_tab_knows_what_a_component_takes(guide: Terminal) -> None:
         ("rosAFE::GammatoneProc -a\t{fb_nC\t", "-ack {fb_nChannels "),
         ("rosAFE::GammatoneProc fb_nC\t", "{fb_nChannels "),
         ("rosAFE::gammatonePort -h\t", "-help "),
+        ("rosAFE::request inn\t", "rosAFE::request innerhaircell "),
+        ("rosAFE::request ild {fb_nC\t", "{fb_nChannels "),
+        ("rosAFE::request ild fb_nC\t", "{fb_nChannels "),
+        ("rosAFE::request {rep\t", "{representation "),
         ("$g unl\t", "$g unload "),
     ):
         guide.press(typed)
