@@ -19,6 +19,7 @@ from rosafe.ros.component import ComponentNode
 from rosafe.ros.events import EventLog
 from rosafe.ros.ports import OutputPort, element, parameters_message, signal_fields
 from rosafe.ros.startup import run_server
+from rosafe.ros.trace import TracePort
 from rosafe.tree.processor import Processor
 from rosafe.tree.tree import Tree
 from rosafe.tree.zone import Block
@@ -56,6 +57,7 @@ class RosafeNode:
         self._node.function("Stop", lambda _: self._tree.stop())
         self._node.diagnostics.add("audio", self._audio_health)
         self._node.diagnostics.add("processors", self._tree_health)
+        self._trace = TracePort(f"{self._node.name}/trace", self._tree.observe)
         self._node.start()
 
     def shutdown(self, by: str) -> None:

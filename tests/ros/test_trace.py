@@ -1,0 +1,139 @@
+"""`rosafe trace`: on a real node and on a file; what it shows is what the tree did, and off it is off."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import signal
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rosgraph
+import rospy
+import soundfile
+from std_msgs.msg import String
+
+from rosafe.interface import KINDS
+from rosafe.ros.trace import TracePort, read
+from rosafe.tree.processor import Observer, State
+from tests.cli.command import refused, rosafe
+from tests.harness import SCRIPTS, Graph, wait_for
+from tests.ros.session import Session, noise
+
+CHAIN = ("PreProc", "GammatoneProc", "IhcProc", "IldProc", "RatemapProc", "CrossCorrelationProc")
+BLOCK = 1600
+BLOCKS = 60
+
+
+def listening(graph: Graph, topic: str) -> bool:
+    return topic in {
+        name for name, nodes in rosgraph.Master("/test", master_uri=graph.uri).getSystemState()[1] if nodes
+    }
+
+
+def spans(path: Path) -> dict[str, list[tuple[str, int | None, int, int]]]:
+    """State, block, begin and end of all spans by row."""
+    events = json.loads(path.read_text())["traceEvents"]
+    rows = {e["tid"]: e["args"]["name"] for e in events if e["name"] == "thread_name"}
+    found: dict[str, list[tuple[str, int | None, int, int]]] = {name: [] for name in rows.values()}
+    for e in events:
+        if e["ph"] == "X":
+            found[rows[e["tid"]]].append((e["cat"], e["args"].get("block"), e["ts"], e["ts"] + e["dur"]))
+    return found
+
+
+def at_once(one: list[Any], other: list[Any], ahead: int) -> int:
+    """How many times `one` computed block n + `ahead` while `other` computed block n."""
+    work = {block: (begin, end) for state, block, begin, end in other if state == "exec"}
+    pairs = [((begin, end), work.get(block - ahead, (0, 0))) for state, block, begin, end in one if state == "exec"]
+    return sum(max(a[0], b[0]) < min(a[1], b[1]) for a, b in pairs)
+
+
+def test_a_real_run_shows_parents_children_and_siblings_at_work_at_once(afe: Session, tmp_path: Path) -> None:
+    """Sound comes faster than the tree computes, so that it never waits for it. Ctrl-C ends the trace."""
+    microphone = afe.build(*CHAIN, block=BLOCK, bufferSize_s_port=0.01, bufferSize_s_getSignal=0.01)
+    path = tmp_path / "trace.json"
+    command = afe.graph.start(str(SCRIPTS / "rosafe"), "trace", "--seconds", "100", "-o", str(path))
+    with command:
+        wait_for(lambda: listening(afe.graph, "/rosAFE/trace"), 20.0)
+        with afe.follow("ild") as messages:
+            microphone.play(noise(BLOCK * BLOCKS))
+            wait_for(lambda: messages[-1].lastFrameIndex == BLOCK * BLOCKS + 1, 30.0)
+        with afe.graph.collect("/rosAFE/trace", String) as told:
+            wait_for(lambda: len(told) > 2, what="two rounds in which the command hears the rest")
+        assert command.stop(signal.SIGINT) == 0, command
+    rows = spans(path)
+    assert list(rows) == [
+        f"{name} ({kind})" for kind, name in zip(KINDS, [*list(KINDS)[:-1], "crosscorrelation"], strict=True)
+    ]
+    for row in rows.values():
+        assert [block for state, block, _, _ in row if state == "exec"] == list(range(BLOCKS))
+        assert {state for state, _, _, _ in row} == {"waitExec", "exec", "waitRelease", "release"}
+        assert all(first[3] == second[2] for first, second in itertools.pairwise(row)), "no time is missing"
+    family = [("gammatone (gammatone)", "ihc (ihc)"), ("ihc (ihc)", "crosscorrelation (crossCorrelation)")]
+    assert sum(at_once(rows[parent], rows[child], 1) for parent, child in family) > 0
+    siblings = [rows["ild (ild)"], rows["ratemap (ratemap)"], rows["crosscorrelation (crossCorrelation)"]]
+    assert at_once(siblings[0], siblings[2], 0) + at_once(siblings[1], siblings[2], 0) > 0
+    for parent, child in family:
+        assert at_once(rows[parent], rows[child], 2) == 0, "never two blocks ahead"
+    assert "gammatone and ihc" in command.out and f"written to {path}" in command.out
+    assert "ended early" in command.err
+    afe.ok("getParameters")
+
+
+def test_a_node_without_processors_and_no_node(afe: Session, tmp_path: Path) -> None:
+    env: Any = {name: afe.graph.env[name] for name in ("ROS_MASTER_URI", "ROS_IP", "HOME")}
+    there = tmp_path / "there.json"
+    there.write_text("mine")
+    refused(rosafe("trace", "-o", there, **env), "is there already", "--force")
+    refused(rosafe("trace", "-o", tmp_path / "no" / "t.json", **env), "there is no folder")
+    refused(rosafe("trace", "--seconds", "0.1", "-o", there, "--force", **env), "/rosAFE has no processors")
+    refused(rosafe("trace", "--node", "nobody", **env), "/nobody does not answer")
+    assert there.read_text() == "mine"
+    for wrong in ("nan", "1e9"):
+        refused(rosafe("trace", f"--seconds={wrong}"), "seconds", code=2)
+
+
+def test_a_sound_file_without_ros(tmp_path: Path) -> None:
+    sound, path = tmp_path / "sound.wav", tmp_path / "trace.json"
+    soundfile.write(sound, np.random.default_rng(1).uniform(-0.5, 0.5, (44100, 2)), 44100)
+    nowhere: Any = {"ROS_MASTER_URI": "http://127.0.0.1:1"}
+    done = rosafe("trace", sound, "-o", path, "--block", "882", "--seconds", "0.5", **nowhere)
+    assert done.returncode == 0, done
+    rows = spans(path)
+    assert len(rows) == len(KINDS)
+    for row in rows.values():
+        assert [block for state, block, _, _ in row if state == "exec"] == list(range(25))
+    soundfile.write(sound, np.zeros((100, 1)), 44100)
+    refused(rosafe("trace", sound, **nowhere), "1 channel")
+    refused(rosafe("trace", tmp_path / "none.wav", **nowhere), "none.wav")
+
+
+def test_nobody_listens_nothing_is_traced(graph: Graph) -> None:
+    graph.client()
+    begun: list[Observer] = []
+    ended = threading.Event()
+
+    def observe(observer: Observer) -> Callable[[], None]:
+        begun.append(observer)
+        ended.clear()
+        return ended.set
+
+    port = TracePort("/of_the_test/trace", observe)
+    assert begun == []
+    for count in (1, 2):
+        got: list[String] = []
+        subscriber = rospy.Subscriber("/of_the_test/trace", String, got.append)
+        wait_for(lambda: len(begun) == count)  # noqa: B023
+        processor = type("Fake", (), {"name": "p", "kind": "ild", "parent": None})()
+        begun[-1](processor, State.EXEC, 3)
+        wait_for(lambda: any(read(m) for m in got))  # noqa: B023
+        (event,) = (event for message in got for event in read(message))
+        assert event[1:] == ("p", "ild", "", "exec", 3)
+        subscriber.unregister()
+        assert ended.wait(10), "the last subscriber has left"
+    assert len(begun) == 2
+    assert isinstance(port, TracePort)

@@ -1,0 +1,153 @@
+"""The trace: every step of every processor, in a form that viewers take, and numbers that are right."""
+
+from __future__ import annotations
+
+import json
+import threading
+
+import numpy as np
+import pytest
+
+from rosafe.tree.processor import State
+from rosafe.tree.trace import Event, Trace, Tracer
+from rosafe.tree.tree import Tree
+
+from .support import WAIT_SECONDS, Feed, Plain, Recorder, use_plain_stages
+
+
+@pytest.fixture
+def feed() -> Feed:
+    return Feed(frames=1)
+
+
+def test_overlap_of_parent_and_child_and_of_siblings(
+    tree: Tree, listener: Recorder, feed: Feed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Stages that insist on it: the siblings meet in mid-work, and then the parent in the middle of its next block."""
+    last = 5
+    siblings_meet, all_meet = threading.Barrier(2), threading.Barrier(3)
+
+    class Parent(Plain):
+        def process(self, block: np.ndarray) -> np.ndarray:
+            if block[0, 0] > 0:
+                all_meet.wait(WAIT_SECONDS)
+            return block
+
+    class Sibling(Plain):
+        def process(self, block: np.ndarray) -> np.ndarray:
+            siblings_meet.wait(WAIT_SECONDS)
+            if block[0, 0] < last:
+                all_meet.wait(WAIT_SECONDS)
+            return block
+
+    use_plain_stages(monkeypatch, preProc=Parent, gammatone=Sibling)
+    tree.add_input("input", feed, 1, 1.0, 1.0)
+    tree.add("preProc", "parent", "input")
+    siblings = [tree.add("gammatone", name, "parent") for name in ("a", "b")]
+    tracer = Tracer()
+    stop = tree.observe(tracer)
+    feed.put(count=last + 1)
+    for one in siblings:
+        listener.wait_blocks(one, last + 1)
+    stop()
+    trace = Trace(tracer.take())
+
+    assert list(trace.processors) == ["input", "parent", "a", "b"], "parents first"
+    assert set(trace.kin()) == {
+        ("input", "parent", "parent and child"),
+        ("parent", "a", "parent and child"),
+        ("parent", "b", "parent and child"),
+        ("a", "b", "siblings"),
+    }
+    for name in trace.processors:
+        assert [span.block for span in trace.of(name, State.EXEC)] == list(range(last + 1))
+        assert [span.block for span in trace.of(name, State.RELEASE)] == list(range(last + 1))
+    for name in ("a", "b"):
+        together = {(one.block, other.block) for one, other in trace.together("parent", name)}
+        assert {(n + 1, n) for n in range(last)} <= together, "the parent at block n + 1, the child at block n"
+    assert {(n, n) for n in range(last + 1)} <= {(a.block, b.block) for a, b in trace.together("a", "b")}
+
+
+def test_nothing_is_noted_after_the_end(tree: Tree, listener: Recorder, feed: Feed) -> None:
+    tracer = Tracer()
+    stop = tree.observe(tracer)
+    tree.add_input("input", feed, 1, 1.0, 1.0)
+    feed.put(count=1)
+    listener.wait_blocks(tree.find("input"), 1)
+    stop()
+    assert tracer.take()
+    feed.put(count=1)
+    listener.wait_blocks(tree.find("input"), 2)
+    assert tracer.take() == []
+
+
+def test_who_comes_and_goes_while_it_is_traced(tree: Tree, listener: Recorder, feed: Feed) -> None:
+    tracer = Tracer()
+    tree.observe(tracer)
+    tree.add_input("input", feed, 1, 1.0, 1.0)
+    tree.add("preProc", "p", "input")
+    feed.put(count=2)
+    listener.wait_blocks(tree.find("p"), 2)
+    tree.remove("p")
+    events = tracer.take()
+    assert {event.name: event.parent for event in events} == {"input": "", "p": "input"}
+    assert [e.state for e in events if e.name == "p"][-1] == "removed"
+    trace = Trace(events)
+    assert max(span.end for span in trace.spans if span.name == "p") == [e.time for e in events if e.name == "p"][-1]
+
+
+# --- numbers ----------------------------------------------------------------------------------------------------
+
+EVENTS = [
+    Event(0, "child", "preProc", "root", "waitExec", None),
+    Event(0, "root", "input", "", "exec", 7),
+    Event(400, "root", "input", "", "waitRelease", 7),
+    Event(400, "root", "input", "", "release", 7),
+    Event(500, "child", "preProc", "root", "exec", 7),
+    Event(500, "root", "input", "", "waitExec", None),
+    Event(600, "root", "input", "", "exec", 8),
+    Event(900, "child", "preProc", "root", "waitRelease", 7),
+    Event(1000, "child", "preProc", "root", "removed", None),
+]
+
+
+def test_spans_overlap_and_shares() -> None:
+    trace = Trace(EVENTS)
+    assert (trace.begin, trace.end) == (0, 1000)
+    assert [(s.begin, s.end, s.block) for s in trace.of("root", State.EXEC)] == [(0, 400, 7), (600, 1000, 8)]
+    assert [(a.block, b.block) for a, b in trace.together("root", "child")] == [(8, 7)]
+    assert trace.at_once() == {0: 100, 1: 600, 2: 300}
+    summary = "\n".join(trace.summary())
+    assert "somebody computes in 90.0% of the time; of that, two or more at once in 33%, 1.33 on average" in summary
+    assert "root and child           0.3 ms  (parent and child)" in summary
+    (row,) = (line.split() for line in summary.splitlines() if line.startswith("child"))
+    assert row == ["child", "1", "0.40", "0.40", "50.0%", "40.0%", "10.0%", "0.0%"]
+
+
+def test_chrome_format() -> None:
+    shown = json.loads(json.dumps(Trace(EVENTS).chrome("/rosAFE")))["traceEvents"]
+    names = {e["tid"]: e["args"]["name"] for e in shown if e["name"] == "thread_name"}
+    assert names == {1: "root (input)", 2: "child (preProc)"}, "a row for each, parents first"
+    spans = [e for e in shown if e["ph"] == "X"]
+    assert {"name", "cat", "ph", "ts", "dur", "pid", "tid", "args"} == set(spans[0])
+    assert [(e["name"], e["ts"], e["dur"], e["args"]) for e in spans if e["tid"] == 2] == [
+        ("waitExec", 0, 500, {}),
+        ("exec 7", 500, 400, {"block": 7}),
+        ("waitRelease 7", 900, 100, {"block": 7}),
+    ]
+
+
+def test_nothing_is_a_trace_too() -> None:
+    trace = Trace([])
+    assert trace.spans == [] and trace.chrome("x")["traceEvents"]
+    assert "somebody computes in 0.0% of the time" in "\n".join(trace.summary())
+
+
+def test_parents_that_nobody_knows_and_circles_do_no_harm() -> None:
+    """A parent that was replaced while it was traced, or a name that came back elsewhere in the tree."""
+    events = [
+        Event(0, "a", "x", "b", "exec", 0),
+        Event(1, "b", "x", "a", "exec", 0),
+        Event(2, "c", "x", "?", "exec", 0),
+    ]
+    assert set(Trace(events).processors) == {"a", "b", "c"}
