@@ -18,7 +18,7 @@ from actionlib import CommState
 from rosafe import process
 from rosafe.interface import KINDS, ROSAFE
 from rosafe.ros import wire
-from tests.harness import Graph, Process, wait_for
+from tests.harness import PYTHON, Graph, Process, wait_for
 
 RATE = 20000  # Hz; cheap, and all default channels lie below half of it
 _topics = itertools.count(1)
@@ -277,6 +277,25 @@ def told(response: Any) -> tuple[str, Mapping[str, Any]]:
     assert set(body) <= {"ex", "detail"}
     assert response.genom_exdetail == json.dumps(body, separators=(",", ":"), ensure_ascii=False)
     return body["ex"], body.get("detail", {})
+
+
+# --- another process that reads ---------------------------------------------------------------------------------
+
+# Prints the index of each message that comes.
+SUBSCRIBER = """
+import sys, rospy
+from rosAFE.msg import rosAFE_TimeFrequencySignalPortStruct as Message
+rospy.init_node("reader", anonymous=True)
+rospy.Subscriber(sys.argv[1], Message, lambda m: print(m.lastFrameIndex, flush=True), buff_size=2**22)
+rospy.spin()
+"""
+
+
+def reader(graph: Graph, topic: str) -> Process:
+    """A process that subscribes to a topic and prints the index of each message; it has got the first one."""
+    process = graph.start(PYTHON, "-c", SUBSCRIBER, topic)
+    wait_for(lambda: process.out, 20, lambda: str(process))
+    return process
 
 
 # --- what a port must hold ---------------------------------------------------------------------------------------

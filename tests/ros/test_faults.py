@@ -16,25 +16,10 @@ import rosservice
 from actionlib_msgs.msg import GoalStatus
 
 from rosafe.interface import KINDS, MAX_ACTIVITIES
-from tests.harness import PYTHON, Graph, Process, proc, run_together, wait_for
-from tests.ros.session import Session, noise, own_node, told
+from tests.harness import Graph, Process, proc, run_together, wait_for
+from tests.ros.session import Session, noise, own_node, reader, told
 
 BLOCK = 2000
-
-# Prints the index of each message that comes.
-SUBSCRIBER = """
-import sys, rospy
-from rosAFE.msg import rosAFE_TimeFrequencySignalPortStruct as Message
-rospy.init_node("reader", anonymous=True)
-rospy.Subscriber(sys.argv[1], Message, lambda m: print(m.lastFrameIndex, flush=True), buff_size=2**22)
-rospy.spin()
-"""
-
-
-def reader(graph: Graph, topic: str) -> Process:
-    process = graph.start(PYTHON, "-c", SUBSCRIBER, topic)
-    wait_for(lambda: process.out, 20, lambda: str(process))
-    return process
 
 
 def reads(process: Process, index: int) -> None:

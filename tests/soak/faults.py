@@ -1,0 +1,189 @@
+"""What is done to the nodes in a round of the soak: one function for each, which raises AssertionError."""
+
+from __future__ import annotations
+
+import os
+import random
+import signal
+from typing import Any
+
+import numpy as np
+import rospy
+
+from rosafe.ros import wire
+from tests.harness import run_together, wait_for
+from tests.ros.session import reader, told
+from tests.soak.world import NAMES, World, following, wait_out
+
+CHANGES = [
+    ("fb_nGamma", "3"),
+    ("fb_bwERBs", "1.2"),
+    ("fb_nChannels", "5"),
+    ("fb_lowFreqHz", "200"),
+    ("fb_cfHz", "500 1000"),
+    ("fb_nGamma", "0"),
+    ("fb_highFreqHz", "nan"),
+    ("fb_type", "drnl"),
+]
+
+
+def subscriber_dies(world: World, chance: random.Random) -> None:
+    """A subscriber stops amid the largest messages, and is killed then."""
+    with reader(world.graph, world.afe.topic("gammatone")) as process:
+        os.kill(process.pid, signal.SIGSTOP)
+        index = world.afe.read("input").lastFrameIndex
+        wait_for(lambda: world.afe.read("input").lastFrameIndex > index + 2 * world.size.block, 20)
+        os.kill(process.pid, signal.SIGKILL)
+
+
+def garbage(world: World, chance: random.Random) -> None:
+    """A second publisher of Audio sends what nobody can use, amid the messages of bass."""
+    message_class = wire.message_class("bass", "::binaudio::portStruct")
+    publisher = rospy.Publisher("/bass/Audio", message_class, queue_size=100, tcp_nodelay=True)
+    try:
+        wait_for(lambda: publisher.get_num_connections(), 20, "rosAFE connects to the second publisher")
+        before = world.counters()["refused"]
+        texts = [b"", b"\1", bytes(35), chance.randbytes(3000), bytes(20) + b"\xff" * 64, bytes(8_000_000)]
+        silence = np.zeros(1000, np.int32)
+        odd: list[dict[str, Any]] = [
+            {"sampleRate": 0, "left": silence, "right": silence},
+            {"left": silence, "right": silence[1:]},
+            {"left": silence[:0], "right": silence[:0]},
+            {"lastFrameIndex": 2**64 - 1, "left": silence, "right": silence},
+            {"left": np.zeros(2**24 + 1, np.int32), "right": np.zeros(2**24 + 1, np.int32)},
+        ]
+        for text in texts:
+            message = message_class()
+            message.serialize = lambda out, text=text: out.write(text)
+            publisher.publish(message)
+        for fields in odd:
+            usual = {"sampleRate": world.size.rate, "nChunksOnPort": 1, "nFramesPerChunk": 1000, "lastFrameIndex": 5}
+            publisher.publish(message_class(**{**usual, **fields}))
+        world.refused += len(texts) + len(odd)
+        world.afe.health(lambda entries: int(entries["refused"]) >= before + len(texts) + len(odd))
+    finally:
+        publisher.unregister()
+
+
+def crowd(world: World, chance: random.Random) -> None:
+    """Hundreds of processors at once; all get a block, all go."""
+    count = world.size.crowd
+
+    def each(client: int, request: str, field: str, **more: Any) -> None:
+        for number in range(client, count, 8):
+            world.afe.ok(request, **{field: f"crowd{number}"}, **more)
+
+    run_together(8, lambda client: each(client, "IldProc", "name"))
+    assert len(world.afe.processors()["ild"]) == count + 1
+    for number in (0, count - 1):
+        wait_for(lambda name=f"crowd{number}": world.afe.read("ild", name=name).lastFrameIndex > 0, 60)  # type: ignore[misc]
+    run_together(8, lambda client: each(client, "removeProcessor", "name"))
+
+
+def cycles(world: World, chance: random.Random) -> None:
+    """Branches come and go."""
+    for number in range(world.size.cycles):
+        world.afe.ok("GammatoneProc", name="come", fb_nChannels=2)
+        world.afe.ok("IhcProc", name="and", upperDepName="come")
+        world.afe.ok("RatemapProc", name=f"go{number}", upperDepName="and")
+        world.afe.ok("removeProcessor", name="come")
+
+
+def clients(world: World, chance: random.Random) -> None:
+    """Eight clients do what comes to their minds, on branches of their own and on each other's."""
+    seed = chance.random()
+
+    def work(client: int) -> None:
+        mine = random.Random(f"{seed} {client}")
+        for _ in range(25):
+            name = f"client{mine.randrange(8)}"
+            requests: list[tuple[str, dict[str, Any]]] = [
+                ("GammatoneProc", {"name": name, "fb_nChannels": 2}),
+                ("IhcProc", {"name": f"{name}_ihc", "upperDepName": name}),
+                ("IldProc", {"name": f"{name}_ild", "upperDepName": f"{name}_ihc"}),
+                ("removeProcessor", {"name": name}),
+                ("getDependencies", {"nameProc": f"{name}_ild"}),
+                ("getSignals", {}),
+                ("getParameters", {}),
+                ("PreProc", {"name": NAMES["ihc"]}),
+                ("modifyParameter", {"nameProc": name, "nameParam": "fb_nGamma", "newValue": "2"}),
+            ]
+            request, fields = mine.choice(requests)
+            response = world.afe.call(request, **fields)
+            if not response.genom_success:
+                told(response)
+
+    run_together(8, work)
+    for name in [n for n in world.afe.processors()["gammatone"] if n.startswith("client")]:
+        world.afe.ok("removeProcessor", name=name)
+
+
+def changes(world: World, chance: random.Random) -> None:
+    """Parameters change while the processor runs, to good values and bad ones."""
+    world.afe.ok("GammatoneProc", name="changing", fb_nChannels=2)
+    for name, value in chance.sample(CHANGES, len(CHANGES)):
+        response = world.afe.call("modifyParameter", nameProc="changing", nameParam=name, newValue=value)
+        assert response.genom_success == (value not in ("0", "nan")), (name, value, response.genom_exdetail)
+    index = world.afe.read("input").lastFrameIndex
+    wait_for(lambda: world.afe.read("gammatone", name="changing").lastFrameIndex > index, 20)
+    world.afe.ok("removeProcessor", name="changing")
+
+
+def master_dies(world: World, chance: random.Random) -> None:
+    """The master is killed, and another one comes at the same address."""
+    services = {name for name in world.graph.services() if name.startswith(("/rosAFE/", "/bass/"))}
+    world.master.kill()
+    world.master.start(world.graph.env)
+    wait_for(lambda: services <= world.graph.services(), 20, lambda: str(services - world.graph.services()))
+    wait_for(lambda: world.afe.topic("ild") in world.graph.topics(), 20)
+
+
+def bass_hiccups(world: World, chance: random.Random) -> None:
+    """bass is held for less than its window is long: nothing is lost."""
+    with world.held(world.bass):
+        wait_out(0.5)
+
+
+def genomix_asks(world: World, chance: random.Random) -> None:
+    """Everything that genomixd passes on."""
+    port = world.http.call(f"rosAFE/ildPort/{NAMES['ild']}")["ildPort"]
+    assert port["framesOnPort"] == 100 and port["right"] == {"dataN": []}
+    assert world.http.call("rosAFE/getDependencies", [NAMES["ild"]])["dependencies"][0] == NAMES["input"]
+    assert world.http.call("bass/Audio")["Audio"]["sampleRate"] == world.size.rate
+
+
+DURING = (
+    subscriber_dies,
+    garbage,
+    crowd,
+    cycles,
+    clients,
+    changes,
+    master_dies,
+    bass_hiccups,
+    genomix_asks,
+)
+
+
+def the_source_dies_and_the_node_is_held(world: World) -> None:
+    """bass is killed and comes back, and is heard without help; then rosAFE is held for longer than a window lasts.
+
+    Whatever happens, a frame on the input's port is the one that its number tells, or was lost, counted, and is zero.
+    (How much is lost is up to the system, which keeps some messages for a process that does not read.)
+    """
+    blocks = 3 * world.size.block
+    world.acquire()
+    with following(world) as follower:
+        wait_for(lambda: follower.index > blocks, 30)
+        world.bass.stop(signal.SIGKILL)
+        world.start_bass()
+        world.acquire()
+        wait_for(lambda: follower.begun == 2 and follower.index > blocks, 30, "another stream")
+        assert follower.lost == 0
+        before = world.counters()["lost"]
+        with world.held(world.afe.process):
+            wait_out(world.window_seconds + 1.0)
+        index, _ = world.audio()
+        wait_for(lambda: follower.index > index, 30, "rosAFE catches up")
+    assert not follower.wrong, follower.wrong
+    assert follower.lost <= world.counters()["lost"] - before

@@ -1,0 +1,257 @@
+"""The nodes that are soaked, the sound that they hear, and what must hold whatever is done to them."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import rospy
+import soundfile
+
+from rosafe.arguments import check_parameters
+from rosafe.chain import Chain
+from rosafe.interface import KINDS, ROSAFE
+from rosafe.ros import registration, wire
+from rosafe.tree.window import SlidingWindow, frames_in
+from tests import harness
+from tests.genomix.world import Http, genomixd
+from tests.harness import proc, wait_for
+from tests.ros.session import Session, assert_holds
+
+NAMES = {kind: ROSAFE.service(entry.request).parameter("name").default for kind, entry in KINDS.items()}
+TREE = {kind: [name] for kind, name in NAMES.items()}
+CHUNKS = 20  # on bass' port, as by default
+DRIFT = 0.15  # seconds that bass' frames may be off the clock: a chunk more or less, and a busy machine
+
+
+@dataclass(frozen=True)
+class Size:
+    """How much is asked of the machine."""
+
+    rate: int
+    chunk: int
+    block: int
+    channels: int  # 0: as by default
+    crowd: int  # processors at once, besides the tree
+    cycles: int  # of creation and removal in a round
+
+
+DEFAULT = Size(44100, 2205, 12000, 0, 200, 100)
+LIGHT = Size(20000, 1000, 4000, 3, 200, 40)
+
+
+@dataclass
+class Use:
+    """What one process takes of the machine."""
+
+    threads: int
+    files: int
+    memory: int  # resident bytes
+
+    @classmethod
+    def of(cls, pid: int) -> Use:
+        status = dict(line.split(":", 1) for line in proc(pid, "status").read_text().splitlines())
+        return cls(int(status["Threads"]), len(list(proc(pid, "fd").iterdir())), int(status["VmRSS"].split()[0]) * 1024)
+
+    def __str__(self) -> str:
+        return f"{self.threads} threads, {self.files} files, {self.memory / 2**20:.0f} MiB"
+
+
+class World:
+    """A master, bass, rosAFE and genomixd. bass plays noise in a loop, so that a frame's number tells its samples."""
+
+    def __init__(self, size: Size, graph: harness.Graph, master: harness.MasterProcess, stack: ExitStack) -> None:
+        self.size = size
+        self.graph = graph
+        self.master = master
+        self.refused = 0  # messages that were garbage
+        self._bass = ExitStack()
+        self.sound = self._noise(int(7.3 * size.rate))
+        self._file = graph.home / "noise.wav"
+        soundfile.write(self._file, self.sound.T, size.rate, subtype="PCM_32")
+        stack.callback(self._bass.close)
+        self.start_bass()
+        self.afe = Session(graph, stack.enter_context(graph.node("rosAFE-ros")))
+        stack.callback(self.afe.close)
+        self.genomixd, port = stack.enter_context(genomixd(graph))
+        self.http = Http(port)
+        self.acquire()
+        self.afe.ok("connect_port", local="Audio", remote="bass/Audio")
+
+    @staticmethod
+    def _noise(frames: int) -> np.ndarray:
+        """Binaural int32 noise, (2, frames), without zeros: a zero on a port is a lost frame."""
+        chance = np.random.default_rng(1)
+        return (chance.integers(2**10, 2**30, (2, frames)) * chance.choice([-1, 1], (2, frames))).astype(np.int32)
+
+    def frames(self, first: int, count: int) -> np.ndarray:
+        """What bass plays from frame number `first` (the first one is 1) on, (2, count)."""
+        return self.sound[:, (np.arange(first - 1, first - 1 + count)) % self.sound.shape[1]]
+
+    @property
+    def window_seconds(self) -> float:
+        """How long bass' window is."""
+        return CHUNKS * self.size.chunk / self.size.rate
+
+    # --- bass ---
+
+    def start_bass(self) -> None:
+        """Start bass-ros, for the first time or after it was killed."""
+        self._bass.close()
+        self.bass = self._bass.enter_context(self.graph.node("bass-ros"))
+
+    def acquire(self) -> None:
+        """Let bass begin anew with frame 1."""
+        answer = self.graph.call(
+            "/bass/Acquire",
+            device=f"file:{self._file}?loop=1",
+            nFramesPerChunk=self.size.chunk,
+            nChunksOnPort=CHUNKS,
+        )
+        assert answer.genom_success, answer.genom_exdetail
+
+    def audio(self) -> tuple[int, float]:
+        """Index and time of bass' newest frame."""
+        message = self.graph.message("/bass/Audio", accept=lambda m: m.lastFrameIndex > 0)
+        return message.lastFrameIndex, message.stamp.sec + message.stamp.nsec / 1e9
+
+    # --- the tree ---
+
+    @contextmanager
+    def stream(self) -> Iterator[None]:
+        """The whole tree on a stream that begins with frame 1; at its end, all that came of it is looked at.
+
+        Nothing may be lost in it, and bass must keep time.
+        """
+        assert self.graph.call("/bass/Stop").genom_success
+        self.afe.ok("Stop")
+        self.afe.ok("InputProc", nFramesPerBlock=self.size.block)
+        for kind in list(KINDS.values())[1:]:
+            few = {"fb_nChannels": self.size.channels} if kind.kind == "gammatone" else {}
+            self.afe.ok(kind.request, **few)
+        before = self.counters()
+        self.acquire()
+        first_index, first_time = self.audio()
+        yield
+        index, time = self.audio()
+        drift = (index - first_index) / self.size.rate - (time - first_time)
+        assert abs(drift) < DRIFT, f"bass is {drift:.3f} s off the clock after {time - first_time:.1f} s"
+        assert self.afe.processors() == TREE, f"the tree is {self.afe.processors()}"
+        assert self.graph.call("/bass/Stop").genom_success
+        self.verify()
+        after = self.counters()
+        for what in ("lost", "breaks"):
+            assert after[what] == before[what], f"{what}: {after[what] - before[what]} more; {after['last loss']}"
+        assert after["refused"] == self.refused, f"{after['refused']} messages refused, {self.refused} were garbage"
+
+    def verify(self) -> None:
+        """All ports hold, bit for bit, what `rosafe.process` makes of the same frames, by their absolute numbers."""
+        end = self.graph.message("/bass/Audio").lastFrameIndex // self.size.block * self.size.block
+        truth = {}
+
+        def keep(kind: str, block: Any) -> None:
+            if kind not in truth:
+                truth[kind] = SlidingWindow(block.data.shape[:-1], frames_in(1.0, block.rate))
+            truth[kind].append(block.data)
+
+        parameters = check_parameters({"fb_nChannels": self.size.channels} if self.size.channels else {})
+        blocks = (self.frames(first, self.size.block) for first in range(1, end, self.size.block))
+        with Chain(blocks, self.size.rate, {"in_doNormalize": True, **parameters}, list(KINDS), keep) as chain:
+            chain.run()
+        for kind in KINDS:
+            assert_holds(self.afe.read(kind, end + 1, timeout=60.0), kind, truth[kind].view().array())
+
+    def counters(self) -> dict[str, Any]:
+        """What rosAFE counts of the audio, from /diagnostics."""
+        entries = self.afe.health(lambda _: True, "audio")
+        return {key: int(value) if value.isdigit() else value for key, value in entries.items()}
+
+    def alive(self) -> None:
+        """All processes are, and none has stumbled."""
+        for process in (self.afe.process, self.bass, self.genomixd):
+            assert process.alive, f"it has ended: {process}"
+            assert "Traceback" not in process.err, process
+        assert self.http.call("rosAFE/getParameters")["parameters"]["input"][0]["name"] == "input"
+
+    def use(self) -> dict[str, Use]:
+        """What the lasting processes take; bass is another one after each time that it was killed."""
+        return {"rosAFE": Use.of(self.afe.process.pid), "genomixd": Use.of(self.genomixd.pid)}
+
+    @contextmanager
+    def held(self, process: harness.Process) -> Iterator[None]:
+        """Stop a process for as long as the `with` lasts."""
+        os.kill(process.pid, signal.SIGSTOP)
+        try:
+            yield
+        finally:
+            os.kill(process.pid, signal.SIGCONT)
+
+
+class Follower:
+    """Looks at every message of the input's port: each frame is the one that its number tells, or lost and zero."""
+
+    def __init__(self, world: World) -> None:
+        self.lost = 0
+        self.begun = 0  # streams
+        self.index = 2**64  # of the next frame
+        self.wrong = ""
+        self._world = world
+        self._lock = threading.Lock()
+
+    def append(self, message: Any) -> None:
+        """Take one message."""
+        with self._lock:
+            if message.lastFrameIndex < self.index:
+                self.begun, self.index = self.begun + 1, 1
+            fresh = min(message.lastFrameIndex - self.index, message.framesOnPort)
+            self.index = message.lastFrameIndex
+            if fresh > 0:
+                truth = self._world.frames(message.lastFrameIndex - fresh, fresh) / (2**31 - 1)
+                held = np.stack((message.left[-fresh:], message.right[-fresh:]))
+                lost = (held == 0).all(axis=0)
+                self.lost += int(lost.sum())
+                if not self.wrong and not np.array_equal(held[:, ~lost], truth[:, ~lost]):
+                    self.wrong = f"wrong samples before index {message.lastFrameIndex}"
+
+
+@contextmanager
+def following(world: World) -> Iterator[Follower]:
+    """A follower of the input's port, from the next block on."""
+    follower = Follower(world)
+    message_class = wire.message_class("rosAFE", ROSAFE.port("inputProcPort").idl)
+    subscriber = rospy.Subscriber(world.afe.topic("input"), message_class, follower.append, buff_size=2**22)
+    try:
+        yield follower
+    finally:
+        subscriber.unregister()
+
+
+@contextmanager
+def world(size: Size, home: Path) -> Iterator[World]:
+    """A world that is up. rospy in this process belongs to it."""
+    with harness.private_graph(home) as (graph, master), ExitStack() as stack:
+        os.environ.update(ROS_MASTER_URI=graph.uri, ROS_IP="127.0.0.1", ROS_HOME=str(home / ".ros"))
+        registrar = registration.init_node("soak", ["soak"])  # which finds its way to a master that was restarted
+        stack.callback(registrar.end)
+        yield World(size, graph, master, stack)
+
+
+def later(seconds: float) -> Callable[[], bool]:
+    """Whether so much time has gone by since this was called."""
+    over = threading.Event()
+    timer = threading.Timer(seconds, over.set)
+    timer.daemon = True
+    timer.start()
+    return over.is_set
+
+
+def wait_out(seconds: float) -> None:
+    """Let so much time go by."""
+    wait_for(later(seconds), seconds + 10)
