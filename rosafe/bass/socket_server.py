@@ -23,7 +23,13 @@ QUIET_SECONDS = 0.05  # after which a request without a line end is taken for co
 DEAD_SECONDS = 10.0  # without taking a byte of an answer, a client counts as dead
 _MAX_REQUEST = 4096  # bytes without a request in them, then they are forgotten
 _MARK = b"Read Port"
-_COUNT, _FIRST = re.compile(rb"N[^\w-]*(\d{1,40})"), re.compile(rb"nfr[^\w-]*(\d{1,40})")
+_COUNT, _FIRST = re.compile(rb"N[^\w-]*(-?\d{1,40})"), re.compile(rb"nfr[^\w-]*(-?\d{1,40})")
+_KEEP_ALIVE = (  # finds those who left without a word within a minute or two
+    (socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1),
+    (socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 60),
+    (socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, 10),
+    (socket.IPPROTO_TCP, socket.TCP_KEEPCNT, 6),
+)
 _HEADER = struct.Struct("<iiq")
 
 
@@ -61,9 +67,9 @@ def take_requests(inbox: bytearray, quiet: bool) -> Iterator[tuple[int, int]]:
 
 
 def _parse(text: bytes) -> tuple[int, int] | None:
-    """The (count, first) that `text` asks for, if it does."""
+    """The (count, first) that `text` asks for, if it does; what is negative counts as 0."""
     count, first = _COUNT.search(text), _FIRST.search(text)
-    return (int(count[1]), int(first[1])) if text.startswith(_MARK) and count and first else None
+    return (max(0, int(count[1])), max(0, int(first[1]))) if text.startswith(_MARK) and count and first else None
 
 
 class _Client:
@@ -136,7 +142,8 @@ class DedicatedSocket:
             return
         connection.setblocking(False)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)  # finds those who left without a word
+        for level, option, value in _KEEP_ALIVE:
+            connection.setsockopt(level, option, value)
         client = _Client(connection)
         self._clients[connection.fileno()] = client
         self._selector.register(connection, selectors.EVENT_READ, client)

@@ -142,6 +142,31 @@ def test_requests_without_line_ends() -> None:
 
 
 @pytest.mark.parametrize(
+    ("text", "request_"),
+    [
+        (b"Read Port - N -5 - nfr -7\n", (0, 0)),
+        (b"Read Port - N 2147483648 - nfr 9223372036854775808\n", (2**31, 2**63)),
+        (b"Read Port N=5, nfr:7\r\n", (5, 7)),
+        (b"\xff\0\x80 binary Read Port - N 1 - nfr 2\n", (1, 2)),
+        (b"Read Port - N 5.9 - nfr 1e9\n", (5, 1)),
+    ],
+)
+def test_odd_requests(text: bytes, request_: tuple[int, int]) -> None:
+    assert list(take_requests(bytearray(text), quiet=False)) == [request_]
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.binary(max_size=300), st.integers(-(2**70), 2**70), st.integers(-(2**70), 2**70))
+def test_whatever_comes_no_answer_is_negative(rubbish: bytes, count: int, first: int) -> None:
+    inbox = bytearray(rubbish + b"Read Port - N %d - nfr %d\n" % (count, first))
+    found = list(take_requests(inbox, quiet=True))
+    assert found[-1] == (max(0, count), max(0, first))
+    for request_ in found:
+        n, loss, following, *_ = parse(read_frames(port_content(100, 20), *request_))
+        assert n >= 0 and loss >= 0 and following >= 0
+
+
+@pytest.mark.parametrize(
     "text", [b"Read Port\n", b"Read Port - N 5\n", b"Read Port - nfr 5\n", b"N 1 - nfr 1\n", b"Close\n", b"\n\0\r", b""]
 )
 def test_what_is_no_request_has_no_answer(text: bytes) -> None:
