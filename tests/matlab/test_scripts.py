@@ -1,0 +1,175 @@
+"""The MATLAB block of the user guide, the blocks of our documents, and scripts like the examples of the original."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from tests import harness
+from tests.genomix.world import World
+from tests.matlab import octave
+
+pytestmark = pytest.mark.ros
+
+DOCUMENT = harness.ROOT / "docs" / "matlab.md"
+REQUESTS = ("inputProc", "preProc", "gammatone", "ihc", "ild", "ratemap", "crossCorrelation")
+
+
+def blocks(document: Path) -> list[str]:
+    """The m-code that a document shows."""
+    found: list[str] = re.findall(r"^```matlab\n(.*?)^```$", document.read_text("utf-8"), re.MULTILINE | re.DOTALL)
+    return found
+
+
+def test_the_block_of_the_guide(world: World) -> None:
+    """Verbatim, but for the device: this machine has none."""
+    guide = harness.shared("spec", "original-user-guide.txt").read_text("utf-8")
+    block = guide.partition("\naddpath(genpath(")
+    text = block[1] + block[2]
+    code = [line for line in text.splitlines() if not re.match(r"[A-Z].*[.:]$|Note$|\w+ \w+ \w+ ", line)]
+    script = "\n".join(code).replace("bass.Acquire('-a')", "bass.Acquire('-a', 'scene:')")
+    assert script.count("rosAFE.") == 20
+    names = [f"{name}Request" for name in REQUESTS if name != "inputProc"]
+    checks = "".join(f"show('{name}', {name}.status)\n" for name in ["inputProcRequest", *names])
+    checks += "".join(
+        f"show('{name}', {{getfield(fieldnames({name}), {{1}}){{1}}, {name}.(fieldnames({name}){{1}}).sampleRate}})\n"
+        for name in ("inputProcOut", "preProcOut", "gammatoneProcOut", "ihcProcOut", "ildProcOut", "ratemapProcOut")
+    )
+    checks += "show('types', fieldnames(getParameters.result.parameters))\n"
+    checks += "show('frames', numel(getSignals.result.signals.ild))\n"
+    # what is given no name asks for a processor that nobody has
+    checks += "show('refused', {getDependencies.exception.ex, removeProcessor.exception.ex})\n"
+    told = octave.shown(world, script + "\n" + checks)
+    assert {told[name] for name in ["inputProcRequest", *names]} == {"sent"}
+    assert told["ratemapProcOut"] == ["ratemapPort", 100]
+    assert told["gammatoneProcOut"] == ["gammatonePort", 44100]
+    assert told["types"] == ["input", "preProc", "gammatone", "ihc", "ild", "ratemap", "crossCorrelation"]
+    assert told["frames"] == 1
+    assert told["refused"] == ["::rosAFE::e_noSuchProcessor"] * 2
+
+
+def test_the_first_block_of_the_page(world: World) -> None:
+    told = octave.shown(world, blocks(DOCUMENT)[0] + "\nshow('cfHz', cfHz); show('rate', rate)")
+    assert len(told["cfHz"]) == 31 and told["cfHz"][0] == 80
+    assert told["rate"] == 100
+
+
+def test_the_picture_of_the_page(world: World, tmp_path: Path) -> None:
+    octave.needed("gs")
+    octave.needed("gnuplot")
+    script = blocks(DOCUMENT)[1]
+    assert len(script.splitlines()) == 10
+    for long, short in (("port', 8)", "port', 1)"), ("pause(9)", "pause(1.5)"), ("1:800", "1:100")):
+        assert long in script
+        script = script.replace(long, short)
+    octave.run(world, script, folder=tmp_path)
+    assert (tmp_path / "ild.png").read_bytes()[:4] == b"\x89PNG"
+    picture = harness.ROOT / "docs" / "ild-octave.png"
+    assert 10_000 < picture.stat().st_size < 100_000
+
+
+def test_the_manager_of_the_page(world: World) -> None:
+    told = octave.shown(world, blocks(DOCUMENT)[2] + "\nshow('sizes', {size(levels), size(right)})")
+    (frames, channels), right = told["sizes"]
+    assert channels == 16 and frames > 100 and right[1] == 16
+    assert not world.http.call("rosAFE/getParameters")["parameters"]["preProc"]
+
+
+def test_the_block_of_the_readme(world: World) -> None:
+    (block,) = blocks(harness.ROOT / "README.md")
+    told = octave.shown(world, block + "\nshow('size', size(out.ildPort.left))")
+    assert told["size"] == [100, 16]
+
+
+READER = """
+    clear all; close all; clc;
+    p = 0.1;
+    addpath(genpath('~/openrobots/lib/matlab'));
+    [bass, rosAFE, client] = initRosAFE();
+    sampleRate = 44100; bufferSize_s_matlab = 10;
+    acquire = bass.Acquire('-a', 'scene:', sampleRate, 2205, sampleRate / 2205);
+    pause(p);
+    if ( strcmp(acquire.status,'error') )
+        error(strcat('Error',acquire.exception.ex));
+    end
+    connection = rosAFE.connect_port('Audio', 'bass/Audio');
+    thisProc = rosAFE.InputProc('-a', 'input', 4410, 1, 1);
+    preProcProc = rosAFE.PreProc('-a', 'preProc', 'input', 0, 5000, 0, 0.97, 0, 500e-3, 0, 10, 0, 'jespen', 1);
+    gammatoneProc = rosAFE.GammatoneProc('-a', 'gammatone', 'preProc', 'gammatone', 80, 8000, 1, 8, 0, 4, 1.0180);
+    ihcProc = rosAFE.IhcProc('-a', 'ihc', 'gammatone', 'dau');
+    ratemapProc = rosAFE.RatemapProc('-a', 'ratemap', 'ihc', 'hann', 0.02, 0.01, 'magnitude', 0.008);
+    pause(p);
+    params = rosAFE.getParameters();
+    cfHz = cell2mat(params.result.parameters.gammatone{1}.fb_cfHz);
+    gammatoneOut = rosAFE.gammatonePort('gammatone');
+    exLastFrameIndex = gammatoneOut.gammatonePort.lastFrameIndex;
+    start = exLastFrameIndex;
+    sig_l = TimeFrequencySignal.construct(sampleRate, bufferSize_s_matlab, 'filterbank', 'gammatone', cfHz, 'left');
+    sig_r = TimeFrequencySignal.construct(sampleRate, bufferSize_s_matlab, 'filterbank', 'gammatone', cfHz, 'right');
+    rounds = 0;
+    while ( rounds < 4 )
+        pause(p);
+        gammatoneOut = rosAFE.gammatonePort('gammatone');
+        gotFrames = gammatoneOut.gammatonePort.lastFrameIndex - exLastFrameIndex;
+        exLastFrameIndex = gammatoneOut.gammatonePort.lastFrameIndex;
+        if ( gotFrames > gammatoneOut.gammatonePort.framesOnPort )
+            lostFrames = gotFrames - gammatoneOut.gammatonePort.framesOnPort;
+            gotFrames = gotFrames - lostFrames;
+            disp(strcat('Lost Frames : ', int2str(lostFrames)));
+        end
+        [ chunkLeft chunkRight ] = adaptTFS( gammatoneOut.gammatonePort.framesOnPort, ...
+            gammatoneOut.gammatonePort.numberOfChannels, gammatoneOut.gammatonePort.left, ...
+            gammatoneOut.gammatonePort.right, true );
+        sig_l.appendChunk( chunkLeft(end-gotFrames+1:end,:) );
+        sig_r.appendChunk( chunkRight(end-gotFrames+1:end,:) );
+        rounds = rounds + (gotFrames > 0);
+    end
+    show('frames', [exLastFrameIndex - start, size(sig_l.Data, 1), size(sig_r.Data, 1)])
+    show('same', isequal(sig_l.Data(end-99:end, :), chunkLeft(end-99:end, :)))
+    show('alive', all(std(sig_r.Data) > 0))
+
+    ratemapOut = rosAFE.ratemapPort('ratemap');
+    exLastFrameIndex = ratemapOut.ratemapPort.lastFrameIndex;
+    gotFrames = 0;
+    while ( gotFrames < 5 )
+        pause(p);
+        ratemapOut = rosAFE.ratemapPort('ratemap');
+        step = ratemapOut.ratemapPort.lastFrameIndex - exLastFrameIndex;
+        gotFrames = step / sampleRate * ratemapOut.ratemapPort.sampleRate;
+    end
+    [ chunkLeft, chunkRight ] = adaptTFS( ratemapOut.ratemapPort.framesOnPort, ...
+        ratemapOut.ratemapPort.numberOfChannels, ratemapOut.ratemapPort.left, true, ratemapOut.ratemapPort.right);
+    show('ratemap', [gotFrames, size(chunkLeft), size(chunkRight), min(chunkLeft(end, :)) > 0])
+    preProc = rosAFE.preProcPort('preProc');
+    inputPort = rosAFE.inputProcPort();
+    bassPort = bass.Audio();
+    both = [cell2mat(inputPort.inputProcPort.left.data) cell2mat(inputPort.inputProcPort.right.data)];
+    show('input', [size(both), max(abs(both(:))) < 1])
+    audio = bass.Audio();
+    audio = audio.Audio();
+    show('audio', [size(cell2mat(audio.left)), iscell(audio.left)])
+    modif = rosAFE.modifyParameter('preProc', 'pp_bLevelScaling', '0');
+    kill = rosAFE.removeProcessor('preProc');
+    show('status', {modif.status, kill.status, gammatoneProc.wait(5)})
+    rosAFE.Stop(); rosAFE.kill(); delete(rosAFE);
+    bass.Stop(); bass.kill(); delete(bass);
+    delete(client);
+"""
+
+
+def test_a_reader_of_ports_in_the_manner_of_the_examples(shared_world: World) -> None:
+    """New frames by lastFrameIndex, `adaptTFS` in its old order, the shutdown: the last test of the module."""
+    told = octave.shown(shared_world, READER)
+    moved, left, right = told["frames"]
+    assert moved == left == right > 0
+    assert moved % 4410 == 0
+    assert told["same"] and told["alive"]
+    assert told["ratemap"][0] % 10 == 0 and told["ratemap"][1:] == [100, 8, 100, 8, 1]
+    assert told["input"] == [44100, 2, 1]
+    assert told["audio"] == [44100, 1, 1]
+    assert told["status"] == ["done", "done", "done"]
+    harness.wait_for(
+        lambda: not {"/bass/kill", "/rosAFE/kill"} & shared_world.graph.services(), what="end of the nodes"
+    )
