@@ -1,7 +1,9 @@
 """The dual resonance nonlinear filterbank: a linear and a compressive path per channel.
 
-E. A. Lopez-Poveda and R. Meddis (2001), J. Acoust. Soc. Am. 110, in the form of the CASP model, M. L. Jepsen,
-S. D. Ewert and T. Dau (2008), J. Acoust. Soc. Am. 124. Input: velocity of the stapes in m/s.
+E. A. Lopez-Poveda and R. Meddis (2001), "A human nonlinear cochlear filterbank", J. Acoust. Soc. Am. 110, 3107-3118,
+in the form of the CASP model: M. L. Jepsen, S. D. Ewert and T. Dau (2008), "A computational model of human auditory
+signal processing and perception", J. Acoust. Soc. Am. 124, 422-438. Input: velocity of the stapes in m/s, that is level
+scaling and middle ear filter with pp_bUnityComp off. `fb_nGamma` and `fb_bwERBs` do not apply.
 """
 
 from __future__ import annotations

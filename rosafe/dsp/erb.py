@@ -1,4 +1,8 @@
-"""The ERB-rate scale of Glasberg and Moore (1990): which frequencies are equally far apart for the ear."""
+"""The ERB-rate scale: which frequencies are equally far apart for the ear.
+
+B. R. Glasberg and B. C. J. Moore (1990), "Derivation of auditory filter shapes from notched-noise data", Hear. Res. 47,
+103-138; in the rounding of the Two!Ears front-end: 9.265 and 0.108 for what is 1 / 0.10793.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""The gammatone filterbank: per channel a cascade of equal complex one-pole filters."""
+"""The gammatone filterbank: per channel a cascade of equal complex one-pole filters.
+
+R. D. Patterson, I. Nimmo-Smith, J. Holdsworth and P. Rice (1987), "An efficient auditory filterbank based on the
+gammatone function", APU report 2341; V. Hohmann (2002), "Frequency analysis and synthesis using a gammatone
+filterbank", Acta Acust. united Acust. 88, 433-442, whose digital filter this is.
+"""
 
 from __future__ import annotations
 
@@ -14,10 +19,12 @@ POLES_TOGETHER = 4
 
 
 class GammatoneBank:
-    """All-pole gammatone filters (Hohmann 2002) of unit gain at their centre frequencies, without delay compensation.
+    """All-pole gammatone filters of unit gain at their centre frequencies, without delay compensation.
 
     With beta = 2 pi b ERB(f) / fs, theta = 2 pi f / fs, p = exp(-beta - j theta) and g = 1 - exp(-beta), a channel is
-    y = 2 Re(H x), H(z) = (g / (1 - p / z))**n. One-pole sections keep 1e-13 of accuracy where the expanded polynomial
+    y = 2 Re(H x), H(z) = (g / (1 - p / z))**n; ERB as in `erb.bandwidth`. Its impulse response is
+    h[k] = 2 g**n binomial(k + n - 1, n - 1) exp(-beta k) cos(theta k), a sampled gammatone but for the polynomial in
+    the place of k**(n - 1). One-pole sections keep 1e-13 of accuracy where the expanded polynomial
     of the original loses up to 5e-7 in the lowest channels.
 
     Parameters

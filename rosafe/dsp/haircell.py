@@ -1,4 +1,14 @@
-"""The inner hair cell stage: rectification and loss of phase locking, by the models in use."""
+"""The inner hair cell stage: rectification and loss of phase locking, by the models in use.
+
+* dau: T. Dau, D. Püschel and A. Kohlrausch (1996), "A quantitative model of the 'effective' signal processing in the
+  auditory system. I. Model structure", J. Acoust. Soc. Am. 99, 3615-3622
+* breebart: J. Breebaart, S. van de Par and A. Kohlrausch (2001), "Binaural processing model based on contralateral
+  inhibition. I. Model structure", J. Acoust. Soc. Am. 110, 1074-1088
+* bernstein: L. R. Bernstein, S. van de Par and C. Trahiotis (1999), "The normalized interaural correlation: accounting
+  for NoSπ thresholds obtained with Gaussian and 'low-noise' masking noise", J. Acoust. Soc. Am. 106, 870-876
+* joergensen: S. Jørgensen and T. Dau (2011), "Predicting speech intelligibility based on the signal-to-noise envelope
+  power ratio after modulation-frequency selective processing", J. Acoust. Soc. Am. 130, 1475-1487
+"""
 
 from __future__ import annotations
 
@@ -49,10 +59,14 @@ class InnerHairCell(Stage):
     square     x**2
     hilbert    the envelope
     joergensen envelope, low-pass of order 1 at 150 Hz
-    dau        max(x, 0), low-pass of order 2 at 1 kHz (Dau et al. 1996)
-    breebart   max(x, 0), five low-passes of order 1 at 2 kHz (Breebaart et al. 2001)
-    bernstein  max(envelope**-0.77 x, 0)**2, low-pass of order 2 at 425 Hz (Bernstein et al. 1999); 0 without envelope
+    dau        max(x, 0), low-pass of order 2 at 1 kHz
+    breebart   max(x, 0), five low-passes of order 1 at 2 kHz, together 3 dB down at 770 Hz
+    bernstein  max(envelope**-0.77 x, 0)**2, low-pass of order 2 at 425 Hz; 0 where there is no envelope
     ========== ===================================================================================================
+
+    All low-passes are Butterworth filters by the bilinear transform with prewarping. The envelope is the filterbank's
+    (`GammatoneBank`, `DrnlBank`), sample by sample: the result does not depend on blocks, as that of an FFT would.
+    ValueError where a low-pass would lie at or above half the sample rate.
     """
 
     PARAMETERS: ClassVar[ParameterTable] = {"ihc_method": Parameter("dau", word(*METHODS))}

@@ -1,4 +1,8 @@
-"""The interaural level difference stage."""
+"""The interaural level difference stage.
+
+As in T. May, S. van de Par and A. Kohlrausch (2011), "A probabilistic model for robust localization based on a binaural
+auditory front-end", IEEE Trans. Audio Speech Lang. Process. 19, 1-13.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""The pre-processing stage: DC removal, pre-emphasis, gain control, level scaling and middle ear, in this order."""
+"""The pre-processing stage: DC removal, pre-emphasis, gain control, level scaling and middle ear, in this order.
+
+Gain control: J. Tchorz and B. Kollmeier (2003), "SNR estimation based on amplitude modulation analysis with
+applications to noise suppression", IEEE Trans. Speech Audio Process. 11, 184-192. Pre-emphasis: S. Young et al. (2006),
+The HTK Book. Level: as in M. L. Jepsen, S. D. Ewert and T. Dau (2008), J. Acoust. Soc. Am. 124, 422-438.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +25,8 @@ LEVEL_OF_RMS_1 = 100.0  # dB SPL
 class PreProc(Stage):
     """Conditioning of the ear signals, (2, N) to (2, N). Any change of a parameter starts all filters anew.
 
-    Level scaling multiplies by 10**((100 - pp_refSPLdB) / 20): inside, an RMS of 1 stands for 100 dB SPL.
+    DC removal is a Butterworth high-pass of order 4, in second-order sections. Level scaling multiplies by
+    10**((100 - pp_refSPLdB) / 20): inside, an RMS of 1 stands for 100 dB SPL.
     """
 
     PARAMETERS: ClassVar[ParameterTable] = {

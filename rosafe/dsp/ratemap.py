@@ -1,4 +1,7 @@
-"""The ratemap (cochleagram) stage: smoothed firing rate per frame."""
+"""The ratemap (cochleagram) stage: smoothed firing rate per frame.
+
+G. J. Brown and M. Cooke (1994), "Computational auditory scene analysis", Comput. Speech Lang. 8, 297-336.
+"""
 
 from __future__ import annotations
 

@@ -26,6 +26,11 @@ ParameterTable = Mapping[str, Parameter]
 class Stage:
     """One processor of the chain: blocks in, blocks out, state kept between.
 
+    The rule for every stage: `_build`, and so `configure`, puts new objects in the place of what it changes (filters,
+    framings, tables) and never alters those that are there. A shallow copy of a stage is therefore a second one that
+    may be configured while the first one works; the tree tries changes on such copies, and may throw them away or put
+    them to work with the state as it is then.
+
     Parameters
     ----------
     sample_rate : float
@@ -74,7 +79,10 @@ class Stage:
             self._values = values
 
     def process(self, block: FloatArray) -> FloatArray:
-        """The output for the next block: a fresh, contiguous array. The input is not modified."""
+        """The output for the next block, (2, ..., N) of numbers: a fresh, contiguous float64 array.
+
+        The input is not modified. ValueError for another shape or type.
+        """
         raise NotImplementedError
 
     def reset(self) -> None:
@@ -82,7 +90,10 @@ class Stage:
         raise NotImplementedError
 
     def _build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
-        """Design for `values` and drop the states that the `changed` ones invalidate; ValueError before any effect."""
+        """Design for `values` and drop the states that the `changed` ones invalidate; ValueError before any effect.
+
+        New objects replace the old ones: see the rule above.
+        """
         raise NotImplementedError
 
     def _with(self, changes: Mapping[str, Any]) -> dict[str, Any]:

@@ -1,4 +1,8 @@
-"""Analysis windows, symmetric, by the names of the original."""
+"""Analysis windows, symmetric, by the names of the original.
+
+F. J. Harris (1978), "On the use of windows for harmonic analysis with the discrete Fourier transform", Proc. IEEE 66,
+51-83; of the exact forms there are several, these are MATLAB's.
+"""
 
 from __future__ import annotations
 
@@ -13,8 +17,18 @@ NAMES = ("hamming", "hanning", "hann", "blackman", "triang", "sqrt_win")
 def window(name: str, length: int) -> FloatArray:
     """The symmetric window `name` of `length` samples.
 
-    `hann` ends in zeros; `hanning` is MATLAB's, whose zeros lie one sample outside; `sqrt_win` is the square root of
-    `triang`. ValueError for other names.
+    With N = `length` and i from 0 to N - 1:
+
+    ======== ===================================================================================
+    hann     (1 - cos(2 pi i / (N - 1))) / 2, zero at both ends
+    hanning  (1 - cos(2 pi (i + 1) / (N + 1))) / 2, whose zeros lie one sample outside
+    hamming  0.54 - 0.46 cos(2 pi i / (N - 1))
+    blackman 0.42 - 0.5 cos(2 pi i / (N - 1)) + 0.08 cos(4 pi i / (N - 1))
+    triang   rising (2 i + 1) / N for even N, 2 (i + 1) / (N + 1) for odd N; falling likewise
+    sqrt_win sqrt(triang)
+    ======== ===================================================================================
+
+    ValueError for other names.
     """
     if name == "hanning":
         return windows.hann(length + 2, sym=True)[1:-1]
