@@ -1,0 +1,119 @@
+"""What capture costs and how regular it is: ``/usr/bin/python3 benchmarks/capture.py`` prints a table.
+
+A master, bass-ros and one subscriber, this process, on the loopback interface; chunks of 50 ms at 44100 Hz from a file.
+For each length of the window: the share of a core that bass takes; how far the stamps are from the even grid of the
+chunks, and how long after its stamp a message is here; the messages that came, and the frames that no window showed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT)]
+
+from rosafe.ros import generate  # noqa: E402
+from rosafe.ros.master import PrivateMaster  # noqa: E402
+
+RATE, CHUNK = 44100, 2205
+WINDOWS = (0.2, 1.0, 10.0, 60.0)  # s
+
+
+class Heard(NamedTuple):
+    """One message, as it came."""
+
+    index: int
+    frames: int  # in its window
+    stamp: float  # s
+    arrival: float
+
+
+def cpu_seconds(pid: int) -> float:
+    """The processor time that a process has used so far."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def measure(call: Any, device: str, window: float, seconds: float, pid: int, heard: list[Heard]) -> list[str]:
+    """A row of the table."""
+    chunks = round(window * RATE / CHUNK)
+    call("Acquire", device=device, sampleRate=RATE, nFramesPerChunk=CHUNK, nChunksOnPort=chunks)
+    time.sleep(2.0)  # until all is warm
+    heard.clear()
+    begun, used = time.monotonic(), cpu_seconds(pid)
+    time.sleep(seconds)
+    share = (cpu_seconds(pid) - used) / (time.monotonic() - begun)
+    came = list(heard)
+    call("Stop")
+    index = np.array([item.index for item in came])
+    stamp = np.array([item.stamp for item in came])
+    grid = stamp[0] + (index - index[0]) / RATE
+    jitter = np.abs(stamp - grid - np.median(stamp - grid)) * 1e3
+    delay = np.array([item.arrival - item.stamp for item in came]) * 1e3
+    lost = np.maximum(0, np.diff(index) - came[0].frames).sum()
+    return [
+        f"{window:g} s",
+        f"{100 * share:.1f} %",
+        f"{np.median(jitter):.3f} / {np.percentile(jitter, 99):.3f}",
+        f"{np.median(delay):.1f} / {np.percentile(delay, 99):.1f}",
+        f"{len(came)} of {round((index[-1] - index[0]) / CHUNK) + 1}",
+        f"{lost}",
+    ]
+
+
+def main() -> None:
+    """Measure all windows."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seconds", type=float, default=10.0, help="for each window (default: %(default)s)")
+    options = parser.parse_args()
+    generate.ensure_messages()
+    with PrivateMaster() as master, tempfile.TemporaryDirectory() as folder:
+        os.environ.update(ROS_MASTER_URI=master.uri, ROS_IP="127.0.0.1", ROS_HOME=folder)
+        import rospy
+        import rosservice
+        import soundfile
+
+        from rosafe.ros import wire
+
+        noise = np.random.default_rng(0).integers(-(2**15), 2**15, (10 * RATE, 2)).astype(np.int16)
+        soundfile.write(f"{folder}/noise.wav", noise, RATE)
+        with subprocess.Popen([str(ROOT / "scripts" / "bass-ros")], stderr=subprocess.DEVNULL) as bass:
+            try:
+                rospy.init_node("benchmark", disable_signals=True)
+                heard: list[Heard] = []
+
+                def hear(message: Any) -> None:
+                    stamp = message.stamp["sec"] + message.stamp["nsec"] * 1e-9
+                    heard.append(Heard(message.lastFrameIndex, len(message.left), stamp, time.time()))
+
+                def call(service: str, **fields: Any) -> None:
+                    rospy.wait_for_service(f"/bass/{service}", 20)
+                    kind = rosservice.get_service_class_by_name(f"/bass/{service}")
+                    answer = rospy.ServiceProxy(f"/bass/{service}", kind)(**fields)
+                    if not answer.genom_success:
+                        sys.exit(f"{service}: {answer.genom_exdetail}")
+
+                audio = wire.message_class("bass", "::binaudio::portStruct")
+                rospy.Subscriber("/bass/Audio", audio, hear, queue_size=1, buff_size=2**26, tcp_nodelay=True)
+                device = f"file:{folder}/noise.wav?loop=1"
+                print("| window | of a core | stamps off, median / p99 (ms) | delay, median / p99 (ms) | messages | lost |")
+                print("|---|--:|--:|--:|--:|--:|")
+                for window in WINDOWS:
+                    row = measure(call, device, window, options.seconds, bass.pid, heard)
+                    print("| " + " | ".join(row) + " |", flush=True)
+                rospy.signal_shutdown("done")
+            finally:
+                bass.terminate()
+
+
+if __name__ == "__main__":
+    main()
