@@ -1,7 +1,8 @@
-"""The curl lines of docs/genomixd.md do what the page says."""
+"""The curl lines of docs/genomixd.md, and the commands of docs/request.md, do what the pages say."""
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 
@@ -33,3 +34,16 @@ def test_the_page_names_every_url(world: World) -> None:
     assert status == 200
     for path in set(re.findall(r"/(?:session|request)/[a-z]+|/[a-z]+(?=/[A-Z]|\?|\n)", told)):
         assert path in page
+
+
+def test_the_page_of_the_request(world: World) -> None:
+    page = (harness.ROOT / "docs" / "request.md").read_text("utf-8")
+    (shell,) = re.findall(r"^```sh\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
+    (shown,) = re.findall(r"\n\n```\n(created .*?)^```$", page, re.MULTILINE | re.DOTALL)
+    (tcl,) = re.findall(r"^```tcl\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
+    acquire, ild, ratemap, rates = shell.splitlines()
+    assert "genom_success: True" in world.graph.run("sh", "-c", acquire).stdout
+    assert world.graph.run("sh", "-c", ild).stdout == shown
+    assert json.loads(world.graph.run("sh", "-c", ratemap).stdout)["created"] == ["ratemap_0"]
+    assert rates.startswith("rostopic hz ") and rates.split()[2] in world.graph.topics()
+    assert world.lines(f"set env(GENOMIXD) $address\n{tcl}") == ["/rosAFE/ildPort/ild_1", "16"]
