@@ -2,7 +2,8 @@
 
 A master, bass-ros and one subscriber, this process, on the loopback interface; chunks of 50 ms at 44100 Hz from a file.
 For each length of the window: the share of a core that bass takes; how far the stamps are from the even grid of the
-chunks, and how long after its stamp a message is here; the messages that came, and the frames that no window showed.
+chunks, and how long after its stamp a message is here (median / 99th percentile); the messages that came, and the
+frames that no window showed.
 """
 
 from __future__ import annotations
@@ -105,7 +106,7 @@ def main() -> None:
                 audio = wire.message_class("bass", "::binaudio::portStruct")
                 rospy.Subscriber("/bass/Audio", audio, hear, queue_size=1, buff_size=2**26, tcp_nodelay=True)
                 device = f"file:{folder}/noise.wav?loop=1"
-                print("| window | of a core | stamps off, median / p99 (ms) | delay, median / p99 (ms) | messages | lost |")
+                print("| window | of a core | stamps off (ms) | delay (ms) | messages | lost |")
                 print("|---|--:|--:|--:|--:|--:|")
                 for window in WINDOWS:
                     row = measure(call, device, window, options.seconds, bass.pid, heard)
