@@ -81,7 +81,7 @@ def run(options: argparse.Namespace) -> int:
     if options.json:
         print(json.dumps(answer, indent=2))
     else:
-        _show(answer, kind, options.instance)
+        _show(answer, kind, options.instance.strip("/"))
     return 0
 
 

@@ -114,8 +114,9 @@ class Proxy:
 
     def service(self, name: str) -> Service:
         """The service or composite called `name` (aliases count), or ``::genom::no_such_service``."""
-        if name in (composite.name for composite in self.component.composites):
-            return REQUEST
+        for composite in self.component.composites:
+            if composite.name == name:
+                return composite
         try:
             return self.component.service(name)
         except KeyError:
@@ -125,7 +126,7 @@ class Proxy:
 
     def arguments(self, service: Service, given: Any) -> dict[str, Any]:
         """What `call` and `start` take, of what a client has `given`; ComponentError where that does not fit."""
-        return partial(given) if service in self.component.composites else complete(service, given)
+        return partial(given) if service is REQUEST else complete(service, given)
 
     async def call(self, service: Service, values: Mapping[str, Any]) -> Value:
         """What a function returns; an activity returns nothing, as soon as it runs."""

@@ -40,13 +40,10 @@ async def build(component: Component, values: Mapping[str, Any]) -> dict[str, An
     Raises
     ------
     ComponentError
-        The component's own; ``::genom::serialization`` for an unknown representation.
+        The component's own.
     """
     given = dict(values)
-    try:
-        kind = request.kind_of(given.pop("representation"))
-    except ValueError as problem:
-        raise ComponentError("::genom::serialization", what=f"{REQUEST.name}: {problem}") from None
+    kind = request.kind_of(given.pop("representation"))
     wish = await asyncio.to_thread(request.understand, kind, given)  # numpy's and scipy's work, and their import
     made: list[str] = []
     try:

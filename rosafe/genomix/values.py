@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from rosafe.interface import KINDS, REQUEST, REQUIRED, ComponentError, Parameter, Service
+from rosafe.request import kind_of
 
 _WORDS = {
     **dict.fromkeys(("1", "true", "yes", "on", "t"), True),
@@ -78,6 +79,10 @@ def partial(given: Any) -> dict[str, Any]:
     unfolded = [pair for name, value in pairs for pair in _unfolded(name, value)]
     values = _converted(REQUEST, [(name, value) for name, value in unfolded if value is not None])
     _require(REQUEST, values)
+    try:
+        kind_of(values["representation"])
+    except ValueError as problem:
+        raise refused(f"{REQUEST.name}: {problem}") from None
     return values
 
 
