@@ -147,6 +147,21 @@ def test_failed_acquisition_leaves_the_port_silent(graph: Graph, bass_node: Proc
     assert messages == []
 
 
+@pytest.mark.parametrize("window_seconds", [10, 250])
+def test_long_windows_lose_nothing(graph: Graph, bass_node: Process, window_seconds: int) -> None:
+    """Of 10 s all frames come; of much more (16 MB a message) the newest do, and windows overlap all the same."""
+    with graph.collect("/bass/Audio", audio_class()) as messages:
+        assert acquire(graph, "scene:", RATE, chunks=window_seconds * RATE // CHUNK).genom_success
+        wait_for(lambda: messages and messages[-1].lastFrameIndex >= RATE)
+        newest = messages[-1]
+    indexes = [message.lastFrameIndex for message in messages]
+    assert max(np.diff(indexes)) <= window_seconds * RATE // 2
+    expected = Scene(RATE).frames(int(newest.lastFrameIndex))
+    assert (
+        np.array_equal(newest.left[-expected.shape[1] :], expected[0]) and not newest.left[: -expected.shape[1]].any()
+    )
+
+
 def test_acquire_replaces_and_stop_keeps_the_port(graph: Graph, bass_node: Process) -> None:
     assert acquire(graph, "scene:", RATE).genom_success
     graph.message("/bass/Audio", audio_class(), lambda m: m.lastFrameIndex >= 3 * CHUNK)
