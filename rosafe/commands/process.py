@@ -158,6 +158,9 @@ def run(options: argparse.Namespace) -> int:
     from rosafe.audiofile import AudioFileError
     from rosafe.files import OutputError, process_file
 
+    if len(inputs) > 1:
+        import scipy.signal  # noqa: F401
+
     works = [
         partial(process_file, source, target, parameters, options.block, outputs, named or options.force)
         for source, target in zip(inputs, targets, strict=True)

@@ -3,6 +3,8 @@
 Needs numpy and scipy only. Every stage is made as ``Stage(sample_rate, **parameters)`` with the original's parameter
 names, takes blocks of any length through ``process``, and gives the same numbers however the signal is cut into
 blocks (1e-12; where gain control starts is the one exception). Finite input gives finite output.
+
+Modules here `import scipy`, which loads `scipy.signal` at its first use: that takes longer than all the rest.
 """
 
 from __future__ import annotations

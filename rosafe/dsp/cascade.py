@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import signal
 
 from .guard import flush
 
@@ -42,7 +42,7 @@ class Cascade:
             return block
         if block.size == 0:
             return np.zeros(block.shape, state.dtype)
-        result, state = signal.sosfilt(self.sections, block, zi=state)
+        result, state = scipy.signal.sosfilt(self.sections, block, zi=state)
         self.state = np.ascontiguousarray(state)
         flush(self.state)
         return result

@@ -11,7 +11,7 @@ import math
 from typing import Any, ClassVar
 
 import numpy as np
-from scipy import fft
+import scipy
 
 from . import kernels
 from .checks import MAX_SAMPLES, positive
@@ -73,7 +73,7 @@ def correlate_by_fft(frames: FloatArray, window: FloatArray, reach: int, result:
     channel_count, frame_count, size = frames.shape[1:]
     middle = result.shape[1] // 2
     inner = slice(middle - reach, middle + reach + 1)
-    transform = fft.next_fast_len(size + reach, real=True)
+    transform = scipy.fft.next_fast_len(size + reach, real=True)
     at_once = max(1, BATCH // transform)  # frames of one channel, or of as many channels as go with them
     channels_at_once = max(1, at_once // max(1, frame_count))
     for first in range(0, channel_count, channels_at_once):
@@ -88,7 +88,7 @@ def _correlate(frames: FloatArray, reach: int, transform: int) -> FloatArray:
     """Windowed frames (2, C, F, w) to (C, F, 2 reach + 1)."""
     left, right = frames
     energies = np.einsum("cfi,cfi->cf", left, left) * np.einsum("cfi,cfi->cf", right, right)
-    spectrum = fft.rfft(left, transform) * np.conj(fft.rfft(right, transform))
-    circular = fft.irfft(spectrum, transform)
+    spectrum = scipy.fft.rfft(left, transform) * np.conj(scipy.fft.rfft(right, transform))
+    circular = scipy.fft.irfft(spectrum, transform)
     lags = np.concatenate((circular[..., transform - reach :], circular[..., : reach + 1]), axis=-1)
     return lags / np.sqrt(energies + EPSILON)[..., np.newaxis]

@@ -9,7 +9,7 @@ scaling and middle ear filter with pp_bUnityComp off. `fb_nGamma` and `fb_bwERBs
 from __future__ import annotations
 
 import numpy as np
-from scipy import signal
+import scipy
 
 from .cascade import Cascade
 from .guard import FloatArray, limited
@@ -77,7 +77,7 @@ class _Channel:
             return _resonator(centre / sample_rate, width / sample_rate)
 
         def lowpass(cutoff: float) -> FloatArray:
-            return signal.butter(2, cutoff, fs=sample_rate, output="sos")
+            return scipy.signal.butter(2, cutoff, fs=sample_rate, output="sos")
 
         if frequency < LOWEST:
             raise ValueError(f"fb_cfHz: drnl has no channel at {frequency:.6g} Hz, below {LOWEST:.12g} Hz")

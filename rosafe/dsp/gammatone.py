@@ -8,8 +8,8 @@ filterbank", Acta Acust. united Acust. 88, 433-442, whose digital filter this is
 from __future__ import annotations
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import signal
 
 from . import kernels
 from .erb import bandwidth
@@ -90,7 +90,7 @@ def filter_by_scipy(
     for channel, cascade in enumerate(sections):
         before = np.zeros((len(cascade), 2, 2), np.complex128)
         before[..., 0] = state[:, channel].T
-        analytic, after = signal.sosfilt(cascade, block, zi=before)
+        analytic, after = scipy.signal.sosfilt(cascade, block, zi=before)
         state[:, channel] = after[..., 0].T
         output[:, channel] = analytic.real
         if envelope is not None:

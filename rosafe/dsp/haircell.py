@@ -16,7 +16,7 @@ from collections.abc import Callable
 from typing import Any, ClassVar
 
 import numpy as np
-from scipy import signal
+import scipy
 
 from . import kernels
 from .cascade import Cascade
@@ -101,7 +101,7 @@ class InnerHairCell(Stage):
             order, cutoff, times = LOWPASS[method]
             if cutoff >= self.sample_rate / 2:
                 raise ValueError(f"ihc_method: {method} needs a sample rate above {2 * cutoff:.12g} Hz")
-            sections = np.tile(signal.butter(order, cutoff, fs=self.sample_rate, output="sos"), (times, 1))
+            sections = np.tile(scipy.signal.butter(order, cutoff, fs=self.sample_rate, output="sos"), (times, 1))
         self._lowpass = Cascade(sections)
 
 

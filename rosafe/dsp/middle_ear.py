@@ -9,7 +9,7 @@ processing and perception", J. Acoust. Soc. Am. 124. Designs as in the MATLAB fu
 from __future__ import annotations
 
 import numpy as np
-from scipy import fft, signal
+import scipy
 
 from .guard import FloatArray
 
@@ -135,13 +135,13 @@ def _frequency_sampling(frequencies: FloatArray, amplitudes: FloatArray) -> Floa
     grid = np.linspace(0.0, frequencies[-1], ORDER + 1)
     delay = np.exp(-1j * np.pi * (ORDER / 2) * np.arange(ORDER + 1) / ORDER)
     response = np.interp(grid, frequencies, amplitudes) * delay
-    return fft.irfft(response, 2 * ORDER)[: ORDER + 1] * signal.windows.hamming(ORDER + 1)
+    return scipy.fft.irfft(response, 2 * ORDER)[: ORDER + 1] * scipy.signal.windows.hamming(ORDER + 1)
 
 
 def _jepsen(nyquist: float) -> FloatArray:
     frequencies, impedances = STAPES_IMPEDANCE[STAPES_IMPEDANCE[:, 0] < nyquist].T
     fir = _frequency_sampling(np.r_[0.0, frequencies, nyquist], np.r_[0.0, 1 / impedances, 0.0])
-    return fir / np.abs(fft.fft(fir)).max() * 1e-8 * 10 ** (REFERENCE_DB_SPL / 20)
+    return fir / np.abs(scipy.fft.fft(fir)).max() * 1e-8 * 10 ** (REFERENCE_DB_SPL / 20)
 
 
 def _lopezpoveda(nyquist: float) -> FloatArray:
@@ -165,6 +165,6 @@ def _lopezpoveda(nyquist: float) -> FloatArray:
 
 def _minimum_phase(fir: FloatArray) -> FloatArray:
     """The minimum phase response with the magnitude of `fir` on a grid of its own length."""
-    magnitude = np.maximum(np.abs(fft.fft(fir)), np.finfo(np.float64).tiny)
-    phase = -np.imag(signal.hilbert(np.log(magnitude)))
-    return fft.ifft(magnitude * np.exp(1j * phase)).real
+    magnitude = np.maximum(np.abs(scipy.fft.fft(fir)), np.finfo(np.float64).tiny)
+    phase = -np.imag(scipy.signal.hilbert(np.log(magnitude)))
+    return scipy.fft.ifft(magnitude * np.exp(1j * phase)).real

@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import Any, ClassVar
 
 import numpy as np
-from scipy import signal
+import scipy
 
 from .cascade import Cascade, leaky_integrator
 from .checks import flag, positive, round_half_away, within, word
@@ -62,7 +62,7 @@ class PreProc(Stage):
             cutoff = values["pp_cutoffHzDC"]
             if cutoff >= self.sample_rate / 2:
                 raise ValueError(f"pp_cutoffHzDC: {cutoff:.12g} Hz is not below half the sample rate")
-            steps.append(Cascade(signal.butter(DC_ORDER, cutoff, "highpass", fs=self.sample_rate, output="sos")))
+            steps.append(Cascade(scipy.signal.butter(DC_ORDER, cutoff, "highpass", fs=self.sample_rate, output="sos")))
         if values["pp_bPreEmphasis"]:
             steps.append(PreEmphasis(abs(values["pp_coefPreEmphasis"])))
         if values["pp_bNormalizeRMS"]:

@@ -7,7 +7,7 @@ F. J. Harris (1978), "On the use of windows for harmonic analysis with the discr
 from __future__ import annotations
 
 import numpy as np
-from scipy.signal import windows
+import scipy
 
 from .guard import FloatArray
 
@@ -31,9 +31,9 @@ def window(name: str, length: int) -> FloatArray:
     ValueError for other names.
     """
     if name == "hanning":
-        return windows.hann(length + 2, sym=True)[1:-1]
+        return scipy.signal.windows.hann(length + 2, sym=True)[1:-1]
     if name == "sqrt_win":
-        return np.sqrt(windows.triang(length, sym=True))
+        return np.sqrt(scipy.signal.windows.triang(length, sym=True))
     if name in NAMES:
-        return windows.get_window(name, length, fftbins=False)
+        return scipy.signal.windows.get_window(name, length, fftbins=False)
     raise ValueError(f"window: {name!r} is not one of {', '.join(NAMES)}")

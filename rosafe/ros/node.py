@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 import threading
 from typing import Any
@@ -59,6 +60,7 @@ class RosafeNode:
         self._node.diagnostics.add("processors", self._tree_health)
         self._trace = TracePort(f"{self._node.name}/trace", self._tree.observe)
         self._node.start()
+        importlib.import_module("scipy.signal")  # whoever has started us waits no longer; no request is to wait for it
 
     def shutdown(self, by: str) -> None:
         """End all processors."""
