@@ -86,13 +86,13 @@ classdef component < handle
     end
 
     methods (Access = private)
-        function value = call(obj, name, arguments)
+        function value = call(obj, name, given)
             % A service is called or a port is read.
             [name, kind] = entry(obj, name);
             flags = struct('a', false, 'm', false, 'h', false);
-            while ~isempty(arguments) && any(strcmp(arguments{1}, {'-a', '-m', '-h'}))
-                flags.(arguments{1}(2)) = true;
-                arguments(1) = [];
+            while ~isempty(given) && any(strcmp(given{1}, {'-a', '-m', '-h'}))
+                flags.(given{1}(2)) = true;
+                given(1) = [];
             end
             described = obj.about.(kind).(name);
             if flags.h
@@ -100,16 +100,16 @@ classdef component < handle
                 value = [];
                 return
             end
-            if isempty(arguments) && genomix.wire.interactive()
-                arguments = genomix.wire.ask(described);
+            if isempty(given) && genomix.wire.interactive()
+                given = genomix.wire.ask(described);
             end
             path = ['/' genomix.wire.quote(obj.about.name) '/' name];
             query = {'i', obj.about.instance};
             try
                 if strcmp(kind, 'ports')
-                    query = [query; element(arguments)];
+                    query = [query; element(given)];
                 else
-                    query = [query; {'input', input_of(arguments)}];
+                    query = [query; {'input', input_of(given)}];
                 end
             catch problem
                 value = genomix.request.failure('::genom::serialization', [name ': ' problem.message]);
@@ -155,22 +155,22 @@ classdef component < handle
     end
 end
 
-function query = element(arguments)
+function query = element(given)
 % The first argument names the element of a port; scripts give some to ports that have none.
 query = cell(0, 2);
-if isempty(arguments)
+if isempty(given)
     return
 end
-if ~ischar(arguments{1})
-    error('genomix:argument', 'the name of an element is a text, and no %s', class(arguments{1}));
+if ~ischar(given{1})
+    error('genomix:argument', 'the name of an element is a text, and no %s', class(given{1}));
 end
-query = {'element', arguments{1}};
+query = {'element', given{1}};
 end
 
-function text = input_of(arguments)
-if numel(arguments) == 1 && isstruct(arguments{1})
-    text = genomix.wire.encode(arguments{1});
+function text = input_of(given)
+if numel(given) == 1 && isstruct(given{1})
+    text = genomix.wire.encode(given{1});
 else
-    text = genomix.wire.encode(arguments);
+    text = genomix.wire.encode(given);
 end
 end

@@ -7,7 +7,14 @@ classdef request < handle
 %   r.wait(s)     waits until it is no longer 'sent', or for s seconds, and returns the status
 %   r.abort()     asks the activity to end
 %
-%   A refusal raises no error: scripts look at status. A lost connection to genomixd does raise one.
+%   A refusal raises no error: scripts look at status. A lost connection to genomixd does raise one. status, result and
+%   exception ask genomixd until the request has ended.
+
+    properties (Dependent)
+        status
+        result
+        exception
+    end
 
     properties (Access = private)
         client
@@ -22,44 +29,25 @@ classdef request < handle
             obj.matrices = matrices;
         end
 
-        function varargout = subsref(obj, s)
-            if ~strcmp(s(1).type, '.')
-                error('genomix:request', 'a request has status, result and exception');
+        function status = get.status(obj)
+            refresh(obj, 0);
+            status = obj.told.status;
+        end
+
+        function result = get.result(obj)
+            refresh(obj, 0);
+            result = [];
+            if strcmp(obj.told.status, 'done')
+                result = output(obj);
             end
-            rest = s(2:end);
-            arguments = {};
-            if any(strcmp(s(1).subs, {'wait', 'abort'})) && ~isempty(rest) && strcmp(rest(1).type, '()')
-                arguments = rest(1).subs;
-                rest(1) = [];
+        end
+
+        function exception = get.exception(obj)
+            refresh(obj, 0);
+            exception = [];
+            if strcmp(obj.told.status, 'error')
+                exception = obj.told.exception;
             end
-            switch s(1).subs
-                case 'status'
-                    refresh(obj, 0);
-                    value = obj.told.status;
-                case 'result'
-                    value = result(obj);
-                case 'exception'
-                    refresh(obj, 0);
-                    value = [];
-                    if strcmp(obj.told.status, 'error')
-                        value = obj.told.exception;
-                    end
-                case 'wait'
-                    value = wait(obj, arguments{:});
-                case 'abort'
-                    abort(obj);
-                    return
-                otherwise
-                    % Such as the name of a port that could not be read.
-                    if strcmp(obj.told.status, 'error')
-                        error('genomix:request', '%s', genomix.request.explain(obj.told.exception));
-                    end
-                    error('genomix:request', 'a request has status, result and exception, and no %s', s(1).subs);
-            end
-            if ~isempty(rest)
-                value = subsref(value, rest);
-            end
-            varargout = {value};
         end
 
         function status = wait(obj, seconds)
@@ -91,9 +79,9 @@ classdef request < handle
             if strcmp(obj.told.status, 'error')
                 fprintf('    exception: %s\n', genomix.request.explain(obj.told.exception));
             elseif strcmp(obj.told.status, 'done')
-                outputs = result(obj);
-                if ~isempty(fieldnames(outputs))
-                    fprintf('    result.%s\n', strjoin(fieldnames(outputs).', ', result.'));
+                names = fieldnames(output(obj));
+                if ~isempty(names)
+                    fprintf('    result.%s\n', strjoin(names.', ', result.'));
                 end
             end
         end
@@ -118,12 +106,8 @@ classdef request < handle
             obj.told = answer;
         end
 
-        function value = result(obj)
-            refresh(obj, 0);
-            value = [];
-            if ~strcmp(obj.told.status, 'done')
-                return
-            end
+        function value = output(obj)
+            % Large outputs are not part of the status.
             if ~isfield(obj.told, 'output')
                 [answer, failed] = obj.client.get('/request/result', {'id', obj.told.id}, obj.matrices);
                 if failed

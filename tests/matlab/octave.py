@@ -52,17 +52,9 @@ def run(world: World, script: str, timeout: float = 60.0, folder: Path | None = 
     (folder / "message.m").write_text(MESSAGE)
     path = folder / "script.m"
     path.write_text(textwrap.dedent(script), "utf-8")
-    return world.graph.run(
-        "sh",
-        "-c",
-        'cd "$1" && shift && exec "$@"',
-        "sh",
-        str(folder),
-        *COMMAND,
-        path.name,
-        timeout=timeout,
-        **environment(world),
-    ).stdout
+    in_folder = ("sh", "-c", 'cd "$1" && shift && exec "$@"', "sh", str(folder))
+    done = world.graph.run(*in_folder, *COMMAND, path.name, timeout=timeout, check=True, stdin="", **environment(world))
+    return done.stdout
 
 
 def shown(world: World, script: str, timeout: float = 60.0, folder: Path | None = None) -> dict[str, Any]:

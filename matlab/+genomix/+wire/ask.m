@@ -1,10 +1,10 @@
-function arguments = ask(about)
+function answers = ask(about)
 %ASK  The arguments of a service, or the element of a port, that a person at the prompt gives; Return takes the default.
 
-arguments = {};
+answers = {};
 if isfield(about, 'multiple')
     if about.multiple
-        arguments = {input('string element: name of the processor > ', 's')};
+        answers = {input('string element: name of the processor > ', 's')};
     end
     return
 end
@@ -22,6 +22,6 @@ for k = 1:numel(names)
     end
 end
 if ~isempty(names)
-    arguments = {given};
+    answers = {given};
 end
 end
