@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from rosafe.commands import Failure
 from rosafe.commands._workers import Interrupted, Signals
-from rosafe.interface import BASS, ComponentError
+from rosafe.interface import ComponentError
 
 if TYPE_CHECKING:
     from rosafe.bass.recording.outputs import Output
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 _TOPIC = "/bass/Audio"
 _EARS = ("left", "right")
-_ACQUIRE = BASS.service("Acquire")
+_RATE = 44100  # of a device without a rate of its own
 _MAX_SECONDS = 1e7
 
 # --- the command line -------------------------------------------------------------------------------------------
@@ -59,9 +59,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--chunk",
         type=_count(1_000_000),
-        default=_ACQUIRE.parameter("nFramesPerChunk").default,
         metavar="N",
-        help="frames that a --device gives at a time (default: %(default)s)",
+        help="frames that a --device gives at a time (default: 50 ms of --rate)",
     )
     parser.add_argument("--force", action="store_true", help="replace OUT where it is there already")
     parser.add_argument("-q", "--quiet", action="store_true", help="no meter; losses and the summary only")
@@ -110,7 +109,7 @@ def run(options: argparse.Namespace) -> int:
     """Record; 0 if all went well."""
     if options.list:
         return _list()
-    path = _checked_output(options)
+    path = _check(options)
     signals, stopping = Signals(), threading.Event()
     outcome: list[int | BaseException] = []
 
@@ -145,9 +144,14 @@ def _list() -> int:
     return 0
 
 
-def _checked_output(options: argparse.Namespace) -> Path | None:
+def _check(options: argparse.Namespace) -> Path | None:
+    """Complete the options, and say where the output goes; Failure, or a usage error, where that cannot be."""
     if options.socket and not options.rate:
         options.usage_error("--socket needs --rate: the protocol does not tell the sample rate")
+    if options.chunk is None:
+        options.chunk = max(1, (options.rate or _RATE) // 20)
+    if "" in (options.device, options.topic):
+        options.usage_error("--device and --topic want a name")
     if options.output is None:
         return None
     path = Path(os.path.expanduser(options.output))

@@ -9,6 +9,7 @@ import time
 from typing import Any
 
 import numpy as np
+import rosgraph.names
 import rospy
 
 from rosafe.bass.sources.base import Chunk, device_error, hwparams_error
@@ -48,6 +49,8 @@ class TopicSource:
     """
 
     def __init__(self, topic: str, sample_rate: int, stopping: threading.Event) -> None:
+        if not rosgraph.names.is_legal_name(topic):
+            raise device_error(f"{topic} is no name of a topic")
         self.name = topic = rospy.resolve_name(topic)
         self.overruns = 0
         self.lost_frames = 0

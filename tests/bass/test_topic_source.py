@@ -1,0 +1,88 @@
+"""The source that listens to a port Audio: what is new, once; losses; and when a stream has ended."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from rosafe.bass.recording import topic
+from rosafe.bass.recording.topic import TopicSource
+from rosafe.interface import ComponentError
+from tests.harness import Graph, wait_for
+from tests.ros.session import RATE, Microphone, noise
+
+
+@pytest.fixture
+def microphone(graph: Graph) -> Iterator[Microphone]:
+    """One with a window of 4000 frames, in which some sound is old already."""
+    microphone = Microphone(graph)
+    microphone.play(noise(2000, seed=9))
+    yield microphone
+    microphone.close()
+
+
+@pytest.fixture
+def source(microphone: Microphone, monkeypatch: pytest.MonkeyPatch) -> Iterator[TopicSource]:
+    monkeypatch.setattr(topic, "STALL_SECONDS", 1.0)
+    source = TopicSource(microphone.topic, 0, threading.Event())
+    yield source
+    source.close()
+
+
+def read(source: TopicSource, frames: int) -> np.ndarray:
+    """That many frames, zeros for gaps."""
+    parts: list[np.ndarray] = []
+    while sum(part.shape[1] for part in parts) < frames:
+        chunk = source.read()
+        assert chunk is not None
+        parts.append(np.pad(chunk.samples, ((0, 0), (chunk.gap, 0))))
+    return np.concatenate(parts, axis=1)
+
+
+def test_what_is_new_once_and_losses(source: TopicSource, microphone: Microphone) -> None:
+    assert (source.sample_rate, source.newest, source.frames_per_chunk) == (RATE, 2000, 400)
+    signal = noise(14_000)
+    microphone.play(signal[:, :3000])
+    assert np.array_equal(read(source, 3000), signal[:, :3000])
+    microphone.publish()  # nothing new
+    microphone.publish_bytes(b"\1\2\3")
+    microphone.lose(signal[:, 3000:6000])
+    microphone.play(signal[:, 6000:8000])
+    assert np.array_equal(read(source, 5000), signal[:, 3000:8000])
+    assert (source.overruns, source.lost_frames) == (0, 0)  # the windows overlapped
+    microphone.lose(signal[:, 8000:13_600])
+    microphone.play(signal[:, 13_600:])
+    heard = read(source, 6000)
+    assert not heard[:, :2000].any() and np.array_equal(heard[:, 2000:], signal[:, 10_000:])
+    assert (source.overruns, source.lost_frames) == (1, 2000)
+
+
+def test_end_and_a_new_stream(source: TopicSource, microphone: Microphone) -> None:
+    microphone.play(noise(400))
+    assert source.read() is not None
+    assert source.read() is None  # nothing for a second
+    microphone.index = 0
+    microphone.play(noise(400))
+    with pytest.raises(ComponentError, match="a new stream begins"):
+        source.read()
+
+
+def test_old_sound_only(source: TopicSource, microphone: Microphone) -> None:
+    with pytest.raises(ComponentError, match=r"shows old sound only.* call Acquire"):
+        source.read()
+
+
+@pytest.mark.parametrize(
+    ("name", "rate", "why"),
+    [
+        ("a b", 0, "is no name of a topic"),
+        ("MICROPHONE", 44100, f"has a sample rate of {RATE} Hz, asked for were 44100"),
+    ],
+)
+def test_refused(graph: Graph, microphone: Microphone, name: str, rate: int, why: str) -> None:
+    with pytest.raises(ComponentError, match=why):
+        TopicSource(name.replace("MICROPHONE", microphone.topic), rate, threading.Event())
+    wait_for(lambda: not microphone.heard)
