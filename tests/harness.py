@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import itertools
 import os
-import pty
 import signal
 import socket
 import subprocess
@@ -55,14 +54,6 @@ def proc(*parts: object) -> Path:
     if not Path("/proc/self").exists():
         pytest.skip("/proc is not mounted here")
     return Path("/proc", *map(str, parts))
-
-
-def open_terminal() -> tuple[int, int]:
-    """Both ends of a new pseudoterminal, ours and the program's; the test is skipped where a bare chroot has none."""
-    try:
-        return pty.openpty()
-    except OSError as problem:
-        pytest.skip(f"no pseudoterminal here: {problem}")
 
 
 def wait_for(condition: Callable[[], T], timeout: float = 10.0, what: str | Callable[[], str] = "") -> T:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import re
-import select
 import signal
 import subprocess
 from collections.abc import Iterator
@@ -17,7 +16,8 @@ import soundfile
 from rosafe.bass.sources.scene import Scene
 from tests.bass import bags
 from tests.cli.command import ROSAFE, environment, refused, rosafe, start
-from tests.harness import Graph, Process, free_port, open_terminal, wait_for
+from tests.harness import Graph, Process, free_port, wait_for
+from tests.terminal import Terminal
 
 RATE = 8000
 
@@ -148,21 +148,10 @@ def test_full_disk(wav: Path, tmp_path: Path) -> None:
 
 
 def test_live_line_on_a_terminal(tmp_path: Path) -> None:
-    ours, theirs = open_terminal()
     command = [str(ROSAFE), "record", "a.wav", "--device", "scene:", "--seconds", "1", "--chunk", "441"]
-    with subprocess.Popen(command, cwd=tmp_path, env=environment(COLUMNS="80"), stdout=theirs, stdin=theirs) as shown:
-        os.close(theirs)
-        text = ""
-
-        def told() -> bool:
-            nonlocal text
-            if select.select([ours], [], [], 0)[0]:
-                text += os.read(ours, 4096).decode()
-            return "frames lost" in text
-
-        wait_for(told, 30, lambda: repr(text))
-        assert shown.wait(20) == 0
-    os.close(ours)
+    with Terminal(command, environment(), cwd=tmp_path, columns=80) as terminal:
+        assert terminal.end(30) == 0
+        text = terminal.sent
     looks = text.split("\r\x1b[K")
     assert len(looks) > 4
     assert re.search(r"0:01  L \[#+-*\|?-*\] +-[\d.]+/ *-[\d.]+ +R \[.*\] .*  lost 0$", looks[-2])

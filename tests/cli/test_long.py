@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import select
 import signal
 import subprocess
 from collections.abc import Callable
@@ -16,7 +15,8 @@ import soundfile
 from rosafe import process
 from rosafe.npz import memory_map
 from tests.cli.command import ROSAFE, environment, noise, rosafe, start, write
-from tests.harness import ROOT, open_terminal, proc, wait_for
+from tests.harness import ROOT, proc, wait_for
+from tests.terminal import Terminal
 
 RATE = 16000
 ONE_CHANNEL = ("--set", "fb_cfHz=1000")
@@ -184,26 +184,12 @@ def _children(pid: int) -> list[int]:
 
 
 def test_a_terminal_shows_one_live_line(long_file: Path) -> None:
-    ours, theirs = open_terminal()
     command = [str(ROSAFE), "process", "in.wav", "--outputs", "ild"]
-    with subprocess.Popen(
-        command, cwd=long_file.parent, env=environment(), stderr=theirs, stdout=theirs, stdin=theirs
-    ) as shown:
-        os.close(theirs)
-        text = ""
-
-        def told() -> bool:
-            nonlocal text
-            if select.select([ours], [], [], 0)[0]:
-                text += os.read(ours, 4096).decode()
-            return "left" in text
-
-        try:
-            wait_for(told, 30, lambda: f"time left in {text!r}")
-        finally:
-            shown.send_signal(signal.SIGINT)
-            assert shown.wait(20) == 130
-    os.close(ours)
+    with Terminal(command, environment(), cwd=long_file.parent, columns=80) as terminal:
+        terminal.expect(" left")
+        text = terminal.sent
+        terminal.press("\x03")
+        assert terminal.end() == 130
     assert "\n" not in text
     line = text.split("\r")[-1]
     assert line.startswith("\x1b[K[") and " % " in line and "left" in line

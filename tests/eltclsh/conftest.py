@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests import harness
-from tests.eltclsh.terminal import Terminal
+from tests.terminal import Terminal
 
 Run = Callable[..., subprocess.CompletedProcess[str]]
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from tests import harness
-from tests.eltclsh.terminal import Terminal
 from tests.genomix import world as worlds
 from tests.genomix.test_guide import guide_commands
+from tests.terminal import Terminal
 
 pytestmark = pytest.mark.ros
 

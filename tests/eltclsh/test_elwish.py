@@ -10,7 +10,7 @@ import pytest
 
 from tests import harness
 from tests.eltclsh.conftest import Run, environment
-from tests.eltclsh.terminal import Terminal
+from tests.terminal import Terminal
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ from rosafe import __version__
 from rosafe.eltclsh.history import decode, encode
 from tests import harness
 from tests.eltclsh.conftest import environment
-from tests.eltclsh.terminal import Terminal
+from tests.terminal import Terminal
 
 ELTCLSH = str(harness.SCRIPTS / "eltclsh")
 QUESTION = "*** Got signal SIGINT\n*** Choose 1: continue, 2: exit, 3: back to the prompt > "
