@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 from rosafe.arguments import check_parameter
 from rosafe.interface import BASS, KINDS, REQUEST, ROSAFE, ComponentError, Parameter, ProcessorKind
 
-HIGHEST_RATE = BASS.service("Acquire").parameter("sampleRate").maximum  # Hz; what is wrong there is wrong at any
+HIGHEST_RATE = float(BASS.service("Acquire").parameter("sampleRate").maximum or 0)  # Hz; what is wrong there is at any
 ALMOST_ZERO = math.ulp(0.0)
 # What only the making of an input needs: the topic, and InputProc's parameters without its name.
 OF_THE_INPUT = ("connect", *(p.name for p in ROSAFE.service("InputProc").parameters[1:]))
@@ -139,12 +139,16 @@ def understand(kind: ProcessorKind, given: Mapping[str, Any]) -> Wish:
 
 
 def _level(kind: ProcessorKind, checked: Mapping[str, Any]) -> Level:
-    from rosafe.dsp import STAGES  # numpy and scipy, which genomixd and the command line can do without until now
-
     given = {p.name: checked[p.name] for p in kind.parameters if p.name in checked}
     values = {p.name: p.check(p.default) for p in kind.parameters} | given
-    assert HIGHEST_RATE is not None
-    return Level(kind, values, STAGES[kind.kind](HIGHEST_RATE, **values).parameters, given)
+    return Level(kind, values, _filterbank(values) if kind.kind == "gammatone" else values, given)
+
+
+def _filterbank(values: Mapping[str, Any]) -> dict[str, Any]:
+    """What a filterbank tells of itself, which depends on no sample rate; ValueError for one that cannot be."""
+    from rosafe.dsp import STAGES  # numpy and scipy, which genomixd and the command line can do without until now
+
+    return STAGES["gammatone"](HIGHEST_RATE, **values).parameters
 
 
 # --- what to do -------------------------------------------------------------------------------------------------

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import tracemalloc
 from collections.abc import Mapping
 from typing import Any
 
@@ -282,7 +283,8 @@ def test_the_sound() -> None:
         ({"fb_nERBs": 0.001}, "too many channels"),
         ({"fb_highFreqHz": 0.0}, "fb_highFreqHz: 0 is out of range"),
         ({"ihc_method": "hilbrt"}, "ihc_method: 'hilbrt' is not one of none"),
-        ({"ild_wSizeSec": 1e-9}, "ild_wSizeSec"),
+        ({"ild_wSizeSec": 61.0}, "ild_wSizeSec: 61 is out of range"),
+        ({"fb_lowFreqHz": 500000.0, "fb_highFreqHz": 600000.0}, "is not below half the sample rate"),
         ({"rm_decaySec": -1.0}, "rm_decaySec: -1 is out of range"),
         ({"nFramesPerBlock": 0}, "nFramesPerBlock: 0 is out of range"),
         ({"bufferSize_s_port": 1e9}, "bufferSize_s_port"),
@@ -301,9 +303,13 @@ def test_what_no_sample_rate_makes_possible_is_refused_before_anything_is_asked(
 
 def test_what_this_sample_rate_makes_impossible_leaves_nothing() -> None:
     model = Model()
-    with pytest.raises(ComponentError, match="not below half the sample rate"):
-        build(model, "ild", fb_highFreqHz=30000.0)
-    assert not model.processors
+    for values, what in (
+        ({"fb_highFreqHz": 30000.0}, "not below half the sample rate"),
+        ({"ild_wSizeSec": 1e-9}, "ild_wSizeSec: too short"),
+    ):
+        with pytest.raises(ComponentError, match=what):
+            build(model, "ild", **values)
+        assert len(model.calls) > 3 and not model.processors
     build(model, "time")
     before = model.state()
     with pytest.raises(ComponentError, match="not below half the sample rate"):
@@ -331,6 +337,16 @@ def test_words_that_the_guide_misspells() -> None:
     model = Model()
     assert build(model, "time", pp_middleEarModel="jespen")["created"] == ["input_0", "time_0"]
     assert build(model, "time")["created"] == []
+
+
+def test_a_long_window_costs_nothing() -> None:
+    """It is the node's to make, or to refuse."""
+    tracemalloc.start()
+    try:
+        request.understand(KINDS["ild"], {"ild_wSizeSec": 60.0})
+        assert tracemalloc.get_traced_memory()[1] < 10e6
+    finally:
+        tracemalloc.stop()
 
 
 # --- arguments --------------------------------------------------------------------------------------------------
@@ -374,3 +390,36 @@ def test_arguments_that_are_refused(given: Any, what: str) -> None:
     with pytest.raises(ComponentError, match=what) as refused:
         partial(given)
     assert refused.value.ex == "::genom::serialization"
+
+
+_NAMES = st.sampled_from(
+    ["representation", "gammatone", "ihc", "name", *(p.name for p in interface.REQUEST.parameters)]
+)
+_SCALARS = st.one_of(
+    st.none(),
+    st.booleans(),
+    st.integers(),
+    st.floats(),
+    st.text(max_size=4),
+    st.sampled_from([*REPRESENTATIONS, "1e3", "0x1", "nan", 0, 1, 16, 1e-300, 1e400]),
+)
+_JSON = st.recursive(
+    _SCALARS,
+    lambda inner: st.one_of(
+        st.lists(inner, max_size=3), st.dictionaries(st.one_of(_NAMES, st.text(max_size=2)), inner, max_size=4)
+    ),
+    max_leaves=8,
+)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.one_of(_JSON, st.dictionaries(_NAMES, _SCALARS).map(lambda form: {**form, "representation": "ild"})))
+def test_whatever_comes_is_understood_or_refused(form: Any) -> None:
+    try:
+        values = partial(form)
+        wish = request.understand(request.kind_of(values.pop("representation")), values)
+    except ComponentError as refused:
+        assert refused.ex in ("::genom::serialization", "::rosAFE::e_badNewValue")
+        assert refused.detail["what"]
+    else:
+        assert wish.kinds[0] == "input"
