@@ -56,6 +56,7 @@ Answers are JSON, with syntax=tcl Tcl dicts, with syntax=packed bytes for MATLAB
 /session/start?s=NAME  /session/stop?s=NAME  /session/listen?s=NAME (server-sent events: request, unload, quit)
 /load/COMPONENT[?i=INSTANCE][&as=NAME]  /unload/NAME  /describe/NAME  /components  /rpath?dir=DIR
 /call/NAME/SERVICE[?input=JSON]  /call/NAME/PORT[/ELEMENT]      waits for the result; an activity returns once it runs
+/call/NAME/request?input=["ild",{{"fb_nChannels":16}}]          builds what a representation needs, or finds it
 /send/NAME/SERVICE[?input=JSON][&ack][&oneway]                  returns the request's id and status at once
 /request/status?id=ID  /request/result?id=ID  /request/wait?id=ID[&ms=N]  /request/abort?id=ID  /request/clean?id=ID
 /requests
