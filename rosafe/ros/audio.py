@@ -279,6 +279,8 @@ def malformed(message: Any) -> str:
         return f"{left} left and {right} right samples"
     if not 0 < left <= MAX_WINDOW:
         return f"{left} samples per ear, allowed are 1 to {MAX_WINDOW}"
+    if message.nChunksOnPort * message.nFramesPerChunk != left:
+        return f"{left} samples per ear, where there should be {message.nChunksOnPort} x {message.nFramesPerChunk}"
     if not 0 < rate <= MAX_RATE:
         return f"a sample rate of {rate} Hz, allowed are 1 to {MAX_RATE} Hz"
     if index >= 2**63:

@@ -9,6 +9,7 @@ is bounded: one that reads slowly or not at all misses old messages and holds up
 from __future__ import annotations
 
 import os
+import select
 import socket
 import struct
 import threading
@@ -52,6 +53,13 @@ class Publisher(rospy.Publisher):
 class _Topic(topics._PublisherImpl):
     """What rospy has behind a Publisher, with senders for connections."""
 
+    connection_poll: topics.Poller
+
+    def __init__(self, name: str, data_class: Any) -> None:
+        super().__init__(name, data_class)
+        self.connection_poll.poller.close()
+        self.connection_poll = _Poller()
+
     def set_queue_size(self, queue_size: int) -> None:
         """Have no queue of rospy's, with a thread of its own: the senders have theirs."""
 
@@ -74,6 +82,20 @@ class _Topic(topics._PublisherImpl):
             message.serialize(written)
             for sender in senders:
                 sender.offer(written)
+
+
+class _Poller(topics.Poller):
+    """Looks for connections that have ended. Its file is closed with the topic.
+
+    rospy's own refers to itself, so that the files of topics that are gone pile up until garbage is collected.
+    """
+
+    def __init__(self) -> None:
+        self.poller = select.epoll()
+
+    add_fd = topics.Poller.add_epoll
+    remove_fd = topics.Poller.remove_epoll
+    error_iter = topics.Poller.error_epoll_iter
 
 
 class _Sender:

@@ -37,10 +37,17 @@ class Source:
         return message(self.rate, self.index, left)
 
 
-def message(rate: int, index: int, left: np.ndarray, right: np.ndarray | None = None) -> Any:
-    return SimpleNamespace(
-        sampleRate=rate, lastFrameIndex=index, left=left, right=-left if right is None else right, problem=""
-    )
+def message(rate: int, index: int, left: np.ndarray, right: np.ndarray | None = None, **other: Any) -> Any:
+    fields = {
+        "sampleRate": rate,
+        "lastFrameIndex": index,
+        "left": left,
+        "right": -left if right is None else right,
+        "nChunksOnPort": 1,
+        "nFramesPerChunk": len(left),
+        "problem": "",
+    }
+    return SimpleNamespace(**{**fields, **other})
 
 
 def opened(ring: AudioRing, block: int) -> AudioReader:
@@ -236,6 +243,9 @@ def test_any_chunks_give_the_same_blocks(chunks: list[int], block: int, late: in
         (message(0, 5, np.zeros(3, np.int32)), "0 Hz"),
         (message(MAX_RATE + 1, 5, np.zeros(3, np.int32)), f"{MAX_RATE + 1} Hz"),
         (message(2**32 - 1, 5, np.zeros(3, np.int32)), "4294967295 Hz"),
+        (message(RATE, 5, np.zeros(3, np.int32), nChunksOnPort=2), "3 samples per ear, where there should be 2 x 3"),
+        (message(RATE, 5, np.zeros(3, np.int32), nChunksOnPort=0), "0 x 3"),
+        (message(RATE, 5, np.zeros(3, np.int32), nFramesPerChunk=2**32 - 1), "1 x 4294967295"),
         (message(RATE, 2**63, np.zeros(3, np.int32)), "9223372036854775808"),
         (message(RATE, 2**64 - 1, np.zeros(3, np.int32)), "18446744073709551615"),
     ],
@@ -404,3 +414,33 @@ def test_plain_messages_with_lists_do_as_well() -> None:
     feed(message(RATE, 6, (3, 4, 9, 10), (7, 8, 11, 12)))  # type: ignore[arg-type]
     read = reader.read()
     assert read is not None and read[0].tolist() == [[9, 10], [11, 12]]
+
+
+@pytest.mark.parametrize("first", [0, 1, 50, 2**63 - 40])
+def test_indexes_that_move_by_anything(first: int) -> None:
+    """By less than a chunk, by nothing, by more than a window, and back: frames keep their numbers throughout."""
+    lines: list[str] = []
+    ring = AudioRing(lines.append)
+    feed = ring.connect()
+    source = Source(index=first)
+    feed(source.message())
+    reader = opened(ring, 1)
+
+    def heard() -> list[tuple[int, int]]:
+        """Number and sample of every frame that can be read."""
+        return [(read[1] - 1, int(read[0][0, 0])) for read in iter(lambda: ring.behind and reader.read(), 0) if read]
+
+    for step in (1, 0, 2, 0, 12):
+        before = source.index
+        source.index += step
+        feed(source.message())
+        assert heard() == [(f, source.sample(f)) for f in range(before + 1, source.index + 1)]
+    before, source.index = source.index, source.index + 15  # three more than the window holds
+    feed(source.message())
+    assert heard() == [(f, 0 if f <= before + 3 else source.sample(f)) for f in range(before + 1, source.index + 1)]
+    assert (ring.counters.lost, ring.counters.gaps, ring.counters.streams) == (3, 1, 1)
+    source.index -= 1  # out of order: nobody but a newcomer says that
+    feed(source.message())
+    assert ring.counters.streams == 2 and "its index fell" in lines[-1]
+    oldest = max(1, source.index - 11)
+    assert heard() == [(f, source.sample(f)) for f in range(oldest, source.index + 1)]

@@ -89,6 +89,11 @@ def threads_and_memory(pid: int) -> tuple[int, int]:
     return int(status["Threads"]), int(status["VmRSS"].split()[0]) * 1024
 
 
+def open_files(pid: int) -> int:
+    """How many files and sockets a process has open."""
+    return len(list(proc(pid, "fd").iterdir()))
+
+
 def test_cycles_of_creation_and_removal_leave_nothing(afe: Session) -> None:
     microphone = afe.build("PreProc", block=BLOCK)
 
@@ -171,6 +176,7 @@ def test_all_slots_of_a_task_are_full_and_empty_again(afe: Session) -> None:
     microphone = afe.build("PreProc", "GammatoneProc", "IhcProc", block=BLOCK, fb_nChannels=2)
     afe.wait_activities(["InputProc", "PreProc", "GammatoneProc", "IhcProc"])
     threads, memory = threads_and_memory(afe.process.pid)
+    files = open_files(afe.process.pid)
     limit = MAX_ACTIVITIES - 1
     share = (limit + 7) // 8
 
@@ -197,3 +203,4 @@ def test_all_slots_of_a_task_are_full_and_empty_again(afe: Session) -> None:
     assert not [t for t in afe.graph.topics() if t.startswith("/rosAFE/ildPort/")]
     wait_for(lambda: threads_and_memory(afe.process.pid)[0] <= threads, what="threads end")
     assert threads_and_memory(afe.process.pid)[1] < memory + 2**26
+    wait_for(lambda: open_files(afe.process.pid) < files + 50, what="files are closed with their topics")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Mapping
 from typing import Any
 
@@ -22,7 +23,7 @@ NAMES = {kind: [ROSAFE.service(k.request).parameter("name").default] for kind, k
 
 def snapshot(afe: Session) -> tuple[Any, set[str]]:
     """What a refused request must leave as it was."""
-    return afe.ok("getParameters").parameters, {t for t in afe.graph.topics() if t.startswith(f"/{afe.name}/")}
+    return afe.ok("getParameters").parameters, {t for t in afe.graph.topics() if re.match(f"/{afe.name}/\\w+Port", t)}
 
 
 # --- InputProc --------------------------------------------------------------------------------------------------

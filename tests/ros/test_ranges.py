@@ -1,0 +1,120 @@
+"""Every value of every request, from the interface table: out of its range it is refused, whichever way it comes."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from rosafe.interface import KINDS, ROSAFE, Parameter, Service
+from tests.ros.session import Session, told
+from tests.ros.test_requests import NAMES, snapshot
+
+PARENTS = ("PreProc", "GammatoneProc", "IhcProc")
+NUMBERS = ("double", "unsigned long", "unsigned long long")
+
+
+def element(parameter: Parameter) -> str:
+    """The IDL type of a parameter, or of the elements of a list."""
+    return parameter.idl.removeprefix("sequence<").removesuffix(">")
+
+
+def numeric(parameters: tuple[Parameter, ...]) -> Iterator[Parameter]:
+    return (p for p in parameters if element(p) in NUMBERS)
+
+
+def outside(parameter: Parameter) -> list[float]:
+    """Values that the parameter's type holds and its range does not; 0 is among them where it is not allowed."""
+    low, high = parameter.minimum, parameter.maximum
+    assert low is not None and high is not None, f"{parameter.name} has no range"
+    if element(parameter) == "double":
+        below = low if parameter.open_minimum else math.nextafter(low, -math.inf)
+        return [math.nan, math.inf, -math.inf, -1e300, 1e300, below, math.nextafter(high, math.inf)]
+    bits = 32 if element(parameter) == "unsigned long" else 64
+    return [value for value in (low - 1, high + 1, 2**bits - 1) if 0 <= value < 2**bits and not low <= value <= high]
+
+
+def in_request(parameter: Parameter) -> Iterator[Any]:
+    """The values of `outside` as a field of a request, in which zero is the default."""
+    for value in outside(parameter):
+        if value != 0:
+            yield value if parameter.idl == element(parameter) else [100.0, value]
+
+
+def refused(response: Any, parameter: Parameter, value: Any) -> None:
+    ex, detail = told(response)
+    assert ex == "::rosAFE::e_badNewValue", (parameter.name, value)
+    assert parameter.name in detail["what"], (parameter.name, value, detail)
+
+
+@pytest.mark.parametrize("service", ROSAFE.activities, ids=lambda service: service.name)
+def test_values_outside_are_refused_by_service_and_action(afe: Session, service: Service) -> None:
+    afe.build(*PARENTS, fb_nChannels=2)
+    before = snapshot(afe)
+    fresh = {"name": "fresh"}
+    tried = 0
+    for parameter in numeric(service.parameters):
+        for value in in_request(parameter):
+            refused(afe.call(service.name, **fresh, **{parameter.name: value}), parameter, value)
+            tried += 1
+        goal = afe.goal(service.name, **fresh, **{parameter.name: value})
+        refused(goal.result(), parameter, value)
+    assert tried or service.name == "IhcProc"
+    assert snapshot(afe) == before
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_values_outside_are_refused_by_modify_parameter(afe: Session, kind: str) -> None:
+    """There, zero is zero."""
+    afe.build(*(k.request for k in KINDS.values() if k.parent), fb_nChannels=2)
+    before = snapshot(afe)
+    for parameter in numeric(KINDS[kind].parameters):
+        for value in outside(parameter):
+            if value == 0 and parameter.idl != element(parameter):
+                continue  # a list of one zero is none
+            response = afe.call(
+                "modifyParameter", nameProc=NAMES[kind][0], nameParam=parameter.name, newValue=repr(value)
+            )
+            refused(response, parameter, value)
+    assert snapshot(afe) == before
+
+
+@pytest.mark.parametrize("kind", [kind for kind in KINDS if KINDS[kind].parent])
+def test_unknown_words_become_the_default_by_service_and_by_modify_parameter(afe: Session, kind: str) -> None:
+    afe.build(*PARENTS, fb_nChannels=2)
+    numbers = itertools.count(1)
+    for parameter in KINDS[kind].parameters:
+        if not parameter.choices:
+            continue
+        for word, meant in [
+            *((choice, choice) for choice in parameter.choices),
+            *((word, parameter.fallback) for word in ("jespen", parameter.choices[0].upper(), "0", "ä b", "x" * 4000)),
+        ]:
+            name = f"word{next(numbers)}"
+            afe.ok(KINDS[kind].request, name=name, **{parameter.name: word})
+            (given,) = [p for p in getattr(afe.ok("getParameters").parameters, kind) if p.name == name]
+            assert getattr(given, parameter.name) == meant
+            afe.ok("modifyParameter", nameProc=name, nameParam=parameter.name, newValue=parameter.choices[-1])
+            afe.ok("modifyParameter", nameProc=name, nameParam=parameter.name, newValue=f" {word} ")
+            (given,) = [p for p in getattr(afe.ok("getParameters").parameters, kind) if p.name == name]
+            assert getattr(given, parameter.name) == meant
+            afe.ok("removeProcessor", name=name)
+
+
+def test_texts_that_are_too_long_or_no_texts(afe: Session) -> None:
+    afe.build("PreProc")
+    before = snapshot(afe)
+    for text in ("x" * 4097, "nul\0"):
+        refused(afe.call("GammatoneProc", fb_type=text), ROSAFE.service("GammatoneProc").parameter("fb_type"), text)
+    assert snapshot(afe) == before
+
+
+def test_lists_that_are_too_long(afe: Session) -> None:
+    afe.build("PreProc")
+    for length in (1025, 100_000):
+        ex, detail = afe.refused("GammatoneProc", fb_cfHz=[100.0] * length)
+        assert ex == "::rosAFE::e_badNewValue" and "fb_cfHz" in detail["what"]
+    assert afe.processors() == {"input": ["input"], "preProc": ["preProc"]}
