@@ -7,6 +7,7 @@ in seconds of the monotonic clock; and the memory in MB by the second.
 
 from __future__ import annotations
 
+import gc
 import json
 import os
 import signal
@@ -47,6 +48,7 @@ def main(result: str, *names: str) -> int:
     for name in names:
         data_class = rostopic.get_topic_class(name, blocking=True)[0]
         rospy.Subscriber(name, array_msg(data_class), take, callback_args=name, buff_size=2**22, tcp_nodelay=True)
+    gc.freeze()  # as docs/subscribers.md says
     memory = []
     while not ended.wait(1.0):
         memory.append(resident())
