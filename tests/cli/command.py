@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import soundfile
 
-from tests.harness import SCRIPTS, Process
+from tests.harness import PYTHON, SCRIPTS, Process
 
 ROSAFE = SCRIPTS / "rosafe"
 SMALL = ("--set", "fb_cfHz=200,800,2000")  # a cheap chain, also at low sample rates
@@ -36,6 +36,11 @@ def rosafe(
         timeout=timeout,
         check=False,
     )
+
+
+def rosafe_alone(*arguments: str) -> subprocess.CompletedProcess[str]:
+    """Run the command with what Python itself brings, without Debian's packages."""
+    return rosafe("-S", ROSAFE, *arguments, program=Path(PYTHON))
 
 
 def start(*arguments: str | Path, cwd: Path) -> Process:

@@ -10,7 +10,7 @@ import pytest
 
 from rosafe import __version__
 from rosafe.interface import KINDS
-from tests.cli.command import ROSAFE, environment, refused, rosafe
+from tests.cli.command import ROSAFE, environment, refused, rosafe, rosafe_alone
 from tests.harness import ROOT
 
 
@@ -110,13 +110,6 @@ def test_a_module_is_all_that_a_command_takes(tmp_path: Path) -> None:
 
 def test_help_needs_nothing_but_python() -> None:
     """Without Debian's packages (-S) help still comes."""
-    done = subprocess.run(
-        ["/usr/bin/python3", "-S", str(ROSAFE), "process", "-h"],
-        env=environment(),
-        capture_output=True,
-        text=True,
-        timeout=30,
-        check=False,
-    )
+    done = rosafe_alone("process", "-h")
     assert done.returncode == 0, done
     assert "fb_nERBs" in done.stdout

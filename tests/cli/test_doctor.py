@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from rosafe.ros import paths
-from tests.cli.command import ROSAFE, environment, rosafe
+from tests.cli.command import environment, rosafe, rosafe_alone
 from tests.harness import ROOT, Graph, free_port
 
 EVERYTHING = ["python", "numbers", "kernels", "sound files", "ROS", "messages", "master", "alsaaudio"]
@@ -75,14 +75,7 @@ def test_messages_of_this_shell(graph: Graph, tmp_path: Path) -> None:
 
 def test_nothing_is_there() -> None:
     """Python without Debian's packages, where also nothing can be generated."""
-    done = subprocess.run(
-        ["/usr/bin/python3", "-S", str(ROSAFE), "doctor", "--json"],
-        env=environment(),
-        capture_output=True,
-        text=True,
-        timeout=60,
-        check=False,
-    )
+    done = rosafe_alone("doctor", "--json")
     assert done.returncode == 1, done
     found = findings(done)
     assert list(found) == EVERYTHING

@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -133,47 +134,46 @@ def test_another_waits_for_the_one_that_builds(copy: Path) -> None:
     assert (copy / ".generated" / "current").exists()
 
 
-def protect(copy: Path) -> None:
+@contextmanager
+def read_only(copy: Path) -> Iterator[None]:
+    """Within this, nobody but root can write in the copy."""
     for path in [copy, *copy.rglob("*")]:
         if not path.is_symlink():
             path.chmod(path.stat().st_mode & ~0o222)
+    try:
+        yield
+    finally:
+        for path in [copy, *copy.rglob("*")]:
+            if path.is_dir() and not path.is_symlink():
+                path.chmod(0o755)
 
 
-def unprotect(copy: Path) -> None:
-    for path in [copy, *copy.rglob("*")]:
-        if path.is_dir() and not path.is_symlink():
-            path.chmod(0o755)
+def world_writable(path: Path, mode: int = 0o777) -> Path:
+    """A new folder for every user."""
+    path.mkdir()
+    path.chmod(mode)
+    return path
 
 
 def test_read_only_tree_uses_the_users_cache(copy: Path) -> None:
-    home = copy.with_name("home")
-    home.mkdir()
-    home.chmod(0o777)
-    protect(copy)
-    try:
+    home = world_writable(copy.with_name("home"))
+    with read_only(copy):
         command = without_rights("env", f"PYTHONPATH={copy}", PYTHON, "-c", IMPORT)
         for _ in range(2):
             place = imported(copy, run(*command, env=environment(HOME=str(home))))
             assert place.is_relative_to(home / ".cache" / "rosafe" / "messages")
         assert not (copy / ".generated").exists()
-    finally:
-        unprotect(copy)
 
 
 def test_read_only_tree_and_home_use_a_private_folder(copy: Path) -> None:
-    temporary = copy.with_name("tmp")
-    temporary.mkdir()
-    temporary.chmod(0o1777)
-    protect(copy)
-    try:
+    temporary = world_writable(copy.with_name("tmp"), 0o1777)
+    with read_only(copy):
         command = without_rights("env", f"PYTHONPATH={copy}", PYTHON, "-c", IMPORT)
         places = {imported(copy, run(*command, env=environment(TMPDIR=str(temporary)))) for _ in range(2)}
         assert len(places) == 1, "the same at every start"
         (private,) = temporary.iterdir()
         assert places.pop().is_relative_to(private)
         assert private.stat().st_mode & 0o777 == 0o700
-    finally:
-        unprotect(copy)
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="making another user's folder takes root")
@@ -182,9 +182,7 @@ def test_messages_that_only_their_maker_can_read(copy: Path, outer: int) -> None
     """Root, whose umask is 077, came first; others have their own then."""
     (copy / ".generated").mkdir(mode=outer)
     assert run("sh", "-c", 'umask 077; exec "$@"', "-", *generate(copy), env=environment()).returncode == 0
-    home = copy.with_name("home")
-    home.mkdir()
-    home.chmod(0o777)
+    home = world_writable(copy.with_name("home"))
     command = without_rights("env", f"PYTHONPATH={copy}", PYTHON, "-c", IMPORT)
     place = imported(copy, run(*command, env=environment(HOME=str(home))))
     assert place.is_relative_to(home / ".cache" / "rosafe" / "messages")
@@ -192,16 +190,11 @@ def test_messages_that_only_their_maker_can_read(copy: Path, outer: int) -> None
 
 @pytest.mark.skipif(os.getuid() != 0, reason="making another user's folder takes root")
 def test_private_folder_that_somebody_else_made_is_refused(copy: Path) -> None:
-    temporary = copy.with_name("tmp")
-    temporary.mkdir()
-    temporary.chmod(0o1777)
+    temporary = world_writable(copy.with_name("tmp"), 0o1777)
     (temporary / "rosafe-65534").mkdir(mode=0o777)
-    protect(copy)
-    try:
+    with read_only(copy):
         command = without_rights(*generate(copy))
         done = run(*command, env=environment(TMPDIR=str(temporary)))
-    finally:
-        unprotect(copy)
     assert done.returncode == 1
     assert "not private" in done.stderr and done.stderr.count("\n") == 1
 
