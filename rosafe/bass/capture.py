@@ -11,7 +11,7 @@ import numpy as np
 
 from rosafe import interface
 from rosafe.bass.sources import Source
-from rosafe.bass.sources.base import hwparams_error, wall_time_ns
+from rosafe.bass.sources.base import hwparams_error, loss_text, wall_time_ns
 
 MAX_WINDOW = 2**24  # frames on the port, 380 s at 44.1 kHz; what goes beyond is a slip of the finger
 LATE_CHUNKS = 2  # behind the clock by more than this, chunks are published together
@@ -121,23 +121,22 @@ class Capture:
 
     def run(self, stopping: threading.Event, cycle: Callable[[float], None]) -> None:
         """Read and publish until the source ends, fails or is told to stop; `cycle` takes the seconds of each turn."""
-        overruns = 0
+        known_lost = 0
         while not stopping.is_set():
             chunk = self.source.read()
             if chunk is None:
                 break
             begin = time.monotonic()
+            lost = self.source.lost_frames - known_lost
+            if lost:
+                known_lost += lost
+                self._report(loss_text(lost, self.last_frame_index, self.source.sample_rate))
             self._window.skip(chunk.gap)
             self._window.append(chunk.samples)
             new = chunk.gap + chunk.samples.shape[1]
             self.last_frame_index += new
             self._unpublished += new
             self._time_ns = wall_time_ns(chunk.time)
-            if self.source.overruns != overruns:
-                overruns = self.source.overruns
-                self._report(
-                    f"{self.source.name}: sound was lost, {self.source.lost_frames} frames in {overruns} gaps so far"
-                )
             if not self._hurries(begin - chunk.time):
                 self.publish()
             cycle(time.monotonic() - begin)

@@ -34,7 +34,7 @@ class BassNode:
         self._audio = self._node.advertise("Audio", self._message_class)
         self._snapshot: Snapshot | None = None
         self._source: Source | None = None  # of the acquisition under way
-        self._last_end = "none"
+        self._last_end = self._last_loss = "none"
         self._printing = threading.Lock()
 
         self._node.activity("Acquire", self._acquire)
@@ -87,6 +87,10 @@ class BassNode:
         activity.interrupt_others()
         return open_source(device, sample_rate, frames_per_chunk, activity.stop_requested)
 
+    def _note_loss(self, text: str) -> None:
+        self._last_loss = text
+        rospy.logwarn(text)
+
     def _publish(self, snapshot: Snapshot) -> None:
         self._snapshot = snapshot
         seconds, nanoseconds = divmod(snapshot.time_ns, 1_000_000_000)
@@ -134,6 +138,7 @@ class BassNode:
         status.add("frames", snapshot.last_frame_index if snapshot else 0)
         status.add("lost frames", source.lost_frames if source else 0)
         status.add("overruns", source.overruns if source else 0)
+        status.add("last loss", self._last_loss)
         status.add("last end", self._last_end)
         return status
 

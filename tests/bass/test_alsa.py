@@ -246,6 +246,30 @@ def test_stop_ends_the_wait_for_sound(pcm: type[FakePcm]) -> None:
     assert source.read() is None
 
 
+def test_soak_the_index_never_leaves_the_clock(pcm: type[FakePcm]) -> None:
+    """Short reads, overruns and reopened devices: frames and losses together are the time that has passed."""
+    random = np.random.default_rng(0)
+    pcm.script[:] = [
+        (XRUN, float(random.uniform(0.001, 0.5)))
+        if kind < 0.02
+        else ("Input/output error", 0.1)
+        if kind < 0.021
+        else int(random.integers(0, 300))
+        for kind in random.uniform(size=12_000)
+    ]
+    source = open_source("hw:9", RATE, 100, threading.Event())
+    count, last = 0, 0.0
+    while pcm.clock < 1800:
+        chunk = source.read()
+        assert chunk is not None and chunk.time >= last
+        last = chunk.time
+        count += chunk.gap + 100
+    assert source.overruns > 150
+    # Each loss is known to half a frame, and the newest frames are still to come.
+    assert count == pytest.approx((pcm.clock - 100) * RATE, abs=300 + source.overruns / 2)
+    assert last == pytest.approx(pcm.clock, abs=0.3)
+
+
 @pytest.mark.parametrize(
     ("changes", "why"),
     [
@@ -332,6 +356,8 @@ def test_capture_devices_as_the_kernel_lists_them(tmp_path: Path) -> None:
         (2, 10, "Loop", "Loop Analog: x"),
         (10, 0, "Mic", "Mic Analog: x"),
     ]
+    (tmp_path / "card2" / "id").unlink()  # it is being unplugged
+    assert [card for card, *_ in libasound.capture_devices(tmp_path)] == [0, 10]
 
 
 # --- the real libasound -----------------------------------------------------------------------------------------

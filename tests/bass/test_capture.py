@@ -92,8 +92,8 @@ def test_lost_frames_are_zeros_that_count_and_are_reported() -> None:
     assert published[2].left.tolist() == [2, 0, 0, 0, 3, 4]
     assert published[3].left.tolist() == [0, 0, 0, 0, 5, 6]
     assert reports == [
-        "script: sound was lost, 3 frames in 1 gaps so far",
-        "script: sound was lost, 103 frames in 2 gaps so far",
+        "lost 3 frames (0.003 s) after frame 2 (0.00 s)",
+        "lost 100 frames (0.100 s) after frame 7 (0.01 s)",
     ]
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import threading
 import time
+import types
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ import pytest
 import soundfile
 
 from rosafe.audiofile import AudioFile, AudioFileError, to_int32
-from rosafe.bass.sources import open_source
+from rosafe.bass.sources import base, open_source
 from rosafe.interface import ComponentError
 
 RATE = 48000
@@ -109,6 +110,25 @@ def test_paced_in_real_time_without_drift(tmp_path: Path) -> None:
     assert np.allclose(np.diff([first.time, second.time, *times]), 0.05, atol=1e-9)
     assert source.read() is None
     assert time.monotonic() - begin >= 0.5 - 1e-3
+
+
+def test_soak_of_a_day_without_drift(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever the waits make of it, chunk k is due at its k-th multiple."""
+    clock = [1000.0]
+    random = np.random.default_rng(0)
+
+    class Sleeper(threading.Event):
+        """Sleeps too long, and now and then stalls."""
+
+        def wait(self, timeout: float | None = None) -> bool:
+            clock[0] += (timeout or 0.0) + random.exponential(0.002) + 30 * (random.uniform() < 1e-4)
+            return False
+
+    monkeypatch.setattr(base, "time", types.SimpleNamespace(monotonic=lambda: clock[0]))
+    pacer = base.Pacer(44100, Sleeper())
+    dues = np.array([pacer.wait(22050) for _ in range(2 * 86400)], float)
+    np.testing.assert_allclose(dues, 1000 + 0.5 * np.arange(1, len(dues) + 1), rtol=0, atol=1e-9)
+    assert abs(clock[0] - dues[-1]) < 60
 
 
 def test_stop_ends_a_wait(tmp_path: Path) -> None:

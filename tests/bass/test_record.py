@@ -64,7 +64,7 @@ def test_loss_is_told_with_its_place(tmp_path: Path) -> None:
     bags.write(tmp_path / "a.bag", messages)
     done = rosafe("record", "a.wav", "--device", "bag:a.bag", "--chunk", "200", cwd=tmp_path)
     assert done.returncode == 0, done
-    assert "lost 800 frames (0.100 s) at 0.05 s\n" in done.stdout and "800 frames lost\n" in done.stdout
+    assert "lost 800 frames (0.100 s) after frame 400 (0.05 s)\n" in done.stdout and "800 frames lost\n" in done.stdout
     samples[:, 400:1200] = 0
     assert np.array_equal(samples_of(tmp_path / "a.wav"), samples[:, :2000])
 

@@ -207,7 +207,10 @@ def record(path: Path | None, script: list[tuple[int, int]], frames: int | None 
 def test_losses_are_zeros_and_told_with_their_place(tmp_path: Path) -> None:
     recorder, reports, ended = record(tmp_path / "a.wav", [(0, 0), (25, 0), (0, 3), (0, 0)])
     assert ended and recorder.frames == 65 and recorder.lost == 28
-    assert reports == ["lost 25 frames (0.025 s) at 0.01 s", "lost 3 frames (0.003 s) at 0.04 s"]
+    assert reports == [
+        "lost 25 frames (0.025 s) after frame 10 (0.01 s)",
+        "lost 3 frames (0.003 s) after frame 45 (0.04 s)",
+    ]
     left = soundfile.read(tmp_path / "a.wav", dtype="int32")[0][:, 0]
     assert left.tolist() == [1] * 10 + [0] * 25 + [2] * 10 + [3] * 10 + [4] * 10
 

@@ -10,7 +10,7 @@ import numpy as np
 from rosafe.bass.recording.levels import Levels
 from rosafe.bass.recording.outputs import Output
 from rosafe.bass.sources import Source
-from rosafe.bass.sources.base import wall_time_ns
+from rosafe.bass.sources.base import loss_text, wall_time_ns
 
 
 class Recorder:
@@ -86,5 +86,4 @@ class Recorder:
         lost = self._source.lost_frames - self.lost
         if lost > 0:
             self.lost += lost
-            rate = self._source.sample_rate
-            self._report(f"lost {lost} frames ({lost / rate:.3f} s) at {self.frames / rate:.2f} s")
+            self._report(loss_text(lost, self.frames, self._source.sample_rate))

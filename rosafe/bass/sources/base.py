@@ -30,6 +30,11 @@ def wall_time_ns(moment: float) -> int:
     return time.time_ns() - int((time.monotonic() - moment) * 1e9)
 
 
+def loss_text(frames: int, index: int, sample_rate: int) -> str:
+    """How it is told that `frames` frames were lost soon after frame `index` of a stream."""
+    return f"lost {frames} frames ({frames / sample_rate:.3f} s) after frame {index} ({index / sample_rate:.2f} s)"
+
+
 class Source(Protocol):
     """Something to read sound from, already open."""
 

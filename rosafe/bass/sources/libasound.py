@@ -72,8 +72,9 @@ def capture_devices(proc: Path = Path("/proc/asound")) -> list[tuple[int, int, s
         raise interface.BASS.error("e_nodevice", f"no sound card ({proc}/card* is empty)")
     found = []
     for card in cards:
-        card_id = (card / "id").read_text().strip()
-        for info in sorted(card.glob("pcm*c/info"), key=lambda path: int(path.parent.name[3:-1])):
-            fields = dict(line.partition(": ")[::2] for line in info.read_text().splitlines())
-            found.append((int(fields["card"]), int(fields["device"]), card_id, fields["id"].strip()))
+        with contextlib.suppress(FileNotFoundError):  # a card that is just being unplugged
+            card_id = (card / "id").read_text().strip()
+            for info in sorted(card.glob("pcm*c/info"), key=lambda path: int(path.parent.name[3:-1])):
+                fields = dict(line.partition(": ")[::2] for line in info.read_text().splitlines())
+                found.append((int(fields["card"]), int(fields["device"]), card_id, fields["id"].strip()))
     return found
