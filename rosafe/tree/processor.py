@@ -112,12 +112,14 @@ class Processor:
         self.history_seconds = history_seconds
         self.zone = SharedZone()
         self.turn = threading.Condition(lock)
+        self._lock = lock
         self.stage = stage  # as it will be after all changes, to be asked and not to be run
         self._stage = stage  # at work
         self._source = source
         self._listener = listener
         self._failed = failed
         self._observers = observers
+        self._private: Block | None = None  # computed, and to be released as soon as no child holds the last one
         self._reading: Processor | None = None  # the parent whose block it holds: the input may be replaced meanwhile
         self._changing = threading.Lock()  # guards _changes, and the exchange of _stage
         self._changes: list[Change] = []
@@ -171,6 +173,8 @@ class Processor:
 
         A method that needs the filterbank's envelope waits for a block that has it.
         """
+        if not self._changes:
+            return
         with self._changing:
             due = self._due(taken.number)
             while due:
@@ -183,6 +187,8 @@ class Processor:
 
     def wants_envelope(self, number: int) -> bool:
         """Whether block `number` of the parent should carry its envelope."""
+        if not self._changes:
+            return _needs_envelope(self._stage)
         with self._changing:
             return _needs_envelope(_changed(self._stage, self._due(number)))
 
@@ -190,7 +196,7 @@ class Processor:
 
     def start(self) -> None:
         """Begin to work, with the block that the parent released last."""
-        with self.turn:
+        with self._lock:
             self._thread.start()  # nothing is attached where the system has no thread left
             if self.parent is not None:
                 self.parent.children.append(self)
@@ -198,13 +204,13 @@ class Processor:
 
     def remove(self) -> None:
         """Take it out of the tree at once: its parent no longer waits for it and it will release nothing more."""
-        with self.turn:
+        with self._lock:
             self._enter(State.REMOVED)
             if self.parent is not None:
                 self.parent.zone.detach(self)
                 if self in self.parent.children:
                     self.parent.children.remove(self)
-                self.parent.turn.notify_all()
+                self.parent._release_if_free()
             self.turn.notify_all()
         if self._source is not None:
             self._source.stop()
@@ -213,7 +219,7 @@ class Processor:
 
     def adopt(self, child: Processor) -> None:
         """Before the start: take over a child of another processor, from the next block that the child takes."""
-        with self.turn:
+        with self._lock:
             assert child.parent is not None
             child.parent.zone.detach(child)
             child.parent.children.remove(child)
@@ -237,7 +243,7 @@ class Processor:
                 self.blocks += 1
         except BaseException as problem:  # whatever it was: the tree must hear of it, and nobody may wait for this one
             self.error = problem
-        with self.turn:
+        with self._lock:
             self._enter(State.DONE)
             self.zone.close()
             for child in self.children:
@@ -264,7 +270,7 @@ class Processor:
         return True
 
     def _enter(self, state: State, block: int | None = None) -> None:
-        with self.turn:
+        with self._lock:
             if not self._gone:
                 self.state = state
                 for observer in self._observers:
@@ -278,7 +284,7 @@ class Processor:
 
     def _wait_exec(self) -> Block | None:
         """Wait for a token of the parent; None where none will come."""
-        with self.turn:
+        with self._lock:
             while not self._gone:
                 parent = self.parent
                 assert parent is not None
@@ -296,7 +302,7 @@ class Processor:
         stage = self._stage
         if not _needs_envelope(stage):
             if hasattr(stage, "provide_envelope"):
-                with self.turn:
+                with self._lock:
                     children = list(self.children)
                 stage.provide_envelope = any(child.wants_envelope(taken.number) for child in children)
             data = stage.process(taken.data)
@@ -309,26 +315,35 @@ class Processor:
 
     def _give_back(self) -> None:
         """Return the token: the parent may release its next block."""
-        with self.turn:
+        with self._lock:
             if self._reading is not None:
                 self._reading.zone.give_back(self)
-                self._reading.turn.notify_all()
+                self._reading._release_if_free()
                 self._reading = None
 
     def _wait_release(self, private: Block) -> bool:
-        """Wait until no child holds the last block, and release `private`; False where it was removed instead."""
-        with self.turn:
+        """Wait until no child holds the last block and `private` is released; False where it was removed instead."""
+        with self._lock:
             self._enter(State.WAIT_RELEASE, private.number)
-            while not self._gone:
-                if self.zone.free:
-                    # in one go with the look at the tokens: a child that comes now takes this block, not the last one
-                    self._enter(State.RELEASE, private.number)
-                    self.zone.release(private)
-                    for child in self.children:
-                        child.turn.notify_all()
-                    return True
+            self._private = private
+            self._release_if_free()
+            while self._private is not None and not self._gone:
                 self.turn.wait()
-            return False
+            return self._private is None
+
+    def _release_if_free(self) -> None:
+        """Release the block that waits for that, if no child holds the last one. With the tree's lock held.
+
+        Called by whoever may have made it possible, which is mostly a child: that one goes on with the new block at
+        once and need not wait until this processor has woken up.
+        """
+        if self._private is not None and self.zone.free and not self._gone:
+            self._enter(State.RELEASE, self._private.number)
+            self.zone.release(self._private)
+            self._private = None
+            for child in self.children:
+                child.turn.notify_all()
+            self.turn.notify_all()
 
     def _publish(self, block: Block) -> None:
         """Tell the world, while the children work on the block."""

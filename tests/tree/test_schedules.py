@@ -238,8 +238,9 @@ def test_the_exploration_finds_a_token_that_comes_between(
         return True
 
     monkeypatch.setattr(Processor, "_wait_release", wait_then_release)
+    monkeypatch.setattr(Processor, "_release_if_free", lambda self: self.turn.notify_all())
     with pytest.raises(AssertionError, match="released while a child holds the last block"):
-        explore(grow, use, 0, WALKS)
+        explore(grow, use, 2, 0)
 
 
 def test_the_exploration_finds_a_token_for_the_wrong_zone(
@@ -251,7 +252,7 @@ def test_the_exploration_finds_a_token_for_the_wrong_zone(
         with self.turn:
             if self.parent is not None:
                 self.parent.zone.give_back(self)
-                self.parent.turn.notify_all()
+                self.parent._release_if_free()
 
     monkeypatch.setattr(Processor, "_give_back", give_back_to_the_present_parent)
     with pytest.raises(AssertionError, match="released"):

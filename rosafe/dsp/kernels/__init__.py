@@ -184,7 +184,7 @@ _ANYTHING = ctypes.c_char * 0
 
 def _address(array: NDArray[Any]) -> int:
     if array.flags.writeable:
-        return ctypes.addressof(_ANYTHING.from_buffer(array))  # takes a third of the time of the other way
+        return ctypes.addressof(_ANYTHING.from_buffer(array.data))  # takes half of the time of the other way
     address: int = array.ctypes.data
     return address
 
