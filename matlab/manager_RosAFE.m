@@ -260,8 +260,8 @@ function yes = same(field, processor, p, defaults)
 wanted = [];
 if isfield(p, field)
     wanted = p.(field);
-elseif isfield(defaults, field) && ~any(strcmp(field, {'name', 'fb_cfHz', 'fb_nChannels'}))
-    wanted = defaults.(field).default; % those three are told as they came out, and not as they were asked for
+elseif isfield(defaults, field) && ~any(strcmp(field, derived(p)))
+    wanted = defaults.(field).default;
 end
 if iscell(wanted)
     wanted = cell2mat(wanted);
@@ -271,6 +271,17 @@ if iscell(value)
     value = cell2mat(value);
 end
 yes = isempty(wanted) || isequal(wanted(:), value(:));
+end
+
+function names = derived(p)
+% What getParameters tells as it came out of what is given, and not as it was asked for.
+names = {'name', 'fb_cfHz', 'fb_nChannels'};
+if isfield(p, 'fb_nChannels') || isfield(p, 'fb_cfHz')
+    names{end + 1} = 'fb_nERBs';
+end
+if isfield(p, 'fb_cfHz')
+    names = [names {'fb_lowFreqHz', 'fb_highFreqHz'}];
+end
 end
 
 function p = plain(p)

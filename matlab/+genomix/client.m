@@ -49,6 +49,9 @@ classdef client < handle
 
         function [answer, failed] = get(obj, path, query, matrices)
             %GET  The answer of genomixd to a URL of this session; see genomix.wire.fetch.
+            if isempty(obj.session)
+                error('genomix:connection', 'the client was deleted');
+            end
             [answer, failed] = genomix.wire.fetch(obj.address, path, [{'s', obj.session}; query], matrices);
         end
 

@@ -41,23 +41,31 @@ def environment(world: World) -> dict[str, str]:
     return {"GENOMIXD": f"127.0.0.1:{world.port}", "LANG": "C.UTF-8", "DISPLAY": ""}
 
 
-def run(world: World, script: str, timeout: float = 60.0, folder: Path | None = None) -> str:
-    """What `script` prints; AssertionError where it ends with an error.
+def command(folder: Path, script: str) -> tuple[str, ...]:
+    """The command that runs `script` in `folder`.
 
-    It may call ``show(name, value)``, and ``message(@() ...)`` for the identifier and message of an error, or ''.
+    The script may call ``show(name, value)``, and ``message(@() ...)``: the identifier and message of an error, or ''.
     """
     needed()
-    folder = folder or world.graph.home
     (folder / "show.m").write_text(SHOW)
     (folder / "message.m").write_text(MESSAGE)
     path = folder / "script.m"
     path.write_text(textwrap.dedent(script), "utf-8")
-    in_folder = ("sh", "-c", 'cd "$1" && shift && exec "$@"', "sh", str(folder))
-    done = world.graph.run(*in_folder, *COMMAND, path.name, timeout=timeout, check=True, stdin="", **environment(world))
-    return done.stdout
+    return ("sh", "-c", 'cd "$1" && shift && exec "$@"', "sh", str(folder), *COMMAND, path.name)
+
+
+def values(printed: str) -> dict[str, Any]:
+    """The values that a script has shown, by name."""
+    lines = (line.partition("=") for line in printed.splitlines())
+    return {name: json.loads(text) for name, equals, text in lines if equals}
+
+
+def run(world: World, script: str, timeout: float = 60.0, folder: Path | None = None) -> str:
+    """What `script` prints; AssertionError where it ends with an error."""
+    words = command(folder or world.graph.home, script)
+    return world.graph.run(*words, timeout=timeout, check=True, stdin="", **environment(world)).stdout
 
 
 def shown(world: World, script: str, timeout: float = 60.0, folder: Path | None = None) -> dict[str, Any]:
     """The values that `script` shows, by name."""
-    lines = run(world, script, timeout, folder).splitlines()
-    return {name: json.loads(text) for name, equals, text in (line.partition("=") for line in lines) if equals}
+    return values(run(world, script, timeout, folder))

@@ -1,0 +1,173 @@
+"""manager_RosAFE and dataObject_RosAFE in Octave: trees by one request, chunks without gaps, changes, refusals."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.genomix.world import World
+from tests.matlab import octave
+
+pytestmark = pytest.mark.ros
+
+# The manager's part of the original's rosAFEclient.m, in its order.
+BEGIN = """
+    addpath(genpath('/home/somebody/TwoEars/AuditoryFrontEnd'));
+    startAuditoryFrontEnd;
+    startRosAFE;
+    client = genomix.client;
+    bass = client.load('bass');
+    rosAFE = client.load('rosAFE');
+    dObj = dataObject_RosAFE( bass, rosAFE, 'scene:', 16000, 1600, 1, 0.5, 3, 2 );
+    par = genParStruct('fb_nChannels', 4, 'fb_highFreqHz', 4000);
+"""
+
+
+def test_representations_and_their_data(world: World) -> None:
+    told = octave.shown(
+        world,
+        BEGIN
+        + """
+        mObj = manager_RosAFE(dObj);
+        show('before', {mObj.Processors.input, mObj.hasProcessor('ildProc')});
+        sOut = mObj.addProcessor('ild', par);
+        [left, both] = mObj.addProcessor({'ratemap', 'crosscorrelation'}, par);
+        show('signals', {sOut{1}.Label, size(left), left{2}.Channel, both{1}.Label, numel(both{1}.lags)});
+        show('cfHz', isequal(sOut{1}.cfHz(:), cell2mat(mObj.Processors.gammatone{1}.fb_cfHz)));
+        p = mObj.Processors;
+        show('names', {p.input{1}.name, p.preProc{1}.name, p.gammatone{1}.name, p.ihc{1}.name, p.ild{1}.name, ...
+            p.ratemap{1}.name, p.crossCorrelation{1}.name});
+        show('counts', structfun(@numel, p));
+        acquire = dObj.acquire;
+        show('acquire', acquire.status);
+
+        % new frames at the end of the old, none lost, none twice
+        mObj.processChunk();
+        rosAFE.inputProcPort('-m');
+        while size(dObj.ild{1}.Data, 1) < 60
+            pause(0.2);
+            mObj.processChunk();
+        end
+        bass.Stop();
+        pause(1);
+        mObj.processChunk();
+        port = rosAFE.inputProcPort('-m').inputProcPort;
+        n = port.framesOnPort;
+        show('input', [n, isequal(dObj.input{1, 1}.Data(end-n+1:end), port.left), ...
+            isequal(dObj.input{1, 2}.Data(end-n+1:end), port.right)]);
+        data = dObj.ratemap{1, 2}.Data;
+        port = rosAFE.ratemapPort('-m', 'ratemap_0').ratemapPort;
+        show('ratemap', isequal(data(end-49:end, :), port.right));
+        port = rosAFE.crossCorrelationPort('-m', 'crosscorrelation_0').crossCorrelationPort;
+        data = dObj.crosscorrelation{1}.Data;
+        show('cc', isequal(data(end-9:end, :, :), port.left(end-9:end, :, :)));
+        seconds = [size(dObj.time{1}.Data, 1) / 16000, size(dObj.filterbank{2}.Data, 1) / 16000, ...
+            size(dObj.innerhaircell{1}.Data, 1) / 16000, size(dObj.ild{1}.Data, 1) / 100];
+        show('seconds', seconds);
+        show('rates', [dObj.time{1}.FsHz, dObj.ild{1}.FsHz, dObj.ratemap{1}.FsHz]);
+        mObj.processChunk();
+        show('nothing new', size(dObj.ild{1}.Data, 1) / 100 == seconds(4));
+        dObj.clearData(0);
+        show('cleared', {size(dObj.ild{1}.Data), isempty(dObj.input{1}.Data)});
+        mObj.reset();
+        show('reset', isempty(dObj.input{1}.Data));
+        """,
+    )
+    assert told["before"] == [[], 0]
+    assert told["signals"] == ["ild_0", [1, 2], "right", "crosscorrelation_0", 37]
+    assert told["cfHz"]
+    assert told["names"] == [
+        "input_0",
+        "time_0",
+        "filterbank_0",
+        "innerhaircell_0",
+        "ild_0",
+        "ratemap_0",
+        "crosscorrelation_0",
+    ]
+    assert told["counts"] == [1] * 7
+    assert told["acquire"] == "sent"
+    assert told["input"] == [8000, True, True] or told["input"] == [8000, 1, 1]
+    assert told["ratemap"] and told["cc"]
+    *samples, frames = told["seconds"]
+    assert min(samples) >= 0.6 and max(samples) - min(samples) <= 0.1001
+    assert abs(frames - samples[0]) <= 0.13
+    assert told["rates"] == [16000, 100, 100]
+    assert told["nothing new"] and told["cleared"][1] is False and told["reset"]
+    assert 0 in told["cleared"][0]
+
+
+def test_reuse_changes_and_refusals(world: World) -> None:
+    told = octave.shown(
+        world,
+        BEGIN
+        + """
+        mObj = manager_RosAFE(dObj, {'ild', 'ratemap'}, par);
+        counts = @() [numel(mObj.Processors.preProc), numel(mObj.Processors.gammatone), numel(mObj.Processors.ild), ...
+            numel(mObj.Processors.ratemap)];
+        show('both', counts());
+        mObj.addProcessor('ild', par);
+        show('again', counts());
+        wider = par;
+        wider.ild_wSizeSec = 0.04;
+        sOut = mObj.addProcessor('ild', wider);
+        show('wider', {counts(), sOut{1}.Label, size(dObj.ild)});
+        other = manager_RosAFE(dObj);
+        has = @(type, p) {isstruct(mObj.hasProcessor(type, p))};
+        show('has', [has('ildProc', par), has('ildProc', wider), has('gammatoneProc', par), has('preProc', []), ...
+            has('ildProc', struct('fb_nERBs', 2)), has('crosscorrelationProc', par)]);
+        h = mObj.hasProcessor('ildProc', wider);
+        show('found', h.name);
+
+        mObj.modifyParameter('time_0', 'pp_bRemoveDC', '1');
+        mObj.modifyParameter('ild_0', 'ild_hSizeSec', 0.005);
+        show('changed', [mObj.Processors.preProc{1}.pp_bRemoveDC, mObj.Processors.ild{1}.ild_hSizeSec]);
+        mObj.addProcessor('ild', par);
+        show('beside', counts());
+        middle = manager_RosAFE(dObj, 'time', struct('pp_bMiddleEarFiltering', 1));
+        show('unity', cellfun(@(one) one.pp_bUnityComp, middle.Processors.preProc));
+
+        show('bad value', message(@() mObj.addProcessor('ild', struct('ild_wSizeSec', -1))));
+        show('bad name', message(@() mObj.addProcessor('pitch')));
+        show('bad member', message(@() mObj.addProcessor('ild', struct('fb_nERB', 1))));
+        show('bad parameter', message(@() mObj.modifyParameter('ild_0', 'rm_scaling', 'power')));
+        show('bad processor', message(@() mObj.deleteProcessor('nobody')));
+        show('bad type', message(@() mObj.hasProcessor('pitch')));
+        show('bad count', message(@() mObj.addProcessor({'ild', 'ratemap', 'time'}, {par, par})));
+        show('bad device', message(@() dataObject_RosAFE(bass, rosAFE, 'file:/nowhere.wav', 16000, 1600)));
+        show('few', message(@() dataObject_RosAFE(bass, rosAFE, 'scene:')));
+        show('after', counts());
+
+        before = mObj.Processors.ild{2}.name;
+        mObj.deleteProcessor('ild', 2);
+        names = cellfun(@(one) one.name, mObj.Processors.ild, 'UniformOutput', false);
+        show('deleted', {before, names, size(dObj.ild)});
+        sOut = mObj.addProcessor('ild', wider);
+        show('name', sOut{1}.Label);
+        mObj.deleteProcessor('time_0');
+        show('root', {counts(), size(dObj.ratemap, 1)});
+        mObj.cleanup();
+        show('clean', {counts(), mObj.Processors.input{1}.name, size(dObj.ild, 1), size(dObj.input, 1)});
+        """,
+    )
+    assert told["both"] == told["again"] == [1, 1, 1, 1]
+    assert told["wider"] == [[1, 1, 2, 1], "ild_1", [2, 1]]
+    assert told["has"] == [True, True, True, True, False, False]
+    assert told["found"] == "ild_1"
+    assert told["changed"] == [1, 0.005]
+    assert told["beside"] == [2, 2, 3, 1]
+    assert told["unity"] == [0, 0, 1]
+    assert told["bad value"].startswith("manager_RosAFE:refused Error::rosAFE::e_badNewValue: ild_wSizeSec: -1")
+    assert "::genom::serialization" in told["bad name"] and "'pitch' is not one of" in told["bad name"]
+    assert "fb_nERB" in told["bad member"]
+    assert told["bad parameter"] == "manager_RosAFE:refused Error::rosAFE::e_noSuchParameter"
+    assert told["bad processor"] == "manager_RosAFE:refused Error::rosAFE::e_noSuchProcessor"
+    assert told["bad type"].startswith("manager_RosAFE:type")
+    assert told["bad count"].startswith("manager_RosAFE:arguments")
+    assert told["bad device"].startswith("dataObject_RosAFE:refused Error::bass::e_device")
+    assert told["few"].startswith("dataObject_RosAFE:arguments")
+    assert told["after"][2:] == [3, 1]
+    before, left, size = told["deleted"]
+    assert before not in left and len(left) == 2 and size == [2, 1]
+    assert told["name"] not in left
+    assert told["root"][0] == [2, 1, 2, 0] and told["root"][1] == 0
+    assert told["clean"] == [[0, 0, 0, 0], "input_0", 0, 1]

@@ -1,0 +1,96 @@
+"""Octave's client when things go wrong: components and servers that end while it waits, and that come back."""
+
+from __future__ import annotations
+
+import signal
+from pathlib import Path
+
+import pytest
+
+from tests import harness
+from tests.genomix import world as worlds
+from tests.matlab import octave
+
+pytestmark = pytest.mark.ros
+
+SCRIPT = """
+    1; % a script, though it begins with functions
+    function say(name)
+        fclose(fopen(name, 'w'));
+    end
+    function await(name)
+        while exist(name, 'file') ~= 2
+            pause(0.02);
+        end
+    end
+    client = genomix.client;
+    bass = client.load('bass');
+    acquire = bass.Acquire('-a', 'scene:');
+    show('sent', acquire.status);
+    say('1 kill the node');
+    status = acquire.wait(20);
+    show('killed', {status, acquire.exception.ex, acquire.exception.detail.what});
+    r = bass.ListDevices();
+    show('dead', {r.status, r.exception.ex});
+    p = bass.Audio();
+    show('dead port', {class(p), p.status});
+    show('load', message(@() client.load('bass')));
+    say('2 start the node');
+    await('3 the node is back');
+    again = bass.Acquire('-a', 'scene:');
+    show('back', again.status);
+
+    say('4 end the server');
+    await('5 the server has ended');
+    show('gone', message(@() bass.Stop()));
+    show('gone status', message(@() again.status));
+    delete(bass);
+    say('6 start the server');
+    await('7 the server is back');
+    bass = client.load('bass');
+    show('forgotten', {again.status, again.exception.ex});
+    show('works', bass.Stop().status);
+    delete(client);
+    show('closed', message(@() client.load('bass')));
+"""
+
+
+def test_components_and_servers_that_end(tmp_path: Path) -> None:
+    """One script from beginning to end; it and the test tell each other by files how far they are."""
+
+    def await_file(name: str) -> None:
+        harness.wait_for(lambda: (tmp_path / name).exists() or not script.alive, 30, lambda: f"{name}: {script}")
+        assert script.alive, script
+
+    with (
+        harness.private_graph(tmp_path) as (graph, master),
+        worlds.genomixd(graph) as (server, port),
+        graph.node("bass-ros") as node,
+    ):
+        world = worlds.World(graph, master, server, port)
+        script = graph.start(*octave.command(tmp_path, SCRIPT), cwd=None, **octave.environment(world))
+        await_file("1 kill the node")
+        node.stop(signal.SIGKILL)
+        await_file("2 start the node")
+        with graph.node("bass-ros"):
+            (tmp_path / "3 the node is back").touch()
+            await_file("4 end the server")
+            assert server.stop() == 0
+            (tmp_path / "5 the server has ended").touch()
+            await_file("6 start the server")
+            with graph.start(str(harness.SCRIPTS / "genomixd"), "-v", "-p", str(port)) as again:
+                assert worlds.port_of(again) == port
+                (tmp_path / "7 the server is back").touch()
+                with script:
+                    assert script.wait(30) == 0
+            told = octave.values(script.out)
+    assert told["sent"] == told["back"] == "sent"
+    assert told["killed"] == ["error", "::genom::mwerr", "bass ended before its activity did"]
+    assert told["dead"] == ["error", "::genom::mwerr"]
+    assert told["dead port"] == ["genomix.request", "error"]
+    assert "bass is not running" in told["load"]
+    for name in ("gone", "gone status"):
+        assert told[name].startswith(f"genomix:connection no answer from genomixd at 127.0.0.1:{port}")
+    assert told["forgotten"] == ["error", "::genomix::e_noSuchRequest"]
+    assert told["works"] == "done"
+    assert told["closed"] == "genomix:connection the client was deleted"
