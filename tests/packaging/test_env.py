@@ -15,8 +15,10 @@ from tests.harness import Graph
 from tests.packaging.clone import environment, fresh_copy, run
 
 SHELLS = pytest.mark.parametrize("shell", ["bash", "dash", "zsh"])
-VARIABLES = ("PATH", "PYTHONPATH", "ROS_PACKAGE_PATH", "TCLLIBPATH", "OCTAVE_PATH", "MATLABPATH")
-VARIABLES += ("ROS_MASTER_URI", "ROS_IP", "ROS_HOSTNAME")
+VARIABLES = (
+    *("PATH", "PYTHONPATH", "ROS_PACKAGE_PATH", "TCLLIBPATH", "OCTAVE_PATH", "MATLABPATH"),
+    *("ROS_MASTER_URI", "ROS_IP", "ROS_HOSTNAME"),
+)
 SHOW = "; ".join(f'echo "${{{name}-unset}}"' for name in VARIABLES)
 
 
