@@ -25,8 +25,8 @@ from rosafe.ros.wire import Gather
 
 # What may wait for one subscriber besides what is on its way. Windows overlap, so that a message of a long port is made
 # up for by the next one, and the newest is enough; messages of short ports are small, and several can wait.
-MAX_WAITING = 16
-MAX_WAITING_BYTES = 4_000_000
+MAX_WAITING = 32
+MAX_WAITING_BYTES = 16_000_000
 _LENGTH = struct.Struct("<I")
 _MAX_PIECES = os.sysconf("SC_IOV_MAX")  # of one sendmsg
 
@@ -153,13 +153,9 @@ class _Sender:
 
 
 def send_pieces(sock: socket.socket, pieces: Sequence[Any]) -> None:
-    """Send contiguous buffers, none of them empty, one after the other; OSError where the other side has left."""
-    views = [memoryview(piece).cast("B") for piece in pieces]
-    done = 0
-    while done < len(views):
-        sent = sock.sendmsg(views[done : done + _MAX_PIECES])
-        while done < len(views) and sent >= len(views[done]):
-            sent -= len(views[done])
-            done += 1
-        if sent:
-            views[done] = views[done][sent:]
+    """Send contiguous buffers, one after the other; OSError where the other side has left."""
+    for first in range(0, len(pieces), _MAX_PIECES):
+        batch = pieces[first : first + _MAX_PIECES]
+        sent = sock.sendmsg(batch)
+        if sent < sum(memoryview(piece).nbytes for piece in batch):  # a signal came in between, or the like
+            sock.sendall(memoryview(b"".join(batch))[sent:])
