@@ -1,0 +1,1 @@
+"""Tests of the MATLAB client, in Octave."""

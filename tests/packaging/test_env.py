@@ -136,7 +136,7 @@ def test_failure_is_one_line_and_changes_nothing(shell: str) -> None:
     with fresh_copy() as broken:
         (broken / "msg" / "rosAFE_signalOneD.msg").write_text("nonsense data\n")
         done = sourced(shell, f"{source(broken)}; echo $?; {SHOW}; set | grep -c '^_rosafe'")
-    assert done.stdout.splitlines() == ["1", environment()["PATH"], *["unset"] * 6, "0"]
+    assert done.stdout.splitlines() == ["1", environment()["PATH"], *["unset"] * (len(VARIABLES) - 1), "0"]
     assert done.stderr.startswith("rosafe: ") and done.stderr.count("\n") == 1
 
 
