@@ -6,6 +6,7 @@ makes them; docs/request.md has the rules.
 
 from __future__ import annotations
 
+import itertools
 import math
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -16,6 +17,8 @@ from rosafe.arguments import check_parameter
 from rosafe.interface import BASS, KINDS, REQUEST, ROSAFE, ComponentError, Parameter, ProcessorKind
 
 HIGHEST_RATE = float(BASS.service("Acquire").parameter("sampleRate").maximum or 0)  # Hz; what is wrong there is at any
+INTERRUPTED = "::genom::interrupted"
+_RACES = {f"::rosAFE::{short}" for short in ("e_existsAlready", "e_noUpperDependencie", "e_noSuchProcessor")}
 ALMOST_ZERO = math.ulp(0.0)
 # What only the making of an input needs: the topic, and InputProc's parameters without its name.
 OF_THE_INPUT = ("connect", *(p.name for p in ROSAFE.service("InputProc").parameters[1:]))
@@ -263,6 +266,14 @@ def topic(instance: str, kind: ProcessorKind, name: str) -> str:
     return f"/{instance}/{kind.port}" + (f"/{name}" if ROSAFE.port(kind.port).multiple else "")
 
 
+def stands(dependencies: Sequence[str], found: Iterable[Found]) -> bool:
+    """Whether processors of these names hang on each other, the first one being the input."""
+    parents = {p.name: p.parent for p in found}
+    return all(parents.get(name) == parent for parent, name in itertools.pairwise(["", *dependencies]))
+
+
 def is_race(problem: ComponentError) -> bool:
     """Whether somebody else changed the tree between the look at it and a step: to be planned anew."""
-    return problem.ex in {f"::rosAFE::{e}" for e in ("e_existsAlready", "e_noUpperDependencie", "e_noSuchProcessor")}
+    if problem.ex == INTERRUPTED:
+        return problem.detail.get("by") == "InputProc"
+    return problem.ex in _RACES

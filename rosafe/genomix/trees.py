@@ -11,6 +11,8 @@ from rosafe.interface import KINDS, REQUEST, ComponentError
 from rosafe.request import Found, Plan, Step, Wish
 
 TRIES = 20  # plans that others' changes of the tree may spoil before the error is told
+INPUT_SECONDS = 1.5  # longer than an InputProc waits for sound
+POLL_SECONDS = 0.02
 
 T = TypeVar("T")
 
@@ -55,16 +57,30 @@ async def build(component: Component, values: Mapping[str, Any]) -> dict[str, An
 
 
 async def _carry_out(component: Component, wish: Wish, made: list[str]) -> list[str]:
-    for attempt in range(TRIES):
+    problem = ComponentError("::genom::mwerr", what="others change the tree all the time")
+    for _ in range(TRIES):
         plan = request.plan(wish, await _look(component, wish.kinds))
         try:
             await _take_steps(component, wish, plan, made)
-        except ComponentError as problem:
-            if not request.is_race(problem) or attempt == TRIES - 1:
+        except ComponentError as error:
+            if not request.is_race(error):
                 raise
+            problem = error
+            if error.ex == request.INTERRUPTED:
+                await _wait_for_input(component)
         else:
-            return plan.dependencies
-    raise AssertionError("the last attempt returns or raises")
+            if not plan.steps or request.stands(plan.dependencies, await _look(component, wish.kinds)):
+                return plan.dependencies
+    raise problem
+
+
+async def _wait_for_input(component: Component) -> None:
+    """Let another's InputProc, which has taken the place of ours, come to its end: it may be waiting for sound."""
+    deadline = asyncio.get_running_loop().time() + INPUT_SECONDS
+    while asyncio.get_running_loop().time() < deadline:
+        if (await component.outputs("getParameters", {}))["parameters"]["input"]:
+            return
+        await asyncio.sleep(POLL_SECONDS)
 
 
 async def _take_steps(component: Component, wish: Wish, plan: Plan, made: list[str]) -> None:

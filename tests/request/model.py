@@ -46,6 +46,8 @@ class Model:
         await asyncio.sleep(0)  # others have their turn
         if number in self.fail:
             raise self.fail[number]
+        if service == "InputProc" and "InputProc" in self.calls[number + 1 :]:
+            raise ComponentError("::genom::interrupted", by="InputProc")  # of two at once, the first
         result: Mapping[str, Any] = getattr(self, f"_{service}", self._make)(service, values)
         await asyncio.sleep(0)
         return result
