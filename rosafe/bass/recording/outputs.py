@@ -126,14 +126,14 @@ class BagFile:
         self._chunk = frames_per_chunk
         self._topic = topic
         self._newest = newest
+        self._held = 0  # frames of the window that are of this recording
+        self._time_ns = 0  # when the newest one was acquired
         self._message_class = wire.message_class("bass", BASS.port("Audio").idl)
         self._window = SlidingWindow(BAG_CHUNKS * frames_per_chunk)
         self._bag = rosbag.Bag(str(path), "w")
 
     def write(self, samples: np.ndarray, time_ns: int) -> None:
         """Append messages that show `samples`."""
-        import genpy
-
         disk = os.statvfs(self._path)
         if disk.f_bavail * disk.f_frsize < BAG_RESERVE:
             raise OSError(28, f"the disk is full but for {BAG_RESERVE >> 20} MiB")
@@ -141,26 +141,49 @@ class BagFile:
         for begin in range(0, count, self._chunk):
             piece = samples[:, begin : begin + self._chunk]
             self._window.append(piece)
-            self._newest += piece.shape[1]
+            self._count(piece.shape[1])
             behind = count - begin - piece.shape[1]
-            seconds, nanoseconds = divmod(time_ns - behind * 1_000_000_000 // self._sample_rate, 1_000_000_000)
-            left, right = self._window.view()
-            message = self._message_class(
-                sampleRate=self._sample_rate,
-                nChunksOnPort=BAG_CHUNKS,
-                nFramesPerChunk=self._chunk,
-                lastFrameIndex=self._newest,
-                left=left,
-                right=right,
-                stamp={"sec": seconds, "nsec": nanoseconds},
-            )
-            self._bag.write(self._topic, message, genpy.Time(seconds, nanoseconds))
+            self._time_ns = time_ns - behind * 1_000_000_000 // self._sample_rate
+            # Not before the window is full, for readers take all of a first window for sound.
+            if self._held == self._window.frames:
+                self._put()
+
+    def _count(self, frames: int) -> None:
+        self._newest += frames
+        self._held = min(self._held + frames, self._window.frames)
+
+    def _put(self) -> None:
+        """Append a message that shows what there is of the window."""
+        import genpy
+
+        full = self._held == self._window.frames
+        seconds, nanoseconds = divmod(self._time_ns, 1_000_000_000)
+        left, right = self._window.view()[:, -self._held :]
+        message = self._message_class(
+            sampleRate=self._sample_rate,
+            nChunksOnPort=BAG_CHUNKS if full else 1,
+            nFramesPerChunk=self._chunk if full else self._held,
+            lastFrameIndex=self._newest,
+            left=left,
+            right=right,
+            stamp={"sec": seconds, "nsec": nanoseconds},
+        )
+        self._bag.write(self._topic, message, genpy.Time(seconds, nanoseconds))
 
     def lose(self, frames: int) -> None:
         """Let the numbers go on, and silence be in the windows."""
+        self._put_unshown()
         self._window.skip(frames)
-        self._newest += frames
+        self._count(frames)
+
+    def _put_unshown(self) -> None:
+        """Show what has filled no window yet."""
+        if 0 < self._held < self._window.frames:
+            self._put()
 
     def close(self) -> None:
         """Write the bag's index."""
-        self._bag.close()
+        try:
+            self._put_unshown()
+        finally:
+            self._bag.close()
