@@ -94,7 +94,8 @@ def stalled(graph: Graph, topic: str) -> Iterator[socket.socket]:
     """A subscriber that makes itself known and then reads nothing, until the test reads for it."""
     master = rosgraph.Master("/stalled", master_uri=graph.uri)
     publisher_uri = master.lookupNode(rospy.get_name())
-    _, _, (_, host, port) = xmlrpc.client.ServerProxy(publisher_uri).requestTopic("/stalled", topic, [["TCPROS"]])
+    answer: Any = xmlrpc.client.ServerProxy(publisher_uri).requestTopic("/stalled", topic, [["TCPROS"]])
+    _, host, port = answer[2]
     with socket.create_connection((host, port)) as sock:
         fields = {"topic": topic, "md5sum": TIME_DOMAIN._md5sum, "callerid": "/stalled", "type": TIME_DOMAIN._type}
         write_ros_handshake_header(sock, fields)
@@ -211,7 +212,8 @@ def resident(pid: int) -> float:
 def connections(session: Session, topic: str) -> int:
     """How many subscribers of a topic the node knows."""
     address = rosgraph.Master("/test", master_uri=session.graph.uri).lookupNode(f"/{session.name}")
-    return sum(entry[4] == topic for entry in xmlrpc.client.ServerProxy(address).getBusInfo("/test")[2])
+    answer: Any = xmlrpc.client.ServerProxy(address).getBusInfo("/test")
+    return sum(entry[4] == topic for entry in answer[2])
 
 
 LISTENER = """
