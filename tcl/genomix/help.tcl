@@ -2,6 +2,9 @@
 
 proc ::genomix::ServiceHelp {name service about} {
     set lines [list "${name}::$service: [dict get $about doc]"]
+    if {[dict get $about composite]} {
+        lappend lines "  ${name}::$service [lindex [dict get $about parameters] 0] ?{parameter value ...}?"
+    }
     dict for {parameter told} [dict get $about parameters] {
         set line "  $parameter ([dict get $told type]"
         if {[dict get $told required]} {

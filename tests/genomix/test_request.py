@@ -228,7 +228,7 @@ def test_tcl(sound: World) -> None:
         show [lindex [failure {rosAFE::request ild {fb_nChannels}}] 1 1]
         show [lindex [failure {rosAFE::request ild {fb_nERB 16}}] 1 1]
         show [lindex [failure {rosAFE::request ild {fb_nChannels 2000}}] 1 1]
-        show [lindex [split [rosAFE::request -h] \\n] 1]
+        puts [rosAFE::request -h]
     """
     chain = "0 input_0 1 time_0 2 filterbank_0 3 innerhaircell_0 4 ild_0"
     lines = sound.lines(script)
@@ -245,7 +245,8 @@ def test_tcl(sound: World) -> None:
     assert lines[7].startswith("request: representation is missing; one of input, time, filterbank")
     assert lines[8] == 'request: after representation comes a dict of parameters, and not "fb_nChannels 16"'
     assert lines[9:12] == ["::genom::serialization"] * 2 + ["::rosAFE::e_badNewValue"]
-    assert lines[12].startswith("  representation (string, no default, one of input, time")
+    assert lines[13] == "  rosAFE::request representation ?{parameter value ...}?"
+    assert lines[14].startswith("  representation (string, no default, one of input, time")
 
 
 # --- the command ------------------------------------------------------------------------------------------------
