@@ -51,6 +51,31 @@ def test_whole_chain_sample_by_sample(method: str) -> None:
         np.testing.assert_allclose(single[kind], expected, rtol=0, atol=tolerance, err_msg=kind)
 
 
+@pytest.mark.parametrize(("fb_type", "method"), [("gammatone", "dau"), ("gammatone", "bernstein"), ("drnl", "hilbert")])
+@given(sizes=st.lists(st.one_of(st.sampled_from([0, 1]), st.integers(2, 24000)), min_size=2, max_size=8).filter(any))
+@settings(max_examples=4, deadline=None, database=None)
+def test_blocks_of_up_to_three_seconds(fb_type: str, method: str, sizes: list[int]) -> None:
+    rate = 8000.0
+    parameters = {
+        "in_doNormalize": False,
+        "pp_bRemoveDC": True,
+        "pp_bLevelScaling": True,
+        "pp_bMiddleEarFiltering": True,
+        "fb_type": fb_type,
+        "fb_cfHz": [80.0, 1000.0],
+        "ihc_method": method,
+        "ild_hSizeSec": 0.05,
+        "rm_wSizeSec": 0.3,
+        "cc_wname": "blackman",
+    }
+    signal = noise("preProc", 24000) * np.repeat([1.0, 0.0, 1e-3], 8000)
+    whole = Chain(rate, parameters).process(signal)
+    pieces = joined(Chain(rate, parameters).run(cut(signal, [*sizes, 1000])))
+    for kind, expected in whole.items():
+        tolerance = 1e-12 * max(1.0, np.abs(expected).max())
+        np.testing.assert_allclose(pieces[kind], expected, rtol=0, atol=tolerance, err_msg=kind)
+
+
 def test_window_longer_than_many_blocks() -> None:
     """1000 samples over blocks of 7: the buffer grows, fills and is moved many times."""
     signal = noise("ild", 5000)
