@@ -13,7 +13,7 @@ import rospy
 from rosafe.interface import KINDS, ROSAFE, ros_type
 from rosafe.ros import wire
 from tests.harness import wait_for
-from tests.ros.session import RATE, Session, assert_holds, expected, noise, windowed
+from tests.ros.session import RATE, Session, assert_holds, ears, expected, noise, windowed
 
 CHAIN = ("PreProc", "GammatoneProc", "IhcProc", "IldProc", "RatemapProc", "CrossCorrelationProc")
 FRAMED = ("ild", "ratemap", "crossCorrelation")
@@ -24,7 +24,7 @@ def rate_of(kind: str, values: Any) -> float:
     return float(values[f"{kind}_frameRate"]) if kind in FRAMED else float(RATE)
 
 
-@pytest.mark.parametrize("seconds", [0.5, 0.05, 0.001])
+@pytest.mark.parametrize("seconds", [0.5, 0.013, 0.001])
 def test_every_port_holds_what_process_computes(afe: Session, seconds: float) -> None:
     """For windows of many blocks, of less than a block, and of less than a frame of the framed ones."""
     afe.build(*CHAIN, block=BLOCK, bufferSize_s_port=seconds, fb_nChannels=3)
@@ -244,6 +244,38 @@ def test_signals_are_what_is_new(afe: Session) -> None:
         assert (message.lastFrameIndex, message.framesOnPort) == (5 * BLOCK + 1, 0), "nothing is new"
         assert arrays(again, kind)[0].size == 0
     assert len(again.gammatone[0].left.dataN) == 2, "channels without frames"
+
+
+def test_many_calls_at_any_moment_get_every_frame_once(afe: Session) -> None:
+    """Called while the tree works; what all calls got together is what `rosafe.process` computes, frame by frame."""
+    parameters = {"fb_nChannels": 2}
+    microphone = afe.build(*CHAIN, block=BLOCK, bufferSize_s_getSignal=2.0, **parameters)
+    blocks = 14
+    signal = noise(blocks * BLOCK)
+    got: dict[str, list[tuple[int, np.ndarray]]] = {kind: [] for kind in KINDS}
+
+    def call() -> None:
+        signals = afe.ok("getSignals").signals
+        for kind in KINDS:
+            (message,) = getattr(signals, kind)
+            got[kind].append((message.lastFrameIndex, arrays(signals, kind)[0]))
+
+    while microphone.index < signal.shape[1]:
+        microphone.play(signal[:, microphone.index : microphone.index + 2 * BLOCK - 700])
+        call()
+    for kind in KINDS:
+        afe.read(kind, blocks * BLOCK + 1)
+    call()
+    truth = expected(signal, BLOCK, parameters)
+    for kind in KINDS:
+        left, _ = ears(kind, truth[kind])
+        np.testing.assert_array_equal(np.concatenate([piece for _, piece in got[kind]], axis=-1), left)
+        seen = 0
+        for index, piece in got[kind]:
+            seen += piece.shape[-1]
+            assert index in range(BLOCK + 1, blocks * BLOCK + 2, BLOCK) or (index, seen) == (0, 0)
+            if kind not in FRAMED:
+                assert seen == max(0, index - 1), "the index is that of the frame after the newest one"
 
 
 def test_signals_are_kept_for_so_long(afe: Session) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import time
+from pathlib import Path
 from typing import Any
 
 import genpy
@@ -11,13 +12,14 @@ import numpy as np
 import pytest
 import rosAFE.msg
 import rosAFE.srv
+import rosbag
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import bass.msg
 from rosafe import interface
 from rosafe.interface import ROSAFE
-from rosafe.ros import wire
+from rosafe.ros import array_msg, wire
 from rosafe.tree.window import SlidingWindow, WindowView
 
 TIME_DOMAIN = "::rosAFE::TimeDomainSignalPortStruct"
@@ -107,6 +109,65 @@ def test_the_pieces_of_a_window_are_sent_as_one() -> None:
     ours, plain = ours_and_plain(CROSS_CORRELATION, array.swapaxes(0, 1))
     ours.left = view.swap_rows()
     assert serialized(ours) == serialized(plain)
+
+
+@settings(deadline=None, max_examples=60)
+@given(
+    idl=st.sampled_from(sorted(LEVELS)),
+    blocks=st.lists(st.integers(1, 40), max_size=6),
+    frames=st.integers(1, 60),
+    row_bytes=st.sampled_from([1, 100, 10**9]),
+)
+def test_rows_as_they_lie_and_rows_copied_together(idl: str, blocks: list[int], frames: int, row_bytes: int) -> None:
+    """Whichever way a window is written, into memory or gathered, from zeros or full of blocks: the same bytes."""
+    rows = (2, 3)[: LEVELS[idl] - 1] if idl == CROSS_CORRELATION else (2, 3)[: LEVELS[idl]]
+    window = SlidingWindow(rows, frames)
+    for size in blocks:
+        window.append(np.random.default_rng(size).normal(size=(*rows, size)))
+    view = window.view()
+    if idl == CROSS_CORRELATION:
+        ours, plain = ours_and_plain(idl, view.array().swapaxes(0, 1))
+        ours.left = view.swap_rows()
+    else:
+        ours, plain = ours_and_plain(idl, *view.array())
+        ours.left, ours.right = view.select(0), view.select(1)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(wire, "ROW_BYTES", row_bytes)
+        gathered = wire.Gather()
+        ours.serialize(gathered)
+        assert serialized(ours) == serialized(plain)
+    assert b"".join(gathered.pieces) == serialized(plain)
+    assert gathered.size == len(serialized(plain))
+
+
+def test_array_msg_is_the_class_that_belongs_to_a_generated_one() -> None:
+    for package, classes in (("rosAFE", rosAFE.msg), ("bass", bass.msg)):
+        for idl in interface.COMPONENTS[package].structs:
+            generated = getattr(classes, interface.ros_type(idl))
+            assert array_msg(generated) is wire.message_class(package, idl)
+            assert array_msg(array_msg(generated)) is array_msg(generated)
+    for wrong in (None, int, "rosAFE/rosAFE_signalND", rosAFE.msg.InputProcGoal, genpy.Message):
+        with pytest.raises(TypeError, match="no message class"):
+            array_msg(wrong)
+
+
+def test_another_build_of_a_class_is_refused() -> None:
+    other = type("binaudio_portStruct", (bass.msg.binaudio_portStruct,), {"_md5sum": "0" * 32})
+    with pytest.raises(TypeError):
+        array_msg(other)
+
+
+def test_bags_keep_such_messages_and_give_them_back(tmp_path: Path) -> None:
+    ours, plain = ours_and_plain(TIME_FREQUENCY, np.arange(12.0).reshape(3, 4))
+    with rosbag.Bag(str(tmp_path / "a.bag"), "w") as bag:
+        bag.write("/ours", ours)
+        bag.write("/plain", plain)
+    with rosbag.Bag(str(tmp_path / "a.bag")) as bag:
+        for _, (name, data, md5, _, _), _ in bag.read_messages(raw=True):
+            assert (name, md5) == (plain._type, plain._md5sum)
+            read = array_msg(type(plain))().deserialize(data)
+            np.testing.assert_array_equal(read.left, ours.left)
+        assert [m.left.dataN[2].data[3] for _, m, _ in bag.read_messages()] == [11.0, 11.0]
 
 
 def test_an_absent_signal_has_no_channels() -> None:
