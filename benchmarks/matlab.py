@@ -1,0 +1,58 @@
+"""How long Octave takes to read ports through genomixd: one second of ILD, ratemap, cross-correlation and gammatone.
+
+``/usr/bin/python3 benchmarks/matlab.py`` starts real nodes on a master of its own, a genomixd, and Octave, and prints
+median ms for cell arrays (the form of the original's scripts) and for matrices (``'-m'``). benchmarks/ports.m measures.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import socket
+import subprocess
+import sys
+import time
+
+import graph
+
+from rosafe.demo.processes import Children
+from rosafe.ros import generate
+
+FULL_SECONDS = 2.0  # until the ports hold a second
+UP_SECONDS = 20.0
+
+
+def main() -> int:
+    """Measure and print."""
+    if shutil.which("octave-cli") is None:
+        print("benchmarks/matlab.py: octave-cli is not installed; scripts/install --tests brings it", file=sys.stderr)
+        return 1
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{probe.getsockname()[1]}"
+    with graph.bench() as bench, Children(os.environ) as children:
+        children.start(graph.PYTHON, str(graph.HERE.parent / "scripts" / "genomixd"), "-p", address.rpartition(":")[2])
+        bench.build(12000, 1.0, 2205)
+        _await(address)
+        time.sleep(FULL_SECONDS)
+        env = {**os.environ, **generate.environment(), "GENOMIXD": address}
+        octave = ["octave-cli", "--norc", "--quiet", "--no-history", str(graph.HERE / "ports.m")]
+        return subprocess.run(octave, env=env, check=False).returncode
+
+
+def _await(address: str) -> None:
+    host, _, port = address.partition(":")
+    end = time.monotonic() + UP_SECONDS
+    while True:
+        try:
+            socket.create_connection((host, int(port))).close()
+        except ConnectionRefusedError:
+            if time.monotonic() > end:
+                raise
+            time.sleep(0.1)
+        else:
+            return
+
+
+if __name__ == "__main__":
+    sys.exit(main())
