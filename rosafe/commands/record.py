@@ -189,11 +189,12 @@ def _open_source(options: argparse.Namespace, stopping: threading.Event) -> Sour
             host, port = options.socket
             return SocketSource(host, port, options.rate, stopping)
         from rosafe.bass.recording.topic import TopicSource, become_node
+        from rosafe.ros.generate import GenerationError
         from rosafe.ros.master import MasterError
 
         try:
             become_node("rosafe_record")
-        except MasterError as problem:
+        except (MasterError, GenerationError) as problem:
             raise Failure(f"{problem}; or record a --device without ROS") from None
         return TopicSource(options.topic or _TOPIC, options.rate, stopping)
     except ComponentError as problem:

@@ -112,6 +112,7 @@ MISTAKES: list[tuple[dict[str, Any], str, str]] = [
     ({"device": "file:/no/such/file.wav"}, "e_device", "/no/such/file.wav: No such file"),
     ({"device": "WAV", "sampleRate": 44100}, "e_hwparams", "8000 Hz, asked for were 44100"),
     ({"device": "WAV?loop=2"}, "e_device", "loop=2 is not 0 or 1"),
+    ({"device": "bag:/no/such.bag"}, "e_device", "/no/such.bag: No such file"),
     ({"device": "scene:?x=1"}, "e_device", "no option 'x'"),
     ({"device": "x" * 5000}, "e_hwparams", "4096 characters"),
     ({"device": "scene:", "sampleRate": 2**31}, "e_hwparams", "sampleRate"),

@@ -136,11 +136,12 @@ class TopicSource:
 
 
 def become_node(name: str) -> None:
-    """Make this process a node of the graph; MasterError where there is no master."""
-    from rosafe.ros import master, startup
+    """Make this process a node of the graph; MasterError where there is no master, GenerationError without messages."""
+    from rosafe.ros import generate, master, startup
 
     master.set_local_defaults()
     master.check_master(os.environ["ROS_MASTER_URI"])
+    generate.ensure_messages()
     startup.ensure_log_directory()
     rospy.init_node(name, argv=[], anonymous=True, disable_signals=True)
     startup.log_to_stderr()
