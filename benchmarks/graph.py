@@ -32,14 +32,14 @@ def topic(kind: str) -> str:
 
 
 class Subscriber:
-    """A process that subscribes to some topics with the zero-copy classes; what came is there after `close`."""
+    """A process that subscribes to some topics with the zero-copy classes; `close` tells what came."""
 
     def __init__(self, children: Children, folder: str, topics: Iterable[str]) -> None:
         self._result = Path(tempfile.mkdtemp(dir=folder)) / "result.json"
         self.child: Child = children.start(PYTHON, str(HERE / "subscriber.py"), str(self._result), *topics)
 
     def close(self) -> dict[str, Any]:
-        """End it: `came`, by topic a list of [lastFrameIndex, monotonic seconds], and `memory` in MB by the second."""
+        """End it; what came, by topic: a list of [lastFrameIndex, monotonic seconds, ...]."""
         self.child.process.terminate()
         if self.child.process.wait(UP_SECONDS) != 0:
             raise RuntimeError(f"the subscriber has failed: {self.child.err}")
@@ -73,8 +73,10 @@ class Bench:
                 self.call(f"/rosAFE/{kind.request}", name=NAMES[kind.kind], upperDepName=NAMES[kind.parent])
 
     def subscribe(self, topics: Iterable[str]) -> Subscriber:
-        """Subscribe from another process."""
-        return Subscriber(self._children, self._folder, topics)
+        """Subscribe from another process; something has come on every topic when this returns."""
+        subscriber = Subscriber(self._children, self._folder, topics)
+        self.session.wait(lambda: "ready" in subscriber.child.out, UP_SECONDS, "the subscriber hears nothing")
+        return subscriber
 
     @property
     def node(self) -> int:
@@ -83,6 +85,12 @@ class Bench:
 
         address = rosgraph.Master("/benchmark").lookupNode("/rosAFE")
         return int(xmlrpc.client.ServerProxy(address).getPid("/benchmark")[2])
+
+
+def resident(pid: int) -> float:
+    """Resident memory of a process in MB."""
+    pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
 @contextmanager

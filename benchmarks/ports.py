@@ -21,12 +21,11 @@ from typing import Any, NamedTuple
 
 import graph
 import numpy as np
-from subscriber import resident
 
 from rosafe.interface import KINDS
 from rosafe.ros import generate
 
-SETTLED = 5  # seconds until memory counts: the windows and buffers are full by then
+SETTLED = 5.0  # seconds until memory counts: windows and buffers are full by then
 GROWTH = 64.0  # MB; a leak of one window in the time would be as much as that
 
 
@@ -123,7 +122,6 @@ class Run(NamedTuple):
     """The result of one run; memory in MB, from when it had settled to the end."""
 
     ports: list[Port]
-    seconds: float
     node: tuple[float, float]
     subscriber: tuple[float, float]
 
@@ -142,19 +140,15 @@ def run(bench: graph.Bench, block: int, port_seconds: float, seconds: float) -> 
     """Subscribe to all ports from another process for so long; the tree is there and runs on blocks of `block`."""
     topics = [graph.topic(kind) for kind in KINDS]
     taker = bench.subscribe(topics)
-    time.sleep(min(SETTLED, seconds / 2))
-    settled = resident(bench.node)
-    begin = time.monotonic()
-    time.sleep(max(0.0, seconds - SETTLED))
-    node = settled, resident(bench.node)
-    found = taker.close()
-    memory = found["memory"]
-    return Run(
-        [count(t, [index for index, _ in found["came"][t]], block, round(port_seconds * graph.RATE)) for t in topics],
-        time.monotonic() - begin,
-        node,
-        (memory[min(SETTLED, len(memory) - 1)], memory[-1]),
-    )
+    pids = bench.node, taker.child.process.pid
+    settling = min(SETTLED, seconds / 2)
+    time.sleep(settling)
+    before = [graph.resident(pid) for pid in pids]
+    time.sleep(seconds - settling)
+    node, subscriber = zip(before, [graph.resident(pid) for pid in pids], strict=True)
+    came = taker.close()
+    window = round(port_seconds * graph.RATE)
+    return Run([count(t, [int(index) for index, _ in came[t]], block, window) for t in topics], node, subscriber)
 
 
 def report(result: Run) -> None:
@@ -163,7 +157,7 @@ def report(result: Run) -> None:
     for port in result.ports:
         print(f"{port.topic:45} {port.came:6d} {port.expected:8d} {port.lost:11d}")
     for name, (first, last) in (("node", result.node), ("subscriber", result.subscriber)):
-        print(f"memory of the {name}: {first:.0f} MB after {SETTLED} s, {last:.0f} MB at the end")
+        print(f"memory of the {name}: {first:.0f} MB at first, {last:.0f} MB at the end")
 
 
 def main() -> int:

@@ -21,10 +21,11 @@ import rosgraph
 import rospy
 from rosgraph.network import read_ros_handshake_header, write_ros_handshake_header
 
+from rosafe.interface import KINDS
 from rosafe.ros import array_msg, publisher
 from rosafe.ros.publisher import MAX_WAITING, MAX_WAITING_BYTES, Publisher, send_pieces
 from rosafe.ros.wire import Gather
-from tests.harness import PYTHON, ROOT, Graph, proc, wait_for
+from tests.harness import PYTHON, ROOT, Graph, Process, proc, wait_for
 from tests.ros.session import Session, noise, own_node
 
 TIME_DOMAIN = rosAFE.msg.rosAFE_TimeDomainSignalPortStruct
@@ -269,3 +270,15 @@ def test_the_table_of_the_document(tree: Session) -> None:
     for name in re.findall(r"`((?:rosAFE|binaudio)_\w+)`", text):
         assert array_msg(getattr(rosAFE.msg, name)), name
     assert f"{MAX_WAITING} messages and {MAX_WAITING_BYTES // 10**6} MB" in text
+
+
+def test_all_ports_for_a_while(tmp_path: Path) -> None:
+    """The short form of the benchmark that runs for minutes: nothing lost, no growth."""
+    env = {k: v for k, v in os.environ.items() if not k.startswith("ROS_")}
+    command = [PYTHON, str(ROOT / "benchmarks" / "ports.py"), "--quick", "--seconds", "3"]
+    with Process(command, {**env, "HOME": str(tmp_path)}) as done:
+        assert done.wait(90) == 0, done
+        rows = re.findall(r"^(/rosAFE/\S+) +(\d+) +(\d+) +(\d+)$", done.out, re.MULTILINE)
+    assert len(rows) == 2 * len(KINDS)
+    for topic, came, expected, lost in rows:
+        assert 2 < int(came) <= int(expected) and int(lost) == 0, topic
