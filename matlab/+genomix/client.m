@@ -14,23 +14,31 @@ classdef client < handle
         session  % the name under which genomixd knows this client
     end
 
+    properties (Access = private)
+        lost = false; % whether genomixd did not answer the last time
+    end
+
     methods
         function obj = client(address)
             if nargin == 0
                 address = getenv('GENOMIXD');
             end
-            obj.address = full_address(address);
+            obj.address = full_address(genomix.wire.chars(address));
             [~, obj.session] = fileparts(tempname()); % MATLAB's rand begins alike in every process
             obj.get('/components', {}, false);
         end
 
         function component = load(obj, component, varargin)
             %LOAD  A component that runs, as an object with its services and ports: load(name), load(name, '-i', instance)
+            if nargin > 1
+                component = genomix.wire.chars(component);
+            end
             if nargin < 2 || ~ischar(component) || isempty(component)
                 error('genomix:load', 'load takes the name of a component, such as ''rosAFE''');
             end
             [~, name] = fileparts(component); % the original takes paths of plug-ins, too
             query = {};
+            varargin = cellfun(@genomix.wire.chars, varargin, 'UniformOutput', false);
             if numel(varargin) == 2 && strcmp(varargin{1}, '-i') && ischar(varargin{2})
                 query = {'i', varargin{2}};
             elseif ~isempty(varargin)
@@ -52,18 +60,24 @@ classdef client < handle
             if isempty(obj.session)
                 error('genomix:connection', 'the client was deleted');
             end
+            obj.lost = true; % unless it returns
             [answer, failed] = genomix.wire.fetch(obj.address, path, [{'s', obj.session}; query], matrices);
+            obj.lost = false;
+        end
+
+        function yes = isConnected(obj)
+            %ISCONNECTED  Whether there is a session, and genomixd has answered the last time.
+            yes = ~isempty(obj.session) && ~obj.lost;
         end
 
         function delete(obj)
             %DELETE  End the session. Activities go on.
-            if isempty(obj.session)
-                return % the constructor has failed, or this is the second time
-            end
-            try
-                obj.get('/session/stop', {}, false);
-            catch
-                % Then the server is gone, and the session with it.
+            if isConnected(obj)
+                try
+                    obj.get('/session/stop', {}, false);
+                catch
+                    % Then the server is gone, and the session with it.
+                end
             end
             obj.session = '';
         end

@@ -60,7 +60,7 @@ classdef component < handle
 
         function delete(obj)
             %DELETE  Forget the component, which goes on.
-            if isempty(obj.about) || isempty(obj.client.session)
+            if isempty(obj.about) || ~obj.client.isConnected()
                 return
             end
             try
@@ -161,10 +161,11 @@ query = cell(0, 2);
 if isempty(given)
     return
 end
-if ~ischar(given{1})
-    error('genomix:argument', 'the name of an element is a text, and no %s', class(given{1}));
+name = genomix.wire.chars(given{1});
+if ~ischar(name)
+    error('genomix:argument', 'the name of an element is a text, and no %s', class(name));
 end
-query = {'element', given{1}};
+query = {'element', name};
 end
 
 function text = input_of(given)

@@ -4,9 +4,7 @@ function text = encode(value)
 %   Numbers, logicals, texts, cell arrays and matrices (as sequences), and structs (as objects). Anything else raises
 %   the error genomix:argument.
 
-if isa(value, 'string') && isscalar(value)
-    value = char(value);
-end
+value = genomix.wire.chars(value);
 if ischar(value) && (isrow(value) || isempty(value))
     text = quoted(value);
 elseif iscell(value)
@@ -44,8 +42,10 @@ end
 
 function text = quoted(value)
 value = strrep(strrep(value, '\', '\\'), '"', '\"');
-for code = unique(double(value(value < ' ')))
-    value = strrep(value, char(code), sprintf('\\u%04x', code));
+if any(value < ' ')
+    for code = 0:31
+        value = strrep(value, char(code), sprintf('\\u%04x', code));
+    end
 end
 text = ['"' value '"'];
 end
