@@ -19,7 +19,7 @@ from rosafe.interface import BASS, KINDS, REQUEST, ROSAFE, ComponentError, Param
 HIGHEST_RATE = float(BASS.service("Acquire").parameter("sampleRate").maximum or 0)  # Hz; what is wrong there is at any
 INTERRUPTED = "::genom::interrupted"
 _RACES = {f"::rosAFE::{short}" for short in ("e_existsAlready", "e_noUpperDependencie", "e_noSuchProcessor")}
-ALMOST_ZERO = math.ulp(0.0)
+ALMOST_ZERO = math.ulp(0.0)  # in place of a zero, which would mean the default, until modifyParameter has set that
 # What only the making of an input needs: the topic, and InputProc's parameters without its name.
 OF_THE_INPUT = ("connect", *(p.name for p in ROSAFE.service("InputProc").parameters[1:]))
 

@@ -32,7 +32,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("representation", metavar="REPRESENTATION", help="what is wanted")
     parser.add_argument(
-        "settings", nargs="*", default=[], metavar="NAME=VALUE", help="a parameter; docs/parameters.md has all"
+        "settings",
+        nargs="*",
+        default=[],
+        metavar="NAME=VALUE",
+        help=f"a parameter: {', '.join(request.OF_THE_INPUT[1:])}, and those that `rosafe process -h` lists",
     )
     parser.add_argument(
         "--connect",
