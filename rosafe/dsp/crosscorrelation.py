@@ -13,7 +13,7 @@ from typing import Any, ClassVar
 import numpy as np
 import scipy
 
-from . import kernels
+from . import kernels, memory
 from .checks import MAX_SAMPLES, positive
 from .framing import FramedStage, frame_parameters
 from .guard import FloatArray, limited
@@ -56,7 +56,7 @@ class CrossCorrelation(FramedStage):
     def _by_kernel(self, samples: FloatArray, reach: int) -> FloatArray:
         frames = self._frames(samples, self._framing.window)
         shape = (samples.shape[1], 2 * self._max_lag + 1, frames.number)
-        result = np.empty(shape) if reach == self._max_lag else np.zeros(shape)
+        result = memory.empty(shape) if reach == self._max_lag else np.zeros(shape)
         kernels.correlations(frames, reach, EPSILON, result)
         return result
 

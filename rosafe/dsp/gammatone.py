@@ -11,7 +11,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from . import kernels
+from . import kernels, memory
 from .erb import bandwidth
 from .guard import FloatArray, flush, limited
 
@@ -52,8 +52,8 @@ class GammatoneBank:
     def process(self, block: FloatArray, with_envelope: bool) -> tuple[FloatArray, FloatArray | None]:
         """Filter (2, N): output (2, C, N), and the envelope 2 abs(H x) of the same shape if wanted, else None."""
         shape = (2, len(self._sections), block.shape[-1])
-        output = np.empty(shape)
-        envelope = np.empty(shape) if with_envelope else None
+        output = memory.empty(shape)
+        envelope = memory.empty(shape) if with_envelope else None
         run = kernels.gammatone if kernels.compiled() else filter_by_scipy
         run(block, self._sections, self._state, output, envelope)
         return output, envelope

@@ -21,7 +21,7 @@ import scipy
 from . import kernels
 from .cascade import Cascade
 from .checks import word
-from .guard import LIMIT, FloatArray, limited
+from .guard import LIMIT, TINY, FloatArray, limited
 from .stage import Parameter, ParameterTable, Stage
 
 # Butterworth low-pass after the rectification: order, cutoff (Hz), how many in cascade
@@ -38,7 +38,9 @@ RECTIFICATION = {
     "square": "square",
     "dau": "halfwave",
     "breebart": "halfwave",
+    "bernstein": "compressed",
 }
+COMPRESSION = -0.77  # of bernstein
 RECTIFIERS: dict[str, Callable[[FloatArray], FloatArray]] = {
     "none": np.copy,
     "halfwave": lambda samples: np.maximum(samples, 0.0),
@@ -80,15 +82,20 @@ class InnerHairCell(Stage):
         """As `Stage.process`; `envelope` is that of `block`, of the same shape, for the methods that need it."""
         samples = self._checked(block)
         method = self._values["ihc_method"]
-        if self.needs_envelope:
-            if envelope is None or np.shape(envelope) != samples.shape:
-                raise ValueError(f"envelope: {method} needs one of the shape of the block")
-            envelope = self._checked(envelope)
-            samples = envelope if method != "bernstein" else _compressed(limited(samples), limited(envelope))
         rectification = RECTIFICATION.get(method, "none")
+        if not self.needs_envelope:
+            envelope = None
+        elif envelope is None or np.shape(envelope) != samples.shape:
+            raise ValueError(f"envelope: {method} needs one of the shape of the block")
+        elif rectification == "compressed":
+            envelope = self._checked(envelope)
+        else:
+            samples, envelope = self._checked(envelope), None
         if kernels.compiled():
             state = self._lowpass.started(samples.shape[:-1])
-            return kernels.rectify_and_filter(rectification, samples, self._lowpass.sections, state)
+            return kernels.rectify_and_filter(rectification, samples, envelope, self._lowpass.sections, state)
+        if envelope is not None:
+            return self._lowpass.process(compressed(limited(samples), limited(envelope)))
         return self._lowpass.process(RECTIFIERS[rectification](limited(samples)))
 
     def reset(self) -> None:
@@ -105,9 +112,9 @@ class InnerHairCell(Stage):
         self._lowpass = Cascade(sections)
 
 
-def _compressed(samples: FloatArray, envelope: FloatArray) -> FloatArray:
-    """max(envelope**-0.77 samples, 0)**2."""
-    compressed = np.power(envelope, -0.77, out=np.zeros_like(envelope), where=envelope > 0)
-    compressed *= samples
+def compressed(samples: FloatArray, envelope: FloatArray) -> FloatArray:
+    """max(envelope**-0.77 samples, 0)**2, 0 where there is no envelope."""
+    result = np.power(envelope, COMPRESSION, out=np.zeros_like(envelope), where=envelope >= TINY)
+    result *= samples
     # the bound tells only where an envelope is smaller by far than the signal it is said to belong to
-    return np.square(np.clip(compressed, 0.0, LIMIT, out=compressed))
+    return np.square(np.clip(result, 0.0, LIMIT, out=result))

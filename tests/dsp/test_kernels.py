@@ -234,8 +234,9 @@ def test_constants_are_those_of_the_sources() -> None:
         "HALF_WAVE",
         "FULL_WAVE",
         "SQUARE",
+        "COMPRESSED",
     ]
-    assert "{ NONE, HALF_WAVE, FULL_WAVE, SQUARE }" in sources["biquads.c"]
+    assert "{ NONE, HALF_WAVE, FULL_WAVE, SQUARE, COMPRESSED }" in sources["biquads.c"]
 
 
 def test_the_processor_is_asked_without_its_newer_instructions() -> None:

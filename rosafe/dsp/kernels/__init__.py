@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from .. import memory
 from .library import Status, loaded
 
 FloatArray = NDArray[np.float64]
@@ -26,7 +27,7 @@ MOST_LAGS = 1024  # of a correlation; FFT is faster beyond
 
 REAL_SIZE = 8  # bytes of a float64
 
-RECTIFICATIONS = ("none", "halfwave", "fullwave", "square")
+RECTIFICATIONS = ("none", "halfwave", "fullwave", "square", "compressed")
 
 
 def compiled() -> bool:
@@ -54,15 +55,19 @@ def gammatone(
     )
 
 
-def rectify_and_filter(rectification: str, block: FloatArray, sections: FloatArray, state: FloatArray) -> FloatArray:
+def rectify_and_filter(
+    rectification: str, block: FloatArray, envelope: FloatArray | None, sections: FloatArray, state: FloatArray
+) -> FloatArray:
     """Rectify (*rows, N), then filter it by second-order sections (S, 6); `state` (S, *rows, 2) as in scipy.
 
-    The twin is `rosafe.dsp.haircell.RECTIFIERS` and `rosafe.dsp.cascade.Cascade`.
+    The envelope of the same shape is for `compressed`. The twin is `rosafe.dsp.haircell.RECTIFIERS`, or `compressed`
+    there, and `rosafe.dsp.cascade.Cascade`.
     """
-    output = np.empty(block.shape)
+    output = memory.empty(block.shape)
     _function("rosafe_biquads")(
         RECTIFICATIONS.index(rectification),
         _address(block),
+        None if envelope is None else _address(envelope),
         math.prod(block.shape[:-1]),
         block.shape[-1],
         _address(sections),

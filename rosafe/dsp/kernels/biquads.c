@@ -1,4 +1,4 @@
-/* The inner hair cell: rectification and low-pass, a cascade of second-order sections that all rows share.
+/* The inner hair cell: rectification or compression, and low-pass: second-order sections that all rows share.
  *
  * Direct form II transposed, as scipy.signal.sosfilt: y = b0 x + s1, s1 = b1 x - a1 y + s2, s2 = b2 x - a2 y.
  *
@@ -7,22 +7,54 @@
  * stay in the first-level cache between them. */
 #include "vector.h"
 
+#include <math.h>
+
+#define COMPRESSION -0.77 /* of the envelope, in rosafe/dsp/haircell.py */
+
 enum { SPAN = 32, ROWS = 16, GROUPS = ROWS / LANES, MOST_SECTIONS = 8 };
 
-enum rectification { NONE, HALF_WAVE, FULL_WAVE, SQUARE };
+enum rectification { NONE, HALF_WAVE, FULL_WAVE, SQUARE, COMPRESSED };
 
 enum { READS = 1, FILTERS = 2, WRITES = 4 }; /* what a pass does; samples that it does not read or write are in the span */
 
 typedef struct {
-    const double *block;
+    const double *block, *envelope;
     double *output;
-    int64_t at[ROWS]; /* where each row begins in both */
+    int64_t at[ROWS]; /* where each row begins in all of them */
 } places;
+
+/* x to the power of COMPRESSION, 0 where x < TINY. Of x = 2^e m with m between sqrt(1/2) and sqrt(2), log m is a series in
+ * (m - 1) / (m + 1); 2^f with f between -1/2 and 1/2 is the exponential series. Both end where they are exact. */
+INLINE vec compressed(vec x) {
+    static const double LOG[] = {1. / 23, 1. / 21, 1. / 19, 1. / 17, 1. / 15, 1. / 13, 1. / 11, 1. / 9, 1. / 7, 1. / 5, 1. / 3, 1};
+    static const double EXP[] = {1. / 6227020800, 1. / 479001600, 1. / 39916800, 1. / 3628800, 1. / 362880, 1. / 40320,
+                                 1. / 5040, 1. / 720, 1. / 120, 1. / 24, 1. / 6, 1. / 2, 1, 1};
+    const double to_integer = 0x1.8p52; /* added, it leaves the nearest integer in the lowest bits */
+    const lanes bits = (lanes)larger(x, all(TINY)), large = (bits & ((1L << 52) - 1)) > 0x6A09E667F3BCC;
+    vec m = (vec)((bits & ((1L << 52) - 1)) | ((1023L + large) << 52));
+    vec e = (vec)(((bits >> 52) - 1023 - large) + (lanes)all(to_integer)) - all(to_integer);
+    vec t = (m - 1) / (m + 1), t2 = t * t, sum = all(LOG[0]);
+    UNROLL for (int i = 1; i < 12; i++) sum = fused(sum, t2, all(LOG[i]));
+    vec power = (e + t * sum * (2 / M_LN2)) * COMPRESSION, rounded = power + to_integer;
+    vec f = (power - (rounded - to_integer)) * M_LN2, result = all(EXP[0]);
+    UNROLL for (int i = 1; i < 14; i++) result = fused(result, f, all(EXP[i]));
+    result = (vec)((lanes)result + ((lanes)rounded << 52));
+    return (vec)((lanes)result & (x >= TINY));
+}
 
 INLINE vec rectified(int64_t how, vec x) {
     x = bounded(x, how == HALF_WAVE ? 0.0 : -LIMIT, LIMIT);
     if (how == FULL_WAVE) x = larger(x, -x);
     return how == SQUARE ? x * x : x;
+}
+
+INLINE void read_some(const int samples, const double *block, const int64_t *at, int64_t t, vec *pair) {
+    const double *from[LANES];
+    UNROLL for (int k = 0; k < LANES; k++) from[k] = block + at[k];
+    if (samples == 2)
+        read_pair(from, t, pair);
+    else
+        pair[0] = gathered(from, t);
 }
 
 /* Samples t and t + 1, or t alone, of `groups` groups of rows. */
@@ -31,13 +63,17 @@ INLINE void step(const int groups, const int does, const int samples, int64_t ho
     UNROLL for (int g = 0; g < groups; g++) {
         vec pair[2];
         if (does & READS) {
-            const double *from[LANES];
-            UNROLL for (int k = 0; k < LANES; k++) from[k] = rows->block + rows->at[g * LANES + k];
-            if (samples == 2)
-                read_pair(from, t, pair);
-            else
-                pair[0] = pair[1] = gathered(from, t);
-            UNROLL for (int i = 0; i < samples; i++) pair[i] = rectified(how, pair[i]);
+            read_some(samples, rows->block, rows->at + g * LANES, t, pair);
+            if (how == COMPRESSED) {
+                vec envelope[2];
+                read_some(samples, rows->envelope, rows->at + g * LANES, t, envelope);
+                UNROLL for (int i = 0; i < samples; i++) {
+                    vec x = bounded(pair[i], -LIMIT, LIMIT) * compressed(smaller(envelope[i], all(LIMIT)));
+                    pair[i] = bounded(x, 0.0, LIMIT) * bounded(x, 0.0, LIMIT);
+                }
+            } else {
+                UNROLL for (int i = 0; i < samples; i++) pair[i] = rectified(how, pair[i]);
+            }
         } else {
             UNROLL for (int i = 0; i < samples; i++) pair[i] = span[i * GROUPS + g];
         }
@@ -95,14 +131,14 @@ INLINE void run(const int groups, int64_t how, const places *rows, int64_t n, co
     }
 }
 
-/* block and output (rows, n), sections (count, 6), state (count, rows, 2). */
-void rosafe_biquads(int64_t how, const double *block, int64_t rows, int64_t n, const double *sections, int64_t count,
-                    double *state, double *output) {
+/* block and output (rows, n), envelope likewise, or null where it is not asked for; sections (count, 6), state (count, rows, 2). */
+void rosafe_biquads(int64_t how, const double *block, const double *envelope, int64_t rows, int64_t n,
+                    const double *sections, int64_t count, double *state, double *output) {
     uint32_t mode = denormals_off();
     /* From the end, which the filterbank has written last: in large blocks only that is in the cache still. */
     for (int64_t first = (rows - 1) / ROWS * ROWS; first >= 0 && rows > 0; first -= ROWS) {
         int64_t row[ROWS]; /* lanes without a row do the last one once more */
-        places places = {.block = block, .output = output};
+        places places = {.block = block, .envelope = envelope, .output = output};
         vec states[MOST_SECTIONS][2 * GROUPS];
         for (int k = 0; k < ROWS; k++) {
             row[k] = least(first + k, rows - 1);

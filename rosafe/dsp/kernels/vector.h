@@ -24,7 +24,7 @@ enum { LANES = 4, STEPS = 2 };
 
 typedef double vec __attribute__((vector_size(8 * LANES)));
 typedef double vec_anywhere __attribute__((vector_size(8 * LANES), aligned(8), may_alias));
-typedef int64_t mask __attribute__((vector_size(8 * LANES)));
+typedef int64_t lanes __attribute__((vector_size(8 * LANES)));
 typedef double duo __attribute__((vector_size(16), aligned(8), may_alias)); /* neighbours in memory */
 typedef double quartet __attribute__((vector_size(32)));
 
@@ -74,7 +74,7 @@ INLINE vec delayed(vec a, const int step) {
     return step == 0 ? __builtin_shufflevector(a, (vec){}, 4, 0, 1, 2) : __builtin_shufflevector(a, (vec){}, 4, 5, 0, 1);
 }
 INLINE vec load_first(const double *from, int64_t n) {
-    return __builtin_ia32_maskloadpd256((const vec *)from, (mask){0, 1, 2, 3} < n);
+    return __builtin_ia32_maskloadpd256((const vec *)from, (lanes){0, 1, 2, 3} < n);
 }
 #endif
 
