@@ -216,8 +216,7 @@ def _record(path: Path | None, options: argparse.Namespace, stopping: threading.
             except ComponentError as problem:
                 raise Failure(problem.why) from None
             finally:
-                if recorder.frames:
-                    meter.message(_summary(recorder, str(path or "heard"), source.sample_rate))
+                meter.message(_summary(recorder, str(path or "heard"), source.sample_rate))
         if ended:
             meter.message(f"{source.name} has ended")
         return 0
@@ -227,7 +226,10 @@ def _record(path: Path | None, options: argparse.Namespace, stopping: threading.
 
 @contextmanager
 def _opened(path: Path | None, options: argparse.Namespace, source: Source) -> Iterator[Output | None]:
-    """The output, if one is wanted; complete at the end, whatever happens. Failure where it cannot be written."""
+    """The output, if one is wanted; complete at the end, whatever happens, or gone where nothing is in it.
+
+    Failure where it cannot be written.
+    """
     if path is None:
         yield None
         return
@@ -237,6 +239,8 @@ def _opened(path: Path | None, options: argparse.Namespace, source: Source) -> I
             yield output
         finally:
             output.close()
+            if not output.frames:
+                path.unlink(missing_ok=True)
     except BrokenPipeError:  # nobody reads the meter any more
         raise
     except OSError as problem:
@@ -254,6 +258,8 @@ def _open_output(path: Path, options: argparse.Namespace, source: Source) -> Out
 
 
 def _summary(recorder: Recorder, name: str, sample_rate: int) -> str:
+    if not recorder.frames:
+        return "nothing was recorded"
     levels = recorder.levels
     peaks = ", ".join(f"{ear} {levels.peak(index):.1f}" for index, ear in enumerate(_EARS))
     return (

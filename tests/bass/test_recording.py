@@ -106,7 +106,7 @@ def test_wav_beyond_4_gib(tmp_path: Path) -> None:
     """A real one, of which most is a hole in the file."""
     file = WavFile(tmp_path / "a.wav", RATE)
     hole = 2**29  # frames
-    file._frames = hole
+    file.frames = hole
     file._file.seek(80 + 8 * hole)
     samples = bags.stream(1000)
     file.write(samples, 0)

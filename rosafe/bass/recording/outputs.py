@@ -20,6 +20,8 @@ BAG_RESERVE = 64 * 2**20  # bytes of the disk that a bag leaves free: what it ne
 class Output(Protocol):
     """A file that grows."""
 
+    frames: int  # in it, lost ones included
+
     def write(self, samples: np.ndarray, time_ns: int) -> None:
         """Append int32 (2, n), the last of which was acquired at `time_ns` since 1970. OSError where it fails."""
 
@@ -48,7 +50,7 @@ class WavFile:
 
     def __init__(self, path: Path, sample_rate: int) -> None:
         self._sample_rate = sample_rate
-        self._frames = 0
+        self.frames = 0
         self._in_header = 0  # frames that the header knows of
         self._file: IO[bytes] = path.open("wb", buffering=0)
         self._write_header()
@@ -59,8 +61,8 @@ class WavFile:
         rest = np.ascontiguousarray(samples.T, "<i4").data.cast("B")
         while rest:
             rest = rest[self._file.write(rest) :]
-        self._frames += samples.shape[1]
-        if self._frames - self._in_header >= HEADER_SECONDS * self._sample_rate:
+        self.frames += samples.shape[1]
+        if self.frames - self._in_header >= HEADER_SECONDS * self._sample_rate:
             self._write_header()
 
     def lose(self, frames: int) -> None:
@@ -71,10 +73,10 @@ class WavFile:
             frames -= count
 
     def _write_header(self) -> None:
-        size = self._frames * self._FRAME
+        size = self.frames * self._FRAME
         whole = self._HEADER - 8 + size
         long = whole > RIFF_LIMIT
-        sizes = struct.pack("<QQQI", whole, size, self._frames, 0) if long else bytes(28)
+        sizes = struct.pack("<QQQI", whole, size, self.frames, 0) if long else bytes(28)
         header = b"".join(
             (
                 struct.pack("<4sI4s", b"RF64" if long else b"RIFF", 2**32 - 1 if long else whole, b"WAVE"),
@@ -84,15 +86,15 @@ class WavFile:
             )
         )
         os.pwrite(self._file.fileno(), header, 0)
-        if not self._frames:
+        if not self.frames:
             self._file.seek(self._HEADER)
-        self._in_header = self._frames
+        self._in_header = self.frames
 
     def close(self) -> None:
         """Cut off what is no whole frame, and complete the header."""
         if not self._file.closed:
-            self._frames = max(0, os.fstat(self._file.fileno()).st_size - self._HEADER) // self._FRAME
-            os.ftruncate(self._file.fileno(), self._HEADER + self._frames * self._FRAME)
+            self.frames = max(0, os.fstat(self._file.fileno()).st_size - self._HEADER) // self._FRAME
+            os.ftruncate(self._file.fileno(), self._HEADER + self.frames * self._FRAME)
             self._write_header()
             self._file.close()
 
@@ -125,6 +127,7 @@ class BagFile:
         self._sample_rate = sample_rate
         self._chunk = frames_per_chunk
         self._topic = topic
+        self.frames = 0
         self._newest = newest
         self._held = 0  # frames of the window that are of this recording
         self._time_ns = 0  # when the newest one was acquired
@@ -149,6 +152,7 @@ class BagFile:
                 self._put()
 
     def _count(self, frames: int) -> None:
+        self.frames += frames
         self._newest += frames
         self._held = min(self._held + frames, self._window.frames)
 
