@@ -67,7 +67,11 @@ class _Topic(topics._PublisherImpl):
         """Take on a subscriber; it gets the latched message."""
         # Messages are written whole, so nothing is gained by keeping back the last bytes of one.
         connection.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        return super().add_connection(_Sender(connection))
+        try:
+            return super().add_connection(_Sender(connection))
+        finally:
+            if self.closed:  # in this very moment; rospy would leave the subscriber waiting
+                connection.close()
 
     def publish(self, message: Any, connection_override: Any = None) -> None:
         """Keep `message` for those who come later, and send it to those who are here (or to one connection)."""
@@ -129,19 +133,20 @@ class _Sender:
             self._turn.notify()
 
     def _run(self) -> None:
-        while True:
-            with self._turn:
-                self._turn.wait_for(lambda: self._waiting or self._connection.done)
-                if self._connection.done:
-                    self._waiting.clear()
-                    return
-                written = self._waiting.popleft()
-            try:
+        try:
+            while True:
+                with self._turn:
+                    self._turn.wait_for(lambda: self._waiting or self._connection.done)
+                    if self._connection.done:
+                        return
+                    written = self._waiting.popleft()
                 self._send(written)
-            except OSError as problem:
-                rospy.logdebug(f"{self._connection.name}: {self._connection.endpoint_id} has left: {problem}")
-                self._connection.close()
-            del written  # it holds on to blocks
+                del written  # it holds on to blocks
+        except OSError as problem:
+            rospy.logdebug(f"{self._connection.name}: {self._connection.endpoint_id} has left: {problem}")
+        finally:
+            self._waiting.clear()
+            self._connection.close()
 
     def _send(self, written: Gather) -> None:
         sock = self._connection.socket
