@@ -52,12 +52,9 @@ classdef dataObject_RosAFE < handle
             dObj.RosAFE = rosAFE;
             dObj.sampleRate = sampleRate;
             dObj.framesPerChunk = framesPerChunk;
-            [chunks, dObj.bufferSize_s_rosAFE_port, dObj.bufferSize_s_rosAFE_getSignal, dObj.bufferSize_s_matlab] = sizes{:};
-            chunks = max(1, floor(chunks * sampleRate / dObj.CHUNK));
-            dObj.acquire = bass.Acquire('-a', inputDevice, sampleRate, dObj.CHUNK, chunks);
-            refuse(dObj.acquire);
-            audio = describe(bass);
-            refuse(rosAFE.connect_port('Audio', [audio.instance '/Audio']));
+            [seconds, dObj.bufferSize_s_rosAFE_port, dObj.bufferSize_s_rosAFE_getSignal, dObj.bufferSize_s_matlab] = ...
+                sizes{:};
+            dObj.acquire = acquireAudio(bass, rosAFE, sampleRate, seconds, dObj.CHUNK, inputDevice);
         end
 
         function signals = get.time(dObj)
@@ -99,10 +96,4 @@ classdef dataObject_RosAFE < handle
             end
         end
     end
-end
-
-function refuse(request)
-if strcmp(request.status, 'error')
-    error('dataObject_RosAFE:refused', 'Error%s', genomix.request.explain(request.exception));
-end
 end

@@ -53,6 +53,16 @@ classdef component < handle
             end
         end
 
+        function names = properties(obj)
+            %PROPERTIES  As fieldnames.
+            names = fieldnames(obj);
+        end
+
+        function yes = isprop(obj, name)
+            %ISPROP  Whether there is a service or port of exactly this name.
+            yes = any(strcmp(name, fieldnames(obj)));
+        end
+
         function about = describe(obj)
             %DESCRIBE  What genomixd tells about the component, its services and ports.
             about = obj.about;

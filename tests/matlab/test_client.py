@@ -32,6 +32,7 @@ def test_components_and_what_is_refused(world: World) -> None:
         show('lines', numel(strfind(text, ': [function_handle]')));
         show('first', ! isempty(strfind(text, '                InputProc: [function_handle]')));
         show('names', fieldnames(rosAFE));
+        show('properties', {numel(properties(rosAFE)), isprop(rosAFE, 'ildPort'), isprop(rosAFE, 'none')});
         show('help', evalc("rosAFE.GammatoneProc('-h')"));
 
         % names: case, aliases, handles
@@ -74,6 +75,7 @@ def test_components_and_what_is_refused(world: World) -> None:
     )
     services, ports = (world.http.get("/describe/rosAFE")[kind] for kind in ("services", "ports"))
     assert told["names"] == [*services, *ports]
+    assert told["properties"] == [len(told["names"]), True, False]
     assert told["lines"] == len(told["names"]) and told["first"]
     assert "unsigned long fb_nChannels: Number of channels; 0: as many as fb_nERBs gives (0)" in told["help"]
     assert told["handle"] == ["function_handle", "done"]

@@ -163,7 +163,7 @@ def test_reuse_changes_and_refusals(world: World) -> None:
     assert told["bad processor"] == "manager_RosAFE:refused Error::rosAFE::e_noSuchProcessor"
     assert told["bad type"].startswith("manager_RosAFE:type")
     assert told["bad count"].startswith("manager_RosAFE:arguments")
-    assert told["bad device"].startswith("dataObject_RosAFE:refused Error::bass::e_device")
+    assert told["bad device"].startswith("acquireAudio:refused Error::bass::e_device")
     assert told["few"].startswith("dataObject_RosAFE:arguments")
     assert told["after"][2:] == [3, 1]
     before, left, size = told["deleted"]

@@ -89,12 +89,7 @@ READER = """
     addpath(genpath('~/openrobots/lib/matlab'));
     [bass, rosAFE, client] = initRosAFE();
     sampleRate = 44100; bufferSize_s_matlab = 10;
-    acquire = bass.Acquire('-a', 'scene:', sampleRate, 2205, sampleRate / 2205);
-    pause(p);
-    if ( strcmp(acquire.status,'error') )
-        error(strcat('Error',acquire.exception.ex));
-    end
-    connection = rosAFE.connect_port('Audio', 'bass/Audio');
+    acquireAudio(bass, rosAFE, sampleRate, 1, 2205, 'scene:');
     thisProc = rosAFE.InputProc('-a', 'input', 4410, 1, 1);
     preProcProc = rosAFE.PreProc('-a', 'preProc', 'input', 0, 5000, 0, 0.97, 0, 500e-3, 0, 10, 0, 'jespen', 1);
     gammatoneProc = rosAFE.GammatoneProc('-a', 'gammatone', 'preProc', 'gammatone', 80, 8000, 1, 8, 0, 4, 1.0180);
@@ -153,9 +148,7 @@ READER = """
     modif = rosAFE.modifyParameter('preProc', 'pp_bLevelScaling', '0');
     kill = rosAFE.removeProcessor('preProc');
     show('status', {modif.status, kill.status, gammatoneProc.wait(5)})
-    rosAFE.Stop(); rosAFE.kill(); delete(rosAFE);
-    bass.Stop(); bass.kill(); delete(bass);
-    delete(client);
+    stopAndKill(bass, rosAFE, client);
 """
 
 
