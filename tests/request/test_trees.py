@@ -364,7 +364,15 @@ def test_arguments_by_name_position_and_structure() -> None:
         assert partial(form) == wanted, form
     assert partial(["ild", "x/y", 4410])["nFramesPerBlock"] == 4410
     assert partial({"representation": "IHC", "pp_refSPLdBS": 90}) == {"representation": "IHC", "pp_refSPLdB": 90.0}
-    assert {p.name for p in interface.REQUEST.parameters} > {"representation", "connect", *VALUES}
+
+
+def test_the_table_knows_every_parameter_of_a_chain_once() -> None:
+    names = [p.name for p in interface.REQUEST.parameters]
+    inputs = [p.name for p in ROSAFE.service("InputProc").parameters if p.name != "name"]
+    own = [p.name for kind in KINDS.values() for p in kind.parameters]
+    assert names == ["representation", "connect", *inputs, *own]
+    assert len({*names}) == len(names)
+    assert interface.REQUEST.parameter("representation").choices == tuple(REPRESENTATIONS)
 
 
 @pytest.mark.parametrize(
