@@ -2,11 +2,8 @@
 
 `message_class` makes a subclass of a generated message class with the same type name, md5 and bytes on the wire,
 whose sample arrays are numpy arrays. Publishers give it arrays (or the pieces of a sliding window); subscribers get
-read-only views of the received buffer:
-
->>> from rosafe.ros import wire                                        # doctest: +SKIP
->>> TimeFrequency = wire.message_class("rosAFE", "::rosAFE::TimeFrequencySignalPortStruct")
->>> rospy.Subscriber("/rosAFE/ildPort/ild", TimeFrequency, lambda m: print(m.left.shape, m.left[:, -1]))
+read-only views of the received buffer. Users of the package name the generated class instead (`array_msg`, see
+docs/subscribers.md).
 
 In such a message `left` and `right` are arrays of shape (frames,), (channels, frames) or (lags, channels, frames)
 instead of the nested `data`, `dataN` and `dataNxN` lists of the generated class. Structs within it are dicts whose
@@ -326,3 +323,17 @@ def response_class(package: str, service: str) -> Any:
     members = (("genom_success", "boolean"), ("genom_exdetail", "string"), *component.service(service).outputs)
     serialize, deserialize = _codec(component, members)
     return type(generated.__name__, (generated,), {"serialize": serialize, "deserialize": deserialize})
+
+
+def array_srv(generated: Any) -> Any:
+    """The service class to call in place of a generated one whose response holds signals, such as `getSignals`.
+
+    Raises
+    ------
+    TypeError
+        For anything that is no service class of rosAFE or bass.
+    """
+    package, _, name = str(getattr(generated, "_type", "")).partition("/")
+    if not hasattr(generated, "_response_class") or package not in interface.COMPONENTS:
+        raise TypeError(f"{generated!r} is no service class of rosAFE or bass")
+    return type(generated.__name__, (generated,), {"_response_class": response_class(package, name)})

@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 import rosAFE.msg
+import rosAFE.srv
 import rospy
 
 from rosafe.interface import KINDS, ROSAFE, ros_type
-from rosafe.ros import wire
+from rosafe.ros import array_srv, wire
 from tests.harness import wait_for
 from tests.ros.session import RATE, Session, assert_holds, ears, expected, noise, windowed
 
@@ -299,6 +300,22 @@ def test_signals_follow_the_order_of_the_parameters(afe: Session) -> None:
     afe.ok("GammatoneProc", name="a", fb_nChannels=5)
     assert afe.processors()["gammatone"] == ["b", "c", "a"]
     assert [s.numberOfChannels for s in afe.ok("getSignals").signals.gammatone] == [2, 4, 5]
+
+
+def test_signals_as_arrays(afe: Session) -> None:
+    microphone = afe.build("PreProc", "GammatoneProc", block=BLOCK, fb_nChannels=2)
+    signal = noise(BLOCK)
+    microphone.play(signal)
+    afe.read("gammatone", BLOCK + 1)
+    response = rospy.ServiceProxy("/rosAFE/getSignals", array_srv(rosAFE.srv.getSignals))()
+    assert response.genom_success
+    truth = expected(signal, BLOCK, {"fb_nChannels": 2})
+    (message,) = response.signals.gammatone
+    np.testing.assert_array_equal(message.left, truth["gammatone"][0])
+    np.testing.assert_array_equal(response.signals.preProc[0].right, truth["preProc"][1])
+    for wrong in (rosAFE.msg.rosAFE_dataObjSt, None, rosAFE.srv.getSignalsRequest):
+        with pytest.raises(TypeError):
+            array_srv(wrong)
 
 
 def test_two_clients_share_what_is_new(afe: Session) -> None:
