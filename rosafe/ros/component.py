@@ -6,8 +6,10 @@ rules come from the interface table.
 
 from __future__ import annotations
 
+import ctypes
 import hashlib
 import importlib
+import itertools
 import os
 import re
 import threading
@@ -34,6 +36,7 @@ BACKLOG = 128  # connections that wait to be accepted
 STATE_PERIOD = 0.9  # seconds between two genom_state messages at the most; the contract is 1
 BURST_SECONDS = 0.005  # what changes within this makes one message, not one each
 DIAGNOSTICS_PERIOD = 1.0
+TRIM_ROUNDS = 20  # of diagnostics between two times that freed memory is given back to the system
 UP_SECONDS = 10.0  # until the master knows a node that starts
 STOP_WAIT = 2.0  # seconds that Stop waits for what it ends
 ACCEPT_SECONDS = 0.5  # a goal is accepted once its activity runs, or after this
@@ -306,8 +309,11 @@ class ComponentNode:
             self.finished.wait(BURST_SECONDS)
 
     def _publish_diagnostics(self) -> None:
+        rounds = itertools.count(1)
         while not self.finished.wait(DIAGNOSTICS_PERIOD):
             self.diagnostics.force_update()  # `update` would ask the master for the period, and fail without one
+            if next(rounds) % TRIM_ROUNDS == 0:
+                _give_back_memory()
 
     def _state_message(self) -> Any:
         msg = self._msg
@@ -337,6 +343,13 @@ _DATE = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(os.path.getmtime(interfa
 def _digest(component: interface.Component) -> str:
     """A fingerprint of the interface, 32 hex digits."""
     return hashlib.md5(re.sub(r" at 0x\w+", "", repr(component)).encode()).hexdigest()
+
+
+def _give_back_memory() -> None:
+    """Return to the system what is free: where large and small pieces have come and gone, the C library keeps holes."""
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc has it
+    if trim is not None:
+        trim(0)
 
 
 def _lengthen_backlog() -> None:

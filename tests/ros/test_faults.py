@@ -67,6 +67,9 @@ def test_bass_is_killed_and_comes_back(graph: Graph) -> None:
     """Nothing but a new Acquire is needed; the index begins anew, and so do the blocks."""
     with own_node(graph) as afe:
         with graph.node("bass-ros") as bass:
+            with graph.collect("/bass/Audio") as audio, graph.collect("/own/inputProcPort") as blocks:
+                afe.wait_activities([])
+            assert (audio, blocks) == ([], []), "advertised, and silent until somebody asks"
             assert graph.call("/bass/Acquire", device="scene:", sampleRate=20000, nFramesPerChunk=1000).genom_success
             afe.ok("connect_port", local="Audio", remote="bass/Audio")
             afe.ok("InputProc", nFramesPerBlock=BLOCK)

@@ -1,0 +1,104 @@
+"""docs/hosts.md: two instances on one machine, as typed there; and two machines, here two network namespaces."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+import signal
+import subprocess
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import pytest
+
+from tests.harness import PYTHON, ROOT, SCRIPTS, Graph, MasterProcess, wait_for
+
+# Builds a tree on /far and prints the first lastFrameIndex that is not 0.
+CLIENT = """
+import rospy, rosAFE.srv, bass.srv
+from rosAFE.msg import rosAFE_TimeDomainSignalPortStruct as Message
+rospy.init_node("client")
+def call(package, name, **fields):
+    answer = rospy.ServiceProxy(name, getattr(package.srv, name.split("/")[-1]))(**fields)
+    assert answer.genom_success, (name, answer)
+call(bass, "/bass/Acquire", device="scene:", nChunksOnPort=4)
+call(rosAFE, "/far/connect_port", local="Audio", remote="/bass/Audio")
+call(rosAFE, "/far/InputProc", nFramesPerBlock=2205)
+call(rosAFE, "/far/PreProc")
+heard = []
+rospy.Subscriber("/far/preProcPort/preProc", Message, heard.append)
+while not heard or heard[-1].lastFrameIndex == 0:
+    rospy.sleep(0.02)
+print("heard", heard[-1].lastFrameIndex)
+"""
+
+
+def test_two_instances_as_in_the_document(graph: Graph) -> None:
+    text = (ROOT / "docs" / "hosts.md").read_text("utf-8")
+    (block,) = re.findall(r"```sh\n(.*?)```", text, re.DOTALL)
+    script = f"set -e\n{block}".replace("roscore & ", "")  # there is a master, and not where everybody's is
+    with graph.start("bash", "-c", f"{script}\nwait", cwd=ROOT) as shell:
+        try:
+            wait_for(lambda: "/right/preProcPort/preProc" in shell.out or not shell.alive, 60, lambda: str(shell))
+            assert {"/left/preProcPort/preProc", "/right/preProcPort/preProc"} == set(shell.out.split()[-2:])
+            assert shell.out.count("genom_success: True") == 7
+        finally:
+            for name in ("left", "right", "bass"):  # those in the background are in sessions of their own
+                assert graph.call(f"/{name}/kill").genom_success
+        assert shell.wait() == 0
+    wait_for(lambda: not {"/left", "/right", "/bass"} & graph.nodes())
+
+
+@dataclass
+class Net:
+    """A second host: a network namespace, and an address on either side."""
+
+    name: str
+    near: str
+    far: str
+
+
+@pytest.fixture
+def net() -> Iterator[Net]:
+    """Two hosts with a cable between them; skipped where that is not allowed."""
+    if shutil.which("ip") is None or os.geteuid() != 0:
+        pytest.skip("network namespaces need root and the command ip")
+    number = os.getpid() % 250
+    net = Net(f"rosafe{os.getpid()}", f"10.213.{number}.1", f"10.213.{number}.2")
+    inside = f"netns exec {net.name} ip"
+    commands = [
+        f"netns add {net.name}",
+        f"link add vn{number} type veth peer name vf{number} netns {net.name}",
+        f"addr add {net.near}/24 dev vn{number}",
+        f"link set vn{number} up",
+        f"{inside} addr add {net.far}/24 dev vf{number}",
+        f"{inside} link set vf{number} up",
+        f"{inside} link set lo up",
+    ]
+    try:
+        for command in commands:
+            done = subprocess.run(["ip", *command.split()], capture_output=True, text=True, check=False)
+            if done.returncode:
+                pytest.skip(f"no network namespaces here: ip {command}: {done.stderr.strip()}")
+        yield net
+    finally:
+        subprocess.run(["ip", "netns", "del", net.name], capture_output=True, check=False)  # the cable goes with it
+
+
+def test_two_machines(net: Net, tmp_path: Path) -> None:
+    """The master and bass are near, rosAFE is far; a client is near, and hears what is computed far."""
+    master = MasterProcess()
+    graph = Graph(f"http://{net.near}:{master.port}", tmp_path)
+    graph.env["ROS_IP"] = net.near
+    try:
+        master.start(graph.env)
+        far = ["ip", "netns", "exec", net.name, str(SCRIPTS / "rosAFE-ros"), "-i", "far"]
+        with graph.node("bass-ros"), graph.start(*far, ROS_IP=net.far) as process:
+            wait_for(lambda: "/far/kill" in graph.services() or not process.alive, 30, lambda: str(process))
+            heard = graph.run(PYTHON, "-c", CLIENT).stdout.split()
+            assert heard[0] == "heard" and (int(heard[1]) - 1) % 2205 == 0
+            assert process.stop(signal.SIGTERM) == 0
+    finally:
+        master.kill()
