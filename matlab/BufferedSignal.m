@@ -2,8 +2,8 @@ classdef BufferedSignal < handle
 %BUFFEREDSIGNAL  The newest seconds of one representation of one ear, oldest first.
 %
 %   TimeDomainSignal (samples), TimeFrequencySignal (frames by channels) and CorrelationSignal (frames by channels by
-%   lags) are made of it. They offer what the original's examples use of the signals of Two!Ears' MATLAB front-end; where
-%   that is ahead on the path, its own classes serve.
+%   lags) are made of it. They offer what the original's examples use of the signals of Two!Ears' MATLAB front-end;
+%   where that is ahead on the path, its own classes serve.
 
     properties (SetAccess = private)
         Name          % of the representation: 'filterbank'

@@ -4,8 +4,8 @@ function [chunkLeft, chunkRight] = adaptTFS(framesOnPort, numberOfChannels, left
 %   chunkLeft = adaptTFS(framesOnPort, numberOfChannels, left, 0)
 %   [chunkLeft, chunkRight] = adaptTFS(framesOnPort, numberOfChannels, left, 1, right)
 %
-%   LEFT and RIGHT are those of a port, such as out.ildPort.left, also of one read with '-m'. The order (..., left, right,
-%   isBinaural) of older scripts is understood too.
+%   LEFT and RIGHT are those of a port, such as out.ildPort.left, also of one read with '-m'. The order (..., left,
+%   right, isBinaural) of older scripts is understood too.
 
 if nargin == 5 && ~(isscalar(isBinaural) && (isnumeric(isBinaural) || islogical(isBinaural)))
     [isBinaural, right] = deal(right, isBinaural);

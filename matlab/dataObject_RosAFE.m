@@ -40,8 +40,8 @@ classdef dataObject_RosAFE < handle
         function dObj = dataObject_RosAFE(bass, rosAFE, inputDevice, sampleRate, framesPerChunk, bufferSize_s_bass, ...
                 bufferSize_s_rosAFE_port, bufferSize_s_rosAFE_getSignal, bufferSize_s_matlab)
             if nargin < 5
-                error('dataObject_RosAFE:arguments', ...
-                    'dataObject_RosAFE takes bass, rosAFE, inputDevice, sampleRate, framesPerChunk, and four buffer sizes');
+                error('dataObject_RosAFE:arguments', ['dataObject_RosAFE takes bass, rosAFE, inputDevice, ' ...
+                    'sampleRate, framesPerChunk, and up to four buffer sizes']);
             end
             sizes = {1, 1, 0.5, 10};
             if nargin > 5, sizes{1} = bufferSize_s_bass; end

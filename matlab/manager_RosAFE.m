@@ -50,8 +50,8 @@ classdef manager_RosAFE < handle
             %ADDPROCESSOR  Have a representation computed: sOut = mObj.addProcessor(request, p)
             %
             %   P is a struct of parameters that are not the defaults, of the representation and of all that it depends
-            %   on. REQUEST and P may be cell arrays, for several at once. SOUT is a row of the data object, a signal for
-            %   each ear.
+            %   on. REQUEST and P may be cell arrays, for several at once. SOUT is a row of the data object, a signal
+            %   for each ear.
             if nargin < 3
                 p = [];
             end
@@ -136,7 +136,7 @@ classdef manager_RosAFE < handle
         end
 
         function modifyParameter(mObj, procName, paramName, newValue)
-            %MODIFYPARAMETER  Change a parameter of a processor, by the processor's name; the value is a text or a number.
+            %MODIFYPARAMETER  Change a parameter of a processor, by the processor's name, to a text or a number.
             if ~ischar(newValue)
                 newValue = sprintf('%.17g ', newValue);
             end
@@ -302,7 +302,8 @@ elseif numel(request) == 1
     request = repmat(request, size(p));
 end
 if numel(request) ~= numel(p)
-    error('manager_RosAFE:arguments', 'there are %d requests and %d structures of parameters', numel(request), numel(p));
+    error('manager_RosAFE:arguments', 'there are %d requests and %d structures of parameters', numel(request), ...
+        numel(p));
 end
 requests = request;
 parameters = p;

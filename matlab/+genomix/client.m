@@ -29,7 +29,7 @@ classdef client < handle
         end
 
         function component = load(obj, component, varargin)
-            %LOAD  A component that runs, as an object with its services and ports: load(name), load(name, '-i', instance)
+            %LOAD  A component that runs, as a genomix.component: load(name), load(name, '-i', instance)
             if nargin > 1
                 component = genomix.wire.chars(component);
             end

@@ -6,10 +6,10 @@ classdef component < handle
 %   r = rosAFE.GammatoneProc(struct('fb_nChannels', 16))
 %   p = rosAFE.ildPort('ild')
 %
-%   A service takes its arguments by position, or as one struct by name; what is missing takes its default. It returns a
-%   genomix.request when it is done, with '-a' as the first argument as soon as it is acknowledged. A port returns a struct
-%   with one field of its name. With '-m', sequences of numbers are matrices and no cell arrays. '-h' prints what there is
-%   to know about a service or port. Upper and lower case do not matter where there is no doubt.
+%   A service takes its arguments by position, or as one struct by name; what is missing takes its default. It returns
+%   a genomix.request when it is done, with '-a' as the first argument as soon as it is acknowledged. A port returns a
+%   struct with one field of its name. With '-m', sequences of numbers are matrices and no cell arrays. '-h' prints what
+%   there is to know about a service or port. Upper and lower case do not matter where there is no doubt.
 %
 %   genomix.client/load makes components. delete(component) forgets one, and leaves it running.
 
@@ -26,7 +26,7 @@ classdef component < handle
 
         function varargout = subsref(obj, s)
             if ~strcmp(s(1).type, '.')
-                error('genomix:component', 'a component has services and ports: %s.%s(...)', obj.about.name, 'getParameters');
+                error('genomix:component', 'a component has services and ports: rosAFE.getParameters()');
             end
             called = numel(s) > 1 && strcmp(s(2).type, '()');
             if strcmp(s(1).subs, 'delete')
