@@ -326,7 +326,8 @@ async def _package(graph: Graph, instance: str) -> str:
         except ComponentError as no_master:
             problem = no_master
         except (Refused, OSError) as failure:
-            problem = middleware_error(f"{instance} is not running, though the master lists it ({failure})")
+            why = str(failure) or "no answer"
+            problem = middleware_error(f"{instance} is not running, though the master lists it ({why})")
         if asyncio.get_running_loop().time() > deadline:
             raise problem
         await asyncio.sleep(POLL_SECONDS)
