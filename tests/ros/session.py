@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 import json
 import threading
+import xmlrpc.client
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any
@@ -12,6 +13,7 @@ from typing import Any
 import actionlib
 import numpy as np
 import rosAFE.msg
+import rosgraph
 import rospy
 from actionlib import CommState
 
@@ -171,6 +173,12 @@ class Session:
         with self.graph.collect(self.topic(kind, name), message_class) as messages:
             wait_for(lambda: messages, what=f"a message on {self.topic(kind, name)}")
             yield messages
+
+    def connections(self, topic: str) -> int:
+        """How many subscribers of one of its topics the node knows."""
+        address = rosgraph.Master("/test", master_uri=self.graph.uri).lookupNode(f"/{self.name}")
+        answer: Any = xmlrpc.client.ServerProxy(address).getBusInfo("/test")
+        return sum(entry[4] == topic for entry in answer[2])
 
     # --- state ---
 

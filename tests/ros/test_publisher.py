@@ -210,13 +210,6 @@ def resident(pid: int) -> float:
     return int(proc(pid, "statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
-def connections(session: Session, topic: str) -> int:
-    """How many subscribers of a topic the node knows."""
-    address = rosgraph.Master("/test", master_uri=session.graph.uri).lookupNode(f"/{session.name}")
-    answer: Any = xmlrpc.client.ServerProxy(address).getBusInfo("/test")
-    return sum(entry[4] == topic for entry in answer[2])
-
-
 LISTENER = """
 import sys, rospy
 from rosAFE.msg import rosAFE_TimeFrequencySignalPortStruct as TimeFrequency
@@ -235,7 +228,7 @@ def test_a_stopped_subscriber_of_22_megabytes_costs_nobody_anything(tree: Sessio
         tree.graph.start(PYTHON, "-u", "-c", LISTENER, "killed", large) as killed,
     ):
         wait_for(lambda: going.out and killed.out, 20.0, what="the latched message")
-        assert connections(tree, large) == 2
+        assert tree.connections(large) == 2
         play(tree, 2)
         for subscriber in (going, killed):
             os.kill(subscriber.pid, signal.SIGSTOP)
@@ -246,7 +239,7 @@ def test_a_stopped_subscriber_of_22_megabytes_costs_nobody_anything(tree: Sessio
         os.kill(killed.pid, signal.SIGKILL)
         os.kill(going.pid, signal.SIGCONT)
         wait_for(lambda: going.out.split()[-1] == str(index), 20.0, lambda: f"{index} in {going}")
-        wait_for(lambda: connections(tree, large) == 1, 20.0)
+        wait_for(lambda: tree.connections(large) == 1, 20.0)
         came = [int(line) for line in going.out.split()]
         assert came == sorted(came) and len(came) < 15, "it did not get what came meanwhile"
         assert tree.read("gammatone").lastFrameIndex == index

@@ -84,6 +84,14 @@ def test_a_real_run_shows_parents_children_and_siblings_at_work_at_once(afe: Ses
     afe.ok("getParameters")
 
 
+def test_a_trace_that_is_killed_is_over_for_the_node_too(afe: Session) -> None:
+    afe.build("PreProc")
+    with afe.graph.start(str(SCRIPTS / "rosafe"), "trace") as command:
+        wait_for(lambda: afe.connections("/rosAFE/trace") == 1, 20.0)
+        command.stop(signal.SIGKILL)
+    wait_for(lambda: afe.connections("/rosAFE/trace") == 0)
+
+
 def test_a_node_without_processors_and_no_node(afe: Session, tmp_path: Path) -> None:
     env: Any = {name: afe.graph.env[name] for name in ("ROS_MASTER_URI", "ROS_IP", "HOME")}
     there = tmp_path / "there.json"
