@@ -35,6 +35,7 @@ class BassNode:
         self._snapshot: Snapshot | None = None
         self._source: Source | None = None  # of the acquisition under way
         self._last_end = self._last_loss = "none"
+        self._log_loss = EventLog(rospy.logwarn)
         self._printing = threading.Lock()
 
         self._node.activity("Acquire", self._acquire)
@@ -57,7 +58,7 @@ class BassNode:
         # Whatever can fail comes before the running acquisition ends, so that a mistake leaves that as it is.
         source = self._open(activity, device, values["sampleRate"], frames_per_chunk)
         try:
-            capture = Capture(source, frames_per_chunk, chunks, self._publish, EventLog(rospy.logwarn))
+            capture = Capture(source, frames_per_chunk, chunks, self._publish, self._note_loss)
             activity.interrupt_others()
             activity.raise_if_interrupted()
             self._source = source
@@ -89,7 +90,7 @@ class BassNode:
 
     def _note_loss(self, text: str) -> None:
         self._last_loss = text
-        rospy.logwarn(text)
+        self._log_loss(text)
 
     def _publish(self, snapshot: Snapshot) -> None:
         self._snapshot = snapshot

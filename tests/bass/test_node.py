@@ -17,6 +17,7 @@ from rosafe.bass.sources import libasound
 from rosafe.bass.sources.scene import Scene
 from rosafe.interface import ComponentError
 from rosafe.ros import wire
+from tests.bass import bags
 from tests.harness import Graph, Process, free_port, run_together, wait_for
 
 RATE, CHUNK, CHUNKS = 8000, 400, 4
@@ -239,6 +240,30 @@ def test_health(graph: Graph, bass_node: Process) -> None:
     values = capturing(graph.message("/diagnostics", accept=lambda m: capturing(m) is not None, timeout=20))
     assert values is not None
     assert (values["device"], values["lost frames"], values["overruns"]) == ("scene:", "0", "0")
+
+
+def test_loss_in_the_window_the_log_and_diagnostics(graph: Graph, bass_node: Process, tmp_path: Path) -> None:
+    samples = bags.stream(4000)
+    indexes = (0, 400, 800, 2400, 2800, 3200)  # the window of 2400 begins with frame 2001
+    bags.write(tmp_path / "a.bag", [bags.message(samples, index, 400, RATE, 400) for index in indexes])
+    with graph.collect("/bass/Audio", audio_class()) as messages:
+        assert acquire(graph, f"bag:{tmp_path / 'a.bag'}?loop=1", chunks=8).genom_success
+        wait_for(lambda: messages and messages[-1].lastFrameIndex >= 3200)
+        window = next(message for message in messages if message.lastFrameIndex >= 3200)
+    samples[:, 800:2000] = 0
+    shown = np.stack((window.left, window.right))[:, : 3200 + 3200 - window.lastFrameIndex]
+    assert np.array_equal(shown, samples[:, 3200 - shown.shape[1] : 3200])
+    wait_for(lambda: "lost 1200 frames (0.150 s) after frame 800 (0.10 s)" in bass_node.err)
+
+    def warned(message: Any) -> bool:
+        return any(
+            status.name == "bass: capture"
+            and status.level == status.WARN
+            and "lost 1200 frames" in {pair.key: pair.value for pair in status.values}["last loss"]
+            for status in message.status
+        )
+
+    graph.message("/diagnostics", accept=warned, timeout=20)
 
 
 def request(connection: socket.socket, count: int, first: int) -> tuple[int, int, int, np.ndarray]:

@@ -84,7 +84,11 @@ class TopicSource:
         end = time.monotonic() + (FIRST_SECONDS if published else NOBODY_SECONDS)
         while not self._arrived.wait(POLL_SECONDS) and not self._stopping.is_set():
             if time.monotonic() > end:
-                what = "has published nothing: call Acquire" if published else "is published by nobody: start bass-ros"
+                what = (
+                    "has published nothing: call Acquire of its bass"
+                    if published
+                    else "is published by nobody: start bass-ros"
+                )
                 raise device_error(f"{self.name} {what}, or record a --device without ROS")
         if self._first is None:
             raise device_error(f"{self.name}: interrupted before a first message came")
