@@ -97,7 +97,8 @@ def one_core(block: int, rounds: int) -> dict[str, Any]:
 def two_cores(block: int, rounds: int, seconds: int = 10) -> dict[str, Any]:
     """The threaded tree on all outputs of `rosafe.process` against the yardstick on one core, by the wall clock."""
     signal = sound(seconds * RATE)
-    steps, kept = plain(RATE), {}
+    steps = plain(RATE)
+    kept: dict[str, Any] = {}
     times: dict[str, list[float]] = {"yardstick": [], "rosafe": []}
     for _ in range(rounds):
         begin = time.perf_counter()
@@ -134,7 +135,7 @@ def machine() -> dict[str, Any]:
         "python": platform.python_version(),
         "numpy": np.__version__,
         "scipy": scipy.__version__,
-        "kernels": kernels.status().detail.partition(",")[0],
+        "kernels": kernels.status().detail.partition(";")[0],
     }
 
 
@@ -150,9 +151,13 @@ def main() -> int:
     if not options.quick:
         measured["two cores"] = {str(block): apart(two_cores, block, options.rounds) for block in BLOCKS}
         measured["configurations"] = configurations.measure()
+        measured["small blocks (us)"] = configurations.small_blocks()
         measured["first block (s)"] = configurations.first_block()
         measured["memory (MB)"] = configurations.memory()
-        measured["silence over sound"] = configurations.silence()
+        measured["silence over sound"] = {
+            "kernels": apart(configurations.silence, "kernels"),
+            "twins": apart(configurations.silence, "twins", ("default",)),
+        }
     text = report.as_markdown(measured)
     print(text)
     if not options.quick:

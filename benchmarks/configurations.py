@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import math
+import os
 import subprocess
 import sys
 import time
 import tracemalloc
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from rosafe.dsp import STAGES, InnerHairCell, Stage
+from rosafe.dsp import STAGES, Filterbank, InnerHairCell, Stage
 from rosafe.dsp.haircell import METHODS
 
 RATE = 44100
@@ -27,32 +30,46 @@ class Case(NamedTuple):
     channels: int = 31
     rate: int = RATE
     block: int = BLOCK
-    times: float = 1.0  # units of work for one of `kind`'s default configuration: what it may cost in proportion
+    times: float = 1.0  # units of work for one of the default configuration: what it should cost in proportion
+
+
+# What a unit of work is; times are in proportion to it.
+UNITS = {
+    "gammatone": "a sample of eight rows (an ear's channel each; so many are filtered at a time) through four poles",
+    "ihc": "a sample of eight rows; with a power (bernstein), four of them",
+    "ild": "a sample, or its product with a window where there are more than two of them",
+    "ratemap": "a sample, or its product with a window where there are more than two of them",
+    "crossCorrelation": "a product of two samples of a frame; a sample's window costs as much as thirty",
+}
+ROWS_AT_ONCE = 8
+WINDOWING = 30
 
 
 def cases() -> list[Case]:
     """What is measured; the first of each kind is the default."""
     found = []
-    for kind in ("gammatone", "ihc", "ild", "ratemap", "crossCorrelation"):
+    for kind in UNITS:
         found.append(Case(kind, "default", {}))
         found += [
-            Case(kind, f"{n} channels", _channels(kind, n), n, times=n / 31) for n in (1, 2, 3, 4, 8, 16, 64, 128, 256)
+            Case(kind, f"{n} channels", _channels(kind, n), n, times=_rows(kind, n))
+            for n in (1, 2, 3, 4, 8, 16, 64, 128, 256)
         ]
-        for rate in (16000, 48000):
+        for rate in (16000, 48000, 96000, 192000):
             found.append(Case(kind, f"{rate} Hz", _rate(kind, rate), rate=rate, times=_work(kind, rate)))
-        found += [Case(kind, f"blocks of {n}", {}, block=n) for n in (441, 882, 4096, 44100)]
+        found += [Case(kind, f"blocks of {n}", {}, block=n) for n in (882, 4096, 44100)]
     found += [Case("gammatone", f"{n} poles", {"fb_nGamma": n}, times=max(n, 4) / 4) for n in (1, 2, 5, 8, 16, 64)]
-    found += [Case("ihc", method, {"ihc_method": method}) for method in METHODS]
+    found += [Case("ihc", m, {"ihc_method": m}, times=4 if m == "bernstein" else 1) for m in METHODS]
     for prefix, kind in (("ild", "ild"), ("rm", "ratemap"), ("cc", "crossCorrelation")):
         for size, hop in ((20, 1), (20, 5), (20, 7), (20, 15), (20, 50), (5, 2), (100, 50), (500, 10)):
             parameters = {f"{prefix}_wSizeSec": size / 1000, f"{prefix}_hSizeSec": hop / 1000}
-            found.append(Case(kind, f"{size} ms every {hop} ms", parameters, times=max(1, size / hop / 2)))
+            products = size / hop / 2
+            times = products if kind == "crossCorrelation" else max(1, products)
+            found.append(Case(kind, f"{size} ms every {hop} ms", parameters, times=times))
         found.append(Case(kind, "blackman", {f"{prefix}_wname": "blackman"}))
     found.append(Case("ratemap", "magnitude", {"rm_scaling": "magnitude"}))
     for delay in (0.02, 0.1, 0.5, 2, 5, 10, 15, 20):
-        lags = 2 * np.ceil(delay / 1000 * RATE) + 1
         parameters = {"cc_maxDelaySec": delay / 1000}
-        found.append(Case("crossCorrelation", f"{lags:.0f} lags", parameters, times=max(1, lags / 99)))
+        found.append(Case("crossCorrelation", f"{_lags(delay, RATE)} lags", parameters, times=_products(delay, RATE)))
     return found
 
 
@@ -64,9 +81,25 @@ def _rate(kind: str, rate: int) -> dict[str, Any]:
     return {"fb_highFreqHz": 7000.0} if kind == "gammatone" and rate == 16000 else {}
 
 
+def _rows(kind: str, channels: int) -> float:
+    """Rows for those of the default; filters of whole registers."""
+    if kind not in ("gammatone", "ihc"):
+        return channels / 31
+    registers, default = (-(-2 * n // ROWS_AT_ONCE) for n in (channels, 31))
+    return registers / default
+
+
+def _lags(delay: float, rate: int) -> int:
+    return 2 * math.ceil(delay / 1000 * rate) + 1
+
+
+def _products(delay: float, rate: int) -> float:
+    return (_lags(delay, rate) + WINDOWING) / (_lags(1.1, RATE) + WINDOWING)
+
+
 def _work(kind: str, rate: int) -> float:
-    """Samples per second; for the correlation, times lags."""
-    return (rate / RATE) ** (2 if kind == "crossCorrelation" else 1)
+    """Samples per second; for the correlation, with all their products."""
+    return rate / RATE * (_products(1.1, rate) if kind == "crossCorrelation" else 1)
 
 
 def measure() -> dict[str, Any]:
@@ -80,23 +113,45 @@ def measure() -> dict[str, Any]:
 
 
 def _cost(case: Case) -> float:
-    stage = STAGES[case.kind](case.rate, **case.parameters)
-    rng = np.random.default_rng(0)
-    shape = (2, case.block) if case.kind == "gammatone" else (2, case.channels, case.block)
-    block = rng.standard_normal(shape)
-    times = []
+    step, block = _prepared(case)
+    times: list[float] = []
     enough = time.perf_counter() + 0.4
     while len(times) < 5 or (time.perf_counter() < enough and len(times) < 200):
         begin = time.thread_time()
-        _process(stage, block)
+        step(block)
         times.append(time.thread_time() - begin)
     return float(np.median(times[2:])) * 1000 * case.rate / case.block
 
 
-def _process(stage: Stage, block: np.ndarray) -> np.ndarray:
+def _prepared(case: Case) -> tuple[Callable[[np.ndarray], Any], np.ndarray]:
+    stage = STAGES[case.kind](case.rate, **case.parameters)
+    shape = (2, case.block) if case.kind == "gammatone" else (2, case.channels, case.block)
+    block = np.random.default_rng(0).standard_normal(shape)
     if isinstance(stage, InnerHairCell) and stage.needs_envelope:
-        return stage.process(block, np.abs(block))
-    return stage.process(block)
+        hair_cell, envelope = stage, np.abs(block)
+        return lambda block: hair_cell.process(block, envelope), block
+    return stage.process, block
+
+
+SMALL_BLOCKS = (1, 20, 50, 100, 200, 400, 800)
+
+
+def small_blocks() -> dict[str, dict[str, float]]:
+    """Microseconds of a block of so many samples, for each stage: a fixed part, and one that grows as they do."""
+    result: dict[str, dict[str, float]] = {}
+    for kind in UNITS:
+        found = result.setdefault(kind, {})
+        for size in SMALL_BLOCKS:
+            step, block = _prepared(Case(kind, "", {}, block=size))
+            blocks = max(200, 40 * 441 // size)  # a mean over many frames: most small blocks complete none
+            means = []
+            for _ in range(5):
+                begin = time.thread_time()
+                for _ in range(blocks):
+                    step(block)
+                means.append((time.thread_time() - begin) / blocks)
+            found[str(size)] = float(np.median(means)) * 1e6
+    return result
 
 
 # --- the rest ---
@@ -132,10 +187,13 @@ def _chain() -> dict[str, Stage]:
     return {kind: stage(RATE) for kind, stage in STAGES.items()}
 
 
-def _through(stages: dict[str, Stage], block: np.ndarray) -> None:
+def _through(stages: dict[str, Stage], block: Any) -> None:
     taken = block
+    hair_cell, filterbank = stages["ihc"], stages["gammatone"]
+    assert isinstance(hair_cell, InnerHairCell) and isinstance(filterbank, Filterbank)
+    filterbank.provide_envelope = hair_cell.needs_envelope
     for kind, stage in stages.items():
-        out = stage.process(taken)
+        out = hair_cell.process(taken, filterbank.envelope) if stage is hair_cell else stage.process(taken)
         if kind in ("input", "preProc", "gammatone", "ihc"):
             taken = out
 
@@ -149,7 +207,7 @@ def memory() -> dict[str, float]:
         _through(stages, block)
     held = tracemalloc.get_traced_memory()[0]
     peaks = []
-    taken = block
+    taken: Any = block
     for kind, stage in stages.items():
         before = tracemalloc.get_traced_memory()[0]
         tracemalloc.reset_peak()
@@ -161,17 +219,34 @@ def memory() -> dict[str, float]:
     return {"state": held / 1e6, "scratch": max(peaks) / 1e6}
 
 
-def silence() -> float:
-    """What silence after sound costs, for what sound costs."""
-    stages = _chain()
+# Chains whose filters have tails: everything that can be chosen in a filter's place.
+TAILS: dict[str, dict[str, dict[str, Any]]] = {
+    "default": {},
+    **{f"ihc_method {method}": {"ihc": {"ihc_method": method}} for method in METHODS},
+    "drnl": {"gammatone": {"fb_type": "drnl"}},
+    "pp_bRemoveDC": {"preProc": {"pp_bRemoveDC": True}},
+    "pp_bNormalizeRMS": {"preProc": {"pp_bNormalizeRMS": True}},
+    "pp_bMiddleEarFiltering": {"preProc": {"pp_bMiddleEarFiltering": True}},
+}
+
+
+def silence(implementation: str, names: Sequence[str] = tuple(TAILS)) -> dict[str, float]:
+    """What silence after sound costs, for what sound costs; the first blocks, in which the filters decay, count."""
+    os.environ["ROSAFE_KERNELS"] = "0" if implementation == "twins" else "4"
     noise = (np.random.default_rng(0).standard_normal((2, BLOCK)) * 2e8).astype(np.int32)
-    spent = {}
-    for name, block in (("sound", noise), ("silence", np.zeros_like(noise))):
-        times = []
-        for _ in range(20):
-            begin = time.thread_time()
-            _through(stages, block)
-            times.append(time.thread_time() - begin)
-        # of silence, the first blocks are the ones that decay: all count
-        spent[name] = float(np.mean(times[:10]) if name == "silence" else np.median(times[2:]))
-    return spent["silence"] / spent["sound"]
+    result = {}
+    for name in names:
+        stages = {kind: stage(RATE, **TAILS[name].get(kind, {})) for kind, stage in STAGES.items()}
+        ratios = []
+        for _ in range(5):
+            sound = [_timed(stages, noise) for _ in range(8)]
+            still = [_timed(stages, np.zeros_like(noise)) for _ in range(8)]
+            ratios.append(np.mean(still) / np.mean(sound[2:]))
+        result[name] = float(np.median(ratios))
+    return result
+
+
+def _timed(stages: dict[str, Stage], block: np.ndarray) -> float:
+    begin = time.thread_time()
+    _through(stages, block)
+    return time.thread_time() - begin

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
+import configurations
+
 
 def _table(head: list[str], rows: list[list[str]]) -> list[str]:
     return [
@@ -26,10 +28,8 @@ def as_markdown(measured: dict[str, Any]) -> str:
         lines += ["## Two cores (the threaded tree; wall clock)", ""]
         rows = [[f"blocks of {block}", *_times(times)] for block, times in measured["two cores"].items()]
         lines += _table(["", "yardstick, one core", "rosafe", "times as fast"], rows)
-        lines += ["## Other configurations", "", "Cost per unit of work is against the default's.", ""]
-        for kind, found in measured["configurations"].items():
-            rows = [[text, f"{cost['ms']:.2f}", f"{cost['per unit']:.2f}"] for text, cost in found.items()]
-            lines += _table([kind, "ms", "per unit of work"], rows)
+        lines += _configurations(measured["configurations"])
+        lines += _small_blocks(measured["small blocks (us)"])
         first, memory = measured["first block (s)"], measured["memory (MB)"]
         lines += [
             "## What else",
@@ -38,11 +38,34 @@ def as_markdown(measured: dict[str, Any]) -> str:
             f" {first['from request to block']:.3f} s",
             f"* between blocks the default chain holds {memory['state']:.1f} MB; a stage takes up to"
             f" {memory['scratch']:.1f} MB more while it works, besides its output",
-            f"* silence after sound costs {measured['silence over sound']:.2f} times what sound costs",
+            "",
+            "What silence after sound costs, for what sound costs (the whole chain):",
             "",
         ]
+        silence = measured["silence over sound"]
+        rows = [[name, f"{ratio:.2f}"] for name, ratio in silence["kernels"].items()]
+        rows += [[f"{name}, the twins", f"{ratio:.2f}"] for name, ratio in silence["twins"].items()]
+        lines += _table(["chain", "silence / sound"], rows)
     return "\n".join(lines)
 
 
 def _times(times: dict[str, float]) -> list[str]:
     return [f"{times['yardstick']:.2f}", f"{times['rosafe']:.2f}", f"{times['ratio']:.1f}"]
+
+
+def _configurations(measured: dict[str, dict[str, dict[str, float]]]) -> list[str]:
+    lines = ["## Other configurations", "", "Cost per unit of work is for one of the default's.", ""]
+    for kind, found in measured.items():
+        rows = [[text, f"{cost['ms']:.2f}", f"{cost['per unit']:.2f}"] for text, cost in found.items()]
+        lines += [f"{kind}: a unit of work is {configurations.UNITS[kind]}.", ""]
+        lines += _table([kind, "ms", "per unit of work"], rows)
+    worst = max(cost["per unit"] for found in measured.values() for cost in found.values())
+    return [*lines, f"The dearest unit of work costs {worst:.2f} times what the default's costs.", ""]
+
+
+def _small_blocks(measured: dict[str, dict[str, float]]) -> list[str]:
+    """A block costs a fixed part, about that of one sample, and one in proportion to its samples."""
+    sizes = list(next(iter(measured.values())))
+    rows = [[kind, *(f"{cost:.0f}" for cost in found.values())] for kind, found in measured.items()]
+    lines = ["## Small blocks", "", "Microseconds that one block of so many samples takes, 31 channels.", ""]
+    return lines + _table(["stage", *sizes], rows)

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import importlib
-import importlib.util
 import json
 import os
 import platform
@@ -173,10 +172,8 @@ def _devices() -> Finding:
 
 
 def _kernels() -> Finding:
-    spec = importlib.util.find_spec("rosafe.dsp.kernels")
-    if spec is None or spec.origin is None:
-        return Finding(NOTE, "there are no compiled kernels; numpy and scipy do the work")
-    return Finding(OK, str(importlib.import_module("rosafe.dsp.kernels").status()))
+    status = importlib.import_module("rosafe.dsp.kernels").status()
+    return Finding(OK if status.compiled else NOTE, status.detail)
 
 
 def _master() -> Finding:

@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 import scipy
 
+from . import kernels
 from .cascade import Cascade
 from .guard import FloatArray, limited
 
@@ -55,8 +56,9 @@ class DrnlBank:
         """Filter (2, N): output (2, C, N), and the envelope of the same shape if wanted, else None."""
         block = limited(block)
         output = np.empty((2, len(self.channels), block.shape[-1]))
-        for index, channel in enumerate(self.channels):
-            output[:, index] = channel.process(block)
+        with kernels.denormals_off():  # tails of the many filters go through them within a block
+            for index, channel in enumerate(self.channels):
+                output[:, index] = channel.process(block)
         envelope = None
         if with_envelope:
             delayed = np.concatenate((self._last, output[..., :-1]), axis=-1)[..., : output.shape[-1]]

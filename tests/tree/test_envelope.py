@@ -69,8 +69,7 @@ def test_a_late_child_never_works_without_the_envelope(tree: Tree, feed: Feed, l
     below = tree.add("ild", "below", "late")
     feed.put(*NOISE[8:])
     listener.wait_blocks(tree.find("gammatone"), 20)
-    for processor in (late, below):
-        listener.wait(lambda p=processor: listener.blocks[p] and listener.blocks[p][-1].number == 19)
+    listener.wait(lambda: all(listener.blocks[p] and listener.blocks[p][-1].number == 19 for p in (late, below)))
     numbers = [block.number for block in listener.blocks[late]]
     assert numbers == list(range(numbers[0], 20))
     assert [block.number for block in listener.blocks[below]][-3:] == [17, 18, 19]

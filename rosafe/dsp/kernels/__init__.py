@@ -11,6 +11,8 @@ from __future__ import annotations
 
 import ctypes
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -175,6 +177,22 @@ def correlations(frames: Frames, reach: int, epsilon: float, output: FloatArray)
         _address(output) + outside * number * output.itemsize,
         lags * number,
     )
+
+
+@contextmanager
+def denormals_off() -> Iterator[None]:
+    """Within this, numpy and scipy take denormal numbers for 0 on this thread, which is many times faster.
+
+    Without kernels, nothing happens.
+    """
+    if not compiled():
+        yield
+        return
+    before = _function("rosafe_denormals_off")()
+    try:
+        yield
+    finally:
+        _function("rosafe_denormals_as")(before)
 
 
 def _function(name: str) -> Any:

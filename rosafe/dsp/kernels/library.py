@@ -12,7 +12,9 @@ from . import build
 
 SWITCH = "ROSAFE_KERNELS"  # environment variable: 0 for numpy and scipy, 3 or 4 for at most that level of processor
 
-_INTEGER, _REAL, _ARRAY = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p
+INSTRUCTIONS = {3: "AVX2 and FMA", 4: "AVX-512"}  # that the levels are for
+
+_INTEGER, _REAL, _ARRAY, _BITS = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p, ctypes.c_uint32
 # history, stride, length; block, length; tail, stride, start; rows; skip; window, size; hop; frames
 _FRAMES = (_ARRAY, _INTEGER, _INTEGER, _ARRAY, _INTEGER, _ARRAY, *[_INTEGER] * 4, _ARRAY, *[_INTEGER] * 3)
 # frames that begin; sums of those that had begun, stride, how many are known; sums
@@ -22,6 +24,8 @@ _ARGUMENTS = {
     "rosafe_biquads": (_INTEGER, _ARRAY, _ARRAY, _INTEGER, _INTEGER, _ARRAY, _INTEGER, _ARRAY, _ARRAY),
     "rosafe_levels": (*_FRAMES, *_SUMS, _REAL, _ARRAY),
     "rosafe_ratemap": (*_FRAMES, *_SUMS, _INTEGER, _REAL, _ARRAY, _ARRAY),
+    "rosafe_denormals_off": (),
+    "rosafe_denormals_as": (_BITS,),
     "rosafe_correlations": (*_FRAMES, _INTEGER, _REAL, _ARRAY, _INTEGER),
 }
 
@@ -48,10 +52,13 @@ def loaded() -> tuple[ctypes.CDLL | None, Status]:
     try:
         paths = build.libraries()
         # the lesser one can be asked on any processor
-        level = min(load(paths[3]).rosafe_processor_level(), int(switch) if switch in ("3", "4") else 4)
+        level = load(paths[3]).rosafe_processor_level()
         if level not in paths:
             raise build.BuildError("the kernels need a processor with AVX2 and FMA (x86-64-v3)")
-        return load(paths[level]), Status(True, f"compiled for {build.LEVELS[level]}, {paths[level]}")
+        reason = f"the processor has {INSTRUCTIONS[level]}"
+        if switch in ("3", "4") and int(switch) < level:
+            level, reason = int(switch), f"{reason}, but {SWITCH} is {switch}"
+        return load(paths[level]), Status(True, f"compiled for {build.LEVELS[level]}: {reason}; {paths[level]}")
     except (build.BuildError, OSError) as problem:
         return None, Status(False, f"numpy and scipy: {problem}")
 
@@ -62,4 +69,5 @@ def load(path: Path) -> ctypes.CDLL:
     for name, arguments in _ARGUMENTS.items():
         function = getattr(library, name)
         function.argtypes, function.restype = arguments, None
+    library.rosafe_denormals_off.restype = _BITS
     return library
