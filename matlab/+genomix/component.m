@@ -70,13 +70,15 @@ classdef component < handle
 
         function delete(obj)
             %DELETE  Forget the component, which goes on.
-            if isempty(obj.about) || ~obj.client.isConnected()
+            if isempty(obj.about)
                 return
             end
             try
-                obj.client.get(['/unload/' obj.about.name], {}, false);
+                if obj.client.isConnected()
+                    obj.client.get(['/unload/' obj.about.name], {}, false);
+                end
             catch
-                % Then the server is gone, and has forgotten it already.
+                % Then the server or the client is gone, and has forgotten it already.
             end
             obj.about = [];
         end
