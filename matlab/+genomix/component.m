@@ -35,6 +35,9 @@ classdef component < handle
             end
             if called
                 value = call(obj, s(1).subs, s(2).subs);
+                if nargout == 0 && isequal(value, [])
+                    return % help was shown
+                end
             else
                 name = entry(obj, s(1).subs);
                 value = @(varargin) call(obj, name, varargin);

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-MAX_PIECES = 32  # beyond that, the pieces of a window are joined, so that small blocks in long windows stay cheap
+MAX_PIECES = 128  # beyond that, the pieces of a window are joined, so that small blocks in long windows stay cheap
 
 
 def frames_in(seconds: float, rate: float) -> int:
