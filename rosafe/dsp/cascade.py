@@ -8,7 +8,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from .guard import flush
+from .guard import SPAN, flush
 
 
 class Cascade:
@@ -42,9 +42,13 @@ class Cascade:
             return block
         if block.size == 0:
             return np.zeros(block.shape, state.dtype)
-        result, state = scipy.signal.sosfilt(self.sections, block, zi=state)
-        self.state = np.ascontiguousarray(state)
-        flush(self.state)
+        result = np.empty(block.shape, state.dtype)
+        for first in range(0, block.shape[-1], SPAN):
+            span = slice(first, first + SPAN)
+            result[..., span], state = scipy.signal.sosfilt(self.sections, block[..., span], zi=state)
+            state = np.ascontiguousarray(state)
+            flush(state)
+        self.state = state
         return result
 
 

@@ -16,7 +16,7 @@ import scipy
 from . import kernels, memory
 from .checks import MAX_SAMPLES, positive
 from .framing import FramedStage, frame_parameters
-from .guard import FloatArray, limited
+from .guard import SQUARE_TINY, FloatArray, limited
 from .stage import Parameter, ParameterTable
 
 EPSILON = 2.2204e-16  # the original's literal
@@ -47,7 +47,7 @@ class CrossCorrelation(FramedStage):
         reach = min(self._max_lag, len(self._framing.window) - 1)  # beyond, frames do not overlap
         if kernels.compiled() and 2 * reach + 1 <= kernels.MOST_LAGS:
             return self._by_kernel(samples, reach)
-        frames = self._framing.frames(self._buffer.append(limited(samples)))  # (2, C, F, w)
+        frames = self._framing.frames(self._buffer.append(limited(samples, SQUARE_TINY)))  # (2, C, F, w)
         result = np.zeros((samples.shape[1], 2 * self._max_lag + 1, frames.shape[2]))
         correlate_by_fft(frames, self._framing.window, reach, result)
         self._buffer.drop(frames.shape[2] * self._framing.hop)

@@ -12,7 +12,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from . import kernels
 from .checks import positive, sample_count, word
-from .guard import FloatArray
+from .guard import SQUARE_TINY, FloatArray, limited
 from .stage import Parameter, Stage
 from .windows import NAMES, window
 
@@ -66,7 +66,7 @@ class Framing:
     def means(self, samples: FloatArray, squared: bool) -> FloatArray:
         """mean(window x), or mean((window x)**2), of each whole frame: (..., n) to (..., F)."""
         if squared and self.complete(samples.shape[-1]) > 0:  # else a long window that is not full yet
-            samples = np.square(samples)
+            samples = np.square(limited(samples, SQUARE_TINY))
         # Not a matrix product: OpenBLAS starts threads of its own for it, and two stages at work at the same time
         # then get in each other's way: several times slower than one alone.
         return np.einsum("...fi,i->...f", self.frames(samples), self.weights(squared))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from . import kernels, memory
 from .erb import bandwidth
-from .guard import FloatArray, flush, limited
+from .guard import SPAN, FloatArray, flush, limited
 
 POLES_TOGETHER = 4
 
@@ -84,15 +84,15 @@ def filter_by_scipy(
 
     `state` (2, C, order) is that of direct form II transposed, p y[n]; it runs on from block to block.
     """
-    if block.shape[-1] == 0:
-        return
     block = limited(block)
-    for channel, cascade in enumerate(sections):
-        before = np.zeros((len(cascade), 2, 2), np.complex128)
-        before[..., 0] = state[:, channel].T
-        analytic, after = scipy.signal.sosfilt(cascade, block, zi=before)
-        state[:, channel] = after[..., 0].T
-        output[:, channel] = analytic.real
-        if envelope is not None:
-            np.abs(analytic, out=envelope[:, channel])
-    flush(state)
+    for first in range(0, block.shape[-1], SPAN):
+        span = slice(first, first + SPAN)
+        for channel, cascade in enumerate(sections):
+            before = np.zeros((len(cascade), 2, 2), np.complex128)
+            before[..., 0] = state[:, channel].T
+            analytic, after = scipy.signal.sosfilt(cascade, block[:, span], zi=before)
+            state[:, channel] = after[..., 0].T
+            output[:, channel, span] = analytic.real
+            if envelope is not None:
+                np.abs(analytic, out=envelope[:, channel, span])
+        flush(state)

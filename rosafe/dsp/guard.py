@@ -1,4 +1,4 @@
-"""What keeps every number finite and fast: a bound on huge samples, and the flush of tiny filter states."""
+"""What keeps every number finite and fast: a bound on huge samples, and 0 for tiny samples and filter states."""
 
 from __future__ import annotations
 
@@ -13,16 +13,23 @@ FloatArray = NDArray[np.float64]
 # (2**31 * 1e70**2)**2 = 5e298. Sound has amplitudes around 1 (100 dB SPL), so nothing real comes near.
 LIMIT = 1e70
 
-# Filter states smaller than this become 0 at the end of a block. The square of the smallest audible amplitude is
-# some 1e-20; the smallest normal double is 2e-308, and arithmetic below it is many times slower.
+# Samples that are smaller than this become 0, and filter states at the end of a block. The square of the smallest
+# audible amplitude is some 1e-20; the smallest normal double is 2e-308, and arithmetic below it is many times slower.
 TINY = 1e-200
+SQUARE_TINY = 1e-145  # the same where samples are squared and weighted
+
+SPAN = 4096  # samples that a filter goes on by before its state is looked at: it may become tiny in a long block
 
 
-def limited(block: FloatArray) -> FloatArray:
-    """`block` with samples bounded to ±LIMIT; `block` itself where it is within already."""
-    if block.size == 0 or (block.max() <= LIMIT and block.min() >= -LIMIT):
+def limited(block: FloatArray, tiny: float = TINY) -> FloatArray:
+    """`block` with samples bounded to ±LIMIT, and 0 for those below `tiny`; `block` itself where none is like that."""
+    size = np.abs(block)
+    below = size < tiny
+    if size.max(initial=0.0) <= LIMIT and not (below & (block != 0)).any():
         return block
-    return np.clip(block, -LIMIT, LIMIT)
+    result = np.clip(block, -LIMIT, LIMIT)
+    result[below] = 0.0
+    return result
 
 
 def flush(state: NDArray[Any]) -> None:

@@ -21,7 +21,7 @@ import scipy
 from . import kernels
 from .cascade import Cascade
 from .checks import word
-from .guard import LIMIT, TINY, FloatArray, limited
+from .guard import SQUARE_TINY, TINY, FloatArray, limited
 from .stage import Parameter, ParameterTable, Stage
 
 # Butterworth low-pass after the rectification: order, cutoff (Hz), how many in cascade
@@ -45,7 +45,7 @@ RECTIFIERS: dict[str, Callable[[FloatArray], FloatArray]] = {
     "none": np.copy,
     "halfwave": lambda samples: np.maximum(samples, 0.0),
     "fullwave": np.abs,
-    "square": np.square,
+    "square": lambda samples: np.square(limited(samples, SQUARE_TINY)),
 }
 ENVELOPE_METHODS = ("hilbert", "joergensen", "bernstein")
 METHODS = ("none", "halfwave", "fullwave", "square", "hilbert", "joergensen", "dau", "breebart", "bernstein")
@@ -117,4 +117,4 @@ def compressed(samples: FloatArray, envelope: FloatArray) -> FloatArray:
     result = np.power(envelope, COMPRESSION, out=np.zeros_like(envelope), where=envelope >= TINY)
     result *= samples
     # the bound tells only where an envelope is smaller by far than the signal it is said to belong to
-    return np.square(np.clip(result, 0.0, LIMIT, out=result))
+    return np.square(limited(np.maximum(result, 0.0, out=result), SQUARE_TINY))

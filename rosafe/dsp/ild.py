@@ -12,7 +12,7 @@ import numpy as np
 
 from . import kernels
 from .framing import FramedStage, frame_parameters
-from .guard import FloatArray, limited
+from .guard import FloatArray
 from .stage import ParameterTable
 
 EPSILON = 2.2204e-16  # the original's literal
@@ -36,5 +36,5 @@ class Ild(FramedStage):
             frames = self._frames(samples, self._framing.weights(squared=True))
             levels, self._begun = kernels.levels(frames, self._begun, EPSILON)
             return levels
-        energies = self._means(limited(samples), squared=True) + EPSILON
+        energies = self._means(samples, squared=True) + EPSILON
         return 10 * np.log10(energies[1] / energies[0])

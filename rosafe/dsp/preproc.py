@@ -14,7 +14,7 @@ import scipy
 
 from .cascade import Cascade, leaky_integrator
 from .checks import flag, positive, round_half_away, within, word
-from .guard import FloatArray, limited
+from .guard import SQUARE_TINY, FloatArray, limited
 from .middle_ear import MODELS, middle_ear_fir
 from .stage import Parameter, ParameterTable, Stage
 
@@ -120,7 +120,7 @@ class GainControl:
         """Normalise (2, N)."""
         gain = np.zeros(block.shape[-1])
         for ear, samples in enumerate(block):
-            squares = samples * samples
+            squares = np.square(limited(samples, SQUARE_TINY))
             if not self.started[ear]:
                 self._start(ear, squares)
             if self.started[ear]:
