@@ -197,8 +197,10 @@ def test_numbers_are_those_of_the_ports(world: World, tmp_path: Path) -> None:
         bass.Stop();
         ports = {{{", ".join(f"'{port}', '{element}'" for port, element in PORTS.items())}}};
         ends = [1 2];
-        while any(ends ~= ends(1)) % until the last block has come through
-            pause(0.2);
+        before = [];
+        while any(ends ~= ends(1)) || ! isequal(ends, before) % until the last block has come through
+            pause(0.3);
+            before = ends;
             for k = 1:2:numel(ports)
                 one = rosAFE.(ports{{k}})('-m', ports{{k + 1}});
                 ends((k + 1) / 2) = one.(ports{{k}}).lastFrameIndex;
