@@ -13,7 +13,7 @@ from rosafe.bass.socket_server import DEFAULT_HOST, DEFAULT_PORT, DedicatedSocke
 from rosafe.bass.sources import Source, device_lines, open_source
 from rosafe.bass.sources.alsa import AlsaSource, DeviceBusyError
 from rosafe.interface import BASS, ComponentError
-from rosafe.ros import wire
+from rosafe.ros import master, wire
 from rosafe.ros.activities import Activity
 from rosafe.ros.component import ComponentNode
 from rosafe.ros.events import EventLog
@@ -116,8 +116,11 @@ class BassNode:
 
     def _dedicated_socket(self, activity: Activity, _: dict[str, Any]) -> None:
         activity.interrupt_others()  # it has the address
-        host = rospy.get_param("~socket_host", DEFAULT_HOST)
-        port = rospy.get_param("~socket_port", DEFAULT_PORT)
+        try:
+            host = rospy.get_param("~socket_host", DEFAULT_HOST)
+            port = rospy.get_param("~socket_port", DEFAULT_PORT)
+        except master.FAILURES as problem:
+            raise ComponentError("::genom::mwerr", what=f"no ROS master: {master.reason(problem)}") from None
         try:
             server = DedicatedSocket(lambda: self._snapshot, str(host), int(port), rospy.logwarn)
         except (OSError, OverflowError, ValueError, TypeError) as problem:

@@ -51,6 +51,9 @@ def stay(node: str, master_is_lost: Path) -> None:
     microphone = Microphone(LonelyGraph())  # type: ignore[arg-type]
     acquire = rospy.ServiceProxy("/bass/Acquire", bass.srv.Acquire)
     assert acquire(device="scene:", sampleRate=microphone.sample_rate, nFramesPerChunk=1000).genom_success
+    rospy.set_param("/bass/socket_port", 0)
+    dedicated_socket = rospy.ServiceProxy("/bass/DedicatedSocket", bass.srv.DedicatedSocket, persistent=True)
+    assert dedicated_socket().genom_success
     call = calls(node)
     assert call["connect_port"](local="Audio", remote=microphone.topic).genom_success
     assert call["InputProc"](nFramesPerBlock=BLOCK).genom_success
@@ -78,6 +81,8 @@ def stay(node: str, master_is_lost: Path) -> None:
     seen: dict[str, Any] = {"GammatoneProc": call["GammatoneProc"](fb_nChannels=2, name="late").genom_success}
     refused = call["connect_port"](local="Audio", remote="bass/Audio")
     seen["connect_port"] = json.loads(refused.genom_exdetail)["ex"]
+    refused = dedicated_socket()  # its parameters are with the master
+    seen["DedicatedSocket"] = json.loads(refused.genom_exdetail)["ex"]
     seen["processors"] = names(call)
     told = len(states)
     wait_for(lambda: len(states) >= told + 2, what="genom_state")

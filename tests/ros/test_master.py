@@ -52,6 +52,7 @@ def test_a_master_is_lost_and_comes_back(
             assert seen == {
                 "GammatoneProc": True,
                 "connect_port": "::genom::port_io",
+                "DedicatedSocket": "::genom::mwerr",
                 "processors": ["input", "preProc", "other", "late"],
                 "removed": True,
                 "left": ["input", "preProc", "late"],
