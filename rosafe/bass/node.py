@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import threading
 from typing import Any
 
@@ -44,6 +45,7 @@ class BassNode:
         self._node.function("ListDevices", self._list_devices)
         self._node.function("Stop", lambda _: None)  # the table says what it interrupts
         self._node.diagnostics.add("capture", self._health)
+        importlib.import_module("rosafe.bass.sources.scene")  # scipy takes long: before a request waits for it
         self._node.start()
 
     def shutdown(self, by: str) -> None:
