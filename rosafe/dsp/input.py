@@ -14,7 +14,8 @@ from .stage import Parameter, ParameterTable, Stage
 class Input(Stage):
     """Scaling of the samples: y = x / in_normalizeValue if in_doNormalize, else y = x. It has no state.
 
-    Full scale of int32 becomes 1 with the default of 2**31 - 1. Samples beyond ±1e70 are taken as that, below 1e-200 as 0.
+    Full scale of int32 becomes 1 with the default of 2**31 - 1. Samples beyond ±1e70 are taken as that, those
+    below 1e-200 as 0.
     """
 
     PARAMETERS: ClassVar[ParameterTable] = {
