@@ -6,7 +6,6 @@ rules come from the interface table.
 
 from __future__ import annotations
 
-import ctypes
 import hashlib
 import importlib
 import itertools
@@ -28,7 +27,7 @@ from rospy.impl import tcpros_base
 
 from rosafe import __version__, interface
 from rosafe.interface import ComponentError
-from rosafe.ros import master, registration
+from rosafe.ros import master, memory, registration
 from rosafe.ros.activities import Activities, Activity, Handler, TaskMeter
 from rosafe.ros.publisher import Publisher
 
@@ -313,7 +312,7 @@ class ComponentNode:
         while not self.finished.wait(DIAGNOSTICS_PERIOD):
             self.diagnostics.force_update()  # `update` would ask the master for the period, and fail without one
             if next(rounds) % TRIM_ROUNDS == 0:
-                _give_back_memory()
+                memory.give_back()
 
     def _state_message(self) -> Any:
         msg = self._msg
@@ -343,13 +342,6 @@ _DATE = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(os.path.getmtime(interfa
 def _digest(component: interface.Component) -> str:
     """A fingerprint of the interface, 32 hex digits."""
     return hashlib.md5(re.sub(r" at 0x\w+", "", repr(component)).encode()).hexdigest()
-
-
-def _give_back_memory() -> None:
-    """Return to the system what is free: where large and small pieces have come and gone, the C library keeps holes."""
-    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # glibc has it
-    if trim is not None:
-        trim(0)
 
 
 def _lengthen_backlog() -> None:

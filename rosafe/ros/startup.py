@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import NoReturn, Protocol
 
 from rosafe import __version__, interface
-from rosafe.ros import generate, master, paths
+from rosafe.ros import generate, master, memory, paths
 
 MASTER_SECONDS = 5.0  # `roscore & rosAFE-ros &` starts both at once, and roscore takes a second or two
 START_SECONDS = 20.0  # a node that is not up by then waits for something that does not come
@@ -128,6 +128,7 @@ def _start(
     for name, variable in _ENVIRONMENT_REMAPPINGS.items():
         if mappings.get(name):
             os.environ[variable] = mappings[name]
+    memory.bound()
     master.set_local_defaults()
     _await_master(os.environ["ROS_MASTER_URI"], received)
     generate.ensure_messages()

@@ -1,0 +1,29 @@
+"""What the C library is told about memory is taken, and a process that has had much gives it back."""
+
+from __future__ import annotations
+
+from tests.harness import PYTHON, ROOT, Graph
+
+# Fills memory from many threads with pieces of all sizes, frees all but a few, and prints the MiB that stay resident.
+SPREAD = """
+import random, threading
+from rosafe.ros import memory
+memory.bound()
+def resident():
+    return int(next(line for line in open("/proc/self/status") if line.startswith("VmRSS")).split()[1]) // 1024
+kept, before = [], resident()
+def work(seed):
+    chance = random.Random(seed)
+    pieces = [bytes(chance.randrange(1000, 300_000)) for _ in range(300)]
+    kept.extend(pieces[::100])
+threads = [threading.Thread(target=work, args=(seed,)) for seed in range(12)]
+[thread.start() for thread in threads]
+[thread.join() for thread in threads]
+memory.give_back()
+print(resident() - before)
+"""
+
+
+def test_memory_that_is_freed_goes_back(graph: Graph) -> None:
+    done = graph.run(PYTHON, "-c", SPREAD, PYTHONPATH=str(ROOT))
+    assert int(done.stdout) < 60, "of some 500 MiB"
