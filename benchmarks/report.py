@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import configurations
@@ -51,6 +52,18 @@ def as_markdown(measured: dict[str, Any]) -> str:
 
 def _times(times: dict[str, float]) -> list[str]:
     return [f"{times['yardstick']:.2f}", f"{times['rosafe']:.2f}", f"{times['ratio']:.1f}"]
+
+
+MARK = "<!-- What follows is written by benchmarks/chain.py. -->\n"
+
+
+def put_into(document: Path, text: str) -> None:
+    """Replace what follows the mark in `document` by `text`, its headings a level lower."""
+    before, mark, _ = document.read_text().partition(MARK)
+    if not mark:
+        raise ValueError(f"{document}: there is no {MARK.strip()}")
+    lines = [f"#{line}" if line.startswith("#") else line for line in text.splitlines()]
+    document.write_text("\n".join([before + MARK, *lines, ""]))
 
 
 def _configurations(measured: dict[str, dict[str, dict[str, float]]]) -> list[str]:

@@ -102,6 +102,12 @@ def test_hair_cell(level: int, method: str, channels: int, sizes: list[int]) -> 
     check(level, "ihc", {"ihc_method": method}, cut(signal(channels, sum(sizes) + 50), [*sizes, 50]))
 
 
+@each_level
+@pytest.mark.parametrize("method", METHODS)
+def test_hair_cell_of_rows_that_are_whole_pages_apart(level: int, method: str) -> None:
+    check(level, "ihc", {"ihc_method": method}, cut(signal(11, 1600), [512, 1024, 64]))
+
+
 def framing(prefix: str) -> st.SearchStrategy[dict[str, Any]]:
     """Windows of 2 to 300 samples, hops of 1 to 700."""
     short, long = st.integers(1, 12), st.integers(1, 150)
@@ -196,6 +202,17 @@ def test_denormal_numbers_stay_a_matter_of_the_kernels(level: int) -> None:
                 np.ones((2, 100)) if kind in ("input", "preProc", "gammatone") else np.ones((2, 3, 100))
             )
             assert (smallest * 1.0)[0] == 5e-324, kind
+
+
+@pytest.mark.parametrize("level", [TWINS, 3, 4])
+def test_denormal_numbers_are_off_for_numpy_where_that_is_asked_for(level: int) -> None:
+    smallest = np.array([5e-324])
+    with using(level):
+        with kernels.denormals_off():
+            assert (smallest * 1.0)[0] == (5e-324 if level == TWINS else 0.0)
+        with pytest.raises(ZeroDivisionError), kernels.denormals_off():
+            raise ZeroDivisionError
+        assert (smallest * 1.0)[0] == 5e-324
 
 
 @each_level

@@ -11,7 +11,7 @@
 
 #define COMPRESSION -0.77 /* of the envelope, in rosafe/dsp/haircell.py */
 
-enum { SPAN = 32, ROWS = 16, GROUPS = ROWS / LANES, MOST_SECTIONS = 8 };
+enum { SPAN = 32, PAGE = 512 /* doubles */, ROWS = 16, GROUPS = ROWS / LANES, MOST_SECTIONS = 8 };
 
 enum rectification { NONE, HALF_WAVE, FULL_WAVE, SQUARE, COMPRESSED };
 
@@ -112,13 +112,14 @@ INLINE void pass(const int groups, const int does, int64_t how, const places *ro
         UNROLL for (int g = 0; g < groups; g++) state[g] = s1[g], state[GROUPS + g] = s2[g];
 }
 
-INLINE void run(const int groups, int64_t how, const places *rows, int64_t n, const double *sections, int64_t count,
+/* `apart`: reading and writing, each a span at a time. */
+INLINE void run(const int groups, const int apart, int64_t how, const places *rows, int64_t n, const double *sections, int64_t count,
                 vec states[MOST_SECTIONS][2 * GROUPS]) {
     if (count == 0) {
         pass(groups, READS | WRITES, how, rows, 0, n, 0, 0, 0);
-    } else if (count == 1 && how == HALF_WAVE) { /* the default, known to the compiler */
+    } else if (count == 1 && !apart && how == HALF_WAVE) { /* the default, known to the compiler */
         pass(groups, READS | FILTERS | WRITES, HALF_WAVE, rows, 0, n, 0, sections, states[0]);
-    } else if (count == 1) {
+    } else if (count == 1 && !apart) {
         pass(groups, READS | FILTERS | WRITES, how, rows, 0, n, 0, sections, states[0]);
     } else {
         vec span[SPAN * GROUPS];
@@ -126,7 +127,12 @@ INLINE void run(const int groups, int64_t how, const places *rows, int64_t n, co
             int64_t until = least(from + SPAN, n), s = 0;
             pass(groups, READS | FILTERS, how, rows, from, until, span, sections, states[s]);
             for (s = 1; s < count - 1; s++) pass(groups, FILTERS, how, rows, from, until, span, sections + 6 * s, states[s]);
-            pass(groups, FILTERS | WRITES, how, rows, from, until, span, sections + 6 * s, states[s]);
+            if (s < count && !apart) {
+                pass(groups, FILTERS | WRITES, how, rows, from, until, span, sections + 6 * s, states[s]);
+                continue;
+            }
+            if (s < count) pass(groups, FILTERS, how, rows, from, until, span, sections + 6 * s, states[s]);
+            pass(groups, WRITES, how, rows, from, until, span, 0, 0);
         }
     }
 }
@@ -136,7 +142,9 @@ void rosafe_biquads(int64_t how, const double *block, const double *envelope, in
                     const double *sections, int64_t count, double *state, double *output) {
     uint32_t mode = denormals_off();
     /* From the end, which the filterbank has written last: in large blocks only that is in the cache still. */
-    for (int64_t first = (rows - 1) / ROWS * ROWS; first >= 0 && rows > 0; first -= ROWS) {
+    /* Rows a multiple of a page apart have the same few places in the first-level cache: fewer of them at a time then. */
+    const int64_t at_once = n % PAGE == 0 ? LANES : ROWS;
+    for (int64_t first = (rows - 1) / at_once * at_once; first >= 0 && rows > 0; first -= at_once) {
         int64_t row[ROWS]; /* lanes without a row do the last one once more */
         places places = {.block = block, .envelope = envelope, .output = output};
         vec states[MOST_SECTIONS][2 * GROUPS];
@@ -147,11 +155,13 @@ void rosafe_biquads(int64_t how, const double *block, const double *envelope, in
                 for (int i = 0; i < 2; i++)
                     states[s][i * GROUPS + k / LANES][k % LANES] = state[2 * (s * rows + row[k]) + i];
         }
-        if (rows - first > LANES)
-            run(GROUPS, how, &places, n, sections, count, states);
+        if (at_once == LANES)
+            run(1, 1, how, &places, n, sections, count, states);
+        else if (rows - first > LANES)
+            run(GROUPS, 0, how, &places, n, sections, count, states);
         else
-            run(1, how, &places, n, sections, count, states);
-        for (int64_t k = 0; k < least(ROWS, rows - first); k++)
+            run(1, 0, how, &places, n, sections, count, states);
+        for (int64_t k = 0; k < least(at_once, rows - first); k++)
             for (int64_t s = 0; s < count; s++)
                 for (int i = 0; i < 2; i++)
                     state[2 * (s * rows + row[k]) + i] = flushed(states[s][i * GROUPS + k / LANES][k % LANES]);

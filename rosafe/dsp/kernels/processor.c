@@ -1,5 +1,5 @@
-/* Which of the libraries the processor can run, and how this thread of it takes denormal numbers. The first function is compiled for any x86-64, so that it can be asked of
- * the library for the lesser processors anywhere. */
+/* Which of the libraries the processor can run, and how a thread of it takes denormal numbers. The first function is compiled
+ * for any x86-64, so that it can be asked of the library for the lesser processors anywhere. */
 #include "vector.h"
 
 /* 4 or 3 for x86-64-v4 (AVX-512) or x86-64-v3 (AVX2, FMA), 0 for less. */
