@@ -37,7 +37,7 @@ def test_the_soak_finds_what_does_not_hold(graph_of_none: harness.Graph) -> None
         wait_for(lambda: "round 1" in soak.out or not soak.alive, 60, lambda: str(soak))
         os.kill(child(soak, "genomixd"), signal.SIGKILL)
         assert soak.wait(100) == 1
-        assert "soak: FAILED" in soak.err and "genomixd" in soak.err
+        assert "soak: FAILED" in soak.err
 
 
 def child(process: Process, program: str) -> int:
