@@ -38,7 +38,6 @@ DIAGNOSTICS_PERIOD = 1.0
 TRIM_ROUNDS = 20  # of diagnostics between two times that freed memory is given back to the system
 UP_SECONDS = 10.0  # until the master knows a node that starts
 STOP_WAIT = 2.0  # seconds that Stop waits for what it ends
-ACCEPT_SECONDS = 0.5  # a goal is accepted once its activity runs, or after this
 SEND_SECONDS = 0.1  # rospy sends answers and results on threads of its own, and does not tell when it has
 
 
@@ -230,8 +229,9 @@ class ComponentNode:
                 del running[goal.get_goal_id().id]
 
             def wait(activity: Activity) -> None:
-                # Accepted means running: a client that waits for it can make the next request, which may need this one.
-                activity.begun.wait(ACCEPT_SECONDS)
+                # Accepted means running, however long that takes: a client that waits for it can make the next request,
+                # which may need this one, and what it stops from then on ends normally.
+                activity.begun.wait()
                 set_accepted()
 
             try:

@@ -118,6 +118,40 @@ def test_a_master_that_is_not_there_yet(tmp_path: Path) -> None:
             master.kill()
 
 
+# bass-ros on a machine on which opening a source takes until the file argv[1] is there.
+SLOW_BASS = """
+import os, sys, time
+from rosafe.bass import node
+at_once = node.open_source
+def open_source(*arguments):
+    while not os.path.exists(sys.argv[1]):
+        time.sleep(0.02)
+    return at_once(*arguments)
+node.open_source = open_source
+sys.exit(node.main([]))
+"""
+
+
+def test_what_is_acknowledged_runs(empty_world: World, tmp_path: Path) -> None:
+    """However long that takes: to stop it then is a normal end."""
+    world, opened = empty_world, tmp_path / "opened"
+    numbers: list[str] = []
+    sender = threading.Thread(
+        target=lambda: numbers.append(world.http.send("bass/Acquire", {"device": "scene:"}, ack=1))
+    )
+    code = f"import sys; sys.path.insert(0, {str(harness.ROOT)!r}){SLOW_BASS}"
+    with world.graph.start(harness.PYTHON, "-c", code, str(opened)):
+        harness.wait_for(lambda: "/bass/Stop" in world.graph.services(), harness.UP_SECONDS)
+        sender.start()
+        harness.wait_for(lambda: "Acquire" in str(world.http.call("bass/genom_state")))
+        sender.join(0.8)
+        assert numbers == []
+        opened.touch()
+        sender.join(20)
+        world.http.call("bass/Stop")
+        assert world.http.wait(numbers[0], "done")["output"] == {}
+
+
 def test_load_waits_for_a_component_that_is_starting(empty_world: World) -> None:
     world = empty_world
     with world.graph.start(str(harness.SCRIPTS / "bass-ros")):

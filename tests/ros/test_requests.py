@@ -41,9 +41,11 @@ def test_input_waits_for_a_first_message(afe: Session) -> None:
     assert afe.refused("InputProc") == ("::rosAFE::e_noData", {})
     assert afe.processors() == {}
     wait_for(lambda: topic.get_num_connections() == 1)
-    goal = afe.goal("InputProc").active()
+    goal = afe.goal("InputProc")
+    afe.wait_activities(["InputProc"])
     topic.publish(_audio_class()(sampleRate=RATE, nChunksOnPort=1, nFramesPerChunk=2, left=[0, 0], right=[0, 0]))
-    wait_for(lambda: afe.processors() == {"input": ["input"]})
+    goal.active()
+    assert afe.processors() == {"input": ["input"]}
     assert goal.running
     topic.unregister()
 
