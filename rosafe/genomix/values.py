@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rosafe.interface import KINDS, REQUEST, REQUIRED, ComponentError, Parameter, Service
@@ -64,18 +64,16 @@ def complete(service: Service, given: Any) -> dict[str, Any]:
 def partial(given: Any) -> dict[str, Any]:
     """The arguments of `interface.REQUEST` that are `given`, and no others.
 
-    An array may end with an object of further parameters. A structure of getParameters, or an array of one, stands for
-    its members. null stands for what is not given.
+    An object, or an array of the representation and, where there are any, an object of the others: by position nobody
+    knows them. A structure of getParameters, or an array of one, stands for its members. null stands for what is not
+    given.
 
     Raises
     ------
     ComponentError
         As `complete`.
     """
-    if isinstance(given, (list, tuple)) and given and isinstance(given[-1], Mapping):
-        pairs = [*_named(REQUEST, given[:-1]), *given[-1].items()]
-    else:
-        pairs = _named(REQUEST, given)
+    pairs = _after_representation(given) if isinstance(given, (list, tuple)) else _named(REQUEST, given)
     unfolded = [pair for name, value in pairs for pair in _unfolded(name, value)]
     values = _converted(REQUEST, [(name, value) for name, value in unfolded if value is not None])
     _require(REQUEST, values)
@@ -84,6 +82,17 @@ def partial(given: Any) -> dict[str, Any]:
     except ValueError as problem:
         raise refused(f"{REQUEST.name}: {problem}") from None
     return values
+
+
+def _after_representation(given: Sequence[Any]) -> list[tuple[str, Any]]:
+    words = list(given)
+    parameters = words.pop() if words and isinstance(words[-1], Mapping) else {}
+    if len(words) == 2 and words[1] in (None, "", []):  # an empty matrix of MATLAB
+        words.pop()
+    if len(words) > 1:
+        given_instead = str(words[1])[:80]
+        raise refused(f"{REQUEST.name}: after representation come the parameters in one object, not {given_instead!r}")
+    return [*(("representation", word) for word in words), *parameters.items()]
 
 
 def _unfolded(name: str, value: Any) -> list[tuple[str, Any]]:
