@@ -105,7 +105,8 @@ classdef component < handle
             % A service is called or a port is read.
             [name, kind] = entry(obj, name);
             flags = struct('a', false, 'm', false, 'h', false);
-            while ~isempty(given) && any(strcmp(given{1}, {'-a', '-m', '-h'}))
+            given = cellfun(@genomix.wire.chars, given, 'UniformOutput', false);
+            while ~isempty(given) && ischar(given{1}) && any(strcmp(given{1}, {'-a', '-m', '-h'}))
                 flags.(given{1}(2)) = true;
                 given(1) = [];
             end
@@ -122,7 +123,7 @@ classdef component < handle
             query = {'i', obj.about.instance};
             try
                 if strcmp(kind, 'ports')
-                    query = [query; element(given)];
+                    query = [query; element(given, described)];
                 else
                     query = [query; {'input', input_of(given)}];
                 end
@@ -170,17 +171,16 @@ classdef component < handle
     end
 end
 
-function query = element(given)
+function query = element(given, port)
 % The first argument names the element of a port; scripts give some to ports that have none.
 query = cell(0, 2);
-if isempty(given)
+if isempty(given) || ~port.multiple
     return
 end
-name = genomix.wire.chars(given{1});
-if ~ischar(name)
-    error('genomix:argument', 'the name of an element is a text, and no %s', class(name));
+if ~ischar(given{1}) || size(given{1}, 1) > 1
+    error('genomix:argument', 'the name of an element is one text, and no %s', class(given{1}));
 end
-query = {'element', name};
+query = {'element', given{1}};
 end
 
 function text = input_of(given)
@@ -188,5 +188,8 @@ if numel(given) == 1 && isstruct(given{1})
     text = genomix.wire.encode(given{1});
 else
     text = genomix.wire.encode(given);
+end
+if numel(text) > 80000 % three times as many in a URL, of which genomixd takes 256 KiB
+    error('genomix:argument', 'the arguments are too long: %d characters', numel(text));
 end
 end
