@@ -9,14 +9,15 @@ import ipaddress
 import logging
 import re
 import socket
-from collections.abc import Awaitable, Callable, Iterator
+from collections.abc import Awaitable, Callable, Coroutine, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from typing import Any, TypeVar
 
 from aiohttp import web
 
 from rosafe import __version__
 from rosafe.genomix import packed
+from rosafe.genomix.graph import middleware_error
 from rosafe.genomix.proxy import Proxy, Value
 from rosafe.genomix.sessions import Request, Session, Sessions, error_body, too_many
 from rosafe.genomix.syntax import SYNTAXES, TCL, Syntax, plain
@@ -29,6 +30,7 @@ MAX_WAIT_MS = 3_600_000
 FORMATTERS = 4  # threads
 BATCH = 128 * 1024  # characters written at a time
 REFUSAL_SECONDS = 0.05
+ANSWER_SECONDS = 75.0  # for any answer that is not told to wait; a component has 60 s for its part
 HEARTBEAT_SECONDS = 15.0  # between two signs of life to a listener
 LAST_WORDS_SECONDS = 1.0  # that answers under way have at the end
 IDLE_SECONDS = 3600.0  # a connection without requests is closed after
@@ -64,6 +66,7 @@ Every URL may carry s=SESSION. docs/genomixd.md tells the rest.
 """
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
+T = TypeVar("T")
 
 
 class Server:
@@ -224,15 +227,15 @@ class Server:
         if name and not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII):
             raise refused("as: letters, digits and _ only, a letter first")
         component, instance = request.match_info["component"], request.query.get("i", "")
-        return _small(request, await self._session(request).load(component, instance, name))
+        return _small(request, await self._in_time(self._session(request).load(component, instance, name)))
 
     async def _unload(self, request: web.Request) -> web.StreamResponse:
-        await self._session(request).unload(request.match_info["name"])
+        await self._in_time(self._session(request).unload(request.match_info["name"]))
         return _small(request, {})
 
     async def _describe(self, request: web.Request) -> web.StreamResponse:
         name = request.match_info["name"]
-        return _small(request, (await self._component(request)).describe(name))
+        return _small(request, (await self._in_time(self._component(request))).describe(name))
 
     async def _components(self, request: web.Request) -> web.StreamResponse:
         loaded = self._session(request).components
@@ -254,18 +257,38 @@ class Server:
         proxy = await self._component(request)
         return session, proxy, path["service"], given, path.get("element", request.query.get("element", ""))
 
+    async def _in_time(self, work: Coroutine[Any, Any, T]) -> T:
+        """What `work` returns; ``::genom::mwerr`` where it waits too long, for what is ahead of it, say.
+
+        It is cancelled then, and not waited for: to undo what it has done may take as long again.
+        """
+        task = asyncio.create_task(work)
+        self._sessions.keep(task)
+        try:
+            await asyncio.wait({task}, timeout=ANSWER_SECONDS)
+        finally:
+            in_time = task.done()
+            task.cancel()
+        if not in_time:
+            raise middleware_error(f"no answer within {ANSWER_SECONDS:g} s: other requests take too long")
+        return task.result()
+
     async def _call(self, request: web.Request) -> web.StreamResponse:
-        session, proxy, name, given, element = await self._target(request)
-        return await self._stream(request, await session.call(proxy, name, given, element))
+        async def work() -> Value:
+            session, proxy, name, given, element = await self._target(request)
+            return await session.call(proxy, name, given, element)
+
+        return await self._stream(request, await self._in_time(work()))
 
     async def _send(self, request: web.Request) -> web.StreamResponse:
-        session, proxy, name, given, element = await self._target(request)
+        session, proxy, name, given, element = await self._in_time(self._target(request))
         oneway = _flag(request, "oneway")
         sent = session.send(request.match_info["name"], proxy, name, given, element, not oneway)
         if oneway:
             return _small(request, {})
         if _flag(request, "ack"):
-            await sent.acknowledged.wait()
+            with contextlib.suppress(TimeoutError):  # then it is still sent, as far as anybody knows
+                await asyncio.wait_for(sent.acknowledged.wait(), ANSWER_SECONDS)
             with contextlib.suppress(TimeoutError):  # a refusal is acknowledged and then told, at once
                 await asyncio.wait_for(sent.finished.wait(), REFUSAL_SECONDS)
         return _status(request, sent)

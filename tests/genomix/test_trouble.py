@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import signal
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import pytest
@@ -118,18 +120,59 @@ def test_a_master_that_is_not_there_yet(tmp_path: Path) -> None:
             master.kill()
 
 
-# bass-ros on a machine on which opening a source takes until the file argv[1] is there.
+# bass-ros on a machine on which opening a source takes until the file argv[1] is there, unless it is stopped before.
 SLOW_BASS = """
 import os, sys, time
 from rosafe.bass import node
 at_once = node.open_source
 def open_source(*arguments):
-    while not os.path.exists(sys.argv[1]):
+    while not (os.path.exists(sys.argv[1]) or arguments[-1].is_set()):
         time.sleep(0.02)
     return at_once(*arguments)
 node.open_source = open_source
 sys.exit(node.main([]))
 """
+
+
+# genomixd with little patience.
+HASTY_GENOMIXD = """
+import sys
+from rosafe.genomix import daemon, server
+server.ANSWER_SECONDS = 0.5
+sys.exit(daemon.main(["-v", "-p", "0"]))
+"""
+
+
+def code(script: str) -> str:
+    """`script` for an interpreter that does not know of the checkout."""
+    return f"import sys; sys.path.insert(0, {str(harness.ROOT)!r}){script}"
+
+
+@contextmanager
+def slow_bass(world: World, opened: Path) -> Iterator[harness.Process]:
+    with world.graph.start(harness.PYTHON, "-c", code(SLOW_BASS), str(opened)) as process:
+        harness.wait_for(lambda: "/bass/Stop" in world.graph.services(), harness.UP_SECONDS)
+        yield process
+
+
+def test_every_request_is_answered(empty_world: World, tmp_path: Path) -> None:
+    """Clients such as Octave wait for ever: for an activity that does not begin, and a component that hangs."""
+    world = empty_world
+    with (
+        slow_bass(world, tmp_path / "opened") as bass,
+        world.graph.start(harness.PYTHON, "-c", code(HASTY_GENOMIXD)) as server,
+    ):
+        hasty = World(world.graph, world.master, server, worlds.port_of(server))
+        number = hasty.http.send("bass/Acquire", {"device": "scene:"}, ack=1)
+        assert hasty.http.status(number) == {"id": number, "status": "sent"}
+        bass_signal(bass, signal.SIGSTOP)
+        for path in ("/load/bass", "/call/bass/Stop", "/send/bass/Stop"):
+            with pytest.raises(HttpError, match="no answer within") as caught:
+                hasty.http.get(path)
+            assert (caught.value.status, caught.value.ex) == (502, "::genom::mwerr")
+        bass_signal(bass, signal.SIGCONT)
+        world.http.call("bass/Stop")
+        assert hasty.http.wait(number, "error")["exception"]["ex"] == "::genom::interrupted"
 
 
 def test_what_is_acknowledged_runs(empty_world: World, tmp_path: Path) -> None:
@@ -139,9 +182,7 @@ def test_what_is_acknowledged_runs(empty_world: World, tmp_path: Path) -> None:
     sender = threading.Thread(
         target=lambda: numbers.append(world.http.send("bass/Acquire", {"device": "scene:"}, ack=1))
     )
-    code = f"import sys; sys.path.insert(0, {str(harness.ROOT)!r}){SLOW_BASS}"
-    with world.graph.start(harness.PYTHON, "-c", code, str(opened)):
-        harness.wait_for(lambda: "/bass/Stop" in world.graph.services(), harness.UP_SECONDS)
+    with slow_bass(world, opened):
         sender.start()
         harness.wait_for(lambda: "Acquire" in str(world.http.call("bass/genom_state")))
         sender.join(0.8)
