@@ -52,6 +52,9 @@ classdef manager_RosAFE < handle
             %   P is a struct of parameters that are not the defaults, of the representation and of all that it depends
             %   on. REQUEST and P may be cell arrays, for several at once. SOUT is a row of the data object, a signal
             %   for each ear.
+            if nargin < 2 || isempty(request)
+                error('manager_RosAFE:arguments', 'addProcessor takes a representation, such as ''ild''');
+            end
             if nargin < 3
                 p = [];
             end
@@ -98,7 +101,7 @@ classdef manager_RosAFE < handle
             for candidate = mObj.Processors.(mObj.TYPES(position).type).'
                 chain = mObj.RosAFE.getDependencies(candidate{1}.name);
                 refuse(chain);
-                if all(cellfun(@(name) alike(mObj, name, p), chain.result.dependencies))
+                if all(cellfun(@(name) hasParameters(mObj, name, p), chain.result.dependencies))
                     processor = candidate{1};
                     return
                 end
@@ -112,7 +115,7 @@ classdef manager_RosAFE < handle
             refuse(output);
             signals = output.result.signals;
             for kind = mObj.TYPES
-                names = cellfun(@(processor) processor.name, mObj.Processors.(kind.type), 'UniformOutput', false);
+                names = namesOf(mObj.Processors.(kind.type));
                 chunks = signals.(kind.type);
                 if numel(chunks) ~= numel(names)
                     continue % another client changes the tree just now: getSignals names none, the next call will do
@@ -129,6 +132,9 @@ classdef manager_RosAFE < handle
             %DELETEPROCESSOR  Remove a processor and all that depend on it: by type and number, or by its name alone.
             name = type;
             if nargin > 2
+                if ~isfield(mObj.Processors, type) || ~any(number == 1:numel(mObj.Processors.(type)))
+                    error('manager_RosAFE:number', 'there is no processor %g of type ''%s''', number, type);
+                end
                 name = mObj.Processors.(type){number}.name;
             end
             refuse(mObj.RosAFE.removeProcessor(name));
@@ -161,45 +167,52 @@ classdef manager_RosAFE < handle
 
     methods (Access = private)
         function update(mObj)
-            % Ask for all processors, and have signals for just those.
+            % Ask for all processors, and have signals for just those, as they are now.
             asked = mObj.RosAFE.getParameters();
             refuse(asked);
+            if isequal(mObj.Processors, asked.result.parameters)
+                return
+            end
             mObj.Processors = asked.result.parameters;
             for kind = mObj.TYPES
                 processors = mObj.Processors.(kind.type);
-                names = cellfun(@(processor) processor.name, processors, 'UniformOutput', false);
-                keepOnly(mObj.dObj, kind.signal, names);
-                for k = find(~ismember(names, labels(mObj.dObj, kind.signal))).'
-                    addSignals(mObj, kind, processors{k});
+                keepOnly(mObj.dObj, kind.signal, namesOf(processors));
+                for k = 1:numel(processors)
+                    signals = signalsOf(mObj, kind, processors{k});
+                    row = find(strcmp(processors{k}.name, labels(mObj.dObj, kind.signal)));
+                    if isempty(row) || ~alike(signals{1}, mObj.dObj.(kind.signal){row, 1})
+                        cellfun(@(signal) addSignal(mObj.dObj, signal), signals);
+                    end
                 end
             end
         end
 
-        function addSignals(mObj, kind, processor)
+        function signals = signalsOf(mObj, kind, processor)
+            % New signals for what a processor computes, one for each ear.
             channels = {'left', 'right'};
             if ~kind.binaural
                 channels = {'mono'};
             end
             fs = mObj.dObj.sampleRate;
             seconds = mObj.dObj.bufferSize_s_matlab;
-            for channel = channels
-                switch kind.type
-                    case {'input', 'preProc'}
-                        signal = TimeDomainSignal.construct(fs, seconds, kind.signal, processor.name, channel{1});
-                    case 'crossCorrelation'
-                        signal = CorrelationSignal(1 / processor.cc_hSizeSec, seconds, kind.signal, processor.name, ...
-                            frequencies(mObj, processor.name), cell2mat(processor.cc_lags), channel{1});
-                    otherwise
-                        if isfield(processor, 'ild_hSizeSec')
-                            fs = 1 / processor.ild_hSizeSec;
-                        elseif isfield(processor, 'rm_hSizeSec')
-                            fs = 1 / processor.rm_hSizeSec;
-                        end
-                        signal = TimeFrequencySignal.construct(fs, seconds, kind.signal, processor.name, ...
-                            frequencies(mObj, processor.name), channel{1});
-                end
-                addSignal(mObj.dObj, signal);
+            switch kind.type
+                case {'input', 'preProc'}
+                    make = @(channel) TimeDomainSignal.construct(fs, seconds, kind.signal, processor.name, channel);
+                case 'crossCorrelation'
+                    cfHz = frequencies(mObj, processor.name);
+                    make = @(channel) CorrelationSignal(1 / processor.cc_hSizeSec, seconds, kind.signal, ...
+                        processor.name, cfHz, cell2mat(processor.cc_lags), channel);
+                otherwise
+                    if isfield(processor, 'ild_hSizeSec')
+                        fs = 1 / processor.ild_hSizeSec;
+                    elseif isfield(processor, 'rm_hSizeSec')
+                        fs = 1 / processor.rm_hSizeSec;
+                    end
+                    cfHz = frequencies(mObj, processor.name);
+                    make = @(channel) TimeFrequencySignal.construct(fs, seconds, kind.signal, processor.name, cfHz, ...
+                        channel);
             end
+            signals = cellfun(make, channels, 'UniformOutput', false);
         end
 
         function cfHz = frequencies(mObj, name)
@@ -217,6 +230,9 @@ classdef manager_RosAFE < handle
         function append(mObj, kind, name, chunk)
             row = find(strcmp(name, labels(mObj.dObj, kind.signal)));
             signals = mObj.dObj.(kind.signal)(row, :);
+            if isprop(signals{1}, 'cfHz') && ~isempty(signals{1}.cfHz) && size(chunk.left, 2) ~= numel(signals{1}.cfHz)
+                return % its channels have changed since getParameters
+            end
             appendChunk(signals{1}, chunk.left);
             if kind.binaural
                 appendChunk(signals{2}, chunk.right);
@@ -238,7 +254,7 @@ classdef manager_RosAFE < handle
             end
         end
 
-        function yes = alike(mObj, name, p)
+        function yes = hasParameters(mObj, name, p)
             % Whether a processor has the parameters of P, and else its defaults.
             p = plain(p);
             for kind = mObj.TYPES
@@ -254,6 +270,18 @@ classdef manager_RosAFE < handle
             yes = false;
         end
     end
+end
+
+function names = namesOf(processors)
+names = cellfun(@(processor) processor.name, processors, 'UniformOutput', false);
+end
+
+function yes = alike(signal, held)
+% Whether the frames of one signal can follow those of another.
+yes = true;
+for name = {'FsHz', 'cfHz', 'lags'}
+    yes = yes && (~isprop(signal, name{1}) || isequal(signal.(name{1}), held.(name{1})));
+end
 end
 
 function yes = same(field, processor, p, defaults)
@@ -288,6 +316,8 @@ function p = plain(p)
 % A struct, also of the parameter object of the MATLAB front-end.
 if isempty(p)
     p = struct();
+elseif isstruct(p) && ~isscalar(p)
+    error('manager_RosAFE:arguments', 'there are %d structures of parameters in place of one', numel(p));
 elseif isobject(p)
     p = cell2struct(values(p.map).', keys(p.map).', 1);
 end

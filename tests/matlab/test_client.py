@@ -64,6 +64,12 @@ def test_components_and_what_is_refused(world: World) -> None:
         show('name', r.exception.detail.what);
         p = rosAFE.ildPort('nobody');
         show('port', {class(p), p.status, p.exception.ex, p.exception.detail.what});
+        show('cells', {rosAFE.ildPort({'-a', 'b', 'c'}).status, rosAFE.getDependencies({1}).status});
+        show('extra', fieldnames(bass.Audio({}, 3)));
+        r = rosAFE.GammatoneProc('long', 'preProc', 'gammatone', 80, 8000, 1, 0, rand(1, 1e5));
+        show('long', {r.status, r.exception.detail.what});
+        r = rosAFE.request('ild', 'fb_nChannels', 16);
+        show('pairs', r.exception.detail.what);
         r = bass.Acquire('-a', 'file:/nowhere.wav');
         show('device', {r.status, r.exception.ex});
         r = rosAFE.Stop();
@@ -98,6 +104,10 @@ def test_components_and_what_is_refused(world: World) -> None:
     assert told["name"].startswith("unknown parameter 'fb_nERB'")
     assert told["port"][:3] == ["genomix.request", "error", "::genom::no_such_outport"]
     assert told["port"][3] == "ildPort has no element 'nobody'; there are: none"
+    assert told["cells"] == ["error", "error"]
+    assert told["extra"] == ["Audio"]
+    assert told["long"][0] == "error" and "the arguments are too long" in told["long"][1]
+    assert told["pairs"].endswith("after representation come the parameters in one object, not 'fb_nChannels'")
     assert told["device"] == ["error", "::bass::e_device"]
     assert told["done"] == ["done", True, True, True]
     assert "was deleted" in told["deleted"]

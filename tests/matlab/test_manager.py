@@ -140,6 +140,9 @@ def test_reuse_changes_and_refusals(world: World) -> None:
         show('bad parameter', message(@() mObj.modifyParameter('ild_0', 'rm_scaling', 'power')));
         show('bad processor', message(@() mObj.deleteProcessor('nobody')));
         show('bad type', message(@() mObj.hasProcessor('pitch')));
+        show('bad number', message(@() mObj.deleteProcessor('ild', 99)));
+        show('two', message(@() mObj.addProcessor('ild', struct('fb_nChannels', {1, 2}))));
+        show('none', message(@() mObj.addProcessor({}, {})));
         show('bad count', message(@() mObj.addProcessor({'ild', 'ratemap', 'time'}, {par, par})));
         show('bad device', message(@() dataObject_RosAFE(bass, rosAFE, 'file:/nowhere.wav', 16000, 1600)));
         show('few', message(@() dataObject_RosAFE(bass, rosAFE, 'scene:')));
@@ -153,6 +156,19 @@ def test_reuse_changes_and_refusals(world: World) -> None:
         show('name', sOut{1}.Label);
         mObj.deleteProcessor('time_0');
         show('root', {counts(), size(dObj.ratemap, 1)});
+
+        % signals follow what changes them
+        sOut = mObj.addProcessor('crosscorrelation', par);
+        name = @(kind) mObj.Processors.(kind){end}.name;
+        mObj.modifyParameter(name('gammatone'), 'fb_cfHz', [500 1000]);
+        mObj.modifyParameter(name('crossCorrelation'), 'cc_maxDelaySec', 0.0005);
+        mObj.modifyParameter(name('crossCorrelation'), 'cc_hSizeSec', 0.02);
+        signal = dObj.crosscorrelation{1};
+        while isempty(signal.Data)
+            pause(0.1);
+            mObj.processChunk();
+        end
+        show('follow', {signal.FsHz, signal.cfHz, numel(signal.lags), size(signal.Data)(2:3), isempty(sOut{1}.Data)});
         mObj.cleanup();
         show('clean', {counts(), mObj.Processors.input{1}.name, size(dObj.ild, 1), size(dObj.input, 1)});
         """,
@@ -170,6 +186,9 @@ def test_reuse_changes_and_refusals(world: World) -> None:
     assert told["bad parameter"] == "manager_RosAFE:refused Error::rosAFE::e_noSuchParameter"
     assert told["bad processor"] == "manager_RosAFE:refused Error::rosAFE::e_noSuchProcessor"
     assert told["bad type"].startswith("manager_RosAFE:type")
+    assert told["bad number"] == "manager_RosAFE:number there is no processor 99 of type 'ild'"
+    assert told["two"].startswith("manager_RosAFE:arguments there are 2 structures")
+    assert told["none"].startswith("manager_RosAFE:arguments")
     assert told["bad count"].startswith("manager_RosAFE:arguments")
     assert told["bad device"].startswith("acquireAudio:refused Error::bass::e_device")
     assert told["few"].startswith("dataObject_RosAFE:arguments")
@@ -178,4 +197,5 @@ def test_reuse_changes_and_refusals(world: World) -> None:
     assert before not in left and len(left) == 2 and size == [2, 1]
     assert told["name"] not in left
     assert told["root"][0] == [2, 1, 2, 0] and told["root"][1] == 0
+    assert told["follow"] == [50, [500, 1000], 17, [2, 17], True]
     assert told["clean"] == [[0, 0, 0, 0], "input_0", 0, 1]
