@@ -109,6 +109,18 @@ def test_a_compiler_that_fails(copy: Path) -> None:
     assert folders(copy) == []
 
 
+def test_a_compiler_that_makes_nothing(copy: Path) -> None:
+    """Nor is a library missed for ever that was lost later."""
+    compiled, status = show(copy, PATH=compiler(copy, "exit 0"))
+    assert not compiled
+    assert status.startswith("numpy and scipy: gcc cannot build the kernels: ")
+    assert folders(copy) == []
+    assert show(copy)[0]
+    (folder,) = folders(copy)
+    (copy / ".generated" / folder / "x86-64-v3.so").unlink()
+    assert show(copy)[0]
+
+
 def test_killed_half_way(copy: Path) -> None:
     path = compiler(copy, "exec sleep 60")
     env = environment(PYTHONPATH=str(copy), PATH=path)
@@ -147,6 +159,9 @@ def test_the_switch(copy: Path) -> None:
     compiled, status = show(copy, ROSAFE_KERNELS="3")
     assert compiled
     assert status.endswith("x86-64-v3.so")
+    compiled, status = show(copy, ROSAFE_KERNELS="off")
+    assert compiled
+    assert "(ROSAFE_KERNELS is 'off', which means nothing: 0, 3 or 4 would)" in status
 
 
 def test_other_machines(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

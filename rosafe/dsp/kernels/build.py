@@ -63,13 +63,22 @@ def libraries(below: Path | None = None) -> dict[int, Path]:
     """
     folder = (place() if below is None else below) / f"kernels-{digest()}"
     try:
-        if not folder.is_dir():
+        if _lacking(folder):
             if platform.machine() != PROCESSOR:
                 raise BuildError(f"the kernels are for {PROCESSOR}, and this machine is {platform.machine()}")
             _build(folder)
     except OSError as problem:
         raise BuildError(f"the kernels cannot be built: {problem}") from problem
+    return _paths(folder)
+
+
+def _paths(folder: Path) -> dict[int, Path]:
     return {level: folder / f"{name}.so" for level, name in LEVELS.items()}
+
+
+def _lacking(folder: Path) -> list[str]:
+    """The names of the libraries that are not in `folder`, or empty."""
+    return [path.name for path in _paths(folder).values() if not path.is_file() or path.stat().st_size == 0]
 
 
 def _build(folder: Path) -> None:
@@ -82,12 +91,14 @@ def _build(folder: Path) -> None:
         fcntl.flock(lock, fcntl.LOCK_EX)  # given back by the kernel even if this process is killed
         for orphan in base.glob("kernels-*.new-*"):  # nobody else builds now: left by one that was killed
             shutil.rmtree(orphan)
-        if not folder.is_dir():
+        if _lacking(folder):
             workshop = Path(tempfile.mkdtemp(prefix=f"{folder.name}.new-", dir=base))
             try:
                 _compile(gcc, workshop)
                 for path in (workshop, *workshop.iterdir()):  # for other users, too, whatever this one's umask is
                     path.chmod(0o755)
+                if folder.is_dir():  # something has been lost there
+                    shutil.rmtree(folder)
                 workshop.rename(folder)
             except BaseException:
                 shutil.rmtree(workshop)
@@ -101,8 +112,8 @@ def _compile(gcc: str, workshop: Path) -> None:
     environment = {**os.environ, "LC_ALL": "C"}
     running = []
     try:
-        for name in LEVELS.values():
-            command = [gcc, *FLAGS, f"-march={name}", "-o", str(workshop / f"{name}.so"), *sources, "-lm"]
+        for level, path in _paths(workshop).items():
+            command = [gcc, *FLAGS, f"-march={LEVELS[level]}", "-o", str(path), *sources, "-lm"]
             running.append(subprocess.Popen(command, stdin=subprocess.DEVNULL, stderr=subprocess.PIPE, env=environment))
         for process in running:
             _, said = process.communicate(timeout=PATIENCE)
@@ -116,6 +127,8 @@ def _compile(gcc: str, workshop: Path) -> None:
         for process in running:
             process.kill()  # one that is done already takes no notice
             process.wait()
+    if missing := _lacking(workshop):
+        raise BuildError(f"gcc cannot build the kernels: it says nothing, and there is no {missing[0]}")
 
 
 def _discard_old(base: Path) -> None:

@@ -56,7 +56,9 @@ def loaded() -> tuple[ctypes.CDLL | None, Status]:
         if level not in paths:
             raise build.BuildError("the kernels need a processor with AVX2 and FMA (x86-64-v3)")
         reason = f"the processor has {INSTRUCTIONS[level]}"
-        if switch in ("3", "4") and int(switch) < level:
+        if switch not in ("", *map(str, paths)):
+            reason += f" ({SWITCH} is {switch[:20]!r}, which means nothing: 0, 3 or 4 would)"
+        elif switch and int(switch) < level:
             level, reason = int(switch), f"{reason}, but {SWITCH} is {switch}"
         return load(paths[level]), Status(True, f"compiled for {build.LEVELS[level]}: {reason}; {paths[level]}")
     except (build.BuildError, OSError) as problem:
