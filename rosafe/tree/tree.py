@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import os
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -13,6 +14,7 @@ from rosafe.interface import KINDS, ROSAFE, ComponentError, Parameter, Processor
 from rosafe.tree.processor import Listener, Observer, Processor, Source, State, subtree
 
 MAX_BYTES = 2**30  # of one output port, of one processor's history, and of the samples that it keeps for a frame
+SHARE = 0.5  # of the machine's memory, for the output ports and histories of all processors together
 
 
 class Tree:
@@ -116,8 +118,7 @@ class Tree:
                 self.check_input(name, source.sample_rate)
                 with _refusing():
                     stage = STAGES["input"](source.sample_rate, **(parameters or {}))
-                    children = old.children if old is not None else ()
-                    _check_sizes(stage, (2,), max(port_seconds, history_seconds), children)
+                    self._check_sizes(stage, (2,), max(port_seconds, history_seconds), old)
             except ComponentError:
                 source.stop()
                 raise
@@ -162,7 +163,7 @@ class Tree:
             parent = self.check(kind, name, parent_name)
             with _refusing():
                 stage = STAGES[kind](self.sample_rate, **(parameters or {}))
-                _check_sizes(stage, parent.rows, self._longest)
+                self._check_sizes(stage, parent.rows, self._longest)
             processor = self._processor(name, kind, stage, parent, None)
             self._begin(processor)
             return processor
@@ -194,8 +195,33 @@ class Tree:
 
     @property
     def _longest(self) -> float:
-        """Seconds of output that are kept, on a port or as history."""
+        """Seconds of output that are kept, on a port or as history: these refer to the same blocks."""
         return max(self.port_seconds, self.history_seconds)
+
+    def _check_sizes(
+        self, stage: Any, rows: tuple[int, ...], seconds: float, instead_of: Processor | None = None
+    ) -> None:
+        """ValueError where `stage`, given blocks of leading shape `rows`, would fill the memory.
+
+        That is with `seconds` of output or with the samples of one frame, its own or of those that it takes over from
+        `instead_of`, or with the output of the whole tree as it would be then.
+        """
+        planned = list(_planned(stage, rows, instead_of.children if instead_of is not None else ()))
+        for one, given in planned:
+            _check_size("port or history", seconds, one.output_rows(given), one.output_rate)
+            for name, value in one.parameters.items():
+                if name.endswith("_wSizeSec"):
+                    _check_size(name, value, given, one.sample_rate)
+        replaced = set(subtree(instead_of)) if instead_of is not None else set()
+        outputs = [(one.output_rows(given), one.output_rate) for one, given in planned]
+        outputs += [(other.rows, other.rate) for other in self._processors.values() if other not in replaced]
+        size = sum(_bytes(seconds, *output) for output in outputs)
+        share = SHARE * os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+        if size > share:
+            raise ValueError(
+                f"{seconds:g} s of output of {len(outputs)} processors take {size / 2**20:.0f} MiB, "
+                f"more than {share / 2**20:.0f} MiB, which is {SHARE:.0%} of this machine's memory"
+            )
 
     # --- changing ---
 
@@ -226,7 +252,7 @@ class Tree:
         rows = processor.parent.rows if processor.parent is not None else (2,)
 
         def accept(stage: Any) -> None:
-            _check_sizes(stage, rows, self._longest, processor.children)
+            self._check_sizes(stage, rows, self._longest, processor)
 
         processor.change(name, value, accept, block)
 
@@ -281,22 +307,19 @@ def _refusing() -> Iterator[None]:
         raise ROSAFE.error("e_badNewValue", what=str(problem)) from None
 
 
-def _check_sizes(stage: Any, rows: tuple[int, ...], seconds: float, children: Iterable[Processor] = ()) -> None:
-    """ValueError where `stage`, given blocks of leading shape `rows`, or one of `children` would fill the memory.
-
-    That is with `seconds` of output, or with the samples of one frame.
-    """
-    output_rows = stage.output_rows(rows)
-    _check_size("port or history", seconds, output_rows, stage.output_rate)
-    for name, value in stage.parameters.items():
-        if name.endswith("_wSizeSec"):
-            _check_size(name, value, rows, stage.sample_rate)
+def _planned(stage: Any, rows: tuple[int, ...], children: Iterable[Processor]) -> Iterator[tuple[Any, tuple[int, ...]]]:
+    """`stage` over `children`, and all stages below: each with the leading shape of the blocks that it would get."""
+    yield stage, rows
     for child in children:
-        _check_sizes(child.stage, output_rows, seconds, child.children)
+        yield from _planned(child.stage, stage.output_rows(rows), child.children)
+
+
+def _bytes(seconds: float, rows: tuple[int, ...], rate: float) -> float:
+    return math.prod(rows, start=8.0 * rate * seconds)
 
 
 def _check_size(what: str, seconds: float, rows: tuple[int, ...], rate: float) -> None:
-    size = math.prod(rows, start=8.0 * rate * seconds)
+    size = _bytes(seconds, rows, rate)
     if size > MAX_BYTES:
         shape = "x".join(map(str, rows))
         raise ValueError(

@@ -12,6 +12,7 @@ import pytest
 
 from rosafe.dsp import STAGES
 from rosafe.interface import ComponentError
+from rosafe.tree import tree as tree_of_processors
 from rosafe.tree.processor import Processor, State
 from rosafe.tree.tree import Tree
 from rosafe.tree.zone import Block
@@ -238,6 +239,32 @@ def test_absurd_sizes_are_refused(tree: Tree, feed: Feed) -> None:
     tree.modify("gammatone", "fb_nChannels", "5")
     tree.modify("crossCorrelation", "cc_maxDelaySec", "0.5")
     refused(tree, "e_badNewValue", large, tree.modify, "gammatone", "fb_nChannels", "1000")  # likewise
+
+
+def test_all_processors_together_have_a_share_of_the_memory(
+    tree: Tree, feed: Feed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What would pass it changes nothing, be it a new processor, a longer port or more channels."""
+    monkeypatch.setattr(tree_of_processors.os, "sysconf", {"SC_PHYS_PAGES": 2**13, "SC_PAGE_SIZE": 2**12}.get)  # 32 MiB
+    share = "MiB, more than 16 MiB, which is 50% of this machine's memory"
+    grow(tree, feed)
+    tree.modify("gammatone", "fb_nChannels", "10")
+    for number in range(50):
+        try:
+            tree.add("gammatone", f"more{number}", "preProc", {"fb_nChannels": 10, "fb_highFreqHz": 4000.0})
+        except ComponentError as problem:
+            assert "more than 16 MiB" in str(problem)
+            break
+    assert 1 < number < 49
+    before = [p.name for p in tree.processors]
+    refused(tree, "e_badNewValue", share, tree.modify, "gammatone", "fb_nChannels", "30")
+    refused(tree, "e_badNewValue", share, tree.add_input, "input", Feed(), 160, 1.5, 1.0)
+    assert [p.name for p in tree.processors] == before
+    tree.modify("gammatone", "fb_nChannels", "5")
+    tree.remove("more0")
+    tree.add("gammatone", "more0", "preProc", {"fb_nChannels": 10, "fb_highFreqHz": 4000.0})
+    tree.add_input("input", Feed(), 160, 0.5, 0.5)  # and now all that are there take half as much
+    tree.modify("gammatone", "fb_nChannels", "30")
 
 
 def test_two_hundred_processors(tree: Tree, feed: Feed, listener: Recorder) -> None:
