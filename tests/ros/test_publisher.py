@@ -267,6 +267,7 @@ def test_the_table_of_the_document(tree: Session) -> None:
 
 def test_all_ports_for_a_while(tmp_path: Path) -> None:
     """The short form of the benchmark that runs for minutes: nothing lost, no growth."""
+    proc()
     env = {k: v for k, v in os.environ.items() if not k.startswith("ROS_")}
     command = [PYTHON, str(ROOT / "benchmarks" / "ports.py"), "--quick", "--seconds", "3"]
     with Process(command, {**env, "HOME": str(tmp_path)}) as done:
