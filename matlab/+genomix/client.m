@@ -89,9 +89,12 @@ classdef client < handle
 end
 
 function address = full_address(address)
+if ~isempty(address) && ~(ischar(address) && isrow(address))
+    error('genomix:connection', 'the address of genomixd is a text, such as ''host:8080''');
+end
 address = regexprep(address, '^http://|/+$', '');
-if isempty(address)
-    address = '127.0.0.1';
+if isempty(address) || address(1) == ':'
+    address = ['127.0.0.1' address];
 end
 if isempty(regexp(address, ':\d+$', 'once'))
     address = [address ':8080'];

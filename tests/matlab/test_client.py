@@ -49,6 +49,8 @@ def test_components_and_what_is_refused(world: World) -> None:
         show('no component', message(@() client.load('nobody')));
         show('no instance', message(@() client.load('rosAFE', '-i')));
         show('wrong instance', message(@() client.load('bass', '-i', 'rosAFE')));
+        show('no text', message(@() genomix.client(7)));
+        show('address', genomix.client([':' regexp(getenv('GENOMIXD'), '\\d+$', 'match'){1}]).address);
         show('no server', message(@() genomix.client('127.0.0.1:1')));
         r = rosAFE.removeProcessor('nobody');
         show('refused', {r.status, r.exception.ex, isempty(r.result)});
@@ -94,6 +96,8 @@ def test_components_and_what_is_refused(world: World) -> None:
     )
     assert "may be only: '-i', 'instance'" in told["no instance"]
     assert "/rosAFE is a rosAFE, and no bass" in told["wrong instance"]
+    assert told["no text"].startswith("genomix:connection the address of genomixd is a text")
+    assert told["address"] == f"127.0.0.1:{world.port}"
     assert told["no server"].startswith("genomix:connection no answer from genomixd at 127.0.0.1:1 (")
     assert "genomixd &" in told["no server"]
     assert told["refused"] == ["error", "::rosAFE::e_noSuchProcessor", True]

@@ -19,7 +19,7 @@ else
     message = '';
     bytes = [];
     try
-        % genomixd itself gives up after 60 s at the latest
+        % genomixd itself gives up after 75 s at the latest
         bytes = webread(url, weboptions('ContentType', 'binary', 'Timeout', 120));
     catch problem
         reached = false;
