@@ -65,10 +65,11 @@ def run(options: argparse.Namespace) -> int:
     """Make the request and print what has come of it."""
     try:
         kind = request.kind_of(options.representation)
-        values = {
-            "representation": kind.representation,
-            **dict(map(_parameter, [*options.settings, *options.interspersed])),
-        }
+        values = {"representation": kind.representation}
+        for name, value in map(_parameter, [*options.settings, *options.interspersed]):
+            if name in values:
+                raise ValueError(f"{name} is given twice")
+            values[name] = value
     except ValueError as problem:
         raise Failure(str(problem)) from None
     if options.connect is not None:
@@ -85,7 +86,7 @@ def run(options: argparse.Namespace) -> int:
     if options.json:
         print(json.dumps(answer, indent=2))
     else:
-        _show(answer, kind, options.instance.strip("/"))
+        _show(answer, kind)
     return 0
 
 
@@ -136,9 +137,10 @@ def _told(problem: ComponentError) -> str:
     return problem.ex + (f": {what}" if what else "")
 
 
-def _show(answer: Mapping[str, Any], kind: ProcessorKind, instance: str) -> None:
+def _show(answer: Mapping[str, Any], kind: ProcessorKind) -> None:
     """A line for each processor, and on stderr one for each parameter that was given in vain."""
     width = max(map(len, answer["dependencies"]))
+    instance = answer["topic"].split("/")[1]
     for name, kind_there in zip(answer["dependencies"], request.chain(kind), strict=True):
         how = "created" if name in answer["created"] else "reused"
         print(f"{how:7}  {name:{width}}  {request.topic(instance, kind_there, name)}")

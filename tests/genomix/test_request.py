@@ -278,6 +278,7 @@ def test_the_command(sound: World) -> None:
         ([], 2, "the following arguments are required: REPRESENTATION;"),
         (["spikes"], 1, "'spikes' is not one of input, time"),
         (["ild", "fb_nChannels"], 1, "fb_nChannels: wanted is NAME=VALUE"),
+        (["ild", "fb_nChannels=1", "fb_nChannels=2"], 1, "fb_nChannels is given twice"),
         (["ild", "fb_nERB=1"], 1, "unknown parameter 'fb_nERB'; there are: nFramesPerBlock"),
         (["ild", "representation=time"], 1, "unknown parameter 'representation'"),
         (["ild", "fb_nChannels=-1"], 1, "fb_nChannels: -1 is not"),
