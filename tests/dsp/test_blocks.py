@@ -23,7 +23,7 @@ sizes = st.lists(st.one_of(st.sampled_from([0, 1, 2]), st.integers(0, 250)), min
 
 @every_mode
 @given(sizes=sizes)
-@settings(max_examples=20, deadline=None, database=None)
+@settings(max_examples=8, deadline=None, database=None)
 def test_block_cutting(kind: str, parameters: dict[str, Any], sizes: list[int]) -> None:
     signal = noise(kind, SAMPLES)
     whole = make(kind, parameters).process(signal)

@@ -80,7 +80,7 @@ def check(level: int, kind: str, parameters: dict[str, Any], blocks: list[FloatA
     sizes=block_sizes,
     envelopes=st.lists(st.booleans(), min_size=8, max_size=8),
 )
-@settings(max_examples=60, deadline=None, database=None)
+@settings(max_examples=30, deadline=None, database=None)
 def test_gammatone(
     level: int, channels: int, order: int, width: float, sizes: list[int], envelopes: list[bool]
 ) -> None:
@@ -97,7 +97,7 @@ def test_gammatone(
 
 @each_level
 @given(method=st.sampled_from(METHODS), channels=st.integers(1, 11), sizes=block_sizes)
-@settings(max_examples=60, deadline=None, database=None)
+@settings(max_examples=30, deadline=None, database=None)
 def test_hair_cell(level: int, method: str, channels: int, sizes: list[int]) -> None:
     check(level, "ihc", {"ihc_method": method}, cut(signal(channels, sum(sizes) + 50), [*sizes, 50]))
 
@@ -122,7 +122,7 @@ def framing(prefix: str) -> st.SearchStrategy[dict[str, Any]]:
 
 @each_level
 @given(parameters=framing("ild"), channels=st.integers(1, 11), sizes=block_sizes)
-@settings(max_examples=60, deadline=None, database=None)
+@settings(max_examples=30, deadline=None, database=None)
 def test_ild(level: int, parameters: dict[str, Any], channels: int, sizes: list[int]) -> None:
     check(level, "ild", parameters, cut(signal(channels, sum(sizes) + 500), [*sizes, 300]))
 
@@ -135,7 +135,7 @@ def test_ild(level: int, parameters: dict[str, Any], channels: int, sizes: list[
     channels=st.integers(1, 11),
     sizes=block_sizes,
 )
-@settings(max_examples=60, deadline=None, database=None)
+@settings(max_examples=30, deadline=None, database=None)
 def test_ratemap(
     level: int, parameters: dict[str, Any], scaling: str, decay: float, channels: int, sizes: list[int]
 ) -> None:
@@ -150,7 +150,7 @@ def test_ratemap(
     channels=st.integers(1, 6),
     sizes=block_sizes,
 )
-@settings(max_examples=80, deadline=None, database=None)
+@settings(max_examples=40, deadline=None, database=None)
 def test_cross_correlation(level: int, parameters: dict[str, Any], lag: int, channels: int, sizes: list[int]) -> None:
     parameters = {**parameters, "cc_maxDelaySec": (lag - 0.5) / RATE}
     check(level, "crossCorrelation", parameters, cut(signal(channels, sum(sizes) + 500), [*sizes, 300]))
@@ -217,7 +217,7 @@ def test_denormal_numbers_are_off_for_numpy_where_that_is_asked_for(level: int) 
 
 @each_level
 def test_the_interpreter_goes_on_meanwhile(level: int) -> None:
-    sound = signal(16, 200_000)
+    sound = signal(16, 100_000)
     span: list[float] = []
     ready = threading.Event()
 
