@@ -57,8 +57,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "-o",
         "--output",
         metavar="OUT",
-        help="output file, replaced where there is one; or the folder for all outputs, ending in / or there already "
-        "(default: beside each input); files in it are named as the inputs, with .npz",
+        help="output file, replaced where there is one; or the folder for all outputs, there already or ending in / "
+        "(it is made then; default: beside each input); files in it are named as the inputs, with .npz",
     )
     parser.add_argument(
         "--set",
@@ -184,6 +184,7 @@ def run(options: argparse.Namespace) -> int:
             )
         display.update(index, 1.0 if told.last else told.part)
 
+    made = _make_folder(options.output)
     try:
         run_together(works, options.jobs, (AudioFileError, OutputError, ValueError), report, signals)
     except Interrupted:
@@ -191,7 +192,20 @@ def run(options: argparse.Namespace) -> int:
         raise
     finally:
         display.clear()
+        if made and not any(made.iterdir()):
+            made.rmdir()
     return 1 if failed else 0
+
+
+def _make_folder(output: str | None) -> Path | None:
+    """The folder for the outputs, if it is wanted and was not there; Failure where it cannot be made."""
+    if output is None or not output.endswith("/") or os.path.isdir(output):
+        return None
+    try:
+        os.mkdir(output)
+    except OSError as problem:
+        raise Failure(f"-o {output}: {problem.strerror}") from None
+    return Path(output)
 
 
 def _targets(inputs: list[Path], output: str | None) -> tuple[list[Path], bool]:

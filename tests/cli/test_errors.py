@@ -158,7 +158,8 @@ def test_places_that_cannot_be_written(folder: Path) -> None:
     content = (folder / "in.wav").read_bytes()
     for out, words in {
         "nowhere/out.npz": ["nowhere/out.npz", "No such file"],
-        "nowhere/": ["nowhere/in.npz", "No such file"],
+        "nowhere/deep/": ["-o nowhere/deep/: ", "No such file"],
+        "in.wav/": ["-o in.wav/: ", "File exists"],
         "in.wav/out.npz": ["in.wav/out.npz", "Not a directory"],
         "/dev/null": ["/dev/null", "not a regular file"],
         "in.wav": ["in.wav is the input itself"],

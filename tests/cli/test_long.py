@@ -169,7 +169,10 @@ def test_two_for_one_place(long_file: Path) -> None:
     here, part = long_file.parent, long_file.with_name("in.npz.part")
     with start("process", "in.wav", "--outputs", "ild", cwd=here) as command:
         wait_for(begun(part), what=lambda: str(command))
+        (child,) = _children(command.pid)
+        os.kill(child, signal.SIGSTOP)  # it has the file, and leaves the processor to others
         done = rosafe("process", "in.wav", "--outputs", "ild", cwd=here)
+        os.kill(child, signal.SIGCONT)
         assert done.returncode == 1
         assert done.stderr == f"rosafe process: in.wav: cannot write {here}/in.npz: another process is writing it\n"
         assert command.alive and part.exists()

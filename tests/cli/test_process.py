@@ -33,61 +33,78 @@ def assert_equal(path: Path, expected: dict[str, Any]) -> None:
         np.testing.assert_array_equal(mapped[name], value, err_msg=name)
 
 
-@pytest.mark.parametrize(
-    ("name", "subtype", "bits"),
-    [
-        ("in.wav", "PCM_U8", 8),
-        ("in.wav", "PCM_16", 16),
-        ("in.wav", "PCM_24", 24),
-        ("in.wav", "PCM_32", 32),
-        ("in.flac", "PCM_16", 16),
-        ("in.aiff", "PCM_24", 24),
-    ],
-)
-def test_integer_files(tmp_path: Path, name: str, subtype: str, bits: int) -> None:
-    full = 2 ** (bits - 1)
-    signal = np.random.default_rng(bits).integers(-full, full, (2, 5000)) / full  # exactly what the file can hold
-    path = write(tmp_path / name, signal, subtype=subtype)
-    done = rosafe("process", path, *SMALL, "--outputs", "input,ild")
+def test_integer_files(tmp_path: Path) -> None:
+    kinds = {
+        "u8.wav": ("PCM_U8", 8),
+        "16.wav": ("PCM_16", 16),
+        "24.wav": ("PCM_24", 24),
+        "32.wav": ("PCM_32", 32),
+        "flac.flac": ("PCM_16", 16),
+        "aiff.aiff": ("PCM_24", 24),
+    }
+    signals = {}
+    for name, (subtype, bits) in kinds.items():
+        full = 2 ** (bits - 1)
+        signals[name] = np.random.default_rng(bits).integers(-full, full, (2, 5000)) / full  # exactly what it can hold
+        write(tmp_path / name, signals[name], subtype=subtype)
+    done = rosafe("process", *kinds, *SMALL, "--outputs", "input,ild", cwd=tmp_path)
     assert done.returncode == 0, done
-    samples = as_int32(signal)
-    assert np.all(samples % 2 ** (32 - bits) == 0)
-    assert_equal(tmp_path / "in.npz", process(samples, 16000, SMALL_PARAMETERS, outputs=["input", "ild"]))
+    for name, (_, bits) in kinds.items():
+        samples = as_int32(signals[name])
+        assert np.all(samples % 2 ** (32 - bits) == 0)
+        expected = process(samples, 16000, SMALL_PARAMETERS, outputs=["input", "ild"])
+        assert_equal((tmp_path / name).with_suffix(".npz"), expected)
 
 
-@pytest.mark.parametrize("subtype", ["PCM_U8", "PCM_24", "FLOAT", "DOUBLE"])
-def test_extensible_header(tmp_path: Path, subtype: str) -> None:
+def test_extensible_header(tmp_path: Path) -> None:
     """WAVE_FORMAT_EXTENSIBLE, as many programs write it."""
     signal = np.random.default_rng(9).integers(-128, 128, (2, 5000)) / 128
-    for name, form in (("plain.wav", "WAV"), ("extensible.wav", "WAVEX")):
-        soundfile.write(tmp_path / name, signal.T, 16000, subtype, format=form)
-    assert rosafe("process", "plain.wav", "extensible.wav", *SMALL, "--outputs", "input", cwd=tmp_path).returncode == 0
-    with np.load(tmp_path / "plain.npz") as plain, np.load(tmp_path / "extensible.npz") as extensible:
-        np.testing.assert_array_equal(plain["input"], extensible["input"])
+    subtypes = ("PCM_U8", "PCM_24", "FLOAT", "DOUBLE")
+    names = []
+    for subtype in subtypes:
+        for form in ("WAV", "WAVEX"):
+            names.append(f"{subtype}-{form}.wav")
+            soundfile.write(tmp_path / names[-1], signal.T, 16000, subtype, format=form)
+    assert rosafe("process", *names, *SMALL, "--outputs", "input", cwd=tmp_path).returncode == 0
+    for subtype in subtypes:
+        with (
+            np.load(tmp_path / f"{subtype}-WAV.npz") as plain,
+            np.load(tmp_path / f"{subtype}-WAVEX.npz") as extensible,
+        ):
+            np.testing.assert_array_equal(plain["input"], extensible["input"])
 
 
-@pytest.mark.parametrize("subtype", ["FLOAT", "DOUBLE"])
-def test_float_files(tmp_path: Path, subtype: str) -> None:
+def test_float_files(tmp_path: Path) -> None:
+    """Beyond full scale they are clipped; what is no number is silence."""
     signal = np.random.default_rng(5).normal(0, 0.3, (2, 5000)).astype(np.float32).astype(np.float64)
-    signal[:, 7] = 1.5, -1.5  # clipped
-    path = write(tmp_path / "in.wav", signal, subtype=subtype)
-    assert rosafe("process", path, *SMALL, "--outputs", "input,ratemap").returncode == 0
+    signal[:, 7] = 1.5, -1.5
+    signal[:, 8] = np.nan, np.inf
+    subtypes = ("FLOAT", "DOUBLE")
+    for subtype in subtypes:
+        write(tmp_path / f"{subtype}.wav", signal, subtype=subtype)
+    names = [f"{subtype}.wav" for subtype in subtypes]
+    assert rosafe("process", *names, *SMALL, "--outputs", "input,ratemap", cwd=tmp_path).returncode == 0
+    signal[:, 8] = 0.0, 1.0
     samples = np.rint(np.clip(signal * (2**31 - 1), -(2**31), 2**31 - 1)).astype(np.int32)
-    assert_equal(tmp_path / "in.npz", process(samples, 16000, SMALL_PARAMETERS, outputs=["input", "ratemap"]))
+    expected = process(samples, 16000, SMALL_PARAMETERS, outputs=["input", "ratemap"])
+    for subtype in subtypes:
+        assert_equal(tmp_path / f"{subtype}.npz", expected)
 
 
-@pytest.mark.parametrize("rate", [22050, 44100, 96000])
-def test_everything_at_any_rate_with_defaults(tmp_path: Path, rate: int) -> None:
-    samples = np.random.default_rng(rate).integers(-(2**31), 2**31, (2, 30000)).astype(np.int32)
-    path = write(tmp_path / "in.wav", samples, rate, "PCM_32")
-    done = rosafe("process", path, "-o", tmp_path / "out.npz")
+def test_everything_at_any_rate_with_defaults(tmp_path: Path) -> None:
+    signals = {}
+    for rate in (22050, 44100, 96000):
+        signals[rate] = np.random.default_rng(rate).integers(-(2**31), 2**31, (2, 13000)).astype(np.int32)
+        write(tmp_path / f"{rate}.wav", signals[rate], rate, "PCM_32")
+    done = rosafe("process", *(f"{rate}.wav" for rate in signals), cwd=tmp_path)
     assert done.returncode == 0, done
-    expected = process(samples, rate)
-    assert set(KINDS) < set(expected)
-    assert_equal(tmp_path / "out.npz", expected)
-    with np.load(tmp_path / "out.npz") as loaded:
-        assert loaded["sample_rate"] == rate
-        assert loaded["block_frames"] == 12000
+    for rate, samples in signals.items():
+        expected = process(samples, rate)
+        assert set(KINDS) < set(expected)
+        assert_equal(tmp_path / f"{rate}.npz", expected)
+        with np.load(tmp_path / f"{rate}.npz") as loaded:
+            assert loaded["sample_rate"] == rate
+            assert loaded["block_frames"] == 12000
 
 
 def test_settings_and_blocks(tmp_path: Path) -> None:
@@ -124,13 +141,15 @@ def test_what_nobody_needs_is_not_there(tmp_path: Path) -> None:
         assert set(loaded) == {"preProc", *BESIDES}
 
 
-@pytest.mark.parametrize("frames", [1, 100, 319, 320, 481, 12000, 12001])
-def test_short_files(tmp_path: Path, frames: int) -> None:
+def test_short_files(tmp_path: Path) -> None:
     """Shorter than a window (of 320 frames), just one, not a whole number of hops, just a block."""
-    samples = np.random.default_rng(frames).integers(-(2**31), 2**31, (2, frames)).astype(np.int32)
-    path = write(tmp_path / "in.wav", samples, subtype="PCM_32")
-    assert rosafe("process", path, *SMALL).returncode == 0
-    assert_equal(tmp_path / "in.npz", process(samples, 16000, SMALL_PARAMETERS))
+    signals = {}
+    for frames in (1, 100, 319, 320, 481, 12000, 12001):
+        signals[frames] = np.random.default_rng(frames).integers(-(2**31), 2**31, (2, frames)).astype(np.int32)
+        write(tmp_path / f"{frames}.wav", signals[frames], subtype="PCM_32")
+    assert rosafe("process", *(f"{frames}.wav" for frames in signals), *SMALL, cwd=tmp_path).returncode == 0
+    for frames, samples in signals.items():
+        assert_equal(tmp_path / f"{frames}.npz", process(samples, 16000, SMALL_PARAMETERS))
 
 
 @pytest.mark.parametrize("settings", [["ild_hSizeSec=0.05"], ["cc_hSizeSec=0.0123", "cc_maxDelaySec=0.03"]])
@@ -183,16 +202,11 @@ def test_one_bad_file_does_not_keep_the_others(tmp_path: Path) -> None:
     assert {path.name for path in tmp_path.glob("*.npz")} == {"a.npz", "c.npz"}
 
 
-def test_input_files_may_follow_settings(tmp_path: Path) -> None:
+def test_input_files_may_follow_settings_and_quiet_is_quiet(tmp_path: Path) -> None:
     write(tmp_path / "a.wav", noise(3000))
-    assert rosafe("process", "--quiet", *SMALL, "a.wav", cwd=tmp_path).returncode == 0
-    assert (tmp_path / "a.npz").exists()
-
-
-def test_quiet_is_quiet(tmp_path: Path) -> None:
-    path = write(tmp_path / "a.wav", noise(3000))
-    done = rosafe("process", path, "--quiet", *SMALL)
+    done = rosafe("process", "--quiet", *SMALL, "a.wav", cwd=tmp_path)
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+    assert (tmp_path / "a.npz").exists()
 
 
 def test_output_file_is_replaced_where_it_is_named(tmp_path: Path) -> None:
@@ -211,6 +225,16 @@ def test_outputs_in_a_folder(tmp_path: Path) -> None:
     (tmp_path / "results").mkdir()
     assert rosafe("process", path, *SMALL, "-o", tmp_path / "results").returncode == 0
     assert [path.name for path in (tmp_path / "results").iterdir()] == ["a.b.npz"]
+
+
+def test_outputs_in_a_folder_that_is_made(tmp_path: Path) -> None:
+    """As in `rosafe process *.wav -o results/`; it is gone again where nothing came into it."""
+    write(tmp_path / "a.wav", noise(3000))
+    write(tmp_path / "mono.wav", noise(3000)[:1])
+    assert rosafe("process", "a.wav", "mono.wav", *SMALL, "-o", "results/", cwd=tmp_path).returncode == 1
+    assert [path.name for path in (tmp_path / "results").iterdir()] == ["a.npz"]
+    assert rosafe("process", "mono.wav", *SMALL, "-o", "others/", cwd=tmp_path).returncode == 1
+    assert not (tmp_path / "others").exists()
 
 
 def test_same_input_same_file(tmp_path: Path) -> None:
