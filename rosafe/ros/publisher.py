@@ -84,6 +84,7 @@ class _Topic(topics._PublisherImpl):
         if senders:
             written = Gather()
             message.serialize(written)
+            self.message_data_sent += _LENGTH.size + written.size  # for getBusStats; once, as rospy counts it
             for sender in senders:
                 sender.offer(written)
 

@@ -141,6 +141,26 @@ def test_what_waits_is_bounded_and_ends_with_the_newest(graph: Graph) -> None:
         port.unregister()
 
 
+def test_statistics_of_the_topic_and_of_each_connection(graph: Graph) -> None:
+    """As `getBusStats` gives them: bytes published, and for each connection its number, bytes, messages, whether up."""
+    graph.client()
+    port = Publisher("/of_the_test/counted", array_msg(TIME_DOMAIN))
+    port.publish(message(1))  # for nobody, yet
+    size = 4 + 4 + 8 + 8 + 2 * (4 + 3 * 8)
+    with stalled(graph, port.resolved_name), graph.collect(port.resolved_name):
+        wait_for(lambda: port.get_num_connections() == 2)
+        port.publish(message(2))
+
+        def statistics() -> Any:
+            node: Any = xmlrpc.client.ServerProxy(rosgraph.Master("/test", graph.uri).lookupNode(rospy.get_name()))
+            return next(entry for entry in node.getBusStats("/test")[2][0] if entry[0] == port.resolved_name)
+
+        wait_for(lambda: [entry[2] for entry in statistics()[2]] == [2, 2], what=lambda: str(statistics()))
+        assert statistics()[1] == 3 * size, "the latched one for each, the other once"
+        assert all(entry[1] >= 2 * size and entry[3] for entry in statistics()[2])
+    port.unregister()
+
+
 def test_a_subscriber_that_left_is_forgotten(graph: Graph) -> None:
     graph.client()
     port = Publisher("/of_the_test/left", array_msg(TIME_DOMAIN))
