@@ -89,16 +89,8 @@ classdef manager_RosAFE < handle
                 p = struct();
             end
             update(mObj);
-            wanted = strrep(lower(type), 'proc', '');
-            if strcmpi(type, 'preProc')
-                wanted = 'preproc';
-            end
-            position = find(strcmpi(wanted, {mObj.TYPES.type}));
-            if isempty(position)
-                error('manager_RosAFE:type', 'there is no type of processors ''%s''', type);
-            end
             processor = 0;
-            for candidate = mObj.Processors.(mObj.TYPES(position).type).'
+            for candidate = mObj.Processors.(typeOf(mObj, type)).'
                 chain = mObj.RosAFE.getDependencies(candidate{1}.name);
                 refuse(chain);
                 if all(cellfun(@(name) hasParameters(mObj, name, p), chain.result.dependencies))
@@ -132,10 +124,11 @@ classdef manager_RosAFE < handle
             %DELETEPROCESSOR  Remove a processor and all that depend on it: by type and number, or by its name alone.
             name = type;
             if nargin > 2
-                if ~isfield(mObj.Processors, type) || ~any(number == 1:numel(mObj.Processors.(type)))
+                processors = mObj.Processors.(typeOf(mObj, type));
+                if ~any(number == 1:numel(processors))
                     error('manager_RosAFE:number', 'there is no processor %g of type ''%s''', number, type);
                 end
-                name = mObj.Processors.(type){number}.name;
+                name = processors{number}.name;
             end
             refuse(mObj.RosAFE.removeProcessor(name));
             update(mObj);
@@ -185,6 +178,19 @@ classdef manager_RosAFE < handle
                     end
                 end
             end
+        end
+
+        function type = typeOf(mObj, name)
+            % The type of processors that is meant: 'gammatone' by that name, 'gammatoneProc' or 'filterbank'.
+            if strcmpi(name, 'time')
+                name = 'preProc';
+            end
+            kinds = mObj.TYPES;
+            meant = strcmpi(name, {kinds.type}) | strcmpi(name, {kinds.request}) | strcmpi(name, {kinds.signal});
+            if ~any(meant)
+                error('manager_RosAFE:type', 'there is no type of processors ''%s''', name);
+            end
+            type = kinds(meant).type;
         end
 
         function signals = signalsOf(mObj, kind, processor)

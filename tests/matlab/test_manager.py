@@ -152,6 +152,8 @@ def test_reuse_changes_and_refusals(world: World) -> None:
         mObj.deleteProcessor('ild', 2);
         names = cellfun(@(one) one.name, mObj.Processors.ild, 'UniformOutput', false);
         show('deleted', {before, names, size(dObj.ild)});
+        middle.deleteProcessor('time', 3);
+        show('middle', numel(middle.Processors.preProc));
         sOut = mObj.addProcessor('ild', wider);
         show('name', sOut{1}.Label);
         mObj.deleteProcessor('time_0');
@@ -196,6 +198,7 @@ def test_reuse_changes_and_refusals(world: World) -> None:
     before, left, size = told["deleted"]
     assert before not in left and len(left) == 2 and size == [2, 1]
     assert told["name"] not in left
-    assert told["root"][0] == [2, 1, 2, 0] and told["root"][1] == 0
+    assert told["middle"] == 2
+    assert told["root"][0] == [1, 1, 2, 0] and told["root"][1] == 0
     assert told["follow"] == [50, [500, 1000], 17, [2, 17], True]
     assert told["clean"] == [[0, 0, 0, 0], "input_0", 0, 1]
