@@ -87,6 +87,7 @@ def net() -> Iterator[Net]:
         subprocess.run(["ip", "netns", "del", net.name], capture_output=True, check=False)  # the cable goes with it
 
 
+@pytest.mark.ros
 def test_two_machines(net: Net, tmp_path: Path) -> None:
     """The master and bass are near, rosAFE is far; a client is near, and hears what is computed far."""
     master = MasterProcess()

@@ -285,6 +285,7 @@ def test_the_table_of_the_document(tree: Session) -> None:
     assert f"{MAX_WAITING} messages and {MAX_WAITING_BYTES // 10**6} MB" in text
 
 
+@pytest.mark.ros
 def test_all_ports_for_a_while(tmp_path: Path) -> None:
     """The short form of the benchmark that runs for minutes: nothing lost, no growth."""
     proc()
