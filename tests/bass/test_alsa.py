@@ -214,6 +214,25 @@ def test_device_that_comes_back_goes_on(pcm: type[FakePcm]) -> None:
     assert len(pcm.opened) == 2 and pcm.opened[0].closed
 
 
+@pytest.mark.parametrize("trouble", ["Input/output error", XRUN])
+def test_loss_lasts_until_there_is_sound_again(pcm: type[FakePcm], trouble: Any) -> None:
+    """A device that takes seconds to start anew, as PulseAudio does."""
+    pcm.frame = 1
+    pcm.script[:] = [10, (trouble, 0.5), (0, 0.9), (0, 1.0), 10]
+    source = open_fake()
+    left(source)
+    assert left(source) == (list(range(11, 21)), 2400)
+    assert (source.overruns, source.lost_frames) == (1, 2400)
+
+
+def test_nothing_is_lost_before_the_first_sound(pcm: type[FakePcm]) -> None:
+    pcm.frame = 1
+    pcm.script[:] = [(0, 1.0), ("Input/output error", 0.5), (XRUN, 0.1), 10]
+    source = open_fake()
+    assert left(source) == (list(range(1, 11)), 0)
+    assert (source.overruns, source.lost_frames) == (2, 0)
+
+
 def test_device_that_is_gone_ends_after_bounded_attempts(pcm: type[FakePcm]) -> None:
     pcm.script[:] = [10, "No such device"]
     source = open_fake()
@@ -429,6 +448,7 @@ def test_route_plugin_swaps_the_ears(real_alsa: Path) -> None:
         ("nosuch", "e_device", "Unknown PCM nosuch"),
         ("file", "e_device", "file is not defined"),
         ("", "e_device", "No such file"),
+        ("two\nlines", "e_device", "'two\\nlines' is no name of a PCM"),
         ("floating", "e_hwparams", "no format S32_LE, it offers FLOAT64_BE, FLOAT64_LE, FLOAT_BE, FLOAT_LE: plug:f"),
         ("sixteen", "e_hwparams", "sixteen: no format S32_LE, it offers S16_LE: plug:sixteen converts"),
         ("microphone", "e_hwparams", "it opens with 1: pick two with ?channels=1,2, or 1,1 for both ears"),

@@ -7,6 +7,7 @@ import re
 import signal
 import subprocess
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ import pytest
 import soundfile
 
 from rosafe.bass.sources.scene import Scene
+from rosafe.cli import main
 from tests.bass import bags
 from tests.cli.command import ROSAFE, environment, refused, rosafe, start
 from tests.harness import Graph, Process, free_port, wait_for
@@ -81,27 +83,36 @@ def test_levels_without_output(tmp_path: Path) -> None:
     assert os.listdir(tmp_path) == ["a.wav"]
 
 
-def test_mistakes_change_nothing(wav: Path, tmp_path: Path) -> None:
+def told(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    """What the command answers, run in this process; for mistakes that show before any sound is asked for."""
+    try:
+        code = main(["record", *map(str, arguments)])
+    except SystemExit as ended:
+        code = int(ended.code or 0)
+    return subprocess.CompletedProcess(arguments, code, *capsys.readouterr())
+
+
+def test_mistakes_change_nothing(wav: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     kept = tmp_path / "kept.wav"
     kept.write_text("precious")
     (tmp_path / "folder.wav").mkdir()
     device = ("--device", f"file:{wav}")
-    refused(rosafe("record", kept, *device), "is there already; --force replaces it")
+    refused(told(capsys, kept, *device), "is there already; --force replaces it")
+    refused(told(capsys, kept, "--force", "--device", f"file:{kept}?loop=1"), "is the input itself")
+    refused(told(capsys, tmp_path / "folder.wav", "--force", *device), "not a regular file")
+    refused(told(capsys, tmp_path / "no" / "a.wav", *device), "there is no folder")
+    refused(told(capsys, tmp_path / "a.mp3", *device), "ends in .wav or .bag", code=2)
+    refused(told(capsys, *device, "--seconds", "nan"), "'nan' is not a number of seconds", code=2)
+    refused(told(capsys, *device, "--rate", "-5"), "'-5' is not a whole number", code=2)
+    refused(told(capsys, *device, "--topic", "/x"), "not allowed with", code=2)
+    refused(told(capsys, "--socket", "nowhere"), "is not HOST:PORT", code=2)
+    refused(told(capsys, "--socket", "127.0.0.1:9"), "needs --rate", code=2)
     refused(rosafe("record", kept, "--force", "--device", "file:missing.wav"), "missing.wav: No such file")
     refused(rosafe("record", kept, "--force", *device, "--rate", "44100"), "8000 Hz, asked for were 44100")
-    refused(rosafe("record", kept, "--force", "--device", f"file:{kept}?loop=1"), "is the input itself")
-    assert kept.read_text() == "precious"
-    refused(rosafe("record", tmp_path / "folder.wav", "--force", *device), "not a regular file")
-    refused(rosafe("record", tmp_path / "no" / "a.wav", *device), "there is no folder")
-    refused(rosafe("record", "a.mp3", *device, cwd=tmp_path), "ends in .wav or .bag", code=2)
-    refused(rosafe("record", *device, "--seconds", "nan"), "'nan' is not a number of seconds", code=2)
-    refused(rosafe("record", *device, "--rate", "-5"), "'-5' is not a whole number", code=2)
-    refused(rosafe("record", *device, "--topic", "/x"), "not allowed with", code=2)
-    refused(rosafe("record", "--socket", "nowhere"), "is not HOST:PORT", code=2)
-    refused(rosafe("record", "--socket", "127.0.0.1:9"), "needs --rate", code=2)
     refused(rosafe("record", "--socket", f"127.0.0.1:{free_port()}", "--rate", "8000"), "Connection refused")
     uri = f"http://127.0.0.1:{free_port()}"
     refused(rosafe("record", ROS_MASTER_URI=uri), f"no ROS master at {uri}", "or record a --device without ROS")
+    assert kept.read_text() == "precious"
     assert sorted(os.listdir(tmp_path)) == ["folder.wav", "kept.wav"]
     done = rosafe("record", kept, "--force", "-q", *device)
     assert done.returncode == 0 and samples_of(kept).shape[1] >= 2000
@@ -113,22 +124,22 @@ def test_list(tmp_path: Path) -> None:
     assert [line.split()[0] for line in done.stdout.splitlines()][:3] == ["file:PATH", "bag:PATH", "scene:"]
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
-def test_a_signal_ends_it_with_a_complete_file(tmp_path: Path, number: int) -> None:
-    with start("record", "a.wav", "--device", "scene:", "--rate", str(RATE), cwd=tmp_path) as recording:
-        wait_for_sound(tmp_path / "a.wav", recording)
-        assert recording.stop(number) == 0
-        assert re.search(r"^a\.wav: [\d.]+ s at 8000 Hz, ", recording.out, re.MULTILINE) and recording.err == ""
-    samples = samples_of(tmp_path / "a.wav")
-    assert samples.shape[1] >= 500 and np.array_equal(samples, Scene(RATE).frames(samples.shape[1]))
-
-
-def test_killed(tmp_path: Path) -> None:
-    with start("record", "a.wav", "--device", "scene:", "--rate", str(RATE), cwd=tmp_path) as recording:
-        wait_for(lambda: "L peak" in recording.out, 20, lambda: str(recording))
-        recording.stop(signal.SIGKILL)
-    samples = samples_of(tmp_path / "a.wav")
-    assert samples.shape[1] >= RATE and np.array_equal(samples, Scene(RATE).frames(samples.shape[1]))
+def test_signals_leave_a_complete_file(tmp_path: Path) -> None:
+    """Those that ask for the end, and the one that does not ask."""
+    numbers = (signal.SIGINT, signal.SIGHUP, signal.SIGKILL)
+    options = ("--device", "scene:", "--rate", str(RATE), "--chunk", "400")
+    with ExitStack() as stack:
+        running = [stack.enter_context(start("record", f"{n}.wav", *options, cwd=tmp_path)) for n in numbers]
+        for recording in running:
+            wait_for(lambda: "L peak" in recording.out, 20, lambda: str(recording))  # noqa: B023  # called at once
+        codes = [recording.stop(number) for number, recording in zip(numbers, running, strict=True)]
+        assert codes == [0, 0, -signal.SIGKILL]
+        for number, recording in zip(numbers[:2], running, strict=False):
+            assert re.search(rf"^{number}\.wav: [\d.]+ s at 8000 Hz, ", recording.out, re.MULTILINE)
+            assert recording.err == ""
+    for number in numbers:
+        samples = samples_of(tmp_path / f"{number}.wav")
+        assert samples.shape[1] >= RATE and np.array_equal(samples, Scene(RATE).frames(samples.shape[1]))
 
 
 def test_full_disk(wav: Path, tmp_path: Path) -> None:
@@ -148,14 +159,14 @@ def test_full_disk(wav: Path, tmp_path: Path) -> None:
 
 
 def test_live_line_on_a_terminal(tmp_path: Path) -> None:
-    command = [str(ROSAFE), "record", "a.wav", "--device", "scene:", "--seconds", "1", "--chunk", "441"]
+    command = [str(ROSAFE), "record", "a.wav", "--device", "scene:", "--seconds", "0.6", "--chunk", "441"]
     with Terminal(command, environment(), cwd=tmp_path, columns=80) as terminal:
         assert terminal.end(30) == 0
         text = terminal.sent
     looks = text.split("\r\x1b[K")
     assert len(looks) > 4
     assert re.search(r"0:01  L \[#+-*\|?-*\] +-[\d.]+/ *-[\d.]+ +R \[.*\] .*  lost 0$", looks[-2])
-    assert max(map(len, looks[:-1])) == 79 and looks[-1].startswith("a.wav: 1.000 s")
+    assert max(map(len, looks[:-1])) == 79 and looks[-1].startswith("a.wav: 0.600 s")
 
 
 def test_reader_of_the_meter_leaves(tmp_path: Path) -> None:
@@ -240,7 +251,9 @@ def test_nothing_to_hear(graph: Graph, capturing: Process, tmp_path: Path) -> No
         "/heard/genom_state": "/heard/genom_state is no port Audio, but of type bass/genom_state_component",
         "/nobody/Audio": "/nobody/Audio is published by nobody: start bass-ros",
     }
-    for topic, why in topics.items():
-        done = graph.run(str(ROSAFE), "record", str(tmp_path / "a.wav"), "--topic", topic, check=False)
-        refused(done, why)
+    command = (str(ROSAFE), "record", str(tmp_path / "a.wav"), "--topic")
+    with ExitStack() as stack:
+        for topic, done in {t: stack.enter_context(graph.start(*command, t)) for t in topics}.items():
+            assert done.wait() == 1
+            assert done.err.startswith(f"rosafe record: {topics[topic]}") and done.err.count("\n") == 1
     assert not os.listdir(tmp_path)

@@ -55,6 +55,8 @@ class AlsaSource:
         self.overruns = 0
         self.lost_frames = 0
         self._pcm_name, _, options = device.partition("?")
+        if not self._pcm_name.isprintable():
+            raise device_error(f"{device!r} is no name of a PCM")
         self._channels: tuple[int, int] | None = parse_options(device, options, {"channels": _channel_pair}).get(
             "channels"
         )
@@ -66,6 +68,8 @@ class AlsaSource:
         self._open()
         self._chunks = Chunker(frames_per_chunk)
         self._heard: float | None = None  # when the newest frame that was read left the converter
+        self._since: float | None = None  # when the device was started, or gave sound
+        self._broken = False  # whether it was started anew since its newest frame
         self._time = 0.0
         self._failures = 0  # attempts to reopen the device since it last gave sound
         self._barren = 0  # overruns since then
@@ -155,14 +159,18 @@ class AlsaSource:
     def _read_some(self) -> None:
         """Take what the device has, which may be less than asked for; or wait a little; or note what was lost."""
         before = time.monotonic()
-        if self._heard is None:
-            self._heard = before  # the first read starts the device
+        if self._since is None:
+            self._since = before  # the first read starts the device
         try:
             count, data = self._pcm.read()
             if count > 0:
                 # What is still in the device came after the newest frame of this read.
                 behind = min(max(0, self._pcm.avail()), RING_CHUNKS * self._frames_per_chunk)
-                self._heard = time.monotonic() - behind / self.sample_rate
+                self._since = time.monotonic()
+                newest = self._since - behind / self.sample_rate
+                if self._broken:
+                    self._lose(newest - count / self.sample_rate)
+                self._heard = newest
                 left, right = self._channels or (1, 2)
                 frames = np.frombuffer(data, "<i4").reshape(-1, self._width).T
                 self._chunks.add(frames[[left - 1, right - 1]])
@@ -173,14 +181,14 @@ class AlsaSource:
                 self._barren += 1
                 if self._barren > RETRIES:
                     raise self._alsa.ALSAAudioError("overrun after overrun and no sound")
-                self._lose(time.monotonic())
+                self._break()
             else:
                 raise self._alsa.ALSAAudioError(os.strerror(-count))
         except self._alsa.ALSAAudioError as problem:
             self._reopen(str(problem))
 
     def _wait_for_sound(self, now: float) -> None:
-        if self._heard is not None and now - self._heard > STALL_SECONDS + self._frames_per_chunk / self.sample_rate:
+        if self._since is not None and now - self._since > STALL_SECONDS + self._frames_per_chunk / self.sample_rate:
             raise self._alsa.ALSAAudioError("no sound comes any more")
         poll = select.poll()
         for descriptor, events in self._pcm.polldescriptors():
@@ -191,14 +199,19 @@ class AlsaSource:
             # Some are ready before there is a frame to read; the pause keeps that from becoming a busy loop.
             self._stopping.wait(0.001)
 
-    def _lose(self, now: float) -> None:
-        """Account for the frames between the newest one read and `now`, when the device begins anew."""
-        heard = now if self._heard is None else self._heard
-        lost = max(1, round((now - heard) * self.sample_rate))
-        self._heard = now
+    def _break(self) -> None:
+        """Note that the device starts anew. What was lost shows with its next sound, for which it may take seconds."""
         self.overruns += 1
-        self.lost_frames += lost
-        self._chunks.lose(lost)
+        self._since = None
+        self._broken = True
+
+    def _lose(self, begin: float) -> None:
+        """Account for the frames between the newest one read and `begin`, from which on there is sound again."""
+        self._broken = False
+        if self._heard is not None:  # else the stream only begins
+            lost = max(1, round((begin - self._heard) * self.sample_rate))
+            self.lost_frames += lost
+            self._chunks.lose(lost)
 
     def _reopen(self, problem: str) -> None:
         """Get a failed device back, or raise ``::bass::e_device`` after some attempts."""
@@ -212,7 +225,7 @@ class AlsaSource:
                 self._open()
             except ComponentError:
                 continue
-            self._lose(time.monotonic())
+            self._break()
             return
         raise device_error(f"{self.name}: {text}; given up after {RETRIES} attempts to open it again")
 
