@@ -362,8 +362,8 @@ def test_arguments_by_name_and_structure() -> None:
         {**wanted, "fb_nERBs": None, "connect": None},
     ):
         assert partial(form) == wanted, form
-    for form in (["ild"], ["ild", {}], ["ild", []], ["ild", ""], ["ild", None]):
-        assert partial(form) == {"representation": "ild"}, form
+    for bare in (["ild"], ["ild", {}], ["ild", []], ["ild", ""], ["ild", None]):
+        assert partial(bare) == {"representation": "ild"}, bare
     assert partial({"representation": "IHC", "pp_refSPLdBS": 90}) == {"representation": "IHC", "pp_refSPLdB": 90.0}
 
 
