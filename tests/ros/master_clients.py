@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import rospy
 
 from rosafe.ros import generate
-from tests.harness import wait_for
+from tests.harness import run_together, wait_for
 
 generate.ensure_messages()
 
@@ -78,11 +79,14 @@ def stay(node: str, master_is_lost: Path) -> None:
     wait_for(master_is_lost.exists, 30)
     microphone.play(noise(BLOCK))
     wait_for(lambda: messages[-1].lastFrameIndex == 2 * BLOCK + 1)
-    seen: dict[str, Any] = {"GammatoneProc": call["GammatoneProc"](fb_nChannels=2, name="late").genom_success}
-    refused = call["connect_port"](local="Audio", remote="bass/Audio")
-    seen["connect_port"] = json.loads(refused.genom_exdetail)["ex"]
-    refused = dedicated_socket()  # its parameters are with the master
-    seen["DedicatedSocket"] = json.loads(refused.genom_exdetail)["ex"]
+    requests: list[Callable[[], Any]] = [
+        lambda: call["GammatoneProc"](fb_nChannels=2, name="late"),
+        lambda: call["connect_port"](local="Audio", remote="bass/Audio"),
+        lambda: dedicated_socket(),  # its parameters are with the master
+    ]
+    added, *refused = run_together(len(requests), lambda number: requests[number]())
+    seen: dict[str, Any] = {"GammatoneProc": added.genom_success}
+    seen["connect_port"], seen["DedicatedSocket"] = (json.loads(answer.genom_exdetail)["ex"] for answer in refused)
     seen["processors"] = names(call)
     told = len(states)
     wait_for(lambda: len(states) >= told + 2, what="genom_state")

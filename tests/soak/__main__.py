@@ -53,7 +53,7 @@ def _parse() -> argparse.Namespace:
     )
     parser.add_argument("--minutes", type=_minutes, default=10.0, help="how long (10); at least one round is done")
     parser.add_argument("--seed", type=int, help="of the order of things, to repeat a run")
-    parser.add_argument("--light", action="store_true", help="a lower sample rate and fewer channels")
+    parser.add_argument("--light", action="store_true", help="a lower sample rate, and less of everything")
     return parser.parse_args()
 
 

@@ -182,7 +182,7 @@ def the_source_dies_and_the_node_is_held(world: World) -> None:
         assert follower.lost == 0
         before = world.counters()["lost"]
         with world.held(world.afe.process):
-            wait_out(world.window_seconds + 1.0)
+            wait_out(1.5 * world.window_seconds)
         index, _ = world.audio()
         wait_for(lambda: follower.index > index, 30, "rosAFE catches up")
     assert not follower.wrong, follower.wrong

@@ -44,7 +44,7 @@ class Size:
 
 
 DEFAULT = Size(44100, 2205, 12000, 0, 200, 100)
-LIGHT = Size(20000, 1000, 4000, 3, 200, 40)
+LIGHT = Size(20000, 800, 4000, 3, 48, 10)
 
 
 @dataclass
