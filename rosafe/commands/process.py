@@ -149,7 +149,7 @@ def run(options: argparse.Namespace) -> int:
         options.usage_error("no sound file is named")
     targets, named = _targets(inputs, options.output)
     try:
-        parameters = dict(check_parameter(*_name_and_value(setting), text=True) for setting in options.settings)
+        parameters = _parameters(options.settings)
         outputs = check_outputs(_words(options.outputs) if options.outputs is not None else None)
     except ValueError as problem:
         raise Failure(str(problem)) from None
@@ -226,9 +226,16 @@ def _targets(inputs: list[Path], output: str | None) -> tuple[list[Path], bool]:
     return targets, False
 
 
-def _name_and_value(setting: str) -> tuple[str, str]:
-    name, _, value = setting.partition("=")
-    return name, value
+def _parameters(settings: list[str]) -> dict[str, Any]:
+    """The values by name; ValueError for what cannot be, and for a name that is there twice."""
+    values: dict[str, Any] = {}
+    for setting in settings:
+        name, _, text = setting.partition("=")
+        name, value = check_parameter(name, text, text=True)
+        if name in values:
+            raise ValueError(f"{name} is given twice")
+        values[name] = value
+    return values
 
 
 def _words(text: str) -> list[str]:

@@ -105,6 +105,12 @@ def test_parameters(folder: Path, setting: str, words: list[str]) -> None:
     assert_untouched(folder)
 
 
+def test_a_parameter_given_twice(folder: Path) -> None:
+    settings = ["--set", "fb_nChannels=4", "--set", "fb_nChannels=8"]
+    refused(rosafe("process", "in.wav", *settings, cwd=folder), "fb_nChannels is given twice")
+    assert_untouched(folder)
+
+
 @pytest.mark.parametrize("outputs", ["ild,rms", "", "ILD", "ild,,ratemap"])
 def test_outputs(folder: Path, outputs: str) -> None:
     refused(rosafe("process", "in.wav", "--outputs", outputs, cwd=folder), "unknown output", "ratemap")
