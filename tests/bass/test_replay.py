@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,10 +15,10 @@ import soundfile
 from rosafe.interface import KINDS
 from rosafe.ros import wire
 from tests.bass import bags
-from tests.harness import Graph, wait_for
+from tests.harness import Graph, Process, wait_for
 from tests.ros.session import RATE, Session, assert_holds, expected, noise, own_node, windowed
 
-CHUNK, CHUNKS, BLOCK, FRAMES = RATE // 20, 20, RATE // 4, 3 * RATE // 2
+CHUNK, CHUNKS, BLOCK, FRAMES = RATE // 20, 20, RATE // 4, 3 * RATE // 4
 SECONDS = FRAMES / RATE
 VALUES = {"fb_nERBs": 3.0, "pp_bRemoveDC": True}
 REQUESTS = [kind.request for kind in KINDS.values() if kind.parent]
@@ -27,7 +28,7 @@ class Recorded(NamedTuple):
     """A live run."""
 
     bag: Path
-    signal: np.ndarray  # int32, (2, FRAMES)
+    sound: np.ndarray  # int32, (2, FRAMES)
     result: Any  # of rosafe.process
 
 
@@ -51,25 +52,27 @@ def acquire(graph: Graph, device: str) -> None:
 
 
 @pytest.fixture(scope="module")
-def recorded(graph: Graph, tmp_path_factory: pytest.TempPathFactory) -> Recorded:
+def bass(graph: Graph) -> Iterator[Process]:
+    with graph.node("bass-ros") as process:
+        yield process
+
+
+@pytest.fixture(scope="module")
+def recorded(graph: Graph, bass: Process, tmp_path_factory: pytest.TempPathFactory) -> Recorded:
     """A file through bass and rosAFE, while `rosbag record` listens."""
     folder = tmp_path_factory.mktemp("replay")
-    signal = noise(FRAMES)
-    soundfile.write(folder / "a.wav", signal.T, RATE, subtype="PCM_32")
-    recorded = Recorded(folder / "live.bag", signal, expected(signal, BLOCK, VALUES))
+    sound = noise(FRAMES)
+    soundfile.write(folder / "a.wav", sound.T, RATE, subtype="PCM_32")
+    recorded = Recorded(folder / "live.bag", sound, expected(sound, BLOCK, VALUES))
     with (
-        graph.node("bass-ros"),
         own_node(graph, name="live") as node,
         graph.start("rosbag", "record", "-O", str(recorded.bag), "/bass/Audio", "__name:=recorder") as recorder,
     ):
         prepare(node, "bass/Audio", *REQUESTS)
-        wait_for(
-            lambda: "* /recorder " in graph.run("rostopic", "info", "/bass/Audio").stdout, what=lambda: str(recorder)
-        )
+        wait_for(lambda: ("/bass/Audio", "/recorder") in graph.readers(), what=lambda: str(recorder))
         acquire(graph, f"file:{folder / 'a.wav'}")
         assert_same(node, recorded)
-        graph.run("rosnode", "kill", "/recorder")
-        recorder.wait()
+        recorder.stop(signal.SIGINT)
     return recorded
 
 
@@ -92,29 +95,32 @@ def test_played_by_rosbag_without_bass(graph: Graph, recorded: Recorded) -> None
 
 def test_played_from_the_middle_and_with_a_loss(graph: Graph, recorded: Recorded, tmp_path: Path) -> None:
     """Frames keep their numbers; what no window shows is zeros."""
-    # The windows that would show frames 14001 to 18000 are not there, and the recording begins with frame 4001.
-    windows = 4 * CHUNK
-    indexes = [i for i in range(4 * CHUNK + windows, FRAMES + 1, CHUNK) if not 14000 < i < 18000 + windows]
-    messages = [bags.message(recorded.signal, i, windows, RATE, CHUNK) for i in indexes]
+    # The windows that would show frames 6001 to 9000 are not there, and the recording begins with frame 1001.
+    window = 4 * CHUNK
+    indexes = [i for i in range(1000 + window, FRAMES + 1, CHUNK) if not 6000 < i < 9000 + window]
+    messages = [bags.message(recorded.sound, i, window, RATE, CHUNK) for i in indexes]
+    end = FRAMES - (FRAMES - 1000) % BLOCK  # of the last whole block
     gap = bags.write(tmp_path / "gap.bag", messages)
     with replay(graph, gap, "gap", []) as node:
-        message = node.read("input", index=FRAMES - (FRAMES - 4000) % BLOCK + 1)
+        message = node.read("input", index=end + 1)
         entries = node.health(lambda entries: int(entries["lost"]) > 0)
-    assert entries["lost"] == "4000" and entries["gaps"] == "1"
-    heard = recorded.signal.copy()
-    heard[:, 14000:18000] = 0
-    wanted = expected(heard[:, 4000 : FRAMES - (FRAMES - 4000) % BLOCK], BLOCK, VALUES)["input"]
+    assert entries["lost"] == "3000" and entries["gaps"] == "1"
+    heard = recorded.sound.copy()
+    heard[:, 6000:9000] = 0
+    wanted = expected(heard[:, 1000:end], BLOCK, VALUES)["input"]
     np.testing.assert_array_equal(np.stack((message.left, message.right))[:, -wanted.shape[1] :], wanted)
 
 
-def test_source_of_bass(graph: Graph, recorded: Recorded) -> None:
+def test_source_of_bass(graph: Graph, bass: Process, recorded: Recorded) -> None:
     """`bag:` publishes the recorded frames under their numbers."""
     audio = wire.message_class("bass", "::binaudio::portStruct")
-    with graph.node("bass-ros"), graph.collect("/bass/Audio", audio) as messages:
+    with graph.collect("/bass/Audio", audio) as messages:
+        wait_for(lambda: messages, what="what the port shows of the live run")
         acquire(graph, f"bag:{recorded.bag}")
-        wait_for(lambda: messages and messages[-1].lastFrameIndex == FRAMES, 20)
+        wait_for(lambda: len(messages) > 2 and messages[-1].lastFrameIndex == FRAMES, 20)
+    del messages[0]
     assert messages[0].lastFrameIndex == 0
-    padded = np.concatenate((np.zeros((2, CHUNK * CHUNKS), np.int32), recorded.signal), axis=1)
+    padded = np.concatenate((np.zeros((2, CHUNK * CHUNKS), np.int32), recorded.sound), axis=1)
     for message in messages:
         window = padded[:, message.lastFrameIndex : message.lastFrameIndex + CHUNK * CHUNKS]
         assert np.array_equal(message.left, window[0]) and np.array_equal(message.right, window[1])
