@@ -14,8 +14,9 @@ import threading
 from concurrent.futures import ThreadPoolExecutor
 
 from rosafe import __version__
+from rosafe.genomix.access import own_names
 from rosafe.genomix.graph import Graph
-from rosafe.genomix.server import Server, own_names
+from rosafe.genomix.server import Server
 from rosafe.genomix.sessions import Sessions
 from rosafe.ros import generate, master, startup
 

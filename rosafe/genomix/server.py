@@ -5,10 +5,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import functools
-import ipaddress
 import logging
 import re
-import socket
 from collections.abc import Awaitable, Callable, Coroutine, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
@@ -17,6 +15,7 @@ from aiohttp import web
 
 from rosafe import __version__
 from rosafe.genomix import packed
+from rosafe.genomix.access import refuse_web_pages
 from rosafe.genomix.graph import middleware_error
 from rosafe.genomix.proxy import Proxy, Value
 from rosafe.genomix.sessions import Request, Session, Sessions, error_body, too_many
@@ -140,7 +139,7 @@ class Server:
         """Refuse what comes from a web page, and put every error into the client's syntax."""
         session: Session | None = None
         try:
-            self._refuse_web_pages(request)
+            refuse_web_pages(request.headers, self._hosts)
             if not _is_packed(request):
                 _syntax(request)
             if not request.path.startswith("/session/"):
@@ -161,21 +160,6 @@ class Server:
             if session is not None:
                 session.busy -= 1
                 session.touch()
-
-    def _refuse_web_pages(self, request: web.Request) -> None:
-        """A robot obeys programs, and no page that someone happens to look at.
-
-        Pages can make browsers send GETs anywhere. Browsers say so, each in one of these ways at least; and a page
-        cannot reach us under a name of its own (DNS rebinding), as only names of this machine count.
-        """
-        host = _host_name(request.headers.get("Host", ""))
-        if host not in self._hosts and not _is_address(host):
-            raise _forbidden(f"{host[:80]!r} is no name of this server; --host gives it one")
-        for header in ("Origin", "Referer", "Sec-Fetch-Site", "Sec-Fetch-Mode", "Sec-Fetch-Dest"):
-            if header in request.headers:
-                raise _forbidden(f"requests of web pages and browsers are refused ({header})")
-        if request.headers.get("User-Agent", "").startswith("Mozilla/"):
-            raise _forbidden("requests of web browsers are refused (User-Agent)")
 
     def _session(self, request: web.Request) -> Session:
         name = request.query.get("s", "")
@@ -367,29 +351,6 @@ def _milliseconds(request: web.Request) -> int:
     if not re.fullmatch(r"[0-9]{1,9}", text):
         raise refused(f"ms: {text[:20]!r} is not a number of milliseconds")
     return min(int(text), MAX_WAIT_MS)
-
-
-def _host_name(header: str) -> str:
-    """The host of a Host header, without port and brackets."""
-    match = re.fullmatch(r"\[([^\]]+)\](:\d*)?|([^:]*)(:\d*)?", header.strip())
-    return (match[1] or match[3] or "").lower().rstrip(".") if match else header.lower()
-
-
-def _is_address(host: str) -> bool:
-    try:
-        ipaddress.ip_address(host)
-    except ValueError:
-        return False
-    return True
-
-
-def _forbidden(what: str) -> ComponentError:
-    return ComponentError("::genomix::e_forbidden", what=what)
-
-
-def own_names() -> set[str]:
-    """What this machine is called by others."""
-    return {socket.gethostname(), socket.getfqdn()}
 
 
 # --- writing ----------------------------------------------------------------------------------------------------
