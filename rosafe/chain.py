@@ -13,7 +13,8 @@ import numpy as np
 
 from rosafe.dsp.framing import FramedStage, Framing
 from rosafe.interface import KINDS, ComponentError
-from rosafe.tree.processor import Observer, Processor
+from rosafe.tree.processor import Processor
+from rosafe.tree.roles import Observer
 from rosafe.tree.tree import Tree
 from rosafe.tree.zone import Block
 

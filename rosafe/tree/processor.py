@@ -1,62 +1,28 @@
-"""One processor of the tree: a thread that goes through waitExec, exec, waitRelease and release."""
+"""One processor of the tree: a thread that goes through waitExec, exec, waitRelease and release.
+
+To wake a thread takes some ten microseconds of both processors of the machine, and then the two want the interpreter
+lock in turn. A processor whose blocks take not much longer than that is carried: the thread that has released its
+parent's block goes through the child's states too, while the child's own thread sleeps. It wakes up as soon as its
+blocks take longer, and for the end.
+"""
 
 from __future__ import annotations
 
 import copy
-import enum
 import itertools
+import math
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple, Protocol
+from typing import Any, NamedTuple
 
-import numpy as np
-
+from rosafe.tree.roles import Listener, Observer, Source, State
 from rosafe.tree.window import History, WindowView
 from rosafe.tree.zone import Block, SharedZone
 
-
-class State(enum.Enum):
-    """The four states of the user guide (figure 11), and the two ends."""
-
-    WAIT_EXEC = "waitExec"
-    EXEC = "exec"
-    WAIT_RELEASE = "waitRelease"
-    RELEASE = "release"
-    DONE = "done"  # its input has come to its end
-    REMOVED = "removed"
-
-
-class Source(Protocol):
-    """Where the input processor reads."""
-
-    sample_rate: float
-
-    def read(self) -> tuple[np.ndarray, int] | None:
-        """The next block, (2, n), and the index of the frame after it; None at the end. Blocks; `stop` ends that."""
-
-    def stop(self) -> None:
-        """Make `read` return None, now and from now on."""
-
-
-class Listener(Protocol):
-    """Who hears of what the processors do. Called on their threads; must not wait for the tree."""
-
-    def added(self, processor: Processor) -> None:
-        """A processor is about to start; nothing was released yet. Where this raises, it is taken out again."""
-
-    def executed(self, processor: Processor, seconds: float) -> None:
-        """One block was computed in so many seconds; the last one perhaps after `ended`."""
-
-    def released(self, processor: Processor, block: Block) -> None:
-        """A block was released. Never called after `ended`."""
-
-    def ended(self, processor: Processor) -> None:
-        """The processor is gone; `processor.error` tells why where it was not asked to."""
-
-
-# Gets (processor, state that it enters, number of the block at hand or None). Called under the tree's lock: no waiting.
-Observer = Callable[["Processor", State, "int | None"], None]
+SHORT = 1.5e-4  # seconds: a processor that works so long on a block is better off on a thread of its own
+OBSERVED = 8  # blocks that a processor does on its own thread before it may be carried
+RISE = 1.1  # what a processor takes for a block is the least of late; that is forgotten at this pace per block
 
 
 class Change(NamedTuple):
@@ -111,7 +77,8 @@ class Processor:
         self.next_index = 0
         self.history_seconds = history_seconds
         self.zone = SharedZone()
-        self.turn = threading.Condition(lock)
+        self.turn = threading.Condition(lock)  # its own thread waits for a block
+        self._released = threading.Condition(lock)  # whoever works for it waits for its children
         self._lock = lock
         self.stage = stage  # as it will be after all changes, to be asked and not to be run
         self._stage = stage  # at work
@@ -120,6 +87,11 @@ class Processor:
         self._failed = failed
         self._observers = observers
         self._private: Block | None = None  # computed, and to be released as soon as no child holds the last one
+        self._working = False  # on a block, until its children have done theirs that are carried
+        self._carried = False  # the thread that works for its parent has taken on its block, or will
+        self._carries: list[Processor] = []  # the children whose block is taken on
+        self._usual = math.inf  # seconds that it takes for a block
+        self._telling = 0.0  # seconds that the listener took for the last block
         self._reading: Processor | None = None  # the parent whose block it holds: the input may be replaced meanwhile
         self._changing = threading.Lock()  # guards _changes, and the exchange of _stage
         self._changes: list[Change] = []
@@ -212,6 +184,7 @@ class Processor:
                     self.parent.children.remove(self)
                 self.parent._release_if_free()
             self.turn.notify_all()
+            self._released.notify_all()
         if self._source is not None:
             self._source.stop()
         with self._publishing:
@@ -239,13 +212,15 @@ class Processor:
 
     def _run(self) -> None:
         try:
-            while self._cycle():
-                self.blocks += 1
+            while (taken := self._next()) is not None:
+                self._cycle(taken)
         except BaseException as problem:  # whatever it was: the tree must hear of it, and nobody may wait for this one
             self.error = problem
         with self._lock:
             self._enter(State.DONE)
             self.zone.close()
+            for child in self._carries:
+                child._carried = False
             for child in self.children:
                 child.turn.notify_all()
         if self.error is not None:
@@ -253,21 +228,46 @@ class Processor:
 
     # --- the four states ---
 
-    def _cycle(self) -> bool:
-        """One block; False when there is no more."""
-        self._enter(State.WAIT_EXEC)
-        taken = self._wait_exec() if self._source is None else self._read(self._source)
-        if taken is None:
-            return False
+    def _next(self) -> Block | None:
+        return self._wait_exec() if self._source is None else self._read(self._source)
+
+    def _cycle(self, taken: Block) -> None:
+        """Do one block, and that of the children that are carried."""
         self._enter(State.EXEC, taken.number)
-        begun = time.perf_counter()
+        begun, work = time.perf_counter(), time.thread_time()
         private = self._exec(taken)
-        seconds = time.perf_counter() - begun
+        seconds, work = time.perf_counter() - begun, time.thread_time() - work
         self._give_back()
         self._listener.executed(self, seconds)
         if private is not None and self._wait_release(private):
+            begun = time.perf_counter()
             self._publish(private)
-        return True
+            self._telling = time.perf_counter() - begun
+        self._usual = min(work, RISE * self._usual)
+        self.blocks += 1
+        self._enter(State.WAIT_EXEC)
+        for child in self._carries:
+            child._ride(self)
+        self._carries = []
+
+    def _ride(self, parent: Processor) -> None:
+        """Do the block of `parent`, on the thread that works for that one."""
+        with self._lock:
+            while self._working and self.parent is parent and not self._gone:  # its own thread is on the last block
+                self._released.wait()
+            mine = self.parent is parent and not self._gone and self.error is None
+            taken = self._take() if mine else None
+        if taken is not None:
+            try:
+                self._cycle(taken)
+            except BaseException as problem:  # its own thread will tell
+                self.error = problem
+        with self._lock:
+            self._carried = False
+            if taken is not None:
+                self._working = False
+            if taken is None or self.error is not None or self.parent is not parent or self._exhausted:
+                self.turn.notify_all()
 
     def _enter(self, state: State, block: int | None = None) -> None:
         with self._lock:
@@ -283,18 +283,32 @@ class Processor:
         return Block(self.blocks, *got, source.sample_rate)
 
     def _wait_exec(self) -> Block | None:
-        """Wait for a token of the parent; None where none will come."""
+        """Wait on its own thread for a token of the parent; None where none will come."""
         with self._lock:
-            while not self._gone:
-                parent = self.parent
-                assert parent is not None
-                if parent.zone.has_token(self):
-                    self._reading = parent
-                    return parent.zone.take(self)
-                if parent.zone.exhausted(self):
-                    return None
+            self._working = False
+            self._released.notify_all()
+            while not self._gone and self.error is None:
+                if not self._carried:
+                    if (taken := self._take()) is not None:
+                        return taken
+                    if self._exhausted:
+                        return None
                 self.turn.wait()
             return None
+
+    def _take(self) -> Block | None:
+        """The block that the parent has released for it, if there is one. With the tree's lock held."""
+        parent = self.parent
+        assert parent is not None
+        if not parent.zone.has_token(self):
+            return None
+        self._working = True
+        self._reading = parent
+        return parent.zone.take(self)
+
+    @property
+    def _exhausted(self) -> bool:
+        return self.parent is not None and self.parent.zone.exhausted(self)
 
     def _exec(self, taken: Block) -> Block | None:
         """Compute into the private zone; None where the block cannot be used."""
@@ -328,7 +342,7 @@ class Processor:
             self._private = private
             self._release_if_free()
             while self._private is not None and not self._gone:
-                self.turn.wait()
+                self._released.wait()
             return self._private is None
 
     def _release_if_free(self) -> None:
@@ -341,9 +355,18 @@ class Processor:
             self._enter(State.RELEASE, self._private.number)
             self.zone.release(self._private)
             self._private = None
+            self._carries = [child for child in self.children if self._can_carry(child)]
             for child in self.children:
-                child.turn.notify_all()
-            self.turn.notify_all()
+                if child in self._carries:
+                    child._carried = True
+                else:
+                    child.turn.notify_all()
+            self._released.notify_all()
+
+    def _can_carry(self, child: Processor) -> bool:
+        """Whether whoever works for this processor should do the child's block, too: both take little time."""
+        known = child.blocks >= OBSERVED and not child._carried
+        return known and max(child._usual, child._telling, self._telling) < SHORT
 
     def _publish(self, block: Block) -> None:
         """Tell the world, while the children work on the block."""

@@ -8,7 +8,8 @@ from collections.abc import Iterator, Sequence
 from statistics import median
 from typing import Any, NamedTuple
 
-from rosafe.tree.processor import Processor, State
+from rosafe.tree.processor import Processor
+from rosafe.tree.roles import State
 
 MAX_EVENTS = 500_000  # that wait to be taken; the oldest are forgotten
 ENDS = (State.DONE.value, State.REMOVED.value)

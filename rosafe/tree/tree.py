@@ -11,7 +11,8 @@ from typing import Any
 
 from rosafe.dsp import STAGES
 from rosafe.interface import KINDS, ROSAFE, ComponentError, Parameter, ProcessorKind
-from rosafe.tree.processor import Listener, Observer, Processor, Source, State, subtree
+from rosafe.tree.processor import Processor, subtree
+from rosafe.tree.roles import Listener, Observer, Source, State
 
 MAX_BYTES = 2**30  # of one output port, of one processor's history, and of the samples that it keeps for a frame
 SHARE = 0.5  # of the machine's memory, for the output ports and histories of all processors together

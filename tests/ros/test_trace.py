@@ -18,7 +18,7 @@ from std_msgs.msg import String
 
 from rosafe.interface import KINDS
 from rosafe.ros.trace import TracePort, read
-from rosafe.tree.processor import Observer, State
+from rosafe.tree.roles import Observer, State
 from tests.cli.command import refused, rosafe
 from tests.harness import SCRIPTS, Graph, wait_for
 from tests.ros.session import Session, noise

@@ -10,7 +10,7 @@ import pytest
 
 from rosafe.dsp import STAGES
 from rosafe.interface import KINDS, ComponentError
-from rosafe.tree.processor import State
+from rosafe.tree.roles import State
 from rosafe.tree.tree import Tree
 from tests.dsp.bare import Chain
 from tests.harness import run_together

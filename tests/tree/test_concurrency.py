@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from rosafe.interface import ComponentError
-from rosafe.tree.processor import State
+from rosafe.tree.roles import State
 from rosafe.tree.tree import Tree
 from tests.harness import wait_for
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from rosafe.dsp import STAGES, InnerHairCell
-from rosafe.tree.processor import Processor, State
+from rosafe.tree.processor import Processor
+from rosafe.tree.roles import State
 from rosafe.tree.tree import Tree
 from tests.dsp.bare import joined
 from tests.harness import wait_for

@@ -13,7 +13,8 @@ import pytest
 from rosafe.dsp import STAGES
 from rosafe.interface import ComponentError
 from rosafe.tree import tree as tree_of_processors
-from rosafe.tree.processor import Processor, State
+from rosafe.tree.processor import Processor
+from rosafe.tree.roles import State
 from rosafe.tree.tree import Tree
 from rosafe.tree.zone import Block
 from tests.harness import run_together, wait_for

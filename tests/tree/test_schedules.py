@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -211,15 +212,60 @@ def test_any_order_of_events(scenario: Scenario, delays: int, use: Callable[[Any
     assert explore(scenario, use, delays, WALKS) > WALKS + 50
 
 
-def test_a_failure_at_any_moment(use: Callable[[Any], None], monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.fixture
+def failing(use: Callable[[Any], None], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Stages of pre-processing that fail in their second block, where they are asked to."""
+
     class Failing(Plain):
         def process(self, block: np.ndarray) -> np.ndarray:
-            if self.parameters.get("fails"):
+            if self.parameters.get("fails") and block[0, 0] == 1.0:
                 raise ZeroDivisionError
             return block
 
     use_plain_stages(monkeypatch, preProc=Failing)
+
+
+@pytest.fixture
+def carried(monkeypatch: pytest.MonkeyPatch) -> list[Processor]:
+    """All processors are carried from their second block on; who was."""
+    monkeypatch.setattr(processor, "OBSERVED", 1)
+    monkeypatch.setattr(processor, "SHORT", math.inf)
+    went: list[Processor] = []
+    cycle, ride = Processor._cycle, Processor._ride
+    riding: list[Processor] = []
+
+    def note_ride(self: Processor, parent: Processor) -> None:
+        riding.append(self)
+        ride(self, parent)
+        riding.remove(self)
+
+    def note_cycle(self: Processor, taken: Block) -> None:
+        if self in riding:
+            went.append(self)
+        cycle(self, taken)
+
+    monkeypatch.setattr(Processor, "_ride", note_ride)
+    monkeypatch.setattr(Processor, "_cycle", note_cycle)
+    return went
+
+
+@pytest.mark.parametrize(("scenario", "delays"), [(grow, 1), (shrink, 2), (leave, 2), (replace_input, 2), (stop, 2)])
+def test_any_order_of_events_where_parents_carry_their_children(
+    scenario: Scenario, delays: int, use: Callable[[Any], None], carried: list[Processor]
+) -> None:
+    explore(scenario, use, delays, WALKS)
+    assert carried
+
+
+def test_a_failure_at_any_moment(use: Callable[[Any], None], failing: None) -> None:
     assert explore(fail, use, 2, WALKS) > WALKS + 50
+
+
+def test_a_failure_of_a_child_that_is_carried(
+    use: Callable[[Any], None], failing: None, carried: list[Processor]
+) -> None:
+    explore(fail, use, 2, WALKS)
+    assert carried
 
 
 def test_the_exploration_finds_a_token_that_comes_between(
@@ -270,3 +316,18 @@ def test_the_exploration_finds_a_deadlock(use: Callable[[Any], None], monkeypatc
     monkeypatch.setattr(Processor, "_give_back", keep_silent)
     with pytest.raises(AssertionError, match="deadlock"):
         explore(grow, use, 0, WALKS)
+
+
+def test_the_exploration_finds_a_child_that_two_threads_work_for(
+    use: Callable[[Any], None], carried: list[Processor], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As above: whoever carries a child does not look whether its own thread is done with the last block."""
+    ride = Processor._ride
+
+    def at_once(self: Processor, parent: Processor) -> None:
+        self._working = False
+        ride(self, parent)
+
+    monkeypatch.setattr(Processor, "_ride", at_once)
+    with pytest.raises(AssertionError, match=r"released|deadlock"):
+        explore(grow, use, 1, WALKS)

@@ -8,7 +8,7 @@ import threading
 import numpy as np
 import pytest
 
-from rosafe.tree.processor import State
+from rosafe.tree.roles import State
 from rosafe.tree.trace import Event, Trace, Tracer
 from rosafe.tree.tree import Tree
 
