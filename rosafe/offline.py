@@ -70,23 +70,25 @@ def process(
     changes = _checked_modifications(modifications)
     wanted = check_outputs(outputs)
 
-    released: dict[str, list[np.ndarray]] = {kind: [] for kind in wanted}
+    gathered: dict[str, _Gathered] = {}
 
     def keep(kind: str, block: Block) -> None:
-        released[kind].append(block.data)
+        gathered[kind].add(block.data)
 
     blocks = (samples[:, first:end] for first, end in itertools.pairwise((0, *ends)))
     with Chain(blocks, rate, values, wanted, keep) as chain:
         sizes = [_size(chain, wanted, ends)]
+        shapes = {kind: chain.shape(kind, samples.shape[1]) for kind in wanted}
         for block, name, value in changes:
             if block < len(ends):
                 chain.schedule(block, name, value)
                 sizes.append(_size(chain, wanted, ends))
         _check_memory(max(sizes))
+        gathered.update((kind, _Gathered(kind, shape)) for kind, shape in shapes.items())
         chain.run()
         results: dict[str, Any] = {}
         for kind in wanted:
-            results[kind] = _join(kind, released.pop(kind), chain.rows(kind))
+            results[kind] = gathered.pop(kind).joined()
         results.update(chain.describe())
         if "crossCorrelation" in results:
             results["cc_lags"] = lags(results["crossCorrelation"].shape[1], rate)
@@ -163,13 +165,47 @@ def _check_memory(size: int) -> None:
         )
 
 
-def _join(kind: str, blocks: list[np.ndarray], rows: tuple[int, ...]) -> np.ndarray:
+class _Gathered:
+    """All that is released of one output. Each block goes to its place in the result at once.
+
+    Parameters
+    ----------
+    kind : str
+        Of the processor.
+    shape : tuple of int
+        Of the whole, if no parameter changes on the way. From where one does, blocks wait for the end.
+    """
+
+    def __init__(self, kind: str, shape: tuple[int, ...]) -> None:
+        self._kind = kind
+        self._whole = np.empty(shape)
+        self._filled = 0  # frames
+        self._begun = False  # a block without frames has rows, too
+        self._others: list[np.ndarray] = []
+
+    def add(self, block: np.ndarray) -> None:
+        """The next block, (..., frames)."""
+        end = self._filled + block.shape[-1]
+        fits = block.shape[:-1] == self._whole.shape[:-1] and end <= self._whole.shape[-1]
+        if fits and not self._others:
+            self._whole[..., self._filled : end] = block
+            self._filled, self._begun = end, True
+        else:
+            self._others.append(block)
+
+    def joined(self) -> np.ndarray:
+        """The whole."""
+        if not self._others and self._filled == self._whole.shape[-1]:
+            return self._whole
+        first = [self._whole[..., : self._filled]] if self._begun else []
+        return _join(self._kind, [*first, *self._others])
+
+
+def _join(kind: str, blocks: list[np.ndarray]) -> np.ndarray:
     """All blocks along the last axis. Where the leading shape changed on the way, the largest rules.
 
     Lags are centred on lag zero, channels aligned at the first; what lies outside is 0.
     """
-    if not blocks:
-        return np.zeros((*rows, 0))
     if all(block.shape[:-1] == blocks[0].shape[:-1] for block in blocks):
         return np.concatenate(blocks, axis=-1)
     shape = tuple(max(sizes) for sizes in zip(*(block.shape[:-1] for block in blocks), strict=True))
