@@ -233,6 +233,24 @@ def test_nothing_is_lost_before_the_first_sound(pcm: type[FakePcm]) -> None:
     assert (source.overruns, source.lost_frames) == (2, 0)
 
 
+@pytest.mark.parametrize(("kept", "lost"), [(400, 6000), (6400, 0)])
+def test_sound_that_is_dropped_in_a_standstill(pcm: type[FakePcm], kept: int, lost: int) -> None:
+    """A sound server keeps so many frames for a process that was stopped, and says nothing of the others."""
+    source = open_fake()
+    begin = pcm.clock
+    left(source)
+    pcm.clock += 6.4
+    pcm.script[:] = [(kept, -kept / RATE)]  # at once
+    frames = CHUNK
+    frames += sum(CHUNK + left(source)[1] for _ in range(kept // CHUNK + 50))
+    pcm.clock += 1.5  # once more, before what there is to compare has come
+    pcm.script[:] = [(1500, -1.5)]
+    while pcm.clock < begin + 12:
+        frames += CHUNK + left(source)[1]
+    assert (source.lost_frames, source.overruns) == (lost, lost > 0)
+    assert frames + source._chunks.pending == pytest.approx(12 * RATE, abs=2 * CHUNK)
+
+
 def test_device_that_is_gone_ends_after_bounded_attempts(pcm: type[FakePcm]) -> None:
     pcm.script[:] = [10, "No such device"]
     source = open_fake()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import signal
+import xmlrpc.client
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+import rosgraph
 import soundfile
 
 from rosafe.interface import KINDS
@@ -72,7 +73,10 @@ def recorded(graph: Graph, bass: Process, tmp_path_factory: pytest.TempPathFacto
         wait_for(lambda: ("/bass/Audio", "/recorder") in graph.readers(), what=lambda: str(recorder))
         acquire(graph, f"file:{folder / 'a.wav'}")
         assert_same(node, recorded)
-        recorder.stop(signal.SIGINT)
+        # As `rosnode kill` does; a signal would end rosbag before its child has closed the bag.
+        address = rosgraph.Master("/test", master_uri=graph.uri).lookupNode("/recorder")
+        xmlrpc.client.ServerProxy(address).shutdown("/test", "")
+        recorder.wait()
     return recorded
 
 

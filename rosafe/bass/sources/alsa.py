@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import math
 import os
 import select
 import threading
@@ -20,6 +21,9 @@ MAX_CHANNELS = 32  # of a device of which two are picked
 POLL_SECONDS = 0.1  # at most, so that a stop is seen
 STALL_SECONDS = 5.0  # without a frame, a device counts as gone; PulseAudio takes 2 s to begin
 RETRIES, RETRY_SECONDS = 5, 0.2  # to reopen a device that failed
+STANDSTILL_SECONDS = 1.0  # without asking the device; then a sound server may have dropped sound and not say so
+SETTLE_SECONDS = 2.0  # until it has handed over what it kept meanwhile
+SLACK_SECONDS = 0.25  # what its delay may change by
 
 
 def _channel_pair(text: str) -> tuple[int, int]:
@@ -70,6 +74,9 @@ class AlsaSource:
         self._heard: float | None = None  # when the newest frame that was read left the converter
         self._since: float | None = None  # when the device was started, or gave sound
         self._broken = False  # whether it was started anew since its newest frame
+        self._asked = math.inf  # when the device was last read from
+        self._settled = math.inf  # after a standstill, when to compare the frames that came with the clock
+        self._reckoned = 0.0  # meanwhile, when the newest one left the converter if none was dropped
         self._time = 0.0
         self._failures = 0  # attempts to reopen the device since it last gave sound
         self._barren = 0  # overruns since then
@@ -161,6 +168,11 @@ class AlsaSource:
         before = time.monotonic()
         if self._since is None:
             self._since = before  # the first read starts the device
+        if self._heard is not None and before - self._asked > STANDSTILL_SECONDS:
+            if self._settled == math.inf:  # else the reckoning of an earlier one goes on
+                self._reckoned = self._heard
+            self._settled = before + SETTLE_SECONDS
+        self._asked = before
         try:
             count, data = self._pcm.read()
             if count > 0:
@@ -171,6 +183,9 @@ class AlsaSource:
                 if self._broken:
                     self._lose(newest - count / self.sample_rate)
                 self._heard = newest
+                self._reckoned += count / self.sample_rate
+                if newest > self._settled:
+                    self._compare(newest)
                 left, right = self._channels or (1, 2)
                 frames = np.frombuffer(data, "<i4").reshape(-1, self._width).T
                 self._chunks.add(frames[[left - 1, right - 1]])
@@ -208,10 +223,21 @@ class AlsaSource:
     def _lose(self, begin: float) -> None:
         """Account for the frames between the newest one read and `begin`, from which on there is sound again."""
         self._broken = False
+        self._reckoned = begin
         if self._heard is not None:  # else the stream only begins
-            lost = max(1, round((begin - self._heard) * self.sample_rate))
-            self.lost_frames += lost
-            self._chunks.lose(lost)
+            self._count(max(1, round((begin - self._heard) * self.sample_rate)))
+
+    def _compare(self, newest: float) -> None:
+        """Account for what was dropped in a standstill without a word; the newest frame is of the time `newest`."""
+        self._settled = math.inf
+        missing = newest - self._reckoned
+        if missing > SLACK_SECONDS:
+            self.overruns += 1
+            self._count(round(missing * self.sample_rate))
+
+    def _count(self, lost: int) -> None:
+        self.lost_frames += lost
+        self._chunks.lose(lost)
 
     def _reopen(self, problem: str) -> None:
         """Get a failed device back, or raise ``::bass::e_device`` after some attempts."""
