@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import random
 import sys
 import threading
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 
 from rosafe.interface import ComponentError
+from rosafe.tree import processor
 from rosafe.tree.roles import State
 from rosafe.tree.tree import Tree
 from tests.harness import wait_for
@@ -151,6 +153,39 @@ def test_nobody_waits_for_a_removed_child(
     go_on.set()
     assert slow.join(WAIT_SECONDS)
     assert listener.blocks[slow] == listener.blocks[below] == []
+
+
+def test_short_work_is_done_on_the_parents_thread(
+    tree: Tree, listener: Recorder, feed: Feed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Until it takes longer: then each has its own thread again."""
+    threads: dict[str, list[str]] = {}
+
+    class Noting(Plain):
+        def process(self, block: np.ndarray) -> np.ndarray:
+            threads.setdefault(self.parameters["name"], []).append(threading.current_thread().name)
+            return block
+
+    use_plain_stages(monkeypatch, preProc=Noting, gammatone=Noting)
+    monkeypatch.setattr(processor, "SHORT", math.inf)
+    tree.add_input("input", feed, 1, 1.0, 1.0)
+    children = [
+        tree.add("preProc", "one", "input", {"name": "one"}),
+        tree.add("preProc", "other", "input", {"name": "other"}),
+        tree.add("gammatone", "below", "one", {"name": "below"}),
+    ]
+
+    def last_threads(blocks: int) -> list[str]:
+        feed.put(count=10)
+        for child in children:
+            listener.wait_blocks(child, blocks)
+        return [threads[child.name][-1] for child in children]
+
+    last_threads(10)
+    last_threads(20)
+    assert last_threads(30) == ["input:input"] * 3
+    monkeypatch.setattr(processor, "SHORT", 0.0)
+    assert last_threads(40) == ["preProc:one", "preProc:other", "gammatone:below"]
 
 
 def test_blocks_arrive_whole_and_in_order_whoever_comes_and_goes(
