@@ -159,7 +159,7 @@ def gammatone_impulses() -> Iterator[Row]:
         Row(f"gammatone, impulse: {what}", "50 digits", "peak", 1e-12, max(impulse_response(*case) for case in cases))
         for what, cases in {
             "8 to 192 kHz, from 20 Hz on": plain,
-            "fb_nGamma 1 to 64": [(rate, 80.0, n, 1.018) for rate in (16000, 192000) for n in (1, 2, 7, 16, 33, 64)],
+            "fb_nGamma 1 to 128": [(rate, 80.0, n, 1.018) for rate in (16000, 192000) for n in (1, 2, 7, 33, 64, 128)],
             "fb_bwERBs 0.1 to 100": [(rate, 80.0, 4, b) for rate in (16000, 44100) for b in (0.1, 0.3, 3.0, 100.0)],
         }.items()
     )

@@ -536,8 +536,8 @@ GAMMATONE_PARAMETERS = (
         1e6,
         True,
     ),
-    Parameter("fb_nGamma", "unsigned long", 4, "Gammatone rising slope order", 1, 64),
-    Parameter("fb_bwERBs", "double", 1.018, "Bandwidth of the filters in ERBs", 0.0, 100.0, True),
+    Parameter("fb_nGamma", "unsigned long", 4, "Gammatone rising slope order", 1, 128),
+    Parameter("fb_bwERBs", "double", 1.018, "Bandwidth of the filters in ERBs", 0.0, 10_000.0, True),
 )
 IHC_PARAMETERS = (
     Parameter(

@@ -55,7 +55,7 @@ class Filterbank(Stage):
         "fb_nERBs": Parameter(1.0, not_negative),
         "fb_nChannels": Parameter(0, whole(0, MAX_CHANNELS)),
         "fb_cfHz": Parameter((), _frequency_list),
-        "fb_nGamma": Parameter(4, whole(1, 64)),
+        "fb_nGamma": Parameter(4, whole(1, 128)),
         "fb_bwERBs": Parameter(1.018, positive),
     }
     BLOCK = ("2 ears", "samples")

@@ -37,6 +37,7 @@ BURST_SECONDS = 0.005  # what changes within this makes one message, not one eac
 DIAGNOSTICS_PERIOD = 1.0
 TRIM_ROUNDS = 20  # of diagnostics between two times that freed memory is given back to the system
 UP_SECONDS = 10.0  # until the master knows a node that starts
+ACCEPT_SECONDS = 2.0  # a goal is accepted once its activity runs, or after this: longer than InputProc waits for sound
 STOP_WAIT = 2.0  # seconds that Stop waits for what it ends
 SEND_SECONDS = 0.1  # rospy sends answers and results on threads of its own, and does not tell when it has
 
@@ -229,9 +230,9 @@ class ComponentNode:
                 del running[goal.get_goal_id().id]
 
             def wait(activity: Activity) -> None:
-                # Accepted means running, however long that takes: a client that waits for it can make the next request,
-                # which may need this one, and what it stops from then on ends normally.
-                activity.begun.wait()
+                # Accepted means running: a client that waits for it can make the next request, which may need this one,
+                # and what it stops from then on ends normally. But a device that hangs is no reason to say nothing.
+                activity.begun.wait(ACCEPT_SECONDS)
                 set_accepted()
 
             try:

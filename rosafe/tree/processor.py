@@ -221,7 +221,7 @@ class Processor:
             self.zone.close()
             for child in self._carries:
                 child._carried = False
-            for child in self.children:
+            for child in (*self._carries, *self.children):  # those carried may have another parent by now
                 child.turn.notify_all()
         if self.error is not None:
             self._failed(self)

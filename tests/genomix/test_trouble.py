@@ -176,7 +176,7 @@ def test_every_request_is_answered(empty_world: World, tmp_path: Path) -> None:
 
 
 def test_what_is_acknowledged_runs(empty_world: World, tmp_path: Path) -> None:
-    """However long that takes: to stop it then is a normal end."""
+    """Also where that takes a while: to stop it then is a normal end."""
     world, opened = empty_world, tmp_path / "opened"
     numbers: list[str] = []
     sender = threading.Thread(

@@ -129,7 +129,7 @@ def test_values_that_are_refused(tree: Tree, feed: Feed) -> None:
         "fb_lowFreqHz": ("5000", "0"),
         "fb_highFreqHz": ("50", "8001"),
         "fb_nERBs": ("0", "1e-9"),
-        "fb_nGamma": ("0", "65"),
+        "fb_nGamma": ("0", "129"),
         "fb_bwERBs": ("0",),
         "ild_wSizeSec": ("0", "1e-9", "61", "-0.02"),
         "rm_hSizeSec": ("0", "1e-9"),

@@ -23,7 +23,7 @@ from .library import Status, loaded
 
 FloatArray = NDArray[np.float64]
 
-MOST_POLES = 64  # of a gammatone filter
+MOST_POLES = 128  # of a gammatone filter
 MOST_SECTIONS = 8  # of a low-pass
 MOST_LAGS = 1024  # of a correlation; FFT is faster beyond
 

@@ -8,7 +8,7 @@
  * first-level cache, so that any order costs the same per pole. */
 #include "vector.h"
 
-enum { SPAN = 32, TOGETHER = 4, MOST_POLES = 64 };
+enum { SPAN = 32, TOGETHER = 4, MOST_POLES = 128 };
 
 typedef struct {
     vec re, im;
