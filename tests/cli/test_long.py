@@ -18,6 +18,8 @@ from tests.cli.command import ROSAFE, environment, noise, rosafe, start, write
 from tests.harness import ROOT, proc, wait_for
 from tests.terminal import Terminal
 
+pytestmark = pytest.mark.long
+
 RATE = 16000
 ONE_CHANNEL = ("--set", "fb_cfHz=1000")
 OUTPUTS = ("--outputs", "input,ihc,ild")  # of one channel: 32 bytes per frame
