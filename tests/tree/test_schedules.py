@@ -17,6 +17,8 @@ from rosafe.tree.zone import Block
 from .explorer import Scheduler, explore
 from .support import Plain, use_plain_stages
 
+pytestmark = pytest.mark.long
+
 WALKS = 400
 
 Scenario = Callable[[Scheduler], Callable[[], None]]

@@ -162,6 +162,7 @@ class World:
                     assert node.seen[-1] == LAST
 
 
+@pytest.mark.long
 def test_every_order_of_steps() -> None:
     """All reachable states: every child sees a contiguous run from where it came to the end, and nobody waits in vain.
 
