@@ -121,12 +121,12 @@ def test_a_master_that_is_not_there_yet(tmp_path: Path) -> None:
 
 # bass-ros on a machine on which opening a source takes until the file argv[1] is there, unless it is stopped before.
 SLOW_BASS = """
-import os, sys, time
+import os, sys
 from rosafe.bass import node
 at_once = node.open_source
 def open_source(*arguments):
-    while not (os.path.exists(sys.argv[1]) or arguments[-1].is_set()):
-        time.sleep(0.02)
+    while not (os.path.exists(sys.argv[1]) or arguments[-1].wait(0.02)):
+        pass
     return at_once(*arguments)
 node.open_source = open_source
 sys.exit(node.main([]))

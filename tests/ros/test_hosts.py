@@ -17,7 +17,7 @@ from tests.harness import PYTHON, ROOT, SCRIPTS, Graph, MasterProcess, wait_for
 
 # Builds a tree on /far and prints the first lastFrameIndex that is not 0.
 CLIENT = """
-import rospy, rosAFE.srv, bass.srv
+import queue, rospy, rosAFE.srv, bass.srv
 from rosAFE.msg import rosAFE_TimeDomainSignalPortStruct as Message
 rospy.init_node("client")
 def call(package, name, **fields):
@@ -27,11 +27,11 @@ call(bass, "/bass/Acquire", device="scene:", nChunksOnPort=4)
 call(rosAFE, "/far/connect_port", local="Audio", remote="/bass/Audio")
 call(rosAFE, "/far/InputProc", nFramesPerBlock=2205)
 call(rosAFE, "/far/PreProc")
-heard = []
-rospy.Subscriber("/far/preProcPort/preProc", Message, heard.append)
-while not heard or heard[-1].lastFrameIndex == 0:
-    rospy.sleep(0.02)
-print("heard", heard[-1].lastFrameIndex)
+heard = queue.Queue()
+rospy.Subscriber("/far/preProcPort/preProc", Message, heard.put)
+while not (index := heard.get(timeout=20).lastFrameIndex):
+    pass
+print("heard", index)
 """
 
 
