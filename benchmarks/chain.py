@@ -32,8 +32,10 @@ import scipy  # noqa: E402
 import yardstick  # noqa: E402
 
 import rosafe  # noqa: E402
-from rosafe.dsp import STAGES, Filterbank, kernels  # noqa: E402
+from rosafe.dsp import kernels  # noqa: E402
 from rosafe.dsp.windows import window  # noqa: E402
+from rosafe.representations import STAGES  # noqa: E402
+from rosafe.representations.filterbank import Filterbank  # noqa: E402
 
 RATE = 44100
 BLOCKS = (12000, 882)

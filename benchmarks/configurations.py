@@ -14,8 +14,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rosafe.dsp import STAGES, Filterbank, InnerHairCell, Stage
-from rosafe.dsp.haircell import METHODS
+from rosafe.dsp.stage import Stage
+from rosafe.representations import STAGES
+from rosafe.representations.filterbank import Filterbank
+from rosafe.representations.haircell import METHODS, InnerHairCell
 
 RATE = 44100
 BLOCK = 12000
@@ -127,7 +129,7 @@ def _prepared(case: Case) -> tuple[Callable[[np.ndarray], Any], np.ndarray]:
     stage = STAGES[case.kind](case.rate, **case.parameters)
     shape = (2, case.block) if case.kind == "gammatone" else (2, case.channels, case.block)
     block = np.random.default_rng(0).standard_normal(shape)
-    if isinstance(stage, InnerHairCell) and stage.needs_envelope:
+    if isinstance(stage, InnerHairCell) and stage.needs:
         hair_cell, envelope = stage, np.abs(block)
         return lambda block: hair_cell.process(block, envelope), block
     return stage.process, block
@@ -191,9 +193,9 @@ def _through(stages: dict[str, Stage], block: Any) -> None:
     taken = block
     hair_cell, filterbank = stages["ihc"], stages["gammatone"]
     assert isinstance(hair_cell, InnerHairCell) and isinstance(filterbank, Filterbank)
-    filterbank.provide_envelope = hair_cell.needs_envelope
+    filterbank.provide_envelope = hair_cell.needs
     for kind, stage in stages.items():
-        out = hair_cell.process(taken, filterbank.envelope) if stage is hair_cell else stage.process(taken)
+        out = hair_cell.process(taken, filterbank.provided["envelope"]) if stage is hair_cell else stage.process(taken)
         if kind in ("input", "preProc", "gammatone", "ihc"):
             taken = out
 

@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
+from rosafe.dsp.crosscorrelation import EPSILON
 from scipy import fft, signal
 
-from rosafe.dsp.crosscorrelation import EPSILON
 from rosafe.dsp.erb import bandwidth
 
 FloatArray = NDArray[np.float64]

@@ -3,27 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
+from rosafe.vocabulary.parameter import Parameter
+
 from . import kernels
-from .checks import positive, sample_count, word
 from .guard import SQUARE_TINY, FloatArray, limited
-from .stage import Parameter, Stage
+from .rounding import sample_count
+from .signal import Signal
+from .stage import Output, Stage
 from .windows import NAMES, window
 
+MAX_FRAME_SECONDS = 60.0  # longest analysis window, and longest step from one to the next
 
-def frame_parameters(prefix: str) -> dict[str, Parameter]:
-    """The three parameters of every framed stage."""
-    return {
-        f"{prefix}_wname": Parameter("hann", word(*NAMES)),
-        f"{prefix}_wSizeSec": Parameter(0.02, positive),
-        f"{prefix}_hSizeSec": Parameter(0.01, positive),
-    }
+
+def frame_parameters(prefix: str) -> tuple[Parameter, Parameter, Parameter]:
+    """The three parameters of every framed stage: window, its duration, and the step to the next."""
+    return (
+        Parameter(f"{prefix}_wname", "string", "hann", "Window name", choices=NAMES, fallback="hann"),
+        Parameter(f"{prefix}_wSizeSec", "double", 0.02, "Window duration (s)", 0.0, MAX_FRAME_SECONDS, True, unit="s"),
+        Parameter(f"{prefix}_hSizeSec", "double", 0.01, "Window step size (s)", 0.0, MAX_FRAME_SECONDS, True, unit="s"),
+    )
 
 
 @dataclass(frozen=True)
@@ -145,20 +150,45 @@ def _last(block: FloatArray, count: int) -> FloatArray:
 class FramedStage(Stage):
     """A stage that works frame by frame.
 
-    A change of window or hop keeps the buffered samples: the next frame starts where it would have started anyway.
+    A subclass says in `frame` what it makes of frames, and needs nothing else; where a kernel does that, it has a
+    `process` of its own. A change of window or hop keeps the buffered samples: the next frame starts where it would
+    have started anyway.
     """
 
-    PREFIX: ClassVar[str]
+    PREFIX: ClassVar[str]  # of the three parameters of `frame_parameters`
 
     _begun: kernels.Sums | None  # over what is held, where a kernel has made them
 
-    def __init__(self, sample_rate: float, **parameters: Any) -> None:
+    def __init__(self, given: Signal | float, **parameters: Any) -> None:
         self._buffer = FrameBuffer()
-        super().__init__(sample_rate, **parameters)
+        super().__init__(given, **parameters)
+
+    def frame(self, frames: FloatArray) -> FloatArray:
+        """What comes out for `frames` (..., F, w), which are not windowed yet (see `window`): (..., F)."""
+        raise NotImplementedError
 
     @property
-    def output_rate(self) -> float:
-        return self.sample_rate / self._framing.hop
+    def window(self) -> FloatArray:
+        """The window (w,) in force."""
+        return self._framing.window
+
+    def process(self, block: FloatArray, extra: FloatArray | None = None) -> Output:
+        frames = self._framing.frames(self._buffer.append(limited(self._checked(block))))
+        output = np.ascontiguousarray(self.frame(frames), np.float64)
+        self._buffer.drop(frames.shape[-2] * self._framing.hop)
+        return output
+
+    def complete(self, count: int) -> int:
+        return self._framing.complete(count)
+
+    def _output(self) -> Signal:
+        return replace(
+            self.given,
+            rate=self.given.rate / self._framing.hop,
+            framed=True,
+            hop=self._framing.hop * self.given.hop,
+            window=(len(self._framing.window) - 1) * self.given.hop + self.given.window,
+        )
 
     def reset(self) -> None:
         self._buffer = FrameBuffer()
@@ -183,5 +213,5 @@ class FramedStage(Stage):
         return kernels.Frames(history, block, room, skip, weights, hop, count)
 
     def _build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
-        self._framing = Framing.design(self.sample_rate, self.PREFIX, values)
+        self._framing = Framing.design(self.given.rate, self.PREFIX, values)
         self._begun = None

@@ -1,42 +1,50 @@
-"""What all stages have in common: named parameters that change atomically, and checked blocks."""
+"""What all stages have in common: declared parameters that change atomically, checked blocks, formats that follow."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, ClassVar, NamedTuple
+import copy
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, ClassVar
 
 import numpy as np
 
-from .checks import Check, positive
+from rosafe.vocabulary.parameter import Parameter, shown
+from rosafe.vocabulary.representation import Representation
+
 from .guard import FloatArray
-
-
-class Parameter(NamedTuple):
-    """Default and check of one parameter."""
-
-    default: Any
-    check: Check
-
+from .signal import Signal
 
 FLOAT64 = np.dtype(np.float64)
-
-ParameterTable = Mapping[str, Parameter]
+Output = FloatArray | tuple[FloatArray, ...]  # a tuple where the representation has several parts
 
 
 class Stage:
     """One processor of the chain: blocks in, blocks out, state kept between.
 
-    The rule for every stage: `_build`, and so `configure`, puts new objects in the place of what it changes (filters,
-    framings, tables) and never alters those that are there. A shallow copy of a stage is therefore a second one that
-    may be configured while the first one works; the tree tries changes on such copies, and may throw them away or put
-    them to work with the state as it is then.
+    A representation is a subclass with its declaration. It implements `_build`, `process`, `reset`, and what differs
+    from the defaults here of `output_rows`, `_output`, `complete`, `look_ahead`, `needs`.
+
+    The rule for every stage: `_build`, and so `configure` and `receive`, puts new objects in the place of what it
+    changes (filters, framings, tables) and never alters those that are there. A shallow copy of a stage is therefore a
+    second one that may be configured while the first one works; the tree tries changes on such copies, and may throw
+    them away or put them to work with the state as it is then.
 
     Parameters
     ----------
-    sample_rate : float
-        Of the input, in Hz.
+    given : Signal or float
+        The format of the blocks that will come, or the sample rate (Hz) of sound.
     **parameters
-        By the names of `PARAMETERS`; what is not given has the default there.
+        By their declared names; what is not given has its default.
+
+    Attributes
+    ----------
+    given, output : Signal
+        The formats of what comes and of what `process` returns.
+    provide : frozenset of str
+        Which of `PROVIDES` whoever hangs on it needs; `process` leaves these in `provided`.
+    provided : dict of str to ndarray
+        Of the last block.
 
     Raises
     ------
@@ -44,14 +52,30 @@ class Stage:
         One line that names the parameter.
     """
 
-    PARAMETERS: ClassVar[ParameterTable]
-    BLOCK: ClassVar[tuple[str, ...]] = ("2 ears", "channels", "samples")
+    REPRESENTATION: ClassVar[Representation]
+    INPUT: ClassVar[tuple[str, ...]] = ("ear", "channel", "time")  # axes of the blocks that come
+    PROVIDES: ClassVar[tuple[str, ...]] = ()  # by-products that children may need, such as the envelope
 
-    def __init__(self, sample_rate: float, **parameters: Any) -> None:
-        self.sample_rate = positive("sample_rate", sample_rate)
-        self._values = {name: parameter.default for name, parameter in self.PARAMETERS.items()}
+    def __init__(self, given: Signal | float, **parameters: Any) -> None:
+        if not isinstance(given, Signal):
+            if isinstance(given, str) or not (math.isfinite(given) and given > 0):
+                raise ValueError(f"sample_rate: {shown(given)} is not more than 0")
+            given = Signal.sound(float(given))
+        self.given = given
+        self.provide: frozenset[str] = frozenset()
+        self.provided: dict[str, FloatArray] = {}
+        declared = self.REPRESENTATION.parameters
+        self._values = {parameter.name: parameter.check(parameter.default) for parameter in declared}
         self._values = self._with(parameters)
-        self._build(self._values, frozenset(self.PARAMETERS))
+        self._build(self._values, frozenset(self._values))
+        self.output = self._output()
+
+    # --- what it is -------------------------------------------------------------------------------------------
+
+    @property
+    def sample_rate(self) -> float:
+        """Of the sound (Hz)."""
+        return self.given.sample_rate
 
     @property
     def parameters(self) -> dict[str, Any]:
@@ -59,13 +83,36 @@ class Stage:
         return dict(self._values)
 
     @property
-    def output_rate(self) -> float:
-        """Samples or frames per second of the output (Hz)."""
-        return self.sample_rate
+    def derived(self) -> dict[str, Any]:
+        """The values of the representation's `derived`, by name."""
+        return {}
+
+    @property
+    def needs(self) -> str:
+        """Which of the parent's by-products `process` must be given with each block; empty for none."""
+        return ""
+
+    @property
+    def look_ahead(self) -> int:
+        """How many frames of its input must have come after one before that one can be put out."""
+        return 0
 
     def output_rows(self, rows: tuple[int, ...]) -> tuple[int, ...]:
-        """The output's shape without its last (time) axis, given the input's."""
+        """The output's shape without its last (time) axis, given the input's; of the first part, if there are more."""
         return rows
+
+    def part_rows(self, rows: tuple[int, ...]) -> tuple[tuple[int, ...], ...]:
+        """`output_rows` of each part."""
+        return (self.output_rows(rows),)
+
+    def complete(self, count: int) -> int:
+        """How many samples or frames it will have put out when `count` have come since the start."""
+        return max(0, count - self.look_ahead)
+
+    def _output(self) -> Signal:
+        return self.given
+
+    # --- changes ----------------------------------------------------------------------------------------------
 
     def configure(self, **changes: Any) -> None:
         """Change parameters between blocks; a ValueError leaves everything as it was.
@@ -77,40 +124,79 @@ class Stage:
             values = self._with(changes)
             self._build(values, frozenset(changes))
             self._values = values
+            self._follow()
 
-    def process(self, block: FloatArray) -> FloatArray:
-        """The output for the next block, (2, ..., N) of numbers: a fresh, contiguous float64 array.
+    def receive(self, given: Signal) -> None:
+        """From now on blocks have the format `given`: the parent has changed. A ValueError changes nothing."""
+        if given == self.given:
+            self.given = given
+            return
+        tried = copy.copy(self)
+        tried.given = given
+        tried._received(self.given)
+        tried._follow()
+        self.__dict__.update(tried.__dict__)
 
-        The input is not modified. ValueError for another shape or type.
+    def _received(self, before: Signal) -> None:
+        """Design anew for `given`, which was `before`; the rule of `_build` holds.
+
+        Where nothing depends on the format there is nothing to do; blocks of other rows are noticed by `process`.
         """
-        raise NotImplementedError
 
-    def reset(self) -> None:
-        """Back to the state before the first block; parameters stay."""
-        raise NotImplementedError
+    def _follow(self) -> None:
+        output = self._output()
+        if output != self.output:
+            self.output = output
 
     def _build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
         """Design for `values` and drop the states that the `changed` ones invalidate; ValueError before any effect.
 
         New objects replace the old ones: see the rule above.
         """
-        raise NotImplementedError
 
     def _with(self, changes: Mapping[str, Any]) -> dict[str, Any]:
         """All values after `changes`, each checked."""
-        for name in changes:
-            if name not in self.PARAMETERS:
-                raise ValueError(f"{name}: {type(self).__name__} has no such parameter")
-        return self._merge({name: self.PARAMETERS[name].check(name, value) for name, value in changes.items()})
+        checked = {}
+        for name, value in changes.items():
+            parameter = self._parameter(name)
+            checked[parameter.name] = parameter.check(value)
+        return self._merge(checked)
+
+    def _parameter(self, name: str) -> Parameter:
+        try:
+            return self.REPRESENTATION.parameter(name)
+        except KeyError:
+            raise ValueError(f"{name}: {type(self).__name__} has no such parameter") from None
 
     def _merge(self, checked: dict[str, Any]) -> dict[str, Any]:
         return {**self._values, **checked}
 
+    # --- blocks -----------------------------------------------------------------------------------------------
+
+    def process(self, block: FloatArray, extra: FloatArray | None = None) -> Output:
+        """The output for the next block, (..., N) of numbers: a fresh, contiguous float64 array, or one for each part.
+
+        The input is not modified. `extra` is what `needs` names, of the same block. ValueError for another shape or
+        type.
+        """
+        raise NotImplementedError
+
+    def reset(self) -> None:
+        """Back to the state before the first block; parameters stay."""
+
     def _checked(self, block: Any) -> FloatArray:
         """`block` as contiguous float64 of the right shape, or ValueError."""
         array = np.asarray(block)
-        if array.dtype is FLOAT64 and array.ndim == len(self.BLOCK) and len(array) == 2 and array.flags.c_contiguous:
+        ears = self.INPUT[0] == "ear"
+        right = array.ndim == len(self.INPUT) and (not ears or len(array) == 2)
+        if right and array.dtype is FLOAT64 and array.flags.c_contiguous:
             return array  # what comes from a stage: no time is lost on the rest
-        if array.dtype.kind not in "iuf" or array.ndim != len(self.BLOCK) or array.shape[0] != 2:
-            raise ValueError(f"block: {array.dtype} of shape {array.shape} is not numbers in ({', '.join(self.BLOCK)})")
+        if not right or array.dtype.kind not in "iuf":
+            axes = ", ".join("2 ears" if axis == "ear" else f"{axis}s" for axis in self.INPUT[:-1])
+            raise ValueError(f"block: {array.dtype} of shape {array.shape} is not numbers in ({axes}, samples)")
         return np.asarray(array, np.float64, order="C")
+
+
+def parts_of(output: Output) -> Sequence[FloatArray]:
+    """The arrays of an output, one for each part."""
+    return output if isinstance(output, tuple) else (output,)

@@ -10,7 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rosafe import interface
-from rosafe.dsp import STAGES, Filterbank, InnerHairCell, Stage
+from rosafe.dsp.stage import Stage
+from rosafe.representations import STAGES
+from rosafe.representations.filterbank import Filterbank
+from rosafe.representations.haircell import InnerHairCell
 
 FloatArray = NDArray[np.float64]
 
@@ -48,11 +51,11 @@ class Chain:
         filterbank, hair_cell = self.stages["gammatone"], self.stages["ihc"]
         assert isinstance(filterbank, Filterbank)
         assert isinstance(hair_cell, InnerHairCell)
-        filterbank.provide_envelope = hair_cell.needs_envelope
+        filterbank.provide = frozenset({hair_cell.needs})
         out = {"input": self.stages["input"].process(block)}
         out["preProc"] = self.stages["preProc"].process(out["input"])
         out["gammatone"] = filterbank.process(out["preProc"])
-        out["ihc"] = hair_cell.process(out["gammatone"], filterbank.envelope)
+        out["ihc"] = hair_cell.process(out["gammatone"], filterbank.provided.get("envelope"))
         for kind in ("ild", "ratemap", "crossCorrelation"):
             out[kind] = self.stages[kind].process(out["ihc"])
         return out

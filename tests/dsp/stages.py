@@ -6,8 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from rosafe.dsp import STAGES, Filterbank, InnerHairCell, Stage
-from rosafe.dsp.haircell import METHODS
+from rosafe.dsp.stage import Stage
+from rosafe.representations import STAGES
+from rosafe.representations.filterbank import Filterbank
+from rosafe.representations.haircell import METHODS, InnerHairCell
 
 from .bare import FloatArray
 
@@ -56,10 +58,10 @@ class WithEnvelope(Stage):
 
     def process(self, block: FloatArray) -> FloatArray:
         if isinstance(self.stage, Filterbank):
-            self.stage.provide_envelope = True
+            self.stage.provide = frozenset({"envelope"})
             output = self.stage.process(block)
-            assert self.stage.envelope is not None
-            return np.concatenate([output, self.stage.envelope])
+            assert self.stage.provided["envelope"] is not None
+            return np.concatenate([output, self.stage.provided["envelope"]])
         assert isinstance(self.stage, InnerHairCell)
         return self.stage.process(block, np.abs(block) + 0.5)
 

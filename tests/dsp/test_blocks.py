@@ -9,7 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rosafe.dsp import STAGES, Filterbank, InnerHairCell, PreProc
+from rosafe.representations import STAGES
+from rosafe.representations.filterbank import Filterbank
+from rosafe.representations.haircell import InnerHairCell
+from rosafe.representations.preproc import PreProc
 
 from .bare import Chain, cut, joined, run
 from .stages import CHANNELS, MODES, NAMES, RATE, make, noise, rows
@@ -159,12 +162,12 @@ def test_the_envelope_costs_only_when_asked_for() -> None:
     bank = Filterbank(RATE, fb_nChannels=2, fb_highFreqHz=4000.0)
     shapes = []
     for wanted in (False, True, False):
-        bank.provide_envelope = wanted
+        bank.provide = frozenset({"envelope"} if wanted else ())
         bank.process(noise("gammatone", 50))
-        shapes.append(None if bank.envelope is None else bank.envelope.shape)
-    assert shapes == [None, (2, 2, 50), None]
-    assert InnerHairCell(RATE, ihc_method="hilbert").needs_envelope
-    assert not InnerHairCell(RATE).needs_envelope
+        shapes.append({name: array.shape for name, array in bank.provided.items()})
+    assert shapes == [{}, {"envelope": (2, 2, 50)}, {}]
+    assert InnerHairCell(RATE, ihc_method="hilbert").needs == "envelope"
+    assert not InnerHairCell(RATE).needs
     with pytest.raises(ValueError, match="envelope: bernstein"):
         InnerHairCell(RATE, ihc_method="bernstein").process(noise("ihc", 5))
     with pytest.raises(ValueError, match="envelope: hilbert"):
@@ -175,15 +178,13 @@ def test_the_envelope_costs_only_when_asked_for() -> None:
 def test_asking_for_the_envelope_later_gives_the_same_one(fb_type: str) -> None:
     signal = noise("gammatone", 200)
     early, late = (Filterbank(RATE, fb_type=fb_type, fb_cfHz=[300.0, 1000.0]) for _ in range(2))
-    early.provide_envelope = True
+    early.provide = frozenset({"envelope"})
     for stage in (early, late):
         stage.process(signal[:, :90])
-    late.provide_envelope = True
+    late.provide = frozenset({"envelope"})
     for stage in (early, late):
         stage.process(signal[:, 90:])
-    assert early.envelope is not None
-    assert late.envelope is not None
-    np.testing.assert_array_equal(early.envelope, late.envelope)
+    np.testing.assert_array_equal(early.provided["envelope"], late.provided["envelope"])
 
 
 def test_gain_control_starts_at_each_ears_first_sound() -> None:

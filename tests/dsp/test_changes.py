@@ -9,28 +9,20 @@ import numpy as np
 import pytest
 
 from rosafe import interface
-from rosafe.dsp import STAGES, CrossCorrelation, Filterbank, Ild, InnerHairCell, Input, PreProc, Ratemap, Stage
 from rosafe.dsp.erb import erb_rate
+from rosafe.dsp.stage import Stage
 from rosafe.dsp.windows import window
+from rosafe.representations import STAGES
+from rosafe.representations.crosscorrelation import CrossCorrelation
+from rosafe.representations.filterbank import Filterbank
+from rosafe.representations.haircell import InnerHairCell
+from rosafe.representations.ild import Ild
+from rosafe.representations.input import Input
+from rosafe.representations.preproc import PreProc
+from rosafe.representations.ratemap import Ratemap
 
 from .bare import run
 from .stages import MODES, NAMES, RATE, make, noise, rows
-
-# --- the table --------------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("kind", interface.KINDS)
-def test_parameters_are_those_of_the_interface(kind: str) -> None:
-    wanted = {p.name: p for p in interface.KINDS[kind].parameters}
-    table = STAGES[kind].PARAMETERS
-    assert list(STAGES[kind](44100.0).parameters) == list(table) == list(wanted)
-    for name, parameter in table.items():
-        assert parameter.default == wanted[name].default
-        for word in wanted[name].choices:
-            assert parameter.check(name, word) == word
-        for bound in (wanted[name].minimum, wanted[name].maximum):
-            if bound and wanted[name].idl != "sequence<double>":
-                assert parameter.check(name, int(bound) if "long" in wanted[name].idl else bound) == bound
 
 
 def test_channels_in_force() -> None:
@@ -47,7 +39,8 @@ def test_channels_in_force() -> None:
     assert listed["fb_cfHz"] == [500.0, 250.0, 1000.0]
     assert (listed["fb_lowFreqHz"], listed["fb_highFreqHz"]) == (500.0, 1000.0)
     assert (listed["fb_nERBs"], listed["fb_nChannels"]) == (0.0, 3)
-    assert Filterbank(44100, **listed).parameters == listed
+    again = {name: value for name, value in listed.items() if name != "fb_nERBs"}
+    assert Filterbank(44100, **again).parameters == listed
 
     assert Filterbank(44100, fb_nChannels=1).parameters["fb_cfHz"] == [80.0]
     for nothing in ([], (), 0, [0], None, np.array([])):
@@ -122,7 +115,7 @@ def test_what_is_refused_changes_nothing(kind: str, changes: dict[str, Any]) -> 
     assert stage.parameters == twin.parameters
     block = noise(kind, 700, seed=2)
     np.testing.assert_array_equal(stage.process(block), twin.process(block))
-    assert stage.output_rate == twin.output_rate
+    assert stage.output.rate == twin.output.rate
 
 
 @pytest.mark.parametrize("kind", STAGES)
@@ -154,7 +147,7 @@ def test_sample_rates_too_low_for_a_filter() -> None:
 PREPROC = {"pp_bRemoveDC": True, "pp_bPreEmphasis": True, "pp_bNormalizeRMS": True, "pp_bMiddleEarFiltering": True}
 
 
-@pytest.mark.parametrize("name", PreProc.PARAMETERS)
+@pytest.mark.parametrize("name", [p.name for p in PreProc.REPRESENTATION.parameters])
 def test_any_preproc_parameter_starts_all_its_filters_anew(name: str) -> None:
     stage = PreProc(RATE, **PREPROC)
     stage.process(noise("preProc", 500) + 0.5)
@@ -223,7 +216,7 @@ def test_hair_cell_method_starts_the_filter_anew() -> None:
     stage = InnerHairCell(RATE)
     stage.process(noise("ihc", 500))
     stage.configure(ihc_method="joergensen")
-    assert stage.needs_envelope
+    assert stage.needs
     block = noise("ihc", 300, seed=2)
     expected = InnerHairCell(RATE, ihc_method="joergensen").process(block, np.abs(block))
     np.testing.assert_array_equal(stage.process(block, np.abs(block)), expected)
@@ -246,7 +239,7 @@ def test_window_and_hop_change_keep_the_buffer_and_the_grid() -> None:
     assert after.shape[-1] == len(starts)
     for frame, start in enumerate(starts):
         np.testing.assert_allclose(after[:, frame], ild_of(x[..., start : start + 60], "blackman"), rtol=0, atol=1e-11)
-    assert stage.output_rate == RATE / 25
+    assert stage.output.rate == RATE / 25
 
 
 def test_a_shorter_window_finds_its_frames_in_the_buffer() -> None:
@@ -307,7 +300,7 @@ def test_lag_and_frame_shapes_are_rebuilt() -> None:
     assert stage.process(x[..., :500]).shape == (3, 11, 2)
     stage.configure(cc_maxDelaySec=40 / RATE)
     assert stage.output_rows((2, 3)) == (3, 81)
-    assert len(stage.lags) == 81
+    assert len(np.array(stage.derived["cc_lags"])) == 81
     np.testing.assert_allclose(stage.process(x[..., 500:]), whole[..., 2:], rtol=0, atol=1e-14)
 
 

@@ -13,12 +13,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rosafe.dsp import STAGES, CrossCorrelation, Ild, InnerHairCell, Ratemap, Stage, kernels
+from rosafe.dsp import kernels
 from rosafe.dsp.gammatone import GammatoneBank
 from rosafe.dsp.guard import LIMIT
-from rosafe.dsp.haircell import METHODS
 from rosafe.dsp.kernels import build
+from rosafe.dsp.stage import Stage
 from rosafe.dsp.windows import NAMES
+from rosafe.representations import STAGES
+from rosafe.representations.crosscorrelation import CrossCorrelation
+from rosafe.representations.haircell import METHODS, InnerHairCell
+from rosafe.representations.ild import Ild
+from rosafe.representations.ratemap import Ratemap
 from tests.harness import ROOT
 
 from .bare import FloatArray, cut
@@ -48,7 +53,7 @@ def outputs(stage: Stage, blocks: Iterable[FloatArray], turns: Iterable[int]) ->
     made = []
     for block, level in zip(blocks, turns, strict=False):
         with using(level):
-            if isinstance(stage, InnerHairCell) and stage.needs_envelope:
+            if isinstance(stage, InnerHairCell) and stage.needs:
                 made.append(stage.process(block, np.abs(block) + 0.25 * np.abs(np.roll(block, 1))))
             else:
                 made.append(stage.process(block))

@@ -7,9 +7,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rosafe.dsp import STAGES, Filterbank, Input, PreProc, Ratemap
 from rosafe.dsp.cascade import Cascade, leaky_integrator
 from rosafe.dsp.guard import LIMIT
+from rosafe.representations import STAGES
+from rosafe.representations.filterbank import Filterbank
+from rosafe.representations.input import Input
+from rosafe.representations.preproc import PreProc
+from rosafe.representations.ratemap import Ratemap
 
 from .bare import Chain, cut, run
 from .stages import MODES, NAMES, RATE, make, noise, rows

@@ -9,8 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 import rosafe
-from rosafe.dsp import STAGES
 from rosafe.interface import KINDS
+from rosafe.representations import STAGES
 from tests.dsp.bare import Chain, cut
 
 RATE = 16000.0

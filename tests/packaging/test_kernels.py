@@ -16,7 +16,7 @@ from tests.harness import PYTHON, run_together, wait_for
 from tests.packaging.clone import environment, fresh_copy, run, without_rights
 
 SHOW = (
-    "import numpy; from rosafe.dsp import Ild, kernels; "
+    "import numpy; from rosafe.dsp import kernels; from rosafe.representations.ild import Ild; "
     "print(kernels.compiled(), kernels.status(), float(Ild(44100).process(numpy.ones((2, 1, 900)))[0, 0]), sep='|')"
 )
 

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
 
-from rosafe.dsp import STAGES, Stage
+from rosafe.dsp.stage import Stage
 from rosafe.interface import KINDS, ROSAFE, ComponentError
+from rosafe.representations import STAGES
 
 RATE = 44100.0
 KIND_OF_SERVICE = {kind.request: kind for kind in KINDS.values()}

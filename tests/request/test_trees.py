@@ -12,10 +12,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rosafe import interface, request
-from rosafe.dsp import STAGES
 from rosafe.genomix import trees
 from rosafe.genomix.values import partial
 from rosafe.interface import KINDS, ROSAFE, ComponentError
+from rosafe.representations import STAGES
 from tests.request.model import RATE, Model
 
 REPRESENTATIONS = [kind.representation for kind in KINDS.values()]

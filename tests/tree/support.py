@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rosafe.dsp import STAGES
 from rosafe.interface import KINDS
+from rosafe.representations import STAGES
 from rosafe.tree.processor import Processor
 from rosafe.tree.tree import Tree
 from rosafe.tree.zone import Block
@@ -120,7 +120,7 @@ class Plain:
     work: Callable[[np.ndarray], None] = staticmethod(lambda block: None)
 
     def __init__(self, sample_rate: float, **parameters: Any) -> None:
-        self.sample_rate = self.output_rate = sample_rate
+        self.sample_rate = self.output.rate = sample_rate
         self.parameters = parameters
 
     def configure(self, **changes: Any) -> None:

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rosafe.dsp import STAGES
 from rosafe.interface import KINDS, ComponentError
+from rosafe.representations import STAGES
 from rosafe.tree.roles import State
 from rosafe.tree.tree import Tree
 from tests.dsp.bare import Chain

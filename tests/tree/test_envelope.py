@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rosafe.dsp import STAGES, InnerHairCell
+from rosafe.representations import STAGES
+from rosafe.representations.haircell import InnerHairCell
 from rosafe.tree.processor import Processor
 from rosafe.tree.roles import State
 from rosafe.tree.tree import Tree
@@ -78,10 +79,10 @@ def test_a_late_child_never_works_without_the_envelope(tree: Tree, feed: Feed, l
     filterbank = chain().stages["gammatone"]
     hair_cell = STAGES["ihc"](RATE, ihc_method=method)
     for number, block in enumerate(NOISE):
-        filterbank.provide_envelope = True  # type: ignore[attr-defined]
+        filterbank.provide = frozenset({"envelope"})  # type: ignore[attr-defined]
         data = filterbank.process(block)
         if number >= numbers[0]:
-            expected = hair_cell.process(data, filterbank.envelope)  # type: ignore[attr-defined,call-arg]
+            expected = hair_cell.process(data, filterbank.provided["envelope"])  # type: ignore[attr-defined,call-arg]
             got = listener.blocks[late][number - numbers[0]].data
             np.testing.assert_allclose(got, expected, rtol=0, atol=1e-12)
 

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rosafe.dsp import STAGES
 from rosafe.interface import ComponentError
+from rosafe.representations import STAGES
 from rosafe.tree import tree as tree_of_processors
 from rosafe.tree.processor import Processor
 from rosafe.tree.roles import State

@@ -62,8 +62,8 @@ def rectify_and_filter(
 ) -> FloatArray:
     """Rectify (*rows, N), then filter it by second-order sections (S, 6); `state` (S, *rows, 2) as in scipy.
 
-    The envelope of the same shape is for `compressed`. The twin is `rosafe.dsp.haircell.RECTIFIERS`, or `compressed`
-    there, and `rosafe.dsp.cascade.Cascade`.
+    The envelope of the same shape is for `compressed`. The twin is `RECTIFIERS` of
+    rosafe/representations/haircell.py, or `compressed` there, and `rosafe.dsp.cascade.Cascade`.
     """
     output = memory.empty(block.shape)
     _function("rosafe_biquads")(

@@ -6,14 +6,12 @@ auditory front-end", IEEE Trans. Audio Speech Lang. Process. 19, 1-13.
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 import numpy as np
 
-from . import kernels
-from .framing import FramedStage, frame_parameters
-from .guard import FloatArray
-from .stage import ParameterTable
+from rosafe.dsp import kernels
+from rosafe.dsp.framing import FramedStage, frame_parameters
+from rosafe.dsp.guard import FloatArray
+from rosafe.vocabulary.representation import Representation
 
 EPSILON = 2.2204e-16  # the original's literal
 
@@ -24,13 +22,21 @@ class Ild(FramedStage):
     10 log10((E_R + eps) / (E_L + eps)) with E = mean((window x)**2) per frame; silence gives 0 dB.
     """
 
+    REPRESENTATION = Representation(
+        kind="ild",
+        doc="Interaural level difference",
+        parent="ihc",
+        axes=("channel", "time"),
+        unit="dB",
+        parameters=frame_parameters("ild"),
+        port_doc="Interaural level differences (dB), in `left`",
+    )
     PREFIX = "ild"
-    PARAMETERS: ClassVar[ParameterTable] = frame_parameters("ild")
 
     def output_rows(self, rows: tuple[int, ...]) -> tuple[int, ...]:
         return rows[1:]
 
-    def process(self, block: FloatArray) -> FloatArray:
+    def process(self, block: FloatArray, extra: FloatArray | None = None) -> FloatArray:
         samples = self._checked(block)
         if kernels.compiled():
             frames = self._frames(samples, self._framing.weights(squared=True))

@@ -7,16 +7,18 @@ The HTK Book. Level: as in M. L. Jepsen, S. D. Ewert and T. Dau (2008), J. Acous
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import scipy
 
-from .cascade import Cascade, leaky_integrator
-from .checks import flag, positive, round_half_away, within, word
-from .guard import SQUARE_TINY, FloatArray, limited
-from .middle_ear import MODELS, middle_ear_fir
-from .stage import Parameter, ParameterTable, Stage
+from rosafe.dsp.cascade import Cascade, leaky_integrator
+from rosafe.dsp.guard import SQUARE_TINY, FloatArray, limited
+from rosafe.dsp.middle_ear import MODELS, middle_ear_fir
+from rosafe.dsp.rounding import round_half_away
+from rosafe.dsp.stage import Stage
+from rosafe.vocabulary.parameter import Parameter
+from rosafe.vocabulary.representation import Representation
 
 DC_ORDER = 4
 LEVEL_OF_RMS_1 = 100.0  # dB SPL
@@ -29,22 +31,76 @@ class PreProc(Stage):
     10**((100 - pp_refSPLdB) / 20): inside, an RMS of 1 stands for 100 dB SPL.
     """
 
-    PARAMETERS: ClassVar[ParameterTable] = {
-        "pp_bRemoveDC": Parameter(False, flag),
-        "pp_cutoffHzDC": Parameter(20.0, positive),
-        "pp_bPreEmphasis": Parameter(False, flag),
-        "pp_coefPreEmphasis": Parameter(0.97, within(-1.0, 1.0)),
-        "pp_bNormalizeRMS": Parameter(False, flag),
-        "pp_intTimeSecRMS": Parameter(0.5, positive),
-        "pp_bLevelScaling": Parameter(False, flag),
-        "pp_refSPLdB": Parameter(100.0, within(-200.0, 400.0)),
-        "pp_bMiddleEarFiltering": Parameter(False, flag),
-        "pp_middleEarModel": Parameter("jepsen", word(*MODELS, jespen="jepsen")),
-        "pp_bUnityComp": Parameter(False, flag),
-    }
-    BLOCK = ("2 ears", "samples")
+    REPRESENTATION = Representation(
+        kind="preProc",
+        doc="Condition the input: DC removal, pre-emphasis, gain control, level scaling, middle ear",
+        parent="input",
+        axes=("ear", "time"),
+        parameters=(
+            Parameter("pp_bRemoveDC", "boolean", False, "Flag to activate the DC-removal high-pass filter"),
+            Parameter(
+                "pp_cutoffHzDC",
+                "double",
+                20.0,
+                "Cutoff frequency (Hz) of DC-removal high-pass filter",
+                minimum=0.0,
+                maximum=1e6,
+                open_minimum=True,
+                unit="Hz",
+            ),
+            Parameter("pp_bPreEmphasis", "boolean", False, "Flag to activate pre-emphasis"),
+            Parameter(
+                "pp_coefPreEmphasis",
+                "double",
+                0.97,
+                "Coefficient for pre-emphasis compensation (usually between 0.9 and 1)",
+                minimum=-1.0,
+                maximum=1.0,
+            ),
+            Parameter("pp_bNormalizeRMS", "boolean", False, "Flag to activate binaural RMS normalization"),
+            Parameter(
+                "pp_intTimeSecRMS",
+                "double",
+                0.5,
+                "Time constant (s) for automatic gain control",
+                minimum=0.0,
+                maximum=3600.0,
+                open_minimum=True,
+                unit="s",
+            ),
+            Parameter("pp_bLevelScaling", "boolean", False, "Flag to activate the level scaling"),
+            Parameter(
+                "pp_refSPLdB",
+                "double",
+                100.0,
+                "Reference dB SPL value to correspond to input signal RMS value of 1",
+                minimum=-200.0,
+                maximum=400.0,
+                aliases=("pp_refSPLdBS",),
+                unit="dB",
+            ),
+            Parameter("pp_bMiddleEarFiltering", "boolean", False, "Flag to activate middle ear filtering"),
+            Parameter(
+                "pp_middleEarModel",
+                "string",
+                "jepsen",
+                "Middle ear filter model (jepsen or lopezpoveda)",
+                choices=tuple(MODELS),
+                fallback="jepsen",
+                spellings={"jespen": "jepsen"},  # as the user guide writes it
+            ),
+            Parameter(
+                "pp_bUnityComp", "boolean", False, "Compensation to have maximum of unity gain for middle ear filter"
+            ),
+        ),
+        name_doc="The name of this activity",
+        request="PreProc",
+        port_doc="What each pre-processor put out",
+        word="time",
+    )
+    INPUT = ("ear", "time")
 
-    def process(self, block: FloatArray) -> FloatArray:
+    def process(self, block: FloatArray, extra: FloatArray | None = None) -> FloatArray:
         if not self._steps and self._gain == 1.0:
             return self._checked(block).copy()
         samples = limited(self._checked(block))

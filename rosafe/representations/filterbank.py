@@ -3,30 +3,21 @@
 from __future__ import annotations
 
 import math
-from typing import Any, ClassVar
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
-from .checks import not_negative, number, positive, whole, word
-from .drnl import DrnlBank
-from .erb import erb_rate, erb_rate_to_frequency
-from .gammatone import GammatoneBank
-from .guard import FloatArray
-from .stage import Parameter, ParameterTable, Stage
+from rosafe.dsp.drnl import DrnlBank
+from rosafe.dsp.erb import erb_rate, erb_rate_to_frequency
+from rosafe.dsp.gammatone import GammatoneBank
+from rosafe.dsp.guard import FloatArray
+from rosafe.dsp.signal import Signal
+from rosafe.dsp.stage import Stage
+from rosafe.vocabulary.parameter import MAX_SEQUENCE, Parameter
+from rosafe.vocabulary.representation import Representation
 
-MAX_CHANNELS = 1024
-
-
-def _frequency_list(name: str, value: Any) -> tuple[float, ...]:
-    """Frequencies above 0; None, 0, [0] and [] all mean that there is no list."""
-    if isinstance(value, (str, bytes)):
-        raise ValueError(f"{name}: {value[:80]!r} is not a list of numbers")
-    items = [] if value is None else np.asarray(value, dtype=object).ravel().tolist()
-    if len(items) > MAX_CHANNELS:
-        raise ValueError(f"{name}: {len(items)} channels are too many, at most {MAX_CHANNELS}")
-    if len(items) == 1 and number(name, items[0]) == 0:
-        return ()
-    return tuple(positive(name, item) for item in items)
+MAX_CHANNELS = MAX_SEQUENCE
 
 
 class Filterbank(Stage):
@@ -40,30 +31,85 @@ class Filterbank(Stage):
     `parameters` tells the channels in force: with a list, `fb_nERBs` is 0 and the range its first and last element;
     with a number of channels n, `fb_nERBs` is the width of the range divided by n, as in the original.
 
-    Attributes
-    ----------
-    provide_envelope : bool
-        Whether `process` also puts the envelope of its output into `envelope`; it costs time.
-    envelope : ndarray (2, C, N) or None
-        Of the last block: 2 abs(H x) for gammatone; for DRNL see `DrnlBank`.
+    The envelope of the output, (2, C, N), is provided to those who need it: 2 abs(H x) for gammatone; for DRNL see
+    `DrnlBank`. It costs time.
     """
 
-    PARAMETERS: ClassVar[ParameterTable] = {
-        "fb_type": Parameter("gammatone", word("gammatone", "drnl")),
-        "fb_lowFreqHz": Parameter(80.0, positive),
-        "fb_highFreqHz": Parameter(8000.0, positive),
-        "fb_nERBs": Parameter(1.0, not_negative),
-        "fb_nChannels": Parameter(0, whole(0, MAX_CHANNELS)),
-        "fb_cfHz": Parameter((), _frequency_list),
-        "fb_nGamma": Parameter(4, whole(1, 128)),
-        "fb_bwERBs": Parameter(1.018, positive),
-    }
-    BLOCK = ("2 ears", "samples")
-
-    def __init__(self, sample_rate: float, **parameters: Any) -> None:
-        self.provide_envelope = False
-        self.envelope: FloatArray | None = None
-        super().__init__(sample_rate, **parameters)
+    REPRESENTATION = Representation(
+        kind="gammatone",
+        doc="Split the signal into frequency channels",
+        parent="preProc",
+        axes=("ear", "channel", "time"),
+        parameters=(
+            Parameter(
+                "fb_type",
+                "string",
+                "gammatone",
+                "Filterbank type (gammatone or drnl)",
+                choices=("gammatone", "drnl"),
+                fallback="gammatone",
+            ),
+            Parameter(
+                "fb_lowFreqHz", "double", 80.0, "Lowest center frequency (Hz)", 0.0, 1e6, open_minimum=True, unit="Hz"
+            ),
+            Parameter(
+                "fb_highFreqHz",
+                "double",
+                8000.0,
+                "Highest center frequency (Hz)",
+                0.0,
+                1e6,
+                open_minimum=True,
+                unit="Hz",
+            ),
+            Parameter(
+                "fb_nERBs",
+                "double",
+                1.0,
+                "Distance between neighboring filters in ERBs",
+                0.0,
+                100.0,
+                open_minimum=True,
+                unit="ERB",
+            ),
+            Parameter(
+                "fb_nChannels",
+                "unsigned long",
+                0,
+                "Number of channels; 0: as many as fb_nERBs gives",
+                0,
+                MAX_CHANNELS,
+            ),
+            Parameter(
+                "fb_cfHz",
+                "sequence<double>",
+                (),
+                "Channels center frequencies (Hz); empty: chosen from the other parameters",
+                0.0,
+                1e6,
+                open_minimum=True,
+                unit="Hz",
+            ),
+            Parameter("fb_nGamma", "unsigned long", 4, "Gammatone rising slope order", 1, 128),
+            Parameter(
+                "fb_bwERBs",
+                "double",
+                1.018,
+                "Bandwidth of the filters in ERBs",
+                0.0,
+                10_000.0,
+                open_minimum=True,
+                unit="ERB",
+            ),
+        ),
+        coordinates=("fb_cfHz",),
+        name_doc="The name of this activity",
+        request_aliases=("Gammatone",),
+        port_doc="What each filterbank put out",
+        word="filterbank",
+    )
+    INPUT = ("ear", "time")
+    PROVIDES = ("envelope",)
 
     @property
     def parameters(self) -> dict[str, Any]:
@@ -72,19 +118,24 @@ class Filterbank(Stage):
     def output_rows(self, rows: tuple[int, ...]) -> tuple[int, ...]:
         return (*rows, len(self._frequencies))
 
-    def process(self, block: FloatArray) -> FloatArray:
-        output, self.envelope = self._bank.process(self._checked(block), self.provide_envelope)
+    def process(self, block: FloatArray, extra: FloatArray | None = None) -> FloatArray:
+        output, envelope = self._bank.process(self._checked(block), "envelope" in self.provide)
+        self.provided = {} if envelope is None else {"envelope": envelope}
         return output
 
     def reset(self) -> None:
         self._bank.reset()
-        self.envelope = None
+        self.provided = {}
+
+    def _output(self) -> Signal:
+        channels = tuple(self._frequencies.tolist())
+        return replace(self.given, center_frequencies=channels, filterbank=self._values["fb_type"])
 
     def _merge(self, checked: dict[str, Any]) -> dict[str, Any]:
         values = super()._merge(checked)
         decides = checked.get("fb_nChannels") or {"fb_lowFreqHz", "fb_highFreqHz", "fb_nERBs"} & checked.keys()
         if decides and not checked.get("fb_cfHz"):
-            values["fb_cfHz"] = ()
+            values["fb_cfHz"] = []
         if "fb_nERBs" in checked and not checked.get("fb_nChannels"):
             values["fb_nChannels"] = 0
         return values
@@ -106,7 +157,7 @@ class Filterbank(Stage):
         elif values["fb_nChannels"]:
             span = erb_rate(frequencies[-1]) - erb_rate(frequencies[0])
             in_force["fb_nERBs"] = float(span) / len(frequencies)
-        self._bank, self._frequencies, self._in_force, self.envelope = bank, frequencies, in_force, None
+        self._bank, self._frequencies, self._in_force, self.provided = bank, frequencies, in_force, {}
 
 
 def _chosen_by(values: dict[str, Any]) -> str:
@@ -132,6 +183,6 @@ def center_frequencies(values: dict[str, Any]) -> FloatArray:
 
 def _steps_below(span: float, step: float) -> int:
     """How many of 0, step, 2 step... lie strictly below `span`, whatever rounding does to a span of whole steps."""
-    if step == 0 or span / step > MAX_CHANNELS:
+    if span / step > MAX_CHANNELS:
         raise ValueError(f"fb_nERBs: {step:.12g} gives too many channels, at most {MAX_CHANNELS}")
     return max(1, math.ceil(span / step - 1e-9))

@@ -5,16 +5,16 @@ G. J. Brown and M. Cooke (1994), "Computational auditory scene analysis", Comput
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
-from . import kernels
-from .cascade import Cascade, leaky_integrator
-from .checks import positive, word
-from .framing import FramedStage, frame_parameters
-from .guard import FloatArray, limited
-from .stage import Parameter, ParameterTable
+from rosafe.dsp import kernels
+from rosafe.dsp.cascade import Cascade, leaky_integrator
+from rosafe.dsp.framing import FramedStage, frame_parameters
+from rosafe.dsp.guard import FloatArray, limited
+from rosafe.vocabulary.parameter import Parameter
+from rosafe.vocabulary.representation import Representation
 
 
 class Ratemap(FramedStage):
@@ -25,14 +25,40 @@ class Ratemap(FramedStage):
     integrated before stay buffered.
     """
 
+    REPRESENTATION = Representation(
+        kind="ratemap",
+        doc="Ratemap (cochleagram)",
+        parent="ihc",
+        axes=("ear", "channel", "time"),
+        parameters=(
+            *frame_parameters("rm"),
+            Parameter(
+                "rm_scaling",
+                "string",
+                "power",
+                "Scaling type (power or magnitude)",
+                choices=("power", "magnitude"),
+                fallback="power",
+                former=("set_rm_scailing",),
+            ),
+            Parameter(
+                "rm_decaySec",
+                "double",
+                0.008,
+                "Signal-smoothing leaky integrator time constant (s)",
+                0.0,
+                3600.0,
+                open_minimum=True,
+                unit="s",
+            ),
+        ),
+        request_aliases=("Ratemap",),
+        port_aliases=("ratemapProcPort",),
+        port_doc="Ratemaps",
+    )
     PREFIX = "rm"
-    PARAMETERS: ClassVar[ParameterTable] = {
-        **frame_parameters("rm"),
-        "rm_scaling": Parameter("power", word("power", "magnitude")),
-        "rm_decaySec": Parameter(0.008, positive),
-    }
 
-    def process(self, block: FloatArray) -> FloatArray:
+    def process(self, block: FloatArray, extra: FloatArray | None = None) -> FloatArray:
         samples = self._checked(block)
         power = self._values["rm_scaling"] == "power"
         if not kernels.compiled():

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
-from .checks import flag, whole
-from .guard import FloatArray, limited
-from .stage import Parameter, ParameterTable, Stage
+from rosafe.dsp.guard import FloatArray, limited
+from rosafe.dsp.stage import Stage
+from rosafe.vocabulary.parameter import Parameter
+from rosafe.vocabulary.representation import Representation
 
 
 class Input(Stage):
@@ -18,13 +19,23 @@ class Input(Stage):
     below 1e-200 as 0.
     """
 
-    PARAMETERS: ClassVar[ParameterTable] = {
-        "in_doNormalize": Parameter(True, flag),
-        "in_normalizeValue": Parameter(2**31 - 1, whole(1, 2**64 - 1)),
-    }
-    BLOCK = ("2 ears", "samples")
+    REPRESENTATION = Representation(
+        kind="input",
+        doc="Read the audio that comes in on the Audio port, block by block",
+        axes=("ear", "time"),
+        parameters=(
+            Parameter("in_doNormalize", "boolean", True, "Flag to divide the samples by in_normalizeValue"),
+            Parameter(
+                "in_normalizeValue", "unsigned long long", 2**31 - 1, "Sample value that becomes 1.0", 1, 2**64 - 1
+            ),
+        ),
+        name_doc="Name of the activity",
+        port="inputProcPort",
+        port_doc="What the input processor put out",
+    )
+    INPUT = ("ear", "time")
 
-    def process(self, block: Any) -> FloatArray:
+    def process(self, block: Any, extra: FloatArray | None = None) -> FloatArray:
         """(2, N) of int32 or float to (2, N); ValueError for NaN and infinities."""
         samples = self._checked(block)
         if np.asarray(block).dtype.kind == "f":  # of whole numbers, all are finite and within the limit
@@ -32,9 +43,6 @@ class Input(Stage):
                 raise ValueError("block: there are samples that are not finite")
             samples = limited(samples)
         return samples / self._divisor
-
-    def reset(self) -> None:
-        """Nothing: there is no state."""
 
     def _build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
         self._divisor = float(values["in_normalizeValue"]) if values["in_doNormalize"] else 1.0

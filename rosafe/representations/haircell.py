@@ -13,16 +13,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 import scipy
 
-from . import kernels
-from .cascade import Cascade
-from .checks import word
-from .guard import SQUARE_TINY, TINY, FloatArray, limited
-from .stage import Parameter, ParameterTable, Stage
+from rosafe.dsp import kernels
+from rosafe.dsp.cascade import Cascade
+from rosafe.dsp.guard import SQUARE_TINY, TINY, FloatArray, limited
+from rosafe.dsp.stage import Stage
+from rosafe.vocabulary.parameter import Parameter
+from rosafe.vocabulary.representation import Representation
 
 # Butterworth low-pass after the rectification: order, cutoff (Hz), how many in cascade
 LOWPASS = {
@@ -71,19 +72,26 @@ class InnerHairCell(Stage):
     ValueError where a low-pass would lie at or above half the sample rate.
     """
 
-    PARAMETERS: ClassVar[ParameterTable] = {"ihc_method": Parameter("dau", word(*METHODS))}
+    REPRESENTATION = Representation(
+        kind="ihc",
+        doc="Inner hair cell representation",
+        parent="gammatone",
+        axes=("ear", "channel", "time"),
+        parameters=(Parameter("ihc_method", "string", "dau", "The IHC method name", choices=METHODS, fallback="dau"),),
+        name_doc="The name of this activity",
+        port_doc="What each inner hair cell processor put out",
+        word="innerhaircell",
+    )
 
     @property
-    def needs_envelope(self) -> bool:
-        """Whether `process` must be given the filterbank's envelope."""
-        return self._values["ihc_method"] in ENVELOPE_METHODS
+    def needs(self) -> str:
+        return "envelope" if self._values["ihc_method"] in ENVELOPE_METHODS else ""
 
-    def process(self, block: FloatArray, envelope: FloatArray | None = None) -> FloatArray:
-        """As `Stage.process`; `envelope` is that of `block`, of the same shape, for the methods that need it."""
-        samples = self._checked(block)
+    def process(self, block: FloatArray, extra: FloatArray | None = None) -> FloatArray:
+        samples, envelope = self._checked(block), extra
         method = self._values["ihc_method"]
         rectification = RECTIFICATION.get(method, "none")
-        if not self.needs_envelope:
+        if not self.needs:
             envelope = None
         elif envelope is None or np.shape(envelope) != samples.shape:
             raise ValueError(f"envelope: {method} needs one of the shape of the block")

@@ -8,16 +8,19 @@ Process. 19, 1-13.
 from __future__ import annotations
 
 import math
-from typing import Any, ClassVar
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import scipy
 
-from . import kernels, memory
-from .checks import MAX_SAMPLES, positive
-from .framing import FramedStage, frame_parameters
-from .guard import SQUARE_TINY, FloatArray, limited
-from .stage import Parameter, ParameterTable
+from rosafe.dsp import kernels, memory
+from rosafe.dsp.framing import FramedStage, frame_parameters
+from rosafe.dsp.guard import SQUARE_TINY, FloatArray, limited
+from rosafe.dsp.rounding import MAX_SAMPLES
+from rosafe.dsp.signal import Signal
+from rosafe.vocabulary.parameter import Parameter
+from rosafe.vocabulary.representation import Derived, Representation
 
 EPSILON = 2.2204e-16  # the original's literal
 BATCH = 2**18  # samples per ear that are transformed at a time, to bound memory and stay in the cache
@@ -31,18 +34,47 @@ class CrossCorrelation(FramedStage):
     of a window's length and beyond give 0, and so does silence.
     """
 
+    REPRESENTATION = Representation(
+        kind="crossCorrelation",
+        doc="Interaural cross-correlation",
+        parent="ihc",
+        axes=("channel", "lag", "time"),
+        parameters=(
+            *frame_parameters("cc"),
+            Parameter(
+                "cc_maxDelaySec",
+                "double",
+                0.0011,
+                "Maximum delay in cross-correlation computation (s)",
+                0.0,
+                10.0,
+                open_minimum=True,
+                unit="s",
+            ),
+        ),
+        request_order=("cc_wSizeSec", "cc_hSizeSec", "cc_maxDelaySec", "cc_wname"),
+        derived=(Derived("cc_lags", "sequence<double>", "The lags, ascending", unit="s"),),
+        coordinates=("cc_lags",),
+        centred="lag",
+        name="crosscorrelation",
+        name_doc="The name of this cross-correlation processor",
+        request_aliases=("CrossCorrelation",),
+        port_doc="Cross-correlations, [lag][channel][frame]",
+        word="crosscorrelation",
+    )
     PREFIX = "cc"
-    PARAMETERS: ClassVar[ParameterTable] = {**frame_parameters("cc"), "cc_maxDelaySec": Parameter(0.0011, positive)}
 
     @property
-    def lags(self) -> FloatArray:
-        """The lags (L,) in seconds, ascending."""
-        return np.arange(-self._max_lag, self._max_lag + 1) / self.sample_rate
+    def derived(self) -> dict[str, Any]:
+        return {"cc_lags": (np.arange(-self._max_lag, self._max_lag + 1) / self.sample_rate).tolist()}
+
+    def _output(self) -> Signal:
+        return replace(super()._output(), lags=self._max_lag)
 
     def output_rows(self, rows: tuple[int, ...]) -> tuple[int, ...]:
         return (rows[1], 2 * self._max_lag + 1)
 
-    def process(self, block: FloatArray) -> FloatArray:
+    def process(self, block: FloatArray, extra: FloatArray | None = None) -> FloatArray:
         samples = self._checked(block)
         reach = min(self._max_lag, len(self._framing.window) - 1)  # beyond, frames do not overlap
         if kernels.compiled() and 2 * reach + 1 <= kernels.MOST_LAGS:

@@ -1,0 +1,59 @@
+"""The one table of the component interface: requests, parameters, types, exceptions and ports of `rosAFE` and `bass`.
+
+The nodes, the HTTP server, the Tcl help, the documentation and the files below msg/, srv/ and action/ all come from
+this table; it comes from the declarations of the representations (rosafe/representations). Nothing else states a
+parameter's name, type, default, range or order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+from rosafe.representations import KINDS
+from rosafe.vocabulary.errors import ComponentError
+from rosafe.vocabulary.idl import ros_type
+from rosafe.vocabulary.parameter import MAX_SEQUENCE, MAX_STRING, REQUIRED, Parameter, text_of
+from rosafe.vocabulary.representation import Representation
+
+from .bass import BASS
+from .genom import COMMON_SERVICES, GENOM_EXCEPTIONS, GENOM_STATE_PORT, MAX_ACTIVITIES
+from .rosafe import FIXED, LAYOUTS, MAX_BLOCK, MAX_SECONDS, REQUEST, ROSAFE
+from .service import Component, Port, Service
+
+COMPONENTS = {c.name: c for c in (ROSAFE, BASS)}
+
+
+def all_services() -> Iterator[tuple[Component, Service]]:
+    """Every (component, service) pair."""
+    for component in COMPONENTS.values():
+        for service in component.services:
+            yield component, service
+
+
+__all__ = [
+    "BASS",
+    "COMMON_SERVICES",
+    "COMPONENTS",
+    "FIXED",
+    "GENOM_EXCEPTIONS",
+    "GENOM_STATE_PORT",
+    "KINDS",
+    "LAYOUTS",
+    "MAX_ACTIVITIES",
+    "MAX_BLOCK",
+    "MAX_SECONDS",
+    "MAX_SEQUENCE",
+    "MAX_STRING",
+    "REQUEST",
+    "REQUIRED",
+    "ROSAFE",
+    "Component",
+    "ComponentError",
+    "Parameter",
+    "Port",
+    "Representation",
+    "Service",
+    "all_services",
+    "ros_type",
+    "text_of",
+]

@@ -1,0 +1,84 @@
+"""The component `bass`, which captures binaural sound, and the type of its port."""
+
+from __future__ import annotations
+
+from rosafe.vocabulary.parameter import Parameter
+
+from .genom import COMMON_SERVICES, GENOM_STATE, GENOM_STATE_PORT
+from .service import Component, Port, Service, Struct
+
+BINAUDIO: dict[str, Struct] = {
+    "::binaudio::timestamp": (("sec", "unsigned long"), ("nsec", "unsigned long")),
+    "::binaudio::portStruct": (
+        ("sampleRate", "unsigned long"),
+        ("nChunksOnPort", "unsigned long"),
+        ("nFramesPerChunk", "unsigned long"),
+        ("lastFrameIndex", "unsigned long long"),
+        ("left", "sequence<long>"),
+        ("right", "sequence<long>"),
+        ("stamp", "::binaudio::timestamp"),
+    ),
+}
+
+BASS = Component(
+    name="bass",
+    doc="Binaural audio streaming server: captures sound and publishes a sliding window of it",
+    services=(
+        Service(
+            "Acquire",
+            "Capture from a device and publish on Audio until stopped",
+            (
+                Parameter("device", "string", "hw:1,0", "ALSA name of the sound device, file:PATH, bag:PATH or scene:"),
+                Parameter(
+                    "sampleRate",
+                    "unsigned long",
+                    44100,
+                    "Sample rate (Hz); 0: the source's own with file: and bag:, else 44100",
+                    0,
+                    768000,
+                    zero_is_default=False,
+                ),
+                Parameter("nFramesPerChunk", "unsigned long", 2205, "Frames in one chunk", 1, 1_000_000),
+                Parameter("nChunksOnPort", "unsigned long", 20, "Chunks in the window on the port", 1, 100_000),
+            ),
+            throws=("::bass::e_nomem", "::bass::e_device", "::bass::e_hwparams", "::bass::e_swparams"),
+            activity=True,
+            task="capture",
+            interrupts=("Acquire",),
+        ),
+        Service(
+            "ListDevices",
+            "Print the capture devices on the component's standard output",
+            throws=("::bass::e_nodevice",),
+        ),
+        Service("Stop", "Stop the acquisition", interrupts=("Acquire",)),
+        Service(
+            "DedicatedSocket",
+            "Serve the Audio port's content on TCP port 8081 until closed",
+            activity=True,
+            task="socket",
+            interrupts=("DedicatedSocket",),
+        ),
+        Service(
+            "CloseSocket",
+            "Close the dedicated socket and all its connections",
+            activity=True,
+            task="socket",
+            interrupts=("DedicatedSocket",),
+        ),
+        *COMMON_SERVICES,
+    ),
+    ports=(
+        Port("Audio", "::binaudio::portStruct", "The newest audio: a window that slides by one chunk"),
+        GENOM_STATE_PORT,
+    ),
+    tasks=("capture", "socket"),
+    exceptions={
+        "e_nomem": "out of memory",
+        "e_nodevice": "no sound card",
+        "e_device": "the device does not exist, is busy or is gone",
+        "e_hwparams": "the device does not offer what was asked for",
+        "e_swparams": "the device's software parameters cannot be set",
+    },
+    structs={**BINAUDIO, **GENOM_STATE},
+)

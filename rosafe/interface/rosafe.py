@@ -1,0 +1,246 @@
+"""The component `rosAFE`, derived from the representations that there are: requests, ports, structs, tasks."""
+
+from __future__ import annotations
+
+from rosafe.representations import KINDS
+from rosafe.representations.registry import ORIGINAL
+from rosafe.vocabulary.parameter import REQUIRED, Parameter
+from rosafe.vocabulary.representation import Representation
+
+from .bass import BINAUDIO
+from .genom import COMMON_SERVICES, GENOM_STATE, GENOM_STATE_PORT
+from .service import Component, Port, Service, Struct
+from .signals import SIGNALS, layout
+
+MAX_SECONDS = 600.0  # longest port or history
+MAX_BLOCK = 10_000_000  # frames
+
+LAYOUTS = {kind: layout(representation) for kind, representation in KINDS.items()}
+FIXED = {kind: KINDS[kind] for kind in ORIGINAL if kind in KINDS}  # what getParameters and getSignals report
+
+# --- types ------------------------------------------------------------------------------------------------------
+
+
+def parameter_struct(kind: str) -> str:
+    """The struct of getParameters for one of the original's kinds."""
+    if kind == "crossCorrelation":
+        return "::rosAFE::crossCorrelationParametres"
+    return f"::rosAFE::{kind.removesuffix('Proc')}ProcsParametres"
+
+
+def _structs() -> dict[str, Struct]:
+    structs = dict(SIGNALS)
+    for a_layout in LAYOUTS.values():
+        structs[a_layout.idl] = a_layout.members
+    for kind, representation in FIXED.items():
+        structs[parameter_struct(kind)] = (
+            ("name", "string"),
+            *((p.name, p.idl) for p in representation.parameters),
+            *((d.name, d.idl) for d in representation.derived),
+        )
+    structs["::rosAFE::parameters"] = tuple((kind, f"sequence<{parameter_struct(kind)}>") for kind in FIXED)
+    structs["::rosAFE::dataObjSt"] = tuple((kind, f"sequence<{LAYOUTS[kind].idl}>") for kind in FIXED)
+    structs["::rosAFE::parameterValue"] = (("name", "string"), ("value", "string"))
+    structs["::rosAFE::processor"] = (
+        *((name, "string") for name in ("name", "kind", "request", "upperDepName", "port", "topic")),
+        ("rate", "double"),
+        ("shape", "sequence<unsigned long>"),
+        ("axes", "sequence<string>"),
+        ("parameters", "sequence<::rosAFE::parameterValue>"),
+    )
+    structs["::rosAFE::representation"] = (
+        ("name", "string"),
+        ("rate", "double"),
+        ("lastFrameIndex", "unsigned long long"),
+        ("axes", "sequence<string>"),
+        ("shape", "sequence<unsigned long>"),
+        ("data", "sequence<double>"),
+    )
+    return structs
+
+
+# --- requests ---------------------------------------------------------------------------------------------------
+
+BLOCK_AND_BUFFERS = (
+    Parameter("nFramesPerBlock", "unsigned long", 12000, "Frames in one block", 1, MAX_BLOCK),
+    Parameter(
+        "bufferSize_s_port",
+        "double",
+        1.0,
+        "Seconds of signal on every output port",
+        0.0,
+        MAX_SECONDS,
+        open_minimum=True,
+        unit="s",
+    ),
+    Parameter(
+        "bufferSize_s_getSignal",
+        "double",
+        1.0,
+        "Seconds of signal that getSignals can return; raised to two blocks where it is less",
+        0.0,
+        MAX_SECONDS,
+        open_minimum=True,
+        unit="s",
+    ),
+)
+_INPUT_THROWS = ("::rosAFE::e_noData", "::rosAFE::e_noMemory", "::rosAFE::e_existsAlready", "::rosAFE::e_badNewValue")
+_PROCESSOR_THROWS = (
+    "::rosAFE::e_noUpperDependencie",
+    "::rosAFE::e_existsAlready",
+    "::rosAFE::e_noSuchProcessor",
+    "::rosAFE::e_badNewValue",
+)
+
+
+def _request(representation: Representation) -> Service:
+    """The request that adds a processor."""
+    name = Parameter("name", "string", representation.name, representation.name_doc)
+    parent = representation.parent
+    if not parent:
+        return Service(
+            representation.request,
+            representation.doc,
+            (name, *BLOCK_AND_BUFFERS),
+            throws=_INPUT_THROWS,
+            activity=True,
+            task=representation.kind,
+            interrupts=(representation.request,),
+        )
+    upper = Parameter("upperDepName", "string", KINDS[parent].name, "The name of the upper dependency")
+    return Service(
+        representation.request,
+        representation.doc,
+        (name, upper, *representation.request_parameters),
+        throws=_PROCESSOR_THROWS,
+        activity=True,
+        task=representation.task,
+        aliases=representation.request_aliases,
+    )
+
+
+_REQUESTS = tuple(map(_request, KINDS.values()))
+_NAME = Parameter("name", "string", "name", "The name of the processor")
+
+REQUEST = Service(
+    "request",
+    "Build what a representation needs, or find it in the tree of processors",
+    (
+        Parameter(
+            "representation",
+            "string",
+            REQUIRED,
+            "What is wanted, such as ild",
+            choices=tuple(kind.word for kind in KINDS.values()),
+        ),
+        Parameter("connect", "string", "bass/Audio", "Topic for the Audio port, where a new input needs one"),
+        *BLOCK_AND_BUFFERS,
+        *(parameter for kind in KINDS.values() for parameter in kind.parameters),
+    ),
+    outputs=(
+        ("name", "string"),
+        ("dependencies", "sequence<string>"),
+        ("created", "sequence<string>"),
+        ("reused", "sequence<string>"),
+        ("unused", "sequence<string>"),
+        ("port", "string"),
+        ("topic", "string"),
+    ),
+    throws=_INPUT_THROWS,
+)
+
+_FUNCTIONS = (
+    Service(
+        "getSignals",
+        "The data that all processors computed since the last call",
+        outputs=(("signals", "::rosAFE::dataObjSt"),),
+        throws=("::rosAFE::e_noMemory", "::rosAFE::e_badIndexParam"),
+        aliases=("getSignal",),
+    ),
+    Service(
+        "getDependencies",
+        "The names of the processors from the input down to the named one",
+        (Parameter("nameProc", "string", "nameProc", "The name of the processor"),),
+        outputs=(("dependencies", "sequence<string>"),),
+        throws=("::rosAFE::e_noMemory", "::rosAFE::e_noSuchProcessor"),
+    ),
+    Service(
+        "getParameters",
+        "The parameters of all processors",
+        outputs=(("parameters", "::rosAFE::parameters"),),
+        throws=("::rosAFE::e_noMemory",),
+    ),
+    Service(
+        "getProcessors",
+        "All processors of every kind: what they are, hang on and put out, and their parameters",
+        outputs=(("processors", "sequence<::rosAFE::processor>"),),
+        throws=("::rosAFE::e_noMemory",),
+    ),
+    Service(
+        "getRepresentation",
+        "What one processor, of whatever kind, put out since this was last asked for it",
+        (_NAME,),
+        outputs=(("parts", "sequence<::rosAFE::representation>"),),
+        throws=("::rosAFE::e_noMemory", "::rosAFE::e_noSuchProcessor"),
+    ),
+    Service(
+        "modifyParameter",
+        "Change one parameter of a processor from its next block on",
+        (
+            Parameter("nameProc", "string", "nameProc", "The name of the processor to change the parameter"),
+            Parameter("nameParam", "string", "nameParam", "The name of the parameter to be changed"),
+            Parameter("newValue", "string", "newValue", "The new value of the parameter to be changed"),
+        ),
+        throws=(
+            "::rosAFE::e_noMemory",
+            "::rosAFE::e_noSuchProcessor",
+            "::rosAFE::e_noSuchParameter",
+            "::rosAFE::e_badNewValue",
+        ),
+    ),
+    Service(
+        "removeProcessor",
+        "Remove a processor and all that depend on it; the input cannot be removed",
+        (Parameter("name", "string", "name", "The name of the processor to delete", aliases=("nameProc",)),),
+        throws=("::rosAFE::e_noSuchProcessor",),
+    ),
+    Service(
+        "Stop",
+        "Stop and remove all processors; port connections stay",
+        interrupts=tuple(service.name for service in _REQUESTS),
+    ),
+)
+
+ROSAFE = Component(
+    name="rosAFE",
+    doc="The Two!Ears auditory front-end: a tree of processors that compute auditory representations",
+    services=(*_REQUESTS, *_FUNCTIONS, *COMMON_SERVICES),
+    ports=(
+        Port("Audio", "::binaudio::portStruct", "Binaural audio to work on", output=False),
+        *(
+            Port(
+                kind.port,
+                LAYOUTS[kind.kind].idl,
+                kind.port_doc,
+                multiple=bool(kind.parent),
+                aliases=kind.port_aliases,
+            )
+            for kind in KINDS.values()
+        ),
+        Port("dataObj", "::rosAFE::dataObjSt", "Advertised as in the original and, as there, never written"),
+        GENOM_STATE_PORT,
+    ),
+    tasks=("init", *(service.task for service in _REQUESTS)),
+    exceptions={
+        "e_noData": "no audio on the Audio port",
+        "e_noMemory": "out of memory",
+        "e_existsAlready": "a processor of this name exists already",
+        "e_noSuchProcessor": "no processor of this name",
+        "e_noSuchParameter": "the processor has no such parameter",
+        "e_noUpperDependencie": "no processor of the right type has the name given as upper dependency",
+        "e_badIndexParam": "bad index",
+        "e_badNewValue": "a value of the wrong type or out of its range",
+    },
+    structs={**_structs(), **BINAUDIO, **GENOM_STATE},
+    composites=(REQUEST,),
+)

@@ -1,0 +1,112 @@
+"""What a component's interface is made of: requests, ports, exceptions, structs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from rosafe.vocabulary.errors import ComponentError
+from rosafe.vocabulary.parameter import REQUIRED, Parameter
+
+Struct = tuple[tuple[str, str], ...]  # (member, IDL type)
+
+
+@dataclass(frozen=True)
+class Service:
+    """One request of a component.
+
+    `activity` requests live until they end or are stopped and have an action beside the service; the others are
+    functions that answer at once. `interrupts` names the activity of which running instances end when this begins.
+    """
+
+    name: str
+    doc: str
+    parameters: tuple[Parameter, ...] = ()
+    outputs: Struct = ()
+    throws: tuple[str, ...] = ()
+    activity: bool = False
+    task: str = ""
+    interrupts: tuple[str, ...] = ()
+    aliases: tuple[str, ...] = ()
+
+    def parameter(self, name: str) -> Parameter:
+        """The parameter called `name` (aliases count), or KeyError."""
+        for parameter in self.parameters:
+            if name == parameter.name or name in parameter.aliases:
+                return parameter
+        raise KeyError(name)
+
+    def from_ros(self, request: Any) -> dict[str, Any]:
+        """The values of a ROS request or goal, not yet checked; 0, "" and [] there stand for the default."""
+        values = {}
+        for parameter in self.parameters:
+            value = getattr(request, parameter.name)
+            unset = not isinstance(value, bool) and (
+                len(value) == 0 if hasattr(value, "__len__") else value == 0  # "" and [] have a length
+            )
+            if unset and parameter.zero_is_default and parameter.default is not REQUIRED:
+                value = parameter.default
+            values[parameter.name] = value
+        return values
+
+    def check(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """All values as their parameters' Python types, or ValueError naming the first that is refused."""
+        return {parameter.name: parameter.check(values[parameter.name]) for parameter in self.parameters}
+
+
+@dataclass(frozen=True)
+class Port:
+    """A data port: one topic, or one topic per element where `multiple`."""
+
+    name: str
+    idl: str
+    doc: str
+    output: bool = True
+    multiple: bool = False
+    aliases: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class Component:
+    """The interface of one component (ROS package)."""
+
+    name: str
+    doc: str
+    services: tuple[Service, ...]
+    ports: tuple[Port, ...]
+    tasks: tuple[str, ...]
+    exceptions: Mapping[str, str]  # short name -> meaning
+    structs: Mapping[str, Struct]  # by IDL name
+    # What genomixd makes of several services, for its clients to call like one; not on the ROS graph.
+    composites: tuple[Service, ...] = ()
+
+    def service(self, name: str) -> Service:
+        """The service called `name` (aliases count), or KeyError."""
+        for service in self.services:
+            if name == service.name or name in service.aliases:
+                return service
+        raise KeyError(name)
+
+    def port(self, name: str) -> Port:
+        """The port called `name` (aliases count), or KeyError."""
+        for port in self.ports:
+            if name == port.name or name in port.aliases:
+                return port
+        raise KeyError(name)
+
+    @property
+    def activities(self) -> tuple[Service, ...]:
+        """The requests that live until they end or are stopped."""
+        return tuple(s for s in self.services if s.activity)
+
+    @property
+    def functions(self) -> tuple[Service, ...]:
+        """The requests that answer at once."""
+        return tuple(s for s in self.services if not s.activity)
+
+    def error(self, short: str, why: str = "", **detail: Any) -> ComponentError:
+        """The component's exception `short`, such as ``e_noData``."""
+        if short not in self.exceptions:
+            raise KeyError(short)
+        return ComponentError(f"::{self.name}::{short}", why, **detail)

@@ -1,0 +1,98 @@
+"""How the arrays of a representation travel: which message, and what stands in each of its fields.
+
+A message says how many frames there are, and how many of everything else; then come the samples. An array of both ears
+goes into `left` and `right`, one of both ears together into `left`. Three axes travel with the second one outermost:
+[lag][channel][frame]. A representation of several arrays has a message of its own, with a field for each.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from rosafe.vocabulary.representation import Part, Representation
+
+from .service import Struct
+
+SIGNALS: dict[str, Struct] = {
+    "::rosAFE::signalOneD": (("data", "sequence<double>"),),
+    "::rosAFE::signalND": (("dataN", "sequence<::rosAFE::signalOneD>"),),
+    "::rosAFE::signalNxND": (("dataNxN", "sequence<::rosAFE::signalND>"),),
+}
+_BY_DIMENSIONS = dict(enumerate(SIGNALS, 1))
+_HEAD = (
+    ("sampleRate", "unsigned long"),
+    ("lastFrameIndex", "unsigned long long"),
+    ("framesOnPort", "unsigned long long"),
+)
+_COUNTS = {  # by axis, in the order of the fields
+    "lag": ("numberOfLags", "unsigned long long"),
+    "filter": ("numberOfFilters", "unsigned long"),
+    "feature": ("numberOfChannels", "unsigned long"),
+    "channel": ("numberOfChannels", "unsigned long"),
+}
+
+
+class Place(NamedTuple):
+    """One field of samples in a message: where it is from."""
+
+    field: str
+    part: int  # which of the representation's parts
+    ear: int | None  # which one of its ears; None for an array of both together
+    present: bool = True  # else it is always empty, as the right ear of ILD
+
+
+class Layout(NamedTuple):
+    """The message of a representation."""
+
+    idl: str
+    counts: tuple[tuple[str, int], ...]  # fields, and which axis each counts: of the rows of an array less its ears
+    places: tuple[Place, ...]
+    members: Struct
+
+
+def _rows(part: Part) -> tuple[str, ...]:
+    """The axes less ear and time."""
+    return tuple(axis for axis in part.axes if axis not in ("ear", "time"))
+
+
+def _type(kind: str, part: Part, single: bool) -> str:
+    if not single:
+        return kind[:1].upper() + kind[1:]
+    rows = _rows(part)
+    if len(rows) < 2:
+        return ("TimeDomain", "TimeFrequency")[len(rows)]
+    if rows[1] == "lag":
+        return "AutoCorrelation" if "ear" in part.axes else "CrossCorrelation"
+    return "Modulation"
+
+
+def layout(representation: Representation) -> Layout:
+    """How what `representation` puts out travels. ValueError where there is no message for its axes."""
+    parts, single = representation.parts, len(representation.parts) == 1
+    kind = _type(representation.kind, parts[0], single)
+    largest = max(parts, key=lambda part: len(part.axes))
+    rows = _rows(largest)
+    if len(rows) > 2 or (not single and not representation.binaural):
+        raise ValueError(f"representation {representation.kind!r}: no message has room for {largest.axes}")
+    if len(rows) == 1:  # of TimeFrequency, whatever the rows are
+        counted = {"channel": 0}
+    elif kind == "Modulation":
+        counted = {"filter": 1, "channel": 0}
+    else:
+        counted = {"lag": 1, "channel": 0} if rows else {}
+    counts = tuple((field, counted[axis], idl) for axis, (field, idl) in _COUNTS.items() if axis in counted)
+    if not single:
+        places = tuple(Place(part.name, index, None) for index, part in enumerate(parts))
+    elif "ear" in parts[0].axes:
+        places = (Place("left", 0, 0), Place("right", 0, 1))
+    else:
+        places = (Place("left", 0, None), Place("right", 0, None, present=False))
+        if kind == "CrossCorrelation":
+            places = places[:1]
+    fields = tuple((place.field, _BY_DIMENSIONS[1 + len(_rows(parts[place.part]))]) for place in places)
+    return Layout(
+        f"::rosAFE::{kind}SignalPortStruct",
+        tuple((field, axis) for field, axis, _ in counts),
+        places,
+        (*_HEAD, *((field, idl) for field, _, idl in counts), *fields),
+    )

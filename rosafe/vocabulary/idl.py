@@ -1,0 +1,48 @@
+"""The scalar types of the interface: what each is called on the ROS graph, how it is packed, and what fits into it."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+
+class Scalar(NamedTuple):
+    """One IDL type. `code` is that of the struct module; `bounds` are those of whole numbers, both included."""
+
+    ros: str
+    code: str = ""
+    bounds: tuple[int, int] | None = None
+
+
+def _whole(ros: str, code: str, bits: int, signed: bool) -> Scalar:
+    low, high = (-(2 ** (bits - 1)), 2 ** (bits - 1) - 1) if signed else (0, 2**bits - 1)
+    return Scalar(ros, code, (low, high))
+
+
+SCALARS = {
+    "boolean": Scalar("bool", "?"),
+    "unsigned short": _whole("uint16", "H", 16, signed=False),
+    "short": _whole("int16", "h", 16, signed=True),
+    "unsigned long": _whole("uint32", "I", 32, signed=False),
+    "long": _whole("int32", "i", 32, signed=True),
+    "unsigned long long": _whole("uint64", "Q", 64, signed=False),
+    "long long": _whole("int64", "q", 64, signed=True),
+    "float": Scalar("float32", "f"),
+    "double": Scalar("float64", "d"),
+    "char": _whole("int8", "b", 8, signed=True),
+    "octet": _whole("uint8", "B", 8, signed=False),
+    "string": Scalar("string"),
+}
+
+
+def element(idl: str) -> str:
+    """The type of a sequence's elements; empty where `idl` is no sequence."""
+    return idl[len("sequence<") : -1] if idl.startswith("sequence<") else ""
+
+
+def ros_type(idl: str) -> str:
+    """The ROS field type of an IDL type: ``unsigned long`` is ``uint32``, ``sequence<double>`` is ``float64[]``."""
+    if of := element(idl):
+        return ros_type(of) + "[]"
+    if idl.startswith("::"):
+        return idl[2:].replace("::", "_")
+    return SCALARS[idl].ros

@@ -1,0 +1,208 @@
+"""Parameters: type, default, range and words of one value that a user can set, and every way to read such a value."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from .idl import SCALARS, element, ros_type
+
+REQUIRED = object()  # a parameter without a default, such as connect_port's `local`
+MAX_STRING = 4096  # characters in any string that a request carries
+MAX_SEQUENCE = 1024  # elements in any list that a request carries, and channels of a filterbank
+
+
+def _plain(value: Any) -> Any:
+    """A number of numpy's, or an array without dimensions, as Python's own type."""
+    return value.item() if hasattr(value, "item") and getattr(value, "ndim", 1) == 0 else value
+
+
+def shown(value: Any) -> str:
+    """`value` for a message of one line, not too long."""
+    text = repr(value)
+    return text if len(text) <= 80 else text[:77] + "..."
+
+
+@dataclass(frozen=True)
+class Parameter:
+    """One member of a request, or one parameter of a processor.
+
+    `minimum` and `maximum` are inclusive unless `open_minimum` says otherwise; they bind the elements of a sequence,
+    `least` and `most` its length. `choices` are the known words of an enumerated string, or of a list of words.
+    Requests from the ROS graph may hold any word: `known_word` says what is taken for it, the original's `fallback`;
+    where there is none, unknown words are refused there as everywhere else.
+    """
+
+    name: str
+    idl: str
+    default: Any
+    doc: str
+    minimum: float | None = None
+    maximum: float | None = None
+    open_minimum: bool = False
+    choices: tuple[str, ...] = ()
+    fallback: str = ""
+    aliases: tuple[str, ...] = ()  # further names, good everywhere
+    former: tuple[str, ...] = ()  # the original's misspelt names of modifyParameter, which go with words like `_power`
+    spellings: Mapping[str, str] = field(default_factory=dict, hash=False)  # known slips: jespen is jepsen
+    unit: str = ""
+    least: int = 0
+    most: int = MAX_SEQUENCE
+    zero_is_default: bool = True  # in ROS requests, which carry no defaults
+
+    @property
+    def ros(self) -> str:
+        """The type of its field in a ROS message."""
+        return ros_type(self.idl)
+
+    @property
+    def range_text(self) -> str:
+        """The range in words, for help texts and error messages; empty where anything goes."""
+        if self.choices:
+            return "one of " + ", ".join(self.choices)
+        low, high = self.minimum, self.maximum
+        if low is None and high is None:
+            return ""
+        if high is None:
+            return f"{'more than' if self.open_minimum else 'at least'} {low:.12g}"
+        if low is None:
+            return f"at most {high:.12g}"
+        return f"{'more than' if self.open_minimum else 'from'} {low:.12g} to {high:.12g}"
+
+    # --- values -----------------------------------------------------------------------------------------------
+
+    def check(self, value: Any) -> Any:
+        """`value` as this parameter's Python type, or ValueError naming the parameter and what is allowed.
+
+        Every value is taken literally: a zero is a zero, an unknown word is refused.
+        """
+        if of := element(self.idl):
+            return self._check_sequence(of, value)
+        return self._check_scalar(self.idl, value)
+
+    def _refuse(self, value: Any, wanted: str) -> ValueError:
+        return ValueError(f"{self.name}: {shown(value)} is not {wanted}")
+
+    def _check_sequence(self, of: str, value: Any) -> list[Any]:
+        if of == "string" and isinstance(value, str):  # a single word is a list of one
+            value = [value]
+        if isinstance(value, (str, bytes, Mapping)):
+            raise self._refuse(value, f"a list of {of}")
+        try:
+            items = [_plain(item) for item in itertools.islice(value, MAX_SEQUENCE + 1)] if value is not None else []
+        except TypeError:  # a single number is a list of one: MATLAB users write 0 for "no list"
+            items = [_plain(value)]
+        if len(items) > self.most:
+            raise ValueError(f"{self.name}: too many values, at most {self.most}")
+        if len(items) == 1 and isinstance(items[0], (int, float)) and items[0] == 0:  # [0] is "no list" likewise
+            items = []
+        if len(items) < self.least:
+            raise ValueError(f"{self.name}: {len(items)} values are too few, at least {self.least}")
+        return [self._check_scalar(of, item) for item in items]
+
+    def _check_scalar(self, idl: str, value: Any) -> Any:
+        if idl == "string":
+            return self._check_word(value)
+        value = _plain(value)
+        if idl == "boolean":
+            if isinstance(value, (bool, int, float)) and value in (0, 1):
+                return bool(value)
+            raise self._refuse(value, "a boolean")
+        try:
+            number = float(value) if isinstance(value, (int, float)) and not isinstance(value, bool) else math.nan
+        except OverflowError:
+            number = math.nan
+        if not math.isfinite(number):
+            raise self._refuse(value, "a finite number")
+        bounds = SCALARS[idl].bounds
+        if bounds is None:
+            self._check_range(number)
+            return number
+        if number != int(number):
+            raise self._refuse(value, "a whole number")
+        whole = int(value)
+        if not bounds[0] <= whole <= bounds[1]:
+            raise self._refuse(value, f"in the range of {idl}")
+        self._check_range(whole)
+        return whole
+
+    def _check_word(self, value: Any) -> str:
+        if not isinstance(value, str):
+            raise self._refuse(value, "a string")
+        if len(value) > MAX_STRING or "\0" in value:
+            raise self._refuse(value, f"a text of at most {MAX_STRING} characters")
+        value = self.spellings.get(value, value)
+        if self.choices and value not in self.choices:
+            raise self._refuse(value, self.range_text)
+        return value
+
+    def _check_range(self, number: float) -> None:
+        low, high = self.minimum, self.maximum
+        below = low is not None and (number < low or (self.open_minimum and number == low))
+        if below or (high is not None and number > high):
+            raise ValueError(f"{self.name}: {number:.12g} is out of range, allowed is {self.range_text}")
+
+    def known_word(self, value: Any) -> Any:
+        """What is taken for `value` where any word goes: itself where it is known, else the `fallback`.
+
+        Anything but an unknown word, and any word where there is no fallback, is left to `check`.
+        """
+        if self.fallback and isinstance(value, str) and self.spellings.get(value, value) not in self.choices:
+            return self.fallback
+        return value
+
+    # --- texts ------------------------------------------------------------------------------------------------
+
+    def parse(self, text: str, name: str = "") -> Any:
+        """The value that `text` says, by modifyParameter's rules, not yet checked for its range (see `check`).
+
+        Booleans: 0, 1, true, false (blanks around are fine). Numbers: decimal or with exponent; no inf, nan or hex.
+        Unsigned: digits only. Lists: numbers or words between blanks, commas, brackets or braces. `name` is what the
+        user calls the parameter.
+        """
+        words = text.strip()
+        if name in self.former:
+            words = words.removeprefix("_")
+        if of := element(self.idl):
+            for mark in "[]{}(),;":
+                words = words.replace(mark, " ")
+            return [self._parse_scalar(of, word) for word in words.split()]
+        return self._parse_scalar(self.idl, words)
+
+    def _parse_scalar(self, idl: str, words: str) -> Any:
+        if idl == "string":
+            return words
+        if idl == "boolean":
+            known = {"0": False, "1": True, "true": True, "false": False}
+            if words not in known:
+                raise self._refuse(words, "a boolean: 0, 1, true or false")
+            return known[words]
+        if SCALARS[idl].bounds is not None:
+            digits = words[1:] if words[:1] in "+-" and words[:1] else words
+            if not (digits.isascii() and digits.isdigit()):
+                raise self._refuse(words, f"a whole number ({idl})")
+            if len(digits) > 30:
+                raise self._refuse(words, f"in the range of {idl}")
+            return int(words)
+        if not words or any(c not in "0123456789+-.eE" for c in words):
+            raise self._refuse(words, "a number")
+        try:
+            return float(words)
+        except ValueError:
+            raise self._refuse(words, "a number") from None
+
+    def read(self, text: str, name: str = "") -> Any:
+        """`parse` and `check`: the value that a literal text says, or ValueError."""
+        return self.check(self.parse(text, name))
+
+
+def text_of(value: Any) -> str:
+    """The text that `Parameter.parse` reads as `value`, to the last digit: 1, 0.02, [100.0, 200.0], hann."""
+    if isinstance(value, bool):
+        return str(int(value))
+    if isinstance(value, (list, tuple)):
+        return f"[{', '.join(map(text_of, value))}]"
+    return str(value)
