@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 import copy
-import math
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
 
-from rosafe.vocabulary.parameter import Parameter, shown
+from rosafe.vocabulary.parameter import REQUIRED, Parameter
 from rosafe.vocabulary.representation import Representation
 
 from .guard import FloatArray
 from .signal import Signal
 
+SAMPLE_RATE = Parameter(
+    "sample_rate", "double", REQUIRED, "Samples per second (Hz)", 0.0, 1e9, open_minimum=True, unit="Hz"
+)
 FLOAT64 = np.dtype(np.float64)
 Output = FloatArray | tuple[FloatArray, ...]  # a tuple where the representation has several parts
 
@@ -58,9 +60,7 @@ class Stage:
 
     def __init__(self, given: Signal | float, **parameters: Any) -> None:
         if not isinstance(given, Signal):
-            if isinstance(given, str) or not (math.isfinite(given) and given > 0):
-                raise ValueError(f"sample_rate: {shown(given)} is not more than 0")
-            given = Signal.sound(float(given))
+            given = Signal.sound(SAMPLE_RATE.check(given))
         self.given = given
         self.provide: frozenset[str] = frozenset()
         self.provided: dict[str, FloatArray] = {}
