@@ -13,12 +13,12 @@ from rosafe.bass.capture import Capture, Snapshot, check_window
 from rosafe.bass.socket_server import DEFAULT_HOST, DEFAULT_PORT, DedicatedSocket
 from rosafe.bass.sources import Source, device_lines, open_source
 from rosafe.bass.sources.alsa import AlsaSource, DeviceBusyError
+from rosafe.component import master, wire
+from rosafe.component.activities import Activity
+from rosafe.component.component import ComponentNode
+from rosafe.component.events import EventLog
+from rosafe.component.startup import run_server
 from rosafe.interface import BASS, ComponentError
-from rosafe.ros import master, wire
-from rosafe.ros.activities import Activity
-from rosafe.ros.component import ComponentNode
-from rosafe.ros.events import EventLog
-from rosafe.ros.startup import run_server
 
 
 class BassNode:

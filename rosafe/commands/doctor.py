@@ -16,8 +16,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
+from rosafe.component import generate, master, paths
 from rosafe.interface import ComponentError
-from rosafe.ros import generate, master, paths
 
 OK, NOTE, MISSING = "ok", "note", "MISSING"
 

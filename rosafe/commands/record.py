@@ -179,7 +179,7 @@ def _open_source(options: argparse.Namespace, stopping: threading.Event) -> Sour
     try:
         if options.device is not None:
             from rosafe.bass.sources import open_source
-            from rosafe.ros.paths import prefer_pypi_packages
+            from rosafe.component.paths import prefer_pypi_packages
 
             prefer_pypi_packages()
             return open_source(options.device, options.rate, options.chunk, stopping)
@@ -188,9 +188,10 @@ def _open_source(options: argparse.Namespace, stopping: threading.Event) -> Sour
 
             host, port = options.socket
             return SocketSource(host, port, options.rate, stopping)
-        from rosafe.bass.recording.topic import TopicSource, become_node
-        from rosafe.ros.generate import GenerationError
-        from rosafe.ros.master import MasterError
+        from rosafe.bass.recording.topic import TopicSource
+        from rosafe.component.generate import GenerationError
+        from rosafe.component.master import MasterError
+        from rosafe.component.startup import become_node
 
         try:
             become_node("rosafe_record")

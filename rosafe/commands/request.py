@@ -16,10 +16,10 @@ import sys
 from collections.abc import Mapping
 from typing import Any
 
-from rosafe import request
-from rosafe.arguments import check_parameter
 from rosafe.commands import Failure
 from rosafe.interface import REQUEST, ROSAFE, ComponentError, ProcessorKind
+from rosafe.interface.arguments import check_parameter
+from rosafe.tree import requests as request
 
 _SETTINGS = [p for p in REQUEST.parameters if p.name not in ("representation", "connect")]  # those have other places
 
@@ -74,7 +74,7 @@ def run(options: argparse.Namespace) -> int:
         raise Failure(str(problem)) from None
     if options.connect is not None:
         values["connect"] = options.connect
-    from rosafe.ros import generate, master
+    from rosafe.component import generate, master
 
     master.set_local_defaults()
     try:

@@ -98,10 +98,10 @@ def _checked_output(options: argparse.Namespace) -> Path | None:
 
 def _compute(path: Path, seconds: float, block: int) -> list[Event]:
     """What the default tree does on the first `seconds` of a sound file."""
-    from rosafe.arguments import check_parameters
-    from rosafe.audiofile import AudioFile, AudioFileError
-    from rosafe.chain import Chain
     from rosafe.interface import KINDS
+    from rosafe.interface.arguments import check_parameters
+    from rosafe.offline.chain import Chain
+    from rosafe.sound.audiofile import AudioFile, AudioFileError
     from rosafe.tree.trace import Tracer
 
     tracer = Tracer()
@@ -128,9 +128,9 @@ def _listen(node: str, seconds: float) -> list[Event]:
     import rospy
     from std_msgs.msg import String
 
-    from rosafe.bass.recording.topic import become_node
-    from rosafe.ros.master import MasterError
-    from rosafe.ros.trace import read
+    from rosafe.component.master import MasterError
+    from rosafe.component.startup import become_node
+    from rosafe.node.trace_port import read
 
     messages: queue.SimpleQueue[Any] = queue.SimpleQueue()
     try:

@@ -153,11 +153,11 @@ def _without_empty_folders(path: Path, signals: _Signals) -> Iterator[None]:
 
 def _run(options: argparse.Namespace, signals: _Signals, scratch: str) -> int:
     """The demonstration, with its failures as one line; `scratch` is a folder for log files and caches."""
-    from rosafe.audiofile import AudioFileError
+    from rosafe.component.generate import GenerationError
+    from rosafe.component.paths import user_cache, writable
     from rosafe.demo import course
     from rosafe.interface import ComponentError
-    from rosafe.ros.generate import GenerationError
-    from rosafe.ros.paths import user_cache, writable
+    from rosafe.sound.audiofile import AudioFileError
 
     try:
         if not writable(options.out):

@@ -143,7 +143,7 @@ class Recorder:
         import rospy
         from diagnostic_msgs.msg import DiagnosticArray
 
-        from rosafe.ros import wire
+        from rosafe.component import wire
 
         self.center_frequencies = np.zeros(0)
         self.lags = np.zeros(0)

@@ -9,6 +9,7 @@ from typing import Any
 
 import rosgraph.names
 
+from rosafe.component import wire
 from rosafe.genomix import packed, syntax, trees
 from rosafe.genomix.actions import ActionClient, Goal
 from rosafe.genomix.graph import Graph, Unknown, middleware_error
@@ -26,7 +27,7 @@ from rosafe.interface import (
     Service,
     ros_type,
 )
-from rosafe.ros import wire
+from rosafe.interface.signals import LEVELS
 
 CALL_SECONDS = 60.0  # for the answer to one request
 APPEAR_SECONDS = 2.0  # that `load` waits for a component that is just starting
@@ -345,7 +346,7 @@ def _zero(component: Component, idl: str) -> Any:
     if idl.startswith("sequence<"):
         return []
     if idl in component.structs:
-        if idl in syntax.SIGNALS:
+        if idl in LEVELS:
             return []
         return {name: _zero(component, kind) for name, kind in component.structs[idl]}
     return "" if idl == "string" else 0

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from rosafe.ros import wire
+from rosafe.component import wire
 
 
 def stream(frames: int, seed: int = 0) -> np.ndarray:

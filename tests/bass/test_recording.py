@@ -14,13 +14,13 @@ import numpy as np
 import pytest
 import soundfile
 
-from rosafe.audiofile import AudioFile
 from rosafe.bass.recording import outputs
 from rosafe.bass.recording.levels import Levels
 from rosafe.bass.recording.outputs import BagFile, WavFile
 from rosafe.bass.recording.recorder import Recorder
 from rosafe.bass.sources import base, open_source
 from rosafe.bass.sources.base import Chunk
+from rosafe.sound.audiofile import AudioFile
 from tests.bass import bags
 
 RATE = 1000

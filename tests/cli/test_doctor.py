@@ -7,7 +7,7 @@ import subprocess
 from pathlib import Path
 from typing import Any
 
-from rosafe.ros import paths
+from rosafe.component import paths
 from tests.cli.command import environment, rosafe, rosafe_alone
 from tests.harness import ROOT, Graph, free_port
 
@@ -96,7 +96,7 @@ def test_nothing_is_there() -> None:
 def test_alsaaudio_of_debian_cannot_capture(tmp_path: Path) -> None:
     (tmp_path / "alsaaudio.py").write_text("PCM_CAPTURE = 1\n")
     program = (
-        "import pathlib, sys; from rosafe import cli; from rosafe.ros import paths;"
+        "import pathlib, sys; from rosafe import cli; from rosafe.component import paths;"
         f"paths.PYPI_DIR = pathlib.Path({str(tmp_path)!r}); sys.exit(cli.main(['doctor', '--json']))"
     )
     done = python(program)

@@ -13,7 +13,7 @@ import pytest
 import soundfile
 
 from rosafe import process
-from rosafe.npz import memory_map
+from rosafe.offline.npz import memory_map
 from tests.cli.command import ROSAFE, environment, noise, rosafe, start, write
 from tests.harness import ROOT, proc, wait_for
 from tests.terminal import Terminal

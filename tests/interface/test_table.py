@@ -7,8 +7,10 @@ from xml.etree import ElementTree
 
 import pytest
 
-from rosafe import __version__, interface
+import rosafe
+from rosafe import interface
 from rosafe.interface import BASS, ROSAFE, Component, Service
+from rosafe.vocabulary.idl import SCALARS
 from tests import harness
 
 FOLDERS = {"rosAFE": harness.ROOT, "bass": harness.ROOT / "bass"}
@@ -75,7 +77,7 @@ def test_ports_and_outputs_have_types(component: Component) -> None:
     used = [p.idl for p in component.ports] + [idl for s in component.services for _, idl in s.outputs]
     for idl in used:
         base = idl.removeprefix("sequence<").removesuffix(">")
-        assert base in component.structs or base in interface.ROS_TYPES, idl
+        assert base in component.structs or base in SCALARS, idl
 
 
 # What the original's interface definition says, in its own order; REQUIRED where it has no default.
@@ -90,6 +92,8 @@ DEFAULTS = {
     "getSignals": [],
     "getDependencies": ["nameProc"],
     "getParameters": [],
+    "getProcessors": [],
+    "getRepresentation": ["name"],
     "modifyParameter": ["nameProc", "nameParam", "newValue"],
     "removeProcessor": ["name"],
     "Acquire": ["hw:1,0", 44100, 2205, 20],
@@ -148,5 +152,5 @@ def test_exceptions() -> None:
 @COMPONENTS
 def test_version_is_that_of_the_package(component: Component) -> None:
     manifest = ElementTree.parse(FOLDERS[component.name] / "package.xml")
-    assert manifest.findtext("version") == __version__
+    assert manifest.findtext("version") == rosafe.__version__
     assert manifest.findtext("name") == component.name

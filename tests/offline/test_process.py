@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 
 import rosafe
 from rosafe import chain
-from rosafe.audiofile import AudioFile
 from rosafe.interface import KINDS
 from rosafe.representations import STAGES
 from rosafe.representations.haircell import InnerHairCell
+from rosafe.sound.audiofile import AudioFile
 from tests import harness
 from tests.dsp.bare import Chain, cut
 from tests.dsp.test_vectors import CASES, assert_reference, load, parameters

@@ -18,8 +18,8 @@ import rospy
 from actionlib import CommState
 
 from rosafe import process
+from rosafe.component import wire
 from rosafe.interface import KINDS, ROSAFE
-from rosafe.ros import wire
 from tests.harness import PYTHON, Graph, Process, wait_for
 
 RATE = 20000  # Hz; cheap, and all default channels lie below half of it

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from rosafe.ros.audio import MAX_RATE, RING_SECONDS, AudioReader, AudioRing
+from rosafe.component.audio import MAX_RATE, RING_SECONDS, AudioReader, AudioRing
 from tests.harness import wait_for
 
 RATE = 8  # Hz: the ring holds 80 frames
@@ -57,7 +57,7 @@ def opened(ring: AudioRing, block: int) -> AudioReader:
 
 
 class Model:
-    """The rules at the head of rosafe/ros/audio.py, on a dict from frame number to sample."""
+    """The rules at the head of rosafe/component/audio.py, on a dict from frame number to sample."""
 
     def __init__(self) -> None:
         self.rate = self.window = self.newest = 0
@@ -270,7 +270,7 @@ def test_malformed_messages_change_nothing_and_are_told_once(bad: Any, why: str)
 
 
 def test_a_window_beyond_all_reason_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rosafe.ros.audio.MAX_WINDOW", 100)
+    monkeypatch.setattr("rosafe.component.audio.MAX_WINDOW", 100)
     lines: list[str] = []
     feed = AudioRing(lines.append).connect()
     feed(message(RATE, 5, np.zeros(101, np.int32)))

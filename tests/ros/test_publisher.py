@@ -21,10 +21,10 @@ import rosgraph
 import rospy
 from rosgraph.network import read_ros_handshake_header, write_ros_handshake_header
 
+from rosafe.component.publisher import MAX_WAITING, MAX_WAITING_BYTES, Publisher, send_pieces
+from rosafe.component.wire import Gather
 from rosafe.interface import KINDS
 from rosafe.ros import array_msg, publisher
-from rosafe.ros.publisher import MAX_WAITING, MAX_WAITING_BYTES, Publisher, send_pieces
-from rosafe.ros.wire import Gather
 from tests.harness import PYTHON, ROOT, Graph, Process, proc, wait_for
 from tests.ros.session import Session, noise, own_node
 

@@ -17,7 +17,7 @@ import soundfile
 from std_msgs.msg import String
 
 from rosafe.interface import KINDS
-from rosafe.ros.trace import TracePort, read
+from rosafe.node.trace_port import TracePort, read
 from rosafe.tree.roles import Observer, State
 from tests.cli.command import refused, rosafe
 from tests.harness import SCRIPTS, Graph, wait_for

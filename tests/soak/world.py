@@ -15,10 +15,10 @@ import numpy as np
 import rospy
 import soundfile
 
-from rosafe.arguments import check_parameters
-from rosafe.chain import Chain
+from rosafe.component import registration, wire
 from rosafe.interface import KINDS, ROSAFE
-from rosafe.ros import registration, wire
+from rosafe.interface.arguments import check_parameters
+from rosafe.offline.chain import Chain
 from rosafe.tree.window import SlidingWindow, frames_in
 from tests import harness
 from tests.genomix.world import Http, genomixd

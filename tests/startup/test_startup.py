@@ -295,7 +295,7 @@ def test_end_is_bounded_when_threads_hang(graph: Graph, tmp_path: Path) -> None:
 import sys, threading
 sys.path.insert(0, {str(SCRIPTS.parent)!r})
 from rosafe import interface
-from rosafe.ros.startup import run_server
+from rosafe.component.startup import run_server
 class Stuck:
     finished = threading.Event()
     def shutdown(self, by):

@@ -120,8 +120,8 @@ class BagFile:
     def __init__(self, path: Path, sample_rate: int, frames_per_chunk: int, topic: str, newest: int = 0) -> None:
         import rosbag
 
+        from rosafe.component import wire
         from rosafe.interface import BASS
-        from rosafe.ros import wire
 
         self._path = path
         self._sample_rate = sample_rate

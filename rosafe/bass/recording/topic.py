@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import queue
 import threading
 import time
@@ -14,9 +13,9 @@ import rospy
 
 from rosafe.bass.sources.base import Chunk, device_error, hwparams_error
 from rosafe.bass.windows import WindowStream
+from rosafe.component import wire
+from rosafe.component.audio import malformed
 from rosafe.interface import BASS, ComponentError
-from rosafe.ros import wire
-from rosafe.ros.audio import malformed
 
 FIRST_SECONDS = 3.0  # for a first message
 NOBODY_SECONDS = 1.0  # for one where nobody publishes the topic
@@ -137,15 +136,3 @@ class TopicSource:
     def close(self) -> None:
         """Listen no more."""
         self._subscriber.unregister()
-
-
-def become_node(name: str) -> None:
-    """Make this process a node of the graph; MasterError where there is no master, GenerationError without messages."""
-    from rosafe.ros import generate, master, startup
-
-    master.set_local_defaults()
-    master.check_master(os.environ["ROS_MASTER_URI"])
-    generate.ensure_messages()
-    startup.ensure_log_directory()
-    rospy.init_node(name, argv=[], anonymous=True, disable_signals=True)
-    startup.log_to_stderr()

@@ -29,9 +29,9 @@ from rosafe.bass.sources.base import (
 )
 from rosafe.bass.sources.file import split_path
 from rosafe.bass.windows import WindowStream
+from rosafe.component import wire
+from rosafe.component.audio import malformed
 from rosafe.interface import BASS, ComponentError
-from rosafe.ros import wire
-from rosafe.ros.audio import malformed
 
 _AUDIO = BASS.port("Audio").idl
 Piece = tuple[int, np.ndarray]  # frames lost before it, and int32 (2, n)

@@ -7,8 +7,8 @@ import threading
 
 import numpy as np
 
-from rosafe.audiofile import AudioFile, AudioFileError
 from rosafe.bass.sources.base import Chunk, Pacer, device_error, flag, hwparams_error, number, parse_options
+from rosafe.sound.audiofile import AudioFile, AudioFileError
 
 
 def split_path(text: str) -> tuple[str, str]:

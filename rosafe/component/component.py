@@ -25,11 +25,12 @@ import rospy
 from actionlib_msgs.msg import GoalStatus
 from rospy.impl import tcpros_base
 
-from rosafe import __version__, interface
+from rosafe import interface
+from rosafe.component import master, memory, registration
+from rosafe.component.activities import Activities, Activity, Handler, TaskMeter
+from rosafe.component.publisher import Publisher
 from rosafe.interface import ComponentError
-from rosafe.ros import master, memory, registration
-from rosafe.ros.activities import Activities, Activity, Handler, TaskMeter
-from rosafe.ros.publisher import Publisher
+from rosafe.version import VERSION
 
 BACKLOG = 128  # connections that wait to be accepted
 STATE_PERIOD = 0.9  # seconds between two genom_state messages at the most; the contract is 1
@@ -334,7 +335,7 @@ class ComponentNode:
                     ],
                 )
             )
-        return msg.genom_state_component(task=tasks, digest=self._digest, date=_DATE, version=__version__)
+        return msg.genom_state_component(task=tasks, digest=self._digest, date=_DATE, version=VERSION)
 
 
 _DATE = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(os.path.getmtime(interface.__file__)))

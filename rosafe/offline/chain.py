@@ -86,9 +86,9 @@ class Chain:
     sample_rate : float
         In Hz.
     parameters : mapping
-        From `rosafe.arguments.check_parameters`.
+        From `rosafe.interface.arguments.check_parameters`.
     outputs : sequence of str
-        From `rosafe.arguments.check_outputs`.
+        From `rosafe.interface.arguments.check_outputs`.
     keep : callable
         Called with the output's name and each block of it, on a thread of that output's own, while the chain goes on
         with the next block; it does not go on beyond that, so memory is bounded. What it raises ends the run.

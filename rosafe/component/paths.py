@@ -17,6 +17,11 @@ def source_root() -> Path | None:
     return CODE_DIR if (CODE_DIR / "msg").is_dir() and (CODE_DIR / "bass" / "msg").is_dir() else None
 
 
+def install_prefix() -> Path:
+    """Where catkin has installed this code: it lies in lib/python3/dist-packages below."""
+    return CODE_DIR.parents[2]
+
+
 def put_ahead(directory: Path) -> None:
     """Make `directory` the first place that Python imports from."""
     entry = str(directory)

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from rosafe.arguments import check_change, check_outputs, check_parameters
-from rosafe.chain import Chain, lags
 from rosafe.interface import REQUIRED, Parameter
+from rosafe.interface.arguments import check_change, check_outputs, check_parameters
+from rosafe.offline.chain import Chain, lags
 from rosafe.tree.zone import Block
 
 DEFAULT_BLOCK = 12000  # frames, as InputProc's

@@ -9,9 +9,10 @@ import os
 import pkgutil
 import sys
 
-from rosafe import __version__, commands
+from rosafe import commands
 from rosafe.commands import Failure
-from rosafe.ros.startup import Parser
+from rosafe.component.startup import Parser
+from rosafe.version import VERSION
 
 _EPILOG = """example:
   rosafe process speech.wav -o speech.npz --outputs ild,ratemap --set fb_nChannels=64
@@ -52,7 +53,7 @@ def _parser() -> argparse.ArgumentParser:
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
-    parser.add_argument("--version", action="version", version=f"rosafe {__version__}")
+    parser.add_argument("--version", action="version", version=f"rosafe {VERSION}")
     subparsers = parser.add_subparsers(title="commands", dest="command", metavar="COMMAND", required=True)
     for module in pkgutil.iter_modules(commands.__path__):
         if not module.name.startswith("_"):

@@ -9,8 +9,8 @@ import numpy as np
 import rospy
 
 from rosafe import interface
+from rosafe.component import wire
 from rosafe.interface import KINDS, ROSAFE
-from rosafe.ros import wire
 from rosafe.tree.processor import Processor
 from rosafe.tree.window import SlidingWindow, WindowView, frames_in
 from rosafe.tree.zone import Block

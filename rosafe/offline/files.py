@@ -15,12 +15,12 @@ from typing import Any
 
 import numpy as np
 
-from rosafe.arguments import check_outputs, check_parameters
-from rosafe.audiofile import AudioFile, AudioFileError
-from rosafe.chain import Chain
 from rosafe.interface import KINDS
-from rosafe.npz import NpzWriter
-from rosafe.offline import DEFAULT_BLOCK
+from rosafe.interface.arguments import check_outputs, check_parameters
+from rosafe.offline.chain import Chain
+from rosafe.offline.npz import NpzWriter
+from rosafe.offline.process import DEFAULT_BLOCK
+from rosafe.sound.audiofile import AudioFile, AudioFileError
 from rosafe.tree.tree import MAX_BYTES
 from rosafe.tree.zone import Block
 

@@ -13,8 +13,9 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from rosafe.arguments import check_parameter
-from rosafe.interface import BASS, KINDS, REQUEST, ROSAFE, ComponentError, Parameter, ProcessorKind
+from rosafe.interface import BASS, KINDS, REQUEST, ROSAFE, ComponentError, Parameter, Representation, text_of
+from rosafe.interface.arguments import check_parameter
+from rosafe.representations import STAGES
 
 HIGHEST_RATE = float(BASS.service("Acquire").parameter("sampleRate").maximum or 0)  # Hz; what is wrong there is at any
 INTERRUPTED = "::genom::interrupted"
@@ -56,7 +57,7 @@ class Level:
     with them (of a filterbank, the channels that come of it); `given` those that the client named.
     """
 
-    kind: ProcessorKind
+    kind: Representation
     values: Mapping[str, Any]
     in_force: Mapping[str, Any]
     given: Mapping[str, Any]
@@ -94,29 +95,29 @@ class Wish:
 # --- what is wanted ---------------------------------------------------------------------------------------------
 
 
-def kind_of(representation: str) -> ProcessorKind:
+def kind_of(representation: str) -> Representation:
     """The kind of processor that computes `representation`, by the original client's name or ours, in any case.
 
     Raises ValueError for any other name.
     """
     for kind in KINDS.values():
-        if representation.lower() in (kind.representation.lower(), kind.kind.lower()):
+        if representation.lower() in map(str.lower, (kind.word, *kind.word_aliases, kind.kind)):
             return kind
     known = REQUEST.parameter("representation").range_text
     raise ValueError(f"representation: {representation[:80]!r} is not {known}")
 
 
-def chain(kind: ProcessorKind) -> list[ProcessorKind]:
+def chain(kind: Representation) -> list[Representation]:
     """The kinds of processors from the input down to `kind`."""
     return [*(chain(KINDS[kind.parent]) if kind.parent else ()), kind]
 
 
-def understand(kind: ProcessorKind, given: Mapping[str, Any]) -> Wish:
+def understand(kind: Representation, given: Mapping[str, Any]) -> Wish:
     """The checked request for a processor of `kind`.
 
     Parameters
     ----------
-    kind : ProcessorKind
+    kind : Representation
         From `kind_of`.
     given : mapping
         Parameters of `interface.REQUEST` by their own names, of the right Python types; taken literally, 0 too.
@@ -141,17 +142,10 @@ def understand(kind: ProcessorKind, given: Mapping[str, Any]) -> Wish:
     return Wish(levels, input_values, dict(given))
 
 
-def _level(kind: ProcessorKind, checked: Mapping[str, Any]) -> Level:
+def _level(kind: Representation, checked: Mapping[str, Any]) -> Level:
     given = {p.name: checked[p.name] for p in kind.parameters if p.name in checked}
     values = {p.name: p.check(p.default) for p in kind.parameters} | given
-    return Level(kind, values, _filterbank(values) if kind.kind == "gammatone" else values, given)
-
-
-def _filterbank(values: Mapping[str, Any]) -> dict[str, Any]:
-    """What a filterbank tells of itself, which depends on no sample rate; ValueError for one that cannot be."""
-    from rosafe.dsp import STAGES  # numpy and scipy, which genomixd and the command line can do without until now
-
-    return STAGES["gammatone"](HIGHEST_RATE, **values).parameters
+    return Level(kind, values, STAGES[kind.kind].in_force(values), given)
 
 
 # --- what to do -------------------------------------------------------------------------------------------------
@@ -184,9 +178,8 @@ def plan(wish: Wish, found: Sequence[Found]) -> Plan:
 def _check_input(root: Found, level: Level) -> None:
     for name, value in level.given.items():
         if root.values[name] != value:
-            what = (
-                f"the input {root.name!r} has {name} {_text(root.values[name])}, which modifyParameter changes for all"
-            )
+            there = f"the input {root.name!r} has {name} {text_of(root.values[name])}"
+            what = f"{there}, which modifyParameter changes for all"
             raise ROSAFE.error("e_existsAlready", what=what)
 
 
@@ -205,13 +198,13 @@ def _deepest(levels: Sequence[Level], found: Iterable[Found]) -> list[str]:
     return next(iter(lines.values()))
 
 
-def free_name(kind: ProcessorKind, names: Collection[str]) -> str:
+def free_name(kind: Representation, names: Collection[str]) -> str:
     """A name for another processor of `kind` beside those called `names`: numbered after the highest of its sort."""
-    pattern = re.compile(rf"{kind.representation}_([0-9]{{1,9}})")
+    pattern = re.compile(rf"{kind.word}_([0-9]{{1,9}})")
     number = 1 + max((int(match[1]) for match in map(pattern.fullmatch, names) if match), default=-1)
-    while f"{kind.representation}_{number}" in names:
+    while f"{kind.word}_{number}" in names:
         number += 1
-    return f"{kind.representation}_{number}"
+    return f"{kind.word}_{number}"
 
 
 def _making(wish: Wish, level: Level, name: str, parent: str) -> list[Step]:
@@ -227,7 +220,7 @@ def _making(wish: Wish, level: Level, name: str, parent: str) -> list[Step]:
     return [
         step,
         *(
-            Step("modifyParameter", {"nameProc": name, "nameParam": p.name, "newValue": _text(level.values[p.name])})
+            Step("modifyParameter", {"nameProc": name, "nameParam": p.name, "newValue": text_of(level.values[p.name])})
             for p in unsaid
         ),
     ]
@@ -236,10 +229,6 @@ def _making(wish: Wish, level: Level, name: str, parent: str) -> list[Step]:
 def _reads_as_default(parameter: Parameter, value: Any) -> bool:
     """Whether a ROS request with this value means the default instead."""
     return not isinstance(value, (bool, str, list)) and value == 0 != parameter.default
-
-
-def _text(value: Any) -> str:
-    return str(int(value)) if isinstance(value, bool) else str(value)
 
 
 # --- what has been done -----------------------------------------------------------------------------------------
@@ -261,7 +250,7 @@ def answer(wish: Wish, dependencies: Sequence[str], created: Collection[str], in
     }
 
 
-def topic(instance: str, kind: ProcessorKind, name: str) -> str:
+def topic(instance: str, kind: Representation, name: str) -> str:
     """Where the processor `name` publishes."""
     return f"/{instance}/{kind.port}" + (f"/{name}" if ROSAFE.port(kind.port).multiple else "")
 

@@ -22,7 +22,7 @@ from rospy.impl.registration import (
     get_topic_manager,
 )
 
-from rosafe.ros import master
+from rosafe.component import master
 
 CHECK_SECONDS = 1.0  # between two looks whether the master still knows this node; between two tries without one
 SETTLE_SECONDS = 1.0  # that a request waits for the master to know what it has changed

@@ -30,10 +30,11 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
+from typing import NamedTuple
 
-from rosafe.ros import master, paths
+from rosafe.component import master, paths
+from rosafe.vocabulary import plugins
 
-PACKAGES = {"rosAFE": ".", "bass": "bass"}  # ROS package -> its folder in the checkout
 # Debian ships the messages of these without package.xml, without which rosmsg finds no message that uses them.
 DEBIAN_PACKAGES = ("std_msgs", "actionlib_msgs", "diagnostic_msgs", "rosgraph_msgs")
 DEBIAN_SHARE = Path("/usr/share")
@@ -77,21 +78,50 @@ def split_action(name: str, text: str) -> dict[str, str]:
     return messages
 
 
-def _sources(root: Path) -> Iterator[Path]:
-    for folder in PACKAGES.values():
-        package = root / folder
-        yield package / "package.xml"
-        for kind in ("msg", "srv", "action"):
-            yield from sorted((package / kind).glob(f"*.{kind}"))
+class Sources(NamedTuple):
+    """Where the definitions are: the folder of each ROS package, that of the executables, and those of plugins."""
+
+    packages: dict[str, Path]
+    executables: Path
+    plugins: dict[str, str]  # texts, by their paths in the package rosAFE
+
+    def files(self) -> Iterator[Path]:
+        """All that are on the disk."""
+        for package in self.packages.values():
+            yield package / "package.xml"
+            for kind in ("msg", "srv", "action"):
+                yield from sorted((package / kind).glob(f"*.{kind}"))
 
 
-def digest(root: Path) -> str:
-    """A name for the generation that the sources under `root` and the generators of this machine give."""
-    sha = hashlib.sha256(f"{root}\0{sys.version_info[:2]}\0".encode())
+def sources() -> Sources | None:
+    """What messages are made of here; None where catkin has installed them and no plugin adds to them."""
+    root, added = paths.source_root(), _plugins()
+    if root is not None:
+        return Sources({"rosAFE": root, "bass": root / "bass"}, root / "scripts", added)
+    if not added:
+        return None
+    prefix = paths.install_prefix()
+    return Sources({name: prefix / "share" / name for name in ("rosAFE", "bass")}, prefix / "lib" / "rosAFE", added)
+
+
+def _plugins() -> dict[str, str]:
+    """The definitions of what plugins bring."""
+    if not plugins.expected():
+        return {}
+    from rosafe.interface import ROSAFE, files, rosafe
+    from rosafe.representations import registry
+
+    own = files.interface_files(rosafe.derive({k: stage.REPRESENTATION for k, stage in registry.own().items()}))
+    return {path: text for path, text in files.interface_files(ROSAFE).items() if path not in own}
+
+
+def digest(found: Sources) -> str:
+    """A name for the generation that these sources and the generators of this machine give."""
+    sha = hashlib.sha256(f"{found.packages['rosAFE']}\0{sys.version_info[:2]}\0{found.plugins}\0".encode())
     genpy = importlib.util.find_spec("genpy")  # found, not imported: importing it takes longer than all this
     if genpy is None or genpy.origin is None:
         raise GenerationError("genpy is not installed; run scripts/install")
-    for path in (Path(__file__), Path(genpy.origin).with_name("generator.py"), *_sources(root)):
+    for path in (Path(__file__), Path(genpy.origin).with_name("generator.py"), *found.files()):
         sha.update(f"{path}\0".encode())
         sha.update(path.read_bytes())
     return sha.hexdigest()[:16]
@@ -100,29 +130,32 @@ def digest(root: Path) -> str:
 # --- what comes out ---------------------------------------------------------------------------------------------
 
 
-def build(root: Path, out: Path) -> None:
-    """Generate ``out/python`` and ``out/share`` from the sources under `root`."""
+def build(found: Sources, out: Path) -> None:
+    """Generate ``out/python`` and ``out/share``."""
     share = out / "share"
     search = {name: [str(DEBIAN_SHARE / name / "msg")] for name in DEBIAN_PACKAGES}
-    for package, folder in PACKAGES.items():
-        _build_share(root, root / folder, share / package)
+    for package, folder in found.packages.items():
+        _build_share(found, folder, share / package)
         search[package] = [str(share / package / "msg")]
-    for package in PACKAGES:
+    for package in found.packages:
         _build_python(package, share / package, out / "python" / package, search)
     for package in DEBIAN_PACKAGES:
         _build_stub(package, share / package)
 
 
-def _build_share(root: Path, source: Path, share: Path) -> None:
+def _build_share(found: Sources, source: Path, share: Path) -> None:
     for kind in ("msg", "srv", "action"):
         (share / kind).mkdir(parents=True)
         for path in (source / kind).glob(f"*.{kind}"):
             shutil.copyfile(path, share / kind / path.name)
+    if share.name == "rosAFE":
+        for name, text in found.plugins.items():
+            (share / name).write_text(text, "utf-8")
     for path in (share / "action").glob("*.action"):
         for name, text in split_action(path.stem, path.read_text("utf-8")).items():
             (share / "msg" / f"{name}.msg").write_text(text, "utf-8")
     shutil.copyfile(source / "package.xml", share / "package.xml")
-    (share / "scripts").symlink_to(root / "scripts")  # where rosrun looks for executables
+    (share / "scripts").symlink_to(found.executables)  # where rosrun looks for them
 
 
 def _build_python(package: str, share: Path, python: Path, search: dict[str, list[str]]) -> None:
@@ -159,7 +192,7 @@ def _build_stub(package: str, share: Path) -> None:
 # --- where it goes ----------------------------------------------------------------------------------------------
 
 
-def _generate(root: Path, base: Path, name: str) -> Path:
+def _generate(found: Sources, base: Path, name: str) -> Path:
     """The generation `name` under `base`, built if it is not there yet. One process at a time builds."""
     wanted = base / name
     base.mkdir(parents=True, exist_ok=True)
@@ -170,7 +203,7 @@ def _generate(root: Path, base: Path, name: str) -> Path:
         if not wanted.is_dir():
             workshop = Path(tempfile.mkdtemp(prefix="build-", dir=base))
             try:
-                build(root, workshop)
+                build(found, workshop)
                 compileall.compile_dir(workshop / "python", quiet=1, stripdir=workshop, prependdir=wanted)
                 workshop.chmod(0o755)
                 workshop.rename(wanted)
@@ -209,17 +242,18 @@ def _is_current(base: Path, name: str) -> bool:
 @functools.cache
 def _generation() -> Path | None:
     """The folder with ``python`` and ``share`` for the sources as they are; None where catkin has installed them."""
-    root = paths.source_root()
-    if root is None:
+    found = sources()
+    if found is None:
         return None
-    name = digest(root)
-    places = (root / ".generated", paths.user_cache() / "messages")
+    name = digest(found)
+    cache = paths.user_cache() / "messages"
+    places = (cache,) if paths.source_root() is None else (found.packages["rosAFE"] / ".generated", cache)
     for base in places:
         if _is_readable(base / name) and (_is_current(base, name) or not paths.writable(base)):
             return base / name
     try:
         writable = [base for base in places if paths.writable(base)]
-        return _generate(root, writable[0] if writable else paths.private_temporary() / "messages", name)
+        return _generate(found, writable[0] if writable else paths.private_temporary() / "messages", name)
     except OSError as problem:
         raise GenerationError(f"cannot write the generated messages: {problem}") from problem
 
@@ -243,22 +277,24 @@ def environment() -> dict[str, str]:
     Raises GenerationError.
     """
     generation = _generation()
-    if generation is None:  # <prefix>/lib/python3/dist-packages
-        prefix = paths.CODE_DIR.parents[2]
-        programs, python, share = prefix / "bin", [], prefix / "share"
+    if paths.source_root() is None:
+        prefix = paths.install_prefix()
+        programs, python, share = prefix / "bin", [], [prefix / "share"]
         tcl, matlab = prefix / "lib" / "tcltk", prefix / "lib" / "matlab"
     else:
+        programs, tcl, matlab = (paths.CODE_DIR / folder for folder in ("scripts", "tcl", "matlab"))
+        python, share = [], []
+    if generation is not None:
         if _is_current(generation.parent, generation.name):  # the name that stays when the sources change
             generation = generation.parent / "current"
-        programs, tcl, matlab = (paths.CODE_DIR / folder for folder in ("scripts", "tcl", "matlab"))
-        python, share = [generation / "python"], generation / "share"
+        python, share = [generation / "python", *python], [generation / "share", *share]
     python.append(paths.CODE_DIR)
     if paths.PYPI_DIR.is_dir():
         python.append(paths.PYPI_DIR)
     return {
         "PATH": _ahead(":", "PATH", [programs]),
         "PYTHONPATH": _ahead(":", "PYTHONPATH", python),
-        "ROS_PACKAGE_PATH": _ahead(":", "ROS_PACKAGE_PATH", [share]),
+        "ROS_PACKAGE_PATH": _ahead(":", "ROS_PACKAGE_PATH", share),
         "TCLLIBPATH": _ahead(" ", "TCLLIBPATH", [tcl]),  # a Tcl list
         "OCTAVE_PATH": _ahead(":", "OCTAVE_PATH", [matlab]),
         "MATLABPATH": _ahead(":", "MATLABPATH", [matlab]),
@@ -277,9 +313,9 @@ def _ahead(separator: str, variable: str, directories: list[Path]) -> str:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """``python3 -m rosafe.ros.generate``: generate what is missing or stale; ``--shell`` prints what env.sh exports."""
+    """Generate what is missing or stale; ``--shell`` prints what env.sh exports."""
     parser = argparse.ArgumentParser(
-        prog="rosafe.ros.generate", description="Generate the message modules where they are missing or stale."
+        prog="rosafe.component.generate", description="Generate the message modules where they are missing or stale."
     )
     parser.add_argument("--shell", action="store_true", help="print the environment as commands for the shell")
     options = parser.parse_args(argv)

@@ -14,8 +14,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NoReturn, Protocol
 
-from rosafe import __version__, interface
-from rosafe.ros import generate, master, memory, paths
+from rosafe import interface
+from rosafe.component import generate, master, memory, paths
+from rosafe.version import VERSION
 
 MASTER_SECONDS = 5.0  # `roscore & rosAFE-ros &` starts both at once, and roscore takes a second or two
 START_SECONDS = 20.0  # a node that is not up by then waits for something that does not come
@@ -107,7 +108,7 @@ def _parse(component: interface.Component, arguments: list[str]) -> argparse.Nam
         default=component.name,
         help=f"name of the node and first part of all its names (default: {component.name})",
     )
-    parser.add_argument("--version", action="version", version=f"{component.name} {__version__}")
+    parser.add_argument("--version", action="version", version=f"{component.name} {VERSION}")
     return parser.parse_args(arguments)
 
 
@@ -143,7 +144,7 @@ def _start(
     sys.setswitchinterval(SWITCH_SECONDS)
     import rospy
 
-    from rosafe.ros import registration
+    from rosafe.component import registration
 
     try:
         registration.init_node(instance, [f"{component.name}-ros", *remappings])
@@ -167,6 +168,18 @@ def _await_master(uri: str, received: list[int]) -> None:
             if received or time.monotonic() > deadline:
                 raise
         time.sleep(0.1)
+
+
+def become_node(name: str) -> None:
+    """Make this process a node of the graph; MasterError where there is no master, GenerationError without messages."""
+    import rospy
+
+    master.set_local_defaults()
+    master.check_master(os.environ["ROS_MASTER_URI"])
+    generate.ensure_messages()
+    ensure_log_directory()
+    rospy.init_node(name, argv=[], anonymous=True, disable_signals=True)
+    log_to_stderr()
 
 
 def ensure_log_directory() -> None:
@@ -216,7 +229,7 @@ def _let_registration_end_at_once() -> None:
     """
     import rospy
 
-    from rosafe.ros import registration
+    from rosafe.component import registration
 
     turn = registration.registrar().manager.cond
 

@@ -21,7 +21,7 @@ import rospy
 from rospy import topics
 from rospy.impl.registration import Registration, get_topic_manager
 
-from rosafe.ros.wire import Gather
+from rosafe.component.wire import Gather
 
 # What may wait for one subscriber besides what is on its way. Windows overlap, so that a message of a long port is made
 # up for by the next one, and the newest is enough; messages of short ports are small, and several can wait.
@@ -39,7 +39,7 @@ class Publisher(rospy.Publisher):
     name : str
         The topic.
     data_class : type
-        A message class of `rosafe.ros.wire`, or a generated one without Header.
+        A message class of `rosafe.component.wire`, or a generated one without Header.
     """
 
     def __init__(self, name: str, data_class: Any) -> None:

@@ -22,25 +22,15 @@ import genpy
 import numpy as np
 
 from rosafe import interface
-from rosafe.ros import generate
+from rosafe.component import generate
+from rosafe.interface.signals import LEVELS
 from rosafe.tree.window import WindowView
+from rosafe.vocabulary.idl import SCALARS
 
-_SCALARS = {
-    "boolean": "?",
-    "unsigned short": "H",
-    "short": "h",
-    "unsigned long": "I",
-    "long": "i",
-    "unsigned long long": "Q",
-    "long long": "q",
-    "float": "f",
-    "double": "d",
-    "char": "b",
-    "octet": "B",
-}
-_SAMPLES: dict[str, np.dtype[Any]] = {"double": np.dtype("<f8"), "long": np.dtype("<i4"), "float": np.dtype("<f4")}
+_SCALARS = {idl: scalar.code for idl, scalar in SCALARS.items() if scalar.code}
+_SAMPLES: dict[str, np.dtype[Any]] = {idl: np.dtype(f"<{_SCALARS[idl]}") for idl in ("double", "long", "float")}
 # How many levels of nested sequences a signal struct wraps; its one member is the sequence.
-_SIGNALS = {"::rosAFE::signalOneD": 1, "::rosAFE::signalND": 2, "::rosAFE::signalNxND": 3}
+_SIGNALS = {idl: len(levels) for idl, levels in LEVELS.items()}
 _COUNT = struct.Struct("<I")
 _MAX_RECORD = 2**31 - 1  # bytes; numpy's layouts go no further
 ROW_BYTES = 4096  # rows of a window in pieces shorter than this are copied together: quicker than handling each

@@ -11,16 +11,16 @@ import rospy
 from diagnostic_msgs.msg import DiagnosticStatus
 
 from rosafe import interface
+from rosafe.component import wire
+from rosafe.component.activities import Activity
+from rosafe.component.audio import AudioRing
+from rosafe.component.component import ComponentNode
+from rosafe.component.events import EventLog
+from rosafe.component.startup import run_server
 from rosafe.dsp import kernels
 from rosafe.interface import KINDS, ROSAFE, ComponentError, ProcessorKind
-from rosafe.ros import wire
-from rosafe.ros.activities import Activity
-from rosafe.ros.audio import AudioRing
-from rosafe.ros.component import ComponentNode
-from rosafe.ros.events import EventLog
-from rosafe.ros.ports import OutputPort, element, parameters_message, signal_fields
-from rosafe.ros.startup import run_server
-from rosafe.ros.trace import TracePort
+from rosafe.node.ports import OutputPort, element, parameters_message, signal_fields
+from rosafe.node.trace_port import TracePort
 from rosafe.tree.processor import Processor
 from rosafe.tree.tree import Tree
 from rosafe.tree.zone import Block

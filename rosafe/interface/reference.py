@@ -1,15 +1,19 @@
-"""The reference of all requests as Markdown: `python3 -m rosafe.view.reference > docs/parameters.md`."""
+"""The reference of all requests as Markdown: docs/parameters.md."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
-from rosafe.interface import COMPONENTS, KINDS, REQUIRED, Component, Parameter, Port, Service, ros_type
+from rosafe.vocabulary.idl import ros_type
+from rosafe.vocabulary.parameter import REQUIRED, Parameter
+from rosafe.vocabulary.representation import Representation
+
+from .service import Component, Port, Service
 
 HEAD = """# Requests, parameters and ports
 
-Made from the interface table, `rosafe/interface.py`, by `python3 -m rosafe.view.reference > docs/parameters.md`.
+Made from the interface table by `python3 -m rosafe.interface`.
 
 * Every request is a ROS service `/<component>/<Request>`; an *activity* is an action of that name as well, which
   answers when the activity ends.
@@ -21,19 +25,19 @@ Made from the interface table, `rosafe/interface.py`, by `python3 -m rosafe.view
 """
 
 
-def markdown() -> str:
+def markdown(components: Iterable[Component], kinds: Mapping[str, Representation]) -> str:
     """The whole document."""
     lines = [HEAD]
-    for component in COMPONENTS.values():
-        lines += _component(component)
+    for component in components:
+        lines += _component(component, kinds)
     return "\n".join(lines)
 
 
-def _component(component: Component) -> Iterator[str]:
+def _component(component: Component, kinds: Mapping[str, Representation]) -> Iterator[str]:
     yield f"## {component.name}\n"
     yield f"{component.doc}.\n"
     for service in component.services:
-        yield from _service(component, service)
+        yield from _service(component, service, kinds)
     yield f"### Ports of {component.name}\n"
     rows = [(_topic(component, port), f"`{ros_type(port.idl)}`", _port_doc(port)) for port in component.ports]
     yield _table(("port", "type", "what it carries"), rows)
@@ -44,12 +48,12 @@ def _component(component: Component) -> Iterator[str]:
     )
 
 
-def _service(component: Component, service: Service) -> Iterator[str]:
+def _service(component: Component, service: Service, kinds: Mapping[str, Representation]) -> Iterator[str]:
     yield f"### {service.name}" + (" (activity)" if service.activity else "") + "\n"
     yield f"{service.doc}.\n"
     if service.parameters:
         yield _table(("parameter", "type", "default", "allowed", "meaning"), [_row(p) for p in service.parameters])
-    for kind in KINDS.values():
+    for kind in kinds.values():
         if kind.request == service.name and not set(kind.parameters) <= set(service.parameters):
             yield "Only by `modifyParameter`, or in `rosafe.process`:\n"
             yield _table(("parameter", "type", "default", "allowed", "meaning"), [_row(p) for p in kind.parameters])
@@ -88,7 +92,3 @@ def _port_doc(port: Port) -> str:
 def _table(head: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
     lines = [head, tuple("---" for _ in head), *rows]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines) + "\n"
-
-
-if __name__ == "__main__":
-    print(markdown(), end="")
