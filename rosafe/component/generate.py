@@ -210,7 +210,8 @@ def _generate(found: Sources, base: Path, name: str) -> Path:
             except BaseException:
                 shutil.rmtree(workshop)
                 raise
-        _make_current(base, name)
+        if not found.plugins:  # which are those of one shell, and `current` is everybody's
+            _make_current(base, name)
     return wanted
 
 
@@ -249,7 +250,7 @@ def _generation() -> Path | None:
     cache = paths.user_cache() / "messages"
     places = (cache,) if paths.source_root() is None else (found.packages["rosAFE"] / ".generated", cache)
     for base in places:
-        if _is_readable(base / name) and (_is_current(base, name) or not paths.writable(base)):
+        if _is_readable(base / name) and (found.plugins or _is_current(base, name) or not paths.writable(base)):
             return base / name
     try:
         writable = [base for base in places if paths.writable(base)]
