@@ -18,12 +18,15 @@ from rosafe.genomix.tcpros import Connection, Refused, ServiceClient, TopicReade
 from rosafe.genomix.values import complete, partial
 from rosafe.interface import (
     COMPONENTS,
+    KINDS,
     REQUEST,
     REQUIRED,
+    ROSAFE,
     Component,
     ComponentError,
     Parameter,
     Port,
+    Representation,
     Service,
     ros_type,
 )
@@ -284,6 +287,7 @@ class Proxy:
                 for p in component.ports
             },
             "exceptions": {f"::{component.name}::{short}": doc for short, doc in component.exceptions.items()},
+            "representations": {kind: _describe_representation(r) for kind, r in KINDS.items() if component is ROSAFE},
         }
 
 
@@ -364,6 +368,22 @@ def _describe_service(service: Service, composite: bool) -> dict[str, Any]:
     }
 
 
+def _describe_representation(representation: Representation) -> dict[str, Any]:
+    return {
+        "word": representation.word,
+        "aliases": list(representation.word_aliases),
+        "request": representation.request,
+        "port": representation.port,
+        "parent": representation.parent,
+        "name": representation.name,
+        "binaural": representation.binaural,
+        "parts": {part.name: {"axes": list(part.axes), "unit": part.unit} for part in representation.parts},
+        "parameters": [p.name for p in representation.parameters],
+        "derived": [d.name for d in representation.derived],
+        "coordinates": list(representation.coordinates),
+    }
+
+
 def _describe_parameter(parameter: Parameter) -> dict[str, Any]:
     required = parameter.default is REQUIRED
     return {
@@ -373,5 +393,6 @@ def _describe_parameter(parameter: Parameter) -> dict[str, Any]:
         "default": "" if required else parameter.default,
         "range": parameter.range_text,
         "choices": list(parameter.choices),
+        "unit": parameter.unit,
         "aliases": list(parameter.aliases),
     }
