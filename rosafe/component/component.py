@@ -66,7 +66,7 @@ class ComponentNode:
         self._srv = importlib.import_module(f"{component.name}.srv")
         self._msg = importlib.import_module(f"{component.name}.msg")
         self._handlers: dict[str, Callable[..., Any]] = {}
-        self._validators: dict[str, Callable[[dict[str, Any]], None]] = {}
+        self._checks: dict[str, Callable[[dict[str, Any]], dict[str, Any]]] = {}
         self._connectors: dict[str, Callable[[str], None]] = {}
         self._registrar = registration.registrar()
         self._turns: dict[str, AbstractContextManager[Any]] = {}  # of each function
@@ -85,14 +85,17 @@ class ComponentNode:
 
     # --- for the node ---
 
-    def activity(self, name: str, handler: Handler, validate: Callable[[dict[str, Any]], None] | None = None) -> None:
+    def activity(
+        self, name: str, handler: Handler, check: Callable[[dict[str, Any]], dict[str, Any]] | None = None
+    ) -> None:
         """Let `handler(activity, values)` serve the activity request `name`.
 
-        `validate(values)` may refuse a request before its values are checked against their ranges.
+        `check(values)` stands in the place of the interface's own check of all values: what is not checked there is
+        for the handler to check. It raises ComponentError or ValueError.
         """
-        self._handlers[self.component.service(name).name] = handler
-        if validate is not None:
-            self._validators[self.component.service(name).name] = validate
+        service = self.component.service(name)
+        self._handlers[service.name] = handler
+        self._checks[service.name] = check or service.check
 
     def function(
         self, name: str, handler: Callable[[dict[str, Any]], dict[str, Any] | None], waits: bool = False
@@ -101,7 +104,9 @@ class ComponentNode:
 
         Functions run one at a time, but for those that `waits` for others, such as the master: nobody waits for them.
         """
-        self._handlers[self.component.service(name).name] = handler
+        service = self.component.service(name)
+        self._handlers[service.name] = handler
+        self._checks[service.name] = service.check
         self._turns[name] = self._control
         if waits:
             self._turns[name] = nullcontext()
@@ -155,11 +160,8 @@ class ComponentNode:
     # --- requests ---
 
     def _values(self, service: interface.Service, request: Any) -> dict[str, Any]:
-        values = service.from_ros(request)
-        if service.name in self._validators:
-            self._validators[service.name](values)
         try:
-            return service.check(values)
+            return self._checks[service.name](service.from_ros(request))
         except ValueError as problem:
             raise self._bad_value(problem) from None
 

@@ -18,12 +18,14 @@ from rosafe.component.component import ComponentNode
 from rosafe.component.events import EventLog
 from rosafe.component.startup import run_server
 from rosafe.dsp import kernels
-from rosafe.interface import KINDS, ROSAFE, ComponentError, ProcessorKind
-from rosafe.node.ports import OutputPort, element, parameters_message, signal_fields
+from rosafe.interface import KINDS, LAYOUTS, ROSAFE, ComponentError, Representation
+from rosafe.node import reports
+from rosafe.node.ports import OutputPort, element
 from rosafe.node.trace_port import TracePort
 from rosafe.tree.processor import Processor
 from rosafe.tree.tree import Tree
-from rosafe.tree.zone import Block
+from rosafe.vocabulary.parameter import MAX_STRING, shown
+from rosafe.tree.block import Block
 
 FIRST_AUDIO_SECONDS = 1.0  # how long InputProc waits for a first message
 
@@ -42,6 +44,7 @@ class RosafeNode:
         self._ports: dict[Processor, OutputPort] = {}
         self._ends: dict[Processor, Activity] = {}
         self._starting = threading.Lock()  # an InputProc that a newer one has interrupted must not replace that one's
+        self._of_the_input: dict[str, Any] = {}  # what the InputProc that runs was asked for
         self._data_object = self._node.advertise("dataObj", wire.message_class("rosAFE", "::rosAFE::dataObjSt"))
         self._input_port = self._advertise("input")
 
@@ -51,7 +54,9 @@ class RosafeNode:
             if kind.parent:
                 self._serve_processor(kind)
         self._node.function("getSignals", self._get_signals)
-        self._node.function("getParameters", self._get_parameters)
+        self._node.function("getParameters", lambda _: {"parameters": reports.parameters(self._tree.processors)})
+        self._node.function("getProcessors", self._get_processors)
+        self._node.function("getRepresentation", self._get_representation)
         self._node.function("getDependencies", lambda v: {"dependencies": self._tree.dependencies(v["nameProc"])})
         self._node.function("modifyParameter", self._modify_parameter)
         self._node.function("removeProcessor", self._remove_processor)
@@ -107,28 +112,28 @@ class RosafeNode:
                 processor = self._tree.add_input(
                     values["name"], reader, frames, values["bufferSize_s_port"], values["bufferSize_s_getSignal"]
                 )
+                self._of_the_input = {name: value for name, value in values.items() if name != "name"}
         except BaseException:
             reader.stop()
             raise
         activity.interrupt_others()
         self._live(activity, processor)
 
-    def _serve_processor(self, kind: ProcessorKind) -> None:
-        def validate(values: dict[str, Any]) -> None:
-            """The original's order: parent unknown, name taken, parent of the wrong type; then the values."""
+    def _serve_processor(self, kind: Representation) -> None:
+        def check(values: dict[str, Any]) -> dict[str, Any]:
+            """The original's order: parent unknown, name taken, parent of the wrong type; the values are the tree's."""
             self._tree.check(kind.kind, values["name"], values["upperDepName"])
+            name = values["name"]
+            if len(name) > MAX_STRING or not re.fullmatch(r"\w+(/\w+)*", name, re.ASCII):
+                what = f"name: {shown(name)} names a topic too: letters, digits and _ only"
+                raise ROSAFE.error("e_badNewValue", what=what)
+            return values
 
         def handle(activity: Activity, values: dict[str, Any]) -> None:
-            self._processor(activity, values, kind)
+            parameters = {p.name: p.known_word(values[p.name]) for p in kind.parameters}
+            self._live(activity, self._tree.add(kind.kind, values["name"], values["upperDepName"], parameters))
 
-        self._node.activity(kind.request, handle, validate)
-
-    def _processor(self, activity: Activity, values: dict[str, Any], kind: ProcessorKind) -> None:
-        name, parent = values.pop("name"), values.pop("upperDepName")
-        if not re.fullmatch(r"\w+(/\w+)*", name, re.ASCII):
-            raise ROSAFE.error("e_badNewValue", what=f"name: {name!r} names a topic too: letters, digits and _ only")
-        known = {p.name: p.known_word(values[p.name]) if p.choices else values[p.name] for p in kind.parameters}
-        self._live(activity, self._tree.add(kind.kind, name, parent, known))
+        self._node.activity(kind.request, handle, check)
 
     def _live(self, activity: Activity, processor: Processor) -> None:
         """From now on the activity is the processor: they end together."""
@@ -147,8 +152,8 @@ class RosafeNode:
     # --- what the tree tells (on its threads) ---
 
     def _advertise(self, kind: str, name: str = "") -> rospy.Publisher:
-        port = ROSAFE.port(KINDS[kind].port)
-        return self._node.advertise(port.name, wire.message_class("rosAFE", port.idl), element(kind, name))
+        message_class = wire.message_class("rosAFE", LAYOUTS[kind].idl)
+        return self._node.advertise(KINDS[kind].port, message_class, element(kind, name))
 
     def added(self, processor: Processor) -> None:
         """Open the processor's port, full of zeros."""
@@ -182,16 +187,14 @@ class RosafeNode:
     # --- functions ---
 
     def _get_signals(self, values: dict[str, Any]) -> dict[str, Any]:
-        arrays: dict[str, list[Any]] = {kind: [] for kind in KINDS}
-        for processor in self._tree.processors:
-            arrays[processor.kind].append(signal_fields(processor.kind, *processor.take_signals()))
-        response = wire.response_class("rosAFE", "getSignals")
-        return {"response": response(genom_success=True, genom_exdetail="", signals=arrays)}
+        return reports.response("getSignals", signals=reports.signals(self._tree.processors))
 
-    def _get_parameters(self, values: dict[str, Any]) -> dict[str, Any]:
-        import rosAFE.msg as messages
+    def _get_processors(self, values: dict[str, Any]) -> dict[str, Any]:
+        told = reports.descriptions(self._tree.processors, self._node.name, self._of_the_input)
+        return reports.response("getProcessors", processors=told)
 
-        return {"parameters": parameters_message(self._tree.processors, messages)}
+    def _get_representation(self, values: dict[str, Any]) -> dict[str, Any]:
+        return reports.response("getRepresentation", parts=reports.representation(self._tree.find(values["name"])))
 
     def _modify_parameter(self, values: dict[str, Any]) -> None:
         self._tree.modify(values["nameProc"], values["nameParam"], values["newValue"])
