@@ -23,7 +23,6 @@ from typing import Any
 import numpy as np
 
 RING_SECONDS = 10.0  # how far the tree may fall behind before frames are lost
-POLL_SECONDS = 0.5  # how often a waiting reader looks whether it should still wait
 MAX_RATE = 1_000_000  # Hz; beyond that a message is garbage, not audio
 MAX_WINDOW = 2**24  # frames in one message, as with bass
 COMPARED = 1000  # frames of a window that are compared with what came before
@@ -103,6 +102,9 @@ class AudioRing:
                 fresh = window
             self._write(np.stack((message.left[window - fresh :], message.right[window - fresh :])))
             self._turn.notify_all()
+            waiting = [reader.wake for reader in self._readers]
+        for wake in waiting:
+            wake()
 
     def refuse(self, why: str) -> None:
         """Count a message that could not even be read."""
@@ -241,29 +243,25 @@ class AudioRing:
         return max((self._newest + 1 - max(reader.position, self._oldest) for reader in takers), default=0)
 
     def read(self, reader: AudioReader) -> tuple[np.ndarray, int] | None:
-        """The next block of `reader`, and the number of the frame after it; None once it is stopped."""
+        """The next block of `reader`, and the number of the frame after it; None where it has not come yet."""
         count = reader.frames_per_block
         with self._turn:
-            while True:
-                if reader.stopped:
-                    return None
-                if self.sample_rate == reader.sample_rate:
-                    if reader.position < self._oldest:
-                        self._lose(reader.position, self._oldest - reader.position)
-                        reader.position = self._oldest
-                    if self._newest + 1 - reader.position >= count:
-                        break
-                self._turn.wait(POLL_SECONDS)
+            if reader.ended or self.sample_rate != reader.sample_rate:
+                return None
+            if reader.position < self._oldest:
+                self._lose(reader.position, self._oldest - reader.position)
+                reader.position = self._oldest
+            if self._newest + 1 - reader.position < count:
+                return None
             reader.position += count
             return self._copy(reader.position - count, count), reader.position
 
     def stop(self, reader: AudioReader) -> None:
-        """End the waiting of `reader`, for good."""
+        """Nobody reads with `reader` any more."""
         with self._turn:
-            reader.stopped = True
+            reader.ended = True
             if reader in self._readers:
                 self._readers.remove(reader)
-            self._turn.notify_all()
 
     @property
     def behind(self) -> int:
@@ -298,7 +296,8 @@ class AudioReader:
         self.frames_per_block = frames_per_block
         self.sample_rate = float(sample_rate)
         self.position = position  # number of the next frame to read; kept by the ring
-        self.stopped = False
+        self.ended = False
+        self.wake: Callable[[], None] = lambda: None
         self._ring = ring
 
     @property
@@ -306,10 +305,14 @@ class AudioReader:
         """Frames that the ring must hold for it: one block to read, and one that comes meanwhile."""
         return 2 * self.frames_per_block
 
+    def open(self, wake: Callable[[], None]) -> None:
+        """From now on call `wake` whenever sound has come."""
+        self.wake = wake
+
     def read(self) -> tuple[np.ndarray, int] | None:
-        """The next block, int32 (2, n), and the number of the frame after it; None once stopped."""
+        """The next block, int32 (2, n), and the number of the frame after it; None where it has not come yet."""
         return self._ring.read(self)
 
     def stop(self) -> None:
-        """Make `read` return None."""
+        """Nothing is read any more."""
         self._ring.stop(self)

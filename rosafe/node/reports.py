@@ -30,7 +30,9 @@ def signals(processors: Iterable[Processor]) -> dict[str, list[Any]]:
     arrays: dict[str, list[Any]] = {kind: [] for kind in FIXED}
     for processor in processors:
         if processor.kind in arrays:
-            arrays[processor.kind].append(signal_fields(processor.kind, *processor.take_signals()))
+            taken = processor.take("getSignals")
+            fields = signal_fields(processor.kind, taken.parts, taken.next_index, taken.signal.rate)
+            arrays[processor.kind].append(fields)
     return arrays
 
 
@@ -70,17 +72,17 @@ def _description(processor: Processor, node: str, of_the_input: Mapping[str, Any
 
 def representation(processor: Processor) -> list[dict[str, Any]]:
     """The `rosAFE_representation` structs of what a processor put out since this was last asked for it."""
-    views, next_index, rate = processor.take_representation()
+    taken = processor.take("getRepresentation")
     return [
         {
             "name": part.name,
-            "rate": rate,
-            "lastFrameIndex": next_index,
+            "rate": taken.signal.rate,
+            "lastFrameIndex": taken.next_index,
             "axes": list(part.axes),
             "shape": list(view.shape),
             "data": view.array().ravel(),
         }
-        for part, view in zip(processor.representation.parts, views, strict=True)
+        for part, view in zip(processor.representation.parts, taken.parts, strict=True)
     ]
 
 

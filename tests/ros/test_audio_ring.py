@@ -350,27 +350,31 @@ def test_waiting_for_the_first_message() -> None:
     assert found[0].position == 8 and found[0].sample_rate == RATE
 
 
-def test_a_blocked_reader_wakes_for_a_block_and_for_stop() -> None:
+def test_a_reader_is_woken_for_all_that_comes_until_it_is_stopped() -> None:
     ring = AudioRing(lambda line: None)
     feed = ring.connect()
     source = Source()
     feed(source.message())
     reader = opened(ring, 6)
-    came: list[Any] = []
+    came: list[int] = []
+    calls = []
 
-    def work() -> None:
+    def wake() -> None:  # as the tree does, but on the feeding thread; the ring must be free then
+        calls.append(1)
         while (block := reader.read()) is not None:
             came.append(block[1])
 
-    thread = threading.Thread(target=work)
-    thread.start()
+    reader.open(wake)
     for _ in range(12):
         source.index += 1
         feed(source.message())
-    wait_for(lambda: came == [7, 13], what=lambda: str(came))
+    assert came == [7, 13]
+    assert len(calls) == 12
     reader.stop()
-    thread.join(10)
-    assert not thread.is_alive()
+    source.index += 12
+    feed(source.message())
+    assert len(calls) == 12
+    assert reader.ended
     assert reader.read() is None
 
 
