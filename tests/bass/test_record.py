@@ -15,7 +15,7 @@ import pytest
 import soundfile
 
 from rosafe.bass.sources.scene import Scene
-from rosafe.commands.cli import main
+from rosafe.commands.__main__ import main
 from tests.bass import bags
 from tests.cli.command import ROSAFE, environment, refused, rosafe, start
 from tests.harness import Graph, Process, free_port, wait_for

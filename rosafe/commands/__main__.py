@@ -73,3 +73,7 @@ def _add(subparsers: argparse._SubParsersAction[Parser], name: str) -> None:
     )
     subparser.set_defaults(run=module.run, usage_error=subparser.error)
     module.configure(subparser)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
