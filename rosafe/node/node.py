@@ -13,7 +13,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from rosafe import interface
 from rosafe.component import wire
 from rosafe.component.activities import Activity
-from rosafe.component.audio import AudioRing
+from rosafe.component.audio import MAX_WINDOW, AudioRing
 from rosafe.component.component import ComponentNode
 from rosafe.component.events import EventLog
 from rosafe.component.startup import run_server
@@ -22,10 +22,10 @@ from rosafe.interface import KINDS, LAYOUTS, ROSAFE, ComponentError, Representat
 from rosafe.node import reports
 from rosafe.node.ports import OutputPort, element
 from rosafe.node.trace_port import TracePort
+from rosafe.tree.block import Block
 from rosafe.tree.processor import Processor
 from rosafe.tree.tree import Tree
 from rosafe.vocabulary.parameter import MAX_STRING, shown
-from rosafe.tree.block import Block
 
 FIRST_AUDIO_SECONDS = 1.0  # how long InputProc waits for a first message
 
@@ -88,7 +88,7 @@ class RosafeNode:
         self._audio_topic = topic
         self._audio = rospy.Subscriber(
             topic,
-            wire.lenient_class("rosAFE", "::binaudio::portStruct"),
+            wire.lenient_class("rosAFE", "::binaudio::portStruct", MAX_WINDOW),
             take,
             queue_size=None,  # all that has come is looked at: a window may be shorter than a hiccup
             buff_size=2**22,

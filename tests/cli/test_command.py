@@ -92,7 +92,13 @@ def test_a_module_is_all_that_a_command_takes(tmp_path: Path) -> None:
 
     def run(*arguments: str) -> subprocess.CompletedProcess[str]:
         return subprocess.run(
-            ["/usr/bin/python3", "-c", program + "sys.exit(rosafe.commands.__main__.main())", str(tmp_path), *arguments],
+            [
+                "/usr/bin/python3",
+                "-c",
+                program + "sys.exit(rosafe.commands.__main__.main())",
+                str(tmp_path),
+                *arguments,
+            ],
             env=environment(PYTHONPATH=str(ROOT)),
             capture_output=True,
             text=True,

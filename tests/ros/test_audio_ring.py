@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from rosafe.component.audio import MAX_RATE, RING_SECONDS, AudioReader, AudioRing
-from tests.harness import wait_for
 
 RATE = 8  # Hz: the ring holds 80 frames
 CAPACITY = int(RING_SECONDS * RATE)

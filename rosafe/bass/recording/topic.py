@@ -14,7 +14,7 @@ import rospy
 from rosafe.bass.sources.base import Chunk, device_error, hwparams_error
 from rosafe.bass.windows import WindowStream
 from rosafe.component import wire
-from rosafe.component.audio import malformed
+from rosafe.component.audio import MAX_WINDOW, malformed
 from rosafe.interface import BASS, ComponentError
 
 FIRST_SECONDS = 3.0  # for a first message
@@ -59,7 +59,7 @@ class TopicSource:
         self._begun = False
         self._first: Any = None
         self._arrived = threading.Event()
-        message_class = wire.lenient_class("bass", BASS.port("Audio").idl)
+        message_class = wire.lenient_class("bass", BASS.port("Audio").idl, MAX_WINDOW)
         kinds = dict(rospy.get_published_topics())
         kind = kinds.get(topic)
         if kind is not None and kind.rpartition("/")[2] != message_class.__name__:
