@@ -12,6 +12,7 @@ import sys
 from rosafe import commands
 from rosafe.commands import Failure
 from rosafe.component.startup import Parser
+from rosafe.output import OutputError
 from rosafe.version import VERSION
 
 _EPILOG = """example:
@@ -34,7 +35,7 @@ def main(argv: list[str] | None = None) -> int:
             return int(options.run(options))
         finally:
             sys.stdout.flush()
-    except Failure as problem:
+    except (Failure, OutputError) as problem:
         print(f"{name}: {problem}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:

@@ -156,6 +156,7 @@ def run(options: argparse.Namespace) -> int:
     signals = Signals()
     # Once, for all processes that are forked from this one.
     from rosafe.offline.files import OutputError, process_file
+    from rosafe.output import OutputError
     from rosafe.sound.audiofile import AudioFileError
 
     if len(inputs) > 1:
