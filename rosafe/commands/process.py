@@ -155,7 +155,7 @@ def run(options: argparse.Namespace) -> int:
         raise Failure(str(problem)) from None
     signals = Signals()
     # Once, for all processes that are forked from this one.
-    from rosafe.offline.files import OutputError, process_file
+    from rosafe.offline.files import process_file
     from rosafe.output import OutputError
     from rosafe.sound.audiofile import AudioFileError
 
