@@ -22,6 +22,8 @@ from typing import Any
 
 import numpy as np
 
+from rosafe.component.overlap import joined
+
 RING_SECONDS = 10.0  # how far the tree may fall behind before frames are lost
 MAX_RATE = 1_000_000  # Hz; beyond that a message is garbage, not audio
 MAX_WINDOW = 2**24  # frames in one message, as with bass
@@ -94,12 +96,11 @@ class AudioRing:
             self._refusing = False
             newest, window = int(message.lastFrameIndex), len(message.left)
             self._join_stream(int(message.sampleRate), newest, window)
-            fresh = newest - self._newest
-            self._compare(message, window - min(fresh, window))
-            if fresh > window:
-                self._lose(self._newest + 1, fresh - window)
-                self._write(np.zeros((2, fresh - window), np.int32))
-                fresh = window
+            lost, fresh = joined(newest - self._newest, window)
+            self._compare(message, window - fresh)
+            if lost:
+                self._lose(self._newest + 1, lost)
+                self._write(np.zeros((2, lost), np.int32))
             self._write(np.stack((message.left[window - fresh :], message.right[window - fresh :])))
             self._turn.notify_all()
             waiting = [reader.wake for reader in self._readers]

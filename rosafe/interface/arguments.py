@@ -8,7 +8,7 @@ from typing import Any
 from rosafe.interface import KINDS
 
 _PARAMETERS = {name: p for kind in KINDS.values() for p in kind.parameters for name in (p.name, *p.aliases)}
-_MISSPELT = {wrong: right for kind in KINDS.values() for wrong, right in kind.rename.items()}
+_MISSPELT = {wrong: p.name for kind in KINDS.values() for p in kind.parameters for wrong in p.former}
 
 
 def check_parameters(parameters: Any) -> dict[str, Any]:
@@ -26,7 +26,7 @@ def check_parameter(name: Any, value: Any, text: bool = False) -> tuple[str, Any
         known = ", ".join(p.name for kind in KINDS.values() for p in kind.parameters)
         raise ValueError(f"unknown parameter {name!r}; there are: {known}")
     parameter = _PARAMETERS[name]
-    checked = parameter.parse(value) if text else parameter.check(value)
+    checked = parameter.read(value) if text else parameter.check(value)
     if checked == "jespen" and "jepsen" in parameter.choices:  # the guide's slip
         checked = "jepsen"
     if parameter.choices and checked not in parameter.choices:

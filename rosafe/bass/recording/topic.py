@@ -12,9 +12,9 @@ import rosgraph.names
 import rospy
 
 from rosafe.bass.sources.base import Chunk, device_error, hwparams_error
-from rosafe.bass.windows import WindowStream
 from rosafe.component import wire
 from rosafe.component.audio import MAX_WINDOW, malformed
+from rosafe.component.overlap import WindowStream
 from rosafe.interface import BASS, ComponentError
 
 FIRST_SECONDS = 3.0  # for a first message

@@ -28,9 +28,9 @@ from rosafe.bass.sources.base import (
     parse_options,
 )
 from rosafe.bass.sources.file import split_path
-from rosafe.bass.windows import WindowStream
 from rosafe.component import wire
 from rosafe.component.audio import malformed
+from rosafe.component.overlap import WindowStream
 from rosafe.interface import BASS, ComponentError
 
 _AUDIO = BASS.port("Audio").idl

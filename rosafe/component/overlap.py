@@ -1,4 +1,4 @@
-"""From the sliding windows of a port Audio back to the stream that they show: every frame once, losses declared."""
+"""From the sliding windows of a port back to the stream that they show: every frame once, losses declared."""
 
 from __future__ import annotations
 
@@ -7,6 +7,12 @@ from typing import Any
 import numpy as np
 
 MAX_JUMP_SECONDS = 3600.0  # an index that jumps further is no loss but another stream
+
+
+def joined(new: int, window: int) -> tuple[int, int]:
+    """Of `new` frames since the last message, how many are lost, and how many a window of so many frames shows."""
+    shown = min(new, window)
+    return new - shown, shown
 
 
 class WindowStream:
@@ -40,7 +46,6 @@ class WindowStream:
         if self.sample_rate == 0:
             self.sample_rate = int(message.sampleRate)
             self.newest = max(0, index - window) if self._with_first else index
-        new = index - self.newest
+        lost, count = joined(index - self.newest, window)
         self.newest = index
-        count = min(new, window)
-        return new - count, np.stack((message.left[window - count :], message.right[window - count :]))
+        return lost, np.stack((message.left[window - count :], message.right[window - count :]))
