@@ -22,10 +22,12 @@ from .windows import NAMES, window
 MAX_FRAME_SECONDS = 60.0  # longest analysis window, and longest step from one to the next
 
 
-def frame_parameters(prefix: str) -> tuple[Parameter, Parameter, Parameter]:
+def frame_parameters(
+    prefix: str, windows: tuple[str, ...] = NAMES, fallback: str = "hann"
+) -> tuple[Parameter, Parameter, Parameter]:
     """The three parameters of every framed stage: window, its duration, and the step to the next."""
     return (
-        Parameter(f"{prefix}_wname", "string", "hann", "Window name", choices=NAMES, fallback="hann"),
+        Parameter(f"{prefix}_wname", "string", "hann", "Window name", choices=windows, fallback=fallback),
         Parameter(f"{prefix}_wSizeSec", "double", 0.02, "Window duration (s)", 0.0, MAX_FRAME_SECONDS, True, unit="s"),
         Parameter(f"{prefix}_hSizeSec", "double", 0.01, "Window step size (s)", 0.0, MAX_FRAME_SECONDS, True, unit="s"),
     )

@@ -11,7 +11,8 @@ import scipy
 
 from .guard import FloatArray
 
-NAMES = ("hamming", "hanning", "hann", "blackman", "triang", "sqrt_win")
+NAMES = ("hamming", "hanning", "hann", "blackman", "triang", "sqrt_win")  # which the original's processors know
+ALL_NAMES = (*NAMES, "rectwin")
 
 
 def window(name: str, length: int) -> FloatArray:
@@ -26,6 +27,7 @@ def window(name: str, length: int) -> FloatArray:
     blackman 0.42 - 0.5 cos(2 pi i / (N - 1)) + 0.08 cos(4 pi i / (N - 1))
     triang   rising (2 i + 1) / N for even N, 2 (i + 1) / (N + 1) for odd N; falling likewise
     sqrt_win sqrt(triang)
+    rectwin  1
     ======== ===================================================================================
 
     ValueError for other names.
@@ -34,6 +36,8 @@ def window(name: str, length: int) -> FloatArray:
         return scipy.signal.windows.hann(length + 2, sym=True)[1:-1]
     if name == "sqrt_win":
         return np.sqrt(scipy.signal.windows.triang(length, sym=True))
+    if name == "rectwin":
+        return np.ones(length)
     if name in NAMES:
         return scipy.signal.windows.get_window(name, length, fftbins=False)
-    raise ValueError(f"window: {name!r} is not one of {', '.join(NAMES)}")
+    raise ValueError(f"window: {name!r} is not one of {', '.join(ALL_NAMES)}")

@@ -14,6 +14,7 @@ from rosafe.dsp.stage import Stage
 from rosafe.representations import STAGES
 from rosafe.representations.filterbank import Filterbank
 from rosafe.representations.haircell import InnerHairCell
+from rosafe.representations.registry import ORIGINAL
 
 FloatArray = NDArray[np.float64]
 
@@ -41,10 +42,10 @@ class Chain:
     """All seven stages, `ihc` feeding the last three."""
 
     def __init__(self, sample_rate: float, parameters: Mapping[str, Any]) -> None:
-        own: dict[str, dict[str, Any]] = {kind: {} for kind in STAGES}
+        own: dict[str, dict[str, Any]] = {kind: {} for kind in ORIGINAL}
         for name, value in parameters.items():
             own[KIND_OF[name]][name] = value
-        self.stages = {kind: stage(sample_rate, **own[kind]) for kind, stage in STAGES.items()}
+        self.stages = {kind: STAGES[kind](sample_rate, **own[kind]) for kind in ORIGINAL}
 
     def process(self, block: NDArray[Any]) -> dict[str, FloatArray]:
         """The output of every stage for one block."""

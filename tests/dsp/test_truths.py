@@ -13,7 +13,7 @@ from rosafe.dsp.drnl import DrnlBank
 from rosafe.dsp.erb import erb_rate, erb_rate_to_frequency
 from rosafe.dsp.middle_ear import middle_ear_fir
 from rosafe.dsp.rounding import round_half_away
-from rosafe.dsp.windows import NAMES, window
+from rosafe.dsp.windows import ALL_NAMES, window
 from rosafe.representations.crosscorrelation import CrossCorrelation
 from rosafe.representations.filterbank import Filterbank
 from rosafe.representations.haircell import InnerHairCell
@@ -76,8 +76,9 @@ def test_windows(length: int) -> None:
         "blackman": 0.42 - 0.5 * np.cos(turn) + 0.08 * np.cos(2 * turn),
         "triang": triangle,
         "sqrt_win": np.sqrt(triangle),
+        "rectwin": np.ones(length),
     }
-    assert set(expected) == set(NAMES)
+    assert set(expected) == set(ALL_NAMES)
     for name, values in expected.items():
         np.testing.assert_allclose(window(name, length), values, rtol=0, atol=1e-15, err_msg=name)
     with pytest.raises(ValueError, match="bartlett"):

@@ -22,11 +22,14 @@ _SUMS = (_INTEGER, _ARRAY, _INTEGER, _INTEGER, _ARRAY)
 _ARGUMENTS = {
     "rosafe_gammatone": (_ARRAY, *[_INTEGER] * 3, *[_ARRAY] * 4),
     "rosafe_biquads": (_INTEGER, _ARRAY, _ARRAY, _INTEGER, _INTEGER, _ARRAY, _INTEGER, _ARRAY, _ARRAY),
+    "rosafe_adaptation": (_ARRAY, _INTEGER, _INTEGER, _REAL, *[_ARRAY, _INTEGER] * 2, _INTEGER, _ARRAY, _ARRAY),
     "rosafe_levels": (*_FRAMES, *_SUMS, _REAL, _ARRAY),
     "rosafe_ratemap": (*_FRAMES, *_SUMS, _INTEGER, _REAL, _ARRAY, _ARRAY),
     "rosafe_denormals_off": (),
     "rosafe_denormals_as": (_BITS,),
     "rosafe_correlations": (*_FRAMES, _INTEGER, _REAL, _ARRAY, _INTEGER),
+    # clipping, alpha, exponent; points, twiddles, places, turns; corrections, lags; output
+    "rosafe_autocorrelations": (*_FRAMES, _INTEGER, _REAL, _REAL, _INTEGER, *[_ARRAY] * 4, _INTEGER, _ARRAY),
 }
 
 

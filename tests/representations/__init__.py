@@ -1,0 +1,1 @@
+"""Tests of each representation beyond the original's seven: numbers, changes, refusals."""

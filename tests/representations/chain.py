@@ -1,0 +1,220 @@
+"""Stages of any kinds joined by hand, without the processor tree; and the reference vectors of the later kinds."""
+
+from __future__ import annotations
+
+import copy
+import itertools
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rosafe.dsp.signal import Signal
+from rosafe.dsp.stage import Output, Stage, parts_of
+from rosafe.representations import KINDS, STAGES
+from tests import harness
+
+FloatArray = NDArray[np.float64]
+
+
+def kind_of(name: str) -> str:
+    """The kind that has a parameter of this name, or of this alias."""
+    for kind in KINDS.values():
+        if any(name in (p.name, *p.aliases, *p.former) for p in kind.parameters):
+            return kind.kind
+    raise KeyError(name)
+
+
+def needed(outputs: Iterable[str]) -> list[str]:
+    """The kinds `outputs` and all that they hang on, parents first."""
+    wanted: set[str] = set()
+    for kind in outputs:
+        while kind and kind not in wanted:
+            wanted.add(kind)
+            kind = KINDS[kind].parent
+    return [kind for kind in STAGES if kind in wanted]
+
+
+def cut(signal: NDArray[Any], sizes: int | Iterable[int]) -> list[NDArray[Any]]:
+    """`signal` in blocks of `sizes` along its last axis, used cyclically; the last block is what is left."""
+    blocks: list[NDArray[Any]] = []
+    position = 0
+    for size in itertools.cycle([sizes] if isinstance(sizes, int) else sizes):
+        if position >= signal.shape[-1]:
+            return blocks
+        blocks.append(signal[..., position : position + size])
+        position += size
+    return blocks
+
+
+class Chain:
+    """The stages of `outputs` and of all that they hang on, one of each kind.
+
+    Parameters
+    ----------
+    given : Signal or float
+        The sample rate (Hz); or, with `root`, the format of what the root's parent would put out.
+    outputs : iterable of str
+        Kinds.
+    parameters : mapping, optional
+        Of any of them, by name or alias.
+    root : str, optional
+        Begin with this kind instead of the input: blocks are what its parent would put out.
+    """
+
+    def __init__(
+        self, given: Signal | float, outputs: Iterable[str], parameters: Mapping[str, Any] | None = None, root: str = ""
+    ) -> None:
+        self.outputs = list(outputs)
+        kinds = needed(self.outputs)
+        if root:
+            kinds = [kind for kind in kinds if root in needed([kind])]
+        own: dict[str, dict[str, Any]] = {kind: {} for kind in kinds}
+        for name, value in (parameters or {}).items():
+            if (kind := kind_of(name)) in own:
+                own[kind][name] = value
+        self.given = given
+        self.stages: dict[str, Stage] = {}
+        for kind in kinds:
+            self.stages[kind] = STAGES[kind](self._comes_to(kind, self.stages), **own[kind])
+
+    def _comes_to(self, kind: str, stages: Mapping[str, Stage]) -> Signal | float:
+        parent = stages.get(KINDS[kind].parent)
+        return self.given if parent is None else parent.output
+
+    def modify(self, name: str, value: Any) -> None:
+        """Change one parameter between blocks; what hangs on it hears of it. A ValueError changes nothing.
+
+        As in the tree, the change is tried on shallow copies first, while the stages stand by.
+        """
+        tried = {kind: copy.copy(stage) for kind, stage in self.stages.items()}
+        tried[kind_of(name)].configure(**{name: value})
+        for kind, stage in tried.items():
+            comes = self._comes_to(kind, tried)
+            if isinstance(comes, Signal):
+                stage.receive(comes)
+        self.stages = tried
+
+    def process(self, block: NDArray[Any], extra: NDArray[Any] | None = None) -> dict[str, Output]:
+        """What every stage makes of one block. `extra` is what the root needs of a parent that is not there."""
+        for stage in self.stages.values():
+            stage.provide = frozenset()
+        for kind, stage in self.stages.items():
+            if stage.needs and (parent := self.stages.get(KINDS[kind].parent)):
+                assert stage.needs in parent.PROVIDES
+                parent.provide |= {stage.needs}
+        made: dict[str, Output] = {}
+        for kind, stage in self.stages.items():
+            parent = self.stages.get(KINDS[kind].parent)
+            if parent is None:
+                made[kind] = stage.process(block, extra)
+                continue
+            data = made[KINDS[kind].parent]
+            assert not isinstance(data, tuple)
+            made[kind] = stage.process(data, parent.provided[stage.needs] if stage.needs else None)
+        return made
+
+    def run(
+        self,
+        signal: NDArray[Any],
+        sizes: int | Sequence[int] | None = None,
+        changes: Iterable[Sequence[Any]] = (),
+    ) -> dict[str, FloatArray]:
+        """`outputs` of a signal (..., N) cut into blocks of `sizes`, joined, by the names of `rosafe.process`.
+
+        `changes` are (block index, parameter, value), made before that block. A kind of several parts comes as
+        `<kind>_<part>`. Where a change alters what lies before the time axis, the largest rules, and what lies outside
+        is 0; the axis `centred` keeps its middle.
+        """
+        changes = list(changes)
+        gathered: dict[str, list[FloatArray]] = {}
+        blocks = [signal] if sizes is None else cut(signal, sizes)
+        for index, block in enumerate(blocks):
+            for _, name, value in (change for change in changes if change[0] == index):
+                self.modify(name, value)
+            made = self.process(block)
+            for kind in self.outputs:
+                for name, part in zip(part_names(kind), parts_of(made[kind]), strict=True):
+                    gathered.setdefault(name, []).append(part)
+        return {name: _joined(name, parts) for name, parts in gathered.items()}
+
+    def coordinates(self) -> dict[str, Any]:
+        """The coordinates of `outputs`, and of framed ones `<kind>_frameRate`."""
+        found: dict[str, Any] = {}
+        for kind in self.outputs:
+            stage = self.stages[kind]
+            known = {**stage.parameters, **stage.derived}
+            found.update((name, known[name]) for name in KINDS[kind].coordinates)
+            if stage.output.framed:
+                found[f"{kind}_frameRate"] = stage.output.rate
+        return found
+
+
+def part_names(kind: str) -> list[str]:
+    """What the parts of a kind are called in the results of `rosafe.process`."""
+    parts = KINDS[kind].parts
+    return [kind] if len(parts) == 1 else [f"{kind}_{part.name}" for part in parts]
+
+
+def _joined(name: str, blocks: Sequence[FloatArray]) -> FloatArray:
+    if len({block.shape[:-1] for block in blocks}) == 1:
+        return np.concatenate(blocks, axis=-1)
+    declared = KINDS[name.split("_")[0]]
+    axes = declared.parts[part_names(declared.kind).index(name)].axes
+    shape = tuple(max(sizes) for sizes in zip(*(block.shape[:-1] for block in blocks), strict=True))
+    joined = np.zeros((*shape, sum(block.shape[-1] for block in blocks)))
+    at = 0
+    for block in blocks:
+        place = [slice(0, size) for size in block.shape]
+        place[-1] = slice(at, at + block.shape[-1])
+        if declared.centred in axes:
+            axis = axes.index(declared.centred)
+            first = (shape[axis] - block.shape[axis]) // 2
+            place[axis] = slice(first, first + block.shape[axis])
+        joined[tuple(place)] = block
+        at += block.shape[-1]
+    return joined
+
+
+def process(
+    signal: NDArray[Any],
+    sample_rate: float,
+    outputs: Iterable[str],
+    parameters: Mapping[str, Any] | None = None,
+    sizes: int | Sequence[int] | None = None,
+    changes: Iterable[Sequence[Any]] = (),
+) -> dict[str, Any]:
+    """As `rosafe.process`, on bare stages: `outputs` of a signal (2, N), with their coordinates and rates."""
+    values = {"in_doNormalize": signal.dtype.kind == "i", **(parameters or {})}
+    chain = Chain(sample_rate, outputs, values)
+    return {**chain.run(signal, sizes, changes), **chain.coordinates()}
+
+
+# --- vectors ----------------------------------------------------------------------------------------------------
+
+
+def reference(name: str) -> tuple[dict[str, Any], dict[str, FloatArray], dict[str, Any]]:
+    """One of ../shared/vectors/more: its case of the manifest, what is expected, and what the stages make of it.
+
+    The latter is thinned out as what is expected is; rates and coordinates are compared already.
+    """
+    cases = json.loads(harness.shared("vectors", "more", "manifest.json").read_text())
+    (case,) = (case for case in cases if case["name"] == name)
+    with np.load(harness.shared("vectors", "more", case["file"])) as arrays:
+        stored = dict(arrays)
+    got = process(stored["signal"], case["fs"], case["outputs"], case["params"], case["chunks"], case["mods"])
+    for output, shape in case["full_shapes"].items():
+        assert got[output].shape == tuple(shape)
+    for output, axes in case["crops"].items():
+        for axis in axes:
+            got[output] = np.take(got[output], stored[f"{output}.idx{axis}"], axis)
+    for coordinate, expected in case["axes"].items():
+        if coordinate not in got:
+            continue  # fb_cfHz, where the filterbank is no output
+        found = got[coordinate]
+        if coordinate in ("ac_lags", "prec_lags"):
+            found = [len(found), found[-1] if coordinate == "ac_lags" else found[0]]
+        np.testing.assert_allclose(found, expected, rtol=1e-12, atol=0, err_msg=coordinate)
+    return case, {output: stored[output] for output in case["full_shapes"]}, got
