@@ -98,7 +98,10 @@ def _spread(of: Spectra) -> FloatArray:
 
 def _entropy(of: Spectra) -> FloatArray:
     shares = of.x / of.total
-    return np.einsum("cef,cef->ef", shares, -np.log(shares + E)) / max(1.0, math.log(len(shares)))
+    channels = len(shares)
+    if channels == 1:
+        return np.zeros(shares.shape[1:])
+    return np.einsum("cef,cef->ef", shares, -np.log(shares + E)) / math.log(channels)
 
 
 def _decrease(of: Spectra) -> FloatArray:
@@ -161,8 +164,8 @@ class SpectralFeatures(Stage):
     """One number for each frame, ear and feature, (2, C, F) to (2, S, F), in the order of sf_requests.
 
     With the rates x_c = max(R_c, 0) of a frame's C channels, their center frequencies f_c and the highest of these
-    f_max, E = 1e-15, X = sum x_c, m = X / C, p_c = x_c / (X + E), D_c = 10 log10(x_c + E), s the standard deviation of x
-    over the channels (C - 1 in the denominator) and g = sum f_c x_c / (X + E):
+    f_max, E = 1e-15, X = sum x_c, m = X / C, p_c = x_c / (X + E), D_c = 10 log10(x_c + E), s the standard deviation of
+    x over the channels (C - 1 in the denominator) and g = sum f_c x_c / (X + E):
 
     ============ ====================================================================================================
     centroid     g / f_max
@@ -256,7 +259,7 @@ class SpectralFeatures(Stage):
             return np.stack([made[word] for word in self._words], axis=1)
         features = np.empty((2, len(FEATURES), rates.shape[-1]))
         kernels.spectral_features(spectra, before, self._frequencies, bright, part, features)
-        return features if self._words == tuple(FEATURES) else features[:, [ORDER[word] for word in self._words]]
+        return features if self._words == tuple(ORDER) else features.take([ORDER[word] for word in self._words], axis=1)
 
     def reset(self) -> None:
         self._last = None

@@ -86,9 +86,10 @@ class OnsetStrength(_Strength):
 class OffsetStrength(_Strength):
     """How fast levels fall, (2, C, F) to (2, C, F) in dB.
 
-    min(max(L[k-1] - L[k], 0), ofs_maxOffsetdB), with L the level of each channel in dB; 0 in the first frame. In exact silence
-    after sound the ratemap's integrator decays: the offset stays at what that loses from frame to frame, 10.86 dB by
-    default, until the level is -2000 dB.
+    min(max(L[k-1] - L[k], 0), ofs_maxOffsetdB), with L the level of each channel in dB; 0 in the first frame.
+
+    In exact silence after sound the ratemap's integrator decays: the offset stays at what that loses from frame to
+    frame, 10.86 dB by default, until the level is -2000 dB.
     """
 
     REPRESENTATION = Representation(
