@@ -1,4 +1,4 @@
-"""Onset and offset maps: the reference vectors, the algorithm spelt out in plain Python, and what changes on the way."""
+"""Onset and offset maps: the reference vectors, the algorithm spelt out in plain Python, and changes on the way."""
 
 from __future__ import annotations
 
@@ -87,7 +87,8 @@ def spelt_out(
     rate: float = 100.0,
 ) -> FloatArray:
     """The map of both ears; a change is for the frames that are not put out yet."""
-    values, come, made = dict(values), 0, []
+    values, come = dict(values), 0
+    made: list[list[FloatArray]] = []
     for index, size in enumerate(sizes):
         values.update({name: value for block, name, value in changes if block == index})
         come += size
@@ -268,12 +269,14 @@ def test_the_next_frame_is_the_first_not_put_out_yet() -> None:
 def test_a_longer_window_finds_frames_that_were_put_out_long_ago() -> None:
     size = KEPT + 300
     strengths, levels = world(2 * size, 5, channels=1)
-    values, changes = {**DEFAULTS, "trm_minSpread": 1}, [(1, "trm_fuseWithinSec", 1.2), (1, "trm_minValuedB", -60.0)]
-    got = run(strengths, levels, values, [size, size], changes)
+    before: dict[str, Any] = {**DEFAULTS, "trm_minSpread": 1}
+    after = {**before, "trm_fuseWithinSec": 1.2, "trm_minValuedB": -60.0}
+    changes = [(1, name, after[name]) for name in ("trm_fuseWithinSec", "trm_minValuedB")]
+    got = run(strengths, levels, before, [size, size], changes)
     assert got.shape[-1] == 2 * size - 240
     first = size - 6
     for k in (first, first + 1, first + 100):
-        expected = column(strengths[0], levels[0], {**values, **{name: value for _, name, value in changes}}, 100.0, k)
+        expected = column(strengths[0], levels[0], after, 100.0, k)
         np.testing.assert_array_equal(got[0, :, k], expected)
 
 

@@ -29,6 +29,13 @@ def rates(levels: Any) -> FloatArray:
     return np.broadcast_to(10 ** (np.array(levels, float) / 10), (2, 2, len(levels))).copy()
 
 
+def made_by(stage: Stage, block: FloatArray) -> FloatArray:
+    """What the stage makes of one block."""
+    made = stage.process(block)
+    assert isinstance(made, np.ndarray)
+    return made
+
+
 def test_reference_vectors() -> None:
     _, expected, got = reference("Q02_onset_offset")
     for kind in ("onsetStrength", "offsetStrength"):
@@ -47,7 +54,7 @@ def test_steps(kind: type[Stage], limit: str, sign: int) -> None:
 @both
 def test_each_ear_and_channel_is_on_its_own(kind: type[Stage], limit: str, sign: int) -> None:
     levels = np.random.default_rng(3).uniform(-300, 100, (2, 2, 20))
-    made = kind(GIVEN, **{limit: 1000.0}).process(10 ** (levels / 10))
+    made = made_by(kind(GIVEN, **{limit: 1000.0}), 10 ** (levels / 10))
     for ear, channel, frame in np.ndindex(2, 2, 20):
         change = levels[ear, channel, frame] - levels[ear, channel, max(0, frame - 1)]
         assert made[ear, channel, frame] == pytest.approx(max(sign * change, 0.0), abs=1e-10)
@@ -59,7 +66,7 @@ def test_silence_is_2000_db_below_1(kind: type[Stage], limit: str, sign: int) ->
     """Also what is below 0, which no ratemap is."""
     block = rates([0] * 8)
     block[:] = [0.0, -3.0, 1e-200, 5e-324, 1.0, 0.0, -1e300, 1e100]
-    made = kind(GIVEN, **{limit: 1000.0}).process(block)[0, 0]
+    made = made_by(kind(GIVEN, **{limit: 1000.0}), block)[0, 0]
     expected = [0, 0, 0, 0, 1000, 0, 0, 1000] if sign > 0 else [0, 0, 0, 0, 0, 1000, 0, 0]
     np.testing.assert_allclose(made, expected, rtol=0, atol=0)
 
@@ -80,10 +87,7 @@ def test_the_level_for_the_maps(kind: type[Stage], limit: str, sign: int) -> Non
 @both
 @pytest.mark.parametrize(("scaling", "factor"), [("power", 2), ("magnitude", 1)])
 def test_the_decay_after_sound(kind: type[Stage], limit: str, sign: int, scaling: str, factor: int) -> None:
-    """The integrator loses 8.686 h / (fs decay) dB each frame, twice that in power, until -2000 dB; then nothing is left.
-
-    Written for frames that lie in the silence altogether.
-    """
+    """What the integrator loses from frame to frame, until -2000 dB; then nothing is left."""
     name = kind.REPRESENTATION.kind
     ihc = Signal(RATE, RATE, center_frequencies=(500.0, 900.0), filterbank="gammatone")
     chain = Chain(ihc, [name], {"rm_scaling": scaling, limit: 30.0}, root="ratemap")
