@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from rosafe import interface
 from rosafe.dsp.stage import Stage
 from rosafe.representations import STAGES
-from rosafe.representations.registry import ORIGINAL
 from rosafe.representations.filterbank import Filterbank
 from rosafe.representations.haircell import InnerHairCell
+from rosafe.representations.registry import ORIGINAL
 
 FloatArray = NDArray[np.float64]
 

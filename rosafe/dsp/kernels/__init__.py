@@ -10,6 +10,7 @@ All arrays are of float64 or complex128, and C-contiguous where nothing else is 
 from __future__ import annotations
 
 import ctypes
+import functools
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -26,9 +27,12 @@ FloatArray = NDArray[np.float64]
 MOST_POLES = 128  # of a gammatone filter
 MOST_SECTIONS = 8  # of a low-pass
 MOST_LAGS = 1024  # of a correlation; FFT is faster beyond
+MOST_LOOPS = 32  # of adaptation
+MOST_SIZE = 4096  # samples of a frame whose autocorrelation is made
 
 REAL_SIZE = 8  # bytes of a float64
 
+CLIPPINGS = ("clp", "clc", "sgn")
 RECTIFICATIONS = ("none", "halfwave", "fullwave", "square", "compressed")
 
 
@@ -74,6 +78,39 @@ def rectify_and_filter(
         block.shape[-1],
         _address(sections),
         len(sections),
+        _address(state),
+        _address(output),
+    )
+    return output
+
+
+def adaptation(
+    block: FloatArray,
+    factor: float,
+    thresholds: FloatArray,
+    offsets: FloatArray,
+    gains: FloatArray,
+    retentions: FloatArray,
+    limits: FloatArray,
+    state: FloatArray,
+) -> FloatArray:
+    """Adaptation loops with their `state` (n, *rows): as `rosafe.representations.adaptation.adapt`.
+
+    The other arguments are the attributes of `Loops` there.
+    """
+    output = memory.empty(block.shape)
+    constants = np.stack((thresholds, offsets, gains), axis=1)
+    loops = np.stack((retentions, 1 - retentions, limits), axis=1)
+    _function("rosafe_adaptation")(
+        _address(block),
+        math.prod(block.shape[:-1]),
+        block.shape[-1],
+        factor,
+        _address(constants),
+        len(constants),
+        _address(loops),
+        len(loops),
+        bool(limits.any()),
         _address(state),
         _address(output),
     )
@@ -224,6 +261,67 @@ def transient_map(
         *(strengths.ctypes.data, levels.ctypes.data, strengths.strides[1] // REAL_SIZE, ears * channels, channels),
         *(first, count, reach, at_once, *thresholds, fuse, spread, peaks, capacity, *others, _address(output)),
     )
+
+
+def autocorrelations(
+    frames: Frames, clipping: str, alpha: float, exponent: float, corrections: FloatArray
+) -> FloatArray:
+    """Normalised autocorrelations of centre-clipped frames at the lags of `corrections` (L,), (*rows, L, F).
+
+    A frame has an even number of samples up to `MOST_SIZE`. The twin is
+    `rosafe.representations.autocorrelation.autocorrelate`.
+    """
+    rows = frames.block.shape[:-1]
+    output = memory.empty((*rows, len(corrections), frames.number))
+    transform = Transform.of_frames(len(frames.weights))
+    _function("rosafe_autocorrelations")(
+        *_arguments(frames),
+        CLIPPINGS.index(clipping),
+        alpha,
+        exponent / 2,
+        transform.points,
+        *map(_address, (transform.twiddles, transform.places, transform.turns, corrections)),
+        len(corrections),
+        _address(output),
+    )
+    return output
+
+
+class Transform(NamedTuple):
+    """Tables for the FFT of N real numbers as that of N / 2 complex ones, by radix 4 and last by 2 where need be.
+
+    Attributes
+    ----------
+    points : int
+        N / 2.
+    twiddles : ndarray, complex
+        exp(-2 pi i j k / n), (n / 4, 3) for j from 1 to 3, of n = N / 2 points, then of n / 4...
+    places : ndarray (N / 4 + 1, 2) of int64
+        Where the points k and N / 2 - k come out.
+    turns : ndarray (N / 4 + 1,), complex
+        exp(2 pi i k / N).
+    """
+
+    points: int
+    twiddles: NDArray[np.complex128]
+    places: NDArray[np.int64]
+    turns: NDArray[np.complex128]
+
+    @classmethod
+    @functools.lru_cache(8)
+    def of_frames(cls, size: int) -> Transform:
+        """For the correlation of frames of so many samples, at least 2, at all lags: N is a power of 2."""
+        points = 1 << (2 * size - 2).bit_length() - 1
+        twiddles, index, place, n = [np.empty((0, 3))], np.arange(points), np.zeros(points, np.int64), points
+        while n >= 4:
+            twiddles.append(np.exp(-2j * np.pi / n * np.arange(n // 4)[:, np.newaxis] * (1, 2, 3)))
+            place += index % 4 * (n // 4)
+            index //= 4
+            n //= 4
+        place += index
+        k = np.arange(points // 2 + 1)
+        places = np.ascontiguousarray(np.stack((place[k], place[-k % points]), axis=1))
+        return cls(points, np.concatenate(twiddles), places, np.exp(1j * np.pi / points * k))
 
 
 @contextmanager

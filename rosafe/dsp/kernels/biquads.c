@@ -5,9 +5,7 @@
  * A section's sample waits for the one before it, some ten cycles; sixteen rows at a time fill the wait. Reading, filtering
  * and writing are one loop, so that they fill one another's waits too; where there are more sections, spans of samples
  * stay in the first-level cache between them. */
-#include "vector.h"
-
-#include <math.h>
+#include "power.h"
 
 #define COMPRESSION -0.77 /* of the envelope, in rosafe/dsp/haircell.py */
 
@@ -22,25 +20,6 @@ typedef struct {
     double *output;
     int64_t at[ROWS]; /* where each row begins in all of them */
 } places;
-
-/* x to the power of COMPRESSION, 0 where x < TINY. Of x = 2^e m with m between sqrt(1/2) and sqrt(2), log m is a series in
- * (m - 1) / (m + 1); 2^f with f between -1/2 and 1/2 is the exponential series. Both end where they are exact. */
-INLINE vec compressed(vec x) {
-    static const double LOG[] = {1. / 23, 1. / 21, 1. / 19, 1. / 17, 1. / 15, 1. / 13, 1. / 11, 1. / 9, 1. / 7, 1. / 5, 1. / 3, 1};
-    static const double EXP[] = {1. / 6227020800, 1. / 479001600, 1. / 39916800, 1. / 3628800, 1. / 362880, 1. / 40320,
-                                 1. / 5040, 1. / 720, 1. / 120, 1. / 24, 1. / 6, 1. / 2, 1, 1};
-    const double to_integer = 0x1.8p52; /* added, it leaves the nearest integer in the lowest bits */
-    const lanes bits = (lanes)larger(x, all(TINY)), large = (bits & ((1L << 52) - 1)) > 0x6A09E667F3BCC;
-    vec m = (vec)((bits & ((1L << 52) - 1)) | ((1023L + large) << 52));
-    vec e = (vec)(((bits >> 52) - 1023 - large) + (lanes)all(to_integer)) - all(to_integer);
-    vec t = (m - 1) / (m + 1), t2 = t * t, sum = all(LOG[0]);
-    UNROLL for (int i = 1; i < 12; i++) sum = fused(sum, t2, all(LOG[i]));
-    vec power = (e + t * sum * (2 / M_LN2)) * COMPRESSION, rounded = power + to_integer;
-    vec f = (power - (rounded - to_integer)) * M_LN2, result = all(EXP[0]);
-    UNROLL for (int i = 1; i < 14; i++) result = fused(result, f, all(EXP[i]));
-    result = (vec)((lanes)result + ((lanes)rounded << 52));
-    return (vec)((lanes)result & (x >= TINY));
-}
 
 INLINE vec rectified(int64_t how, vec x) {
     x = bounded(x, how == HALF_WAVE ? 0.0 : -LIMIT, LIMIT);
@@ -68,7 +47,7 @@ INLINE void step(const int groups, const int does, const int samples, int64_t ho
                 vec envelope[2];
                 read_some(samples, rows->envelope, rows->at + g * LANES, t, envelope);
                 UNROLL for (int i = 0; i < samples; i++) {
-                    vec x = bounded(pair[i], -LIMIT, LIMIT) * compressed(smaller(envelope[i], all(LIMIT)));
+                    vec x = bounded(pair[i], -LIMIT, LIMIT) * power(smaller(envelope[i], all(LIMIT)), COMPRESSION);
                     pair[i] = bounded(x, 0.0, LIMIT) * bounded(x, 0.0, LIMIT);
                 }
             } else {

@@ -22,6 +22,7 @@ _SUMS = (_INTEGER, _ARRAY, _INTEGER, _INTEGER, _ARRAY)
 _ARGUMENTS = {
     "rosafe_gammatone": (_ARRAY, *[_INTEGER] * 3, *[_ARRAY] * 4),
     "rosafe_biquads": (_INTEGER, _ARRAY, _ARRAY, _INTEGER, _INTEGER, _ARRAY, _INTEGER, _ARRAY, _ARRAY),
+    "rosafe_adaptation": (_ARRAY, _INTEGER, _INTEGER, _REAL, *[_ARRAY, _INTEGER] * 2, _INTEGER, _ARRAY, _ARRAY),
     "rosafe_levels": (*_FRAMES, *_SUMS, _REAL, _ARRAY),
     "rosafe_ratemap": (*_FRAMES, *_SUMS, _INTEGER, _REAL, _ARRAY, _ARRAY),
     "rosafe_denormals_off": (),
@@ -32,6 +33,8 @@ _ARGUMENTS = {
         *(_ARRAY, _ARRAY, *[_INTEGER] * 7, _REAL, _REAL, _INTEGER, _INTEGER),
         *(_ARRAY, _INTEGER, *[_ARRAY] * 5),
     ),
+    # clipping, alpha, exponent; points, twiddles, places, turns; corrections, lags; output
+    "rosafe_autocorrelations": (*_FRAMES, _INTEGER, _REAL, _REAL, _INTEGER, *[_ARRAY] * 4, _INTEGER, _ARRAY),
 }
 
 

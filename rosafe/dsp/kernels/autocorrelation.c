@@ -1,0 +1,211 @@
+/* Autocorrelation of centre-clipped frames by FFT (rosafe/representations/autocorrelation.py).
+ *
+ * A frame in each lane. A frame and zeros, N real numbers, are taken for N / 2 complex ones, and so is the power spectrum on
+ * its way back: J. W. Cooley, P. A. W. Lewis and P. D. Welch (1970), J. Sound Vib. 12, 315-337. Out of the transform there,
+ * which halves in frequency, they come in reversed order, and the transform back, which halves in time, takes them so.
+ * Butterflies of four; each transform is done quarter by quarter, so that all but the first of its passes stay in the cache
+ * (R. C. Singleton (1967), Comm. ACM 10). */
+#include "power.h"
+
+#include <string.h>
+
+enum { MOST_SIZE = 4096 /* of a frame */, MOST_POINTS = MOST_SIZE /* complex ones */ };
+
+enum clipping { COMPRESS, CLIP_ONLY, SIGN };
+
+typedef struct {
+    vec re, im;
+} complexes;
+
+typedef struct {
+    double re, im;
+} number;
+
+/* --- transforms --- */
+
+INLINE complexes sum(complexes a, complexes b) { return (complexes){a.re + b.re, a.im + b.im}; }
+INLINE complexes difference(complexes a, complexes b) { return (complexes){a.re - b.re, a.im - b.im}; }
+INLINE complexes times_i(complexes a) { return (complexes){-a.im, a.re}; }
+INLINE complexes times(complexes a, number w) {
+    return (complexes){fused(a.re, all(w.re), -(a.im * all(w.im))), fused(a.re, all(w.im), a.im * all(w.re))};
+}
+INLINE complexes times_conjugate(complexes a, number w) { return times(a, (number){w.re, -w.im}); }
+
+/* Twiddles: for n points exp(-2 pi i j k / n), j = 1, 2, 3 for each k < n / 4, and behind these the ones for n / 4 points.
+ * `half`: the upper half is zeros, and is not read. */
+INLINE void butterflies_there(complexes *x, int64_t n, const number *w, const int half) {
+    const int64_t q = n / 4;
+    for (int64_t k = 0; k < q; k++, w += 3) {
+        complexes a = x[k], b = x[k + q], c = half ? (complexes){} : x[k + 2 * q], d = half ? (complexes){} : x[k + 3 * q];
+        complexes even = half ? a : sum(a, c), odd = half ? a : difference(a, c);
+        complexes even2 = half ? b : sum(b, d), odd2 = times_i(half ? b : difference(b, d));
+        x[k] = sum(even, even2);
+        x[k + q] = times(difference(odd, odd2), w[0]);
+        x[k + 2 * q] = times(difference(even, even2), w[1]);
+        x[k + 3 * q] = times(sum(odd, odd2), w[2]);
+    }
+}
+
+/* `half`: of what comes out, the upper half is not written. */
+INLINE void butterflies_back(complexes *x, int64_t n, const number *w, const int half) {
+    const int64_t q = n / 4;
+    for (int64_t k = 0; k < q; k++, w += 3) {
+        complexes a = x[k], b = times_conjugate(x[k + q], w[0]);
+        complexes c = times_conjugate(x[k + 2 * q], w[1]), d = times_conjugate(x[k + 3 * q], w[2]);
+        complexes even = sum(a, c), odd = difference(a, c), even2 = sum(b, d), odd2 = times_i(difference(b, d));
+        x[k] = sum(even, even2);
+        x[k + q] = sum(odd, odd2);
+        if (!half) {
+            x[k + 2 * q] = difference(even, even2);
+            x[k + 3 * q] = difference(odd, odd2);
+        }
+    }
+}
+
+INLINE void pair(complexes *x) {
+    complexes a = x[0], b = x[1];
+    x[0] = sum(a, b);
+    x[1] = difference(a, b);
+}
+
+static void there(complexes *x, int64_t n, const number *w) {
+    if (n == 2) pair(x);
+    if (n < 4) return;
+    butterflies_there(x, n, w, 0);
+    for (int64_t i = 0; i < 4; i++) there(x + i * (n / 4), n / 4, w + 3 * (n / 4));
+}
+
+static void back(complexes *x, int64_t n, const number *w) {
+    if (n == 2) pair(x);
+    if (n < 4) return;
+    for (int64_t i = 0; i < 4; i++) back(x + i * (n / 4), n / 4, w + 3 * (n / 4));
+    butterflies_back(x, n, w, 0);
+}
+
+/* From the transform of N real numbers taken for n = N / 2 complex ones, to that of the real numbers' powers taken likewise.
+ * Points k and n - k, at places[k], go together; turns[k] = exp(2 pi i k / N). */
+INLINE void to_powers(const int squared, complexes *x, int64_t n, const int64_t (*places)[2], const number *turns,
+                      double exponent) {
+    for (int64_t k = 0; k <= n / 2; k++) {
+        complexes a = x[places[k][0]], b = x[places[k][1]];
+        vec cosine = all(turns[k].re), sine = all(turns[k].im);
+        complexes even = {a.re + b.re, a.im - b.im}, odd = {a.im + b.im, b.re - a.re};
+        odd = (complexes){fused(odd.re, cosine, odd.im * sine), fused(odd.im, cosine, -(odd.re * sine))};
+        complexes low = sum(even, odd), high = difference(even, odd);
+        vec p = fused(low.re, low.re, low.im * low.im), q = fused(high.re, high.re, high.im * high.im);
+        if (!squared) p = power(p, exponent), q = power(q, exponent);
+        vec both = p + q, apart = p - q;
+        x[places[k][0]] = (complexes){fused(-apart, sine, both), apart * cosine};
+        x[places[k][1]] = (complexes){fused(apart, sine, both), apart * cosine};
+    }
+}
+
+/* The circular autocorrelation, times some number, of 2 n real numbers in x, of which the upper half is 0; the lower half of
+ * that. The upper half of x need not be set where n is at least 4. */
+static void autocorrelate(complexes *x, int64_t n, const number *twiddles, const int64_t (*places)[2], const number *turns,
+                          double exponent) {
+    if (n < 4) {
+        there(x, n, twiddles);
+    } else {
+        butterflies_there(x, n, twiddles, 1);
+        for (int64_t i = 0; i < 4; i++) there(x + i * (n / 4), n / 4, twiddles + 3 * (n / 4));
+    }
+    if (exponent == 1)
+        to_powers(1, x, n, places, turns, exponent);
+    else
+        to_powers(0, x, n, places, turns, exponent);
+    if (n < 4) {
+        back(x, n, twiddles);
+    } else {
+        for (int64_t i = 0; i < 4; i++) back(x + i * (n / 4), n / 4, twiddles + 3 * (n / 4));
+        butterflies_back(x, n, twiddles, 1);
+    }
+}
+
+/* --- frames --- */
+
+/* Samples of the rows, windowed, to x; returns the largest, and to *lowest the smallest. */
+INLINE vec windowed(const double *const rows[LANES], const double *window, int64_t size, vec *x, vec *lowest) {
+    vec high = all(-INFINITY), low = all(INFINITY);
+    for (int64_t t = 0; t < size; t += 2) { /* sizes are even */
+        read_pair(rows, t, x + t);
+        UNROLL for (int i = 0; i < 2; i++) {
+            vec sample = bounded(x[t + i], -LIMIT, LIMIT);
+            sample = (vec)((lanes)sample & ((sample >= TINY) | (sample <= -TINY))) * all(window[t + i]);
+            high = larger(high, sample);
+            low = smaller(low, sample);
+            x[t + i] = sample;
+        }
+    }
+    *lowest = low;
+    return high;
+}
+
+INLINE vec magnitude(vec x) { return larger(x, -x); }
+
+/* Where x reaches over `above` or under -`below`, in one way or the other; 0 elsewhere. All times `scale`. */
+INLINE void clip(const enum clipping how, vec *x, int64_t size, vec above, vec below, vec scale) {
+    for (int64_t t = 0; t < size; t++) {
+        vec y = x[t];
+        lanes over = y >= above, under = y <= -below;
+        if (how == COMPRESS)
+            y = (vec)((lanes)y & (over | under)) * scale;
+        else if (how == CLIP_ONLY)
+            y = (vec)(((lanes)(y + below) & under) | ((lanes)(y - above) & over & ~under)) * scale;
+        else
+            y = (vec)(((lanes)all(-1.0) & under & (y < 0)) | ((lanes)all(1.0) & over & (y > 0)));
+        x[t] = y;
+    }
+}
+
+/* The samples of a row are the `held` ones of `history` and the n of `block` behind them; the first frame begins at `skip`,
+ * each next one `hop` later. Rows of the history lie history_stride apart. Samples from tail_from on, which are all of the
+ * block, go to `tail`, which may be where the history was. Tables are for transforms of `points` complex numbers, of which
+ * 2 points is at least 2 size - 1; the size is even. corrections (lags) are by what to multiply each lag. output is (rows,
+ * lags, number). */
+void rosafe_autocorrelations(const double *history, int64_t history_stride, int64_t held, const double *block, int64_t n,
+                             double *tail, int64_t tail_stride, int64_t tail_from, int64_t rows, int64_t skip,
+                             const double *window, int64_t size, int64_t hop, int64_t number_of_frames, int64_t how,
+                             double alpha, double exponent, int64_t points, const double *twiddles, const int64_t *places,
+                             const double *turns, const double *corrections, int64_t lags, double *output) {
+    uint32_t mode = denormals_off();
+    for (int64_t first = 0; first < rows * number_of_frames; first += LANES) {
+        complexes x[MOST_POINTS];
+        vec *samples = &x[0].re;
+        double joined[LANES][MOST_SIZE];
+        const double *from[LANES];
+        double *to[LANES];
+        for (int k = 0; k < LANES; k++) { /* lanes without a frame do the last one once more */
+            int64_t which = least(first + k, rows * number_of_frames - 1);
+            int64_t row = which / number_of_frames, frame = which % number_of_frames, start = skip + frame * hop;
+            to[k] = output + row * lags * number_of_frames + frame;
+            from[k] = block + row * n + start - held;
+            if (start < held) {
+                int64_t old = least(held - start, size);
+                memcpy(joined[k], history + row * history_stride + start, old * sizeof(double));
+                memcpy(joined[k] + old, block + row * n, (size - old) * sizeof(double));
+                from[k] = joined[k];
+            }
+        }
+        vec lowest, highest = windowed(from, window, size, samples, &lowest);
+        vec above = all(alpha) * magnitude(highest), below = all(alpha) * magnitude(lowest);
+        vec peak = larger(magnitude(highest), magnitude(lowest)), scale = all(1.0) / larger(peak, all(1e-300));
+        if (how == COMPRESS)
+            clip(COMPRESS, samples, size, above, below, scale);
+        else if (how == CLIP_ONLY)
+            clip(CLIP_ONLY, samples, size, above, below, scale);
+        else
+            clip(SIGN, samples, size, above, below, scale);
+        for (int64_t t = size; t < (points < 4 ? 2 : 1) * points; t++) samples[t] = (vec){};
+        autocorrelate(x, points, (const number *)twiddles, (const int64_t (*)[2])places, (const number *)turns, exponent);
+        vec least_of_all = larger(samples[0], all(1e-300)); /* silence: 0 at all lags */
+        vec norm = all(1.0) / least_of_all;
+        for (int64_t lag = 0; lag < lags; lag++) {
+            vec y = samples[lag] * norm * all(corrections[lag]);
+            UNROLL for (int k = 0; k < LANES; k++) to[k][lag * number_of_frames] = y[k];
+        }
+    }
+    for (int64_t i = 0; i < rows; i++)
+        memcpy(tail + i * tail_stride, block + i * n + (tail_from - held), (held + n - tail_from) * sizeof(double));
+    denormals_as(mode);
+}

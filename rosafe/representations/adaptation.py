@@ -1,0 +1,238 @@
+"""The adaptation stage: feedback loops that emphasise onsets, as the auditory nerve does.
+
+* D. Püschel (1988), "Prinzipien der zeitlichen Analyse beim Hören", doctoral thesis, Universität Göttingen
+* T. Dau, D. Püschel and A. Kohlrausch (1996), "A quantitative model of the 'effective' signal processing in the
+  auditory system. I. Model structure", J. Acoust. Soc. Am. 99, 3615-3622
+* T. Dau, B. Kollmeier and A. Kohlrausch (1997), "Modeling auditory processing of amplitude modulation. I. Detection and
+  masking with narrow-band carriers", J. Acoust. Soc. Am. 102, 2892-2905: the limit of the overshoot
+* J. Breebaart, S. van de Par and A. Kohlrausch (2001), "Binaural processing model based on contralateral inhibition.
+  I. Model structure", J. Acoust. Soc. Am. 110, 1074-1088
+* J. van Dorp Schuitman, D. de Vries and A. Lindau (2013), "Deriving content-specific measures of room acoustic
+  perception using a binaural, nonlinear auditory model", J. Acoust. Soc. Am. 133, 1572-1585
+* E. Terhardt (1979), "Calculating virtual pitch", Hear. Res. 1, 155-182: the threshold of hearing
+* M. L. Jepsen, S. D. Ewert and T. Dau (2008), "A computational model of human auditory signal processing and
+  perception", J. Acoust. Soc. Am. 124, 422-438: behind DRNL
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from rosafe.dsp import kernels
+from rosafe.dsp.guard import LIMIT, FloatArray
+from rosafe.dsp.signal import Signal
+from rosafe.dsp.stage import Stage
+from rosafe.vocabulary.parameter import Parameter
+from rosafe.vocabulary.representation import Representation
+
+FULL_SCALE_DB = 100.0  # SPL of sound whose rms is 1, and model units that it settles at
+GREATEST_THRESHOLD_DB = 99.0  # from 100 on, there is nothing between threshold and full scale
+DRNL_FACTOR = 1e5  # of the squares: (10**(50 / 20))**2
+LEAST_LIMIT = 1e-30  # stands for no room above 1 at all
+LEAST, MOST = 1e-100, 1e100  # bounds of the quotients, far beyond sound: no state becomes 0 or infinite
+
+TAU = (0.005, 0.05, 0.129, 0.253, 0.5)
+EVEN_TAU = tuple(np.linspace(0.005, 0.5, 5).tolist())
+TERHARDT = "adt_vandorpschuitman"
+SETS: dict[str, dict[str, Any]] = {
+    "adt_dau": {"adpt_lim": 10.0, "adpt_mindB": 0.0, "adpt_tau": TAU},
+    "adt_puschel": {"adpt_lim": 0.0, "adpt_mindB": 0.0, "adpt_tau": EVEN_TAU},
+    "adt_breebaart": {"adpt_lim": 10.0, "adpt_mindB": 0.0, "adpt_tau": EVEN_TAU},
+    TERHARDT: {"adpt_lim": 0.0, "adpt_tau": TAU},
+}
+
+
+class Adaptation(Stage):
+    """Adaptation loops, (2, C, N) to (2, C, N) in model units: 0 at the threshold, 100 for steady 100 dB SPL (rms 1).
+
+    With v = max(x, x_min), x_min = 10**((adpt_mindB - 100) / 20), for each time constant tau in turn
+
+    * v = v / s
+    * v = 1 + m tanh((v - 1) / m) where v > 1 and adpt_lim > 1; m = (1 - s_rest**2) adpt_lim - 1
+    * s = a s + (1 - a) v, a = exp(-1 / (tau fs))
+
+    and y = 100 (v - K) / (1 - K). The loops start from rest at x_min, s_rest = x_min**(1/2), x_min**(1/4)..., of which
+    K is the last: it is what x_min comes to. Papers have 2 m / (1 + exp(-2 (v - 1) / m)) - m + 1 for the limit, which
+    is the same.
+
+    A name in `adpt_model` puts the values of a published set in the place of the other three; an empty one leaves these
+    as they are. adt_vandorpschuitman has a threshold of its own for each channel, that of hearing (at most 99 dB),
+    and leaves adpt_mindB alone. Any change begins anew, from rest.
+
+    Behind a DRNL filterbank, x becomes (10**(50/20) x)**2 first.
+    """
+
+    REPRESENTATION = Representation(
+        kind="adaptation",
+        doc="Adaptation loops",
+        parent="ihc",
+        axes=("ear", "channel", "time"),
+        unit="MU",
+        parameters=(
+            Parameter(
+                "adpt_lim",
+                "double",
+                10.0,
+                "Limit of the overshoot, as ratio of the onset's response to the steady one; 1 or less: none",
+                0.0,
+                1e6,
+            ),
+            Parameter("adpt_mindB", "double", 0.0, "Quietest audible level (dB SPL)", -300.0, 99.0, unit="dB"),
+            Parameter(
+                "adpt_tau",
+                "sequence<double>",
+                TAU,
+                "Time constant of each loop (s)",
+                0.0,
+                3600.0,
+                open_minimum=True,
+                least=1,
+                most=kernels.MOST_LOOPS,
+                unit="s",
+            ),
+            Parameter(
+                "adpt_model",
+                "string",
+                "",
+                "Published set that overrides the other three; empty: none",
+                choices=(*SETS, ""),
+                spellings={"adt_breebart": "adt_breebaart"},
+            ),
+        ),
+        port_doc="What the adaptation loops put out (model units)",
+    )
+
+    _state: FloatArray | None  # (n, 2, C); None is rest
+
+    def process(self, block: FloatArray, extra: FloatArray | None = None) -> FloatArray:
+        samples = self._checked(block)
+        loops, channels = self._loops, samples.shape[1]
+        if len(loops.thresholds) not in (1, channels):
+            raise ValueError(f"block: {channels} channels, but thresholds of {len(loops.thresholds)}")
+        if self._state is None or self._state.shape[1:] != samples.shape[:-1]:
+            rest = np.broadcast_to(loops.rest[:, np.newaxis], (len(loops.rest), 2, channels))
+            self._state = np.array(rest, order="C")
+        if kernels.compiled():
+            return kernels.adaptation(
+                samples,
+                loops.factor,
+                loops.thresholds,
+                loops.offsets,
+                loops.gains,
+                loops.retentions,
+                loops.limits,
+                self._state,
+            )
+        return adapt(samples, loops, self._state)
+
+    def reset(self) -> None:
+        self._state = None
+
+    def _received(self, before: Signal) -> None:
+        self._build(self._values, frozenset())
+
+    def _merge(self, checked: dict[str, Any]) -> dict[str, Any]:
+        values = super()._merge(checked)
+        published = SETS.get(values["adpt_model"], {})
+        return {**values, **{name: self._parameter(name).check(value) for name, value in published.items()}}
+
+    def _build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
+        threshold = np.array([values["adpt_mindB"]])
+        if values["adpt_model"] == TERHARDT:
+            if not self.given.center_frequencies:
+                raise ValueError(f"adpt_model: {TERHARDT} needs channels of known frequencies")
+            threshold = np.minimum(hearing_threshold(np.array(self.given.center_frequencies)), GREATEST_THRESHOLD_DB)
+        self._loops = Loops.design(
+            self.sample_rate,
+            threshold,
+            values["adpt_tau"],
+            values["adpt_lim"],
+            DRNL_FACTOR if self.given.filterbank == "drnl" else 0.0,
+        )
+        self._state = None
+
+
+class Loops(NamedTuple):
+    """n adaptation loops, for C channels of different thresholds, or with C = 1 for any number of equal ones.
+
+    Attributes
+    ----------
+    factor : float
+        0, or what the squares of the samples are multiplied with first.
+    thresholds, offsets, gains : ndarray (C,)
+        Smaller samples are taken as the threshold; what comes out, less the offset, is multiplied with the gain.
+    retentions, limits : ndarray (n,)
+        a and m of each loop. Without limits, m is 0 throughout.
+    rest : ndarray (n, C)
+        The states before the first sample.
+    """
+
+    factor: float
+    thresholds: FloatArray
+    offsets: FloatArray
+    gains: FloatArray
+    retentions: FloatArray
+    limits: FloatArray
+    rest: FloatArray
+
+    @classmethod
+    def design(
+        cls, sample_rate: float, threshold_db: FloatArray, tau: list[float], overshoot: float, factor: float
+    ) -> Loops:
+        """For thresholds (C,) in dB SPL; with limits there must be one threshold."""
+        log_threshold = (threshold_db - FULL_SCALE_DB) / 20 * math.log(10)
+        logs = log_threshold * 0.5 ** np.arange(1, len(tau) + 1)[:, np.newaxis]
+        limits = np.zeros(len(tau))
+        if overshoot > 1:  # m tanh(u / m) does not depend on the sign of m
+            limits = np.maximum(np.abs(-np.expm1(2 * logs[:, 0]) * overshoot - 1), LEAST_LIMIT)
+        with np.errstate(divide="ignore", over="ignore"):  # a time constant may be nothing at all
+            retentions = np.exp(-1 / (np.array(tau) * sample_rate))
+        return cls(
+            factor,
+            np.exp(log_threshold),
+            np.exp(logs[-1]),
+            -100 / np.expm1(logs[-1]),
+            retentions,
+            limits,
+            np.exp(logs),
+        )
+
+
+def hearing_threshold(frequencies: FloatArray) -> FloatArray:
+    """Threshold of hearing in dB SPL at `frequencies` in Hz (Terhardt 1979)."""
+    f = frequencies / 1000
+    return 3.64 * f**-0.8 - 6.5 * np.exp(-0.6 * (f - 3.3) ** 2) + 0.001 * f**4
+
+
+def adapt(samples: FloatArray, loops: Loops, state: FloatArray) -> FloatArray:
+    """What `loops` make of (2, C, N); their `state` (n, 2, C) goes on.
+
+    All loops work at a time, each one on a sample later than the next one's: (n, 2, C) numbers in one operation.
+    """
+    x = np.clip(samples, -LIMIT, LIMIT)
+    if loops.factor:
+        x = x * x * loops.factor
+    x = np.moveaxis(np.maximum(x, loops.thresholds[:, np.newaxis]), -1, 0)
+    output = np.empty(x.shape)
+    number, count = len(x), len(state)
+    a, b, m = (values[:, np.newaxis, np.newaxis] for values in (loops.retentions, 1 - loops.retentions, loops.limits))
+    passed = np.empty((count + 1, *x.shape[1:]))  # what comes to each loop, and what leaves the last
+    for step in range(number + count - 1 if number else 0):
+        first, end = max(0, step - number + 1), min(count, step + 1)  # the loops that have something to do
+        busy = slice(first, end)
+        if first == 0:
+            passed[0] = x[step]
+        v = np.maximum(passed[busy] / state[busy], LEAST)
+        if m.any():
+            over = np.maximum(v, 1) - 1
+            v = np.minimum(v, 1) + m[busy] * np.tanh(over / m[busy])
+        else:
+            v = np.minimum(v, MOST)
+        state[busy] = a[busy] * state[busy] + b[busy] * v
+        passed[first + 1 : end + 1] = v
+        if end == count:
+            output[step - count + 1] = passed[-1]
+    return np.ascontiguousarray(np.moveaxis((output - loops.offsets) * loops.gains, 0, -1))
