@@ -19,7 +19,7 @@ from actionlib_msgs.msg import GoalID
 from rosgraph.network import encode_ros_handshake_header, read_ros_handshake_header
 from std_msgs.msg import Header
 
-from rosafe.ros import door
+from rosafe.component import door
 from tests.harness import Graph, proc, wait_for
 from tests.ros.attacker import HUGE, FakePublisher, Target, closed, length, pour, publisher_header
 from tests.ros.session import Session, own_node
