@@ -110,15 +110,15 @@ def _admit(sock: socket.socket, address: Any, opening: bytes, rest: bytes) -> No
         problem = _give_to_owner(sock, address, header, rest)
         if problem:
             write_ros_handshake_header(sock, {"error": problem})
-            _report("TCPROS", address[0], problem, "header")
     except OSError:
-        problem = "it has left"
+        sock.close()  # it has left
+        return
     except Exception as fault:  # rospy's of many kinds, and its handlers fail where a topic is closed meanwhile
         problem = f"{type(fault).__name__}: {fault}"
-        if not rospy.core.is_shutdown_requested():
-            _report("TCPROS", address[0], problem, "header")
     if problem:
         sock.close()
+        if not rospy.core.is_shutdown_requested():
+            _report("TCPROS", address[0], problem, "header")
 
 
 def _give_to_owner(sock: socket.socket, address: Any, header: Mapping[str, str], rest: bytes) -> str | None:

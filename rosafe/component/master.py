@@ -39,10 +39,14 @@ def set_local_defaults(environ: MutableMapping[str, str] = os.environ) -> None:
 
 def is_local(uri: str) -> bool:
     """Whether `uri` names this machine by a loopback address."""
+    return _is_loopback(_host(uri))
+
+
+def _host(uri: str) -> str:
     try:
-        return _is_loopback(urlsplit(uri).hostname or "")
+        return urlsplit(uri).hostname or ""
     except ValueError:
-        return False
+        return ""
 
 
 def _is_loopback(host: str) -> bool:
@@ -65,7 +69,7 @@ def unreachable(environ: Mapping[str, str] = os.environ) -> str:
         wrong = "which is no address to call a node at"
     elif not any(map(_is_own, found)):
         wrong = "which is no address of this machine: nobody can call a node"
-    elif _is_loopback(host) and not any(map(_is_own, _addresses(urlsplit(uri).hostname or ""))):
+    elif _is_loopback(host) and not any(map(_is_own, _addresses(_host(uri) or host))):
         wrong = f"where only this machine can call a node, but the master is at {uri}"
     else:
         return ""

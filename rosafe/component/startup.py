@@ -143,6 +143,7 @@ def _start(
             os.environ[variable] = mappings[name]
     memory.bound()
     master.set_local_defaults()
+    master.check_address(os.environ["ROS_MASTER_URI"])  # a wrong one does not get better
     doubt = master.unreachable()
     if doubt:
         print(f"{component.name}-ros: warning: {doubt}", file=sys.stderr, flush=True)
@@ -177,7 +178,6 @@ def _await_master(uri: str, received: list[int], patient: str) -> None:
 
     The program that is `patient` says so and waits for ever; a signal is `_Ended` to it.
     """
-    master.check_address(uri)  # a wrong one does not get better
     deadline = time.monotonic() + MASTER_SECONDS
     told = False
     while True:
