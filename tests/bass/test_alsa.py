@@ -465,7 +465,7 @@ def test_route_plugin_swaps_the_ears(real_alsa: Path) -> None:
         ("hw:7,0", "e_device", "hw:7,0: No such file or directory (Cannot get card index for 7;"),
         ("nosuch", "e_device", "Unknown PCM nosuch"),
         ("file", "e_device", "file is not defined"),
-        ("", "e_device", "is no name of a PCM"),
+        ("", "e_device", "no name of a PCM"),
         ("two\nlines", "e_device", "in no device's name"),
         ("floating", "e_hwparams", "no format S32_LE, it offers FLOAT64_BE, FLOAT64_LE, FLOAT_BE, FLOAT_LE: plug:f"),
         ("sixteen", "e_hwparams", "sixteen: no format S32_LE, it offers S16_LE: plug:sixteen converts"),
