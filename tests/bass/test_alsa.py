@@ -276,7 +276,7 @@ def test_delay_that_changes_in_a_standstill(pcm: type[FakePcm], change: float, l
 def test_plugins_see_what_the_poll_said(pcm: type[FakePcm], monkeypatch: pytest.MonkeyPatch) -> None:
     """One whose descriptor is ready at once, and that has sound once it was told of that."""
     told: list[list[tuple[int, int]]] = []
-    monkeypatch.setattr(pcm, "polldescriptors_revents", lambda self, ready: told.append(ready) or 1)
+    monkeypatch.setattr(pcm, "polldescriptors_revents", lambda self, ready: told.append(ready))
     read = pcm.read
 
     def read_when_told(self: FakePcm) -> tuple[int, bytes]:

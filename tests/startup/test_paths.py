@@ -45,7 +45,7 @@ def _link(folder: Path) -> None:
 @pytest.mark.parametrize("make", [_link, Path.touch, os.mkfifo], ids=["link", "file", "fifo"])
 def test_what_is_no_folder_is_refused(folder: Path, make: Callable[[Path], None]) -> None:
     make(folder)
-    with pytest.raises(OSError, match="not private|File exists"):
+    with pytest.raises(OSError, match=r"not private|File exists"):
         private_temporary()
 
 
