@@ -1,4 +1,4 @@
-"""Adaptation loops: the reference vectors, the formulas sample by sample, and what is known of steady sound and onsets."""
+"""Adaptation loops: the reference vectors, the formulas sample by sample, steady sound, onsets, and every change."""
 
 from __future__ import annotations
 
