@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -11,44 +10,52 @@ from typing import Any
 
 import numpy as np
 
-from rosafe.dsp.framing import FramedStage, Framing
 from rosafe.interface import KINDS, ComponentError
-from rosafe.tree.processor import Processor
-from rosafe.tree.roles import Observer
+from rosafe.tree import sizes
+from rosafe.tree.block import Block
+from rosafe.tree.processor import Observer, Processor
 from rosafe.tree.tree import Tree
-from rosafe.tree.zone import Block
+from rosafe.vocabulary.representation import Part
 
 
-def lags(count: int, sample_rate: float) -> np.ndarray:
-    """The `count` lags of a cross-correlation, (count,) in seconds, zero in the middle."""
-    return np.arange(-(count // 2), count // 2 + 1) / sample_rate
+def output_parts(kind: str) -> dict[str, Part]:
+    """The arrays of a kind of processor by their names in a result: the kind, or with the part's name where several."""
+    parts = KINDS[kind].parts
+    return {kind if len(parts) == 1 else f"{kind}_{part.name}": part for part in parts}
 
 
 class _GatedSource:
-    """Feeds blocks to the tree, one after the other, once `open` says that the whole tree stands."""
+    """Feeds blocks to the tree, one after the other, once `let_flow` says that the whole tree stands."""
 
     def __init__(self, blocks: Iterable[np.ndarray], sample_rate: float) -> None:
         self.sample_rate = sample_rate
+        self.ended = False
         self._blocks = iter(blocks)
         self._frames = 0
-        self._stopped = False
-        self._gate = threading.Event()
+        self._flowing = False
+        self._wake: Callable[[], None] = lambda: None
 
-    def open(self) -> None:
+    def open(self, wake: Callable[[], None]) -> None:
+        self._wake = wake
+
+    def let_flow(self) -> None:
         """Let the signal flow."""
-        self._gate.set()
+        self._flowing = True
+        self._wake()
 
     def read(self) -> tuple[np.ndarray, int] | None:
-        self._gate.wait()
-        block = None if self._stopped else next(self._blocks, None)
+        if not self._flowing or self.ended:
+            return None
+        block = next(self._blocks, None)
         if block is None:
+            self.stop()
             return None
         self._frames += block.shape[-1]
         return block, self._frames
 
     def stop(self) -> None:
-        self._stopped = True
-        self._gate.set()
+        self.ended = True
+        self._wake()
 
 
 class _Listener:
@@ -58,6 +65,7 @@ class _Listener:
         self._wanted = frozenset(wanted)
         self._source = source
         self._keep = keep
+        self._lock = threading.Lock()
         self.error: BaseException | None = None
 
     def added(self, processor: Processor) -> None:
@@ -72,7 +80,8 @@ class _Listener:
 
     def ended(self, processor: Processor) -> None:
         if processor.error is not None:
-            self.error = self.error or processor.error
+            with self._lock:
+                self.error = self.error or processor.error
             self._source.stop()
 
 
@@ -88,10 +97,10 @@ class Chain:
     parameters : mapping
         From `rosafe.interface.arguments.check_parameters`.
     outputs : sequence of str
-        From `rosafe.interface.arguments.check_outputs`.
+        Kinds, from `rosafe.interface.arguments.check_outputs`.
     keep : callable
-        Called with the output's name and each block of it, on a thread of that output's own, while the chain goes on
-        with the next block; it does not go on beyond that, so memory is bounded. What it raises ends the run.
+        Called with the kind and each block of it, in their order, while the chain goes on with the next block; it does
+        not go on beyond that, so memory is bounded. What it raises ends the run.
 
     Raises
     ------
@@ -112,12 +121,14 @@ class Chain:
         self._listener = _Listener(outputs, self._source, keep)
         self._tree = Tree(self._listener)
         self._processors: dict[str, Processor] = {}
+        self._longest: dict[str, Any] = {}  # of what is derived from parameters: the most elements there will be
         try:
             with _as_value_error():
                 self._build(_needed(outputs), parameters)
         except BaseException:
             self.close()
             raise
+        self._remember()
 
     def _build(self, needed: set[str], values: Mapping[str, Any]) -> None:
         for kind in KINDS.values():  # parents come first in the table
@@ -131,6 +142,13 @@ class Chain:
         """Change a (checked) parameter before block `block`; the blocks of successive calls ascend. Or ValueError."""
         with _as_value_error():
             self._tree.schedule(block, name, value)
+        self._remember()
+
+    def _remember(self) -> None:
+        for processor in self._processors.values():
+            for name, value in processor.derived().items():
+                if np.size(value) >= np.size(self._longest.get(name, ())):
+                    self._longest[name] = value
 
     def observe(self, observer: Observer) -> None:
         """Tell `observer` of every state that a processor enters."""
@@ -138,7 +156,7 @@ class Chain:
 
     def run(self) -> None:
         """Let the signal flow and wait for its end; raises what the first processor failed with."""
-        self._source.open()
+        self._source.let_flow()
         for processor in self._processors.values():
             processor.join()
         if self._listener.error is not None:
@@ -147,8 +165,7 @@ class Chain:
     def close(self) -> None:
         """End the run, if it is not over, and all threads."""
         self._tree.stop()
-        for processor in self._processors.values():
-            processor.join()
+        self._tree.join()
 
     def __enter__(self) -> Chain:
         return self
@@ -160,43 +177,42 @@ class Chain:
 
     # --- what it is ---
 
-    def rows(self, output: str) -> tuple[int, ...]:
-        """Leading shape of an output, such as (2, channels)."""
-        return self._processors[output].rows
+    def shapes(self, kind: str, frames: int) -> dict[str, tuple[int, ...]]:
+        """Shape of each part of an output, for a signal of so many frames if no parameter changes on the way."""
+        processor = self._processors[kind]
+        count = self._count(processor, frames)
+        return dict(zip(output_parts(kind), ((*rows, count) for rows in processor.part_rows), strict=True))
 
-    def shape(self, output: str, frames: int) -> tuple[int, ...]:
-        """Shape of an output for a signal of so many frames, if no parameter changes on the way."""
-        stage = self._processors[output].stage
-        if isinstance(stage, FramedStage):
-            frames = Framing.design(stage.sample_rate, stage.PREFIX, stage.parameters).complete(frames)
-        return (*self.rows(output), frames)
+    def _count(self, processor: Processor, frames: int) -> int:
+        """How many frames it puts out for so many of the signal."""
+        return processor.stage.complete(frames if processor.parent is None else self._count(processor.parent, frames))
 
     def largest_block(self, frames: int) -> tuple[str, int]:
         """Which processor puts out most for one block of so many frames, and how many bytes that can be."""
-        sizes = {}
-        for kind, processor in self._processors.items():
-            stage = processor.stage
-            hop = stage.sample_rate / stage.output_rate
-            sizes[kind] = 8 * math.prod(processor.rows) * math.ceil(frames / hop)
-        kind = max(sizes, key=lambda kind: sizes[kind])
-        return kind, sizes[kind]
+        seconds = frames / self.sample_rate
+        taken = {kind: sizes.output_size(p.stage, p.given_rows, seconds) for kind, p in self._processors.items()}
+        kind = max(taken, key=lambda kind: taken[kind])
+        return kind, int(taken[kind])
 
     def describe(self) -> dict[str, Any]:
-        """Axes and rates of what runs: `fb_cfHz` (Hz), `cc_lags` (s), `ild_frameRate` and its like (Hz)."""
+        """Axes and rates of what runs: `fb_cfHz` (Hz), `cc_lags` (s), `ild_frameRate` and its like (Hz).
+
+        What is a parameter is told as it is at last, what follows from parameters as where it is longest.
+        """
         described: dict[str, Any] = {}
         for kind, processor in self._processors.items():
-            if kind == "gammatone":
-                described["fb_cfHz"] = np.array(processor.parameters()["fb_cfHz"])
-            if isinstance(processor.stage, FramedStage):
+            values = {**processor.parameters(), **self._longest}
+            for name in processor.representation.coordinates:
+                words = any(isinstance(value, str) for value in values[name])
+                described[name] = list(values[name]) if words else np.array(values[name], np.float64)
+            if processor.signal.framed:
                 described[f"{kind}_frameRate"] = processor.rate
-            if kind == "crossCorrelation":
-                described["cc_lags"] = lags(processor.rows[1], self.sample_rate)
         return described
 
 
 def _needed(outputs: Iterable[str]) -> set[str]:
     """The processors to run for `outputs`."""
-    needed = {"input"}
+    needed = {kind.kind for kind in KINDS.values() if not kind.parent}
     for kind in outputs:
         while kind:
             needed.add(kind)

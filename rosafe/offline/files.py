@@ -13,13 +13,13 @@ import numpy as np
 
 from rosafe.interface import KINDS
 from rosafe.interface.arguments import check_outputs, check_parameters
-from rosafe.offline.chain import Chain
+from rosafe.offline.chain import Chain, output_parts
 from rosafe.offline.npz import NpzWriter
 from rosafe.offline.process import DEFAULT_BLOCK
 from rosafe.output import OutputError, new_file
 from rosafe.sound.audiofile import AudioFile, AudioFileError
-from rosafe.tree.tree import MAX_BYTES
-from rosafe.tree.zone import Block
+from rosafe.tree import sizes
+from rosafe.tree.block import Block
 
 _DEFAULTS = {parameter.name: parameter.default for kind in KINDS.values() for parameter in kind.parameters}
 
@@ -93,7 +93,8 @@ def _stream(
     telling = threading.Lock()
 
     def keep(kind: str, block: Block) -> None:
-        writer.append(kind, block.data)
+        for name, data in zip(output_parts(kind), block.parts, strict=True):
+            writer.append(name, data)
         with telling:
             done[kind] = block.next_index
             progress(min(done.values()), file.frames)
@@ -108,7 +109,7 @@ def _stream(
                 "parameters": json.dumps({**_DEFAULTS, **values}),
                 **chain.describe(),
             },
-            {kind: chain.shape(kind, file.frames) for kind in wanted},
+            {name: shape for kind in wanted for name, shape in chain.shapes(kind, file.frames).items()},
         )
         _check_room(descriptor, writer.size)
         chain.run()
@@ -127,9 +128,9 @@ def _blocks(file: AudioFile, block_frames: int) -> Iterator[np.ndarray]:
 
 def _check_memory(kind: str, size: int) -> None:
     """ValueError where one block of output would fill the memory; several are under way at the same time."""
-    if size > MAX_BYTES:
+    if size > sizes.MAX_BYTES:
         raise ValueError(
-            f"{kind}: one block of output would take {size / 1e9:.1f} GB, allowed are {MAX_BYTES / 1e9:.1f} GB; "
+            f"{kind}: one block of output would take {size / 1e9:.1f} GB, allowed are {sizes.MAX_BYTES / 1e9:.1f} GB; "
             "take fewer channels or lags, or a smaller --block"
         )
 

@@ -4,20 +4,19 @@ from __future__ import annotations
 
 import itertools
 import math
-import os
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from rosafe.interface import REQUIRED, Parameter
+from rosafe.dsp.stage import SAMPLE_RATE
+from rosafe.interface import KINDS
 from rosafe.interface.arguments import check_change, check_outputs, check_parameters
-from rosafe.offline.chain import Chain, lags
-from rosafe.tree.zone import Block
+from rosafe.offline.chain import Chain, output_parts
+from rosafe.tree import sizes
+from rosafe.tree.block import Block
 
 DEFAULT_BLOCK = 12000  # frames, as InputProc's
-
-_SAMPLE_RATE = Parameter("sample_rate", "double", REQUIRED, "Samples per second (Hz)", 0.0, 1e9, open_minimum=True)
 
 
 def process(
@@ -64,7 +63,7 @@ def process(
         parameter or output that does not exist, a value of the wrong type or out of its range.
     """
     samples = _checked_signal(signal)
-    rate = _SAMPLE_RATE.check(sample_rate)
+    rate = SAMPLE_RATE.check(sample_rate)
     ends = _block_ends(block_frames, samples.shape[1])
     values = {"in_doNormalize": samples.dtype == np.int32, **check_parameters(parameters)}
     changes = _checked_modifications(modifications)
@@ -73,25 +72,27 @@ def process(
     gathered: dict[str, _Gathered] = {}
 
     def keep(kind: str, block: Block) -> None:
-        gathered[kind].add(block.data)
+        for name, data in zip(output_parts(kind), block.parts, strict=True):
+            gathered[name].add(data)
 
     blocks = (samples[:, first:end] for first, end in itertools.pairwise((0, *ends)))
     with Chain(blocks, rate, values, wanted, keep) as chain:
-        sizes = [_size(chain, wanted, ends)]
-        shapes = {kind: chain.shape(kind, samples.shape[1]) for kind in wanted}
+        taken = [_size(chain, wanted, ends)]
+        shapes = {kind: chain.shapes(kind, samples.shape[1]) for kind in wanted}
         for block, name, value in changes:
             if block < len(ends):
                 chain.schedule(block, name, value)
-                sizes.append(_size(chain, wanted, ends))
-        _check_memory(max(sizes))
-        gathered.update((kind, _Gathered(kind, shape)) for kind, shape in shapes.items())
+                taken.append(_size(chain, wanted, ends))
+        _check_memory(max(taken))
+        for kind in wanted:
+            for name, part in output_parts(kind).items():
+                middle = part.axes.index(KINDS[kind].centred) if KINDS[kind].centred in part.axes else -1
+                gathered[name] = _Gathered(shapes[kind][name], middle)
         chain.run()
         results: dict[str, Any] = {}
-        for kind in wanted:
-            results[kind] = gathered.pop(kind).joined()
+        for name in list(gathered):
+            results[name] = gathered.pop(name).joined()
         results.update(chain.describe())
-        if "crossCorrelation" in results:
-            results["cc_lags"] = lags(results["crossCorrelation"].shape[1], rate)
         return results
 
 
@@ -151,13 +152,13 @@ def _size(chain: Chain, wanted: list[str], ends: list[int]) -> int:
     """Bytes of the largest thing there will be at a time: all results, or one block of what is not kept."""
     frames = ends[-1] if ends else 0
     largest_block = max((end - first for first, end in itertools.pairwise((0, *ends))), default=0)
-    results = sum(8 * math.prod(chain.shape(kind, frames)) for kind in wanted)
+    results = sum(8 * math.prod(shape) for kind in wanted for shape in chain.shapes(kind, frames).values())
     return max(results, chain.largest_block(largest_block)[1])
 
 
 def _check_memory(size: int) -> None:
     """ValueError where `size` bytes are more than the machine has: there the kernel would end the process."""
-    memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    memory = sizes.machine_memory()
     if size > memory:
         raise ValueError(
             f"outputs: they would take {size / 1e9:.1f} GB of memory, this machine has {memory / 1e9:.1f} GB; "
@@ -170,14 +171,14 @@ class _Gathered:
 
     Parameters
     ----------
-    kind : str
-        Of the processor.
     shape : tuple of int
         Of the whole, if no parameter changes on the way. From where one does, blocks wait for the end.
+    middle : int
+        The axis whose middle stays where it is where a change alters its length; -1 for none.
     """
 
-    def __init__(self, kind: str, shape: tuple[int, ...]) -> None:
-        self._kind = kind
+    def __init__(self, shape: tuple[int, ...], middle: int) -> None:
+        self._middle = middle
         self._whole = np.empty(shape)
         self._filled = 0  # frames
         self._begun = False  # a block without frames has rows, too
@@ -198,13 +199,13 @@ class _Gathered:
         if not self._others and self._filled == self._whole.shape[-1]:
             return self._whole
         first = [self._whole[..., : self._filled]] if self._begun else []
-        return _join(self._kind, [*first, *self._others])
+        return _join(self._middle, [*first, *self._others])
 
 
-def _join(kind: str, blocks: list[np.ndarray]) -> np.ndarray:
+def _join(middle: int, blocks: list[np.ndarray]) -> np.ndarray:
     """All blocks along the last axis. Where the leading shape changed on the way, the largest rules.
 
-    Lags are centred on lag zero, channels aligned at the first; what lies outside is 0.
+    The axis `middle` is aligned at its middle, others at their first; what lies outside is 0.
     """
     if all(block.shape[:-1] == blocks[0].shape[:-1] for block in blocks):
         return np.concatenate(blocks, axis=-1)
@@ -214,9 +215,9 @@ def _join(kind: str, blocks: list[np.ndarray]) -> np.ndarray:
     for block in blocks:
         place = [slice(0, size) for size in block.shape]
         place[-1] = slice(at, at + block.shape[-1])
-        if kind == "crossCorrelation":
-            first = (shape[1] - block.shape[1]) // 2
-            place[1] = slice(first, first + block.shape[1])
+        if middle >= 0:
+            first = (shape[middle] - block.shape[middle]) // 2
+            place[middle] = slice(first, first + block.shape[middle])
         joined[tuple(place)] = block
         at += block.shape[-1]
     return joined

@@ -131,13 +131,14 @@ class StateMachine:
     def begin(self) -> Block | None:
         """Somebody works on it from now on. Returns the block that is taken, if it was waiting for one."""
         self.at_work = True
+        if self.state is not State.WAIT_EXEC:
+            return None
         self.called = False
-        taken = self._token
-        if taken is not None and self.state is State.WAIT_EXEC:
-            self._token, self._reading = None, self.parent
+        taken, self._token = self._token, None
+        if taken is not None:
+            self._reading = self.parent
             self._enter(State.EXEC, taken.number)
-            return taken
-        return None
+        return taken
 
     def read(self, number: int) -> None:
         """The input has read its block of that number, and works on it."""

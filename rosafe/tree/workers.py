@@ -155,7 +155,9 @@ class Workers:
     def _start_worker(self) -> None:
         names = (f"{WORKER} {number}" for number in itertools.count(1))
         name = next(name for name in names if name not in self._threads)
-        self._start(name, functools.partial(self._run, name))
+        worker = _Worker()
+        self._start(name, functools.partial(self._run, name, worker))
+        self._workers.append(worker)
         self._idle += 1
         self._called += 1
 
@@ -164,10 +166,8 @@ class Workers:
         thread.start()
         self._threads[name] = thread
 
-    def _run(self, name: str) -> None:
-        me = _Worker()
+    def _run(self, name: str, me: _Worker) -> None:
         with self.lock:
-            self._workers.append(me)
             self._idle -= 1
             self._called -= 1
             while (task := self._next()) is not None:

@@ -11,7 +11,7 @@ import pytest
 from rosafe.representations import STAGES
 from rosafe.representations.haircell import InnerHairCell
 from rosafe.tree.processor import Processor
-from rosafe.tree.roles import State
+from rosafe.tree.states import State
 from rosafe.tree.tree import Tree
 from tests.dsp.bare import joined
 from tests.harness import wait_for
@@ -27,7 +27,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
     original = STAGES["gammatone"].process
 
     def process(self: Any, block: np.ndarray) -> np.ndarray:
-        answers.append(self.provide_envelope)
+        answers.append("envelope" in self.provide)
         return original(self, block)
 
     monkeypatch.setattr(STAGES["gammatone"], "process", process)
