@@ -17,6 +17,7 @@ from rosafe.dsp import kernels
 from rosafe.dsp.gammatone import GammatoneBank
 from rosafe.dsp.guard import LIMIT
 from rosafe.dsp.kernels import build
+from rosafe.dsp.signal import Signal
 from rosafe.dsp.stage import Stage
 from rosafe.dsp.windows import NAMES
 from rosafe.representations import STAGES
@@ -68,11 +69,13 @@ def agree(got: Iterable[FloatArray], expected: Iterable[FloatArray], tolerance: 
     np.testing.assert_allclose(got, expected, rtol=0, atol=tolerance * largest)
 
 
-def check(level: int, kind: str, parameters: dict[str, Any], blocks: list[FloatArray]) -> None:
+def check(
+    level: int, kind: str, parameters: dict[str, Any], blocks: list[FloatArray], given: Signal | float = RATE
+) -> None:
     """The kernels give what the twins give; so does a stage that goes back and forth between the two."""
-    expected = outputs(STAGES[kind](RATE, **parameters), blocks, [TWINS] * len(blocks))
-    agree(outputs(STAGES[kind](RATE, **parameters), blocks, [level] * len(blocks)), expected)
-    agree(outputs(STAGES[kind](RATE, **parameters), blocks, [level, TWINS, TWINS, level] * len(blocks)), expected)
+    expected = outputs(STAGES[kind](given, **parameters), blocks, [TWINS] * len(blocks))
+    agree(outputs(STAGES[kind](given, **parameters), blocks, [level] * len(blocks)), expected)
+    agree(outputs(STAGES[kind](given, **parameters), blocks, [level, TWINS, TWINS, level] * len(blocks)), expected)
 
 
 # --- the kernels ------------------------------------------------------------------------------------------------
@@ -171,7 +174,79 @@ def test_cross_correlation_of_long_windows(level: int, size: int, lag: int) -> N
 
 
 @each_level
-@pytest.mark.parametrize("kind", ["gammatone", "ihc", "ild", "ratemap", "crossCorrelation"])
+@given(
+    tau=st.lists(st.floats(1e-4, 2), min_size=1, max_size=8),
+    lim=st.one_of(st.sampled_from([0.0, 1.0, 1.5, 1 / (1 - 1e-5), 10.0, 1e6]), st.floats(1, 50)),
+    threshold=st.floats(-300, 60),
+    filterbank=st.sampled_from(["gammatone", "drnl"]),
+    model=st.sampled_from(["", "", "adt_vandorpschuitman"]),
+    channels=st.integers(1, 19),
+    sizes=block_sizes,
+)
+@settings(max_examples=40, deadline=None, database=None)
+def test_adaptation(
+    level: int,
+    tau: list[float],
+    lim: float,
+    threshold: float,
+    filterbank: str,
+    model: str,
+    channels: int,
+    sizes: list[int],
+) -> None:
+    given_signal = Signal(RATE, RATE, False, 1, 1, tuple(np.geomspace(50.0, 7000.0, channels).tolist()), filterbank)
+    parameters = {"adpt_tau": tau, "adpt_lim": lim, "adpt_mindB": threshold, "adpt_model": model}
+    check(level, "adaptation", parameters, cut(signal(channels, sum(sizes) + 50), [*sizes, 50]), given_signal)
+
+
+@each_level
+def test_adaptation_by_many_loops(level: int) -> None:
+    tau = np.geomspace(0.001, 1.0, 32).tolist()
+    for lim in (0.0, 10.0):  # the output is the last loop's, times 5e9: 1e-11 is much to ask for
+        parameters = {"adpt_tau": tau, "adpt_lim": lim}
+        blocks = cut(np.abs(signal(3, 600)), [100, 1, 33])
+        expected = outputs(STAGES["adaptation"](RATE, **parameters), blocks, [TWINS] * len(blocks))
+        agree(outputs(STAGES["adaptation"](RATE, **parameters), blocks, [level] * len(blocks)), expected, 1e-6)
+
+
+@each_level
+@given(
+    parameters=framing("ac"),
+    clipping=st.sampled_from(kernels.CLIPPINGS),
+    alpha=st.one_of(st.sampled_from([0.0, 0.6, 1.0]), st.floats(0, 1)),
+    exponent=st.one_of(st.sampled_from([2.0, 2 / 3, 10.0]), st.floats(0.01, 10)),
+    channels=st.integers(1, 6),
+    sizes=block_sizes,
+)
+@settings(max_examples=60, deadline=None, database=None)
+def test_autocorrelation(
+    level: int,
+    parameters: dict[str, Any],
+    clipping: str,
+    alpha: float,
+    exponent: float,
+    channels: int,
+    sizes: list[int],
+) -> None:
+    if clipping == "sgn":  # whose spectra have zeros: what rounding makes of 0 must not be made larger
+        exponent = max(exponent, 1.0)
+    parameters = {**parameters, "ac_clipMethod": clipping, "ac_clipAlpha": alpha, "ac_K": exponent}
+    check(level, "autocorrelation", parameters, cut(signal(channels, sum(sizes) + 500), [*sizes, 300]))
+
+
+@each_level
+@pytest.mark.parametrize("size", [882, 960, 1024, 1026, 4096, 4098])
+@pytest.mark.parametrize("exponent", [2.0, 0.5])
+def test_autocorrelation_of_long_windows(level: int, size: int, exponent: float) -> None:
+    """Up to the longest one of the kernel, and just beyond, where scipy takes over."""
+    parameters = {"ac_wSizeSec": size / RATE, "ac_hSizeSec": size / 3 / RATE, "ac_K": exponent}
+    check(level, "autocorrelation", parameters, cut(signal(2, 12000), [5000, 100]))
+
+
+@each_level
+@pytest.mark.parametrize(
+    "kind", ["gammatone", "ihc", "ild", "ratemap", "crossCorrelation", "adaptation", "autocorrelation"]
+)
 @pytest.mark.parametrize("value", [1e300, LIMIT, 1e-160, 5e-324])
 def test_far_beyond_sound(level: int, kind: str, value: float) -> None:
     """Huge samples are bounded alike. Of tiny ones the kernels may make 0, which differs by less than anything."""
@@ -181,7 +256,8 @@ def test_far_beyond_sound(level: int, kind: str, value: float) -> None:
     got = outputs(STAGES[kind](RATE), blocks, [level] * len(blocks))
     joined = np.concatenate(got, axis=-1)
     assert np.isfinite(joined).all()
-    np.testing.assert_allclose(joined, np.concatenate(expected, axis=-1), rtol=1e-11, atol=1e-11 * min(value, 1.0))
+    size = 1.0 if kind == "autocorrelation" else min(value, 1.0)  # which tells nothing of the level
+    np.testing.assert_allclose(joined, np.concatenate(expected, axis=-1), rtol=1e-11, atol=1e-11 * size)
 
 
 @each_level
@@ -252,6 +328,10 @@ def test_constants_are_those_of_the_sources() -> None:
     assert f"MOST_POLES = {kernels.MOST_POLES} " in sources["gammatone.c"]
     assert f"MOST_SECTIONS = {kernels.MOST_SECTIONS} " in sources["biquads.c"]
     assert f"MOST_LAGS = {kernels.MOST_LAGS}," in sources["correlation.c"]
+    assert f"MOST_LOOPS = {kernels.MOST_LOOPS} " in sources["adaptation.c"]
+    assert f"MOST_SIZE = {kernels.MOST_SIZE} " in sources["autocorrelation.c"]
+    assert kernels.CLIPPINGS == ("clp", "clc", "sgn")
+    assert "{ COMPRESS, CLIP_ONLY, SIGN }" in sources["autocorrelation.c"]
     assert [name.upper().replace("WAVE", "_WAVE") for name in kernels.RECTIFICATIONS] == [
         "NONE",
         "HALF_WAVE",

@@ -1,0 +1,339 @@
+"""Autocorrelation: the reference vectors, sums and Fourier transforms written out, and signals that are known."""
+
+from __future__ import annotations
+
+import copy
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rosafe.dsp.signal import Signal
+from rosafe.dsp.windows import ALL_NAMES, window
+from rosafe.representations.autocorrelation import Autocorrelation
+
+from .chain import Chain, FloatArray, cut, reference
+
+RATE = 8000.0
+SOUND = Signal(RATE, RATE, center_frequencies=(100.0, 1000.0, 3000.0), filterbank="gammatone")
+
+
+def framed(size: int, hop: int, **more: Any) -> dict[str, Any]:
+    return {"ac_wSizeSec": size / RATE, "ac_hSizeSec": hop / RATE, **more}
+
+
+def sound(samples: int, seed: int = 0, channels: int = 3) -> FloatArray:
+    """Noise with a period, half-wave rectified in the left ear, with some silence."""
+    rng = np.random.default_rng(seed)
+    x = 0.3 * rng.standard_normal((2, channels, samples)) + np.sin(2 * np.pi * np.arange(samples) / 17)
+    x[0] = np.maximum(x[0], 0)
+    x[..., 150:300] = 0
+    return x
+
+
+def clipped_by_the_book(x: list[float], method: str, alpha: float) -> list[float]:
+    above, below = alpha * abs(max(x)), alpha * abs(min(x))
+    y = []
+    for value in x:
+        kept = 0.0
+        if value >= above:
+            kept = {"clp": value, "clc": value - above, "sgn": float(value > 0)}[method]
+        if value <= -below:
+            kept = {"clp": value, "clc": value + below, "sgn": -float(value < 0)}[method]
+        y.append(kept)
+    return y
+
+
+def by_the_book(frame: FloatArray, method: str, alpha: float, exponent: float) -> FloatArray:
+    """Of a windowed frame (w,): sums of products, or Fourier transforms as matrices."""
+    size = len(frame)
+    y = np.array(clipped_by_the_book(frame.tolist(), method, alpha))
+    if exponent == 2:
+        r = np.array([np.dot(y[: size - lag], y[lag:]) for lag in range(size - 1)])
+    else:
+        points = 2
+        while points < 2 * size - 1:
+            points *= 2
+        turns = np.exp(-2j * np.pi * (np.outer(np.arange(points), np.arange(points)) % points) / points)
+        spectrum = np.abs(turns[:, :size] @ y) ** exponent
+        r = (turns.conj() @ spectrum).real[: size - 1] / points
+    if r[0] == 0:
+        return np.zeros(size - 1)
+    return r / r[0] * size / (size - np.arange(size - 1))
+
+
+def test_reference_vectors() -> None:
+    _, expected, got = reference("Q04_autocorrelation")
+    np.testing.assert_allclose(got["autocorrelation"], expected["autocorrelation"], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("exponent", [2.0, 2 / 3, 1.0, 7.0])
+@pytest.mark.parametrize("alpha", [0.0, 0.3, 0.6, 1.0])
+@pytest.mark.parametrize("method", ["clp", "clc", "sgn"])
+def test_it_is_the_formula(method: str, alpha: float, exponent: float) -> None:
+    x = sound(400)
+    stage = Autocorrelation(
+        SOUND, **framed(50, 31, ac_clipMethod=method, ac_clipAlpha=alpha, ac_K=exponent, ac_wname="hamming")
+    )
+    got = stage.process(x)
+    assert got.shape == (2, 3, 49, 12)
+    for ear, channel, frame in np.ndindex(2, 3, 12):
+        windowed = window("hamming", 50) * x[ear, channel, 31 * frame : 31 * frame + 50]
+        expected = by_the_book(windowed, method, alpha, exponent)
+        # signs have spectra with zeros, and what rounding makes of 0 is not small after an exponent below 1
+        tolerance = 1e-9 if method == "sgn" and exponent < 1 else 1e-12
+        np.testing.assert_allclose(got[ear, channel, :, frame], expected, rtol=0, atol=tolerance)
+
+
+@pytest.mark.parametrize("size", [2, 4, 6, 16, 32, 34, 64, 66, 130])
+@pytest.mark.parametrize("name", ALL_NAMES)
+def test_sizes_and_windows(size: int, name: str) -> None:
+    """Up to the lag before the last but one, however long the transform must be."""
+    x = np.random.default_rng(size).standard_normal((2, 1, size + 3))
+    stage = Autocorrelation(RATE, **framed(size, 3, ac_wname=name, ac_clipAlpha=0.2))
+    got = stage.process(x)
+    assert got.shape == (2, 1, size - 1, 2)
+    for ear, frame in np.ndindex(2, 2):
+        expected = by_the_book(window(name, size) * x[ear, 0, 3 * frame : 3 * frame + size], "clp", 0.2, 2.0)
+        np.testing.assert_allclose(got[ear, 0, :, frame], expected, rtol=0, atol=1e-12 * size)
+
+
+def test_the_means_are_not_biased() -> None:
+    """A constant correlates with itself alike at all lags; so do pulses, at all multiples of their period."""
+    plain: dict[str, Any] = {"ac_wname": "rectwin", "ac_clipAlpha": 0.0}
+    constant = Autocorrelation(RATE, **framed(100, 50, **plain)).process(np.full((2, 2, 350), 0.3))
+    assert constant.shape == (2, 2, 99, 6)
+    np.testing.assert_allclose(constant, 1.0, rtol=1e-12)
+    pulses = np.zeros((2, 1, 400))
+    pulses[..., ::10] = 1.0
+    got = Autocorrelation(RATE, **framed(100, 50, **plain)).process(pulses)
+    expected = np.where(np.arange(99) % 10 == 0, 1.0, 0.0)
+    np.testing.assert_allclose(got[1, 0], np.repeat(expected[:, np.newaxis], 7, axis=1), rtol=0, atol=1e-12)
+
+
+def test_a_sine() -> None:
+    """Closed form: the sum of products of sines."""
+    turn, size = 2 * np.pi * 0.037, 200
+    x = np.sin(turn * np.arange(size)) * np.ones((2, 1, 1))
+    got = Autocorrelation(RATE, **framed(size, 100, ac_wname="rectwin", ac_clipAlpha=0.0)).process(x)[0, 0, :, 0]
+    lag = np.arange(size - 1)
+    n = size - lag
+    sums = n * np.cos(turn * lag) / 2 - np.sin(turn * n) / np.sin(turn) * np.cos(turn * (size - 1)) / 2
+    np.testing.assert_allclose(got, sums / sums[0] * size / n, rtol=0, atol=1e-12)
+
+
+def test_the_level_makes_no_difference() -> None:
+    """From the quietest to what no sound is, and whatever the exponent."""
+    for method in ("clp", "clc", "sgn"):
+        for exponent in (2.0, 10.0, 0.1):
+            parameters = framed(100, 50, ac_clipMethod=method, ac_K=exponent)
+            expected = Autocorrelation(RATE, **parameters).process(sound(1000))
+            for scale in (1e-150, 2.0**-40, 1e60):
+                got = Autocorrelation(RATE, **parameters).process(sound(1000) * scale)
+                np.testing.assert_allclose(got, expected, rtol=0, atol=1e-11)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("exponent", [2.0, 0.01, 10.0])
+@pytest.mark.parametrize("method", ["clp", "clc", "sgn"])
+def test_silence_and_what_is_hardly_sound(method: str, exponent: float) -> None:
+    def made(x: FloatArray, alpha: float = 0.6) -> FloatArray:
+        parameters = framed(40, 20, ac_clipMethod=method, ac_K=exponent, ac_clipAlpha=alpha)
+        return Autocorrelation(RATE, **parameters).process(x)
+
+    silence = np.zeros((2, 2, 100))
+    for alpha in (0.0, 0.6, 1.0):
+        assert not made(silence, alpha).any()
+    one_ear = silence.copy()
+    one_ear[1, 1] = sound(100)[0, 0]
+    got = made(one_ear)
+    assert not got[0].any() and not got[1, 0].any()
+    np.testing.assert_allclose(got[1, 1, 0], 1.0, rtol=1e-15)
+    rng = np.random.default_rng(0)
+    for scale in (5e-324, 1e-310, 1e-203, 1e-199, 1e-160, 1e70, 1e300):
+        assert np.isfinite(made(scale * rng.choice([-1.0, 0.0, 1.0], (2, 2, 100)))).all()
+    wide = 10.0 ** rng.uniform(-300, 300, (2, 2, 200)) * rng.choice([-1, 1], (2, 2, 200))
+    for alpha in (0.0, 1e-9, 1.0):
+        assert np.isfinite(made(wide, alpha)).all()
+
+
+def test_the_sign_of_zeros() -> None:
+    """Zeros of a half-wave rectified frame are neither above nor below."""
+    x = np.zeros((2, 1, 40))
+    x[..., ::8] = 1.0
+    got = Autocorrelation(RATE, **framed(40, 40, ac_clipMethod="sgn", ac_wname="rectwin")).process(x)[0, 0, :, 0]
+    np.testing.assert_allclose(got, np.where(np.arange(39) % 8 == 0, 1.0, 0.0), rtol=0, atol=1e-12)
+
+
+# --- streams ----------------------------------------------------------------------------------------------------
+
+MODES: list[dict[str, Any]] = [
+    framed(64, 32),
+    framed(40, 77, ac_clipMethod="clc", ac_wname="rectwin"),
+    framed(130, 11, ac_K=0.7, ac_clipAlpha=0.1),
+]
+each_mode = pytest.mark.parametrize("parameters", MODES, ids=str)
+sizes = st.lists(st.one_of(st.sampled_from([0, 1, 2]), st.integers(0, 300)), min_size=1, max_size=12).filter(any)
+
+
+@each_mode
+@given(sizes=sizes)
+@settings(max_examples=15, deadline=None, database=None)
+def test_cuts_and_prefixes(parameters: dict[str, Any], sizes: list[int]) -> None:
+    x = sound(700)
+    whole = Autocorrelation(SOUND, **parameters).process(x)
+    stage = Autocorrelation(SOUND, **parameters)
+    assert whole.shape[-1] == stage.complete(700)
+    blocks = [stage.process(block) for block in cut(x, sizes)]
+    np.testing.assert_allclose(np.concatenate(blocks, axis=-1), whole, rtol=0, atol=1e-12)
+    first = Autocorrelation(SOUND, **parameters).process(x[..., : sizes[0]])
+    assert first.shape[-1] == stage.complete(sizes[0])
+    np.testing.assert_allclose(first, whole[..., : first.shape[-1]], rtol=0, atol=1e-12)
+
+
+def test_first_blocks_that_complete_no_frame() -> None:
+    stage = Autocorrelation(SOUND, **framed(160, 80))
+    for samples in (0, 1, 100, 58):
+        assert stage.process(sound(samples)).shape == (2, 3, 159, 0)
+    assert stage.process(sound(1)).shape == (2, 3, 159, 1)
+
+
+@each_mode
+def test_reset_and_other_channels_are_a_new_beginning(parameters: dict[str, Any]) -> None:
+    stage = Autocorrelation(SOUND, **parameters)
+    expected = stage.process(sound(333))
+    stage.reset()
+    np.testing.assert_array_equal(stage.process(sound(333)), expected)
+    stage.receive(replace(SOUND, center_frequencies=(1.0, 2.0, 3.0)))  # as many, but others
+    np.testing.assert_array_equal(stage.process(sound(333)), expected)
+    assert stage.output.center_frequencies == (1.0, 2.0, 3.0)
+    for channels in (5, 2):
+        x = sound(400, 2, channels)
+        np.testing.assert_array_equal(stage.process(x), Autocorrelation(RATE, **parameters).process(x))
+
+
+@each_mode
+def test_what_comes_out_is_fresh(parameters: dict[str, Any]) -> None:
+    stage = Autocorrelation(SOUND, **parameters)
+    x = sound(500)
+    x.setflags(write=False)
+    made = stage.process(x)
+    assert made.flags.c_contiguous and made.flags.writeable and made.dtype == np.float64
+    assert made.shape[:-1] == stage.output_rows((2, 3))
+    kept = made.copy()
+    stage.process(x)
+    np.testing.assert_array_equal(made, kept)
+
+
+def test_the_format_of_the_output() -> None:
+    stage = Autocorrelation(SOUND, **framed(160, 70))
+    output = stage.output
+    assert (output.framed, output.hop, output.window, output.lags) == (True, 70, 160, 158)
+    assert output.rate == RATE / 70
+    assert stage.derived["ac_lags"] == [lag / RATE for lag in range(159)]
+    stage.configure(ac_wSizeSec=100 / RATE)
+    assert (stage.output.lags, stage.output_rows((2, 3)), len(stage.derived["ac_lags"])) == (98, (2, 3, 99), 99)
+
+
+# --- parameters -------------------------------------------------------------------------------------------------
+
+
+def test_the_defaults() -> None:
+    assert Autocorrelation(44100).parameters == {
+        "ac_wname": "hann",
+        "ac_wSizeSec": 0.02,
+        "ac_hSizeSec": 0.01,
+        "ac_clipMethod": "clp",
+        "ac_clipAlpha": 0.6,
+        "ac_K": 2.0,
+    }
+    assert Autocorrelation(44100).output_rows((2, 31)) == (2, 31, 881)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"ac_wname": "blackman"},
+        {"ac_wSizeSec": 50 / RATE},
+        {"ac_wSizeSec": 200 / RATE},
+        {"ac_hSizeSec": 20 / RATE},
+        {"ac_clipMethod": "sgn"},
+        {"ac_clipAlpha": 0.0},
+        {"ac_K": 0.7},
+    ],
+    ids=str,
+)
+def test_a_change_keeps_the_buffer_and_the_grid(change: dict[str, Any]) -> None:
+    """The next frame starts where it would have started; all of it is made in the new way."""
+    x = sound(900)
+    before, after = framed(100, 40), {**framed(100, 40), **change}
+    stage = Autocorrelation(SOUND, **before)
+    assert stage.process(x[..., :430]).shape[-1] == 9  # those at 0 ... 320; the next one at 360
+    stage.configure(**change)
+    np.testing.assert_allclose(
+        stage.process(x[..., 430:]), Autocorrelation(SOUND, **after).process(x[..., 360:]), rtol=0, atol=1e-12
+    )
+
+
+def test_changes_on_the_way_by_the_chain() -> None:
+    """Lags are aligned at 0; what was not computed is 0."""
+    x = np.random.default_rng(0).standard_normal((2, 3000))
+    chain = Chain(RATE, ["autocorrelation"], {"fb_cfHz": [300.0, 900.0], "in_doNormalize": False, "ac_wSizeSec": 0.01})
+    changes = [(1, "ac_wSizeSec", 0.02), (2, "ac_clipMethod", "clc"), (2, "fb_cfHz", [500.0, 600.0, 700.0])]
+    made = chain.run(x, 1000, changes)["autocorrelation"]
+    assert made.shape == (2, 3, 159, 12 + 12 + 11)
+    assert not made[:, :, 79:, :12].any()
+    np.testing.assert_allclose(made[:, :2, 0], 1.0, rtol=1e-14)
+
+
+def test_copies_may_be_changed_and_thrown_away() -> None:
+    expected = Autocorrelation(SOUND).process(sound(700))
+    stage, made = Autocorrelation(SOUND), []
+    for block in cut(sound(700), 100):
+        planned = copy.copy(stage)
+        planned.configure(ac_wSizeSec=0.01, ac_hSizeSec=0.001, ac_K=1, ac_clipMethod="sgn", ac_clipAlpha=0)
+        planned.receive(replace(SOUND, center_frequencies=(5.0,)))
+        made.append(stage.process(block))
+    np.testing.assert_allclose(np.concatenate(made, axis=-1), expected, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"ac_wname": "hanns"},
+        {"ac_wname": ""},
+        *({name: value} for name in ("ac_wSizeSec", "ac_hSizeSec") for value in (0, -1, 61, math.nan, "x", 1e-6)),
+        {"ac_clipMethod": "abs"},
+        {"ac_clipMethod": ""},
+        {"ac_clipAlpha": -0.01},
+        {"ac_clipAlpha": 1.01},
+        {"ac_K": 0},
+        {"ac_K": 10.1},
+        {"ac_K": -2},
+    ],
+    ids=str,
+)
+def test_refusals(changes: dict[str, Any]) -> None:
+    (name,) = changes
+    with pytest.raises(ValueError, match=f"^{name}: "):
+        Autocorrelation(RATE, **changes)
+    stage, twin = Autocorrelation(RATE), Autocorrelation(RATE)
+    for each in (stage, twin):
+        each.process(sound(200))
+    other = {"ac_clipAlpha": 0.5} if name != "ac_clipAlpha" else {"ac_K": 1.5}
+    with pytest.raises(ValueError, match=f"^{name}: "):
+        stage.configure(**other, **changes)
+    assert stage.parameters == twin.parameters
+    np.testing.assert_array_equal(stage.process(sound(200)), twin.process(sound(200)))
+    parameter = Autocorrelation.REPRESENTATION.parameter(name)
+    assert parameter.known_word("nonsense") == "nonsense"  # there are no old scripts: nothing is taken for it
+
+
+def test_other_blocks_are_refused() -> None:
+    for block in (np.zeros((2, 5)), np.zeros((3, 3, 5)), np.zeros((1, 3, 5)), np.zeros((2, 3, 5), complex)):
+        with pytest.raises(ValueError, match=r"^block: "):
+            Autocorrelation(SOUND).process(block)
