@@ -63,8 +63,9 @@ class _Map(Stage):
        or more frames from all that stay.
     4. Those that touch, at corners too, form fragments; fragments of fewer than trm_minSpread units are removed.
 
-    Frame k is that of the stretch from max(0, k - H) to k + H with H = 2 q + trm_minSpread - 1. Nothing begins anew
-    when a parameter changes: the next frame put out is the first that was not yet.
+    Frame k is that of the stretch from max(0, k - H) to k + H with H = 2 q + trm_minSpread - 1. (So with q = 0 and
+    trm_minSpread = 1 nothing stays: one frame has no peaks.) Nothing begins anew when a parameter changes: the next
+    frame put out is the first that was not yet. Other channels do mean a new beginning, without the frames held back.
     """
 
     _fuse: int  # q

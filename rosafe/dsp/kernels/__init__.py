@@ -252,7 +252,7 @@ def transient_map(
     room = (
         np.empty((channels, capacity, 4)),
         np.empty(channels, np.int64),
-        np.empty(2 * reach // max(1, fuse) + 3, np.int64),
+        np.empty(2 * reach // fuse + 3 if fuse else 0, np.int64),
         np.zeros((2, channels, 2 * spread - 1), np.int64),
         np.empty(spread, np.int64),
     )
