@@ -138,7 +138,7 @@ def _whole_tree(kinds: Kinds) -> Service:
             ),
             Parameter("connect", "string", "bass/Audio", "Topic for the Audio port, where a new input needs one"),
             *BLOCK_AND_BUFFERS,
-            *(parameter for kind in kinds.values() for parameter in kind.parameters),
+            *{p.name: p for kind in kinds.values() for p in kind.parameters}.values(),  # some are of two kinds
         ),
         outputs=(
             ("name", "string"),

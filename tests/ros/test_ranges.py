@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from rosafe.interface import KINDS, ROSAFE, Parameter, Service
+from rosafe.interface import FIXED, ROSAFE, Parameter, Service
 from tests.ros.session import Session, told
 from tests.ros.test_requests import NAMES, snapshot
 
@@ -66,12 +66,12 @@ def test_values_outside_are_refused_by_service_and_action(afe: Session, service:
     assert snapshot(afe) == before
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", FIXED)
 def test_values_outside_are_refused_by_modify_parameter(afe: Session, kind: str) -> None:
     """There, zero is zero."""
-    afe.build(*(k.request for k in KINDS.values() if k.parent), fb_nChannels=2)
+    afe.build(*(k.request for k in FIXED.values() if k.parent), fb_nChannels=2)
     before = snapshot(afe)
-    for parameter in numeric(KINDS[kind].parameters):
+    for parameter in numeric(FIXED[kind].parameters):
         for value in outside(parameter):
             if value == 0 and parameter.idl != element(parameter):
                 continue  # a list of one zero is none
@@ -82,11 +82,11 @@ def test_values_outside_are_refused_by_modify_parameter(afe: Session, kind: str)
     assert snapshot(afe) == before
 
 
-@pytest.mark.parametrize("kind", [kind for kind in KINDS if KINDS[kind].parent])
+@pytest.mark.parametrize("kind", [kind for kind in FIXED if FIXED[kind].parent])
 def test_unknown_words_become_the_default_by_service_and_by_modify_parameter(afe: Session, kind: str) -> None:
     afe.build(*PARENTS, fb_nChannels=2)
     numbers = itertools.count(1)
-    for parameter in KINDS[kind].parameters:
+    for parameter in FIXED[kind].parameters:
         if not parameter.choices:
             continue
         for word, meant in [
@@ -94,7 +94,7 @@ def test_unknown_words_become_the_default_by_service_and_by_modify_parameter(afe
             *((word, parameter.fallback) for word in ("jespen", parameter.choices[0].upper(), "0", "ä b", "x" * 4000)),
         ]:
             name = f"word{next(numbers)}"
-            afe.ok(KINDS[kind].request, name=name, **{parameter.name: word})
+            afe.ok(FIXED[kind].request, name=name, **{parameter.name: word})
             (given,) = [p for p in getattr(afe.ok("getParameters").parameters, kind) if p.name == name]
             assert getattr(given, parameter.name) == meant
             afe.ok("modifyParameter", nameProc=name, nameParam=parameter.name, newValue=parameter.choices[-1])

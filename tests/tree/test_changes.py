@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rosafe.interface import KINDS, ComponentError
-from rosafe.representations import STAGES
+from rosafe.interface import FIXED, ComponentError
 from rosafe.tree import sizes
 from rosafe.tree.states import State
 from rosafe.tree.tree import Tree
@@ -57,7 +56,7 @@ CHANGES: dict[str, tuple[str, Any]] = {
     "cc_hSizeSec": ("0.02", 0.02),
     "cc_maxDelaySec": ("0.002", 0.002),
 }
-OWNER = {p.name: kind.kind for kind in KINDS.values() for p in kind.parameters}
+OWNER = {p.name: kind.kind for kind in FIXED.values() for p in kind.parameters}  # later kinds: tests/representations
 
 
 def test_every_parameter_has_a_change_here() -> None:
@@ -208,7 +207,7 @@ def test_a_refused_change_does_not_touch_the_numbers(
             tree.modify(OWNER[name], name, text)
     settle(tree, feed, listener, *NOISE[2:4])
     outputs = chain().run(list(NOISE[:4]))
-    for kind in STAGES:
+    for kind in FIXED:
         assert_as(listener, tree, kind, outputs)
 
 

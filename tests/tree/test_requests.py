@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rosafe.interface import ComponentError
+from rosafe.interface import FIXED, ComponentError
 from rosafe.representations import STAGES
 from rosafe.tree import sizes
+from rosafe.tree.block import Block
 from rosafe.tree.processor import Processor
 from rosafe.tree.states import State
 from rosafe.tree.tree import Tree
-from rosafe.tree.block import Block
 from tests.harness import run_together, wait_for
 
 from .support import RATE, WAIT_SECONDS, Feed, Plain, Recorder, grow, tree_threads, use_plain_stages
@@ -38,7 +38,7 @@ def refused(tree: Tree, ex: str, what: str, request: Any, *arguments: Any) -> No
 
 def test_the_tree_of_the_guide(tree: Tree, feed: Feed, listener: Recorder) -> None:
     grow(tree, feed)
-    assert [p.name for p in tree.processors] == [p.kind for p in tree.processors] == list(STAGES)
+    assert [p.name for p in tree.processors] == [p.kind for p in tree.processors] == list(FIXED)
     assert tree.dependencies("ratemap") == ["input", "preProc", "gammatone", "ihc", "ratemap"]
     assert tree.dependencies("input") == ["input"]
     assert tree.input is tree.find("input")

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-import pytest
 
 from rosafe.dsp.signal import Signal
 from rosafe.tree.block import Block
