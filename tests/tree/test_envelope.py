@@ -21,6 +21,12 @@ from .test_changes import LEAVES, NOISE, assert_as, chain, settle
 
 
 @pytest.fixture
+def workers() -> int:
+    """A parent is to compute its next block while a child is held up."""
+    return 2
+
+
+@pytest.fixture
 def asked(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
     """Whether the filterbank computed the envelope, block by block."""
     answers: list[bool] = []

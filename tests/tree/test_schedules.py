@@ -289,7 +289,7 @@ def go(patch: pytest.MonkeyPatch, scenario: Scenario, count: int, delays: int, w
     [(grow, 1), (hear, 1), (shrink, 2), (leave, 2), (replace_input, 2), (stop, 2), (fail, 2)],
 )
 def test_any_order_of_events(scenario: Scenario, delays: int, count: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert go(monkeypatch, scenario, count, delays, WALKS) > WALKS + 50
+    assert go(monkeypatch, scenario, count, delays, WALKS) > WALKS + 15
 
 
 # --- and it is found where they do not ---

@@ -6,10 +6,11 @@ import copy
 from typing import Any
 
 import numpy as np
+import pytest
 
 from rosafe.dsp.signal import Signal
 from rosafe.tree.block import Block
-from rosafe.tree.states import State, StateMachine
+from rosafe.tree.states import ENDS, State, StateMachine
 
 SIGNAL = Signal.sound(1.0)
 STEPS = ("come", "go", "replace", "call", "begin", "skip", "compute", "tell", "rest")
@@ -32,6 +33,9 @@ class Machine(StateMachine):
         self.released: list[int] = []
         self.told: list[int] = []
         self.begins: int | None = None  # the first block that it should see; None: any
+
+    def __str__(self) -> str:
+        return self.name
 
     def follow(self, machines: dict[str, Machine]) -> None:
         """As a copy: know the copies of the others."""
@@ -57,8 +61,8 @@ class Machine(StateMachine):
         return (
             *(self.state, self.at_work, self.called, self.attached, self.roused, self.then, self.number),
             *(number(some) for some in (self.shared, self.untold, self._private, self._token)),
-            *(None if one is None else one.name for one in (self.parent, self._reading)),  # type: ignore[attr-defined]
-            *(tuple(sorted(one.name for one in group)) for group in (self.children, self._holders)),  # type: ignore[attr-defined]
+            *(None if one is None else str(one) for one in (self.parent, self._reading)),
+            *(tuple(sorted(map(str, group))) for group in (self.children, self._holders)),
             *(tuple(self.seen), tuple(self.released), tuple(self.told)),
         )
 
@@ -72,14 +76,19 @@ class World:
         The parent of each name; of the inputs an empty one.
     blocks : int
         That an input reads until it ends; the numbers of the second one's begin at 10.
+    called_once : bool
+        All are there from the start, and the input is called then and never again.
     """
 
-    def __init__(self, parents: dict[str, str], blocks: int) -> None:
+    def __init__(self, parents: dict[str, str], blocks: int, called_once: bool = False) -> None:
         self.machines: dict[str, Machine] = {}
         for name, parent in parents.items():
             self.machines[name] = Machine(name, self.machines.get(parent))
         self.coming = {name: [first + n for n in range(blocks)] for name, first in (("root", 0), ("new", 10))}
+        self.called_once = called_once
         self.attach(self.machines["root"])
+        if called_once:
+            self.call(self.machines["root"])
 
     def attach(self, machine: Machine) -> None:
         machine.attached = True
@@ -100,7 +109,8 @@ class World:
         if step == "replace":
             return one.name == "new" and not one.attached and self.machines["root"].state is not State.DONE
         if step == "call":
-            return above is None and one.attached and not one.called and one.state is not State.DONE and not one.gone
+            listens = above is None and one.attached and not one.called and one.state not in ENDS
+            return listens and not self.called_once
         if step == "begin":
             return one.roused and one.ready
         return one.then in {"rest": ("rest", "tell"), "skip": ("compute",)}.get(step, (step,))
@@ -253,15 +263,124 @@ def fingerprint(world: World) -> tuple[Any, ...]:
     return tuple(machine.fingerprint() for machine in world.machines.values())
 
 
-if __name__ == "__main__":
-    import time
-    for parents, blocks in (
-    ({"root": "", "a": "root"}, 2),
-    ({"root": "", "a": "root"}, 3),
-    ({"root": "", "a": "root", "c": "a"}, 2),
-    ({"root": "", "a": "root", "b": "root"}, 2),
-    ({"root": "", "new": "", "a": "root"}, 2),
-    ({"root": "", "a": "root", "b": "root", "c":"a"}, 1),({"root": "", "new": "", "a": "root"}, 1),
-    ):
-        t = time.time()
-        print(parents, blocks, explore(World(parents, blocks)), time.time() - t, flush=True)
+CHILD = {"root": "", "a": "root"}
+GRANDCHILD = {**CHILD, "c": "a"}
+SIBLINGS = {**CHILD, "b": "root"}
+ANOTHER_INPUT = {"root": "", "new": "", "a": "root"}
+
+
+@pytest.mark.parametrize(
+    ("parents", "blocks", "least"),
+    [
+        (CHILD, 3, 4_000),
+        (ANOTHER_INPUT, 1, 6_000),
+        pytest.param(GRANDCHILD, 2, 14_000, marks=pytest.mark.long),
+        pytest.param(SIBLINGS, 2, 50_000, marks=pytest.mark.long),
+        pytest.param({**SIBLINGS, "c": "a"}, 1, 30_000, marks=pytest.mark.long),
+        pytest.param(ANOTHER_INPUT, 2, 150_000, marks=pytest.mark.long),
+    ],
+)
+def test_every_order_of_steps(parents: dict[str, str], blocks: int, least: int) -> None:
+    """Each sees a contiguous run of what its parent releases, nobody waits in vain, and who is ready is known to be."""
+    states, ends = explore(World(parents, blocks))
+    assert states > least
+    assert ends > 50
+
+
+def test_all_blocks_may_be_there_before_the_first_look() -> None:
+    explore(World(CHILD, 3, called_once=True))
+
+
+def test_a_call_that_is_forgotten_while_it_tells_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    begin = StateMachine.begin
+
+    def forget(self: StateMachine) -> Block | None:
+        self.called = False
+        return begin(self)
+
+    monkeypatch.setattr(StateMachine, "begin", forget)
+    with pytest.raises(AssertionError, match="waits for ever"):
+        explore(World(CHILD, 3, called_once=True))
+
+
+@pytest.mark.parametrize(
+    ("name", "mutant", "fault"),
+    [
+        ("_freed_by", lambda self, child: self._holders.discard(child), "waits for ever"),
+        (
+            "give_back",
+            lambda self: self.parent and self.parent._freed_by(self),
+            "changed under its reader|waits for ever|saw",
+        ),
+        ("_end_if_exhausted", lambda self: None, "waits for ever"),
+        ("_leave", lambda self: self.parent and self.parent.children.remove(self), "waits for ever|changed|assert"),
+    ],
+)
+def test_faults_are_found(name: str, mutant: Any, fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(StateMachine, name, mutant)
+    with pytest.raises(AssertionError, match=fault):
+        for parents in (CHILD, ANOTHER_INPUT):
+            explore(World(parents, 2))
+
+
+# --- single steps ---
+
+
+def machine(name: str, parent: Machine | None = None, *released: int) -> Machine:
+    """One that is attached, and has released these blocks."""
+    one = Machine(name, parent)
+    one.attach()
+    for number in released:
+        one.hold(block(number))
+        one.untold = None
+        one.rest()
+    return one
+
+
+def test_a_block_is_not_released_while_a_child_holds_the_last_one() -> None:
+    parent = machine("parent")
+    child = machine("child", parent)
+    parent.hold(block(0))
+    assert (child.begin() or block(-1)).number == 0
+    parent.rest()
+    parent.hold(block(1))
+    assert parent.state is State.WAIT_RELEASE
+    assert parent.shared is not None and parent.shared.number == 0
+    child.give_back()
+    assert parent.shared.number == 1
+
+
+def test_a_token_is_taken_once() -> None:
+    parent = machine("parent", None, 0)
+    late = machine("late", parent)
+    assert late.ready
+    assert late.begin() is not None
+    late.give_back()
+    late.rest()
+    assert not late.ready
+    assert late.begin() is None
+
+
+def test_siblings_read_the_same_memory() -> None:
+    parent = machine("parent")
+    siblings = [machine(name, parent) for name in "abc"]
+    parent.hold(block(0))
+    taken = [child.begin() for child in siblings]
+    assert all(one is parent.shared for one in taken)
+    for child in siblings:
+        assert parent._holders
+        child.give_back()
+    assert not parent._holders
+
+
+def test_one_that_was_removed_releases_nothing_and_holds_up_nobody() -> None:
+    parent = machine("parent")
+    child = machine("child", parent)
+    parent.hold(block(0))
+    child.begin()
+    child.remove()
+    assert not parent._holders
+    child.give_back()
+    child.hold(block(0))
+    child.rest()
+    assert child.over and child.shared is None and not child.ready
