@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from rosafe.audiofile import AudioFile
 
+from rosafe.sound.audiofile import AudioFile
 from tests import harness
 
 from .chain import FloatArray, process

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rosafe.interface import KINDS, ComponentError
-from rosafe.representations import STAGES
+from rosafe.interface import FIXED, ComponentError
 from rosafe.tree import sizes
 from rosafe.tree.states import State
 from rosafe.tree.tree import Tree
