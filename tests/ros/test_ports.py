@@ -11,8 +11,9 @@ import rosAFE.msg
 import rosAFE.srv
 import rospy
 
+from rosafe.component import wire
 from rosafe.interface import FIXED, ROSAFE, ros_type
-from rosafe.component import array_srv, wire
+from rosafe.ros import array_srv
 from tests.harness import wait_for
 from tests.ros.session import RATE, Session, assert_holds, ears, expected, noise, windowed
 

@@ -14,11 +14,12 @@ import numpy as np
 import rosgraph
 import rospy
 import soundfile
-from rosafe.tree.states import Observer, State
 from std_msgs.msg import String
 
 from rosafe.interface import FIXED
 from rosafe.node.trace_port import TracePort, read
+from rosafe.tree.processor import Observer
+from rosafe.tree.states import State
 from tests.cli.command import refused, rosafe
 from tests.harness import SCRIPTS, Graph, wait_for
 from tests.ros.session import Session, noise

@@ -18,8 +18,9 @@ from hypothesis import strategies as st
 
 import bass.msg
 from rosafe import interface
+from rosafe.component import wire
 from rosafe.interface import ROSAFE
-from rosafe.component import array_msg, wire
+from rosafe.ros import array_msg
 from rosafe.tree.window import SlidingWindow, WindowView
 
 TIME_DOMAIN = "::rosAFE::TimeDomainSignalPortStruct"
