@@ -28,8 +28,9 @@ class MasterError(Exception):
 def set_local_defaults(environ: MutableMapping[str, str] = os.environ) -> None:
     """Let ROS work on this machine alone where the environment says nothing else.
 
-    What is empty counts as not set, where rospy would complain again and again. Numbers instead of `localhost`, which rospy waits for without end on a machine without /etc/hosts. ROS_IP is left
-    alone beside a master on another host, which could not call back to loopback.
+    Numbers instead of `localhost`, which rospy waits for without end on a machine without /etc/hosts. ROS_IP is left
+    alone beside a master on another host, which could not call back to loopback. What is empty counts as not set;
+    rospy would complain of it again and again.
     """
     for variable in ("ROS_HOSTNAME", "ROS_IP"):
         if environ.get(variable) == "":
