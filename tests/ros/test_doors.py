@@ -156,6 +156,10 @@ def test_requests_that_are_not_finished_or_not_begun(target: Target) -> None:
         amid = stack.enter_context(target.client("connect_service", persistent="1"))
         amid.sendall(length(8))
         target.assert_well()
+        body = xmlrpc.client.dumps(("/hasty",), "getPid").encode()
+        call = b"POST / HTTP/1.1\r\nHost: node\r\nContent-Length: %d\r\n\r\n%s" % (len(body), body)
+        unread = stack.enter_context(target.connect("XML-RPC"))
+        assert pour(unread, call * 1000) < 50e6, "who does not read the answers is not asked for more"
         for sock in (*hanging, amid):
             assert closed(sock)
         patient.sendall(length(8) + bytes(8))
@@ -253,15 +257,11 @@ def test_a_publisher_that_lies_about_lengths_is_left(afe: tuple[Session, Target]
         poured.append(pour(sock, bytes(10**6)))
 
     def answer(port: int) -> Any:
-        return (
-            (1, "", ["TCPROS", "127.0.0.1", "x" * 40_000_000])
-            if behaviour == "answer"
-            else (1, "", ["TCPROS", "127.0.0.1", port])
-        )
+        return 1, "", ["TCPROS", "x" * 40_000_000 if behaviour == "answer" else "127.0.0.1", port]
 
     session.build("PreProc")  # the first one takes memory that stays
     session.ok("Stop")
-    with target.costs_nothing(), FakePublisher(graph, "/evil/Audio", AUDIO._type, behave, answer) as evil:
+    with target.costs_nothing(megabytes=60), FakePublisher(graph, "/evil/Audio", AUDIO._type, behave, answer) as evil:
         session.ok("connect_port", local="Audio", remote="/evil/Audio")
         if behaviour == "answer":
             wait_for(lambda: evil.calls, 20)

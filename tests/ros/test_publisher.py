@@ -20,6 +20,9 @@ import rosAFE.msg
 import rosgraph
 import rospy
 from rosgraph.network import read_ros_handshake_header, write_ros_handshake_header
+from rospy import topics
+from rospy.impl.tcpros_base import TCPROSTransport
+from rospy.impl.tcpros_pubsub import TCPROSPub
 
 from rosafe.component import publisher
 from rosafe.component.publisher import MAX_WAITING, MAX_WAITING_BYTES, Publisher, send_pieces
@@ -170,6 +173,36 @@ def test_a_subscriber_that_left_is_forgotten(graph: Graph) -> None:
     wait_for(lambda: (port.publish(message(1)), port.get_num_connections() == 0)[1])
     wait_for(lambda: not [t for t in threading.enumerate() if t.name == "to /stalled"], what="end of its sender")
     port.unregister()
+
+
+@pytest.mark.parametrize("moment", ["before", "amid"])
+def test_a_subscriber_of_a_topic_that_is_closed_in_that_very_moment(
+    graph: Graph, monkeypatch: pytest.MonkeyPatch, moment: str
+) -> None:
+    """Its connection ends, and so does the thread that was to send to it."""
+    graph.client()
+    port = Publisher(f"/of_the_test/closing_{moment}", array_msg(TIME_DOMAIN))
+    port.publish(message(1))
+    topic, name = port.impl, port.resolved_name
+    if moment == "before":
+        port.unregister()
+    else:
+        add = topics._TopicImpl.add_connection
+
+        def add_and_close(self: Any, connection: Any) -> Any:
+            added = add(self, connection)
+            port.unregister()
+            return added
+
+        monkeypatch.setattr(topics._TopicImpl, "add_connection", add_and_close)
+    with socket.create_server(("127.0.0.1", 0)) as listener, socket.create_connection(listener.getsockname()) as theirs:
+        ours, _ = listener.accept()
+        transport = TCPROSTransport(TCPROSPub(name, TIME_DOMAIN), name)
+        transport.set_socket(ours, "/closing")
+        assert not topic.add_connection(transport)
+        theirs.settimeout(10)
+        assert theirs.recv(1) == b""
+        wait_for(lambda: not [t for t in threading.enumerate() if t.name == "to /closing"], what="end of its sender")
 
 
 def test_late_subscribers_get_the_newest_and_withdrawal_ends_everything(graph: Graph) -> None:

@@ -160,28 +160,29 @@ def test_waiting_for_a_master_that_answers_nothing_can_be_ended(graph: Graph) ->
 
 # --- an address that nobody can call -----------------------------------------------------------------------------
 
-UNREACHABLE = {
-    "ROS_IP": ("203.0.113.7", "which is no address of this machine"),
-    "ROS_HOSTNAME": ("nobody.invalid", "no name that is known here"),
-}
-
 
 @PROGRAMS
-@pytest.mark.parametrize("variable", UNREACHABLE)
-def test_an_address_that_nobody_can_call_is_said(graph: Graph, program: str, variable: str) -> None:
-    """In one line; the node starts all the same. By remapping too."""
-    address, why = UNREACHABLE[variable]
-    name = f"unreachable_{variable.lower()}"
-    option = {"ROS_IP": "__ip", "ROS_HOSTNAME": "__hostname"}[variable]
-    for arguments, env in (([], {variable: address}), ([f"{option}:={address}"], {})):
-        with graph.node(program, "-i", name, *arguments, **env) as node:
-            assert node.err.startswith(f"{program}: warning: {variable} is {address}, ") and why in node.err
-            assert "set it to 127.0.0.1" in node.err and node.err.count("\n") == 1
-
-
-def test_addresses_that_can_be_called_are_not_mentioned(graph: Graph) -> None:
-    for env in ({"ROS_IP": "127.0.0.1"}, {"ROS_IP": "127.3.2.1"}, {"ROS_HOSTNAME": "127.0.0.1"}):
-        with graph.node("bass-ros", "-i", "reachable", **env) as node:
+@pytest.mark.parametrize(
+    ("ip", "hostname", "remapping", "why"),
+    [
+        ("203.0.113.7", "", "", "ROS_IP is 203.0.113.7, which is no address of this machine"),
+        ("127.0.0.1", "nobody.invalid", "", "ROS_HOSTNAME is nobody.invalid, which is no address, and no name"),
+        ("127.0.0.1", "", "__ip:=203.0.113.8", "ROS_IP is 203.0.113.8, which is no address of this machine"),
+        ("127.0.0.1", "", "", ""),
+        ("127.3.2.1", "", "", ""),
+        ("203.0.113.7", "localhost", "", ""),
+    ],
+)
+def test_an_address_that_nobody_can_call_is_said(
+    graph: Graph, program: str, ip: str, hostname: str, remapping: str, why: str
+) -> None:
+    """In one line; the node starts all the same."""
+    name = f"at_{program.partition('-')[0]}"
+    with graph.node(program, "-i", name, *filter(None, [remapping]), ROS_IP=ip, ROS_HOSTNAME=hostname) as node:
+        if why:
+            assert node.err.startswith(f"{program}: warning: {why}") and "set it to 127.0.0.1" in node.err
+            assert node.err.count("\n") == 1
+        else:
             assert node.err == ""
 
 
