@@ -16,7 +16,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -231,9 +231,14 @@ class SpectralFeatures(Stage):
 
     _last: FloatArray | None = None  # the last spectra, (2, C, 1)
 
+    @classmethod
+    def in_force(cls, values: Mapping[str, Any]) -> dict[str, Any]:
+        words = values["sf_requests"]
+        return {**values, "sf_requests": list(FEATURES) if "all" in words else words}
+
     @property
     def parameters(self) -> dict[str, Any]:
-        return {**self._values, "sf_requests": list(self._words)}
+        return self.in_force(self._values)
 
     def output_rows(self, rows: tuple[int, ...]) -> tuple[int, ...]:
         return (rows[0], len(self._words))

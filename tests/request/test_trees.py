@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rosafe import interface
+from rosafe.dsp.stage import Stage
 from rosafe.genomix import trees
 from rosafe.genomix.values import partial
 from rosafe.interface import KINDS, ROSAFE, ComponentError
@@ -44,10 +45,16 @@ def build(model: Model, representation: str, **parameters: Any) -> dict[str, Any
     return asyncio.run(trees.build(model, {"representation": representation, **parameters}))
 
 
-def in_force(kind: str, parameters: Mapping[str, Any]) -> dict[str, Any]:
-    """What a processor made with these parameters of the chain reports."""
+def in_force(kind: str, parameters: dict[str, Any]) -> dict[str, Any]:
+    """What a processor made with these tells of itself."""
+    return stage(kind, parameters).parameters
+
+
+def stage(kind: str, parameters: dict[str, Any]) -> Stage:
+    """A stage of this kind on all that it needs."""
     own = {p.name: parameters[p.name] for p in KINDS[kind].parameters if p.name in parameters}
-    return STAGES[kind](RATE, **own).parameters
+    parent = KINDS[kind].parent
+    return STAGES[kind](stage(parent, parameters).output if parent else RATE, **own)
 
 
 def check(model: Model, before: Mapping[str, Any], wanted: tuple[str, Mapping[str, Any]], told: dict[str, Any]) -> None:
