@@ -30,6 +30,9 @@ _ARGUMENTS = {
     "rosafe_correlations": (*_FRAMES, _INTEGER, _REAL, _ARRAY, _INTEGER),
     # clipping, alpha, exponent; points, twiddles, places, turns; corrections, lags; output
     "rosafe_autocorrelations": (*_FRAMES, _INTEGER, _REAL, _REAL, _INTEGER, *[_ARRAY] * 4, _INTEGER, _ARRAY),
+    "rosafe_windowed": (*_FRAMES, *[_ARRAY] * 4),
+    "rosafe_correlate_filtered": (*(_ARRAY, _INTEGER, _INTEGER, _ARRAY, _ARRAY) * 2, *[_INTEGER] * 6, *[_ARRAY] * 3),
+    "rosafe_add_spectra": (_ARRAY, *[_INTEGER] * 3, _ARRAY, _ARRAY, _INTEGER, *[_ARRAY] * 5),
 }
 
 
