@@ -201,11 +201,28 @@ def ratemap(
     return rates, sums
 
 
+def modulation(
+    frames: Frames, begun: Sums | None, sections: FloatArray, state: FloatArray
+) -> tuple[FloatArray, Sums]:
+    """Weighted sums of the magnitudes of what parallel sections (M, 6) make of each frame's samples, (*rows, M, F).
+
+    Of samples (*rows, N), with the sections' state (M, *rows, 2). The history of `frames` is (*rows, M), and what has come
+    out already, the block goes in now. The twin is `rosafe.dsp.framing.Framing.means` of the magnitudes of what
+    `rosafe.dsp.cascade.Parallel` makes.
+    """
+    sums, arguments = _sums(frames, begun)
+    means = np.empty((*frames.tail.store.shape[:-1], frames.number))
+    _function("rosafe_modulation")(
+        *_arguments(frames), *arguments, len(sections), *map(_address, (sections, state, means))
+    )
+    return means, sums
+
+
 def _sums(frames: Frames, begun: Sums | None) -> tuple[Sums, tuple[int | None, ...]]:
     """Room for the sums of `frames`, and the arguments that tell of it and of the sums known already."""
     samples = frames.history.length + frames.block.shape[-1]
     number = max(0, -((frames.skip - samples) // frames.hop))
-    sums = Sums(np.empty((*frames.block.shape[:-1], number)), frames.number)
+    sums = Sums(np.empty((*frames.tail.store.shape[:-1], number)), frames.number)
     if begun is None:
         return sums, (number, None, 0, 0, _address(sums.sums))
     stride = begun.sums.shape[-1]
