@@ -1,7 +1,7 @@
 """The amplitude modulation spectrogram stage: how fast the level of each channel goes up and down.
 
-* S. D. Ewert and T. Dau (2000), "Characterizing frequency selectivity for envelope fluctuations", J. Acoust. Soc. Am. 108,
-  1181-1196
+* S. D. Ewert and T. Dau (2000), "Characterizing frequency selectivity for envelope fluctuations", J. Acoust. Soc. Am.
+  108, 1181-1196
 * T. May and T. Dau (2014), "Computational speech segregation based on an auditory-inspired modulation analysis", J.
   Acoust. Soc. Am. 136, 3350-3359
 * G. Kim, Y. Lu, Y. Hu and P. C. Loizou (2009), "An algorithm that improves speech intelligibility in noise for
@@ -24,7 +24,7 @@ from rosafe.dsp import kernels
 from rosafe.dsp.cascade import SPAN, Parallel
 from rosafe.dsp.framing import MAX_FRAME_SECONDS, FrameBuffer, FramedStage, Framing
 from rosafe.dsp.guard import FloatArray, limited
-from rosafe.dsp.rounding import round_half_away, sample_count
+from rosafe.dsp.rounding import sample_count
 from rosafe.dsp.signal import Signal
 from rosafe.dsp.windows import ALL_NAMES, window
 from rosafe.vocabulary.parameter import Parameter
@@ -124,12 +124,8 @@ class AmsFeatures(FramedStage):
                 unit="Hz",
             ),
             Parameter("ams_dsRatio", "unsigned long", 4, "Every so-manieth sample is taken", 1, 1000),
-            Parameter(
-                "ams_wSizeSec", "double", 0.032, "Window duration (s)", 0.0, MAX_FRAME_SECONDS, True, unit="s"
-            ),
-            Parameter(
-                "ams_hSizeSec", "double", 0.016, "Window step size (s)", 0.0, MAX_FRAME_SECONDS, True, unit="s"
-            ),
+            Parameter("ams_wSizeSec", "double", 0.032, "Window duration (s)", 0.0, MAX_FRAME_SECONDS, True, unit="s"),
+            Parameter("ams_hSizeSec", "double", 0.016, "Window step size (s)", 0.0, MAX_FRAME_SECONDS, True, unit="s"),
             Parameter("ams_wname", "string", "rectwin", "Window name", choices=ALL_NAMES),
         ),
         coordinates=("ams_cfHz",),
@@ -137,6 +133,9 @@ class AmsFeatures(FramedStage):
         port_doc="Amplitude modulation spectrograms, [filter][channel][frame]",
     )
     PREFIX = "ams"
+
+    _decimation: Decimation
+    _filters: Parallel
 
     @property
     def parameters(self) -> dict[str, Any]:
@@ -233,7 +232,7 @@ def design_framing(values: Mapping[str, Any], rate: float) -> Framing:
 
 
 def center_frequencies(values: Mapping[str, Any]) -> FloatArray:
-    """Centre frequencies (M,) in Hz that the checked parameters ask for; ValueError where they contradict themselves."""
+    """Centre frequencies (M,) in Hz that the checked parameters ask for; ValueError where these do not go together."""
     low, high, count, given = (values[f"ams_{name}"] for name in ("lowFreqHz", "highFreqHz", "nFilters", "cfHz"))
     if high <= low:
         raise ValueError(f"ams_highFreqHz: {high:.12g} Hz is not more than ams_lowFreqHz ({low:.12g} Hz)")

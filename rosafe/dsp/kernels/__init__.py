@@ -201,13 +201,11 @@ def ratemap(
     return rates, sums
 
 
-def modulation(
-    frames: Frames, begun: Sums | None, sections: FloatArray, state: FloatArray
-) -> tuple[FloatArray, Sums]:
+def modulation(frames: Frames, begun: Sums | None, sections: FloatArray, state: FloatArray) -> tuple[FloatArray, Sums]:
     """Weighted sums of the magnitudes of what parallel sections (M, 6) make of each frame's samples, (*rows, M, F).
 
-    Of samples (*rows, N), with the sections' state (M, *rows, 2). The history of `frames` is (*rows, M), and what has come
-    out already, the block goes in now. The twin is `rosafe.dsp.framing.Framing.means` of the magnitudes of what
+    Of samples (*rows, N), with the sections' state (M, *rows, 2). The history of `frames` is (*rows, M), and what has
+    come out already, the block goes in now. The twin is `rosafe.dsp.framing.Framing.means` of the magnitudes of what
     `rosafe.dsp.cascade.Parallel` makes.
     """
     sums, arguments = _sums(frames, begun)
@@ -389,6 +387,24 @@ def correlate_filtered(
         *map(_address, (scratch, correlations, energies)),
     )
     return correlations, energies
+
+
+def patterns(levels: FloatArray, count: int, reach: int, places: NDArray[np.int64], weights: FloatArray) -> FloatArray:
+    """As `rosafe.representations.gabor.respond_by_scipy`."""
+    frames = -(-count // MOST_LANES) * MOST_LANES
+    padded = np.zeros((*levels.shape[:-1], frames + 2 * reach))
+    padded[..., : levels.shape[-1]] = levels
+    sums = np.empty((len(levels), len(places), frames))
+    _function("rosafe_patterns")(
+        _address(padded),
+        levels.shape[1],
+        frames,
+        reach,
+        _address(places),
+        len(places),
+        *map(_address, (weights, sums)),
+    )
+    return sums[..., :count]
 
 
 @contextmanager

@@ -26,6 +26,7 @@ _ARGUMENTS = {
     "rosafe_levels": (*_FRAMES, *_SUMS, _REAL, _ARRAY),
     "rosafe_ratemap": (*_FRAMES, *_SUMS, _INTEGER, _REAL, _ARRAY, _ARRAY),
     "rosafe_modulation": (*_FRAMES, *_SUMS, _INTEGER, *[_ARRAY] * 3),
+    "rosafe_patterns": (_ARRAY, *[_INTEGER] * 3, _ARRAY, _INTEGER, _ARRAY, _ARRAY),
     "rosafe_denormals_off": (),
     "rosafe_denormals_as": (_BITS,),
     "rosafe_correlations": (*_FRAMES, _INTEGER, _REAL, _ARRAY, _INTEGER),
