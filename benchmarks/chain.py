@@ -1,6 +1,6 @@
 """How fast the chain is: against plain numpy and scipy, in other configurations, and what else it costs.
 
-``/usr/bin/python3 benchmarks/chain.py`` prints tables and writes them to benchmarks/results and docs/speed.md. Times
+``/usr/bin/python3 benchmarks/chain.py`` prints tables and writes them to benchmarks/results. Times
 are milliseconds of computing per second of sound, medians of warm blocks. On one core it is the thread's own processor
 time that counts, which other programs on the machine hardly touch; both sides take turns. For two cores it is the clock
 on the wall: let the machine be quiet.
@@ -166,8 +166,6 @@ def main() -> int:
         options.results.mkdir(parents=True, exist_ok=True)
         (options.results / "chain.json").write_text(json.dumps(measured, indent=2) + "\n")
         (options.results / "chain.md").write_text(text)
-        if options.results == HERE / "results":
-            report.put_into(HERE.parent / "docs" / "speed.md", text)
     return 0
 
 

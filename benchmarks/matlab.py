@@ -15,8 +15,8 @@ import time
 
 import graph
 
+from rosafe.component import generate
 from rosafe.demo.processes import Children
-from rosafe.ros import generate
 
 FULL_SECONDS = 2.0  # until the ports hold a second
 UP_SECONDS = 20.0

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any
 
 import configurations
@@ -55,15 +54,6 @@ def _times(times: dict[str, float]) -> list[str]:
 
 
 MARK = "<!-- What follows is written by benchmarks/chain.py. -->\n"
-
-
-def put_into(document: Path, text: str) -> None:
-    """Replace what follows the mark in `document` by `text`, its headings a level lower."""
-    before, mark, _ = document.read_text().partition(MARK)
-    if not mark:
-        raise ValueError(f"{document}: there is no {MARK.strip()}")
-    lines = [f"#{line}" if line.startswith("#") else line for line in text.splitlines()]
-    document.write_text("\n".join([before + MARK, *lines, ""]))
 
 
 def _configurations(measured: dict[str, dict[str, dict[str, float]]]) -> list[str]:

@@ -7,17 +7,18 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-__version__ = "0.1.0"
+from rosafe.version import VERSION as __version__
+
 __all__ = ["__version__", "process"]
 
 if TYPE_CHECKING:
-    from rosafe.offline import process
+    from rosafe.offline.process import process
 
 
 def __getattr__(name: str) -> Any:
     # The numerics load numpy and scipy, which programs that only speak ROS need not wait for.
     if name == "process":
-        from rosafe.offline import process
+        from rosafe.offline.process import process
 
         return process
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

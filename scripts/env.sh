@@ -29,12 +29,12 @@ fi
 _rosafe_status=1
 _rosafe_root=$(realpath -- "$_rosafe_file" 2>/dev/null) || :
 _rosafe_root=${_rosafe_root%/scripts/env.sh}
-if [ ! -f "$_rosafe_root/rosafe/ros/generate.py" ]; then
+if [ ! -f "$_rosafe_root/rosafe/component/generate.py" ]; then
   echo "rosafe: this shell does not say where env.sh is; change into the checkout, then: . scripts/env.sh" >&2
 elif [ ! -x /usr/bin/python3 ]; then
   echo "rosafe: /usr/bin/python3 is missing; run $_rosafe_root/scripts/install" >&2
 elif _rosafe_exports=$(PYTHONPATH="$_rosafe_root${PYTHONPATH:+:$PYTHONPATH}" \
-  /usr/bin/python3 -P -m rosafe.ros.generate --shell); then
+  /usr/bin/python3 -P -m rosafe.component.generate --shell); then
   eval "$_rosafe_exports"
   _rosafe_status=0
 fi

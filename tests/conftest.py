@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from rosafe.ros import generate
+from rosafe.component import generate
 from tests import harness
 from tests.bass.pulse import PulseServer
 

@@ -29,8 +29,8 @@ from typing import IO, Any, TypeVar
 import pytest
 
 from rosafe import interface
-from rosafe.ros import generate
-from rosafe.ros.master import PrivateMaster
+from rosafe.component import generate
+from rosafe.component.master import PrivateMaster
 
 ROOT = Path(__file__).resolve().parents[1]
 SCRIPTS = ROOT / "scripts"
@@ -341,7 +341,7 @@ class MasterProcess:
 
     def start(self, env: dict[str, str]) -> None:
         """Start it and wait until it answers."""
-        from rosafe.ros.master import MasterError, check_master
+        from rosafe.component.master import MasterError, check_master
 
         def answers() -> bool:
             try:

@@ -17,11 +17,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from rosafe.arguments import check_outputs, check_parameter
 from rosafe.commands import Failure
 from rosafe.commands._progress import Display, bytes_text
 from rosafe.commands._workers import Interrupted, Report, Signals, run_together
 from rosafe.interface import KINDS, ROSAFE, Parameter
+from rosafe.interface.arguments import check_outputs, check_parameter
 
 _BLOCK = ROSAFE.service("InputProc").parameter("nFramesPerBlock")
 _MAX_JOBS = 10_000
@@ -155,8 +155,9 @@ def run(options: argparse.Namespace) -> int:
         raise Failure(str(problem)) from None
     signals = Signals()
     # Once, for all processes that are forked from this one.
-    from rosafe.audiofile import AudioFileError
-    from rosafe.files import OutputError, process_file
+    from rosafe.offline.files import process_file
+    from rosafe.output import OutputError
+    from rosafe.sound.audiofile import AudioFileError
 
     if len(inputs) > 1:
         import scipy.signal  # noqa: F401

@@ -16,10 +16,10 @@ import sys
 from collections.abc import Mapping
 from typing import Any
 
-from rosafe import request
-from rosafe.arguments import check_parameter
 from rosafe.commands import Failure
-from rosafe.interface import REQUEST, ROSAFE, ComponentError, ProcessorKind
+from rosafe.interface import REQUEST, ROSAFE, ComponentError, Representation
+from rosafe.interface.arguments import check_parameter
+from rosafe.tree import requests as request
 
 _SETTINGS = [p for p in REQUEST.parameters if p.name not in ("representation", "connect")]  # those have other places
 
@@ -65,7 +65,7 @@ def run(options: argparse.Namespace) -> int:
     """Make the request and print what has come of it."""
     try:
         kind = request.kind_of(options.representation)
-        values = {"representation": kind.representation}
+        values = {"representation": kind.word}
         for name, value in map(_parameter, [*options.settings, *options.interspersed]):
             if name in values:
                 raise ValueError(f"{name} is given twice")
@@ -74,7 +74,7 @@ def run(options: argparse.Namespace) -> int:
         raise Failure(str(problem)) from None
     if options.connect is not None:
         values["connect"] = options.connect
-    from rosafe.ros import generate, master
+    from rosafe.component import generate, master
 
     master.set_local_defaults()
     try:
@@ -137,7 +137,7 @@ def _told(problem: ComponentError) -> str:
     return problem.ex + (f": {what}" if what else "")
 
 
-def _show(answer: Mapping[str, Any], kind: ProcessorKind) -> None:
+def _show(answer: Mapping[str, Any], kind: Representation) -> None:
     """A line for each processor, and on stderr one for each parameter that was given in vain."""
     width = max(map(len, answer["dependencies"]))
     instance = answer["topic"].split("/")[1]

@@ -17,10 +17,12 @@ import os
 import queue
 import sys
 import time
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rosafe.commands import Failure
+from rosafe.output import new_file
 
 if TYPE_CHECKING:
     from rosafe.tree.trace import Event
@@ -63,22 +65,21 @@ def _block(text: str) -> int:
 
 def run(options: argparse.Namespace) -> int:
     """Listen or compute, write, print."""
-    output = _checked_output(options)
-    if options.sound is not None:
-        title, events = str(options.sound), _compute(options.sound, options.seconds, options.block)
-    else:
-        title = f"/{options.node.strip('/')}"
-        events = _listen(title, options.seconds)
-    from rosafe.tree.trace import Trace
+    output: Path | None = options.output
+    with nullcontext() if output is None else new_file(output, options.force) as descriptor:
+        if options.sound is not None:
+            title, events = str(options.sound), _compute(options.sound, options.seconds, options.block)
+        else:
+            title = f"/{options.node.strip('/')}"
+            events = _listen(title, options.seconds)
+        from rosafe.tree.trace import Trace
 
-    trace = Trace(events)
-    if not trace.spans:
-        raise Failure(f"{title} has no processors: nothing to trace")
-    if output is not None:
-        try:
-            output.write_text(json.dumps(trace.chrome(title)))
-        except OSError as problem:
-            raise Failure(f"cannot write {output}: {problem.strerror}") from None
+        trace = Trace(events)
+        if not trace.spans:
+            raise Failure(f"{title} has no processors: nothing to trace")
+        if descriptor is not None:
+            with os.fdopen(descriptor, "w", encoding="utf-8", closefd=False) as stream:
+                json.dump(trace.chrome(title), stream)
     print(f"{title}, {(trace.end - trace.begin) / 1e6:.2f} s")
     print("\n".join(trace.summary()))
     if output is not None:
@@ -86,22 +87,12 @@ def run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _checked_output(options: argparse.Namespace) -> Path | None:
-    output: Path | None = options.output
-    if output is not None:
-        if os.path.lexists(output) and not (options.force and output.is_file()):
-            raise Failure(f"{output} is there already" + ("; --force replaces it" if output.is_file() else ""))
-        if not output.parent.is_dir():
-            raise Failure(f"cannot write {output}: there is no folder {output.parent}")
-    return output
-
-
 def _compute(path: Path, seconds: float, block: int) -> list[Event]:
     """What the default tree does on the first `seconds` of a sound file."""
-    from rosafe.arguments import check_parameters
-    from rosafe.audiofile import AudioFile, AudioFileError
-    from rosafe.chain import Chain
     from rosafe.interface import KINDS
+    from rosafe.interface.arguments import check_parameters
+    from rosafe.offline.chain import Chain
+    from rosafe.sound.audiofile import AudioFile, AudioFileError
     from rosafe.tree.trace import Tracer
 
     tracer = Tracer()
@@ -128,9 +119,9 @@ def _listen(node: str, seconds: float) -> list[Event]:
     import rospy
     from std_msgs.msg import String
 
-    from rosafe.bass.recording.topic import become_node
-    from rosafe.ros.master import MasterError
-    from rosafe.ros.trace import read
+    from rosafe.component.master import MasterError
+    from rosafe.component.startup import become_node
+    from rosafe.node.trace_port import read
 
     messages: queue.SimpleQueue[Any] = queue.SimpleQueue()
     try:

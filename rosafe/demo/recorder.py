@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from rosafe.component.overlap import joined
 from rosafe.interface import KINDS, ROSAFE, ros_type
 from rosafe.view.report import PortRow
 from rosafe.view.representations import Representations
@@ -66,9 +67,7 @@ class PortFollower:
                 self.beginnings += 1
             self._arrivals.append(now)
             self.frame_rate = message.sampleRate
-            fresh = self._fresh(message)
-            lost = max(0, fresh - message.framesOnPort)
-            fresh -= lost
+            lost, fresh = joined(self._fresh(message), message.framesOnPort)
             self.lost += lost
             self.frames += fresh
             self.index, self.message = message.lastFrameIndex, message
@@ -143,7 +142,7 @@ class Recorder:
         import rospy
         from diagnostic_msgs.msg import DiagnosticArray
 
-        from rosafe.ros import wire
+        from rosafe.component import wire
 
         self.center_frequencies = np.zeros(0)
         self.lags = np.zeros(0)

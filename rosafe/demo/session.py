@@ -11,27 +11,19 @@ from types import TracebackType
 from typing import Any
 
 from rosafe import interface
+from rosafe.component import generate
+from rosafe.component.master import PrivateMaster
+from rosafe.component.paths import CODE_DIR
 from rosafe.demo.processes import Child, Children
 from rosafe.demo.sound import Sound
-from rosafe.ros import generate
-from rosafe.ros.master import PrivateMaster
-from rosafe.ros.paths import CODE_DIR
 
 START_SECONDS = 30.0
 REQUEST_SECONDS = 30.0
 _RESET = "\x1b[0m"  # rospy's log lines are coloured
 POLL_SECONDS = 0.02
 NODES = {"bass": "bass-ros", "rosAFE": "rosAFE-ros"}
-# From kind of processor to the name that it gets: the guide's.
-NAMES = {
-    "input": "input",
-    "preProc": "preProc",
-    "gammatone": "gammatone",
-    "ihc": "ihc",
-    "ild": "ild",
-    "ratemap": "ratemap",
-    "crossCorrelation": "crosscorrelation",
-}
+# From kind of processor to the name that it gets: those of the guide.
+NAMES = {kind: representation.name for kind, representation in interface.FIXED.items()}
 
 
 class DemoError(Exception):

@@ -13,9 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-from rosafe.audiofile import AudioFile
 from rosafe.bass.sources import DEFAULT_RATE, open_source
 from rosafe.bass.sources.scene import WALK_SECONDS, scene_azimuth
+from rosafe.sound.audiofile import AudioFile
 
 SOUND_FILES = {".wav", ".flac", ".ogg", ".oga", ".opus", ".mp3", ".aif", ".aiff", ".aifc", ".au", ".caf", ".w64"}
 GUIDE_RATES = (32000, 48000)  # at which the guide's block and chunk are used as they are

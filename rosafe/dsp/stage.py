@@ -70,6 +70,14 @@ class Stage:
         self._build(self._values, frozenset(self._values))
         self.output = self._output()
 
+    @classmethod
+    def in_force(cls, values: Mapping[str, Any]) -> dict[str, Any]:
+        """What `parameters` tells of a stage with these (checked) values, as far as no sample rate is needed for that.
+
+        ValueError for values that go together at no sample rate.
+        """
+        return dict(values)
+
     # --- what it is -------------------------------------------------------------------------------------------
 
     @property

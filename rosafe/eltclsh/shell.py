@@ -11,11 +11,11 @@ from pathlib import Path
 from tkinter import TclError
 from typing import TYPE_CHECKING, Any, NoReturn
 
-from rosafe import __version__
 from rosafe.eltclsh.interpreter import LIBRARY, PACKAGES, Interpreter
 from rosafe.eltclsh.library import tcl as library
 from rosafe.eltclsh.signals import Signals
 from rosafe.eltclsh.words import parse
+from rosafe.version import VERSION
 
 if TYPE_CHECKING:  # readline is for terminals: scripts do without
     from rosafe.eltclsh.history import History
@@ -38,7 +38,7 @@ def main(tk: bool = False) -> NoReturn:
         print(told, end="")
         sys.exit(0)
     if sys.argv[1:] == ["--version"]:
-        print(f"{name} {__version__}")
+        print(f"{name} {VERSION}")
         sys.exit(0)
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, signal.SIG_DFL)  # as tclsh; Python's would wait for Tcl to return
@@ -182,7 +182,7 @@ class Shell:
         tk.eval("set ::tcl_interactive 1")
         if self.signals.command("INT") == "-default":
             self.signals.command("INT", "::el::interrupted")
-        self.tcl.say(f"{self.name} {__version__}, Tcl {tk.eval('info patchlevel')}")
+        self.tcl.say(f"{self.name} {VERSION}, Tcl {tk.eval('info patchlevel')}")
         while (line := self._next_line()) is not None:
             # What was pasted comes as one piece with line ends.
             for part in line.split("\n"):

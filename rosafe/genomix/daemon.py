@@ -13,12 +13,12 @@ import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
 
-from rosafe import __version__
+from rosafe.component import generate, master, startup
 from rosafe.genomix.access import own_names
 from rosafe.genomix.graph import Graph
 from rosafe.genomix.server import Server
 from rosafe.genomix.sessions import Sessions
-from rosafe.ros import generate, master, startup
+from rosafe.version import VERSION
 
 DEFAULT_PORT = 8080
 DEFAULT_HOST = "127.0.0.1"
@@ -62,7 +62,7 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
         action="store_true",
         help="say the port on stdout, and end with the standard input: a private server of the program that starts it",
     )
-    parser.add_argument("--version", action="version", version=f"genomixd {__version__}")
+    parser.add_argument("--version", action="version", version=f"genomixd {VERSION}")
     return parser.parse_args(arguments)
 
 

@@ -17,8 +17,8 @@ from xml.parsers.expat import ExpatError
 
 import aiohttp
 
+from rosafe.component import startup
 from rosafe.interface import ComponentError
-from rosafe.ros import startup
 
 RPC_SECONDS = 3.0  # for one call of the master or of a node
 NODE_SECONDS = 15.0  # for becoming a node of the graph
@@ -123,7 +123,7 @@ class Graph:
         await self.master("getPid")  # rospy would wait for the master without end
         import rospy
 
-        from rosafe.ros import registration
+        from rosafe.component import registration
 
         loop = asyncio.get_running_loop()
         registrar = await asyncio.to_thread(registration.init_node, self.name[1:], ["genomixd"])

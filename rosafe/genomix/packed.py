@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from rosafe.genomix.syntax import SIGNALS
 from rosafe.interface import Component
+from rosafe.interface.signals import LEVELS
 
 STRUCTURE, SEQUENCE, END = b"{", b"[", b"."
 NUMBER, TEXT, NUMBERS, SIGNAL, ERROR = b"d", b"s", b"D", b"S", b"!"
@@ -45,9 +45,9 @@ def _numbers(values: Any) -> bytes:
 
 
 def pieces(component: Component, idl: str, value: Any) -> Iterator[bytes]:
-    """The bytes of `value`, as `rosafe.ros.wire.decode` gives it, of IDL type `idl`."""
-    if idl in SIGNALS:
-        yield from _signal(SIGNALS[idl], value)
+    """The bytes of `value`, as `rosafe.component.wire.decode` gives it, of IDL type `idl`."""
+    if idl in LEVELS:
+        yield from _signal(LEVELS[idl], value)
     elif idl.startswith("sequence<"):
         element = idl[len("sequence<") : -1]
         if not element.startswith("::") and element != "string":

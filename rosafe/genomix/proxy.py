@@ -9,6 +9,7 @@ from typing import Any
 
 import rosgraph.names
 
+from rosafe.component import wire
 from rosafe.genomix import packed, syntax, trees
 from rosafe.genomix.actions import ActionClient, Goal
 from rosafe.genomix.graph import Graph, Unknown, middleware_error
@@ -17,16 +18,19 @@ from rosafe.genomix.tcpros import Connection, Refused, ServiceClient, TopicReade
 from rosafe.genomix.values import complete, partial
 from rosafe.interface import (
     COMPONENTS,
+    KINDS,
     REQUEST,
     REQUIRED,
+    ROSAFE,
     Component,
     ComponentError,
     Parameter,
     Port,
+    Representation,
     Service,
     ros_type,
 )
-from rosafe.ros import wire
+from rosafe.interface.signals import LEVELS
 
 CALL_SECONDS = 60.0  # for the answer to one request
 APPEAR_SECONDS = 2.0  # that `load` waits for a component that is just starting
@@ -283,6 +287,7 @@ class Proxy:
                 for p in component.ports
             },
             "exceptions": {f"::{component.name}::{short}": doc for short, doc in component.exceptions.items()},
+            "representations": {kind: _describe_representation(r) for kind, r in KINDS.items() if component is ROSAFE},
         }
 
 
@@ -345,7 +350,7 @@ def _zero(component: Component, idl: str) -> Any:
     if idl.startswith("sequence<"):
         return []
     if idl in component.structs:
-        if idl in syntax.SIGNALS:
+        if idl in LEVELS:
             return []
         return {name: _zero(component, kind) for name, kind in component.structs[idl]}
     return "" if idl == "string" else 0
@@ -363,6 +368,22 @@ def _describe_service(service: Service, composite: bool) -> dict[str, Any]:
     }
 
 
+def _describe_representation(representation: Representation) -> dict[str, Any]:
+    return {
+        "word": representation.word,
+        "aliases": list(representation.word_aliases),
+        "request": representation.request,
+        "port": representation.port,
+        "parent": representation.parent,
+        "name": representation.name,
+        "binaural": representation.binaural,
+        "parts": {part.name: {"axes": list(part.axes), "unit": part.unit} for part in representation.parts},
+        "parameters": [p.name for p in representation.parameters],
+        "derived": [d.name for d in representation.derived],
+        "coordinates": list(representation.coordinates),
+    }
+
+
 def _describe_parameter(parameter: Parameter) -> dict[str, Any]:
     required = parameter.default is REQUIRED
     return {
@@ -372,5 +393,6 @@ def _describe_parameter(parameter: Parameter) -> dict[str, Any]:
         "default": "" if required else parameter.default,
         "range": parameter.range_text,
         "choices": list(parameter.choices),
+        "unit": parameter.unit,
         "aliases": list(parameter.aliases),
     }

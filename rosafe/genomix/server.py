@@ -13,7 +13,6 @@ from typing import Any, TypeVar
 
 from aiohttp import web
 
-from rosafe import __version__
 from rosafe.genomix import packed
 from rosafe.genomix.access import refuse_web_pages
 from rosafe.genomix.graph import middleware_error
@@ -22,6 +21,7 @@ from rosafe.genomix.sessions import Request, Session, Sessions, error_body, too_
 from rosafe.genomix.syntax import SYNTAXES, TCL, Syntax, plain
 from rosafe.genomix.values import parse_input, refused
 from rosafe.interface import ComponentError
+from rosafe.version import VERSION
 
 MAX_CONNECTIONS = 2000
 MAX_URL = 256 * 1024  # bytes of a request line: a list of 1024 numbers fits, percent signs and all
@@ -170,7 +170,7 @@ class Server:
     # --- sessions ---
 
     async def _help(self, request: web.Request) -> web.Response:
-        return _text(_HELP.format(version=__version__))
+        return _text(_HELP.format(version=VERSION))
 
     async def _session_start(self, request: web.Request) -> web.Response:
         if not request.query.get("s"):

@@ -17,6 +17,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from rosafe.interface import Component
+from rosafe.interface.signals import LEVELS
 
 STEP = 1024  # numbers formatted at a time: about 0.3 ms, during which no other thread runs
 
@@ -25,12 +26,6 @@ _BRACEABLE = re.compile(r"[^{}\\\r\n]*")  # no line ends: an event is one line
 _TCL_ESCAPES = {
     **{ord(mark): "\\" + mark for mark in ' ;"$[]{}\\'},
     **{ord(mark): f"\\{name}" for mark, name in zip("\t\n\r\f\v", "tnrfv", strict=True)},
-}
-# How many levels of nested sequences each signal structure wraps, with the names of its levels.
-SIGNALS = {
-    "::rosAFE::signalOneD": ("data",),
-    "::rosAFE::signalND": ("dataN", "data"),
-    "::rosAFE::signalNxND": ("dataNxN", "dataN", "data"),
 }
 
 
@@ -124,9 +119,9 @@ SYNTAXES = {syntax.name: syntax for syntax in (JSON, TCL)}
 
 
 def pieces(syntax: Syntax, component: Component, idl: str, value: Any) -> Iterator[str]:
-    """The text of `value`, as `rosafe.ros.wire.decode` gives it, of IDL type `idl`, in short pieces."""
-    if idl in SIGNALS:
-        yield from _signal(syntax, SIGNALS[idl], value)
+    """The text of `value`, as `rosafe.component.wire.decode` gives it, of IDL type `idl`, in short pieces."""
+    if idl in LEVELS:
+        yield from _signal(syntax, LEVELS[idl], value)
     elif idl.startswith("sequence<"):
         yield syntax.open("sequence")
         yield from _elements(syntax, component, idl[len("sequence<") : -1], value)

@@ -19,9 +19,9 @@ from typing import Any
 import genpy
 import rosgraph.network
 
+from rosafe.component import wire
 from rosafe.genomix.graph import Graph, Unknown, middleware_error
 from rosafe.interface import ComponentError
-from rosafe.ros import wire
 
 CONNECT_SECONDS = 3.0
 CONNECTIONS = 4  # at once per service or type of topic; rospy's nodes take few new ones at a time

@@ -1,14 +1,14 @@
-"""Makes whole trees of processors, as `rosafe.request` plans them, with the services of a component."""
+"""Makes whole trees of processors, as `rosafe.tree.requests` plans them, with the services of a component."""
 
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Collection, Mapping
+from collections.abc import Awaitable, Mapping
 from typing import Any, Protocol, TypeVar
 
-from rosafe import request
 from rosafe.interface import KINDS, REQUEST, ComponentError
-from rosafe.request import Found, Plan, Step, Wish
+from rosafe.tree import requests as request
+from rosafe.tree.requests import Found, Plan, Step, Wish
 
 TRIES = 20  # plans that others' changes of the tree may spoil before the error is told
 INPUT_SECONDS = 1.5  # longer than an InputProc waits for sound
@@ -59,7 +59,7 @@ async def build(component: Component, values: Mapping[str, Any]) -> dict[str, An
 async def _carry_out(component: Component, wish: Wish, made: list[str]) -> list[str]:
     problem = ComponentError("::genom::mwerr", what="others change the tree all the time")
     for _ in range(TRIES):
-        plan = request.plan(wish, await _look(component, wish.kinds))
+        plan = request.plan(wish, await _look(component))
         try:
             await _take_steps(component, wish, plan, made)
         except ComponentError as error:
@@ -69,7 +69,7 @@ async def _carry_out(component: Component, wish: Wish, made: list[str]) -> list[
             if error.ex == request.INTERRUPTED:
                 await _wait_for_input(component)
         else:
-            if not plan.steps or request.stands(plan.dependencies, await _look(component, wish.kinds)):
+            if not plan.steps or request.stands(plan.dependencies, await _look(component)):
                 return plan.dependencies
     raise problem
 
@@ -78,7 +78,7 @@ async def _wait_for_input(component: Component) -> None:
     """Let another's InputProc, which has taken the place of ours, come to its end: it may be waiting for sound."""
     deadline = asyncio.get_running_loop().time() + INPUT_SECONDS
     while asyncio.get_running_loop().time() < deadline:
-        if (await component.outputs("getParameters", {}))["parameters"]["input"]:
+        if await _look(component):
             return
         await asyncio.sleep(POLL_SECONDS)
 
@@ -116,35 +116,23 @@ async def _connect(component: Component, wish: Wish) -> None:
         await component.outputs("connect_port", {"local": "Audio", "remote": topic})
 
 
-async def _look(component: Component, kinds: Collection[str]) -> list[Found]:
-    """All processors; the parents only of those of `kinds`."""
-    parameters = (await component.outputs("getParameters", {}))["parameters"]
+async def _look(component: Component) -> list[Found]:
+    """All processors of the kinds that are known here."""
     found = []
-    for kind in KINDS:
-        for structure in parameters[kind]:
-            values = {name: _plain(value) for name, value in structure.items()}
-            name = values.pop("name")
-            parent = ""
-            if kind in kinds and KINDS[kind].parent:
-                try:
-                    parent = (await component.outputs("getDependencies", {"nameProc": name}))["dependencies"][-2]
-                except ComponentError as problem:
-                    if not request.is_race(problem):
-                        raise
-                    continue  # it is gone
-            found.append(Found(name, kind, parent, values))
+    for processor in (await component.outputs("getProcessors", {}))["processors"]:
+        kind = KINDS.get(processor["kind"])
+        if kind is not None:
+            texts = {entry["name"]: entry["value"] for entry in processor["parameters"]}
+            values = {p.name: p.parse(texts[p.name]) for p in kind.parameters}
+            found.append(Found(processor["name"], kind.kind, processor["upperDepName"], values))
     return found
-
-
-def _plain(value: Any) -> Any:
-    return value.tolist() if hasattr(value, "tolist") else value
 
 
 async def _remove(component: Component, wish: Wish, made: list[str]) -> None:
     """Remove what was made, leaves first, but nothing that others have come to use. Errors are told by what failed."""
     try:
         for name in reversed(made):
-            found = await _look(component, list(KINDS))
+            found = await _look(component)
             this = next((p for p in found if p.name == name), None)
             if this is None or any(p.parent == name for p in found):
                 continue

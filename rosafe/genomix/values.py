@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rosafe.interface import KINDS, REQUEST, REQUIRED, ComponentError, Parameter, Service
-from rosafe.request import kind_of
+from rosafe.tree.requests import kind_of
 
 _WORDS = {
     **dict.fromkeys(("1", "true", "yes", "on", "t"), True),
@@ -17,8 +17,9 @@ _WORDS = {
 }
 _WHOLE = re.compile(r"[+-]?[0-9]{1,30}")
 MANY = 20  # parameters in one line
-_STRUCTURES = {name for kind in KINDS.values() for name in (kind.kind, kind.representation)}
-_NO_PARAMETERS = {"name", "cc_lags"}  # members of those structures all the same
+_STRUCTURES = {name for kind in KINDS.values() for name in (kind.kind, kind.word)}
+# members of those structures all the same
+_NO_PARAMETERS = {"name", *(derived.name for kind in KINDS.values() for derived in kind.derived)}
 
 
 def refused(what: str) -> ComponentError:
@@ -147,7 +148,7 @@ def _parameter(service: Service, name: str) -> Parameter:
 
 
 def _convert(service: Service, parameter: Parameter, value: Any) -> Any:
-    unbounded = dataclasses.replace(parameter, minimum=None, maximum=None)
+    unbounded = dataclasses.replace(parameter, minimum=None, maximum=None, least=0, choices=(), spellings={})
     try:
         return unbounded.check(_typed(parameter.idl, value))
     except ValueError as problem:

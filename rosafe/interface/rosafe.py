@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from rosafe.representations import KINDS
 from rosafe.representations.registry import ORIGINAL
 from rosafe.vocabulary.parameter import REQUIRED, Parameter
@@ -14,6 +16,8 @@ from .signals import SIGNALS, layout
 
 MAX_SECONDS = 600.0  # longest port or history
 MAX_BLOCK = 10_000_000  # frames
+
+Kinds = Mapping[str, Representation]  # parents first
 
 LAYOUTS = {kind: layout(representation) for kind, representation in KINDS.items()}
 FIXED = {kind: KINDS[kind] for kind in ORIGINAL if kind in KINDS}  # what getParameters and getSignals report
@@ -28,10 +32,10 @@ def parameter_struct(kind: str) -> str:
     return f"::rosAFE::{kind.removesuffix('Proc')}ProcsParametres"
 
 
-def _structs() -> dict[str, Struct]:
+def _structs(kinds: Kinds) -> dict[str, Struct]:
     structs = dict(SIGNALS)
-    for a_layout in LAYOUTS.values():
-        structs[a_layout.idl] = a_layout.members
+    for kind in kinds:
+        structs[LAYOUTS[kind].idl] = LAYOUTS[kind].members
     for kind, representation in FIXED.items():
         structs[parameter_struct(kind)] = (
             ("name", "string"),
@@ -93,7 +97,7 @@ _PROCESSOR_THROWS = (
 )
 
 
-def _request(representation: Representation) -> Service:
+def _adding(representation: Representation, kinds: Kinds) -> Service:
     """The request that adds a processor."""
     name = Parameter("name", "string", representation.name, representation.name_doc)
     parent = representation.parent
@@ -107,7 +111,7 @@ def _request(representation: Representation) -> Service:
             task=representation.kind,
             interrupts=(representation.request,),
         )
-    upper = Parameter("upperDepName", "string", KINDS[parent].name, "The name of the upper dependency")
+    upper = Parameter("upperDepName", "string", kinds[parent].name, "The name of the upper dependency")
     return Service(
         representation.request,
         representation.doc,
@@ -119,35 +123,35 @@ def _request(representation: Representation) -> Service:
     )
 
 
-_REQUESTS = tuple(map(_request, KINDS.values()))
-_NAME = Parameter("name", "string", "name", "The name of the processor")
-
-REQUEST = Service(
-    "request",
-    "Build what a representation needs, or find it in the tree of processors",
-    (
-        Parameter(
-            "representation",
-            "string",
-            REQUIRED,
-            "What is wanted, such as ild",
-            choices=tuple(kind.word for kind in KINDS.values()),
+def _whole_tree(kinds: Kinds) -> Service:
+    """The request for a representation and all that it needs."""
+    return Service(
+        "request",
+        "Build what a representation needs, or find it in the tree of processors",
+        (
+            Parameter(
+                "representation",
+                "string",
+                REQUIRED,
+                "What is wanted, such as ild",
+                choices=tuple(kind.word for kind in kinds.values()),
+            ),
+            Parameter("connect", "string", "bass/Audio", "Topic for the Audio port, where a new input needs one"),
+            *BLOCK_AND_BUFFERS,
+            *{p.name: p for kind in kinds.values() for p in kind.parameters}.values(),  # some are of two kinds
         ),
-        Parameter("connect", "string", "bass/Audio", "Topic for the Audio port, where a new input needs one"),
-        *BLOCK_AND_BUFFERS,
-        *(parameter for kind in KINDS.values() for parameter in kind.parameters),
-    ),
-    outputs=(
-        ("name", "string"),
-        ("dependencies", "sequence<string>"),
-        ("created", "sequence<string>"),
-        ("reused", "sequence<string>"),
-        ("unused", "sequence<string>"),
-        ("port", "string"),
-        ("topic", "string"),
-    ),
-    throws=_INPUT_THROWS,
-)
+        outputs=(
+            ("name", "string"),
+            ("dependencies", "sequence<string>"),
+            ("created", "sequence<string>"),
+            ("reused", "sequence<string>"),
+            ("unused", "sequence<string>"),
+            ("port", "string"),
+            ("topic", "string"),
+        ),
+        throws=_INPUT_THROWS,
+    )
+
 
 _FUNCTIONS = (
     Service(
@@ -179,7 +183,7 @@ _FUNCTIONS = (
     Service(
         "getRepresentation",
         "What one processor, of whatever kind, put out since this was last asked for it",
-        (_NAME,),
+        (Parameter("name", "string", "name", "The name of the processor"),),
         outputs=(("parts", "sequence<::rosAFE::representation>"),),
         throws=("::rosAFE::e_noMemory", "::rosAFE::e_noSuchProcessor"),
     ),
@@ -204,43 +208,48 @@ _FUNCTIONS = (
         (Parameter("name", "string", "name", "The name of the processor to delete", aliases=("nameProc",)),),
         throws=("::rosAFE::e_noSuchProcessor",),
     ),
-    Service(
-        "Stop",
-        "Stop and remove all processors; port connections stay",
-        interrupts=tuple(service.name for service in _REQUESTS),
-    ),
 )
 
-ROSAFE = Component(
-    name="rosAFE",
-    doc="The Two!Ears auditory front-end: a tree of processors that compute auditory representations",
-    services=(*_REQUESTS, *_FUNCTIONS, *COMMON_SERVICES),
-    ports=(
-        Port("Audio", "::binaudio::portStruct", "Binaural audio to work on", output=False),
-        *(
-            Port(
-                kind.port,
-                LAYOUTS[kind.kind].idl,
-                kind.port_doc,
-                multiple=bool(kind.parent),
-                aliases=kind.port_aliases,
-            )
-            for kind in KINDS.values()
+# --- the component ----------------------------------------------------------------------------------------------
+
+
+def derive(kinds: Kinds) -> Component:
+    """The component whose processors are of these kinds."""
+    adding = tuple(_adding(kind, kinds) for kind in kinds.values())
+    stop = Service(
+        "Stop",
+        "Stop and remove all processors; port connections stay",
+        interrupts=tuple(service.name for service in adding),
+    )
+    ports = (
+        Port(kind.port, LAYOUTS[kind.kind].idl, kind.port_doc, multiple=bool(kind.parent), aliases=kind.port_aliases)
+        for kind in kinds.values()
+    )
+    return Component(
+        name="rosAFE",
+        doc="The Two!Ears auditory front-end: a tree of processors that compute auditory representations",
+        services=(*adding, *_FUNCTIONS, stop, *COMMON_SERVICES),
+        ports=(
+            Port("Audio", "::binaudio::portStruct", "Binaural audio to work on", output=False),
+            *ports,
+            Port("dataObj", "::rosAFE::dataObjSt", "Advertised as in the original and, as there, never written"),
+            GENOM_STATE_PORT,
         ),
-        Port("dataObj", "::rosAFE::dataObjSt", "Advertised as in the original and, as there, never written"),
-        GENOM_STATE_PORT,
-    ),
-    tasks=("init", *(service.task for service in _REQUESTS)),
-    exceptions={
-        "e_noData": "no audio on the Audio port",
-        "e_noMemory": "out of memory",
-        "e_existsAlready": "a processor of this name exists already",
-        "e_noSuchProcessor": "no processor of this name",
-        "e_noSuchParameter": "the processor has no such parameter",
-        "e_noUpperDependencie": "no processor of the right type has the name given as upper dependency",
-        "e_badIndexParam": "bad index",
-        "e_badNewValue": "a value of the wrong type or out of its range",
-    },
-    structs={**_structs(), **BINAUDIO, **GENOM_STATE},
-    composites=(REQUEST,),
-)
+        tasks=("init", *(service.task for service in adding)),
+        exceptions={
+            "e_noData": "no audio on the Audio port",
+            "e_noMemory": "out of memory",
+            "e_existsAlready": "a processor of this name exists already",
+            "e_noSuchProcessor": "no processor of this name",
+            "e_noSuchParameter": "the processor has no such parameter",
+            "e_noUpperDependencie": "no processor of the right type has the name given as upper dependency",
+            "e_badIndexParam": "bad index",
+            "e_badNewValue": "a value of the wrong type or out of its range",
+        },
+        structs={**_structs(kinds), **BINAUDIO, **GENOM_STATE},
+        composites=(_whole_tree(kinds),),
+    )
+
+
+ROSAFE = derive(KINDS)
+(REQUEST,) = ROSAFE.composites

@@ -52,7 +52,7 @@ class Service:
 
     def check(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """All values as their parameters' Python types, or ValueError naming the first that is refused."""
-        return {parameter.name: parameter.check(values[parameter.name]) for parameter in self.parameters}
+        return {p.name: p.check(p.known_word(values[p.name])) for p in self.parameters}
 
 
 @dataclass(frozen=True)

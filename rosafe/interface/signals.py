@@ -18,6 +18,12 @@ SIGNALS: dict[str, Struct] = {
     "::rosAFE::signalND": (("dataN", "sequence<::rosAFE::signalOneD>"),),
     "::rosAFE::signalNxND": (("dataNxN", "sequence<::rosAFE::signalND>"),),
 }
+# The member at each level of nesting, from the outermost in.
+LEVELS = {
+    "::rosAFE::signalOneD": ("data",),
+    "::rosAFE::signalND": ("dataN", "data"),
+    "::rosAFE::signalNxND": ("dataNxN", "dataN", "data"),
+}
 _BY_DIMENSIONS = dict(enumerate(SIGNALS, 1))
 _HEAD = (
     ("sampleRate", "unsigned long"),
@@ -45,7 +51,7 @@ class Layout(NamedTuple):
     """The message of a representation."""
 
     idl: str
-    counts: tuple[tuple[str, int], ...]  # fields, and which axis each counts: of the rows of an array less its ears
+    counts: tuple[tuple[str, int, int], ...]  # field, part and axis of it that it counts
     places: tuple[Place, ...]
     members: Struct
 
@@ -70,7 +76,7 @@ def layout(representation: Representation) -> Layout:
     """How what `representation` puts out travels. ValueError where there is no message for its axes."""
     parts, single = representation.parts, len(representation.parts) == 1
     kind = _type(representation.kind, parts[0], single)
-    largest = max(parts, key=lambda part: len(part.axes))
+    largest = max(parts, key=lambda part: len(_rows(part)))
     rows = _rows(largest)
     if len(rows) > 2 or (not single and not representation.binaural):
         raise ValueError(f"representation {representation.kind!r}: no message has room for {largest.axes}")
@@ -92,7 +98,7 @@ def layout(representation: Representation) -> Layout:
     fields = tuple((place.field, _BY_DIMENSIONS[1 + len(_rows(parts[place.part]))]) for place in places)
     return Layout(
         f"::rosAFE::{kind}SignalPortStruct",
-        tuple((field, axis) for field, axis, _ in counts),
+        tuple((field, parts.index(largest), axis + ("ear" in largest.axes)) for field, axis, _ in counts),
         places,
         (*_HEAD, *((field, idl) for field, _, idl in counts), *fields),
     )

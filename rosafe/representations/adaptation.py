@@ -17,6 +17,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -135,9 +136,13 @@ class Adaptation(Stage):
         self._build(self._values, frozenset())
 
     def _merge(self, checked: dict[str, Any]) -> dict[str, Any]:
-        values = super()._merge(checked)
+        return self.in_force(super()._merge(checked))
+
+    @classmethod
+    def in_force(cls, values: Mapping[str, Any]) -> dict[str, Any]:
+        parameter = cls.REPRESENTATION.parameter
         published = SETS.get(values["adpt_model"], {})
-        return {**values, **{name: self._parameter(name).check(value) for name, value in published.items()}}
+        return {**values, **{name: parameter(name).check(value) for name, value in published.items()}}
 
     def _build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
         threshold = np.array([values["adpt_mindB"]])

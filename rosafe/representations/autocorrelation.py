@@ -100,10 +100,8 @@ class Autocorrelation(FramedStage):
             frames = self._frames(samples, self.window)
             return kernels.autocorrelations(frames, clipping, alpha, exponent, self._corrections)
         whole = self._framing.frames(self._buffer.append(limited(samples)))  # (2, C, F, w)
-        result = np.empty((*samples.shape[:-1], self._lags, whole.shape[-2]))
-        for row in np.ndindex(*samples.shape[:-1]):
-            result[row] = autocorrelate(whole[row], self.window, clipping, alpha, exponent, self._corrections).T
-        self._buffer.drop(whole.shape[-2] * self._framing.hop)
+        result = autocorrelate(whole, self.window, clipping, alpha, exponent, self._corrections)
+        self._buffer.drop(result.shape[-1] * self._framing.hop)
         return result
 
     @property
@@ -125,24 +123,29 @@ class Autocorrelation(FramedStage):
 def autocorrelate(
     frames: FloatArray, window: FloatArray, clipping: str, alpha: float, exponent: float, corrections: FloatArray
 ) -> FloatArray:
-    """Frames (F, w) to (F, L), the autocorrelation at lag 0 being 1; each lag l is multiplied by corrections[l]."""
-    result = np.empty((len(frames), len(corrections)))
-    points = 1 << (2 * len(window) - 2).bit_length()
-    at_once = max(1, BATCH // points)
-    for first in range(0, len(frames), at_once):
-        part = slice(first, first + at_once)
-        spectrum = scipy.fft.rfft(clipped(frames[part] * window, clipping, alpha), points)
-        power = np.square(spectrum.real) + np.square(spectrum.imag)
-        if exponent != 2:
-            power **= exponent / 2
-        circular = scipy.fft.irfft(power, points)
-        norm = 1 / np.maximum(circular[:, :1], SMALLEST)
-        result[part] = circular[:, : len(corrections)] * norm * corrections
+    """Frames (2, C, F, w) to (2, C, L, F), 1 at lag 0; what is at lag l is multiplied by corrections[l]."""
+    channel_count, frame_count, size = frames.shape[1:]
+    lags = len(corrections)
+    result = np.empty((2, channel_count, lags, frame_count))
+    points = 1 << (2 * size - 2).bit_length()
+    at_once = max(1, BATCH // (2 * points))  # frames of one channel, or of as many channels as go with them
+    channels_at_once = max(1, at_once // max(1, frame_count))
+    for first in range(0, channel_count, channels_at_once):
+        channels = slice(first, first + channels_at_once)
+        for begin in range(0, frame_count, at_once):
+            part = slice(begin, begin + at_once)
+            spectrum = scipy.fft.rfft(clipped(frames[:, channels, part] * window, clipping, alpha), points)
+            power = np.square(spectrum.real) + np.square(spectrum.imag)
+            if exponent != 2:
+                power **= exponent / 2
+            circular = scipy.fft.irfft(power, points)[..., :lags]
+            normalised = circular / np.maximum(circular[..., :1], SMALLEST) * corrections
+            result[:, channels, :, part] = normalised.swapaxes(2, 3)
     return result
 
 
 def clipped(frames: FloatArray, clipping: str, alpha: float) -> FloatArray:
-    """Frames (F, w), centre-clipped and scaled so that no exponent leads beyond the range of numbers."""
+    """Frames (..., w), centre-clipped and scaled so that no exponent leads beyond the range of numbers."""
     high, low = np.abs(frames.max(axis=-1, keepdims=True)), np.abs(frames.min(axis=-1, keepdims=True))
     above, below = frames >= alpha * high, frames <= -alpha * low
     if clipping == "sgn":

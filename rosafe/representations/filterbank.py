@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -111,9 +112,19 @@ class Filterbank(Stage):
     INPUT = ("ear", "time")
     PROVIDES = ("envelope",)
 
+    @classmethod
+    def in_force(cls, values: Mapping[str, Any]) -> dict[str, Any]:
+        frequencies = center_frequencies(values).tolist()
+        told = {**values, "fb_nChannels": len(frequencies), "fb_cfHz": frequencies}
+        if values["fb_cfHz"]:
+            told.update(fb_lowFreqHz=frequencies[0], fb_highFreqHz=frequencies[-1], fb_nERBs=0.0)
+        elif values["fb_nChannels"]:
+            told["fb_nERBs"] = float(erb_rate(frequencies[-1]) - erb_rate(frequencies[0])) / len(frequencies)
+        return told
+
     @property
     def parameters(self) -> dict[str, Any]:
-        return {**self._values, **self._in_force, "fb_cfHz": self._frequencies.tolist()}
+        return self.in_force(self._values)
 
     def output_rows(self, rows: tuple[int, ...]) -> tuple[int, ...]:
         return (*rows, len(self._frequencies))
@@ -151,20 +162,14 @@ class Filterbank(Stage):
             bank = DrnlBank(self.sample_rate, frequencies)
         else:
             bank = GammatoneBank(self.sample_rate, frequencies, values["fb_nGamma"], values["fb_bwERBs"])
-        in_force: dict[str, Any] = {"fb_nChannels": len(frequencies)}
-        if values["fb_cfHz"]:
-            in_force.update(fb_lowFreqHz=float(frequencies[0]), fb_highFreqHz=float(frequencies[-1]), fb_nERBs=0.0)
-        elif values["fb_nChannels"]:
-            span = erb_rate(frequencies[-1]) - erb_rate(frequencies[0])
-            in_force["fb_nERBs"] = float(span) / len(frequencies)
-        self._bank, self._frequencies, self._in_force, self.provided = bank, frequencies, in_force, {}
+        self._bank, self._frequencies, self.provided = bank, frequencies, {}
 
 
-def _chosen_by(values: dict[str, Any]) -> str:
+def _chosen_by(values: Mapping[str, Any]) -> str:
     return "fb_cfHz" if values["fb_cfHz"] else "fb_highFreqHz"
 
 
-def center_frequencies(values: dict[str, Any]) -> FloatArray:
+def center_frequencies(values: Mapping[str, Any]) -> FloatArray:
     """Centre frequencies (C,) in Hz that the checked parameters of `Filterbank` ask for; ValueError if impossible."""
     if values["fb_cfHz"]:
         return np.array(values["fb_cfHz"])

@@ -119,10 +119,11 @@ class Pitch(Stage):
         count, order = max(0, held - self.look_ahead), self._values["pi_medianOrder"]
         first = frames.shape[-1] - held
         output = frames[..., first : first + count].copy()
-        begin = first - order // 2
-        windows = np.sort(sliding_window_view(frames[:, 0, begin : begin + count + order - 1], order, axis=-1))
-        output[:, 0] = (windows[..., (order - 1) // 2] + windows[..., order // 2]) / 2
-        output[:, 0][output[:, 0] == 0] = np.nan
+        if count:
+            begin = first - order // 2
+            windows = np.sort(sliding_window_view(frames[:, 0, begin : begin + count + order - 1], order, axis=-1))
+            median = (windows[..., (order - 1) // 2] + windows[..., order // 2]) / 2
+            output[:, 0] = np.where(median > 0, median, np.nan)
         self._held = held - count
         self._frames = frames[..., frames.shape[-1] - self._held - MOST_ORDER // 2 :].copy()
         return output

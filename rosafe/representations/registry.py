@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import importlib.metadata
 import importlib.util
 import os
 import pkgutil
@@ -12,10 +11,9 @@ from pathlib import Path
 from types import ModuleType
 
 from rosafe.dsp.stage import Stage
+from rosafe.vocabulary import plugins
 from rosafe.vocabulary.representation import Representation
 
-FOLDERS = "ROSAFE_PLUGINS"
-ENTRY_POINTS = "rosafe.representations"
 # The original's processors, in its order: also that of getParameters and getSignals, which report no others.
 ORIGINAL = ("input", "preProc", "gammatone", "ihc", "ild", "ratemap", "crossCorrelation")
 
@@ -31,10 +29,13 @@ def _stages_in(module: ModuleType) -> dict[str, type[Stage]]:
     return found
 
 
-def _own() -> Iterator[ModuleType]:
+def own() -> dict[str, type[Stage]]:
+    """The representations of this folder by kind, without plugins; parents first."""
+    found: dict[str, type[Stage]] = {}
     for info in pkgutil.iter_modules([str(Path(__file__).parent)]):
         if info.name != Path(__file__).stem:
-            yield importlib.import_module(f"{__package__}.{info.name}")
+            found.update(_stages_in(importlib.import_module(f"{__package__}.{info.name}")))
+    return _ordered(found)
 
 
 def _ordered(stages: Mapping[str, type[Stage]]) -> dict[str, type[Stage]]:
@@ -66,9 +67,9 @@ def _clash(stage: type[Stage], others: Mapping[str, type[Stage]]) -> str:
 
 def _plugin_modules(problems: list[str]) -> Iterator[tuple[str, ModuleType]]:
     """Each plugin's origin and module; what cannot be imported goes to `problems`."""
-    for folder in filter(None, os.environ.get(FOLDERS, "").split(os.pathsep)):
+    for folder in plugins.folders():
         if not os.path.isdir(folder):
-            problems.append(f"{folder}: named in {FOLDERS}, and no folder")
+            problems.append(f"{folder}: named in {plugins.FOLDERS}, and no folder")
         for path in sorted(Path(folder).glob("*.py")):
             try:
                 spec = importlib.util.spec_from_file_location(f"rosafe_plugin_{path.stem}", path)
@@ -80,7 +81,7 @@ def _plugin_modules(problems: list[str]) -> Iterator[tuple[str, ModuleType]]:
                 problems.append(f"{path}: {type(problem).__name__}: {problem}")
             else:
                 yield str(path), module
-    for point in importlib.metadata.entry_points(group=ENTRY_POINTS):
+    for point in plugins.entry_points():
         try:
             module = importlib.import_module(point.module)
         except (Exception, SystemExit) as problem:
@@ -91,9 +92,7 @@ def _plugin_modules(problems: list[str]) -> Iterator[tuple[str, ModuleType]]:
 
 def find() -> tuple[dict[str, type[Stage]], list[str]]:
     """All representations by kind, parents first, and a line for each plugin that is left out."""
-    stages: dict[str, type[Stage]] = {}
-    for module in _own():
-        stages.update(_stages_in(module))
+    stages = own()
     problems: list[str] = []
     offered = []
     for origin, module in _plugin_modules(problems):

@@ -1,103 +1,147 @@
-"""One processor of the tree: a thread that goes through waitExec, exec, waitRelease and release.
-
-To wake a thread takes some ten microseconds of both processors of the machine, and then the two want the interpreter
-lock in turn. A processor whose blocks take not much longer than that is carried: the thread that has released its
-parent's block goes through the child's states too, while the child's own thread sleeps. It wakes up as soon as its
-blocks take longer, and for the end.
-"""
+"""One processor of the tree: a task that goes through waitExec, exec, waitRelease and release, block after block."""
 
 from __future__ import annotations
 
-import copy
-import itertools
-import math
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from typing import Any, Protocol
 
-from rosafe.tree.roles import Listener, Observer, Source, State
-from rosafe.tree.window import History, WindowView
-from rosafe.tree.zone import Block, SharedZone
+from numpy.typing import NDArray
 
-SHORT = 1.5e-4  # seconds: a processor that works so long on a block is better off on a thread of its own
-OBSERVED = 8  # blocks that a processor does on its own thread before it may be carried
-RISE = 1.1  # what a processor takes for a block is the least of late; that is forgotten at this pace per block
+from rosafe.dsp.signal import Signal
+from rosafe.dsp.stage import Stage, parts_of
+from rosafe.tree.block import Block
+from rosafe.tree.changes import Changes
+from rosafe.tree.history import History, Taken
+from rosafe.tree.states import State, StateMachine
+from rosafe.tree.workers import Workers
+from rosafe.vocabulary.representation import Representation
 
-
-class Change(NamedTuple):
-    """A parameter change that waits for the processor's next block, or for a later one."""
-
-    block: int  # of the input; it is made before this one, or the next one if that is a later one
-    name: str
-    value: Any
+SHORT = 1.5e-4  # seconds: a listener that takes so long is called once nothing deeper in the tree is ready
+EARS = (2,)  # leading shape of what the input takes
 
 
-class Processor:
+class Source(Protocol):
+    """Where the input reads. Called with no lock of the tree's held, and `read` by one thread at a time.
+
+    Attributes
+    ----------
+    sample_rate : float
+        In Hz.
+    ended : bool
+        Nothing more will come; what has come may still be read.
+    """
+
+    sample_rate: float
+    ended: bool
+
+    def open(self, wake: Callable[[], None]) -> None:
+        """From now on call `wake` whenever there may be a block to read, or the end. It returns at once.
+
+        There may be one already: the tree looks once without being called.
+        """
+
+    def read(self) -> tuple[NDArray[Any], int] | None:
+        """The next block, (2, n), and the index of the frame after it; None where there is none yet, or no more."""
+
+    def stop(self) -> None:
+        """Nobody will read any more."""
+
+
+class Listener(Protocol):
+    """Who hears of what the processors do. Called by workers, of which others go on; must not wait for the tree."""
+
+    def added(self, processor: Processor) -> None:
+        """A processor is about to start; nothing was released yet. Where this raises, it is taken out again."""
+
+    def executed(self, processor: Processor, seconds: float) -> None:
+        """One block was computed in so many seconds; the last one perhaps after `ended`."""
+
+    def released(self, processor: Processor, block: Block) -> None:
+        """A block was released. Never called after `ended`, and for one processor by one worker at a time."""
+
+    def ended(self, processor: Processor) -> None:
+        """The processor is gone; `processor.error` tells why where it was not asked to."""
+
+
+# Gets (processor, state that it enters, number of the block at hand or None). Called under the tree's lock: no waiting.
+Observer = Callable[["Processor", State, "int | None"], None]
+
+
+@dataclass(frozen=True)
+class Company:
+    """What all processors of one tree have in common.
+
+    `failed` is called, by the worker, where a processor's `error` is set.
+    """
+
+    workers: Workers
+    listener: Listener
+    failed: Callable[[Processor], None]
+    over: threading.Condition  # on the tree's lock: somebody may have come to its end
+    observers: list[Observer] = field(default_factory=list)
+
+
+class Processor(StateMachine):
     """A node of the tree. Made and wired by `Tree`; the public members are safe from any thread.
 
-    Locks are taken in this order: the tree's requests, `_publishing`, `_changing` or the tree's lock.
+    Locks are taken in this order: the tree's requests, `_telling`, the tree's lock or those of changes and history.
 
     Parameters
     ----------
-    name, kind : str
-        The user's name for it; a key of `rosafe.interface.KINDS`.
-    stage : rosafe.dsp.Stage
+    name : str
+        The user's name for it.
+    stage : Stage
         The numerics.
     parent : Processor or None
         None for the input, which reads from `source`.
-    lock : threading.RLock
-        The tree's lock, which guards all tokens.
-    failed : callable
-        Called at the end of its thread where `error` is set.
-    observers : sequence of Observer
-        The tree's, as they come and go.
+    company : Company
+        The others.
+    history_seconds : float
+        How much of its output it remembers.
+
+    Attributes
+    ----------
+    kind : str
+        Its representation's.
+    error : BaseException or None
+        Why it came to its end.
+    blocks : int
+        That it has worked on, and
+    busy : float
+        the seconds that it took for them.
     """
+
+    parent: Processor | None
+    children: list[Processor]  # type: ignore[assignment]  # state machines, all of which are processors
 
     def __init__(
         self,
         name: str,
-        kind: str,
-        stage: Any,
+        stage: Stage,
         parent: Processor | None,
-        source: Source | None,
-        lock: threading.RLock,
-        listener: Listener,
+        company: Company,
         history_seconds: float,
-        failed: Callable[[Processor], None],
-        observers: Sequence[Observer] = (),
+        source: Source | None = None,
     ) -> None:
+        super().__init__(parent)
         self.name = name
-        self.kind = kind
-        self.parent = parent
-        self.children: list[Processor] = []
-        self.state = State.WAIT_EXEC
         self.error: BaseException | None = None
         self.blocks = 0
-        self.next_index = 0
-        self.history_seconds = history_seconds
-        self.zone = SharedZone()
-        self.turn = threading.Condition(lock)  # its own thread waits for a block
-        self._released = threading.Condition(lock)  # whoever works for it waits for its children
-        self._lock = lock
-        self.stage = stage  # as it will be after all changes, to be asked and not to be run
-        self._stage = stage  # at work
+        self.busy = 0.0
+        self.held_up_since = 0.0
+        self.changes = Changes(stage)
+        self.history = History(self.part_rows, stage.output, history_seconds)
+        self._company = company
+        self._workers = company.workers
+        self._lock = company.workers.lock
         self._source = source
-        self._listener = listener
-        self._failed = failed
-        self._observers = observers
-        self._private: Block | None = None  # computed, and to be released as soon as no child holds the last one
-        self._working = False  # on a block, until its children have done theirs that are carried
-        self._carried = False  # the thread that works for its parent has taken on its block, or will
-        self._carries: list[Processor] = []  # the children whose block is taken on
-        self._usual = math.inf  # seconds that it takes for a block
-        self._telling = 0.0  # seconds that the listener took for the last block
-        self._reading: Processor | None = None  # the parent whose block it holds: the input may be replaced meanwhile
-        self._changing = threading.Lock()  # guards _changes, and the exchange of _stage
-        self._changes: list[Change] = []
-        self._publishing = threading.Lock()  # `released` and `ended` exclude each other
-        self._history = History(self.rows, self.rate, history_seconds)
-        self._thread = threading.Thread(target=self._run, name=f"{kind}:{name}", daemon=True)
+        self._started = False
+        self._taken: Block | None = None
+        self._usual_telling = 0.0  # seconds that the listener took for the last block
+        self._telling = threading.Lock()  # `released` and `ended` exclude each other
 
     def __repr__(self) -> str:
         return f"<{self.kind} {self.name!r} {self.state.value}>"
@@ -105,302 +149,199 @@ class Processor:
     # --- what it is ---
 
     @property
+    def stage(self) -> Stage:
+        """As it will be after all changes, to be asked and not to be run."""
+        return self.changes.planned
+
+    @property
+    def representation(self) -> Representation:
+        """The declaration of what it computes."""
+        return self.stage.REPRESENTATION
+
+    @property
+    def kind(self) -> str:
+        return self.representation.kind
+
+    @property
+    def given_rows(self) -> tuple[int, ...]:
+        """Leading shape of what it takes."""
+        return EARS if self.parent is None else self.parent.rows
+
+    @property
+    def part_rows(self) -> tuple[tuple[int, ...], ...]:
+        """Leading shape of each part of its output, such as (2, channels)."""
+        return self.stage.part_rows(self.given_rows)
+
+    @property
     def rows(self) -> tuple[int, ...]:
-        """Leading shape of its output: (2,), (2, channels), (channels,) or (channels, lags)."""
-        return tuple(self.stage.output_rows(self.parent.rows if self.parent is not None else (2,)))
+        """That of the first part, which its children take."""
+        return self.stage.output_rows(self.given_rows)
+
+    @property
+    def axes(self) -> tuple[tuple[str, ...], ...]:
+        """What lies along the dimensions of each part, time last."""
+        return tuple(part.axes for part in self.representation.parts)
+
+    @property
+    def signal(self) -> Signal:
+        """The format of its output."""
+        return self.stage.output
 
     @property
     def rate(self) -> float:
         """Frames of output per second."""
-        return float(self.stage.output_rate)
+        return self.signal.rate
+
+    @property
+    def next_index(self) -> int:
+        """Of the audio frame after the newest one that its output knows of."""
+        return self.history.next_index
 
     def parameters(self) -> dict[str, Any]:
-        """The values from the next block on, in the order of the parameter structure; `cc_lags` (s) at its end."""
-        stage = self.stage
-        values = dict(stage.parameters)
-        if hasattr(stage, "lags"):
-            values["cc_lags"] = stage.lags.tolist()
-        return values
+        """The values from the next block on, in the order of the parameter structure."""
+        return self.stage.parameters
 
-    # --- changes ---
+    def derived(self) -> dict[str, Any]:
+        """What follows from these."""
+        return self.stage.derived
 
-    def change(self, name: str, value: Any, accept: Callable[[Any], None], block: int = 0) -> None:
-        """Change one parameter before block `block` of the input, or before the next one if that is a later one.
-
-        `accept` sees the changed stage before it is put to work and may raise ValueError; then, as where the stage
-        itself does, everything stays as it was. The caller makes one change at a time, in the order of their blocks.
-        """
-        change = Change(block, name, value)
-        planned = _changed(self.stage, [change])
-        accept(planned)
-        with self._changing:
-            self._changes.append(change)
-            self.stage = planned
-
-    def _due(self, block: int) -> list[Change]:
-        return list(itertools.takewhile(lambda change: change.block <= block, self._changes))
-
-    def _apply_changes(self, taken: Block) -> None:
-        """Make the changes that are due, up to the last one after which the stage can work on block `taken`.
-
-        A method that needs the filterbank's envelope waits for a block that has it.
-        """
-        if not self._changes:
-            return
-        with self._changing:
-            due = self._due(taken.number)
-            while due:
-                stage = _changed(self._stage, due)
-                if taken.envelope is not None or not _needs_envelope(stage):
-                    self._stage = stage
-                    del self._changes[: len(due)]
-                    return
-                due.pop()
-
-    def wants_envelope(self, number: int) -> bool:
-        """Whether block `number` of the parent should carry its envelope."""
-        if not self._changes:
-            return _needs_envelope(self._stage)
-        with self._changing:
-            return _needs_envelope(_changed(self._stage, self._due(number)))
+    def take(self, reader: str) -> Taken:
+        """What it released since `reader` asked last, at most the history."""
+        return self.history.take(reader)
 
     # --- life ---
 
     def start(self) -> None:
         """Begin to work, with the block that the parent released last."""
         with self._lock:
-            self._thread.start()  # nothing is attached where the system has no thread left
-            if self.parent is not None:
-                self.parent.children.append(self)
-                self.parent.zone.attach(self)
+            self._workers.enter()  # nothing is attached where the system has no thread left
+            self._started = True
+            self.attach()
+            self.called = self._source is not None
+            self.rouse()
+            self._workers.wake()
+        if self._source is not None:
+            self._source.open(self._call)
 
-    def remove(self) -> None:
-        """Take it out of the tree at once: its parent no longer waits for it and it will release nothing more."""
+    def _call(self) -> None:
+        """The source may have something."""
         with self._lock:
-            self._enter(State.REMOVED)
-            if self.parent is not None:
-                self.parent.zone.detach(self)
-                if self in self.parent.children:
-                    self.parent.children.remove(self)
-                self.parent._release_if_free()
-            self.turn.notify_all()
-            self._released.notify_all()
+            self.called = True
+            self.rouse()
+            self._workers.wake()
+
+    def end(self) -> None:
+        """Take it out of the tree, at once; whoever works on it still will not be heard."""
+        with self._lock:
+            self.remove()
+            if self._started:
+                self._workers.leave()
+            self._workers.wake()
         if self._source is not None:
             self._source.stop()
-        with self._publishing:
-            self._listener.ended(self)
-
-    def adopt(self, child: Processor) -> None:
-        """Before the start: take over a child of another processor, from the next block that the child takes."""
-        with self._lock:
-            assert child.parent is not None
-            child.parent.zone.detach(child)
-            child.parent.children.remove(child)
-            child.parent = self
-            self.children.append(child)
-            self.zone.attach(child)
+        with self._telling:
+            self._company.listener.ended(self)
 
     def join(self, timeout: float | None = None) -> bool:
-        """Wait for its thread; whether that has ended."""
-        if self._thread.ident is not None:
-            self._thread.join(timeout)
-        return not self._thread.is_alive()
+        """Wait until nobody works on it and nobody will; whether that is so."""
+        with self._lock:
+            return bool(self._company.over.wait_for(lambda: self.over, timeout))
 
-    @property
-    def _gone(self) -> bool:
-        return self.state is State.REMOVED
+    def rouse(self) -> None:
+        if self.ready:
+            self._workers.push(self)
 
-    def _run(self) -> None:
+    def entered(self, state: State, number: int | None) -> None:
+        for observer in self._company.observers:
+            observer(self, state, number)
+        if self.over:
+            self._company.over.notify_all()
+
+    # --- what workers do ---
+
+    def begin(self) -> Block | None:
+        self._taken = super().begin()
+        return self._taken
+
+    def rest(self) -> None:
+        super().rest()
+        if self.over:
+            self._company.over.notify_all()
+
+    def work(self) -> None:
+        """Take the next step: tell of the last block, or compute the next one."""
         try:
-            while (taken := self._next()) is not None:
-                self._cycle(taken)
+            if self.untold is not None:
+                self._tell()
+            elif self._source is not None:
+                self._read(self._source)
+            elif self._taken is not None:
+                self._compute(self._taken)
         except BaseException as problem:  # whatever it was: the tree must hear of it, and nobody may wait for this one
             self.error = problem
-        with self._lock:
-            self._enter(State.DONE)
-            self.zone.close()
-            for child in self._carries:
-                child._carried = False
-            for child in (*self._carries, *self.children):  # those carried may have another parent by now
-                child.turn.notify_all()
-        if self.error is not None:
-            self._failed(self)
+            with self._lock:
+                self.finish()
+            self.held_up_since = time.monotonic()  # by requests
+            self._company.failed(self)
+        self._taken = None
+        self.held_up_since = 0.0
 
-    # --- the four states ---
+    def _read(self, source: Source) -> None:
+        self.held_up_since = time.monotonic()
+        while True:
+            ended = source.ended  # looked at first: what has come before the end is read
+            got = source.read()
+            if got is not None or ended == source.ended:
+                break
+        self.held_up_since = 0.0
+        if got is not None:
+            with self._lock:
+                self.read(self.blocks)
+            self._compute(Block(self.blocks, (got[0],), got[1], self.stage.given))
+        elif ended:
+            with self._lock:
+                self.finish()
 
-    def _next(self) -> Block | None:
-        return self._wait_exec() if self._source is None else self._read(self._source)
-
-    def _cycle(self, taken: Block) -> None:
-        """Do one block, and that of the children that are carried."""
-        self._enter(State.EXEC, taken.number)
-        begun, work = time.perf_counter(), time.thread_time()
-        private = self._exec(taken)
-        seconds, work = time.perf_counter() - begun, time.thread_time() - work
-        self._give_back()
-        self._listener.executed(self, seconds)
-        if private is not None and self._wait_release(private):
-            begun = time.perf_counter()
-            self._publish(private)
-            self._telling = time.perf_counter() - begun
-        self._usual = min(work, RISE * self._usual)
+    def _compute(self, taken: Block) -> None:
+        begun = time.perf_counter()
+        private = self._process(taken)
+        seconds = time.perf_counter() - begun
         self.blocks += 1
-        self._enter(State.WAIT_EXEC)
-        for child in self._carries:
-            child._ride(self)
-        self._carries = []
-
-    def _ride(self, parent: Processor) -> None:
-        """Do the block of `parent`, on the thread that works for that one."""
+        self.busy += seconds
         with self._lock:
-            while self._working and self.parent is parent and not self._gone:  # its own thread is on the last block
-                self._released.wait()
-            mine = self.parent is parent and not self._gone and self.error is None
-            taken = self._take() if mine else None
-        if taken is not None:
-            try:
-                self._cycle(taken)
-            except BaseException as problem:  # its own thread will tell
-                self.error = problem
-        with self._lock:
-            self._carried = False
-            if taken is not None:
-                self._working = False
-            if taken is None or self.error is not None or self.parent is not parent or self._exhausted:
-                self.turn.notify_all()
+            self.give_back()
+            if private is not None:
+                self.hold(private)
+        self._company.listener.executed(self, seconds)
+        if self.untold is not None and self._usual_telling < SHORT:
+            self._tell()
 
-    def _enter(self, state: State, block: int | None = None) -> None:
-        with self._lock:
-            if not self._gone:
-                self.state = state
-                for observer in self._observers:
-                    observer(self, state, block)
-
-    def _read(self, source: Source) -> Block | None:
-        got = source.read()
-        if got is None or self._gone:
+    def _process(self, taken: Block) -> Block | None:
+        """What comes out for a block; None where that cannot be used."""
+        stage = self.changes.stage_for(taken)
+        if stage is None:
             return None
-        return Block(self.blocks, *got, source.sample_rate)
+        if stage.PROVIDES:
+            with self._lock:
+                children = list(self.children)
+            wanted = {child.changes.needs(taken.number) for child in children}
+            stage.provide = frozenset(wanted.intersection(stage.PROVIDES))
+        needs = stage.needs
+        output = stage.process(taken.data, taken.extras[needs]) if needs else stage.process(taken.data)
+        next_index = max(0, taken.next_index - stage.look_ahead * stage.given.hop)
+        return Block(taken.number, tuple(parts_of(output)), next_index, stage.output, stage.provided)
 
-    def _wait_exec(self) -> Block | None:
-        """Wait on its own thread for a token of the parent; None where none will come."""
-        with self._lock:
-            self._working = False
-            self._released.notify_all()
-            while not self._gone and self.error is None:
-                if not self._carried:
-                    if (taken := self._take()) is not None:
-                        return taken
-                    if self._exhausted:
-                        return None
-                self.turn.wait()
-            return None
-
-    def _take(self) -> Block | None:
-        """The block that the parent has released for it, if there is one. With the tree's lock held."""
-        parent = self.parent
-        assert parent is not None
-        if not parent.zone.has_token(self):
-            return None
-        self._working = True
-        self._reading = parent
-        return parent.zone.take(self)
-
-    @property
-    def _exhausted(self) -> bool:
-        return self.parent is not None and self.parent.zone.exhausted(self)
-
-    def _exec(self, taken: Block) -> Block | None:
-        """Compute into the private zone; None where the block cannot be used."""
-        self._apply_changes(taken)
-        stage = self._stage
-        if not _needs_envelope(stage):
-            if hasattr(stage, "provide_envelope"):
-                with self._lock:
-                    children = list(self.children)
-                stage.provide_envelope = any(child.wants_envelope(taken.number) for child in children)
-            data = stage.process(taken.data)
-        elif taken.envelope is not None:
-            data = stage.process(taken.data, taken.envelope)
-        else:  # from before the filterbank knew that somebody wants the envelope
-            return None
-        envelope = getattr(stage, "envelope", None)
-        return Block(taken.number, data, taken.next_index, float(stage.output_rate), envelope)
-
-    def _give_back(self) -> None:
-        """Return the token: the parent may release its next block."""
-        with self._lock:
-            if self._reading is not None:
-                self._reading.zone.give_back(self)
-                self._reading._release_if_free()
-                self._reading = None
-
-    def _wait_release(self, private: Block) -> bool:
-        """Wait until no child holds the last block and `private` is released; False where it was removed instead."""
-        with self._lock:
-            self._enter(State.WAIT_RELEASE, private.number)
-            self._private = private
-            self._release_if_free()
-            while self._private is not None and not self._gone:
-                self._released.wait()
-            return self._private is None
-
-    def _release_if_free(self) -> None:
-        """Release the block that waits for that, if no child holds the last one. With the tree's lock held.
-
-        Called by whoever may have made it possible, which is mostly a child: that one goes on with the new block at
-        once and need not wait until this processor has woken up.
-        """
-        if self._private is not None and self.zone.free and not self._gone:
-            self._enter(State.RELEASE, self._private.number)
-            self.zone.release(self._private)
-            self._private = None
-            self._carries = [child for child in self.children if self._can_carry(child)]
-            for child in self.children:
-                if child in self._carries:
-                    child._carried = True
-                else:
-                    child.turn.notify_all()
-            self._released.notify_all()
-
-    def _can_carry(self, child: Processor) -> bool:
-        """Whether whoever works for this processor should do the child's block, too: both take little time."""
-        known = child.blocks >= OBSERVED and not child._carried
-        return known and max(child._usual, child._telling, self._telling) < SHORT
-
-    def _publish(self, block: Block) -> None:
-        """Tell the world, while the children work on the block."""
-        with self._publishing:
-            if not self._gone:
-                self.next_index = block.next_index
-                self._remember(block)
-                self._listener.released(self, block)
-
-    # --- history, for getSignals ---
-
-    def _remember(self, block: Block) -> None:
-        like = (block.data.shape[:-1], block.rate, self.history_seconds)
-        if (self._history.rows, self._history.rate, self._history.seconds) != like:
-            self._history = History(*like)  # frames of different shapes or rates do not go together
-        self._history.append(block.data)
-
-    def take_signals(self) -> tuple[WindowView, int, float]:
-        """What it released since the last call: data, index after it in audio frames, frames per second."""
-        with self._publishing:
-            return self._history.take(), self.next_index, self._history.rate
-
-
-def _changed(stage: Any, changes: list[Change]) -> Any:
-    """`stage` after `changes`. It shares the state of `stage`, which does not notice."""
-    if changes:
-        stage = copy.copy(stage)
-    for change in changes:
-        stage.configure(**{change.name: change.value})
-    return stage
-
-
-def _needs_envelope(stage: Any) -> bool:
-    return bool(getattr(stage, "needs_envelope", False))
+    def _tell(self) -> None:
+        """Tell the world of the block that was released last."""
+        block, self.untold = self.untold, None
+        assert block is not None
+        self.held_up_since = begun = time.monotonic()
+        with self._telling:
+            if not self.gone:
+                self.history.append(block)
+                self._company.listener.released(self, block)
+        self.held_up_since = 0.0
+        self._usual_telling = time.monotonic() - begun
 
 
 def subtree(processor: Processor) -> Iterator[Processor]:

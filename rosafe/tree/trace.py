@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from collections import deque
 from collections.abc import Iterator, Sequence
@@ -9,10 +10,11 @@ from statistics import median
 from typing import Any, NamedTuple
 
 from rosafe.tree.processor import Processor
-from rosafe.tree.roles import State
+from rosafe.tree.states import ENDS, State
+from rosafe.tree.workers import WORKER
 
 MAX_EVENTS = 500_000  # that wait to be taken; the oldest are forgotten
-ENDS = (State.DONE.value, State.REMOVED.value)
+PROCESSORS, WORKERS = 1, 2  # what viewers take for processes
 
 
 class Event(NamedTuple):
@@ -24,6 +26,7 @@ class Event(NamedTuple):
     parent: str  # empty for the input
     state: str
     block: int | None  # the input's number of the block at hand
+    worker: str = ""  # who brought it there, where that was one
 
 
 class Span(NamedTuple):
@@ -34,6 +37,7 @@ class Span(NamedTuple):
     block: int | None
     begin: int
     end: int
+    worker: str
 
 
 class Tracer:
@@ -45,8 +49,9 @@ class Tracer:
     def __call__(self, processor: Processor, state: State, block: int | None) -> None:
         """Note one step."""
         parent = processor.parent.name if processor.parent is not None else ""
-        now = time.monotonic_ns() // 1000
-        self._events.append(Event(now, processor.name, processor.kind, parent, state.value, block))
+        now, thread = time.monotonic_ns() // 1000, threading.current_thread().name
+        worker = thread.removeprefix("rosafe ") if thread.startswith(WORKER) else ""
+        self._events.append(Event(now, processor.name, processor.kind, parent, state.value, block, worker))
 
     def take(self) -> list[Event]:
         """All events since the last call."""
@@ -66,6 +71,7 @@ class Trace:
         self.begin, self.end = (events[0].time, events[-1].time) if events else (0, 0)
         self.processors = _parents_first({event.name: event for event in events})
         self.spans = list(self._spans(events))
+        self.workers = sorted({span.worker for span in self.spans if span.worker}, key=lambda name: (len(name), name))
         self._of: dict[tuple[str, str], list[Span]] = {}
         for span in self.spans:
             self._of.setdefault((span.name, span.state), []).append(span)
@@ -75,11 +81,11 @@ class Trace:
         for event in events:
             before = entered.pop(event.name, None)
             if before is not None:
-                yield Span(before.name, before.state, before.block, before.time, event.time)
-            if event.state not in ENDS:
+                yield _span(before, event.time)
+            if State(event.state) not in ENDS:
                 entered[event.name] = event
         for event in entered.values():
-            yield Span(event.name, event.state, event.block, event.time, self.end)
+            yield _span(event, self.end)
 
     def of(self, name: str, state: State) -> list[Span]:
         """When a processor was in a state, in the order of time."""
@@ -119,27 +125,36 @@ class Trace:
     # --- for people and viewers ---
 
     def chrome(self, title: str) -> dict[str, Any]:
-        """The trace event format that Perfetto (ui.perfetto.dev) and chrome://tracing show: a row per processor."""
+        """The trace event format that Perfetto (ui.perfetto.dev) and chrome://tracing show.
+
+        There is a row for each processor, and below them one for each worker with what it computed.
+        """
         rows = {name: row for row, name in enumerate(self.processors, 1)}
-        shown: list[dict[str, Any]] = [_metadata("process_name", 0, name=title)]
+        workers = {name: row for row, name in enumerate(self.workers, 1)}
+        shown = [_metadata("process_name", PROCESSORS, 0, name=title)]
         for name, row in rows.items():
-            shown.append(_metadata("thread_name", row, name=f"{name} ({self.processors[name].kind})"))
-            shown.append(_metadata("thread_sort_index", row, sort_index=row))
+            shown.append(_metadata("thread_name", PROCESSORS, row, name=f"{name} ({self.processors[name].kind})"))
+            shown.append(_metadata("thread_sort_index", PROCESSORS, row, sort_index=row))
+        shown += [_metadata("process_name", WORKERS, 0, name="workers")] if workers else []
+        shown += [_metadata("thread_name", WORKERS, row, name=name) for name, row in workers.items()]
         for span in self.spans:
-            block = {} if span.block is None else {"block": span.block}
-            shown.append(
-                {
-                    "name": " ".join([span.state, *map(str, block.values())]),
-                    "cat": span.state,
-                    "ph": "X",
-                    "ts": span.begin - self.begin,
-                    "dur": span.end - span.begin,
-                    "pid": 1,
-                    "tid": rows[span.name],
-                    "args": block,
-                }
-            )
+            shown.append(self._shown(span, span.state, PROCESSORS, rows[span.name]))
+            if span.worker and span.state == State.EXEC.value:
+                shown.append(self._shown(span, span.name, WORKERS, workers[span.worker]))
         return {"traceEvents": shown, "displayTimeUnit": "ms"}
+
+    def _shown(self, span: Span, what: str, process: int, row: int) -> dict[str, Any]:
+        block = {} if span.block is None else {"block": span.block}
+        return {
+            "name": " ".join([what, *map(str, block.values())]),
+            "cat": span.state,
+            "ph": "X",
+            "ts": span.begin - self.begin,
+            "dur": span.end - span.begin,
+            "pid": process,
+            "tid": row,
+            "args": block,
+        }
 
     def summary(self) -> list[str]:
         """Lines: each processor's share of the time in its states, and who works at the same time as whom."""
@@ -161,6 +176,10 @@ class Trace:
             f"somebody computes in {busy / self._length:.1%} of the time; of that, two or more at once in "
             f"{several / max(1, busy):.0%}, {computed / max(1, busy):.2f} on average"
         )
+        for worker in self.workers:
+            did = [span for span in self.spans if span.worker == worker and span.state == State.EXEC.value]
+            share = sum(span.end - span.begin for span in did) / self._length
+            lines.append(f"{worker:{width}} {len(did):6d} blocks, computes in {share:.1%} of the time")
         lines.append("at the same time:")
         for one, other, what in self.kin():
             both = sum(_common(a, b) for a, b in self.together(one, other))
@@ -186,5 +205,9 @@ def _common(a: Span, b: Span) -> int:
     return min(a.end, b.end) - max(a.begin, b.begin)
 
 
-def _metadata(what: str, row: int, **arguments: Any) -> dict[str, Any]:
-    return {"name": what, "ph": "M", "pid": 1, "tid": row, "args": arguments}
+def _span(event: Event, end: int) -> Span:
+    return Span(event.name, event.state, event.block, event.time, end, event.worker)
+
+
+def _metadata(what: str, process: int, row: int, **arguments: Any) -> dict[str, Any]:
+    return {"name": what, "ph": "M", "pid": process, "tid": row, "args": arguments}

@@ -2,20 +2,29 @@
 
 from __future__ import annotations
 
-import math
-import os
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, NamedTuple
 
-from rosafe.dsp import STAGES
-from rosafe.interface import KINDS, ROSAFE, ComponentError, Parameter, ProcessorKind
-from rosafe.tree.processor import Processor, subtree
-from rosafe.tree.roles import Listener, Observer, Source, State
+from rosafe.dsp.stage import Stage
+from rosafe.interface import KINDS, ROSAFE, ComponentError
+from rosafe.representations import STAGES
+from rosafe.tree import sizes
+from rosafe.tree.processor import EARS, Company, Listener, Observer, Processor, Source, subtree
+from rosafe.tree.sizes import Rows
+from rosafe.tree.states import State
+from rosafe.tree.workers import Workers, workers_to_use
 
-MAX_BYTES = 2**30  # of one output port, of one processor's history, and of the samples that it keeps for a frame
-SHARE = 0.5  # of the machine's memory, for the output ports and histories of all processors together
+INPUT = next(kind for kind, representation in KINDS.items() if not representation.parent)
+
+
+class Planned(NamedTuple):
+    """A processor as it would be after a request."""
+
+    processor: Processor
+    stage: Stage
+    rows: Rows  # that it would get
 
 
 class Tree:
@@ -27,14 +36,22 @@ class Tree:
     ----------
     listener : Listener
         Hears of every block and every end.
+    workers : int, optional
+        How many threads compute. By default as many as the environment variable ROSAFE_WORKERS says, or as there are
+        cores to use.
+
+    Raises
+    ------
+    ValueError
+        For another number of workers than 1 to 1024.
     """
 
-    def __init__(self, listener: Listener) -> None:
-        self._listener = listener
+    def __init__(self, listener: Listener, workers: int | None = None) -> None:
         self._processors: dict[str, Processor] = {}  # in the order of creation, as getParameters reports them
         self._lock = threading.RLock()  # guards all tokens
         self._requests = threading.RLock()  # one request at a time; taken before _lock
-        self._observers: list[Observer] = []
+        self._workers = Workers(self._lock, workers_to_use(workers))
+        self._company = Company(self._workers, listener, self.end, threading.Condition(self._lock))
         self.sample_rate = 0.0
         self.port_seconds = 1.0
         self.history_seconds = 1.0
@@ -50,7 +67,8 @@ class Tree:
     @property
     def input(self) -> Processor | None:
         """The root, if there is one."""
-        return next((p for p in self.processors if p.parent is None), None)
+        with self._requests:
+            return next((p for p in self._processors.values() if p.parent is None), None)
 
     def find(self, name: str) -> Processor:
         """The processor called `name`, or e_noSuchProcessor."""
@@ -75,11 +93,11 @@ class Tree:
         with self._requests, self._lock:
             for processor in self._processors.values():
                 observer(processor, processor.state, None)
-            self._observers.append(observer)
+            self._company.observers.append(observer)
 
         def end() -> None:
             with self._lock:
-                self._observers.remove(observer)
+                self._company.observers.remove(observer)
 
         return end
 
@@ -118,15 +136,16 @@ class Tree:
             try:
                 self.check_input(name, source.sample_rate)
                 with _refusing():
-                    stage = STAGES["input"](source.sample_rate, **(parameters or {}))
-                    self._check_sizes(stage, (2,), max(port_seconds, history_seconds), old)
+                    stage = STAGES[INPUT](source.sample_rate, **(parameters or {}))
+                    new = Processor(name, stage, None, self._company, history_seconds, source)
+                    heir = old if old is not None and old.state is not State.DONE else new
+                    self._check(_planned(heir, stage, EARS), max(port_seconds, history_seconds), old)
             except ComponentError:
                 source.stop()
                 raise
             self.sample_rate = source.sample_rate
             self.port_seconds = port_seconds
             self.history_seconds = history_seconds
-            new = self._processor(name, "input", stage, None, source)
             if old is not None:
                 self._replace(old, new)
             self._begin(new)
@@ -137,10 +156,10 @@ class Tree:
         with self._lock:
             if old.state is not State.DONE:
                 for child in list(old.children):
-                    new.adopt(child)
+                    child.move(new)
         self._remove(old)
         for processor in self._processors.values():
-            processor.history_seconds = self.history_seconds
+            processor.history.seconds = self.history_seconds
         self._processors = {new.name: new, **self._processors}
 
     def check(self, kind: str, name: str, parent_name: str) -> Processor:
@@ -163,32 +182,17 @@ class Tree:
         with self._requests:
             parent = self.check(kind, name, parent_name)
             with _refusing():
-                stage = STAGES[kind](self.sample_rate, **(parameters or {}))
-                self._check_sizes(stage, parent.rows, self._longest)
-            processor = self._processor(name, kind, stage, parent, None)
+                stage = STAGES[kind](parent.signal, **(parameters or {}))
+                _check_needs(stage, parent.stage)
+                processor = Processor(name, stage, parent, self._company, self.history_seconds)
+                self._check(_planned(processor, stage, parent.rows), self._longest)
             self._begin(processor)
             return processor
-
-    def _processor(
-        self, name: str, kind: str, stage: Any, parent: Processor | None, source: Source | None
-    ) -> Processor:
-        return Processor(
-            name,
-            kind,
-            stage,
-            parent,
-            source,
-            self._lock,
-            self._listener,
-            self.history_seconds,
-            failed=self.end,
-            observers=self._observers,
-        )
 
     def _begin(self, processor: Processor) -> None:
         self._processors[processor.name] = processor
         try:
-            self._listener.added(processor)
+            self._company.listener.added(processor)
             processor.start()
         except BaseException:
             self._remove(processor)
@@ -199,30 +203,18 @@ class Tree:
         """Seconds of output that are kept, on a port or as history: these refer to the same blocks."""
         return max(self.port_seconds, self.history_seconds)
 
-    def _check_sizes(
-        self, stage: Any, rows: tuple[int, ...], seconds: float, instead_of: Processor | None = None
-    ) -> None:
-        """ValueError where `stage`, given blocks of leading shape `rows`, would fill the memory.
+    def _check(self, planned: Iterable[Planned], seconds: float, instead_of: Processor | None = None) -> None:
+        """ValueError where what is `planned` would fill the memory.
 
-        That is with `seconds` of output or with the samples of one frame, its own or of those that it takes over from
-        `instead_of`, or with the output of the whole tree as it would be then.
+        That is with `seconds` of output or with the samples of one frame, or with the output of the whole tree as it
+        would be then: without `instead_of` and all below it.
         """
-        planned = list(_planned(stage, rows, instead_of.children if instead_of is not None else ()))
-        for one, given in planned:
-            _check_size("port or history", seconds, one.output_rows(given), one.output_rate)
-            for name, value in one.parameters.items():
-                if name.endswith("_wSizeSec"):
-                    _check_size(name, value, given, one.sample_rate)
+        coming = [(stage, rows) for _, stage, rows in planned]
+        for stage, rows in coming:
+            sizes.check_stage(stage, rows, seconds)
         replaced = set(subtree(instead_of)) if instead_of is not None else set()
-        outputs = [(one.output_rows(given), one.output_rate) for one, given in planned]
-        outputs += [(other.rows, other.rate) for other in self._processors.values() if other not in replaced]
-        size = sum(_bytes(seconds, *output) for output in outputs)
-        share = SHARE * os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-        if size > share:
-            raise ValueError(
-                f"{seconds:g} s of output of {len(outputs)} processors take {size / 2**20:.0f} MiB, "
-                f"more than {share / 2**20:.0f} MiB, which is {SHARE:.0%} of this machine's memory"
-            )
+        staying = [(p.stage, p.given_rows) for p in self._processors.values() if p not in replaced]
+        sizes.check_all([*coming, *staying], seconds)
 
     # --- changing ---
 
@@ -230,13 +222,15 @@ class Tree:
         """modifyParameter: change one parameter, given as text, from the processor's next block on."""
         with self._requests:
             processor = self.find(name)
-            parameter = _parameter(KINDS[processor.kind], parameter_name)
-            if parameter_name == "set_rm_scailing":  # the original's misspelt name came with misspelt values
-                text = text.strip().removeprefix("_")
+            try:
+                parameter = processor.representation.parameter(parameter_name)
+            except KeyError:
+                known = ", ".join(p.name for p in processor.representation.parameters) or "none at all"
+                raise ROSAFE.error(
+                    "e_noSuchParameter", f"processors of kind {processor.kind} have no {parameter_name!r}, but: {known}"
+                ) from None
             with _refusing():
-                value = parameter.parse(text)
-                if parameter.choices:
-                    value = parameter.known_word(value)
+                value = parameter.known_word(parameter.parse(text, parameter_name))
                 self._change(processor, parameter.name, value)
 
     def schedule(self, block: int, parameter_name: str, value: Any) -> None:
@@ -246,16 +240,17 @@ class Tree:
         """
         with self._requests, _refusing():
             for processor in self._processors.values():
-                if any(parameter_name == p.name for p in KINDS[processor.kind].parameters):
+                if any(parameter_name == p.name for p in processor.representation.parameters):
                     self._change(processor, parameter_name, value, block)
 
     def _change(self, processor: Processor, name: str, value: Any, block: int = 0) -> None:
-        rows = processor.parent.rows if processor.parent is not None else (2,)
-
-        def accept(stage: Any) -> None:
-            self._check_sizes(stage, rows, self._longest, processor)
-
-        processor.change(name, value, accept, block)
+        """Change a parameter if all processors below can go on then; else ValueError, and nothing has changed."""
+        changed = processor.changes.plan(name, value)
+        planned = list(_planned(processor, changed, processor.given_rows))
+        self._check(planned, self._longest, processor)
+        for one, stage, _ in planned:
+            one.changes.planned = stage
+        processor.changes.accept(changed, name, value, block)
 
     # --- removing ---
 
@@ -274,29 +269,23 @@ class Tree:
                 self._remove(processor)
 
     def stop(self) -> None:
-        """Remove everything."""
+        """Remove everything. Workers may still be at a block each, of which nobody will hear."""
         with self._requests:
             root = self.input
             if root is not None:
                 self._remove(root)
 
+    def join(self) -> None:
+        """After `stop`, wait until the workers have ended."""
+        self._workers.join()
+
     def _remove(self, processor: Processor) -> list[Processor]:
         # Their threads may still work on one long block; nobody waits for that, and nobody will see it.
         going = list(subtree(processor))
         for one in going:
-            one.remove()
+            one.end()
             del self._processors[one.name]
         return going
-
-
-def _parameter(kind: ProcessorKind, name: str) -> Parameter:
-    try:
-        return kind.parameter(name)
-    except KeyError:
-        known = ", ".join(p.name for p in kind.parameters)
-        raise ROSAFE.error(
-            "e_noSuchParameter", f"processors of kind {kind.kind} have no {name!r}, but: {known}"
-        ) from None
 
 
 @contextmanager
@@ -308,22 +297,15 @@ def _refusing() -> Iterator[None]:
         raise ROSAFE.error("e_badNewValue", what=str(problem)) from None
 
 
-def _planned(stage: Any, rows: tuple[int, ...], children: Iterable[Processor]) -> Iterator[tuple[Any, tuple[int, ...]]]:
-    """`stage` over `children`, and all stages below: each with the leading shape of the blocks that it would get."""
-    yield stage, rows
-    for child in children:
-        yield from _planned(child.stage, stage.output_rows(rows), child.children)
+def _planned(processor: Processor, stage: Stage, rows: Rows) -> Iterator[Planned]:
+    """`processor` with `stage`, and all below it as they would be then; ValueError where one could not go on."""
+    yield Planned(processor, stage, rows)
+    for child in processor.children:
+        below = child.changes.follow(stage.output)
+        _check_needs(below, stage)
+        yield from _planned(child, below, stage.output_rows(rows))
 
 
-def _bytes(seconds: float, rows: tuple[int, ...], rate: float) -> float:
-    return math.prod(rows, start=8.0 * rate * seconds)
-
-
-def _check_size(what: str, seconds: float, rows: tuple[int, ...], rate: float) -> None:
-    size = _bytes(seconds, rows, rate)
-    if size > MAX_BYTES:
-        shape = "x".join(map(str, rows))
-        raise ValueError(
-            f"{what}: {seconds:g} s of {shape} values at {rate:g} Hz take {size / 2**20:.0f} MiB, "
-            f"more than {MAX_BYTES // 2**20} MiB"
-        )
+def _check_needs(stage: Stage, parent: Stage) -> None:
+    if stage.needs and stage.needs not in parent.PROVIDES:
+        raise ValueError(f"{stage.REPRESENTATION} needs the {stage.needs} of {parent.REPRESENTATION}, which has none")

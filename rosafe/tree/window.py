@@ -1,4 +1,4 @@
-"""Sliding windows and histories over released blocks: references to the blocks, no copies until somebody looks.
+"""Sliding windows over released blocks: references to the blocks, no copies until somebody looks.
 
 Released blocks are never written again, so a window is just the newest blocks. What it looked like at one moment is a
 `WindowView`, which stays valid whatever comes later.
@@ -10,6 +10,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
+
+from rosafe.dsp.guard import FloatArray
 
 MAX_PIECES = 128  # beyond that, the pieces of a window are joined, so that small blocks in long windows stay cheap
 
@@ -26,11 +28,11 @@ class WindowView:
     The first `skip` frames of the first piece lie outside.
     """
 
-    pieces: tuple[np.ndarray, ...]
+    pieces: tuple[FloatArray, ...]
     skip: int = 0
 
     @classmethod
-    def of(cls, array: np.ndarray) -> WindowView:
+    def of(cls, array: FloatArray) -> WindowView:
         """A view of one array of shape (..., frames)."""
         return cls((array,))
 
@@ -51,22 +53,64 @@ class WindowView:
         """The first two axes exchanged, such as [channel][lag] to the port's [lag][channel]."""
         return WindowView(tuple(piece.swapaxes(0, 1) for piece in self.pieces), self.skip)
 
-    def trimmed(self) -> list[np.ndarray]:
+    def trimmed(self) -> list[FloatArray]:
         """The pieces without what lies outside, oldest first."""
         return [self.pieces[0][..., self.skip :], *self.pieces[1:]]
 
-    def copy_to(self, target: np.ndarray) -> None:
+    def copy_to(self, target: FloatArray) -> None:
         """Write all frames into `target`, whose shape is `shape`."""
         at = 0
         for part in self.trimmed():
             target[..., at : at + part.shape[-1]] = part
             at += part.shape[-1]
 
-    def array(self) -> np.ndarray:
+    def array(self) -> FloatArray:
         """All frames in one fresh array."""
         joined = np.empty(self.shape)
         self.copy_to(joined)
         return joined
+
+
+class Newest:
+    """The newest frames of a signal.
+
+    Parameters
+    ----------
+    first : ndarray (*rows, n)
+        What is there before anything comes.
+    capacity : int
+        How many frames are kept, at least 0.
+    """
+
+    def __init__(self, first: FloatArray, capacity: int) -> None:
+        self.capacity = capacity
+        self.frames = first.shape[-1]  # that there are, besides some in the first piece that nobody needs
+        self._pieces = [first]
+
+    @property
+    def rows(self) -> tuple[int, ...]:
+        """Leading shape of the blocks."""
+        return self._pieces[0].shape[:-1]
+
+    def append(self, block: FloatArray) -> None:
+        """Put `block`, of shape (*rows, n), at the end. The block must not be written again."""
+        if block.shape[-1] == 0:
+            return
+        self._pieces.append(block)
+        self.frames += block.shape[-1]
+        while len(self._pieces) > 1 and self.frames - self._pieces[0].shape[-1] >= self.capacity:
+            self.frames -= self._pieces.pop(0).shape[-1]
+        if len(self._pieces) > MAX_PIECES:
+            self._pieces = [self.view(self.capacity).array()]
+            self.frames = self._pieces[0].shape[-1]
+
+    def view(self, frames: int) -> WindowView:
+        """The newest `frames`, or as many as there are of these."""
+        skip, first = max(0, self.frames - min(frames, self.capacity)), 0
+        while first < len(self._pieces) - 1 and skip >= self._pieces[first].shape[-1]:
+            skip -= self._pieces[first].shape[-1]
+            first += 1
+        return WindowView(tuple(self._pieces[first:]), skip)
 
 
 class SlidingWindow:
@@ -84,65 +128,12 @@ class SlidingWindow:
         self.rows = rows
         self.frames = frames
         # rows of one row, which is nowhere before somebody writes to it
-        self._pieces: list[np.ndarray] = [np.broadcast_to(np.zeros(frames), (*rows, frames))]
-        self._skip = 0
+        self._newest = Newest(np.broadcast_to(np.zeros(frames), (*rows, frames)), frames)
 
-    def append(self, block: np.ndarray) -> None:
+    def append(self, block: FloatArray) -> None:
         """Shift left and put `block`, of shape (*rows, n), at the end. The block must not be written again."""
-        if block.shape[-1] == 0:
-            return
-        self._pieces.append(block)
-        self._skip += block.shape[-1]
-        while len(self._pieces) > 1 and self._skip >= self._pieces[0].shape[-1]:
-            self._skip -= self._pieces.pop(0).shape[-1]
-        if len(self._pieces) > MAX_PIECES:
-            self._pieces, self._skip = [self.view().array()], 0
+        self._newest.append(block)
 
     def view(self) -> WindowView:
         """The window as it is now: `frames` frames, newest last."""
-        return WindowView(tuple(self._pieces), self._skip)
-
-
-class History:
-    """What a processor put out since somebody last asked, at most the newest `seconds`.
-
-    Parameters
-    ----------
-    rows : tuple of int
-        Leading shape of the blocks.
-    rate : float
-        Frames per second.
-    seconds : float
-        Its length.
-    """
-
-    def __init__(self, rows: tuple[int, ...], rate: float, seconds: float) -> None:
-        self.rows = rows
-        self.rate = rate
-        self.seconds = seconds
-        self.capacity = frames_in(seconds, rate)
-        self._pieces: list[np.ndarray] = []
-        self._frames = 0
-
-    def append(self, block: np.ndarray) -> None:
-        """Add `block` of shape (*rows, n); what no longer fits is forgotten. The block must not be written again."""
-        if block.shape[-1] == 0:
-            return
-        self._pieces.append(block)
-        self._frames += block.shape[-1]
-        while self._pieces and self._frames - self._pieces[0].shape[-1] >= self.capacity:
-            self._frames -= self._pieces.pop(0).shape[-1]
-        if len(self._pieces) > MAX_PIECES:
-            self._pieces = [self._view().array()]
-            self._frames = self._pieces[0].shape[-1]
-
-    def _view(self) -> WindowView:
-        return WindowView(tuple(self._pieces), max(0, self._frames - self.capacity))
-
-    def take(self) -> WindowView:
-        """Everything since the last `take`, oldest first; shape (*rows, 0) where nothing is new."""
-        if not self._pieces:
-            return WindowView.of(np.empty((*self.rows, 0)))
-        view = self._view()
-        self._pieces, self._frames = [], 0
-        return view
+        return self._newest.view(self.frames)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import ndimage
 
-from rosafe.bass.sources.scene import HEAD_RADIUS, SPEED_OF_SOUND, ear_delay, shadow_gain
+from rosafe.sound.head import HEAD_RADIUS, SPEED_OF_SOUND, ear_delay, shadow_gain
 from rosafe.view.representations import Representations
 
 AZIMUTHS = np.arange(-90.0, 90.5, 1.0)  # degrees; what the estimates choose from

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from rosafe.ros import paths
+from rosafe.component import paths
 from tests.harness import Process, wait_for
 
 

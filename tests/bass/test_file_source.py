@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 import soundfile
 
-from rosafe.audiofile import AudioFile, AudioFileError, to_int32
 from rosafe.bass.sources import base, open_source
 from rosafe.interface import ComponentError
+from rosafe.sound.audiofile import AudioFile, AudioFileError, to_int32
 
 RATE = 48000
 

@@ -15,8 +15,8 @@ import soundfile
 
 from rosafe.bass.sources import libasound
 from rosafe.bass.sources.scene import Scene
+from rosafe.component import wire
 from rosafe.interface import ComponentError
-from rosafe.ros import wire
 from tests.bass import bags
 from tests.harness import Graph, Process, free_port, run_together, wait_for
 

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import soundfile
 
-from rosafe.ros import wire
+from rosafe.component import wire
 from tests.bass.pulse import PulseServer
 from tests.harness import Graph, Process, wait_for
 

@@ -15,7 +15,7 @@ import pytest
 import soundfile
 
 from rosafe.bass.sources.scene import Scene
-from rosafe.cli import main
+from rosafe.commands.__main__ import main
 from tests.bass import bags
 from tests.cli.command import ROSAFE, environment, refused, rosafe, start
 from tests.harness import Graph, Process, free_port, wait_for
@@ -29,8 +29,9 @@ def samples_of(path: Path) -> np.ndarray:
 
 
 def wait_for_sound(path: Path, recording: Process) -> None:
-    """Until some sound is in the file."""
-    wait_for(lambda: path.exists() and path.stat().st_size > 4000, 20, lambda: str(recording))
+    """Until some sound is on its way into the file."""
+    part = path.with_name(f"{path.name}.part")
+    wait_for(lambda: part.exists() and part.stat().st_size > 4000, 20, lambda: str(recording))
 
 
 def number(pattern: str, text: str) -> float:
@@ -99,6 +100,10 @@ def test_mistakes_change_nothing(wav: Path, tmp_path: Path, capsys: pytest.Captu
     device = ("--device", f"file:{wav}")
     refused(told(capsys, kept, *device), "is there already; --force replaces it")
     refused(told(capsys, kept, "--force", "--device", f"file:{kept}?loop=1"), "is the input itself")
+    (tmp_path / "left.wav.part").write_text("precious")
+    for_left = ("--force", "--device", f"file:{tmp_path}/left.wav.part")
+    refused(told(capsys, tmp_path / "left.wav", *for_left), "left.wav.part is the input itself")
+    (tmp_path / "left.wav.part").unlink()
     refused(told(capsys, tmp_path / "folder.wav", "--force", *device), "not a regular file")
     refused(told(capsys, tmp_path / "no" / "a.wav", *device), "there is no folder")
     refused(told(capsys, tmp_path / "a.mp3", *device), "ends in .wav or .bag", code=2)
@@ -138,7 +143,7 @@ def test_signals_leave_a_complete_file(tmp_path: Path) -> None:
             assert re.search(rf"^{number}\.wav: [\d.]+ s at 8000 Hz, ", recording.out, re.MULTILINE)
             assert recording.err == ""
     for number in numbers:
-        samples = samples_of(tmp_path / f"{number}.wav")
+        samples = samples_of(tmp_path / (f"{number}.wav" + ".part" * (number == signal.SIGKILL)))
         assert samples.shape[1] >= RATE and np.array_equal(samples, Scene(RATE).frames(samples.shape[1]))
 
 
@@ -251,9 +256,12 @@ def test_nothing_to_hear(graph: Graph, capturing: Process, tmp_path: Path) -> No
         "/heard/genom_state": "/heard/genom_state is no port Audio, but of type bass/genom_state_component",
         "/nobody/Audio": "/nobody/Audio is published by nobody: start bass-ros",
     }
-    command = (str(ROSAFE), "record", str(tmp_path / "a.wav"), "--topic")
     with ExitStack() as stack:
-        for topic, done in {t: stack.enter_context(graph.start(*command, t)) for t in topics}.items():
+        running = {
+            topic: stack.enter_context(graph.start(str(ROSAFE), "record", str(tmp_path / name), "--topic", topic))
+            for topic, name in zip(topics, ("a.wav", "b.wav"), strict=True)
+        }
+        for topic, done in running.items():
             assert done.wait() == 1
             assert done.err.startswith(f"rosafe record: {topics[topic]}") and done.err.count("\n") == 1
     assert not os.listdir(tmp_path)

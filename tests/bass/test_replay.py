@@ -13,8 +13,8 @@ import pytest
 import rosgraph
 import soundfile
 
+from rosafe.component import wire
 from rosafe.interface import KINDS
-from rosafe.ros import wire
 from tests.bass import bags
 from tests.harness import Graph, Process, wait_for
 from tests.ros.session import RATE, Session, assert_holds, expected, noise, own_node, windowed

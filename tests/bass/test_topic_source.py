@@ -11,6 +11,7 @@ import pytest
 from rosafe.bass.recording import topic
 from rosafe.bass.recording.topic import TopicSource
 from rosafe.interface import ComponentError
+from tests.bass import bags
 from tests.harness import Graph, wait_for
 from tests.ros.session import RATE, Microphone, noise
 
@@ -58,6 +59,31 @@ def test_what_is_new_once_and_losses(source: TopicSource, microphone: Microphone
     heard = read(source, 6000)
     assert not heard[:, :2000].any() and np.array_equal(heard[:, 2000:], signal[:, 10_000:])
     assert (source.overruns, source.lost_frames) == (1, 2000)
+
+
+def test_who_reads_too_slowly_loses_sound_and_not_the_memory(
+    source: TopicSource, microphone: Microphone, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(topic, "MAX_WAITING", 2000)
+    signal = noise(10_000)
+    microphone.play(signal[:, :8000])
+    wait_for(lambda: source._stream.newest == 2000 + 8000)
+    assert source._news.qsize() == 5
+    assert np.array_equal(read(source, 2000), signal[:, :2000])
+    microphone.play(signal[:, 8000:])
+    heard = read(source, 8000)
+    assert not heard[:, :6000].any() and np.array_equal(heard[:, 6000:], signal[:, 8000:])
+    assert (source.overruns, source.lost_frames) == (1, 6000)
+
+
+def test_streams_that_begin_again_and_again_are_told_once(source: TopicSource) -> None:
+    for index in range(100, 0, -10):
+        message = bags.message(noise(100), index, 10, rate=RATE)
+        message.problem = ""
+        source._hear(message)
+    with pytest.raises(ComponentError, match="its index falls from 2000 to 100"):
+        source.read()
+    assert source._news.empty()
 
 
 def test_end_and_a_new_stream(source: TopicSource, microphone: Microphone) -> None:

@@ -88,11 +88,17 @@ def test_a_module_is_all_that_a_command_takes(tmp_path: Path) -> None:
         "    print('hello', options.name)\n    return 3\n"
     )
     (tmp_path / "_part.py").write_text("raise RuntimeError('not a command')\n")
-    program = "import sys, rosafe.commands, rosafe.cli; rosafe.commands.__path__.append(sys.argv.pop(1));"
+    program = "import sys, rosafe.commands, rosafe.commands.__main__; rosafe.commands.__path__.append(sys.argv.pop(1));"
 
     def run(*arguments: str) -> subprocess.CompletedProcess[str]:
         return subprocess.run(
-            ["/usr/bin/python3", "-c", program + "sys.exit(rosafe.cli.main())", str(tmp_path), *arguments],
+            [
+                "/usr/bin/python3",
+                "-c",
+                program + "sys.exit(rosafe.commands.__main__.main())",
+                str(tmp_path),
+                *arguments,
+            ],
             env=environment(PYTHONPATH=str(ROOT)),
             capture_output=True,
             text=True,

@@ -7,11 +7,11 @@ import subprocess
 from pathlib import Path
 from typing import Any
 
-from rosafe.ros import paths
+from rosafe.component import paths
 from tests.cli.command import environment, rosafe, rosafe_alone
 from tests.harness import ROOT, Graph, free_port
 
-EVERYTHING = ["python", "numbers", "kernels", "sound files", "ROS", "messages", "master", "alsaaudio"]
+EVERYTHING = ["python", "numbers", "kernels", "sound files", "ROS", "messages", "master", "address", "alsaaudio"]
 EVERYTHING += ["sound devices", "HTTP server", "Tcl", "plots"]
 
 
@@ -60,6 +60,24 @@ def test_master_is_there(graph: Graph) -> None:
     assert (found["master"]["state"], found["master"]["detail"]) == ("ok", f"answers at {graph.uri}")
 
 
+def test_address_that_nobody_can_call(graph: Graph) -> None:
+    """ROS_IP or ROS_HOSTNAME of another machine; or one that a master elsewhere cannot call."""
+    for env, why in (
+        ({"ROS_IP": "203.0.113.7"}, "ROS_IP is 203.0.113.7, which is no address of this machine"),
+        ({"ROS_HOSTNAME": "nobody.invalid"}, "ROS_HOSTNAME is nobody.invalid, which is no address, and no name"),
+        ({"ROS_IP": "http://127.0.0.1"}, "ROS_IP is http://127.0.0.1, which is no address"),
+        ({"ROS_IP": "0.0.0.0"}, "ROS_IP is 0.0.0.0, which is no address to call"),
+        ({"ROS_IP": "127.0.0.1", "ROS_MASTER_URI": "http://203.0.113.7:11311"}, "but the master is at http://203.0"),
+    ):
+        done = rosafe("doctor", "--json", **{"ROS_MASTER_URI": graph.uri, **env})
+        found = findings(done)["address"]
+        assert (done.returncode, found["state"]) == (1, "MISSING")
+        assert why in found["detail"] and "unset it or set it to " in found["todo"]
+    for env in ({"ROS_IP": "127.0.0.1"}, {"ROS_HOSTNAME": "127.0.0.1", "ROS_IP": "203.0.113.7"}, {}):
+        found = findings(rosafe("doctor", "--json", **{"ROS_MASTER_URI": graph.uri, **env}))["address"]
+        assert found["state"] == "ok" and "is 127.0.0.1" in found["detail"]
+
+
 def test_messages_of_this_shell(graph: Graph, tmp_path: Path) -> None:
     """As env.sh sets it up, as a bare shell is, and as another checkout would set it up."""
     paths_of_env = graph.env["PYTHONPATH"]
@@ -96,7 +114,7 @@ def test_nothing_is_there() -> None:
 def test_alsaaudio_of_debian_cannot_capture(tmp_path: Path) -> None:
     (tmp_path / "alsaaudio.py").write_text("PCM_CAPTURE = 1\n")
     program = (
-        "import pathlib, sys; from rosafe import cli; from rosafe.ros import paths;"
+        "import pathlib, sys; from rosafe import cli; from rosafe.component import paths;"
         f"paths.PYPI_DIR = pathlib.Path({str(tmp_path)!r}); sys.exit(cli.main(['doctor', '--json']))"
     )
     done = python(program)

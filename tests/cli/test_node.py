@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rosafe.interface import KINDS
+from rosafe.interface import FIXED
 from tests.cli.command import rosafe, write
 from tests.harness import Graph
 from tests.ros.session import RATE, assert_holds, noise, own_node, windowed
@@ -23,10 +23,10 @@ def test_same_numbers_as_the_node(graph: Graph, tmp_path: Path) -> None:
     assert done.returncode == 0, done
     with np.load(tmp_path / "in.npz") as loaded, own_node(graph, name="besides") as node:
         seconds = BLOCK * BLOCKS / RATE
-        requests = [kind.request for kind in KINDS.values() if kind.parent]
+        requests = [kind.request for kind in FIXED.values() if kind.parent]
         microphone = node.build(*requests, block=BLOCK, bufferSize_s_port=seconds, **VALUES)
         microphone.play(signal)
-        for kind in KINDS:
+        for kind in FIXED:
             rate = float(loaded[f"{kind}_frameRate"]) if f"{kind}_frameRate" in loaded else RATE
             message = node.read(kind, index=BLOCK * BLOCKS + 1)  # of the frame after the last
             assert_holds(message, kind, windowed(loaded[kind], seconds, rate))

@@ -1,4 +1,4 @@
-"""rosafe.npz: whatever is appended in whatever order, numpy and zipfile read it; what does not fit is refused."""
+"""The npz writer: whatever is appended in whatever order, numpy and zipfile read it; what does not fit is refused."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rosafe.npz import NpzWriter, memory_map
+from rosafe.offline.npz import NpzWriter, memory_map
 
 SHAPES = st.lists(st.integers(0, 5), min_size=1, max_size=3)
 

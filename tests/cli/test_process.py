@@ -14,7 +14,7 @@ import soundfile
 
 from rosafe import process
 from rosafe.interface import KINDS
-from rosafe.npz import memory_map
+from rosafe.offline.npz import memory_map
 from tests.cli.command import SMALL, SMALL_PARAMETERS, as_int32, noise, rosafe, write
 from tests.harness import shared
 

@@ -18,7 +18,7 @@ from rosafe.representations.registry import ORIGINAL
 
 FloatArray = NDArray[np.float64]
 
-KIND_OF = {p.name: kind.kind for kind in interface.KINDS.values() for p in kind.parameters}
+KIND_OF = {p.name: kind.kind for kind in interface.FIXED.values() for p in kind.parameters}
 
 
 def cut(signal: NDArray[Any], sizes: int | Iterable[int]) -> list[NDArray[Any]]:

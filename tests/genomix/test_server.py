@@ -92,7 +92,7 @@ def test_aliases_of_services_and_ports(world: World) -> None:
     world.http.call("rosAFE/IhcProc")
     world.http.call("rosAFE/Ratemap", {"name": "r"})
     assert world.http.call("rosAFE/ratemapProcPort/r")["ratemapPort"]["numberOfChannels"] == 4
-    assert set(world.http.call("rosAFE/getSignal")["signals"]) == set(interface.KINDS)
+    assert set(world.http.call("rosAFE/getSignal")["signals"]) == set(interface.FIXED)
 
 
 def test_signals_are_those_of_the_ports(world: World) -> None:
@@ -338,7 +338,7 @@ def test_ports_give_the_newest_sample(world: World) -> None:
 
 
 def test_a_port_without_a_sample_is_zeros(world: World) -> None:
-    assert world.http.call("rosAFE/dataObj")["dataObj"] == {kind: [] for kind in interface.KINDS}
+    assert world.http.call("rosAFE/dataObj")["dataObj"] == {kind: [] for kind in interface.FIXED}
 
 
 def test_elements_that_are_superfluous_or_misspelt_as_in_the_guide(world: World) -> None:

@@ -71,7 +71,8 @@ def test_refuses_what_is_out_of_range(parameter: Parameter) -> None:
     whole = "long" in parameter.idl or "short" in parameter.idl
     low, high = parameter.minimum, parameter.maximum
     if high is not None:
-        assert parameter.check(element(int(high) if whole else high))
+        highest = element(int(high) if whole else high)
+        assert parameter.check(highest) == highest
         with pytest.raises(ValueError, match=OUT_OF_RANGE):
             parameter.check(element(int(high) + 1 if whole else math.nextafter(high, math.inf)))
     if low is not None:

@@ -7,8 +7,10 @@ from xml.etree import ElementTree
 
 import pytest
 
-from rosafe import __version__, interface
+import rosafe
+from rosafe import interface
 from rosafe.interface import BASS, ROSAFE, Component, Service
+from rosafe.vocabulary.idl import SCALARS
 from tests import harness
 
 FOLDERS = {"rosAFE": harness.ROOT, "bass": harness.ROOT / "bass"}
@@ -75,8 +77,11 @@ def test_ports_and_outputs_have_types(component: Component) -> None:
     used = [p.idl for p in component.ports] + [idl for s in component.services for _, idl in s.outputs]
     for idl in used:
         base = idl.removeprefix("sequence<").removesuffix(">")
-        assert base in component.structs or base in interface.ROS_TYPES, idl
+        assert base in component.structs or base in SCALARS, idl
 
+
+# The requests of representations that the original did not have.
+LATER = {kind.request: kind for kind in interface.KINDS.values() if kind.kind not in interface.FIXED}
 
 # What the original's interface definition says, in its own order; REQUIRED where it has no default.
 DEFAULTS = {
@@ -90,6 +95,8 @@ DEFAULTS = {
     "getSignals": [],
     "getDependencies": ["nameProc"],
     "getParameters": [],
+    "getProcessors": [],
+    "getRepresentation": ["name"],
     "modifyParameter": ["nameProc", "nameParam", "newValue"],
     "removeProcessor": ["name"],
     "Acquire": ["hw:1,0", 44100, 2205, 20],
@@ -104,9 +111,18 @@ DEFAULTS = {
 }
 
 
-@SERVICES
+@pytest.mark.parametrize(("component", "service"), list(interface.all_services()), ids=lambda x: x.name)
 def test_defaults(component: Component, service: Service) -> None:
-    assert [p.default for p in service.parameters] == DEFAULTS[service.name]
+    if service.name in LATER:
+        kind = LATER[service.name]
+        parent = interface.KINDS[kind.parent]
+        assert [p.default for p in service.parameters] == [
+            kind.name,
+            parent.name,
+            *(p.default for p in kind.parameters),
+        ]
+    else:
+        assert [p.default for p in service.parameters] == DEFAULTS[service.name]
 
 
 @SERVICES
@@ -124,9 +140,10 @@ def test_parameter_structs_hold_the_parameters_of_the_requests() -> None:
 
 
 def test_tasks() -> None:
-    assert ROSAFE.tasks == (
+    assert ROSAFE.tasks[:8] == (
         *("init", "input", "preProc", "gammatoneProc", "ihcProc", "ildProc", "ratemapProc", "crossCorrelationProc"),
     )
+    assert set(ROSAFE.tasks[8:]) == {request[:1].lower() + request[1:] for request in LATER}
     assert BASS.tasks == ("capture", "socket")
     for component in interface.COMPONENTS.values():
         assert {s.task for s in component.activities} <= set(component.tasks)
@@ -148,5 +165,5 @@ def test_exceptions() -> None:
 @COMPONENTS
 def test_version_is_that_of_the_package(component: Component) -> None:
     manifest = ElementTree.parse(FOLDERS[component.name] / "package.xml")
-    assert manifest.findtext("version") == __version__
+    assert manifest.findtext("version") == rosafe.__version__
     assert manifest.findtext("name") == component.name

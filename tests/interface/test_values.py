@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosafe.interface import BASS, MAX_SEQUENCE, REQUIRED, ROSAFE, Parameter
+from rosafe.interface import BASS, MAX_SEQUENCE, REQUIRED, ROSAFE, Parameter, text_of
 
 BOOLEAN = Parameter("flag", "boolean", False, "")
 UNSIGNED = Parameter("count", "unsigned long", 1, "")
@@ -20,7 +20,8 @@ LARGE = Parameter("large", "unsigned long long", 1, "", 1, 2**64 - 1)
 SIGNED = Parameter("offset", "long", 0, "")
 NUMBER = Parameter("number", "double", 1.0, "", 0.0, 10.0, open_minimum=True)
 LIST = Parameter("list", "sequence<double>", (), "", 0.0, 100.0, open_minimum=True)
-WORD = Parameter("word", "string", "hann", "", choices=("hann", "triang"), fallback="hann")
+WORD = Parameter("word", "string", "hann", "", choices=("hann", "triang"), fallback="hann", spellings={"han": "hann"})
+WORDS = Parameter("words", "sequence<string>", ("a",), "", choices=("a", "b"), least=1, most=4)
 
 
 @pytest.mark.parametrize(
@@ -53,13 +54,16 @@ WORD = Parameter("word", "string", "hann", "", choices=("hann", "triang"), fallb
         (LIST, range(1, 4), [1.0, 2.0, 3.0]),
         (LIST, (x for x in (1, 2)), [1.0, 2.0]),
         (WORD, "triang", "triang"),
-        (WORD, np.str_("anything"), "anything"),
+        (WORD, np.str_("hann"), "hann"),
+        (WORD, "han", "hann"),
+        (WORDS, "b", ["b"]),
+        (WORDS, ("b", "a", "b"), ["b", "a", "b"]),
     ],
 )
 def test_values_from_python(parameter: Parameter, value: Any, wanted: Any) -> None:
     got = parameter.check(value)
     assert got == wanted
-    python_types = {"boolean": bool, "double": float, "sequence<double>": list, "string": str}
+    python_types = {"boolean": bool, "double": float, "sequence<double>": list, "sequence<string>": list, "string": str}
     assert isinstance(got, python_types.get(parameter.idl, int))
 
 
@@ -85,6 +89,11 @@ def test_values_from_python(parameter: Parameter, value: Any, wanted: Any) -> No
         (LIST, itertools.repeat(1.0)),  # it never ends
         (LIST, np.ones(MAX_SEQUENCE + 1)),
         (WORD, "x\0"),
+        (WORD, "anything"),
+        (WORD, ""),
+        (WORDS, []),
+        (WORDS, ["a", "c"]),
+        (WORDS, ["a"] * 5),
     ],
 )
 def test_values_that_are_refused(parameter: Parameter, value: Any) -> None:
@@ -109,19 +118,19 @@ def test_a_value_passes_its_own_check_or_is_refused_with_a_reason(value: Any) ->
 def test_whole_numbers_are_exact_or_refused(value: int) -> None:
     for parameter, low, high in ((UNSIGNED, 0, 2**32 - 1), (LARGE, 1, 2**64 - 1), (SIGNED, -(2**31), 2**31 - 1)):
         if low <= value <= high:
-            assert parameter.check(value) == parameter.parse(f" {value} ") == value
+            assert parameter.check(value) == parameter.read(f" {value} ") == value
             continue
         with pytest.raises(ValueError, match=parameter.name):
             parameter.check(value)
         with pytest.raises(ValueError, match=parameter.name):
-            parameter.parse(f" {value} ")
+            parameter.read(f" {value} ")
 
 
 @given(st.lists(st.floats(1e-300, 100.0), min_size=2, max_size=20), st.sampled_from([" ", ",", ", ", ";", "\n"]))
 def test_lists_in_texts(values: list[float], between: str) -> None:
     text = between.join(map(repr, values))
     for shape in ("{}", "[{}]", "{{{}}}", "({})", " {} "):
-        assert LIST.parse(shape.format(text)) == values
+        assert LIST.read(shape.format(text)) == values
 
 
 @pytest.mark.parametrize(
@@ -131,12 +140,13 @@ def test_lists_in_texts(values: list[float], between: str) -> None:
         (UNSIGNED, {"5": 5, "+5": 5, "007": 7, " 12 ": 12, "-0": 0}),
         (NUMBER, {"5": 5.0, "5.": 5.0, ".5": 0.5, "20E-3": 0.02, "+1e1": 10.0, " 1 ": 1.0}),
         (LIST, {"": [], "{}": [], "0": [], "{0}": [], "5": [5.0], "1 2": [1.0, 2.0]}),
-        (WORD, {"triang": "triang", " triang ": "triang", "Triang": "Triang", "": ""}),
+        (WORD, {"triang": "triang", " triang ": "triang", "han": "hann"}),
+        (WORDS, {"a": ["a"], "{b, a}": ["b", "a"], "[a b]": ["a", "b"]}),
     ],
 )
 def test_texts(parameter: Parameter, texts: dict[str, Any]) -> None:
     for text, wanted in texts.items():
-        assert parameter.parse(text) == wanted
+        assert parameter.read(text) == wanted
 
 
 @pytest.mark.parametrize(
@@ -179,20 +189,33 @@ def test_texts(parameter: Parameter, texts: dict[str, Any]) -> None:
             ],
         ),
         (LIST, ["1 x", "nan", "1e999 1", "1 0", "0x1", "1 " * (MAX_SEQUENCE + 1)]),
+        (WORD, ["Triang", "", "hann hann"]),
+        (WORDS, ["", "c", "a c"]),
     ],
 )
 def test_texts_that_are_refused(parameter: Parameter, texts: list[str]) -> None:
     for text in texts:
         with pytest.raises(ValueError, match=f"^{parameter.name}: ") as raised:
-            parameter.parse(text)
+            parameter.read(text)
         assert len(str(raised.value)) < 200
 
 
 def test_words_that_nobody_knows() -> None:
     assert [WORD.known_word(word) for word in ("triang", "Hann", "", "hann ")] == ["triang", "hann", "hann", "hann"]
+    assert WORDS.known_word("x") == "x"  # nothing is taken for it
+    for text in ("x" * 4097, "nul\0"):  # nor for what is no word at all
+        assert WORD.known_word(text) == text
     for kind, word in (("PreProc", "jespen"), ("GammatoneProc", "string"), ("IhcProc", "meddis")):
         enumerated = next(p for p in ROSAFE.service(kind).parameters if p.choices)
-        assert enumerated.known_word(word) == enumerated.default
+        assert enumerated.check(enumerated.known_word(word)) == enumerated.default
+
+
+@given(st.one_of(st.booleans(), st.integers(0, 2**32 - 1), st.floats(allow_nan=False, allow_infinity=False)))
+def test_texts_read_back_as_the_value(value: Any) -> None:
+    parameter = {bool: BOOLEAN, int: UNSIGNED, float: Parameter("any", "double", 1.0, "")}[type(value)]
+    assert parameter.read(text_of(value)) == value
+    numbers = Parameter("list", "sequence<double>", (), "")
+    assert numbers.read(text_of([1.5, float(value)])) == [1.5, float(value)]
 
 
 def requests() -> list[Any]:

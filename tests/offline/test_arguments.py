@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 import rosafe
-from rosafe import offline
+from rosafe.offline import process as offline
+from rosafe.tree import sizes
 
 GOOD = np.zeros((2, 100))
 RATE = 16000
@@ -167,7 +168,7 @@ def test_sizes_that_fill_the_memory() -> None:
 
 
 def test_results_larger_than_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(offline.os, "sysconf", lambda name: 2**12)  # 16 MiB
+    monkeypatch.setattr(sizes.os, "sysconf", lambda name: 2**12)  # 16 MiB
     sound, lags = np.zeros((2, 4000)), {"cc_maxDelaySec": 1.0}
     refused("outputs: they would take .* GB of memory, this machine has", sound, RATE, lags)
     refused("outputs: they would take", sound, RATE, modifications=[(0, *change) for change in lags.items()])

@@ -15,11 +15,11 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import rosafe
-from rosafe import chain
-from rosafe.audiofile import AudioFile
-from rosafe.interface import KINDS
+from rosafe.interface import FIXED
+from rosafe.offline import chain
 from rosafe.representations import STAGES
 from rosafe.representations.haircell import InnerHairCell
+from rosafe.sound.audiofile import AudioFile
 from tests import harness
 from tests.dsp.bare import Chain, cut
 from tests.dsp.test_vectors import CASES, assert_reference, load, parameters
@@ -194,11 +194,11 @@ def test_silence() -> None:
 # --- parts of the outputs ---
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", FIXED)
 def test_what_nothing_depends_on_is_not_computed(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = rosafe.process(SOUND, RATE, FEW)
     needed = [kind]
-    while parent := KINDS[needed[-1]].parent:
+    while parent := FIXED[needed[-1]].parent:
         needed.append(parent)
 
     def refuse(*arguments: Any, **parameters: Any) -> None:
@@ -260,7 +260,7 @@ def test_changes_before_their_blocks() -> None:
     stages = Chain(RATE, {**FEW, "in_doNormalize": False})
     made = [(at, name.replace("BS", "B"), value) for at, name, value in changes if at < 6]
     outputs = stages.run(cut(SOUND, 500), sorted(made, key=lambda change: change[0]))
-    for kind in STAGES:
+    for kind in FIXED:
         wanted = np.concatenate([output[kind] for output in outputs], axis=-1)
         np.testing.assert_allclose(results[kind], wanted, rtol=0, atol=1e-12, err_msg=kind)
     assert results["ild_frameRate"] == 200.0

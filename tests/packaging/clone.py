@@ -56,4 +56,4 @@ def without_rights(*command: str | Path) -> list[str | Path]:
 
 def generate(copy: Path, *arguments: str) -> list[str | Path]:
     """The command that generates the messages of a copy."""
-    return ["env", f"PYTHONPATH={copy}", PYTHON, "-m", "rosafe.ros.generate", *arguments]
+    return ["env", f"PYTHONPATH={copy}", PYTHON, "-m", "rosafe.component.generate", *arguments]

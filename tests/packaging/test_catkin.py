@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from rosafe import __version__
-from rosafe.ros import generate
+from rosafe.component import generate
 from tests.harness import PYTHON, Graph, MasterProcess, wait_for
 from tests.packaging.clone import environment, fresh_copy, run
 
@@ -115,7 +115,7 @@ def test_tcl_package(workspace: Path) -> None:
 def test_environment_for_children(workspace: Path) -> None:
     install = workspace / "install"
     python = install / "lib" / "python3" / "dist-packages"
-    command = [PYTHON, "-m", "rosafe.ros.generate", "--shell"]
+    command = [PYTHON, "-m", "rosafe.component.generate", "--shell"]
     exports = dict(
         line.removeprefix("export ").split("=", 1)
         for line in printed(run(*command, env=environment(PYTHONPATH=str(python)), cwd=Path("/"))).splitlines()

@@ -76,7 +76,7 @@ def test_twice_is_once(copy: Path, shell: str) -> None:
         ("", ". scripts/env.sh"),
         ("", ". ./scripts/env.sh"),
         ("scripts", ". ./env.sh"),
-        ("rosafe/ros", ". ../../scripts/env.sh"),
+        ("rosafe/node", ". ../../scripts/env.sh"),
         ("", "(. scripts/env.sh && {show})"),  # in a subshell
         ("", "set -eu; . scripts/env.sh"),
     ],

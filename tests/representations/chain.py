@@ -19,12 +19,12 @@ from tests import harness
 FloatArray = NDArray[np.float64]
 
 
-def kind_of(name: str) -> str:
-    """The kind that has a parameter of this name, or of this alias."""
-    for kind in KINDS.values():
-        if any(name in (p.name, *p.aliases, *p.former) for p in kind.parameters):
-            return kind.kind
-    raise KeyError(name)
+def kinds_of(name: str) -> list[str]:
+    """The kinds that have a parameter of this name, or of this alias: both maps have the same ones."""
+    found = [k.kind for k in KINDS.values() if any(name in (p.name, *p.aliases, *p.former) for p in k.parameters)]
+    if not found:
+        raise KeyError(name)
+    return found
 
 
 def needed(outputs: Iterable[str]) -> list[str]:
@@ -73,7 +73,7 @@ class Chain:
             kinds = [kind for kind in kinds if root in needed([kind])]
         own: dict[str, dict[str, Any]] = {kind: {} for kind in kinds}
         for name, value in (parameters or {}).items():
-            if (kind := kind_of(name)) in own:
+            for kind in set(kinds_of(name)) & own.keys():
                 own[kind][name] = value
         self.given = given
         self.stages: dict[str, Stage] = {}
@@ -90,7 +90,8 @@ class Chain:
         As in the tree, the change is tried on shallow copies first, while the stages stand by.
         """
         tried = {kind: copy.copy(stage) for kind, stage in self.stages.items()}
-        tried[kind_of(name)].configure(**{name: value})
+        for kind in set(kinds_of(name)) & tried.keys():
+            tried[kind].configure(**{name: value})
         for kind, stage in tried.items():
             comes = self._comes_to(kind, tried)
             if isinstance(comes, Signal):

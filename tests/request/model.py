@@ -9,7 +9,7 @@ from types import SimpleNamespace
 from typing import Any
 
 from rosafe.dsp.stage import Stage
-from rosafe.interface import KINDS, ROSAFE, ComponentError
+from rosafe.interface import KINDS, ROSAFE, ComponentError, text_of
 from rosafe.representations import STAGES
 
 RATE = 44100.0
@@ -81,7 +81,8 @@ class Model:
             raise ROSAFE.error("e_existsAlready")
         try:
             checked = {p.name: p.check(values[p.name]) for p in kind.parameters if p.name in values}
-            self.processors[name] = Processor(kind.kind, parent, STAGES[kind.kind](RATE, **checked))
+            given = self.processors[parent].stage.output if parent else RATE
+            self.processors[name] = Processor(kind.kind, parent, STAGES[kind.kind](given, **checked))
         except ValueError as problem:
             raise ROSAFE.error("e_badNewValue", what=str(problem)) from None
         return {}
@@ -93,20 +94,27 @@ class Model:
             for processor in self.processors.values():
                 processor.parent = name if processor.parent == old else processor.parent
 
-    def _getParameters(self, _: str, values: Mapping[str, Any]) -> dict[str, Any]:
-        arrays: dict[str, list[Any]] = {kind: [] for kind in KINDS}
-        for name, processor in self.processors.items():
-            arrays[processor.kind].append({"name": name, **processor.stage.parameters})
-        return {"parameters": arrays}
-
-    def _getDependencies(self, _: str, values: Mapping[str, Any]) -> dict[str, Any]:
-        return {"dependencies": list(self.line(values["nameProc"]))[::-1]}
+    def _getProcessors(self, _: str, values: Mapping[str, Any]) -> dict[str, Any]:
+        return {
+            "processors": [
+                {
+                    "name": name,
+                    "kind": processor.kind,
+                    "upperDepName": processor.parent,
+                    "parameters": [
+                        {"name": parameter, "value": text_of(value)}
+                        for parameter, value in {**processor.stage.parameters, **processor.stage.derived}.items()
+                    ],
+                }
+                for name, processor in self.processors.items()
+            ]
+        }
 
     def _modifyParameter(self, _: str, values: Mapping[str, Any]) -> dict[str, Any]:
         processor = self._find(values["nameProc"])
         parameter = KINDS[processor.kind].parameter(values["nameParam"])
         try:
-            processor.stage.configure(**{parameter.name: parameter.parse(values["newValue"])})
+            processor.stage.configure(**{parameter.name: parameter.read(values["newValue"])})
         except ValueError as problem:
             raise ROSAFE.error("e_badNewValue", what=str(problem)) from None
         return {}

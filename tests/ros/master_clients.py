@@ -10,7 +10,7 @@ from typing import Any
 
 import rospy
 
-from rosafe.ros import generate
+from rosafe.component import generate
 from tests.harness import run_together, wait_for
 
 generate.ensure_messages()

@@ -11,11 +11,11 @@ import rospy
 from actionlib import CommState
 from actionlib_msgs.msg import GoalStatus
 
-from rosafe.interface import KINDS, ROSAFE
+from rosafe.interface import FIXED, ROSAFE
 from tests.harness import Graph, wait_for
 from tests.ros.session import Goal, Session, noise, own_node, told
 
-REQUESTS = [kind.request for kind in KINDS.values()]
+REQUESTS = [kind.request for kind in FIXED.values()]
 
 
 def build(afe: Session, *requests: str) -> dict[str, Goal]:
@@ -48,7 +48,7 @@ def test_a_whole_tree_of_goals(afe: Session) -> None:
     """Accepted means running, so that each can follow at once; the results come when the activities end."""
     goals = build(afe, *REQUESTS[1:])
     assert afe.processors() == {
-        kind: [ROSAFE.service(k.request).parameter("name").default] for kind, k in KINDS.items()
+        kind: [ROSAFE.service(k.request).parameter("name").default] for kind, k in FIXED.items()
     }
     ids = afe.wait_activities(REQUESTS)
     assert list(ids.values()) == REQUESTS and sorted(ids) == list(ids), "ids grow in the order of the requests"

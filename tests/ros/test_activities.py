@@ -9,9 +9,9 @@ from typing import Any
 
 import pytest
 
+from rosafe.component import activities as module
+from rosafe.component.activities import Activities, Activity, TaskMeter
 from rosafe.interface import BASS, MAX_ACTIVITIES, ROSAFE, ComponentError
-from rosafe.ros import activities as module
-from rosafe.ros.activities import Activities, Activity, TaskMeter
 
 INPUT = ROSAFE.service("InputProc")  # interrupts its own kind
 IHC = ROSAFE.service("IhcProc")

@@ -13,8 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from rosafe.ros.audio import MAX_RATE, RING_SECONDS, AudioReader, AudioRing
-from tests.harness import wait_for
+from rosafe.component.audio import MAX_RATE, RING_SECONDS, AudioReader, AudioRing
 
 RATE = 8  # Hz: the ring holds 80 frames
 CAPACITY = int(RING_SECONDS * RATE)
@@ -57,7 +56,7 @@ def opened(ring: AudioRing, block: int) -> AudioReader:
 
 
 class Model:
-    """The rules at the head of rosafe/ros/audio.py, on a dict from frame number to sample."""
+    """The rules at the head of rosafe/component/audio.py, on a dict from frame number to sample."""
 
     def __init__(self) -> None:
         self.rate = self.window = self.newest = 0
@@ -270,7 +269,7 @@ def test_malformed_messages_change_nothing_and_are_told_once(bad: Any, why: str)
 
 
 def test_a_window_beyond_all_reason_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rosafe.ros.audio.MAX_WINDOW", 100)
+    monkeypatch.setattr("rosafe.component.audio.MAX_WINDOW", 100)
     lines: list[str] = []
     feed = AudioRing(lines.append).connect()
     feed(message(RATE, 5, np.zeros(101, np.int32)))
@@ -350,27 +349,31 @@ def test_waiting_for_the_first_message() -> None:
     assert found[0].position == 8 and found[0].sample_rate == RATE
 
 
-def test_a_blocked_reader_wakes_for_a_block_and_for_stop() -> None:
+def test_a_reader_is_woken_for_all_that_comes_until_it_is_stopped() -> None:
     ring = AudioRing(lambda line: None)
     feed = ring.connect()
     source = Source()
     feed(source.message())
     reader = opened(ring, 6)
-    came: list[Any] = []
+    came: list[int] = []
+    calls = []
 
-    def work() -> None:
+    def wake() -> None:  # as the tree does, but on the feeding thread; the ring must be free then
+        calls.append(1)
         while (block := reader.read()) is not None:
             came.append(block[1])
 
-    thread = threading.Thread(target=work)
-    thread.start()
+    reader.open(wake)
     for _ in range(12):
         source.index += 1
         feed(source.message())
-    wait_for(lambda: came == [7, 13], what=lambda: str(came))
+    assert came == [7, 13]
+    assert len(calls) == 12
     reader.stop()
-    thread.join(10)
-    assert not thread.is_alive()
+    source.index += 12
+    feed(source.message())
+    assert len(calls) == 12
+    assert reader.ended
     assert reader.read() is None
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 
-from rosafe.ros.events import EventLog
+from rosafe.component.events import EventLog
 from tests.harness import run_together, wait_for
 
 

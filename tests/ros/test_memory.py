@@ -7,7 +7,7 @@ from tests.harness import PYTHON, ROOT, Graph, proc
 # Fills memory from many threads with pieces of all sizes, frees all but a few, and prints the MiB that stay resident.
 SPREAD = """
 import random, threading
-from rosafe.ros import memory
+from rosafe.component import memory
 memory.bound()
 def resident():
     return int(next(line for line in open("/proc/self/status") if line.startswith("VmRSS")).split()[1]) // 1024

@@ -21,10 +21,11 @@ import rosgraph
 import rospy
 from rosgraph.network import read_ros_handshake_header, write_ros_handshake_header
 
-from rosafe.interface import KINDS
-from rosafe.ros import array_msg, publisher
-from rosafe.ros.publisher import MAX_WAITING, MAX_WAITING_BYTES, Publisher, send_pieces
-from rosafe.ros.wire import Gather
+from rosafe.component import publisher
+from rosafe.component.publisher import MAX_WAITING, MAX_WAITING_BYTES, Publisher, send_pieces
+from rosafe.component.wire import Gather
+from rosafe.interface import FIXED
+from rosafe.ros import array_msg
 from tests.harness import PYTHON, ROOT, Graph, Process, proc, wait_for
 from tests.ros.session import Session, noise, own_node
 
@@ -294,6 +295,6 @@ def test_all_ports_for_a_while(tmp_path: Path) -> None:
     with Process(command, {**env, "HOME": str(tmp_path)}) as done:
         assert done.wait(90) == 0, done
         rows = re.findall(r"^(/rosAFE/\S+) +(\d+) +(\d+) +(\d+)$", done.out, re.MULTILINE)
-    assert len(rows) == 2 * len(KINDS)
+    assert len(rows) == 2 * len(FIXED)
     for topic, came, expected, lost in rows:
         assert 2 < int(came) <= int(expected) and int(lost) == 0, topic

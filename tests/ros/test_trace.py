@@ -16,9 +16,10 @@ import rospy
 import soundfile
 from std_msgs.msg import String
 
-from rosafe.interface import KINDS
-from rosafe.ros.trace import TracePort, read
-from rosafe.tree.roles import Observer, State
+from rosafe.interface import FIXED
+from rosafe.node.trace_port import TracePort, read
+from rosafe.tree.processor import Observer
+from rosafe.tree.states import State
 from tests.cli.command import refused, rosafe
 from tests.harness import SCRIPTS, Graph, wait_for
 from tests.ros.session import Session, noise
@@ -67,7 +68,7 @@ def test_a_real_run_shows_parents_children_and_siblings_at_work_at_once(afe: Ses
         assert command.stop(signal.SIGINT) == 0, command
     rows = spans(path)
     assert list(rows) == [
-        f"{name} ({kind})" for kind, name in zip(KINDS, [*list(KINDS)[:-1], "crosscorrelation"], strict=True)
+        f"{name} ({kind})" for kind, name in zip(FIXED, [*list(FIXED)[:-1], "crosscorrelation"], strict=True)
     ]
     for row in rows.values():
         assert [block for state, block, _, _ in row if state == "exec"] == list(range(BLOCKS))
@@ -112,7 +113,7 @@ def test_a_sound_file_without_ros(tmp_path: Path) -> None:
     done = rosafe("trace", sound, "-o", path, "--block", "882", "--seconds", "0.5", **nowhere)
     assert done.returncode == 0, done
     rows = spans(path)
-    assert len(rows) == len(KINDS)
+    assert len(rows) == len(FIXED)
     for row in rows.values():
         assert [block for state, block, _, _ in row if state == "exec"] == list(range(25))
     soundfile.write(sound, np.zeros((100, 1)), 44100)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import rospy
 
-from rosafe.ros import wire
+from rosafe.component import wire
 from tests.harness import run_together, wait_for
 from tests.ros.session import reader, told
 from tests.soak.world import NAMES, World, following, wait_out

@@ -15,17 +15,17 @@ import numpy as np
 import rospy
 import soundfile
 
-from rosafe.arguments import check_parameters
-from rosafe.chain import Chain
-from rosafe.interface import KINDS, ROSAFE
-from rosafe.ros import registration, wire
+from rosafe.component import registration, wire
+from rosafe.interface import FIXED, ROSAFE
+from rosafe.interface.arguments import check_parameters
+from rosafe.offline.chain import Chain
 from rosafe.tree.window import SlidingWindow, frames_in
 from tests import harness
 from tests.genomix.world import Http, genomixd
 from tests.harness import proc, wait_for
 from tests.ros.session import Session, assert_holds
 
-NAMES = {kind: ROSAFE.service(entry.request).parameter("name").default for kind, entry in KINDS.items()}
+NAMES = {kind: ROSAFE.service(entry.request).parameter("name").default for kind, entry in FIXED.items()}
 TREE = {kind: [name] for kind, name in NAMES.items()}
 CHUNKS = 20  # on bass' port, as by default
 DRIFT = 0.15  # seconds that bass' frames may be off the clock: a chunk more or less, and a busy machine
@@ -133,7 +133,7 @@ class World:
         assert self.graph.call("/bass/Stop").genom_success
         self.afe.ok("Stop")
         self.afe.ok("InputProc", nFramesPerBlock=self.size.block)
-        for kind in list(KINDS.values())[1:]:
+        for kind in list(FIXED.values())[1:]:
             few = {"fb_nChannels": self.size.channels} if kind.kind == "gammatone" else {}
             self.afe.ok(kind.request, **few)
         before = self.counters()
@@ -163,9 +163,9 @@ class World:
 
         parameters = check_parameters({"fb_nChannels": self.size.channels} if self.size.channels else {})
         blocks = (self.frames(first, self.size.block) for first in range(1, end, self.size.block))
-        with Chain(blocks, self.size.rate, {"in_doNormalize": True, **parameters}, list(KINDS), keep) as chain:
+        with Chain(blocks, self.size.rate, {"in_doNormalize": True, **parameters}, list(FIXED), keep) as chain:
             chain.run()
-        for kind in KINDS:
+        for kind in FIXED:
             assert_holds(self.afe.read(kind, end + 1, timeout=60.0), kind, truth[kind].view().array())
 
     def counters(self) -> dict[str, Any]:

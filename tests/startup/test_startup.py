@@ -127,6 +127,64 @@ def test_address_that_is_none(graph: Graph, uri: str) -> None:
         assert "ROS_MASTER_URI" in refusal(node)
 
 
+def test_waiting_for_a_master(private_graph: tuple[Graph, MasterProcess]) -> None:
+    """As services at boot do: longer than by default, and then all is as usual; without --wait nothing has changed."""
+    graph, master = private_graph
+    master.kill()
+    with (
+        graph.start("rosAFE-ros", "--wait") as afe,
+        graph.start("bass-ros", "--wait", "-b") as bass,
+        graph.start("bass-ros", "-i", "hasty") as hasty,
+        graph.start("bass-ros", "-i", "stopped", "--wait") as stopped,
+    ):
+        assert "start roscore first" in refusal(hasty), "the patient ones have waited as long by now"
+        line = f"waiting for a ROS master at {graph.uri}"
+        for node in (afe, bass, stopped):
+            wait_for(lambda: line in node.err, 20, lambda: str(node))  # noqa: B023
+            assert node.alive and node.err.count("\n") == 1, node
+        assert stopped.stop(signal.SIGTERM, timeout=5) == 0
+        master.start(graph.env)
+        wait_for(lambda: {"/rosAFE/Stop", "/bass/Stop"} <= graph.services(), 30, lambda: f"{afe} {bass}")
+        assert bass.wait() == 0, "the shell goes on once the node is up"
+        assert "Traceback" not in afe.err + bass.err
+        done = graph.run("rosservice", "call", "/bass/kill")
+        assert "genom_success: True" in done.stdout
+
+
+def test_waiting_for_a_master_that_answers_nothing_can_be_ended(graph: Graph) -> None:
+    with silent_port() as port, graph.start("bass-ros", "--wait", ROS_MASTER_URI=f"http://127.0.0.1:{port}") as node:
+        wait_for(lambda: "waiting" in node.err, 20, lambda: str(node))
+        assert node.stop(signal.SIGINT, timeout=5) == 0
+        assert node.err.count("\n") == 1, node
+
+
+# --- an address that nobody can call -----------------------------------------------------------------------------
+
+UNREACHABLE = {
+    "ROS_IP": ("203.0.113.7", "which is no address of this machine"),
+    "ROS_HOSTNAME": ("nobody.invalid", "no name that is known here"),
+}
+
+
+@PROGRAMS
+@pytest.mark.parametrize("variable", UNREACHABLE)
+def test_an_address_that_nobody_can_call_is_said(graph: Graph, program: str, variable: str) -> None:
+    """In one line; the node starts all the same. By remapping too."""
+    address, why = UNREACHABLE[variable]
+    name = f"unreachable_{variable.lower()}"
+    option = {"ROS_IP": "__ip", "ROS_HOSTNAME": "__hostname"}[variable]
+    for arguments, env in (([], {variable: address}), ([f"{option}:={address}"], {})):
+        with graph.node(program, "-i", name, *arguments, **env) as node:
+            assert node.err.startswith(f"{program}: warning: {variable} is {address}, ") and why in node.err
+            assert "set it to 127.0.0.1" in node.err and node.err.count("\n") == 1
+
+
+def test_addresses_that_can_be_called_are_not_mentioned(graph: Graph) -> None:
+    for env in ({"ROS_IP": "127.0.0.1"}, {"ROS_IP": "127.3.2.1"}, {"ROS_HOSTNAME": "127.0.0.1"}):
+        with graph.node("bass-ros", "-i", "reachable", **env) as node:
+            assert node.err == ""
+
+
 # --- up and down ------------------------------------------------------------------------------------------------
 
 
@@ -295,7 +353,7 @@ def test_end_is_bounded_when_threads_hang(graph: Graph, tmp_path: Path) -> None:
 import sys, threading
 sys.path.insert(0, {str(SCRIPTS.parent)!r})
 from rosafe import interface
-from rosafe.ros.startup import run_server
+from rosafe.component.startup import run_server
 class Stuck:
     finished = threading.Event()
     def shutdown(self, by):

@@ -22,7 +22,13 @@ def feed() -> Feed:
 
 
 @pytest.fixture
-def tree(listener: Recorder) -> Iterator[Tree]:
-    tree = Tree(listener)
+def workers() -> int | None:
+    """How many; None for one on each core."""
+    return None
+
+
+@pytest.fixture
+def tree(listener: Recorder, workers: int | None) -> Iterator[Tree]:
+    tree = Tree(listener, workers)
     yield tree
     end(tree, listener)

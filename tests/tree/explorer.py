@@ -17,6 +17,7 @@ from types import SimpleNamespace, TracebackType
 from typing import Any
 
 HANG_SECONDS = 30.0  # no thread gets its turn for so long: the scheduler itself has failed
+MOST_PASSES = 10  # of time, one after the other, in which nothing happens: nothing ever will
 
 
 class Abandoned(BaseException):
@@ -29,6 +30,7 @@ class Task:
     def __init__(self, name: str) -> None:
         self.name = name
         self.ready: Callable[[], bool] = lambda: True
+        self.in_time: Callable[[], bool] | None = None  # ready as soon as time passes, and this holds
         self.finished = False
         self.go = threading.Lock()  # released to give it its turn
         self.go.acquire()
@@ -77,7 +79,10 @@ class Priorities:
 
 
 class Scheduler:
-    """Lets one thread run at a time; `strategy` decides which where there is a choice."""
+    """Lets one thread run at a time; `strategy` decides which where there is a choice.
+
+    Time stands still, and passes where nobody can go on otherwise.
+    """
 
     def __init__(self, strategy: Delays | Priorities) -> None:
         self.trace: list[str] = []
@@ -85,6 +90,7 @@ class Scheduler:
         self.tasks = [Task("main")]
         self._current = self.tasks[0]
         self._strategy = strategy
+        self._passes = 0
         self.threading = SimpleNamespace(
             Lock=lambda: Lock(self),
             RLock=lambda: Lock(self),
@@ -93,16 +99,24 @@ class Scheduler:
             current_thread=threading.current_thread,
         )
 
-    def until(self, ready: Callable[[], bool]) -> None:
-        """Let others run as the schedule says, until `ready()` holds and it is this thread's turn."""
+    def until(self, ready: Callable[[], bool], in_time: Callable[[], bool] | None = None) -> None:
+        """Let others run as the schedule says, until `ready()` holds and it is this thread's turn.
+
+        Or until `in_time()` holds, and time has passed.
+        """
         me = self._current
-        me.ready = ready
+        me.ready, me.in_time = ready, in_time
         self._switch(me)
 
     def _switch(self, me: Task) -> None:
         start = self.tasks.index(me)
         in_turn = self.tasks[start:] + self.tasks[:start]
         able = [task for task in in_turn if not task.finished and task.ready()]
+        if able:
+            self._passes = 0
+        elif self._passes < MOST_PASSES:
+            self._passes += 1
+            able = [task for task in in_turn if not task.finished and task.in_time is not None and task.in_time()]
         if not able:
             waiting = [task.name for task in self.tasks if not task.finished]
             if waiting and not self.deadlock:
@@ -169,7 +183,7 @@ class Condition(Lock):
     def __init__(self, scheduler: Scheduler, lock: Lock) -> None:
         super().__init__(scheduler)
         self._lock = lock
-        self._waiting: set[Task] = set()
+        self._waiting: list[Task] = []
 
     def acquire(self) -> None:
         self._lock.acquire()
@@ -177,16 +191,30 @@ class Condition(Lock):
     def release(self) -> None:
         self._lock.release()
 
-    def wait(self) -> None:
+    def wait(self, timeout: float | None = None) -> None:
         lock, me = self._lock, self._scheduler._current
         depth, lock.owner, lock.depth = lock.depth, None, 0
-        self._waiting.add(me)
-        self._scheduler.until(lambda: me not in self._waiting and lock.owner is None)
+        self._waiting.append(me)
+        self._scheduler.until(
+            lambda: me not in self._waiting and lock.owner is None,
+            None if timeout is None else lambda: lock.owner is None,
+        )
+        if me in self._waiting:
+            self._waiting.remove(me)
         lock.owner, lock.depth = me, depth
 
-    def notify_all(self) -> None:
+    def wait_for(self, predicate: Callable[[], bool], timeout: float | None = None) -> bool:
+        assert timeout is None
+        while not predicate():
+            self.wait()
+        return True
+
+    def notify(self, count: int = 1) -> None:
         assert self._lock.owner is self._scheduler._current
-        self._waiting.clear()
+        del self._waiting[:count]
+
+    def notify_all(self) -> None:
+        self.notify(len(self._waiting))
 
 
 class Thread:

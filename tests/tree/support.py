@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import collections
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 import pytest
 
-from rosafe.interface import KINDS
-from rosafe.representations import STAGES
+from rosafe.dsp.stage import Stage
+from rosafe.representations import KINDS, STAGES
+from rosafe.tree.block import Block
 from rosafe.tree.processor import Processor
 from rosafe.tree.tree import Tree
-from rosafe.tree.zone import Block
 
 RATE = 16000.0
 WAIT_SECONDS = 20.0  # for anything that must happen
@@ -26,41 +26,36 @@ class Feed:
     def __init__(self, rate: float = RATE, frames: int = 160) -> None:
         self.sample_rate = rate
         self.frames = frames
-        self.stopped = False
+        self.ended = self.stopped = False
         self._at = 0
         self._blocks: collections.deque[np.ndarray] = collections.deque()
-        self._ended = False
-        self._turn = threading.Condition()
+        self._wake: Callable[[], None] = lambda: None
 
     def put(self, *blocks: np.ndarray, count: int = 0) -> None:
         """Add `blocks`, or `count` blocks of numbered frames."""
-        with self._turn:
-            for _ in range(count):
-                numbers = np.arange(self._at, self._at + self.frames, dtype=float)
-                self._blocks.append(np.stack((numbers, numbers)))
-                self._at += self.frames
-            self._blocks.extend(blocks)
-            self._turn.notify_all()
+        for _ in range(count):
+            numbers = np.arange(self._at, self._at + self.frames, dtype=float)
+            self._blocks.append(np.stack((numbers, numbers)))
+            self._at += self.frames
+        self._blocks.extend(blocks)
+        self._wake()
 
     def end(self) -> None:
         """Nothing more will come."""
-        with self._turn:
-            self._ended = True
-            self._turn.notify_all()
+        self.ended = True
+        self._wake()
+
+    def open(self, wake: Callable[[], None]) -> None:
+        self._wake = wake
 
     def read(self) -> tuple[np.ndarray, int] | None:
-        with self._turn:
-            while not self._blocks and not self._ended and not self.stopped:
-                self._turn.wait(WAIT_SECONDS)
-            if self.stopped or not self._blocks:
-                return None
-            block = self._blocks.popleft()
-            return block, int(block[0, -1]) + 1 if block.size else 0
+        if self.stopped or not self._blocks:
+            return None
+        block = self._blocks.popleft()
+        return block, int(block[0, -1]) + 1 if block.size else 0
 
     def stop(self) -> None:
-        with self._turn:
-            self.stopped = True
-            self._turn.notify_all()
+        self.ended = self.stopped = True
 
 
 class Recorder:
@@ -114,35 +109,29 @@ class Recorder:
         return np.concatenate([block.data for block in self.blocks[processor]], axis=-1)
 
 
-class Plain:
-    """A stage of any kind that hands its blocks on as they are."""
+class Plain(Stage):
+    """A stage of any kind, with any parameters, that hands its blocks on as they are."""
 
     work: Callable[[np.ndarray], None] = staticmethod(lambda block: None)
 
-    def __init__(self, sample_rate: float, **parameters: Any) -> None:
-        self.sample_rate = self.output.rate = sample_rate
-        self.parameters = parameters
-
-    def configure(self, **changes: Any) -> None:
-        self.parameters = {**self.parameters, **changes}
-
-    def output_rows(self, rows: tuple[int, ...]) -> tuple[int, ...]:
-        return rows
-
-    def process(self, block: np.ndarray) -> np.ndarray:
+    def process(self, block: np.ndarray, extra: np.ndarray | None = None) -> np.ndarray:
         self.work(block)
         return block
 
+    def _with(self, changes: Mapping[str, Any]) -> dict[str, Any]:
+        return {**self._values, **changes}
+
 
 def tree_threads() -> set[threading.Thread]:
-    """The threads of all processors of all trees, and of nobody else."""
-    return {thread for thread in threading.enumerate() if thread.name.split(":")[0] in KINDS}
+    """The threads of all trees, and of nobody else."""
+    return {thread for thread in threading.enumerate() if thread.name.startswith("rosafe ")}
 
 
 def use_plain_stages(patch: pytest.MonkeyPatch, **stages: type[Plain]) -> None:
     """Let the tree make `Plain` stages, or those given, of all kinds."""
-    for kind in STAGES:
-        patch.setitem(STAGES, kind, stages.get(kind, Plain))  # type: ignore[misc]
+    for kind, representation in KINDS.items():
+        base = stages.get(kind, Plain)
+        patch.setitem(STAGES, kind, type(base.__name__, (base,), {"REPRESENTATION": representation}))
 
 
 DEFAULT_TREE = (
@@ -168,4 +157,6 @@ def end(tree: Tree, listener: Recorder) -> None:
     tree.stop()
     for processor in listener.processors:
         assert processor.join(WAIT_SECONDS), f"{processor!r} is still running"
+    tree.join()
+    assert tree_threads() == set()
     assert listener.late == []

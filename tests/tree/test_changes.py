@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rosafe.interface import KINDS, ComponentError
-from rosafe.representations import STAGES
-from rosafe.tree.roles import State
+from rosafe.interface import FIXED, ComponentError
+from rosafe.tree import sizes
+from rosafe.tree.states import State
 from rosafe.tree.tree import Tree
 from tests.dsp.bare import Chain
 from tests.harness import run_together
@@ -56,7 +56,7 @@ CHANGES: dict[str, tuple[str, Any]] = {
     "cc_hSizeSec": ("0.02", 0.02),
     "cc_maxDelaySec": ("0.002", 0.002),
 }
-OWNER = {p.name: kind.kind for kind in KINDS.values() for p in kind.parameters}
+OWNER = {p.name: kind.kind for kind in FIXED.values() for p in kind.parameters}  # later kinds: tests/representations
 
 
 def test_every_parameter_has_a_change_here() -> None:
@@ -184,26 +184,30 @@ def test_names_and_words_of_the_original(tree: Tree, feed: Feed) -> None:
         ("crossCorrelation", "cc_maxDelaySec", "0.00025", "cc_lags", [m / RATE for m in range(-4, 5)]),
     ):
         tree.modify(processor, parameter, text)
-        assert tree.find(processor).parameters()[name] == value, (parameter, text)
+        found = tree.find(processor)
+        assert {**found.parameters(), **found.derived()}[name] == value, (parameter, text)
 
 
 # --- when and how ---
 
 
-def test_a_refused_change_does_not_touch_the_numbers(tree: Tree, feed: Feed, listener: Recorder) -> None:
+def test_a_refused_change_does_not_touch_the_numbers(
+    tree: Tree, feed: Feed, listener: Recorder, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Not even one that a stage has made of itself already when the tree refuses it."""
 
-    def refuse(stage: Any) -> None:
+    def refuse(*_: Any) -> None:
         raise ValueError("refused")
 
     grow(tree, feed)
     settle(tree, feed, listener, *NOISE[:2])
-    for name, (_, value) in CHANGES.items():
-        with pytest.raises(ValueError, match="refused"):
-            tree.find(OWNER[name]).change(name, value, refuse)
+    monkeypatch.setattr(sizes, "check_all", refuse)
+    for name, (text, _) in CHANGES.items():
+        with pytest.raises(ComponentError, match="refused"):
+            tree.modify(OWNER[name], name, text)
     settle(tree, feed, listener, *NOISE[2:4])
     outputs = chain().run(list(NOISE[:4]))
-    for kind in STAGES:
+    for kind in FIXED:
         assert_as(listener, tree, kind, outputs)
 
 
@@ -227,15 +231,16 @@ def test_a_change_waits_for_no_block_and_never_meets_one_half_way(
     working, go_on = threading.Event(), threading.Event()
 
     class Slow(Plain):
-        def process(self, block: np.ndarray) -> np.ndarray:
+        def process(self, block: np.ndarray, extra: np.ndarray | None = None) -> np.ndarray:
             before = dict(self.parameters)
             working.set()
             assert go_on.wait(WAIT_SECONDS)
             assert self.parameters == before
-            return block * (1.0 + self.parameters.get("rm_decaySec", 0.0))
+            return block * self.parameters["rm_decaySec"]
 
     use_plain_stages(monkeypatch, ratemap=Slow)
     grow(tree, feed)
+    tree.modify("ratemap", "rm_decaySec", "1")
     feed.put(*np.ones((2, 2, 10)))
     assert working.wait(WAIT_SECONDS)
     tree.modify("ratemap", "rm_decaySec", "2")
@@ -244,7 +249,7 @@ def test_a_change_waits_for_no_block_and_never_meets_one_half_way(
     assert ratemap.parameters()["rm_decaySec"] == 2.0
     go_on.set()
     listener.wait_blocks(ratemap, 2)
-    assert [block.data[0, 0] for block in listener.blocks[ratemap]] == [1.0, 3.0]
+    assert [block.data[0, 0] for block in listener.blocks[ratemap]] == [1.0, 2.0]
 
 
 def test_what_is_asked_while_others_change_it_fits_together(tree: Tree, feed: Feed) -> None:
@@ -256,7 +261,8 @@ def test_what_is_asked_while_others_change_it_fits_together(tree: Tree, feed: Fe
             if user < 2:
                 tree.modify("crossCorrelation", "cc_maxDelaySec", str(0.001 * (1 + (user + step) % 3)))
             else:
-                values = correlation.parameters()
+                stage = correlation.stage
+                values = {**stage.parameters, **stage.derived}
                 if values["cc_lags"][-1] != np.ceil(values["cc_maxDelaySec"] * RATE) / RATE:
                     return False
         return True

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import math
 import random
 import sys
 import threading
@@ -12,8 +11,7 @@ import numpy as np
 import pytest
 
 from rosafe.interface import ComponentError
-from rosafe.tree import processor
-from rosafe.tree.roles import State
+from rosafe.tree.states import State
 from rosafe.tree.tree import Tree
 from tests.harness import wait_for
 
@@ -25,6 +23,12 @@ def feed() -> Feed:
     return Feed(frames=1)
 
 
+@pytest.fixture
+def workers() -> int:
+    """So that whoever may work at the same time can, on any machine."""
+    return 4
+
+
 def test_siblings_work_at_the_same_time(
     tree: Tree, listener: Recorder, feed: Feed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -32,7 +36,7 @@ def test_siblings_work_at_the_same_time(
     meeting = threading.Barrier(3)
 
     class Meeting(Plain):
-        def process(self, block: np.ndarray) -> np.ndarray:
+        def process(self, block: np.ndarray, extra: np.ndarray | None = None) -> np.ndarray:
             meeting.wait(WAIT_SECONDS)
             return block
 
@@ -54,14 +58,14 @@ def test_a_parent_works_on_the_next_block_while_its_child_works_on_the_last(
     turn = threading.Condition()
 
     class Parent(Plain):
-        def process(self, block: np.ndarray) -> np.ndarray:
+        def process(self, block: np.ndarray, extra: np.ndarray | None = None) -> np.ndarray:
             with turn:
                 computed.append(int(block[0, 0]))
                 turn.notify_all()
             return block
 
     class Child(Plain):
-        def process(self, block: np.ndarray) -> np.ndarray:
+        def process(self, block: np.ndarray, extra: np.ndarray | None = None) -> np.ndarray:
             with turn:
                 number = int(block[0, 0])
                 assert turn.wait_for(lambda: number == last or number + 1 in computed, WAIT_SECONDS)
@@ -93,7 +97,7 @@ def test_the_four_states(tree: Tree, listener: Recorder, feed: Feed, monkeypatch
     working, go_on = threading.Event(), threading.Event()
 
     class Slow(Plain):
-        def process(self, block: np.ndarray) -> np.ndarray:
+        def process(self, block: np.ndarray, extra: np.ndarray | None = None) -> np.ndarray:
             working.set()
             assert go_on.wait(WAIT_SECONDS)
             return block
@@ -126,7 +130,7 @@ def test_nobody_waits_for_a_removed_child(
     working, go_on = threading.Event(), threading.Event()
 
     class Slow(Plain):
-        def process(self, block: np.ndarray) -> np.ndarray:
+        def process(self, block: np.ndarray, extra: np.ndarray | None = None) -> np.ndarray:
             if self.parameters.get("slow"):
                 working.set()
                 assert go_on.wait(WAIT_SECONDS)
@@ -155,39 +159,6 @@ def test_nobody_waits_for_a_removed_child(
     assert listener.blocks[slow] == listener.blocks[below] == []
 
 
-def test_short_work_is_done_on_the_parents_thread(
-    tree: Tree, listener: Recorder, feed: Feed, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Until it takes longer: then each has its own thread again."""
-    threads: dict[str, list[str]] = {}
-
-    class Noting(Plain):
-        def process(self, block: np.ndarray) -> np.ndarray:
-            threads.setdefault(self.parameters["name"], []).append(threading.current_thread().name)
-            return block
-
-    use_plain_stages(monkeypatch, preProc=Noting, gammatone=Noting)
-    monkeypatch.setattr(processor, "SHORT", math.inf)
-    tree.add_input("input", feed, 1, 1.0, 1.0)
-    children = [
-        tree.add("preProc", "one", "input", {"name": "one"}),
-        tree.add("preProc", "other", "input", {"name": "other"}),
-        tree.add("gammatone", "below", "one", {"name": "below"}),
-    ]
-
-    def last_threads(blocks: int) -> list[str]:
-        feed.put(count=10)
-        for child in children:
-            listener.wait_blocks(child, blocks)
-        return [threads[child.name][-1] for child in children]
-
-    last_threads(10)
-    last_threads(20)
-    assert last_threads(30) == ["input:input"] * 3
-    monkeypatch.setattr(processor, "SHORT", 0.0)
-    assert last_threads(40) == ["preProc:one", "preProc:other", "gammatone:below"]
-
-
 def test_blocks_arrive_whole_and_in_order_whoever_comes_and_goes(
     tree: Tree, listener: Recorder, feed: Feed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -195,7 +166,7 @@ def test_blocks_arrive_whole_and_in_order_whoever_comes_and_goes(
     dice = random.Random(1)
 
     class Erratic(Plain):
-        def process(self, block: np.ndarray) -> np.ndarray:
+        def process(self, block: np.ndarray, extra: np.ndarray | None = None) -> np.ndarray:
             for _ in range(dice.choice((0, 0, 10, 300))):
                 pass
             return block

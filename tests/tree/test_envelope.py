@@ -11,7 +11,7 @@ import pytest
 from rosafe.representations import STAGES
 from rosafe.representations.haircell import InnerHairCell
 from rosafe.tree.processor import Processor
-from rosafe.tree.roles import State
+from rosafe.tree.states import State
 from rosafe.tree.tree import Tree
 from tests.dsp.bare import joined
 from tests.harness import wait_for
@@ -21,13 +21,19 @@ from .test_changes import LEAVES, NOISE, assert_as, chain, settle
 
 
 @pytest.fixture
+def workers() -> int:
+    """A parent is to compute its next block while a child is held up."""
+    return 2
+
+
+@pytest.fixture
 def asked(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
     """Whether the filterbank computed the envelope, block by block."""
     answers: list[bool] = []
     original = STAGES["gammatone"].process
 
     def process(self: Any, block: np.ndarray) -> np.ndarray:
-        answers.append(self.provide_envelope)
+        answers.append("envelope" in self.provide)
         return original(self, block)
 
     monkeypatch.setattr(STAGES["gammatone"], "process", process)

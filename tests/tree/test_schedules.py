@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterator
+from collections import deque
+from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import numpy as np
 import pytest
 
-from rosafe.tree import processor, tree
+from rosafe.tree import changes, history, processor, tree, workers
+from rosafe.tree.block import Block
 from rosafe.tree.processor import Processor
+from rosafe.tree.states import State, StateMachine
 from rosafe.tree.tree import Tree
-from rosafe.tree.zone import Block
+from rosafe.tree.workers import Workers
 
 from .explorer import Scheduler, explore
 from .support import Plain, use_plain_stages
@@ -21,30 +24,33 @@ pytestmark = pytest.mark.long
 
 WALKS = 400
 
-Scenario = Callable[[Scheduler], Callable[[], None]]
+Check = Callable[[], None]
+Scenario = Callable[[Scheduler, int], Check]
 
 
 class Numbers:
-    """A source of blocks that hold their number; then it ends, or waits until it is stopped."""
+    """A source of blocks that hold their number. It ends with them, or never."""
 
     sample_rate = 1000.0
 
-    def __init__(self, scheduler: Scheduler, numbers: range, ends: bool = True) -> None:
-        self.stopped = False
-        self._scheduler = scheduler
-        self._numbers = iter(numbers)
+    def __init__(self, numbers: range, ends: bool = True) -> None:
+        self.ended = self.stopped = False
+        self.numbers = deque(numbers)
+        self.wake: Callable[[], None] = lambda: None
         self._ends = ends
 
+    def open(self, wake: Callable[[], None]) -> None:
+        self.wake = wake
+
     def read(self) -> tuple[np.ndarray, int] | None:
-        number = next(self._numbers, None)
-        if number is not None and not self.stopped:
+        if self.numbers and not self.stopped:
+            number = self.numbers.popleft()
             return np.full((2, 1), float(number)), number + 1
-        if not self._ends:
-            self._scheduler.until(lambda: self.stopped)
+        self.ended = self.ended or self._ends
         return None
 
     def stop(self) -> None:
-        self.stopped = True
+        self.stopped = self.ended = True
 
 
 class Log:
@@ -79,25 +85,36 @@ class Log:
             assert numbers[-1:] == [last], f"{processor!r} released {numbers}"
 
 
-@pytest.fixture
-def use(monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[[Any], None]]:
-    use_plain_stages(monkeypatch)
-
-    def replace(threading: Any) -> None:
-        for module in (processor, tree):
-            monkeypatch.setattr(module, "threading", threading)
-
-    yield replace
+def use(patch: pytest.MonkeyPatch, threading: Any) -> None:
+    """Let the tree's code take locks and threads from there."""
+    for module in (changes, history, processor, tree, workers):
+        patch.setattr(module, "threading", threading)
 
 
-def grow(scheduler: Scheduler) -> Callable[[], None]:
+def run_to_the_end(tree: Tree) -> None:
+    """Wait until all processors have come to their end, then until no thread is left."""
+    for one in tree.processors:
+        one.join()
+    end(tree)
+
+
+def end(tree: Tree) -> None:
+    tree.stop()
+    tree.join()
+
+
+# --- scenarios ---
+
+
+def grow(scheduler: Scheduler, count: int) -> Check:
     """Processors come while blocks flow: siblings, and a child's child."""
     log = Log()
-    tree = Tree(log)
-    root = tree.add_input("input", Numbers(scheduler, range(3)), 1, 0.0, 0.0)
+    tree = Tree(log, count)
+    root = tree.add_input("input", Numbers(range(3)), 1, 0.0, 0.0)
     first = tree.add("preProc", "first", "input")
     below = tree.add("gammatone", "below", "first")
     second = tree.add("preProc", "second", "input")
+    run_to_the_end(tree)
 
     def check() -> None:
         log.assert_run(root, 0, 2)
@@ -107,20 +124,48 @@ def grow(scheduler: Scheduler) -> Callable[[], None]:
     return check
 
 
-def shrink(scheduler: Scheduler) -> Callable[[], None]:
+def hear(scheduler: Scheduler, count: int) -> Check:
+    """Blocks come one by one from a thread of their own, which wakes the tree each time."""
+    log = Log()
+    tree = Tree(log, count)
+    source = Numbers(range(0), ends=False)
+    root = tree.add_input("input", source, 1, 0.0, 0.0)
+    child = tree.add("preProc", "child", "input")
+
+    def play() -> None:
+        for number in range(3):
+            source.numbers.append(number)
+            source.wake()
+        source.ended = True
+        source.wake()
+
+    player = scheduler.threading.Thread(play, "player")
+    player.start()
+    player.join()
+    run_to_the_end(tree)
+
+    def check() -> None:
+        log.assert_run(root, 0, 2)
+        log.assert_run(child, 0, 2)
+
+    return check
+
+
+def shrink(scheduler: Scheduler, count: int) -> Check:
     """One of two siblings goes with what is below it; its name is used again at once."""
     log = Log()
-    tree = Tree(log)
-    root = tree.add_input("input", Numbers(scheduler, range(2)), 1, 0.0, 0.0)
+    tree = Tree(log, count)
+    root = tree.add_input("input", Numbers(range(2)), 1, 0.0, 0.0)
     staying = tree.add("preProc", "staying", "input")
     going = tree.add("preProc", "going", "input")
     below = tree.add("gammatone", "below", "going")
     removed = tree.remove("going")
     released = {one: list(log.numbers[one]) for one in removed}
     after = tree.add("preProc", "going", "input")
+    run_to_the_end(tree)
 
     def check() -> None:
-        assert removed == [below, going] == log.ends
+        assert removed == [below, going] == log.ends[:2]
         log.assert_run(root, 0, 1)
         log.assert_run(staying, None, 1)
         log.assert_run(after, None, 1)
@@ -131,35 +176,37 @@ def shrink(scheduler: Scheduler) -> Callable[[], None]:
     return check
 
 
-def leave(scheduler: Scheduler) -> Callable[[], None]:
+def leave(scheduler: Scheduler, count: int) -> Check:
     """The only child goes: the input does not wait for it."""
     log = Log()
-    tree = Tree(log)
-    root = tree.add_input("input", Numbers(scheduler, range(3)), 1, 0.0, 0.0)
+    tree = Tree(log, count)
+    root = tree.add_input("input", Numbers(range(3)), 1, 0.0, 0.0)
     child = tree.add("preProc", "child", "input")
     tree.remove("child")
+    run_to_the_end(tree)
 
     def check() -> None:
-        assert log.ends == [child]
+        assert log.ends == [child, root]
         log.assert_run(root, 0, 2)
         log.assert_run(child, None, None)
 
     return check
 
 
-def replace_input(scheduler: Scheduler) -> Callable[[], None]:
+def replace_input(scheduler: Scheduler, count: int) -> Check:
     """A new input takes over the tree: the child misses nothing of it, whatever it did for the old one."""
     log = Log()
-    tree = Tree(log)
-    old_source, new_source = Numbers(scheduler, range(2), ends=False), Numbers(scheduler, range(10, 13))
+    tree = Tree(log, count)
+    old_source, new_source = Numbers(range(2), ends=False), Numbers(range(10, 13))
     old = tree.add_input("input", old_source, 1, 0.0, 0.0)
     child = tree.add("preProc", "child", "input")
     below = tree.add("gammatone", "below", "child")
     new = tree.add_input("input", new_source, 1, 0.0, 0.0)
+    run_to_the_end(tree)
 
     def check() -> None:
         assert old_source.stopped
-        assert log.ends == [old]
+        assert log.ends[0] is old
         log.assert_run(old, None, None)
         log.assert_run(new, 10, 12)
         for one in (child, below):
@@ -172,164 +219,162 @@ def replace_input(scheduler: Scheduler) -> Callable[[], None]:
     return check
 
 
-def stop(scheduler: Scheduler) -> Callable[[], None]:
+def stop(scheduler: Scheduler, count: int) -> Check:
     """Everything ends at any moment, and the tree begins anew."""
     log = Log()
-    tree = Tree(log)
-    tree.add_input("input", Numbers(scheduler, range(9), ends=False), 1, 0.0, 0.0)
+    tree = Tree(log, count)
+    tree.add_input("input", Numbers(range(9), ends=False), 1, 0.0, 0.0)
     tree.add("preProc", "child", "input")
     tree.stop()
-    root = tree.add_input("input", Numbers(scheduler, range(2)), 1, 0.0, 0.0)
+    root = tree.add_input("input", Numbers(range(2)), 1, 0.0, 0.0)
     child = tree.add("preProc", "child", "input")
+    run_to_the_end(tree)
 
     def check() -> None:
-        assert len(log.ends) == 2
+        assert len(log.ends) == 4
         log.assert_run(root, 0, 1)
         log.assert_run(child, None, 1)
 
     return check
 
 
-def fail(scheduler: Scheduler) -> Callable[[], None]:
+def fail(scheduler: Scheduler, count: int) -> Check:
     """A processor fails in its second block: it goes with what is below it, the others do not notice."""
     log = Log()
-    tree = Tree(log)
-    root = tree.add_input("input", Numbers(scheduler, range(2)), 1, 0.0, 0.0)
+    tree = Tree(log, count)
+    root = tree.add_input("input", Numbers(range(2)), 1, 0.0, 0.0)
     staying = tree.add("preProc", "staying", "input")
     going = tree.add("preProc", "going", "input", {"fails": True})
     scheduler.until(lambda: going in log.ends)
+    left = tree.processors
+    run_to_the_end(tree)
 
     def check() -> None:
-        assert log.ends == [going]
+        assert log.ends[0] is going
         assert isinstance(going.error, ZeroDivisionError)
-        assert tree.processors == [root, staying]
+        assert left == [root, staying]
         log.assert_run(root, 0, 1)
         log.assert_run(staying, None, 1)
 
     return check
 
 
-@pytest.mark.parametrize(("scenario", "delays"), [(grow, 1), (shrink, 2), (leave, 2), (replace_input, 2), (stop, 2)])
-def test_any_order_of_events(scenario: Scenario, delays: int, use: Callable[[Any], None]) -> None:
-    assert explore(scenario, use, delays, WALKS) > WALKS + 50
+class Failing(Plain):
+    """Fails in its second block, where it is asked to."""
+
+    def process(self, block: np.ndarray, extra: np.ndarray | None = None) -> np.ndarray:
+        if self.parameters.get("fails") and block[0, 0] == 1.0:
+            raise ZeroDivisionError
+        return block
 
 
-@pytest.fixture
-def failing(use: Callable[[Any], None], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Stages of pre-processing that fail in their second block, where they are asked to."""
+# --- they hold ---
 
-    class Failing(Plain):
-        def process(self, block: np.ndarray) -> np.ndarray:
-            if self.parameters.get("fails") and block[0, 0] == 1.0:
-                raise ZeroDivisionError
-            return block
 
+@pytest.fixture(autouse=True)
+def plain(monkeypatch: pytest.MonkeyPatch) -> None:
     use_plain_stages(monkeypatch, preProc=Failing)
 
 
-@pytest.fixture
-def carried(monkeypatch: pytest.MonkeyPatch) -> list[Processor]:
-    """All processors are carried from their second block on; who was."""
-    monkeypatch.setattr(processor, "OBSERVED", 1)
-    monkeypatch.setattr(processor, "SHORT", math.inf)
-    went: list[Processor] = []
-    cycle, ride = Processor._cycle, Processor._ride
-    riding: list[Processor] = []
+def go(patch: pytest.MonkeyPatch, scenario: Scenario, count: int, delays: int, walks: int) -> int:
+    def run(scheduler: Scheduler) -> Check:
+        return scenario(scheduler, count)
 
-    def note_ride(self: Processor, parent: Processor) -> None:
-        riding.append(self)
-        ride(self, parent)
-        riding.remove(self)
-
-    def note_cycle(self: Processor, taken: Block) -> None:
-        if self in riding:
-            went.append(self)
-        cycle(self, taken)
-
-    monkeypatch.setattr(Processor, "_ride", note_ride)
-    monkeypatch.setattr(Processor, "_cycle", note_cycle)
-    return went
+    return explore(run, partial(use, patch), delays, walks)
 
 
-@pytest.mark.parametrize(("scenario", "delays"), [(grow, 1), (shrink, 2), (leave, 2), (replace_input, 2), (stop, 2)])
-def test_any_order_of_events_where_parents_carry_their_children(
-    scenario: Scenario, delays: int, use: Callable[[Any], None], carried: list[Processor]
-) -> None:
-    explore(scenario, use, delays, WALKS)
-    assert carried
+@pytest.mark.parametrize("count", [1, 2, 3])
+@pytest.mark.parametrize(
+    ("scenario", "delays"),
+    [(grow, 1), (hear, 1), (shrink, 2), (leave, 2), (replace_input, 2), (stop, 2), (fail, 2)],
+)
+def test_any_order_of_events(scenario: Scenario, delays: int, count: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert go(monkeypatch, scenario, count, delays, WALKS) > WALKS + 15
 
 
-def test_a_failure_at_any_moment(use: Callable[[Any], None], failing: None) -> None:
-    assert explore(fail, use, 2, WALKS) > WALKS + 50
+# --- and it is found where they do not ---
 
 
-def test_a_failure_of_a_child_that_is_carried(
-    use: Callable[[Any], None], failing: None, carried: list[Processor]
-) -> None:
-    explore(fail, use, 2, WALKS)
-    assert carried
+def test_the_exploration_finds_a_parent_that_does_not_wait(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It releases while a child holds the last block, or has not taken it."""
+    release = StateMachine._release_if_free
 
+    def release_anyway(self: StateMachine) -> None:
+        self._holders.clear()
+        release(self)
 
-def test_the_exploration_finds_a_token_that_comes_between(
-    use: Callable[[Any], None], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The proof that it can fail: a parent that looks at the tokens and releases in two steps."""
-
-    def wait_then_release(self: Processor, private: Block) -> bool:
-        with self.turn:
-            while not self.zone.free:
-                self.turn.wait()
-        with self.turn:
-            self.zone.release(private)
-            for child in self.children:
-                child.turn.notify_all()
-        return True
-
-    monkeypatch.setattr(Processor, "_wait_release", wait_then_release)
-    monkeypatch.setattr(Processor, "_release_if_free", lambda self: self.turn.notify_all())
-    with pytest.raises(AssertionError, match="released while a child holds the last block"):
-        explore(grow, use, 2, 0)
-
-
-def test_the_exploration_finds_a_token_for_the_wrong_zone(
-    use: Callable[[Any], None], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As above: a child that gives its block back to the parent that it has now."""
-
-    def give_back_to_the_present_parent(self: Processor) -> None:
-        with self.turn:
-            if self.parent is not None:
-                self.parent.zone.give_back(self)
-                self.parent._release_if_free()
-
-    monkeypatch.setattr(Processor, "_give_back", give_back_to_the_present_parent)
+    monkeypatch.setattr(StateMachine, "_release_if_free", release_anyway)
     with pytest.raises(AssertionError, match="released"):
-        explore(replace_input, use, 0, WALKS)
+        go(monkeypatch, grow, 2, 1, WALKS)
 
 
-def test_the_exploration_finds_a_deadlock(use: Callable[[Any], None], monkeypatch: pytest.MonkeyPatch) -> None:
-    """As above: a child that does not say that it is done."""
+def test_the_exploration_finds_a_look_at_tokens_that_is_out_of_date(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A child that looks whether there is a token, and takes it later: there may be another one meanwhile."""
 
-    def keep_silent(self: Processor) -> None:
-        with self.turn:
-            if self.parent is not None:
-                self.parent.zone.give_back(self)
+    def take_later(self: Processor) -> Block | None:
+        self.at_work = True
+        taken = self._token
+        self._lock.release()
+        self._lock.acquire()
+        self.called, self._token, self._reading = False, None, self.parent
+        if taken is not None:
+            self._enter(State.EXEC, taken.number)
+        self._taken = taken
+        return taken
 
-    monkeypatch.setattr(Processor, "_give_back", keep_silent)
-    with pytest.raises(AssertionError, match="deadlock"):
-        explore(grow, use, 0, WALKS)
-
-
-def test_the_exploration_finds_a_child_that_two_threads_work_for(
-    use: Callable[[Any], None], carried: list[Processor], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As above: whoever carries a child does not look whether its own thread is done with the last block."""
-    ride = Processor._ride
-
-    def at_once(self: Processor, parent: Processor) -> None:
-        self._working = False
-        ride(self, parent)
-
-    monkeypatch.setattr(Processor, "_ride", at_once)
+    monkeypatch.setattr(Processor, "begin", take_later)
     with pytest.raises(AssertionError, match=r"released|deadlock"):
-        explore(grow, use, 1, WALKS)
+        go(monkeypatch, replace_input, 2, 2, WALKS)
+
+
+def test_the_exploration_finds_a_token_for_the_wrong_zone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A child that gives its block back to the parent that it has now."""
+
+    def give_back_to_the_present_parent(self: StateMachine) -> None:
+        if self.parent is not None:
+            self.parent._freed_by(self)
+
+    monkeypatch.setattr(StateMachine, "give_back", give_back_to_the_present_parent)
+    with pytest.raises(AssertionError, match="released"):
+        go(monkeypatch, replace_input, 2, 0, WALKS)
+
+
+def test_the_exploration_finds_a_deadlock(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A child that does not say that it is done."""
+    monkeypatch.setattr(StateMachine, "_freed_by", lambda self, child: self._holders.discard(child))
+    with pytest.raises(AssertionError, match="deadlock"):
+        go(monkeypatch, grow, 2, 0, WALKS)
+
+
+def test_the_exploration_finds_a_task_that_two_work_on(monkeypatch: pytest.MonkeyPatch) -> None:
+    ready = StateMachine.ready.fget  # type: ignore[attr-defined]
+
+    def ready_though_at_work(self: StateMachine) -> bool:
+        at_work, self.at_work = self.at_work, False
+        try:
+            return bool(ready(self))
+        finally:
+            self.at_work = at_work
+
+    monkeypatch.setattr(StateMachine, "ready", property(ready_though_at_work))
+    with pytest.raises(AssertionError):
+        go(monkeypatch, grow, 2, 1, WALKS)
+
+
+def test_the_exploration_finds_a_call_that_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An input that forgets, after it has looked for sound in vain, that it was called meanwhile."""
+    rest = Processor.rest
+
+    def forget(self: Processor) -> None:
+        self.called = self.called and self.state is not State.WAIT_EXEC
+        rest(self)
+
+    monkeypatch.setattr(Processor, "rest", forget)
+    with pytest.raises(AssertionError, match="deadlock"):
+        go(monkeypatch, hear, 2, 1, WALKS)
+
+
+def test_the_exploration_finds_a_worker_that_is_not_called(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Workers, "wake", lambda self: None)
+    with pytest.raises(AssertionError, match="deadlock"):
+        go(monkeypatch, hear, 2, 1, WALKS)

@@ -8,7 +8,7 @@ import threading
 import numpy as np
 import pytest
 
-from rosafe.tree.roles import State
+from rosafe.tree.states import State
 from rosafe.tree.trace import Event, Trace, Tracer
 from rosafe.tree.tree import Tree
 
@@ -20,6 +20,11 @@ def feed() -> Feed:
     return Feed(frames=1)
 
 
+@pytest.fixture
+def workers() -> int:
+    return 3
+
+
 def test_overlap_of_parent_and_child_and_of_siblings(
     tree: Tree, listener: Recorder, feed: Feed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -28,13 +33,13 @@ def test_overlap_of_parent_and_child_and_of_siblings(
     siblings_meet, all_meet = threading.Barrier(2), threading.Barrier(3)
 
     class Parent(Plain):
-        def process(self, block: np.ndarray) -> np.ndarray:
+        def process(self, block: np.ndarray, extra: np.ndarray | None = None) -> np.ndarray:
             if block[0, 0] > 0:
                 all_meet.wait(WAIT_SECONDS)
             return block
 
     class Sibling(Plain):
-        def process(self, block: np.ndarray) -> np.ndarray:
+        def process(self, block: np.ndarray, extra: np.ndarray | None = None) -> np.ndarray:
             siblings_meet.wait(WAIT_SECONDS)
             if block[0, 0] < last:
                 all_meet.wait(WAIT_SECONDS)

@@ -8,7 +8,10 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from rosafe.tree.window import MAX_PIECES, History, SlidingWindow, WindowView, frames_in
+from rosafe.dsp.signal import Signal
+from rosafe.tree.block import Block
+from rosafe.tree.history import History
+from rosafe.tree.window import MAX_PIECES, SlidingWindow, WindowView, frames_in
 
 ROWS = st.sampled_from([(2,), (2, 3), (3,), (2, 5)])
 SIZES = st.lists(st.one_of(st.integers(0, 5), st.integers(0, 60)), max_size=3 * MAX_PIECES)
@@ -23,7 +26,8 @@ def numbered(rows: tuple[int, ...], sizes: list[int]) -> list[NDArray[np.float64
 
 @settings(deadline=None)
 @given(ROWS, st.integers(0, 80), SIZES)
-@example((2,), 70, [1] * (2 * MAX_PIECES + 10))
+@example((2,), 2 * MAX_PIECES + 50, [1] * (3 * MAX_PIECES))
+@example((2, 3), 2 * MAX_PIECES + 7, [2, 1, 0] * MAX_PIECES)
 def test_a_window_is_the_newest_frames_after_zeros(rows: tuple[int, ...], frames: int, sizes: list[int]) -> None:
     window = SlidingWindow(rows, frames)
     model = np.zeros((*rows, frames))
@@ -40,30 +44,57 @@ def test_a_window_is_the_newest_frames_after_zeros(rows: tuple[int, ...], frames
 
 
 @settings(deadline=None)
-@given(ROWS, st.integers(0, 80), st.lists(st.one_of(st.none(), st.integers(0, 40)), max_size=3 * MAX_PIECES))
-@example((2,), 70, [1] * (2 * MAX_PIECES + 10))
+@given(ROWS, st.integers(0, 80), st.lists(st.one_of(st.sampled_from("ab"), st.integers(0, 40)), max_size=40))
+@example((2,), 2 * MAX_PIECES + 50, ["a", *[1] * (2 * MAX_PIECES), "a", *[1] * MAX_PIECES, "b", *[1] * 30])
 def test_a_history_is_what_came_since_it_was_taken(
-    rows: tuple[int, ...], capacity: int, steps: list[int | None]
+    rows: tuple[int, ...], capacity: int, steps: list[int | str]
 ) -> None:
-    """None stands for somebody who takes it."""
-    history = History(rows, 100.0, capacity / 100)
-    assert history.capacity == capacity
-    blocks = iter(numbered(rows, [step for step in steps if step is not None]))
-    model = np.zeros((*rows, 0))
+    """Each reader (a word) has a memory of its own, and the second part goes with the first."""
+    signal = Signal.sound(100.0)
+    history = History([rows, (7,)], signal, capacity / 100)
+    sizes = [step for step in steps if isinstance(step, int)]
+    blocks = zip(numbered(rows, sizes), numbered((7,), sizes), strict=True)
+    came = [np.zeros((*rows, 0)), np.zeros((7, 0))]
+    read: dict[str, int] = {}
     taken = []
-    for step in [*steps, None]:
-        if step is None:
-            taken.append((history.take(), model))
-            model = np.zeros((*rows, 0))
+    for step in [*steps, "a", "b"]:
+        if isinstance(step, str):
+            end = came[0].shape[-1]
+            first = max(read.get(step, 0), end - capacity)
+            taken.append((history.take(step), [part[..., first:] for part in came], end))
+            read[step] = end
         else:
-            block = next(blocks)
-            history.append(block)
-            model = np.concatenate((model, block), axis=-1)
-            model = model[..., max(0, model.shape[-1] - capacity) :]
-    for view, expected in taken:
-        assert view.shape == expected.shape
-        assert len(view.pieces) <= MAX_PIECES
-        np.testing.assert_array_equal(view.array(), expected)
+            parts = next(blocks)
+            end = came[0].shape[-1] + step
+            history.append(Block(0, parts, end, signal))
+            came = [np.concatenate(pair, axis=-1) for pair in zip(came, parts, strict=True)]
+    for (views, next_index, its_signal), expected, end in taken:
+        assert (next_index, its_signal) == (end, signal)
+        for view, part in zip(views, expected, strict=True):
+            assert view.shape == part.shape
+            assert len(view.pieces) <= MAX_PIECES
+            np.testing.assert_array_equal(view.array(), part)
+
+
+def test_a_history_grows_and_shrinks_with_its_seconds() -> None:
+    signal = Signal.sound(10.0)
+    history = History([(2,)], signal, 0.5)
+    whole = np.arange(40.0).reshape(2, 20)
+    for first, seconds in ((0, 1.0), (10, 2.0), (15, 0.3)):
+        history.append(Block(0, (whole[:, first : first + 5],), first + 5, signal))
+        history.seconds = seconds
+    history.append(Block(0, (whole[:, 18:19],), 19, signal))
+    (view,) = history.take("x").parts
+    np.testing.assert_array_equal(view.array(), whole[:, [18, 19, 18]])
+
+
+def test_a_history_begins_anew_with_other_rows_or_another_rate() -> None:
+    signal = Signal.sound(10.0)
+    history = History([(2,)], signal, 1.0)
+    for rows, of in (((2,), signal), ((3,), signal), ((3,), Signal.sound(20.0)), ((3,), Signal(10.0, 20.0, lags=5))):
+        history.append(Block(0, (np.ones((*rows, 2)),), 0, of))
+    (view,), _, last = history.take("x")
+    assert (view.shape, last.lags) == ((3, 4), 5)
 
 
 @settings(deadline=None)
@@ -85,11 +116,12 @@ def test_views_of_a_part_and_of_exchanged_rows(frames: int, sizes: list[int]) ->
 
 def test_blocks_are_referred_to_and_not_copied() -> None:
     block = np.ones((2, 10))
-    window, history = SlidingWindow((2,), 25), History((2,), 100.0, 0.25)
+    signal = Signal.sound(100.0)
+    window, history = SlidingWindow((2,), 25), History([(2,)], signal, 0.25)
     window.append(block)
-    history.append(block)
+    history.append(Block(0, (block,), 10, signal))
     assert window.view().pieces[-1] is block
-    assert history.take().pieces == (block,)
+    assert history.take("x").parts[0].pieces[-1] is block
 
 
 def test_an_empty_window_costs_no_memory() -> None:

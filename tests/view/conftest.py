@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import rosafe
-from rosafe.audiofile import AudioFile
 from rosafe.bass.sources.scene import Scene
+from rosafe.sound.audiofile import AudioFile
 from rosafe.view.representations import Representations
 from tests.harness import shared
 

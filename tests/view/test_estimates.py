@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 import rosafe
-from rosafe.bass.sources.scene import HEAD_RADIUS, SPEED_OF_SOUND, Scene, scene_azimuth
+from rosafe.bass.sources.scene import Scene, scene_azimuth
+from rosafe.sound.head import HEAD_RADIUS, SPEED_OF_SOUND
 from rosafe.view import estimates
 from rosafe.view.representations import Representations
 from tests.view.conftest import WALK, represented

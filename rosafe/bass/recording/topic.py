@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import queue
 import threading
 import time
@@ -13,15 +12,17 @@ import rosgraph.names
 import rospy
 
 from rosafe.bass.sources.base import Chunk, device_error, hwparams_error
-from rosafe.bass.windows import WindowStream
+from rosafe.component import wire
+from rosafe.component.audio import MAX_WINDOW, malformed
+from rosafe.component.overlap import WindowStream
 from rosafe.interface import BASS, ComponentError
-from rosafe.ros import wire
-from rosafe.ros.audio import malformed
 
 FIRST_SECONDS = 3.0  # for a first message
 NOBODY_SECONDS = 1.0  # for one where nobody publishes the topic
 STALL_SECONDS = 5.0  # without anything new, the stream counts as ended; besides a chunk's own length
 POLL_SECONDS = 0.1
+MAX_WAITING = 2**24  # frames that came and were not read yet, 128 MB; more are lost
+MAX_CHUNK = int(BASS.service("Acquire").parameter("nFramesPerChunk").maximum or 0)
 
 
 class TopicSource:
@@ -57,10 +58,13 @@ class TopicSource:
         self._stopping = stopping
         self._stream = WindowStream(with_first=False)
         self._news: queue.SimpleQueue[Any] = queue.SimpleQueue()  # (gap, samples, time), or why the stream has ended
+        self._put = self._taken = 0  # frames into the queue and out of it; each is counted by one thread
+        self._missed = 0  # frames that found no room since the last that did
+        self._ended = False  # whether the queue says so
         self._begun = False
         self._first: Any = None
         self._arrived = threading.Event()
-        message_class = wire.lenient_class("bass", BASS.port("Audio").idl)
+        message_class = wire.lenient_class("bass", BASS.port("Audio").idl, MAX_WINDOW)
         kinds = dict(rospy.get_published_topics())
         kind = kinds.get(topic)
         if kind is not None and kind.rpartition("/")[2] != message_class.__name__:
@@ -70,7 +74,7 @@ class TopicSource:
             self._await_first(kind is not None)
             self.sample_rate = int(self._first.sampleRate)
             self.newest = int(self._first.lastFrameIndex)
-            self.frames_per_chunk = max(1, int(self._first.nFramesPerChunk))
+            self.frames_per_chunk = min(max(1, int(self._first.nFramesPerChunk)), MAX_CHUNK)
             if sample_rate not in (0, self.sample_rate):
                 raise hwparams_error(
                     f"{topic} has a sample rate of {self.sample_rate} Hz, asked for were {sample_rate}"
@@ -94,19 +98,25 @@ class TopicSource:
             raise device_error(f"{self.name}: interrupted before a first message came")
 
     def _hear(self, message: Any) -> None:
-        if message.problem or malformed(message):
+        if self._ended or message.problem or malformed(message):
             return  # the next window shows what it would have shown
         if self._first is None:
             self._first = message
             self._stream.fresh(message)
             self._arrived.set()
         elif why := self._stream.joint(message):
+            self._ended = True
             self._news.put(f"{self.name}: a new stream begins ({why})")
         else:
             stamp = message.stamp["sec"] + message.stamp["nsec"] * 1e-9
             gap, samples = self._stream.fresh(message)
-            if samples.shape[1]:
-                self._news.put((gap, samples, time.monotonic() - (time.time() - stamp)))
+            frames = samples.shape[1]
+            if self._put - self._taken + frames > MAX_WAITING:
+                self._missed += gap + frames
+            elif frames:
+                self._put += frames
+                self._news.put((gap + self._missed, samples, time.monotonic() - (time.time() - stamp)))
+                self._missed = 0
 
     def read(self) -> Chunk | None:
         """What is new, of any length; None once nothing new has come for some seconds.
@@ -129,6 +139,7 @@ class TopicSource:
                 raise device_error(news)
             gap, samples, moment = news
             self._begun = True
+            self._taken += samples.shape[1]
             self.overruns += gap > 0
             self.lost_frames += gap
             return Chunk(np.asarray(samples), gap, moment)
@@ -137,15 +148,3 @@ class TopicSource:
     def close(self) -> None:
         """Listen no more."""
         self._subscriber.unregister()
-
-
-def become_node(name: str) -> None:
-    """Make this process a node of the graph; MasterError where there is no master, GenerationError without messages."""
-    from rosafe.ros import generate, master, startup
-
-    master.set_local_defaults()
-    master.check_master(os.environ["ROS_MASTER_URI"])
-    generate.ensure_messages()
-    startup.ensure_log_directory()
-    rospy.init_node(name, argv=[], anonymous=True, disable_signals=True)
-    startup.log_to_stderr()

@@ -1,7 +1,6 @@
 """The source `scene:`: a built-in binaural scene, a talker who walks from far left to far right and back again.
 
-The head is the sphere of Brown and Duda, "A structural model for binaural sound synthesis", IEEE Trans. Speech Audio
-Process. 6(5), 1998: Woodworth's delays and a head shadow of one pole and one zero for each ear.
+The head is the sphere of rosafe/sound/head.py.
 """
 
 from __future__ import annotations
@@ -11,15 +10,13 @@ import threading
 import numpy as np
 from scipy import signal
 
-from rosafe.audiofile import to_int32
 from rosafe.bass.sources.base import Chunk, Pacer, device_error, hwparams_error, number, parse_options
+from rosafe.sound.audiofile import to_int32
+from rosafe.sound.head import HEAD_TIME, ear_delay, shadow_gain
 
-HEAD_RADIUS = 0.0875  # m
-SPEED_OF_SOUND = 343.0  # m/s
 WALK_SECONDS = 10.0
 LEVEL_DB = -30.0
 MIN_RATE = 1000  # Hz; below, nothing of the sound would be left
-_HEAD_TIME = HEAD_RADIUS / SPEED_OF_SOUND
 _BLOCK = 4096  # frames made at once, whatever the chunks, so that the samples never depend on them
 _REACH = 3  # frames on each side that the interpolation looks at
 _PITCH = (125.0, 25.0, 0.37)  # Hz: mean, excursion and speed of the talker's gliding voice
@@ -38,16 +35,6 @@ def scene_azimuth(seconds: np.ndarray | float, walk: float = WALK_SECONDS) -> np
     """
     way = np.mod(np.asarray(seconds, dtype=np.float64) / walk, 2.0)
     return 90.0 - 180.0 * np.abs(way - 1.0)
-
-
-def ear_delay(incidence: np.ndarray) -> np.ndarray:
-    """Woodworth's delay (s) to an ear with the sound `incidence` rad (0 to pi) off its axis; 0 is the head's centre."""
-    return _HEAD_TIME * np.where(incidence < np.pi / 2, -np.cos(incidence), incidence - np.pi / 2)
-
-
-def shadow_gain(incidence: np.ndarray) -> np.ndarray:
-    """Gain of the head at high frequencies, from 2 at the ear to 0.1 behind the head (Brown and Duda, eq. 4)."""
-    return 1.05 + 0.95 * np.cos(incidence * (180.0 / 150.0))
 
 
 class Scene:
@@ -72,9 +59,9 @@ class Scene:
         first_second = _Carrier(sample_rate, seed).block(np.arange(sample_rate) / sample_rate)
         self._gain = 10 ** (level / 20) / np.sqrt(np.mean(first_second**2))
         # The shadow is alpha + (1 - alpha) / (1 + s / (2 omega0)): its pole stands still while the source walks.
-        self._pole = signal.bilinear([1.0], [_HEAD_TIME / 2, 1.0], sample_rate)
+        self._pole = signal.bilinear([1.0], [HEAD_TIME / 2, 1.0], sample_rate)
         self._pole_state = np.zeros(1)
-        self._history = _REACH + int(np.ceil(_HEAD_TIME * (1 + np.pi / 2) * sample_rate)) + _REACH
+        self._history = _REACH + int(np.ceil(HEAD_TIME * (1 + np.pi / 2) * sample_rate)) + _REACH
         self._ears = np.zeros((2, self._history + _BLOCK))
         self._frame = 0  # the first one of the next block
         self._block = np.zeros((2, 0), np.int32)
@@ -103,7 +90,7 @@ class Scene:
             history[: self._history] = history[_BLOCK:]
             history[self._history :] = lowpassed + shadow_gain(incidence) * (source - lowpassed)
             # The nearest that an ear comes is one head radius before the centre; no sample may come from the future.
-            delay = (ear_delay(incidence) + _HEAD_TIME) * self.sample_rate + _REACH
+            delay = (ear_delay(incidence) + HEAD_TIME) * self.sample_rate + _REACH
             out[ear] = _interpolate(history, self._history + np.arange(_BLOCK) - delay)
         return to_int32(out)
 

@@ -4,7 +4,7 @@ A stage calls its kernel where `compiled()` says so, and the twin elsewhere: whe
 processors, and where the environment variable ROSAFE_KERNELS is 0. Both work on the same states and agree to 1e-11 of
 the largest number. Tests hold each kernel to its twin, which is the reference. Kernels release the interpreter lock.
 
-All arrays are of float64 or complex128 and C-contiguous.
+All arrays are of float64 or complex128, and C-contiguous where nothing else is said.
 """
 
 from __future__ import annotations
@@ -241,6 +241,53 @@ def correlations(frames: Frames, reach: int, epsilon: float, output: FloatArray)
         epsilon,
         _address(output) + outside * number * output.itemsize,
         lags * number,
+    )
+
+
+def spectral_features(
+    spectra: FloatArray, last: FloatArray, frequencies: FloatArray, bright: float, part: float, features: FloatArray
+) -> None:
+    """All features of spectra (2, C, F), of which `last` (2, C) was the one before, into `features` (2, 14, F).
+
+    The twin is `FEATURES` of rosafe/representations/spectralfeatures.py.
+    """
+    work = np.empty((4, spectra.shape[1]))
+    arrays = map(_address, (work, features))
+    _function("rosafe_spectral_features")(
+        _address(spectra), _address(last), *spectra.shape, _address(frequencies), bright, part, *arrays
+    )
+
+
+def transient_map(
+    strengths: FloatArray,
+    levels: FloatArray,
+    first: int,
+    reach: int,
+    thresholds: tuple[float, float],
+    fuse: int,
+    spread: int,
+    output: FloatArray,
+) -> None:
+    """The frames of a map from `first` on, `output` (2, C, F), of strengths and levels (2, C, n).
+
+    Each is made from those that lie up to `reach` frames from it; n is at least first + F + reach. `thresholds` are the
+    least strength and the least level. The twin is `columns` of rosafe/representations/transientmaps.py, with a `fuse`
+    of 0 where peaks are not fused.
+    """
+    ears, channels, count = output.shape
+    at_once = max(1, min(count, 2 * reach))  # frames that share a search for peaks
+    capacity = at_once // 2 + reach + 1
+    room = (
+        np.empty((channels, capacity, 4)),
+        np.empty(channels, np.int64),
+        np.empty(2 * reach // fuse + 3 if fuse else 0, np.int64),
+        np.zeros((2, channels, 2 * spread - 1), np.int64),
+        np.empty(spread, np.int64),
+    )
+    peaks, *others = (array.ctypes.data for array in room)
+    _function("rosafe_transient_map")(
+        *(strengths.ctypes.data, levels.ctypes.data, strengths.strides[1] // REAL_SIZE, ears * channels, channels),
+        *(first, count, reach, at_once, *thresholds, fuse, spread, peaks, capacity, *others, _address(output)),
     )
 
 

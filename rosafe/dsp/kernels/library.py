@@ -30,6 +30,11 @@ _ARGUMENTS = {
     "rosafe_denormals_off": (),
     "rosafe_denormals_as": (_BITS,),
     "rosafe_correlations": (*_FRAMES, _INTEGER, _REAL, _ARRAY, _INTEGER),
+    "rosafe_spectral_features": (_ARRAY, _ARRAY, *[_INTEGER] * 3, _ARRAY, _REAL, _REAL, _ARRAY, _ARRAY),
+    "rosafe_transient_map": (
+        *(_ARRAY, _ARRAY, *[_INTEGER] * 7, _REAL, _REAL, _INTEGER, _INTEGER),
+        *(_ARRAY, _INTEGER, *[_ARRAY] * 5),
+    ),
     # clipping, alpha, exponent; points, twiddles, places, turns; corrections, lags; output
     "rosafe_autocorrelations": (*_FRAMES, _INTEGER, _REAL, _REAL, _INTEGER, *[_ARRAY] * 4, _INTEGER, _ARRAY),
     "rosafe_windowed": (*_FRAMES, *[_ARRAY] * 4),

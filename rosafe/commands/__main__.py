@@ -1,0 +1,80 @@
+"""The command `rosafe`: finds its subcommands in `rosafe.commands` and runs one."""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import inspect
+import os
+import pkgutil
+import sys
+
+from rosafe import commands
+from rosafe.commands import Failure
+from rosafe.component.startup import Parser
+from rosafe.output import OutputError
+from rosafe.version import VERSION
+
+_EPILOG = """example:
+  rosafe process speech.wav -o speech.npz --outputs ild,ratemap --set fb_nChannels=64
+  rosafe process -h          # all options and parameters"""
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Run `rosafe`; returns its exit code. A wrong command line raises SystemExit(2); -h and --version (0)."""
+    name = "rosafe"
+    try:
+        try:
+            options, rest = _parser().parse_known_args(argv)
+            if hasattr(options, "interspersed"):
+                options.interspersed = [word for word in rest if not word.startswith("-")]
+                rest = [word for word in rest if word.startswith("-")]
+            if rest:
+                options.usage_error(f"unrecognized arguments: {' '.join(rest)}")
+            name = f"rosafe {options.command}"
+            return int(options.run(options))
+        finally:
+            sys.stdout.flush()
+    except (Failure, OutputError) as problem:
+        print(f"{name}: {problem}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        return 130
+    except BrokenPipeError:  # whoever read our output has had enough, as `head` does
+        for stream in (sys.stdout, sys.stderr):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
+        return 141
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = Parser(
+        prog="rosafe",
+        description="The Two!Ears auditory front-end without ROS, and tools around it.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    parser.add_argument("--version", action="version", version=f"rosafe {VERSION}")
+    subparsers = parser.add_subparsers(title="commands", dest="command", metavar="COMMAND", required=True)
+    for module in pkgutil.iter_modules(commands.__path__):
+        if not module.name.startswith("_"):
+            _add(subparsers, module.name)
+    return parser
+
+
+def _add(subparsers: argparse._SubParsersAction[Parser], name: str) -> None:
+    module = importlib.import_module(f"{commands.__name__}.{name}")
+    text = inspect.getdoc(module) or ""
+    subparser = subparsers.add_parser(
+        name.replace("_", "-"),
+        help=text.partition("\n")[0].rstrip("."),
+        description=text,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    subparser.set_defaults(run=module.run, usage_error=subparser.error)
+    module.configure(subparser)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

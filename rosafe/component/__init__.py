@@ -1,0 +1,1 @@
+"""Any component on the ROS graph, as GenoM makes them: requests, ports, wire format, messages, start-up."""

@@ -1,0 +1,51 @@
+"""From the sliding windows of a port back to the stream that they show: every frame once, losses declared."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+MAX_JUMP_SECONDS = 3600.0  # an index that jumps further is no loss but another stream
+
+
+def joined(new: int, window: int) -> tuple[int, int]:
+    """Of `new` frames since the last message, how many are lost, and how many a window of so many frames shows."""
+    shown = min(new, window)
+    return new - shown, shown
+
+
+class WindowStream:
+    """One stream of frames, out of messages (`binaudio_portStruct` with arrays) that overlap.
+
+    Parameters
+    ----------
+    with_first : bool
+        Whether the stream begins with what the first message shows, or with the first frame after it.
+    """
+
+    def __init__(self, with_first: bool) -> None:
+        self.sample_rate = 0  # Hz; 0 before the first message
+        self.newest = 0  # number of the newest frame
+        self._with_first = with_first
+
+    def joint(self, message: Any) -> str:
+        """Why `message` cannot be of this stream; empty where it can."""
+        rate, index = message.sampleRate, message.lastFrameIndex
+        if self.sample_rate in (0, rate):
+            if index < self.newest:
+                return f"its index falls from {self.newest} to {index}"
+            if self.sample_rate and index - self.newest > MAX_JUMP_SECONDS * rate + len(message.left):
+                return f"its index jumps from {self.newest} to {index}"
+            return ""
+        return f"its sample rate changes from {self.sample_rate} to {rate} Hz"
+
+    def fresh(self, message: Any) -> tuple[int, np.ndarray]:
+        """What `message`, one of this stream, brings: how many frames were lost before it, and int32 (2, n)."""
+        index, window = int(message.lastFrameIndex), len(message.left)
+        if self.sample_rate == 0:
+            self.sample_rate = int(message.sampleRate)
+            self.newest = max(0, index - window) if self._with_first else index
+        lost, count = joined(index - self.newest, window)
+        self.newest = index
+        return lost, np.stack((message.left[window - count :], message.right[window - count :]))

@@ -1,0 +1,219 @@
+"""What this node offers and reads, as the master should know it: told by a thread of its own, again where need be.
+
+rospy tells the master from whichever thread makes or ends a topic, under its locks, without a limit of time, and once.
+So a master that hangs would hold up the node, and one that was restarted would never hear of it. Here all is told by
+one thread, in calls that are bounded, until the master knows it; a master that has forgotten the node is told anew.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import rospy
+from rospy.impl.registration import (
+    Registration,
+    RegistrationListener,
+    RegManager,
+    get_registration_listeners,
+    get_service_manager,
+    get_topic_manager,
+)
+
+from rosafe.component import inbound, master
+from rosafe.component.connector import Connector
+
+CHECK_SECONDS = 1.0  # between two looks whether the master still knows this node; between two tries without one
+SETTLE_SECONDS = 1.0  # that a request waits for the master to know what it has changed
+
+_NOUNS = {Registration.PUB: "Publisher", Registration.SUB: "Subscriber", Registration.SRV: "Service"}
+
+
+@dataclass(frozen=True, eq=False)
+class _Entry:
+    """One thing that was offered once: made again under the same name, it is another one."""
+
+    kind: str
+    name: str
+    data: str  # the type of a topic, the address of a service
+
+
+class Registrar(RegistrationListener):
+    """Keeps the master informed. Made by `init_node`; rospy calls `reg_added` and `reg_removed`.
+
+    Parameters
+    ----------
+    manager : rospy.impl.registration.RegManager
+        rospy's own, which connects subscribers to the publishers that the master names.
+
+    Whoever ends the node calls `end` before rospy takes its leave of the master, in a hook of `rospy.on_shutdown`.
+    """
+
+    def __init__(self, manager: RegManager) -> None:
+        self.changes = 0  # so many times something was offered or withdrawn
+        self.manager = manager
+        self._name = rospy.get_name()
+        self._master: Any = master.proxy(manager.master_uri)
+        self._pid: int | None = None  # of the master; None before it was asked
+        self._turn = threading.Condition()
+        self._offered: dict[tuple[str, str], _Entry] = {}
+        self._told: dict[tuple[str, str], _Entry] = {}  # what the master may know; of this thread alone
+        self._settled = 0  # the master knows as much as after so many changes
+        self._away = False  # it did not answer the last time
+        self._again = 0  # rounds in which all is told: a call that came to no end may have an effect later
+        self._newcomers: list[Callable[[], None]] = []
+        self._ended = False
+        self._thread = threading.Thread(target=self._run, name="registrar", daemon=True)
+
+    # --- rospy tells what there is ---
+
+    def reg_added(self, resolved_name: str, data_type_or_uri: str, reg_type: str) -> None:
+        with self._turn:
+            self._offered[reg_type, resolved_name] = _Entry(reg_type, resolved_name, data_type_or_uri)
+            self._changed()
+
+    def reg_removed(self, resolved_name: str, data_type_or_uri: str, reg_type: str) -> None:
+        with self._turn:
+            self._offered.pop((reg_type, resolved_name), None)
+            self._changed()
+
+    def _changed(self) -> None:
+        self.changes += 1
+        self._turn.notify_all()
+
+    # --- for the node ---
+
+    def start(self) -> None:
+        """Begin, with what the master knows already."""
+        topics, services = get_topic_manager(), get_service_manager()
+        for kind, there in (
+            (Registration.PUB, topics.get_publications()),
+            (Registration.SUB, topics.get_subscriptions()),
+            (Registration.SRV, services.get_services()),
+        ):
+            for name, data in there:
+                self._offered[kind, name] = self._told[kind, name] = _Entry(kind, name, data)
+        self._thread.start()
+
+    def on_new_master(self, greet: Callable[[], None]) -> None:
+        """Let `greet()` be called whenever a master was told everything anew; it may raise what a lost call raises."""
+        self._newcomers.append(greet)
+
+    def settle(self, seconds: float = SETTLE_SECONDS) -> bool:
+        """Wait until the master knows all that is offered now, but not for one that does not answer; whether it does.
+
+        Not to be called under a lock that anything else needs.
+        """
+        with self._turn:
+            wanted = self.changes
+            self._turn.wait_for(lambda: self._settled >= wanted or self._away or self._ended, seconds)
+            return self._settled >= wanted
+
+    def end(self) -> None:
+        """Tell the master nothing more."""
+        with self._turn:
+            self._ended = True
+            self._turn.notify_all()
+
+    # --- the thread ---
+
+    def _run(self) -> None:
+        while not self._ended:
+            with self._turn:
+                self._turn.wait_for(
+                    lambda: self._ended or (self._settled != self.changes and not self._away), CHECK_SECONDS
+                )
+                changes, offered = self.changes, dict(self._offered)
+            try:
+                self._tell(offered)
+            except master.FAILURES as problem:
+                self._lost(problem)
+            else:
+                self._found(changes)
+
+    def _tell(self, offered: dict[tuple[str, str], _Entry]) -> None:
+        """Make the master know exactly `offered` of this node."""
+        renewed = not self._is_known()
+        if renewed:
+            self._told.clear()
+        for entry in [e for key, e in self._told.items() if offered.get(key) is not e]:
+            data = entry.data if entry.kind == Registration.SRV else self.manager.uri
+            self._call(f"unregister{_NOUNS[entry.kind]}", entry.name, data)
+            del self._told[entry.kind, entry.name]
+        for key, entry in offered.items():
+            if key not in self._told or self._again:
+                self._told[key] = entry
+                publishers = self._call(f"register{_NOUNS[entry.kind]}", entry.name, entry.data, self.manager.uri)
+                if entry.kind == Registration.SUB:
+                    self.manager.publisher_update(entry.name, publishers)
+        if renewed and not self._ended:
+            for greet in self._newcomers:
+                greet()
+            rospy.logwarn("the ROS master did not know this node (any more) and was told of it")
+
+    def _is_known(self) -> bool:
+        """Whether the master is the one of the last time, and knows this node."""
+        (_, _, pid), (code, _, _) = self._master.getPid(self._name), self._master.lookupNode(self._name, self._name)
+        same = self._pid in (None, pid)
+        self._pid = pid
+        return same and code == 1
+
+    def _call(self, method: str, *arguments: str) -> Any:
+        if self._ended:
+            raise OSError("the node ends")
+        code, message, value = getattr(self._master, method)(self._name, *arguments)
+        if code != 1:
+            rospy.logerr(f"the ROS master refuses {method} of {arguments[0]}: {message}")
+            return []
+        return value
+
+    def _lost(self, problem: Exception) -> None:
+        with self._turn:
+            first, self._away, self._again = not self._away, True, 2
+            self._turn.notify_all()
+        if first and not self._ended:
+            rospy.logwarn(
+                f"no answer from the ROS master at {self.manager.master_uri} ({master.reason(problem)}): what is "
+                "connected goes on; what is new will be announced when it answers"
+            )
+
+    def _found(self, changes: int) -> None:
+        with self._turn:
+            back, self._away, self._again = self._away, False, max(0, self._again - 1)
+            self._settled = changes
+            self._turn.notify_all()
+        if back:
+            rospy.logwarn("the ROS master answers again")
+
+
+_registrar: Registrar | None = None
+
+
+def registrar() -> Registrar:
+    """The one of this process; `init_node` has made it."""
+    assert _registrar is not None
+    return _registrar
+
+
+def init_node(name: str, argv: list[str]) -> Registrar:
+    """`rospy.init_node` for servers: no signal handlers of its own; what listens, and calls of the master, are ours."""
+    global _registrar
+    inbound.install()
+    uri = master.uri()
+    # All that rospy itself asks of the master, such as parameters, goes through this proxy.
+    rospy.core._xmlrpc_cache[uri] = rospy.core._LockedServerProxy(uri, transport=master.Transport())
+    rospy.init_node(name, argv=argv, disable_signals=True)
+    listeners = get_registration_listeners()
+    with listeners.lock:
+        manager = next(_managers(listeners.listeners))
+        Connector(manager)
+        _registrar = Registrar(manager)
+        listeners.listeners[:] = [_registrar]
+    _registrar.start()
+    return _registrar
+
+
+def _managers(listeners: list[RegistrationListener]) -> Iterator[RegManager]:
+    return (listener for listener in listeners if isinstance(listener, RegManager))

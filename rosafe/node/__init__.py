@@ -1,0 +1,1 @@
+"""The rosAFE node: the processor tree behind a component's requests and ports."""

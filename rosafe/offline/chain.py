@@ -1,0 +1,229 @@
+"""The chain of processors that some outputs need: what `rosafe.process` and the file front end run on."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from types import TracebackType
+from typing import Any
+
+import numpy as np
+
+from rosafe.interface import KINDS, ComponentError
+from rosafe.tree import sizes
+from rosafe.tree.block import Block
+from rosafe.tree.processor import Observer, Processor
+from rosafe.tree.tree import Tree
+from rosafe.vocabulary.representation import Part
+
+
+def output_parts(kind: str) -> dict[str, Part]:
+    """The arrays of a kind of processor by their names in a result: the kind, or with the part's name where several."""
+    parts = KINDS[kind].parts
+    return {kind if len(parts) == 1 else f"{kind}_{part.name}": part for part in parts}
+
+
+class _GatedSource:
+    """Feeds blocks to the tree, one after the other, once `let_flow` says that the whole tree stands."""
+
+    def __init__(self, blocks: Iterable[np.ndarray], sample_rate: float) -> None:
+        self.sample_rate = sample_rate
+        self.ended = False
+        self._blocks = iter(blocks)
+        self._frames = 0
+        self._flowing = False
+        self._wake: Callable[[], None] = lambda: None
+
+    def open(self, wake: Callable[[], None]) -> None:
+        self._wake = wake
+
+    def let_flow(self) -> None:
+        """Let the signal flow."""
+        self._flowing = True
+        self._wake()
+
+    def read(self) -> tuple[np.ndarray, int] | None:
+        if not self._flowing or self.ended:
+            return None
+        block = next(self._blocks, None)
+        if block is None:
+            self.stop()
+            return None
+        self._frames += block.shape[-1]
+        return block, self._frames
+
+    def stop(self) -> None:
+        self.ended = True
+        self._wake()
+
+
+class _Listener:
+    """Hands on what the wanted processors release, and keeps the first error, which ends the run."""
+
+    def __init__(self, wanted: Iterable[str], source: _GatedSource, keep: Callable[[str, Block], None]) -> None:
+        self._wanted = frozenset(wanted)
+        self._source = source
+        self._keep = keep
+        self._lock = threading.Lock()
+        self.error: BaseException | None = None
+
+    def added(self, processor: Processor) -> None:
+        pass
+
+    def executed(self, processor: Processor, seconds: float) -> None:
+        pass
+
+    def released(self, processor: Processor, block: Block) -> None:
+        if processor.kind in self._wanted:
+            self._keep(processor.kind, block)
+
+    def ended(self, processor: Processor) -> None:
+        if processor.error is not None:
+            with self._lock:
+                self.error = self.error or processor.error
+            self._source.stop()
+
+
+class Chain:
+    """The processors that some outputs need, standing in a tree; nothing flows before `run`. A context manager.
+
+    Parameters
+    ----------
+    blocks : iterable of ndarray, (2, n), int32 or float
+        The signal; it is asked for the next block when the chain has room for it.
+    sample_rate : float
+        In Hz.
+    parameters : mapping
+        From `rosafe.interface.arguments.check_parameters`.
+    outputs : sequence of str
+        Kinds, from `rosafe.interface.arguments.check_outputs`.
+    keep : callable
+        Called with the kind and each block of it, in their order, while the chain goes on with the next block; it does
+        not go on beyond that, so memory is bounded. What it raises ends the run.
+
+    Raises
+    ------
+    ValueError
+        Parameters that do not go together, or not with the sample rate.
+    """
+
+    def __init__(
+        self,
+        blocks: Iterable[np.ndarray],
+        sample_rate: float,
+        parameters: Mapping[str, Any],
+        outputs: Iterable[str],
+        keep: Callable[[str, Block], None],
+    ) -> None:
+        self.sample_rate = sample_rate
+        self._source = _GatedSource(blocks, sample_rate)
+        self._listener = _Listener(outputs, self._source, keep)
+        self._tree = Tree(self._listener)
+        self._processors: dict[str, Processor] = {}
+        self._longest: dict[str, Any] = {}  # of what is derived from parameters: the most elements there will be
+        try:
+            with _as_value_error():
+                self._build(_needed(outputs), parameters)
+        except BaseException:
+            self.close()
+            raise
+        self._remember()
+
+    def _build(self, needed: set[str], values: Mapping[str, Any]) -> None:
+        for kind in KINDS.values():  # parents come first in the table
+            mine = {p.name: values[p.name] for p in kind.parameters if p.name in values}
+            if not kind.parent:
+                self._processors[kind.kind] = self._tree.add_input(kind.kind, self._source, 1, 0.0, 0.0, mine)
+            elif kind.kind in needed:
+                self._processors[kind.kind] = self._tree.add(kind.kind, kind.kind, kind.parent, mine)
+
+    def schedule(self, block: int, name: str, value: Any) -> None:
+        """Change a (checked) parameter before block `block`; the blocks of successive calls ascend. Or ValueError."""
+        with _as_value_error():
+            self._tree.schedule(block, name, value)
+        self._remember()
+
+    def _remember(self) -> None:
+        for processor in self._processors.values():
+            for name, value in processor.derived().items():
+                if np.size(value) >= np.size(self._longest.get(name, ())):
+                    self._longest[name] = value
+
+    def observe(self, observer: Observer) -> None:
+        """Tell `observer` of every state that a processor enters."""
+        self._tree.observe(observer)
+
+    def run(self) -> None:
+        """Let the signal flow and wait for its end; raises what the first processor failed with."""
+        self._source.let_flow()
+        for processor in self._processors.values():
+            processor.join()
+        if self._listener.error is not None:
+            raise self._listener.error
+
+    def close(self) -> None:
+        """End the run, if it is not over, and all threads."""
+        self._tree.stop()
+        self._tree.join()
+
+    def __enter__(self) -> Chain:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    # --- what it is ---
+
+    def shapes(self, kind: str, frames: int) -> dict[str, tuple[int, ...]]:
+        """Shape of each part of an output, for a signal of so many frames if no parameter changes on the way."""
+        processor = self._processors[kind]
+        count = self._count(processor, frames)
+        return dict(zip(output_parts(kind), ((*rows, count) for rows in processor.part_rows), strict=True))
+
+    def _count(self, processor: Processor, frames: int) -> int:
+        """How many frames it puts out for so many of the signal."""
+        return processor.stage.complete(frames if processor.parent is None else self._count(processor.parent, frames))
+
+    def largest_block(self, frames: int) -> tuple[str, int]:
+        """Which processor puts out most for one block of so many frames, and how many bytes that can be."""
+        seconds = frames / self.sample_rate
+        taken = {kind: sizes.output_size(p.stage, p.given_rows, seconds) for kind, p in self._processors.items()}
+        kind = max(taken, key=lambda kind: taken[kind])
+        return kind, int(taken[kind])
+
+    def describe(self) -> dict[str, Any]:
+        """Axes and rates of what runs: `fb_cfHz` (Hz), `cc_lags` (s), `ild_frameRate` and its like (Hz).
+
+        What is a parameter is told as it is at last, what follows from parameters as where it is longest.
+        """
+        described: dict[str, Any] = {}
+        for kind, processor in self._processors.items():
+            values = {**processor.parameters(), **self._longest}
+            for name in processor.representation.coordinates:
+                words = any(isinstance(value, str) for value in values[name])
+                described[name] = list(values[name]) if words else np.array(values[name], np.float64)
+            if processor.signal.framed:
+                described[f"{kind}_frameRate"] = processor.rate
+        return described
+
+
+def _needed(outputs: Iterable[str]) -> set[str]:
+    """The processors to run for `outputs`."""
+    needed = {kind.kind for kind in KINDS.values() if not kind.parent}
+    for kind in outputs:
+        while kind:
+            needed.add(kind)
+            kind = KINDS[kind].parent
+    return needed
+
+
+@contextmanager
+def _as_value_error() -> Iterator[None]:
+    """Make ValueError of the interface's named exceptions."""
+    try:
+        yield
+    except ComponentError as problem:
+        raise ValueError(str(problem)) from None

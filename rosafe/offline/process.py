@@ -1,0 +1,223 @@
+"""`rosafe.process`: the whole chain on a signal in memory, on the same tree as the node, as fast as it goes."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from rosafe.dsp.stage import SAMPLE_RATE
+from rosafe.interface import KINDS
+from rosafe.interface.arguments import check_change, check_outputs, check_parameters
+from rosafe.offline.chain import Chain, output_parts
+from rosafe.tree import sizes
+from rosafe.tree.block import Block
+
+DEFAULT_BLOCK = 12000  # frames, as InputProc's
+
+
+def process(
+    signal: np.ndarray,
+    sample_rate: float,
+    parameters: Mapping[str, Any] | None = None,
+    block_frames: int | Sequence[int] = DEFAULT_BLOCK,
+    modifications: Sequence[tuple[int, str, Any]] = (),
+    outputs: Sequence[str] | None = None,
+) -> dict[str, Any]:
+    """Compute auditory representations of a binaural signal.
+
+    Parameters
+    ----------
+    signal : ndarray, shape (2, N), float or int32
+        Left and right ear.
+    sample_rate : float
+        In Hz.
+    parameters : mapping, optional
+        Any of the original's parameter names (`in_*`, `pp_*`, `fb_*`, `ihc_*`, `ild_*`, `rm_*`, `cc_*`) and its value.
+        The rest takes the interface table's defaults, but for `in_doNormalize`: True for int32, False for float.
+    block_frames : int or sequence of int
+        Block size, or sizes that are used in turn; the last block is what is left. Only where gain control
+        (`pp_bNormalizeRMS`) starts do the numbers depend on it.
+    modifications : sequence of (block, name, value)
+        Parameter changes, each made before the block of that number (from 0); several for one block are made in the
+        order given. Those for blocks that never come are ignored. The original's `set_rm_scailing` is known here too.
+    outputs : sequence of str, optional
+        The representations to return, of `input`, `preProc`, `gammatone`, `ihc`, `ild`, `ratemap`,
+        `crossCorrelation`. All by default. What none of them depends on is not computed.
+
+    Returns
+    -------
+    dict
+        `input`, `preProc` (2, N); `gammatone`, `ihc` (2, C, N); `ild` (C, F) in dB; `ratemap` (2, C, F);
+        `crossCorrelation` (C, L, F); `fb_cfHz` (C,) in Hz; `cc_lags` (L,) in seconds; `ild_frameRate`,
+        `ratemap_frameRate`, `crossCorrelation_frameRate` in Hz. Where a change alters the number of lags or channels,
+        L and C are the largest and what lies outside is 0; rates and `fb_cfHz` are the last ones.
+
+    Raises
+    ------
+    ValueError
+        For anything that cannot be: a signal of the wrong shape or type or with samples that are not finite, a
+        parameter or output that does not exist, a value of the wrong type or out of its range.
+    """
+    samples = _checked_signal(signal)
+    rate = SAMPLE_RATE.check(sample_rate)
+    ends = _block_ends(block_frames, samples.shape[1])
+    values = {"in_doNormalize": samples.dtype == np.int32, **check_parameters(parameters)}
+    changes = _checked_modifications(modifications)
+    wanted = check_outputs(outputs)
+
+    gathered: dict[str, _Gathered] = {}
+
+    def keep(kind: str, block: Block) -> None:
+        for name, data in zip(output_parts(kind), block.parts, strict=True):
+            gathered[name].add(data)
+
+    blocks = (samples[:, first:end] for first, end in itertools.pairwise((0, *ends)))
+    with Chain(blocks, rate, values, wanted, keep) as chain:
+        taken = [_size(chain, wanted, ends)]
+        shapes = {kind: chain.shapes(kind, samples.shape[1]) for kind in wanted}
+        for block, name, value in changes:
+            if block < len(ends):
+                chain.schedule(block, name, value)
+                taken.append(_size(chain, wanted, ends))
+        _check_memory(max(taken))
+        for kind in wanted:
+            for name, part in output_parts(kind).items():
+                middle = part.axes.index(KINDS[kind].centred) if KINDS[kind].centred in part.axes else -1
+                gathered[name] = _Gathered(shapes[kind][name], middle)
+        chain.run()
+        results: dict[str, Any] = {}
+        for name in list(gathered):
+            results[name] = gathered.pop(name).joined()
+        results.update(chain.describe())
+        return results
+
+
+# --- arguments ---
+
+
+def _checked_signal(signal: Any) -> np.ndarray:
+    try:
+        array = np.asarray(signal)
+    except ValueError as problem:
+        raise ValueError(f"signal is no array: {problem}") from None
+    if array.ndim != 2 or array.shape[0] != 2:
+        raise ValueError(f"signal has shape {array.shape}, wanted is (2, frames): left and right ear")
+    if array.dtype.kind == "i" and array.dtype.itemsize == 4:
+        return np.asarray(array, np.int32)
+    if array.dtype.kind != "f":
+        raise ValueError(f"signal is of type {array.dtype}, wanted is a float type or int32")
+    with np.errstate(over="ignore"):  # a long double beyond the range of double becomes infinite
+        array = np.asarray(array, np.float64)
+    if not np.isfinite(array).all():
+        raise ValueError("signal holds NaN or infinite samples")
+    return array
+
+
+def _block_ends(block_frames: Any, frames: int) -> list[int]:
+    """The end of each block of a signal of so many frames."""
+    several = isinstance(block_frames, (Sequence, np.ndarray)) and not isinstance(block_frames, (str, bytes))
+    sizes = list(block_frames) if several else [block_frames]
+    whole = all(isinstance(n, (int, np.integer)) and not isinstance(n, bool) and n > 0 for n in sizes)
+    if not sizes or not whole:
+        raise ValueError(f"block_frames: {block_frames!r} is not a positive whole number, or a sequence of such")
+    ends = itertools.accumulate(itertools.cycle(map(int, sizes)))
+    return [*itertools.takewhile(lambda end: end < frames, ends), frames] if frames else []
+
+
+def _checked_modifications(modifications: Any) -> list[tuple[int, str, Any]]:
+    """The changes in the order of their blocks."""
+    changes = []
+    try:
+        triples = [tuple(change) for change in modifications]
+    except TypeError:
+        triples = [()]
+    for change in triples:
+        if len(change) != 3:
+            raise ValueError("modifications: wanted is a sequence of (block, name, value)")
+        block, name, value = change
+        if isinstance(block, bool) or not isinstance(block, (int, np.integer)) or block < 0:
+            raise ValueError(f"modifications: {block!r} is not a block number")
+        changes.append((int(block), *check_change(name, value)))
+    return sorted(changes, key=lambda change: change[0])
+
+
+# --- what comes out ---
+
+
+def _size(chain: Chain, wanted: list[str], ends: list[int]) -> int:
+    """Bytes of the largest thing there will be at a time: all results, or one block of what is not kept."""
+    frames = ends[-1] if ends else 0
+    largest_block = max((end - first for first, end in itertools.pairwise((0, *ends))), default=0)
+    results = sum(8 * math.prod(shape) for kind in wanted for shape in chain.shapes(kind, frames).values())
+    return max(results, chain.largest_block(largest_block)[1])
+
+
+def _check_memory(size: int) -> None:
+    """ValueError where `size` bytes are more than the machine has: there the kernel would end the process."""
+    memory = sizes.machine_memory()
+    if size > memory:
+        raise ValueError(
+            f"outputs: they would take {size / 1e9:.1f} GB of memory, this machine has {memory / 1e9:.1f} GB; "
+            "name fewer outputs, or take fewer channels or lags"
+        )
+
+
+class _Gathered:
+    """All that is released of one output. Each block goes to its place in the result at once.
+
+    Parameters
+    ----------
+    shape : tuple of int
+        Of the whole, if no parameter changes on the way. From where one does, blocks wait for the end.
+    middle : int
+        The axis whose middle stays where it is where a change alters its length; -1 for none.
+    """
+
+    def __init__(self, shape: tuple[int, ...], middle: int) -> None:
+        self._middle = middle
+        self._whole = np.empty(shape)
+        self._filled = 0  # frames
+        self._begun = False  # a block without frames has rows, too
+        self._others: list[np.ndarray] = []
+
+    def add(self, block: np.ndarray) -> None:
+        """The next block, (..., frames)."""
+        end = self._filled + block.shape[-1]
+        fits = block.shape[:-1] == self._whole.shape[:-1] and end <= self._whole.shape[-1]
+        if fits and not self._others:
+            self._whole[..., self._filled : end] = block
+            self._filled, self._begun = end, True
+        else:
+            self._others.append(block)
+
+    def joined(self) -> np.ndarray:
+        """The whole."""
+        if not self._others and self._filled == self._whole.shape[-1]:
+            return self._whole
+        first = [self._whole[..., : self._filled]] if self._begun else []
+        return _join(self._middle, [*first, *self._others])
+
+
+def _join(middle: int, blocks: list[np.ndarray]) -> np.ndarray:
+    """All blocks along the last axis. Where the leading shape changed on the way, the largest rules.
+
+    The axis `middle` is aligned at its middle, others at their first; what lies outside is 0.
+    """
+    if all(block.shape[:-1] == blocks[0].shape[:-1] for block in blocks):
+        return np.concatenate(blocks, axis=-1)
+    shape = tuple(max(sizes) for sizes in zip(*(block.shape[:-1] for block in blocks), strict=True))
+    joined = np.zeros((*shape, sum(block.shape[-1] for block in blocks)))
+    at = 0
+    for block in blocks:
+        place = [slice(0, size) for size in block.shape]
+        place[-1] = slice(at, at + block.shape[-1])
+        if middle >= 0:
+            first = (shape[middle] - block.shape[middle]) // 2
+            place[middle] = slice(first, first + block.shape[middle])
+        joined[tuple(place)] = block
+        at += block.shape[-1]
+    return joined

@@ -1,0 +1,280 @@
+"""Spectral features: fourteen numbers that describe the shape of each frame's spectrum.
+
+* G. Peeters, B. L. Giordano, P. Susini, N. Misdariis and S. McAdams (2011), "The Timbre Toolbox: extracting audio
+  descriptors from musical signals", J. Acoust. Soc. Am. 130, 2902-2916
+* H. Misra, S. Ikbal, H. Bourlard and H. Hermansky (2004), "Spectral entropy based feature for robust ASR", Proc.
+  ICASSP, 193-196
+* K. Jensen and T. H. Andersen (2004), "Real-time beat estimation using feature extraction", in Computer Music Modeling
+  and Retrieval, LNCS 2771, Springer, 13-22
+* A. Lerch (2012), "An introduction to audio content analysis", Wiley
+* G. Tzanetakis and P. Cook (2002), "Musical genre classification of audio signals", IEEE Trans. Speech Audio Process.
+  10, 293-302
+* E. Scheirer and M. Slaney (1997), "Construction and evaluation of a robust multifeature speech/music discriminator",
+  Proc. ICASSP, 1331-1334
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from rosafe.dsp import kernels
+from rosafe.dsp.guard import LIMIT, FloatArray
+from rosafe.dsp.signal import Signal
+from rosafe.dsp.stage import Stage
+from rosafe.vocabulary.parameter import Parameter
+from rosafe.vocabulary.representation import Representation
+
+E = 1e-15  # keeps quotients and logarithms finite
+LARGEST = LIMIT**2  # of the rates: the square of the largest sample
+
+
+@dataclass
+class Spectra:
+    """Spectra x_c of F frames with what several features make of them. Arrays are (C, 2, F), or (2, F) in each frame.
+
+    `extended` is (C, 2, F + 1): each spectrum's predecessor lies before it.
+    """
+
+    extended: FloatArray
+    frequencies: FloatArray  # f_c (C,) in Hz
+    bright: float  # sf_brCF
+    part: float  # sf_roPerc
+
+    @cached_property
+    def x(self) -> FloatArray:
+        return self.extended[..., 1:]
+
+    @cached_property
+    def highest(self) -> float:
+        return float(self.frequencies.max())
+
+    @cached_property
+    def total(self) -> FloatArray:
+        """X + E, X the sum over channels."""
+        return self.x.sum(axis=0) + E
+
+    @cached_property
+    def mean(self) -> FloatArray:
+        return self.x.mean(axis=0)
+
+    @cached_property
+    def center(self) -> FloatArray:
+        """Of gravity, in Hz."""
+        return self.moment(self.frequencies)
+
+    @cached_property
+    def levels(self) -> FloatArray:
+        """10 log10(x + E) in dB, of the extended spectra."""
+        return 10 * np.log10(self.extended + E)
+
+    @cached_property
+    def deviations(self) -> FloatArray:
+        """From the mean over the channels, in standard deviations."""
+        deviations = self.x - self.mean
+        channels = len(deviations)
+        squares = np.einsum("cef,cef->ef", deviations, deviations)
+        return deviations / (np.sqrt(squares / max(1, channels - 1)) + E)
+
+    @cached_property
+    def norms(self) -> FloatArray:
+        """||x|| + E, of the extended spectra."""
+        return np.sqrt(np.einsum("cef,cef->ef", self.extended, self.extended)) + E
+
+    def moment(self, weights: FloatArray) -> FloatArray:
+        """sum w_c x_c / (X + E)."""
+        return np.einsum("c,cef->ef", weights, self.x) / self.total
+
+
+def _spread(of: Spectra) -> FloatArray:
+    distances = of.frequencies[:, np.newaxis, np.newaxis] - of.center
+    return np.sqrt(np.einsum("cef,cef,cef->ef", distances, distances, of.x) / of.total) / of.highest
+
+
+def _entropy(of: Spectra) -> FloatArray:
+    shares = of.x / of.total
+    channels = len(shares)
+    if channels == 1:
+        return np.zeros(shares.shape[1:])
+    return np.einsum("cef,cef->ef", shares, -np.log(shares + E)) / math.log(channels)
+
+
+def _decrease(of: Spectra) -> FloatArray:
+    first, others = of.x[0], of.x[1:]
+    steps = 1.0 / np.arange(1, len(others) + 1)
+    return np.einsum("c,cef->ef", steps, others - first) / (others.sum(axis=0) + E)
+
+
+def _flatness(of: Spectra) -> FloatArray:
+    sounding = of.x > 0
+    logarithms = np.log(of.x, out=np.zeros(of.x.shape), where=sounding)
+    return sounding.all(axis=0) * np.exp(logarithms.mean(axis=0)) / (of.mean + E)
+
+
+def _rolloff(of: Spectra) -> FloatArray:
+    sums = of.x.cumsum(axis=0)
+    threshold = of.part * sums[-1]
+    index = (sums >= threshold).argmax(axis=0)
+    before = np.maximum(index - 1, 0)
+    below, above = (np.take_along_axis(sums, i[np.newaxis], axis=0)[0] for i in (before, index))
+    way = np.divide(threshold - below, above - below, out=np.zeros(index.shape), where=index > 0)
+    low, high = of.frequencies[before], of.frequencies[index]
+    return np.where(sums[-1] > 0, (low + way * (high - low)) / of.highest, 0.0)
+
+
+def _flux(of: Spectra) -> FloatArray:
+    return np.sqrt(np.square(np.diff(of.levels, axis=-1)).mean(axis=0))
+
+
+def _irregularity(of: Spectra) -> FloatArray:
+    steps = np.diff(of.levels[..., 1:], axis=0)
+    return np.sqrt(np.einsum("cef,cef->ef", steps, steps) / max(1, len(steps)))
+
+
+def _variation(of: Spectra) -> FloatArray:
+    products = np.einsum("cef,cef->ef", of.x, of.extended[..., :-1])
+    return 1 - products / (of.norms[..., 1:] * of.norms[..., :-1])
+
+
+FEATURES: dict[str, Callable[[Spectra], FloatArray]] = {
+    "centroid": lambda of: of.center / of.highest,
+    "crest": lambda of: of.x.max(axis=0) / (of.mean + E),
+    "spread": _spread,
+    "entropy": _entropy,
+    "brightness": lambda of: of.moment((of.frequencies > of.bright) * 1.0),
+    "hfc": lambda of: of.moment(np.square(of.frequencies)),
+    "decrease": _decrease,
+    "flatness": _flatness,
+    "flux": _flux,
+    "kurtosis": lambda of: np.square(np.square(of.deviations)).mean(axis=0) - 3,
+    "skewness": lambda of: (np.square(of.deviations) * of.deviations).mean(axis=0),
+    "irregularity": _irregularity,
+    "rolloff": _rolloff,
+    "variation": _variation,
+}
+ORDER = {word: index for index, word in enumerate(FEATURES)}
+
+
+class SpectralFeatures(Stage):
+    """One number for each frame, ear and feature, (2, C, F) to (2, S, F), in the order of sf_requests.
+
+    With the rates x_c = max(R_c, 0) of a frame's C channels, their center frequencies f_c and the highest of these
+    f_max, E = 1e-15, X = sum x_c, m = X / C, p_c = x_c / (X + E), D_c = 10 log10(x_c + E), s the standard deviation of
+    x over the channels (C - 1 in the denominator) and g = sum f_c x_c / (X + E):
+
+    ============ ====================================================================================================
+    centroid     g / f_max
+    crest        max x_c / (m + E)
+    spread       sqrt(sum (f_c - g)**2 x_c / (X + E)) / f_max
+    entropy      -sum p_c ln(p_c + E) / ln C
+    brightness   sum of x_c where f_c > sf_brCF, over X + E
+    hfc          sum f_c**2 x_c / (X + E), in Hz**2
+    decrease     sum over c >= 1 of (x_c - x_0) / c, over E + sum over c >= 1 of x_c
+    flatness     exp(mean ln x_c) / (m + E); 0 where a channel is silent
+    flux         sqrt(mean (D_c[k] - D_c[k-1])**2) in dB; 0 in the first frame
+    kurtosis     mean ((x_c - m) / (s + E))**4, less 3
+    skewness     mean ((x_c - m) / (s + E))**3
+    irregularity sqrt(mean over c >= 1 of (D_c - D_(c-1))**2) in dB
+    rolloff      f_r / f_max, with f_r where x_0 + ... + x_c, joined by straight lines, reaches sf_roPerc X; f_0 where
+                 x_0 is enough; 0 for silence
+    variation    1 - sum x_c[k] x_c[k-1] / ((||x[k]|| + E) (||x[k-1]|| + E)); the first frame goes before itself
+    ============ ====================================================================================================
+
+    Silence gives 0, but for kurtosis, -3, and variation, 1. With one channel, entropy, irregularity and s are 0.
+    Parameters change nothing but what is put out; other channels than before are a new beginning.
+    """
+
+    REPRESENTATION = Representation(
+        kind="spectralFeatures",
+        doc="Spectral features",
+        parent="ratemap",
+        axes=("ear", "feature", "time"),
+        parameters=(
+            Parameter(
+                "sf_requests",
+                "sequence<string>",
+                ("all",),
+                "Features, in this order; all of them where one is all",
+                choices=("all", *FEATURES),
+                least=1,
+            ),
+            Parameter(
+                "sf_brCF",
+                "double",
+                1500.0,
+                "Brightness counts the channels above this (Hz)",
+                0.0,
+                1e6,
+                open_minimum=True,
+                aliases=("sf_br_cf",),
+                unit="Hz",
+            ),
+            Parameter(
+                "sf_roPerc",
+                "double",
+                0.8,
+                "Part of the energy below the roll-off",
+                0.0,
+                1.0,
+                open_minimum=True,
+                aliases=("sf_ro_perc",),
+            ),
+        ),
+        coordinates=("sf_requests",),
+        port_doc="Spectral features, [feature][frame]",
+    )
+
+    _last: FloatArray | None = None  # the last spectra, (2, C, 1)
+
+    @classmethod
+    def in_force(cls, values: Mapping[str, Any]) -> dict[str, Any]:
+        words = values["sf_requests"]
+        return {**values, "sf_requests": list(FEATURES) if "all" in words else words}
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        return self.in_force(self._values)
+
+    def output_rows(self, rows: tuple[int, ...]) -> tuple[int, ...]:
+        return (rows[0], len(self._words))
+
+    def _output(self) -> Signal:
+        return replace(self.given, center_frequencies=())
+
+    def process(self, block: FloatArray, extra: FloatArray | None = None) -> FloatArray:
+        rates = self._checked(block)
+        channels, known = rates.shape[1], len(self._frequencies)
+        if not channels == known > 0:
+            raise ValueError(f"block: {channels} channels, and the center frequencies of {known} are known")
+        if rates.shape[-1] == 0:
+            return np.empty((2, len(self._words), 0))
+        spectra = np.minimum(np.maximum(rates, 0.0), LARGEST)
+        before = spectra[..., :1].copy() if self._last is None else self._last
+        self._last = spectra[..., -1:].copy()
+        bright, part = self._values["sf_brCF"], self._values["sf_roPerc"]
+        if not kernels.compiled():
+            extended = np.concatenate((before, spectra), axis=-1).swapaxes(0, 1)
+            of = Spectra(np.ascontiguousarray(extended), self._frequencies, bright, part)
+            made = {word: FEATURES[word](of) for word in dict.fromkeys(self._words)}
+            return np.stack([made[word] for word in self._words], axis=1)
+        features = np.empty((2, len(FEATURES), rates.shape[-1]))
+        kernels.spectral_features(spectra, before, self._frequencies, bright, part, features)
+        return features if self._words == tuple(ORDER) else features.take([ORDER[word] for word in self._words], axis=1)
+
+    def reset(self) -> None:
+        self._last = None
+
+    def _received(self, before: Signal) -> None:
+        if self.given.center_frequencies != before.center_frequencies:
+            self._last = None
+            self._frequencies = np.array(self.given.center_frequencies)
+
+    def _build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
+        words: Sequence[str] = values["sf_requests"]
+        self._words = tuple(FEATURES) if "all" in words else tuple(words)
+        self._frequencies = np.array(self.given.center_frequencies)

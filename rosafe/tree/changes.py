@@ -1,0 +1,113 @@
+"""Parameter changes of one processor: planned on copies of its stage, made between two blocks."""
+
+from __future__ import annotations
+
+import copy
+import itertools
+import threading
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from rosafe.dsp.signal import Signal
+from rosafe.dsp.stage import Stage
+from rosafe.tree.block import Block
+
+
+class Change(NamedTuple):
+    """A change that waits for the processor's next block, or for a later one."""
+
+    block: int  # of the input; it is made before this one, or the next one if that is a later one
+    name: str
+    value: Any
+    needs: str  # of the parent's by-products, from then on
+
+
+class Changes:
+    """The stage of a processor as it is at work, and as it will be.
+
+    A change is made before the first block that the stage can then work on: a method that needs the parent's envelope
+    waits for a block that has it, one that goes with the parent's coming format only waits for that.
+
+    Attributes
+    ----------
+    planned : Stage
+        As it will be after all changes, its own and its parents': to be asked, and not to be run.
+    """
+
+    def __init__(self, stage: Stage) -> None:
+        self.planned = stage
+        self._working = stage
+        self._waiting: list[Change] = []
+        self._lock = threading.Lock()  # guards _waiting, and the exchange of _working
+
+    def plan(self, name: str, value: Any) -> Stage:
+        """The stage after one more change, which is not made yet; ValueError where it refuses that."""
+        stage = copy.copy(self.planned)
+        stage.configure(**{name: value})
+        return stage
+
+    def follow(self, given: Signal) -> Stage:
+        """The stage under a parent that puts out another format, or ValueError; `planned` where it is the same."""
+        if given == self.planned.given:
+            return self.planned
+        stage = copy.copy(self.planned)
+        stage.receive(given)
+        return stage
+
+    def accept(self, planned: Stage, name: str, value: Any, block: int = 0) -> None:
+        """Make the change that was `planned` before block `block` of the input; blocks of successive calls ascend."""
+        with self._lock:
+            self.planned = planned
+            self._waiting.append(Change(block, name, value, planned.needs))
+
+    def needs(self, number: int) -> str:
+        """Which of the parent's by-products block `number` should carry."""
+        if not self._waiting:
+            return self._working.needs
+        with self._lock:
+            due = self._due(number)
+            return due[-1].needs if due else self._working.needs
+
+    def stage_for(self, block: Block) -> Stage | None:
+        """The stage to work on `block`, after all changes that are due and go with it; None where none can."""
+        stage = self._working
+        if self._waiting or block.signal is not stage.given:
+            with self._lock:
+                due = self._due(block.number)
+                for count in range(len(due), -1, -1):
+                    if (changed := _changed(stage, block.signal, due[:count])) is not None and _fits(changed, block):
+                        self._working = changed
+                        del self._waiting[:count]
+                        return changed
+            return None
+        return stage if _fits(stage, block) else None
+
+    def _due(self, number: int) -> list[Change]:
+        return list(itertools.takewhile(lambda change: change.block <= number, self._waiting))
+
+
+def _fits(stage: Stage, block: Block) -> bool:
+    return not stage.needs or stage.needs in block.extras
+
+
+def _changed(stage: Stage, given: Signal, changes: Sequence[Change]) -> Stage | None:
+    """`stage` after `changes`, with blocks of the format `given`, or None where that cannot be.
+
+    It shares the state of `stage`, which does not notice. The format may be what makes a change possible, or the
+    other way round: what goes in any order is taken.
+    """
+    if given == stage.given and not changes:
+        stage.receive(given)
+        return stage
+    for first in range(len(changes) + 1):
+        changed = copy.copy(stage)
+        try:
+            for change in changes[:first]:
+                changed.configure(**{change.name: change.value})
+            changed.receive(given)
+            for change in changes[first:]:
+                changed.configure(**{change.name: change.value})
+        except ValueError:
+            continue
+        return changed
+    return None

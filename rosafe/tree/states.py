@@ -1,0 +1,192 @@
+"""What a processor is at, and the tokens that it exchanges with its parent and its children. No threads in here.
+
+    waitExec --begin--> exec --hold--> waitRelease --once no child holds the last block--> release --rest--> waitExec
+
+A parent releases a block only while nobody holds a token of its last one; every child then gets a token of its own,
+takes the block with it, and gives it back when done. Children read the parent's memory.
+"""
+
+from __future__ import annotations
+
+import enum
+
+from rosafe.tree.block import Block
+
+
+class State(enum.Enum):
+    """The four states of the user guide (figure 11), and the two ends."""
+
+    WAIT_EXEC = "waitExec"
+    EXEC = "exec"
+    WAIT_RELEASE = "waitRelease"
+    RELEASE = "release"
+    DONE = "done"  # its input has come to its end
+    REMOVED = "removed"
+
+
+ENDS = (State.DONE, State.REMOVED)
+
+
+class StateMachine:
+    """States and tokens of one processor. All is done with the tree's lock held.
+
+    Attributes
+    ----------
+    depth : int
+        How many there are above it.
+    at_work : bool
+        A worker is at it, from `begin` to `rest`.
+    called : bool
+        Of the input: there may be sound to read.
+    shared : Block or None
+        Released last; children read it.
+    untold : Block or None
+        The same until the world has been told of it.
+    """
+
+    def __init__(self, parent: StateMachine | None) -> None:
+        self.parent = parent
+        self.children: list[StateMachine] = []
+        self.depth: int = 0 if parent is None else parent.depth + 1
+        self.state = State.WAIT_EXEC
+        self.at_work = self.called = False
+        self.shared: Block | None = None
+        self.untold: Block | None = None
+        self._private: Block | None = None  # computed, and to be released as soon as no child holds the last one
+        self._token: Block | None = None  # the parent's, not taken yet
+        self._reading: StateMachine | None = (
+            None  # the parent whose block it holds; the input may be replaced meanwhile
+        )
+        self._holders: set[StateMachine] = set()  # children that have not given the last block back
+
+    # --- what a processor adds ---
+
+    def rouse(self) -> None:
+        """Perhaps it has become ready."""
+
+    def entered(self, state: State, number: int | None) -> None:
+        """It has entered a state, with the block of that number at hand."""
+
+    # --- coming and going ---
+
+    def attach(self) -> None:
+        """Become a child of its parent, and begin with the block that this has released last, if there is one."""
+        if self.parent is not None:
+            self.parent.children.append(self)
+            if self.parent.shared is not None:
+                self.parent._hand(self)
+            self._end_if_exhausted()
+        self.rouse()
+
+    def move(self, parent: StateMachine) -> None:
+        """Become a child of another parent, which has released nothing yet; a block that was not taken is dropped."""
+        self._leave()
+        self.parent, self._token = parent, None
+        parent.children.append(self)
+
+    def remove(self) -> None:
+        """Gone at once: its parent waits for it no longer, and it will release nothing more."""
+        self._enter(State.REMOVED)
+        self.shared = self._private = self._token = None
+        self._leave()
+
+    def finish(self) -> None:
+        """Nothing more will come of it; children may still take its last block."""
+        self.give_back()
+        self._enter(State.DONE)
+        for child in self.children:
+            child._end_if_exhausted()
+
+    def _leave(self) -> None:
+        if self.parent is not None and self in self.parent.children:
+            self.parent.children.remove(self)
+            self.parent._freed_by(self)
+
+    def _end_if_exhausted(self) -> None:
+        alive = self.parent is None or self.parent.state is not State.DONE or self._token is not None
+        if not alive and not self.at_work and self.state is State.WAIT_EXEC:
+            self.finish()
+
+    @property
+    def gone(self) -> bool:
+        """Whether it was removed."""
+        return self.state is State.REMOVED
+
+    @property
+    def over(self) -> bool:
+        """Whether nobody works on it and nobody ever will."""
+        return self.state in ENDS and not self.at_work
+
+    # --- the four states ---
+
+    @property
+    def ready(self) -> bool:
+        """Whether there is something to do: a block to take, or one to tell of."""
+        if self.at_work:
+            return False
+        if self.state is State.WAIT_EXEC:
+            return self.called or self._token is not None
+        return self.state is State.RELEASE
+
+    def begin(self) -> Block | None:
+        """Somebody works on it from now on. Returns the block that is taken, if it was waiting for one."""
+        self.at_work = True
+        if self.state is not State.WAIT_EXEC:
+            return None
+        self.called = False
+        taken, self._token = self._token, None
+        if taken is not None:
+            self._reading = self.parent
+            self._enter(State.EXEC, taken.number)
+        return taken
+
+    def read(self, number: int) -> None:
+        """The input has read its block of that number, and works on it."""
+        self.called = True  # perhaps there is more
+        self._enter(State.EXEC, number)
+
+    def give_back(self) -> None:
+        """Return the parent's block, which may release its next one then."""
+        if self._reading is not None:
+            reading, self._reading = self._reading, None
+            reading._freed_by(self)
+
+    def hold(self, private: Block) -> None:
+        """It has computed `private`, which is released at once or as soon as no child holds the last one."""
+        self._enter(State.WAIT_RELEASE, private.number)
+        self._private = private
+        self._release_if_free()
+
+    def rest(self) -> None:
+        """Nobody works on it any more."""
+        self.at_work = False
+        if self.state is State.EXEC or (self.state is State.RELEASE and self.untold is None):
+            self._enter(State.WAIT_EXEC)
+        self._end_if_exhausted()
+        self.rouse()
+
+    def _freed_by(self, child: StateMachine) -> None:
+        self._holders.discard(child)
+        self._release_if_free()
+
+    def _release_if_free(self) -> None:
+        """Called by whoever may have made it possible, which is mostly a child."""
+        block = self._private
+        if block is None or self._holders or self.gone:
+            return
+        self._enter(State.RELEASE, block.number)
+        self.shared = self.untold = block
+        self._private = None
+        for child in self.children:
+            self._hand(child)
+        self.rouse()
+
+    def _hand(self, child: StateMachine) -> None:
+        self._holders.add(child)
+        child._token = self.shared
+        child.rouse()
+
+    def _enter(self, state: State, number: int | None = None) -> None:
+        if not self.gone:
+            self.state = state
+            self.entered(state, number)

@@ -1,0 +1,219 @@
+"""Who runs what when: threads, as many as there are cores to use, that take up whatever task is ready.
+
+A worker that has finished a task goes on with the deepest one that is ready, mostly what it has just made ready: the
+block is still in its cache. It wakes another worker only where something is left over and one is idle. On one core no
+thread is ever switched so; on several, siblings and successive blocks are worked on at the same time.
+
+Only those who compute count. A worker that somebody else holds up (a listener that does not return, a source that does
+not answer), or whose processor was removed, loses its seat to another one after `PATIENCE` seconds.
+"""
+
+from __future__ import annotations
+
+import functools
+import itertools
+import os
+import threading
+import time
+from collections.abc import Callable
+from typing import Protocol
+
+VARIABLE = "ROSAFE_WORKERS"
+MOST = 1024
+PATIENCE = 0.05  # seconds
+WORKER = "rosafe worker"  # what the names of their threads begin with
+
+
+def workers_to_use(wanted: int | None = None) -> int:
+    """How many workers there should be: `wanted`, else what ROSAFE_WORKERS says, else one for each core to use."""
+    text = os.environ.get(VARIABLE, "").strip()
+    name, given = ("workers", str(wanted)) if wanted is not None else (VARIABLE, text)
+    if not given:
+        return len(os.sched_getaffinity(0))
+    if not (given.isascii() and given.isdigit()) or not 1 <= int(given[:20]) <= MOST:
+        raise ValueError(f"{name}: {given[:80]!r} is not a whole number from 1 to {MOST}")
+    return int(given)
+
+
+class Task(Protocol):
+    """What workers do. One works on it at a time; `begin` and `rest` are called with the lock held."""
+
+    depth: int
+    held_up_since: float  # time.monotonic() at which somebody else began to hold it up; 0 where nobody does
+
+    @property
+    def ready(self) -> bool:
+        """Whether there is something to do."""
+
+    @property
+    def gone(self) -> bool:
+        """Whether nobody wants the result of what is being done any more."""
+
+    def begin(self) -> object:
+        """Somebody works on it from now on."""
+
+    def work(self) -> None:
+        """Do it. Raises nothing."""
+
+    def rest(self) -> None:
+        """Nobody works on it any more; it may be ready again."""
+
+
+class _Worker:
+    """What one of the threads is at."""
+
+    def __init__(self) -> None:
+        self.task: Task | None = None
+        self.seated = False  # counts as one of those who compute
+
+
+class Workers:
+    """The threads of one tree. There are none before the first member comes and after the last one has gone.
+
+    Parameters
+    ----------
+    lock : threading.RLock
+        The tree's lock. All but `join` is called with it held.
+    count : int
+        How many may compute at the same time.
+    """
+
+    def __init__(self, lock: threading.RLock, count: int) -> None:
+        self.lock = lock
+        self.count = count
+        self._members = 0
+        self._ready: list[list[Task]] = []  # by depth; what came last is taken first
+        self._waiting = 0  # tasks in there
+        self._free = count  # seats that nobody has
+        self._idle = 0  # threads that wait for a task, or are about to begin, and
+        self._called = 0  # those of them that are called already
+        self._turn = threading.Condition(lock)
+        self._watch = threading.Condition(lock)
+        self._workers: list[_Worker] = []
+        self._threads: dict[str, threading.Thread] = {}
+
+    def enter(self) -> None:
+        """One member more. RuntimeError where the system has no thread left for the first one."""
+        self._members += 1
+        try:
+            if not self._threads:
+                self._start("rosafe watch", self._keep_watch)
+            if not self._workers:
+                self._start_worker()
+        except RuntimeError:
+            self.leave()
+            raise
+
+    def leave(self) -> None:
+        """One member less."""
+        self._members -= 1
+        if self._members == 0:
+            self._ready, self._waiting = [], 0
+            self._turn.notify_all()
+            self._watch.notify_all()
+
+    def join(self) -> None:
+        """Wait until all threads have ended, as they do when there are no members."""
+        with self.lock:
+            threads = list(self._threads.values())
+        for thread in threads:
+            thread.join()
+
+    # --- tasks ---
+
+    def push(self, task: Task) -> None:
+        """`task` is ready. Who is no worker calls `wake` after that."""
+        while len(self._ready) <= task.depth:
+            self._ready.append([])
+        self._ready[task.depth].append(task)
+        self._waiting += 1
+
+    def wake(self) -> None:
+        """Call an idle worker, or start one, for each task that waits, as far as there are seats."""
+        for _ in range(min(self._waiting, self._free) - self._called):
+            if self._idle > self._called:
+                self._called += 1
+                self._turn.notify()
+                continue
+            try:
+                self._start_worker()
+            except RuntimeError:  # the system has none left: those that there are must do
+                return
+
+    def _pop(self) -> Task | None:
+        """The deepest task that is ready."""
+        for tasks in reversed(self._ready):
+            while tasks:
+                task = tasks.pop()
+                self._waiting -= 1
+                if task.ready:
+                    return task
+        return None
+
+    # --- threads ---
+
+    def _start_worker(self) -> None:
+        names = (f"{WORKER} {number}" for number in itertools.count(1))
+        name = next(name for name in names if name not in self._threads)
+        worker = _Worker()
+        self._start(name, functools.partial(self._run, name, worker))
+        self._workers.append(worker)
+        self._idle += 1
+        self._called += 1
+
+    def _start(self, name: str, run: Callable[[], None]) -> None:
+        thread = threading.Thread(target=run, name=name, daemon=True)
+        thread.start()
+        self._threads[name] = thread
+
+    def _run(self, name: str, me: _Worker) -> None:
+        with self.lock:
+            self._idle -= 1
+            self._called -= 1
+            while (task := self._next()) is not None:
+                self._do(me, task)
+            self._workers.remove(me)
+            del self._threads[name]
+
+    def _next(self) -> Task | None:
+        """A task and a seat for it, as soon as there are both; None where the thread is to end."""
+        while self._members:
+            if self._free and (task := self._pop()) is not None:
+                self._free -= 1
+                self.wake()
+                return task
+            if self._idle >= self.count:  # others have come in the place of those that were held up
+                break
+            self._idle += 1
+            self._turn.wait()
+            self._idle -= 1
+            self._called = max(0, self._called - 1)
+        return None
+
+    def _do(self, me: _Worker, task: Task) -> None:
+        me.task, me.seated = task, True
+        task.begin()
+        self.lock.release()
+        try:
+            task.work()
+        finally:
+            self.lock.acquire()
+            self._free += me.seated
+            me.task, me.seated = None, False
+            task.rest()
+
+    def _keep_watch(self) -> None:
+        """Give the seats of those that are held up to others."""
+        with self.lock:
+            while self._members:
+                self._watch.wait(PATIENCE)
+                for worker in self._workers:
+                    if worker.seated and worker.task is not None and _held_up(worker.task):
+                        worker.seated = False
+                        self._free += 1
+                self.wake()
+            del self._threads["rosafe watch"]
+
+
+def _held_up(task: Task) -> bool:
+    return task.gone or 0 < task.held_up_since < time.monotonic() - PATIENCE

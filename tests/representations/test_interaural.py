@@ -1,0 +1,135 @@
+"""Time difference and coherence: the reference vectors, parabolas, delays and mixtures that are known."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from fractions import Fraction
+
+import numpy as np
+import pytest
+
+from rosafe.dsp.signal import Signal
+from rosafe.representations import KINDS
+from rosafe.representations.interaural import Ic, Itd
+
+from .chain import Chain, FloatArray, process, reference
+
+RATE = 16000.0
+CHANNELS = [300.0, 500.0, 800.0]
+GIVEN = Signal(RATE, 100.0, True, 160, 320, (500.0,), "gammatone", lags=4)
+
+
+def of(correlations: list[float] | FloatArray) -> tuple[float, float]:
+    """ITD in samples and coherence of one frame of one channel."""
+    block = np.array(correlations, float)[np.newaxis, :, np.newaxis]
+    return Itd(GIVEN).process(block).item() * RATE, Ic(GIVEN).process(block).item()
+
+
+def test_reference_vectors() -> None:
+    _, expected, got = reference("Q01_itd_ic")
+    np.testing.assert_allclose(got["itd"], expected["itd"], rtol=0, atol=1e-14)
+    np.testing.assert_allclose(got["ic"], expected["ic"], rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("top", [-3.2, -2.5, -1.0, -0.2, 0.0, 0.3, 1.7, 3.49])
+@pytest.mark.parametrize("height", [1e-250, 0.4, 1.0])
+def test_the_top_of_a_parabola(top: float, height: float) -> None:
+    lags = np.arange(-4, 5)
+    itd, ic = of(height * (1 - 0.01 * (lags - top) ** 2))
+    assert itd == pytest.approx(top, abs=1e-12)
+    assert ic == pytest.approx(height, rel=1e-13)
+
+
+def test_it_is_the_formula() -> None:
+    """In rational numbers, for every place that the peak can have."""
+    rng = np.random.default_rng(5)
+    block = np.round(rng.standard_normal((40, 9, 50)), 1)  # with ties
+    itd, ic = Itd(GIVEN).process(block) * RATE, Ic(GIVEN).process(block)
+    places = set()
+    for channel, frame in np.ndindex(40, 50):
+        c = [Fraction(x) for x in block[channel, :, frame]]
+        i = c.index(max(c))
+        delta = Fraction(0)
+        if 0 < i < 8:
+            delta = (c[i - 1] - c[i + 1]) / (c[i - 1] - 2 * c[i] + c[i + 1]) / 2
+            assert ic[channel, frame] == pytest.approx(float(c[i] - (c[i - 1] - c[i + 1]) * delta / 4), rel=1e-14)
+        else:
+            assert ic[channel, frame] == float(c[i])
+        assert itd[channel, frame] == pytest.approx(float(i - 4 + delta), abs=1e-14)
+        places.add(i)
+    assert places == set(range(9))
+
+
+def test_equal_values() -> None:
+    assert of([0.0] * 9) == (0.0, 0.0)
+    assert of([0.3] * 9) == (0.0, 0.3)  # all lags are equal
+    assert of([-0.3] * 8 + [-0.4]) == (-4.0, -0.3)  # the first of equals, at the end: no parabola
+    assert of([0, 0, 1, 1, 0, 0, 1, 0, 0]) == (-1.5, 1.125)  # the first peak, between its two equals
+    assert of([0.1] * 8 + [0.2]) == (4.0, 0.2)
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_peak_that_rounding_flattens() -> None:
+    """1 less its neighbours is 0 for floating point if 2 c[i] is subtracted first."""
+    below = np.nextafter(1.0, 0.0)
+    assert of([0, 0, 0, 0, below, 1, 1, 0, 0]) == (1.5, 1.0)
+    itd, ic = of([0, 0, 5e-324, 1e-323, 5e-324, 0, 0, 0, 0])
+    assert itd == -1.0
+    assert ic == 1e-323
+
+
+@pytest.mark.parametrize("delay", [-9, -4, 0, 3, 8])
+def test_the_delay_between_the_ears(delay: int) -> None:
+    """Positive where the left ear hears it later; the filters ring, so that the peak lies between samples."""
+    sound = np.random.default_rng(2).standard_normal(6400)
+    ears = np.stack([np.roll(sound, delay), sound])
+    values = {"fb_cfHz": CHANNELS, "ihc_method": "none", "cc_maxDelaySec": 0.001}
+    made = process(ears, RATE, ["itd", "ic"], values)
+    assert made["itd"].shape == (3, 39)
+    np.testing.assert_allclose(made["itd"][:, 3:], delay / RATE, rtol=0, atol=2e-5)
+    assert made["ic"][:, 3:].min() > 0.98
+    assert made["itd_frameRate"] == made["ic_frameRate"] == 100.0
+
+
+def test_coherence_of_a_mixture() -> None:
+    """Noise of which the part p is common to the ears, in power: the coherence is near p."""
+    rng = np.random.default_rng(4)
+    common, own = rng.standard_normal(48000), rng.standard_normal((2, 48000))
+    values = {"fb_cfHz": [4000.0], "ihc_method": "none", "cc_wSizeSec": 0.5, "cc_hSizeSec": 0.5}
+    for part in (0.3, 0.7, 1.0):
+        ears = np.sqrt(part) * common + np.sqrt(1 - part) * own
+        assert np.median(process(ears, RATE, ["ic"], values)["ic"]) == pytest.approx(part, abs=0.07)
+
+
+def test_one_silent_ear() -> None:
+    sound = np.random.default_rng(2).standard_normal(3200)
+    made = process(np.stack([sound, 0 * sound]), RATE, ["itd", "ic"], {"fb_cfHz": CHANNELS})
+    assert not made["itd"].any()
+    assert not made["ic"].any()
+
+
+def test_lags_may_change_on_the_way() -> None:
+    sound = np.random.default_rng(2).standard_normal((2, 4800))
+    chain = Chain(RATE, ["itd", "ic"], {"in_doNormalize": False, "fb_cfHz": CHANNELS})
+    made = chain.run(sound, 1600, [(1, "cc_maxDelaySec", 0.0001), (2, "cc_maxDelaySec", 0.02)])
+    short = made["itd"][:, 9:19] * RATE
+    assert np.abs(short).max() <= 2
+    wide = process(sound, RATE, ["itd", "ic"], {"fb_cfHz": CHANNELS, "cc_maxDelaySec": 0.02})
+    np.testing.assert_allclose(made["itd"][:, 19:], wide["itd"][:, 19:], rtol=0, atol=1e-12)
+    assert chain.stages["itd"].output == replace(chain.stages["crossCorrelation"].output, lags=0)
+
+
+@pytest.mark.parametrize("kind", [Itd, Ic])
+def test_there_are_no_parameters(kind: type[Itd] | type[Ic]) -> None:
+    stage = kind(GIVEN)
+    assert stage.parameters == {}
+    with pytest.raises(ValueError, match=r"^cc_wname: "):
+        stage.configure(cc_wname="hann")
+
+
+def test_declarations() -> None:
+    for kind, request, unit in (("itd", "ItdProc", "s"), ("ic", "IcProc", "")):
+        declared = KINDS[kind]
+        assert (declared.request, declared.parent, declared.port) == (request, "crossCorrelation", f"{kind}Port")
+        assert (declared.parts[0].axes, declared.parts[0].unit) == (("channel", "time"), unit)
+        assert declared.binaural

@@ -1,0 +1,108 @@
+"""Medial olivocochlear attenuation: the reference vectors, the cubic and where it is cut off, and what is refused."""
+
+from __future__ import annotations
+
+import math
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rosafe.dsp.signal import Signal
+from rosafe.representations import KINDS
+from rosafe.representations.moc import Moc
+
+from .chain import FloatArray, reference
+
+GIVEN = Signal(16000.0, 100.0, True, 160, 320, (500.0,), "drnl")
+DEFAULTS = {"moc_extIpsi": 1.0, "moc_extContra": 1.0, "moc_thresholdRatedB": -180.0, "moc_maxAttenuationdB": 40.0}
+FACTORS = [Fraction(x) for x in ("-0.00012411", "-0.051322", "-6.3528", "-206.11")]
+
+
+def attenuation(levels: Any, **parameters: float) -> FloatArray:
+    """Of the levels (F,) 20 log10 R in dB."""
+    rates = np.broadcast_to(10 ** (np.array(levels, float) / 20), (2, 1, len(levels)))
+    return Moc(GIVEN, **parameters).process(rates)[1, 0]
+
+
+def cubic(level: float) -> float:
+    """P(y), in rational numbers."""
+    y, a, b, c, d = Fraction(level), *FACTORS
+    return float(a * y**3 + b * y**2 + c * y + d)
+
+
+def test_reference_vectors() -> None:
+    _, expected, got = reference("Q11_moc")
+    np.testing.assert_allclose(got["moc"], expected["moc"], rtol=0, atol=1e-9)
+
+
+def test_the_cubic_between_its_turning_points() -> None:
+    levels = np.linspace(-181.8, -93.83, 50)
+    expected = [max(0.0, cubic(level)) for level in levels]
+    got = attenuation(levels, moc_thresholdRatedB=-1000.0, moc_maxAttenuationdB=200.0)
+    np.testing.assert_allclose(got, expected, rtol=0, atol=1e-10)
+    assert (np.diff(got) >= 0).all()
+
+
+def test_it_saturates() -> None:
+    """The cubic alone would say 37 dB at -80 dB, 0 at -40 dB, and ever more below -182 dB."""
+    top, bottom = cubic(-93.821837), max(0.0, cubic(-181.858339))
+    free = {"moc_thresholdRatedB": -1000.0, "moc_maxAttenuationdB": 200.0}
+    np.testing.assert_allclose(attenuation([-93, -80, -40, 0, 100], **free), top, rtol=1e-12)
+    np.testing.assert_allclose(attenuation([-182, -190, -250, -900], **free), bottom, rtol=1e-12)
+    assert top == pytest.approx(40.656, abs=1e-3)
+    np.testing.assert_array_equal(attenuation([-93, -80, -40, 0, 100]), 40.0)
+    np.testing.assert_array_equal(attenuation([-93, -80], moc_maxAttenuationdB=7.5), 7.5)
+    np.testing.assert_array_equal(attenuation([-93, -120], moc_maxAttenuationdB=0.0), 0.0)
+
+
+def test_the_threshold() -> None:
+    """Below it the attenuation is that of the threshold; 0 dB makes every sound as loud as can be."""
+    got = attenuation([-300, -150, -140.5, -120], moc_thresholdRatedB=-140.0)
+    np.testing.assert_allclose(got, [cubic(-140.0)] * 3 + [cubic(-120.0)], rtol=1e-11)
+    np.testing.assert_array_equal(attenuation([-300, -150, -93], moc_thresholdRatedB=0.0), 40.0)
+
+
+@pytest.mark.filterwarnings("error")
+def test_no_sound_is_no_attenuation() -> None:
+    block = np.zeros((2, 1, 5))
+    block[:] = [0.0, -1.0, -1e-320, 1e-320, 1e140]
+    np.testing.assert_array_equal(Moc(GIVEN, moc_thresholdRatedB=0.0).process(block)[0, 0], [0, 0, 0, 40, 40])
+
+
+def test_changes_take_effect_at_once() -> None:
+    stage = Moc(GIVEN)
+    block = np.full((2, 1, 3), 10 ** (-120 / 20))
+    first = stage.process(block)
+    stage.configure(moc_maxAttenuationdB=1.5)
+    np.testing.assert_array_equal(stage.process(block), 1.5)
+    stage.configure(moc_mocMaxAttenuationdB=40.0)
+    np.testing.assert_array_equal(stage.process(block), first)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *((name, value) for name in ("moc_extIpsi", "moc_extContra") for value in (0.0, 0.5, 1.0000001, -1, 2)),
+        *(("moc_thresholdRatedB", value) for value in (1e-9, -1000.1, math.nan, "low")),
+        *(("moc_maxAttenuationdB", value) for value in (-1e-9, 200.1, math.inf)),
+    ],
+)
+def test_values_that_are_refused(name: str, value: Any) -> None:
+    with pytest.raises(ValueError, match=f"^{name}: "):
+        Moc(GIVEN, **{name: value})
+    stage = Moc(GIVEN)
+    with pytest.raises(ValueError, match=f"^{name}: "):
+        stage.configure(moc_maxAttenuationdB=1.0, **{name: value}) if name != "moc_maxAttenuationdB" else (
+            stage.configure(**{name: value})
+        )
+    assert stage.parameters == DEFAULTS
+
+
+def test_declaration() -> None:
+    declared = KINDS["moc"]
+    assert (declared.request, declared.port, declared.parent) == ("MocProc", "mocPort", "ratemap")
+    assert {p.name: p.default for p in declared.parameters} == DEFAULTS
+    aliases = ["moc_mocIpsi", "moc_mocContra", "moc_mocThresholdRatedB", "moc_mocMaxAttenuationdB"]
+    assert [declared.parameter(alias) for alias in aliases] == list(declared.parameters)

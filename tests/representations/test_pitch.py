@@ -1,0 +1,379 @@
+"""Pitch: the reference vectors, a model written out frame by frame, its memory and its look-ahead, and a glide."""
+
+from __future__ import annotations
+
+import copy
+import math
+import statistics
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rosafe.dsp.signal import Signal
+from rosafe.representations.pitch import Pitch
+
+from .chain import Chain, FloatArray, cut, process, reference
+
+FS = 1000.0
+# 10 frames a second, so that 5 s are 50 of them; lags from 0 to 30 ms
+GIVEN = Signal(FS, 10.0, True, 100, 31, (200.0, 300.0), "gammatone", lags=30)
+WIDE: dict[str, Any] = {"pi_rangeHz": [40.0, 400.0]}  # lags 3 to 25
+
+
+def correlations(frames: int, seed: int = 0, channels: int = 2, lags: int = 31) -> FloatArray:
+    """Numbers with few different values, so that there are plateaus and ties; some frames are silent, some negative."""
+    rng = np.random.default_rng(seed)
+    made = rng.integers(-3, 6, (2, channels, lags, frames)) / 8
+    made[..., rng.random(frames) < 0.1] = 0.0
+    made[..., rng.random(frames) < 0.1] -= 2.0
+    return made
+
+
+def peaks_at(lags: list[int], heights: list[float]) -> FloatArray:
+    """Frames of both ears whose only peak lies at these lags; none where the height is 0."""
+    made = np.zeros((2, 2, 31, len(lags)))
+    for frame, (lag, height) in enumerate(zip(lags, heights, strict=True)):
+        made[:, :, lag, frame] = height
+    return made
+
+
+def by_the_book(
+    frames: FloatArray, limits: list[float], threshold: float, order: int, rate: float = 10.0
+) -> tuple[list[float], list[float], list[float]]:
+    """One ear (C, L, F) to pitch, rawPitch and confidence, those that can be told."""
+    raw: list[float] = []
+    confidence: list[float] = []
+    chosen: list[float] = []
+    reach = max(1, math.floor(5 * rate + 0.5))
+    for frame in np.moveaxis(frames, -1, 0):
+        summary = [math.fsum(values) / len(values) for values in frame.T]
+        lags = [lag for lag in range(len(summary)) if 1 / max(limits) <= lag / FS <= 1 / min(limits)]
+        curve = np.array([summary[lag] for lag in lags])
+        peaks = [(float(curve[at]), -int(at)) for at in scipy.signal.find_peaks(curve)[0] if curve[at] > 0]
+        height, place = max(peaks, default=(0.0, 0))
+        raw.append(FS / lags[-place] if peaks else 0.0)
+        confidence.append(height)
+        chosen.append(raw[-1] if height >= threshold * max(confidence[-reach:]) else 0.0)
+    known = len(raw) - (math.ceil(order / 2) - 1)
+    padded = [0.0] * order + chosen
+    medians = [
+        statistics.median(padded[order + k - order // 2 : order + k + math.ceil(order / 2)]) for k in range(known)
+    ]
+    pitch = [value if value > 0 else math.nan for value in medians]
+    return pitch, raw[: max(0, known)], confidence[: max(0, known)]
+
+
+def test_reference_vectors() -> None:
+    _, expected, got = reference("Q07_pitch")
+    np.testing.assert_array_equal(np.isnan(got["pitch"]), np.isnan(expected["pitch"]))
+    np.testing.assert_allclose(got["pitch"], expected["pitch"], rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("channels", [1, 2, 5])
+@pytest.mark.parametrize("order", [1, 2, 3, 4, 7, 8, 99])
+@pytest.mark.parametrize("threshold", [0.0, 0.5, 0.7, 1.0])
+def test_it_is_the_formula(threshold: float, order: int, channels: int) -> None:
+    x = correlations(170, order, channels)
+    parameters = {**WIDE, "pi_confThres": threshold, "pi_medianOrder": order}
+    got = Pitch(GIVEN, **parameters).process(x)
+    for ear in range(2):
+        expected = by_the_book(x[ear], [40.0, 400.0], threshold, order)
+        np.testing.assert_allclose(got[ear], expected, rtol=1e-14, atol=1e-15)
+    if channels == 1:
+        assert (got[:, 1] == 0).any() and (got[:, 1] > 0).any()
+
+
+@pytest.mark.parametrize(
+    ("curve", "lag", "height"),
+    [
+        ([0, 0, 1, 0, 0, 0], 2, 1),
+        ([0, 0, 1, 1, 0, 0], 2, 1),  # a plateau, at the floor of its middle
+        ([0, 1, 1, 1, 0, 0], 2, 1),
+        ([0, 1, 1, 1, 1, 0], 2, 1),
+        ([0, 1, 0, 2, 0, 2], 3, 2),  # the last one is the range's end
+        ([3, 1, 2, 1, 0, 4], 2, 2),  # nor is the first one a peak
+        ([0, 1, 0, 1, 0, 0], 1, 1),  # the first of equals
+        ([0, 1, 1, 2, 2, 0], 3, 2),  # a step on the way up is none
+        ([2, 2, 1, 1, 1, 2], 0, 0),
+        ([0, 1, 2, 3, 3, 3], 0, 0),  # a plateau at the end
+        ([0, 0, 0, 0, 0, 0], 0, 0),
+        ([-9, -3, -9, -9, -9, -9], 0, 0),  # below 0
+        ([-9, 0, -9, -9, -9, -9], 0, 0),
+        ([-9, 0.5, -9, 0, -9, -9], 1, 0.5),
+    ],
+)
+def test_peaks(curve: list[float], lag: int, height: float) -> None:
+    """The range ends at lags 10 and 15, with more on both sides."""
+    x = np.full((2, 1, 31, 1), 7.0)
+    x[:, 0, 10:16, 0] = curve
+    got = Pitch(GIVEN, pi_rangeHz=[FS / 15.5, FS / 9.5], pi_medianOrder=1, pi_confThres=0).process(x)
+    assert got[0, 1:, 0].tolist() == [FS / (10 + lag) if height else 0.0, height]
+    assert got[1, 0, 0] == got[0, 1, 0] or (math.isnan(got[1, 0, 0]) and not height)
+
+
+@pytest.mark.parametrize("limits", [[80.0, 400.0], [100.0, 300.0], [0.1, 7.0], [49.0, 1e9], [90.0, 110.0]])
+@pytest.mark.parametrize("rate", [8000.0, 16000.0, 44100.0, 48000.0, 11025.0])
+def test_the_range(rate: float, limits: list[float]) -> None:
+    """In any order; both ends belong to it, as the quotients say."""
+    format_ = Signal(rate, 100.0, True, round(rate / 100), 2, (), "", lags=round(rate / 50))
+    lags = [lag for lag in range(format_.lags + 1) if 1 / limits[1] <= lag / rate <= 1 / limits[0]]
+    if len(lags) < 3:
+        with pytest.raises(ValueError, match=r"^pi_rangeHz: .* lags"):
+            Pitch(format_, pi_rangeHz=limits)
+        return
+    for given_limits in (limits, limits[::-1]):
+        stage = Pitch(format_, pi_rangeHz=given_limits, pi_medianOrder=1)
+        assert stage._range == slice(lags[0], lags[-1] + 1)
+        x = np.zeros((2, 1, format_.lags + 1, 3))
+        for frame, lag in enumerate((lags[0], lags[1], lags[-2])):
+            x[:, 0, lag, frame] = 1.0
+        np.testing.assert_allclose(stage.process(x)[0, 1], [0.0, rate / lags[1], rate / lags[-2]], rtol=1e-15)
+
+
+@pytest.mark.parametrize(("rate", "reach"), [(10.0, 50), (1.3, 7), (0.01, 1), (0.3, 2), (0.29, 1)])
+def test_five_seconds_of_confidences(rate: float, reach: int) -> None:
+    """A clear frame silences less clear ones for as long as it is remembered, and none before it."""
+    lags = [9] * (2 * reach + 5)
+    heights = [0.5] * len(lags)
+    heights[2] = 1.0
+    x = peaks_at(lags, heights)
+    for sizes in ([len(lags)], [1], [3, 0, 7]):
+        stage = Pitch(replace(GIVEN, rate=rate), **WIDE, pi_medianOrder=1)
+        got = np.concatenate([stage.process(block) for block in cut(x, sizes)], axis=-1)
+        silenced = np.isnan(got[1, 0])
+        assert silenced.tolist() == [3 <= k < 2 + reach for k in range(len(lags))]
+        np.testing.assert_allclose(got[1, 1], FS / 9)
+        np.testing.assert_allclose(got[1, 2], heights)
+
+
+# --- streams ----------------------------------------------------------------------------------------------------
+
+sizes = st.lists(st.one_of(st.sampled_from([0, 1, 2]), st.integers(0, 90)), min_size=1, max_size=9).filter(any)
+
+
+@given(sizes=sizes, order=st.sampled_from([1, 2, 3, 6, 41, 99]), rate=st.sampled_from([0.4, 10.0]))
+@settings(max_examples=40, deadline=None, database=None)
+def test_cuts_and_prefixes(sizes: list[int], order: int, rate: float) -> None:
+    def stage() -> Pitch:
+        return Pitch(replace(GIVEN, rate=rate), **WIDE, pi_medianOrder=order)
+
+    x = correlations(130)
+    whole = stage().process(x)
+    assert whole.shape == (2, 3, max(0, 130 - (math.ceil(order / 2) - 1)))
+    one, made, count = stage(), [], 0
+    for block in cut(x, sizes):
+        made.append(one.process(block))
+        count += block.shape[-1]
+        assert sum(part.shape[-1] for part in made) == one.complete(count)
+    np.testing.assert_array_equal(np.concatenate(made, axis=-1), whole)
+    first = stage().process(x[..., : sizes[0]])
+    np.testing.assert_array_equal(first, whole[..., : first.shape[-1]])
+
+
+@pytest.mark.filterwarnings("error")
+def test_silence_has_no_pitch() -> None:
+    got = Pitch(GIVEN, **WIDE).process(np.zeros((2, 4, 31, 20)))
+    assert np.isnan(got[:, 0]).all()
+    assert not got[:, 1:].any()
+    chain = Chain(8000.0, ["pitch"], {"fb_cfHz": [300.0, 900.0]})
+    for samples in (0, 1, 100, 1000, 900):
+        made = chain.process(np.zeros((2, samples)))["pitch"]
+        assert isinstance(made, np.ndarray)
+        assert np.isnan(made[:, 0]).all()
+        assert not made[:, 1:].any()
+
+
+def test_reset_and_other_channels_are_a_new_beginning() -> None:
+    """Frames that were held back are dropped then."""
+    for order in (3, 8):
+        stage = Pitch(GIVEN, **WIDE, pi_medianOrder=order)
+        expected = stage.process(correlations(40))
+        stage.reset()
+        np.testing.assert_array_equal(stage.process(correlations(40)), expected)
+        stage.receive(replace(GIVEN, center_frequencies=(1.0, 2.0)))
+        np.testing.assert_array_equal(stage.process(correlations(40)), expected)
+        stage.receive(replace(GIVEN, center_frequencies=(1.0, 2.0), filterbank="drnl"))
+        np.testing.assert_array_equal(stage.process(correlations(40)), expected)
+        fresh = Pitch(GIVEN, **WIDE, pi_medianOrder=order).process(correlations(40, channels=3))
+        np.testing.assert_array_equal(stage.process(correlations(40, channels=3)), fresh)  # nobody has told
+
+
+def test_what_comes_out() -> None:
+    stage = Pitch(GIVEN, **WIDE)
+    x = correlations(30)
+    x.setflags(write=False)
+    made = stage.process(x)
+    assert made.flags.c_contiguous and made.flags.writeable and made.dtype == np.float64
+    assert (made.shape, stage.output_rows((2, 5, 31))) == ((2, 3, 29), (2, 3))
+    kept = made.copy()
+    stage.process(x)
+    np.testing.assert_array_equal(made, kept)
+    assert (stage.output.rate, stage.output.hop, stage.output.lags, stage.look_ahead) == (10.0, 100, 0, 1)
+
+
+# --- parameters -------------------------------------------------------------------------------------------------
+
+
+def test_the_defaults_and_the_documentations_names() -> None:
+    stage = Pitch(Signal(16000.0, 100.0, True, 160, 320, (), "", lags=318))
+    assert stage.parameters == {"pi_rangeHz": [80.0, 400.0], "pi_confThres": 0.7, "pi_medianOrder": 3}
+    stage.configure(p_pitchRangeHz=[100, 300], p_confThresPerc=0, p_orderMedFilt=5)
+    assert stage.parameters == {"pi_rangeHz": [100.0, 300.0], "pi_confThres": 0.0, "pi_medianOrder": 5}
+
+
+@pytest.mark.parametrize("orders", [(3, 9), (9, 3), (1, 99), (99, 1), (4, 5), (5, 4), (2, 1)])
+def test_another_order_of_the_median(orders: tuple[int, int]) -> None:
+    """The next frame is the first that has not come out; each is as if its order had always been in force."""
+    x = correlations(150)
+    stage = Pitch(GIVEN, **WIDE, pi_medianOrder=orders[0])
+    made = [stage.process(x[..., :70])]
+    stage.configure(pi_medianOrder=orders[1])
+    made += [stage.process(block) for block in cut(x[..., 70:], [0, 1, 5, 30])]
+    wholes = [Pitch(GIVEN, **WIDE, pi_medianOrder=order).process(x) for order in orders]
+    count = 70 - (math.ceil(orders[0] / 2) - 1)
+    assert made[0].shape[-1] == max(0, count)
+    expected = np.concatenate((wholes[0][..., : max(0, count)], wholes[1][..., max(0, count) :]), axis=-1)
+    np.testing.assert_array_equal(np.concatenate(made, axis=-1), expected)
+
+
+def test_thresholds_and_ranges_hold_for_what_comes() -> None:
+    """What is held back stays as it was; greatest confidences are remembered."""
+    x = peaks_at([9, 9, 20, 20, 20, 20], [1.0, 0.5, 0.5, 0.5, 0.9, 0.6])
+    stage = Pitch(GIVEN, **WIDE, pi_medianOrder=1, pi_confThres=0.8)
+    made = [stage.process(x[..., :3])]
+    stage.configure(pi_confThres=0.6)
+    made.append(stage.process(x[..., 3:4]))
+    stage.configure(pi_rangeHz=[40.0, 60.0])
+    made.append(stage.process(x[..., 4:]))
+    got = np.concatenate(made, axis=-1)[0]
+    np.testing.assert_allclose(got[0], [FS / 9, math.nan, math.nan, math.nan, FS / 20, FS / 20])
+    np.testing.assert_allclose(got[1], [FS / 9, FS / 9, *[FS / 20] * 4])
+
+    stage = Pitch(GIVEN, **WIDE, pi_medianOrder=5, pi_confThres=0.4)
+    made = [stage.process(x)]
+    stage.configure(pi_confThres=1.0, pi_rangeHz=[100.0, 400.0])
+    made.append(stage.process(peaks_at([6, 6], [0.1, 0.1])))
+    got = np.concatenate(made, axis=-1)[0]
+    np.testing.assert_allclose(got[1], [FS / 9, FS / 9, *[FS / 20] * 4])
+    np.testing.assert_allclose(got[0], [FS / 20, FS / 20, FS / 20, FS / 20, FS / 20, FS / 20])
+
+
+def test_another_step_of_the_parent() -> None:
+    """5 s are as many frames as they are now; the frames that are remembered stay."""
+    stage = Pitch(GIVEN, **WIDE, pi_medianOrder=1)
+    assert not np.isnan(stage.process(peaks_at([9] * 20, [0.9] * 19 + [1.0]))[0, 0]).any()
+    stage.receive(replace(GIVEN, rate=4.0, hop=250))  # 20 frames
+    assert stage.output.rate == 4.0
+    assert np.isnan(stage.process(peaks_at([9] * 19, [0.65] * 19))[0, 0]).all()
+    stage.receive(replace(GIVEN, rate=1.0, hop=1000))  # 5 frames
+    assert not np.isnan(stage.process(peaks_at([9], [0.5]))[0, 0]).any()
+
+
+def test_another_window_of_the_parent() -> None:
+    stage = Pitch(GIVEN, pi_rangeHz=[20.0, 400.0])
+    stage.process(correlations(10))
+    stage.receive(replace(GIVEN, lags=12))
+    assert stage._range == slice(3, 13)
+    assert stage.process(correlations(10, lags=13)).shape == (2, 3, 10)  # with the one that was held back
+    with pytest.raises(ValueError, match=r"^pi_rangeHz: .* 2 lags"):
+        stage.receive(replace(GIVEN, lags=4))
+    assert stage.given.lags == 12
+    assert stage.process(correlations(10, lags=13)).shape == (2, 3, 10)
+    with pytest.raises(ValueError, match=r"^block: 31 lags"):
+        stage.process(correlations(10))
+
+
+def test_in_a_chain() -> None:
+    """A window of the autocorrelation that leaves too few lags is refused; new channels begin anew."""
+    x = np.random.default_rng(0).standard_normal((2, 6000))
+    values = {"fb_cfHz": [300.0, 900.0], "in_doNormalize": False}
+    chain = Chain(8000.0, ["autocorrelation", "pitch"], values)
+    with pytest.raises(ValueError, match=r"^pi_rangeHz: "):
+        chain.modify("ac_wSizeSec", 0.002)
+    made = chain.run(x, 2000, [(1, "ac_wSizeSec", 0.03), (2, "fb_cfHz", [300.0, 901.0])])
+    frames = made["autocorrelation"].shape[-1]
+    assert frames == 24 + 24 + 23
+    assert made["pitch"].shape[-1] == 23 + 24 + 22  # one is held back, then dropped
+    begun = Pitch(chain.stages["autocorrelation"].output).process(made["autocorrelation"][..., -23:])
+    np.testing.assert_allclose(made["pitch"][..., -22:], begun, rtol=1e-14)
+
+
+def test_copies_may_be_changed_and_thrown_away() -> None:
+    expected = Pitch(GIVEN, **WIDE).process(correlations(60))
+    stage, made = Pitch(GIVEN, **WIDE), []
+    for block in cut(correlations(60), 7):
+        planned = copy.copy(stage)
+        planned.configure(pi_medianOrder=9, pi_rangeHz=[50.0, 60.0], pi_confThres=0)
+        planned.receive(replace(GIVEN, center_frequencies=(5.0,), rate=1.0))
+        made.append(stage.process(block))
+    np.testing.assert_array_equal(np.concatenate(made, axis=-1), expected)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"pi_rangeHz": []},
+        {"pi_rangeHz": [80.0]},
+        {"pi_rangeHz": 80.0},
+        {"pi_rangeHz": [80.0, 100.0, 400.0]},
+        {"pi_rangeHz": [0.0, 400.0]},
+        {"pi_rangeHz": [-80.0, 400.0]},
+        {"pi_rangeHz": [80.0, math.inf]},
+        {"pi_rangeHz": [80.0, math.nan]},
+        {"pi_rangeHz": "80 400"},
+        {"pi_rangeHz": [100.0, 100.0]},  # one lag
+        {"pi_rangeHz": [1e-9, 2e-9]},  # none
+        {"pi_rangeHz": [5e-324, 5e-324]},
+        {"pi_rangeHz": [1e300, 1e308]},
+        {"pi_confThres": -0.1},
+        {"pi_confThres": 1.1},
+        {"pi_medianOrder": 0},
+        {"pi_medianOrder": 100},
+        {"pi_medianOrder": 2.5},
+    ],
+    ids=str,
+)
+def test_refusals(changes: dict[str, Any]) -> None:
+    (name,) = changes
+    with pytest.raises(ValueError, match=f"^{name}: "):
+        Pitch(GIVEN, **changes)
+    stage, twin = Pitch(GIVEN, **WIDE), Pitch(GIVEN, **WIDE)
+    for each in (stage, twin):
+        each.process(correlations(20))
+    other = {"pi_confThres": 0.1} if name != "pi_confThres" else {"pi_medianOrder": 9}
+    with pytest.raises(ValueError, match=f"^{name}: "):
+        stage.configure(**other, **changes)
+    assert stage.parameters == twin.parameters
+    np.testing.assert_array_equal(stage.process(correlations(20)), twin.process(correlations(20)))
+
+
+def test_other_blocks_are_refused() -> None:
+    for block in (np.zeros((2, 3, 5)), np.zeros((3, 3, 31, 5)), np.zeros((2, 3, 31, 5), complex)):
+        with pytest.raises(ValueError, match=r"^block: "):
+            Pitch(GIVEN).process(block)
+
+
+# --- sound ------------------------------------------------------------------------------------------------------
+
+
+def test_a_glide() -> None:
+    """Within 2 % where it is voiced, and it is voiced nearly everywhere; windows of several periods are needed."""
+    rate, seconds, window = 16000.0, 1.5, 0.04
+    time = np.arange(int(rate * seconds)) / rate
+    phase = np.cumsum(110.0 * 2 ** (time / seconds)) / rate  # one octave up
+    voice = sum(np.cos(2 * np.pi * harmonic * phase) / harmonic**0.5 for harmonic in range(1, 16))
+    x = 0.1 * np.stack((voice, 0.5 * np.roll(voice, 8)))
+    parameters = {"fb_nChannels": 16, "fb_lowFreqHz": 100.0, "fb_highFreqHz": 6500.0, "ac_wSizeSec": window}
+    got = process(x, rate, ["pitch"], parameters, 1000)
+    assert got["pitch_frameRate"] == 100.0
+    middle = np.arange(got["pitch"].shape[-1]) / 100 + window / 2
+    expected = 110.0 * 2 ** (middle / seconds)
+    for found in got["pitch"][:, 0]:
+        voiced = ~np.isnan(found)
+        assert voiced.mean() > 0.95
+        np.testing.assert_array_less(np.abs(found / expected - 1)[voiced], 0.02)

@@ -1,0 +1,401 @@
+"""Onset and offset maps: the reference vectors, the algorithm spelt out in plain Python, and changes on the way."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rosafe.dsp.signal import Signal
+from rosafe.representations import KINDS
+from rosafe.representations.transientmaps import KEPT, OffsetMap, OnsetMap
+from tests.dsp.implementations import TWINS, using
+
+from .chain import Chain, FloatArray, reference
+
+GIVEN = Signal(16000.0, 100.0, True, 160, 320, (200.0, 500.0, 1200.0, 3000.0), "gammatone")
+DEFAULTS = {"trm_minStrengthdB": 3.0, "trm_minSpread": 5, "trm_fuseWithinSec": 0.03, "trm_minValuedB": -2000.0}
+
+
+# --- the algorithm, step by step --------------------------------------------------------------------------------
+
+
+def peaks_of(x: Sequence[float]) -> list[int]:
+    found = []
+    for start in range(1, len(x)):
+        stop = start
+        while stop + 1 < len(x) and x[stop + 1] == x[start]:
+            stop += 1
+        if x[start - 1] < x[start] and stop + 1 < len(x) and x[stop + 1] < x[start]:
+            found.append((start + stop) // 2)
+    return found
+
+
+def offline(strengths: FloatArray, levels: FloatArray, values: dict[str, Any], rate: float) -> FloatArray:
+    """Which of the units (C, n) of a stretch stay."""
+    q = math.floor(values["trm_fuseWithinSec"] * rate + 0.5)
+    units = set()
+    for channel, (of_channel, level) in enumerate(zip(strengths, levels, strict=True)):
+        x = [
+            s if s >= values["trm_minStrengthdB"] and v >= values["trm_minValuedB"] else 0.0
+            for s, v in zip(of_channel.tolist(), level.tolist(), strict=True)
+        ]
+        stay: list[int] = []
+        for peak in sorted(peaks_of(x), key=lambda at: (-x[at], at)):
+            if q <= 2 or all(abs(peak - other) >= q for other in stay):
+                stay.append(peak)
+        units |= {(channel, at) for at in stay}
+    result = np.zeros(strengths.shape)
+    while units:
+        fragment, found = [], [units.pop()]
+        while found:
+            channel, at = found.pop()
+            fragment.append((channel, at))
+            near = {(channel + i, at + j) for i in (-1, 0, 1) for j in (-1, 0, 1)} & units
+            units -= near
+            found += near
+        if len(fragment) >= values["trm_minSpread"]:
+            for unit in fragment:
+                result[unit] = 1
+    return result
+
+
+def reach_of(values: dict[str, Any], rate: float) -> int:
+    return 2 * math.floor(values["trm_fuseWithinSec"] * rate + 0.5) + values["trm_minSpread"] - 1
+
+
+def column(strengths: FloatArray, levels: FloatArray, values: dict[str, Any], rate: float, k: int) -> FloatArray:
+    """Frame k of the map of one ear."""
+    reach = reach_of(values, rate)
+    first = max(0, k - reach)
+    stretch = slice(first, k + reach + 1)
+    return offline(strengths[:, stretch], levels[:, stretch], values, rate)[:, k - first]
+
+
+def spelt_out(
+    strengths: FloatArray,
+    levels: FloatArray,
+    values: dict[str, Any],
+    sizes: Sequence[int],
+    changes: Sequence[tuple[int, str, Any]] = (),
+    rate: float = 100.0,
+) -> FloatArray:
+    """The map of both ears; a change is for the frames that are not put out yet."""
+    values, come = dict(values), 0
+    made: list[list[FloatArray]] = []
+    for index, size in enumerate(sizes):
+        values.update({name: value for block, name, value in changes if block == index})
+        come += size
+        while len(made) + reach_of(values, rate) < come:
+            made.append([column(strengths[ear], levels[ear], values, rate, len(made)) for ear in range(2)])
+    return np.moveaxis(np.array(made).reshape(len(made), *strengths.shape[:2]), 0, -1)
+
+
+def run(
+    strengths: FloatArray,
+    levels: FloatArray,
+    values: dict[str, Any],
+    sizes: Sequence[int],
+    changes: Sequence[tuple[int, str, Any]] = (),
+    given_signal: Signal = GIVEN,
+) -> FloatArray:
+    """What the stage makes of it."""
+    stage, made, at = OnsetMap(given_signal, **values), [], 0
+    for index, size in enumerate(sizes):
+        for _, name, value in (change for change in changes if change[0] == index):
+            stage.configure(**{name: value})
+        made.append(stage.process(strengths[..., at : at + size], levels[..., at : at + size]))
+        at += size
+    return np.concatenate(made, axis=-1)
+
+
+def world(frames: int, seed: int, channels: int = 4) -> tuple[FloatArray, FloatArray]:
+    """Strengths and levels of few different values: plateaus and equals are everywhere."""
+    rng = np.random.default_rng(seed)
+    strengths = rng.integers(0, 7, (2, channels, frames)) * rng.integers(0, 2, (2, 1, frames))
+    return np.minimum(strengths, 5.0), rng.choice([-90.0, -60.0, -30.0, -2000.0], (2, channels, frames))
+
+
+# --- the reference ----------------------------------------------------------------------------------------------
+
+
+def test_reference_vectors() -> None:
+    _, expected, got = reference("Q09_onsetMap_offsetMap")
+    for kind in ("onsetMap", "offsetMap"):
+        assert expected[kind].sum() > 100
+        np.testing.assert_array_equal(got[kind], expected[kind])
+
+
+parameters = st.fixed_dictionaries(
+    {
+        "trm_minStrengthdB": st.sampled_from([0.0, 1.0, 2.5]),
+        "trm_minSpread": st.integers(1, 6),
+        "trm_fuseWithinSec": st.sampled_from([0.0, 0.01, 0.015, 0.02, 0.024, 0.025, 0.03, 0.07]),
+        "trm_minValuedB": st.sampled_from([-2000.0, -60.0, -59.9]),
+    }
+)
+block_sizes = st.lists(st.one_of(st.sampled_from([0, 1]), st.integers(0, 25)), min_size=1, max_size=6)
+changes = st.lists(
+    st.one_of(
+        st.tuples(st.integers(0, 5), st.just("trm_minStrengthdB"), st.sampled_from([0.0, 3.0])),
+        st.tuples(st.integers(0, 5), st.just("trm_minSpread"), st.integers(1, 9)),
+        st.tuples(st.integers(0, 5), st.just("trm_fuseWithinSec"), st.sampled_from([0.0, 0.02, 0.03, 0.1])),
+        st.tuples(st.integers(0, 5), st.just("trm_minValuedB"), st.sampled_from([-2000.0, -60.0])),
+    ),
+    max_size=3,
+)
+
+
+@settings(deadline=None, max_examples=150)
+@given(parameters, st.integers(0, 99), block_sizes, changes, st.integers(1, 5))
+def test_the_algorithm_spelt_out(
+    values: dict[str, Any], seed: int, sizes: list[int], changes: list[tuple[int, str, Any]], channels: int
+) -> None:
+    """Whatever the parameters, the blocks, and the changes between blocks."""
+    strengths, levels = world(sum(sizes), seed, channels)
+    np.testing.assert_array_equal(
+        run(strengths, levels, values, sizes, changes), spelt_out(strengths, levels, values, sizes, changes)
+    )
+
+
+@pytest.mark.parametrize("kind", ["onsetMap", "offsetMap"])
+def test_sparse_events_are_those_of_the_whole_signal(kind: str) -> None:
+    """Where conflicts do not make long chains, the windows change nothing."""
+    rng = np.random.default_rng(1)
+    strengths = np.zeros((2, 12, 300))
+    for at in range(20, 290, 23):
+        strengths[:, :, at - 3 : at + 3] += rng.uniform(0, 12, (2, 12, 6))
+    levels = np.zeros(strengths.shape)
+    stage = {"onsetMap": OnsetMap, "offsetMap": OffsetMap}[kind](GIVEN)
+    made = stage.process(strengths, levels)
+    assert made.shape[-1] == 290
+    assert made.sum() > 50
+    for ear in range(2):
+        np.testing.assert_array_equal(made[ear], offline(strengths[ear], levels[ear], DEFAULTS, 100.0)[:, :290])
+
+
+# --- pictures ---------------------------------------------------------------------------------------------------
+
+
+def marks(rows: list[str], **values: Any) -> list[str]:
+    """The map of strengths drawn as digits. By default all peaks within 4 frames stay."""
+    values = {"trm_minStrengthdB": 1.0, "trm_minSpread": 1, "trm_fuseWithinSec": 0.02, **values}
+    stage = OnsetMap(GIVEN, **values)
+    one = np.array([[float(character) for character in row + "0" * stage.look_ahead] for row in rows])
+    block = np.stack([one, np.zeros(one.shape)])
+    made = stage.process(block, np.zeros(block.shape))
+    assert not made[1].any()
+    return ["".join(".#"[int(unit)] for unit in row) for row in made[0]]
+
+
+def test_peaks() -> None:
+    assert marks(["012321"]) == ["...#.."]
+    assert marks(["03300444403333300"]) == [".#....#.....#...."]  # plateaus: the middle, or before that
+    assert marks(["0333333333330"]) == ["............."]  # none that is longer than what is looked at
+    assert marks(["550001"]) == [".....#"]  # the first frame is no peak
+    assert marks(["0202030100"], trm_minStrengthdB=2.0) == [".#.#.#...."]
+
+
+def test_fusing() -> None:
+    assert marks(["0102030201"]) == [".#.#.#.#.#"]  # 2 frames: all stay
+    # from the strongest to the weakest: what has gone claims nothing
+    assert marks(["0102030201"], trm_fuseWithinSec=0.03) == [".#...#...#"]
+    assert marks(["0101010"], trm_fuseWithinSec=0.03) == [".#...#."]  # of equals the earlier
+    assert marks(["010010"], trm_fuseWithinSec=0.03) == [".#..#."]  # 3 frames apart
+    assert marks(["01010"], trm_fuseWithinSec=0.03) == [".#..."]
+
+
+def test_fragments() -> None:
+    rows = ["00200000000002000000", "00020000020000000000", "00002000000000000000", "00000000000000002020"]
+    expected = ["..#.................", "...#................", "....#...............", "...................."]
+    assert marks(rows, trm_minSpread=3) == expected
+    assert marks(rows, trm_minSpread=4) == ["." * 20] * 4
+    tall = ["00020000"] * 4
+    assert marks(tall, trm_minSpread=4) == ["...#...."] * 4  # units, not channels
+    assert marks(tall, trm_minSpread=5) == ["........"] * 4
+
+
+def test_a_fragment_may_wind() -> None:
+    """The units that make it large enough lie as far away as they can."""
+    rows = ["0" * k + "2" + "0" * (9 - k) for k in (3, 4, 5, 6, 7)]
+    assert marks(rows, trm_minSpread=5) == [row.replace("0", ".").replace("2", "#") for row in rows]
+    assert not any("#" in row for row in marks(rows, trm_minSpread=6))
+
+
+def test_nothing_is_a_peak_without_neighbours() -> None:
+    """With a look-ahead of 0, as the formula for it has it."""
+    assert marks(["0202030100"], trm_fuseWithinSec=0.0) == [".........."]
+    assert marks(["0202030100"] * 2, trm_fuseWithinSec=0.0, trm_minSpread=2) == [".#.#.#.#.."] * 2
+
+
+# --- looking ahead ----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("values", "rate", "expected"),
+    [
+        ({}, 100.0, 10),
+        ({"trm_fuseWithinSec": 0.025}, 100.0, 10),  # 2.5 is 3
+        ({"trm_fuseWithinSec": 0.0249}, 100.0, 8),
+        ({"trm_fuseWithinSec": 0.0, "trm_minSpread": 1}, 100.0, 0),
+        ({}, 50.0, 8),
+        ({"trm_fuseWithinSec": 10.0, "trm_minSpread": 1024}, 100.0, 3023),
+    ],
+)
+def test_how_far(values: dict[str, Any], rate: float, expected: int) -> None:
+    stage = OnsetMap(replace(GIVEN, rate=rate), **values)
+    assert stage.look_ahead == expected
+    assert [stage.complete(expected + more) for more in (-1, 0, 1, 5)] == [0, 0, 1, 5]
+
+
+def test_the_next_frame_is_the_first_not_put_out_yet() -> None:
+    """A shorter look-ahead puts out several at once, a longer one none for a while."""
+    strengths, levels = world(60, 3)
+    stage = OnsetMap(GIVEN)
+    assert stage.process(strengths[..., :30], levels[..., :30]).shape[-1] == 20
+    stage.configure(trm_minSpread=1)
+    assert stage.process(strengths[..., :0], levels[..., :0]).shape[-1] == 4
+    stage.configure(trm_fuseWithinSec=0.1)  # 20
+    assert stage.process(strengths[..., 30:44], levels[..., 30:44]).shape[-1] == 0
+    assert stage.process(strengths[..., 44:45], levels[..., 44:45]).shape[-1] == 1
+
+
+def test_a_longer_window_finds_frames_that_were_put_out_long_ago() -> None:
+    size = KEPT + 300
+    strengths, levels = world(2 * size, 5, channels=1)
+    before: dict[str, Any] = {**DEFAULTS, "trm_minSpread": 1}
+    after = {**before, "trm_fuseWithinSec": 1.2, "trm_minValuedB": -60.0}
+    changes = [(1, name, after[name]) for name in ("trm_fuseWithinSec", "trm_minValuedB")]
+    got = run(strengths, levels, before, [size, size], changes)
+    assert got.shape[-1] == 2 * size - 240
+    first = size - 6
+    for k in (first, first + 1, first + 100):
+        expected = column(strengths[0], levels[0], after, 100.0, k)
+        np.testing.assert_array_equal(got[0, :, k], expected)
+
+
+def test_other_steps_of_the_parent() -> None:
+    """q and H follow the rate; the frames that are there stay."""
+    strengths, levels = world(60, 6)
+    values = {**DEFAULTS, "trm_minSpread": 2, "trm_minStrengthdB": 1.0, "trm_fuseWithinSec": 0.05}  # H 11
+    stage = OnsetMap(GIVEN, **values)
+    first = stage.process(strengths[..., :30], levels[..., :30])
+    assert first.shape[-1] == 19
+    stage.receive(replace(GIVEN, rate=60.0, hop=267))  # q 3, H 7
+    assert stage.look_ahead == 7
+    assert stage.output.rate == 60.0
+    rest = stage.process(strengths[..., 30:], levels[..., 30:])
+    assert rest.shape[-1] == 34
+    for k in range(19, 53):
+        expected = column(strengths[0], levels[0], values, 60.0, k)
+        np.testing.assert_array_equal(rest[0, :, k - 19], expected)
+
+
+# --- the level --------------------------------------------------------------------------------------------------
+
+
+def test_the_level_of_the_ratemap() -> None:
+    """From the ratemap to the map; a unit below trm_minValuedB counts for nothing, a limit set later too."""
+    rng = np.random.default_rng(8)
+    rates = 10 ** rng.uniform(-8, -2, (2, 4, 80))
+    settings_ = {"trm_minSpread": 1, "trm_fuseWithinSec": 0.02, "trm_minStrengthdB": 1.0}
+    free = Chain(GIVEN, ["onsetMap"], settings_, root="onsetStrength").run(rates, 9)["onsetMap"]
+    chain = Chain(GIVEN, ["onsetMap", "onsetStrength"], {**settings_, "trm_minValuedB": -40.0}, root="onsetStrength")
+    made = chain.run(rates, 9)
+    loud = 10 * np.log10(rates) >= -40
+    strengths = np.where(loud, made["onsetStrength"], 0.0)
+    expected = run(strengths, np.zeros(strengths.shape), {**DEFAULTS, **settings_}, [80])
+    np.testing.assert_array_equal(made["onsetMap"], expected)
+    assert (expected < free).any()
+    late = Chain(GIVEN, ["onsetMap"], settings_, root="onsetStrength")
+    got = late.run(rates, 40, [(1, "trm_minValuedB", -40.0)])["onsetMap"]
+    np.testing.assert_array_equal(got, np.concatenate([free[..., :36], expected[..., 36:]], axis=-1))
+
+
+@pytest.mark.parametrize("extra", [None, np.zeros((2, 4, 6)), np.zeros((2, 3, 7)), np.zeros((4, 7))])
+def test_a_block_without_its_level(extra: Any) -> None:
+    stage = OnsetMap(GIVEN)
+    assert stage.needs == "level"
+    with pytest.raises(ValueError, match=r"^level: "):
+        stage.process(np.zeros((2, 4, 7)), extra)
+
+
+# --- kernel and twin --------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("level", [3, 4])
+@pytest.mark.parametrize(
+    "values",
+    [
+        {},
+        {"trm_minSpread": 10, "trm_fuseWithinSec": 0.0, "trm_minStrengthdB": 0.0},
+        {"trm_minSpread": 3, "trm_fuseWithinSec": 0.4},
+        {"trm_minSpread": 1, "trm_fuseWithinSec": 0.04, "trm_minValuedB": -60.0},
+        {"trm_minSpread": 1024},
+    ],
+)
+@pytest.mark.parametrize("ties", [True, False])
+def test_the_kernel_gives_what_its_twin_gives(level: int, values: dict[str, Any], ties: bool) -> None:
+    if ties:
+        strengths, levels = world(400, 9, channels=12)
+    else:
+        rng = np.random.default_rng(10)
+        strengths, levels = rng.uniform(0, 20, (2, 12, 400)), rng.uniform(-90, 0, (2, 12, 400))
+    sizes = [150, 1, 0, 3, 200, 46]
+    made = []
+    for implementation in (TWINS, level):
+        with using(implementation):
+            made.append(run(strengths, levels, values, sizes))
+    np.testing.assert_array_equal(made[1], made[0])
+    if values.get("trm_minSpread") != 1024:
+        assert 0 < made[0].mean() < 0.5
+
+
+# --- refusals ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", [OnsetMap, OffsetMap])
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        *(("trm_minStrengthdB", value) for value in (-1e-9, 1000.1, math.nan)),
+        *(("trm_minSpread", value) for value in (0, 1025, -1, 2.5, "5")),
+        *(("trm_fuseWithinSec", value) for value in (-0.01, 10.01, math.inf)),
+        *(("trm_minValuedB", value) for value in (-2000.1, 1000.1, None)),
+    ],
+)
+def test_values_that_are_refused(kind: type[OnsetMap] | type[OffsetMap], name: str, value: Any) -> None:
+    with pytest.raises(ValueError, match=f"^{name}: "):
+        kind(GIVEN, **{name: value})
+    stage = kind(GIVEN)
+    with pytest.raises(ValueError, match=f"^{name}: "):
+        stage.configure(**{name: value})
+    assert stage.parameters == DEFAULTS
+    assert stage.look_ahead == 10
+
+
+def test_more_frames_than_can_be_meant() -> None:
+    with pytest.raises(ValueError, match=r"^trm_fuseWithinSec: too long"):
+        OnsetMap(replace(GIVEN, rate=1e9), trm_fuseWithinSec=10.0)
+    stage = OnsetMap(GIVEN, trm_fuseWithinSec=10.0)
+    with pytest.raises(ValueError, match=r"^trm_fuseWithinSec: too long"):
+        stage.receive(replace(GIVEN, rate=1e9))
+    assert stage.output.rate == 100.0
+
+
+def test_declarations() -> None:
+    for kind, request, parent in (
+        ("onsetMap", "OnsetMapProc", "onsetStrength"),
+        ("offsetMap", "OffsetMapProc", "offsetStrength"),
+    ):
+        declared = KINDS[kind]
+        assert (declared.request, declared.port, declared.parent) == (request, f"{kind}Port", parent)
+        assert {p.name: p.default for p in declared.parameters} == DEFAULTS
+        assert [p.idl for p in declared.parameters] == ["double", "unsigned long", "double", "double"]
+        assert declared.parts[0].axes == ("ear", "channel", "time")

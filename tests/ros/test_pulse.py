@@ -1,0 +1,149 @@
+"""A node knows whether it can be called, and tells /diagnostics, the log and systemd."""
+
+from __future__ import annotations
+
+import os
+import resource
+import signal
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import pytest
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+
+from rosafe.component import systemd
+from tests.harness import Graph, MasterProcess, wait_for
+from tests.ros.attacker import Target
+
+
+class Systemd:
+    """What takes the datagrams of a service."""
+
+    def __init__(self, address: str) -> None:
+        self.told: list[tuple[float, str]] = []
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._socket.bind(address)
+        self._thread = threading.Thread(target=self._run)
+        self._thread.start()
+
+    def _run(self) -> None:
+        while (data := self._socket.recv(4096)) != b"end":
+            self.told.append((time.monotonic(), data.decode()))
+
+    def count(self, what: str) -> int:
+        """How often it was told so."""
+        return sum(told == what for _, told in self.told)
+
+    def close(self) -> None:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sock:
+            sock.sendto(b"end", self._socket.getsockname())
+        self._thread.join()
+        self._socket.close()
+
+
+@contextmanager
+def listening(address: str) -> Iterator[Systemd]:
+    told = Systemd(address)
+    try:
+        yield told
+    finally:
+        told.close()
+
+
+@pytest.mark.parametrize("component", ["rosAFE", "bass"])
+def test_a_node_that_cannot_be_called_says_so_until_it_can(graph: Graph, tmp_path: Path, component: str) -> None:
+    """Subscribers that never read take all descriptors; systemd's watchdog is fed before and after, not meanwhile."""
+    name = f"{component}_watched"
+    with (
+        listening(str(tmp_path / "notify")) as told,
+        graph.node(
+            f"{component}-ros", "-i", name, NOTIFY_SOCKET=str(tmp_path / "notify"), WATCHDOG_USEC="6000000"
+        ) as process,
+        graph.collect("/diagnostics", DiagnosticArray) as messages,
+        ExitStack() as stack,
+    ):
+
+        def health() -> DiagnosticStatus:
+            statuses = [s for m in list(messages) for s in m.status if s.name == f"{name}: calls"]
+            return statuses[-1] if statuses else DiagnosticStatus(level=DiagnosticStatus.STALE)
+
+        target = Target(graph, process, name)
+        wait_for(lambda: told.count("WATCHDOG=1") > 1, 20, lambda: f"{told.told} {process}")
+        assert told.told[0][1] in ("READY=1", "WATCHDOG=1") and told.count("READY=1") == 1
+        wait_for(lambda: (health().level, health().message) == (DiagnosticStatus.OK, "this node can be called"), 20)
+
+        limits = resource.prlimit(process.pid, resource.RLIMIT_NOFILE)
+        limit = target.descriptors + 60
+        resource.prlimit(process.pid, resource.RLIMIT_NOFILE, (limit, limits[1]))
+        for number in range(limit):
+            stack.enter_context(target.subscribe("genom_state", f"/deaf{number}", wait=False))
+        wait_for(lambda: "this node cannot be called: " in health().message, 40, lambda: str(process))
+        assert health().level == DiagnosticStatus.ERROR and "no answer within" in health().message
+        fed = told.count("WATCHDOG=1")
+        wait_for(lambda: {v.key: v.value for v in health().values}["failed calls in a row"] > "3", 40)
+        assert told.count("WATCHDOG=1") == fed, "systemd may end it"
+        assert process.err.count("this node cannot be called: ") == 1
+
+        stack.close()
+        wait_for(lambda: health().message == "this node can be called", 40, lambda: str(process))
+        wait_for(lambda: told.count("WATCHDOG=1") > fed + 1, 20, lambda: f"{told.told}")
+        wait_for(lambda: process.err.count("this node can be called again") == 1, what=lambda: str(process))
+        target.assert_well()
+        assert process.stop(signal.SIGTERM) == 0
+        assert told.told[-1][1] == "STOPPING=1" and told.count("READY=1") == 1
+
+
+def test_what_takes_the_news_may_have_an_abstract_address_or_none(graph: Graph) -> None:
+    """And a watchdog that is meant for another process, or makes no sense, is none of ours."""
+    address = f"rosafe-test-{os.getpid()}"
+    with listening(f"\0{address}") as told:
+        for microseconds, pid in (("3000000", "1"), ("nonsense", ""), ("0", ""), ("", "")):
+            env = {"NOTIFY_SOCKET": f"@{address}", "WATCHDOG_USEC": microseconds, "WATCHDOG_PID": pid}
+            with graph.node("bass-ros", "-i", "unwatched", **env) as process:
+                wait_for(lambda: told.count("READY=1"), 20)
+                assert process.stop(signal.SIGTERM) == 0
+            assert [what for _, what in told.told] == ["READY=1", "STOPPING=1"]
+            told.told.clear()
+    with graph.node("bass-ros", "-i", "unwatched", NOTIFY_SOCKET="/nowhere/at/all", WATCHDOG_USEC="3000000") as process:
+        assert process.stop(signal.SIGTERM) == 0 and process.err == ""
+
+
+def test_the_watchdog_of_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("WATCHDOG_PID", raising=False)
+    for text, seconds in {"3000000": 3.0, "1": 1e-6, "": None, "0": None, "-5": None, "2e6": None, "²": None}.items():
+        monkeypatch.setenv("WATCHDOG_USEC", text)
+        assert systemd.watchdog_seconds() == seconds
+    monkeypatch.setenv("WATCHDOG_USEC", "5000000")
+    for pid, seconds in {str(os.getpid()): 5.0, "1": None}.items():
+        monkeypatch.setenv("WATCHDOG_PID", pid)
+        assert systemd.watchdog_seconds() == seconds
+
+
+def test_while_a_node_waits_for_a_master_systemd_is_patient(
+    private_graph: tuple[Graph, MasterProcess], tmp_path: Path
+) -> None:
+    graph, master = private_graph
+    master.kill()
+    address = str(tmp_path / "notify")
+    with listening(address) as told, graph.start("bass-ros", "--wait", NOTIFY_SOCKET=address) as process:
+        wait_for(lambda: len(told.told) > 2, 20, lambda: str(process))
+        assert told.told[-1][1] == f"STATUS=waiting for a ROS master at {graph.uri}\nEXTEND_TIMEOUT_USEC=30000000"
+        master.start(graph.env)
+        wait_for(lambda: told.told[-1][1] == "READY=1", 30, lambda: f"{told.told} {process}")
+
+
+def test_the_master_has_no_part_in_it(private_graph: tuple[Graph, MasterProcess], tmp_path: Path) -> None:
+    """A node whose master is gone can be called by those who know it, and is left alone by systemd."""
+    graph, master = private_graph
+    address = str(tmp_path / "notify")
+    env = {"NOTIFY_SOCKET": address, "WATCHDOG_USEC": "3000000"}
+    with listening(address) as told, graph.node("bass-ros", **env) as process:
+        master.kill()
+        wait_for(lambda: "no answer from the ROS master" in process.err, 20)
+        fed = told.count("WATCHDOG=1")
+        wait_for(lambda: told.count("WATCHDOG=1") > fed + 3, 20, lambda: f"{told.told} {process}")
+        assert "cannot be called" not in process.err

@@ -1,0 +1,386 @@
+"""The state machine that runs, without threads: every state that a small tree can get into, by every order of steps."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rosafe.dsp.signal import Signal
+from rosafe.tree.block import Block
+from rosafe.tree.states import ENDS, State, StateMachine
+
+SIGNAL = Signal.sound(1.0)
+STEPS = ("come", "go", "replace", "call", "begin", "skip", "compute", "tell", "rest")
+
+
+def block(number: int) -> Block:
+    return Block(number, (np.zeros((2, 0)),), 0, SIGNAL)
+
+
+class Machine(StateMachine):
+    """A processor without numerics; what a worker is about to do with it is `then`."""
+
+    def __init__(self, name: str, parent: Machine | None) -> None:
+        super().__init__(parent)
+        self.name = name
+        self.attached = self.roused = False
+        self.then = ""
+        self.number: int | None = None  # of the block at hand
+        self.seen: list[int] = []
+        self.released: list[int] = []
+        self.told: list[int] = []
+        self.begins: int | None = None  # the first block that it should see; None: any
+
+    def __str__(self) -> str:
+        return self.name
+
+    def follow(self, machines: dict[str, Machine]) -> None:
+        """As a copy: know the copies of the others."""
+
+        def twin(one: Any) -> Any:
+            return None if one is None else machines[one.name]
+
+        self.parent, self._reading = twin(self.parent), twin(self._reading)
+        self.children, self._holders = list(map(twin, self.children)), set(map(twin, self._holders))
+        self.seen, self.released, self.told = list(self.seen), list(self.released), list(self.told)
+
+    def rouse(self) -> None:
+        self.roused = self.roused or self.ready
+
+    def entered(self, state: State, number: int | None) -> None:
+        if state is State.RELEASE and number is not None:
+            self.released.append(number)
+
+    def fingerprint(self) -> tuple[Any, ...]:
+        def number(some: Block | None) -> int | None:
+            return None if some is None else some.number
+
+        return (
+            *(self.state, self.at_work, self.called, self.attached, self.roused, self.then, self.number),
+            *(number(some) for some in (self.shared, self.untold, self._private, self._token)),
+            *(None if one is None else str(one) for one in (self.parent, self._reading)),
+            *(tuple(sorted(map(str, group))) for group in (self.children, self._holders)),
+            *(tuple(self.seen), tuple(self.released), tuple(self.told)),
+        )
+
+
+class World:
+    """An input, what may hang on it, and perhaps one that takes its place.
+
+    Parameters
+    ----------
+    parents : dict of str to str
+        The parent of each name; of the inputs an empty one.
+    blocks : int
+        That an input reads until it ends; the numbers of the second one's begin at 10.
+    called_once : bool
+        All are there from the start, and the input is called then and never again.
+    """
+
+    def __init__(self, parents: dict[str, str], blocks: int, called_once: bool = False) -> None:
+        self.machines: dict[str, Machine] = {}
+        for name, parent in parents.items():
+            self.machines[name] = Machine(name, self.machines.get(parent))
+        self.coming = {name: [first + n for n in range(blocks)] for name, first in (("root", 0), ("new", 10))}
+        self.called_once = called_once
+        self.attach(self.machines["root"])
+        if called_once:
+            self.call(self.machines["root"])
+
+    def attach(self, machine: Machine) -> None:
+        machine.attached = True
+        if machine.parent is not None and machine.parent.shared is not None:
+            machine.begins = machine.parent.shared.number
+        machine.attach()
+
+    def steps(self) -> list[tuple[str, str]]:
+        """All that can happen next, each as a name and a step."""
+        return [(name, step) for name in self.machines for step in STEPS if self.can(self.machines[name], step)]
+
+    def can(self, one: Machine, step: str) -> bool:
+        above = one.parent
+        if step == "come":
+            return above is not None and not one.attached and above.attached and not above.gone  # type: ignore[attr-defined]
+        if step == "go":
+            return above is not None and one.attached and not one.gone
+        if step == "replace":
+            return one.name == "new" and not one.attached and self.machines["root"].state is not State.DONE
+        if step == "call":
+            listens = above is None and one.attached and not one.called and one.state not in ENDS
+            return listens and not self.called_once
+        if step == "begin":
+            return one.roused and one.ready
+        return one.then in {"rest": ("rest", "tell"), "skip": ("compute",)}.get(step, (step,))
+
+    def after(self, name: str, step: str) -> World:
+        """The world after that step."""
+        world = copy.copy(self)
+        world.machines = {name: copy.copy(machine) for name, machine in self.machines.items()}
+        world.coming = {name: list(numbers) for name, numbers in self.coming.items()}
+        for machine in world.machines.values():
+            machine.follow(world.machines)
+        getattr(world, step)(world.machines[name])
+        return world
+
+    # requests
+
+    def come(self, one: Machine) -> None:
+        self.attach(one)
+
+    def go(self, one: Machine) -> None:
+        for child in list(one.children):
+            self.go(child)  # type: ignore[arg-type]
+        one.remove()
+
+    def replace(self, new: Machine) -> None:
+        old = self.machines["root"]
+        for child in list(old.children):
+            child.move(new)
+            child.begins = None  # type: ignore[attr-defined]
+        for other in self.machines.values():
+            if other.parent is old:
+                other.parent = new
+        old.remove()
+        self.attach(new)
+
+    def call(self, one: Machine) -> None:
+        one.called = True
+        one.rouse()
+
+    # what a worker does, each step with the lock held
+
+    def begin(self, one: Machine) -> None:
+        one.roused = False
+        telling = one.state is State.RELEASE
+        taken = one.begin()
+        if telling:
+            one.then = "tell"
+            return
+        if one.parent is not None:
+            assert taken is not None
+            one.number = taken.number
+        elif self.coming[one.name]:
+            one.number = self.coming[one.name].pop(0)
+            one.read(one.number)
+        else:
+            one.finish()
+            one.then = "rest"
+            return
+        one.seen.append(one.number)
+        one.then = "compute"
+
+    def compute(self, one: Machine) -> None:
+        assert one.number is not None
+        one.give_back()
+        one.hold(block(one.number))
+        one.number = None
+        one.then = "rest" if one.untold is None else "tell"
+
+    def skip(self, one: Machine) -> None:
+        """A block that it cannot use."""
+        one.give_back()
+        one.number = None
+        one.then = "rest"
+
+    def tell(self, one: Machine) -> None:
+        if one.untold is not None:
+            if not one.gone:
+                one.told.append(one.untold.number)
+            one.untold = None
+        one.then = "rest"
+
+    def rest(self, one: Machine) -> None:
+        """Also before it has told: somebody else may do that."""
+        one.then = ""
+        one.rest()
+
+    # what holds
+
+    def check(self) -> None:
+        """At any moment."""
+        for one in self.machines.values():
+            for first in (0, 10) if one.parent is not None else ():
+                came = self.released(one, range(first, first + 10))
+                seen = [n for n in one.seen if n in range(first, first + 10)]
+                assert not seen or seen == came[came.index(seen[0]) :][: len(seen)], f"{one.name} saw {one.seen}"
+            assert one.told == one.released[: len(one.told)], f"{one.name} told {one.told} of {one.released}"
+            if one.seen and one.begins is not None:
+                assert one.seen[0] == one.begins
+            if one.ready:
+                assert one.roused, f"{one.name} is ready, and nobody knows"
+            reading = one._reading
+            if one.number is not None and reading is not None and not reading.gone and not one.gone:
+                assert reading.shared is not None
+                assert reading.shared.number == one.number, "a block changed under its reader"
+            assert (one.parent is None) or (one in one.parent.children) == (
+                one.attached and not one.gone and not one.parent.gone
+            )
+
+    def released(self, child: Machine, numbers: range) -> list[int]:
+        """Which of these its parent has released, or the input before that."""
+        parents = {child.parent}
+        if child.parent is self.machines.get("new"):
+            parents.add(self.machines["root"])
+        return sorted(n for parent in parents for n in parent.released if n in numbers)  # type: ignore[union-attr]
+
+    def check_end(self) -> None:
+        """Where nothing can happen any more but that somebody comes or goes."""
+        replaced = self.machines["root"].gone
+        for one in self.machines.values():
+            if one.attached and not one.gone:
+                assert one.over and one.state is State.DONE, f"{one.name} waits for ever"
+                assert not one._holders
+                assert one.untold is None
+                if one.parent is not None and one.begins is not None and not replaced:
+                    assert one.seen[-1:] == one.parent.released[-1:]  # type: ignore[attr-defined]
+
+
+def explore(start: World) -> tuple[int, int]:
+    """Go through all states; their number, and that of those in which only requests are left."""
+    known = {fingerprint(start)}
+    unexplored = [start]
+    ends = 0
+    while unexplored:
+        world = unexplored.pop()
+        steps = world.steps()
+        if all(step in ("come", "go", "replace") for _, step in steps):
+            world.check_end()
+            ends += 1
+        for name, step in steps:
+            following = world.after(name, step)
+            following.check()
+            mark = fingerprint(following)
+            if mark not in known:
+                known.add(mark)
+                unexplored.append(following)
+    return len(known), ends
+
+
+def fingerprint(world: World) -> tuple[Any, ...]:
+    return tuple(machine.fingerprint() for machine in world.machines.values())
+
+
+CHILD = {"root": "", "a": "root"}
+GRANDCHILD = {**CHILD, "c": "a"}
+SIBLINGS = {**CHILD, "b": "root"}
+ANOTHER_INPUT = {"root": "", "new": "", "a": "root"}
+
+
+@pytest.mark.parametrize(
+    ("parents", "blocks", "least"),
+    [
+        (CHILD, 3, 4_000),
+        (ANOTHER_INPUT, 1, 6_000),
+        pytest.param(GRANDCHILD, 2, 14_000, marks=pytest.mark.long),
+        pytest.param(SIBLINGS, 2, 50_000, marks=pytest.mark.long),
+        pytest.param({**SIBLINGS, "c": "a"}, 1, 30_000, marks=pytest.mark.long),
+        pytest.param(ANOTHER_INPUT, 2, 150_000, marks=pytest.mark.long),
+    ],
+)
+def test_every_order_of_steps(parents: dict[str, str], blocks: int, least: int) -> None:
+    """Each sees a contiguous run of what its parent releases, nobody waits in vain, and who is ready is known to be."""
+    states, ends = explore(World(parents, blocks))
+    assert states > least
+    assert ends > 50
+
+
+def test_all_blocks_may_be_there_before_the_first_look() -> None:
+    explore(World(CHILD, 3, called_once=True))
+
+
+def test_a_call_that_is_forgotten_while_it_tells_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    begin = StateMachine.begin
+
+    def forget(self: StateMachine) -> Block | None:
+        self.called = False
+        return begin(self)
+
+    monkeypatch.setattr(StateMachine, "begin", forget)
+    with pytest.raises(AssertionError, match="waits for ever"):
+        explore(World(CHILD, 3, called_once=True))
+
+
+@pytest.mark.parametrize(
+    ("name", "mutant", "fault"),
+    [
+        ("_freed_by", lambda self, child: self._holders.discard(child), "waits for ever"),
+        (
+            "give_back",
+            lambda self: self.parent and self.parent._freed_by(self),
+            "changed under its reader|waits for ever|saw",
+        ),
+        ("_end_if_exhausted", lambda self: None, "waits for ever"),
+        ("_leave", lambda self: self.parent and self.parent.children.remove(self), "waits for ever|changed|assert"),
+    ],
+)
+def test_faults_are_found(name: str, mutant: Any, fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(StateMachine, name, mutant)
+    with pytest.raises(AssertionError, match=fault):
+        for parents in (CHILD, ANOTHER_INPUT):
+            explore(World(parents, 2))
+
+
+# --- single steps ---
+
+
+def machine(name: str, parent: Machine | None = None, *released: int) -> Machine:
+    """One that is attached, and has released these blocks."""
+    one = Machine(name, parent)
+    one.attach()
+    for number in released:
+        one.hold(block(number))
+        one.untold = None
+        one.rest()
+    return one
+
+
+def test_a_block_is_not_released_while_a_child_holds_the_last_one() -> None:
+    parent = machine("parent")
+    child = machine("child", parent)
+    parent.hold(block(0))
+    assert (child.begin() or block(-1)).number == 0
+    parent.rest()
+    parent.hold(block(1))
+    assert parent.state is State.WAIT_RELEASE
+    assert parent.shared is not None and parent.shared.number == 0
+    child.give_back()
+    assert parent.shared.number == 1
+
+
+def test_a_token_is_taken_once() -> None:
+    parent = machine("parent", None, 0)
+    late = machine("late", parent)
+    assert late.ready
+    assert late.begin() is not None
+    late.give_back()
+    late.rest()
+    assert not late.ready
+    assert late.begin() is None
+
+
+def test_siblings_read_the_same_memory() -> None:
+    parent = machine("parent")
+    siblings = [machine(name, parent) for name in "abc"]
+    parent.hold(block(0))
+    taken = [child.begin() for child in siblings]
+    assert all(one is parent.shared for one in taken)
+    for child in siblings:
+        assert parent._holders
+        child.give_back()
+    assert not parent._holders
+
+
+def test_one_that_was_removed_releases_nothing_and_holds_up_nobody() -> None:
+    parent = machine("parent")
+    child = machine("child", parent)
+    parent.hold(block(0))
+    child.begin()
+    child.remove()
+    assert not parent._holders
+    child.give_back()
+    child.hold(block(0))
+    child.rest()
+    assert child.over and child.shared is None and not child.ready
