@@ -203,10 +203,13 @@ class FramedStage(Stage):
         self._buffer.drop(means.shape[-1] * self._framing.hop)
         return means
 
-    def _frames(self, block: FloatArray, weights: FloatArray) -> kernels.Frames:
-        """The frames that `block` completes, for a kernel; the buffer has moved on then."""
+    def _frames(self, block: FloatArray, weights: FloatArray, rows: tuple[int, ...] | None = None) -> kernels.Frames:
+        """The frames that `block` completes, for a kernel; the buffer has moved on then.
+
+        `rows` are those of what is held, where that is not what comes.
+        """
         arriving, hop = block.shape[-1], self._framing.hop
-        self._buffer.begin(block.shape[:-1])
+        self._buffer.begin(block.shape[:-1] if rows is None else rows)
         if self._buffer.held == 0:
             self._begun = None
         skip = self._buffer.skip

@@ -337,7 +337,10 @@ def test_constants_are_those_of_the_sources() -> None:
     sources = {path.name: path.read_text() for path in (ROOT / "rosafe" / "dsp" / "kernels").glob("*.[ch]")}
     assert f"MOST_POLES = {kernels.MOST_POLES} " in sources["gammatone.c"]
     assert f"MOST_SECTIONS = {kernels.MOST_SECTIONS} " in sources["biquads.c"]
-    assert f"MOST_LAGS = {kernels.MOST_LAGS}," in sources["correlation.c"]
+    assert f"MOST_LAGS = {kernels.MOST_LAGS}," in sources["products.h"]
+    assert f"MOST_POINTS = {kernels.MOST_POINTS // 2} " in sources["fourier.h"]
+    assert f"TAPS = {kernels.TAPS} " in sources["precedence.c"]
+    assert f"TOGETHER = {kernels.TOGETHER} " in sources["precedence.c"]
     assert f"MOST_LOOPS = {kernels.MOST_LOOPS} " in sources["adaptation.c"]
     assert f"MOST_SIZE = {kernels.MOST_SIZE} " in sources["autocorrelation.c"]
     assert kernels.CLIPPINGS == ("clp", "clc", "sgn")
