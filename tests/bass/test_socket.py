@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from rosafe.bass import socket_server
 from rosafe.bass.capture import Snapshot
 from rosafe.bass.socket_server import DedicatedSocket, read_frames, take_requests
-from tests.harness import wait_for
+from tests.harness import PATIENCE, wait_for
 
 
 def port_content(last: int, length: int) -> Snapshot:
@@ -63,7 +63,7 @@ class Server:
 
     @contextmanager
     def client(self) -> Iterator[socket.socket]:
-        with socket.create_connection(self.address, timeout=10) as connection:
+        with socket.create_connection(self.address, timeout=PATIENCE) as connection:
             yield connection
 
 
@@ -72,7 +72,7 @@ def server() -> Iterator[Server]:
     running = Server()
     yield running
     running.stopping.set()
-    running.thread.join(5)
+    running.thread.join(PATIENCE)
     assert not running.thread.is_alive()
 
 
@@ -200,7 +200,7 @@ def test_conversation(server: Server) -> None:
 
 
 def test_as_many_clients_as_promised(server: Server) -> None:
-    connections = [socket.create_connection(server.address, timeout=10) for _ in range(socket_server.MAX_CLIENTS)]
+    connections = [socket.create_connection(server.address, timeout=PATIENCE) for _ in range(socket_server.MAX_CLIENTS)]
     for index, connection in enumerate(connections):
         connection.sendall(b"Read Port - N 1 - nfr %d\n" % (81 + index % 20))
     assert [receive(c)[3] for c in connections] == [[81 + index % 20] for index in range(len(connections))]
@@ -251,7 +251,7 @@ def test_end_closes_connections_and_frees_the_port(server: Server) -> None:
         wait_for(lambda: server.clients() == 1)
         server.stopping.set()
         assert connection.recv(1) == b""
-    server.thread.join(5)
+    server.thread.join(PATIENCE)
     with socket.create_server(server.address):
         pass
 

@@ -11,6 +11,7 @@ import pytest
 from rosafe.bass import socket_client
 from rosafe.bass.socket_client import Block, SocketClient, blocks
 from tests.bass.test_socket import Server, port_content
+from tests.harness import PATIENCE
 
 
 @pytest.fixture
@@ -18,7 +19,7 @@ def server() -> Iterator[Server]:
     running = Server()
     yield running
     running.stopping.set()
-    running.thread.join(5)
+    running.thread.join(PATIENCE)
 
 
 def numbers(block: Block) -> list[int]:
@@ -73,6 +74,6 @@ def test_broken_connection_is_an_error(server: Server) -> None:
     server.stopping.set()
     with pytest.raises(OSError, match=r"closed the connection|reset|Broken pipe"):
         next(stream)
-    server.thread.join(5)
+    server.thread.join(PATIENCE)
     with pytest.raises(ConnectionRefusedError):
         next(blocks(host, port))

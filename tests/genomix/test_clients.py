@@ -118,7 +118,7 @@ def test_sessions_and_requests_are_bounded(empty_world: World) -> None:
     ids=range(7),
 )
 def test_garbage_hurts_nobody(world: World, garbage: bytes) -> None:
-    with socket.create_connection(("127.0.0.1", world.port), timeout=10) as connection:
+    with socket.create_connection(("127.0.0.1", world.port), timeout=harness.PATIENCE) as connection:
         try:
             connection.sendall(garbage)
             connection.shutdown(socket.SHUT_WR)
@@ -202,7 +202,7 @@ def test_vanished_clients_leave_nothing(world: World) -> None:
         for connection in (listener, half, download):
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\1\0\0\0\0\0\0\0")  # a reset, as from a crash
             connection.close()
-    harness.wait_for(lambda: open_files(pid) <= files + 8, 10, lambda: f"{open_files(pid)} files, {files} before")
+    harness.wait_for(lambda: open_files(pid) <= files + 8, what=lambda: f"{open_files(pid)} files, {files} before")
     assert threads(pid) <= before + 20  # those of the pool stay
 
 
@@ -225,7 +225,7 @@ def test_a_client_that_is_killed_takes_its_session_with_it(world: World) -> None
 
 
 async def wait_until(condition: Callable[[], bool]) -> None:
-    async with asyncio.timeout(10):
+    async with asyncio.timeout(harness.PATIENCE):
         while not condition():
             await asyncio.sleep(0.005)
 

@@ -74,7 +74,7 @@ def test_a_signal_ends_it_whatever_clients_do(home_graph: harness.Graph, number:
         kept = socket.create_connection(("127.0.0.1", port))
         kept.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
         assert kept.recv(10) == b"HTTP/1.1 2"
-        assert process.stop(number, timeout=5) == 0
+        assert process.stop(number, timeout=harness.END_SECONDS) == 0
         assert next(events) == ("quit", "")
         kept.close()
         assert "Traceback" not in process.err
@@ -115,7 +115,7 @@ def test_a_private_server_ends_with_its_starter(home_graph: harness.Graph) -> No
     port = int(process.stdout.readline())
     assert Http(port).raw("/")[0] == 200
     process.stdin.close()
-    assert process.wait(8) == 0
+    assert process.wait(harness.PATIENCE) == 0
 
 
 def test_verbosity(home_graph: harness.Graph) -> None:

@@ -74,7 +74,7 @@ def test_a_component_that_hangs_keeps_others_out_of_it(empty_world: World) -> No
             world.http.get("/request/abort", id=number, s="t")
         assert (caught.value.ex, caught.value.status) == ("::genom::syserr", 422)
         bass_signal(bass, signal.SIGCONT)
-        caller.join(20)
+        caller.join(harness.PATIENCE)
         assert answers == [{}]
 
 
@@ -150,7 +150,7 @@ def code(script: str) -> str:
 @contextmanager
 def slow_bass(world: World, opened: Path) -> Iterator[harness.Process]:
     with world.graph.start(harness.PYTHON, "-c", code(SLOW_BASS), str(opened)) as process:
-        harness.wait_for(lambda: "/bass/Stop" in world.graph.services(), harness.UP_SECONDS)
+        harness.wait_for(lambda: "/bass/Stop" in world.graph.services())
         yield process
 
 
@@ -188,7 +188,7 @@ def test_what_is_acknowledged_runs(empty_world: World, tmp_path: Path) -> None:
         sender.join(0.8)
         assert numbers == []
         opened.touch()
-        sender.join(20)
+        sender.join(harness.PATIENCE)
         world.http.call("bass/Stop")
         assert world.http.wait(numbers[0], "done")["output"] == {}
 

@@ -34,7 +34,7 @@ def environment(**more: str) -> dict[str, str]:
 
 
 def run(
-    *command: str | Path, env: dict[str, str], cwd: Path = Path("/"), seconds: int = 120
+    *command: str | Path, env: dict[str, str], cwd: Path = Path("/"), seconds: int = 240
 ) -> subprocess.CompletedProcess[str]:
     """Run a command to its end, whatever that is."""
     return subprocess.run(

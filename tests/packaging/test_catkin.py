@@ -17,7 +17,6 @@ from rosafe.ros import generate
 from tests.harness import PYTHON, Graph, MasterProcess, wait_for
 from tests.packaging.clone import environment, fresh_copy, run
 
-pytestmark = pytest.mark.timeout(400)  # the build, where the processors have other work
 NEEDED = ("catkin_make", "cmake", "make", "cc")
 
 
@@ -144,7 +143,7 @@ def test_both_nodes_run_from_the_install_space(
         graph.start("env", "-i", *plain, "sh", "-c", f"{setup} && exec rosAFE-ros") as rosafe,
     ):
         for name, node in (("bass", bass), ("rosAFE", rosafe)):
-            wait_for(lambda name=name: f"/{name}/Stop" in graph.services(), 30, lambda node=node: str(node))  # type: ignore[misc]
+            wait_for(lambda name=name: f"/{name}/Stop" in graph.services(), what=lambda node=node: str(node))  # type: ignore[misc]
         called = printed(sourced(workspace, "rosservice call /bass/Acquire \"{device: 'scene:'}\"", **ros))
         assert "genom_success: True" in called
         heard = printed(sourced(workspace, "rostopic echo -n1 /bass/Audio/sampleRate", **ros))

@@ -201,7 +201,7 @@ def test_kill_ends_everything_and_the_node(graph: Graph) -> None:
         afe.ok("kill")
         for goal in goals.values():
             succeeded(goal)
-        assert afe.process.wait(5.0) == 0
+        assert afe.process.wait() == 0
         assert "Traceback" not in afe.process.err
         assert "/own" not in graph.nodes()
 
@@ -258,5 +258,5 @@ def test_the_action_status_is_published_on_change_only(afe: Session) -> None:
         wait_for(lambda: messages, what="the latched one")
         afe.build("PreProc")
         with afe.graph.collect("/rosAFE/genom_state", rosAFE.msg.genom_state_component) as states:
-            wait_for(lambda: len(states) >= 3, timeout=10)
+            wait_for(lambda: len(states) >= 3)
         assert len(messages) == 1, "a plain service is no goal"

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from rosafe.ros.audio import MAX_RATE, RING_SECONDS, AudioReader, AudioRing
-from tests.harness import wait_for
+from tests.harness import PATIENCE, wait_for
 
 RATE = 8  # Hz: the ring holds 80 frames
 CAPACITY = int(RING_SECONDS * RATE)
@@ -346,7 +346,7 @@ def test_waiting_for_the_first_message() -> None:
     waiting = threading.Thread(target=lambda: found.append(ring.open_reader(4, 60.0, lambda: False)))
     waiting.start()
     feed(Source(index=7).message())
-    waiting.join(10)
+    waiting.join(PATIENCE)
     assert found[0].position == 8 and found[0].sample_rate == RATE
 
 
@@ -369,7 +369,7 @@ def test_a_blocked_reader_wakes_for_a_block_and_for_stop() -> None:
         feed(source.message())
     wait_for(lambda: came == [7, 13], what=lambda: str(came))
     reader.stop()
-    thread.join(10)
+    thread.join(PATIENCE)
     assert not thread.is_alive()
     assert reader.read() is None
 

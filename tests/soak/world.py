@@ -166,7 +166,7 @@ class World:
         with Chain(blocks, self.size.rate, {"in_doNormalize": True, **parameters}, list(KINDS), keep) as chain:
             chain.run()
         for kind in KINDS:
-            assert_holds(self.afe.read(kind, end + 1, timeout=60.0), kind, truth[kind].view().array())
+            assert_holds(self.afe.read(kind, end + 1), kind, truth[kind].view().array())
 
     def counters(self) -> dict[str, Any]:
         """What rosAFE counts of the audio, from /diagnostics."""

@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from types import SimpleNamespace, TracebackType
 from typing import Any
 
-HANG_SECONDS = 30.0  # no thread gets its turn for so long: the scheduler itself has failed
+HANG_SECONDS = 60.0  # no thread gets its turn for so long: the scheduler itself has failed
 
 
 class Abandoned(BaseException):

@@ -15,9 +15,9 @@ from rosafe.interface import KINDS
 from rosafe.tree.processor import Processor
 from rosafe.tree.tree import Tree
 from rosafe.tree.zone import Block
+from tests.harness import PATIENCE
 
 RATE = 16000.0
-WAIT_SECONDS = 20.0  # for anything that must happen
 
 
 class Feed:
@@ -51,7 +51,7 @@ class Feed:
     def read(self) -> tuple[np.ndarray, int] | None:
         with self._turn:
             while not self._blocks and not self._ended and not self.stopped:
-                self._turn.wait(WAIT_SECONDS)
+                self._turn.wait(PATIENCE)
             if self.stopped or not self._blocks:
                 return None
             block = self._blocks.popleft()
@@ -103,7 +103,7 @@ class Recorder:
     def wait(self, condition: Callable[[], Any]) -> None:
         """Wait until `condition()` holds after something that a processor did."""
         with self._turn:
-            assert self._turn.wait_for(condition, WAIT_SECONDS), f"not within {WAIT_SECONDS:g} s"
+            assert self._turn.wait_for(condition, PATIENCE), f"not within {PATIENCE:g} s"
 
     def wait_blocks(self, processor: Processor, count: int) -> None:
         """Wait until `processor` has released `count` blocks in all."""
@@ -167,5 +167,5 @@ def end(tree: Tree, listener: Recorder) -> None:
     """Stop the tree and see to it that no thread is left."""
     tree.stop()
     for processor in listener.processors:
-        assert processor.join(WAIT_SECONDS), f"{processor!r} is still running"
+        assert processor.join(PATIENCE), f"{processor!r} is still running"
     assert listener.late == []
