@@ -57,6 +57,17 @@ def proc(*parts: object) -> Path:
     return Path("/proc", *map(str, parts))
 
 
+def let_children_have_default_signals() -> None:
+    """Whatever this process starts from now on has the system's default signals, also those that it ignores itself.
+
+    Under `nohup`, and in a script behind `&`, a process ignores SIGHUP or SIGINT, and so would all that it starts: what
+    is ignored is inherited. What is handled is not, so here a handler ignores it.
+    """
+    for number in signal.valid_signals() - {signal.SIGPIPE, signal.SIGXFSZ}:  # these two subprocess restores itself
+        if signal.getsignal(number) is signal.SIG_IGN:
+            signal.signal(number, lambda number, frame: None)
+
+
 def wait_for(condition: Callable[[], T], timeout: float = PATIENCE, what: str | Callable[[], str] = "") -> T:
     """The first true value of `condition()`, asked every 20 ms; AssertionError after `timeout` seconds."""
     end = time.monotonic() + timeout

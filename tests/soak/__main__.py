@@ -12,6 +12,7 @@ from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 
+from tests.harness import let_children_have_default_signals
 from tests.soak import faults
 from tests.soak.world import DEFAULT, LIGHT, Use, World, world
 
@@ -23,6 +24,7 @@ WARM = 3  # of so many parts of the time, the first is that in which pools and t
 def main() -> int:
     """Run; 0 where everything held, 1 where something did not."""
     options = _parse()
+    let_children_have_default_signals()
     random_seed = options.seed if options.seed is not None else random.randrange(10**6)
     print(f"soak: {options.minutes:g} min, --seed {random_seed}", flush=True)
     with tempfile.TemporaryDirectory(prefix="rosafe-soak-") as folder:
