@@ -187,6 +187,16 @@ def _master() -> Finding:
     return Finding(OK, f"answers at {uri}")
 
 
+def _address() -> Finding:
+    environ = dict(os.environ)
+    master.set_local_defaults(environ)
+    wrong, _, todo = master.unreachable(environ).partition("; ")
+    if wrong:
+        return Finding(MISSING, wrong, todo)
+    shown = [f"{name} is {environ[name]}" for name in ("ROS_HOSTNAME", "ROS_IP") if environ.get(name)]
+    return Finding(OK, shown[0] if shown else f"nodes are called by this machine's name, {platform.node()}")
+
+
 CHECKS: dict[str, Callable[[], Finding]] = {
     "python": _python,
     "numbers": lambda: _needs(_NUMBERS),
@@ -195,6 +205,7 @@ CHECKS: dict[str, Callable[[], Finding]] = {
     "ROS": lambda: _needs(_ROS, _ROS_COMMANDS),
     "messages": _messages,
     "master": _master,
+    "address": _address,
     "alsaaudio": _alsaaudio,
     "sound devices": _devices,
     "HTTP server": lambda: _needs(_HTTP),

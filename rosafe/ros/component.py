@@ -23,15 +23,14 @@ import diagnostic_updater
 import rosgraph
 import rospy
 from actionlib_msgs.msg import GoalStatus
-from rospy.impl import tcpros_base
 
 from rosafe import __version__, interface
 from rosafe.interface import ComponentError
 from rosafe.ros import master, memory, registration
 from rosafe.ros.activities import Activities, Activity, Handler, TaskMeter
 from rosafe.ros.publisher import Publisher
+from rosafe.ros.pulse import Pulse
 
-BACKLOG = 128  # connections that wait to be accepted
 STATE_PERIOD = 0.9  # seconds between two genom_state messages at the most; the contract is 1
 BURST_SECONDS = 0.005  # what changes within this makes one message, not one each
 DIAGNOSTICS_PERIOD = 1.0
@@ -61,6 +60,8 @@ class ComponentNode:
         self.meters = {task: TaskMeter(task) for task in component.tasks}
         self.diagnostics = diagnostic_updater.Updater()
         self.diagnostics.setHardwareID("none")
+        self._pulse = Pulse(self.finished)
+        self.diagnostics.add("calls", self._pulse.health)
         self._bad_value = bad_value
         self._srv = importlib.import_module(f"{component.name}.srv")
         self._msg = importlib.import_module(f"{component.name}.msg")
@@ -74,7 +75,6 @@ class ComponentNode:
         self._turn = threading.Event()
         self._keep: list[Any] = []  # services and action servers, alive as long as the node
         self._digest = _digest(component)
-        _lengthen_backlog()
         self._set_parameters()
         self._registrar.on_new_master(self._set_parameters)
         self.function("connect_port", self._connect_port, waits=True)
@@ -141,6 +141,7 @@ class ComponentNode:
         for task in (self._publish_state, self._publish_diagnostics):
             threading.Thread(target=task, name=task.__name__, daemon=True).start()
         self._registrar.settle(UP_SECONDS)
+        self._pulse.start()
 
     def shutdown(self, by: str) -> None:
         """End all activities and wait for them (bounded); `by` is what their exceptions name."""
@@ -343,10 +344,3 @@ _DATE = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(os.path.getmtime(interfa
 def _digest(component: interface.Component) -> str:
     """A fingerprint of the interface, 32 hex digits."""
     return hashlib.md5(re.sub(r" at 0x\w+", "", repr(component)).encode()).hexdigest()
-
-
-def _lengthen_backlog() -> None:
-    """Let more clients connect at the same time than rospy's five: TCP tries again only after a whole second."""
-    server = tcpros_base.init_tcpros_server().tcp_ros_server
-    if server is not None:
-        server.server_sock.listen(BACKLOG)

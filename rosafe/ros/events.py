@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 PERIOD = 1.0  # seconds in which a kind of event gets one line
+KINDS = 50  # at once; what goes beyond is of one kind
 
 _NUMBER = re.compile(r"\d+(\.\d+)?")
 
@@ -40,10 +41,12 @@ class EventLog:
         self._held: dict[str, _Held] = {}
         self._lock = threading.Lock()
 
-    def __call__(self, line: str) -> None:
-        """Report one event."""
-        kind = _NUMBER.sub("#", line)
+    def __call__(self, line: str, kind: str = "") -> None:
+        """Report one event, of a `kind` that need not be told by the line."""
+        kind = kind or _NUMBER.sub("#", line)
         with self._lock:
+            if kind not in self._held and len(self._held) >= KINDS:
+                kind = ""
             held = self._held.get(kind)
             if held is not None:
                 held.count += 1

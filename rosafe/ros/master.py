@@ -4,16 +4,21 @@ from __future__ import annotations
 
 import http.client
 import os
+import socket
 import threading
+import time
 import xmlrpc.client
-from collections.abc import MutableMapping
-from typing import cast
+from collections.abc import Callable, Mapping, MutableMapping
+from typing import TypeVar, cast
 from urllib.parse import urlsplit
 
 DEFAULT_URI = "http://127.0.0.1:11311"
 PROBE_SECONDS = 3.0
+ANSWER_BYTES = 2**24  # of any call; the longest is the master's list of all there is
 RESOLVE_SECONDS = 5.0  # the whole probe; a name server that is silent is not bound by the socket's timeout
 FAILURES = (OSError, xmlrpc.client.Error, http.client.HTTPException, ValueError, SyntaxError)  # of a call, see `reason`
+
+T = TypeVar("T")
 
 
 class MasterError(Exception):
@@ -35,10 +40,66 @@ def set_local_defaults(environ: MutableMapping[str, str] = os.environ) -> None:
 def is_local(uri: str) -> bool:
     """Whether `uri` names this machine by a loopback address."""
     try:
-        host = urlsplit(uri).hostname or ""
+        return _is_loopback(urlsplit(uri).hostname or "")
     except ValueError:
         return False
+
+
+def _is_loopback(host: str) -> bool:
     return host in ("localhost", "::1") or host.startswith("127.")
+
+
+def unreachable(environ: Mapping[str, str] = os.environ) -> str:
+    """Why nobody could call a node that starts with this environment, and what to do; empty where all is well.
+
+    A node tells the master ROS_HOSTNAME, or else ROS_IP, as the address to call it at.
+    """
+    variable = next((v for v in ("ROS_HOSTNAME", "ROS_IP") if environ.get(v)), "")
+    if not variable:
+        return ""
+    host, uri = environ[variable], environ.get("ROS_MASTER_URI") or DEFAULT_URI
+    found = _addresses(host)
+    if not found:
+        wrong = "which is no address, and no name that is known here: nobody can call a node"
+    elif {"0.0.0.0", "::"} & set(found):
+        wrong = "which is no address to call a node at"
+    elif not any(map(_is_own, found)):
+        wrong = "which is no address of this machine: nobody can call a node"
+    elif _is_loopback(host) and not any(map(_is_own, _addresses(urlsplit(uri).hostname or ""))):
+        wrong = f"where only this machine can call a node, but the master is at {uri}"
+    else:
+        return ""
+    return f"{variable} is {host}, {wrong}; unset it or set it to {_own_addresses(is_local(uri))}"
+
+
+def _addresses(host: str) -> list[str]:
+    """The addresses that `host` stands for; none where it stands for nothing, or the name server does not answer."""
+
+    def resolve() -> list[str]:
+        try:
+            return [str(entry[4][0]) for entry in socket.getaddrinfo(host, None, type=socket.SOCK_STREAM)]
+        except (OSError, UnicodeError):
+            return []
+
+    return _bounded(resolve, [])
+
+
+def _is_own(address: str) -> bool:
+    """Whether an address belongs to this machine: others cannot be bound."""
+    try:
+        with socket.socket(socket.AF_INET6 if ":" in address else socket.AF_INET, socket.SOCK_STREAM) as sock:
+            sock.bind((address, 0))
+            return True
+    except OSError:
+        return False
+
+
+def _own_addresses(loopback: bool) -> str:
+    try:
+        from rosgraph.network import get_local_addresses
+    except ImportError:
+        return "an address of this machine"
+    return " or ".join(a for a in get_local_addresses() if loopback or not _is_loopback(a)) or "an address of its own"
 
 
 def check_address(uri: str) -> None:
@@ -52,16 +113,23 @@ def check_address(uri: str) -> None:
         raise MasterError(f"ROS_MASTER_URI is {uri!r}, which is no address like {DEFAULT_URI}")
 
 
-def check_master(uri: str) -> None:
-    """Return if a ROS master answers at `uri` within a few seconds, else raise MasterError."""
+def check_master(uri: str, give_up: Callable[[], bool] = lambda: False) -> None:
+    """Return if a ROS master answers at `uri` within a few seconds, else (or once `give_up()`) raise MasterError."""
     check_address(uri)
-    outcome: list[str] = []
-    asking = threading.Thread(target=lambda: outcome.append(_ask(uri)), daemon=True)
-    asking.start()
-    asking.join(RESOLVE_SECONDS)
-    problem = outcome[0] if outcome else "no answer"
+    problem = _bounded(lambda: _ask(uri), "no answer", give_up)
     if problem:
         raise _error(uri, problem)
+
+
+def _bounded(ask: Callable[[], T], otherwise: T, give_up: Callable[[], bool] = lambda: False) -> T:
+    """What `ask()` returns within `RESOLVE_SECONDS`: name servers that are silent have no other bound."""
+    outcome: list[T] = []
+    asking = threading.Thread(target=lambda: outcome.append(ask()), daemon=True)
+    asking.start()
+    deadline = time.monotonic() + RESOLVE_SECONDS
+    while asking.is_alive() and time.monotonic() < deadline and not give_up():
+        asking.join(0.1)
+    return outcome[0] if outcome else otherwise
 
 
 def _error(uri: str, problem: str) -> MasterError:
@@ -105,18 +173,38 @@ def uri() -> str:
     return os.environ.get("ROS_MASTER_URI") or DEFAULT_URI
 
 
-def proxy(uri: str) -> xmlrpc.client.ServerProxy:
-    """The master at `uri`, or another XML-RPC server, with calls that end within `PROBE_SECONDS`."""
-    return xmlrpc.client.ServerProxy(uri, transport=Transport())
+def proxy(uri: str, seconds: float = PROBE_SECONDS) -> xmlrpc.client.ServerProxy:
+    """The master at `uri`, or another XML-RPC server, with calls that end within `seconds` where nothing comes."""
+    return xmlrpc.client.ServerProxy(uri, transport=Transport(seconds))
 
 
 class Transport(xmlrpc.client.Transport):
-    """HTTP that gives up."""
+    """HTTP that gives up: where nothing comes for some seconds, and where too much comes."""
+
+    accept_gzip_encoding = False  # packed, a short answer may be long
+
+    def __init__(self, seconds: float = PROBE_SECONDS) -> None:
+        super().__init__()
+        self._seconds = seconds
 
     def make_connection(self, host: object) -> http.client.HTTPConnection:
         connection = super().make_connection(host)  # type: ignore[arg-type]
-        connection.timeout = PROBE_SECONDS
+        connection.timeout = self._seconds
+        connection.response_class = _Answer
         return connection
+
+
+class _Answer(http.client.HTTPResponse):
+    """One of bounded length; ValueError beyond it."""
+
+    _taken = 0
+
+    def read(self, amt: int | None = None) -> bytes:
+        data = super().read(ANSWER_BYTES + 1 if amt is None else amt)
+        self._taken += len(data)
+        if self._taken > ANSWER_BYTES:
+            raise ValueError(f"an answer of more than {ANSWER_BYTES} bytes")
+        return data
 
 
 class PrivateMaster:

@@ -15,7 +15,7 @@ from rosafe.dsp import kernels
 from rosafe.interface import KINDS, ROSAFE, ComponentError, ProcessorKind
 from rosafe.ros import wire
 from rosafe.ros.activities import Activity
-from rosafe.ros.audio import AudioRing
+from rosafe.ros.audio import MAX_WINDOW, AudioRing
 from rosafe.ros.component import ComponentNode
 from rosafe.ros.events import EventLog
 from rosafe.ros.ports import OutputPort, element, parameters_message, signal_fields
@@ -83,7 +83,7 @@ class RosafeNode:
         self._audio_topic = topic
         self._audio = rospy.Subscriber(
             topic,
-            wire.lenient_class("rosAFE", "::binaudio::portStruct"),
+            wire.lenient_class("rosAFE", "::binaudio::portStruct", MAX_WINDOW),
             take,
             queue_size=None,  # all that has come is looked at: a window may be shorter than a hiccup
             buff_size=2**22,

@@ -22,7 +22,8 @@ from rospy.impl.registration import (
     get_topic_manager,
 )
 
-from rosafe.ros import master
+from rosafe.ros import inbound, master
+from rosafe.ros.connector import Connector
 
 CHECK_SECONDS = 1.0  # between two looks whether the master still knows this node; between two tries without one
 SETTLE_SECONDS = 1.0  # that a request waits for the master to know what it has changed
@@ -197,15 +198,18 @@ def registrar() -> Registrar:
 
 
 def init_node(name: str, argv: list[str]) -> Registrar:
-    """`rospy.init_node` for servers: without its signal handlers, and with the master's calls as they are here."""
+    """`rospy.init_node` for servers: no signal handlers of its own; what listens, and calls of the master, are ours."""
     global _registrar
+    inbound.install()
     uri = master.uri()
     # All that rospy itself asks of the master, such as parameters, goes through this proxy.
     rospy.core._xmlrpc_cache[uri] = rospy.core._LockedServerProxy(uri, transport=master.Transport())
     rospy.init_node(name, argv=argv, disable_signals=True)
     listeners = get_registration_listeners()
     with listeners.lock:
-        _registrar = Registrar(next(_managers(listeners.listeners)))
+        manager = next(_managers(listeners.listeners))
+        Connector(manager)
+        _registrar = Registrar(manager)
         listeners.listeners[:] = [_registrar]
     _registrar.start()
     return _registrar

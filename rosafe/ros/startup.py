@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import NoReturn, Protocol
 
 from rosafe import __version__, interface
-from rosafe.ros import generate, master, memory, paths
+from rosafe.ros import generate, master, memory, paths, systemd
 
 MASTER_SECONDS = 5.0  # `roscore & rosAFE-ros &` starts both at once, and roscore takes a second or two
 START_SECONDS = 20.0  # a node that is not up by then waits for something that does not come
@@ -35,6 +35,10 @@ class Node(Protocol):
 
 class _Failure(Exception):
     """The node cannot start; the text is the one line that the user gets."""
+
+
+class _Ended(Exception):
+    """A signal came while the node was waiting for a master, as it was told to."""
 
 
 def run_server(component: interface.Component, build: Callable[[str], Node], argv: list[str] | None = None) -> int:
@@ -66,13 +70,16 @@ def run_server(component: interface.Component, build: Callable[[str], Node], arg
         if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # nohup's wish counts
             signal.signal(number, lambda number, frame: received.append(number))
     try:
-        node = _start(component, build, options.instance, remappings, received)
+        node = _start(component, build, options, remappings, received)
+    except _Ended:
+        return 0
     except (_Failure, generate.GenerationError, master.MasterError, interface.ComponentError, OSError) as problem:
         print(f"{component.name}-ros: {problem}", file=sys.stderr)
         watchdog(END_SECONDS, 1)
         return 1
     if told is not None:
         told.up()
+    systemd.notify("READY=1")
     _serve(node, received)
     return 0
 
@@ -91,7 +98,7 @@ def _parse(component: interface.Component, arguments: list[str]) -> argparse.Nam
     program = f"{component.name}-ros"
     parser = Parser(
         prog=program,
-        usage=f"{program} [-b] [-i NAME] [-h] [--version] [NAME:=VALUE ...]",
+        usage=f"{program} [-b] [-i NAME] [--wait] [-h] [--version] [NAME:=VALUE ...]",
         description=f"{component.doc}.",
         epilog=f"ROS remappings are taken too: topics (a:=b) and __name, __ns, __master, __ip, __hostname, __log.\n\n"
         f"example:\n  {program} -b -i left        # serves /left/...; returns once the node is up",
@@ -107,6 +114,11 @@ def _parse(component: interface.Component, arguments: list[str]) -> argparse.Nam
         default=component.name,
         help=f"name of the node and first part of all its names (default: {component.name})",
     )
+    parser.add_argument(
+        "--wait",
+        action="store_true",
+        help=f"wait for a ROS master for ever, as a service at boot must (default: for {MASTER_SECONDS:g} s)",
+    )
     parser.add_argument("--version", action="version", version=f"{component.name} {__version__}")
     return parser.parse_args(arguments)
 
@@ -117,12 +129,12 @@ def _parse(component: interface.Component, arguments: list[str]) -> argparse.Nam
 def _start(
     component: interface.Component,
     build: Callable[[str], Node],
-    instance: str,
+    options: argparse.Namespace,
     remappings: list[str],
     received: list[int],
 ) -> Node:
     mappings = dict(remapping.split(":=", 1) for remapping in remappings)
-    instance = mappings.get("__name", instance)
+    instance = mappings.get("__name", options.instance)
     if not re.fullmatch("[A-Za-z][A-Za-z0-9_]*", instance):
         raise _Failure(f"{instance!r} is no instance name: letters, digits and _ only, a letter first")
     for name, variable in _ENVIRONMENT_REMAPPINGS.items():
@@ -130,7 +142,10 @@ def _start(
             os.environ[variable] = mappings[name]
     memory.bound()
     master.set_local_defaults()
-    _await_master(os.environ["ROS_MASTER_URI"], received)
+    doubt = master.unreachable()
+    if doubt:
+        print(f"{component.name}-ros: warning: {doubt}", file=sys.stderr, flush=True)
+    _await_master(os.environ["ROS_MASTER_URI"], received, f"{component.name}-ros" if options.wait else "")
     generate.ensure_messages()
     paths.prefer_pypi_packages()
     ensure_log_directory()
@@ -156,16 +171,27 @@ def _start(
     return node
 
 
-def _await_master(uri: str, received: list[int]) -> None:
-    """Give a master that is just starting a moment; MasterError where none is there by then, or at a signal."""
+def _await_master(uri: str, received: list[int], patient: str) -> None:
+    """Give a master that is just starting a moment; MasterError where none is there by then, or at a signal.
+
+    The program that is `patient` says so and waits for ever; a signal is `_Ended` to it.
+    """
     master.check_address(uri)  # a wrong one does not get better
     deadline = time.monotonic() + MASTER_SECONDS
+    told = False
     while True:
         try:
-            return master.check_master(uri)
+            return master.check_master(uri, lambda: bool(received))
         except master.MasterError:
-            if received or time.monotonic() > deadline:
+            if received and patient:
+                raise _Ended from None
+            if received or (time.monotonic() > deadline and not patient):
                 raise
+        if patient and not told:
+            print(f"{patient}: waiting for a ROS master at {uri}", file=sys.stderr, flush=True)
+            told = True
+        if patient:
+            systemd.notify(f"STATUS=waiting for a ROS master at {uri}", "EXTEND_TIMEOUT_USEC=30000000")
         time.sleep(0.1)
 
 
@@ -204,6 +230,7 @@ def _serve(node: Node, received: list[int]) -> None:
     # An Event must not be set from a signal handler, which may interrupt the wait while that holds its lock.
     while not received and not rospy.is_shutdown() and not node.finished.wait(0.1):
         pass
+    systemd.notify("STOPPING=1")
     watchdog(END_SECONDS, 0)
     rospy.signal_shutdown("signal" if received else "kill")
     over.wait()  # another thread may be at it already; the watchdog bounds this

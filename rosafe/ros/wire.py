@@ -296,10 +296,11 @@ def array_msg(generated: Any) -> Any:
 
 
 @functools.cache
-def lenient_class(package: str, idl: str) -> Any:
+def lenient_class(package: str, idl: str, longest: int) -> Any:
     """As `message_class`, but what cannot be read becomes a message whose `problem` says why (else it is empty).
 
     Where deserialisation raises, rospy breaks the connection, and cannot mend it: one bad message would end a topic.
+    Its sequences have up to `longest` elements; a message that could hold more is not even read.
     """
     strict = message_class(package, idl)
 
@@ -311,7 +312,7 @@ def lenient_class(package: str, idl: str) -> Any:
             self.problem = str(problem)
         return self
 
-    return type(strict.__name__, (strict,), {"deserialize": deserialize})
+    return type(strict.__name__, (strict,), {"deserialize": deserialize, "longest_sequence": longest})
 
 
 @functools.cache

@@ -11,7 +11,7 @@ from rosafe.ros import paths
 from tests.cli.command import environment, rosafe, rosafe_alone
 from tests.harness import ROOT, Graph, free_port
 
-EVERYTHING = ["python", "numbers", "kernels", "sound files", "ROS", "messages", "master", "alsaaudio"]
+EVERYTHING = ["python", "numbers", "kernels", "sound files", "ROS", "messages", "master", "address", "alsaaudio"]
 EVERYTHING += ["sound devices", "HTTP server", "Tcl", "plots"]
 
 

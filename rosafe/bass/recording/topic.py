@@ -16,7 +16,7 @@ from rosafe.bass.sources.base import Chunk, device_error, hwparams_error
 from rosafe.bass.windows import WindowStream
 from rosafe.interface import BASS, ComponentError
 from rosafe.ros import wire
-from rosafe.ros.audio import malformed
+from rosafe.ros.audio import MAX_WINDOW, malformed
 
 FIRST_SECONDS = 3.0  # for a first message
 NOBODY_SECONDS = 1.0  # for one where nobody publishes the topic
@@ -60,7 +60,7 @@ class TopicSource:
         self._begun = False
         self._first: Any = None
         self._arrived = threading.Event()
-        message_class = wire.lenient_class("bass", BASS.port("Audio").idl)
+        message_class = wire.lenient_class("bass", BASS.port("Audio").idl, MAX_WINDOW)
         kinds = dict(rospy.get_published_topics())
         kind = kinds.get(topic)
         if kind is not None and kind.rpartition("/")[2] != message_class.__name__:
@@ -141,11 +141,12 @@ class TopicSource:
 
 def become_node(name: str) -> None:
     """Make this process a node of the graph; MasterError where there is no master, GenerationError without messages."""
-    from rosafe.ros import generate, master, startup
+    from rosafe.ros import generate, inbound, master, startup
 
     master.set_local_defaults()
     master.check_master(os.environ["ROS_MASTER_URI"])
     generate.ensure_messages()
     startup.ensure_log_directory()
+    inbound.install()
     rospy.init_node(name, argv=[], anonymous=True, disable_signals=True)
     startup.log_to_stderr()

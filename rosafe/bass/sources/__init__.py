@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import re
 import threading
 from collections.abc import Iterator
 
-from rosafe.bass.sources.base import Chunk, Source
+from rosafe.bass.sources.base import Chunk, Source, device_error
 
 __all__ = ["Chunk", "Source", "device_lines", "open_source"]
 
 DEFAULT_RATE = 44100
+MAX_NAME = 8192  # characters
+_CONTROL = re.compile("[\0-\x1f\x7f-\x9f\u2028\u2029]")  # would make several lines of a line in the log
 # What ListDevices says of the sources that need no hardware: name, contents.
 BUILT_IN = (
     ("file:PATH", "a sound file in real time; ?loop=1 repeats it, ?start=SECONDS skips its beginning"),
@@ -38,7 +41,7 @@ def open_source(device: str, sample_rate: int, frames_per_chunk: int, stopping: 
     ----------
     device : str
         ``file:PATH``, ``bag:PATH``, ``scene:`` or the name of an ALSA capture device, each with options after a
-        question mark.
+        question mark. It may come from anywhere: nothing in it is evaluated.
     sample_rate : int
         Hz; 0 is the file's or bag's own rate, or 44100 with other sources.
     frames_per_chunk : int
@@ -51,6 +54,10 @@ def open_source(device: str, sample_rate: int, frames_per_chunk: int, stopping: 
     interface.ComponentError
         ``::bass::e_device`` or ``::bass::e_hwparams``, with one line that says why.
     """
+    if len(device) > MAX_NAME:
+        raise device_error(f"a device's name of {len(device)} characters, at most {MAX_NAME} go")
+    if _CONTROL.search(device):
+        raise device_error(f"{device!r}: line ends, null bytes and the like are in no device's name")
     # Imported here: a missing library must only hurt those who use its source.
     if device.startswith("file:"):
         from rosafe.bass.sources.file import FileSource

@@ -14,6 +14,7 @@ import numpy as np
 
 from rosafe.bass.sources.base import Chunk, Chunker, device_error, hwparams_error, parse_options
 from rosafe.bass.sources.libasound import complaints, load_alsaaudio
+from rosafe.bass.sources.pcmname import checked_name
 from rosafe.interface import ComponentError
 
 RING_CHUNKS = 8  # asked for; the device may give fewer
@@ -46,7 +47,8 @@ class AlsaSource:
     Parameters
     ----------
     device : str
-        PCM name, with ``?channels=L,R`` for the channels (from 1) of a device that has others than two.
+        PCM name (see `checked_name`), with ``?channels=L,R`` for the channels (from 1) of a device that has others
+        than two.
     sample_rate : int
         Hz.
     frames_per_chunk : int
@@ -58,9 +60,9 @@ class AlsaSource:
         self.sample_rate = sample_rate
         self.overruns = 0
         self.lost_frames = 0
-        self._pcm_name, _, options = device.partition("?")
-        if not self._pcm_name.isprintable():
-            raise device_error(f"{device!r} is no name of a PCM")
+        pcm_name, _, options = device.partition("?")
+        with complaints():
+            self._pcm_name = checked_name(pcm_name)
         self._channels: tuple[int, int] | None = parse_options(device, options, {"channels": _channel_pair}).get(
             "channels"
         )

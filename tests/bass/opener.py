@@ -1,0 +1,54 @@
+"""A process that opens PCMs of libasound by name, in its own folder, and tells what came of each as a line of JSON.
+
+It knows of every file that was written or opened for writing there (inotify), and of every process that was run.
+Reads lines of JSON, each a list of a name and whether it is to be checked first, as bass does.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import os
+import resource
+import sys
+
+from rosafe.bass.sources.libasound import complaints, load_alsaaudio
+from rosafe.bass.sources.pcmname import checked_name
+from rosafe.interface import ComponentError
+from rosafe.ros.paths import prefer_pypi_packages
+
+WRITTEN = 0x2 | 0x8 | 0x40 | 0x80 | 0x100 | 0x200  # IN_MODIFY, CLOSE_WRITE, MOVED_FROM, MOVED_TO, CREATE, DELETE
+
+
+def main() -> None:
+    """Serve until stdin ends."""
+    prefer_pypi_packages()
+    alsa = load_alsaaudio()
+    libc = ctypes.CDLL(None)
+    watch = libc.inotify_init1(os.O_NONBLOCK)
+    assert libc.inotify_add_watch(watch, b".", WRITTEN) > 0
+
+    def children() -> tuple[float, ...]:
+        used = resource.getrusage(resource.RUSAGE_CHILDREN)
+        return used.ru_utime, used.ru_stime, used.ru_minflt, used.ru_maxrss
+
+    for line in sys.stdin:
+        name, checked = json.loads(line)
+        before, outcome = children(), "opened"
+        with complaints():
+            try:
+                wanted = checked_name(name) if checked else name
+                alsa.PCM(type=alsa.PCM_CAPTURE, mode=alsa.PCM_NONBLOCK, device=wanted).close()
+            except ComponentError as problem:
+                outcome = f"refused: {problem.why}"
+            except (alsa.ALSAAudioError, ValueError) as problem:
+                outcome = f"failed: {problem}"
+        try:
+            written = bool(os.read(watch, 65536))
+        except BlockingIOError:
+            written = False
+        print(json.dumps([outcome, written, children() != before]), flush=True)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,106 @@
+"""A device name that would run a command, through every door that leads to bass: refused, and nothing has run."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from rosafe.ros import wire
+from tests.cli.command import refused, rosafe
+from tests.genomix import world as worlds
+from tests.genomix.world import HttpError, World
+from tests.harness import Graph, Process
+from tests.matlab import octave
+
+pytestmark = pytest.mark.ros
+ATTACKS = (
+    "tee:null,'|touch MARK',raw",
+    "plug:\"file:'|touch MARK',raw\"",
+    "plug:SLAVE='file:FILE=|touch MARK'",
+    "file1:a/b",
+)
+WHY = "is no name of a PCM"
+ACTION = """
+import sys, actionlib, rospy
+from bass.msg import AcquireAction, AcquireGoal
+rospy.init_node("attacker", anonymous=True)
+client = actionlib.SimpleActionClient("/bass/Acquire", AcquireAction)
+assert client.wait_for_server(rospy.Duration(20))
+client.send_goal_and_wait(AcquireGoal(device=sys.argv[1]), rospy.Duration(20))
+print(client.get_result().genom_exdetail)
+"""
+
+
+@pytest.fixture(scope="module")
+def doors(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
+    """A world with a bass that works in a folder of its own."""
+    with worlds.world(tmp_path_factory.mktemp("world"), nodes=False) as world:
+        work = world.graph.home / "work"
+        work.mkdir()
+        with world.graph.node("bass-ros", cwd=work):
+            yield world
+
+
+def service(world: World, name: str) -> str:
+    return world.graph.run("rosservice", "call", "/bass/Acquire", json.dumps({"device": name})).stdout
+
+
+def action(world: World, name: str) -> str:
+    return world.graph.run("/usr/bin/python3", "-c", ACTION, name).stdout
+
+
+def http(world: World, name: str) -> str:
+    with pytest.raises(HttpError) as caught:
+        world.http.call("bass/Acquire", {"device": name})
+    return f"{caught.value.ex} {caught.value.what}"
+
+
+def tcl(world: World, name: str) -> str:
+    hexed = name.encode().hex()
+    script = f"""
+        set c [genomix::connect $address]
+        $c load bass
+        set name [encoding convertfrom utf-8 [binary decode hex {hexed}]]
+        puts [failure {{bass::Acquire [dict create device $name]}}]
+    """
+    return world.tcl(script).stdout
+
+
+def in_octave(world: World, name: str) -> str:
+    characters = [ord(character) for character in name]
+    script = f"""
+        client = genomix.client;
+        bass = client.load('bass');
+        r = bass.Acquire(char({characters}));
+        show('told', {{r.status, r.exception.ex}});
+    """
+    return str(octave.shown(world, script)["told"])
+
+
+@pytest.mark.parametrize("door", [service, action, http, tcl, in_octave], ids=lambda door: door.__name__)
+@pytest.mark.parametrize("name", ATTACKS, ids=range(len(ATTACKS)))
+def test_through_the_node(doors: World, door: Callable[[World, str], str], name: str) -> None:
+    assert "::bass::e_device" in door(doors, name)
+    assert os.listdir(doors.graph.home / "work") == []
+
+
+@pytest.mark.parametrize("name", ATTACKS, ids=range(len(ATTACKS)))
+def test_through_the_command(tmp_path: Path, name: str) -> None:
+    refused(rosafe("record", "--device", name, "--seconds", "1", cwd=tmp_path), WHY)
+    refused(rosafe("record", "a.wav", "--device", name, "--seconds", "1", cwd=tmp_path), WHY)
+    assert os.listdir(tmp_path) == []
+
+
+def test_the_reason_is_told_and_the_acquisition_goes_on(graph: Graph, bass_node: Process) -> None:
+    assert graph.call("/bass/Acquire", device="scene:", sampleRate=8000, nFramesPerChunk=400).genom_success
+    answer = graph.call("/bass/Acquire", device=ATTACKS[0])
+    told = json.loads(answer.genom_exdetail)
+    assert told["ex"] == "::bass::e_device"
+    audio = wire.message_class("bass", "::binaudio::portStruct")
+    newest = graph.message("/bass/Audio", audio).lastFrameIndex
+    graph.message("/bass/Audio", audio, accept=lambda message: message.lastFrameIndex > newest + 800)
+    assert WHY in bass_node.err and bass_node.err.count("tee:null") == 1

@@ -1,0 +1,288 @@
+"""Names of PCMs from outside: none makes libasound run or write anything, through no door; honest ones go on."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from rosafe.bass.sources import open_source
+from rosafe.bass.sources.alsa import AlsaSource
+from rosafe.bass.sources.pcmname import checked_name
+from rosafe.interface import ComponentError
+from rosafe.ros import paths
+from tests.harness import PYTHON, ROOT
+
+RUN = "tee:null,'|touch MARK',raw"
+# What somebody who set this machine up may have defined, with and without arguments.
+CONFIGURATION = """</usr/share/alsa/alsa.conf>
+pcm.recorded { type file slave.pcm "null" file /dev/null infile "SAMPLES" format raw }
+pcm.logged "tee:null,'LOG',raw"
+pcm.rated { @args [ RATE ] @args.RATE { type integer } type rate slave { pcm "null" rate $RATE } }
+pcm.alias file
+pcm.writer { @args [ F ] @args.F { type string } type file slave.pcm "null" file $F format raw }
+pcm.hidden {
+    @args [ F ] @args.F { type string }
+    type plug slave.pcm { @func concat strings [ "tee:null,'" $F "',raw" ] }
+}
+pcm.any { @args [ T ] @args.T { type string } type $T slave.pcm "null" file MARK format raw }
+pcm.foreign { @args [ A ] @args.A { type string } type someones slave.pcm $A }
+pcm.endless {
+    @args [ A ] @args.A { type string default "a" }
+    type plug slave.pcm { @func concat strings [ "endless:a" $A ] }
+}
+pcm_slave.writer { @args [ F ] @args.F { type string } pcm { type file slave.pcm "null" file $F format raw } }
+pcm.slave { @args [ S ] @args.S { type string } type plug slave $S }
+"""
+HEADS = (
+    *("hw", "plughw", "plug", "null", "tee", "file", "shm", "default", "sysdefault", "front", "iec958", "spdif"),
+    *("hdmi", "dmix", "dsnoop", "pulse", "jack", "oss", "a52", "speex", "upmix", "vdownmix", "usbstream", "lavrate"),
+    *("samplerate", "speexrate", "recorded", "logged", "rated", "alias", "writer", "hidden", "any", "foreign"),
+    *("endless", "slave", "pcm.file", "pcm.tee", "ctl.shm", "pcm_slave.writer", "cards.pcm.default", "_ucm0001.hw"),
+    *("nosuch",),
+)
+ARGUMENTS = ("", ":MARK", ":null,MARK,raw", ":0", ":SLAVE=file:MARK", ":'|touch MARK'", ":file:MARK,0", ":=")
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Where the test works, with the configuration and a file `precious`."""
+    paths.prefer_pypi_packages()
+    pytest.importorskip("alsaaudio", reason="pyalsaaudio is not here: scripts/install brings it")
+    text = CONFIGURATION.replace("SAMPLES", str(tmp_path / "samples.raw")).replace("LOG", str(tmp_path / "log.raw"))
+    (tmp_path / "asound.conf").write_text(text)
+    (tmp_path / "samples.raw").write_bytes(bytes(80_000))
+    (tmp_path / "precious").write_text("precious")
+    monkeypatch.setenv("ALSA_CONFIG_PATH", str(tmp_path / "asound.conf"))
+    monkeypatch.setenv("PULSE_SERVER", "unix:/nonexistent")
+    monkeypatch.setenv("JACK_NO_START_SERVER", "1")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+class Told(NamedTuple):
+    """What has come of a name."""
+
+    outcome: str  # "opened", "failed: ..." or "refused: ..."
+    written: bool  # whether a file in the folder was made, changed or opened for writing
+    run: bool  # whether a command was run
+
+
+class Opener:
+    """tests/bass/opener.py, which is started again where libasound ends it."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder / "opened"
+        self._folder.mkdir()
+        (self._folder / "MARK").write_text("precious")
+        self._process: subprocess.Popen[str] | None = None
+
+    def tell(self, name: str, checked: bool = True) -> Told:
+        """Open `name`, if it is not refused."""
+        if self._process is None or self._process.poll() is not None:
+            self._process = subprocess.Popen(
+                [PYTHON, "-m", "tests.bass.opener"],
+                cwd=self._folder,
+                env={**os.environ, "PYTHONPATH": f"{ROOT}:{os.environ.get('PYTHONPATH', '')}"},
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.DEVNULL,
+                text=True,
+            )
+        assert self._process.stdin and self._process.stdout
+        print(json.dumps([name, checked]), file=self._process.stdin, flush=True)
+        answer = self._process.stdout.readline()
+        assert answer, f"{name!r} ends the process: {self._process.wait(10)}"
+        return Told(*json.loads(answer))
+
+    def close(self) -> None:
+        """End it."""
+        if self._process is not None:
+            self._process.kill()
+            self._process.communicate()
+
+
+@pytest.fixture
+def opener(folder: Path) -> Iterator[Opener]:
+    opener = Opener(folder)
+    yield opener
+    opener.close()
+
+
+# --- the names --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        RUN,
+        "plug:\"file:'|touch MARK',raw\"",
+        "plug:SLAVE='file:FILE=|touch MARK'",
+        "plug:\"tee:null,'|touch MARK',raw\"",
+        "plug:{SLAVE=\"file:'|touch MARK',raw\"}",
+        "{type file slave.pcm null file MARK}",
+        "file:{FILE MARK}",
+        "tee:null,MARK,raw",
+        "tee:SLAVE=null,FILE=MARK",
+        "tee:null,/tmp/MARK",
+        "file:MARK",
+        "file:FILE=MARK,FORMAT=raw",
+        "pcm.file:MARK",
+        "alias:MARK",
+        "plug:file:MARK",
+        "plug:SLAVE=file:MARK",
+        "plug:SLAVE=tee:null,MARK",
+        "plug:plug:file:MARK",
+        "plug:pcm.tee:null,MARK",
+        "plug:alias:MARK",
+        "speex:SLAVE=file:MARK",
+        "speex:file:MARK",
+        "lavrate:SLAVE=file:MARK,RATE=8000",
+        "a52:0,file:MARK",
+        "writer:MARK",
+        "hidden:MARK",
+        "plug:hidden:MARK",
+        "any:file",
+        "any:shm",
+        "slave:writer:MARK",
+        "shm:a,b",
+        "ctl.shm:a,b",
+        "oss:MARK",
+        "plug:oss:MARK",
+        "foreign:hw",
+        "endless:a",
+        "hw:$HOME",
+        "hw:@func",
+        "hw:0}",
+        "hw:0|id",
+        "hw:0;id",
+        "hw:0 ",
+        " hw:0",
+        "hw:\\060",
+        "hw:(0)",
+        "hw:[0]",
+        "hw:<0>",
+        "hw:0&a",
+        "hw:0#",
+        "hw:0!",
+        "hw:~",
+        "hw:*",
+        "hw=0:1",
+        "hw,0",
+        "hw\n",
+        "hw:0\n",
+        "hw:\0",
+        "hw:0\0'",
+        "hw:\u0661",  # an Arabic digit
+        "hw:\uff11",  # a wide one
+        "\u0397w:0",
+        "hw:\u2028",
+        "../asound.conf",
+        "/dev/snd/pcmC0D0c",
+        "",
+        ":",
+        ":0",
+        "hw:" + "A" * 256 + "=1",  # ends the process where libasound sees it
+        "A" * 1_000_000,
+    ],
+)
+def test_names_that_are_refused(folder: Path, name: str) -> None:
+    opening = AlsaSource if name.startswith("file:") else open_source  # that is bass's own source
+    with pytest.raises(ComponentError) as caught:
+        opening(name, 44100, 2205, threading.Event())
+    assert caught.value.ex == "::bass::e_device"
+    assert re.search("is no name of a PCM|reaches|in no device's name|at most 8192 go", caught.value.why)
+    assert len(caught.value.why) < 500 and caught.value.why.isprintable()
+    assert sorted(os.listdir(folder)) == ["asound.conf", "precious", "samples.raw"]
+
+
+@pytest.mark.parametrize(
+    ("name", "asked"),
+    [
+        ("hw:1,0", None),
+        ("hw:CARD=PCH,DEV=0,SUBDEV=1", None),
+        ("plughw:CARD=Mic_1", None),
+        ("default", None),
+        ("sysdefault:CARD=PCH", None),
+        ("front:CARD=PCH,DEV=0", None),
+        ("dsnoop:CARD=PCH,DEV=0", None),
+        ("plug:default", None),
+        ("plug:SLAVE=hw", None),
+        ("plug:hw:1", None),
+        ("plug:hw:1,0", "plug:'hw:1,0'"),
+        ("plug:dsnoop:CARD=PCH,DEV=0", "plug:'dsnoop:CARD=PCH,DEV=0'"),
+        ("plug:SLAVE=dsnoop:1,0", "plug:'dsnoop:1,0'"),
+        ("pulse:alsa_input.usb-C-Media_Electronics-00.analog-stereo", None),
+        ("bluealsa:DEV=00:11:22:33:44:55,PROFILE=sco", None),
+        ("recorded", None),
+        ("plug:recorded", None),
+        ("rated:48000", None),
+        ("logged", None),
+        ("nosuch", None),
+    ],
+)
+def test_names_that_go(folder: Path, name: str, asked: str | None) -> None:
+    assert checked_name(name) == (asked or name)
+
+
+def test_what_this_machine_defines_goes_on_under_its_plain_name(folder: Path) -> None:
+    """Also a file, and one that writes: those who may change ALSA's configuration may say so."""
+    samples = np.random.default_rng(5).integers(-(2**31), 2**31, (2, 1000)).astype("<i4")
+    samples.T.tofile(folder / "samples.raw")
+    for name in ("recorded", "plug:recorded"):
+        source = open_source(name, 44100, 500, threading.Event())
+        chunk = source.read()
+        source.close()
+        assert chunk is not None and np.array_equal(chunk.samples, samples[:, :500])
+    source = open_source("logged", 44100, 500, threading.Event())
+    assert source.read() is not None
+    source.close()
+    assert (folder / "log.raw").exists()
+
+
+def test_the_slave_of_plug_may_have_several_arguments(opener: Opener) -> None:
+    """libasound by itself takes them for arguments of plug."""
+    assert opener.tell("plug:rated:RATE=48000", checked=False).outcome.startswith("failed: No such file")
+    assert opener.tell("plug:rated:RATE=48000").outcome == "opened"
+    assert opener.tell("plug:speex:SLAVE=null,AGC=on").outcome == "opened"
+
+
+# --- what libasound does with them ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", [RUN, "tee:null,MARK,raw", "plug:'file:MARK'", "hidden:MARK"])
+def test_the_opener_sees_what_it_is_there_for(opener: Opener, name: str) -> None:
+    told = opener.tell(name, checked=False)
+    assert told.written and told.run == ("|" in name)
+
+
+def test_no_name_of_this_machine_does_harm(opener: Opener) -> None:
+    for head in HEADS:
+        for arguments in ARGUMENTS:
+            if head != "logged" or arguments:
+                told = opener.tell(head + arguments)
+                assert not (told.written or told.run), (head + arguments, told)
+
+
+WORDS = st.sampled_from([*HEADS, "MARK", "raw", "0", "1", "SLAVE", "FILE", "CARD", "DEV", "PCM", "SOCKET", "FORMAT"])
+SIGNS = st.sampled_from([*":::==,,.-_'|{}/ $\n", '"', ""])
+NAMES = st.lists(st.tuples(WORDS, SIGNS), min_size=1, max_size=8).map(lambda parts: "".join(map("".join, parts)))
+
+
+@settings(max_examples=1500, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(NAMES | st.text("hw:=,.-_aF0\0 '", max_size=30))
+def test_no_name_does_harm(opener: Opener, name: str) -> None:
+    """Whatever it is made of: no file is opened for writing, nothing is run, and the process goes on."""
+    if name not in ("logged", "pcm.logged"):
+        told = opener.tell(name)
+        assert not (told.written or told.run), told
