@@ -131,11 +131,8 @@ def changes(world: World, chance: random.Random) -> None:
 
 def master_dies(world: World, chance: random.Random) -> None:
     """The master is killed, and another one comes at the same address."""
-    services = {name for name in world.graph.services() if name.startswith(("/rosAFE/", "/bass/"))}
     world.master.kill()
-    world.master.start(world.graph.env)
-    wait_for(lambda: services <= world.graph.services(), what=lambda: str(services - world.graph.services()))
-    wait_for(lambda: world.afe.topic("ild") in world.graph.topics())
+    world.bring_master()
 
 
 def bass_hiccups(world: World, chance: random.Random) -> None:
