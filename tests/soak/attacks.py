@@ -128,7 +128,7 @@ def names_of_devices(world: World, chance: random.Random) -> None:
         f'plug:{{type file slave.pcm null file "{run}" format raw}}',
         "{type null}",
         "null\ntype file",
-        "plug:'" * 1000,
+        "plug:'" * 500,
     ]
     for name in names:
         world.refuses(name)
