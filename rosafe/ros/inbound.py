@@ -47,7 +47,7 @@ from rosafe.ros.wire import Gather
 HEADER_BYTES = 65536  # of a TCPROS header; it holds the definition of a message
 HTTP_HEADER_BYTES = 16384
 BODY_BYTES = 2**18  # of an XML-RPC request; the longest is a list of publishers
-SLIP_BYTES = 2**20  # so much is read of any message: whoever is a little beyond a bound gets its error by name
+SLIP_BYTES = 2**20  # so much is read of any service request: a list that is too long gets its error by name
 LONG_BYTES, LONG_REQUESTS = 65536, 16  # of requests longer than this so many are read at a time
 REQUEST_SECONDS = 10.0  # from the first byte of a service request to the last
 ANSWER_SECONDS = 60.0  # for a client to take an answer
@@ -163,7 +163,7 @@ def _serve(sock: socket.socket, address: Any, header: Mapping[str, str], rest: b
         if header.get("probe") == "1":
             return None
         persistent = header.get("persistent", "").lower() in ("1", "true")
-        reader = _Requests(sock, rest, largest(service.request_class))
+        reader = _Requests(sock, rest, max(SLIP_BYTES, largest(service.request_class)))
         try:
             while True:
                 data = reader.next(persistent)
@@ -228,7 +228,7 @@ def _answer(sock: socket.socket, service: Any, data: bytes, header: Mapping[str,
     try:
         try:
             request = service.request_class().deserialize(data)
-        except genpy.message.DeserializationError as problem:
+        except Exception as problem:  # genpy's of several kinds
             raise rospy.ServiceException(f"it cannot be read: {problem}") from None
         request._connection_header = header
         response = tcpros_service.convert_return_to_response(service.handler(request), service.response_class)
@@ -292,13 +292,13 @@ _WIDTHS.update(float32=4, float64=8)
 
 @functools.cache
 def largest(message_class: Any) -> int:
-    """The bytes of the longest message that makes sense, and `SLIP_BYTES` at least.
+    """The bytes of the longest message that makes sense.
 
     Texts have up to MAX_STRING characters, and sequences up to MAX_SEQUENCE elements or as many as the class'
     `longest_sequence` says.
     """
     longest = getattr(message_class, "longest_sequence", MAX_SEQUENCE)
-    return max(SLIP_BYTES, sum(_largest(kind, longest) for kind in message_class._slot_types))
+    return sum(_largest(kind, longest) for kind in message_class._slot_types)
 
 
 def _largest(kind: str, longest: int) -> int:

@@ -14,7 +14,7 @@ from urllib.parse import urlsplit
 
 DEFAULT_URI = "http://127.0.0.1:11311"
 PROBE_SECONDS = 3.0
-ANSWER_BYTES = 2**24  # of any call; the longest is the master's list of all there is
+ANSWER_BYTES = 2**22  # to any call; the longest is the master's list of all topics
 RESOLVE_SECONDS = 5.0  # the whole probe; a name server that is silent is not bound by the socket's timeout
 FAILURES = (OSError, xmlrpc.client.Error, http.client.HTTPException, ValueError, SyntaxError)  # of a call, see `reason`
 

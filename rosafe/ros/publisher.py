@@ -73,6 +73,10 @@ class _Topic(topics._PublisherImpl):
             if self.closed:  # in this very moment; rospy would leave the subscriber waiting
                 connection.close()
 
+    def remove_connection(self, connection: Any) -> None:
+        """Forget a subscriber; rospy would tell its listeners, which there are none of, and stumble at the end."""
+        topics._TopicImpl.remove_connection(self, connection)
+
     def publish(self, message: Any, connection_override: Any = None) -> None:
         """Keep `message` for those who come later, and send it to those who are here (or to one connection)."""
         if self.closed:

@@ -1,0 +1,225 @@
+"""What a hostile or broken peer does to a node, from outside, and whether the node is well afterwards."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import io
+import os
+import re
+import socket
+import socketserver
+import struct
+import threading
+import time
+import xmlrpc.client
+import xmlrpc.server
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+from urllib.parse import urlsplit
+
+import rosgraph
+from rosgraph.network import encode_ros_handshake_header, read_ros_handshake_header
+
+from tests.harness import Graph, Process, proc, wait_for
+
+WELL_SECONDS = 2.0  # for any call of a node that is well
+HUGE = 0xFFFFFFFF
+
+
+class Target:
+    """A node under attack."""
+
+    def __init__(self, graph: Graph, process: Process, name: str) -> None:
+        self.graph = graph
+        self.process = process
+        self.name = name
+        self._master = rosgraph.Master("/attacker", master_uri=graph.uri)
+        state = importlib.import_module(f"{'bass' if 'bass' in name else 'rosAFE'}.msg")
+        self._state = state.genom_state_component
+        api, service = self._master.lookupNode(f"/{name}"), self._master.lookupService(f"/{name}/Stop")
+        self.api_uri = api
+        self.ports = {"XML-RPC": _address(api), "TCPROS": _address(service)}
+
+    # --- attacks ---
+
+    def connect(self, port: str, said: bytes = b"") -> socket.socket:
+        """A connection on which something was said."""
+        sock = socket.create_connection(self.ports[port], 20)
+        sock.sendall(said)
+        return sock
+
+    def subscribe(self, topic: str, caller: str = "/attacker", wait: bool = True) -> socket.socket:
+        """A subscriber that never reads; where it does not `wait`, its header is not answered yet."""
+        fields = {"topic": f"/{self.name}/{topic}", "md5sum": "*", "type": "*", "callerid": caller}
+        return self._greet(fields, wait)
+
+    def client(self, service: str, **fields: str) -> socket.socket:
+        """A service client that has not asked for anything yet."""
+        return self._greet({"service": f"/{self.name}/{service}", "md5sum": "*", "callerid": "/attacker", **fields})
+
+    def _greet(self, fields: dict[str, str], wait: bool = True) -> socket.socket:
+        sock = self.connect("TCPROS", encode_ros_handshake_header(fields))
+        if wait:
+            read_ros_handshake_header(sock, io.BytesIO(), 4096)
+        return sock
+
+    # --- how it is ---
+
+    def assert_well(self) -> None:
+        """Whoever comes now is served at once: a service call, a subscriber, and the master or a tool."""
+        begin = time.monotonic()
+        self.graph.call(f"/{self.name}/abort_activity", activity=2**32 - 1)
+        called = time.monotonic()
+        node: Any = xmlrpc.client.ServerProxy(self.api_uri)
+        assert node.getPid("/test")[2] == self.process.pid
+        asked = time.monotonic()
+        self.graph.message(f"/{self.name}/genom_state", self._state)
+        seen = time.monotonic()
+        took = called - begin, asked - called, seen - asked
+        assert max(took) < WELL_SECONDS, f"service, XML-RPC, topic: {took} s; {self.process}"
+
+    @property
+    def descriptors(self) -> int:
+        return len(os.listdir(proc(self.process.pid, "fd")))
+
+    @property
+    def threads(self) -> int:
+        return len(os.listdir(proc(self.process.pid, "task")))
+
+    @property
+    def megabytes(self) -> float:
+        return int(proc(self.process.pid, "statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+    @contextmanager
+    def costs_nothing(self, megabytes: float = 30.0) -> Iterator[None]:
+        """What was done within is over: soon as many descriptors as before, no more memory, and the node is well."""
+        self.assert_well()
+        descriptors, before = self.descriptors, self.megabytes
+        yield
+        self.assert_well()
+        wait_for(
+            lambda: self.descriptors <= descriptors + 2,
+            what=lambda: f"{descriptors} descriptors, there are {self.descriptors}",
+        )
+        assert self.megabytes < before + megabytes
+        assert self.process.alive and "Traceback" not in self.process.err, self.process
+
+    def said(self, pattern: str) -> int:
+        """How many lines the log has of an event, those that only sum up left out."""
+        lines = self.process.err.splitlines()
+        return sum(bool(re.search(pattern, line)) and " like it in " not in line for line in lines)
+
+    @contextmanager
+    def says_once(self, *patterns: str) -> Iterator[None]:
+        """What is done within makes one line of each kind, or none where there was one already a moment ago."""
+        before = {pattern: self.said(pattern) for pattern in patterns}
+        yield
+        for pattern in patterns:
+            wait_for(lambda: self.said(pattern), what=lambda: f"{pattern} in {self.process}")  # noqa: B023
+            assert self.said(pattern) <= before[pattern] + 1
+
+
+def _address(uri: str) -> tuple[str, int]:
+    parts = urlsplit(uri)
+    assert parts.hostname and parts.port
+    return parts.hostname, parts.port
+
+
+def closed(sock: socket.socket) -> bool:
+    """Whether the node has closed a connection, once it has or 20 s are over."""
+    sock.settimeout(20)
+    try:
+        while sock.recv(65536):
+            continue
+    except TimeoutError:
+        return False
+    except ConnectionError:
+        return True
+    return True
+
+
+def pour(sock: socket.socket, data: bytes, most: int = 200_000_000) -> int:
+    """Send `data` again and again until the node does not take it any more; how many bytes went."""
+    sent = 0
+    sock.settimeout(20)
+    with contextlib.suppress(ConnectionError):
+        while sent < most:
+            sent += sock.send(data)
+    return sent
+
+
+class FakePublisher:
+    """A publisher of a topic as the master and a subscriber see it, which then sends what it likes.
+
+    Parameters
+    ----------
+    behave : callable
+        Takes each connection of a subscriber whose header has been read.
+    asked : callable, optional
+        The answer to requestTopic, from the port; by default a right one.
+    """
+
+    def __init__(
+        self,
+        graph: Graph,
+        topic: str,
+        kind: str,
+        behave: Callable[[socket.socket], None],
+        asked: Callable[[int], Any] | None = None,
+        name: str = "/evil_publisher",
+    ) -> None:
+        self.calls = 0
+
+        class Connection(socketserver.BaseRequestHandler):
+            def handle(self) -> None:
+                read_ros_handshake_header(self.request, io.BytesIO(), 4096)
+                behave(self.request)
+
+        class Listener(socketserver.ThreadingTCPServer):
+            daemon_threads = True
+            block_on_close = False
+
+        class Api(socketserver.ThreadingMixIn, xmlrpc.server.SimpleXMLRPCServer):
+            daemon_threads = True
+            block_on_close = False
+
+        def request_topic(*_: Any) -> Any:
+            self.calls += 1
+            return asked(port) if asked else (1, "", ["TCPROS", "127.0.0.1", port])
+
+        self._listener = Listener(("127.0.0.1", 0), Connection)
+        port = self._listener.server_address[1]
+        self._api = Api(("127.0.0.1", 0), logRequests=False)
+        self._api.register_function(request_topic, "requestTopic")
+        for server in (self._listener, self._api):
+            threading.Thread(target=server.serve_forever, args=(0.05,), daemon=True).start()
+        self._topic = topic
+        self._uri = f"http://127.0.0.1:{self._api.server_address[1]}/"
+        self._master = xmlrpc.client.ServerProxy(graph.uri)
+        self._name = name
+        self._master.registerPublisher(name, topic, kind, self._uri)
+
+    def __enter__(self) -> FakePublisher:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._master.unregisterPublisher(self._name, self._topic, self._uri)
+        for server in (self._listener, self._api):
+            server.shutdown()
+            server.server_close()
+
+
+def publisher_header(kind: Any, topic: str) -> bytes:
+    """The header with which a right publisher answers."""
+    return bytes(
+        encode_ros_handshake_header(
+            {"topic": topic, "type": kind._type, "md5sum": kind._md5sum, "callerid": "/evil", "latching": "0"}
+        )
+    )
+
+
+def length(size: int) -> bytes:
+    """A length as TCPROS has them."""
+    return struct.pack("<I", size)

@@ -1,0 +1,394 @@
+"""Attacks on the ports of running nodes: silence, garbage, floods and lies about lengths cost nobody anything."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import re
+import resource
+import socket
+import threading
+import xmlrpc.client
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from typing import Any
+
+import pytest
+import rosAFE.msg
+from actionlib_msgs.msg import GoalID
+from rosgraph.network import encode_ros_handshake_header, read_ros_handshake_header
+from std_msgs.msg import Header
+
+from rosafe.ros import door
+from tests.harness import Graph, proc, wait_for
+from tests.ros.attacker import HUGE, FakePublisher, Target, closed, length, pour, publisher_header
+from tests.ros.session import Session, own_node
+
+PORTS = ("TCPROS", "XML-RPC")
+
+
+@contextmanager
+def node(graph: Graph, component: str, name: str) -> Iterator[Target]:
+    with graph.node(f"{component}-ros", "-i", name) as process:
+        yield Target(graph, process, name)
+
+
+@pytest.fixture(scope="module", params=["rosAFE", "bass"])
+def target(graph: Graph, request: pytest.FixtureRequest) -> Iterator[Target]:
+    """Each of the two nodes; it must be as well after a test as before."""
+    with node(graph, request.param, f"{request.param}_attacked") as target:
+        yield target
+
+
+# --- silence and garbage ----------------------------------------------------------------------------------------
+
+OPENINGS = {
+    "nothing": b"",
+    "a length and no more": length(40),
+    "half a request": b"POST / HTTP/1.1\r\nContent-Length: 100\r\n\r\n<?xml",
+    "a request for a page": b"GET / HTTP/1.1\r\nHost: node\r\n\r\n",
+    "ones": b"\xff" * 100,
+    "zeros": bytes(100),
+    "a header with wrong lines": length(30) + length(1000) + bytes(26),
+    "a header that is no text": length(14) + length(10) + b"\xff\xfe=\xff\xfe\xff\xfe\xff\xfe\xff",
+    "an empty header": length(0),
+}
+
+
+def test_one_that_says_too_little_or_garbage_holds_nobody_up(target: Target) -> None:
+    """Nor do all of them together; the node closes them within some seconds, and says so in the log."""
+    lines = "TCPROS: 127.0.0.1: said nothing for 5 s", r"TCPROS: 127.0.0.1: a header of \d+ bytes, which is not ROS"
+    with target.says_once(*lines), target.costs_nothing(), ExitStack() as stack:
+        open_ones = []
+        for port in PORTS:
+            for said in OPENINGS.values():
+                open_ones.append(stack.enter_context(target.connect(port, said)))
+                target.assert_well()
+        for sock in open_ones:
+            assert closed(sock)
+
+
+def test_many_that_are_silent_or_slow_hold_nobody_up(target: Target) -> None:
+    """More than rospy could have open at all; some of them say a byte now and then."""
+    line = "TCPROS: too many connections that say nothing"
+    with target.says_once(line), target.costs_nothing(), ExitStack() as stack:
+        for port in PORTS:
+            crowd = [stack.enter_context(target.connect(port)) for _ in range(1200)]
+            target.assert_well()
+            for byte in (b"\x10", b"\0", b"\0"):
+                for sock in crowd[-200:]:
+                    with contextlib.suppress(ConnectionError):
+                        sock.sendall(byte)
+                target.assert_well()
+        assert target.descriptors < 2 * door.GUESTS + 200, "no more wait than that"
+
+
+def test_one_who_says_its_piece_byte_by_byte_is_understood(target: Target) -> None:
+    header = encode_ros_handshake_header(
+        {"service": f"/{target.name}/connect_service", "md5sum": "*", "callerid": "/slow"}
+    )
+    request = length(8) + bytes(8)
+    with target.connect("TCPROS") as sock:
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        for byte in header + request:  # the request does not wait for the answer to the header
+            sock.sendall(bytes([byte]))
+        answer = b""
+        while b"no_such_remote" not in answer and (part := sock.recv(4096)):
+            answer += part
+        assert b"no_such_remote" in answer
+    body = xmlrpc.client.dumps(("/slow",), "getPid").encode()
+    call = b"POST / HTTP/1.1\r\nHost: node\r\nContent-Length: %d\r\n\r\n%s" % (len(body), body)
+    with target.connect("XML-RPC") as sock:
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        for byte in call:
+            sock.sendall(bytes([byte]))
+        sock.sendall(call + call)  # two more at once, on the same connection
+        answers = b""
+        while answers.count(b"</methodResponse>") < 3:
+            part = sock.recv(4096)
+            assert part, answers
+            answers += part
+        assert answers.count(b"<int>%d</int>" % target.process.pid) == 3
+
+
+# --- lengths ----------------------------------------------------------------------------------------------------
+
+
+def test_lengths_beyond_all_reason_are_not_believed(target: Target) -> None:
+    """Of headers, requests, HTTP bodies and HTTP headers; each is one line in the log however often it comes."""
+    bomb = b"<value><i4>1</i4></value>" * 10
+    lines = (
+        r"TCPROS: 127.0.0.1: a header of \d+ bytes",
+        rf"/{target.name}/Stop: 127.0.0.1: a request of \d+ bytes",
+        r"XML-RPC: 127.0.0.1: an HTTP request of \d+ bytes",
+        "XML-RPC: 127.0.0.1: an HTTP request whose headers have no end",
+    )
+    with target.says_once(*lines), target.costs_nothing():
+        for _ in range(3):
+            with target.connect("TCPROS", length(HUGE)) as sock:
+                assert pour(sock, bytes(10**6)) < 20e6
+            for service in ("connect_port", "Stop", "get_loggers"):
+                for size in (HUGE, 2**21):
+                    with target.client(service) as sock:
+                        sock.sendall(length(size))
+                        assert pour(sock, bytes(10**6)) < 20e6
+            with target.connect("XML-RPC", b"POST / HTTP/1.1\r\nContent-Length: 4000000000\r\n\r\n") as sock:
+                assert pour(sock, bytes(10**6)) < 20e6
+            with target.connect("XML-RPC", b"POST / HTTP/1.1\r\n") as sock:
+                assert pour(sock, b"x: y\r\n" * 10**5) < 20e6
+            with target.connect("XML-RPC") as sock:
+                assert pour(sock, b"x" * 10**6) < 20e6
+            packed = b"POST / HTTP/1.1\r\nContent-Encoding: gzip\r\nContent-Length: %d\r\n\r\n" % len(bomb)
+            with target.connect("XML-RPC", packed + bomb) as sock:
+                assert sock.recv(100).startswith(b"HTTP/1.1 501")
+
+
+def test_requests_that_are_not_finished_or_not_begun(target: Target) -> None:
+    """A client has some seconds for its request; only a persistent one may keep silent, and not amid a request."""
+    lines = [
+        f"/{target.name}/{name}: 127.0.0.1: no whole request within" for name in ("connect_port", "connect_service")
+    ]
+    with target.says_once(*lines), target.costs_nothing(), ExitStack() as stack:
+        hanging = [stack.enter_context(target.client("connect_port")) for _ in range(20)]
+        for sock in hanging[10:]:
+            sock.sendall(length(16384) + b"x")
+        patient = stack.enter_context(target.client("connect_service", persistent="1"))
+        amid = stack.enter_context(target.client("connect_service", persistent="1"))
+        amid.sendall(length(8))
+        target.assert_well()
+        for sock in (*hanging, amid):
+            assert closed(sock)
+        patient.sendall(length(8) + bytes(8))
+        assert b"no_such_remote" in patient.recv(4096)
+
+
+def test_requests_that_are_garbage_get_an_answer(target: Target) -> None:
+    with target.costs_nothing():
+        for garbage in (b"", b"x", length(HUGE) + b"x", b"\xff" * 5000):
+            with target.client("connect_port") as sock:
+                sock.sendall(length(len(garbage)) + garbage)
+                answer = sock.recv(4096)
+                assert answer[:1] == b"\0" and b"service cannot process request" in answer
+        api: Any = xmlrpc.client.ServerProxy(target.api_uri)
+        with pytest.raises(xmlrpc.client.Fault):
+            api.system.multicall([{"methodName": "getBusInfo", "params": ["/evil"]}] * 100)
+        deep = "<value><array><data>" * 8000
+        body = f"<methodCall><methodName>getPid</methodName><params><param>{deep}".encode()
+        with target.connect("XML-RPC", b"POST / HTTP/1.1\r\nContent-Length: %d\r\n\r\n" % len(body) + body) as sock:
+            answer = b""
+            while b"</methodResponse>" not in answer and (part := sock.recv(4096)):
+                answer += part
+            assert b"<fault>" in answer
+
+
+def test_a_name_that_would_break_those_who_read_it_is_refused(target: Target) -> None:
+    """`rosnode info` gets the names of all subscribers in XML, where such characters cannot stand."""
+    for caller in ("/evil\x01name", "/" + "x" * 5000):
+        fields = {"topic": f"/{target.name}/genom_state", "md5sum": "*", "callerid": caller}
+        with target.connect("TCPROS", encode_ros_handshake_header(fields)) as sock:
+            assert read_ros_handshake_header(sock, io.BytesIO(), 4096)["error"] == "callerid is no name"
+            assert closed(sock)
+
+
+# --- descriptors ------------------------------------------------------------------------------------------------
+
+
+def test_the_soft_limit_is_raised(target: Target) -> None:
+    limits = proc(target.process.pid, "limits").read_text()
+    soft, hard = re.findall(r"^Max open files +(\d+) +(\d+)", limits, re.MULTILINE)[0]
+    assert int(soft) == min(door.DESCRIPTORS, int(hard)) or int(soft) > door.DESCRIPTORS
+
+
+def test_when_descriptors_run_out_the_node_waits_and_goes_on(target: Target) -> None:
+    """Subscribers that never read take all there are; once they are gone, all who waited are served."""
+    pid = target.process.pid
+    usual = resource.prlimit(pid, resource.RLIMIT_NOFILE)
+    try:
+        with target.costs_nothing(), ExitStack() as stack:
+            limit = target.descriptors + 60
+            resource.prlimit(pid, resource.RLIMIT_NOFILE, (limit, usual[1]))
+            for number in range(limit + 50):
+                stack.enter_context(target.subscribe("genom_state", f"/deaf{number}", wait=False))
+            wait_for(lambda: target.said("TCPROS: of"), what=lambda: str(target.process))
+            assert target.descriptors < limit, "some are left to the node itself"
+            stack.close()
+            target.assert_well()
+    finally:
+        resource.prlimit(pid, resource.RLIMIT_NOFILE, usual)
+    line = f"TCPROS: of {limit} file descriptors none is left for connections: new ones wait"
+    assert target.said(line) == target.said("TCPROS: there are file descriptors for connections again") == 1
+
+
+def test_1100_subscribers_that_never_read(target: Target) -> None:
+    """More than fitted into Debian's usual limit; the one after them is served as the first."""
+    with target.costs_nothing(megabytes=60), ExitStack() as stack:
+        for number in range(1100):
+            stack.enter_context(target.subscribe("genom_state", f"/deaf{number}"))
+        target.assert_well()
+        stack.close()
+        wait_for(lambda: target.threads < 100, what=lambda: f"end of {target.threads} threads")
+
+
+# --- publishers -------------------------------------------------------------------------------------------------
+
+AUDIO = rosAFE.msg.binaudio_portStruct
+
+
+@pytest.fixture
+def afe(graph: Graph) -> Iterator[tuple[Session, Target]]:
+    with own_node(graph, name="listening") as session:
+        yield session, Target(graph, session.process, session.name)
+
+
+@pytest.mark.parametrize("behaviour", ["header", "message", "answer"])
+def test_a_publisher_that_lies_about_lengths_is_left(afe: tuple[Session, Target], graph: Graph, behaviour: str) -> None:
+    """Of its header, of a message, of its answer to the question where it is; sound from others comes as before."""
+    session, target = afe
+    poured: list[int] = []
+
+    def behave(sock: socket.socket) -> None:
+        if behaviour == "message":
+            sock.sendall(publisher_header(AUDIO, "/evil/Audio"))
+        sock.sendall(length(HUGE if behaviour == "header" else 2**28))
+        poured.append(pour(sock, bytes(10**6)))
+
+    def answer(port: int) -> Any:
+        return (
+            (1, "", ["TCPROS", "127.0.0.1", "x" * 40_000_000])
+            if behaviour == "answer"
+            else (1, "", ["TCPROS", "127.0.0.1", port])
+        )
+
+    session.build("PreProc")  # the first one takes memory that stays
+    session.ok("Stop")
+    with target.costs_nothing(), FakePublisher(graph, "/evil/Audio", AUDIO._type, behave, answer) as evil:
+        session.ok("connect_port", local="Audio", remote="/evil/Audio")
+        if behaviour == "answer":
+            wait_for(lambda: evil.calls, 20)
+        else:
+            wait_for(lambda: poured, 30, lambda: str(target.process))
+            assert poured[0] < 40e6
+        target.assert_well()
+    session.listen()
+    session.build("PreProc")
+    line = {
+        "header": "TCPROS: 127.0.0.1: a header of 4294967295",
+        "message": "/evil/Audio: 127.0.0.1: a message of 268435456",
+    }
+    if behaviour in line:
+        assert target.said(line[behaviour]) == 1, target.process
+
+
+def test_goals_are_bounded_in_all_their_texts(afe: tuple[Session, Target], graph: Graph) -> None:
+    """`frame_id`, the goal's id and the request's own names; the topics go on for others."""
+    session, target = afe
+    goal = rosAFE.msg.PreProcActionGoal
+    long = "x" * 200_000
+    topics = {
+        "goal": [
+            goal(header=Header(frame_id=long)),
+            goal(goal_id=GoalID(id=long)),
+            goal(goal=rosAFE.msg.PreProcGoal(name=long)),
+        ],
+        "cancel": [GoalID(id=long)],
+    }
+    for topic, messages in topics.items():
+        for message in messages:
+            name = f"/{session.name}/PreProc/{topic}"
+            behaved = threading.Event()
+
+            def behave(sock: socket.socket, message: Any = message, name: str = name) -> None:
+                out = io.BytesIO()
+                message.serialize(out)
+                sock.sendall(publisher_header(message, name) + length(len(out.getvalue())) + out.getvalue())
+                if closed(sock):
+                    behaved.set()  # noqa: B023
+
+            with FakePublisher(graph, name, message._type, behave):
+                assert behaved.wait(20), target.process
+            assert target.said(f"{name}: 127.0.0.1: a message of") == 1
+    session.listen()
+    goal_of_mine = session.goal("InputProc", nFramesPerBlock=1600).active()
+    session.ok("Stop")
+    assert goal_of_mine.result().genom_success
+
+
+def test_a_publisher_of_garbage_goals_does_not_keep_others_from_theirs(
+    afe: tuple[Session, Target], graph: Graph
+) -> None:
+    session, target = afe
+    goal = rosAFE.msg.InputProcActionGoal
+    name = f"/{session.name}/InputProc/goal"
+    came = threading.Semaphore(0)
+
+    def behave(sock: socket.socket) -> None:
+        sock.sendall(publisher_header(goal, name) + length(50) + b"\xff" * 50)
+        came.release()
+        closed(sock)
+
+    with FakePublisher(graph, name, goal._type, behave):
+        for _ in range(2):  # it is tried again
+            assert came.acquire(timeout=20)
+        session.listen()
+        mine = session.goal("InputProc", nFramesPerBlock=1600).active()
+        session.ok("Stop")
+        assert mine.result().genom_success
+        target.assert_well()
+
+
+def test_lists_of_publishers_that_are_not_there_cost_little(afe: tuple[Session, Target], graph: Graph) -> None:
+    """Thousands of addresses where nobody answers, sent by anybody; the one that is there is found all the same."""
+    session, target = afe
+    session.listen()
+    topic = session.microphone.topic if session.microphone else ""
+    with socket.create_server(("127.0.0.1", 0), backlog=1) as silent:
+        where = silent.getsockname()[1]
+        threads = target.threads
+        api: Any = xmlrpc.client.ServerProxy(target.api_uri)
+        for turn in range(3):
+            crowd = [f"http://127.0.0.1:{where}/{turn}/{number}" for number in range(1500)]
+            assert api.publisherUpdate("/evil", topic, crowd)[0] == 1
+        assert target.threads < threads + 20
+        target.assert_well()
+        another = session.listen()
+        wait_for(lambda: another.heard, 30)
+        assert target.threads < threads + 20
+
+
+# --- all at once ------------------------------------------------------------------------------------------------
+
+
+def test_a_mixed_load_loses_no_frame(graph: Graph) -> None:
+    """30 subscribers that never read, clients that die, garbage on all ports, while sound is worked on."""
+    with node(graph, "bass", "bass_mixed") as bass, own_node(graph, name="mixed") as session:
+        target = Target(graph, session.process, "mixed")
+        target.graph.call(
+            "/bass_mixed/Acquire", device="scene:", sampleRate=44100, nFramesPerChunk=2205, nChunksOnPort=20
+        )
+        session.ok("connect_port", local="Audio", remote="/bass_mixed/Audio")
+        session.ok("InputProc", nFramesPerBlock=4410, bufferSize_s_port=0.1)  # several messages may wait for a reader
+        for request in ("PreProc", "GammatoneProc"):
+            session.ok(request)
+        with ExitStack() as stack, session.follow("gammatone") as messages:
+            for number in range(30):
+                topic = ("gammatonePort/gammatone", "genom_state")[number % 2]
+                stack.enter_context(target.subscribe(topic, f"/deaf{number}"))
+            for turn in range(15):
+                for victim in (target, bass):
+                    victim.client("connect_port").close()
+                    victim.subscribe("genom_state", f"/dying{turn}").close()
+                    for port in PORTS:
+                        stack.enter_context(victim.connect(port, list(OPENINGS.values())[turn % len(OPENINGS)]))
+                seen = len(messages)
+                wait_for(lambda: len(messages) > seen + 1, 20)  # noqa: B023
+            for victim in (target, bass):
+                victim.assert_well()
+                done = graph.run("rosservice", "call", f"/{victim.name}/connect_service", "{local: a, remote: b}")
+                assert "no_such_remote" in done.stdout
+                done = graph.run("rostopic", "echo", "-n1", f"/{victim.name}/genom_state")
+                assert "task" in done.stdout
+        indices = [m.lastFrameIndex for m in messages if m.lastFrameIndex]
+        assert indices == list(range(indices[0], indices[-1] + 1, 4410)), "no block is missing"
+        health = session.health(lambda entries: "lost" in entries)
+        assert (health["lost"], health["gaps"], health["refused"]) == ("0", "0", "0")
+        graph.call("/bass_mixed/Stop")
