@@ -11,6 +11,7 @@ import sys
 
 from rosafe import __version__, commands
 from rosafe.commands import Failure
+from rosafe.output import OutputError
 from rosafe.ros.startup import Parser
 
 _EPILOG = """example:
@@ -33,7 +34,7 @@ def main(argv: list[str] | None = None) -> int:
             return int(options.run(options))
         finally:
             sys.stdout.flush()
-    except Failure as problem:
+    except (Failure, OutputError) as problem:
         print(f"{name}: {problem}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:

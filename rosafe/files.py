@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import errno
-import fcntl
 import json
 import os
-import stat
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -21,15 +17,11 @@ from rosafe.chain import Chain
 from rosafe.interface import KINDS
 from rosafe.npz import NpzWriter
 from rosafe.offline import DEFAULT_BLOCK
+from rosafe.output import OutputError, new_file
 from rosafe.tree.tree import MAX_BYTES
 from rosafe.tree.zone import Block
 
 _DEFAULTS = {parameter.name: parameter.default for kind in KINDS.values() for parameter in kind.parameters}
-PART = ".part"  # what the name of an unfinished output ends with
-
-
-class OutputError(Exception):
-    """The output cannot be written; the text is one line that says why."""
 
 
 def process_file(
@@ -78,15 +70,13 @@ def process_file(
     values, wanted = check_parameters(parameters), check_outputs(outputs)
     file = AudioFile(source)
     try:
-        path = _target(file.path, target, replace)
+        if os.path.exists(target) and os.path.samefile(file.path, target):
+            raise OutputError(f"{target} is the input itself")
         if file.channels != 2:
             kind = "is mono (one channel)" if file.channels == 1 else f"has {file.channels} channels"
             raise AudioFileError(f"{file.path} {kind}; wanted are two: left and right ear")
-        try:
-            with _new_file(path, replace) as descriptor:
-                return _stream(file, descriptor, values, block_frames, wanted, progress)
-        except OSError as problem:
-            raise OutputError(f"cannot write {path}: {problem.strerror or problem}") from problem
+        with new_file(target, replace) as descriptor:
+            return _stream(file, descriptor, values, block_frames, wanted, progress)
     finally:
         file.close()
 
@@ -142,65 +132,6 @@ def _check_memory(kind: str, size: int) -> None:
             f"{kind}: one block of output would take {size / 1e9:.1f} GB, allowed are {MAX_BYTES / 1e9:.1f} GB; "
             "take fewer channels or lags, or a smaller --block"
         )
-
-
-# --- the output -------------------------------------------------------------------------------------------------
-
-
-def _target(source: Path, target: str | Path, replace: bool) -> Path:
-    """Where the output goes, links followed: to a new file, or in the place of a file that may be replaced."""
-    path = Path(os.path.realpath(target))
-    try:
-        found = path.stat()
-    except FileNotFoundError:
-        return path
-    except OSError as problem:
-        raise OutputError(f"cannot write {target}: {problem.strerror}") from None
-    if not stat.S_ISREG(found.st_mode):
-        raise OutputError(f"{target} is not a regular file")
-    if os.path.samefile(source, path):
-        raise OutputError(f"{target} is the input itself")
-    if not replace:
-        raise OutputError(f"{target} is there already; --force replaces it")
-    return path
-
-
-@contextmanager
-def _new_file(path: Path, replace: bool) -> Iterator[int]:
-    """A descriptor of an empty file that takes the place `path` if all goes well, and else is gone.
-
-    Its name until then is always the same, and it is locked: two at once for one place notice each other, and what
-    a killed process has left is used up by the next one.
-    """
-    part = path.with_name(path.name + PART)
-    descriptor = _open_locked(part)
-    try:
-        yield descriptor
-        if not replace and path.exists():
-            raise FileExistsError(errno.EEXIST, "it has come into being meanwhile")
-        part.rename(path)
-    except BaseException:
-        part.unlink(missing_ok=True)
-        raise
-    finally:
-        os.close(descriptor)
-
-
-def _open_locked(part: Path) -> int:
-    while True:
-        descriptor = os.open(part, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW, 0o666)
-        try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if part.exists() and os.path.samestat(part.stat(), os.fstat(descriptor)):
-                os.ftruncate(descriptor, 0)
-                return descriptor
-        except BlockingIOError:
-            os.close(descriptor)
-            raise BlockingIOError(errno.EAGAIN, "another process is writing it") from None
-        except BaseException:
-            os.close(descriptor)
-            raise
-        os.close(descriptor)  # whoever had it has just finished, and moved or removed it
 
 
 def _check_room(descriptor: int, size: int) -> None:

@@ -37,6 +37,7 @@ class BassNode:
         self._source: Source | None = None  # of the acquisition under way
         self._last_end = self._last_loss = "none"
         self._log_loss = EventLog(rospy.logwarn)
+        self._log_clients = EventLog(rospy.logwarn)
         self._printing = threading.Lock()
 
         self._node.activity("Acquire", self._acquire)
@@ -124,7 +125,7 @@ class BassNode:
         except master.FAILURES as problem:
             raise ComponentError("::genom::mwerr", what=f"no ROS master: {master.reason(problem)}") from None
         try:
-            server = DedicatedSocket(lambda: self._snapshot, str(host), int(port), rospy.logwarn)
+            server = DedicatedSocket(lambda: self._snapshot, str(host), int(port), self._log_clients)
         except (OSError, OverflowError, ValueError, TypeError) as problem:
             why = f"cannot serve {host}:{port}: {getattr(problem, 'strerror', None) or problem}"
             raise ComponentError("::genom::syserr", why, code=getattr(problem, "errno", None) or 22) from None

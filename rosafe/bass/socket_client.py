@@ -20,7 +20,7 @@ TIMEOUT_SECONDS = 10.0  # for an answer
 POLL_SECONDS = 0.02  # between two requests where nothing is new
 RESTART_SECONDS = 1.0  # without anything new, look whether the stream began anew
 _HEADER = struct.Struct("<iiq")
-_MOST = 2**31 - 1
+_MOST = 2**24  # frames: no window is longer
 
 
 class Block(NamedTuple):
@@ -45,6 +45,8 @@ class SocketClient:
         """Up to `frames` frames from number `first` (from 1 on); none where nothing is new."""
         self._connection.sendall(b"Read Port - N %d - nfr %d\n" % (frames, first))
         count, lost, following = _HEADER.unpack(self._take(_HEADER.size))
+        if not 0 <= count <= min(frames, _MOST) or lost < 0 or following < count:
+            raise ConnectionError(f"what answers is no bass: {count} frames where {frames} were asked for")
         samples = np.frombuffer(self._take(8 * count), "<i4").reshape(2, count)
         return Block(following - count, samples, lost)
 

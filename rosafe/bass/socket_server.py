@@ -7,6 +7,7 @@ on that were no longer there), int64 nfr to ask for next, n int32 of the left ea
 
 from __future__ import annotations
 
+import errno
 import re
 import selectors
 import socket
@@ -21,6 +22,8 @@ DEFAULT_HOST, DEFAULT_PORT = "127.0.0.1", 8081
 MAX_CLIENTS = 31
 QUIET_SECONDS = 0.05  # after which a request without a line end is taken for complete
 DEAD_SECONDS = 10.0  # without taking a byte of an answer, a client counts as dead
+IDLE_SECONDS = 10.0  # without a whole request, a client goes where another one wants in
+PAUSE_SECONDS = 0.5  # without accepting, where the process has no file descriptor left
 _MAX_REQUEST = 4096  # bytes without a request in them, then they are forgotten
 _MARK = b"Read Port"
 _COUNT, _FIRST = re.compile(rb"N[^\w-]*(-?\d{1,40})"), re.compile(rb"nfr[^\w-]*(-?\d{1,40})")
@@ -79,11 +82,12 @@ class _Client:
         self.requests: list[tuple[int, int]] = []
         self.outbox = memoryview(b"")
         self.pending = False  # whether the inbox may hold a request without a line end
-        self.heard = self.moved = time.monotonic()
+        self.heard = self.moved = self.asked = time.monotonic()
 
 
 class DedicatedSocket:
     """The server. Each client has at most one answer under way, so a slow one takes no more memory than a window.
+    Where all places are taken, a client that has asked for nothing for `IDLE_SECONDS` makes room for a new one.
 
     Parameters
     ----------
@@ -92,7 +96,7 @@ class DedicatedSocket:
     host, port : str, int
         Address to serve.
     report : callable
-        Takes a line about clients turned away.
+        Takes a line about clients turned away or sent away.
 
     Raises
     ------
@@ -111,6 +115,7 @@ class DedicatedSocket:
         self.address = self._listener.getsockname()
         self._selector = selectors.DefaultSelector()
         self._selector.register(self._listener, selectors.EVENT_READ)
+        self._paused: float | None = None  # since when nobody is accepted
 
     def serve(self, stopping: threading.Event) -> None:
         """Answer clients until told to stop; then close all connections."""
@@ -122,6 +127,7 @@ class DedicatedSocket:
                     else:
                         self._attend(key.data, events)
                 self._look_after_quiet()
+                self._accept_again()
         finally:
             for client in list(self._clients.values()):
                 self._drop(client)
@@ -133,11 +139,15 @@ class DedicatedSocket:
 
     def _accept(self) -> None:
         try:
-            connection, address = self._listener.accept()
-        except OSError:  # gone before we came, or no descriptor left: nobody to answer
-            return
-        if len(self._clients) >= MAX_CLIENTS:
-            self._report(f"DedicatedSocket: {address[0]} turned away, {MAX_CLIENTS} clients are connected")
+            connection, (address, *_) = self._listener.accept()
+        except OSError as problem:
+            if problem.errno in (errno.EMFILE, errno.ENFILE):
+                self._report(f"DedicatedSocket: nobody is let in for a while: {problem.strerror}")
+                self._selector.unregister(self._listener)  # it would be ready again and again
+                self._paused = time.monotonic()
+            return  # else the client was gone before we came
+        if len(self._clients) >= MAX_CLIENTS and not self._make_room():
+            self._report(f"DedicatedSocket: {address} turned away, {MAX_CLIENTS} clients are connected")
             connection.close()
             return
         connection.setblocking(False)
@@ -147,6 +157,22 @@ class DedicatedSocket:
         client = _Client(connection)
         self._clients[connection.fileno()] = client
         self._selector.register(connection, selectors.EVENT_READ, client)
+
+    def _accept_again(self) -> None:
+        if self._paused is not None and time.monotonic() - self._paused > PAUSE_SECONDS:
+            self._selector.register(self._listener, selectors.EVENT_READ)
+            self._paused = None
+
+    def _make_room(self) -> bool:
+        """Send away who has asked for nothing for longest, if that is long; those who take an answer go last."""
+        now = time.monotonic()
+        idle = [client for client in self._clients.values() if now - client.asked > IDLE_SECONDS]
+        if not idle:
+            return False
+        longest = min(idle, key=lambda client: (bool(client.outbox), client.asked))
+        self._report(f"DedicatedSocket: a client that has asked for nothing for {now - longest.asked:.0f} s goes")
+        self._drop(longest)
+        return True
 
     def _drop(self, client: _Client) -> None:
         del self._clients[client.connection.fileno()]
@@ -171,7 +197,7 @@ class DedicatedSocket:
         while client.requests or client.outbox:
             if not client.outbox:
                 client.outbox = memoryview(read_frames(self._snapshot(), *client.requests.pop(0)))
-                client.moved = time.monotonic()
+                client.moved = client.asked = time.monotonic()
             try:
                 sent = client.connection.send(client.outbox)
             except BlockingIOError:

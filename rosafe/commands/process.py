@@ -156,7 +156,8 @@ def run(options: argparse.Namespace) -> int:
     signals = Signals()
     # Once, for all processes that are forked from this one.
     from rosafe.audiofile import AudioFileError
-    from rosafe.files import OutputError, process_file
+    from rosafe.files import process_file
+    from rosafe.output import OutputError
 
     if len(inputs) > 1:
         import scipy.signal  # noqa: F401

@@ -12,13 +12,14 @@ import os
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rosafe.commands import Failure
 from rosafe.commands._workers import Interrupted, Signals
 from rosafe.interface import ComponentError
+from rosafe.output import OutputError, Part
 
 if TYPE_CHECKING:
     from rosafe.bass.recording.outputs import Output
@@ -157,15 +158,8 @@ def _check(options: argparse.Namespace) -> Path | None:
     path = Path(os.path.expanduser(options.output))
     if path.suffix.lower() not in (".wav", ".bag"):
         options.usage_error(f"{options.output}: wanted is a name that ends in .wav or .bag")
-    if os.path.lexists(path):
-        if not path.is_file():
-            raise Failure(f"{path} is not a regular file")
-        if not options.force:
-            raise Failure(f"{path} is there already; --force replaces it")
-        if _is_input(path, options.device or ""):
-            raise Failure(f"{path} is the input itself")
-    elif not path.parent.is_dir():
-        raise Failure(f"cannot write {path}: there is no folder {path.parent}")
+    if options.force and path.exists() and _is_input(path, options.device or ""):
+        raise Failure(f"{path} is the input itself")
     return path
 
 
@@ -205,11 +199,13 @@ def _record(path: Path | None, options: argparse.Namespace, stopping: threading.
     from rosafe.bass.recording.recorder import Recorder
     from rosafe.commands._meter import Meter
 
-    source = _open_source(options, stopping)
-    try:
+    with ExitStack() as stack:
+        # Its place comes first, so that of two recorders the second one is told, whatever they listen to.
+        part = None if path is None else stack.enter_context(closing(Part(path, options.force, precious=True)))
+        source = stack.enter_context(closing(_open_source(options, stopping)))
         meter = Meter(sys.stdout, source.sample_rate, options.quiet)
         limit = None if options.seconds is None else max(1, round(options.seconds * source.sample_rate))
-        with _opened(path, options, source) as output:
+        with _opened(part, options, source) as output:
             recorder = Recorder(source, output, limit, meter.show, meter.message)
             try:
                 ended = recorder.run(stopping)
@@ -219,42 +215,42 @@ def _record(path: Path | None, options: argparse.Namespace, stopping: threading.
                 meter.message(_summary(recorder, str(path or "heard"), source.sample_rate))
         if ended:
             meter.message(f"{source.name} has ended")
-        return 0
-    finally:
-        source.close()
+    return 0
 
 
 @contextmanager
-def _opened(path: Path | None, options: argparse.Namespace, source: Source) -> Iterator[Output | None]:
-    """The output, if one is wanted; complete at the end, whatever happens, or gone where nothing is in it.
-
-    Failure where it cannot be written.
-    """
-    if path is None:
+def _opened(part: Part | None, options: argparse.Namespace, source: Source) -> Iterator[Output | None]:
+    """The output, if one is wanted; complete and in its place at the end, whatever happens, if there is sound in it."""
+    if part is None:
         yield None
         return
     try:
-        output = _open_output(path, options, source)
+        output = _open_output(part, options, source)
         try:
             yield output
         finally:
+            part.keep = output.frames > 0  # even where it cannot be closed
             output.close()
-            if not output.frames:
-                path.unlink(missing_ok=True)
+            part.keep = output.frames > 0
+            if part.keep:
+                part.complete()
     except BrokenPipeError:  # nobody reads the meter any more
         raise
+    except FileExistsError:
+        raise OutputError(f"{part.target} has come into being meanwhile; the recording is {part.name}") from None
     except OSError as problem:
-        raise Failure(f"cannot write {path}: {problem.strerror or problem}") from None
+        raise part.error(problem) from None
 
 
-def _open_output(path: Path, options: argparse.Namespace, source: Source) -> Output:
+def _open_output(part: Part, options: argparse.Namespace, source: Source) -> Output:
     from rosafe.bass.recording.outputs import BagFile, WavFile
 
-    if path.suffix.lower() == ".wav":
-        return WavFile(path, source.sample_rate)
+    descriptor = part.begin()
+    if part.target.suffix.lower() == ".wav":
+        return WavFile(descriptor, source.sample_rate)
     # A stream that others hear too keeps its numbers and its name.
     chunk, newest = getattr(source, "frames_per_chunk", options.chunk), getattr(source, "newest", 0)
-    return BagFile(path, source.sample_rate, chunk, source.name if options.topic else _TOPIC, newest)
+    return BagFile(descriptor, source.sample_rate, chunk, source.name if options.topic else _TOPIC, newest)
 
 
 def _summary(recorder: Recorder, name: str, sample_rate: int) -> str:

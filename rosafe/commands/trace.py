@@ -17,10 +17,12 @@ import os
 import queue
 import sys
 import time
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rosafe.commands import Failure
+from rosafe.output import new_file
 
 if TYPE_CHECKING:
     from rosafe.tree.trace import Event
@@ -63,37 +65,26 @@ def _block(text: str) -> int:
 
 def run(options: argparse.Namespace) -> int:
     """Listen or compute, write, print."""
-    output = _checked_output(options)
-    if options.sound is not None:
-        title, events = str(options.sound), _compute(options.sound, options.seconds, options.block)
-    else:
-        title = f"/{options.node.strip('/')}"
-        events = _listen(title, options.seconds)
-    from rosafe.tree.trace import Trace
+    output: Path | None = options.output
+    with nullcontext() if output is None else new_file(output, options.force) as descriptor:
+        if options.sound is not None:
+            title, events = str(options.sound), _compute(options.sound, options.seconds, options.block)
+        else:
+            title = f"/{options.node.strip('/')}"
+            events = _listen(title, options.seconds)
+        from rosafe.tree.trace import Trace
 
-    trace = Trace(events)
-    if not trace.spans:
-        raise Failure(f"{title} has no processors: nothing to trace")
-    if output is not None:
-        try:
-            output.write_text(json.dumps(trace.chrome(title)))
-        except OSError as problem:
-            raise Failure(f"cannot write {output}: {problem.strerror}") from None
+        trace = Trace(events)
+        if not trace.spans:
+            raise Failure(f"{title} has no processors: nothing to trace")
+        if descriptor is not None:
+            with os.fdopen(descriptor, "w", encoding="utf-8", closefd=False) as stream:
+                json.dump(trace.chrome(title), stream)
     print(f"{title}, {(trace.end - trace.begin) / 1e6:.2f} s")
     print("\n".join(trace.summary()))
     if output is not None:
         print(f"written to {output}, which https://ui.perfetto.dev shows")
     return 0
-
-
-def _checked_output(options: argparse.Namespace) -> Path | None:
-    output: Path | None = options.output
-    if output is not None:
-        if os.path.lexists(output) and not (options.force and output.is_file()):
-            raise Failure(f"{output} is there already" + ("; --force replaces it" if output.is_file() else ""))
-        if not output.parent.is_dir():
-            raise Failure(f"cannot write {output}: there is no folder {output.parent}")
-    return output
 
 
 def _compute(path: Path, seconds: float, block: int) -> list[Event]:

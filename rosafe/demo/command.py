@@ -156,6 +156,7 @@ def _run(options: argparse.Namespace, signals: _Signals, scratch: str) -> int:
     from rosafe.audiofile import AudioFileError
     from rosafe.demo import course
     from rosafe.interface import ComponentError
+    from rosafe.output import OutputError
     from rosafe.ros.generate import GenerationError
     from rosafe.ros.paths import user_cache, writable
 
@@ -165,7 +166,7 @@ def _run(options: argparse.Namespace, signals: _Signals, scratch: str) -> int:
         cache = user_cache() / "matplotlib"
         os.environ["MPLCONFIGDIR"] = str(cache) if writable(cache) else scratch
         course.run(options.sound, options.seconds, options.out / PICTURE, scratch, signals.check, signals.defer)
-    except (course.DemoError, AudioFileError, ComponentError, GenerationError) as problem:
+    except (course.DemoError, AudioFileError, ComponentError, GenerationError, OutputError) as problem:
         print(f"demo: {' '.join(str(problem).split())}", file=sys.stderr)
         return 1
     return 0

@@ -162,7 +162,4 @@ def _draw(shown: Representations, sound: Sound, picture: Path) -> None:
         f"{shown.times[-1] - shown.times[0]:.1f} s as they came from rosAFE's ports"
     )
     drawing = figure.draw(shown, sound.title, subtitle, sound.true_azimuth)
-    try:
-        figure.save(drawing, picture)
-    except OSError as problem:
-        raise DemoError(f"cannot write {picture}: {problem.strerror or problem}") from None
+    figure.save(drawing, picture)

@@ -7,7 +7,6 @@
 from __future__ import annotations
 
 import os
-import tempfile
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -20,6 +19,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 
+from rosafe.output import new_file
 from rosafe.view import estimates
 from rosafe.view.representations import Representations
 
@@ -98,27 +98,18 @@ def draw(
 
 
 def save(figure: Figure, path: Path) -> None:
-    """Write the picture as PNG: the whole file, or none (OSError)."""
-    handle, name = tempfile.mkstemp(prefix=".", suffix=".png", dir=path.parent)
-    try:
-        with os.fdopen(handle, "wb") as stream, _style():  # some settings matter only now
-            figure.savefig(stream, format="png", metadata={"Software": "rosAFE"})
-        os.chmod(name, 0o666 & ~_umask())
-        os.replace(name, path)
-    except BaseException:
-        os.unlink(name)
-        raise
+    """Write the picture as PNG, in the place of one that is there; OutputError where that cannot be."""
+    with (
+        new_file(path, replace=True) as descriptor,
+        os.fdopen(descriptor, "wb", closefd=False) as stream,
+        _style(),  # some settings matter only now
+    ):
+        figure.savefig(stream, format="png", metadata={"Software": "rosAFE"})
 
 
 def _style() -> AbstractContextManager[None]:
     """The picture's own settings, whatever the user's are."""
     return matplotlib.style.context(["default", _STYLE])
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
 
 
 def _extent(shown: Representations, low: float, high: float) -> tuple[float, float, float, float]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
@@ -39,6 +40,40 @@ def write(path: Path, messages: Iterable[Any], topic: str = "/bass/Audio", **opt
     with rosbag.Bag(str(path), "w", **options) as bag:
         for count, item in enumerate(messages):
             bag.write(topic, item, genpy.Time(1000 + count // 100, count % 100 * 10_000_000))
+    return path
+
+
+def record(op: int, data: bytes = b"", length: int | None = None, **fields: bytes) -> bytes:
+    """A record of a bag as it lies in the file; `length` is what it says of its data, if that is a lie."""
+    header = b"".join(
+        struct.pack("<I", len(name) + 1 + len(value)) + name.encode() + b"=" + value
+        for name, value in {"op": bytes([op]), **fields}.items()
+    )
+    return struct.pack("<I", len(header)) + header + struct.pack("<I", len(data) if length is None else length) + data
+
+
+def number(value: int, size: int = 4) -> bytes:
+    """A field's value."""
+    return value.to_bytes(size, "little")
+
+
+def forge(path: Path, chunks: bytes, hole: int = 0, connections: int = 1) -> Path:
+    """A bag of these chunks and a hole, with one connection of a port Audio, 0, at its end."""
+    kind = wire.message_class("bass", "::binaudio::portStruct")
+
+    def head(index: int) -> bytes:
+        header = record(
+            3, b" " * 4000, index_pos=number(index, 8), conn_count=number(connections), chunk_count=number(1)
+        )
+        return b"#ROSBAG V2.0\n" + header
+
+    texts = {"topic": b"/bass/Audio", "type": kind._type.encode(), "md5sum": kind._md5sum.encode()}
+    data = b"".join(number(len(name) + 1 + len(text)) + name.encode() + b"=" + text for name, text in texts.items())
+    index = len(head(0)) + len(chunks) + hole
+    with path.open("wb") as file:
+        file.write(head(index) + chunks)
+        file.seek(index)
+        file.write(record(7, data, conn=number(0), topic=b"/bass/Audio"))
     return path
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import importlib
 import os
+import select
 import sys
 import threading
 import types
@@ -203,6 +204,15 @@ def test_overruns_without_any_sound_end_as_a_broken_device(pcm: type[FakePcm]) -
     assert caught.value.ex == "::bass::e_device"
 
 
+def test_overruns_with_sound_between_them_are_no_broken_device(pcm: type[FakePcm]) -> None:
+    """However many there are: the device is never opened again."""
+    pcm.script[:] = [10, XRUN] * 50
+    source = open_fake()
+    for _ in range(50):
+        assert source.read() is not None
+    assert source.overruns >= 49 and len(pcm.opened) == 1
+
+
 def test_device_that_comes_back_goes_on(pcm: type[FakePcm]) -> None:
     pcm.frame = 1
     pcm.script[:] = [10, ("Input/output error", 0.5), 10]
@@ -249,6 +259,37 @@ def test_sound_that_is_dropped_in_a_standstill(pcm: type[FakePcm], kept: int, lo
         frames += CHUNK + left(source)[1]
     assert (source.lost_frames, source.overruns) == (lost, lost > 0)
     assert frames + source._chunks.pending == pytest.approx(12 * RATE, abs=2 * CHUNK)
+
+
+@pytest.mark.parametrize(("change", "lost"), [(0.2, 0), (-0.2, 0), (0.3, 300)])
+def test_delay_that_changes_in_a_standstill(pcm: type[FakePcm], change: float, lost: int) -> None:
+    """What a sound server has under way may be more or less than before; only much more is a loss."""
+    source = open_fake()
+    left(source)
+    pcm.clock += 3.0
+    pcm.script[:] = [(3000 - round(change * RATE), -3.0 + change)]
+    while pcm.clock < 110:
+        left(source)
+    assert (source.lost_frames, source.overruns) == (lost, lost > 0)
+
+
+def test_plugins_see_what_the_poll_said(pcm: type[FakePcm], monkeypatch: pytest.MonkeyPatch) -> None:
+    """One whose descriptor is ready at once, and that has sound once it was told of that."""
+    told: list[list[tuple[int, int]]] = []
+    monkeypatch.setattr(pcm, "polldescriptors_revents", lambda self, ready: told.append(ready))
+    read = pcm.read
+
+    def read_when_told(self: FakePcm) -> tuple[int, bytes]:
+        if told:
+            return read(self)
+        pcm.clock += 0.1
+        return 0, b""
+
+    monkeypatch.setattr(pcm, "read", read_when_told)
+    source = open_fake()
+    assert source.read() is not None
+    ((descriptor, events),) = told[0]
+    assert descriptor == pcm.opened[0]._pipe[0] and events & select.POLLIN
 
 
 def test_device_that_is_gone_ends_after_bounded_attempts(pcm: type[FakePcm]) -> None:
@@ -465,7 +506,7 @@ def test_route_plugin_swaps_the_ears(real_alsa: Path) -> None:
         ("hw:7,0", "e_device", "hw:7,0: No such file or directory (Cannot get card index for 7;"),
         ("nosuch", "e_device", "Unknown PCM nosuch"),
         ("file", "e_device", "file is not defined"),
-        ("", "e_device", "is no name of a PCM"),
+        ("", "e_device", "no name of a PCM"),
         ("two\nlines", "e_device", "in no device's name"),
         ("floating", "e_hwparams", "no format S32_LE, it offers FLOAT64_BE, FLOAT64_LE, FLOAT_BE, FLOAT_LE: plug:f"),
         ("sixteen", "e_hwparams", "sixteen: no format S32_LE, it offers S16_LE: plug:sixteen converts"),

@@ -23,7 +23,7 @@ ATTACKS = (
     "plug:SLAVE='file:FILE=|touch MARK'",
     "file1:a/b",
 )
-WHY = "is no name of a PCM"
+WHY = "no name of a PCM"
 ACTION = """
 import sys, actionlib, rospy
 from bass.msg import AcquireAction, AcquireGoal

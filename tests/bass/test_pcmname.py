@@ -201,7 +201,7 @@ def test_names_that_are_refused(folder: Path, name: str) -> None:
     with pytest.raises(ComponentError) as caught:
         opening(name, 44100, 2205, threading.Event())
     assert caught.value.ex == "::bass::e_device"
-    assert re.search("is no name of a PCM|reaches|in no device's name|at most 8192 go", caught.value.why)
+    assert re.search("no name of a PCM|reaches|in no device's name", caught.value.why)
     assert len(caught.value.why) < 500 and caught.value.why.isprintable()
     assert sorted(os.listdir(folder)) == ["asound.conf", "precious", "samples.raw"]
 

@@ -29,8 +29,9 @@ def samples_of(path: Path) -> np.ndarray:
 
 
 def wait_for_sound(path: Path, recording: Process) -> None:
-    """Until some sound is in the file."""
-    wait_for(lambda: path.exists() and path.stat().st_size > 4000, what=lambda: str(recording))
+    """Until some sound is on its way into the file."""
+    part = path.with_name(f"{path.name}.part")
+    wait_for(lambda: part.exists() and part.stat().st_size > 4000, what=lambda: str(recording))
 
 
 def number(pattern: str, text: str) -> float:
@@ -138,7 +139,7 @@ def test_signals_leave_a_complete_file(tmp_path: Path) -> None:
             assert re.search(rf"^{number}\.wav: [\d.]+ s at 8000 Hz, ", recording.out, re.MULTILINE)
             assert recording.err == ""
     for number in numbers:
-        samples = samples_of(tmp_path / f"{number}.wav")
+        samples = samples_of(tmp_path / (f"{number}.wav" + ".part" * (number == signal.SIGKILL)))
         assert samples.shape[1] >= RATE and np.array_equal(samples, Scene(RATE).frames(samples.shape[1]))
 
 
@@ -251,9 +252,12 @@ def test_nothing_to_hear(graph: Graph, capturing: Process, tmp_path: Path) -> No
         "/heard/genom_state": "/heard/genom_state is no port Audio, but of type bass/genom_state_component",
         "/nobody/Audio": "/nobody/Audio is published by nobody: start bass-ros",
     }
-    command = (str(ROSAFE), "record", str(tmp_path / "a.wav"), "--topic")
     with ExitStack() as stack:
-        for topic, done in {t: stack.enter_context(graph.start(*command, t)) for t in topics}.items():
+        running = {
+            topic: stack.enter_context(graph.start(str(ROSAFE), "record", str(tmp_path / name), "--topic", topic))
+            for topic, name in zip(topics, ("a.wav", "b.wav"), strict=True)
+        }
+        for topic, done in running.items():
             assert done.wait() == 1
             assert done.err.startswith(f"rosafe record: {topics[topic]}") and done.err.count("\n") == 1
     assert not os.listdir(tmp_path)

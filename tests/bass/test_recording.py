@@ -26,6 +26,11 @@ from tests.bass import bags
 RATE = 1000
 
 
+def empty(path: Path) -> int:
+    """A descriptor of a new file."""
+    return os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC)
+
+
 # --- levels ---
 
 
@@ -65,7 +70,7 @@ def test_the_end_of_16_bits_is_clipped_too(sample: int, clipped: int) -> None:
 def test_wav_is_exact_and_readable_by_everybody(tmp_path: Path) -> None:
     samples = bags.stream(2500)
     samples[:, :2] = [[-(2**31)], [2**31 - 1]]
-    file = WavFile(tmp_path / "a.wav", RATE)
+    file = WavFile(empty(tmp_path / "a.wav"), RATE)
     for part in np.array_split(samples, 9, axis=1):
         file.write(part, 0)
     file.lose(70_000)
@@ -81,7 +86,7 @@ def test_wav_is_exact_and_readable_by_everybody(tmp_path: Path) -> None:
 
 
 def test_wav_that_nobody_closed_holds_all_but_the_last_second(tmp_path: Path) -> None:
-    file = WavFile(tmp_path / "a.wav", RATE)
+    file = WavFile(empty(tmp_path / "a.wav"), RATE)
     samples = bags.stream(2300)
     for part in np.array_split(samples, 23, axis=1):
         file.write(part, 0)
@@ -92,7 +97,7 @@ def test_wav_that_nobody_closed_holds_all_but_the_last_second(tmp_path: Path) ->
 def test_long_wav_is_an_rf64(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     samples = bags.stream(3000)
     monkeypatch.setattr(outputs, "RIFF_LIMIT", 80 - 8 + 8 * 1999)
-    file = WavFile(tmp_path / "a.wav", RATE)
+    file = WavFile(empty(tmp_path / "a.wav"), RATE)
     file.write(samples[:, :1999], 0)
     assert (tmp_path / "a.wav").read_bytes()[:4] == b"RIFF"
     file.write(samples[:, 1999:], 0)
@@ -104,7 +109,7 @@ def test_long_wav_is_an_rf64(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
 
 def test_wav_beyond_4_gib(tmp_path: Path) -> None:
     """A real one, of which most is a hole in the file."""
-    file = WavFile(tmp_path / "a.wav", RATE)
+    file = WavFile(empty(tmp_path / "a.wav"), RATE)
     hole = 2**29  # frames
     file.frames = hole
     file._file.seek(80 + 8 * hole)
@@ -138,7 +143,7 @@ def test_bag_holds_every_frame_under_its_number_and_time(tmp_path: Path, no_paus
     import rosbag
 
     samples = bags.stream(500)
-    file = BagFile(tmp_path / "a.bag", RATE, 10, "/left/Audio", newest=700)
+    file = BagFile(empty(tmp_path / "a.bag"), RATE, 10, "/left/Audio", newest=700)
     file.write(samples[:, :35], 5_000_000_000)
     file.lose(15)
     file.write(samples[:, 50:], 6_000_000_000)  # more than a window
@@ -157,7 +162,7 @@ def test_bag_holds_every_frame_under_its_number_and_time(tmp_path: Path, no_paus
 
 def test_bag_of_less_than_a_window(tmp_path: Path, no_pauses: None) -> None:
     samples = bags.stream(25)
-    file = BagFile(tmp_path / "a.bag", RATE, 10, "/bass/Audio", newest=5)
+    file = BagFile(empty(tmp_path / "a.bag"), RATE, 10, "/bass/Audio", newest=5)
     file.write(samples, 10**9)
     file.close()
     assert np.array_equal(play(tmp_path / "a.bag")[0][:, :25], samples)
@@ -167,7 +172,7 @@ def test_bag_stops_while_there_is_room_for_its_index(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, no_pauses: None
 ) -> None:
     samples = bags.stream(200)
-    file = BagFile(tmp_path / "a.bag", RATE, 10, "/bass/Audio")
+    file = BagFile(empty(tmp_path / "a.bag"), RATE, 10, "/bass/Audio")
     file.write(samples[:, :100], 10**9)
     monkeypatch.setattr(outputs, "BAG_RESERVE", 2**62)
     with pytest.raises(OSError, match="the disk is full"):
@@ -204,7 +209,7 @@ class Scripted:
 
 def record(path: Path | None, script: list[tuple[int, int]], frames: int | None = None) -> tuple[Any, list[str], bool]:
     reports: list[str] = []
-    output = WavFile(path, RATE) if path else None
+    output = WavFile(empty(path), RATE) if path else None
     recorder = Recorder(Scripted(script), output, frames, lambda samples, lost: None, reports.append)
     ended = recorder.run(threading.Event())
     if output:

@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import errno
+import os
+import select
+import selectors
 import socket
 import struct
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +22,7 @@ from hypothesis import strategies as st
 from rosafe.bass import socket_server
 from rosafe.bass.capture import Snapshot
 from rosafe.bass.socket_server import DedicatedSocket, read_frames, take_requests
-from tests.harness import PATIENCE, wait_for
+from tests.harness import PATIENCE, ROOT, wait_for
 
 
 def port_content(last: int, length: int) -> Snapshot:
@@ -215,6 +221,103 @@ def test_as_many_clients_as_promised(server: Server) -> None:
     for connection in connections:
         connection.close()
     wait_for(lambda: server.clients() == 0)
+
+
+def full(server: Server) -> list[socket.socket]:
+    """All places taken by clients that say nothing, the first of which came first."""
+    connections = [socket.create_connection(server.address, timeout=10) for _ in range(socket_server.MAX_CLIENTS)]
+    wait_for(lambda: server.clients() == socket_server.MAX_CLIENTS)
+    return connections
+
+
+def let_in(server: Server) -> bool:
+    """Whether a new client gets an answer."""
+    with server.client() as connection:
+        try:
+            connection.sendall(b"Read Port - N 1 - nfr 100\n")
+            return receive(connection)[3] == [100]
+        except (AssertionError, ConnectionError):  # turned away
+            return False
+
+
+def closed(connection: socket.socket) -> bool:
+    if not select.select([connection], [], [], 0)[0]:
+        return False
+    try:
+        return connection.recv(1, socket.MSG_PEEK) == b""
+    except ConnectionResetError:
+        return True
+
+
+def test_idle_clients_make_room(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
+    connections = full(server)
+    assert not let_in(server) and not any(map(closed, connections)), "not at once"
+    monkeypatch.setattr(socket_server, "IDLE_SECONDS", 0.5)
+    wait_for(lambda: let_in(server))
+    assert [closed(connection) for connection in connections].count(True) == 1
+    assert closed(connections[0]), "the longest idle"
+    assert sum("asked for nothing for" in line for line in server.reports) == 1
+    for _ in range(socket_server.MAX_CLIENTS + 2):  # each of which has left when the next one comes
+        assert let_in(server)
+    assert [closed(connection) for connection in connections].count(True) == 1, "nobody goes where there is room"
+    for connection in connections:
+        connection.close()
+
+
+def test_who_asks_stays_and_who_only_sends_goes(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(socket_server, "IDLE_SECONDS", 0.5)
+    asking, sending, *others = full(server)
+    others += [socket.create_connection(server.address, timeout=10) for _ in range(3)]  # three too many
+
+    def all_served() -> bool:
+        asking.sendall(b"Read Port - N 1 - nfr 90\n")
+        assert receive(asking)[3] == [90]
+        if not closed(sending):
+            sending.sendall(b"rubbish, Read Port - N")
+        others.append(socket.create_connection(server.address, timeout=10))
+        return closed(sending)
+
+    wait_for(all_served, 30, "the end of the client that sends rubbish")
+    assert not closed(asking)
+    asking.sendall(b"Read Port - N 1 - nfr 91\n")
+    assert receive(asking)[3] == [91]
+    for connection in (asking, sending, *others):
+        connection.close()
+
+
+def test_time_of_the_idle_is_as_documented() -> None:
+    text = (ROOT / "docs" / "capture.md").read_text("utf-8")
+    assert f"asked for nothing for {socket_server.IDLE_SECONDS:g} s" in " ".join(text.split())
+
+
+def test_without_descriptors_it_waits_and_goes_on(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
+    listener = server._socket._listener
+    tries: list[float] = []
+
+    class NoDescriptors:
+        """The listening socket of a process that has none left."""
+
+        def __getattr__(self, name: str) -> Any:
+            return getattr(listener, name)
+
+        def accept(self) -> Any:
+            tries.append(time.monotonic())
+            raise OSError(errno.EMFILE, os.strerror(errno.EMFILE))
+
+    with server.client() as before:
+        wait_for(lambda: server.clients() == 1)
+        server._socket._selector.unregister(listener)
+        server._socket._listener = NoDescriptors()  # type: ignore[assignment]
+        server._socket._selector.register(server._socket._listener, selectors.EVENT_READ)
+        with server.client() as waiting:
+            waiting.sendall(b"Read Port - N 1 - nfr 100\n")
+            wait_for(lambda: len(tries) >= 2)
+            before.sendall(b"Read Port - N 1 - nfr 99\n")
+            assert receive(before)[3] == [99], "those who are in go on"
+            monkeypatch.setattr(NoDescriptors, "accept", lambda self: listener.accept())
+            assert receive(waiting)[3] == [100]
+    assert tries[1] - tries[0] >= socket_server.PAUSE_SECONDS
+    assert "Too many open files" in server.reports[0]
 
 
 def test_slow_client_neither_hinders_others_nor_fills_memory(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:

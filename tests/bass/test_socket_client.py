@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import socket
+import struct
 import threading
 from collections.abc import Iterator
 
@@ -77,3 +79,13 @@ def test_broken_connection_is_an_error(server: Server) -> None:
     server.thread.join(PATIENCE)
     with pytest.raises(ConnectionRefusedError):
         next(blocks(host, port))
+
+
+@pytest.mark.parametrize("header", [(2**31 - 1, 0, 2**31), (-1, 0, 5), (6, 0, 100), (1, -1, 5), (5, 0, 2)])
+def test_whoever_is_no_bass_fills_no_memory(header: tuple[int, int, int]) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        client = SocketClient(*listener.getsockname())
+        connection, _ = listener.accept()
+        with connection, client, pytest.raises(OSError, match="what answers is no bass"):
+            connection.sendall(struct.pack("<iiq", *header))
+            client.read(5, 1)

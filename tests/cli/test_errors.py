@@ -163,7 +163,7 @@ def test_a_failure_leaves_the_old_output(folder: Path) -> None:
 def test_places_that_cannot_be_written(folder: Path) -> None:
     content = (folder / "in.wav").read_bytes()
     for out, words in {
-        "nowhere/out.npz": ["nowhere/out.npz", "No such file"],
+        "nowhere/out.npz": ["nowhere/out.npz", "there is no folder"],
         "nowhere/deep/": ["-o nowhere/deep/: ", "No such file"],
         "in.wav/": ["-o in.wav/: ", "File exists"],
         "in.wav/out.npz": ["in.wav/out.npz", "Not a directory"],

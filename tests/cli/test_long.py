@@ -176,7 +176,9 @@ def test_two_for_one_place(long_file: Path) -> None:
         done = rosafe("process", "in.wav", "--outputs", "ild", cwd=here)
         os.kill(child, signal.SIGCONT)
         assert done.returncode == 1
-        assert done.stderr == f"rosafe process: in.wav: cannot write {here}/in.npz: another process is writing it\n"
+        command_line = " ".join(proc(child, "cmdline").read_text().split("\0"))
+        who = f"process {child} ({command_line.strip()})"
+        assert done.stderr == f"rosafe process: cannot write in.npz: {who} is writing it\n"
         assert command.alive and part.exists()
         command.stop(signal.SIGINT)
 

@@ -13,6 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from rosafe.bass.sources.scene import scene_azimuth
+from rosafe.output import OutputError
 from rosafe.view import estimates, figure
 from rosafe.view.representations import Representations
 from tests.view.conftest import WALK, represented
@@ -110,7 +111,7 @@ def test_failed_save_leaves_the_old_picture(
         raise OSError(28, os.strerror(28))
 
     monkeypatch.setattr(drawing, "savefig", full)
-    with pytest.raises(OSError, match="No space"):
+    with pytest.raises(OutputError, match="No space"):
         figure.save(drawing, path)
     assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import struct
-from pathlib import Path
 from typing import IO, Protocol
 
 import numpy as np
@@ -39,8 +38,8 @@ class WavFile:
 
     Parameters
     ----------
-    path : Path
-        Replaced where there is one.
+    descriptor : int
+        Of an empty file, open for writing; it stays open.
     sample_rate : int
         Hz.
     """
@@ -48,11 +47,11 @@ class WavFile:
     _FRAME = 8  # bytes
     _HEADER = 80  # bytes
 
-    def __init__(self, path: Path, sample_rate: int) -> None:
+    def __init__(self, descriptor: int, sample_rate: int) -> None:
         self._sample_rate = sample_rate
         self.frames = 0
         self._in_header = 0  # frames that the header knows of
-        self._file: IO[bytes] = path.open("wb", buffering=0)
+        self._file: IO[bytes] = os.fdopen(descriptor, "wb", buffering=0, closefd=False)
         self._write_header()
 
     def write(self, samples: np.ndarray, time_ns: int) -> None:
@@ -105,8 +104,8 @@ class BagFile:
 
     Parameters
     ----------
-    path : Path
-        Replaced where there is one.
+    descriptor : int
+        Of an empty file, open for reading and writing; it stays open.
     sample_rate : int
         Hz.
     frames_per_chunk : int
@@ -117,13 +116,13 @@ class BagFile:
         Number of the frame before the first one that will be written.
     """
 
-    def __init__(self, path: Path, sample_rate: int, frames_per_chunk: int, topic: str, newest: int = 0) -> None:
+    def __init__(self, descriptor: int, sample_rate: int, frames_per_chunk: int, topic: str, newest: int = 0) -> None:
         import rosbag
 
         from rosafe.interface import BASS
         from rosafe.ros import wire
 
-        self._path = path
+        self._descriptor = descriptor
         self._sample_rate = sample_rate
         self._chunk = frames_per_chunk
         self._topic = topic
@@ -133,11 +132,11 @@ class BagFile:
         self._time_ns = 0  # when the newest one was acquired
         self._message_class = wire.message_class("bass", BASS.port("Audio").idl)
         self._window = SlidingWindow(BAG_CHUNKS * frames_per_chunk)
-        self._bag = rosbag.Bag(str(path), "w")
+        self._bag = rosbag.Bag(os.fdopen(descriptor, "w+b", closefd=False), "w")
 
     def write(self, samples: np.ndarray, time_ns: int) -> None:
         """Append messages that show `samples`."""
-        disk = os.statvfs(self._path)
+        disk = os.fstatvfs(self._descriptor)
         if disk.f_bavail * disk.f_frsize < BAG_RESERVE:
             raise OSError(28, f"the disk is full but for {BAG_RESERVE >> 20} MiB")
         count = samples.shape[1]

@@ -1,22 +1,22 @@
 """The source `bag:PATH`: what a port Audio published while rosbag recorded it, in real time.
 
-The one source that needs ROS: its library `rosbag` and the messages, but no master.
+The one source that needs ROS: its messages, but no master.
 """
 
 from __future__ import annotations
 
 import os
 import re
-import stat
-import struct
 import threading
 from collections.abc import Iterator
 from itertools import chain, groupby, islice
 from pathlib import Path
 from typing import Any
 
+import genpy
 import numpy as np
 
+from rosafe.bass.sources.bagfile import BagError, BagFile, NotClosedError
 from rosafe.bass.sources.base import (
     Chunk,
     Chunker,
@@ -31,8 +31,10 @@ from rosafe.bass.sources.file import split_path
 from rosafe.bass.windows import WindowStream
 from rosafe.interface import BASS, ComponentError
 from rosafe.ros import wire
-from rosafe.ros.audio import malformed
+from rosafe.ros.audio import MAX_WINDOW, malformed
 
+MAX_MESSAGE = 2 * 4 * MAX_WINDOW + 1024  # bytes: both ears, and the rest
+MAX_LISTED = 20  # topics in a refusal
 _AUDIO = BASS.port("Audio").idl
 Piece = tuple[int, np.ndarray]  # frames lost before it, and int32 (2, n)
 
@@ -80,10 +82,14 @@ class BagSource:
         self._start = options.get("start", 0.0)
         self._another = False  # whether the bag holds more streams after this one
         self.sample_rate = 0
-        self._recording = _Recording(path, options.get("topic"))
+        self._stopping = stopping
+        self._recording = _Recording(path, options.get("topic"), stopping)
         try:
             self._pieces = self._play()
-            self._pieces = chain([next(self._pieces)], self._pieces)
+            first = next(self._pieces, None)
+            if first is None:
+                raise device_error(f"{self.name}: interrupted before its sound was found")
+            self._pieces = chain([first], self._pieces)
             if sample_rate not in (0, self.sample_rate):
                 raise hwparams_error(
                     f"{path} was recorded at {self.sample_rate} Hz, asked for were {sample_rate}; 0 is what it has"
@@ -100,6 +106,8 @@ class BagSource:
         while True:
             streams = self._recording.streams()
             chosen = next(islice(streams, self._stream - 1, None), None)
+            if self._stopping.is_set():
+                return
             if chosen is None:
                 raise device_error(f"{self.name}: no stream {self._stream} of sound in the bag")
             self.sample_rate, pieces = chosen
@@ -119,7 +127,7 @@ class BagSource:
             if samples.shape[1]:
                 yield gap * begun, samples  # it begins with sound
                 begun = True
-        if not begun:
+        if not begun and not self._stopping.is_set():
             raise device_error(f"{self.name}: start={self._start:g} is behind the end of the stream")
 
     def read(self) -> Chunk | None:
@@ -154,30 +162,19 @@ class _Recording:
     Raises ``::bass::e_device`` where the file is no whole bag, or does not hold that port.
     """
 
-    def __init__(self, path: str, topic: str | None) -> None:
-        import genpy
-        import rosbag
-
+    def __init__(self, path: str, topic: str | None, stopping: threading.Event) -> None:
         self._path = Path(os.path.expanduser(path))
-        # What rosbag raises where a bag is damaged, depending on where.
-        self._troubles = (
-            *(rosbag.ROSBagException, genpy.DeserializationError, struct.error),
-            *(OSError, EOFError, ValueError, LookupError, RuntimeError),
-        )
         self._message_class = wire.message_class("bass", _AUDIO)
         try:
-            if not stat.S_ISREG(self._path.stat().st_mode):  # a FIFO would block the open for ever
-                raise device_error(f"{path} is not a regular file")
+            self._bag = BagFile(self._path, MAX_MESSAGE, stopping)
         except (OSError, ValueError) as problem:  # ValueError: a path that no file can have
             raise device_error(f"{path}: {getattr(problem, 'strerror', None) or problem}") from None
-        try:
-            self._bag = rosbag.Bag(str(self._path))
-        except rosbag.ROSBagUnindexedException:
+        except NotClosedError:
             raise device_error(
                 f"{path} was not closed by its recorder, or is cut off; `rosbag reindex {path}` repairs what is there"
             ) from None
-        except self._troubles as problem:
-            raise device_error(f"{path} is no whole bag: {problem}") from None
+        except BagError as problem:
+            raise device_error(f"{path} {problem}") from None
         try:
             self._topic = self._pick(topic)
         except ComponentError:
@@ -185,17 +182,15 @@ class _Recording:
             raise
 
     def _pick(self, topic: str | None) -> str:
-        found = self._bag.get_type_and_topic_info().topics
-        ports = sorted(
-            name for name, info in found.items() if info.msg_type.endswith(f"/{self._message_class.__name__}")
-        )
+        found = {connection.topic: connection.type for connection in self._bag.connections.values()}
+        ports = sorted(name for name, kind in found.items() if kind.endswith(f"/{self._message_class.__name__}"))
         if topic is None and len(ports) == 1:
             return ports[0]
         if topic is not None and topic in ports:
             return topic
         if topic in found:
-            raise device_error(f"{self._path}: {topic} is no port Audio, but of type {found[topic].msg_type}")
-        there = ", ".join(ports if ports or topic is None else sorted(found)) or "none"
+            raise device_error(f"{self._path}: {topic} is no port Audio, but of type {found[topic]}")
+        there = ", ".join((ports if ports or topic is None else sorted(found))[:MAX_LISTED]) or "none"
         if topic is not None:
             raise device_error(f"{self._path}: no topic {topic} in there; there are: {there}")
         if not ports:
@@ -233,13 +228,16 @@ class _Recording:
             yield count, message.sampleRate, stream.fresh(message)
 
     def _messages(self) -> Iterator[Any]:
-        wanted = self._message_class._md5sum
+        connections = {number for number, one in self._bag.connections.items() if one.topic == self._topic}
         try:
-            for _, (_, data, md5sum, *_), _ in self._bag.read_messages(topics=[self._topic], raw=True):
-                if md5sum != wanted:
+            for number, data in self._bag.messages(connections):
+                md5sum = self._bag.connections[number].md5sum
+                if md5sum != self._message_class._md5sum:
                     raise device_error(f"{self._path}: {self._topic} is of another version of its type ({md5sum})")
                 yield self._message_class().deserialize(data)
-        except self._troubles as problem:
+        except BagError as problem:
+            raise device_error(f"{self._path} {problem}") from None
+        except (genpy.DeserializationError, OSError, ValueError) as problem:
             raise device_error(f"{self._path} is damaged: {problem}") from None
 
     def close(self) -> None:

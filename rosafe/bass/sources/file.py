@@ -9,6 +9,7 @@ import numpy as np
 
 from rosafe.audiofile import AudioFile, AudioFileError
 from rosafe.bass.sources.base import Chunk, Pacer, device_error, flag, hwparams_error, number, parse_options
+from rosafe.interface import BASS
 
 
 def split_path(text: str) -> tuple[str, str]:
@@ -19,6 +20,7 @@ def split_path(text: str) -> tuple[str, str]:
     return path, options
 
 
+_MAX_RATE = BASS.service("Acquire").parameter("sampleRate").maximum or 0
 _OPTIONS = {"loop": flag, "start": number(0, 1e9)}
 
 
@@ -72,6 +74,8 @@ class FileSource:
         if channels != 2:
             cure = f"`sox {path} -c 2 two.wav` makes two of it" if channels == 1 else "keep two, left and right ear"
             raise hwparams_error(f"{path} has {channels} channel{'s' * (channels > 1)}, two are needed: {cure}")
+        if self.sample_rate > _MAX_RATE:
+            raise hwparams_error(f"{path} has a sample rate of {self.sample_rate} Hz, at most {_MAX_RATE:.0f} go")
         if sample_rate not in (0, self.sample_rate):
             raise hwparams_error(
                 f"{path} has a sample rate of {self.sample_rate} Hz, asked for were {sample_rate}; 0 is the file's own"

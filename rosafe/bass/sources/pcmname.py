@@ -37,10 +37,10 @@ def checked_name(name: str) -> str:
         ``::bass::e_device`` for any other name; nothing has been opened then.
     """
     if not _NAME.fullmatch(name):
-        shown = repr(name if len(name) <= 80 else name[:77] + "...")
+        short = name if len(name) <= 80 else name[:77] + "..."
         raise device_error(
-            f"{shown} is no name of a PCM: wanted is NAME or NAME:ARGUMENTS, at most 100 and 150 characters out of "
-            "letters, digits and _ - . , : ="
+            f"{short if name and name.isprintable() else repr(short)}: this is no name of a PCM; wanted is NAME or "
+            "NAME:ARGUMENTS, at most 100 and 150 characters out of letters, digits and _ - . , : ="
         )
     head, colon, arguments = name.partition(":")
     if not colon:

@@ -1,0 +1,186 @@
+"""Files that the product writes: complete or not there, never two writers in one."""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import errno
+import fcntl
+import glob
+import os
+import shlex
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+PART = ".part"  # what the name of an unfinished output ends with
+_AT_FDCWD, _RENAME_NOREPLACE = -100, 1  # of renameat2
+
+
+class OutputError(Exception):
+    """The output cannot be written; the text is one line that says why."""
+
+
+class Part:
+    """An output on its way, in a file beside its place whose name ends with ``.part``.
+
+    That name is always the same, and the file is locked: two writers for one place notice each other, and what a killed
+    process has left is found.
+
+    Parameters
+    ----------
+    target : path
+        Where the output goes, links followed: to a new file, or in the place of one.
+    replace : bool
+        Whether it may take the place of a file that is there, now or at the end.
+    precious : bool
+        Whether what a killed process has left under the name of the part is kept, unless `replace`. Else it is used up.
+
+    Attributes
+    ----------
+    name : Path
+        Of the part.
+    descriptor : int
+        Of the part, open for reading and writing. Nothing has been changed in it before `begin`.
+    keep : bool
+        Whether `close` leaves it where it is.
+
+    Raises
+    ------
+    OutputError
+        The place is taken, or another process writes to it (the text says which), or nothing can be written there.
+    """
+
+    def __init__(self, target: str | Path, replace: bool, precious: bool = False) -> None:
+        self.target = Path(target)
+        self._path = _place(self.target, replace)
+        self.name = self._path.with_name(self._path.name + PART)
+        self._replace = replace
+        self._begun = self.keep = False
+        try:
+            self.descriptor = self._locked()
+        except OSError as problem:
+            raise self.error(problem) from None
+        if precious and not replace and self._left_over():
+            self.close()
+            raise OutputError(
+                f"{self.name} is what an interrupted recording has left: rename or remove it; --force replaces it"
+            )
+
+    def _locked(self) -> int:
+        while True:
+            flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
+            descriptor = os.open(self.name, flags, 0o666)
+            try:
+                found = os.fstat(descriptor)
+                if not stat.S_ISREG(found.st_mode) or found.st_nlink > 1:
+                    raise OSError(errno.EEXIST, f"{self.name} is there, and no file of its own")
+                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                if self._is_at_its_name(found):
+                    return descriptor
+            except BlockingIOError:
+                who = _holder(descriptor)
+                os.close(descriptor)
+                raise BlockingIOError(errno.EAGAIN, f"{who} is writing it") from None
+            except BaseException:
+                os.close(descriptor)
+                raise
+            os.close(descriptor)  # whoever had it has just finished, and moved or removed it
+
+    def _is_at_its_name(self, status: os.stat_result) -> bool:
+        try:
+            return os.path.samestat(self.name.lstat(), status)
+        except FileNotFoundError:
+            return False
+
+    def _left_over(self) -> bool:
+        return not self._begun and os.fstat(self.descriptor).st_size > 0
+
+    def begin(self) -> int:
+        """Empty it of what somebody else has left; returns the descriptor."""
+        os.ftruncate(self.descriptor, 0)
+        self._begun = True
+        return self.descriptor
+
+    def complete(self) -> None:
+        """Let it take its place; OSError where it cannot, FileExistsError where that is taken now."""
+        os.fsync(self.descriptor)  # else a power cut could leave an empty file of that name
+        if not self._is_at_its_name(os.fstat(self.descriptor)):
+            raise FileNotFoundError(errno.ENOENT, f"{self.name} is not there any more")
+        if self._replace:
+            self.name.rename(self._path)
+        else:
+            _rename_to_nothing(self.name, self._path)
+        self.keep = True
+
+    def close(self) -> None:
+        """Unlock it; what is not complete goes, unless it is to be kept or is still what somebody else has left."""
+        if not (self.keep or self._left_over()) and self._is_at_its_name(os.fstat(self.descriptor)):
+            self.name.unlink()
+        os.close(self.descriptor)
+
+    def error(self, problem: OSError) -> OutputError:
+        """What to say of a failure to write."""
+        return OutputError(f"cannot write {self.target}: {problem.strerror or problem}")
+
+
+@contextmanager
+def new_file(target: str | Path, replace: bool) -> Iterator[int]:
+    """A descriptor of an empty file that takes the place `target` if all goes well, and else is gone.
+
+    Raises OutputError as `Part` does, and for an OSError from within.
+    """
+    part = Part(target, replace)
+    try:
+        yield part.begin()
+        part.complete()
+    except OSError as problem:
+        raise part.error(problem) from problem
+    finally:
+        part.close()
+
+
+def _place(target: Path, replace: bool) -> Path:
+    """Where the output goes, links followed; OutputError where that is taken or cannot be."""
+    try:
+        path = Path(os.path.realpath(target))
+        found = path.lstat()
+    except FileNotFoundError:
+        if not path.parent.is_dir():
+            raise OutputError(f"cannot write {target}: there is no folder {path.parent}") from None
+        return path
+    except (OSError, ValueError) as problem:
+        raise OutputError(f"cannot write {target}: {getattr(problem, 'strerror', None) or problem}") from None
+    if not stat.S_ISREG(found.st_mode):
+        raise OutputError(f"{target} is not a regular file")
+    if not replace:
+        raise OutputError(f"{target} is there already; --force replaces it")
+    return path
+
+
+def _rename_to_nothing(name: Path, path: Path) -> None:
+    """Rename; FileExistsError where `path` is there."""
+    libc = ctypes.CDLL(None, use_errno=True)
+    if libc.renameat2(_AT_FDCWD, os.fsencode(name), _AT_FDCWD, os.fsencode(path), _RENAME_NOREPLACE) == 0:
+        return
+    problem = ctypes.get_errno()
+    if problem in (errno.EINVAL, errno.ENOSYS) and not os.path.lexists(path):  # a file system that cannot, such as NFS
+        name.rename(path)
+        return
+    if problem in (errno.EINVAL, errno.ENOSYS, errno.EEXIST):
+        raise FileExistsError(errno.EEXIST, "it has come into being meanwhile")
+    raise OSError(problem, os.strerror(problem))
+
+
+def _holder(descriptor: int) -> str:
+    """Which process has the file locked, for people; of those of other users nothing is known."""
+    wanted = os.fstat(descriptor)
+    for opened in map(Path, glob.iglob("/proc/[0-9]*/fd/*")):
+        with contextlib.suppress(OSError):  # closed by now, or somebody else's
+            process = opened.parents[1]
+            if os.path.samestat(opened.stat(), wanted) and "FLOCK" in (process / "fdinfo" / opened.name).read_text():
+                words = (process / "cmdline").read_bytes().decode(errors="replace").split("\0")[:-1]
+                command = shlex.join(words)[:200]
+                return f"process {process.name} ({command if command.isprintable() else 'unknown'})"
+    return "another process"
