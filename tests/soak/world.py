@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
+import genpy
 import numpy as np
 import rospy
 import soundfile
@@ -336,6 +337,7 @@ def world(size: Size, home: Path) -> Iterator[World]:
     with harness.private_graph(home) as (graph, master), ExitStack() as stack:
         os.environ.update(ROS_MASTER_URI=graph.uri, ROS_IP="127.0.0.1", ROS_HOME=str(home / ".ros"))
         registrar = registration.init_node("soak", ["soak"])  # which finds its way to a master that was restarted
+        genpy.Message.longest_sequence = 2**26  # here, what the nodes send is no attack, however long
         stack.callback(registrar.end)
         yield World(size, graph, master, stack)
 
