@@ -80,6 +80,16 @@ def test_a_signal_ends_it_whatever_clients_do(home_graph: harness.Graph, number:
         assert "Traceback" not in process.err
 
 
+def test_nohup_is_respected_and_a_script_may_start_it_in_the_background(home_graph: harness.Graph) -> None:
+    command = ["sh", "-c", f"trap '' HUP INT QUIT; exec {GENOMIXD} -v -p 0"]
+    with home_graph.start(*command) as process:
+        port = worlds.port_of(process)
+        os.kill(process.pid, signal.SIGHUP)
+        assert Http(port).raw("/")[0] == 200
+        assert process.alive
+        assert process.stop(signal.SIGINT) == 0
+
+
 def test_background_returns_once_it_serves(home_graph: harness.Graph) -> None:
     port = str(harness.free_port())
 

@@ -36,7 +36,7 @@ def workspace() -> Iterator[Path]:
             *("catkin_make", "-C", folder, "install", f"-DPYTHON_EXECUTABLE={PYTHON}"),
             env=environment(HOME=str(folder), ROS_LANG_DISABLE="genlisp:gencpp"),
             cwd=folder,
-            seconds=360,
+            seconds=550,
         )
         assert done.returncode == 0, done.stdout[-5000:] + done.stderr[-5000:]
         assert "CMake Warning" not in done.stderr.replace("CMake Deprecation Warning", ""), done.stderr

@@ -165,6 +165,15 @@ def test_nohup_is_respected(graph: Graph) -> None:
         assert node.stop(signal.SIGTERM) == 0
 
 
+@PROGRAMS
+def test_a_script_may_start_it_in_the_background(graph: Graph, program: str) -> None:
+    """There `&` lets it ignore SIGINT."""
+    name = program.removesuffix("-ros")
+    with graph.start("sh", "-c", f"trap '' INT QUIT; exec {program}") as node:
+        wait_for(lambda: f"/{name}/kill" in graph.services(), what=lambda: str(node))
+        assert node.stop(signal.SIGINT) == 0
+
+
 def test_the_shells_process_is_the_node(graph: Graph) -> None:
     with graph.node("bass-ros") as node:
         assert f"Pid: {node.pid}\n" in graph.run("rosnode", "info", "/bass").stdout
