@@ -85,8 +85,8 @@ def test_nohup_is_respected_and_a_script_may_start_it_in_the_background(home_gra
     with home_graph.start(*command) as process:
         port = worlds.port_of(process)
         os.kill(process.pid, signal.SIGHUP)
-        assert Http(port).raw("/")[0] == 200
-        assert process.alive
+        for _ in range(10):  # one that ends may still answer the first
+            assert Http(port).raw("/")[0] == 200
         assert process.stop(signal.SIGINT) == 0
 
 
