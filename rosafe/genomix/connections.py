@@ -61,7 +61,7 @@ class Connections:
         self._clients: dict[str, Client] = {}
         self._count = 0
         self.heads = 0  # bytes of long requests
-        self._answers: dict[Connection, int] = {}  # bytes that are being taken
+        self._answers: dict[Connection, tuple[object, int]] = {}  # what is being taken, and its bytes
 
     def admit(self, connection: Connection, address: str) -> Client | None:
         """The client of a new connection; None where there is no room for it and none can be made."""
@@ -104,20 +104,27 @@ class Connections:
             held.discard(connection)
 
     @contextlib.contextmanager
-    def taking(self, connection: Connection, size: int) -> Iterator[None]:
-        """While a client takes an answer of `size` bytes; those that do not take theirs make room for it."""
+    def taking(self, connection: Connection, data: object, size: int) -> Iterator[None]:
+        """While a client takes an answer: `data` of `size` bytes, which others may be taking, too.
+
+        Clients that do not take theirs make room for it.
+        """
         for other in list(self._answers):
-            if sum(self._answers.values()) + size <= MAX_ANSWERS:
+            if self._fits(data, size):
                 break
             if other.stalled(YIELD_SECONDS):
                 other.drop()
-        if self._answers and sum(self._answers.values()) + size > MAX_ANSWERS:
+        if not self._fits(data, size):
             raise too_many(f"clients are taking {MAX_ANSWERS >> 20} MiB of answers at this moment")
-        self._answers[connection] = size
+        self._answers[connection] = (data, size)
         try:
             yield
         finally:
             self._answers.pop(connection, None)
+
+    def _fits(self, data: object, size: int) -> bool:
+        taken = {id(one): one_size for one, one_size in self._answers.values()}
+        return not taken or id(data) in taken or sum(taken.values()) + size <= MAX_ANSWERS
 
 
 class Connection(web.RequestHandler):
@@ -234,15 +241,20 @@ class Connection(web.RequestHandler):
         self._under_way, self._head = False, 0
         self._count()
         self.client.waiting[self] = None
-        self._socket.resume_reading()
         self._next_request()
+        if len(self._ahead) < SHORT:
+            self._socket.resume_reading()
 
     def handle_error(
         self, request: web.BaseRequest, status: int = 500, exc: BaseException | None = None, message: str | None = None
     ) -> web.Response:
         """The answer to what is no request; aiohttp's own is HTML, with a traceback in the log."""
+        if isinstance(exc, ConnectionError):  # a client that has vanished, or was dropped
+            raise exc
         if status >= HTTPStatus.INTERNAL_SERVER_ERROR:
             self.log_exception("cannot answer", exc_info=exc)
+        if request.writer.output_size > 0:
+            raise ConnectionAbortedError("a part of another answer was sent already")
         what = (message or str(exc) or HTTPStatus(status).phrase).splitlines()[0][:200]
         body = _body(ComponentError("::genomix::e_url", what=what))
         answer = web.Response(body=body, status=status, content_type=JSON.media_type, charset="utf-8")

@@ -44,6 +44,7 @@ class Value:
         self._component = component
         self._members = members
         self.values = values
+        self.data: object = self  # what the values belong to, and perhaps those of others
 
     def pieces(self, form: Syntax) -> Iterator[str]:
         """The text, as one nested value, in short pieces."""
@@ -241,7 +242,9 @@ class Proxy:
         value = _zero(self.component, port.idl)
         if message is not None:
             value = {name: getattr(message, name) for name, _ in self.component.structs[port.idl]}
-        return Value(self.component, ((port.name, port.idl),), {port.name: value})
+        sample = Value(self.component, ((port.name, port.idl),), {port.name: value})
+        sample.data = message
+        return sample
 
     async def _other_element(self, topic: str, port: Port, element: str) -> str:
         """An element that differs in the case of letters only: the user's guide reads 'crossCorrelation'."""

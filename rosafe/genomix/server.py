@@ -320,7 +320,7 @@ class Server:
         pieces = _encoded(request, value)
         if value.size <= BATCH // 8:
             return _respond(request, b"".join(pieces))
-        with self._connections.taking(_connection(request), value.size):
+        with self._connections.taking(_connection(request), value.data, value.size):
             return await self._stream_pieces(request, pieces)
 
     async def _stream_pieces(self, request: web.Request, pieces: Iterator[bytes]) -> web.StreamResponse:

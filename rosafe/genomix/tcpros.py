@@ -21,6 +21,7 @@ import rosgraph.network
 
 from rosafe.genomix.graph import Graph, Unknown, middleware_error
 from rosafe.genomix.tasks import shared
+from rosafe.genomix.values import refused
 from rosafe.interface import ComponentError
 from rosafe.ros import wire
 
@@ -216,7 +217,10 @@ class ServiceClient:
         Raises ComponentError: the component's own exception, or ``::genom::mwerr`` where none came.
         """
         buffer = io.BytesIO()
-        self._request_class(**values).serialize(buffer)
+        try:
+            self._request_class(**values).serialize(buffer)
+        except UnicodeEncodeError:  # bytes of a command line that are no UTF-8
+            raise refused(f"{self.name}: half a surrogate pair is no character") from None
         try:
             return self._response_class().deserialize(await asyncio.wait_for(self._ask(buffer.getvalue()), timeout))
         except TimeoutError:
