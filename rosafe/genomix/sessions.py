@@ -170,19 +170,19 @@ class Session:
         abortable = service is not None and service.activity
         request = Request(f"{component}::{next(self._sessions.numbers)}", abortable, size)
         self._add(request, keep)
-        work: Awaitable[Value]
+        work: Callable[[], Awaitable[Value]]
         if service is not None:
-            work = self._in_turn(functools.partial(self._serve, request, proxy, service, values))
+            work = functools.partial(self._in_turn, functools.partial(self._serve, request, proxy, service, values))
         else:
             assert port is not None
-            work = proxy.read(port, element)
+            work = functools.partial(proxy.read, port, element)
         self._sessions.keep(asyncio.create_task(self._follow(request, work)))
         return request
 
-    async def _follow(self, request: Request, work: Awaitable[Value]) -> None:
+    async def _follow(self, request: Request, work: Callable[[], Awaitable[Value]]) -> None:
         value, error = NOTHING, None
         try:
-            value = await work
+            value = await work()
         except ComponentError as problem:
             error = problem
         except Exception as problem:  # a fault of ours must not leave the client waiting
