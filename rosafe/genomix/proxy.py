@@ -248,12 +248,16 @@ class Proxy:
 
     async def _other_element(self, topic: str, port: Port, element: str) -> str:
         """An element that differs in the case of letters only: the user's guide reads 'crossCorrelation'."""
-        topics = [t for t in await self._graph.topics() if t.startswith(f"{topic}/")]
+        missing = f"{port.name} has no element {element[:80]!r}"
+        try:
+            topics = [t for t in await self._graph.topics() if t.startswith(f"{topic}/")]
+        except ComponentError:
+            raise _no_port(missing) from None
         alike = [t for t in topics if t.lower() == f"{topic}/{element}".lower()]
         if len(alike) == 1:
             return alike[0]
         names = ", ".join(t.removeprefix(f"{topic}/") for t in topics) or "none"
-        raise _no_port(f"{port.name} has no element {element[:80]!r}; there are: {names}")
+        raise _no_port(f"{missing}; there are: {names}")
 
     def _reader(self, port: Port) -> TopicReader:
         if port.idl not in self._readers:

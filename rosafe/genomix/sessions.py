@@ -172,7 +172,8 @@ class Session:
         self._add(request, keep)
         work: Callable[[], Awaitable[Value]]
         if service is not None:
-            work = functools.partial(self._in_turn, functools.partial(self._serve, request, proxy, service, values))
+            serve = functools.partial(self._serve, request, proxy, service, values)
+            work = functools.partial[Awaitable[Value]](self._in_turn, serve)
         else:
             assert port is not None
             work = functools.partial(proxy.read, port, element)
