@@ -14,7 +14,7 @@ from pathlib import Path
 
 from tests.harness import let_children_have_default_signals
 from tests.soak import attacks, faults
-from tests.soak.world import DEFAULT, LIGHT, Use, World, world
+from tests.soak.world import DEFAULT, LIGHT, Use, World, wait_out, world
 
 WARM = 3  # of so many parts of the time, the first is that in which pools and the allocator come to their size
 
@@ -101,6 +101,7 @@ class Soak:
         with self._world.stream():
             if set(names) & ATTACKS:
                 self._world.unharmed("before anything happens")
+                wait_out(2.0)  # genomixd connects to all that a component has, once it is used
             for name in self._chance.sample(names, len(names)):
                 self._do(name, lambda name=name: self._inflict(name))  # type: ignore[misc]
             self._say("every frame, every port, every count")

@@ -230,6 +230,7 @@ class World:
         assert all("lastFrameIndex" in message for message in told[2:]), f"{when}: {told}"
         answer = self.quick("HTTP", lambda: self.http.call("rosAFE/getDependencies", ["input"]))
         assert answer == {"dependencies": ["input"]}, f"{when}: {answer}"
+        assert self.quick("HTTP", lambda: self.http.call("bass/genom_state"))["genom_state"], when
 
     def quick(self, what: str, work: Callable[[], T]) -> T:
         """The result of what takes no longer than it may; how long is kept in `slowest`."""
