@@ -225,7 +225,7 @@ def test_as_many_clients_as_promised(server: Server) -> None:
 
 def full(server: Server) -> list[socket.socket]:
     """All places taken by clients that say nothing, the first of which came first."""
-    connections = [socket.create_connection(server.address, timeout=10) for _ in range(socket_server.MAX_CLIENTS)]
+    connections = [socket.create_connection(server.address, timeout=PATIENCE) for _ in range(socket_server.MAX_CLIENTS)]
     wait_for(lambda: server.clients() == socket_server.MAX_CLIENTS)
     return connections
 
@@ -267,17 +267,17 @@ def test_idle_clients_make_room(server: Server, monkeypatch: pytest.MonkeyPatch)
 def test_who_asks_stays_and_who_only_sends_goes(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(socket_server, "IDLE_SECONDS", 0.5)
     asking, sending, *others = full(server)
-    others += [socket.create_connection(server.address, timeout=10) for _ in range(3)]  # three too many
+    others += [socket.create_connection(server.address, timeout=PATIENCE) for _ in range(3)]  # three too many
 
     def all_served() -> bool:
         asking.sendall(b"Read Port - N 1 - nfr 90\n")
         assert receive(asking)[3] == [90]
         if not closed(sending):
             sending.sendall(b"rubbish, Read Port - N")
-        others.append(socket.create_connection(server.address, timeout=10))
+        others.append(socket.create_connection(server.address, timeout=PATIENCE))
         return closed(sending)
 
-    wait_for(all_served, 30, "the end of the client that sends rubbish")
+    wait_for(all_served, what="the end of the client that sends rubbish")
     assert not closed(asking)
     asking.sendall(b"Read Port - N 1 - nfr 91\n")
     assert receive(asking)[3] == [91]

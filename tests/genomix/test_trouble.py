@@ -179,7 +179,7 @@ def await_clients(world: World) -> None:
         def connected(node: Any = node, parts: set[str] = parts) -> bool:
             return parts <= {connection[4] for connection in node.getBusInfo("/test")[2]}
 
-        harness.wait_for(connected, harness.UP_SECONDS, f"all connections to {component.name}")
+        harness.wait_for(connected, what=f"all connections to {component.name}")
 
 
 def test_a_component_that_moves_is_found_again(empty_world: World) -> None:

@@ -29,7 +29,7 @@ call(rosAFE, "/far/InputProc", nFramesPerBlock=2205)
 call(rosAFE, "/far/PreProc")
 heard = queue.Queue()
 rospy.Subscriber("/far/preProcPort/preProc", Message, heard.put)
-while not (index := heard.get(timeout=20).lastFrameIndex):
+while not (index := heard.get(timeout=60).lastFrameIndex):
     pass
 print("heard", index)
 """

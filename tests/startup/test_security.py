@@ -14,7 +14,8 @@ from pathlib import Path
 import pytest
 
 from rosafe.bass import socket_server
-from rosafe.genomix import daemon
+from rosafe.genomix import connections, daemon, sessions
+from rosafe.ros import door, inbound, pulse
 from tests.genomix.world import Http, genomixd
 from tests.harness import PYTHON, ROOT, Graph, MasterProcess, free_port, proc
 
@@ -99,6 +100,29 @@ def test_what_the_page_says_listens(setting: str, tmp_path: Path) -> None:
             assert listening(process.pid, ports) == expected[name], name
     assert (str(daemon.DEFAULT_PORT), daemon.DEFAULT_HOST) in expected["genomixd"]
     assert (str(socket_server.DEFAULT_PORT), socket_server.DEFAULT_HOST) in expected["bass-ros"]
+
+
+def test_the_bounds_of_the_page() -> None:
+    wanted = [
+        door.OPENING_SECONDS,
+        door.GUESTS,
+        inbound.HEADER_BYTES,
+        inbound.BODY_BYTES,
+        (door.DESCRIPTORS, door.RESERVE),
+        "what the longest that makes sense has",
+        pulse.PERIOD,
+        (socket_server.MAX_CLIENTS, socket_server.IDLE_SECONDS),
+        (connections.MAX_CONNECTIONS, connections.MAX_CONNECTIONS // connections.SHARE),
+        (connections.REQUEST_SECONDS, connections.STALL_SECONDS),
+        connections.MAX_ANSWERS // 2**20,
+        (sessions.MAX_SESSIONS, sessions.MAX_REQUESTS),
+    ]
+    shown = [
+        "; ".join(f"{number:.0f}" if not isinstance(number, str) else number for number in numbers)
+        for numbers in (entry if isinstance(entry, tuple) else (entry,) for entry in wanted)
+    ]
+    assert [bound for *_, bound in rows("Bounds")] == shown
+    assert pulse.FAILURES == 2
 
 
 # --- the firewall -----------------------------------------------------------------------------------------------
