@@ -50,7 +50,6 @@ def garbage(world: World, chance: random.Random) -> None:
             {"left": silence, "right": silence[1:]},
             {"left": silence[:0], "right": silence[:0]},
             {"lastFrameIndex": 2**64 - 1, "left": silence, "right": silence},
-            {"left": np.zeros(2**24 + 1, np.int32), "right": np.zeros(2**24 + 1, np.int32)},
         ]
         for text in texts:
             message = message_class()

@@ -50,7 +50,7 @@ def test_the_soak_finds_what_does_not_hold(monkeypatch: pytest.MonkeyPatch, capf
             dying.stop(signal.SIGKILL)
 
         monkeypatch.setattr(command, "world", lambda size, home: nullcontext(there))
-        monkeypatch.setattr(command.faults, "DURING", (end,))
+        monkeypatch.setattr(command, "FAULTS", {"end": end})
         monkeypatch.setattr("sys.argv", ["soak", "--light", "--minutes", "0"])
         assert command.main() == 1
     said = capfd.readouterr()
