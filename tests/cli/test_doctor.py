@@ -31,7 +31,7 @@ def python(program: str, *options: str, **env: str) -> subprocess.CompletedProce
         env=environment(PYTHONPATH=str(ROOT), **env),
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=120,
         check=False,
     )
 

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from rosafe import interface
 from rosafe.genomix import packed
 from tests.genomix.world import World
-from tests.harness import ROOT
+from tests.harness import PATIENCE, ROOT
 
 SPECTRUM = "::rosAFE::TimeFrequencySignalPortStruct"
 
@@ -186,7 +186,7 @@ def test_octave_reads_the_same(tmp_path: Path) -> None:
     """
     (tmp_path / "check.m").write_text("1;\n" + script, "utf-8")
     done = subprocess.run(
-        ["timeout", "60", "octave-cli", "--norc", "--quiet", "--no-history", "check.m"],
+        ["timeout", "120", "octave-cli", "--norc", "--quiet", "--no-history", "check.m"],
         cwd=tmp_path,
         env={"PATH": "/usr/bin:/bin", "HOME": str(tmp_path), "OCTAVE_PATH": str(ROOT / "matlab"), "LANG": "C.UTF-8"},
         capture_output=True,
@@ -208,7 +208,7 @@ def test_the_server_answers_packed(world: World) -> None:
     """The same as in JSON; errors with HTTP status 200, marked."""
 
     def get(url: str) -> Any:
-        connection = http.client.HTTPConnection("127.0.0.1", world.port, timeout=30)
+        connection = http.client.HTTPConnection("127.0.0.1", world.port, timeout=PATIENCE)
         connection.request("GET", url)
         response = connection.getresponse()
         assert response.status == 200

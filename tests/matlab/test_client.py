@@ -155,12 +155,12 @@ def test_values(world: World) -> None:
         show('waited', acquire.wait(0.1));
         shown = evalc('disp(acquire)');
         acquire.abort();
-        show('aborted', {acquire.wait(10), isempty(acquire.exception), acquire.status, shown});
+        show('aborted', {acquire.wait(60), isempty(acquire.exception), acquire.status, shown});
         again = bass.Acquire('-a', 'scene:');
         bass.Stop();
-        show('stopped', again.wait(10));
+        show('stopped', again.wait(60));
         f = rosAFE.getParameters('-a');
-        show('function', {f.wait(10), fieldnames(f.result)});
+        show('function', {f.wait(60), fieldnames(f.result)});
         """,
     )
     assert told["odd"] == "error"  # no name of a topic

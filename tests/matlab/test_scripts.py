@@ -149,7 +149,7 @@ READER = """
     show('audio', [size(cell2mat(audio.left)), iscell(audio.left)])
     modif = rosAFE.modifyParameter('preProc', 'pp_bLevelScaling', '0');
     kill = rosAFE.removeProcessor('preProc');
-    show('status', {modif.status, kill.status, gammatoneProc.wait(5)})
+    show('status', {modif.status, kill.status, gammatoneProc.wait(60)})
     stopAndKill(bass, rosAFE, client);
 """
 

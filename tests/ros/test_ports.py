@@ -63,7 +63,7 @@ def test_the_default_tree_at_44100(afe: Session) -> None:
     microphone.play(signal)
     truth = expected(signal, 12000, rate=rate)
     for kind in FIXED:
-        message = afe.read(kind, 12000 * blocks + 1, timeout=30)
+        message = afe.read(kind, 12000 * blocks + 1)
         frame_rate = truth[f"{kind}_frameRate"] if kind in FRAMED else rate
         assert message.framesOnPort == frame_rate
         assert_holds(message, kind, windowed(truth[kind], 1.0, frame_rate))

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from rosafe import __version__
-from tests.harness import SCRIPTS, Graph, MasterProcess, Process, free_port, wait_for
+from tests.harness import END_SECONDS, SCRIPTS, Graph, MasterProcess, Process, free_port, wait_for
 from tests.packaging.clone import fresh_copy, without_rights
 
 PROGRAMS = pytest.mark.parametrize("program", ["rosAFE-ros", "bass-ros"])
@@ -100,7 +100,7 @@ def masterless(graph: Graph) -> Iterator[dict[str, Process]]:
 
 def refusal(node: Process) -> str:
     """The one line that a node ends with which cannot start."""
-    assert node.wait(30) == 1
+    assert node.wait() == 1
     assert node.out == ""
     assert re.fullmatch(r"(rosAFE|bass)-ros: .*\n", node.err), node
     return node.err
@@ -194,7 +194,7 @@ def test_an_address_that_nobody_can_call_is_said(
 def test_signal_ends_it_and_leaves_nothing(graph: Graph, program: str, number: int) -> None:
     name = f"/{program.removesuffix('-ros')}"
     with graph.node(program) as node:
-        assert node.stop(number, timeout=5) == 0
+        assert node.stop(number, timeout=END_SECONDS) == 0
         assert name not in graph.nodes()
         assert "Traceback" not in node.err
 
@@ -204,24 +204,33 @@ def test_kill_request_ends_it(graph: Graph, program: str) -> None:
     name = program.removesuffix("-ros")
     with graph.node(program) as node:
         assert "genom_success: True" in graph.run("rosservice", "call", f"/{name}/kill", "{}").stdout
-        assert node.wait(5) == 0
+        assert node.wait(END_SECONDS) == 0
         assert f"/{name}" not in graph.nodes()
 
 
 def test_rosnode_kill_ends_it(graph: Graph) -> None:
     with graph.node("bass-ros") as node:
         graph.run("rosnode", "kill", "/bass")
-        assert node.wait(5) == 0
+        assert node.wait(END_SECONDS) == 0
 
 
 def test_nohup_is_respected(graph: Graph) -> None:
     with graph.start("nohup", "bass-ros", "-i", "lasting") as node:
-        wait_for(lambda: "/lasting/kill" in graph.services(), 20, lambda: str(node))
+        wait_for(lambda: "/lasting/kill" in graph.services(), what=lambda: str(node))
         wait_for(lambda: "/lasting/Acquire/cancel" in graph.run("rostopic", "list").stdout)
         os.kill(node.pid, signal.SIGHUP)
         assert graph.call("/lasting/Stop").genom_success
         assert node.alive
         assert node.stop(signal.SIGTERM) == 0
+
+
+@PROGRAMS
+def test_a_script_may_start_it_in_the_background(graph: Graph, program: str) -> None:
+    """There `&` lets it ignore SIGINT."""
+    name = program.removesuffix("-ros")
+    with graph.start("sh", "-c", f"trap '' INT QUIT; exec {program}") as node:
+        wait_for(lambda: f"/{name}/kill" in graph.services(), what=lambda: str(node))
+        assert node.stop(signal.SIGINT) == 0
 
 
 def test_the_shells_process_is_the_node(graph: Graph) -> None:
@@ -258,7 +267,7 @@ def test_stdout_is_left_to_the_requests(graph: Graph) -> None:
 )
 def test_instance(graph: Graph, arguments: list[str], name: str) -> None:
     with graph.start("bass-ros", *arguments) as node:
-        wait_for(lambda: f"{name}/kill" in graph.services(), 20, lambda: str(node))
+        wait_for(lambda: f"{name}/kill" in graph.services(), what=lambda: str(node))
         assert not any(service.startswith("/bass/") for service in graph.services())
         assert node.stop() == 0
 
@@ -271,7 +280,7 @@ def test_two_instances_at_once(graph: Graph) -> None:
 
 def test_a_second_one_of_the_same_name_takes_over(graph: Graph) -> None:
     with graph.node("bass-ros") as old, graph.start("bass-ros") as new:
-        assert old.wait(10) == 0
+        assert old.wait() == 0
         assert "new node registered with same name" in old.out
         wait_for(lambda: f"Pid: {new.pid}\n" in graph.run("rosnode", "info", "/bass", check=False).stdout)
         wait_for(lambda: "/bass/Stop" in graph.services())
@@ -281,7 +290,7 @@ def test_a_second_one_of_the_same_name_takes_over(graph: Graph) -> None:
 def test_master_and_address_by_remapping(graph: Graph) -> None:
     command = ["bass-ros", "-i", "mapped", f"__master:={graph.uri}", "__ip:=127.0.0.2"]
     with graph.start(*command, ROS_MASTER_URI="http://127.0.0.1:1", ROS_IP="") as node:
-        wait_for(lambda: "/mapped/kill" in graph.services(), 20, lambda: str(node))
+        wait_for(lambda: "/mapped/kill" in graph.services(), what=lambda: str(node))
         assert "127.0.0.2" in graph.run("rosservice", "uri", "/mapped/kill").stdout
 
 
@@ -329,7 +338,7 @@ def test_starts_without_any_environment(graph: Graph) -> None:
     """No env.sh, no PYTHONPATH, no HOME, another folder."""
     command = ["env", "-i", f"ROS_MASTER_URI={graph.uri}", str(SCRIPTS / "bass-ros"), "-i", "bare"]
     with graph.start(*command, cwd=Path("/")) as node:
-        wait_for(lambda: "/bare/kill" in graph.services(), 20, lambda: str(node))
+        wait_for(lambda: "/bare/kill" in graph.services(), what=lambda: str(node))
         assert node.stop() == 0
 
 
@@ -342,7 +351,7 @@ def test_home_that_cannot_be_written(graph: Graph) -> None:
         command = [str(word) for word in without_rights(copy / "scripts" / "bass-ros", "-i", "poor")]
         poor = {"HOME": "/nonexistent", "ROS_HOME": "/nonexistent/.ros", "TMPDIR": str(temporary), "PYTHONPATH": ""}
         with Process(command, {**graph.env, **poor}) as node:
-            wait_for(lambda: "/poor/kill" in graph.services(), 20, lambda: str(node))
+            wait_for(lambda: "/poor/kill" in graph.services(), what=lambda: str(node))
             assert "WARNING" not in node.err
             assert node.stop() == 0
 
@@ -372,5 +381,5 @@ sys.exit(run_server(interface.BASS, build))
         graph.client()
         import rospy
 
-        wait_for(lambda: rospy.get_param("/stuck_is_up", False), 20, lambda: str(node))
+        wait_for(lambda: rospy.get_param("/stuck_is_up", False), what=lambda: str(node))
         assert node.stop(signal.SIGTERM, timeout=6) == 0

@@ -14,9 +14,9 @@ from rosafe.tree.processor import Processor
 from rosafe.tree.states import State
 from rosafe.tree.tree import Tree
 from tests.dsp.bare import joined
-from tests.harness import wait_for
+from tests.harness import PATIENCE, wait_for
 
-from .support import RATE, WAIT_SECONDS, Feed, Recorder, grow
+from .support import RATE, Feed, Recorder, grow
 from .test_changes import LEAVES, NOISE, assert_as, chain, settle
 
 
@@ -119,14 +119,14 @@ def test_a_block_that_is_on_its_way_without_the_envelope_goes_the_old_way(
 
     def process(self: InnerHairCell, block: np.ndarray, *envelope: np.ndarray) -> np.ndarray:
         working.set()
-        assert go_on.wait(WAIT_SECONDS)
+        assert go_on.wait(PATIENCE)
         return original(self, block, *envelope)
 
     monkeypatch.setattr(InnerHairCell, "process", process)
     grow(tree, feed)
     filterbank, ihc = tree.find("gammatone"), tree.find("ihc")
     feed.put(*NOISE[:2])
-    assert working.wait(WAIT_SECONDS)
+    assert working.wait(PATIENCE)
     wait_for(lambda: filterbank.state is State.WAIT_RELEASE)
     tree.modify("ihc", "ihc_method", "hilbert")
     feed.put(*NOISE[2:4])
@@ -145,7 +145,7 @@ def test_a_block_without_the_envelope_after_all_is_no_gap(
     def process(self: InnerHairCell, block: np.ndarray, *envelope: np.ndarray) -> np.ndarray:
         if block[0, 0, 0] == first[0, 0, 0]:
             working.set()
-            assert go_on.wait(WAIT_SECONDS)
+            assert go_on.wait(PATIENCE)
         return original(self, block, *envelope)
 
     first = chain().run([NOISE[0]])[0]["gammatone"]
@@ -154,7 +154,7 @@ def test_a_block_without_the_envelope_after_all_is_no_gap(
     filterbank, ihc = tree.find("gammatone"), tree.find("ihc")
     tree.modify("ihc", "ihc_method", "hilbert")
     feed.put(NOISE[0])
-    assert working.wait(WAIT_SECONDS)
+    assert working.wait(PATIENCE)
     tree.modify("ihc", "ihc_method", "fullwave")
     feed.put(NOISE[1])
     wait_for(lambda: filterbank.state is State.WAIT_RELEASE)

@@ -18,9 +18,9 @@ from rosafe.tree.block import Block
 from rosafe.tree.processor import Processor
 from rosafe.tree.states import State
 from rosafe.tree.tree import Tree
-from tests.harness import run_together, wait_for
+from tests.harness import PATIENCE, run_together, wait_for
 
-from .support import RATE, WAIT_SECONDS, Feed, Plain, Recorder, grow, tree_threads, use_plain_stages
+from .support import RATE, Feed, Plain, Recorder, grow, tree_threads, use_plain_stages
 
 
 def refused(tree: Tree, ex: str, what: str, request: Any, *arguments: Any) -> None:
@@ -140,7 +140,7 @@ def test_stop_and_begin_anew(tree: Tree, listener: Recorder) -> None:
         assert feed.stopped
         assert tree.processors == []
         assert tree.input is None
-        assert all(p.join(WAIT_SECONDS) for p in before)
+        assert all(p.join(PATIENCE) for p in before)
     assert len(listener.ends) == 21
 
 
@@ -207,7 +207,7 @@ def test_a_tree_whose_source_has_ended_goes_with_it(tree: Tree, feed: Feed, list
     feed.put(count=1)
     feed.end()
     for processor in before:
-        assert processor.join(WAIT_SECONDS)
+        assert processor.join(PATIENCE)
     tree.add_input("input", Feed(), 160, 1.0, 1.0)
     names = ["ild", "ratemap", "crossCorrelation", "ihc", "gammatone", "preProc", "input"]
     assert [p.name for p in listener.ends] == names
@@ -283,7 +283,7 @@ def test_three_hundred_cycles_leave_nothing_behind(tree: Tree, feed: Feed, liste
         feed.put(count=1)
         listener.wait_blocks(tree.find("gammatone"), 1)
         for processor in tree.remove("preProc"):
-            assert processor.join(WAIT_SECONDS)
+            assert processor.join(PATIENCE)
         listener.forget()
 
     def memory() -> int:
