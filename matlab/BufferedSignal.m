@@ -1,9 +1,9 @@
 classdef BufferedSignal < handle
 %BUFFEREDSIGNAL  The newest seconds of one representation of one ear, oldest first.
 %
-%   TimeDomainSignal (samples), TimeFrequencySignal (frames by channels) and CorrelationSignal (frames by channels by
-%   lags) are made of it. They offer what the original's examples use of the signals of Two!Ears' MATLAB front-end;
-%   where that is ahead on the path, its own classes serve.
+%   TimeDomainSignal (samples, N-by-1), TimeFrequencySignal (frames by channels) and CorrelationSignal (frames by
+%   channels by lags) are made of it. They offer what the original's examples use of the signals of Two!Ears' MATLAB
+%   front-end, and take chunks of the same shapes; where that is ahead on the path, its own classes serve.
 
     properties (SetAccess = private)
         Name          % of the representation: 'filterbank'
@@ -34,18 +34,12 @@ classdef BufferedSignal < handle
         end
 
         function appendChunk(obj, chunk)
-            %APPENDCHUNK  Add frames at the end; the oldest go where there are too many.
-            if isempty(chunk)
-                return
-            end
-            if isempty(obj.cfHz)
-                chunk = chunk(:); % samples come as a row or as a column
-            elseif size(chunk, 2) ~= numel(obj.cfHz)
-                error('BufferedSignal:channels', '%s has %d channels, and the chunk has %d', obj.Label, ...
-                    numel(obj.cfHz), size(chunk, 2));
-            end
-            if obj.held > 0 && size(obj.chunks{1}, 3) ~= size(chunk, 3)
-                clearData(obj); % cc_maxDelaySec has changed
+            %APPENDCHUNK  Add frames, the rows of a chunk, at the end; the oldest go where there are too many.
+            wanted = frameSize(obj);
+            if ~isequal(size(chunk), [size(chunk, 1) wanted])
+                shown = sprintf('%d-by-', size(chunk));
+                error('BufferedSignal:size', '%s takes chunks of N%s (time goes down), and this one is %s', ...
+                    obj.Label, sprintf('-by-%d', wanted), shown(1:end - 4));
             end
             obj.chunks{end + 1, 1} = chunk;
             obj.held = obj.held + size(chunk, 1);
@@ -68,6 +62,13 @@ classdef BufferedSignal < handle
             %CLEARDATA  Forget all frames.
             obj.chunks = cell(0, 1);
             obj.held = 0;
+        end
+    end
+
+    methods (Access = protected)
+        function sizes = frameSize(obj)
+            % How many numbers a frame has: channels, or channels and lags.
+            sizes = max(1, numel(obj.cfHz));
         end
     end
 

@@ -29,4 +29,12 @@ classdef CorrelationSignal < BufferedSignal
             title(strrep([obj.Label ' ' obj.Channel], '_', ' '));
         end
     end
+
+    methods (Access = protected)
+        function sizes = frameSize(obj)
+            one = zeros(1, numel(obj.cfHz), numel(obj.lags)); % a last dimension of one is none
+            sizes = size(one);
+            sizes = sizes(2:end);
+        end
+    end
 end

@@ -90,7 +90,7 @@ classdef manager_RosAFE < handle
             end
             update(mObj);
             processor = 0;
-            for candidate = mObj.Processors.(typeOf(mObj, type)).'
+            for candidate = mObj.Processors.(typeOf(mObj, type))(:).'
                 chain = mObj.RosAFE.getDependencies(candidate{1}.name);
                 refuse(chain);
                 if all(cellfun(@(name) hasParameters(mObj, name, p), chain.result.dependencies))
@@ -146,7 +146,7 @@ classdef manager_RosAFE < handle
         function cleanup(mObj)
             %CLEANUP  Remove all processors but the input.
             update(mObj);
-            for processor = mObj.Processors.preProc.'
+            for processor = mObj.Processors.preProc(:).'
                 refuse(mObj.RosAFE.removeProcessor(processor{1}.name));
             end
             update(mObj);
@@ -226,7 +226,7 @@ classdef manager_RosAFE < handle
             chain = mObj.RosAFE.getDependencies(name);
             refuse(chain);
             cfHz = [];
-            for bank = mObj.Processors.gammatone.'
+            for bank = mObj.Processors.gammatone(:).'
                 if any(strcmp(bank{1}.name, chain.result.dependencies))
                     cfHz = cell2mat(bank{1}.fb_cfHz);
                 end
@@ -236,8 +236,12 @@ classdef manager_RosAFE < handle
         function append(mObj, kind, name, chunk)
             row = find(strcmp(name, labels(mObj.dObj, kind.signal)));
             signals = mObj.dObj.(kind.signal)(row, :);
-            if isprop(signals{1}, 'cfHz') && ~isempty(signals{1}.cfHz) && size(chunk.left, 2) ~= numel(signals{1}.cfHz)
-                return % its channels have changed since getParameters
+            axes = {'cfHz', 'lags'};
+            for k = 1:2 % channels, lags
+                if isprop(signals{1}, axes{k}) && ~isempty(signals{1}.(axes{k})) && ...
+                        size(chunk.left, 1 + k) ~= numel(signals{1}.(axes{k}))
+                    return % they have changed since getParameters
+                end
             end
             appendChunk(signals{1}, chunk.left);
             if kind.binaural
@@ -264,7 +268,7 @@ classdef manager_RosAFE < handle
             % Whether a processor has the parameters of P, and else its defaults.
             p = plain(p);
             for kind = mObj.TYPES
-                for processor = mObj.Processors.(kind.type).'
+                for processor = mObj.Processors.(kind.type)(:).'
                     if strcmp(processor{1}.name, name)
                         about = describe(mObj.RosAFE);
                         defaults = about.services.(kind.request).parameters;

@@ -153,22 +153,30 @@ def test_octave_reads_the_same(tmp_path: Path) -> None:
         "lags": correlation,
         "ragged": b"".join(packed.pieces(interface.ROSAFE, "::rosAFE::signalND", [np.ones(2), np.zeros(3)])),
         "error": packed.error({"ex": "x"}),
+        "empty": b"".join(packed.pieces(interface.ROSAFE, "::rosAFE::signalNxND", [[np.empty(0), np.empty(0)]])),
     }
     for name, data in documents.items():
         (tmp_path / name).write_bytes(data)
     script = r"""
-    function [value, failed] = get(name, matrices)
+    function [value, failed] = get(name, matrices, columns = false)
         file = fopen(name);
-        [value, failed] = genomix.wire.decode(uint8(fread(file, Inf).'), matrices);
+        [value, failed] = genomix.wire.decode(uint8(fread(file, Inf).'), matrices, columns);
         fclose(file);
     end
     p = get('plain', false);
-    assert(iscell(p.a) && isequal(size(p.a), [3 1]) && p.a{2} == 2.5 && isnan(p.a{3}))
-    assert(isequal(p.b, {'x'; 'äß€'; ''}) && isequal(size(p.c), [0 1]) && iscell(p.c))
+    assert(iscell(p.a) && isequal(size(p.a), [1 3]) && p.a{2} == 2.5 && isnan(p.a{3}))
+    assert(isequal(p.b, {'x', 'äß€', ''}) && isequal(size(p.c), [1 0]) && iscell(p.c))
+    t = get('plain', false, true);
+    assert(isequal(t.a(1:2), {1; 2.5}) && isequal(t.b, {'x'; 'äß€'; ''}) && isequal(size(t.c), [0 1]))
     m = get('plain', true);
     assert(isa(m.a, 'double') && m.a(1) == 1 && iscell(m.b))
     c = get('lags', false);
+    assert(isequal(size(c.dataNxN), [1 4]) && isequal(c.dataNxN{3}.dataN{2}.data, {210, 211, 212}))
+    c = get('lags', false, true);
     assert(isequal(size(c.dataNxN), [4 1]) && isequal(c.dataNxN{3}.dataN{2}.data, {210; 211; 212}))
+    e = get('empty', false);
+    assert(isequal(e, struct('dataNxN', {{struct('dataN', {{struct('data', {cell(1, 0)}), struct('data', {cell(1, 0)})}})}})))
+    assert(isequal(size(get('empty', true)), [0 2]))
     m = get('lags', true);
     assert(isequal(size(m), [3 2 4]) && isequal(m(:, 2, 3), [210; 211; 212]))
     r = get('ragged', true);

@@ -15,7 +15,6 @@ from typing import Any
 
 import pytest
 
-from rosafe.genomix import proxy
 from rosafe.interface import COMPONENTS
 from tests import harness
 from tests.genomix import world as worlds
@@ -299,7 +298,7 @@ def test_load_waits_for_a_component_that_is_starting(empty_world: World) -> None
     world = empty_world
     begin = time.monotonic()
     assert "bass is not running" in problem(world, "bass/Stop")
-    assert time.monotonic() - begin > proxy.APPEAR_SECONDS
+    assert time.monotonic() - begin > 1.9  # as docs/genomixd.md says
     with world.graph.start(harness.PYTHON, "-c", code(PATIENT_GENOMIXD)) as server, ThreadPoolExecutor() as pool:
         patient = worlds.Http(worlds.port_of(server))
         loads = [pool.submit(patient.get, "/load/bass", s=f"s{number}") for number in range(3)]

@@ -32,7 +32,7 @@ def test_representations_and_their_data(world: World) -> None:
         sOut = mObj.addProcessor('ild', par);
         [left, both] = mObj.addProcessor({'ratemap', 'crosscorrelation'}, par);
         show('signals', {sOut{1}.Label, size(left), left{2}.Channel, both{1}.Label, numel(both{1}.lags)});
-        show('cfHz', isequal(sOut{1}.cfHz(:), cell2mat(mObj.Processors.gammatone{1}.fb_cfHz)));
+        show('cfHz', isequal(sOut{1}.cfHz, cell2mat(mObj.Processors.gammatone{1}.fb_cfHz)));
         p = mObj.Processors;
         show('names', {p.input{1}.name, p.preProc{1}.name, p.gammatone{1}.name, p.ihc{1}.name, p.ild{1}.name, ...
             p.ratemap{1}.name, p.crossCorrelation{1}.name});
