@@ -62,19 +62,26 @@ def test_master_is_there(graph: Graph) -> None:
 
 def test_address_that_nobody_can_call(graph: Graph) -> None:
     """ROS_IP or ROS_HOSTNAME of another machine; or one that a master elsewhere cannot call."""
-    for env, why in (
+    master: dict[str, Any] = {"ROS_MASTER_URI": graph.uri}
+    unreachable: tuple[tuple[dict[str, Any], str], ...] = (
         ({"ROS_IP": "203.0.113.7"}, "ROS_IP is 203.0.113.7, which is no address of this machine"),
         ({"ROS_HOSTNAME": "nobody.invalid"}, "ROS_HOSTNAME is nobody.invalid, which is no address, and no name"),
         ({"ROS_IP": "http://127.0.0.1"}, "ROS_IP is http://127.0.0.1, which is no address"),
         ({"ROS_IP": "0.0.0.0"}, "ROS_IP is 0.0.0.0, which is no address to call"),
         ({"ROS_IP": "127.0.0.1", "ROS_MASTER_URI": "http://203.0.113.7:11311"}, "but the master is at http://203.0"),
-    ):
-        done = rosafe("doctor", "--json", **{"ROS_MASTER_URI": graph.uri, **env})
+    )
+    for env, why in unreachable:
+        done = rosafe("doctor", "--json", **{**master, **env})
         found = findings(done)["address"]
         assert (done.returncode, found["state"]) == (1, "MISSING")
         assert why in found["detail"] and "unset it or set it to " in found["todo"]
-    for env in ({"ROS_IP": "127.0.0.1"}, {"ROS_HOSTNAME": "127.0.0.1", "ROS_IP": "203.0.113.7"}, {}):
-        found = findings(rosafe("doctor", "--json", **{"ROS_MASTER_URI": graph.uri, **env}))["address"]
+    fine: tuple[dict[str, Any], ...] = (
+        {"ROS_IP": "127.0.0.1"},
+        {"ROS_HOSTNAME": "127.0.0.1", "ROS_IP": "203.0.113.7"},
+        {},
+    )
+    for env in fine:
+        found = findings(rosafe("doctor", "--json", **{**master, **env}))["address"]
         assert found["state"] == "ok" and "is 127.0.0.1" in found["detail"]
 
 

@@ -253,11 +253,8 @@ def test_a_publisher_that_lies_about_lengths_is_left(afe: tuple[Session, Target]
         poured.append(pour(sock, bytes(10**6)))
 
     def answer(port: int) -> Any:
-        return (
-            (1, "", ["TCPROS", "127.0.0.1", "x" * 40_000_000])
-            if behaviour == "answer"
-            else (1, "", ["TCPROS", "127.0.0.1", port])
-        )
+        reported: int | str = "x" * 40_000_000 if behaviour == "answer" else port
+        return 1, "", ["TCPROS", "127.0.0.1", reported]
 
     session.build("PreProc")  # the first one takes memory that stays
     session.ok("Stop")

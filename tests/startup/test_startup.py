@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -173,14 +174,19 @@ def test_an_address_that_nobody_can_call_is_said(graph: Graph, program: str, var
     address, why = UNREACHABLE[variable]
     name = f"unreachable_{variable.lower()}"
     option = {"ROS_IP": "__ip", "ROS_HOSTNAME": "__hostname"}[variable]
-    for arguments, env in (([], {variable: address}), ([f"{option}:={address}"], {})):
+    given: tuple[tuple[list[str], dict[str, Any]], ...] = (
+        ([], {variable: address}),
+        ([f"{option}:={address}"], {}),
+    )
+    for arguments, env in given:
         with graph.node(program, "-i", name, *arguments, **env) as node:
             assert node.err.startswith(f"{program}: warning: {variable} is {address}, ") and why in node.err
             assert "set it to 127.0.0.1" in node.err and node.err.count("\n") == 1
 
 
 def test_addresses_that_can_be_called_are_not_mentioned(graph: Graph) -> None:
-    for env in ({"ROS_IP": "127.0.0.1"}, {"ROS_IP": "127.3.2.1"}, {"ROS_HOSTNAME": "127.0.0.1"}):
+    for variable, address in (("ROS_IP", "127.0.0.1"), ("ROS_IP", "127.3.2.1"), ("ROS_HOSTNAME", "127.0.0.1")):
+        env: dict[str, Any] = {variable: address}
         with graph.node("bass-ros", "-i", "reachable", **env) as node:
             assert node.err == ""
 
