@@ -28,7 +28,7 @@ from rosafe.representations.ratemap import Ratemap
 from rosafe.representations.registry import ORIGINAL
 from tests.harness import ROOT
 
-from .bare import FloatArray, cut
+from .bare import FloatArray, cut, single
 from .implementations import TWINS, levels, using
 
 RATE = 16000.0
@@ -58,7 +58,7 @@ def outputs(stage: Stage, blocks: Iterable[FloatArray], turns: Iterable[int]) ->
             if isinstance(stage, InnerHairCell) and stage.needs:
                 made.append(stage.process(block, np.abs(block) + 0.25 * np.abs(np.roll(block, 1))))
             else:
-                made.append(stage.process(block))
+                made.append(single(stage.process(block)))
     return made
 
 

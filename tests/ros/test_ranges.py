@@ -61,7 +61,8 @@ def refused(response: Any, parameter: Parameter, value: Any) -> None:
 
 @pytest.mark.parametrize("service", ROSAFE.activities, ids=lambda service: service.name)
 def test_values_outside_are_refused_by_service_and_action(afe: Session, service: Service) -> None:
-    above = next((list(parents(kind)) for kind in KINDS.values() if kind.request == service.name), [])
+    served = [kind for kind in KINDS.values() if kind.request == service.name]
+    above = [kind for one in served for kind in parents(one)]
     afe.build(*(kind.request for kind in above if kind.parent), fb_nChannels=2)
     before = snapshot(afe)
     fresh = {"name": "fresh"}

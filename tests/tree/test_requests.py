@@ -18,6 +18,7 @@ from rosafe.tree.block import Block
 from rosafe.tree.processor import Processor
 from rosafe.tree.states import State
 from rosafe.tree.tree import Tree
+from tests.dsp.bare import single
 from tests.harness import PATIENCE, run_together, wait_for
 
 from .support import RATE, Feed, Plain, Recorder, grow, tree_threads, use_plain_stages
@@ -168,7 +169,7 @@ def test_children_go_on_with_the_new_input_and_what_they_held(tree: Tree, listen
     whole = noise
     for kind in ("preProc", "gammatone", "ihc"):
         processor = tree.find(kind)
-        whole = STAGES[kind](RATE, **processor.parameters()).process(whole)
+        whole = single(STAGES[kind](RATE, **processor.parameters()).process(whole))
         listener.wait_blocks(processor, 4)
         np.testing.assert_allclose(listener.data(processor), whole, rtol=0, atol=1e-12)
     for leaf in leaves[1:]:

@@ -357,8 +357,8 @@ def test_a_token_is_taken_once() -> None:
     assert late.begin() is not None
     late.give_back()
     late.rest()
-    assert not late.ready
     assert late.begin() is None
+    assert not late.ready
 
 
 def test_siblings_read_the_same_memory() -> None:
