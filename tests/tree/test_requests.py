@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rosafe.dsp.stage import parts_of
 from rosafe.interface import FIXED, ComponentError
 from rosafe.representations import STAGES
 from rosafe.tree import sizes
@@ -168,7 +169,7 @@ def test_children_go_on_with_the_new_input_and_what_they_held(tree: Tree, listen
     whole = noise
     for kind in ("preProc", "gammatone", "ihc"):
         processor = tree.find(kind)
-        whole = STAGES[kind](RATE, **processor.parameters()).process(whole)
+        (whole,) = parts_of(STAGES[kind](RATE, **processor.parameters()).process(whole))
         listener.wait_blocks(processor, 4)
         np.testing.assert_allclose(listener.data(processor), whole, rtol=0, atol=1e-12)
     for leaf in leaves[1:]:
@@ -241,7 +242,7 @@ def test_all_processors_together_have_a_share_of_the_memory(
     tree: Tree, feed: Feed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What would pass it changes nothing, be it a new processor, a longer port or more channels."""
-    monkeypatch.setattr(sizes.os, "sysconf", {"SC_PHYS_PAGES": 2**13, "SC_PAGE_SIZE": 2**12}.get)  # 32 MiB
+    monkeypatch.setattr(sizes, "machine_memory", lambda: 2**25)
     share = "MiB, more than 16 MiB, which is 50% of this machine's memory"
     grow(tree, feed)
     tree.modify("gammatone", "fb_nChannels", "10")
