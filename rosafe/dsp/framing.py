@@ -76,7 +76,8 @@ class Framing:
             samples = np.square(limited(samples, SQUARE_TINY))
         # Not a matrix product: OpenBLAS starts threads of its own for it, and two stages at work at the same time
         # then get in each other's way: several times slower than one alone.
-        return np.einsum("...fi,i->...f", self.frames(samples), self.weights(squared))
+        means: FloatArray = np.einsum("...fi,i->...f", self.frames(samples), self.weights(squared))
+        return means
 
 
 class FrameBuffer:

@@ -242,7 +242,7 @@ def test_all_processors_together_have_a_share_of_the_memory(
     tree: Tree, feed: Feed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What would pass it changes nothing, be it a new processor, a longer port or more channels."""
-    monkeypatch.setattr(sizes.os, "sysconf", {"SC_PHYS_PAGES": 2**13, "SC_PAGE_SIZE": 2**12}.get)  # 32 MiB
+    monkeypatch.setattr(sizes, "machine_memory", lambda: 2**25)
     share = "MiB, more than 16 MiB, which is 50% of this machine's memory"
     grow(tree, feed)
     tree.modify("gammatone", "fb_nChannels", "10")
