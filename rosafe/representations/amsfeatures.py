@@ -21,9 +21,9 @@ import numpy as np
 import scipy
 
 from rosafe.dsp import kernels
-from rosafe.dsp.cascade import SPAN, Parallel
+from rosafe.dsp.cascade import Parallel
 from rosafe.dsp.framing import MAX_FRAME_SECONDS, FrameBuffer, FramedStage, Framing
-from rosafe.dsp.guard import FloatArray, limited
+from rosafe.dsp.guard import SPAN, FloatArray, limited
 from rosafe.dsp.rounding import sample_count
 from rosafe.dsp.signal import Signal
 from rosafe.dsp.windows import ALL_NAMES, window

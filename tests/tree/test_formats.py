@@ -20,9 +20,9 @@ from rosafe.tree.states import State
 from rosafe.tree.tree import Tree
 from rosafe.vocabulary.parameter import Parameter
 from rosafe.vocabulary.representation import Part, Representation
-from tests.harness import wait_for
+from tests.harness import PATIENCE, wait_for
 
-from .support import RATE, WAIT_SECONDS, Feed, Recorder, use_plain_stages
+from .support import RATE, Feed, Recorder, use_plain_stages
 
 
 def declared(kind: str, **differs: Any) -> Representation:
@@ -231,14 +231,14 @@ def test_a_change_waits_for_the_format_that_it_goes_with(
 
     def process(self: Picky, block: FloatArray, extra: FloatArray | None = None) -> Output:
         working.set()
-        assert go_on.wait(WAIT_SECONDS)
+        assert go_on.wait(PATIENCE)
         return original(self, block, extra)
 
     monkeypatch.setattr(Picky, "process", process)
     grow(tree, feed, fb_held=0)
     coarser, picky = tree.find("coarser"), tree.find("picky")
     feed.put(count=2)
-    assert working.wait(WAIT_SECONDS)
+    assert working.wait(PATIENCE)
     wait_for(lambda: coarser.state is State.WAIT_RELEASE)
     tree.modify("coarser", "pp_lags", "50")
     tree.modify("picky", "fb_least", "30")  # goes only with the new format

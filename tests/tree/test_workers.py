@@ -17,9 +17,9 @@ from rosafe.tree.processor import Processor
 from rosafe.tree.states import State
 from rosafe.tree.tree import Tree
 from rosafe.tree.workers import MOST, VARIABLE, workers_to_use
-from tests.harness import wait_for
+from tests.harness import PATIENCE, wait_for
 
-from .support import WAIT_SECONDS, Feed, Plain, Recorder, tree_threads, use_plain_stages
+from .support import Feed, Plain, Recorder, tree_threads, use_plain_stages
 
 
 @pytest.fixture
@@ -73,7 +73,7 @@ def test_no_more_compute_than_there_are_workers(
             with lock:
                 now += 1
                 at_once.append(now)
-            meeting.wait(WAIT_SECONDS)
+            meeting.wait(PATIENCE)
             with lock:
                 now -= 1
             return block
@@ -140,7 +140,7 @@ class Stubborn(Recorder):
     def released(self, processor: Processor, block: Block) -> None:
         if processor.name in self.holds and not self.go.is_set():
             self.held.add(processor.name)
-            assert self.go.wait(WAIT_SECONDS)
+            assert self.go.wait(PATIENCE)
         super().released(processor, block)
 
 
@@ -190,25 +190,25 @@ def test_a_block_that_takes_long_stops_no_request(
         def process(self, block: np.ndarray, extra: np.ndarray | None = None) -> np.ndarray:
             if self.parameters.get("long"):
                 working.set()
-                assert go_on.wait(WAIT_SECONDS)
+                assert go_on.wait(PATIENCE)
             return block
 
     use_plain_stages(monkeypatch, preProc=Long)
     root = tree.add_input("input", feed, 1, 1.0, 1.0)
     long = tree.add("preProc", "long", "input", {"long": True})
     feed.put(count=3)
-    assert working.wait(WAIT_SECONDS)
+    assert working.wait(PATIENCE)
     begun = time.monotonic()
     other = tree.add("preProc", "other", "input")
     tree.modify("long", "pp_bRemoveDC", "1")
     assert tree.dependencies("other") == ["input", "other"]
     assert [(view.frames, index) for (view,), index, _ in [root.take("x")]] in ([(0, 0)], [(1, 1)])
     assert tree.remove("long") == [long]
-    assert time.monotonic() - begun < WAIT_SECONDS / 4
+    assert time.monotonic() - begun < PATIENCE / 4
     listener.wait_blocks(other, 3)
     assert not long.join(0.0)
     go_on.set()
-    assert long.join(WAIT_SECONDS)
+    assert long.join(PATIENCE)
     assert listener.blocks[long] == []
     wait_for(lambda: computing() == 1)
 
@@ -222,7 +222,7 @@ def test_a_source_that_does_not_answer(tree: Tree, listener: Stubborn, monkeypat
             got = super().read()
             if got is None and not self.ended:
                 asked.set()
-                assert answer.wait(WAIT_SECONDS)
+                assert answer.wait(PATIENCE)
             return got
 
     use_plain_stages(monkeypatch)
@@ -230,13 +230,13 @@ def test_a_source_that_does_not_answer(tree: Tree, listener: Stubborn, monkeypat
     source.put(count=1)
     root = tree.add_input("input", source, 1, 1.0, 1.0)
     child = tree.add("preProc", "child", "input")
-    assert asked.wait(WAIT_SECONDS)
+    assert asked.wait(PATIENCE)
     listener.wait_blocks(child, 1)
     tree.stop()
     assert listener.ends == [child, root]
     assert not root.join(0.0)
     answer.set()
-    assert root.join(WAIT_SECONDS)
+    assert root.join(PATIENCE)
 
 
 def test_a_listener_that_is_slow_is_told_last(
