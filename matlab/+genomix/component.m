@@ -180,6 +180,7 @@ end
 if ~ischar(given{1}) || size(given{1}, 1) > 1
     error('genomix:argument', 'the name of an element is one text, and no %s', class(given{1}));
 end
+genomix.wire.utf8(given{1}); % raises an error where it is none
 query = {'element', given{1}};
 end
 

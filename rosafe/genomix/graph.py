@@ -1,12 +1,13 @@
 """The ROS graph as genomixd sees it: the master and nodes by XML-RPC, and a node of its own once one is needed.
 
 All calls are coroutines with a time limit. A master that is away, or comes back empty, is an error while it lasts and
-nothing more.
+nothing more; where components were reached the last time, they are looked for without it.
 """
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import errno
 import os
 import time
@@ -18,11 +19,15 @@ from xml.parsers.expat import ExpatError
 import aiohttp
 
 from rosafe.component import startup
+from rosafe.genomix.tasks import shared
 from rosafe.interface import ComponentError
 
 RPC_SECONDS = 3.0  # for one call of the master or of a node
 NODE_SECONDS = 15.0  # for becoming a node of the graph
-
+LOOK_SECONDS = 0.05  # between two looks at what the master knows, however many wait for that
+MAX_CALLS = 8  # of the master at once
+MAX_ANSWER = 16 * 2**20  # bytes of an answer of the master or a node
+MAX_KNOWN = 1000  # components whose addresses are remembered
 
 _FAILURES = (OSError, aiohttp.ClientError, ValueError)  # TimeoutError is an OSError
 
@@ -49,6 +54,12 @@ class Graph:
         )
         self._node: asyncio.Task[None] | None = None
         self._is_node = False
+        self._calls = asyncio.Semaphore(MAX_CALLS)
+        self._look: asyncio.Task[set[str]] | None = None  # the next look at the services, which has not begun yet
+        self._looking = asyncio.Lock()
+        self._looked_at = 0.0
+        self._addresses: dict[str, tuple[str, int]] = {}  # where instances were reached the last time
+        self._uris: dict[str, str] = {}  # and their nodes
 
     async def close(self) -> None:
         """Leave the graph."""
@@ -65,7 +76,8 @@ class Graph:
     async def master(self, method: str, *arguments: Any) -> Any:
         """The value of the master's `method`; Unknown where it has none, ComponentError where it does not answer."""
         try:
-            return await self.node(self.uri, method, *arguments)
+            async with asyncio.timeout(RPC_SECONDS), self._calls:
+                return await self.node(self.uri, method, *arguments)
         except _FAILURES as problem:
             raise middleware_error(
                 f"no ROS master at {self.uri} ({_reason(problem)}): start roscore first, or set ROS_MASTER_URI"
@@ -74,10 +86,14 @@ class Graph:
     async def node(self, uri: str, method: str, *arguments: Any) -> Any:
         """The value of `method` of the node (or master) at `uri`."""
         body = xmlrpc.client.dumps((self.name, *arguments), method)
+        text = bytearray()
         async with self._http.post(uri, data=body.encode(), headers={"Content-Type": "text/xml"}) as response:
-            text = await response.text()
+            async for part in response.content.iter_any():
+                text += part
+                if len(text) > MAX_ANSWER:
+                    raise OSError(errno.EMSGSIZE, os.strerror(errno.EMSGSIZE))
         try:
-            values: Any = xmlrpc.client.loads(text)[0]
+            values: Any = xmlrpc.client.loads(text.decode())[0]
             code, message, value = values[0]
         except (ExpatError, xmlrpc.client.Error, ValueError, TypeError, IndexError):
             raise OSError(errno.EPROTO, os.strerror(errno.EPROTO)) from None
@@ -89,20 +105,53 @@ class Graph:
         """Host and port of the service `name`, or Unknown."""
         return _address(await self.master("lookupService", name))
 
+    async def serves(self, name: str) -> bool:
+        """Whether somebody serves `name`. One look at the master answers all who ask before it begins."""
+        if self._look is None:
+            self._look = shared(self._look_at_services())
+        return name in await asyncio.shield(self._look)
+
+    async def _look_at_services(self) -> set[str]:
+        clock = asyncio.get_running_loop().time
+        async with self._looking:
+            await asyncio.sleep(self._looked_at + LOOK_SECONDS - clock())
+            self._look, self._looked_at = None, clock()
+            return {name for name, _ in (await self.master("getSystemState"))[2]}
+
     async def topics(self) -> dict[str, str]:
         """All topics that somebody publishes, with their types."""
         return dict(await self.master("getPublishedTopics", ""))
 
-    async def topic_address(self, topic: str, node: str) -> tuple[str, int]:
-        """Host and port where `node` gives out `topic`, or Unknown."""
-        uri = await self.master("lookupNode", node)
+    async def topic_address(self, topic: str, instance: str) -> tuple[str, int]:
+        """Host and port where the node `instance` gives out `topic`, or Unknown. It is asked itself."""
+        known = self._uris.get(instance)
+        if known is not None:
+            with contextlib.suppress(*_FAILURES):
+                return await self._topic_at(known, topic)
         try:
-            protocol = await self.node(uri, "requestTopic", topic, [["TCPROS"]])
+            return await self._topic_at(await self.node_uri(instance), topic)
         except _FAILURES as problem:
-            raise middleware_error(f"{node} does not answer ({_reason(problem)})") from None
+            raise middleware_error(f"{instance} does not answer ({_reason(problem)})") from None
+
+    async def _topic_at(self, uri: str, topic: str) -> tuple[str, int]:
+        protocol = await self.node(uri, "requestTopic", topic, [["TCPROS"]])
         if len(protocol) != 3 or protocol[0] != "TCPROS":
-            raise Unknown(f"{node} does not give out {topic}")
+            raise Unknown(f"nobody gives out {topic}")
         return str(protocol[1]), int(protocol[2])
+
+    async def node_uri(self, instance: str) -> str:
+        """Where the node `instance` takes XML-RPC, or Unknown; remembered."""
+        uri = str(await self.master("lookupNode", f"/{instance}"))
+        _remember(self._uris, instance, uri)
+        return uri
+
+    def known_address(self, instance: str) -> tuple[str, int] | None:
+        """Where the services of `instance` were reached the last time."""
+        return self._addresses.get(instance)
+
+    def reached(self, instance: str, address: tuple[str, int]) -> None:
+        """The services of `instance` are there: all of a node are at one address."""
+        _remember(self._addresses, instance, address)
 
     # --- our node ---
 
@@ -131,6 +180,13 @@ class Graph:
         startup.log_to_stderr()
         rospy.on_shutdown(registrar.end)
         rospy.on_shutdown(lambda: loop.is_closed() or loop.call_soon_threadsafe(self.gone.set))
+
+
+def _remember(book: dict[str, Any], instance: str, value: Any) -> None:
+    book.pop(instance, None)  # the newest are last
+    book[instance] = value
+    while len(book) > MAX_KNOWN:
+        del book[next(iter(book))]
 
 
 def _address(uri: str) -> tuple[str, int]:

@@ -14,7 +14,8 @@ from rosafe.genomix import packed, syntax, trees
 from rosafe.genomix.actions import ActionClient, Goal
 from rosafe.genomix.graph import Graph, Unknown, middleware_error
 from rosafe.genomix.syntax import Syntax
-from rosafe.genomix.tcpros import Connection, Refused, ServiceClient, TopicReader, component_exception
+from rosafe.genomix.tasks import shared
+from rosafe.genomix.tcpros import Connection, Refused, ServiceClient, TopicReader, component_exception, reach
 from rosafe.genomix.values import complete, partial
 from rosafe.interface import (
     COMPONENTS,
@@ -34,7 +35,7 @@ from rosafe.interface.signals import LEVELS
 
 CALL_SECONDS = 60.0  # for the answer to one request
 APPEAR_SECONDS = 2.0  # that `load` waits for a component that is just starting
-POLL_SECONDS = 0.05
+POLL_SECONDS = 0.1
 REGISTER_SECONDS = 20.0  # for becoming a client of an action, the first time for becoming a node too
 LATE_SECONDS = 0.5  # results that a component sent before it ended arrive within
 MAX_PENDING = 1000  # requests to one component that are not answered yet
@@ -47,6 +48,7 @@ class Value:
         self._component = component
         self._members = members
         self.values = values
+        self.data: object = self  # what the values belong to, and perhaps those of others
 
     def pieces(self, form: Syntax) -> Iterator[str]:
         """The text, as one nested value, in short pieces."""
@@ -86,6 +88,7 @@ class Proxy:
         self._link: asyncio.Task[None] | None = None
         self._building = asyncio.Lock()  # one tree at a time
         self.pending = 0  # requests that are not answered yet
+        self.used_at = asyncio.get_running_loop().time()
 
     @classmethod
     async def load(cls, graph: Graph, instance: str) -> Proxy:
@@ -94,7 +97,14 @@ class Proxy:
         if package not in COMPONENTS:
             known = ", ".join(COMPONENTS)
             raise _cannot_load(f"/{instance} is a {package}; genomixd knows {known}")
+        with contextlib.suppress(Unknown, ComponentError):  # later, perhaps
+            await graph.node_uri(instance)  # for its ports, should the master be away then
         return cls(graph, COMPONENTS[package], instance)
+
+    def prepare(self) -> None:
+        """Begin to become a client of all activities: then they can be had while the master is away, too."""
+        for activity in self.component.activities:
+            self._registering(activity.name)
 
     async def check(self, name: str) -> None:
         """Return if the component runs still and may be called `name`, else raise ComponentError."""
@@ -182,13 +192,16 @@ class Proxy:
             self._services[service] = ServiceClient(self._graph, self.component.name, self.instance, service)
         return self._services[service]
 
-    async def _action(self, action: str) -> ActionClient:
+    def _registering(self, action: str) -> asyncio.Task[ActionClient]:
         task = self._actions.get(action)
         if task is None or (task.done() and (task.cancelled() or task.exception() is not None)):
             made = ActionClient.create(self._graph, self.component.name, self.instance, action)
-            task = self._actions[action] = asyncio.create_task(made)
+            task = self._actions[action] = shared(made)
+        return task
+
+    async def _action(self, action: str) -> ActionClient:
         try:
-            return await asyncio.wait_for(asyncio.shield(task), REGISTER_SECONDS)
+            return await asyncio.wait_for(asyncio.shield(self._registering(action)), REGISTER_SECONDS)
         except TimeoutError:  # rospy tries on until the master answers, and a later request finds it done
             raise middleware_error(f"the ROS master at {self._graph.uri} does not answer") from None
 
@@ -233,16 +246,22 @@ class Proxy:
         value = _zero(self.component, port.idl)
         if message is not None:
             value = {name: getattr(message, name) for name, _ in self.component.structs[port.idl]}
-        return Value(self.component, ((port.name, port.idl),), {port.name: value})
+        sample = Value(self.component, ((port.name, port.idl),), {port.name: value})
+        sample.data = message
+        return sample
 
     async def _other_element(self, topic: str, port: Port, element: str) -> str:
         """An element that differs in the case of letters only: the user's guide reads 'crossCorrelation'."""
-        topics = [t for t in await self._graph.topics() if t.startswith(f"{topic}/")]
+        missing = f"{port.name} has no element {element[:80]!r}"
+        try:
+            topics = [t for t in await self._graph.topics() if t.startswith(f"{topic}/")]
+        except ComponentError:
+            raise _no_port(missing) from None
         alike = [t for t in topics if t.lower() == f"{topic}/{element}".lower()]
         if len(alike) == 1:
             return alike[0]
         names = ", ".join(t.removeprefix(f"{topic}/") for t in topics) or "none"
-        raise _no_port(f"{port.name} has no element {element[:80]!r}; there are: {names}")
+        raise _no_port(f"{missing}; there are: {names}")
 
     def _reader(self, port: Port) -> TopicReader:
         if port.idl not in self._readers:
@@ -318,24 +337,32 @@ def names(component: str, instance: str) -> tuple[str, str]:
 async def _package(graph: Graph, instance: str) -> str:
     """The ROS package of the component that runs as `instance`, asked of the component itself."""
     name = f"/{instance}/connect_port"
+    probe = {"service": name, "md5sum": "*", "probe": "1", "callerid": graph.name}
     deadline = asyncio.get_running_loop().time() + APPEAR_SECONDS
+    pause = POLL_SECONDS
     while True:
         try:
-            address = await graph.service_address(name)
-            probe = {"service": name, "md5sum": "*", "probe": "1", "callerid": graph.name}
-            connection = await Connection.open(address, probe)
-            connection.close()
-            return connection.header.get("type", "").split("/")[0]
+            # Where it was the last time, or where somebody says that it is.
+            if graph.known_address(instance) is not None or await graph.serves(name):
+                connection = await reach(graph, instance, probe)
+                connection.close()
+                return connection.header.get("type", "").split("/")[0]
+            problem = _not_running(instance, name)
         except Unknown:
-            problem = middleware_error(f"{instance} is not running: nobody serves {name}")
+            problem = _not_running(instance, name)
         except ComponentError as no_master:
             problem = no_master
         except (Refused, OSError) as failure:
             why = str(failure) or "no answer"
             problem = middleware_error(f"{instance} is not running, though the master lists it ({why})")
+            pause *= 2  # a look is for all, a connection for one only
         if asyncio.get_running_loop().time() > deadline:
             raise problem
-        await asyncio.sleep(POLL_SECONDS)
+        await asyncio.sleep(pause)
+
+
+def _not_running(instance: str, name: str) -> ComponentError:
+    return middleware_error(f"{instance} is not running: nobody serves {name}")
 
 
 def _cannot_load(what: str) -> ComponentError:

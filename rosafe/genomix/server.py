@@ -10,21 +10,24 @@ import re
 from collections.abc import Awaitable, Callable, Coroutine, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
+from urllib.parse import unquote_to_bytes
 
 from aiohttp import web
 
 from rosafe.genomix import packed
 from rosafe.genomix.access import refuse_web_pages
+from rosafe.genomix.connections import Connection, Connections
+from rosafe.genomix.errors import error_body
 from rosafe.genomix.graph import middleware_error
 from rosafe.genomix.proxy import Proxy, Value
-from rosafe.genomix.sessions import Request, Session, Sessions, error_body, too_many
+from rosafe.genomix.requests import Request
+from rosafe.genomix.sessions import Session, Sessions
 from rosafe.genomix.syntax import SYNTAXES, TCL, Syntax, plain
+from rosafe.genomix.tasks import first
 from rosafe.genomix.values import parse_input, refused
 from rosafe.interface import ComponentError
 from rosafe.version import VERSION
 
-MAX_CONNECTIONS = 2000
-MAX_URL = 256 * 1024  # bytes of a request line: a list of 1024 numbers fits, percent signs and all
 MAX_WAIT_MS = 3_600_000
 FORMATTERS = 4  # threads
 BATCH = 128 * 1024  # characters written at a time
@@ -32,7 +35,6 @@ REFUSAL_SECONDS = 0.05
 ANSWER_SECONDS = 75.0  # for any answer that is not told to wait; a component has 60 s for its part
 HEARTBEAT_SECONDS = 15.0  # between two signs of life to a listener
 LAST_WORDS_SECONDS = 1.0  # that answers under way have at the end
-IDLE_SECONDS = 3600.0  # a connection without requests is closed after
 
 log = logging.getLogger("genomixd")
 
@@ -104,12 +106,8 @@ class Server:
             ("/requests", self._requests),
         ):
             app.router.add_get(path, handler, allow_head=False)
-        self._runner = web.AppRunner(
-            app,
-            access_log=log if log.isEnabledFor(logging.DEBUG) else None,
-            keepalive_timeout=IDLE_SECONDS,
-            max_line_size=MAX_URL,
-        )
+        self._runner = web.AppRunner(app)
+        self._connections = Connections()
         self._listener: asyncio.AbstractServer | None = None
         # A few threads for all results: more would only fight for the interpreter.
         self._formatters = ThreadPoolExecutor(FORMATTERS, "format")
@@ -118,7 +116,8 @@ class Server:
         """Listen and return the port; OSError where that cannot be."""
         await self._runner.setup()
         assert self._runner.server is not None
-        connect = functools.partial(_connect, self._runner.server)
+        access_log = log if log.isEnabledFor(logging.DEBUG) else None
+        connect = functools.partial(Connection, self._connections, self._runner.server, access_log=access_log)
         self._listener = await asyncio.get_running_loop().create_server(connect, host, port, backlog=512)
         return int(self._listener.sockets[0].getsockname()[1])
 
@@ -138,8 +137,10 @@ class Server:
     async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         """Refuse what comes from a web page, and put every error into the client's syntax."""
         session: Session | None = None
+        _connection(request).begun()
         try:
             refuse_web_pages(request.headers, self._hosts)
+            _check_url(request)
             if not _is_packed(request):
                 _syntax(request)
             if not request.path.startswith("/session/"):
@@ -165,7 +166,7 @@ class Server:
         name = request.query.get("s", "")
         if name and not _SESSION_NAME.fullmatch(name):
             raise refused("s: a session's name has up to 100 letters, digits and . : @ _ -")
-        return self._sessions.get(name)
+        return self._sessions.get(name, _connection(request).client.address)
 
     # --- sessions ---
 
@@ -182,7 +183,10 @@ class Server:
         return _text("")
 
     async def _session_listen(self, request: web.Request) -> web.StreamResponse:
-        session, form = self._session(request), _syntax(request)
+        with self._connections.held(_connection(request)):
+            return await self._listen(request, self._session(request), _syntax(request))
+
+    async def _listen(self, request: web.Request, session: Session, form: Syntax) -> web.StreamResponse:
         queue = session.listen()
         try:
             response = web.StreamResponse(headers={"Content-Type": "text/event-stream", **_HEADERS})
@@ -198,7 +202,7 @@ class Server:
                     data = "".join(_unwrapped(form, data.pieces(form)))
                 elif data:
                     data = "".join(_unwrapped(form, iter((plain(form, data),))))
-                await response.write(f"event: {event}\ndata: {data}\n\n".encode())
+                await response.write(_utf8(f"event: {event}\ndata: {data}\n\n"))
                 if event == "quit":
                     return response
         finally:
@@ -267,7 +271,8 @@ class Server:
     async def _send(self, request: web.Request) -> web.StreamResponse:
         session, proxy, name, given, element = await self._in_time(self._target(request))
         oneway = _flag(request, "oneway")
-        sent = session.send(request.match_info["name"], proxy, name, given, element, not oneway)
+        size = len(request.raw_path)
+        sent = session.send(request.match_info["name"], proxy, name, given, element, not oneway, size)
         if oneway:
             return _small(request, {})
         if _flag(request, "ack"):
@@ -292,9 +297,10 @@ class Server:
         return await self._stream(request, known.value)
 
     async def _request_wait(self, request: web.Request) -> web.StreamResponse:
-        known = self._known(request)
-        with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(known.finished.wait(), _milliseconds(request) / 1000)
+        known, seconds = self._known(request), _milliseconds(request) / 1000
+        connection = _connection(request)
+        with self._connections.held(connection):
+            await first(known.finished, connection.gone, timeout=seconds)
         return _status(request, known)
 
     async def _request_abort(self, request: web.Request) -> web.StreamResponse:
@@ -314,6 +320,10 @@ class Server:
         pieces = _encoded(request, value)
         if value.size <= BATCH // 8:
             return _respond(request, b"".join(pieces))
+        with self._connections.taking(_connection(request), value.data, value.size):
+            return await self._stream_pieces(request, pieces)
+
+    async def _stream_pieces(self, request: web.Request, pieces: Iterator[bytes]) -> web.StreamResponse:
         response = web.StreamResponse(headers={"Content-Type": _media_type(request), **_HEADERS})
         await response.prepare(request)
         loop = asyncio.get_running_loop()
@@ -324,6 +334,20 @@ class Server:
 
 
 # --- reading ----------------------------------------------------------------------------------------------------
+
+
+def _connection(request: web.Request) -> Connection:
+    connection = request.protocol
+    assert isinstance(connection, Connection)
+    return connection
+
+
+def _check_url(request: web.Request) -> None:
+    """Raise ``::genom::serialization`` for a URL that is no text: what was meant would silently be something else."""
+    try:
+        unquote_to_bytes(request.raw_path.encode("utf-8", "surrogateescape")).decode()
+    except UnicodeDecodeError:
+        raise refused("the URL is not UTF-8") from None
 
 
 def _is_packed(request: web.Request) -> bool:
@@ -366,6 +390,11 @@ def _text(text: str) -> web.Response:
     return web.Response(text=text, headers=_HEADERS)
 
 
+def _utf8(text: str) -> bytes:
+    """Half a surrogate pair, such as a node may send, has no UTF-8; it is told as an escape, as in exdetail."""
+    return text.encode("utf-8", "backslashreplace")
+
+
 def _unwrapped(form: Syntax, pieces: Iterator[str]) -> Iterator[str]:
     """A whole document: in Tcl the outermost braces would make it a list of one."""
     if form is not TCL:
@@ -382,7 +411,7 @@ def _encoded(request: web.Request, value: Value | Request) -> Iterator[bytes]:
     if _is_packed(request):
         return value.packed()
     form = _syntax(request)
-    return (piece.encode() for piece in _unwrapped(form, value.pieces(form)))
+    return (_utf8(piece) for piece in _unwrapped(form, value.pieces(form)))
 
 
 def _media_type(request: web.Request) -> str:
@@ -399,7 +428,7 @@ def _small(request: web.Request, value: Any) -> web.Response:
     if _is_packed(request):
         return _respond(request, packed.plain(value))
     form = _syntax(request)
-    return _respond(request, "".join(_unwrapped(form, iter((plain(form, value),)))).encode())
+    return _respond(request, _utf8("".join(_unwrapped(form, iter((plain(form, value),))))))
 
 
 def _error(request: web.Request, error: ComponentError, status: int = 0) -> web.Response:
@@ -407,7 +436,7 @@ def _error(request: web.Request, error: ComponentError, status: int = 0) -> web.
         return _respond(request, packed.error(error_body(error)))
     form = _written_in(request)
     text = "".join(_unwrapped(form, iter((plain(form, error_body(error)),))))
-    return _respond(request, text.encode(), status or _STATUS.get(error.ex, _COMPONENT_ERROR))
+    return _respond(request, _utf8(text), status or _STATUS.get(error.ex, _COMPONENT_ERROR))
 
 
 def _status(request: web.Request, known: Request) -> web.Response:
@@ -423,18 +452,3 @@ def _batch(pieces: Iterator[bytes]) -> bytes:
         if size >= BATCH:
             break
     return b"".join(parts)
-
-
-def _connect(server: web.Server) -> asyncio.Protocol:
-    return server() if len(server.connections) < MAX_CONNECTIONS else _Full()
-
-
-class _Full(asyncio.Protocol):
-    """A connection too many."""
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        assert isinstance(transport, asyncio.Transport)
-        body = plain(SYNTAXES["json"], error_body(too_many(f"{MAX_CONNECTIONS} clients are connected"))).encode()
-        head = f"HTTP/1.1 503 Service Unavailable\r\nConnection: close\r\nContent-Length: {len(body)}\r\n\r\n"
-        transport.write(head.encode() + body)
-        transport.close()

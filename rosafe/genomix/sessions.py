@@ -1,115 +1,37 @@
-"""Clients and what they asked for: sessions with their components, requests with their results, and events."""
+"""Clients and what they asked for: sessions with their components, requests and listeners, and what these occupy."""
 
 from __future__ import annotations
 
 import asyncio
-import errno
 import functools
 import itertools
 import logging
-from collections.abc import Awaitable, Callable, Iterator, Mapping
+from collections import Counter
+from collections.abc import Awaitable, Callable, Mapping
 from typing import Any, TypeVar
 
-from rosafe.genomix import packed
-from rosafe.genomix.actions import Goal
+from rosafe.genomix.connections import SHARE
+from rosafe.genomix.errors import too_many
 from rosafe.genomix.graph import Graph
 from rosafe.genomix.proxy import NOTHING, Proxy, Value, names
-from rosafe.genomix.syntax import Syntax, plain
+from rosafe.genomix.requests import Request
+from rosafe.genomix.tasks import first
 from rosafe.interface import ComponentError, Service
 
 MAX_SESSIONS = 1000
-MAX_REQUESTS = 1000  # kept per session
+MAX_REQUESTS = 1000  # kept or under way, per session
 MAX_LISTENERS = 8  # per session
 MAX_EVENTS = 10_000  # waiting for one listener
-MAX_KEPT = 512 * 2**20  # bytes of results kept per session
+MAX_KEPT = 512 * 2**20  # bytes of all requests and their results
 MAX_COMPONENTS = 64  # per session
-MAX_LOADING = 8  # at the same time
 IDLE_SECONDS = 600.0  # a session without a listener ends so long after its last request
 LINGER_SECONDS = 10.0  # a session that lost its last listener ends so long after
+UNUSED_SECONDS = 600.0  # connections to a component that no session has loaded are kept so long
 SWEEP_SECONDS = 1.0
 ORDER_SECONDS = 5.0  # the next request of a session waits at most so long for the one before to be acknowledged
-EVENT_BYTES = 65_536  # larger results are not part of events and of the status
 
 log = logging.getLogger("genomixd")
 T = TypeVar("T")
-
-
-class Request:
-    """One request that a client follows by its id. `status` is ``sent``, ``done`` or ``error``.
-
-    `abortable` are activities only.
-    """
-
-    def __init__(self, number: str, abortable: bool = False) -> None:
-        self.id = number
-        self.status = "sent"
-        self.value: Value = NOTHING
-        self.error: ComponentError | None = None
-        self.acknowledged = asyncio.Event()
-        self.finished = asyncio.Event()
-        self.forgotten = asyncio.Event()  # nobody is interested in its end
-        self._abortable = abortable
-        self._aborted = False
-        self._goal: Goal | None = None
-
-    def abort(self) -> None:
-        """Ask the activity to end, or not to begin; ``::genom::syserr`` (EAGAIN) for a function under way."""
-        if self.finished.is_set():
-            return
-        if not self._abortable:
-            raise ComponentError("::genom::syserr", code=errno.EAGAIN)
-        self._aborted = True
-        if self._goal is not None:
-            self._goal.cancel()
-
-    def may_begin(self) -> None:
-        """Raise ``::genom::interrupted`` where the request was aborted before it was sent."""
-        if self._aborted:
-            raise ComponentError("::genom::interrupted", by="client")
-
-    def begun(self, goal: Goal) -> None:
-        """It is in the component's hands."""
-        self._goal = goal
-        if self._aborted:
-            goal.cancel()
-
-    def finish(self, value: Value, error: ComponentError | None) -> None:
-        """Record the end."""
-        self.value, self.error = value, error
-        self.status = "done" if error is None else "error"
-        self.acknowledged.set()
-        self.finished.set()
-
-    def pieces(self, form: Syntax) -> Iterator[str]:
-        """The status as text: id, status, and output or exception once there is one."""
-        yield form.open("struct")
-        yield form.key(0, "id") + form.string(self.id) + form.key(1, "status") + form.string(self.status)
-        if self.error is not None:
-            yield form.key(2, "exception") + plain(form, error_body(self.error))
-        elif self.status == "done" and self.value.size <= EVENT_BYTES:
-            yield form.key(2, "output")
-            yield from self.value.pieces(form)
-        elif self.status == "done":
-            yield form.key(2, "large") + str(self.value.size)
-        yield form.close("struct")
-
-    def packed(self) -> Iterator[bytes]:
-        """The status as `pieces` tells it, packed."""
-        yield packed.STRUCTURE
-        yield packed.member("id") + packed.plain(self.id) + packed.member("status") + packed.plain(self.status)
-        if self.error is not None:
-            yield packed.member("exception") + packed.plain(error_body(self.error))
-        elif self.status == "done" and self.value.size <= EVENT_BYTES:
-            yield packed.member("output")
-            yield from self.value.packed()
-        elif self.status == "done":
-            yield packed.member("large") + packed.plain(self.value.size)
-        yield packed.END
-
-
-def error_body(error: ComponentError) -> dict[str, Any]:
-    """An exception as clients get it."""
-    return {"ex": error.ex, **({"detail": error.detail} if error.detail else {})}
 
 
 class Session:
@@ -118,15 +40,20 @@ class Session:
     The requests of a session that has a name go out in order: each once the one before is acknowledged, so that
     a script may ask for a processor and for its child in one breath. Those without a name share one session and wait
     for nobody.
+
+    `owner` is the address of the client that began it, `kept` about how many bytes its requests occupy.
     """
 
-    def __init__(self, name: str, sessions: Sessions) -> None:
+    def __init__(self, name: str, sessions: Sessions, owner: str = "") -> None:
         self.name = name
+        self.owner = owner
+        self.kept = 0
         self.components: dict[str, Proxy] = {}
         self.requests: dict[str, Request] = {}
         self.listeners: list[asyncio.Queue[tuple[str, Any]]] = []
         self.busy = 0  # HTTP requests under way
-        self.ends_at = 0.0
+        self.used_at = 0.0
+        self._loose = 0  # requests under way of which nobody wants to know any more
         self._listened = False
         self._sessions = sessions
         self._turn = asyncio.Lock()
@@ -136,8 +63,17 @@ class Session:
 
     def touch(self) -> None:
         """Something happened: the session lives on for a while."""
-        linger = LINGER_SECONDS if self._listened else IDLE_SECONDS
-        self.ends_at = asyncio.get_running_loop().time() + linger
+        self.used_at = asyncio.get_running_loop().time()
+
+    @property
+    def idle(self) -> bool:
+        """Whether no connection is about it at this moment."""
+        return not (self.busy or self.listeners)
+
+    @property
+    def settled(self) -> bool:
+        """Whether all its requests have ended."""
+        return all(request.finished.is_set() for request in self.requests.values())
 
     @property
     def over(self) -> bool:
@@ -145,9 +81,10 @@ class Session:
 
         One that asks for the status now and then, and never listens, may be quiet as long as an activity runs.
         """
-        if self.busy or self.listeners or asyncio.get_running_loop().time() <= self.ends_at:
+        linger = LINGER_SECONDS if self._listened else IDLE_SECONDS
+        if not self.idle or asyncio.get_running_loop().time() <= self.used_at + linger:
             return False
-        return self._listened or all(request.finished.is_set() for request in self.requests.values())
+        return self._listened or self.settled
 
     def listen(self) -> asyncio.Queue[tuple[str, Any]]:
         """A queue of all events from now on: (name, request or text)."""
@@ -176,10 +113,10 @@ class Session:
     async def close(self) -> None:
         """End the session. Activities that it began go on."""
         self.tell("quit", "")
-        for request in self.requests.values():
-            request.forgotten.set()
-        for name in list(self.components):
-            await self.unload(name)
+        for request in list(self.requests.values()):
+            self._forget(request)
+        self.components.clear()
+        await self._sessions.release()
 
     # --- components ---
 
@@ -189,7 +126,7 @@ class Session:
         name = name or proxy.instance
         old = self.components.get(name)
         if old is None and len(self.components) >= MAX_COMPONENTS:
-            raise too_many(f"a session loads at most {MAX_COMPONENTS} components")
+            await self.unload(next(iter(self.components)))  # the next call of it loads it again
         self.components[name] = proxy
         return proxy.describe(name)
 
@@ -206,7 +143,8 @@ class Session:
         """The component loaded under `name`; `instance`, or the one of that name, is loaded if need be."""
         if name not in self.components:
             await self.load(instance or name, instance, name)
-        return self.components[name]
+        self.components[name] = proxy = self.components.pop(name)  # the one that was used last is last
+        return proxy
 
     # --- requests ---
 
@@ -219,40 +157,39 @@ class Session:
         values = proxy.arguments(service, given)
         return await self._in_turn(lambda _: proxy.call(service, values))
 
-    def send(self, component: str, proxy: Proxy, name: str, given: Any, element: str, keep: bool) -> Request:
-        """Make a request that the client follows by its id, unless it does not want to `keep` it."""
+    def send(
+        self, component: str, proxy: Proxy, name: str, given: Any, element: str, keep: bool = True, size: int = 0
+    ) -> Request:
+        """Make a request that the client follows by its id, unless it does not want to `keep` it.
+
+        `size` is about how many bytes its arguments occupy.
+        """
         port = proxy.port(name)
         service = None if port is not None else proxy.service(name)
         values = {} if service is None else proxy.arguments(service, given)
-        if keep:
-            self._make_room()
-        request = Request(f"{component}::{next(self._sessions.numbers)}", service is not None and service.activity)
-        if keep:
-            self.requests[request.id] = request
-        else:
-            request.forgotten.set()
-        work: Awaitable[Value]
+        abortable = service is not None and service.activity
+        request = Request(f"{component}::{next(self._sessions.numbers)}", abortable, size)
+        self._add(request, keep)
+        work: Callable[[], Awaitable[Value]]
         if service is not None:
-            work = self._in_turn(functools.partial(self._serve, request, proxy, service, values))
+            serve = functools.partial(self._serve, request, proxy, service, values)
+            work = functools.partial[Awaitable[Value]](self._in_turn, serve)
         else:
             assert port is not None
-            work = proxy.read(port, element)
+            work = functools.partial(proxy.read, port, element)
         self._sessions.keep(asyncio.create_task(self._follow(request, work)))
         return request
 
-    async def _follow(self, request: Request, work: Awaitable[Value]) -> None:
+    async def _follow(self, request: Request, work: Callable[[], Awaitable[Value]]) -> None:
         value, error = NOTHING, None
         try:
-            value = await work
+            value = await work()
         except ComponentError as problem:
             error = problem
         except Exception as problem:  # a fault of ours must not leave the client waiting
             log.exception("request %s", request.id)
             error = ComponentError("::genom::unkex", what=f"{type(problem).__name__}: {problem}"[:127])
-        request.finish(value, error)
-        if request.id in self.requests:
-            self.tell("request", request)
-            self.drop_large()
+        self._finish(request, value, error)
 
     async def _serve(
         self, request: Request, proxy: Proxy, service: Service, values: Mapping[str, Any], turn: _Turn
@@ -268,7 +205,7 @@ class Session:
             turn.over()
             if not goal.ended.is_set() and request.id in self.requests:
                 self.tell("request", request)
-            await _first(goal.ended, request.forgotten)
+            await first(goal.ended, request.forgotten)
         finally:
             goal.forget()
         if goal.error is not None:
@@ -294,35 +231,52 @@ class Session:
 
     def clean(self, number: str) -> None:
         """Forget a request; what it started goes on."""
-        self.request(number).forgotten.set()
-        del self.requests[number]
+        self._forget(self.request(number))
 
-    def _make_room(self) -> None:
-        while len(self.requests) >= MAX_REQUESTS:
-            oldest = next((r.id for r in self.requests.values() if r.finished.is_set()), None)
-            if oldest is None:
+    # --- what requests occupy ---
+
+    def _add(self, request: Request, keep: bool = True) -> None:
+        while len(self.requests) + self._loose >= MAX_REQUESTS:
+            if not self.drop_oldest():
                 raise too_many(f"a session has at most {MAX_REQUESTS} requests under way")
-            del self.requests[oldest]
+        self._sessions.make_room(request)
+        self._occupy(request.size)
+        if keep:
+            self.requests[request.id] = request
+        else:
+            self._loose += 1
+            request.forgotten.set()
 
-    def drop_large(self) -> None:
-        """Forget the oldest results where all together are too large."""
-        large = [(r, r.value.size) for r in self.requests.values() if r.value is not NOTHING]
-        excess = sum(size for _, size in large) - MAX_KEPT
-        for request, size in large[:-1]:
-            if excess <= 0:
-                return
-            del self.requests[request.id]
-            excess -= size
+    def _finish(self, request: Request, value: Value, error: ComponentError | None) -> None:
+        request.finish(value, error)
+        if request.id not in self.requests:
+            self._loose -= 1
+            self._occupy(-request.size)
+            return
+        request.size += value.size
+        self._occupy(value.size)
+        self.tell("request", request)
+        self._sessions.make_room(request)
 
+    def _forget(self, request: Request) -> None:
+        del self.requests[request.id]
+        request.forgotten.set()
+        if request.finished.is_set():
+            self._occupy(-request.size)
+            request.let_go()
+        else:
+            self._loose += 1
 
-async def _first(*events: asyncio.Event) -> None:
-    """Wait until one of the events is set."""
-    waits = [asyncio.create_task(event.wait()) for event in events]
-    try:
-        await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
-    finally:
-        for task in waits:
-            task.cancel()
+    def drop_oldest(self, but: Request | None = None) -> bool:
+        """Forget the oldest request that has ended, if there is one `but` the given one."""
+        oldest = next((r for r in self.requests.values() if r.finished.is_set() and r is not but), None)
+        if oldest is not None:
+            self._forget(oldest)
+        return oldest is not None
+
+    def _occupy(self, size: int) -> None:
+        self.kept += size
+        self._sessions.kept += size
 
 
 class _Turn:
@@ -340,20 +294,15 @@ class _Turn:
             self._timer.cancel()
 
 
-def too_many(what: str) -> ComponentError:
-    """The error of a bound that is reached."""
-    return ComponentError("::genomix::e_tooMany", what=what)
-
-
 class Sessions:
-    """All sessions, and the components that they share."""
+    """All sessions, and the components that they share. `kept` is about how many bytes all requests occupy."""
 
     def __init__(self, graph: Graph) -> None:
         self.graph = graph
         self.numbers = itertools.count(1)
+        self.kept = 0
         self._sessions: dict[str, Session] = {}
         self._proxies: dict[str, Proxy] = {}
-        self._loading = asyncio.Semaphore(MAX_LOADING)
         self._tasks: set[asyncio.Task[Any]] = set()
         self.keep(asyncio.create_task(self._sweep()))
 
@@ -362,13 +311,31 @@ class Sessions:
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
-    def get(self, name: str) -> Session:
-        """The session `name`, new if need be."""
+    # --- sessions ---
+
+    def get(self, name: str, owner: str = "") -> Session:
+        """The session `name`, new if need be, and then of the client at the address `owner`."""
         if name not in self._sessions:
-            if len(self._sessions) >= MAX_SESSIONS:
-                raise too_many(f"{MAX_SESSIONS} sessions are open")
-            self._sessions[name] = Session(name, self)
+            self._make_place(owner)
+            self._sessions[name] = Session(name, self, owner)
         return self._sessions[name]
+
+    def _make_place(self, owner: str) -> None:
+        """End an idle session where there are too many: of this client, or else of the one that has most."""
+        counts = Counter(session.owner for session in self._sessions.values())
+        if counts[owner] >= MAX_SESSIONS // SHARE:
+            crowd = owner
+        elif counts.total() >= MAX_SESSIONS:
+            crowd = counts.most_common(1)[0][0]
+        else:
+            return
+        idle = [s for s in self._sessions.values() if s.owner == crowd and s.idle and s.name]
+        idle.sort(key=lambda session: session.used_at)
+        if not idle:
+            raise too_many(f"{counts[crowd]} sessions are open")
+        given_up = next((session for session in idle if session.settled), idle[0])
+        del self._sessions[given_up.name]
+        self.keep(asyncio.create_task(given_up.close()))
 
     async def stop(self, name: str) -> None:
         """End the session `name`; an unknown one has ended already."""
@@ -376,23 +343,41 @@ class Sessions:
         if session is not None:
             await session.close()
 
+    def make_room(self, request: Request) -> None:
+        """Forget results where all together are too large: the oldest of the session that has most, but not this one.
+
+        ``::genomix::e_tooMany`` where there is no room for a new one.
+        """
+        new = 0 if request.finished.is_set() else request.size
+        sessions = set(self._sessions.values())
+        while self.kept + new > MAX_KEPT and sessions:
+            largest = max(sessions, key=lambda session: session.kept)
+            if not largest.drop_oldest(but=request):
+                sessions.remove(largest)
+        if new and self.kept + new > MAX_KEPT:
+            raise too_many(f"requests under way take {MAX_KEPT >> 20} MiB")
+
+    # --- components ---
+
     async def proxy(self, component: str, instance: str) -> Proxy:
         """The proxy of a component that runs; the one that is in use, if there is one for the instance."""
         name, instance = names(component, instance)
-        if instance not in self._proxies:
-            async with self._loading:
-                if instance not in self._proxies:
-                    self._proxies[instance] = await Proxy.load(self.graph, instance)
-        proxy = self._proxies[instance]
+        proxy = self._proxies.get(instance)
+        if proxy is None:
+            found = await Proxy.load(self.graph, instance)
+            proxy = self._proxies.setdefault(instance, found)
         await proxy.check(name)
-        self.graph.prepare()
+        proxy.prepare()
         return proxy
 
     async def release(self) -> None:
-        """Close the proxies that no session has loaded any more, once their last requests are answered."""
+        """Close the proxies that no session has had loaded for long, once their last requests are answered."""
         used = {proxy for session in self._sessions.values() for proxy in session.components.values()}
+        now = asyncio.get_running_loop().time()
         for instance, proxy in list(self._proxies.items()):
-            if proxy not in used and not proxy.pending:
+            if proxy in used or proxy.pending:
+                proxy.used_at = now
+            elif now > proxy.used_at + UNUSED_SECONDS:
                 del self._proxies[instance]
                 await proxy.close()
 
@@ -403,6 +388,7 @@ class Sessions:
         for task in list(self._tasks):
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
+        await asyncio.gather(*(proxy.close() for proxy in self._proxies.values()))
 
     async def _sweep(self) -> None:
         while True:

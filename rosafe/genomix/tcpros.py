@@ -21,16 +21,20 @@ import rosgraph.network
 
 from rosafe.component import wire
 from rosafe.genomix.graph import Graph, Unknown, middleware_error
+from rosafe.genomix.tasks import shared
+from rosafe.genomix.values import refused
 from rosafe.interface import ComponentError
 
 CONNECT_SECONDS = 3.0
 CONNECTIONS = 4  # at once per service or type of topic; rospy's nodes take few new ones at a time
-MAX_MESSAGE = 2**30  # bytes
+MAX_MESSAGE = 2**30  # bytes of a message or an answer that holds something
+MAX_TEXT = 256 * 1024  # bytes of a header, with the definition of a type in it, or of an error
 SAMPLE_SECONDS = 0.3  # a latched message comes at once; where none comes there is none yet
 MESSAGE_SECONDS = 30.0  # for the rest of it
 READ_BUFFER = 2**20
 
 _LENGTH = struct.Struct("<I")
+_GARBAGE = (asyncio.IncompleteReadError, rosgraph.network.ROSHandshakeException, ValueError, struct.error)
 
 
 class Refused(Exception):
@@ -54,7 +58,7 @@ class Connection:
             try:
                 _keep_alive(writer.get_extra_info("socket"))
                 writer.write(rosgraph.network.encode_ros_handshake_header(header))
-                answer = await _read_frame(reader)
+                answer = await _read_frame(reader, MAX_TEXT)
                 fields = rosgraph.network.decode_ros_handshake_header(_LENGTH.pack(len(answer)) + answer)
                 if "error" in fields:
                     raise Refused(fields["error"])
@@ -65,7 +69,7 @@ class Connection:
 
         try:
             return await asyncio.wait_for(attempt(), CONNECT_SECONDS)
-        except (asyncio.IncompleteReadError, rosgraph.network.ROSHandshakeException) as problem:
+        except _GARBAGE as problem:
             raise Refused(f"no ROS node: {problem}") from None
 
     @property
@@ -84,12 +88,12 @@ class Connection:
     def close(self) -> None:
         self._writer.close()
 
-    async def request(self, payload: bytes) -> bytearray:
-        """One service call; Refused with the text of an answer that is an error."""
+    async def request(self, payload: bytes, limit: int) -> bytearray:
+        """One service call, answered with up to `limit` bytes; Refused with the text of an answer that is an error."""
         self._writer.write(_LENGTH.pack(len(payload)) + payload)
-        good = await self._reader.readexactly(1)
-        answer = await _read_frame(self._reader)
-        if good != b"\1":
+        good = await self._reader.readexactly(1) == b"\1"
+        answer = await _read_frame(self._reader, limit if good else MAX_TEXT)
+        if not good:
             raise Refused(answer.decode("utf-8", "replace"))
         return answer
 
@@ -99,7 +103,7 @@ class Connection:
             length = await asyncio.wait_for(self._reader.readexactly(4), SAMPLE_SECONDS)
         except TimeoutError:
             return None
-        return await asyncio.wait_for(_read_body(self._reader, length), MESSAGE_SECONDS)
+        return await asyncio.wait_for(_read_body(self._reader, length, MAX_MESSAGE), MESSAGE_SECONDS)
 
 
 def _keep_alive(sock: socket.socket) -> None:
@@ -111,24 +115,42 @@ def _keep_alive(sock: socket.socket) -> None:
     sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, 3)
 
 
-async def _read_frame(reader: asyncio.StreamReader) -> bytearray:
-    """A length and as many bytes, read into one piece of memory without copies of the whole."""
-    return await _read_body(reader, await reader.readexactly(4))
+async def _read_frame(reader: asyncio.StreamReader, limit: int) -> bytearray:
+    """A length and as many bytes."""
+    return await _read_body(reader, await reader.readexactly(4), limit)
 
 
-async def _read_body(reader: asyncio.StreamReader, prefix: bytes) -> bytearray:
+async def _read_body(reader: asyncio.StreamReader, prefix: bytes, limit: int) -> bytearray:
     (length,) = _LENGTH.unpack(prefix)
-    if length > MAX_MESSAGE:
+    if length > limit:
         raise Refused(f"a message of {length} bytes is more than genomixd takes")
-    frame = bytearray(length)
-    at = 0
-    while at < length:
-        part = await reader.read(length - at)
+    frame = bytearray()  # it grows as bytes come: what is only claimed takes no memory
+    while len(frame) < length:
+        part = await reader.read(length - len(frame))
         if not part:
-            raise asyncio.IncompleteReadError(bytes(frame[:at][:64]), length)
-        frame[at : at + len(part)] = part
-        at += len(part)
+            raise asyncio.IncompleteReadError(bytes(frame[:64]), length)
+        frame += part
     return frame
+
+
+async def reach(graph: Graph, instance: str, header: Mapping[str, str]) -> Connection:
+    """A connection to the service of `instance` that `header` names: where it was the last time, or the master says.
+
+    Raises Unknown, Refused or OSError, and ComponentError where the master has to be asked and is not there.
+    """
+    known = graph.known_address(instance)
+    failure: Exception | None = None
+    if known is not None:
+        try:
+            return await Connection.open(known, header)
+        except (Refused, OSError) as problem:
+            failure = problem
+    address = await graph.service_address(header["service"])
+    if failure is not None and address == known:
+        raise failure
+    connection = await Connection.open(address, header)
+    graph.reached(instance, address)
+    return connection
 
 
 # --- services ---------------------------------------------------------------------------------------------------
@@ -151,6 +173,8 @@ class ServiceClient:
             "callerid": graph.name,
             "persistent": "1",
         }
+        outputs = self._response_class.__slots__[2:]  # after genom_success and genom_exdetail
+        self._limit = MAX_MESSAGE if outputs else MAX_TEXT
         self._slots = asyncio.Semaphore(CONNECTIONS)
         self._idle: list[Connection] = []
 
@@ -167,7 +191,7 @@ class ServiceClient:
                 return connection
             connection.close()
         try:
-            return await Connection.open(await self._graph.service_address(self.name), self._header)
+            return await reach(self._graph, self._instance, self._header)
         except Unknown:
             raise middleware_error(f"{self._instance} is not running: nobody serves {self.name}") from None
         except Refused as problem:
@@ -193,7 +217,10 @@ class ServiceClient:
         Raises ComponentError: the component's own exception, or ``::genom::mwerr`` where none came.
         """
         buffer = io.BytesIO()
-        self._request_class(**values).serialize(buffer)
+        try:
+            self._request_class(**values).serialize(buffer)
+        except UnicodeEncodeError:  # bytes of a command line that are no UTF-8
+            raise refused(f"{self.name}: half a surrogate pair is no character") from None
         try:
             return self._response_class().deserialize(await asyncio.wait_for(self._ask(buffer.getvalue()), timeout))
         except TimeoutError:
@@ -205,7 +232,7 @@ class ServiceClient:
         async with self._slots:
             connection = await self.connect()
             try:
-                answer = await connection.request(request)
+                answer = await connection.request(request, self._limit)
             except Refused as problem:
                 connection.close()
                 raise middleware_error(f"{self.name}: {problem}") from None
@@ -232,28 +259,34 @@ class TopicReader:
 
     def __init__(self, graph: Graph, instance: str, message_class: Any) -> None:
         self._graph = graph
-        self._node = f"/{instance}"
+        self._instance = instance
         self._class = message_class
         self._slots = asyncio.Semaphore(CONNECTIONS)
-        self._address: tuple[str, int] | None = None  # one node gives out all its topics at one address
+        self._reads: dict[str, asyncio.Task[Any]] = {}  # that have not begun yet
 
     async def read(self, topic: str) -> Any:
-        """The message, None where the topic has none yet, or Unknown where the component has no such topic."""
-        if self._address is not None:
-            try:
-                return await self._read(self._address, topic)
-            except (TimeoutError, Refused, OSError, asyncio.IncompleteReadError):
-                self._address = None  # restarted, or the topic is gone
-        try:
-            self._address = await self._graph.topic_address(topic, self._node)
-            return await self._read(self._address, topic)
-        except (Refused, genpy.DeserializationError) as problem:
-            raise middleware_error(f"{topic}: {problem}") from None
-        except (TimeoutError, OSError, asyncio.IncompleteReadError) as problem:
-            why = type(problem).__name__
-            raise middleware_error(f"{self._node[1:]} does not give out {topic} any more ({why})") from None
+        """The message, None where the topic has none yet, or Unknown where the component has no such topic.
 
-    async def _read(self, address: tuple[str, int], topic: str) -> Any:
+        Those who ask while connections are few get the same message, one that is fetched after they asked.
+        """
+        if topic not in self._reads:
+            self._reads[topic] = shared(self._read(topic))
+        return await asyncio.shield(self._reads[topic])
+
+    async def _read(self, topic: str) -> Any:
+        async with self._slots:
+            del self._reads[topic]
+            # The node is asked first: one that is asked for a topic that it does not have logs kilobytes.
+            address = await self._graph.topic_address(topic, self._instance)
+            try:
+                return await self._fetch(address, topic)
+            except (Refused, genpy.DeserializationError) as problem:
+                raise middleware_error(f"{topic}: {problem}") from None
+            except (TimeoutError, OSError, asyncio.IncompleteReadError) as problem:
+                why = type(problem).__name__
+                raise middleware_error(f"{self._instance} does not give out {topic} any more ({why})") from None
+
+    async def _fetch(self, address: tuple[str, int], topic: str) -> Any:
         header = {
             "topic": topic,
             "type": self._class._type,
@@ -262,12 +295,11 @@ class TopicReader:
             "tcp_nodelay": "1",
             "message_definition": self._class._full_text,
         }
-        async with self._slots:
-            connection = await Connection.open(address, header)
-            try:
-                data = await connection.message()
-            finally:
-                connection.close()
+        connection = await Connection.open(address, header)
+        try:
+            data = await connection.message()
+        finally:
+            connection.close()
         return None if data is None else self._class().deserialize(data)
 
 

@@ -32,9 +32,13 @@ def parse_input(text: str) -> Any:
     if not text.strip():
         return {}
     try:
-        return json.loads(text)
+        value = json.loads(text)
+        json.dumps(value, ensure_ascii=False).encode()
+    except UnicodeEncodeError:
+        raise refused("input: half a surrogate pair is no character") from None
     except (ValueError, RecursionError) as problem:
         raise refused(f"input is not JSON: {problem}") from None
+    return value
 
 
 def complete(service: Service, given: Any) -> dict[str, Any]:

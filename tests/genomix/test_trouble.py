@@ -5,18 +5,26 @@ from __future__ import annotations
 import os
 import signal
 import threading
+import time
+import xmlrpc.client
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from rosafe.genomix import proxy
+from rosafe.interface import COMPONENTS
 from tests import harness
 from tests.genomix import world as worlds
+from tests.genomix.test_server import start_tree
 from tests.genomix.world import HttpError, World
 
 pytestmark = pytest.mark.ros
+
+ACTION_TOPICS = ("goal", "cancel", "status", "result")
 
 
 def problem(world: World, target: str, given: object = None) -> str:
@@ -100,6 +108,91 @@ def test_a_master_that_dies_and_comes_back(empty_world: World) -> None:
         assert world.http.status(number) == {"id": number, "status": "sent"}
         world.http.call("bass/Stop")
         world.http.wait(number, "done")
+
+
+@pytest.mark.parametrize("how", ["killed", "hanging"])
+def test_known_components_go_on_without_a_master(tmp_path: Path, how: str) -> None:
+    """Services and activities that were not used before, new sessions, ports of what is new, by HTTP and in Tcl."""
+    with worlds.world(tmp_path) as world:
+        http = world.http
+        start_tree(http)
+        await_clients(world)
+        with away(world.master, how):
+            go_on(world)
+
+
+@contextmanager
+def away(master: harness.MasterProcess, how: str) -> Iterator[None]:
+    """Meanwhile the master does not answer."""
+    assert master.process is not None
+    if how == "killed":
+        master.kill()
+        yield
+        return
+    os.kill(master.process.pid, signal.SIGSTOP)
+    try:
+        yield
+    finally:
+        os.kill(master.process.pid, signal.SIGCONT)
+
+
+def go_on(world: World) -> None:
+    """Use what is known, and some that is new, of both components."""
+    http = world.http
+    assert http.call("rosAFE/getDependencies", ["gammatone"])["dependencies"][-1] == "gammatone"
+    assert http.get("/load/rosAFE", s="new")["instance"] == "rosAFE"
+    first = http.call("bass/Audio")["Audio"]["lastFrameIndex"]
+    harness.wait_for(lambda: http.call("bass/Audio")["Audio"]["lastFrameIndex"] > first)
+    number = http.send("rosAFE/IhcProc", s="new", ack=1)
+    assert http.status(number, s="new") == {"id": number, "status": "sent"}
+    assert http.call("rosAFE/ihcPort/ihc")["ihcPort"]["numberOfChannels"] == 4
+    made = http.call("rosAFE/request", ["ratemap", {"nFramesPerBlock": 4410, "fb_nChannels": 4}])
+    assert made["reused"] and made["created"][-1] == "ratemap_0"
+    with pytest.raises(HttpError) as caught:
+        http.call("rosAFE/ihcPort/none")
+    assert (caught.value.ex, caught.value.what) == ("::genom::no_such_outport", "ihcPort has no element 'none'")
+    http.call("rosAFE/removeProcessor", ["ihc"])
+    assert http.wait(number, "done", s="new")["output"] == {}
+    script = """
+        set g [genomix::connect $address]
+        $g load rosAFE
+        $g load bass
+        bass::Stop
+        set acquire [bass::Acquire scene: &]
+        show [dict get [rosAFE::getParameters] parameters gammatone 0 name]
+        show [dict get [rosAFE::gammatonePort gammatone] gammatonePort numberOfChannels] [$acquire status]
+        bass::Stop
+        show [$acquire wait]
+    """
+    assert world.lines(script) == ["gammatone", "4|sent", "done"]
+    with pytest.raises(HttpError, match="no ROS master at"):
+        http.get("/load/stranger")
+
+
+def await_clients(world: World) -> None:
+    """Wait until genomixd is connected to all activities of both components."""
+    master = xmlrpc.client.ServerProxy(world.graph.uri)
+    for component in COMPONENTS.values():
+        parts = {f"/{component.name}/{s.name}/{p}" for s in component.activities for p in ACTION_TOPICS}
+        node = xmlrpc.client.ServerProxy(master.lookupNode("/test", f"/{component.name}")[2])  # type: ignore[index]
+
+        def connected(node: Any = node, parts: set[str] = parts) -> bool:
+            return parts <= {connection[4] for connection in node.getBusInfo("/test")[2]}
+
+        harness.wait_for(connected, harness.UP_SECONDS, f"all connections to {component.name}")
+
+
+def test_a_component_that_moves_is_found_again(empty_world: World) -> None:
+    """Where it was is asked first; another one that is there now says that it is another one."""
+    world = empty_world
+    with world.graph.node("bass-ros") as bass:
+        world.http.call("bass/Stop")
+        world.http.call("bass/Audio")
+        bass.stop(signal.SIGKILL)
+    for _ in range(2):
+        with world.graph.node("bass-ros"):
+            assert world.http.call("bass/Stop") == {}
+            assert world.http.call("bass/Audio")["Audio"]["left"] == []
 
 
 def test_a_master_that_is_not_there_yet(tmp_path: Path) -> None:
@@ -193,10 +286,26 @@ def test_what_is_acknowledged_runs(empty_world: World, tmp_path: Path) -> None:
         assert world.http.wait(numbers[0], "done")["output"] == {}
 
 
+# genomixd that waits as long for a component as one takes to start on a busy machine.
+PATIENT_GENOMIXD = """
+import sys
+from rosafe.genomix import daemon, proxy
+proxy.APPEAR_SECONDS = 60.0
+sys.exit(daemon.main(["-v", "-p", "0"]))
+"""
+
+
 def test_load_waits_for_a_component_that_is_starting(empty_world: World) -> None:
     world = empty_world
-    with world.graph.start(str(harness.SCRIPTS / "bass-ros")):
-        assert world.http.get("/load/bass")["component"] == "bass"
+    begin = time.monotonic()
+    assert "bass is not running" in problem(world, "bass/Stop")
+    assert time.monotonic() - begin > proxy.APPEAR_SECONDS
+    with world.graph.start(harness.PYTHON, "-c", code(PATIENT_GENOMIXD)) as server, ThreadPoolExecutor() as pool:
+        patient = worlds.Http(worlds.port_of(server))
+        loads = [pool.submit(patient.get, "/load/bass", s=f"s{number}") for number in range(3)]
+        assert patient.get("/components") == {}
+        with world.graph.node("bass-ros"):
+            assert [load.result()["component"] for load in loads] == ["bass"] * 3
 
 
 def test_stop_everything_at_once(empty_world: World) -> None:

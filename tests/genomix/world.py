@@ -64,12 +64,12 @@ class Http:
         """What has become of a request of the session ``t``."""
         return dict(self.get("/request/status", id=number, **{"s": "t", **query}))
 
-    def wait(self, number: str, status: str, seconds: float = 10.0) -> dict[str, Any]:
-        """The status of a request of the session ``t`` once it is that."""
+    def wait(self, number: str, status: str, seconds: float = 10.0, s: str = "t") -> dict[str, Any]:
+        """The status of a request of the session `s` once it is that."""
         return harness.wait_for(
-            lambda: (now := self.status(number))["status"] == status and now,
+            lambda: (now := self.status(number, s=s))["status"] == status and now,
             seconds,
-            lambda: f"{status} of {self.status(number)}",
+            lambda: f"{status} of {self.status(number, s=s)}",
         )
 
     @contextmanager

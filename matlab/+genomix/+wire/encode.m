@@ -41,6 +41,7 @@ end
 end
 
 function text = quoted(value)
+genomix.wire.utf8(value); % raises an error where it is none
 value = strrep(strrep(value, '\', '\\'), '"', '\"');
 if any(value < ' ')
     for code = 0:31

@@ -1,7 +1,7 @@
 function text = quote(text)
 %QUOTE  A text as a part of a URL: what is no letter, digit or one of -_.~ becomes a percent sign and two hex digits.
 
-bytes = unicode2native(text, 'UTF-8');
+bytes = genomix.wire.utf8(text);
 plain = (bytes >= 'a' & bytes <= 'z') | (bytes >= 'A' & bytes <= 'Z') | (bytes >= '0' & bytes <= '9') | ...
     ismember(bytes, uint8('-_.~'));
 pieces = cell(1, numel(bytes));

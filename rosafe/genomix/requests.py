@@ -1,0 +1,100 @@
+"""Requests that clients follow by their ids: how they end, and how that is told."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+from collections.abc import Iterator
+
+from rosafe.genomix import packed
+from rosafe.genomix.actions import Goal
+from rosafe.genomix.errors import error_body
+from rosafe.genomix.proxy import NOTHING, Value
+from rosafe.genomix.syntax import Syntax, plain
+from rosafe.interface import ComponentError
+
+REQUEST_BYTES = 4096  # of a request without arguments and results
+EVENT_BYTES = 65_536  # larger results are not part of events and of the status
+KEPT_BYTES = 1024  # smaller ones may wait in events for a listener
+
+
+class Request:
+    """One request that a client follows by its id. `status` is ``sent``, ``done`` or ``error``.
+
+    `abortable` are activities only. `size` is about how many bytes it occupies.
+    """
+
+    def __init__(self, number: str, abortable: bool = False, size: int = 0) -> None:
+        self.id = number
+        self.size = REQUEST_BYTES + size
+        self.status = "sent"
+        self.value: Value = NOTHING
+        self.output_size = 0
+        self._told = True  # the output is part of events and of the status
+        self.error: ComponentError | None = None
+        self.acknowledged = asyncio.Event()
+        self.finished = asyncio.Event()
+        self.forgotten = asyncio.Event()  # nobody is interested in its end
+        self._abortable = abortable
+        self._aborted = False
+        self._goal: Goal | None = None
+
+    def abort(self) -> None:
+        """Ask the activity to end, or not to begin; ``::genom::syserr`` (EAGAIN) for a function under way."""
+        if self.finished.is_set():
+            return
+        if not self._abortable:
+            raise ComponentError("::genom::syserr", code=errno.EAGAIN)
+        self._aborted = True
+        if self._goal is not None:
+            self._goal.cancel()
+
+    def may_begin(self) -> None:
+        """Raise ``::genom::interrupted`` where the request was aborted before it was sent."""
+        if self._aborted:
+            raise ComponentError("::genom::interrupted", by="client")
+
+    def begun(self, goal: Goal) -> None:
+        """It is in the component's hands."""
+        self._goal = goal
+        if self._aborted:
+            goal.cancel()
+
+    def finish(self, value: Value, error: ComponentError | None) -> None:
+        """Record the end."""
+        self.value, self.error, self.output_size = value, error, value.size
+        self._told = value.size <= EVENT_BYTES
+        self.status = "done" if error is None else "error"
+        self.acknowledged.set()
+        self.finished.set()
+
+    def let_go(self) -> None:
+        """Forget an output that takes memory. An event that waits for its listener tells how large it was, then."""
+        if self.output_size > KEPT_BYTES:
+            self.value, self._told = NOTHING, False
+
+    def pieces(self, form: Syntax) -> Iterator[str]:
+        """The status as text: id, status, and output or exception once there is one."""
+        yield form.open("struct")
+        yield form.key(0, "id") + form.string(self.id) + form.key(1, "status") + form.string(self.status)
+        if self.error is not None:
+            yield form.key(2, "exception") + plain(form, error_body(self.error))
+        elif self.status == "done" and self._told:
+            yield form.key(2, "output")
+            yield from self.value.pieces(form)
+        elif self.status == "done":
+            yield form.key(2, "large") + str(self.output_size)
+        yield form.close("struct")
+
+    def packed(self) -> Iterator[bytes]:
+        """The status as `pieces` tells it, packed."""
+        yield packed.STRUCTURE
+        yield packed.member("id") + packed.plain(self.id) + packed.member("status") + packed.plain(self.status)
+        if self.error is not None:
+            yield packed.member("exception") + packed.plain(error_body(self.error))
+        elif self.status == "done" and self._told:
+            yield packed.member("output")
+            yield from self.value.packed()
+        elif self.status == "done":
+            yield packed.member("large") + packed.plain(self.output_size)
+        yield packed.END

@@ -1,0 +1,367 @@
+"""Attacks from another process on a live genomixd: others are served meanwhile, and afterwards all is as before."""
+
+from __future__ import annotations
+
+import asyncio
+import http.client
+import json
+import re
+import select
+import socket
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager, contextmanager
+
+import pytest
+
+from rosafe.genomix import connections
+from rosafe.interface import ComponentError
+from tests import harness
+from tests.genomix import attacks
+from tests.genomix import world as worlds
+from tests.genomix.test_fuzz import open_files, resident
+from tests.genomix.test_server import start_tree
+from tests.genomix.world import HttpError, World
+
+pytestmark = pytest.mark.ros
+
+SOON = 10.0  # s; on a machine with nothing else to do it is well below 1 s
+MUCH = 150  # MB that an attack may take
+
+# genomixd with little patience and little memory.
+HASTY = """
+import sys
+from rosafe.genomix import connections, daemon
+connections.REQUEST_SECONDS = 1.0
+connections.STALL_SECONDS = 1.0
+connections.YIELD_SECONDS = 0.2
+connections.MAX_ANSWERS = 50 * 2**20
+sys.exit(daemon.main(["-v", "-p", "0"]))
+"""
+
+
+def served(world: World) -> None:
+    """A client by HTTP and one in Tcl, both new, get what they ask for, and soon."""
+    begin = time.monotonic()
+    assert list(world.http.call("rosAFE/getParameters", s=f"fresh{begin}")) == ["parameters"]
+    script = "set g [genomix::connect $address]; $g load rosAFE; show [dict keys [rosAFE::getParameters]]"
+    assert world.lines(script) == ["parameters"]
+    assert time.monotonic() - begin < SOON
+
+
+@contextmanager
+def hasty(world: World) -> Iterator[World]:
+    """The world with a genomixd of little patience."""
+    code = f"import sys; sys.path.insert(0, {str(harness.ROOT)!r}){HASTY}"
+    with world.graph.start(harness.PYTHON, "-c", code) as server:
+        yield World(world.graph, world.master, server, worlds.port_of(server))
+
+
+# --- connections ------------------------------------------------------------------------------------------------
+
+Crowd = Callable[[int], AbstractContextManager[list[socket.socket]]]
+
+
+@pytest.mark.parametrize(
+    "crowd", [attacks.half_requests, attacks.silence, attacks.long_halves, attacks.bodies, attacks.listeners]
+)
+def test_a_crowd_keeps_nobody_out(world: World, crowd: Crowd) -> None:
+    served(world)
+    pid = world.server.pid
+    files, memory = open_files(pid), resident(pid)
+    with crowd(world.port):
+        assert resident(pid) < memory + MUCH
+        harness.wait_for(lambda: world.http.raw("/components")[0] == 200, SOON)  # once the last of them is looked at
+        served(world)
+    served(world)
+    most = files + 100  # connections to the components, which it has loaded meanwhile
+    harness.wait_for(lambda: open_files(pid) <= most, SOON, lambda: f"{open_files(pid)} files, {files} before")
+
+
+def test_answers_that_nobody_reads_stop_the_requests(world: World) -> None:
+    memory = resident(world.server.pid)
+    with attacks.pipelined(world.port) as sent:
+        assert sent < 500_000  # some wait in the kernel
+        assert resident(world.server.pid) < memory + 30
+        served(world)
+    served(world)
+
+
+def test_pipelined_requests_are_answered_in_order(world: World) -> None:
+    """Those that wait are not forgotten, nor what comes in pieces; empty lines before a request do not count."""
+    names = [f"p{number}" for number in range(3000)]
+    urls = [f"/session/start?s={name}" for name in names[:900]] + [f"/nothing/{name}" for name in names[900:]]
+    sent = b"".join(b"\r\n" + attacks.GET.format(url).encode() for url in urls)
+    with socket.create_connection(("127.0.0.1", world.port), timeout=30) as connection, ThreadPoolExecutor(1) as pool:
+        sending = pool.map(connection.sendall, (sent[i : i + 999] for i in range(0, len(sent), 999)))
+        answers = b""
+        while answers.count(b"HTTP/1.1 ") < len(names) or not answers.endswith(b"}"):
+            part = connection.recv(65536)
+            assert part
+            answers += part
+        assert len(list(sending)) == len(sent) // 999 + 1
+    assert re.findall(r"(?:\r\n\r\n|GET /nothing/)(p\d+)", answers.decode()) == names
+
+
+@pytest.mark.parametrize("sent", ["", "GET /components HTTP/1.1\r\nHo", "G"])
+def test_a_request_that_does_not_come_to_an_end(world: World, sent: str) -> None:
+    with hasty(world) as other:
+        # At once, and on a connection that was used before.
+        with socket.create_connection(("127.0.0.1", other.port), timeout=30) as connection:
+            connection.sendall(sent.encode())
+            assert connection.recv(1000).startswith(b"HTTP/1.1 408 ")
+        if sent:
+            used = http.client.HTTPConnection("127.0.0.1", other.port, timeout=30)
+            used.request("GET", "/components")
+            assert used.getresponse().read() == b"{}"
+            assert not select.select((used.sock,), (), (), 1.5)[0]  # a connection may be idle
+            used.request("GET", "/components")
+            assert used.getresponse().read() == b"{}"
+            used.sock.sendall(sent.encode())
+            assert used.sock.recv(1000).startswith(b"HTTP/1.1 408 ")
+
+
+def test_a_request_that_comes_drop_by_drop(world: World) -> None:
+    """It is the whole that has to come in time."""
+    with hasty(world) as other, socket.create_connection(("127.0.0.1", other.port), timeout=30) as connection:
+        connection.sendall(b"GET /components HTTP/1.1\r\nHost: localhost\r\nX: ")
+        end = time.monotonic() + 20
+        while not select.select((connection,), (), (), 0.1)[0]:
+            connection.sendall(b"x")
+            assert time.monotonic() < end
+        assert connection.recv(1000).startswith(b"HTTP/1.1 408 ")
+
+
+@pytest.mark.parametrize(
+    ("sent", "status"),
+    [
+        (b"POST /call/bass/Stop HTTP/1.1\r\nHost: localhost\r\nContent-Length: 5\r\n\r\nhello", 405),
+        (b"GET /call/bass/Stop HTTP/1.1\r\nHost: localhost\r\ncontent-length: 05\r\n\r\nhello", 400),
+        (b"GET /call/bass/Stop HTTP/1.1\r\nHost: localhost\r\nTransfer-Encoding: chunked\r\n\r\n5\r\nhello", 400),
+        (b"GET /call/bass/Stop HTTP/1.1\r\nHost: localhost\r\nContent-Length: 0\r\n\r\n", 200),
+        (b"GET /call/bass/Stop HTTP/1.1\nHost: localhost\n\n", 200),
+        (b"GET /components HTTP/1.1\r\nHost: localhost\r\nUpgrade: x\r\nConnection: Upgrade\r\n\r\n", 200),
+        (b"CONNECT localhost:80 HTTP/1.1\r\nHost: localhost\r\n\r\n", 404),
+    ],
+    ids=range(7),
+)
+def test_requests_have_no_body(world: World, sent: bytes, status: int) -> None:
+    with socket.create_connection(("127.0.0.1", world.port), timeout=30) as connection:
+        connection.sendall(sent)
+        answer = http.client.HTTPResponse(connection)
+        answer.begin()
+        assert answer.status == status
+        assert json.load(answer).get("ex") == (None if status == 200 else "::genomix::e_url")
+    served(world)
+
+
+# --- answers ----------------------------------------------------------------------------------------------------
+
+
+def test_answers_that_nobody_takes_are_dropped(world: World) -> None:
+    """They make room for others at once where the memory is short, and go after a while in any case."""
+    start_tree(world.http)
+    url = "/call/rosAFE/getSignals"
+    harness.wait_for(lambda: len(world.http.raw(url)[1]) > 10_000)
+    with hasty(world) as other:
+        pid = other.server.pid
+        files, memory = open_files(pid), resident(pid)
+        port = "/call/rosAFE/gammatonePort/gammatone?syntax=packed"
+        with attacks.unread_answers(other.port, port, 100) as unread:  # they share what they get
+            for connection in unread:
+                assert select.select((connection,), (), (), 30)[0]
+            assert resident(pid) < memory + 2 * MUCH
+            assert other.http.raw("/components")[0] == 200
+            # All of them go; those to the component stay.
+            harness.wait_for(lambda: open_files(pid) < files + 80, SOON, lambda: f"{open_files(pid)} files")
+
+
+def test_answers_together_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(connections, "MAX_ANSWERS", 100)
+    every = connections.Connections()
+    one, two, three = (Fake(every) for _ in range(3))
+    samples = object(), object(), object()
+
+    def taken(client: Fake, number: int, size: int) -> AbstractContextManager[None]:
+        return every.taking(client, samples[number], size)  # type: ignore[arg-type]
+
+    with taken(one, 0, 1000):  # one that is too large by itself is nobody's concern while it is alone
+        with pytest.raises(ComponentError, match="clients are taking"), taken(two, 1, 1):
+            pass
+        with taken(two, 0, 1000):  # the same data
+            one.stalls = True
+            with pytest.raises(ComponentError, match="clients are taking"), taken(three, 1, 1):
+                pass
+            assert (one.dropped, two.dropped) == (True, False)
+    with taken(one, 0, 60), taken(two, 1, 40):
+        one.stalls, one.dropped = False, False
+        two.stalls = True
+        with taken(three, 2, 40):
+            assert (one.dropped, two.dropped) == (False, True)
+
+
+class Fake:
+    """A connection as `Connections` sees it."""
+
+    def __init__(self, every: connections.Connections) -> None:
+        self.stalls = False
+        self.dropped = False
+        self.client = connections.Client("")
+        self.every = every
+
+    def stalled(self, seconds: float) -> bool:
+        return self.stalls
+
+    def drop(self) -> None:
+        self.dropped = True
+        self.every.forget(self)  # type: ignore[arg-type]
+
+
+# --- who goes ---------------------------------------------------------------------------------------------------
+
+
+class Room:
+    """A server with room for eight connections, four from one address."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(connections, "MAX_CONNECTIONS", 8)
+        self.every = connections.Connections()
+
+    def come(self, address: str, busy: bool = False) -> Fake | None:
+        """A new connection, None where it is refused."""
+        new = Fake(self.every)
+        client = self.every.admit(new, address)  # type: ignore[arg-type]
+        if client is None:
+            return None
+        new.client = client
+        if busy:
+            del client.waiting[new]  # type: ignore[arg-type]
+        return new
+
+
+def test_who_waits_longest_goes_first(monkeypatch: pytest.MonkeyPatch) -> None:
+    server = Room(monkeypatch)
+    mine = [server.come("me") for _ in range(2)]
+    crowd = [server.come("crowd", busy=number == 0) for number in range(10)]
+    # Six of the crowd had to go, but not the one that is served, and nobody else.
+    assert [one.dropped for one in crowd if one] == [False] + [True] * 6 + [False] * 3
+    others = [server.come("other") for _ in range(2)]  # now it is full
+    assert server.come("third") is not None  # for one of those who have most
+    assert [one.dropped for one in crowd[7:] if one] == [True, False, False]
+    assert not any(one.dropped for one in (*mine, *others) if one)
+
+
+def test_who_is_served_stays(monkeypatch: pytest.MonkeyPatch) -> None:
+    server = Room(monkeypatch)
+    assert all(server.come("crowd", busy=True) for _ in range(4))
+    assert server.come("crowd") is None
+    assert all(server.come("more", busy=True) for _ in range(3))
+    last = server.come("more")
+    assert server.come("me") is not None
+    assert last is not None and last.dropped
+    assert server.come("you") is not None  # for the one before, which waits
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "same"),
+    [
+        ("127.0.0.1", "127.8.9.10", True),
+        ("127.0.0.1", "::1", True),
+        ("::ffff:127.0.0.1", "::1", True),
+        ("10.0.0.1", "::ffff:10.0.0.1", True),
+        ("10.0.0.1", "10.0.0.2", False),
+        ("2001:db8::1", "2001:db8::ffff:2", True),
+        ("2001:db8::1", "2001:db8:0:1::1", False),
+        ("fe80::1%eth0", "fe80::1", True),
+        ("10.0.0.1", "127.0.0.1", False),
+    ],
+)
+def test_addresses_of_one_client(one: str, other: str, same: bool) -> None:
+    assert (connections._address((one, 1)) == connections._address((other, 2))) is same
+
+
+# --- sessions and loads -----------------------------------------------------------------------------------------
+
+
+def test_many_sessions_keep_nobody_out(world: World) -> None:
+    world.http.get("/load/bass", s="mine")
+    with world.http.listening(s="mine") as events:
+        number = world.http.send("bass/Acquire", {"device": "scene:"}, s="mine", ack=1)
+        assert next(events)[0] == "request"
+        attacks.named_sessions(world.port, 2000)
+        served(world)
+        assert world.http.status(number, s="mine")["status"] == "sent"  # somebody listens there
+    world.http.call("bass/Stop")
+
+
+def test_absent_components_hold_up_no_load(world: World) -> None:
+    """200 of them took 50 s."""
+    with world.graph.node("bass-ros", "-i", "waited"), attacks.absent_loads(world.port) as waiting:
+        begin = time.monotonic()
+        assert world.http.get("/load/bass", i="waited")["instance"] == "waited"
+        assert time.monotonic() - begin < SOON
+        for connection in waiting:
+            assert connection.recv(12).endswith(b" 502")
+    served(world)
+
+
+def test_many_names_for_one_component(world: World) -> None:
+    """A session's names for components go, the oldest first; an instance is found again by its own."""
+    for number in range(70):
+        world.http.get("/load/bass", s="names", **{"as": f"x{number}"})
+    loaded = world.http.get("/components", s="names")
+    assert len(loaded) == 64 and "x69" in loaded and "x0" not in loaded
+    assert world.http.call("x0/Stop", s="names", i="bass") == {}
+    assert world.http.call("bass/Stop", s="names") == {}
+
+
+def test_waiting_clients_that_vanish_are_forgotten(world: World) -> None:
+    """Their requests wait for an hour else, and take the place of others."""
+    number = world.http.send("bass/Acquire", {"device": "scene:"}, ack=1)
+
+    async def wait_and_vanish() -> None:
+        url = f"/request/wait?s=t&id={number}"
+        for _ in range(12):
+            writers = []
+            for _ in range(100):
+                _, writer = await asyncio.open_connection("127.0.0.1", world.port)
+                writer.write(attacks.GET.format(url).encode())
+                await writer.drain()
+                writers.append(writer)
+            for writer in writers:
+                writer.close()
+                await writer.wait_closed()
+
+    asyncio.run(wait_and_vanish())
+
+    def listening() -> bool:
+        with world.http.listening(s="t"):
+            return True
+
+    harness.wait_for(listening)
+    assert world.http.get("/request/wait", id=number, s="t", ms=10)["status"] == "sent"
+    world.http.call("bass/Stop")
+
+
+# --- texts ------------------------------------------------------------------------------------------------------
+
+
+def test_half_a_surrogate_pair_is_refused_everywhere(world: World) -> None:
+    assert set(attacks.surrogates(world.port)) == {400}
+    assert "Traceback" not in world.server.err
+    told = "GENOM ::genom::serialization {what {the URL is not UTF-8}}"
+    script = r"""
+        set g [genomix::connect $address]
+        $g load rosAFE
+        show [lindex [failure {rosAFE::getDependencies [list nameProc \ud800]}] 1]
+        show [lindex [failure {rosAFE::ildPort \udfff}] 1]
+        show [lindex [failure {$g load bass -i \ud800}] 1]
+    """
+    assert world.lines(script) == [told] * 3
+    command = ("sh", "-c", r"""rosafe request ild --connect "$(printf '\355\240\200')" """)
+    done = world.graph.run(*command, check=False)
+    assert done.returncode == 1 and "Traceback" not in done.stderr and done.stderr.count("\n") == 1
+    with pytest.raises(HttpError, match="half a surrogate pair is no character"):
+        world.http.call("bass/Acquire", ["\ud800"])
+    served(world)

@@ -1,0 +1,303 @@
+"""Sessions without a server and a graph: how long they live, who has how many, and what their requests occupy."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import weakref
+from collections.abc import Awaitable, Callable, Mapping
+from typing import Any
+
+import numpy as np
+import pytest
+
+from rosafe.genomix import sessions
+from rosafe.genomix.graph import Graph
+from rosafe.genomix.proxy import Proxy, Value
+from rosafe.genomix.requests import REQUEST_BYTES, Request
+from rosafe.genomix.sessions import Session, Sessions
+from rosafe.genomix.syntax import JSON
+from rosafe.interface import BASS, ROSAFE, ComponentError, Service
+
+
+class Component(Proxy):
+    """A bass whose functions answer with as many bytes as they are told, once they may."""
+
+    def __init__(self) -> None:
+        super().__init__(Graph("http://127.0.0.1:9"), BASS, "bass")
+        self.may_answer = asyncio.Event()
+        self.may_answer.set()
+        self.answers: weakref.WeakSet[Value] = weakref.WeakSet()
+        self.size = 0
+        self.called: list[str] = []
+
+    def arguments(self, service: Service, given: Any) -> dict[str, Any]:
+        return {}
+
+    async def call(self, service: Service, values: Mapping[str, Any]) -> Value:
+        self.called.append(service.name)
+        await self.may_answer.wait()
+        value = Value(ROSAFE, (("data", "sequence<double>"),), {"data": np.zeros(self.size // 8)})
+        self.answers.add(value)
+        return value
+
+
+def run(test: Callable[[Sessions, Component], Awaitable[None]]) -> None:
+    """Run a test on sessions."""
+
+    async def checked() -> None:
+        component = Component()
+        every = Sessions(component._graph)
+        await test(every, component)
+        component.may_answer.set()
+        await every.close()
+        await component._graph.close()
+
+    asyncio.run(checked())
+
+
+def send(session: Session, component: Component, keep: bool = True, size: int = 0) -> Request:
+    """Send a function that takes `size` bytes of arguments."""
+    return session.send("bass", component, "ListDevices", {}, "", keep, size)
+
+
+async def wait_until(condition: Callable[[], bool]) -> None:
+    async with asyncio.timeout(30):
+        while not condition():
+            await asyncio.sleep(0.005)
+
+
+# --- how long they live -----------------------------------------------------------------------------------------
+
+
+def test_sessions_end_when_their_clients_are_gone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sessions, "SWEEP_SECONDS", 0.01)
+    monkeypatch.setattr(sessions, "LINGER_SECONDS", 0.05)
+    monkeypatch.setattr(sessions, "IDLE_SECONDS", 0.1)
+
+    async def check(every: Sessions, component: Component) -> None:
+        component.may_answer.clear()
+        idle, listening, busy, following = (every.get(name) for name in ("idle", "listening", "busy", "following"))
+        queue = listening.listen()
+        busy.busy += 1
+        request = send(following, component)
+        await wait_until(lambda: every.get("idle") is not idle)
+        assert every.get("listening") is listening
+        assert every.get("busy") is busy
+        assert every.get("following") is following
+        listening.leave(queue)
+        await wait_until(lambda: every.get("listening") is not listening)
+        assert every.get("busy") is busy
+        component.may_answer.set()
+        await request.finished.wait()
+        await wait_until(lambda: every.get("following") is not following)
+
+    run(check)
+
+
+def test_who_has_most_gives_up_what_is_idle_longest(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sessions, "MAX_SESSIONS", 8)
+
+    async def check(every: Sessions, component: Component) -> None:
+        shared, mine = every.get("", "me"), every.get("mine", "me")
+        component.may_answer.clear()
+        crowd = [every.get("c0", "crowd")]
+        send(crowd[0], component)
+        crowd += [every.get(f"c{number}", "crowd") for number in range(1, 4)]
+        crowd[1].listen()
+        crowd[2].touch()  # c3 is idle for longer
+        every.get("c4", "crowd")
+        assert set(every._sessions) == {"", "mine", "c0", "c1", "c2", "c4"}
+        every.get("c5", "crowd")
+        assert set(every._sessions) == {"", "mine", "c0", "c1", "c4", "c5"}
+        others = [every.get(f"o{number}", "other") for number in range(2)]
+        every.get("n", "new")  # it is full now, and the crowd has most
+        assert set(every._sessions) == {"", "mine", "c0", "c1", "c5", "o0", "o1", "n"}
+        for name in ("c6", "c7"):
+            every.get(name, "crowd")
+        assert "c0" in every._sessions  # its request has not ended
+        for session in (every.get("c7", "crowd"), every.get("c1"), *others, shared, mine):
+            session.busy += 1
+        every.get("c8", "crowd")
+        assert "c0" not in every._sessions  # nothing better is left to give up
+        every.get("c8").busy += 1
+        send(every.get("c7"), component)
+        with pytest.raises(ComponentError, match="sessions are open"):
+            for number in range(9, 12):
+                every.get(f"c{number}", "crowd").busy += 1
+        assert every.get("") is shared and every.get("mine") is mine
+
+    run(check)
+
+
+# --- what requests occupy ---------------------------------------------------------------------------------------
+
+
+def test_results_that_nobody_fetches_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The oldest of whoever has most go; the newest of all stays, however large."""
+    monkeypatch.setattr(sessions, "MAX_KEPT", 100_000 + 7 * REQUEST_BYTES)
+
+    async def check(every: Sessions, component: Component) -> None:
+        one, other = every.get("one"), every.get("other")
+
+        async def result(session: Session, size: int) -> str:
+            component.size = size
+            request = send(session, component)
+            await request.finished.wait()
+            await asyncio.sleep(0)
+            return request.id
+
+        small = await result(other, 1000)
+        first, second, third = [await result(one, 40_000) for _ in range(3)]
+        assert list(one.requests) == [second, third]
+        huge = await result(other, 1_000_000)
+        assert (list(one.requests), list(other.requests)) == ([], [huge])
+        assert every.kept == other.kept > 1_000_000
+        last = await result(one, 10)
+        assert (list(one.requests), list(other.requests)) == ([last], [])
+        assert small != first
+        one.clean(last)
+        assert every.kept == one.kept == other.kept == 0
+
+    run(check)
+
+
+def test_events_keep_no_results(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A listener that does not read holds on to nothing large; it is told how large it was."""
+
+    async def check(every: Sessions, component: Component) -> None:
+        session = every.get("s")
+        deaf = session.listen()
+        for component.size in (10, 5000, 100_000):
+            request = send(session, component)
+            await request.finished.wait()
+            await asyncio.sleep(0)
+            session.clean(request.id)
+        gc.collect()
+        assert [value.size for value in component.answers] == [72]
+        told = ["".join(deaf.get_nowait()[1].pieces(JSON)).partition('"status":')[2] for _ in range(3)]
+        assert told == ['"done","output":{"data":[0.0]}}', '"done","large":5064}', '"done","large":100064}']
+
+    run(check)
+
+
+@pytest.mark.parametrize("keep", [True, False])
+def test_requests_under_way_are_bounded(monkeypatch: pytest.MonkeyPatch, keep: bool) -> None:
+    """Those that nobody follows, and those that were cleaned, count until they have ended."""
+    monkeypatch.setattr(sessions, "MAX_REQUESTS", 10)
+    monkeypatch.setattr(sessions, "MAX_KEPT", 17 * REQUEST_BYTES)
+
+    async def check(every: Sessions, component: Component) -> None:
+        component.may_answer.clear()
+        one, other = every.get("one"), every.get("other")
+        for _ in range(10):
+            request = send(one, component, keep)
+            if keep:
+                one.clean(request.id)
+        with pytest.raises(ComponentError, match="a session has at most 10 requests under way"):
+            send(one, component, keep)
+        for _ in range(6):
+            send(other, component, keep)
+        with pytest.raises(ComponentError, match="requests under way take"):
+            send(other, component, keep, size=REQUEST_BYTES + 1)
+        send(other, component, keep)
+        with pytest.raises(ComponentError, match="requests under way take"):
+            send(every.get("third"), component, keep)
+        component.may_answer.set()
+        await wait_until(lambda: len(component.called) == 17)
+        await wait_until(lambda: every.kept == sum(request.size for request in other.requests.values()))
+        assert len(other.requests) == 7 * keep
+        send(one, component, keep)
+
+    run(check)
+
+
+def test_what_has_not_ended_is_not_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+    """For new requests those go that have ended, and only those."""
+    monkeypatch.setattr(sessions, "MAX_REQUESTS", 4)
+
+    async def check(every: Sessions, component: Component) -> None:
+        session = every.get("")
+        component.may_answer.clear()
+        running = [send(session, component) for _ in range(3)]
+        await wait_until(lambda: len(component.called) == 3)
+        component.may_answer = asyncio.Event()
+        component.may_answer.set()
+        ended = [send(session, component)]
+        for _ in range(3):
+            await ended[-1].finished.wait()
+            ended.append(send(session, component))
+        assert list(session.requests.values()) == [*running, ended[-1]]
+        await ended[-1].finished.wait()
+        component.may_answer.clear()
+        running.append(send(session, component))
+        with pytest.raises(ComponentError, match="a session has at most 4 requests under way"):
+            send(session, component)
+        assert list(session.requests.values()) == running
+        for request in running:
+            session.request(request.id).forgotten.set()
+
+    run(check)
+
+
+# --- in which order ---------------------------------------------------------------------------------------------
+
+
+def test_a_request_waits_for_the_one_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    async def check(every: Sessions, component: Component) -> None:
+        for session, called in ((every.get(""), 2), (every.get("named"), 1)):
+            component.called.clear()
+            component.may_answer.clear()
+            requests = [send(session, component) for _ in range(2)]
+            for _ in range(50):
+                await asyncio.sleep(0)
+            assert len(component.called) == called  # those without a name wait for nobody
+            component.may_answer.set()
+            for request in requests:
+                await request.finished.wait()
+
+    run(check)
+
+
+def test_a_request_waits_not_for_ever() -> None:
+    async def check(every: Sessions, component: Component) -> None:
+        component.may_answer.clear()
+        requests = [send(every.get("named"), component) for _ in range(2)]
+        await wait_until(lambda: len(component.called) == 2)
+        assert not any(request.finished.is_set() for request in requests)
+
+    run(check)
+
+
+def test_what_ended_sessions_asked_for_is_forgotten() -> None:
+    async def check(every: Sessions, component: Component) -> None:
+        component.may_answer.clear()
+        session = every.get("s")
+        request = send(session, component)
+        await every.stop("s")
+        assert every.kept == REQUEST_BYTES
+        component.may_answer.set()
+        await request.finished.wait()
+        await wait_until(lambda: every.kept == 0)
+
+    run(check)
+
+
+# --- events -----------------------------------------------------------------------------------------------------
+
+
+def test_a_listener_that_reads_nothing_is_dropped(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sessions, "MAX_EVENTS", 3)
+
+    async def check(every: Sessions, _: Component) -> None:
+        session = every.get("s")
+        deaf, attentive = session.listen(), session.listen()
+        heard = []
+        for number in range(5):
+            session.tell("request", number)
+            heard.append(attentive.get_nowait())
+        assert [deaf.get_nowait() for _ in range(4)] == [("request", 0), ("request", 1), ("request", 2), ("quit", "")]
+        assert deaf.empty()
+        assert heard == [("request", number) for number in range(5)]
+
+    run(check)
