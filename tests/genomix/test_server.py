@@ -341,6 +341,26 @@ def test_a_port_without_a_sample_is_zeros(world: World) -> None:
     assert world.http.call("rosAFE/dataObj")["dataObj"] == {kind: [] for kind in interface.FIXED}
 
 
+def test_what_is_not_there_makes_the_node_say_nothing(world: World) -> None:
+    """A node that is asked for a topic that it does not have names all that it has, in kilobytes."""
+    with world.graph.node("rosAFE-ros", "-i", "quiet") as node:
+        world.http.call("bass/Acquire", ["scene:"])
+        world.http.call("quiet/request", ["filterbank", {"fb_nChannels": 2}])
+        assert "gammatonePort" in world.http.call("quiet/gammatonePort/filterbank_0")
+        world.http.call("quiet/removeProcessor", ["filterbank_0"])
+        for element in ("dummyName", "filterbank_0", "FILTERBANK_0", "a/b"):
+            with pytest.raises(HttpError, match="has no element"):
+                world.http.call(f"quiet/gammatonePort/{element}")
+        script = """
+            set g [genomix::connect $address]
+            $g load rosAFE -i quiet
+            set request [::quiet::preProcPort dummyName &]
+            show [$request wait]
+        """
+        assert world.lines(script) == ["error"]
+        assert node.err == ""
+
+
 def test_elements_that_are_superfluous_or_misspelt_as_in_the_guide(world: World) -> None:
     start_tree(world.http)
     assert "inputProcPort" in world.http.call("rosAFE/inputProcPort/input")

@@ -171,10 +171,10 @@ def go_on(world: World) -> None:
 
 def await_clients(world: World) -> None:
     """Wait until genomixd is connected to all activities of both components."""
-    master = xmlrpc.client.ServerProxy(world.graph.uri)
+    master: Any = xmlrpc.client.ServerProxy(world.graph.uri)
     for component in COMPONENTS.values():
         parts = {f"/{component.name}/{s.name}/{p}" for s in component.activities for p in ACTION_TOPICS}
-        node = xmlrpc.client.ServerProxy(master.lookupNode("/test", f"/{component.name}")[2])  # type: ignore[index]
+        node = xmlrpc.client.ServerProxy(master.lookupNode("/test", f"/{component.name}")[2])
 
         def connected(node: Any = node, parts: set[str] = parts) -> bool:
             return parts <= {connection[4] for connection in node.getBusInfo("/test")[2]}

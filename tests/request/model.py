@@ -32,6 +32,7 @@ class Model:
         self.instance = "rosAFE"
         self.processors: dict[str, Processor] = {}
         self.calls: list[str] = []
+        self.answers: list[asyncio.Task[Mapping[str, Any]]] = []
         self.connected = ""
         self.audio = audio
         self.fail: dict[int, ComponentError] = {}
@@ -40,8 +41,13 @@ class Model:
     # --- as a component ---
 
     async def outputs(self, service: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
-        number = len(self.calls)
+        # What a component has been asked for it does, also where nobody waits for its answer any more.
+        call = asyncio.create_task(self._answer(len(self.calls), service, values))
         self.calls.append(service)
+        self.answers.append(call)
+        return await asyncio.shield(call)
+
+    async def _answer(self, number: int, service: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
         if number in self.cancel:
             self.cancel[number].cancel()
         await asyncio.sleep(0)  # others have their turn

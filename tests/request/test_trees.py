@@ -125,10 +125,11 @@ def test_clients_that_do_not_know_of_each_other(wanted: list[tuple[str, dict[str
 
 
 @settings(max_examples=60, deadline=None)
-@given(REQUESTS, REQUESTS, st.integers(0, 20), st.booleans())
+@given(REQUESTS, REQUESTS, st.integers(0, 20), st.booleans(), st.integers(1, 10))
 def test_nothing_is_left_of_what_fails(
-    first: tuple[str, dict[str, Any]], wanted: tuple[str, dict[str, Any]], at: int, cancelled: bool
+    first: tuple[str, dict[str, Any]], wanted: tuple[str, dict[str, Any]], at: int, cancelled: bool, again: int
 ) -> None:
+    """Of what the component refuses, and of what is cancelled, also where the clearing up is cancelled again."""
     model = Model()
     build(model, first[0], **first[1])
     before, number = model.state(), len(model.calls) + at
@@ -137,10 +138,13 @@ def test_nothing_is_left_of_what_fails(
     async def go() -> dict[str, Any]:
         task = asyncio.create_task(trees.build(model, {"representation": wanted[0], **wanted[1]}))
         if cancelled:
-            model.cancel[number] = task
+            model.cancel[number] = model.cancel[number + again] = task
         else:
             model.fail[number] = error
-        return await task
+        try:
+            return await task
+        finally:
+            await asyncio.gather(*(a for a in model.answers if not a.done()), return_exceptions=True)
 
     try:
         asyncio.run(go())
