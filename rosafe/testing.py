@@ -130,8 +130,8 @@ class _Trial:
                 twin.configure(**{name: value})
             except ValueError:
                 continue  # what is told of a stage need not be what can be set
-        outputs = [self.run(sound[:, half:], [half], stages) for stages in (touched, left)]
-        _assert_equal(*outputs, "a change of a shallow copy alters the stage: _build must make new objects")
+        one, other = (self.run(sound[:, half:], [half], stages) for stages in (touched, left))
+        _assert_equal(one, other, "a change of a shallow copy alters the stage: _build must make new objects")
         for stage in touched:
             stage.reset()
         _assert_equal(

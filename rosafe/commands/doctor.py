@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from rosafe.component import generate, master, paths
-from rosafe.interface import ComponentError
+from rosafe.interface import COMPONENTS, ComponentError
 
 OK, NOTE, MISSING = "ok", "note", "MISSING"
 
@@ -128,7 +128,7 @@ def _messages() -> Finding:
         generate.ensure_messages()
     except generate.GenerationError as problem:
         return Finding(MISSING, f"the messages cannot be generated: {problem}")
-    for package in generate.PACKAGES:
+    for package in COMPONENTS:
         module = importlib.import_module(f"{package}.msg")
     where = Path(str(module.__file__)).parents[2]
     if stale:

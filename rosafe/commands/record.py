@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 from rosafe.commands import Failure
 from rosafe.commands._workers import Interrupted, Signals
 from rosafe.interface import ComponentError
-from rosafe.output import OutputError, Part
+from rosafe.output import PART, OutputError, Part
 
 if TYPE_CHECKING:
     from rosafe.bass.recording.outputs import Output
@@ -158,8 +158,9 @@ def _check(options: argparse.Namespace) -> Path | None:
     path = Path(os.path.expanduser(options.output))
     if path.suffix.lower() not in (".wav", ".bag"):
         options.usage_error(f"{options.output}: wanted is a name that ends in .wav or .bag")
-    if options.force and path.exists() and _is_input(path, options.device or ""):
-        raise Failure(f"{path} is the input itself")
+    for replaced in (path, path.with_name(path.name + PART)):
+        if options.force and replaced.exists() and _is_input(replaced, options.device or ""):
+            raise Failure(f"{replaced} is the input itself")
     return path
 
 

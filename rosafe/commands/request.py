@@ -17,7 +17,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from rosafe.commands import Failure
-from rosafe.interface import REQUEST, ROSAFE, ComponentError, ProcessorKind
+from rosafe.interface import REQUEST, ROSAFE, ComponentError, Representation
 from rosafe.interface.arguments import check_parameter
 from rosafe.tree import requests as request
 
@@ -65,7 +65,7 @@ def run(options: argparse.Namespace) -> int:
     """Make the request and print what has come of it."""
     try:
         kind = request.kind_of(options.representation)
-        values = {"representation": kind.representation}
+        values = {"representation": kind.word}
         for name, value in map(_parameter, [*options.settings, *options.interspersed]):
             if name in values:
                 raise ValueError(f"{name} is given twice")
@@ -137,7 +137,7 @@ def _told(problem: ComponentError) -> str:
     return problem.ex + (f": {what}" if what else "")
 
 
-def _show(answer: Mapping[str, Any], kind: ProcessorKind) -> None:
+def _show(answer: Mapping[str, Any], kind: Representation) -> None:
     """A line for each processor, and on stderr one for each parameter that was given in vain."""
     width = max(map(len, answer["dependencies"]))
     instance = answer["topic"].split("/")[1]

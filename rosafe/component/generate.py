@@ -284,7 +284,8 @@ def environment() -> dict[str, str]:
         tcl, matlab = prefix / "lib" / "tcltk", prefix / "lib" / "matlab"
     else:
         programs, tcl, matlab = (paths.CODE_DIR / folder for folder in ("scripts", "tcl", "matlab"))
-        python, share = [], []
+        python: list[Path] = []
+        share: list[Path] = []
     if generation is not None:
         if _is_current(generation.parent, generation.name):  # the name that stays when the sources change
             generation = generation.parent / "current"

@@ -12,7 +12,7 @@ import rosAFE.srv
 import rospy
 
 from rosafe.interface import FIXED, ROSAFE, ros_type
-from rosafe.ros import array_srv, wire
+from rosafe.component import array_srv, wire
 from tests.harness import wait_for
 from tests.ros.session import RATE, Session, assert_holds, ears, expected, noise, windowed
 

@@ -24,7 +24,7 @@ from rosgraph.network import read_ros_handshake_header, write_ros_handshake_head
 from rosafe.component.publisher import MAX_WAITING, MAX_WAITING_BYTES, Publisher, send_pieces
 from rosafe.component.wire import Gather
 from rosafe.interface import FIXED
-from rosafe.ros import array_msg, publisher
+from rosafe.component import array_msg, publisher
 from tests.harness import PYTHON, ROOT, Graph, Process, proc, wait_for
 from tests.ros.session import Session, noise, own_node
 
@@ -233,7 +233,7 @@ def resident(pid: int) -> float:
 LISTENER = """
 import sys, rospy
 from rosAFE.msg import rosAFE_TimeFrequencySignalPortStruct as TimeFrequency
-from rosafe.ros import array_msg
+from rosafe.component import array_msg
 rospy.init_node(sys.argv[1])
 rospy.Subscriber(sys.argv[2], array_msg(TimeFrequency), lambda m: print(m.lastFrameIndex), buff_size=2**22)
 rospy.spin()

@@ -14,7 +14,7 @@ import numpy as np
 import rosgraph
 import rospy
 import soundfile
-from rosafe.tree.roles import Observer, State
+from rosafe.tree.states import Observer, State
 from std_msgs.msg import String
 
 from rosafe.interface import FIXED

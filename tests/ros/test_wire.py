@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 import bass.msg
 from rosafe import interface
 from rosafe.interface import ROSAFE
-from rosafe.ros import array_msg, wire
+from rosafe.component import array_msg, wire
 from rosafe.tree.window import SlidingWindow, WindowView
 
 TIME_DOMAIN = "::rosAFE::TimeDomainSignalPortStruct"

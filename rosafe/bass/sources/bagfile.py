@@ -83,8 +83,10 @@ class BagFile:
             raise
 
     def close(self) -> None:
-        """Close the file."""
-        os.close(self._descriptor)
+        """Close the file; once more is no harm."""
+        if self._descriptor >= 0:
+            os.close(self._descriptor)
+            self._descriptor = -1
 
     def _read_bag_header(self) -> None:
         begin = os.pread(self._descriptor, len(_MAGIC), 0)
