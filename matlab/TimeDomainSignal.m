@@ -13,9 +13,8 @@ classdef TimeDomainSignal < BufferedSignal
             end
             h = place(obj, h);
             plot(seconds(obj), obj.Data);
-            xlabel('Time (s)');
             ylabel('Amplitude');
-            title(strrep([obj.Label ' ' obj.Channel], '_', ' '));
+            caption(obj);
         end
     end
 
