@@ -17,7 +17,7 @@ sys.path.insert(0, str(HERE.parent))
 
 from rosafe.demo.processes import Child, Children  # noqa: E402
 from rosafe.demo.session import NAMES, Session  # noqa: E402
-from rosafe.interface import KINDS, ROSAFE  # noqa: E402
+from rosafe.interface import FIXED, ROSAFE  # noqa: E402
 
 PYTHON = "/usr/bin/python3"
 AUDIO = "/bass/Audio"
@@ -27,7 +27,7 @@ UP_SECONDS = 20.0
 
 def topic(kind: str) -> str:
     """The topic of the default tree's processor of a kind."""
-    port = ROSAFE.port(KINDS[kind].port)
+    port = ROSAFE.port(FIXED[kind].port)
     return f"/rosAFE/{port.name}" + (f"/{NAMES[kind]}" if port.multiple else "")
 
 
@@ -68,7 +68,7 @@ class Bench:
         self.call("/rosAFE/connect_port", local="Audio", remote=AUDIO)
         self.call("/bass/Acquire", device=device, sampleRate=RATE, nFramesPerChunk=chunk, nChunksOnPort=20)
         self.call("/rosAFE/InputProc", nFramesPerBlock=block, bufferSize_s_port=port_seconds)
-        for kind in KINDS.values():
+        for kind in FIXED.values():
             if kind.parent:
                 self.call(f"/rosAFE/{kind.request}", name=NAMES[kind.kind], upperDepName=NAMES[kind.parent])
 

@@ -17,7 +17,7 @@ import time
 import graph
 import numpy as np
 
-from rosafe.interface import KINDS
+from rosafe.interface import FIXED
 
 
 def latencies(came: dict[str, list[list[float]]]) -> np.ndarray:
@@ -54,7 +54,7 @@ def main() -> int:
         print(f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores; blocks of {options.block}; ms")
         print(f"{'':50} {'count':>5} {'median':>8} {'p99':>8} {'max':>8}")
         report("only ILD subscribed", measure(bench, options.block, options.messages))
-        taker = bench.subscribe(graph.topic(kind) for kind in KINDS)
+        taker = bench.subscribe(graph.topic(kind) for kind in FIXED)
         report("all ports subscribed elsewhere", measure(bench, options.block, options.messages))
         taker.close()
     return 0

@@ -23,7 +23,7 @@ import graph
 import numpy as np
 
 from rosafe.component import generate
-from rosafe.interface import KINDS
+from rosafe.interface import FIXED
 
 SETTLED = 5.0  # seconds until memory counts: windows and buffers are full by then
 GROWTH = 64.0  # MB; a leak of one window in the time would be as much as that
@@ -138,7 +138,7 @@ class Run(NamedTuple):
 
 def run(bench: graph.Bench, block: int, port_seconds: float, seconds: float) -> Run:
     """Subscribe to all ports from another process for so long; the tree is there and runs on blocks of `block`."""
-    topics = [graph.topic(kind) for kind in KINDS]
+    topics = [graph.topic(kind) for kind in FIXED]
     taker = bench.subscribe(topics)
     pids = bench.node, taker.child.process.pid
     settling = min(SETTLED, seconds / 2)

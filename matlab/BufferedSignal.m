@@ -1,10 +1,10 @@
 classdef BufferedSignal < handle
 %BUFFEREDSIGNAL  The newest seconds of what a processor puts out for one ear, or for both together, oldest first.
 %
-%   TimeDomainSignal (samples), TimeFrequencySignal (frames by channels), FeatureSignal (frames by features),
+%   TimeDomainSignal (samples, N-by-1), TimeFrequencySignal (frames by channels), FeatureSignal (frames by features),
 %   CorrelationSignal (frames by channels by lags) and ModulationSignal (frames by channels by filters) are made of it.
-%   They offer what the original's examples use of the signals of Two!Ears' MATLAB front-end; where that is ahead on
-%   the path, its own classes serve.
+%   They offer what the original's examples use of the signals of Two!Ears' MATLAB front-end, and take chunks of the
+%   same shapes; where that is ahead on the path, its own classes serve.
 
     properties (SetAccess = private)
         Name          % of the representation: 'filterbank'
@@ -19,34 +19,28 @@ classdef BufferedSignal < handle
     end
 
     properties (Access = private)
-        columns            % how many a frame has; [] for samples
+        frameSize            % how many numbers a frame has: channels, or channels and lags
         chunks = cell(0, 1); % joined when Data is asked for, as copying all of it for every chunk takes time
         held = 0;            % frames in all chunks
     end
 
     methods
-        function obj = BufferedSignal(fs, bufferSize_s, name, label, columns, channel)
+        function obj = BufferedSignal(fs, bufferSize_s, name, label, frameSize, channel)
             obj.FsHz = fs;
             obj.bufferSize_s = bufferSize_s;
             obj.Name = name;
             obj.Label = label;
-            obj.columns = columns;
+            sizes = size(zeros([1 max(1, frameSize)])); % a last dimension of one is none
+            obj.frameSize = sizes(2:end);
             obj.Channel = channel;
         end
 
         function appendChunk(obj, chunk)
-            %APPENDCHUNK  Add frames at the end; the oldest go where there are too many.
-            if isempty(chunk)
-                return
-            end
-            if isempty(obj.columns)
-                chunk = chunk(:); % samples come as a row or as a column
-            elseif size(chunk, 2) ~= obj.columns
-                error('BufferedSignal:channels', '%s has %d channels, and the chunk has %d', obj.Label, ...
-                    obj.columns, size(chunk, 2));
-            end
-            if obj.held > 0 && size(obj.chunks{1}, 3) ~= size(chunk, 3)
-                clearData(obj); % the lags or filters have changed
+            %APPENDCHUNK  Add frames, the rows of a chunk, at the end; the oldest go where there are too many.
+            if ~isequal(size(chunk), [size(chunk, 1) obj.frameSize])
+                shown = sprintf('%d-by-', size(chunk));
+                error('BufferedSignal:size', '%s takes chunks of N%s (time goes down), and this one is %s', ...
+                    obj.Label, sprintf('-by-%d', obj.frameSize), shown(1:end - 4));
             end
             obj.chunks{end + 1, 1} = chunk;
             obj.held = obj.held + size(chunk, 1);

@@ -8,7 +8,7 @@ classdef CorrelationSignal < BufferedSignal
 
     methods
         function obj = CorrelationSignal(fs, bufferSize_s, name, label, cfHz, lags, channel)
-            obj = obj@BufferedSignal(fs, bufferSize_s, name, label, numel(cfHz), channel);
+            obj = obj@BufferedSignal(fs, bufferSize_s, name, label, [numel(cfHz) numel(lags)], channel);
             obj.cfHz = cfHz(:).';
             obj.lags = lags(:).';
         end

@@ -8,7 +8,7 @@ classdef ModulationSignal < BufferedSignal
 
     methods
         function obj = ModulationSignal(fs, bufferSize_s, name, label, cfHz, modCfHz, channel)
-            obj = obj@BufferedSignal(fs, bufferSize_s, name, label, numel(cfHz), channel);
+            obj = obj@BufferedSignal(fs, bufferSize_s, name, label, [numel(cfHz) numel(modCfHz)], channel);
             obj.cfHz = cfHz(:).';
             obj.modCfHz = modCfHz(:).';
         end

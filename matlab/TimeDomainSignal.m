@@ -3,7 +3,7 @@ classdef TimeDomainSignal < BufferedSignal
 
     methods
         function obj = TimeDomainSignal(fs, bufferSize_s, name, label, channel)
-            obj = obj@BufferedSignal(fs, bufferSize_s, name, label, [], channel);
+            obj = obj@BufferedSignal(fs, bufferSize_s, name, label, 1, channel);
         end
 
         function h = plot(obj, h)

@@ -14,6 +14,12 @@ from tests.bass.pulse import PulseServer
 generate.ensure_messages()  # test modules import rosAFE.msg and bass.msg at their top
 
 
+@pytest.fixture(scope="session", autouse=True)
+def _default_signals() -> None:
+    """In every process that runs tests, before it starts anything; not in the one that only starts those."""
+    harness.let_children_have_default_signals()
+
+
 @pytest.fixture(scope="session")
 def graph(tmp_path_factory: pytest.TempPathFactory) -> Iterator[harness.Graph]:
     """The ROS graph that all tests of this process share: a master on a free port."""

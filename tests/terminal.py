@@ -53,7 +53,7 @@ class Terminal:
         """That without the escape sequences."""
         return _ESCAPES.sub("", self.sent)
 
-    def expect(self, text: str, timeout: float = 20.0) -> str:
+    def expect(self, text: str, timeout: float = harness.PATIENCE) -> str:
         """Wait until `text` is shown behind what was expected before; what was shown up to its end."""
         end = time.monotonic() + timeout
         while True:
@@ -86,7 +86,7 @@ class Terminal:
         self.expect("\n")
         return self.expect(prompt).removesuffix(prompt).rstrip("\n")
 
-    def end(self, timeout: float = 10.0) -> int:
+    def end(self, timeout: float = harness.PATIENCE) -> int:
         """The exit code; AssertionError where the program does not end."""
         limit = time.monotonic() + timeout
         while self._read(limit):

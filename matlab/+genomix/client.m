@@ -3,6 +3,7 @@ classdef client < handle
 %
 %   client = genomix.client                   % the genomixd of this machine (or of the environment's GENOMIXD)
 %   client = genomix.client('host:8080')      % that of another one; 8080 is the port unless another is given
+%   client = genomix.client('-columns')       % with sequences as N-by-1 cells, not 1-by-N; also after an address
 %   rosAFE = client.load('rosAFE')            % a genomix.component
 %   left = client.load('rosAFE', '-i', 'left')
 %   delete(client)                            % activities go on
@@ -12,6 +13,7 @@ classdef client < handle
     properties (SetAccess = private)
         address  % host:port of genomixd
         session  % the name under which genomixd knows this client
+        columns  % whether sequences are N-by-1 cells, as in the original's first version
     end
 
     properties (Access = private)
@@ -19,11 +21,16 @@ classdef client < handle
     end
 
     methods
-        function obj = client(address)
-            if nargin == 0
-                address = getenv('GENOMIXD');
+        function obj = client(varargin)
+            given = cellfun(@genomix.wire.chars, varargin, 'UniformOutput', false);
+            obj.columns = ~isempty(given) && ischar(given{end}) && strcmp(given{end}, '-columns');
+            given = given(1:end - obj.columns);
+            if isempty(given)
+                given = {getenv('GENOMIXD')};
+            elseif numel(given) > 1
+                error('genomix:connection', 'after the address of genomixd there may be only: ''-columns''');
             end
-            obj.address = full_address(genomix.wire.chars(address));
+            obj.address = full_address(given{1});
             [~, obj.session] = fileparts(tempname()); % MATLAB's rand begins alike in every process
             obj.get('/components', {}, false);
         end
@@ -47,6 +54,8 @@ classdef client < handle
             [about, failed] = obj.get(['/load/' genomix.wire.quote(name)], query, false);
             if failed
                 error('genomix:load', 'load %s: %s', component, genomix.request.explain(about));
+            elseif ~isstruct(about) || ~all(isfield(about, {'name', 'instance', 'services', 'ports'}))
+                error('genomix:connection', 'what answers at %s is no genomixd', obj.address);
             end
             component = genomix.component(obj, about);
         end
@@ -61,7 +70,8 @@ classdef client < handle
                 error('genomix:connection', 'the client was deleted');
             end
             obj.lost = true; % unless it returns
-            [answer, failed] = genomix.wire.fetch(obj.address, path, [{'s', obj.session}; query], matrices);
+            [answer, failed] = genomix.wire.fetch(obj.address, path, [{'s', obj.session}; query], matrices, ...
+                obj.columns);
             obj.lost = false;
         end
 

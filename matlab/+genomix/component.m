@@ -158,7 +158,7 @@ classdef component < handle
                     entries = obj.about.(kind);
                     names = fieldnames(entries);
                     for k = 1:numel(names)
-                        if any(same{1}(name, [names(k); entries.(names{k}).aliases]))
+                        if any(same{1}(name, [names(k); entries.(names{k}).aliases(:)]))
                             name = names{k};
                             return
                         end

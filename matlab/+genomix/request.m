@@ -75,15 +75,14 @@ classdef request < handle
 
         function disp(obj)
             refresh(obj, 0);
-            fprintf('  genomix.request: %s\n', obj.told.status);
+            [result, exception] = deal('[]');
             if strcmp(obj.told.status, 'error')
-                fprintf('    exception: %s\n', genomix.request.explain(obj.told.exception));
+                exception = ['[1x1 struct] ' genomix.request.explain(obj.told.exception)];
             elseif strcmp(obj.told.status, 'done')
-                names = fieldnames(output(obj));
-                if ~isempty(names)
-                    fprintf('    result.%s\n', strjoin(names.', ', result.'));
-                end
+                result = '[1x1 struct]';
             end
+            fprintf('  request with properties:\n\n');
+            fprintf('%13s: %s\n', 'status', ['''' obj.told.status ''''], 'result', result, 'exception', exception);
         end
     end
 

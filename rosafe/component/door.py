@@ -129,7 +129,8 @@ class Door:
                     next_look = time.monotonic() + _TICK
             except Exception:  # a fault of ours must not make the node deaf
                 if self._listener.fileno() >= 0:
-                    self._report("", f"connections: {traceback.format_exc()}")
+                    with contextlib.suppress(Exception):
+                        self._report("", f"connections: {traceback.format_exc()}")
                     time.sleep(_TICK)
         for guest in list(self._guests.values()):
             self._dismiss(guest)
@@ -140,10 +141,13 @@ class Door:
     # --- coming in ---
 
     def _accept(self) -> None:
-        for _ in range(ACCEPTED_AT_ONCE):
-            if not self._has_room() and not self._make_room():
-                self._pause()
-                return
+        for turn in range(ACCEPTED_AT_ONCE):
+            if not self._has_room():
+                if turn:
+                    return  # there may be nobody to make room for
+                if not self._make_room():
+                    self._pause()
+                    return
             try:
                 sock, address = self._listener.accept()
             except BlockingIOError:
@@ -193,7 +197,10 @@ class Door:
         guest.sock.setblocking(False)
         self._guests[guest.sock.fileno()] = guest
         self._selector.register(guest.sock, selectors.EVENT_READ, lambda: self._read(guest))
-        self._read(guest)
+        if guest.data:
+            self._consider(guest)  # who has said much at once must not make us take more and more
+        else:
+            self._read(guest)
 
     # --- what they say ---
 
@@ -203,19 +210,21 @@ class Door:
         try:
             part = guest.sock.recv(READ_BYTES)
         except BlockingIOError:
-            part = b""
+            return
         except OSError:
+            part = b""
+        if not part:
             self._dismiss(guest)
             return
-        else:
-            if not part:
-                self._dismiss(guest)
-                return
         guest.data += part
-        if guest.idle and part:
+        if guest.idle:
             guest.idle, guest.until = False, time.monotonic() + OPENING_SECONDS
+        self._consider(guest)
+
+    def _consider(self, guest: _Guest) -> None:
+        """Hand on or send away whoever has said enough for that."""
         try:
-            size = self._opening(guest.data) if guest.data else None
+            size = self._opening(guest.data)
         except Refused as refusal:
             self._report(guest.address[0], f"{refusal}; disconnected")
             self._dismiss(guest, refusal.answer)

@@ -59,7 +59,10 @@ class EventLog:
         self._held[kind] = _Held()
         timer = threading.Timer(self._period, self._release, (kind,))
         timer.daemon = True
-        timer.start()
+        try:
+            timer.start()
+        except RuntimeError:  # no thread is left: the next one gets a line too
+            del self._held[kind]
 
     def _release(self, kind: str) -> None:
         with self._lock:

@@ -278,14 +278,14 @@ def environment() -> dict[str, str]:
     Raises GenerationError.
     """
     generation = _generation()
+    python: list[Path] = []
+    share: list[Path] = []
     if paths.source_root() is None:
         prefix = paths.install_prefix()
-        programs, python, share = prefix / "bin", [], [prefix / "share"]
+        programs, share = prefix / "bin", [prefix / "share"]
         tcl, matlab = prefix / "lib" / "tcltk", prefix / "lib" / "matlab"
     else:
         programs, tcl, matlab = (paths.CODE_DIR / folder for folder in ("scripts", "tcl", "matlab"))
-        python: list[Path] = []
-        share: list[Path] = []
     if generation is not None:
         if _is_current(generation.parent, generation.name):  # the name that stays when the sources change
             generation = generation.parent / "current"

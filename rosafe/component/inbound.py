@@ -332,11 +332,13 @@ class XmlRpcServer(rosgraph.xmlrpc.ThreadingXMLRPCServer):
 
     def _enter(self, sock: socket.socket, address: Any, opening: bytes, rest: bytes) -> None:
         """Answer one request, and wait for the next one if the client likes."""
-        sock.settimeout(REQUEST_SECONDS)
         try:
+            sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             handler = _Request(sock, address, self, opening)
+            sock.settimeout(REQUEST_SECONDS)
+            sock.sendall(handler.wfile.getvalue())
         except Exception as problem:
-            if not isinstance(problem, OSError):  # else it has left
+            if not isinstance(problem, OSError):  # else it has left, or does not read
                 _report("XML-RPC", address[0], f"{type(problem).__name__}: {problem}", "request")
             sock.close()
         else:
@@ -354,15 +356,17 @@ class _Request(rosgraph.xmlrpc.SilenceableXMLRPCRequestHandler):
         super().__init__(sock, address, server)
 
     def setup(self) -> None:
-        """Read from what is here."""
-        super().setup()
-        self.rfile.close()
+        """Read from what is here, and keep the answer."""
         self.rfile: Any = io.BytesIO(self._opening)
+        self.wfile: Any = io.BytesIO()
 
     def handle(self) -> None:
         """Only this one: the next may be long in coming."""
         self.close_connection = True
         self.handle_one_request()
+
+    def finish(self) -> None:
+        """Leave the answer to be sent."""
 
     def decode_request_content(self, data: bytes) -> bytes | None:
         """As it is: packed, a short request may be long."""

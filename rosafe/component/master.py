@@ -29,8 +29,12 @@ def set_local_defaults(environ: MutableMapping[str, str] = os.environ) -> None:
     """Let ROS work on this machine alone where the environment says nothing else.
 
     Numbers instead of `localhost`, which rospy waits for without end on a machine without /etc/hosts. ROS_IP is left
-    alone beside a master on another host, which could not call back to loopback.
+    alone beside a master on another host, which could not call back to loopback. What is empty counts as not set;
+    rospy would complain of it again and again.
     """
+    for variable in ("ROS_HOSTNAME", "ROS_IP"):
+        if environ.get(variable) == "":
+            del environ[variable]
     if not environ.get("ROS_MASTER_URI"):
         environ["ROS_MASTER_URI"] = DEFAULT_URI
     if not (environ.get("ROS_IP") or environ.get("ROS_HOSTNAME")) and is_local(environ["ROS_MASTER_URI"]):

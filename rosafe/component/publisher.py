@@ -67,11 +67,16 @@ class _Topic(topics._PublisherImpl):
         """Take on a subscriber; it gets the latched message."""
         # Messages are written whole, so nothing is gained by keeping back the last bytes of one.
         connection.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        sender = _Sender(connection)
         try:
-            return super().add_connection(_Sender(connection))
+            return super().add_connection(sender)
+        except Exception:
+            if not self.closed:
+                raise
+            return False
         finally:
             if self.closed:  # in this very moment; rospy would leave the subscriber waiting
-                connection.close()
+                sender.end()
 
     def remove_connection(self, connection: Any) -> None:
         """Forget a subscriber; rospy would tell its listeners, which there are none of, and stumble at the end."""
@@ -123,11 +128,21 @@ class _Sender:
         """Let rospy know when the connection is closed."""
 
         def closed(_: Any) -> None:
-            callback(self)
-            with self._turn:
-                self._turn.notify()
+            try:
+                callback(self)
+            finally:
+                self._wake()
 
         self._connection.set_cleanup_callback(closed)
+
+    def end(self) -> None:
+        """Close the connection, whether rospy knows it or not."""
+        self._connection.close()
+        self._wake()
+
+    def _wake(self) -> None:
+        with self._turn:
+            self._turn.notify()
 
     def offer(self, written: Gather) -> None:
         """Send a message when there is time, unless too many newer ones come before."""

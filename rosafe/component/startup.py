@@ -67,9 +67,8 @@ def run_server(component: interface.Component, build: Callable[[str], Node], arg
     if told is not None and told.in_parent:
         return told.wait()
     received: list[int] = []
-    for number in SIGNALS:
-        if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # nohup's wish counts
-            signal.signal(number, lambda number, frame: received.append(number))
+    for number in ending_signals():
+        signal.signal(number, lambda number, frame: received.append(number))
     try:
         node = _start(component, build, options, remappings, received)
     except _Ended:
@@ -83,6 +82,12 @@ def run_server(component: interface.Component, build: Callable[[str], Node], arg
     systemd.notify("READY=1")
     _serve(node, received)
     return 0
+
+
+def ending_signals() -> list[int]:
+    """The signals that end a server: also SIGINT where a script has put it behind `&`, but not SIGHUP under nohup."""
+    nohup = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    return [number for number in SIGNALS if not (nohup and number == signal.SIGHUP)]
 
 
 # --- command line -----------------------------------------------------------------------------------------------

@@ -52,6 +52,40 @@ class Cascade:
         return result
 
 
+class Parallel:
+    """Second-order sections with their states, from rest, which all get the same samples.
+
+    Parameters
+    ----------
+    sections : ndarray (M, 6)
+        Real sections as in `scipy.signal.sosfilt`: b0, b1, b2, 1, a1, a2.
+    """
+
+    def __init__(self, sections: NDArray[np.float64]) -> None:
+        self.sections = np.ascontiguousarray(sections)
+        self.state = np.empty((len(sections), 0, 2))  # (M, *rows, 2), direct form II transposed
+
+    def started(self, rows: tuple[int, ...]) -> NDArray[np.float64]:
+        """The states for a block of `rows`. Other rows than in the last block mean a start from rest."""
+        shape = (len(self.sections), *rows, 2)
+        if self.state.shape != shape:
+            self.state = np.zeros(shape)
+        return self.state
+
+    def process(self, block: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Filter (*rows, N) along its last axis by each section: (*rows, M, N)."""
+        states = self.started(block.shape[:-1])
+        result = np.empty((*block.shape[:-1], len(self.sections), block.shape[-1]))
+        for number, section in enumerate(self.sections):
+            for first in range(0, block.shape[-1], SPAN):
+                span = slice(first, first + SPAN)
+                state = states[number][np.newaxis]
+                result[..., number, span], state = scipy.signal.sosfilt([section], block[..., span], zi=state)
+                states[number] = state[0]
+                flush(states[number])
+        return result
+
+
 def leaky_integrator(retention: float) -> NDArray[np.float64]:
     """The section of u[n] = r u[n-1] + (1-r) x[n]; its first state value is r u[n]."""
     return np.array([[1.0 - retention, 0.0, 0.0, 1.0, -retention, 0.0]])

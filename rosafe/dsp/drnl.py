@@ -79,7 +79,8 @@ class _Channel:
             return _resonator(centre / sample_rate, width / sample_rate)
 
         def lowpass(cutoff: float) -> FloatArray:
-            return scipy.signal.butter(2, cutoff, fs=sample_rate, output="sos")
+            sections: FloatArray = scipy.signal.butter(2, cutoff, fs=sample_rate, output="sos")
+            return sections
 
         if frequency < LOWEST:
             raise ValueError(f"fb_cfHz: drnl has no channel at {frequency:.6g} Hz, below {LOWEST:.12g} Hz")
@@ -106,7 +107,9 @@ class _Channel:
             cascade.reset()
 
     def process(self, block: FloatArray) -> FloatArray:
-        return self.linear.process(block) + self.after.process(self._broken_stick(self.before.process(block)))
+        broken = self._broken_stick(self.before.process(block))
+        output: FloatArray = self.linear.process(block) + self.after.process(broken)
+        return output
 
     def _broken_stick(self, samples: FloatArray) -> FloatArray:
         """sign(x) min(a abs(x), b abs(x)**c)."""

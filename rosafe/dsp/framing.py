@@ -76,7 +76,8 @@ class Framing:
             samples = np.square(limited(samples, SQUARE_TINY))
         # Not a matrix product: OpenBLAS starts threads of its own for it, and two stages at work at the same time
         # then get in each other's way: several times slower than one alone.
-        return np.einsum("...fi,i->...f", self.frames(samples), self.weights(squared))
+        means: FloatArray = np.einsum("...fi,i->...f", self.frames(samples), self.weights(squared))
+        return means
 
 
 class FrameBuffer:
@@ -203,10 +204,13 @@ class FramedStage(Stage):
         self._buffer.drop(means.shape[-1] * self._framing.hop)
         return means
 
-    def _frames(self, block: FloatArray, weights: FloatArray) -> kernels.Frames:
-        """The frames that `block` completes, for a kernel; the buffer has moved on then."""
+    def _frames(self, block: FloatArray, weights: FloatArray, rows: tuple[int, ...] | None = None) -> kernels.Frames:
+        """The frames that `block` completes, for a kernel; the buffer has moved on then.
+
+        `rows` are those of what is held, where that is not what comes.
+        """
         arriving, hop = block.shape[-1], self._framing.hop
-        self._buffer.begin(block.shape[:-1])
+        self._buffer.begin(block.shape[:-1] if rows is None else rows)
         if self._buffer.held == 0:
             self._begun = None
         skip = self._buffer.skip

@@ -135,13 +135,15 @@ def _frequency_sampling(frequencies: FloatArray, amplitudes: FloatArray) -> Floa
     grid = np.linspace(0.0, frequencies[-1], ORDER + 1)
     delay = np.exp(-1j * np.pi * (ORDER / 2) * np.arange(ORDER + 1) / ORDER)
     response = np.interp(grid, frequencies, amplitudes) * delay
-    return scipy.fft.irfft(response, 2 * ORDER)[: ORDER + 1] * scipy.signal.windows.hamming(ORDER + 1)
+    fir: FloatArray = scipy.fft.irfft(response, 2 * ORDER)[: ORDER + 1] * scipy.signal.windows.hamming(ORDER + 1)
+    return fir
 
 
 def _jepsen(nyquist: float) -> FloatArray:
     frequencies, impedances = STAPES_IMPEDANCE[STAPES_IMPEDANCE[:, 0] < nyquist].T
     fir = _frequency_sampling(np.r_[0.0, frequencies, nyquist], np.r_[0.0, 1 / impedances, 0.0])
-    return fir / np.abs(scipy.fft.fft(fir)).max() * 1e-8 * 10 ** (REFERENCE_DB_SPL / 20)
+    fir /= np.abs(scipy.fft.fft(fir)).max()
+    return fir * 1e-8 * 10 ** (REFERENCE_DB_SPL / 20)
 
 
 def _lopezpoveda(nyquist: float) -> FloatArray:
@@ -167,4 +169,5 @@ def _minimum_phase(fir: FloatArray) -> FloatArray:
     """The minimum phase response with the magnitude of `fir` on a grid of its own length."""
     magnitude = np.maximum(np.abs(scipy.fft.fft(fir)), np.finfo(np.float64).tiny)
     phase = -np.imag(scipy.signal.hilbert(np.log(magnitude)))
-    return scipy.fft.ifft(magnitude * np.exp(1j * phase)).real
+    response: FloatArray = scipy.fft.ifft(magnitude * np.exp(1j * phase)).real
+    return response

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -128,20 +128,27 @@ class Stage:
         A parameter that is set counts as changed even where it had the value already, as in the original.
         Which states start anew is said by each stage.
         """
-        if changes:
-            values = self._with(changes)
-            self._build(values, frozenset(changes))
-            self._values = values
-            self._follow()
+        self.become(self.given, [changes])
 
     def receive(self, given: Signal) -> None:
         """From now on blocks have the format `given`: the parent has changed. A ValueError changes nothing."""
-        if given == self.given:
+        self.become(given, ())
+
+    def become(self, given: Signal, changes: Collection[Mapping[str, Any]]) -> None:
+        """`receive` and one `configure` after the other, at once: only what comes of it all must be possible."""
+        if given == self.given and not any(changes):
             self.given = given
             return
         tried = copy.copy(self)
         tried.given = given
-        tried._received(self.given)
+        changed: set[str] = set()
+        for change in changes:
+            tried._values = tried._with(change)
+            changed.update(self._parameter(name).name for name in change)
+        if given != self.given:
+            tried._received(self.given)
+        if changed:
+            tried._build(tried._values, frozenset(changed))
         tried._follow()
         self.__dict__.update(tried.__dict__)
 

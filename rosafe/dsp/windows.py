@@ -32,12 +32,15 @@ def window(name: str, length: int) -> FloatArray:
 
     ValueError for other names.
     """
+    values: FloatArray
     if name == "hanning":
-        return scipy.signal.windows.hann(length + 2, sym=True)[1:-1]
-    if name == "sqrt_win":
-        return np.sqrt(scipy.signal.windows.triang(length, sym=True))
-    if name == "rectwin":
-        return np.ones(length)
-    if name in NAMES:
-        return scipy.signal.windows.get_window(name, length, fftbins=False)
-    raise ValueError(f"window: {name!r} is not one of {', '.join(ALL_NAMES)}")
+        values = scipy.signal.windows.hann(length + 2, sym=True)[1:-1]
+    elif name == "sqrt_win":
+        values = np.sqrt(scipy.signal.windows.triang(length, sym=True))
+    elif name == "rectwin":
+        values = np.ones(length)
+    elif name in NAMES:
+        values = scipy.signal.windows.get_window(name, length, fftbins=False)
+    else:
+        raise ValueError(f"window: {name!r} is not one of {', '.join(ALL_NAMES)}")
+    return values

@@ -93,7 +93,7 @@ def _log_to_stderr(verbosity: int) -> None:
 async def _serve(options: argparse.Namespace, told: startup.Background | None) -> int:
     loop = asyncio.get_running_loop()
     end = asyncio.Event()
-    for number in startup.SIGNALS:
+    for number in startup.ending_signals():
         loop.add_signal_handler(number, end.set)
     signal.signal(signal.SIGPIPE, signal.SIG_IGN)
     loop.set_default_executor(ThreadPoolExecutor(THREADS, "rospy"))

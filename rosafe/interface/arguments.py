@@ -1,14 +1,14 @@
-"""Parameters and outputs as users of offline processing name them: checks that need neither numpy nor a tree."""
+"""Parameters and outputs as users of offline processing name them: checks that need no tree."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
 
-from rosafe.interface import FIXED, KINDS
+from rosafe.interface import FIXED, KINDS, Parameter
 
-_PARAMETERS = {name: p for kind in KINDS.values() for p in kind.parameters for name in (p.name, *p.aliases)}
-_MISSPELT = {wrong: p.name for kind in KINDS.values() for p in kind.parameters for wrong in p.former}
+_BY_NAME = {name: p for kind in KINDS.values() for p in kind.parameters for name in (p.name, *p.aliases)}
+_BY_FORMER_NAME = {name: p for kind in KINDS.values() for p in kind.parameters for name in p.former}
 
 
 def check_parameters(parameters: Any) -> dict[str, Any]:
@@ -22,12 +22,8 @@ def check_parameters(parameters: Any) -> dict[str, Any]:
 
 def check_parameter(name: Any, value: Any, text: bool = False) -> tuple[str, Any]:
     """The real name and the checked value of one parameter, or ValueError; `value` may be given as `text`."""
-    if not isinstance(name, str) or name not in _PARAMETERS:
-        known = ", ".join(p.name for kind in KINDS.values() for p in kind.parameters)
-        raise ValueError(f"unknown parameter {name!r}; there are: {known}")
-    parameter = _PARAMETERS[name]
-    checked = parameter.read(value) if text else parameter.check(value)
-    return parameter.name, checked
+    parameter = _parameter(name)
+    return parameter.name, parameter.read(value) if text else parameter.check(value)
 
 
 def check_change(name: Any, value: Any) -> tuple[str, Any]:
@@ -35,14 +31,21 @@ def check_change(name: Any, value: Any) -> tuple[str, Any]:
 
     With that (`set_rm_scailing`) go its misspelt values (`_power`).
     """
-    if isinstance(name, str) and name in _MISSPELT:
-        name = _MISSPELT[name]
-        value = value.removeprefix("_") if isinstance(value, str) else value
+    if isinstance(name, str) and name in _BY_FORMER_NAME:
+        parameter = _BY_FORMER_NAME[name]
+        return parameter.name, parameter.check(value.removeprefix("_") if isinstance(value, str) else value)
     return check_parameter(name, value)
 
 
+def _parameter(name: Any) -> Parameter:
+    if not isinstance(name, str) or name not in _BY_NAME:
+        known = ", ".join(p.name for kind in KINDS.values() for p in kind.parameters)
+        raise ValueError(f"unknown parameter {name!r}; there are: {known}")
+    return _BY_NAME[name]
+
+
 def check_outputs(outputs: Any) -> list[str]:
-    """The outputs to keep, each once, in the order of the chain (None: the original's seven), or ValueError."""
+    """The outputs to keep, each once, parents first (None: those of the original), or ValueError."""
     try:
         wanted = [outputs] if isinstance(outputs, str) else list(FIXED if outputs is None else outputs)
     except TypeError:

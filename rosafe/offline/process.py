@@ -17,6 +17,11 @@ from rosafe.tree import sizes
 from rosafe.tree.block import Block
 
 DEFAULT_BLOCK = 12000  # frames, as InputProc's
+# beyond the machine's memory, where the kernel would end the process
+_TOO_LARGE = (
+    "outputs: they would take {taken:.1f} GB of memory, this machine has {limit:.1f} GB; "
+    "name fewer outputs, or take fewer channels or lags"
+)
 
 
 def process(
@@ -83,7 +88,7 @@ def process(
             if block < len(ends):
                 chain.schedule(block, name, value)
                 taken.append(_size(chain, wanted, ends))
-        _check_memory(max(taken))
+        sizes.refuse_over(sizes.machine_memory(), max(taken), _TOO_LARGE, 1e9)
         for kind in wanted:
             for name, part in output_parts(kind).items():
                 middle = part.axes.index(KINDS[kind].centred) if KINDS[kind].centred in part.axes else -1
@@ -154,16 +159,6 @@ def _size(chain: Chain, wanted: list[str], ends: list[int]) -> int:
     largest_block = max((end - first for first, end in itertools.pairwise((0, *ends))), default=0)
     results = sum(8 * math.prod(shape) for kind in wanted for shape in chain.shapes(kind, frames).values())
     return max(results, chain.largest_block(largest_block)[1])
-
-
-def _check_memory(size: int) -> None:
-    """ValueError where `size` bytes are more than the machine has: there the kernel would end the process."""
-    memory = sizes.machine_memory()
-    if size > memory:
-        raise ValueError(
-            f"outputs: they would take {size / 1e9:.1f} GB of memory, this machine has {memory / 1e9:.1f} GB; "
-            "name fewer outputs, or take fewer channels or lags"
-        )
 
 
 class _Gathered:

@@ -75,7 +75,8 @@ class Changes:
             with self._lock:
                 due = self._due(block.number)
                 for count in range(len(due), -1, -1):
-                    if (changed := _changed(stage, block.signal, due[:count])) is not None and _fits(changed, block):
+                    changed = _changed(stage, block.signal, due[:count])
+                    if changed is not None and _fits(changed, block):
                         self._working = changed
                         del self._waiting[:count]
                         return changed
@@ -93,21 +94,14 @@ def _fits(stage: Stage, block: Block) -> bool:
 def _changed(stage: Stage, given: Signal, changes: Sequence[Change]) -> Stage | None:
     """`stage` after `changes`, with blocks of the format `given`, or None where that cannot be.
 
-    It shares the state of `stage`, which does not notice. The format may be what makes a change possible, or the
-    other way round: what goes in any order is taken.
+    It shares the state of `stage`, which does not notice.
     """
     if given == stage.given and not changes:
         stage.receive(given)
         return stage
-    for first in range(len(changes) + 1):
-        changed = copy.copy(stage)
-        try:
-            for change in changes[:first]:
-                changed.configure(**{change.name: change.value})
-            changed.receive(given)
-            for change in changes[first:]:
-                changed.configure(**{change.name: change.value})
-        except ValueError:
-            continue
-        return changed
-    return None
+    changed = copy.copy(stage)
+    try:
+        changed.become(given, [{change.name: change.value} for change in changes])
+    except ValueError:
+        return None
+    return changed

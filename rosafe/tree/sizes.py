@@ -32,32 +32,30 @@ def output_size(stage: Stage, rows: Rows, seconds: float) -> float:
     return sum(size(part, seconds * stage.output.rate) for part in stage.part_rows(rows))
 
 
-def refuse_over(limit: float, taken: float, what: str, whose: str = "") -> None:
-    """ValueError where what is `taken` passes the limit."""
+def refuse_over(limit: float, taken: float, text: str, unit: float = 2**20) -> None:
+    """ValueError where `taken` passes `limit`; `text` says so, with {taken} and {limit} in its place, in units."""
     if taken > limit:
-        raise ValueError(f"{what} take {taken / 2**20:.0f} MiB, more than {limit / 2**20:.0f} MiB{whose}")
+        raise ValueError(text.format(taken=taken / unit, limit=limit / unit))
 
 
 def check_stage(stage: Stage, rows: Rows, seconds: float) -> None:
     """ValueError where `seconds` of one stage's output, or what it keeps of its input for a frame, are too large."""
     for part in stage.part_rows(rows):
-        rate = stage.output.rate
-        refuse_over(
-            MAX_BYTES, size(part, seconds * rate), f"port or history: {seconds:g} s of {_shape(part)} at {rate:g} Hz"
-        )
+        _check_span("port or history", part, seconds, stage.output.rate)
     given = stage.given
     frames = (stage.output.window - given.window) / given.hop + 1
     name = f"{stage.PREFIX}_wSizeSec" if isinstance(stage, FramedStage) else "window"
-    what = f"{name}: {frames / given.rate:g} s of {_shape(rows)} at {given.rate:g} Hz"
-    refuse_over(MAX_BYTES, size(rows, frames), what)
+    _check_span(name, rows, frames / given.rate, given.rate)
 
 
-def _shape(rows: Rows) -> str:
-    return f"{'x'.join(map(str, rows))} values"
+def _check_span(what: str, rows: Rows, seconds: float, rate: float) -> None:
+    span = f"{seconds:g} s of {'x'.join(map(str, rows))} values at {rate:g} Hz"
+    text = f"{what}: {span} take {{taken:.0f}} MiB, more than {{limit:.0f}} MiB"
+    refuse_over(MAX_BYTES, size(rows, seconds * rate), text)
 
 
 def check_all(stages: Iterable[tuple[Stage, Rows]], seconds: float) -> None:
     """ValueError where `seconds` of output of all stages together would fill the machine's memory."""
     sizes = [output_size(stage, rows, seconds) for stage, rows in stages]
-    what = f"{seconds:g} s of output of {len(sizes)} processors"
-    refuse_over(SHARE * machine_memory(), sum(sizes), what, f", which is {SHARE:.0%} of this machine's memory")
+    text = f"{seconds:g} s of output of {len(sizes)} processors take {{taken:.0f}} MiB, more than {{limit:.0f}} MiB"
+    refuse_over(SHARE * machine_memory(), sum(sizes), f"{text}, which is {SHARE:.0%} of this machine's memory")

@@ -91,7 +91,7 @@ class StateMachine:
         self._leave()
 
     def finish(self) -> None:
-        """Nothing more will come of it; children may still take its last block."""
+        """Nothing more will come of it; children may still take the block released last."""
         self.give_back()
         self._enter(State.DONE)
         for child in self.children:
@@ -171,12 +171,12 @@ class StateMachine:
 
     def _release_if_free(self) -> None:
         """Called by whoever may have made it possible, which is mostly a child."""
-        block = self._private
-        if block is None or self._holders or self.gone:
+        if self.state is not State.WAIT_RELEASE or self._holders:
             return
+        block, self._private = self._private, None
+        assert block is not None
         self._enter(State.RELEASE, block.number)
         self.shared = self.untold = block
-        self._private = None
         for child in self.children:
             self._hand(child)
         self.rouse()

@@ -139,7 +139,7 @@ class Tree:
                     stage = STAGES[INPUT](source.sample_rate, **(parameters or {}))
                     new = Processor(name, stage, None, self._company, history_seconds, source)
                     heir = old if old is not None and old.state is not State.DONE else new
-                    self._check(_planned(heir, stage, EARS), max(port_seconds, history_seconds), old)
+                    self._check(_planned(heir, stage, EARS, None), max(port_seconds, history_seconds), old)
             except ComponentError:
                 source.stop()
                 raise
@@ -183,9 +183,8 @@ class Tree:
             parent = self.check(kind, name, parent_name)
             with _refusing():
                 stage = STAGES[kind](parent.signal, **(parameters or {}))
-                _check_needs(stage, parent.stage)
                 processor = Processor(name, stage, parent, self._company, self.history_seconds)
-                self._check(_planned(processor, stage, parent.rows), self._longest)
+                self._check(_planned(processor, stage, parent.rows, parent.stage), self._longest)
             self._begin(processor)
             return processor
 
@@ -246,7 +245,8 @@ class Tree:
     def _change(self, processor: Processor, name: str, value: Any, block: int = 0) -> None:
         """Change a parameter if all processors below can go on then; else ValueError, and nothing has changed."""
         changed = processor.changes.plan(name, value)
-        planned = list(_planned(processor, changed, processor.given_rows))
+        above = None if processor.parent is None else processor.parent.stage
+        planned = list(_planned(processor, changed, processor.given_rows, above))
         self._check(planned, self._longest, processor)
         for one, stage, _ in planned:
             one.changes.planned = stage
@@ -297,15 +297,13 @@ def _refusing() -> Iterator[None]:
         raise ROSAFE.error("e_badNewValue", what=str(problem)) from None
 
 
-def _planned(processor: Processor, stage: Stage, rows: Rows) -> Iterator[Planned]:
-    """`processor` with `stage`, and all below it as they would be then; ValueError where one could not go on."""
+def _planned(processor: Processor, stage: Stage, rows: Rows, above: Stage | None) -> Iterator[Planned]:
+    """`processor` with `stage`, and all below it as they would be then; ValueError where one could not go on.
+
+    `above` is the stage of its parent.
+    """
+    if above is not None and stage.needs and stage.needs not in above.PROVIDES:
+        raise ValueError(f"{processor.kind} needs the {stage.needs} of {above.REPRESENTATION}, which has none")
     yield Planned(processor, stage, rows)
     for child in processor.children:
-        below = child.changes.follow(stage.output)
-        _check_needs(below, stage)
-        yield from _planned(child, below, stage.output_rows(rows))
-
-
-def _check_needs(stage: Stage, parent: Stage) -> None:
-    if stage.needs and stage.needs not in parent.PROVIDES:
-        raise ValueError(f"{stage.REPRESENTATION} needs the {stage.needs} of {parent.REPRESENTATION}, which has none")
+        yield from _planned(child, child.changes.follow(stage.output), stage.output_rows(rows), stage)

@@ -150,9 +150,10 @@ class Parameter:
 
         Anything but an unknown word, and any word where there is no fallback, is left to `check`.
         """
-        if self.fallback and isinstance(value, str) and self.spellings.get(value, value) not in self.choices:
-            return self.fallback
-        return value
+        word = isinstance(value, str) and len(value) <= MAX_STRING and "\0" not in value
+        return (
+            self.fallback if self.fallback and word and self.spellings.get(value, value) not in self.choices else value
+        )
 
     # --- texts ------------------------------------------------------------------------------------------------
 

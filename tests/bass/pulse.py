@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from rosafe.component import paths
-from tests.harness import Process, wait_for
+from tests.harness import PATIENCE, Process, wait_for
 
 
 class PulseServer:
@@ -43,10 +43,10 @@ class PulseServer:
             ],
             self.env,
         )
-        wait_for(self._answers, 20, lambda: f"PulseAudio: {self._process}")
+        wait_for(self._answers, what=lambda: f"PulseAudio: {self._process}")
 
     def _answers(self) -> bool:
-        done = subprocess.run(["pactl", "info"], env=self.env, capture_output=True, timeout=10, check=False)
+        done = subprocess.run(["pactl", "info"], env=self.env, capture_output=True, timeout=PATIENCE, check=False)
         return done.returncode == 0
 
     def play(self, path: Path) -> Process:

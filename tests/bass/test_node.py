@@ -18,7 +18,7 @@ from rosafe.bass.sources.scene import Scene
 from rosafe.component import wire
 from rosafe.interface import ComponentError
 from tests.bass import bags
-from tests.harness import Graph, Process, free_port, run_together, wait_for
+from tests.harness import PATIENCE, Graph, Process, free_port, run_together, wait_for
 
 RATE, CHUNK, CHUNKS = 8000, 400, 4
 
@@ -224,7 +224,7 @@ def test_common_requests(graph: Graph, bass_node: Process) -> None:
     wait_for(lambda: live(graph) == [])
     assert acquire(graph, "scene:", RATE).genom_success
     assert graph.call("/bass/kill").genom_success
-    assert bass_node.wait(8) == 0
+    assert bass_node.wait() == 0
 
 
 def test_health(graph: Graph, bass_node: Process) -> None:
@@ -237,7 +237,7 @@ def test_health(graph: Graph, bass_node: Process) -> None:
                 return values
         return None
 
-    values = capturing(graph.message("/diagnostics", accept=lambda m: capturing(m) is not None, timeout=20))
+    values = capturing(graph.message("/diagnostics", accept=lambda m: capturing(m) is not None))
     assert values is not None
     assert (values["device"], values["lost frames"], values["overruns"]) == ("scene:", "0", "0")
 
@@ -263,7 +263,7 @@ def test_loss_in_the_window_the_log_and_diagnostics(graph: Graph, bass_node: Pro
             for status in message.status
         )
 
-    graph.message("/diagnostics", accept=warned, timeout=20)
+    graph.message("/diagnostics", accept=warned)
 
 
 def request(connection: socket.socket, count: int, first: int) -> tuple[int, int, int, np.ndarray]:
@@ -280,10 +280,10 @@ def test_dedicated_socket(graph: Graph, bass_node: Process, wav: tuple[str, np.n
     port = free_port()
     rospy.set_param("/bass/socket_port", port)
     assert graph.call("/bass/DedicatedSocket").genom_success
-    with socket.create_connection(("127.0.0.1", port), timeout=10) as connection:
+    with socket.create_connection(("127.0.0.1", port), timeout=PATIENCE) as connection:
         assert request(connection, 10, 1)[:3] == (0, 0, 1)
         assert acquire(graph, wav[0], chunks=20).genom_success
-        pieces, following, end = [], 1, time.monotonic() + 20
+        pieces, following, end = [], 1, time.monotonic() + PATIENCE
         while following <= 4400:
             assert time.monotonic() < end
             _, loss, following, samples = request(connection, 300, following)

@@ -35,15 +35,15 @@ def test_captured_is_what_was_played_and_the_plug_may_be_pulled(graph: Graph, pu
     audio = wire.message_class("bass", "::binaudio::portStruct")
     with graph.node("bass-ros", **pulse.env) as bass, graph.collect("/bass/Audio", audio) as messages:
         assert graph.call("/bass/Acquire", device="pulse", sampleRate=44100, nChunksOnPort=60).genom_success
-        wait_for(lambda: messages and messages[-1].lastFrameIndex > 0, 20, lambda: str(bass))
+        wait_for(lambda: messages and messages[-1].lastFrameIndex > 0, what=lambda: str(bass))
         # On a busy machine PulseAudio itself drops or repeats something now and then; not every time.
         assert any(played_as_captured(pulse, messages, samples, bass) for _ in range(4)), str(bass)
 
         pulse.kill()
-        wait_for(lambda: "given up after 5 attempts" in bass.err, 20, lambda: str(bass))
+        wait_for(lambda: "given up after 5 attempts" in bass.err, what=lambda: str(bass))
         assert "the acquisition has ended: pulse: " in bass.err
         assert not graph.call("/bass/Acquire", device="pulse", sampleRate=44100).genom_success
         pulse.start()
         assert graph.call("/bass/Acquire", device="pulse", sampleRate=44100, nChunksOnPort=10).genom_success
-        wait_for(lambda: messages[-1].nChunksOnPort == 10 and messages[-1].lastFrameIndex > 0, 20, lambda: str(bass))
+        wait_for(lambda: messages[-1].nChunksOnPort == 10 and messages[-1].lastFrameIndex > 0, what=lambda: str(bass))
         assert "ALSA lib" not in bass.err

@@ -18,7 +18,7 @@ from rosafe.bass.sources.scene import Scene
 from rosafe.commands.__main__ import main
 from tests.bass import bags
 from tests.cli.command import ROSAFE, environment, refused, rosafe, start
-from tests.harness import Graph, Process, free_port, wait_for
+from tests.harness import PATIENCE, Graph, Process, free_port, wait_for
 from tests.terminal import Terminal
 
 RATE = 8000
@@ -31,7 +31,7 @@ def samples_of(path: Path) -> np.ndarray:
 def wait_for_sound(path: Path, recording: Process) -> None:
     """Until some sound is on its way into the file."""
     part = path.with_name(f"{path.name}.part")
-    wait_for(lambda: part.exists() and part.stat().st_size > 4000, 20, lambda: str(recording))
+    wait_for(lambda: part.exists() and part.stat().st_size > 4000, what=lambda: str(recording))
 
 
 def number(pattern: str, text: str) -> float:
@@ -136,7 +136,7 @@ def test_signals_leave_a_complete_file(tmp_path: Path) -> None:
     with ExitStack() as stack:
         running = [stack.enter_context(start("record", f"{n}.wav", *options, cwd=tmp_path)) for n in numbers]
         for recording in running:
-            wait_for(lambda: "L peak" in recording.out, 20, lambda: str(recording))  # noqa: B023  # called at once
+            wait_for(lambda: "L peak" in recording.out, what=lambda: str(recording))  # noqa: B023  # called at once
         codes = [recording.stop(number) for number, recording in zip(numbers, running, strict=True)]
         assert codes == [0, 0, -signal.SIGKILL]
         for number, recording in zip(numbers[:2], running, strict=False):
@@ -155,7 +155,7 @@ def test_full_disk(wav: Path, tmp_path: Path) -> None:
         env=environment(),
         capture_output=True,
         text=True,
-        timeout=60,
+        timeout=PATIENCE,
         check=False,
     )
     assert done.returncode == 1 and done.stderr == "rosafe record: cannot write a.wav: File too large\n"
@@ -166,7 +166,7 @@ def test_full_disk(wav: Path, tmp_path: Path) -> None:
 def test_live_line_on_a_terminal(tmp_path: Path) -> None:
     command = [str(ROSAFE), "record", "a.wav", "--device", "scene:", "--seconds", "0.6", "--chunk", "441"]
     with Terminal(command, environment(), cwd=tmp_path, columns=80) as terminal:
-        assert terminal.end(30) == 0
+        assert terminal.end() == 0
         text = terminal.sent
     looks = text.split("\r\x1b[K")
     assert len(looks) > 4
@@ -179,7 +179,7 @@ def test_reader_of_the_meter_leaves(tmp_path: Path) -> None:
     os.close(read)
     command = [str(ROSAFE), "record", "a.wav", "--device", "scene:", "--rate", str(RATE), "--chunk", "400"]
     done = subprocess.run(
-        command, cwd=tmp_path, env=environment(), stdout=write, stderr=subprocess.PIPE, timeout=60, check=False
+        command, cwd=tmp_path, env=environment(), stdout=write, stderr=subprocess.PIPE, timeout=PATIENCE, check=False
     )
     os.close(write)
     assert done.returncode == 141 and done.stderr == b""

@@ -121,7 +121,7 @@ def test_source_of_bass(graph: Graph, bass: Process, recorded: Recorded) -> None
     with graph.collect("/bass/Audio", audio) as messages:
         wait_for(lambda: messages, what="what the port shows of the live run")
         acquire(graph, f"bag:{recorded.bag}")
-        wait_for(lambda: len(messages) > 2 and messages[-1].lastFrameIndex == FRAMES, 20)
+        wait_for(lambda: len(messages) > 2 and messages[-1].lastFrameIndex == FRAMES)
     del messages[0]
     assert messages[0].lastFrameIndex == 0
     padded = np.concatenate((np.zeros((2, CHUNK * CHUNKS), np.int32), recorded.sound), axis=1)

@@ -22,7 +22,7 @@ from hypothesis import strategies as st
 from rosafe.bass import socket_server
 from rosafe.bass.capture import Snapshot
 from rosafe.bass.socket_server import DedicatedSocket, read_frames, take_requests
-from tests.harness import ROOT, wait_for
+from tests.harness import PATIENCE, ROOT, wait_for
 
 
 def port_content(last: int, length: int) -> Snapshot:
@@ -69,7 +69,7 @@ class Server:
 
     @contextmanager
     def client(self) -> Iterator[socket.socket]:
-        with socket.create_connection(self.address, timeout=10) as connection:
+        with socket.create_connection(self.address, timeout=PATIENCE) as connection:
             yield connection
 
 
@@ -78,7 +78,7 @@ def server() -> Iterator[Server]:
     running = Server()
     yield running
     running.stopping.set()
-    running.thread.join(5)
+    running.thread.join(PATIENCE)
     assert not running.thread.is_alive()
 
 
@@ -206,7 +206,7 @@ def test_conversation(server: Server) -> None:
 
 
 def test_as_many_clients_as_promised(server: Server) -> None:
-    connections = [socket.create_connection(server.address, timeout=10) for _ in range(socket_server.MAX_CLIENTS)]
+    connections = [socket.create_connection(server.address, timeout=PATIENCE) for _ in range(socket_server.MAX_CLIENTS)]
     for index, connection in enumerate(connections):
         connection.sendall(b"Read Port - N 1 - nfr %d\n" % (81 + index % 20))
     assert [receive(c)[3] for c in connections] == [[81 + index % 20] for index in range(len(connections))]
@@ -225,7 +225,7 @@ def test_as_many_clients_as_promised(server: Server) -> None:
 
 def full(server: Server) -> list[socket.socket]:
     """All places taken by clients that say nothing, the first of which came first."""
-    connections = [socket.create_connection(server.address, timeout=10) for _ in range(socket_server.MAX_CLIENTS)]
+    connections = [socket.create_connection(server.address, timeout=PATIENCE) for _ in range(socket_server.MAX_CLIENTS)]
     wait_for(lambda: server.clients() == socket_server.MAX_CLIENTS)
     return connections
 
@@ -268,17 +268,17 @@ def test_idle_clients_make_room(server: Server, monkeypatch: pytest.MonkeyPatch)
 def test_who_asks_stays_and_who_only_sends_goes(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(socket_server, "IDLE_SECONDS", 0.5)
     asking, sending, *others = full(server)
-    others += [socket.create_connection(server.address, timeout=10) for _ in range(3)]  # three too many
+    others += [socket.create_connection(server.address, timeout=PATIENCE) for _ in range(3)]  # three too many
 
     def all_served() -> bool:
         asking.sendall(b"Read Port - N 1 - nfr 90\n")
         assert receive(asking)[3] == [90]
         if not closed(sending):
             sending.sendall(b"rubbish, Read Port - N")
-        others.append(socket.create_connection(server.address, timeout=10))
+        others.append(socket.create_connection(server.address, timeout=PATIENCE))
         return closed(sending)
 
-    wait_for(all_served, 30, "the end of the client that sends rubbish")
+    wait_for(all_served, what="the end of the client that sends rubbish")
     assert not closed(asking)
     asking.sendall(b"Read Port - N 1 - nfr 91\n")
     assert receive(asking)[3] == [91]
@@ -355,7 +355,7 @@ def test_end_closes_connections_and_frees_the_port(server: Server) -> None:
         wait_for(lambda: server.clients() == 1)
         server.stopping.set()
         assert connection.recv(1) == b""
-    server.thread.join(5)
+    server.thread.join(PATIENCE)
     with socket.create_server(server.address):
         pass
 

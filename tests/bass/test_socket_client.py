@@ -13,6 +13,7 @@ import pytest
 from rosafe.bass import socket_client
 from rosafe.bass.socket_client import Block, SocketClient, blocks
 from tests.bass.test_socket import Server, port_content
+from tests.harness import PATIENCE
 
 
 @pytest.fixture
@@ -20,7 +21,7 @@ def server() -> Iterator[Server]:
     running = Server()
     yield running
     running.stopping.set()
-    running.thread.join(5)
+    running.thread.join(PATIENCE)
 
 
 def numbers(block: Block) -> list[int]:
@@ -75,7 +76,7 @@ def test_broken_connection_is_an_error(server: Server) -> None:
     server.stopping.set()
     with pytest.raises(OSError, match=r"closed the connection|reset|Broken pipe"):
         next(stream)
-    server.thread.join(5)
+    server.thread.join(PATIENCE)
     with pytest.raises(ConnectionRefusedError):
         next(blocks(host, port))
 

@@ -23,7 +23,7 @@ def environment(**changes: str) -> dict[str, str]:
 
 
 def rosafe(
-    *arguments: str | Path, cwd: Path | None = None, timeout: float = 60.0, program: Path = ROSAFE, **env: str
+    *arguments: str | Path, cwd: Path | None = None, timeout: float = 120.0, program: Path = ROSAFE, **env: str
 ) -> subprocess.CompletedProcess[str]:
     """Run the command to its end."""
     return subprocess.run(

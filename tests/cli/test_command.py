@@ -11,7 +11,7 @@ import pytest
 from rosafe import __version__
 from rosafe.interface import KINDS
 from tests.cli.command import ROSAFE, environment, refused, rosafe, rosafe_alone
-from tests.harness import ROOT
+from tests.harness import PATIENCE, ROOT
 
 
 def test_version() -> None:
@@ -55,7 +55,7 @@ def test_help_into_a_pipe_that_closes() -> None:
         env=environment(),
         capture_output=True,
         text=True,
-        timeout=30,
+        timeout=PATIENCE,
         check=False,
     )
     assert done.stderr == ""
@@ -102,7 +102,7 @@ def test_a_module_is_all_that_a_command_takes(tmp_path: Path) -> None:
             env=environment(PYTHONPATH=str(ROOT)),
             capture_output=True,
             text=True,
-            timeout=30,
+            timeout=PATIENCE,
             check=False,
         )
 

@@ -221,7 +221,7 @@ def test_full_disk(folder: Path) -> None:
         env=environment(),
         text=True,
         capture_output=True,
-        timeout=60,
+        timeout=120,
         check=False,
     )
     refused(done, "in.npz", "File too large")

@@ -46,7 +46,7 @@ def peak_kilobytes(*arguments: str | Path) -> int:
         capture_output=True,
         text=True,
         check=True,
-        timeout=120,
+        timeout=300,
     )
     return int(done.stdout)
 
@@ -134,7 +134,7 @@ def work(progress):
 run_together([work], 1, (), lambda index, told: print(told), Signals())
 """
     done = subprocess.run(
-        ["/usr/bin/python3", "-c", program], env=environment(), cwd=ROOT, capture_output=True, text=True, timeout=60
+        ["/usr/bin/python3", "-c", program], env=environment(), cwd=ROOT, capture_output=True, text=True, timeout=120
     )
     assert (done.returncode, done.stdout, done.stderr) == (130, "", "")
 
@@ -223,7 +223,7 @@ def test_reader_of_messages_leaves(long_file: Path) -> None:
         env=environment(),
         stderr=write_end,
         stdout=write_end,
-        timeout=60,
+        timeout=120,
         check=False,
     )
     os.close(write_end)

@@ -36,7 +36,7 @@ def written(path: Path) -> np.ndarray:
 
 def begun(path: Path, recording: Process) -> None:
     part = path.with_name(f"{path.name}.part")
-    wait_for(lambda: part.exists() and part.stat().st_size > 20_000, 30, lambda: str(recording))
+    wait_for(lambda: part.exists() and part.stat().st_size > 20_000, what=lambda: str(recording))
 
 
 def content(folder: Path) -> dict[str, str]:

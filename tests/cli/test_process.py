@@ -166,7 +166,7 @@ def test_frames_that_do_not_overlap_or_divide(tmp_path: Path, settings: list[str
 def test_the_recordings(tmp_path: Path) -> None:
     names = ["speech_anechoic_16k.wav", "speech_room_16k.wav"]
     paths = [shared("audio", name) for name in names]
-    done = rosafe("process", *paths, "--outputs", "ild,crossCorrelation", "-o", f"{tmp_path}/", timeout=120)
+    done = rosafe("process", *paths, "--outputs", "ild,crossCorrelation", "-o", f"{tmp_path}/")
     assert done.returncode == 0, done
     for path in paths:
         samples, rate = soundfile.read(path, dtype="int32")

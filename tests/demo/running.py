@@ -15,7 +15,7 @@ import pytest
 
 from tests.harness import SCRIPTS, Process, proc, wait_for
 
-DEMO_SECONDS = 120.0  # all of it, on a busy machine
+DEMO_SECONDS = 240.0  # all of it, on a busy machine
 PORTS = {
     "inputProcPort": "TimeDomain",
     "preProcPort/preProc": "TimeDomain",
@@ -73,7 +73,7 @@ class Demo(Process):
 
     def assert_gone(self) -> None:
         """Nothing of it is left, after a moment for the kernel."""
-        wait_for(lambda: not family(self.mark), 5.0, lambda: f"end of {family(self.mark)}")
+        wait_for(lambda: not family(self.mark), what=lambda: f"end of {family(self.mark)}")
 
 
 @contextmanager

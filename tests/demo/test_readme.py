@@ -17,7 +17,7 @@ from tests.harness import PYTHON, ROOT, SCRIPTS, Process, free_port, wait_for
 
 README = (ROOT / "README.md").read_text("utf-8")
 WHOLE_SUITE = "scripts/test"  # is what runs this; .ci/run runs it from a clean clone
-SESSION_SECONDS = 270.0  # on a machine with much other work; a quarter of that elsewhere
+SESSION_SECONDS = 500.0  # on a machine with much other work; a tenth of that elsewhere
 
 
 def blocks(language: str) -> list[str]:
@@ -39,7 +39,9 @@ def place_like_the_checkout(folder: Path) -> dict[str, str]:
     tools.mkdir()
     stand_ins = {
         "roscore": f"exec /usr/bin/roscore -p {port}",
-        "rostopic": 'exec timeout -s INT 6 /usr/bin/rostopic "$@"',
+        "rostopic": """[ "$1" = hz ] || exec /usr/bin/rostopic "$@"
+PYTHONUNBUFFERED=1 /usr/bin/rostopic "$@" | grep -m 3 rate
+""",
         "rosservice": f"""cd {tools}
 [ -e up ] || until [ "$(/usr/bin/rosservice list 2>/dev/null | grep -c '^/.*/kill$')" = 2 ]; do :; done
 touch up
@@ -55,7 +57,6 @@ exec /usr/bin/rosservice "$@"
     return {**env, "PATH": f"{tools}:/usr/local/bin:/usr/bin:/bin", "ROS_MASTER_URI": uri, "HOME": str(folder)}
 
 
-@pytest.mark.timeout(300)
 def test_every_command_of_the_shell(tmp_path: Path) -> None:
     """The commands in their order, in one bash that stops at the first that fails."""
     commands = [line for block in blocks("sh") for line in block.splitlines() if line != WHOLE_SUITE]
@@ -87,9 +88,8 @@ def test_every_command_of_the_shell(tmp_path: Path) -> None:
 
 
 def _announced(command: str) -> str:
-    """`command`, said before it runs. `timeout` ends `rostopic hz` with a code of its own, as Ctrl-C would."""
-    ending = " || [ $? = 124 ]" if command.startswith("rostopic hz") else ""
-    return f"echo + {shlex.quote(command)}\n{command.partition('    #')[0]}{ending}"
+    """`command`, said before it runs."""
+    return f"echo + {shlex.quote(command)}\n{command.partition('    #')[0]}"
 
 
 @pytest.mark.parametrize("shell", ["dash", "bash"])

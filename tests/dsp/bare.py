@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rosafe import interface
-from rosafe.dsp.stage import Stage
+from rosafe.dsp.stage import Output, Stage
 from rosafe.representations import STAGES
 from rosafe.representations.filterbank import Filterbank
 from rosafe.representations.haircell import InnerHairCell
@@ -33,9 +33,15 @@ def cut(signal: NDArray[Any], sizes: int | Iterable[int]) -> list[NDArray[Any]]:
     return blocks
 
 
+def single(output: Output) -> FloatArray:
+    """The array that a stage of one part puts out."""
+    assert isinstance(output, np.ndarray)
+    return output
+
+
 def run(stage: Stage, blocks: Iterable[NDArray[Any]]) -> FloatArray:
     """What `stage` makes of `blocks`, joined."""
-    return np.concatenate([stage.process(block) for block in blocks], axis=-1)
+    return np.concatenate([single(stage.process(block)) for block in blocks], axis=-1)
 
 
 class Chain:
@@ -53,12 +59,12 @@ class Chain:
         assert isinstance(filterbank, Filterbank)
         assert isinstance(hair_cell, InnerHairCell)
         filterbank.provide = frozenset({hair_cell.needs})
-        out = {"input": self.stages["input"].process(block)}
-        out["preProc"] = self.stages["preProc"].process(out["input"])
+        out = {"input": single(self.stages["input"].process(block))}
+        out["preProc"] = single(self.stages["preProc"].process(out["input"]))
         out["gammatone"] = filterbank.process(out["preProc"])
         out["ihc"] = hair_cell.process(out["gammatone"], filterbank.provided.get("envelope"))
         for kind in ("ild", "ratemap", "crossCorrelation"):
-            out[kind] = self.stages[kind].process(out["ihc"])
+            out[kind] = single(self.stages[kind].process(out["ihc"]))
         return out
 
     def run(

@@ -14,7 +14,7 @@ from rosafe.representations.filterbank import Filterbank
 from rosafe.representations.haircell import InnerHairCell
 from rosafe.representations.preproc import PreProc
 
-from .bare import Chain, cut, joined, run
+from .bare import Chain, cut, joined, run, single
 from .stages import CHANNELS, MODES, NAMES, RATE, make, noise, rows
 
 SAMPLES = 600
@@ -29,7 +29,7 @@ sizes = st.lists(st.one_of(st.sampled_from([0, 1, 2]), st.integers(0, 250)), min
 @settings(max_examples=8, deadline=None, database=None)
 def test_block_cutting(kind: str, parameters: dict[str, Any], sizes: list[int]) -> None:
     signal = noise(kind, SAMPLES)
-    whole = make(kind, parameters).process(signal)
+    whole = single(make(kind, parameters).process(signal))
     blocks = cut(signal, [16, *sizes]) if parameters.get("pp_bNormalizeRMS") else cut(signal, sizes)
     pieces = run(make(kind, parameters), blocks)
     assert pieces.shape == whole.shape
@@ -83,7 +83,7 @@ def test_window_longer_than_many_blocks() -> None:
     """1000 samples over blocks of 7: the buffer grows, fills and is moved many times."""
     signal = noise("ild", 5000)
     parameters = {"ild_wSizeSec": 1000 / RATE, "ild_hSizeSec": 3 / RATE}
-    whole = make("ild", parameters).process(signal)
+    whole = single(make("ild", parameters).process(signal))
     assert whole.shape == (CHANNELS, (5000 - 1000) // 3 + 1)
     np.testing.assert_allclose(run(make("ild", parameters), cut(signal, 7)), whole, rtol=0, atol=1e-11)
 
@@ -118,7 +118,7 @@ def test_memory_order_and_plain_lists(kind: str, parameters: dict[str, Any]) -> 
     expected = make(kind, parameters).process(block)
     for other in (np.asfortranarray(block), np.repeat(block, 2, axis=-1)[..., ::2]):
         got = STAGES[kind](RATE, **parameters)
-        out = got.process(other, np.abs(other) + 0.5) if isinstance(got, InnerHairCell) else got.process(other)
+        out = single(got.process(other, np.abs(other) + 0.5 if isinstance(got, InnerHairCell) else None))
         assert out.flags.c_contiguous
         np.testing.assert_array_equal(out, expected[:2] if kind == "gammatone" else expected)
 

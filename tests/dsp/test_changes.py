@@ -315,7 +315,7 @@ def test_no_change_is_no_reset(kind: str, parameters: dict[str, Any]) -> None:
         def __init__(self) -> None:
             pass
 
-        def process(self, block: Any) -> Any:
+        def process(self, block: Any, extra: Any = None) -> Any:
             stage.configure()
             return (
                 stage.process(block, np.abs(block) + 0.5) if isinstance(stage, InnerHairCell) else stage.process(block)

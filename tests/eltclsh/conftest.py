@@ -39,7 +39,7 @@ def run(home: Path, tmp_path: Path) -> Run:
     ) -> subprocess.CompletedProcess[str]:
         program = shell if shell == "tclsh" else str(harness.SCRIPTS / shell)
         return subprocess.run(
-            ["timeout", "-k", "2", "30", program, *arguments],
+            ["timeout", "-k", "2", str(harness.PATIENCE), program, *arguments],
             env={**environment(home), **env},
             cwd=tmp_path,
             input=stdin,

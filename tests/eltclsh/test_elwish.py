@@ -20,7 +20,7 @@ def display(home: Path) -> Iterator[str]:
         pytest.skip("Xvfb is not installed; scripts/install --tests brings it")
     command = ["Xvfb", "-displayfd", "1", "-nolisten", "tcp", "-screen", "0", "640x480x24"]
     with harness.Process(command, environment(home)) as server:
-        yield ":" + harness.wait_for(lambda: server.out.strip(), 20, lambda: f"a display of {server}")
+        yield ":" + harness.wait_for(lambda: server.out.strip(), what=lambda: f"a display of {server}")
 
 
 def test_without_a_display_it_says_so(run: Run) -> None:

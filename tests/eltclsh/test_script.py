@@ -11,6 +11,7 @@ import pytest
 from rosafe import __version__
 from tests import harness
 from tests.eltclsh.conftest import Run, environment
+from tests.harness import PATIENCE
 
 # Each is run by both shells, which must print, fail and end alike.
 SCRIPTS = {
@@ -87,7 +88,7 @@ def test_scripts_that_are_programs(run: Run, tmp_path: Path, home: Path) -> None
         script = tmp_path / "program"
         script.write_text(header + "puts [list $argv [file tail $argv0]]\n")
         script.chmod(0o755)
-        done = subprocess.run([script, "a b"], env=env, capture_output=True, text=True, check=True, timeout=30)
+        done = subprocess.run([script, "a b"], env=env, capture_output=True, text=True, check=True, timeout=PATIENCE)
         assert done.stdout == "{{a b}} program\n"
 
 

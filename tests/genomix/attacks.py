@@ -106,7 +106,7 @@ def pipelined(port: int, count: int = 1_000_000, seconds: float = 20.0) -> Itera
 
 def named_sessions(port: int, count: int = 999) -> None:
     """Sessions that one client begins, each of another name, and leaves alone."""
-    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=30)
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=90)
     for number in range(count):
         connection.request("GET", f"/session/start?s=attack{number}")
         connection.getresponse().read()

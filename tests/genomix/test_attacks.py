@@ -93,7 +93,7 @@ def test_pipelined_requests_are_answered_in_order(world: World) -> None:
     names = [f"p{number}" for number in range(3000)]
     urls = [f"/session/start?s={name}" for name in names[:900]] + [f"/nothing/{name}" for name in names[900:]]
     sent = b"".join(b"\r\n" + attacks.GET.format(url).encode() for url in urls)
-    with socket.create_connection(("127.0.0.1", world.port), timeout=30) as connection, ThreadPoolExecutor(1) as pool:
+    with socket.create_connection(("127.0.0.1", world.port), timeout=90) as connection, ThreadPoolExecutor(1) as pool:
         sending = pool.map(connection.sendall, (sent[i : i + 999] for i in range(0, len(sent), 999)))
         answers = b""
         while answers.count(b"HTTP/1.1 ") < len(names) or not answers.endswith(b"}"):
@@ -108,11 +108,11 @@ def test_pipelined_requests_are_answered_in_order(world: World) -> None:
 def test_a_request_that_does_not_come_to_an_end(world: World, sent: str) -> None:
     with hasty(world) as other:
         # At once, and on a connection that was used before.
-        with socket.create_connection(("127.0.0.1", other.port), timeout=30) as connection:
+        with socket.create_connection(("127.0.0.1", other.port), timeout=90) as connection:
             connection.sendall(sent.encode())
             assert connection.recv(1000).startswith(b"HTTP/1.1 408 ")
         if sent:
-            used = http.client.HTTPConnection("127.0.0.1", other.port, timeout=30)
+            used = http.client.HTTPConnection("127.0.0.1", other.port, timeout=90)
             used.request("GET", "/components")
             assert used.getresponse().read() == b"{}"
             assert not select.select((used.sock,), (), (), 1.5)[0]  # a connection may be idle
@@ -124,7 +124,7 @@ def test_a_request_that_does_not_come_to_an_end(world: World, sent: str) -> None
 
 def test_a_request_that_comes_drop_by_drop(world: World) -> None:
     """It is the whole that has to come in time."""
-    with hasty(world) as other, socket.create_connection(("127.0.0.1", other.port), timeout=30) as connection:
+    with hasty(world) as other, socket.create_connection(("127.0.0.1", other.port), timeout=90) as connection:
         connection.sendall(b"GET /components HTTP/1.1\r\nHost: localhost\r\nX: ")
         end = time.monotonic() + 20
         while not select.select((connection,), (), (), 0.1)[0]:
@@ -147,7 +147,7 @@ def test_a_request_that_comes_drop_by_drop(world: World) -> None:
     ids=range(7),
 )
 def test_requests_have_no_body(world: World, sent: bytes, status: int) -> None:
-    with socket.create_connection(("127.0.0.1", world.port), timeout=30) as connection:
+    with socket.create_connection(("127.0.0.1", world.port), timeout=90) as connection:
         connection.sendall(sent)
         answer = http.client.HTTPResponse(connection)
         answer.begin()

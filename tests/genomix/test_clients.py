@@ -111,7 +111,7 @@ def test_requests_and_listeners_are_bounded(empty_world: World) -> None:
     ids=range(7),
 )
 def test_garbage_hurts_nobody(world: World, garbage: bytes) -> None:
-    with socket.create_connection(("127.0.0.1", world.port), timeout=10) as connection:
+    with socket.create_connection(("127.0.0.1", world.port), timeout=harness.PATIENCE) as connection:
         try:
             connection.sendall(garbage)
             connection.shutdown(socket.SHUT_WR)
@@ -195,7 +195,7 @@ def test_vanished_clients_leave_nothing(world: World) -> None:
         for connection in (listener, half, download):
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\1\0\0\0\0\0\0\0")  # a reset, as from a crash
             connection.close()
-    harness.wait_for(lambda: open_files(pid) <= files + 8, 10, lambda: f"{open_files(pid)} files, {files} before")
+    harness.wait_for(lambda: open_files(pid) <= files + 8, what=lambda: f"{open_files(pid)} files, {files} before")
     assert threads(pid) <= before + 20  # those of the pool stay
 
 

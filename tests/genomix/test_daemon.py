@@ -74,10 +74,20 @@ def test_a_signal_ends_it_whatever_clients_do(home_graph: harness.Graph, number:
         kept = socket.create_connection(("127.0.0.1", port))
         kept.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
         assert kept.recv(10) == b"HTTP/1.1 2"
-        assert process.stop(number, timeout=5) == 0
+        assert process.stop(number, timeout=harness.END_SECONDS) == 0
         assert next(events) == ("quit", "")
         kept.close()
         assert "Traceback" not in process.err
+
+
+def test_nohup_is_respected_and_a_script_may_start_it_in_the_background(home_graph: harness.Graph) -> None:
+    command = ["sh", "-c", f"trap '' HUP INT QUIT; exec {GENOMIXD} -v -p 0"]
+    with home_graph.start(*command) as process:
+        port = worlds.port_of(process)
+        os.kill(process.pid, signal.SIGHUP)
+        for _ in range(10):  # one that ends may still answer the first
+            assert Http(port).raw("/")[0] == 200
+        assert process.stop(signal.SIGINT) == 0
 
 
 def test_background_returns_once_it_serves(home_graph: harness.Graph) -> None:
@@ -115,7 +125,7 @@ def test_a_private_server_ends_with_its_starter(home_graph: harness.Graph) -> No
     port = int(process.stdout.readline())
     assert Http(port).raw("/")[0] == 200
     process.stdin.close()
-    assert process.wait(8) == 0
+    assert process.wait(harness.PATIENCE) == 0
 
 
 def test_verbosity(home_graph: harness.Graph) -> None:

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from rosafe import interface
 from tests.genomix.world import World
-from tests.harness import proc
+from tests.harness import PATIENCE, proc
 
 pytestmark = pytest.mark.ros
 
@@ -62,9 +62,9 @@ queries = st.lists(
 )
 
 
-@pytest.mark.timeout(int(LONG) + 180)
+@pytest.mark.timeout(int(LONG) + 600)
 def test_nonsense_is_told_to_be_nonsense(world: World) -> None:
-    connection = http.client.HTTPConnection("127.0.0.1", world.port, timeout=30)
+    connection = http.client.HTTPConnection("127.0.0.1", world.port, timeout=PATIENCE)
     end = time.monotonic() + LONG
     world.http.call("rosAFE/connect_port", ["Audio", "bass/Audio"])
 

@@ -19,7 +19,7 @@ from hypothesis import strategies as st
 from rosafe import interface
 from rosafe.genomix import packed
 from tests.genomix.world import World
-from tests.harness import ROOT
+from tests.harness import PATIENCE, ROOT
 
 SPECTRUM = "::rosAFE::TimeFrequencySignalPortStruct"
 
@@ -153,22 +153,31 @@ def test_octave_reads_the_same(tmp_path: Path) -> None:
         "lags": correlation,
         "ragged": b"".join(packed.pieces(interface.ROSAFE, "::rosAFE::signalND", [np.ones(2), np.zeros(3)])),
         "error": packed.error({"ex": "x"}),
+        "empty": b"".join(packed.pieces(interface.ROSAFE, "::rosAFE::signalNxND", [[np.empty(0), np.empty(0)]])),
     }
     for name, data in documents.items():
         (tmp_path / name).write_bytes(data)
     script = r"""
-    function [value, failed] = get(name, matrices)
+    function [value, failed] = get(name, matrices, columns = false)
         file = fopen(name);
-        [value, failed] = genomix.wire.decode(uint8(fread(file, Inf).'), matrices);
+        [value, failed] = genomix.wire.decode(uint8(fread(file, Inf).'), matrices, columns);
         fclose(file);
     end
     p = get('plain', false);
-    assert(iscell(p.a) && isequal(size(p.a), [3 1]) && p.a{2} == 2.5 && isnan(p.a{3}))
-    assert(isequal(p.b, {'x'; 'äß€'; ''}) && isequal(size(p.c), [0 1]) && iscell(p.c))
+    assert(iscell(p.a) && isequal(size(p.a), [1 3]) && p.a{2} == 2.5 && isnan(p.a{3}))
+    assert(isequal(p.b, {'x', 'äß€', ''}) && isequal(size(p.c), [1 0]) && iscell(p.c))
+    t = get('plain', false, true);
+    assert(isequal(t.a(1:2), {1; 2.5}) && isequal(t.b, {'x'; 'äß€'; ''}) && isequal(size(t.c), [0 1]))
     m = get('plain', true);
     assert(isa(m.a, 'double') && m.a(1) == 1 && iscell(m.b))
     c = get('lags', false);
+    assert(isequal(size(c.dataNxN), [1 4]) && isequal(c.dataNxN{3}.dataN{2}.data, {210, 211, 212}))
+    c = get('lags', false, true);
     assert(isequal(size(c.dataNxN), [4 1]) && isequal(c.dataNxN{3}.dataN{2}.data, {210; 211; 212}))
+    e = get('empty', false);
+    none = struct('data', {cell(1, 0)});
+    assert(isequal(e, struct('dataNxN', {{struct('dataN', {{none, none}})}})))
+    assert(isequal(size(get('empty', true)), [0 2]))
     m = get('lags', true);
     assert(isequal(size(m), [3 2 4]) && isequal(m(:, 2, 3), [210; 211; 212]))
     r = get('ragged', true);
@@ -186,7 +195,7 @@ def test_octave_reads_the_same(tmp_path: Path) -> None:
     """
     (tmp_path / "check.m").write_text("1;\n" + script, "utf-8")
     done = subprocess.run(
-        ["timeout", "60", "octave-cli", "--norc", "--quiet", "--no-history", "check.m"],
+        ["timeout", "120", "octave-cli", "--norc", "--quiet", "--no-history", "check.m"],
         cwd=tmp_path,
         env={"PATH": "/usr/bin:/bin", "HOME": str(tmp_path), "OCTAVE_PATH": str(ROOT / "matlab"), "LANG": "C.UTF-8"},
         capture_output=True,
@@ -208,7 +217,7 @@ def test_the_server_answers_packed(world: World) -> None:
     """The same as in JSON; errors with HTTP status 200, marked."""
 
     def get(url: str) -> Any:
-        connection = http.client.HTTPConnection("127.0.0.1", world.port, timeout=30)
+        connection = http.client.HTTPConnection("127.0.0.1", world.port, timeout=PATIENCE)
         connection.request("GET", url)
         response = connection.getresponse()
         assert response.status == 200

@@ -64,7 +64,7 @@ class Http:
         """What has become of a request of the session ``t``."""
         return dict(self.get("/request/status", id=number, **{"s": "t", **query}))
 
-    def wait(self, number: str, status: str, seconds: float = 10.0, s: str = "t") -> dict[str, Any]:
+    def wait(self, number: str, status: str, seconds: float = harness.PATIENCE, s: str = "t") -> dict[str, Any]:
         """The status of a request of the session `s` once it is that."""
         return harness.wait_for(
             lambda: (now := self.status(number, s=s))["status"] == status and now,
@@ -75,7 +75,7 @@ class Http:
     @contextmanager
     def listening(self, **query: Any) -> Iterator[Iterator[tuple[str, str]]]:
         """The events of a session, as they come: (name, data)."""
-        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=30)
+        connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=90)
         connection.request("GET", f"/session/listen?{urlencode(query)}")
         response = connection.getresponse()
         assert response.status == 200
@@ -112,7 +112,7 @@ class World:
         self.http = Http(port)
 
     def tcl(
-        self, script: str, timeout: float = 60.0, check: bool = True, shell: str = "tclsh"
+        self, script: str, timeout: float = 120.0, check: bool = True, shell: str = "tclsh"
     ) -> subprocess.CompletedProcess[str]:
         """Run a script in a Tcl shell; ``$address`` is that of genomixd, and ``show`` prints a value on a line."""
         prelude = f"""
@@ -128,7 +128,7 @@ class World:
         path.write_text(textwrap.dedent(prelude) + textwrap.dedent(script), "utf-8")
         return self.graph.run(shell, str(path), timeout=timeout, check=check)
 
-    def lines(self, script: str, timeout: float = 60.0, shell: str = "tclsh") -> list[str]:
+    def lines(self, script: str, timeout: float = 120.0, shell: str = "tclsh") -> list[str]:
         """The lines that a script prints."""
         return self.tcl(script, timeout, shell=shell).stdout.splitlines()
 
@@ -146,7 +146,7 @@ def port_of(process: harness.Process) -> int:
         found = re.search(r"serving http://[^ ]*:(\d+)", process.err)
         return found[1] if found else ""
 
-    return int(harness.wait_for(said, harness.UP_SECONDS, lambda: f"start of {process}"))
+    return int(harness.wait_for(said, what=lambda: f"start of {process}"))
 
 
 @contextmanager

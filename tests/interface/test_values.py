@@ -203,6 +203,8 @@ def test_texts_that_are_refused(parameter: Parameter, texts: list[str]) -> None:
 def test_words_that_nobody_knows() -> None:
     assert [WORD.known_word(word) for word in ("triang", "Hann", "", "hann ")] == ["triang", "hann", "hann", "hann"]
     assert WORDS.known_word("x") == "x"  # nothing is taken for it
+    for text in ("x" * 4097, "nul\0"):  # nor for what is no word at all
+        assert WORD.known_word(text) == text
     for kind, word in (("PreProc", "jespen"), ("GammatoneProc", "string"), ("IhcProc", "meddis")):
         enumerated = next(p for p in ROSAFE.service(kind).parameters if p.choices)
         assert enumerated.check(enumerated.known_word(word)) == enumerated.default

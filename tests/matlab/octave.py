@@ -60,12 +60,12 @@ def values(printed: str) -> dict[str, Any]:
     return {name: json.loads(text) for name, equals, text in lines if equals}
 
 
-def run(world: World, script: str, timeout: float = 60.0, folder: Path | None = None) -> str:
+def run(world: World, script: str, timeout: float = 120.0, folder: Path | None = None) -> str:
     """What `script` prints; AssertionError where it ends with an error."""
     words = command(folder or world.graph.home, script)
     return world.graph.run(*words, timeout=timeout, check=True, stdin="", **environment(world)).stdout
 
 
-def shown(world: World, script: str, timeout: float = 60.0, folder: Path | None = None) -> dict[str, Any]:
+def shown(world: World, script: str, timeout: float = 120.0, folder: Path | None = None) -> dict[str, Any]:
     """The values that `script` shows, by name."""
     return values(run(world, script, timeout, folder))

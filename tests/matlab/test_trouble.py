@@ -28,7 +28,7 @@ SCRIPT = """
     acquire = bass.Acquire('-a', 'scene:');
     show('sent', acquire.status);
     say('1 kill the node');
-    status = acquire.wait(20);
+    status = acquire.wait(60);
     show('killed', {status, acquire.exception.ex, acquire.exception.detail.what});
     r = bass.ListDevices();
     show('dead', {r.status, r.exception.ex});
@@ -59,7 +59,7 @@ def test_components_and_servers_that_end(tmp_path: Path) -> None:
     """One script from beginning to end; it and the test tell each other by files how far they are."""
 
     def await_file(name: str) -> None:
-        harness.wait_for(lambda: (tmp_path / name).exists() or not script.alive, 30, lambda: f"{name}: {script}")
+        harness.wait_for(lambda: (tmp_path / name).exists() or not script.alive, what=lambda: f"{name}: {script}")
         assert script.alive, script
 
     with (
@@ -82,7 +82,7 @@ def test_components_and_servers_that_end(tmp_path: Path) -> None:
                 assert worlds.port_of(again) == port
                 (tmp_path / "7 the server is back").touch()
                 with script:
-                    assert script.wait(30) == 0
+                    assert script.wait() == 0
             told = octave.values(script.out)
     assert told["sent"] == told["back"] == "sent"
     assert told["killed"] == ["error", "::genom::mwerr", "bass ended before its activity did"]

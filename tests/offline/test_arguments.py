@@ -168,7 +168,7 @@ def test_sizes_that_fill_the_memory() -> None:
 
 
 def test_results_larger_than_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sizes.os, "sysconf", lambda name: 2**12)  # 16 MiB
+    monkeypatch.setattr(sizes, "machine_memory", lambda: 2**24)
     sound, lags = np.zeros((2, 4000)), {"cc_maxDelaySec": 1.0}
     refused("outputs: they would take .* GB of memory, this machine has", sound, RATE, lags)
     refused("outputs: they would take", sound, RATE, modifications=[(0, *change) for change in lags.items()])

@@ -13,6 +13,7 @@ from pathlib import Path
 from tests.harness import PYTHON, ROOT
 
 NOBODY = 65534
+ENVIRONMENT = {"PATH": "/usr/local/bin:/usr/bin:/bin", "HOME": "/nonexistent"}
 LEFT_OUT = shutil.ignore_patterns(
     ".git", ".generated", ".*_cache", ".hypothesis", "__pycache__", "tests", "rosafe-demo"
 )
@@ -30,11 +31,11 @@ def fresh_copy() -> Iterator[Path]:
 
 def environment(**more: str) -> dict[str, str]:
     """What a login shell would have, and nothing of this process."""
-    return {"PATH": "/usr/local/bin:/usr/bin:/bin", "HOME": "/nonexistent", **more}
+    return {**ENVIRONMENT, **more}
 
 
 def run(
-    *command: str | Path, env: dict[str, str], cwd: Path = Path("/"), seconds: int = 120
+    *command: str | Path, env: dict[str, str], cwd: Path = Path("/"), seconds: int = 240
 ) -> subprocess.CompletedProcess[str]:
     """Run a command to its end, whatever that is."""
     return subprocess.run(

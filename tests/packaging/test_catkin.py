@@ -17,7 +17,6 @@ from rosafe.component import generate
 from tests.harness import PYTHON, Graph, MasterProcess, wait_for
 from tests.packaging.clone import environment, fresh_copy, run
 
-pytestmark = pytest.mark.timeout(400)  # the build, where the processors have other work
 NEEDED = ("catkin_make", "cmake", "make", "cc")
 
 
@@ -37,7 +36,7 @@ def workspace() -> Iterator[Path]:
             *("catkin_make", "-C", folder, "install", f"-DPYTHON_EXECUTABLE={PYTHON}"),
             env=environment(HOME=str(folder), ROS_LANG_DISABLE="genlisp:gencpp"),
             cwd=folder,
-            seconds=360,
+            seconds=550,
         )
         assert done.returncode == 0, done.stdout[-5000:] + done.stderr[-5000:]
         assert "CMake Warning" not in done.stderr.replace("CMake Deprecation Warning", ""), done.stderr
@@ -144,7 +143,7 @@ def test_both_nodes_run_from_the_install_space(
         graph.start("env", "-i", *plain, "sh", "-c", f"{setup} && exec rosAFE-ros") as rosafe,
     ):
         for name, node in (("bass", bass), ("rosAFE", rosafe)):
-            wait_for(lambda name=name: f"/{name}/Stop" in graph.services(), 30, lambda node=node: str(node))  # type: ignore[misc]
+            wait_for(lambda name=name: f"/{name}/Stop" in graph.services(), what=lambda node=node: str(node))  # type: ignore[misc]
         called = printed(sourced(workspace, "rosservice call /bass/Acquire \"{device: 'scene:'}\"", **ros))
         assert "genom_success: True" in called
         heard = printed(sourced(workspace, "rostopic echo -n1 /bass/Audio/sampleRate", **ros))

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.harness import PYTHON, ROOT, Graph, run_together
+from tests.harness import PATIENCE, PYTHON, ROOT, Graph, run_together
 from tests.packaging.clone import environment, fresh_copy, generate, run, without_rights
 
 IMPORT = (
@@ -124,7 +124,7 @@ def test_another_waits_for_the_one_that_builds(copy: Path) -> None:
             waiting.wait(1.0)
         assert not (copy / ".generated" / "current").exists()
         holder.kill()
-        assert waiting.wait(20) == 0
+        assert waiting.wait(PATIENCE) == 0
     finally:
         for process in (holder, waiting):
             process.kill()

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
 
+from rosafe.dsp.signal import Signal
 from rosafe.dsp.stage import Stage
 from rosafe.interface import KINDS, ROSAFE, ComponentError, text_of
 from rosafe.representations import STAGES
@@ -74,21 +75,21 @@ class Model:
 
     def _make(self, service: str, values: Mapping[str, Any]) -> dict[str, Any]:
         # As the node reads a ROS request: 0, "" and [] are the default.
-        values = ROSAFE.service(service).from_ros(SimpleNamespace(**values))
-        kind, name, parent = KIND_OF_SERVICE[service], values.pop("name"), values.pop("upperDepName", "")
+        given = ROSAFE.service(service).from_ros(SimpleNamespace(**values))
+        kind, name, parent = KIND_OF_SERVICE[service], given.pop("name"), given.pop("upperDepName", "")
         if not parent:
             if not (self.audio and self.connected):
                 raise ROSAFE.error("e_noData")
             self._replace_input(name)
-            values = {}
+            given = {}
         elif getattr(self.processors.get(parent), "kind", "") != kind.parent:
             raise ROSAFE.error("e_noUpperDependencie")
         if name in self.processors:
             raise ROSAFE.error("e_existsAlready")
         try:
-            checked = {p.name: p.check(values[p.name]) for p in kind.parameters if p.name in values}
-            given = self.processors[parent].stage.output if parent else RATE
-            self.processors[name] = Processor(kind.kind, parent, STAGES[kind.kind](given, **checked))
+            checked = {p.name: p.check(given[p.name]) for p in kind.parameters if p.name in given}
+            comes: Signal | float = self.processors[parent].stage.output if parent else RATE
+            self.processors[name] = Processor(kind.kind, parent, STAGES[kind.kind](comes, **checked))
         except ValueError as problem:
             raise ROSAFE.error("e_badNewValue", what=str(problem)) from None
         return {}

@@ -45,12 +45,12 @@ def build(model: Model, representation: str, **parameters: Any) -> dict[str, Any
     return asyncio.run(trees.build(model, {"representation": representation, **parameters}))
 
 
-def in_force(kind: str, parameters: dict[str, Any]) -> dict[str, Any]:
+def in_force(kind: str, parameters: Mapping[str, Any]) -> dict[str, Any]:
     """What a processor made with these tells of itself."""
     return stage(kind, parameters).parameters
 
 
-def stage(kind: str, parameters: dict[str, Any]) -> Stage:
+def stage(kind: str, parameters: Mapping[str, Any]) -> Stage:
     """A stage of this kind on all that it needs."""
     own = {p.name: parameters[p.name] for p in KINDS[kind].parameters if p.name in parameters}
     parent = KINDS[kind].parent
@@ -228,7 +228,8 @@ def test_a_structure_of_getparameters_means_the_processor_that_it_describes(valu
     name, processor = [(n, p) for n, p in model.processors.items() if p.kind == "gammatone"][1]
     told = {"name": name, **processor.stage.parameters}
     assert told["name"] == "filterbank_1"
-    for structure in ({"filterbank": told}, {"gammatone": [told]}):
+    structures: tuple[dict[str, Any], ...] = ({"filterbank": told}, {"gammatone": [told]})
+    for structure in structures:
         wanted = partial({"representation": "ratemap", **structure})
         assert asyncio.run(trees.build(model, wanted))["dependencies"][2] == "filterbank_1"
     if not values:

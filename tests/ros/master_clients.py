@@ -76,7 +76,7 @@ def stay(node: str, master_is_lost: Path) -> None:
     wait_for(lambda: messages and messages[-1].lastFrameIndex == BLOCK + 1 and states)
     print("ready", flush=True)
 
-    wait_for(master_is_lost.exists, 30)
+    wait_for(master_is_lost.exists)
     microphone.play(noise(BLOCK))
     wait_for(lambda: messages[-1].lastFrameIndex == 2 * BLOCK + 1)
     requests: list[Callable[[], Any]] = [
@@ -106,7 +106,7 @@ def come(node: str) -> None:
     rospy.Subscriber(
         f"{node}/gammatonePort/late", rosAFE.msg.rosAFE_TimeFrequencySignalPortStruct, messages.append, buff_size=2**22
     )
-    wait_for(lambda: len(messages) > 3 and messages[-1].lastFrameIndex > 4 * BLOCK, 20, "audio from bass")
+    wait_for(lambda: len(messages) > 3 and messages[-1].lastFrameIndex > 4 * BLOCK, what="audio from bass")
     seen["topics"] = sorted(name for name, _ in rospy.get_published_topics(node) if "Port/" in name)
     seen["removed"] = call["removeProcessor"](name="preProc").genom_success
     seen["left"] = sorted(name for name, _ in rospy.get_published_topics(node) if "Port/" in name)

@@ -20,7 +20,7 @@ from actionlib import CommState
 from rosafe import process
 from rosafe.component import wire
 from rosafe.interface import FIXED, ROSAFE
-from tests.harness import PYTHON, Graph, Process, wait_for
+from tests.harness import PATIENCE, PYTHON, Graph, Process, wait_for
 
 RATE = 20000  # Hz; cheap, and all default channels lie below half of it
 _topics = itertools.count(1)
@@ -157,7 +157,7 @@ class Session:
         element = name or ROSAFE.service(FIXED[kind].request).parameter("name").default
         return f"/{self.name}/{port.name}" + (f"/{element}" if port.multiple else "")
 
-    def read(self, kind: str, index: int | None = None, name: str = "", timeout: float = 15.0) -> Any:
+    def read(self, kind: str, index: int | None = None, name: str = "", timeout: float = PATIENCE) -> Any:
         """The newest message of a port, with arrays; the one with lastFrameIndex `index` where that is given."""
         return self.graph.message(
             self.topic(kind, name),
@@ -224,7 +224,7 @@ class Session:
         if client is None:
             action = getattr(rosAFE.msg, f"{service}Action")
             client = self._clients[service] = actionlib.ActionClient(f"/{self.name}/{service}", action)
-            assert client.wait_for_server(rospy.Duration(15))
+            assert client.wait_for_server(rospy.Duration(PATIENCE))
         return Goal(client, getattr(rosAFE.msg, f"{service}Goal")(**fields))
 
     def close(self) -> None:
@@ -260,7 +260,7 @@ class Goal:
         if state == CommState.DONE:
             self._done.set()
 
-    def active(self, timeout: float = 10.0) -> Goal:
+    def active(self, timeout: float = PATIENCE) -> Goal:
         """Wait until it is accepted."""
         assert self._active.wait(timeout), f"not accepted, but {self.states}"
         return self
@@ -269,7 +269,7 @@ class Goal:
     def running(self) -> bool:
         return self._active.is_set() and not self._done.is_set()
 
-    def result(self, timeout: float = 10.0) -> Any:
+    def result(self, timeout: float = PATIENCE) -> Any:
         """Wait for the result."""
         assert self._done.wait(timeout), f"no result, but {self.states}"
         return self.handle.get_result()
@@ -302,7 +302,7 @@ rospy.spin()
 def reader(graph: Graph, topic: str) -> Process:
     """A process that subscribes to a topic and prints the index of each message; it has got the first one."""
     process = graph.start(PYTHON, "-c", SUBSCRIBER, topic)
-    wait_for(lambda: process.out, 20, lambda: str(process))
+    wait_for(lambda: process.out, what=lambda: str(process))
     return process
 
 

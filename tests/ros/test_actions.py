@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import signal
+import statistics
+import time
 from typing import Any
 
 import pytest
@@ -201,7 +204,7 @@ def test_kill_ends_everything_and_the_node(graph: Graph) -> None:
         afe.ok("kill")
         for goal in goals.values():
             succeeded(goal)
-        assert afe.process.wait(5.0) == 0
+        assert afe.process.wait() == 0
         assert "Traceback" not in afe.process.err
         assert "/own" not in graph.nodes()
 
@@ -243,11 +246,16 @@ def test_genom_state_tells_what_is(afe: Session) -> None:
 def test_genom_state_comes_each_second_and_at_every_change(afe: Session) -> None:
     afe.build()
     with afe.graph.collect("/rosAFE/genom_state", rosAFE.msg.genom_state_component) as messages:
-        wait_for(lambda: len(messages) >= 4, timeout=4.5, what="one message a second, and the latched one")
+        moments = []
+        for count in range(1, 7):  # the latched one comes first
+            wait_for(lambda: len(messages) >= count)  # noqa: B023
+            moments.append(time.monotonic())
+        periods = [after - before for before, after in itertools.pairwise(moments[1:])]
+        assert statistics.median(periods) < 1.1, "one a second, but where the machine has other work for a moment"
         afe.ok("PreProc")
-        wait_for(lambda: "PreProc" in {a.name for t in messages[-1].task for a in t.activity}, timeout=1.0)
+        wait_for(lambda: "PreProc" in {a.name for t in messages[-1].task for a in t.activity})
         afe.ok("removeProcessor", name="preProc")
-        wait_for(lambda: "PreProc" not in {a.name for t in messages[-1].task for a in t.activity}, timeout=1.0)
+        wait_for(lambda: "PreProc" not in {a.name for t in messages[-1].task for a in t.activity})
 
 
 def test_the_action_status_is_published_on_change_only(afe: Session) -> None:
@@ -258,5 +266,5 @@ def test_the_action_status_is_published_on_change_only(afe: Session) -> None:
         wait_for(lambda: messages, what="the latched one")
         afe.build("PreProc")
         with afe.graph.collect("/rosAFE/genom_state", rosAFE.msg.genom_state_component) as states:
-            wait_for(lambda: len(states) >= 3, timeout=10)
+            wait_for(lambda: len(states) >= 3)
         assert len(messages) == 1, "a plain service is no goal"

@@ -12,6 +12,7 @@ import pytest
 from rosafe.component import activities as module
 from rosafe.component.activities import Activities, Activity, TaskMeter
 from rosafe.interface import BASS, MAX_ACTIVITIES, ROSAFE, ComponentError
+from tests.harness import PATIENCE
 
 INPUT = ROSAFE.service("InputProc")  # interrupts its own kind
 IHC = ROSAFE.service("IhcProc")
@@ -38,7 +39,7 @@ class Board:
 
 def until_stopped(activity: Activity, values: dict[str, Any]) -> None:
     activity.running()
-    activity.stop_requested.wait(30)
+    activity.stop_requested.wait(PATIENCE)
 
 
 def raising(problem: BaseException) -> Any:
@@ -60,7 +61,7 @@ def test_ids_grow_over_all_kinds_and_the_ended_leave(board: Board) -> None:
     assert [first.id, second.id, third.id] == [1, 2, 3]
     assert board.activities.live() == [first, second, third]
     second.interrupt("abort_activity")
-    assert second.ended.wait(10)
+    assert second.ended.wait(PATIENCE)
     assert second.error is None, "an activity that was running ends normally"
     assert board.activities.live() == [first, third]
     assert board.start().id == 4
@@ -79,7 +80,7 @@ def test_a_task_takes_so_many_activities_and_no_more(board: Board) -> None:
     board.start(INPUT)
     leaving = board.activities.find(5)
     leaving.interrupt("client")
-    assert leaving.ended.wait(10)
+    assert leaving.ended.wait(PATIENCE)
     assert not board.activities.full(IHC)
     board.start()
     assert board.activities.full(IHC)
@@ -96,7 +97,7 @@ def test_a_task_takes_so_many_activities_and_no_more(board: Board) -> None:
 )
 def test_failures_have_a_name(board: Board, problem: BaseException, exdetail: str, crashes: int) -> None:
     activity = board.start(handler=raising(problem))
-    assert activity.begun.wait(10) and activity.ended.wait(10)
+    assert activity.begun.wait(PATIENCE) and activity.ended.wait(PATIENCE)
     assert activity.error is not None and activity.error.exdetail == exdetail
     assert len(board.crashes) == crashes
     assert board.activities.live() == []
@@ -109,7 +110,7 @@ def test_no_thread_left(board: Board, monkeypatch: pytest.MonkeyPatch) -> None:
             board.start()
     assert caught.value.exdetail == '{"ex":"::genom::syserr","detail":{"code":11}}'
     assert board.activities.live() == []
-    assert board.start().begun.wait(10)
+    assert board.start().begun.wait(PATIENCE)
 
 
 def raising_start(thread: threading.Thread) -> None:
@@ -119,7 +120,7 @@ def raising_start(thread: threading.Thread) -> None:
 def test_the_requester_is_told_before_anybody_who_waits(board: Board) -> None:
     seen: list[Any] = []
     activity = board.start(on_end=lambda a: seen.append((a.begun.is_set(), a.ended.is_set(), board.activities.live())))
-    activity.begun.wait(10)
+    activity.begun.wait(PATIENCE)
     board.activities.interrupt_named(["IhcProc"], "Stop", wait=10)
     assert seen == [(True, False, [])]
 
@@ -127,7 +128,7 @@ def test_the_requester_is_told_before_anybody_who_waits(board: Board) -> None:
 def test_an_end_that_cannot_be_told_is_an_end(board: Board, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(threading, "excepthook", lambda arguments: None)
     activity = board.start(handler=raising(ROSAFE.error("e_noData")), on_end=raising_end)
-    assert activity.ended.wait(10)
+    assert activity.ended.wait(PATIENCE)
 
 
 def raising_end(activity: Activity) -> None:
@@ -138,7 +139,7 @@ def test_interrupted_before_it_ran(board: Board) -> None:
     gate = threading.Event()
 
     def slow(activity: Activity, values: dict[str, Any]) -> None:
-        gate.wait(10)
+        gate.wait(PATIENCE)
         activity.raise_if_interrupted()
         pytest.fail("it was interrupted")
 
@@ -146,7 +147,7 @@ def test_interrupted_before_it_ran(board: Board) -> None:
     activity.interrupt("client")
     activity.interrupt("Stop")
     gate.set()
-    assert activity.ended.wait(10)
+    assert activity.ended.wait(PATIENCE)
     assert activity.error is not None
     assert activity.error.exdetail == '{"ex":"::genom::interrupted","detail":{"by":"client"}}', "the first one counts"
 
@@ -156,30 +157,30 @@ def test_a_newcomer_waits_for_those_that_it_replaces(board: Board) -> None:
 
     def reluctant(activity: Activity, values: dict[str, Any]) -> None:
         activity.running()
-        activity.stop_requested.wait(10)
-        release.wait(10)
+        activity.stop_requested.wait(PATIENCE)
+        release.wait(PATIENCE)
 
     def replacing(activity: Activity, values: dict[str, Any]) -> None:
         activity.interrupt_others()
         until_stopped(activity, values)
 
     bystander, old = board.start(), board.start(INPUT, reluctant)
-    old.begun.wait(10)
+    old.begun.wait(PATIENCE)
     new = board.start(INPUT, replacing)
-    assert old.stop_requested.wait(10) and old.stopped_by == "InputProc"
+    assert old.stop_requested.wait(PATIENCE) and old.stopped_by == "InputProc"
     assert not new.begun.is_set()
     release.set()
-    assert new.begun.wait(10) and old.ended.is_set() and old.error is None
+    assert new.begun.wait(PATIENCE) and old.ended.is_set() and old.error is None
     assert not bystander.stop_requested.is_set()
 
 
 def test_stopping_by_name_is_bounded(board: Board) -> None:
     deaf = threading.Event()
-    activity = board.start(handler=lambda activity, values: deaf.wait(10))
+    activity = board.start(handler=lambda activity, values: deaf.wait(PATIENCE))
     board.activities.interrupt_named(["IhcProc", "IldProc"], "Stop", wait=0.05)
     assert activity.stopped_by == "Stop" and not activity.ended.is_set()
     deaf.set()
-    assert activity.ended.wait(10)
+    assert activity.ended.wait(PATIENCE)
 
 
 def test_the_table_names_activities_that_exist() -> None:

@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
 from rosafe.component.audio import MAX_RATE, RING_SECONDS, AudioReader, AudioRing
+from tests.harness import PATIENCE
 
 RATE = 8  # Hz: the ring holds 80 frames
 CAPACITY = int(RING_SECONDS * RATE)
@@ -345,7 +346,7 @@ def test_waiting_for_the_first_message() -> None:
     waiting = threading.Thread(target=lambda: found.append(ring.open_reader(4, 60.0, lambda: False)))
     waiting.start()
     feed(Source(index=7).message())
-    waiting.join(10)
+    waiting.join(PATIENCE)
     assert found[0].position == 8 and found[0].sample_rate == RATE
 
 

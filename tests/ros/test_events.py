@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import re
+import time
 
-from rosafe.component.events import EventLog
+from rosafe.component.events import KINDS, EventLog
 from tests.harness import run_together, wait_for
 
 
@@ -34,6 +36,32 @@ def test_a_storm_is_one_line_a_period_with_the_last_of_it() -> None:
     wait_for(lambda: not log._held)
     log("lost frame 1000")
     assert lines[-1] == "lost frame 1000", "at once again"
+
+
+def test_a_storm_that_goes_on_is_never_two_lines_at_a_time() -> None:
+    """The line that counts is not followed by the next event's own."""
+    times: list[float] = []
+    log = EventLog(lambda line: times.append(time.monotonic()), period=0.5)
+
+    def five_lines() -> bool:
+        log("lost 1 frame")
+        return len(times) >= 5
+
+    wait_for(five_lines, 20)
+    gaps = [later - earlier for earlier, later in itertools.pairwise(times)]
+    assert min(gaps) > 0.1, gaps
+
+
+def test_a_kind_may_be_named_and_there_are_not_too_many_at_once() -> None:
+    """What others may choose the text of does not fill the log."""
+    lines: list[str] = []
+    log = EventLog(lines.append, period=60.0)
+    for text in ("a", "b"):
+        log(f"peer says {text}", kind="peer")
+    assert lines == ["peer says a"]
+    for number in range(1000):
+        log("x", kind=f"peer {number}")
+    assert len(lines) == KINDS + 1, "the last stands for all others"
 
 
 def test_events_from_many_threads_are_all_counted() -> None:

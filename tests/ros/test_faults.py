@@ -79,7 +79,7 @@ def test_bass_is_killed_and_comes_back(graph: Graph) -> None:
         before = afe.read("preProc").lastFrameIndex
         with graph.node("bass-ros"):
             assert graph.call("/bass/Acquire", device="scene:", sampleRate=20000, nFramesPerChunk=1000).genom_success
-            wait_for(lambda: 1 < afe.read("preProc").lastFrameIndex < before, timeout=20)
+            wait_for(lambda: 1 < afe.read("preProc").lastFrameIndex < before)
             assert (afe.read("preProc").lastFrameIndex - 1) % BLOCK == 0
             health = afe.health(lambda entries: int(entries["streams"]) > 1)
             assert health["lost"] == "0"
@@ -196,7 +196,7 @@ def test_all_slots_of_a_task_are_full_and_empty_again(afe: Session) -> None:
     afe.ok("RatemapProc")  # another task has slots
     microphone.play(noise(BLOCK))
     for name in ("ild0", f"ild{limit - 1}"):
-        assert afe.read("ild", BLOCK + 1, name=name, timeout=30).framesOnPort == 100
+        assert afe.read("ild", BLOCK + 1, name=name).framesOnPort == 100
     wait_for(lambda: {len(s.left.dataN) for s in afe.ok("getSignals").signals.ild} == {2})
     assert threads_and_memory(afe.process.pid)[0] <= threads + 2 * (limit + 1) + 16, "two for each processor"
     afe.ok("removeProcessor", name="ild7")

@@ -29,7 +29,7 @@ call(rosAFE, "/far/InputProc", nFramesPerBlock=2205)
 call(rosAFE, "/far/PreProc")
 heard = queue.Queue()
 rospy.Subscriber("/far/preProcPort/preProc", Message, heard.put)
-while not (index := heard.get(timeout=20).lastFrameIndex):
+while not (index := heard.get(timeout=60).lastFrameIndex):
     pass
 print("heard", index)
 """
@@ -41,7 +41,7 @@ def test_two_instances_as_in_the_document(graph: Graph) -> None:
     script = f"set -e\n{block}".replace("roscore & ", "")  # there is a master, and not where everybody's is
     with graph.start("bash", "-c", f"{script}\nwait", cwd=ROOT) as shell:
         try:
-            wait_for(lambda: "/right/preProcPort/preProc" in shell.out or not shell.alive, 60, lambda: str(shell))
+            wait_for(lambda: "/right/preProcPort/preProc" in shell.out or not shell.alive, what=lambda: str(shell))
             assert {"/left/preProcPort/preProc", "/right/preProcPort/preProc"} == set(shell.out.split()[-2:])
             assert shell.out.count("genom_success: True") == 7
         finally:
@@ -97,7 +97,7 @@ def test_two_machines(net: Net, tmp_path: Path) -> None:
         master.start(graph.env)
         far = ["ip", "netns", "exec", net.name, str(SCRIPTS / "rosAFE-ros"), "-i", "far"]
         with graph.node("bass-ros"), graph.start(*far, ROS_IP=net.far) as process:
-            wait_for(lambda: "/far/kill" in graph.services() or not process.alive, 30, lambda: str(process))
+            wait_for(lambda: "/far/kill" in graph.services() or not process.alive, what=lambda: str(process))
             heard = graph.run(PYTHON, "-c", CLIENT).stdout.split()
             assert heard[0] == "heard" and (int(heard[1]) - 1) % 2205 == 0
             assert process.stop(signal.SIGTERM) == 0

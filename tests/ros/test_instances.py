@@ -30,7 +30,7 @@ def test_two_instances_share_one_source(graph: Graph) -> None:
         left.wait_activities(["InputProc"])
         right.wait_activities(["InputProc", "PreProc", "GammatoneProc"])
         left.ok("kill")
-        assert left.process.wait(5.0) == 0
+        assert left.process.wait() == 0
         microphone.play(noise(BLOCK))
         right.read("gammatone", 3 * BLOCK + 1)
 
@@ -38,9 +38,9 @@ def test_two_instances_share_one_source(graph: Graph) -> None:
 def test_a_name_that_is_taken_ends_the_older_node(graph: Graph) -> None:
     """As ROS has it: the newcomer takes over, the older one ends cleanly."""
     with own_node(graph, name="twice") as older, graph.start(str(SCRIPTS / "rosAFE-ros"), "-i", "twice") as process:
-        assert older.process.wait(10.0) == 0
+        assert older.process.wait() == 0
         newer = Session(graph, process, "twice")
-        wait_for(lambda: "/twice/kill" in graph.services(), 20, lambda: str(process))
+        wait_for(lambda: "/twice/kill" in graph.services(), what=lambda: str(process))
         newer.build("PreProc")
         assert list(newer.processors()) == ["input", "preProc"]
         newer.close()
@@ -62,7 +62,7 @@ def test_remapped_topics(graph: Graph) -> None:
 
 def test_a_namespace_comes_before_all_names(graph: Graph) -> None:
     with graph.start(str(SCRIPTS / "rosAFE-ros"), "__ns:=/robot") as process:
-        wait_for(lambda: "/robot/rosAFE/kill" in graph.services(), 20, lambda: str(process))
+        wait_for(lambda: "/robot/rosAFE/kill" in graph.services(), what=lambda: str(process))
         afe = Session(graph, process, "robot/rosAFE")
         microphone = afe.listen(topic="/robot/bass/Audio")
         afe.ok("connect_port", local="Audio", remote="bass/Audio")  # relative to the namespace

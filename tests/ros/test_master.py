@@ -30,7 +30,7 @@ def hang(graph: Graph, master: MasterProcess) -> Callable[[], None]:
 
 def assert_all_is_there(graph: Graph, clients: list[str], path: str) -> None:
     """A client that comes now finds services, topics and parameters, and audio from bass."""
-    done = graph.run(*clients, "come", "/rosAFE", PYTHONPATH=path, timeout=60)
+    done = graph.run(*clients, "come", "/rosAFE", PYTHONPATH=path)
     assert json.loads(done.stdout.splitlines()[-1]) == {
         "processors": ["input", "preProc", "late"],
         "topics": ["/rosAFE/gammatonePort/late", "/rosAFE/preProcPort/preProc"],
@@ -53,11 +53,11 @@ def test_a_master_is_lost_and_comes_back(
         before = graph.services()
         readers = graph.readers()
         with graph.start(*clients, "stay", "/rosAFE", str(lost), cwd=ROOT, PYTHONPATH=path) as client:
-            wait_for(lambda: "ready" in client.out or not client.alive, 30, lambda: str(client))
+            wait_for(lambda: "ready" in client.out or not client.alive, what=lambda: str(client))
             bring_back = lose(graph, master)
             lost.touch()
             try:
-                wait_for(lambda: not client.alive or "{" in client.out, 60, lambda: f"{client} {afe}")
+                wait_for(lambda: not client.alive or "{" in client.out, what=lambda: f"{client} {afe}")
                 wait_for(lambda: "no answer from the ROS master" in afe.err)
             finally:
                 bring_back()
@@ -71,9 +71,9 @@ def test_a_master_is_lost_and_comes_back(
                 "left": ["input", "preProc", "late"],
             }, client
             assert afe.err.count("no answer from the ROS master") == 1
-        wait_for(lambda: before <= graph.services(), 20, lambda: f"{before - graph.services()} {afe} {bass}")
-        wait_for(lambda: "/rosAFE/gammatonePort/late" in graph.topics(), 20)
-        wait_for(lambda: "/rosAFE/preProcPort/other" not in graph.topics(), 20)
+        wait_for(lambda: before <= graph.services(), what=lambda: f"{before - graph.services()} {afe} {bass}")
+        wait_for(lambda: "/rosAFE/gammatonePort/late" in graph.topics())
+        wait_for(lambda: "/rosAFE/preProcPort/other" not in graph.topics())
         if lose is kill:  # another master knows nothing but what it was told
             assert_all_is_there(graph, clients, path)
         assert readers <= graph.readers(), "actions are back too"

@@ -11,8 +11,9 @@ import rosAFE.msg
 import rosAFE.srv
 import rospy
 
+from rosafe.component import wire
 from rosafe.interface import FIXED, ROSAFE, ros_type
-from rosafe.component import array_srv, wire
+from rosafe.ros import array_srv
 from tests.harness import wait_for
 from tests.ros.session import RATE, Session, assert_holds, ears, expected, noise, windowed
 
@@ -62,7 +63,7 @@ def test_the_default_tree_at_44100(afe: Session) -> None:
     microphone.play(signal)
     truth = expected(signal, 12000, rate=rate)
     for kind in FIXED:
-        message = afe.read(kind, 12000 * blocks + 1, timeout=30)
+        message = afe.read(kind, 12000 * blocks + 1)
         frame_rate = truth[f"{kind}_frameRate"] if kind in FRAMED else rate
         assert message.framesOnPort == frame_rate
         assert_holds(message, kind, windowed(truth[kind], 1.0, frame_rate))

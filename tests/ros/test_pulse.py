@@ -102,8 +102,9 @@ def test_what_takes_the_news_may_have_an_abstract_address_or_none(graph: Graph) 
     address = f"rosafe-test-{os.getpid()}"
     with listening(f"\0{address}") as told:
         for microseconds, pid in (("3000000", "1"), ("nonsense", ""), ("0", ""), ("", "")):
-            env = {"NOTIFY_SOCKET": f"@{address}", "WATCHDOG_USEC": microseconds, "WATCHDOG_PID": pid}
-            with graph.node("bass-ros", "-i", "unwatched", **env) as process:
+            with graph.node(
+                "bass-ros", "-i", "unwatched", NOTIFY_SOCKET=f"@{address}", WATCHDOG_USEC=microseconds, WATCHDOG_PID=pid
+            ) as process:
                 wait_for(lambda: told.count("READY=1"), 20)
                 assert process.stop(signal.SIGTERM) == 0
             assert [what for _, what in told.told] == ["READY=1", "STOPPING=1"]
@@ -140,8 +141,10 @@ def test_the_master_has_no_part_in_it(private_graph: tuple[Graph, MasterProcess]
     """A node whose master is gone can be called by those who know it, and is left alone by systemd."""
     graph, master = private_graph
     address = str(tmp_path / "notify")
-    env = {"NOTIFY_SOCKET": address, "WATCHDOG_USEC": "3000000"}
-    with listening(address) as told, graph.node("bass-ros", **env) as process:
+    with (
+        listening(address) as told,
+        graph.node("bass-ros", NOTIFY_SOCKET=address, WATCHDOG_USEC="3000000") as process,
+    ):
         master.kill()
         wait_for(lambda: "no answer from the ROS master" in process.err, 20)
         fed = told.count("WATCHDOG=1")

@@ -14,13 +14,14 @@ import numpy as np
 import rosgraph
 import rospy
 import soundfile
-from rosafe.tree.states import Observer, State
 from std_msgs.msg import String
 
 from rosafe.interface import FIXED
 from rosafe.node.trace_port import TracePort, read
+from rosafe.tree.processor import Observer
+from rosafe.tree.states import State
 from tests.cli.command import refused, rosafe
-from tests.harness import SCRIPTS, Graph, wait_for
+from tests.harness import PATIENCE, SCRIPTS, Graph, wait_for
 from tests.ros.session import Session, noise
 
 CHAIN = ("PreProc", "GammatoneProc", "IhcProc", "IldProc", "RatemapProc", "CrossCorrelationProc")
@@ -58,10 +59,10 @@ def test_a_real_run_shows_parents_children_and_siblings_at_work_at_once(afe: Ses
     path = tmp_path / "trace.json"
     command = afe.graph.start(str(SCRIPTS / "rosafe"), "trace", "--seconds", "100", "-o", str(path))
     with command:
-        wait_for(lambda: listening(afe.graph, "/rosAFE/trace"), 20.0)
+        wait_for(lambda: listening(afe.graph, "/rosAFE/trace"))
         with afe.follow("ild") as messages:
             microphone.play(noise(BLOCK * BLOCKS))
-            wait_for(lambda: messages[-1].lastFrameIndex == BLOCK * BLOCKS + 1, 30.0)
+            wait_for(lambda: messages[-1].lastFrameIndex == BLOCK * BLOCKS + 1)
         with afe.graph.collect("/rosAFE/trace", String) as told:
             wait_for(lambda: len(told) > 2, what="two rounds in which the command hears the rest")
         assert command.stop(signal.SIGINT) == 0, command
@@ -87,7 +88,7 @@ def test_a_real_run_shows_parents_children_and_siblings_at_work_at_once(afe: Ses
 def test_a_trace_that_is_killed_is_over_for_the_node_too(afe: Session) -> None:
     afe.build("PreProc")
     with afe.graph.start(str(SCRIPTS / "rosafe"), "trace") as command:
-        wait_for(lambda: afe.connections("/rosAFE/trace") == 1, 20.0)
+        wait_for(lambda: afe.connections("/rosAFE/trace") == 1)
         command.stop(signal.SIGKILL)
     wait_for(lambda: afe.connections("/rosAFE/trace") == 0)
 
@@ -142,6 +143,6 @@ def test_nobody_listens_nothing_is_traced(graph: Graph) -> None:
         (event,) = (event for message in got for event in read(message))
         assert event[1:] == ("p", "ild", "", "exec", 3)
         subscriber.unregister()
-        assert ended.wait(10), "the last subscriber has left"
+        assert ended.wait(PATIENCE), "the last subscriber has left"
     assert len(begun) == 2
     assert isinstance(port, TracePort)

@@ -18,8 +18,9 @@ from hypothesis import strategies as st
 
 import bass.msg
 from rosafe import interface
+from rosafe.component import wire
 from rosafe.interface import ROSAFE
-from rosafe.component import array_msg, wire
+from rosafe.ros import array_msg
 from rosafe.tree.window import SlidingWindow, WindowView
 
 TIME_DOMAIN = "::rosAFE::TimeDomainSignalPortStruct"
@@ -258,6 +259,18 @@ def test_garbage_is_refused_or_read_and_nothing_else(idl: str, data: bytes) -> N
         assert lenient.problem == str(problem) != ""
     else:
         assert lenient.problem == ""
+
+
+def test_a_signal_beyond_what_numpy_can_lay_out_is_read_all_the_same() -> None:
+    """More than 2 GB in one piece; zeros that nobody looks at, so that they are not in memory."""
+    head = serialized(plain_class(TIME_DOMAIN)())[:20]
+    count = 2**28 + 1
+    data = np.zeros(len(head) + 4 + 8 * count + 4, np.uint8)
+    data[: len(head)] = np.frombuffer(head, np.uint8)
+    data[len(head) : len(head) + 4] = np.frombuffer(count.to_bytes(4, "little"), np.uint8)
+    message = wire.message_class("rosAFE", TIME_DOMAIN)().deserialize(data)
+    assert (message.left.shape, message.right.shape) == ((count,), (0,))
+    assert message.left[0] == message.left[-1] == 0.0
 
 
 @pytest.mark.parametrize("idl", sorted(LEVELS))

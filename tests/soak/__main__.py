@@ -8,28 +8,32 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from tests.soak import faults
-from tests.soak.world import DEFAULT, LIGHT, Use, World, world
+from tests.harness import let_children_have_default_signals
+from tests.soak import attacks, faults
+from tests.soak.world import DEFAULT, LIGHT, Use, World, wait_out, world
 
-MORE_MEMORY = 64 * 2**20  # bytes that a process may have more at the end than once it was warm
-MORE_THREADS = 8  # and threads, and files: clients that are just leaving
 WARM = 3  # of so many parts of the time, the first is that in which pools and the allocator come to their size
+
+
+FAULTS = {fault.__name__: fault for fault in (*faults.DURING, *attacks.ATTACKS)}
+ATTACKS = {attack.__name__ for attack in attacks.ATTACKS}
 
 
 def main() -> int:
     """Run; 0 where everything held, 1 where something did not."""
     options = _parse()
+    let_children_have_default_signals()
     random_seed = options.seed if options.seed is not None else random.randrange(10**6)
     print(f"soak: {options.minutes:g} min, --seed {random_seed}", flush=True)
     with tempfile.TemporaryDirectory(prefix="rosafe-soak-") as folder:
         home = Path(folder)
         try:
             with world(LIGHT if options.light else DEFAULT, home) as there:
-                Soak(there, random.Random(random_seed), options.minutes * 60).run()
+                Soak(there, random.Random(random_seed), options.minutes * 60, options.only).run()
         except KeyboardInterrupt:
             print("soak: interrupted", file=sys.stderr)
             return 130
@@ -45,15 +49,21 @@ def _parse() -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="soak",
         description="Runs a master, bass-ros, rosAFE-ros and genomixd for long, does to them what happens in the field "
-        "(processes killed or held, garbage, crowds of processors, clients all at once, changes), and checks after "
-        "each round that every sample on every port is right, nothing was lost without a reason, and nothing grows.",
-        epilog="example:\n  scripts/soak --minutes 60",
+        "(processes killed or held, garbage, crowds of processors, clients all at once, changes) and what those do who "
+        "mean ill (floods, silence, lies about lengths, names that are commands), and checks after each round that "
+        "every sample on every port is right, nothing was lost without a reason, everybody else is answered, and "
+        "nothing grows.",
+        epilog="examples:\n  scripts/soak --minutes 60\n  scripts/soak --minutes 10 --only a_mixed_load\n\n"
+        f"faults and attacks: {', '.join(FAULTS)}",
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
     parser.add_argument("--minutes", type=_minutes, default=10.0, help="how long (10); at least one round is done")
     parser.add_argument("--seed", type=int, help="of the order of things, to repeat a run")
     parser.add_argument("--light", action="store_true", help="a lower sample rate, and less of everything")
+    parser.add_argument(
+        "--only", metavar="NAME", action="append", choices=FAULTS, help="of all that is done, only this"
+    )
     return parser.parse_args()
 
 
@@ -67,8 +77,9 @@ def _minutes(text: str) -> float:
 class Soak:
     """Rounds of faults in a world."""
 
-    def __init__(self, there: World, chance: random.Random, seconds: float) -> None:
+    def __init__(self, there: World, chance: random.Random, seconds: float, only: Sequence[str] | None = None) -> None:
         self._world = there
+        self._only = only
         self._chance = chance
         self._seconds = seconds
         self._begin = time.monotonic()
@@ -85,12 +96,30 @@ class Soak:
         self._check_growth()
 
     def _go_round(self) -> None:
-        """The whole tree on one stream, all faults in some order; then those that break the stream."""
+        """The whole tree on one stream, all faults and attacks in some order; then those that break the stream."""
+        names = self._only or list(FAULTS)
         with self._world.stream():
-            for fault in self._chance.sample(faults.DURING, len(faults.DURING)):
-                self._do(fault.__name__, lambda fault=fault: fault(self._world, self._chance))  # type: ignore[misc]
+            if set(names) & ATTACKS:
+                self._world.unharmed("before anything happens")
+                wait_out(2.0)  # genomixd connects to all that a component has, once it is used
+            for name in self._chance.sample(names, len(names)):
+                self._do(name, lambda name=name: self._inflict(name))  # type: ignore[misc]
             self._say("every frame, every port, every count")
-        self._do("the source dies", lambda: faults.the_source_dies_and_the_node_is_held(self._world))
+        if not self._only:
+            self._do("the source dies", lambda: faults.the_source_dies_and_the_node_is_held(self._world))
+
+    def _inflict(self, name: str) -> None:
+        """One fault; after an attack everybody else is answered, and nothing of it is left."""
+        if name not in ATTACKS:
+            FAULTS[name](self._world, self._chance)
+            return
+        before = self._world.use()
+        self._world.slowest = 0.0, ""
+        FAULTS[name](self._world, self._chance)
+        self._world.unharmed(f"after {name}")
+        self._world.recovers(before)
+        took, what = self._world.slowest
+        self._say(f"    slowest answer: {took:.2f} s ({what})")
 
     def _do(self, name: str, what: Callable[[], None]) -> None:
         self._say(name.replace("_", " "))
@@ -105,10 +134,8 @@ class Soak:
         """Nothing is more in the end than it was once it was warm."""
         early, late = self._uses[len(self._uses) // WARM], self._uses[-1]
         for name, use in late.items():
-            first = early[name]
-            assert use.memory <= first.memory + MORE_MEMORY, f"{name} grows: {first}, then {use}"
-            assert use.threads <= first.threads + MORE_THREADS, f"{name} gathers threads: {first}, then {use}"
-            assert use.files <= first.files + MORE_THREADS, f"{name} gathers files: {first}, then {use}"
+            more = use.exceeds(early[name])
+            assert not more, f"{name} gathers {more}: {early[name]}, then {use}"
 
 
 if __name__ == "__main__":

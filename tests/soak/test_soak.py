@@ -33,7 +33,7 @@ def graph_of_none(tmp_path: Path) -> Iterator[harness.Graph]:
 def test_a_round_of_the_soak(graph_of_none: harness.Graph) -> None:
     proc()
     with graph_of_none.start(*SOAK, "--minutes", "0", "--seed", "1", cwd=ROOT) as soak:
-        assert soak.wait(150) == 0, soak
+        assert soak.wait(500) == 0, soak
         assert soak.out.rstrip().endswith("soak: all held")
         assert "every frame, every port, every count" in soak.out
 
@@ -50,7 +50,7 @@ def test_the_soak_finds_what_does_not_hold(monkeypatch: pytest.MonkeyPatch, capf
             dying.stop(signal.SIGKILL)
 
         monkeypatch.setattr(command, "world", lambda size, home: nullcontext(there))
-        monkeypatch.setattr(command.faults, "DURING", (end,))
+        monkeypatch.setattr(command, "FAULTS", {"end": end})
         monkeypatch.setattr("sys.argv", ["soak", "--light", "--minutes", "0"])
         assert command.main() == 1
     said = capfd.readouterr()
@@ -67,7 +67,7 @@ def test_what_grows_is_found() -> None:
         soak._uses = [{"node": replace(use, **{name: value * 10})}, {"node": use}, {"node": use}]
         soak._check_growth()
         soak._uses.append({"node": replace(use, **{name: value})})
-        with pytest.raises(AssertionError, match=r"node (grows|gathers (threads|files))"):
+        with pytest.raises(AssertionError, match=r"node gathers (memory|threads|files)"):
             soak._check_growth()
 
 

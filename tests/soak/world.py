@@ -5,30 +5,38 @@ from __future__ import annotations
 import os
 import signal
 import threading
+import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
+import genpy
 import numpy as np
 import rospy
 import soundfile
 
 from rosafe.component import registration, wire
-from rosafe.interface import FIXED, ROSAFE
+from rosafe.interface import BASS, FIXED, ROSAFE
 from rosafe.interface.arguments import check_parameters
 from rosafe.offline.chain import Chain
 from rosafe.tree.window import SlidingWindow, frames_in
 from tests import harness
 from tests.genomix.world import Http, genomixd
-from tests.harness import proc, wait_for
+from tests.harness import free_port, proc, run_together, wait_for
 from tests.ros.session import Session, assert_holds
 
 NAMES = {kind: ROSAFE.service(entry.request).parameter("name").default for kind, entry in FIXED.items()}
 TREE = {kind: [name] for kind, name in NAMES.items()}
 CHUNKS = 20  # on bass' port, as by default
 DRIFT = 0.15  # seconds that bass' frames may be off the clock: a chunk more or less, and a busy machine
+ANSWER_SECONDS = 2.0  # for a fresh client to be answered, whatever others do
+SLOWER = 3.0  # or so many times what it took before, where the machine has much other work
+PEAK_MEMORY = 160 * 2**20  # bytes that a process may take for a moment, for what others say is to come
+MORE_MEMORY = 64 * 2**20  # bytes that a process may have more once all is over
+MORE_THREADS, MORE_FILES = 8, 16  # and threads and files: clients that are just leaving
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -41,10 +49,12 @@ class Size:
     channels: int  # 0: as by default
     crowd: int  # processors at once, besides the tree
     cycles: int  # of creation and removal in a round
+    connections: int  # of those who mean ill, to one port
+    mixed_seconds: float  # of all of it at once
 
 
-DEFAULT = Size(44100, 2205, 12000, 0, 200, 100)
-LIGHT = Size(20000, 800, 4000, 3, 48, 10)
+DEFAULT = Size(44100, 2205, 12000, 0, 200, 100, 2100, 60.0)
+LIGHT = Size(20000, 800, 4000, 3, 48, 10, 300, 3.0)
 
 
 @dataclass
@@ -60,6 +70,14 @@ class Use:
         status = dict(line.split(":", 1) for line in proc(pid, "status").read_text().splitlines())
         return cls(int(status["Threads"]), len(list(proc(pid, "fd").iterdir())), int(status["VmRSS"].split()[0]) * 1024)
 
+    def exceeds(self, other: Use) -> str:
+        """What is more than in `other`, if it is much."""
+        if self.memory > other.memory + MORE_MEMORY:
+            return "memory"
+        if self.threads > other.threads + MORE_THREADS:
+            return "threads"
+        return "files" if self.files > other.files + MORE_FILES else ""
+
     def __str__(self) -> str:
         return f"{self.threads} threads, {self.files} files, {self.memory / 2**20:.0f} MiB"
 
@@ -72,6 +90,9 @@ class World:
         self.graph = graph
         self.master = master
         self.refused = 0  # messages that were garbage
+        self.slowest = (0.0, "")  # of the answers to fresh clients
+        self._turn = False
+        self._usual: dict[str, float] = {}  # seconds that such an answer took at first
         self._bass = ExitStack()
         self.sound = self._noise(int(7.3 * size.rate))
         self._file = graph.home / "noise.wav"
@@ -82,6 +103,7 @@ class World:
         stack.callback(self.afe.close)
         self.genomixd, port = stack.enter_context(genomixd(graph))
         self.http = Http(port)
+        self.http_address = "127.0.0.1", port
         self.acquire()
         self.afe.ok("connect_port", local="Audio", remote="bass/Audio")
 
@@ -106,6 +128,9 @@ class World:
         """Start bass-ros, for the first time or after it was killed."""
         self._bass.close()
         self.bass = self._bass.enter_context(self.graph.node("bass-ros"))
+        self.socket_address = "127.0.0.1", free_port()
+        rospy.set_param("/bass/socket_port", self.socket_address[1])
+        assert self.graph.call("/bass/DedicatedSocket").genom_success
 
     def acquire(self) -> None:
         """Let bass begin anew with frame 1."""
@@ -166,7 +191,7 @@ class World:
         with Chain(blocks, self.size.rate, {"in_doNormalize": True, **parameters}, list(FIXED), keep) as chain:
             chain.run()
         for kind in FIXED:
-            assert_holds(self.afe.read(kind, end + 1, timeout=60.0), kind, truth[kind].view().array())
+            assert_holds(self.afe.read(kind, end + 1), kind, truth[kind].view().array())
 
     def counters(self) -> dict[str, Any]:
         """What rosAFE counts of the audio, from /diagnostics."""
@@ -181,8 +206,79 @@ class World:
         assert self.http.call("rosAFE/getParameters")["parameters"]["input"][0]["name"] == "input"
 
     def use(self) -> dict[str, Use]:
-        """What the lasting processes take; bass is another one after each time that it was killed."""
-        return {"rosAFE": Use.of(self.afe.process.pid), "genomixd": Use.of(self.genomixd.pid)}
+        """What the processes take."""
+        processes = {"rosAFE": self.afe.process, "bass": self.bass, "genomixd": self.genomixd}
+        return {name: Use.of(process.pid) for name, process in processes.items()}
+
+    # --- attacks ---
+
+    def unharmed(self, when: str = "") -> None:
+        """Whoever comes anew is answered in time: rosservice by one node, rostopic by the other, in turn, and HTTP."""
+        services = [("/rosAFE/getDependencies", "{nameProc: input}"), ("/bass/abort_activity", "{activity: 0}")]
+        topics = ["/bass/Audio", self.afe.topic("ild")]
+        service, topic = services[0], topics[0]
+        if self._turn:
+            service, topic = services[1], topics[1]
+        self._turn = not self._turn
+        commands = [("rosservice", "call", *service), ("rostopic", "echo", "-n", "1", "--noarr", topic)]
+
+        def run(number: int) -> str:
+            return self.quick(commands[number][0], lambda: self.graph.run(*commands[number]).stdout)
+
+        called, heard = run_together(len(commands), run)
+        assert "genom_success: True" in called or "no_such_activity" in called, f"{when}: {called}"
+        assert "lastFrameIndex" in heard, f"{when}: {heard}"
+        for node in ("rosAFE", "bass"):  # connections of a client that does not have to start first
+            answer = self.quick("a new client", lambda: self.graph.call(f"/{node}/abort_activity", activity=0))  # noqa: B023
+            assert "no_such_activity" in answer.genom_exdetail, f"{when}: {answer}"
+        answer = self.quick("HTTP", lambda: self.http.call("rosAFE/getDependencies", ["input"]))
+        assert answer == {"dependencies": ["input"]}, f"{when}: {answer}"
+        assert self.quick("HTTP", lambda: self.http.call("bass/genom_state"))["genom_state"], when
+
+    def quick(self, what: str, work: Callable[[], T]) -> T:
+        """The result of what takes no longer than it may; how long is kept in `slowest`."""
+        begin = time.monotonic()
+        result = work()
+        took = time.monotonic() - begin
+        self.slowest = max(self.slowest, (took, what))
+        limit = max(ANSWER_SECONDS, SLOWER * self._usual.setdefault(what, took))
+        assert took <= limit, f"{what} took {took:.2f} s, {limit:.2f} go"
+        return result
+
+    def recovers(self, before: dict[str, Use]) -> None:
+        """Memory, threads and descriptors come back to what they were."""
+
+        def more() -> list[str]:
+            return [
+                f"{name}: {use}, before {before[name]}" for name, use in self.use().items() if use.exceeds(before[name])
+            ]
+
+        wait_for(lambda: not more(), what=lambda: f"an end of what was taken; {more()}")
+
+    @contextmanager
+    def bounded_memory(self) -> Iterator[None]:
+        """No process takes much memory meanwhile, not for a moment."""
+        before = self.use()
+        processes = (self.afe.process, self.bass, self.genomixd)
+        for process in processes:
+            proc(process.pid, "clear_refs").write_text("5")  # what it had at most is what it has
+        yield
+        for process, (name, use) in zip(processes, before.items(), strict=True):
+            status = dict(line.split(":", 1) for line in proc(process.pid, "status").read_text().splitlines())
+            peak = int(status["VmHWM"].split()[0]) * 1024
+            assert peak < use.memory + PEAK_MEMORY, f"{name}: {peak / 2**20:.0f} MiB at most, before {use}"
+
+    def refuses(self, device: str) -> None:
+        """bass does not take a device, says so by name, and what it plays goes on."""
+        answer = self.graph.call("/bass/Acquire", device=device)
+        assert not answer.genom_success and "::bass::e_device" in answer.genom_exdetail, (device, answer)
+
+    def bring_master(self) -> None:
+        """A master comes at the address of the one that was killed, and is told of everything that is there."""
+        self.master.start(self.graph.env)
+        wanted = {f"/{component.name}/{service.name}" for component in (ROSAFE, BASS) for service in component.services}
+        wait_for(lambda: wanted <= self.graph.services(), what=lambda: str(wanted - self.graph.services()))
+        wait_for(lambda: {self.afe.topic("ild"), "/bass/Audio"} <= self.graph.topics())
 
     @contextmanager
     def held(self, process: harness.Process) -> Iterator[None]:
@@ -220,6 +316,12 @@ class Follower:
                 if not self.wrong and not np.array_equal(held[:, ~lost], truth[:, ~lost]):
                     self.wrong = f"wrong samples before index {message.lastFrameIndex}"
 
+    def goes_on(self) -> None:
+        """Wait for another block."""
+        wait_for(lambda: self.begun)
+        index = self.index
+        wait_for(lambda: self.index > index, what="another block")
+
 
 @contextmanager
 def following(world: World) -> Iterator[Follower]:
@@ -239,8 +341,18 @@ def world(size: Size, home: Path) -> Iterator[World]:
     with harness.private_graph(home) as (graph, master), ExitStack() as stack:
         os.environ.update(ROS_MASTER_URI=graph.uri, ROS_IP="127.0.0.1", ROS_HOME=str(home / ".ros"))
         registrar = registration.init_node("soak", ["soak"])  # which finds its way to a master that was restarted
+        genpy.Message.longest_sequence = 2**26  # here, what the nodes send is no attack, however long
         stack.callback(registrar.end)
         yield World(size, graph, master, stack)
+
+
+def recorded(world: World, path: Path) -> int:
+    """How many frames a recording has, each of which is the one that follows in what bass plays."""
+    samples = soundfile.read(path, dtype="int32")[0].T
+    begin = np.flatnonzero((world.sound == samples[:, :1]).all(axis=0))
+    assert len(begin) == 1, f"{path} begins with {samples[:, :1]}"
+    np.testing.assert_array_equal(samples, world.frames(int(begin[0]) + 1, samples.shape[1]))
+    return int(samples.shape[1])
 
 
 def later(seconds: float) -> Callable[[], bool]:

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from rosafe import __version__
-from tests.harness import SCRIPTS, Graph, MasterProcess, Process, free_port, wait_for
+from tests.harness import END_SECONDS, SCRIPTS, Graph, MasterProcess, Process, free_port, wait_for
 from tests.packaging.clone import fresh_copy, without_rights
 
 PROGRAMS = pytest.mark.parametrize("program", ["rosAFE-ros", "bass-ros"])
@@ -100,7 +100,7 @@ def masterless(graph: Graph) -> Iterator[dict[str, Process]]:
 
 def refusal(node: Process) -> str:
     """The one line that a node ends with which cannot start."""
-    assert node.wait(30) == 1
+    assert node.wait() == 1
     assert node.out == ""
     assert re.fullmatch(r"(rosAFE|bass)-ros: .*\n", node.err), node
     return node.err
@@ -160,28 +160,29 @@ def test_waiting_for_a_master_that_answers_nothing_can_be_ended(graph: Graph) ->
 
 # --- an address that nobody can call -----------------------------------------------------------------------------
 
-UNREACHABLE = {
-    "ROS_IP": ("203.0.113.7", "which is no address of this machine"),
-    "ROS_HOSTNAME": ("nobody.invalid", "no name that is known here"),
-}
-
 
 @PROGRAMS
-@pytest.mark.parametrize("variable", UNREACHABLE)
-def test_an_address_that_nobody_can_call_is_said(graph: Graph, program: str, variable: str) -> None:
-    """In one line; the node starts all the same. By remapping too."""
-    address, why = UNREACHABLE[variable]
-    name = f"unreachable_{variable.lower()}"
-    option = {"ROS_IP": "__ip", "ROS_HOSTNAME": "__hostname"}[variable]
-    for arguments, env in (([], {variable: address}), ([f"{option}:={address}"], {})):
-        with graph.node(program, "-i", name, *arguments, **env) as node:
-            assert node.err.startswith(f"{program}: warning: {variable} is {address}, ") and why in node.err
-            assert "set it to 127.0.0.1" in node.err and node.err.count("\n") == 1
-
-
-def test_addresses_that_can_be_called_are_not_mentioned(graph: Graph) -> None:
-    for env in ({"ROS_IP": "127.0.0.1"}, {"ROS_IP": "127.3.2.1"}, {"ROS_HOSTNAME": "127.0.0.1"}):
-        with graph.node("bass-ros", "-i", "reachable", **env) as node:
+@pytest.mark.parametrize(
+    ("ip", "hostname", "remapping", "why"),
+    [
+        ("203.0.113.7", "", "", "ROS_IP is 203.0.113.7, which is no address of this machine"),
+        ("127.0.0.1", "nobody.invalid", "", "ROS_HOSTNAME is nobody.invalid, which is no address, and no name"),
+        ("127.0.0.1", "", "__ip:=203.0.113.8", "ROS_IP is 203.0.113.8, which is no address of this machine"),
+        ("127.0.0.1", "", "", ""),
+        ("127.3.2.1", "", "", ""),
+        ("203.0.113.7", "localhost", "", ""),
+    ],
+)
+def test_an_address_that_nobody_can_call_is_said(
+    graph: Graph, program: str, ip: str, hostname: str, remapping: str, why: str
+) -> None:
+    """In one line; the node starts all the same."""
+    name = f"at_{program.partition('-')[0]}"
+    with graph.node(program, "-i", name, *filter(None, [remapping]), ROS_IP=ip, ROS_HOSTNAME=hostname) as node:
+        if why:
+            assert node.err.startswith(f"{program}: warning: {why}") and "set it to 127.0.0.1" in node.err
+            assert node.err.count("\n") == 1
+        else:
             assert node.err == ""
 
 
@@ -193,7 +194,7 @@ def test_addresses_that_can_be_called_are_not_mentioned(graph: Graph) -> None:
 def test_signal_ends_it_and_leaves_nothing(graph: Graph, program: str, number: int) -> None:
     name = f"/{program.removesuffix('-ros')}"
     with graph.node(program) as node:
-        assert node.stop(number, timeout=5) == 0
+        assert node.stop(number, timeout=END_SECONDS) == 0
         assert name not in graph.nodes()
         assert "Traceback" not in node.err
 
@@ -203,24 +204,33 @@ def test_kill_request_ends_it(graph: Graph, program: str) -> None:
     name = program.removesuffix("-ros")
     with graph.node(program) as node:
         assert "genom_success: True" in graph.run("rosservice", "call", f"/{name}/kill", "{}").stdout
-        assert node.wait(5) == 0
+        assert node.wait(END_SECONDS) == 0
         assert f"/{name}" not in graph.nodes()
 
 
 def test_rosnode_kill_ends_it(graph: Graph) -> None:
     with graph.node("bass-ros") as node:
         graph.run("rosnode", "kill", "/bass")
-        assert node.wait(5) == 0
+        assert node.wait(END_SECONDS) == 0
 
 
 def test_nohup_is_respected(graph: Graph) -> None:
     with graph.start("nohup", "bass-ros", "-i", "lasting") as node:
-        wait_for(lambda: "/lasting/kill" in graph.services(), 20, lambda: str(node))
+        wait_for(lambda: "/lasting/kill" in graph.services(), what=lambda: str(node))
         wait_for(lambda: "/lasting/Acquire/cancel" in graph.run("rostopic", "list").stdout)
         os.kill(node.pid, signal.SIGHUP)
         assert graph.call("/lasting/Stop").genom_success
         assert node.alive
         assert node.stop(signal.SIGTERM) == 0
+
+
+@PROGRAMS
+def test_a_script_may_start_it_in_the_background(graph: Graph, program: str) -> None:
+    """There `&` lets it ignore SIGINT."""
+    name = program.removesuffix("-ros")
+    with graph.start("sh", "-c", f"trap '' INT QUIT; exec {program}") as node:
+        wait_for(lambda: f"/{name}/kill" in graph.services(), what=lambda: str(node))
+        assert node.stop(signal.SIGINT) == 0
 
 
 def test_the_shells_process_is_the_node(graph: Graph) -> None:
@@ -257,7 +267,7 @@ def test_stdout_is_left_to_the_requests(graph: Graph) -> None:
 )
 def test_instance(graph: Graph, arguments: list[str], name: str) -> None:
     with graph.start("bass-ros", *arguments) as node:
-        wait_for(lambda: f"{name}/kill" in graph.services(), 20, lambda: str(node))
+        wait_for(lambda: f"{name}/kill" in graph.services(), what=lambda: str(node))
         assert not any(service.startswith("/bass/") for service in graph.services())
         assert node.stop() == 0
 
@@ -270,7 +280,7 @@ def test_two_instances_at_once(graph: Graph) -> None:
 
 def test_a_second_one_of_the_same_name_takes_over(graph: Graph) -> None:
     with graph.node("bass-ros") as old, graph.start("bass-ros") as new:
-        assert old.wait(10) == 0
+        assert old.wait() == 0
         assert "new node registered with same name" in old.out
         wait_for(lambda: f"Pid: {new.pid}\n" in graph.run("rosnode", "info", "/bass", check=False).stdout)
         wait_for(lambda: "/bass/Stop" in graph.services())
@@ -280,7 +290,7 @@ def test_a_second_one_of_the_same_name_takes_over(graph: Graph) -> None:
 def test_master_and_address_by_remapping(graph: Graph) -> None:
     command = ["bass-ros", "-i", "mapped", f"__master:={graph.uri}", "__ip:=127.0.0.2"]
     with graph.start(*command, ROS_MASTER_URI="http://127.0.0.1:1", ROS_IP="") as node:
-        wait_for(lambda: "/mapped/kill" in graph.services(), 20, lambda: str(node))
+        wait_for(lambda: "/mapped/kill" in graph.services(), what=lambda: str(node))
         assert "127.0.0.2" in graph.run("rosservice", "uri", "/mapped/kill").stdout
 
 
@@ -328,7 +338,7 @@ def test_starts_without_any_environment(graph: Graph) -> None:
     """No env.sh, no PYTHONPATH, no HOME, another folder."""
     command = ["env", "-i", f"ROS_MASTER_URI={graph.uri}", str(SCRIPTS / "bass-ros"), "-i", "bare"]
     with graph.start(*command, cwd=Path("/")) as node:
-        wait_for(lambda: "/bare/kill" in graph.services(), 20, lambda: str(node))
+        wait_for(lambda: "/bare/kill" in graph.services(), what=lambda: str(node))
         assert node.stop() == 0
 
 
@@ -341,7 +351,7 @@ def test_home_that_cannot_be_written(graph: Graph) -> None:
         command = [str(word) for word in without_rights(copy / "scripts" / "bass-ros", "-i", "poor")]
         poor = {"HOME": "/nonexistent", "ROS_HOME": "/nonexistent/.ros", "TMPDIR": str(temporary), "PYTHONPATH": ""}
         with Process(command, {**graph.env, **poor}) as node:
-            wait_for(lambda: "/poor/kill" in graph.services(), 20, lambda: str(node))
+            wait_for(lambda: "/poor/kill" in graph.services(), what=lambda: str(node))
             assert "WARNING" not in node.err
             assert node.stop() == 0
 
@@ -371,5 +381,5 @@ sys.exit(run_server(interface.BASS, build))
         graph.client()
         import rospy
 
-        wait_for(lambda: rospy.get_param("/stuck_is_up", False), 20, lambda: str(node))
+        wait_for(lambda: rospy.get_param("/stuck_is_up", False), what=lambda: str(node))
         assert node.stop(signal.SIGTERM, timeout=6) == 0

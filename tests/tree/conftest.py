@@ -6,9 +6,16 @@ from collections.abc import Iterator
 
 import pytest
 
+from rosafe.dsp import kernels
 from rosafe.tree.tree import Tree
 
 from .support import Feed, Recorder, end
+
+
+@pytest.fixture(scope="session", autouse=True)
+def built() -> None:
+    """No test waits for gcc."""
+    kernels.compiled()
 
 
 @pytest.fixture

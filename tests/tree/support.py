@@ -15,9 +15,9 @@ from rosafe.representations import KINDS, STAGES
 from rosafe.tree.block import Block
 from rosafe.tree.processor import Processor
 from rosafe.tree.tree import Tree
+from tests.harness import PATIENCE
 
 RATE = 16000.0
-WAIT_SECONDS = 20.0  # for anything that must happen
 
 
 class Feed:
@@ -98,7 +98,7 @@ class Recorder:
     def wait(self, condition: Callable[[], Any]) -> None:
         """Wait until `condition()` holds after something that a processor did."""
         with self._turn:
-            assert self._turn.wait_for(condition, WAIT_SECONDS), f"not within {WAIT_SECONDS:g} s"
+            assert self._turn.wait_for(condition, PATIENCE), f"not within {PATIENCE:g} s"
 
     def wait_blocks(self, processor: Processor, count: int) -> None:
         """Wait until `processor` has released `count` blocks in all."""
@@ -156,7 +156,7 @@ def end(tree: Tree, listener: Recorder) -> None:
     """Stop the tree and see to it that no thread is left."""
     tree.stop()
     for processor in listener.processors:
-        assert processor.join(WAIT_SECONDS), f"{processor!r} is still running"
+        assert processor.join(PATIENCE), f"{processor!r} is still running"
     tree.join()
     assert tree_threads() == set()
     assert listener.late == []

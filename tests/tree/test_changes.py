@@ -13,9 +13,9 @@ from rosafe.tree import sizes
 from rosafe.tree.states import State
 from rosafe.tree.tree import Tree
 from tests.dsp.bare import Chain
-from tests.harness import run_together
+from tests.harness import PATIENCE, run_together
 
-from .support import CHANNELS, RATE, WAIT_SECONDS, Feed, Plain, Recorder, grow, use_plain_stages
+from .support import CHANNELS, RATE, Feed, Plain, Recorder, grow, use_plain_stages
 
 LEAVES = ("ild", "ratemap", "crossCorrelation")
 NOISE = np.random.default_rng(7).standard_normal((20, 2, 400))
@@ -234,7 +234,7 @@ def test_a_change_waits_for_no_block_and_never_meets_one_half_way(
         def process(self, block: np.ndarray, extra: np.ndarray | None = None) -> np.ndarray:
             before = dict(self.parameters)
             working.set()
-            assert go_on.wait(WAIT_SECONDS)
+            assert go_on.wait(PATIENCE)
             assert self.parameters == before
             return block * self.parameters["rm_decaySec"]
 
@@ -242,7 +242,7 @@ def test_a_change_waits_for_no_block_and_never_meets_one_half_way(
     grow(tree, feed)
     tree.modify("ratemap", "rm_decaySec", "1")
     feed.put(*np.ones((2, 2, 10)))
-    assert working.wait(WAIT_SECONDS)
+    assert working.wait(PATIENCE)
     tree.modify("ratemap", "rm_decaySec", "2")
     ratemap = tree.find("ratemap")
     assert ratemap.state is State.EXEC

@@ -13,9 +13,9 @@ import pytest
 from rosafe.interface import ComponentError
 from rosafe.tree.states import State
 from rosafe.tree.tree import Tree
-from tests.harness import wait_for
+from tests.harness import PATIENCE, wait_for
 
-from .support import RATE, WAIT_SECONDS, Feed, Plain, Recorder, use_plain_stages
+from .support import RATE, Feed, Plain, Recorder, use_plain_stages
 
 
 @pytest.fixture
@@ -37,7 +37,7 @@ def test_siblings_work_at_the_same_time(
 
     class Meeting(Plain):
         def process(self, block: np.ndarray, extra: np.ndarray | None = None) -> np.ndarray:
-            meeting.wait(WAIT_SECONDS)
+            meeting.wait(PATIENCE)
             return block
 
     use_plain_stages(monkeypatch, preProc=Meeting)
@@ -68,7 +68,7 @@ def test_a_parent_works_on_the_next_block_while_its_child_works_on_the_last(
         def process(self, block: np.ndarray, extra: np.ndarray | None = None) -> np.ndarray:
             with turn:
                 number = int(block[0, 0])
-                assert turn.wait_for(lambda: number == last or number + 1 in computed, WAIT_SECONDS)
+                assert turn.wait_for(lambda: number == last or number + 1 in computed, PATIENCE)
                 assert number + 2 not in computed, "the parent went on without the child's token"
             return block
 
@@ -99,7 +99,7 @@ def test_the_four_states(tree: Tree, listener: Recorder, feed: Feed, monkeypatch
     class Slow(Plain):
         def process(self, block: np.ndarray, extra: np.ndarray | None = None) -> np.ndarray:
             working.set()
-            assert go_on.wait(WAIT_SECONDS)
+            assert go_on.wait(PATIENCE)
             return block
 
     use_plain_stages(monkeypatch, gammatone=Slow)
@@ -108,7 +108,7 @@ def test_the_four_states(tree: Tree, listener: Recorder, feed: Feed, monkeypatch
     child = tree.add("gammatone", "child", "parent")
     assert [p.state for p in (root, parent, child)] == [State.WAIT_EXEC] * 3
     feed.put(count=1)
-    assert working.wait(WAIT_SECONDS)
+    assert working.wait(PATIENCE)
     assert child.state is State.EXEC
     wait_for(lambda: parent.state is State.WAIT_EXEC)
     feed.put(count=1)
@@ -133,7 +133,7 @@ def test_nobody_waits_for_a_removed_child(
         def process(self, block: np.ndarray, extra: np.ndarray | None = None) -> np.ndarray:
             if self.parameters.get("slow"):
                 working.set()
-                assert go_on.wait(WAIT_SECONDS)
+                assert go_on.wait(PATIENCE)
             return block
 
     use_plain_stages(monkeypatch, preProc=Slow)
@@ -142,7 +142,7 @@ def test_nobody_waits_for_a_removed_child(
     below = tree.add("gammatone", "below", "slow")
     other = tree.add("preProc", "other", "input")
     feed.put(count=5)
-    assert working.wait(WAIT_SECONDS)
+    assert working.wait(PATIENCE)
     listener.wait_blocks(other, 1)
     wait_for(lambda: (root.state, other.state) == (State.WAIT_RELEASE, State.WAIT_EXEC))
     assert len(listener.blocks[root]) == 1
@@ -155,7 +155,7 @@ def test_nobody_waits_for_a_removed_child(
     listener.wait_blocks(again, 2)
     assert not slow.join(0.0)
     go_on.set()
-    assert slow.join(WAIT_SECONDS)
+    assert slow.join(PATIENCE)
     assert listener.blocks[slow] == listener.blocks[below] == []
 
 
@@ -207,7 +207,7 @@ def test_blocks_arrive_whole_and_in_order_whoever_comes_and_goes(
         feed.end()
         alive = tree.processors
         for processor in alive:
-            assert processor.join(WAIT_SECONDS), f"{processor!r} hangs"
+            assert processor.join(PATIENCE), f"{processor!r} hangs"
     finally:
         sys.setswitchinterval(interval)
     assert errors == []
@@ -229,7 +229,7 @@ def test_a_stream_of_any_rate_ends_by_itself(listener: Recorder, tree: Tree) -> 
     child = tree.add("preProc", "child", "input")
     feed.put(count=3)
     feed.end()
-    assert child.join(WAIT_SECONDS)
+    assert child.join(PATIENCE)
     assert root.state is child.state is State.DONE
     np.testing.assert_array_equal(listener.data(child)[0], np.arange(300))
     assert listener.blocks[child][-1].next_index == child.next_index == 300

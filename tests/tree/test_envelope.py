@@ -8,15 +8,16 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rosafe.dsp.stage import Output
 from rosafe.representations import STAGES
 from rosafe.representations.haircell import InnerHairCell
 from rosafe.tree.processor import Processor
 from rosafe.tree.states import State
 from rosafe.tree.tree import Tree
-from tests.dsp.bare import joined
-from tests.harness import wait_for
+from tests.dsp.bare import joined, single
+from tests.harness import PATIENCE, wait_for
 
-from .support import RATE, WAIT_SECONDS, Feed, Recorder, grow
+from .support import RATE, Feed, Recorder, grow
 from .test_changes import LEAVES, NOISE, assert_as, chain, settle
 
 
@@ -32,7 +33,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
     answers: list[bool] = []
     original = STAGES["gammatone"].process
 
-    def process(self: Any, block: np.ndarray) -> np.ndarray:
+    def process(self: Any, block: np.ndarray) -> Output:
         answers.append("envelope" in self.provide)
         return original(self, block)
 
@@ -85,10 +86,10 @@ def test_a_late_child_never_works_without_the_envelope(tree: Tree, feed: Feed, l
     filterbank = chain().stages["gammatone"]
     hair_cell = STAGES["ihc"](RATE, ihc_method=method)
     for number, block in enumerate(NOISE):
-        filterbank.provide = frozenset({"envelope"})  # type: ignore[attr-defined]
-        data = filterbank.process(block)
+        filterbank.provide = frozenset({"envelope"})
+        data = single(filterbank.process(block))
         if number >= numbers[0]:
-            expected = hair_cell.process(data, filterbank.provided["envelope"])  # type: ignore[attr-defined,call-arg]
+            expected = hair_cell.process(data, filterbank.provided["envelope"])
             got = listener.blocks[late][number - numbers[0]].data
             np.testing.assert_allclose(got, expected, rtol=0, atol=1e-12)
 
@@ -119,14 +120,14 @@ def test_a_block_that_is_on_its_way_without_the_envelope_goes_the_old_way(
 
     def process(self: InnerHairCell, block: np.ndarray, *envelope: np.ndarray) -> np.ndarray:
         working.set()
-        assert go_on.wait(WAIT_SECONDS)
+        assert go_on.wait(PATIENCE)
         return original(self, block, *envelope)
 
     monkeypatch.setattr(InnerHairCell, "process", process)
     grow(tree, feed)
     filterbank, ihc = tree.find("gammatone"), tree.find("ihc")
     feed.put(*NOISE[:2])
-    assert working.wait(WAIT_SECONDS)
+    assert working.wait(PATIENCE)
     wait_for(lambda: filterbank.state is State.WAIT_RELEASE)
     tree.modify("ihc", "ihc_method", "hilbert")
     feed.put(*NOISE[2:4])
@@ -145,7 +146,7 @@ def test_a_block_without_the_envelope_after_all_is_no_gap(
     def process(self: InnerHairCell, block: np.ndarray, *envelope: np.ndarray) -> np.ndarray:
         if block[0, 0, 0] == first[0, 0, 0]:
             working.set()
-            assert go_on.wait(WAIT_SECONDS)
+            assert go_on.wait(PATIENCE)
         return original(self, block, *envelope)
 
     first = chain().run([NOISE[0]])[0]["gammatone"]
@@ -154,7 +155,7 @@ def test_a_block_without_the_envelope_after_all_is_no_gap(
     filterbank, ihc = tree.find("gammatone"), tree.find("ihc")
     tree.modify("ihc", "ihc_method", "hilbert")
     feed.put(NOISE[0])
-    assert working.wait(WAIT_SECONDS)
+    assert working.wait(PATIENCE)
     tree.modify("ihc", "ihc_method", "fullwave")
     feed.put(NOISE[1])
     wait_for(lambda: filterbank.state is State.WAIT_RELEASE)

@@ -18,9 +18,10 @@ from rosafe.tree.block import Block
 from rosafe.tree.processor import Processor
 from rosafe.tree.states import State
 from rosafe.tree.tree import Tree
-from tests.harness import run_together, wait_for
+from tests.dsp.bare import single
+from tests.harness import PATIENCE, run_together, wait_for
 
-from .support import RATE, WAIT_SECONDS, Feed, Plain, Recorder, grow, tree_threads, use_plain_stages
+from .support import RATE, Feed, Plain, Recorder, grow, tree_threads, use_plain_stages
 
 
 def refused(tree: Tree, ex: str, what: str, request: Any, *arguments: Any) -> None:
@@ -140,7 +141,7 @@ def test_stop_and_begin_anew(tree: Tree, listener: Recorder) -> None:
         assert feed.stopped
         assert tree.processors == []
         assert tree.input is None
-        assert all(p.join(WAIT_SECONDS) for p in before)
+        assert all(p.join(PATIENCE) for p in before)
     assert len(listener.ends) == 21
 
 
@@ -168,7 +169,7 @@ def test_children_go_on_with_the_new_input_and_what_they_held(tree: Tree, listen
     whole = noise
     for kind in ("preProc", "gammatone", "ihc"):
         processor = tree.find(kind)
-        whole = STAGES[kind](RATE, **processor.parameters()).process(whole)
+        whole = single(STAGES[kind](RATE, **processor.parameters()).process(whole))
         listener.wait_blocks(processor, 4)
         np.testing.assert_allclose(listener.data(processor), whole, rtol=0, atol=1e-12)
     for leaf in leaves[1:]:
@@ -207,7 +208,7 @@ def test_a_tree_whose_source_has_ended_goes_with_it(tree: Tree, feed: Feed, list
     feed.put(count=1)
     feed.end()
     for processor in before:
-        assert processor.join(WAIT_SECONDS)
+        assert processor.join(PATIENCE)
     tree.add_input("input", Feed(), 160, 1.0, 1.0)
     names = ["ild", "ratemap", "crossCorrelation", "ihc", "gammatone", "preProc", "input"]
     assert [p.name for p in listener.ends] == names
@@ -241,7 +242,7 @@ def test_all_processors_together_have_a_share_of_the_memory(
     tree: Tree, feed: Feed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What would pass it changes nothing, be it a new processor, a longer port or more channels."""
-    monkeypatch.setattr(sizes.os, "sysconf", {"SC_PHYS_PAGES": 2**13, "SC_PAGE_SIZE": 2**12}.get)  # 32 MiB
+    monkeypatch.setattr(sizes, "machine_memory", lambda: 2**25)
     share = "MiB, more than 16 MiB, which is 50% of this machine's memory"
     grow(tree, feed)
     tree.modify("gammatone", "fb_nChannels", "10")
@@ -283,7 +284,7 @@ def test_three_hundred_cycles_leave_nothing_behind(tree: Tree, feed: Feed, liste
         feed.put(count=1)
         listener.wait_blocks(tree.find("gammatone"), 1)
         for processor in tree.remove("preProc"):
-            assert processor.join(WAIT_SECONDS)
+            assert processor.join(PATIENCE)
         listener.forget()
 
     def memory() -> int:

@@ -11,8 +11,9 @@ import pytest
 from rosafe.tree.states import State
 from rosafe.tree.trace import Event, Trace, Tracer
 from rosafe.tree.tree import Tree
+from tests.harness import PATIENCE
 
-from .support import WAIT_SECONDS, Feed, Plain, Recorder, use_plain_stages
+from .support import Feed, Plain, Recorder, use_plain_stages
 
 
 @pytest.fixture
@@ -35,14 +36,14 @@ def test_overlap_of_parent_and_child_and_of_siblings(
     class Parent(Plain):
         def process(self, block: np.ndarray, extra: np.ndarray | None = None) -> np.ndarray:
             if block[0, 0] > 0:
-                all_meet.wait(WAIT_SECONDS)
+                all_meet.wait(PATIENCE)
             return block
 
     class Sibling(Plain):
         def process(self, block: np.ndarray, extra: np.ndarray | None = None) -> np.ndarray:
-            siblings_meet.wait(WAIT_SECONDS)
+            siblings_meet.wait(PATIENCE)
             if block[0, 0] < last:
-                all_meet.wait(WAIT_SECONDS)
+                all_meet.wait(PATIENCE)
             return block
 
     use_plain_stages(monkeypatch, preProc=Parent, gammatone=Sibling)

@@ -4,7 +4,7 @@ function answers = ask(about)
 answers = {};
 if isfield(about, 'multiple')
     if about.multiple
-        answers = {input('string element: name of the processor > ', 's')};
+        answers = {unquoted(input('string element: name of the processor > ', 's'))};
     end
     return
 end
@@ -16,7 +16,7 @@ for k = 1:numel(names)
     if ~parameter.required
         default = [' (' genomix.wire.shown(parameter.default) ')'];
     end
-    answer = input(sprintf('%s %s: %s%s > ', parameter.type, names{k}, parameter.doc, default), 's');
+    answer = unquoted(input(sprintf('%s %s: %s%s > ', parameter.type, names{k}, parameter.doc, default), 's'));
     if ~isempty(answer)
         given.(names{k}) = answer; % genomixd reads numbers in texts
     end
@@ -24,4 +24,9 @@ end
 if ~isempty(names)
     answers = {given};
 end
+end
+
+function text = unquoted(text)
+% People type texts as in a script, with their quotes: one pair is not part of them.
+text = regexprep(strtrim(text), '^([''"])(.*)\1$', '$2');
 end

@@ -1,11 +1,11 @@
-function [answer, failed] = fetch(address, path, query, matrices)
+function [answer, failed] = fetch(address, path, query, matrices, columns)
 %FETCH  What genomixd answers to one request (docs/genomixd.md).
 %
-%   [answer, failed] = genomix.wire.fetch('host:port', '/call/rosAFE/Stop', {'s', 'me'; ...}, matrices)
+%   [answer, failed] = genomix.wire.fetch('host:port', '/call/rosAFE/Stop', {'s', 'me'; ...}, matrices, columns)
 %
-%   QUERY is an N-by-2 cell array of names and texts; MATRICES is that of genomix.wire.decode. FAILED is true where the
-%   server or the component refused, and ANSWER is the exception then (fields ex and, for some, detail). A server that
-%   cannot be reached raises the error genomix:connection.
+%   QUERY is an N-by-2 cell array of names and texts; MATRICES and COLUMNS are those of genomix.wire.decode. FAILED is
+%   true where the server or the component refused, and ANSWER is the exception then (fields ex and, for some, detail).
+%   A server that cannot be reached raises the error genomix:connection.
 
 url = ['http://' address path '?syntax=packed'];
 for k = 1:size(query, 1)
@@ -39,7 +39,7 @@ bytes = uint8(bytes(:).');
 if ~any(bytes(1) == uint8('dsD[{S!'))
     error('genomix:connection', 'what answers at %s is no genomixd: %s', address, char(bytes(1:min(end, 80))));
 end
-[answer, failed] = genomix.wire.decode(bytes, matrices);
+[answer, failed] = genomix.wire.decode(bytes, matrices, columns);
 end
 
 function bypass_proxy(address)

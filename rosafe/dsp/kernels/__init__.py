@@ -29,8 +29,12 @@ MOST_SECTIONS = 8  # of a low-pass
 MOST_LAGS = 1024  # of a correlation; FFT is faster beyond
 MOST_LOOPS = 32  # of adaptation
 MOST_SIZE = 4096  # samples of a frame whose autocorrelation is made
+MOST_POINTS = 8192  # real ones of a Fourier transform
+TAPS = 6  # of a filter that takes an echo out
 
 REAL_SIZE = 8  # bytes of a float64
+MOST_LANES = 8  # float64 in a register
+TOGETHER = 8  # rows that lie in memory sample by sample
 
 CLIPPINGS = ("clp", "clc", "sgn")
 RECTIFICATIONS = ("none", "halfwave", "fullwave", "square", "compressed")
@@ -149,6 +153,15 @@ class Frames(NamedTuple):
     hop: int  # from a frame's start to that of the next one
     number: int  # of whole ones
 
+    def part(self, first: int, number: int) -> Frames:
+        """Some of them, for a kernel that leaves the tail alone."""
+        return self._replace(skip=self.skip + first * self.hop, number=number)
+
+    def keep(self) -> None:
+        """Fill the tail, after such kernels."""
+        length = self.tail.length
+        self.tail.samples[...] = self.block[..., self.block.shape[-1] - length :]
+
 
 class Sums(NamedTuple):
     """Of the frames that begin in a call's samples, (*rows, F): first the `whole` ones, then those that go on.
@@ -188,11 +201,26 @@ def ratemap(
     return rates, sums
 
 
+def modulation(frames: Frames, begun: Sums | None, sections: FloatArray, state: FloatArray) -> tuple[FloatArray, Sums]:
+    """Weighted sums of the magnitudes of what parallel sections (M, 6) make of each frame's samples, (*rows, M, F).
+
+    Of samples (*rows, N), with the sections' state (M, *rows, 2). The history of `frames` is (*rows, M), and what has
+    come out already, the block goes in now. The twin is `rosafe.dsp.framing.Framing.means` of the magnitudes of what
+    `rosafe.dsp.cascade.Parallel` makes.
+    """
+    sums, arguments = _sums(frames, begun)
+    means = np.empty((*frames.tail.store.shape[:-1], frames.number))
+    _function("rosafe_modulation")(
+        *_arguments(frames), *arguments, len(sections), *map(_address, (sections, state, means))
+    )
+    return means, sums
+
+
 def _sums(frames: Frames, begun: Sums | None) -> tuple[Sums, tuple[int | None, ...]]:
     """Room for the sums of `frames`, and the arguments that tell of it and of the sums known already."""
     samples = frames.history.length + frames.block.shape[-1]
     number = max(0, -((frames.skip - samples) // frames.hop))
-    sums = Sums(np.empty((*frames.block.shape[:-1], number)), frames.number)
+    sums = Sums(np.empty((*frames.tail.store.shape[:-1], number)), frames.number)
     if begun is None:
         return sums, (number, None, 0, 0, _address(sums.sums))
     stride = begun.sums.shape[-1]
@@ -273,7 +301,7 @@ def autocorrelations(
     """
     rows = frames.block.shape[:-1]
     output = memory.empty((*rows, len(corrections), frames.number))
-    transform = Transform.of_frames(len(frames.weights))
+    transform = Transform.of(2 * len(frames.weights) - 1)
     _function("rosafe_autocorrelations")(
         *_arguments(frames),
         CLIPPINGS.index(clipping),
@@ -309,9 +337,9 @@ class Transform(NamedTuple):
 
     @classmethod
     @functools.lru_cache(8)
-    def of_frames(cls, size: int) -> Transform:
-        """For the correlation of frames of so many samples, at least 2, at all lags: N is a power of 2."""
-        points = 1 << (2 * size - 2).bit_length() - 1
+    def of(cls, samples: int) -> Transform:
+        """For so many samples and zeros behind, at least 3 together: N is the next power of 2."""
+        points = 1 << (samples - 1).bit_length() - 1
         twiddles, index, place, n = [np.empty((0, 3))], np.arange(points), np.zeros(points, np.int64), points
         while n >= 4:
             twiddles.append(np.exp(-2j * np.pi / n * np.arange(n // 4)[:, np.newaxis] * (1, 2, 3)))
@@ -322,6 +350,108 @@ class Transform(NamedTuple):
         k = np.arange(points // 2 + 1)
         places = np.ascontiguousarray(np.stack((place[k], place[-k % points]), axis=1))
         return cls(points, np.concatenate(twiddles), places, np.exp(1j * np.pi / points * k))
+
+
+class Windowed(NamedTuple):
+    """Frames of the two ears times a window, and what can be said of them at once."""
+
+    samples: FloatArray  # (F, 2, C, w)
+    sums: FloatArray  # over channels, (F, 2, w)
+    peaks: FloatArray  # the largest sample of each, (F, 2, C)
+    energies: FloatArray  # the sum of squares of each, (F, 2, C)
+
+    @classmethod
+    def room(cls, frames: int, channels: int, size: int) -> Windowed:
+        """To be filled."""
+        each = (frames, 2, channels)
+        return cls(np.empty((*each, size)), np.empty((frames, 2, size)), np.empty(each), np.empty(each))
+
+    def first(self, frames: int) -> Windowed:
+        """That of the first frames."""
+        return Windowed(*(array[:frames] for array in self))
+
+
+class Taps(NamedTuple):
+    """Filters y[t] = sum_i values[i] x[t - shifts[i]]; y begins where x does and is shifts[-1] samples longer."""
+
+    shifts: NDArray[np.int64]  # (..., TAPS), ascending
+    values: FloatArray  # (..., TAPS)
+
+    def of(self, *place: Any) -> Taps:
+        """Those at `place`."""
+        return Taps(self.shifts[place], self.values[place])
+
+
+def windowed(frames: Frames, output: Windowed) -> None:
+    """The frames of (2, C, N), windowed by their weights, to `output`; the tail is left alone.
+
+    The twin is `rosafe.representations.precedence.windowed`.
+    """
+    _function("rosafe_windowed")(*_arguments(frames), *map(_address, output))
+
+
+def add_spectra(
+    samples: FloatArray, points: int, gains: FloatArray, factors: FloatArray, power: FloatArray
+) -> FloatArray:
+    """As `rosafe.representations.precedence.add_spectra`, of a power of 2 up to MOST_POINTS points; w is even."""
+    count, ears, channels, size = samples.shape
+    transform = Transform.of(points)
+    sums, factors = np.empty((count, ears, power.shape[1])), np.ascontiguousarray(factors)
+    _function("rosafe_add_spectra")(
+        _address(samples),
+        channels,
+        count,
+        size,
+        *map(_address, (gains, factors)),
+        transform.points,
+        *map(_address, (transform.twiddles, transform.places, transform.turns, power, sums)),
+    )
+    return sums
+
+
+def correlate_filtered(
+    left: FloatArray, left_taps: Taps, right: FloatArray, right_taps: Taps, reach: int
+) -> tuple[FloatArray, FloatArray]:
+    """As `rosafe.representations.precedence.correlate_filtered`, of at most MOST_LAGS lags."""
+    count, rows, size = left.shape
+    correlations, energies = np.empty((count, rows, 2 * reach + 1)), np.empty((2, count, rows))
+    longest = size + max(0, int(left_taps.shifts.max(initial=0)), int(right_taps.shifts.max(initial=0)))
+    scratch = np.empty(2 * MOST_LANES * (size + reach) + 2 * longest)
+    filters = [np.ascontiguousarray(array) for taps in (left_taps, right_taps) for array in taps]
+    _function("rosafe_correlate_filtered")(
+        left.ctypes.data,
+        *(step // REAL_SIZE for step in left.strides[:2]),
+        *map(_address, filters[:2]),
+        right.ctypes.data,
+        *(step // REAL_SIZE for step in right.strides[:2]),
+        *map(_address, filters[2:]),
+        count,
+        rows,
+        size,
+        left_taps.shifts.shape[1] < rows,
+        reach,
+        longest,
+        *map(_address, (scratch, correlations, energies)),
+    )
+    return correlations, energies
+
+
+def patterns(levels: FloatArray, count: int, reach: int, places: NDArray[np.int64], weights: FloatArray) -> FloatArray:
+    """As `rosafe.representations.gabor.respond_by_scipy`."""
+    frames = -(-count // MOST_LANES) * MOST_LANES
+    padded = np.zeros((*levels.shape[:-1], frames + 2 * reach))
+    padded[..., : levels.shape[-1]] = levels
+    sums = np.empty((len(levels), len(places), frames))
+    _function("rosafe_patterns")(
+        _address(padded),
+        levels.shape[1],
+        frames,
+        reach,
+        _address(places),
+        len(places),
+        *map(_address, (weights, sums)),
+    )
+    return sums[..., :count]
 
 
 @contextmanager

@@ -1,50 +1,18 @@
 /* Autocorrelation of centre-clipped frames by FFT (rosafe/representations/autocorrelation.py).
  *
  * A frame in each lane. A frame and zeros, N real numbers, are taken for N / 2 complex ones, and so is the power spectrum on
- * its way back: J. W. Cooley, P. A. W. Lewis and P. D. Welch (1970), J. Sound Vib. 12, 315-337. Out of the transform there,
- * which halves in frequency, they come in reversed order, and the transform back, which halves in time, takes them so.
- * Butterflies of four; each transform is done quarter by quarter, so that all but the first of its passes stay in the cache
- * (R. C. Singleton (1967), Comm. ACM 10). */
+ * its way back. Out of the transform there, which halves in frequency, they come in reversed order, and the transform back,
+ * which halves in time, takes them so. */
+#include "fourier.h"
 #include "power.h"
 
 #include <string.h>
 
-enum { MOST_SIZE = 4096 /* of a frame */, MOST_POINTS = MOST_SIZE /* complex ones */ };
+enum { MOST_SIZE = 4096 /* of a frame: as many complex points are the power of 2 above two of them */ };
 
 enum clipping { COMPRESS, CLIP_ONLY, SIGN };
 
-typedef struct {
-    vec re, im;
-} complexes;
-
-typedef struct {
-    double re, im;
-} number;
-
 /* --- transforms --- */
-
-INLINE complexes sum(complexes a, complexes b) { return (complexes){a.re + b.re, a.im + b.im}; }
-INLINE complexes difference(complexes a, complexes b) { return (complexes){a.re - b.re, a.im - b.im}; }
-INLINE complexes times_i(complexes a) { return (complexes){-a.im, a.re}; }
-INLINE complexes times(complexes a, number w) {
-    return (complexes){fused(a.re, all(w.re), -(a.im * all(w.im))), fused(a.re, all(w.im), a.im * all(w.re))};
-}
-INLINE complexes times_conjugate(complexes a, number w) { return times(a, (number){w.re, -w.im}); }
-
-/* Twiddles: for n points exp(-2 pi i j k / n), j = 1, 2, 3 for each k < n / 4, and behind these the ones for n / 4 points.
- * `half`: the upper half is zeros, and is not read. */
-INLINE void butterflies_there(complexes *x, int64_t n, const number *w, const int half) {
-    const int64_t q = n / 4;
-    for (int64_t k = 0; k < q; k++, w += 3) {
-        complexes a = x[k], b = x[k + q], c = half ? (complexes){} : x[k + 2 * q], d = half ? (complexes){} : x[k + 3 * q];
-        complexes even = half ? a : sum(a, c), odd = half ? a : difference(a, c);
-        complexes even2 = half ? b : sum(b, d), odd2 = times_i(half ? b : difference(b, d));
-        x[k] = sum(even, even2);
-        x[k + q] = times(difference(odd, odd2), w[0]);
-        x[k + 2 * q] = times(difference(even, even2), w[1]);
-        x[k + 3 * q] = times(sum(odd, odd2), w[2]);
-    }
-}
 
 /* `half`: of what comes out, the upper half is not written. */
 INLINE void butterflies_back(complexes *x, int64_t n, const number *w, const int half) {
@@ -62,19 +30,6 @@ INLINE void butterflies_back(complexes *x, int64_t n, const number *w, const int
     }
 }
 
-INLINE void pair(complexes *x) {
-    complexes a = x[0], b = x[1];
-    x[0] = sum(a, b);
-    x[1] = difference(a, b);
-}
-
-static void there(complexes *x, int64_t n, const number *w) {
-    if (n == 2) pair(x);
-    if (n < 4) return;
-    butterflies_there(x, n, w, 0);
-    for (int64_t i = 0; i < 4; i++) there(x + i * (n / 4), n / 4, w + 3 * (n / 4));
-}
-
 static void back(complexes *x, int64_t n, const number *w) {
     if (n == 2) pair(x);
     if (n < 4) return;
@@ -87,16 +42,12 @@ static void back(complexes *x, int64_t n, const number *w) {
 INLINE void to_powers(const int squared, complexes *x, int64_t n, const int64_t (*places)[2], const number *turns,
                       double exponent) {
     for (int64_t k = 0; k <= n / 2; k++) {
-        complexes a = x[places[k][0]], b = x[places[k][1]];
-        vec cosine = all(turns[k].re), sine = all(turns[k].im);
-        complexes even = {a.re + b.re, a.im - b.im}, odd = {a.im + b.im, b.re - a.re};
-        odd = (complexes){fused(odd.re, cosine, odd.im * sine), fused(odd.im, cosine, -(odd.re * sine))};
-        complexes low = sum(even, odd), high = difference(even, odd);
-        vec p = fused(low.re, low.re, low.im * low.im), q = fused(high.re, high.re, high.im * high.im);
-        if (!squared) p = power(p, exponent), q = power(q, exponent);
-        vec both = p + q, apart = p - q;
-        x[places[k][0]] = (complexes){fused(-apart, sine, both), apart * cosine};
-        x[places[k][1]] = (complexes){fused(apart, sine, both), apart * cosine};
+        vec cosine = all(turns[k].re), sine = all(turns[k].im), both[2];
+        powers(x[places[k][0]], x[places[k][1]], turns[k], both);
+        if (!squared) both[0] = power(both[0], exponent), both[1] = power(both[1], exponent);
+        vec together = both[0] + both[1], apart = both[0] - both[1];
+        x[places[k][0]] = (complexes){fused(-apart, sine, together), apart * cosine};
+        x[places[k][1]] = (complexes){fused(apart, sine, together), apart * cosine};
     }
 }
 
@@ -104,12 +55,7 @@ INLINE void to_powers(const int squared, complexes *x, int64_t n, const int64_t 
  * that. The upper half of x need not be set where n is at least 4. */
 static void autocorrelate(complexes *x, int64_t n, const number *twiddles, const int64_t (*places)[2], const number *turns,
                           double exponent) {
-    if (n < 4) {
-        there(x, n, twiddles);
-    } else {
-        butterflies_there(x, n, twiddles, 1);
-        for (int64_t i = 0; i < 4; i++) there(x + i * (n / 4), n / 4, twiddles + 3 * (n / 4));
-    }
+    there_from_half(x, n, twiddles);
     if (exponent == 1)
         to_powers(1, x, n, places, turns, exponent);
     else

@@ -25,6 +25,8 @@ _ARGUMENTS = {
     "rosafe_adaptation": (_ARRAY, _INTEGER, _INTEGER, _REAL, *[_ARRAY, _INTEGER] * 2, _INTEGER, _ARRAY, _ARRAY),
     "rosafe_levels": (*_FRAMES, *_SUMS, _REAL, _ARRAY),
     "rosafe_ratemap": (*_FRAMES, *_SUMS, _INTEGER, _REAL, _ARRAY, _ARRAY),
+    "rosafe_modulation": (*_FRAMES, *_SUMS, _INTEGER, *[_ARRAY] * 3),
+    "rosafe_patterns": (_ARRAY, *[_INTEGER] * 3, _ARRAY, _INTEGER, _ARRAY, _ARRAY),
     "rosafe_denormals_off": (),
     "rosafe_denormals_as": (_BITS,),
     "rosafe_correlations": (*_FRAMES, _INTEGER, _REAL, _ARRAY, _INTEGER),
@@ -35,6 +37,9 @@ _ARGUMENTS = {
     ),
     # clipping, alpha, exponent; points, twiddles, places, turns; corrections, lags; output
     "rosafe_autocorrelations": (*_FRAMES, _INTEGER, _REAL, _REAL, _INTEGER, *[_ARRAY] * 4, _INTEGER, _ARRAY),
+    "rosafe_windowed": (*_FRAMES, *[_ARRAY] * 4),
+    "rosafe_correlate_filtered": (*(_ARRAY, _INTEGER, _INTEGER, _ARRAY, _ARRAY) * 2, *[_INTEGER] * 6, *[_ARRAY] * 3),
+    "rosafe_add_spectra": (_ARRAY, *[_INTEGER] * 3, _ARRAY, _ARRAY, _INTEGER, *[_ARRAY] * 5),
 }
 
 

@@ -10,6 +10,7 @@
 #include <stdint.h>
 
 #define INLINE static inline __attribute__((always_inline))
+#define INTERNAL __attribute__((visibility("hidden"))) /* between the sources; not for Python */
 #define UNROLL _Pragma("GCC unroll 32") /* -O2 leaves even loops over four things rolled */
 
 /* As in rosafe/dsp/guard.py: samples are bounded to LIMIT; states below TINY become 0 at the end of a block. */

@@ -1,0 +1,54 @@
+/* Gabor features (rosafe/representations/gabor.py): sums of levels times the weights of many patterns of channels and frames.
+ * A frame in each lane; each weight is read once for several registers of them. The order of the sums does not depend on how
+ * many frames there are. */
+#include "vector.h"
+
+enum { TOGETHER = 2, /* registers of frames of each ear that share the reading of a weight */
+       CHAINS = 2 };    /* sums that do not wait for one another */
+
+/* The channels and frames that a feature takes in, those next to frame 0 included, and where its weights begin. */
+typedef struct {
+    int64_t first, channels, reach, weights;
+} pattern;
+
+/* Of `count` registers of frames from `levels` on, of the left ear and, `ear` further, of the right one. */
+INLINE void add_products(const int count, const double *levels, int64_t ear, int64_t stride, const pattern *of,
+                         const double *weights, double *left, double *right) {
+    vec sum[2][TOGETHER][CHAINS] = {};
+    const double *weight = weights + of->weights;
+    for (int64_t c = of->first; c < of->first + of->channels; c++) {
+        const double *level = levels + c * stride - of->reach;
+        int64_t u = 0;
+        for (; u + CHAINS <= 2 * of->reach + 1; u += CHAINS, level += CHAINS, weight += CHAINS)
+            UNROLL for (int k = 0; k < CHAINS; k++)
+                UNROLL for (int i = 0; i < 2 * count; i++) {
+                    vec *mine = &sum[i / count][i % count][k];
+                    *mine = fused(all(weight[k]), load(level + k + i / count * ear + i % count * LANES), *mine);
+                }
+        for (; u < 2 * of->reach + 1; u++, level++, weight++)
+            UNROLL for (int i = 0; i < 2 * count; i++) {
+                vec *mine = &sum[i / count][i % count][0];
+                *mine = fused(all(*weight), load(level + i / count * ear + i % count * LANES), *mine);
+            }
+    }
+    UNROLL for (int i = 0; i < 2 * count; i++)
+        *(vec_anywhere *)((i / count ? right : left) + i % count * LANES) = sum[i / count][i % count][0] + sum[i / count][i % count][1];
+}
+
+/* levels (2, channels, reach + frames + reach), where frames are a multiple of 8; patterns (features), sums (2, features,
+ * frames). */
+void rosafe_patterns(const double *levels, int64_t channels, int64_t frames, int64_t reach, const pattern *patterns,
+                     int64_t features, const double *weights, double *sums) {
+    const int64_t stride = frames + 2 * reach, ear = channels * stride;
+    uint32_t mode = denormals_off();
+    for (int64_t begin = 0; begin < frames; begin += TOGETHER * LANES)
+        for (int64_t g = 0; g < features; g++) {
+            const double *mine = levels + reach + begin;
+            double *left = sums + g * frames + begin, *right = left + features * frames;
+            if (frames - begin >= TOGETHER * LANES)
+                add_products(TOGETHER, mine, ear, stride, patterns + g, weights, left, right);
+            else
+                add_products(1, mine, ear, stride, patterns + g, weights, left, right);
+        }
+    denormals_as(mode);
+}

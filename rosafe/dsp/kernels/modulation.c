@@ -1,0 +1,91 @@
+/* Modulation filters in parallel, and means of what they put out over moving windows (rosafe/representations/amsfeatures.py).
+ *
+ * A filter in each lane; all get the same samples. Second-order sections in direct form II transposed, in the very order of
+ * operations of scipy.signal.sosfilt: at a thousandth of the sample rate, what is rounded otherwise would show. A section's
+ * sample waits for the one before it; several registers of filters fill the wait. Each frame that touches a span of samples
+ * adds its part of it, so that only the tail that is kept goes to memory. */
+#include "frames.h"
+
+#include <string.h>
+
+enum { SPAN = 64, FILTERS = 16 /* at a time */, GROUPS = FILTERS / LANES };
+
+typedef struct {
+    vec b[3], a[3], s1, s2;
+} section;
+
+/* |y| of n samples. */
+INLINE void filter(section *sections, const double *x, int64_t n, vec magnitudes[SPAN][GROUPS]) {
+    vec s1[GROUPS], s2[GROUPS];
+    UNROLL for (int g = 0; g < GROUPS; g++) s1[g] = sections[g].s1, s2[g] = sections[g].s2;
+    for (int64_t t = 0; t < n; t++) {
+        const vec in = bounded(all(x[t]), -LIMIT, LIMIT);
+        UNROLL for (int g = 0; g < GROUPS; g++) {
+            const vec *b = sections[g].b, *a = sections[g].a;
+            vec y = b[0] * in + s1[g];
+            s1[g] = b[1] * in - a[1] * y + s2[g];
+            s2[g] = b[2] * in - a[2] * y;
+            magnitudes[t][g] = larger(y, -y);
+        }
+    }
+    UNROLL for (int g = 0; g < GROUPS; g++) sections[g].s1 = s1[g], sections[g].s2 = s2[g];
+}
+
+/* The n magnitudes of which the first is sample `at`: adds their part to each frame's sum, of each of the lanes that are used. */
+INLINE void add_magnitudes(vec magnitudes[SPAN][GROUPS], int64_t at, int64_t n, const framing *of, int64_t used,
+                           double *sums) {
+    const int64_t past = at - of->skip - of->size;
+    int64_t frame = past < 0 ? 0 : past / of->hop + 1; /* none before reaches so far */
+    for (int64_t begin; frame < of->number && (begin = of->skip + frame * of->hop) < at + n; frame++) {
+        const int64_t from = most(at, begin), until = least(at + n, begin + of->size);
+        vec sum[GROUPS] = {};
+        for (int64_t t = from; t < until; t++)
+            UNROLL for (int g = 0; g < GROUPS; g++) sum[g] = fused(all(of->weights[t - begin]), magnitudes[t - at][g], sum[g]);
+        for (int64_t k = 0; k < used; k++) sums[k * of->number + frame] += sum[k / LANES][k % LANES];
+    }
+}
+
+/* The arguments as in rosafe_levels, but that the samples that are held and summed are those that come out: magnitudes, in
+ * rows * filters rows, `filters` of them to each of the `rows` of block. state is (filters, rows, 2), means (rows, filters,
+ * whole). */
+void rosafe_modulation(const double *history, int64_t history_stride, int64_t held, const double *block, int64_t n,
+                       double *tail, int64_t tail_stride, int64_t tail_from, int64_t rows, int64_t skip,
+                       const double *weights, int64_t size, int64_t hop, int64_t whole, int64_t number, const double *begun,
+                       int64_t begun_stride, int64_t known, double *sums, int64_t filters, const double *b0_b1_b2_1_a1_a2,
+                       double *state, double *means) {
+    const framing frames = {skip, weights, size, hop, number};
+    uint32_t mode = denormals_off();
+    for (int64_t row = 0; row < rows; row++)
+        for (int64_t first = 0; first < filters; first += FILTERS) {
+            const int64_t used = least(FILTERS, filters - first), line = row * filters + first;
+            section sections[GROUPS];
+            double *mine = sums + line * number;
+            for (int k = 0; k < FILTERS; k++) { /* lanes without a filter do the last one once more */
+                const int64_t which = least(k, used - 1);
+                const double *design = b0_b1_b2_1_a1_a2 + 6 * (first + which), *before = state + 2 * ((first + which) * rows + row);
+                section *of = &sections[k / LANES];
+                for (int i = 0; i < 3; i++) of->b[i][k % LANES] = design[i], of->a[i][k % LANES] = design[3 + i];
+                of->s1[k % LANES] = before[0], of->s2[k % LANES] = before[1];
+            }
+            for (int64_t k = 0; k < used; k++) {
+                begin_sums(begun + (line + k) * begun_stride, known, number, mine + k * number);
+                if (!known) add_frames(0, history + (line + k) * history_stride, 0, held, &frames, mine + k * number);
+            }
+            for (int64_t at = held, end; at < held + n; at = end) {
+                vec magnitudes[SPAN][GROUPS];
+                end = least(at + SPAN, held + n);
+                filter(sections, block + row * n + at - held, end - at, magnitudes);
+                add_magnitudes(magnitudes, at, end - at, &frames, used, mine);
+                for (int64_t t = most(at, tail_from); t < end; t++)
+                    for (int64_t k = 0; k < used; k++)
+                        tail[(line + k) * tail_stride + t - tail_from] = magnitudes[t - at][k / LANES][k % LANES];
+            }
+            for (int64_t k = 0; k < used; k++) {
+                double *after = state + 2 * ((first + k) * rows + row);
+                after[0] = flushed(sections[k / LANES].s1[k % LANES]);
+                after[1] = flushed(sections[k / LANES].s2[k % LANES]);
+                memcpy(means + (line + k) * whole, mine + k * number, whole * sizeof(double));
+            }
+        }
+    denormals_as(mode);
+}

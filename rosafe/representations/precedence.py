@@ -1,0 +1,330 @@
+"""The precedence stage: time and level differences of the first wave front, with a reflection taken out of the ears.
+
+* J. Braasch (2013), "A precedence effect model to simulate localization dominance using an adaptive, stimulus
+  parameter-based inhibition process", J. Acoust. Soc. Am. 134, 420-435
+* R. M. Stern, A. S. Zeiberg and C. Trahiotis (1988), "Lateralization of complex binaural stimuli: a weighted-image
+  model", J. Acoust. Soc. Am. 84, 156-165
+* H. Wallach, E. B. Newman and M. R. Rosenzweig (1949), "The precedence effect in sound localization", Am. J. Psychol.
+  62, 315-336
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import scipy
+
+from rosafe.dsp import kernels
+from rosafe.dsp.framing import FrameBuffer, FramedStage, frame_parameters
+from rosafe.dsp.guard import SQUARE_TINY, TINY, FloatArray, limited
+from rosafe.dsp.kernels import TAPS, TOGETHER, Taps, Windowed
+from rosafe.dsp.rounding import MAX_SAMPLES, round_half_away
+from rosafe.dsp.signal import Signal
+from rosafe.vocabulary.parameter import Parameter
+from rosafe.vocabulary.representation import Derived, Part, Representation
+
+EPSILON = 2.2204e-16  # the original's literal
+SECONDS = 0.01  # that autocorrelations reach
+LOWEST = 100.0  # Hz: channels below weigh as one here
+LOUD = 10 ** (-12 / 20)  # of the highest peak of all channels: those that reach it are active
+FEW = 5  # active channels; where there are no more, each channel is normalised
+FAINT = 1e-3  # of the strongest channel; weaker ones are left out then
+NOISE = 1e-13  # of an autocorrelation's maximum: what rounding leaves of a 0
+GAINS = np.arange(101) / 100  # that an echo may have
+RATIOS = GAINS / (1 + GAINS**2)  # of an autocorrelation at the echo's delay and at lag 0
+MOST_GAIN = 0.9  # of these
+SMALL, LARGE = 0, 1  # the two ways to clean
+PAIRS = np.array([(SMALL, SMALL), (LARGE, LARGE), (SMALL, LARGE), (LARGE, SMALL)])  # for left and right
+BATCH = 2**18  # samples per ear that are worked on at a time, to bound memory and stay in the cache
+
+
+class Running:
+    """What has been summed since the start.
+
+    Attributes
+    ----------
+    gains, weights : ndarray (C,)
+        Of the channels' autocorrelations, and of the correlations that come out.
+    power : ndarray (2 C / 8, K, 8)
+        Spectra of the channels' weighted autocorrelations; the rows are those of the left ear, then of the right one.
+    energies : ndarray (2, C)
+        These autocorrelations at lag 0, where they are largest.
+    pairs : ndarray (4, L)
+        Correlations of the `PAIRS`.
+    """
+
+    def __init__(self) -> None:
+        self.begin(np.empty(0), 0, 0)
+
+    def begin(self, frequencies: FloatArray, bins: int, lags: int) -> None:
+        """Nothing has come yet of the channels at these frequencies (Hz)."""
+        channels = len(frequencies)
+        self.gains, self.weights = 1 / np.maximum(frequencies, LOWEST), weights(frequencies)
+        self.power = np.zeros((math.ceil(2 * channels / TOGETHER), bins, TOGETHER))
+        self.energies = np.zeros((2, channels))
+        self.pairs = np.zeros((len(PAIRS), lags))
+
+
+class Precedence(FramedStage):
+    """Of each frame of (2, C, N), with an echo taken out: ITD (C, F) in s, ILD (C, F) in dB, correlation (C, L, F).
+
+    Positive differences mean that the source is on the right: the left ear hears it later, the right one louder. With x
+    a frame times the window (hanning), fs the sample rate, f the centre frequencies and XC(a, b)[m] = sum a[n+m] b[n]:
+
+    1. Each ear's autocorrelations up to 10 ms, divided by max(f, 100 Hz), are summed since the start for each channel,
+       and these over channels to s. Where no more than 5 channels have their peaks within 12 dB of the highest one,
+       each channel is divided by its maximum before, and those with less than 0.001 of the strongest are left out.
+    2. The echo's delay d is where s is largest from 0.75 ms on; its gain b = 0, 0.01... 0.9 is the first one with
+       b / (1 + b**2) >= s[d] / max s; it is faded by t = 1 up to 6 ms, (1 - (d - 1 - 6 Q) / (14 Q - 1))**4 up to
+       20 ms, Q being 1 ms.
+    3. There are two ways to clean x: sum over i of (-b t)**i x[n - i d], which is 5 d longer than the frame, or sum
+       over i of (-1)**(i+1) b**(6-i) t**(5-i) x[n + (6-i) d], which is d shorter; i = 0...5.
+    4. Of the four pairs that these make for both ears, with all channels added up, correlations up to 1 ms are summed
+       since the start. The pair with the largest maximum is used.
+    5. Its correlation in each channel is XC(l, r) / sqrt(sum l**2 sum r**2 + eps) W(f), with `weights` W. The ITD is
+       the lag of the first maximum, 0 where all lags are equal; the ILD 10 log10(sum r**2 / sum l**2), 0 where an ear
+       is silent.
+
+    Any parameter that is set begins the sums since the start anew, and so do other channels. Where centre frequencies
+    are not known they count as 0.
+    """
+
+    REPRESENTATION = Representation(
+        kind="precedence",
+        doc="Interaural differences of the first wave front",
+        parent="gammatone",
+        parts=(
+            Part("itd", ("channel", "time"), "s"),
+            Part("ild", ("channel", "time"), "dB"),
+            Part("cc", ("channel", "lag", "time")),
+        ),
+        parameters=(
+            replace(frame_parameters("prec")[1], minimum=SECONDS),
+            frame_parameters("prec")[2],
+            Parameter(
+                "prec_maxDelaySec",
+                "double",
+                0.001,
+                "Maximum delay in cross-correlation computation (s)",
+                0.0,
+                10.0,
+                open_minimum=True,
+                unit="s",
+            ),
+        ),
+        derived=(Derived("prec_lags", "sequence<double>", "The lags, ascending", unit="s"),),
+        coordinates=("prec_lags",),
+        centred="lag",
+        port_doc="Interaural time differences (s), level differences (dB) and correlations of the first wave front",
+    )
+    PREFIX = "prec"
+
+    @property
+    def derived(self) -> dict[str, Any]:
+        return {"prec_lags": (np.arange(-self._max_lag, self._max_lag + 1) / self.sample_rate).tolist()}
+
+    def output_rows(self, rows: tuple[int, ...]) -> tuple[int, ...]:
+        return rows[1:]
+
+    def part_rows(self, rows: tuple[int, ...]) -> tuple[tuple[int, ...], ...]:
+        return (rows[1:], rows[1:], (rows[1], 2 * self._max_lag + 1))
+
+    def process(self, block: FloatArray, extra: FloatArray | None = None) -> tuple[FloatArray, ...]:
+        samples = self._checked(block)
+        channels = samples.shape[1]
+        if self._running.energies.shape[1] != channels:
+            frequencies = np.array(self.given.center_frequencies)
+            known = len(frequencies) == channels
+            bins, lags = self._points // 2 + 1, 2 * self._pair_reach + 1
+            self._running.begin(frequencies if known else np.zeros(channels), bins, lags)
+        compiled = kernels.compiled()
+        if compiled:
+            frames = self._frames(samples, self._framing.window)
+            count = frames.number
+        else:
+            views = self._framing.frames(self._buffer.append(limited(samples, SQUARE_TINY)))
+            count = views.shape[-2]
+        itd, ild = np.empty((channels, count)), np.empty((channels, count))
+        cc = np.zeros((channels, 2 * self._max_lag + 1, count))
+        at_once = min(count, max(1, BATCH // max(1, channels * self._size)))
+        room = Windowed.room(at_once, channels, self._size)
+        for first in range(0, count, max(1, at_once)):
+            part = slice(first, min(first + at_once, count))
+            taken = room.first(part.stop - first)
+            if compiled:
+                kernels.windowed(frames.part(first, part.stop - first), taken)
+            else:
+                windowed(views[..., part, :], self._framing.window, taken)
+            self._localise(taken, itd[:, part], ild[:, part], cc[..., part])
+        if compiled:
+            frames.keep()
+        else:
+            self._buffer.drop(count * self._framing.hop)
+        return itd, ild, cc
+
+    def reset(self) -> None:
+        super().reset()
+        self._running = Running()
+
+    def _output(self) -> Signal:
+        return replace(super()._output(), lags=self._max_lag)
+
+    def _received(self, before: Signal) -> None:
+        self._build(self._values, frozenset())
+        self._buffer = FrameBuffer()
+
+    def _build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
+        rate = self.sample_rate
+        lag, first_delay = values["prec_maxDelaySec"] * rate, math.floor(0.75 * rate / 1000)
+        if lag > MAX_SAMPLES:
+            raise ValueError(f"prec_maxDelaySec: too long, {lag:.6g} samples")
+        if first_delay < 1:
+            raise ValueError(f"sample_rate: {rate:.12g} Hz is too low for precedence, which needs 1334 Hz")
+        super()._build({**values, "prec_wname": "hanning"}, changed)
+        self._size = len(self._framing.window)
+        self._max_lag, self._pair_reach = math.ceil(lag), math.ceil(rate / 1000)
+        self._first_delay, self._last_delay = first_delay, round_half_away(SECONDS * rate)
+        self._points = 1 << (self._size + self._last_delay - 1).bit_length()
+        self._running = Running()
+
+    # --- some frames ----------------------------------------------------------------------------------------------
+
+    def _localise(self, frames: Windowed, itd: FloatArray, ild: FloatArray, cc: FloatArray) -> None:
+        """Fill in the results (C, F), (C, F) and (C, L, F)."""
+        count, running = itd.shape[1], self._running
+        filters = self._filters(self._autocorrelations(frames))
+
+        left, right = (np.broadcast_to(frames.sums[:, [ear]], (count, len(PAIRS), self._size)) for ear in range(2))
+        l_taps, r_taps = (filters.of(slice(None), ear, PAIRS[:, ear]) for ear in range(2))  # (F, 4)
+        lags, _ = self._correlate(left, l_taps, right, r_taps, self._pair_reach)
+        sums = np.cumsum(np.concatenate((running.pairs[np.newaxis], lags)), axis=0)
+        running.pairs = sums[-1].copy()
+        best = PAIRS[sums[1:].max(axis=-1).argmax(axis=-1)]  # (F, 2)
+
+        left, right = frames.samples[:, 0], frames.samples[:, 1]
+        place = np.arange(count)[:, np.newaxis]
+        l_taps, r_taps = (filters.of(place, ear, best[:, [ear]]) for ear in range(2))  # (F, 1)
+        reach = min(self._max_lag, self._size + (TAPS - 1) * self._last_delay - 1)  # beyond, nothing overlaps
+        lags, energies = self._correlate(left, l_taps, right, r_taps, reach)
+        lags *= (running.weights / np.sqrt(energies[0] * energies[1] + EPSILON))[..., np.newaxis]
+        if reach < self._max_lag:
+            lags = np.pad(lags, ((0, 0), (0, 0), (self._max_lag - reach, self._max_lag - reach)))
+        cc[...] = lags.transpose(1, 2, 0)
+        differs = lags.max(axis=-1) > lags.min(axis=-1)
+        itd[...] = (np.where(differs, lags.argmax(axis=-1) - self._max_lag, 0) / self.sample_rate).T
+        levels = np.log10(energies, out=np.zeros_like(energies), where=(energies > 0).all(axis=0))
+        ild[...] = 10 * (levels[1] - levels[0]).T
+
+    def _autocorrelations(self, frames: Windowed) -> FloatArray:
+        """Summed since the start and over channels, (F, 2, lags from 0 on)."""
+        running = self._running
+        energies = np.cumsum(np.concatenate((running.energies[np.newaxis], frames.energies * running.gains)), axis=0)
+        running.energies = energies[-1].copy()
+        energies = energies[1:]
+        active = (frames.peaks > LOUD * frames.peaks.max(axis=-1, keepdims=True)).sum(axis=-1, keepdims=True)
+        strong = energies > np.maximum(FAINT * energies.max(axis=-1, keepdims=True), TINY)
+        factors = np.where(active > FEW, 1.0, np.divide(1.0, energies, out=np.zeros_like(energies), where=strong))
+        add = kernels.add_spectra if kernels.compiled() and self._points <= kernels.MOST_POINTS else add_spectra
+        spectra = add(frames.samples, self._points, running.gains, factors, running.power)
+        lags: FloatArray = scipy.fft.irfft(spectra, self._points)
+        lags = lags[..., : self._last_delay + 1]
+        lags[np.abs(lags) < NOISE * lags[..., :1]] = 0.0
+        lags[..., self._size :] = 0.0  # nothing overlaps
+        return lags
+
+    def _filters(self, lags: FloatArray) -> Taps:
+        """What cleans frames whose `_autocorrelations` are these: (F, 2 ears, 2 ways) filters."""
+        delays = self._first_delay + lags[..., self._first_delay :].argmax(axis=-1)
+        largest = lags.max(axis=-1)
+        echo = np.take_along_axis(lags, delays[..., np.newaxis], axis=-1)[..., 0]
+        ratios = np.divide(echo, largest, out=np.zeros_like(echo), where=largest > 0).clip(0.0, 0.5)
+        gains = np.minimum(GAINS[np.searchsorted(RATIOS, ratios)], MOST_GAIN)[..., np.newaxis]
+        faded = fading(delays, round_half_away(self.sample_rate / 1000))[..., np.newaxis]
+        order = np.arange(TAPS)
+        back = TAPS - order
+        small, large = (-gains * faded) ** order, (-1.0) ** (order + 1) * gains**back * faded ** (back - 1)
+        return Taps(delays[..., np.newaxis, np.newaxis] * np.stack((order, -back)), np.stack((small, large), axis=-2))
+
+    def _correlate(
+        self, left: FloatArray, left_taps: Taps, right: FloatArray, right_taps: Taps, reach: int
+    ) -> tuple[FloatArray, FloatArray]:
+        by_kernel = kernels.compiled() and 2 * reach + 1 <= kernels.MOST_LAGS
+        correlate = kernels.correlate_filtered if by_kernel else correlate_filtered
+        return correlate(left, left_taps, right, right_taps, reach)
+
+
+def fading(delays: Any, millisecond: int) -> FloatArray:
+    """How much of an echo counts, by its delay: all of it up to 6 ms, nothing from 20 ms on."""
+    late = (delays - 1 - 6 * millisecond) / (14 * millisecond - 1)
+    return np.where(delays <= 6 * millisecond, 1.0, np.where(delays <= 20 * millisecond, (1 - late) ** 4, 0.0))
+
+
+def weights(frequencies: FloatArray) -> FloatArray:
+    """How much channels tell of a source's direction: W of Stern et al. (1988), greatest at some 600 Hz."""
+    low = np.minimum(frequencies, 1200.0)
+    level: FloatArray = 0.0938272 * low - 0.000112586 * low**2 + 3.99154e-8 * low**3
+    return 10 ** (level / 10) / 276
+
+
+# --- the twins of the kernels -----------------------------------------------------------------------------------
+
+
+def windowed(frames: FloatArray, window: FloatArray, output: Windowed) -> None:
+    """Frames (2, C, F, w) times the window (w,)."""
+    np.multiply(frames.transpose(2, 0, 1, 3), window, out=output.samples)
+    np.sum(output.samples, axis=2, out=output.sums)
+    np.max(output.samples, axis=-1, out=output.peaks)
+    np.einsum("feci,feci->fec", output.samples, output.samples, out=output.energies)
+
+
+def add_spectra(
+    samples: FloatArray, points: int, gains: FloatArray, factors: FloatArray, power: FloatArray
+) -> FloatArray:
+    """Add the power spectra of frames (F, 2, C, w), times `gains` (C,), to `power` as of `Running`, frame by frame.
+
+    Returns what `power` is with each frame, times `factors` (F, 2, C) and summed over channels: (F, 2, K). The spectra
+    are of `points` points, K is half of these and one more.
+    """
+    sums = np.empty((len(samples), 2, power.shape[1]))
+    row = np.arange(2 * len(gains)).reshape(2, -1)
+    group, lane = row // TOGETHER, row % TOGETHER
+    for frame, total, factor in zip(samples, sums, factors, strict=True):
+        spectra = scipy.fft.rfft(frame, points)
+        power[group, :, lane] += (np.square(spectra.real) + np.square(spectra.imag)) * gains[:, np.newaxis]
+        np.einsum("ec,eck->ek", factor, power[group, :, lane], out=total)
+    return sums
+
+
+def correlate_filtered(
+    left: FloatArray, left_taps: Taps, right: FloatArray, right_taps: Taps, reach: int
+) -> tuple[FloatArray, FloatArray]:
+    """Correlations of frames (F, A, w) of the two ears, each through its filter, over lags up to `reach`: (F, A, L).
+
+    The filters are (F, A), or (F, 1) for all alike. Also returns the filtered frames' energies, (2, F, A).
+    """
+    correlations, energies = np.empty((*left.shape[:2], 2 * reach + 1)), np.empty((2, *left.shape[:2]))
+    alike = left_taps.shifts.shape[1] == 1
+    for frame, which in np.ndindex(left_taps.shifts.shape[:2]):
+        rows = slice(None) if alike else slice(which, which + 1)
+        l_filtered = _filtered(left[frame, rows], left_taps.of(frame, which))
+        r_filtered = _filtered(right[frame, rows], right_taps.of(frame, which))
+        for ear, filtered in enumerate((l_filtered, r_filtered)):
+            energies[ear, frame, rows] = np.einsum("ai,ai->a", filtered, filtered)
+        longest = max(l_filtered.shape[1], r_filtered.shape[1], reach + 1)
+        points = scipy.fft.next_fast_len(longest + reach, real=True)
+        spectra = scipy.fft.rfft(l_filtered, points) * np.conj(scipy.fft.rfft(r_filtered, points))
+        correlations[frame, rows] = np.roll(scipy.fft.irfft(spectra, points), reach, axis=-1)[:, : 2 * reach + 1]
+    return correlations, energies
+
+
+def _filtered(rows: FloatArray, taps: Taps) -> FloatArray:
+    """(A, w) through one filter, with at least one sample."""
+    size = rows.shape[1]
+    result = np.zeros((len(rows), max(1, size + taps.shifts[-1])))
+    for shift, value in zip(*taps, strict=True):
+        place = slice(max(0, shift), max(0, min(size + shift, result.shape[1])))
+        result[:, place] += value * rows[:, place.start - shift : place.stop - shift]
+    return result

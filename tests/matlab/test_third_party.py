@@ -1,0 +1,139 @@
+"""Octave scripts in the manner of what others wrote for the original's client: its arithmetic needs certain shapes."""
+
+from __future__ import annotations
+
+import pytest
+
+from tests.genomix.world import World
+from tests.matlab import octave
+
+pytestmark = pytest.mark.ros
+
+# How the robot interfaces of Two!Ears get their ear signals.
+ROBOT = """
+    1;
+    function [signals, seconds] = getSignal(bass, duration)
+        b = bass.Audio();
+        signals = [cell2mat(b.Audio.left); cell2mat(b.Audio.right)]' ./ 2^31;
+        wanted = round(duration * b.Audio.sampleRate);
+        if wanted > size(signals, 1)
+            error('the desired chunk is longer than the buffer');
+        end
+        signals = signals(end - wanted + 1:end, :);
+        seconds = length(signals) / b.Audio.sampleRate;
+    end
+    client = genomix.client;
+    bass = client.load('bass');
+    bass.Acquire('-a', 'scene:', 44100, 2205, 20);
+    while bass.Audio().Audio.lastFrameIndex < 44100
+        pause(0.05);
+    end
+    bass.Stop();
+    [signals, seconds] = getSignal(bass, 0.5);
+    whole = getSignal(bass, 1);
+    b = bass.Audio();
+    show('sizes', {size(b.Audio.left), size(signals), seconds, size(whole)});
+    show('same', [isequal(whole(:, 1)' * 2^31, [b.Audio.left{:}]), isequal(whole(:, 2)' * 2^31, [b.Audio.right{:}])]);
+    show('alive', all(std(whole) > 0));
+    show('types', cellfun(@class, {b.Audio.left, b.Audio.left{1}}, 'UniformOutput', false));
+
+    % a tutorial of 2015 shows a client whose sequences are columns
+    old = genomix.client(client.address, '-columns');
+    p = old.load('bass').Audio();
+    show('old', {size(p.Audio.left), size([cell2mat(p.Audio.left) cell2mat(p.Audio.right)])});
+    setenv('GENOMIXD', client.address);
+    rosAFE = genomix.client('-columns').load('rosAFE');
+    show('fields', {size(rosAFE.getParameters().result.parameters.ild), rosAFE.GETPARAMETERS().status});
+    show('wrong', message(@() genomix.client('a:1', '-rows')));
+"""
+
+
+def test_a_robot_interface(world: World) -> None:
+    told = octave.shown(world, ROBOT)
+    assert told["sizes"] == [[1, 44100], [22050, 2], 0.5, [44100, 2]]
+    assert all(told["same"]) and told["alive"]
+    assert told["types"] == ["cell", "double"]
+    assert told["old"] == [[44100, 1], [44100, 2]]
+    assert told["fields"] == [[0, 1], "done"]
+    assert told["wrong"] == "genomix:connection after the address of genomixd there may be only: '-columns'"
+
+
+# A buffer that takes what Two!Ears' circVBuf takes, by an assignment of rows: time goes down.
+SIGNALS = """
+    1;
+    function data = held(data, chunk)
+        n = size(chunk, 1);
+        old = size(data, 1);
+        data(old + 1:old + n, :, :) = chunk(:, :, :);
+    end
+    function taken(name, signal, buffer, chunk)
+        theirs = message(@() held(buffer, chunk));
+        ours = message(@() signal.appendChunk(chunk));
+        show(name, {isempty(theirs), isempty(ours), size(signal.Data)});
+    end
+    client = genomix.client;
+    bass = client.load('bass');
+    rosAFE = client.load('rosAFE');
+    bass.Acquire('-a', 'scene:', 16000);
+    rosAFE.request('crosscorrelation', struct('fb_nChannels', 3, 'fb_highFreqHz', 4000, 'bufferSize_s_port', 0.1, ...
+        'nFramesPerBlock', 1600));
+    while rosAFE.crossCorrelationPort('crosscorrelation_0').crossCorrelationPort.lastFrameIndex < 3200
+        pause(0.05);
+    end
+    bass.Stop();
+    p = rosAFE.getParameters().result.parameters;
+    cfHz = cell2mat(p.gammatone{1}.fb_cfHz);
+    lags = cell2mat(p.crossCorrelation{1}.cc_lags);
+
+    time = TimeDomainSignal.construct(16000, 10, 'input', 'input_0', 'left');
+    port = rosAFE.inputProcPort().inputProcPort;
+    taken('time', time, zeros(0, 1), cell2mat(port.left.data)');
+    show('samples', isequal(time.Data', cell2mat(port.left.data)));
+    taken('time as it comes', time, zeros(0, 1), cell2mat(port.left.data));
+    taken('two ears', time, zeros(0, 1), [cell2mat(port.left.data); cell2mat(port.right.data)]');
+
+    bank = TimeFrequencySignal.construct(16000, 10, 'filterbank', 'filterbank_0', cfHz, 'left');
+    port = rosAFE.gammatonePort('filterbank_0').gammatonePort;
+    chunk = zeros(port.framesOnPort, port.numberOfChannels);
+    for jj = 1:port.numberOfChannels
+        chunk(:, jj) = cell2mat(port.left.dataN{jj}.data)';
+    end
+    taken('bank', bank, zeros(0, 3), chunk);
+    show('channels', isequal(bank.Data, chunk));
+    show('adapted', isequal(adaptTFS(port.framesOnPort, port.numberOfChannels, port.left, 0), chunk));
+    taken('bank on its side', bank, zeros(0, 3), chunk');
+    taken('one channel', bank, zeros(0, 3), chunk(:, 1));
+    taken('nothing new', bank, zeros(0, 3), chunk(end + 1:end, :));
+
+    cc = CorrelationSignal(100, 10, 'crosscorrelation', 'crosscorrelation_0', cfHz, lags, 'mono');
+    chunk = rosAFE.crossCorrelationPort('-m', 'crosscorrelation_0').crossCorrelationPort.left;
+    taken('correlation', cc, zeros(0, 3, numel(lags)), chunk);
+    taken('other lags', cc, zeros(0, 3, numel(lags)), chunk(:, :, 2:end));
+    taken('lags first', cc, zeros(0, 3, numel(lags)), permute(chunk, [1 3 2]));
+
+    brief = TimeDomainSignal.construct(10, 1, 'input', 'input_0', 'left');
+    brief.appendChunk((1:25)');
+    show('newest', brief.Data');
+    show('told', message(@() brief.appendChunk(1:4410)));
+    show('told 3', message(@() cc.appendChunk(chunk(:, :, 1))));
+"""
+
+
+def test_signals_take_what_the_front_ends_take(world: World) -> None:
+    told = octave.shown(world, SIGNALS)
+    samples, channels = [1600, 1], [1600, 3]
+    frames = told["correlation"][2]
+    assert told["time"] == [True, True, samples] and told["samples"]
+    assert told["bank"] == [True, True, channels] and told["channels"] and told["adapted"]
+    assert told["correlation"][:2] == [True, True] and frames == [10, 3, 37]
+    assert told["nothing new"] == [True, True, channels]
+    for name in ("time as it comes", "two ears"):
+        assert told[name] == [False, False, samples]
+    for name in ("bank on its side", "one channel"):
+        assert told[name] == [False, False, channels]
+    for name in ("other lags", "lags first"):
+        assert told[name] == [False, False, frames]
+    assert told["newest"] == list(range(16, 26))
+    wanted = "takes chunks of N-by-1 (time goes down), and this one is 1-by-4410"
+    assert told["told"] == f"BufferedSignal:size input_0 {wanted}"
+    assert told["told 3"].endswith("takes chunks of N-by-3-by-37 (time goes down), and this one is 10-by-3")

@@ -1,0 +1,195 @@
+"""Things that happen in the one moment in which they hurt: made to happen there, on real nodes."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import xmlrpc.client
+import xmlrpc.server
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from socketserver import ThreadingMixIn
+from typing import Any
+
+import pytest
+import rosgraph
+
+from rosafe.component import master
+from tests.harness import PYTHON, Graph, MasterProcess, run_together, wait_for
+from tests.ros.session import Session, told
+
+# --- two inputs at a time ---------------------------------------------------------------------------------------
+
+# A node whose first InputProc stops for a while at one place, and tells by files what happens.
+STALLING = """
+import sys, threading
+from pathlib import Path
+from rosafe.component import audio, node
+where, folder = sys.argv.pop(1), Path(sys.argv.pop(1))
+
+def stall():
+    (folder / "stalled").touch()
+    while not (folder / "go").exists():
+        threading.Event().wait(0.02)
+
+open_reader = audio.AudioRing.open_reader
+def stall_reading(ring, frames, *rest):
+    reader = open_reader(ring, frames, *rest)
+    if where == "reader" and frames == 1600:
+        stall()
+    return reader
+audio.AudioRing.open_reader = stall_reading
+
+add_input = node.Tree.add_input
+def stall_adding(tree, name, *rest):
+    if where == "adding" and name == "first":
+        stall()
+    added = add_input(tree, name, *rest)
+    if name == "second":
+        (folder / "second").touch()
+    return added
+node.Tree.add_input = stall_adding
+
+class Lock:  # tells when somebody has to wait for it
+    def __init__(self):
+        self.lock = threading.Lock()
+    def __enter__(self):
+        if not self.lock.acquire(blocking=False):
+            (folder / "waits").touch()
+            self.lock.acquire()
+    def __exit__(self, *_):
+        self.lock.release()
+
+start = node.ComponentNode.start
+def with_lock(component):
+    for owner in component._handlers["InputProc"].__self__,:
+        owner._starting = Lock()
+    start(component)
+node.ComponentNode.start = with_lock
+sys.exit(node.main())
+"""
+
+
+@pytest.mark.parametrize("where", ["reader", "adding"])
+def test_the_newer_of_two_inputs_stays_wherever_the_older_one_is(graph: Graph, tmp_path: Path, where: str) -> None:
+    """The older one has its audio but no processor yet, or is about to get that."""
+    program = tmp_path / "stalling.py"
+    program.write_text(STALLING)
+    name = f"stalling_{where}"
+    with graph.start(PYTHON, str(program), where, str(tmp_path), "-i", name, PYTHONPATH=python_path(graph)) as process:
+        wait_for(lambda: f"/{name}/Stop" in graph.services(), 30, lambda: str(process))
+        session = Session(graph, process, name)
+        session.listen()
+
+        def first() -> Any:
+            return session.call("InputProc", name="first", nFramesPerBlock=1600)
+
+        def second() -> Any:
+            wait_for((tmp_path / "stalled").exists, 20, lambda: str(process))
+            return session.call("InputProc", name="second", nFramesPerBlock=800)
+
+        def release() -> None:
+            wait_for(lambda: (tmp_path / "waits").exists() or (tmp_path / "second").exists(), 20, lambda: str(process))
+            (tmp_path / "go").touch()
+
+        steps: list[Callable[[], Any]] = [first, second, release]
+        older, newer, _ = run_together(3, lambda number: steps[number]())
+        assert newer.genom_success, newer.genom_exdetail
+        if where == "reader":
+            assert told(older)[0] == "::genom::interrupted"
+        session.wait_activities(["InputProc"])
+        assert session.processors() == {"input": ["second"]}
+        session.close()
+
+
+def python_path(graph: Graph) -> str:
+    return f"{Path(__file__).resolve().parents[2]}:{graph.env['PYTHONPATH']}"
+
+
+# --- the master -------------------------------------------------------------------------------------------------
+
+
+def test_another_master_that_knows_a_little_is_told_all(private_graph: tuple[Graph, MasterProcess]) -> None:
+    """It came so quickly that the node missed nothing, and knows the node by one topic."""
+    graph, master_process = private_graph
+    with graph.node("bass-ros") as process:
+        services = graph.services()
+        address = rosgraph.Master("/test", master_uri=graph.uri).lookupNode("/bass")
+        os.kill(process.pid, signal.SIGSTOP)
+        try:
+            master_process.kill()
+            master_process.start(graph.env)
+            decoy = rosgraph.Master("/bass", master_uri=graph.uri)
+            decoy.registerPublisher("/bass/decoy", "std_msgs/String", address)
+        finally:
+            os.kill(process.pid, signal.SIGCONT)
+        wait_for(lambda: services <= graph.services(), 20, lambda: f"{services - graph.services()} {process}")
+
+
+class SlowMaster(ThreadingMixIn, xmlrpc.server.SimpleXMLRPCServer):
+    """Between a node and its master: one call gets no answer, and takes effect late, after another one.
+
+    Parameters
+    ----------
+    uri : str
+        Of the master.
+    """
+
+    daemon_threads = True
+    block_on_close = False
+
+    def __init__(self, uri: str) -> None:
+        super().__init__(("127.0.0.1", 0), logRequests=False, allow_none=True)
+        self.uri = f"http://127.0.0.1:{self.server_address[1]}"
+        self.held = ""  # the topic whose next unregisterPublisher is held
+        self.late = threading.Event()  # it has taken effect
+        self._waiting: list[tuple[Any, ...]] = []
+        self._end = threading.Event()
+        self._master_uri = uri
+
+    def _dispatch(self, method: str, params: Any) -> Any:
+        def call(name: str, arguments: tuple[Any, ...]) -> Any:
+            with master.proxy(self._master_uri) as proxy:
+                return getattr(proxy, name)(*arguments)
+
+        if self.held and (method, *params[1:2]) == ("unregisterPublisher", self.held):
+            self.held = ""
+            self._waiting.append(params)
+            self._end.wait()  # the node gives up before
+        result = call(method, params)
+        if self._waiting and method == "registerPublisher" and params[1] == self._waiting[0][1]:
+            call("unregisterPublisher", self._waiting.pop())
+            self.late.set()
+        return result
+
+    def close(self) -> None:
+        self._end.set()
+        self.shutdown()
+        self.server_close()
+
+
+@contextmanager
+def slow_master(uri: str) -> Iterator[SlowMaster]:
+    server = SlowMaster(uri)
+    threading.Thread(target=server.serve_forever, args=(0.05,), daemon=True).start()
+    try:
+        yield server
+    finally:
+        server.close()
+
+
+def test_a_call_that_takes_effect_when_it_was_given_up_is_made_good(graph: Graph) -> None:
+    """A topic is withdrawn and offered again; the master hears of that the wrong way round, and knows it in the end."""
+    with slow_master(graph.uri) as server, graph.node("rosAFE-ros", "-i", "late", ROS_MASTER_URI=server.uri) as process:
+        session = Session(graph, process, "late")
+        session.build("PreProc")
+        topic = session.topic("preProc")
+        assert topic in graph.topics()
+        server.held = topic
+        session.ok("removeProcessor", name="preProc")
+        session.ok("PreProc")
+        assert server.late.wait(30), process
+        wait_for(lambda: topic in graph.topics(), 20, lambda: str(process))
+        session.close()

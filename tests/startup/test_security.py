@@ -1,0 +1,196 @@
+"""docs/security.md: what the page says listens is what listens, and its firewall lets in whom it should."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import socket
+import subprocess
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import ExitStack
+from pathlib import Path
+
+import pytest
+
+from rosafe.bass import socket_server
+from rosafe.component import door, inbound, pulse
+from rosafe.genomix import connections, daemon, sessions
+from tests.genomix.world import Http, genomixd
+from tests.harness import PYTHON, ROOT, Graph, MasterProcess, free_port, proc
+
+PAGE = (ROOT / "docs" / "security.md").read_text("utf-8")
+LISTENING = "0A"
+LOOPBACK, EVERYWHERE = "127.0.0.1", "0.0.0.0"
+
+
+def rows(heading: str) -> list[list[str]]:
+    """The rows of the table under a heading of the page."""
+    section = PAGE.partition(f"## {heading}\n")[2].partition("\n## ")[0]
+    lines = [line for line in section.splitlines() if line.startswith("|")][2:]
+    return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
+
+
+def promised(ros_address: str) -> dict[str, Counter[tuple[str, str]]]:
+    """What each program listens on, as the page says: how often (port or `any`, address)."""
+    found: dict[str, Counter[tuple[str, str]]] = {}
+    for programs, _, port, address in rows("What listens where"):
+        where = ros_address if address == "as `ROS_IP` says" else address.split()[0]
+        for program in re.findall("`(.*?)`", programs):
+            found.setdefault(program, Counter())[port.split()[0], where] += 1
+    return found
+
+
+def listening(pid: int, ports: dict[int, str]) -> Counter[tuple[str, str]]:
+    """What a process listens on; `ports` are those that are not any, and what the page calls them."""
+    inodes = set()
+    for path in proc(pid, "fd").iterdir():
+        try:
+            inodes.add(path.readlink().name)
+        except OSError:  # closed meanwhile
+            continue
+    found: Counter[tuple[str, str]] = Counter()
+    for table in ("tcp", "tcp6", "udp", "udp6"):
+        for line in proc("net", table).read_text().splitlines()[1:]:
+            _, local, _, state, *_, inode = line.split()[:10]
+            if f"socket:[{inode}]" in inodes and (state == LISTENING or table.startswith("udp")):
+                address, port = local.split(":")
+                assert len(address) == 8, f"not IPv4: {line}"
+                name = socket.inet_ntoa(bytes.fromhex(address)[::-1])
+                found[ports.get(int(port, 16), "any") if table == "tcp" else table, name] += 1
+    return found
+
+
+def own_address() -> str:
+    """An address of this machine that is no loopback address; the test is skipped where there is none."""
+    if shutil.which("ip") is None:
+        pytest.skip("no command ip")
+    shown = subprocess.run(["ip", "-4", "-o", "address"], capture_output=True, text=True, check=True).stdout
+    found = [address for address in re.findall(r" inet ([\d.]+)/", shown) if not address.startswith("127.")]
+    if not found:
+        pytest.skip("this machine has no address but loopback")
+    return str(found[0])
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize("setting", ["loopback", "unset", "an address"])
+def test_what_the_page_says_listens(setting: str, tmp_path: Path) -> None:
+    """Master, nodes, genomixd and the dedicated socket, beside each other as on a robot."""
+    address = own_address() if setting == "an address" else LOOPBACK
+    socket_port = free_port()
+    master = MasterProcess()
+    graph = Graph(f"http://{address}:{master.port}", tmp_path)
+    graph.env["ROS_IP"] = address
+    with ExitStack() as stack:
+        stack.callback(master.kill)
+        master.start(graph.env)
+        if setting == "unset":  # what our commands make of it; the master is roscore's, and was told
+            del graph.env["ROS_IP"]
+        nodes = {name: stack.enter_context(graph.node(name)) for name in ("bass-ros", "rosAFE-ros")}
+        graph.run("rosparam", "set", "/bass/socket_port", str(socket_port))
+        graph.run("rosservice", "call", "/bass/DedicatedSocket", "{}")
+        nodes["genomixd"], http_port = stack.enter_context(genomixd(graph))
+        assert Http(http_port).call("bass/Stop") == {}
+        assert master.process is not None
+        nodes["roscore"] = master.process
+        expected = promised(LOOPBACK if address == LOOPBACK else EVERYWHERE)
+        assert expected.keys() == nodes.keys()
+        ports = {master.port: "11311", socket_port: "8081", http_port: "8080"}
+        for name, process in nodes.items():
+            assert listening(process.pid, ports) == expected[name], name
+    assert (str(daemon.DEFAULT_PORT), daemon.DEFAULT_HOST) in expected["genomixd"]
+    assert (str(socket_server.DEFAULT_PORT), socket_server.DEFAULT_HOST) in expected["bass-ros"]
+
+
+def test_the_bounds_of_the_page() -> None:
+    wanted = [
+        door.OPENING_SECONDS,
+        door.GUESTS,
+        inbound.HEADER_BYTES,
+        inbound.BODY_BYTES,
+        (door.DESCRIPTORS, door.RESERVE),
+        "what the longest that makes sense has",
+        pulse.PERIOD,
+        (socket_server.MAX_CLIENTS, socket_server.IDLE_SECONDS),
+        (connections.MAX_CONNECTIONS, connections.MAX_CONNECTIONS // connections.SHARE),
+        (connections.REQUEST_SECONDS, connections.STALL_SECONDS),
+        connections.MAX_ANSWERS // 2**20,
+        (sessions.MAX_SESSIONS, sessions.MAX_REQUESTS),
+    ]
+    shown = [
+        "; ".join(f"{number:.0f}" if not isinstance(number, str) else number for number in numbers)
+        for numbers in (entry if isinstance(entry, tuple) else (entry,) for entry in wanted)
+    ]
+    assert [bound for *_, bound in rows("Bounds")] == shown
+    assert pulse.FAILURES == 2
+
+
+# --- the firewall -----------------------------------------------------------------------------------------------
+
+# Listens on ports of an address, until its input ends.
+SERVER = """
+import socket, sys
+servers = [socket.create_server(("0.0.0.0", int(port))) for port in sys.argv[1:]]
+print("up", flush=True)
+sys.stdin.read()
+"""
+# Connects from one address to another; says whether that went.
+CLIENT = """
+import socket, sys
+here, there, port, seconds = sys.argv[1:]
+try:
+    socket.create_connection((there, int(port)), float(seconds), (here, 0)).close()
+    print("in")
+except TimeoutError:
+    print("out")
+"""
+
+
+@pytest.fixture
+def robot() -> Iterator[str]:
+    """The name of a host, a network namespace, with the page's address; behind its cable are the partner and others."""
+    if shutil.which("ip") is None or shutil.which("nft") is None:
+        pytest.skip("network namespaces and firewalls need the commands ip and nft")
+    number = free_port()
+    robot, others = f"robot{number}", f"others{number}"
+    commands = [
+        f"netns add {robot}",
+        f"netns add {others}",
+        f"link add eth0 netns {robot} type veth peer name eth0 netns {others}",
+        f"-n {robot} addr add 10.0.0.1/24 dev eth0",
+        *(f"-n {others} addr add 10.0.0.{host}/24 dev eth0" for host in (2, 3)),
+        *(f"-n {name} link set {device} up" for name in (robot, others) for device in ("lo", "eth0")),
+    ]
+    try:
+        for command in commands:
+            done = subprocess.run(["ip", *command.split()], capture_output=True, text=True, check=False)
+            if done.returncode:
+                pytest.skip(f"no network namespaces here: ip {command}: {done.stderr.strip()}")
+        yield robot
+    finally:
+        for name in (robot, others):
+            subprocess.run(["ip", "netns", "del", name], capture_output=True, check=False)
+
+
+def test_the_firewall_lets_in_the_partner_and_nobody_else(robot: str) -> None:
+    (rules,) = re.findall(r"^```nft\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
+    inside, outside = (["ip", "netns", "exec", name] for name in (robot, robot.replace("robot", "others")))
+    done = subprocess.run([*inside, "nft", "-f", "-"], input=rules, capture_output=True, text=True, check=False)
+    if "not supported" in done.stderr or "Operation not permitted" in done.stderr:
+        pytest.skip(f"no firewall here: {done.stderr}")
+    assert done.returncode == 0, done.stderr
+    ports = ("8080", "8081", "11311", "32768", "60999", "22")
+
+    def reached(where: list[str], here: str, there: str, port: str, seconds: float) -> bool:
+        command = [*where, PYTHON, "-c", CLIENT, here, there, port, str(seconds)]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout == "in\n"
+
+    server = [*inside, PYTHON, "-c", SERVER, *ports]
+    with subprocess.Popen(server, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdin is not None and process.stdout is not None
+        assert process.stdout.readline() == "up\n"
+        for port in ports:
+            assert reached(outside, "10.0.0.2", "10.0.0.1", port, 30), port
+            assert reached(inside, "127.0.0.1", "127.0.0.1", port, 30), port
+            assert reached(outside, "10.0.0.3", "10.0.0.1", port, 30 if port == "22" else 0.5) == (port == "22"), port
+        process.stdin.close()
