@@ -7,7 +7,6 @@ import re
 import wave
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 from unittest import mock
 
 import numpy as np
