@@ -126,8 +126,8 @@ def test_every_representation_comes_as_its_port_gives_it_out(world: World, sound
         show('fList', {dObj.pitch{1}.fList, dObj.spectralFeatures{1}.fList});
         show('alike', isequal(dObj.onsetStrength{1}.cfHz, dObj.itd{1}.cfHz, dObj.zeroCrossings{1}.cfHz));
         show('lags', [dObj.autocorrelation{2}.lags(2), dObj.crosscorrelation{1}.lags(1)]);
-        show('figures', cellfun(@(signal) ishghandle(signal.plot()), {dObj.pitch{1}, dObj.itd{1}, dObj.amsFeatures{1}, ...
-            dObj.autocorrelation{1}, dObj.time{1}}));
+        shown = {dObj.pitch{1}, dObj.itd{1}, dObj.amsFeatures{1}, dObj.autocorrelation{1}, dObj.time{1}};
+        show('figures', cellfun(@(signal) ishghandle(signal.plot()), shown));
         mObj.cleanup();
         show('clean', structfun(@numel, mObj.Processors));
         """,
