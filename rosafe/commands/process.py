@@ -19,7 +19,7 @@ from typing import Any
 
 from rosafe.commands import Failure
 from rosafe.commands._progress import Display, bytes_text
-from rosafe.commands._workers import Interrupted, Report, Signals, run_together
+from rosafe.commands._workers import Interrupted, Interrupts, Report, run_together
 from rosafe.interface import KINDS, ROSAFE, Parameter
 from rosafe.interface.arguments import check_outputs, check_parameter
 
@@ -153,7 +153,7 @@ def run(options: argparse.Namespace) -> int:
         outputs = check_outputs(_words(options.outputs) if options.outputs is not None else None)
     except ValueError as problem:
         raise Failure(str(problem)) from None
-    signals = Signals()
+    signals = Interrupts()
     # Once, for all processes that are forked from this one.
     from rosafe.offline.files import process_file
     from rosafe.output import OutputError
