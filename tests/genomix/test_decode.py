@@ -35,7 +35,14 @@ def signal(*levels: tuple[str, int], data: bytes = b"") -> bytes:
 def documents() -> list[bytes]:
     """Answers of all kinds."""
     lags = [[np.arange(3.0) + 10 * channel for channel in range(2)] for _ in range(4)]
-    port = {"sampleRate": 1, "lastFrameIndex": 2, "framesOnPort": 3, "numberOfChannels": 2, "left": lags[0], "right": []}
+    port = {
+        "sampleRate": 1,
+        "lastFrameIndex": 2,
+        "framesOnPort": 3,
+        "numberOfChannels": 2,
+        "left": lags[0],
+        "right": [],
+    }
     spectrum = "::rosAFE::TimeFrequencySignalPortStruct"
     return [
         packed.plain({"a": [1, 2.5], "b": ["x", "ä€", ""], "c": [], "d": {"::e": True}, "e": {"f": {"g": None}}}),
