@@ -143,7 +143,7 @@ printf('%g %s\n', slowest, regexp(status, 'VmHWM:\s*(\d+)', 'tokens'){1}{1});
 
 
 def decoded(folder: Path, answers: list[bytes]) -> tuple[list[str], float, float]:
-    """What Octave makes of each, as cells and as matrices: ``good`` or the error; the longest time in s, memory in MB."""
+    """What Octave makes of each, as cells and as matrices: ``good`` or the error; the most seconds and megabytes."""
     if shutil.which("octave-cli") is None:
         pytest.skip("octave-cli is not installed; scripts/install --tests brings it")
     with (folder / "documents").open("wb") as out:

@@ -1,4 +1,4 @@
-"""The Tcl and Octave clients before a server that is no genomixd, or one that lies: an error, at once, without memory."""
+"""The Tcl and Octave clients before a server that is no genomixd, or one that lies: an error, at once."""
 
 from __future__ import annotations
 
