@@ -1,9 +1,10 @@
 classdef BufferedSignal < handle
-%BUFFEREDSIGNAL  The newest seconds of one representation of one ear, oldest first.
+%BUFFEREDSIGNAL  The newest seconds of what a processor puts out for one ear, or for both together, oldest first.
 %
-%   TimeDomainSignal (samples, N-by-1), TimeFrequencySignal (frames by channels) and CorrelationSignal (frames by
-%   channels by lags) are made of it. They offer what the original's examples use of the signals of Two!Ears' MATLAB
-%   front-end, and take chunks of the same shapes; where that is ahead on the path, its own classes serve.
+%   TimeDomainSignal (samples, N-by-1), TimeFrequencySignal (frames by channels), FeatureSignal (frames by features),
+%   CorrelationSignal (frames by channels by lags) and ModulationSignal (frames by channels by filters) are made of it.
+%   They offer what the original's examples use of the signals of Two!Ears' MATLAB front-end, and take chunks of the
+%   same shapes; where that is ahead on the path, its own classes serve.
 
     properties (SetAccess = private)
         Name          % of the representation: 'filterbank'
@@ -11,7 +12,6 @@ classdef BufferedSignal < handle
         Channel       % 'left', 'right' or 'mono'
         FsHz          % frames per second
         bufferSize_s  % how many seconds are kept
-        cfHz          % centre frequencies of the channels, [] for none
     end
 
     properties (Dependent)
@@ -19,27 +19,28 @@ classdef BufferedSignal < handle
     end
 
     properties (Access = private)
+        frameSize            % how many numbers a frame has: channels, or channels and lags
         chunks = cell(0, 1); % joined when Data is asked for, as copying all of it for every chunk takes time
         held = 0;            % frames in all chunks
     end
 
     methods
-        function obj = BufferedSignal(fs, bufferSize_s, name, label, cfHz, channel)
+        function obj = BufferedSignal(fs, bufferSize_s, name, label, frameSize, channel)
             obj.FsHz = fs;
             obj.bufferSize_s = bufferSize_s;
             obj.Name = name;
             obj.Label = label;
-            obj.cfHz = cfHz(:).';
+            sizes = size(zeros([1 max(1, frameSize)])); % a last dimension of one is none
+            obj.frameSize = sizes(2:end);
             obj.Channel = channel;
         end
 
         function appendChunk(obj, chunk)
             %APPENDCHUNK  Add frames, the rows of a chunk, at the end; the oldest go where there are too many.
-            wanted = frameSize(obj);
-            if ~isequal(size(chunk), [size(chunk, 1) wanted])
+            if ~isequal(size(chunk), [size(chunk, 1) obj.frameSize])
                 shown = sprintf('%d-by-', size(chunk));
                 error('BufferedSignal:size', '%s takes chunks of N%s (time goes down), and this one is %s', ...
-                    obj.Label, sprintf('-by-%d', wanted), shown(1:end - 4));
+                    obj.Label, sprintf('-by-%d', obj.frameSize), shown(1:end - 4));
             end
             obj.chunks{end + 1, 1} = chunk;
             obj.held = obj.held + size(chunk, 1);
@@ -65,13 +66,6 @@ classdef BufferedSignal < handle
         end
     end
 
-    methods (Access = protected)
-        function sizes = frameSize(obj)
-            % How many numbers a frame has: channels, or channels and lags.
-            sizes = max(1, numel(obj.cfHz));
-        end
-    end
-
     methods (Access = private)
         function frames = capacity(obj)
             frames = max(1, round(obj.bufferSize_s * obj.FsHz));
@@ -92,6 +86,23 @@ classdef BufferedSignal < handle
 
         function t = seconds(obj)
             t = (0:size(obj.Data, 1) - 1) / obj.FsHz;
+        end
+
+        function caption(obj)
+            % What all pictures have in common.
+            xlabel('Time (s)');
+            title(strrep([obj.Name ' ' obj.Label ' ' obj.Channel], '_', ' '));
+        end
+
+        function image(obj, rows, values)
+            % A picture of rows over time, frames by rows, with some of the rows' values at the side.
+            imagesc(seconds(obj), 1:numel(values), rows.');
+            axis('xy');
+            ticks = unique(round(linspace(1, numel(values), 6)));
+            set(gca(), 'ytick', ticks, 'yticklabel', arrayfun(@(k) sprintf('%.4g', values(k)), ticks, ...
+                'UniformOutput', false));
+            colorbar();
+            caption(obj);
         end
     end
 end

@@ -1,13 +1,15 @@
 classdef CorrelationSignal < BufferedSignal
-%CORRELATIONSIGNAL  Frames by channels by lags of both ears. See BufferedSignal.
+%CORRELATIONSIGNAL  Frames by channels by lags, of one ear or of both. See BufferedSignal.
 
     properties (SetAccess = private)
+        cfHz  % centre frequencies of the channels
         lags  % seconds
     end
 
     methods
         function obj = CorrelationSignal(fs, bufferSize_s, name, label, cfHz, lags, channel)
-            obj = obj@BufferedSignal(fs, bufferSize_s, name, label, cfHz, channel);
+            obj = obj@BufferedSignal(fs, bufferSize_s, name, label, [numel(cfHz) numel(lags)], channel);
+            obj.cfHz = cfHz(:).';
             obj.lags = lags(:).';
         end
 
@@ -17,24 +19,10 @@ classdef CorrelationSignal < BufferedSignal
                 h = [];
             end
             h = place(obj, h);
-            if isempty(obj.Data)
-                return
+            if ~isempty(obj.Data)
+                image(obj, permute(mean(obj.Data, 2), [1 3 2]), 1000 * obj.lags);
+                ylabel('Lag (ms)');
             end
-            mean_of = permute(mean(obj.Data, 2), [3 1 2]);
-            imagesc(seconds(obj), 1000 * obj.lags, mean_of);
-            axis('xy');
-            colorbar();
-            xlabel('Time (s)');
-            ylabel('Lag (ms)');
-            title(strrep([obj.Label ' ' obj.Channel], '_', ' '));
-        end
-    end
-
-    methods (Access = protected)
-        function sizes = frameSize(obj)
-            one = zeros(1, numel(obj.cfHz), numel(obj.lags)); % a last dimension of one is none
-            sizes = size(one);
-            sizes = sizes(2:end);
         end
     end
 end

@@ -3,7 +3,7 @@ classdef TimeDomainSignal < BufferedSignal
 
     methods
         function obj = TimeDomainSignal(fs, bufferSize_s, name, label, channel)
-            obj = obj@BufferedSignal(fs, bufferSize_s, name, label, [], channel);
+            obj = obj@BufferedSignal(fs, bufferSize_s, name, label, 1, channel);
         end
 
         function h = plot(obj, h)
@@ -13,9 +13,8 @@ classdef TimeDomainSignal < BufferedSignal
             end
             h = place(obj, h);
             plot(seconds(obj), obj.Data);
-            xlabel('Time (s)');
             ylabel('Amplitude');
-            title(strrep([obj.Label ' ' obj.Channel], '_', ' '));
+            caption(obj);
         end
     end
 

@@ -1,9 +1,14 @@
 classdef TimeFrequencySignal < BufferedSignal
 %TIMEFREQUENCYSIGNAL  Frames by channels of one ear, or of both for level differences. See BufferedSignal.
 
+    properties (SetAccess = private)
+        cfHz  % centre frequencies of the channels
+    end
+
     methods
         function obj = TimeFrequencySignal(fs, bufferSize_s, name, label, cfHz, channel)
-            obj = obj@BufferedSignal(fs, bufferSize_s, name, label, cfHz, channel);
+            obj = obj@BufferedSignal(fs, bufferSize_s, name, label, numel(cfHz), channel);
+            obj.cfHz = cfHz(:).';
         end
 
         function h = plot(obj, h)
@@ -12,18 +17,10 @@ classdef TimeFrequencySignal < BufferedSignal
                 h = [];
             end
             h = place(obj, h);
-            if isempty(obj.Data)
-                return
+            if ~isempty(obj.Data)
+                image(obj, obj.Data, obj.cfHz);
+                ylabel('Centre frequency (Hz)');
             end
-            imagesc(seconds(obj), 1:numel(obj.cfHz), obj.Data.');
-            axis('xy');
-            ticks = unique(round(linspace(1, numel(obj.cfHz), 6)));
-            set(gca(), 'ytick', ticks, 'yticklabel', arrayfun(@(k) sprintf('%.0f', obj.cfHz(k)), ticks, ...
-                'UniformOutput', false));
-            colorbar();
-            xlabel('Time (s)');
-            ylabel('Centre frequency (Hz)');
-            title(strrep([obj.Label ' ' obj.Channel], '_', ' '));
         end
     end
 

@@ -9,9 +9,9 @@ classdef manager_RosAFE < handle
 %   mObj.deleteProcessor('ild', 1)
 %   mObj.cleanup()
 %
-%   Representations: 'time', 'filterbank', 'innerhaircell', 'ild', 'ratemap', 'crosscorrelation'. What is there already
-%   with the same parameters is used again. Processors has a field for each type of processor, with their parameters as
-%   getParameters tells them: mObj.Processors.gammatone{1}.fb_cfHz.
+%   Representations are all that rosAFE has, those of plugins too: fieldnames(dObj) lists them. What is there already
+%   with the same parameters is used again. Processors has a field for each kind of processor, with their parameters in
+%   force: mObj.Processors.gammatone{1}.fb_cfHz.
 
     properties (SetAccess = private)
         Processors
@@ -19,15 +19,8 @@ classdef manager_RosAFE < handle
         dObj
     end
 
-    properties (Constant, Access = private)
-        % The types of processors, as getParameters calls them; the representation of each in the data object; their
-        % requests; how the original calls them in hasProcessor.
-        TYPES = struct( ...
-            'type', {'input', 'preProc', 'gammatone', 'ihc', 'ild', 'ratemap', 'crossCorrelation'}, ...
-            'signal', {'input', 'preProc', 'filterbank', 'innerhaircell', 'ild', 'ratemap', 'crosscorrelation'}, ...
-            'request', {'InputProc', 'PreProc', 'GammatoneProc', 'IhcProc', 'IldProc', 'RatemapProc', ...
-                'CrossCorrelationProc'}, ...
-            'binaural', {true, true, true, true, false, true, false});
+    properties (Access = private)
+        told = {}; % what getProcessors tells of all processors
     end
 
     methods
@@ -37,6 +30,7 @@ classdef manager_RosAFE < handle
             end
             mObj.dObj = dObj;
             mObj.RosAFE = dObj.RosAFE;
+            sort(mObj);
             update(mObj);
             if nargin > 1 && ~isempty(request)
                 if nargin < 3
@@ -71,52 +65,39 @@ classdef manager_RosAFE < handle
             asked = mObj.RosAFE.request(request, parametersOf(mObj, p));
             refuse(asked);
             update(mObj);
-            name = asked.result.name;
-            for kind = mObj.TYPES
-                row = find(strcmp(name, labels(mObj.dObj, kind.signal)));
-                if ~isempty(row)
-                    out = mObj.dObj.(kind.signal)(row, :);
-                end
-            end
+            [~, kind] = named(mObj, asked.result.name);
+            out = signalsOf(mObj.dObj, kind, asked.result.name);
         end
 
         function processor = hasProcessor(mObj, type, p)
             %HASPROCESSOR  The parameters of a processor that computes a type with given parameters, or 0.
             %
-            %   TYPE: 'input', 'preProc', 'gammatoneProc', 'ihcProc', 'ildProc', 'ratemapProc', 'crosscorrelationProc'.
+            %   TYPE: a representation or the request of its processors: 'ild', 'ildProc', 'onsetStrength', 'onsetProc'.
             %   P is a struct as that of addProcessor; what it lacks has to have its default.
-            if nargin < 3 || isempty(p)
-                p = struct();
+            if nargin < 3
+                p = [];
             end
+            about = representations(mObj.dObj);
+            asked = mObj.RosAFE.find(about.(typeOf(mObj, type)).word, parametersOf(mObj, p));
             update(mObj);
             processor = 0;
-            for candidate = mObj.Processors.(typeOf(mObj, type))(:).'
-                chain = mObj.RosAFE.getDependencies(candidate{1}.name);
-                refuse(chain);
-                if all(cellfun(@(name) hasParameters(mObj, name, p), chain.result.dependencies))
-                    processor = candidate{1};
-                    return
-                end
+            if strcmp(asked.status, 'done')
+                processor = named(mObj, asked.result.name);
+            elseif isempty(regexp(asked.exception.ex, '::e_(noSuchProcessor|existsAlready)$', 'once'))
+                refuse(asked);
             end
         end
 
         function processChunk(mObj)
             %PROCESSCHUNK  Add what all processors have computed since the last call to the signals of the data object.
             update(mObj);
-            output = mObj.RosAFE.getSignals('-m');
-            refuse(output);
-            signals = output.result.signals;
-            for kind = mObj.TYPES
-                names = namesOf(mObj.Processors.(kind.type));
-                chunks = signals.(kind.type);
-                if numel(chunks) ~= numel(names)
-                    continue % another client changes the tree just now: getSignals names none, the next call will do
+            for processor = mObj.told
+                got = mObj.RosAFE.getRepresentation('-m', processor{1}.name);
+                if strcmp(got.status, 'error') && ~isempty(strfind(got.exception.ex, 'e_noSuchProcessor')) %#ok<STREMP>
+                    continue % another client has just removed it
                 end
-                for k = 1:numel(names)
-                    if chunks{k}.framesOnPort > 0
-                        append(mObj, kind, names{k}, chunks{k});
-                    end
-                end
+                refuse(got);
+                append(mObj, processor{1}, got.result.parts);
             end
         end
 
@@ -135,19 +116,24 @@ classdef manager_RosAFE < handle
         end
 
         function modifyParameter(mObj, procName, paramName, newValue)
-            %MODIFYPARAMETER  Change a parameter of a processor, by the processor's name, to a text or a number.
-            if ~ischar(newValue)
-                newValue = sprintf('%.17g ', newValue);
+            %MODIFYPARAMETER  Change a parameter of a processor, by its name, to a text, a number or several of them.
+            if iscell(newValue)
+                newValue = strjoin(cellfun(@textOf, newValue(:).', 'UniformOutput', false), ' ');
             end
-            refuse(mObj.RosAFE.modifyParameter(procName, paramName, strtrim(newValue)));
+            refuse(mObj.RosAFE.modifyParameter(procName, paramName, textOf(newValue)));
             update(mObj);
         end
 
         function cleanup(mObj)
             %CLEANUP  Remove all processors but the input.
             update(mObj);
-            for processor = mObj.Processors.preProc(:).'
-                refuse(mObj.RosAFE.removeProcessor(processor{1}.name));
+            roots = {''};
+            for processor = mObj.told % in the order of creation: parents first
+                if isempty(processor{1}.upperDepName)
+                    roots{end + 1} = processor{1}.name; %#ok<AGROW>
+                elseif any(strcmp(processor{1}.upperDepName, roots))
+                    refuse(mObj.RosAFE.removeProcessor(processor{1}.name));
+                end
             end
             update(mObj);
         end
@@ -161,91 +147,155 @@ classdef manager_RosAFE < handle
     methods (Access = private)
         function update(mObj)
             % Ask for all processors, and have signals for just those, as they are now.
-            asked = mObj.RosAFE.getParameters();
+            asked = mObj.RosAFE.getProcessors();
             refuse(asked);
-            if isequal(mObj.Processors, asked.result.parameters)
+            processors = asked.result.processors(:).';
+            kinds = representations(mObj.dObj);
+            % What genomixd does not know, as the plugin that it is of is the node's alone, cannot be asked for here.
+            processors = processors(cellfun(@(processor) isfield(kinds, processor.kind), processors));
+            if isequal(mObj.told, processors)
                 return
             end
-            mObj.Processors = asked.result.parameters;
-            for kind = mObj.TYPES
-                processors = mObj.Processors.(kind.type);
-                keepOnly(mObj.dObj, kind.signal, namesOf(processors));
-                for k = 1:numel(processors)
-                    signals = signalsOf(mObj, kind, processors{k});
-                    row = find(strcmp(processors{k}.name, labels(mObj.dObj, kind.signal)));
-                    if isempty(row) || ~alike(signals{1}, mObj.dObj.(kind.signal){row, 1})
-                        cellfun(@(signal) addSignal(mObj.dObj, signal), signals);
-                    end
+            mObj.told = processors;
+            sort(mObj);
+            for kind = fieldnames(mObj.Processors).'
+                names = cellfun(@(processor) processor.name, mObj.Processors.(kind{1}), 'UniformOutput', false);
+                keepOnly(mObj.dObj, kind{1}, names);
+            end
+            for processor = processors
+                signals = newSignals(mObj, processor{1});
+                held = signalsOf(mObj.dObj, processor{1}.kind, processor{1}.name);
+                if isempty(held) || ~all(cellfun(@alike, signals, held))
+                    addSignals(mObj.dObj, processor{1}.kind, signals);
                 end
             end
         end
 
-        function type = typeOf(mObj, name)
-            % The type of processors that is meant: 'gammatone' by that name, 'gammatoneProc' or 'filterbank'.
-            if strcmpi(name, 'time')
-                name = 'preProc';
+        function sort(mObj)
+            % Processors, by kind, with the values of their parameters.
+            mObj.Processors = structfun(@(kind) cell(1, 0), representations(mObj.dObj), 'UniformOutput', false);
+            for processor = mObj.told
+                values = struct('name', processor{1}.name);
+                for parameter = processor{1}.parameters(:).'
+                    values.(parameter{1}.name) = valueOf(parameter{1}.value);
+                end
+                mObj.Processors.(processor{1}.kind){end + 1} = values;
             end
-            kinds = mObj.TYPES;
-            meant = strcmpi(name, {kinds.type}) | strcmpi(name, {kinds.request}) | strcmpi(name, {kinds.signal});
-            if ~any(meant)
-                error('manager_RosAFE:type', 'there is no type of processors ''%s''', name);
-            end
-            type = kinds(meant).type;
         end
 
-        function signals = signalsOf(mObj, kind, processor)
-            % New signals for what a processor computes, one for each ear.
-            channels = {'left', 'right'};
-            if ~kind.binaural
+        function kind = typeOf(mObj, name)
+            % The kind of processors that is meant: 'gammatone' by that name, 'gammatoneProc' or 'filterbank'.
+            kind = kindOf(mObj.dObj, name);
+            if isempty(kind)
+                error('manager_RosAFE:type', 'there is no type of processors ''%s''; there are: %s', name, ...
+                    strjoin(fieldnames(mObj.dObj).', ', '));
+            end
+        end
+
+        function [values, kind, processor] = named(mObj, name)
+            % A processor: the values of its parameters, its kind, and what getProcessors tells of it.
+            names = cellfun(@(processor) processor.name, mObj.told, 'UniformOutput', false);
+            if ~any(strcmp(name, names))
+                error('manager_RosAFE:removed', 'somebody has removed the processor %s', name);
+            end
+            processor = mObj.told{strcmp(name, names)};
+            kind = processor.kind;
+            same = cellfun(@(other) strcmp(other.name, name), mObj.Processors.(kind));
+            values = mObj.Processors.(kind){same};
+        end
+
+        function signals = newSignals(mObj, processor)
+            % Signals for what a processor computes: for each of its parts and, where those are of one ear, each ear.
+            about = representations(mObj.dObj);
+            about = about.(processor.kind);
+            parts = fieldnames(about.parts);
+            signals = cell(1, 0);
+            for k = 1:numel(parts)
+                name = about.word;
+                if numel(parts) > 1
+                    name = [name '_' parts{k}]; %#ok<AGROW>
+                end
+                axes_of = about.parts.(parts{k}).axes(:).';
                 channels = {'mono'};
+                if any(strcmp('ear', axes_of))
+                    channels = {'left', 'right'};
+                end
+                for channel = channels
+                    signals{end + 1} = newSignal(mObj, processor, name, rowsOf(axes_of), channel{1}); %#ok<AGROW>
+                end
             end
-            fs = mObj.dObj.sampleRate;
+        end
+
+        function signal = newSignal(mObj, processor, name, rows, channel)
+            % A signal of the class that the MATLAB front-end has for such axes.
+            fs = processor.rate;
+            label = processor.name;
             seconds = mObj.dObj.bufferSize_s_matlab;
-            switch kind.type
-                case {'input', 'preProc'}
-                    make = @(channel) TimeDomainSignal.construct(fs, seconds, kind.signal, processor.name, channel);
-                case 'crossCorrelation'
-                    cfHz = frequencies(mObj, processor.name);
-                    make = @(channel) CorrelationSignal(1 / processor.cc_hSizeSec, seconds, kind.signal, ...
-                        processor.name, cfHz, cell2mat(processor.cc_lags), channel);
-                otherwise
-                    if isfield(processor, 'ild_hSizeSec')
-                        fs = 1 / processor.ild_hSizeSec;
-                    elseif isfield(processor, 'rm_hSizeSec')
-                        fs = 1 / processor.rm_hSizeSec;
+            along = cellfun(@(axis) coordinates(mObj, processor, axis), rows, 'UniformOutput', false);
+            if isempty(rows)
+                signal = TimeDomainSignal.construct(fs, seconds, name, label, channel);
+            elseif strcmp(rows{1}, 'feature')
+                signal = FeatureSignal(fs, seconds, name, label, along{1}, channel);
+            elseif isscalar(rows)
+                signal = TimeFrequencySignal.construct(fs, seconds, name, label, along{1}, channel);
+            elseif strcmp(rows{2}, 'lag')
+                signal = CorrelationSignal(fs, seconds, name, label, along{:}, channel);
+            else
+                signal = ModulationSignal(fs, seconds, name, label, along{:}, channel);
+            end
+        end
+
+        function values = coordinates(mObj, processor, axis)
+            % What lies along an axis: the kind's own coordinate for its last axis, else what its parent says.
+            n = sizeOf(processor, axis);
+            about = representations(mObj.dObj);
+            while true
+                kind = about.(processor.kind);
+                own = rowsOf(processor.axes(:).');
+                if strcmp(axis, 'feature') && ~isempty(kind.features)
+                    values = kind.features(:).';
+                elseif ~isempty(own) && strcmp(own{end}, axis) && ~isempty(kind.coordinates)
+                    values = named(mObj, processor.name);
+                    values = values.(kind.coordinates{1});
+                elseif ~isempty(processor.upperDepName)
+                    [~, ~, processor] = named(mObj, processor.upperDepName);
+                    continue
+                else
+                    values = {};
+                end
+                break
+            end
+            if numel(values) ~= n % nobody says
+                values = num2cell(1:n);
+            end
+            if strcmp(axis, 'feature')
+                values = cellfun(@textOf, values, 'UniformOutput', false);
+            else
+                values = cell2mat(values);
+            end
+        end
+
+        function append(mObj, processor, parts)
+            % What getRepresentation gives, as frames by rows for each ear, to the processor's signals.
+            signals = signalsOf(mObj.dObj, processor.kind, processor.name);
+            at = 0;
+            for part = parts(:).'
+                axes_of = part{1}.axes(:).';
+                rows = rowsOf(axes_of);
+                sizes = part{1}.shape(:).';
+                ears = prod(sizes(strcmp('ear', axes_of)));
+                fits = cellfun(@(axis) sizes(strcmp(axis, axes_of)) == sizeOf(processor, axis), rows);
+                if all(fits) && sizes(end) > 0 % else they have changed since getProcessors
+                    [~, order] = ismember([{'time'} rows {'ear'}], fliplr(axes_of));
+                    order(order == 0) = [];
+                    data = permute(reshape(part{1}.data, [fliplr(sizes) 1]), [order, numel(order) + 1]);
+                    data = reshape(data, [], ears);
+                    for k = 1:ears
+                        shape = cellfun(@(axis) sizeOf(processor, axis), rows);
+                        appendChunk(signals{at + k}, reshape(data(:, k), [sizes(end), shape, 1]));
                     end
-                    cfHz = frequencies(mObj, processor.name);
-                    make = @(channel) TimeFrequencySignal.construct(fs, seconds, kind.signal, processor.name, cfHz, ...
-                        channel);
-            end
-            signals = cellfun(make, channels, 'UniformOutput', false);
-        end
-
-        function cfHz = frequencies(mObj, name)
-            % The centre frequencies of the filterbank that a processor hangs on, or is.
-            chain = mObj.RosAFE.getDependencies(name);
-            refuse(chain);
-            cfHz = [];
-            for bank = mObj.Processors.gammatone(:).'
-                if any(strcmp(bank{1}.name, chain.result.dependencies))
-                    cfHz = cell2mat(bank{1}.fb_cfHz);
                 end
-            end
-        end
-
-        function append(mObj, kind, name, chunk)
-            row = find(strcmp(name, labels(mObj.dObj, kind.signal)));
-            signals = mObj.dObj.(kind.signal)(row, :);
-            axes = {'cfHz', 'lags'};
-            for k = 1:2 % channels, lags
-                if isprop(signals{1}, axes{k}) && ~isempty(signals{1}.(axes{k})) && ...
-                        size(chunk.left, 1 + k) ~= numel(signals{1}.(axes{k}))
-                    return % they have changed since getParameters
-                end
-            end
-            appendChunk(signals{1}, chunk.left);
-            if kind.binaural
-                appendChunk(signals{2}, chunk.right);
+                at = at + ears;
             end
         end
 
@@ -263,62 +313,51 @@ classdef manager_RosAFE < handle
                 parameters.(name{1}) = p.(name{1});
             end
         end
-
-        function yes = hasParameters(mObj, name, p)
-            % Whether a processor has the parameters of P, and else its defaults.
-            p = plain(p);
-            for kind = mObj.TYPES
-                for processor = mObj.Processors.(kind.type)(:).'
-                    if strcmp(processor{1}.name, name)
-                        about = describe(mObj.RosAFE);
-                        defaults = about.services.(kind.request).parameters;
-                        yes = all(cellfun(@(field) same(field, processor{1}, p, defaults), fieldnames(processor{1})));
-                        return
-                    end
-                end
-            end
-            yes = false;
-        end
     end
 end
 
-function names = namesOf(processors)
-names = cellfun(@(processor) processor.name, processors, 'UniformOutput', false);
+function rows = rowsOf(axes_of)
+% The axes less ears and time.
+rows = axes_of(~ismember(axes_of, {'ear', 'time'}));
+end
+
+function n = sizeOf(processor, axis)
+% How much of an axis a processor puts out.
+shape = [processor.shape{:}];
+n = shape(strcmp(axis, processor.axes(:).'));
 end
 
 function yes = alike(signal, held)
 % Whether the frames of one signal can follow those of another.
-yes = true;
-for name = {'FsHz', 'cfHz', 'lags'}
+yes = strcmp(class(signal), class(held));
+for name = {'FsHz', 'cfHz', 'lags', 'modCfHz', 'fList'}
     yes = yes && (~isprop(signal, name{1}) || isequal(signal.(name{1}), held.(name{1})));
 end
 end
 
-function yes = same(field, processor, p, defaults)
-wanted = [];
-if isfield(p, field)
-    wanted = p.(field);
-elseif isfield(defaults, field) && ~any(strcmp(field, derived(p)))
-    wanted = defaults.(field).default;
+function value = valueOf(text)
+% The value that a text of getProcessors tells: a number, a word, or a row of them.
+if ~isempty(text) && text(1) == '['
+    words = strtrim(strsplit(text(2:end - 1), ','));
+    value = words(~cellfun(@isempty, words));
+    numbers = str2double(value);
+    if ~any(isnan(numbers))
+        value = num2cell(numbers);
+    end
+else
+    value = str2double(text);
+    if isnan(value)
+        value = text;
+    end
 end
-if iscell(wanted)
-    wanted = cell2mat(wanted);
-end
-value = processor.(field);
-if iscell(value)
-    value = cell2mat(value);
-end
-yes = isempty(wanted) || isequal(wanted(:), value(:));
 end
 
-function names = derived(p)
-% What getParameters tells as it came out of what is given, and not as it was asked for.
-names = {'name', 'fb_cfHz', 'fb_nChannels'};
-if isfield(p, 'fb_nChannels') || isfield(p, 'fb_cfHz')
-    names{end + 1} = 'fb_nERBs';
-end
-if isfield(p, 'fb_cfHz')
-    names = [names {'fb_lowFreqHz', 'fb_highFreqHz'}];
+function text = textOf(value)
+% The text that modifyParameter reads as a value, to the last digit.
+if ischar(value)
+    text = strtrim(value);
+else
+    text = strtrim(sprintf('%.17g ', value));
 end
 end
 

@@ -19,8 +19,8 @@ from rosafe.genomix.tcpros import Connection, Refused, ServiceClient, TopicReade
 from rosafe.genomix.values import complete, partial
 from rosafe.interface import (
     COMPONENTS,
+    FIND,
     KINDS,
-    REQUEST,
     REQUIRED,
     ROSAFE,
     Component,
@@ -140,14 +140,15 @@ class Proxy:
 
     def arguments(self, service: Service, given: Any) -> dict[str, Any]:
         """What `call` and `start` take, of what a client has `given`; ComponentError where that does not fit."""
-        return partial(given) if service is REQUEST else complete(service, given)
+        return partial(given) if service in self.component.composites else complete(service, given)
 
     async def call(self, service: Service, values: Mapping[str, Any]) -> Value:
         """What a function returns; an activity returns nothing, as soon as it runs."""
         with self._one_more():
-            if service is REQUEST:
+            if service in self.component.composites:
                 async with self._building:
-                    return Value(self.component, service.outputs, await trees.build(self, values))
+                    answer = await (trees.find if service is FIND else trees.build)(self, values)
+                return Value(self.component, service.outputs, answer)
             client = self._client(service.name)
             response = await client.call(values, CALL_SECONDS)
         if not response.genom_success:
@@ -408,6 +409,7 @@ def _describe_representation(representation: Representation) -> dict[str, Any]:
         "parameters": [p.name for p in representation.parameters],
         "derived": [d.name for d in representation.derived],
         "coordinates": list(representation.coordinates),
+        "features": list(representation.features),
     }
 
 

@@ -1,8 +1,8 @@
 """Values as text: every IDL type in JSON or in Tcl syntax, written piece by piece so that millions of numbers stream.
 
 Numbers are written in the shortest way that reads back as the same number, booleans as 0 and 1, what is not finite as
-null. In JSON a sequence is an array and a structure an object in the order of its declaration. In Tcl both are dicts;
-the keys of a sequence are its indexes: ``{0 input 1 preProc}``.
+null, but NaN in Tcl as NaN. In JSON a sequence is an array and a structure an object in the order of its declaration.
+In Tcl both are dicts; the keys of a sequence are its indexes: ``{0 input 1 preProc}``.
 """
 
 from __future__ import annotations
@@ -50,6 +50,7 @@ class Syntax(Protocol):
     def close(self, kind: str) -> str: ...
     def key(self, index: int, name: str) -> str: ...
     def item(self, index: int) -> str: ...
+    def not_finite(self, value: float) -> str: ...
 
 
 class _Json:
@@ -75,6 +76,9 @@ class _Json:
 
     def item(self, index: int) -> str:
         return "," if index else ""
+
+    def not_finite(self, value: float) -> str:
+        return "null"
 
 
 class _Tcl:
@@ -103,6 +107,9 @@ class _Tcl:
 
     def item(self, index: int) -> str:
         return f"{' ' if index else ''}{index} "
+
+    def not_finite(self, value: float) -> str:
+        return "NaN" if math.isnan(value) else "null"
 
 
 @functools.lru_cache(maxsize=256)
@@ -158,7 +165,7 @@ def _scalar(syntax: Syntax, idl: str, value: Any) -> str:
     if idl == "boolean":
         return "1" if value else "0"
     if idl in ("double", "float") and not math.isfinite(value):
-        return "null"
+        return syntax.not_finite(value)
     return f"{value:.9g}" if idl == "float" else repr(value)
 
 
@@ -176,9 +183,11 @@ def _signal(syntax: Syntax, levels: tuple[str, ...], value: Any) -> Iterator[str
 def _array(syntax: Syntax, values: np.ndarray) -> Iterator[str]:
     for start in range(0, len(values), STEP):
         part = values[start : start + STEP]
-        words = list(map(repr, part.tolist()))
-        if part.dtype.kind == "f" and not np.isfinite(part).all():
-            words = [word if finite else "null" for word, finite in zip(words, np.isfinite(part), strict=True)]
+        numbers = part.tolist()
+        words = list(map(repr, numbers))
+        if part.dtype.kind == "f":
+            for k in np.flatnonzero(~np.isfinite(part)):
+                words[k] = syntax.not_finite(numbers[k])
         yield syntax.numbers(start, words)
 
 
@@ -195,9 +204,9 @@ def plain(syntax: Syntax, value: Any) -> str:
         return syntax.open("sequence") + "".join(items) + syntax.close("sequence")
     if isinstance(value, str):
         return syntax.string(value)
-    if value is None or (isinstance(value, float) and not math.isfinite(value)):
+    if value is None:
         return "null"
-    return _scalar(syntax, "boolean" if isinstance(value, bool) else "", value)
+    return _scalar(syntax, {bool: "boolean", float: "double"}.get(type(value), ""), value)
 
 
 def document(syntax: Syntax, text: str) -> str:

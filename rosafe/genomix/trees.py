@@ -6,7 +6,7 @@ import asyncio
 from collections.abc import Awaitable, Mapping
 from typing import Any, Protocol, TypeVar
 
-from rosafe.interface import KINDS, REQUEST, ComponentError
+from rosafe.interface import KINDS, REQUEST, ROSAFE, ComponentError
 from rosafe.tree import requests as request
 from rosafe.tree.requests import Found, Plan, Step, Wish
 
@@ -44,9 +44,7 @@ async def build(component: Component, values: Mapping[str, Any]) -> dict[str, An
     ComponentError
         The component's own.
     """
-    given = dict(values)
-    kind = request.kind_of(given.pop("representation"))
-    wish = await asyncio.to_thread(request.understand, kind, given)  # numpy's and scipy's work, and their import
+    wish = await _understood(values)
     made: list[str] = []
     try:
         dependencies = await _carry_out(component, wish, made)
@@ -54,6 +52,22 @@ async def build(component: Component, values: Mapping[str, Any]) -> dict[str, An
         await _uncancelled(_remove(component, wish, made))
         raise
     return request.answer(wish, dependencies, made, component.instance)
+
+
+async def find(component: Component, values: Mapping[str, Any]) -> dict[str, Any]:
+    """What `build` would answer if all that it needs is there; ``::rosAFE::e_noSuchProcessor`` where it is not."""
+    wish = await _understood(values)
+    plan = request.plan(wish, await _look(component))
+    if plan.steps:
+        missing = ", ".join(step.service for step in plan.steps if step.makes)
+        raise ROSAFE.error("e_noSuchProcessor", what=f"there is none with these parameters; missing: {missing}")
+    return request.answer(wish, plan.dependencies, (), component.instance)
+
+
+async def _understood(values: Mapping[str, Any]) -> Wish:
+    given = dict(values)
+    kind = request.kind_of(given.pop("representation"))
+    return await asyncio.to_thread(request.understand, kind, given)  # numpy's and scipy's work, and their import
 
 
 async def _carry_out(component: Component, wish: Wish, made: list[str]) -> list[str]:

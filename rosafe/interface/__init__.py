@@ -17,7 +17,7 @@ from rosafe.vocabulary.representation import Representation
 
 from .bass import BASS
 from .genom import COMMON_SERVICES, GENOM_EXCEPTIONS, GENOM_STATE_PORT, MAX_ACTIVITIES
-from .rosafe import FIXED, LAYOUTS, MAX_BLOCK, MAX_SECONDS, REQUEST, ROSAFE
+from .rosafe import FIND, FIXED, LAYOUTS, MAX_BLOCK, MAX_SECONDS, REQUEST, ROSAFE
 from .service import Component, Port, Service
 
 COMPONENTS = {c.name: c for c in (ROSAFE, BASS)}
@@ -34,6 +34,7 @@ __all__ = [
     "BASS",
     "COMMON_SERVICES",
     "COMPONENTS",
+    "FIND",
     "FIXED",
     "GENOM_EXCEPTIONS",
     "GENOM_STATE_PORT",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 from rosafe.representations import KINDS
 from rosafe.representations.registry import ORIGINAL
@@ -123,9 +124,9 @@ def _adding(representation: Representation, kinds: Kinds) -> Service:
     )
 
 
-def _whole_tree(kinds: Kinds) -> Service:
-    """The request for a representation and all that it needs."""
-    return Service(
+def _whole_trees(kinds: Kinds) -> tuple[Service, ...]:
+    """The requests for a representation and all that it needs: to build it, and to find what is there of it."""
+    build = Service(
         "request",
         "Build what a representation needs, or find it in the tree of processors",
         (
@@ -151,6 +152,13 @@ def _whole_tree(kinds: Kinds) -> Service:
         ),
         throws=_INPUT_THROWS,
     )
+    find = replace(
+        build,
+        name="find",
+        doc="What the request would use for a representation if all of it is there; nothing is made",
+        throws=("::rosAFE::e_noSuchProcessor", "::rosAFE::e_existsAlready", "::rosAFE::e_badNewValue"),
+    )
+    return build, find
 
 
 _FUNCTIONS = (
@@ -247,9 +255,9 @@ def derive(kinds: Kinds) -> Component:
             "e_badNewValue": "a value of the wrong type or out of its range",
         },
         structs={**_structs(kinds), **BINAUDIO, **GENOM_STATE},
-        composites=(_whole_tree(kinds),),
+        composites=_whole_trees(kinds),
     )
 
 
 ROSAFE = derive(KINDS)
-(REQUEST,) = ROSAFE.composites
+REQUEST, FIND = ROSAFE.composites

@@ -137,9 +137,13 @@ class AmsFeatures(FramedStage):
     _decimation: Decimation
     _filters: Parallel
 
+    @classmethod
+    def in_force(cls, values: Mapping[str, Any]) -> dict[str, Any]:
+        return {**values, "ams_cfHz": center_frequencies(values).tolist()}
+
     @property
     def parameters(self) -> dict[str, Any]:
-        return {**self._values, "ams_cfHz": self._frequencies.tolist()}
+        return self.in_force(self._values)
 
     def output_rows(self, rows: tuple[int, ...]) -> tuple[int, ...]:
         return (*rows, len(self._frequencies))
@@ -247,7 +251,7 @@ def center_frequencies(values: Mapping[str, Any]) -> FloatArray:
     if given:
         return np.array(given)
     if count == 0:
-        return low * 2.0 ** np.arange(math.floor(math.log2(high) - math.log2(low) + 1e-9) + 1)
+        return np.ldexp(low, np.arange(math.floor(math.log2(high) - math.log2(low) + 1e-9) + 1))
     return 2 ** np.linspace(math.log2(low), math.log2(high), count)
 
 

@@ -45,6 +45,7 @@ class Pitch(Stage):
         doc="Pitch",
         parent="autocorrelation",
         axes=("ear", "feature", "time"),
+        features=("pitch", "rawPitch", "confidence"),
         parameters=(
             Parameter(
                 "pi_rangeHz",

@@ -66,6 +66,8 @@ class Representation:
         Names of the parameters in the order of the request, where that is another one.
     coordinates : tuple of str
         The parameters and derived values that tell what lies along its axes; `rosafe.process` returns them.
+    features : tuple of str
+        What the rows along its `feature` axis are, where that never changes.
     centred : str
         The axis whose middle stays where it is when a change alters its length; others are aligned at their first.
     """
@@ -80,6 +82,7 @@ class Representation:
     request_order: tuple[str, ...] = ()
     derived: tuple[Derived, ...] = ()
     coordinates: tuple[str, ...] = ()
+    features: tuple[str, ...] = ()
     centred: str = ""
     name: str = ""
     name_doc: str = ""

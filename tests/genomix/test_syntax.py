@@ -99,11 +99,13 @@ def test_long_arrays_come_back_the_same(split: Any, length: int) -> None:
     assert [float(w) for w in words[1::2]] == numbers.tolist()
 
 
-def test_what_is_not_finite_is_null() -> None:
+def test_what_is_not_finite_is_null_but_nan_is_nan_in_tcl() -> None:
     values = np.array([1.5, math.nan, math.inf, -math.inf])
     assert text_of(JSON, "sequence<double>", values) == "[1.5,null,null,null]"
-    assert text_of(TCL, "sequence<double>", values) == "{0 1.5 1 null 2 null 3 null}"
+    assert text_of(TCL, "sequence<double>", values) == "{0 1.5 1 NaN 2 null 3 null}"
     assert text_of(JSON, "double", math.nan) == "null"
+    assert text_of(TCL, "double", math.nan) == "NaN"
+    assert syntax.plain(TCL, {"a": math.nan, "b": None}) == "{a NaN b null}"
 
 
 def test_signals_are_nested_as_in_the_messages() -> None:

@@ -37,6 +37,7 @@ def test_representations_and_their_data(world: World) -> None:
         show('names', {p.input{1}.name, p.preProc{1}.name, p.gammatone{1}.name, p.ihc{1}.name, p.ild{1}.name, ...
             p.ratemap{1}.name, p.crossCorrelation{1}.name});
         show('counts', structfun(@numel, p));
+        show('kinds', numel(fieldnames(dObj)));
         acquire = dObj.acquire;
         show('acquire', acquire.status);
 
@@ -92,7 +93,7 @@ def test_representations_and_their_data(world: World) -> None:
         "ratemap_0",
         "crosscorrelation_0",
     ]
-    assert told["counts"] == [1] * 7
+    assert told["counts"] == [1] * 7 + [0] * (told["kinds"] - 7)
     assert told["acquire"] == "sent"
     assert told["input"] == [8000, True, True] or told["input"] == [8000, 1, 1]
     assert told["ratemap"] and told["cc"]
@@ -135,11 +136,11 @@ def test_reuse_changes_and_refusals(world: World) -> None:
         show('unity', cellfun(@(one) one.pp_bUnityComp, middle.Processors.preProc));
 
         show('bad value', message(@() mObj.addProcessor('ild', struct('ild_wSizeSec', -1))));
-        show('bad name', message(@() mObj.addProcessor('pitch')));
+        show('bad name', message(@() mObj.addProcessor('spikes')));
         show('bad member', message(@() mObj.addProcessor('ild', struct('fb_nERB', 1))));
         show('bad parameter', message(@() mObj.modifyParameter('ild_0', 'rm_scaling', 'power')));
         show('bad processor', message(@() mObj.deleteProcessor('nobody')));
-        show('bad type', message(@() mObj.hasProcessor('pitch')));
+        show('bad type', message(@() mObj.hasProcessor('spikes')));
         show('bad number', message(@() mObj.deleteProcessor('ild', 99)));
         show('two', message(@() mObj.addProcessor('ild', struct('fb_nChannels', {1, 2}))));
         show('none', message(@() mObj.addProcessor({}, {})));
@@ -183,7 +184,7 @@ def test_reuse_changes_and_refusals(world: World) -> None:
     assert told["beside"] == [2, 2, 3, 1]
     assert told["unity"] == [0, 0, 1]
     assert told["bad value"].startswith("manager_RosAFE:refused Error::rosAFE::e_badNewValue: ild_wSizeSec: -1")
-    assert "::genom::serialization" in told["bad name"] and "'pitch' is not one of" in told["bad name"]
+    assert "::genom::serialization" in told["bad name"] and "'spikes' is not one of" in told["bad name"]
     assert "fb_nERB" in told["bad member"]
     assert told["bad parameter"] == "manager_RosAFE:refused Error::rosAFE::e_noSuchParameter"
     assert told["bad processor"] == "manager_RosAFE:refused Error::rosAFE::e_noSuchProcessor"
