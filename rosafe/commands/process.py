@@ -73,7 +73,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--outputs",
         metavar="NAME,...",
-        help=f"what to keep of {', '.join(KINDS)} (default: the first {len(FIXED)}); what none of them needs is not computed",
+        help=f"what to keep of {', '.join(KINDS)} (default: the first {len(FIXED)}); "
+        "what none of them needs is not computed",
     )
     parser.add_argument(
         "--block",
@@ -127,7 +128,8 @@ def _epilog() -> str:
 
 
 def _coordinates() -> str:
-    units = {named.name: named.unit for kind in KINDS.values() for named in (*kind.parameters, *kind.derived)}
+    units = {parameter.name: parameter.unit for kind in KINDS.values() for parameter in kind.parameters}
+    units |= {derived.name: derived.unit for kind in KINDS.values() for derived in kind.derived}
     names = dict.fromkeys(name for kind in KINDS.values() for name in kind.coordinates)
     return ", ".join(f"{name} ({units[name]})" if units[name] else name for name in names)
 
