@@ -17,7 +17,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from rosafe.component import generate, master, paths
-from rosafe.interface import COMPONENTS, ComponentError
+from rosafe.vocabulary import plugins
+from rosafe.vocabulary.errors import ComponentError
 
 OK, NOTE, MISSING = "ok", "note", "MISSING"
 
@@ -128,7 +129,7 @@ def _messages() -> Finding:
         generate.ensure_messages()
     except generate.GenerationError as problem:
         return Finding(MISSING, f"the messages cannot be generated: {problem}")
-    for package in COMPONENTS:
+    for package in ("bass", "rosAFE"):
         module = importlib.import_module(f"{package}.msg")
     where = Path(str(module.__file__)).parents[2]
     if stale:
@@ -182,6 +183,16 @@ def _devices() -> Finding:
 def _kernels() -> Finding:
     status = importlib.import_module("rosafe.dsp.kernels").status()
     return Finding(OK if status.compiled else NOTE, status.detail)
+
+
+def _plugins() -> Finding:
+    if not plugins.expected():
+        return Finding(OK, f"none; {plugins.FOLDERS} names folders of them")
+    from rosafe.representations import PROBLEMS, STAGES, registry
+
+    if PROBLEMS:
+        return Finding(NOTE, "; ".join(" ".join(line.split()) for line in PROBLEMS), "mend them: they are left out")
+    return Finding(OK, ", ".join(kind for kind in STAGES if kind not in registry.own()))
 
 
 def _master() -> Finding:

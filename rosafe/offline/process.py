@@ -41,7 +41,7 @@ def process(
     sample_rate : float
         In Hz.
     parameters : mapping, optional
-        Any of the original's parameter names (`in_*`, `pp_*`, `fb_*`, `ihc_*`, `ild_*`, `rm_*`, `cc_*`) and its value.
+        Names and values, such as `fb_nChannels`; docs/parameters.md has them all.
         The rest takes the interface table's defaults, but for `in_doNormalize`: True for int32, False for float.
     block_frames : int or sequence of int
         Block size, or sizes that are used in turn; the last block is what is left. Only where gain control
@@ -50,16 +50,17 @@ def process(
         Parameter changes, each made before the block of that number (from 0); several for one block are made in the
         order given. Those for blocks that never come are ignored. The original's `set_rm_scailing` is known here too.
     outputs : sequence of str, optional
-        The representations to return, of `input`, `preProc`, `gammatone`, `ihc`, `ild`, `ratemap`,
-        `crossCorrelation`. All by default. What none of them depends on is not computed.
+        The representations to return, of `interface.KINDS`; `input`, `preProc`, `gammatone`, `ihc`, `ild`, `ratemap`
+        and `crossCorrelation` by default. What none of them depends on is not computed.
 
     Returns
     -------
     dict
-        `input`, `preProc` (2, N); `gammatone`, `ihc` (2, C, N); `ild` (C, F) in dB; `ratemap` (2, C, F);
-        `crossCorrelation` (C, L, F); `fb_cfHz` (C,) in Hz; `cc_lags` (L,) in seconds; `ild_frameRate`,
-        `ratemap_frameRate`, `crossCorrelation_frameRate` in Hz. Where a change alters the number of lags or channels,
-        L and C are the largest and what lies outside is 0; rates and `fb_cfHz` are the last ones.
+        Each output as float64 with the axes that `rosafe process -h` lists, such as `input`, `preProc` (2, N);
+        `gammatone`, `ihc` (2, C, N); `ild` (C, F) in dB; `ratemap` (2, C, F); `crossCorrelation` (C, L, F); one that
+        has several parts as `<kind>_<part>`. What lies along their axes, such as `fb_cfHz` (C,) in Hz and `cc_lags`
+        (L,) in seconds. `<kind>_frameRate` in Hz of those in frames. Where a change alters the number of lags or
+        channels, L and C are the largest and what lies outside is 0; rates and `fb_cfHz` are the last ones.
 
     Raises
     ------
