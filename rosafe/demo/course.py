@@ -156,7 +156,7 @@ def _say_path(shown: Representations, sound: Sound) -> None:
 
 
 def _draw(shown: Representations, sound: Sound, picture: Path) -> None:
-    from rosafe.view import figure  # matplotlib takes a second to import
+    from rosafe.view import axes, figure  # matplotlib takes a second to import
 
     channels = len(shown.center_frequencies)
     subtitle = (
@@ -164,4 +164,4 @@ def _draw(shown: Representations, sound: Sound, picture: Path) -> None:
         f"{shown.times[-1] - shown.times[0]:.1f} s as they came from rosAFE's ports"
     )
     drawing = figure.draw(shown, sound.title, subtitle, sound.true_azimuth)
-    figure.save(drawing, picture)
+    axes.save(drawing, picture)

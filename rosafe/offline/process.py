@@ -12,7 +12,7 @@ import numpy as np
 from rosafe.dsp.stage import SAMPLE_RATE
 from rosafe.interface import KINDS
 from rosafe.interface.arguments import check_change, check_outputs, check_parameters
-from rosafe.offline.chain import Chain, output_parts
+from rosafe.offline.chain import Chain
 from rosafe.tree import sizes
 from rosafe.tree.block import Block
 
@@ -78,7 +78,7 @@ def process(
     gathered: dict[str, _Gathered] = {}
 
     def keep(kind: str, block: Block) -> None:
-        for name, data in zip(output_parts(kind), block.parts, strict=True):
+        for name, data in zip(KINDS[kind].outputs, block.parts, strict=True):
             gathered[name].add(data)
 
     blocks = (samples[:, first:end] for first, end in itertools.pairwise((0, *ends)))
@@ -91,7 +91,7 @@ def process(
                 taken.append(_size(chain, wanted, ends))
         sizes.refuse_over(sizes.machine_memory(), max(taken), _TOO_LARGE, 1e9)
         for kind in wanted:
-            for name, part in output_parts(kind).items():
+            for name, part in KINDS[kind].outputs.items():
                 middle = part.axes.index(KINDS[kind].centred) if KINDS[kind].centred in part.axes else -1
                 gathered[name] = _Gathered(shapes[kind][name], middle)
         chain.run()
