@@ -137,9 +137,13 @@ class AmsFeatures(FramedStage):
     _decimation: Decimation
     _filters: Parallel
 
+    @classmethod
+    def in_force(cls, values: Mapping[str, Any]) -> dict[str, Any]:
+        return {**values, "ams_cfHz": center_frequencies(values).tolist()}
+
     @property
     def parameters(self) -> dict[str, Any]:
-        return {**self._values, "ams_cfHz": self._frequencies.tolist()}
+        return self.in_force(self._values)
 
     def output_rows(self, rows: tuple[int, ...]) -> tuple[int, ...]:
         return (*rows, len(self._frequencies))
