@@ -333,6 +333,11 @@ class Graph:
             rospy.init_node(f"test_{os.getpid()}", disable_signals=True)
 
 
+def python_path(graph: Graph) -> str:
+    """PYTHONPATH for programs of a test's own: this checkout, and the messages."""
+    return f"{ROOT}:{graph.env['PYTHONPATH']}"
+
+
 @contextmanager
 def shared_graph(home: Path) -> Iterator[Graph]:
     """The graph of this test process: its master runs in it, and rospy here talks to that."""

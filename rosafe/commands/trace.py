@@ -89,7 +89,7 @@ def run(options: argparse.Namespace) -> int:
 
 def _compute(path: Path, seconds: float, block: int) -> list[Event]:
     """What the default tree does on the first `seconds` of a sound file."""
-    from rosafe.interface import KINDS
+    from rosafe.interface import FIXED
     from rosafe.interface.arguments import check_parameters
     from rosafe.offline.chain import Chain
     from rosafe.sound.audiofile import AudioFile, AudioFileError
@@ -104,7 +104,7 @@ def _compute(path: Path, seconds: float, block: int) -> list[Event]:
             frames = min(sound.frames, math.ceil(seconds * sound.sample_rate))
             blocks = (sound.read(min(block, frames - first)) for first in range(0, frames, block))
             values = {"in_doNormalize": True, **check_parameters(None)}
-            with Chain(blocks, sound.sample_rate, values, KINDS, lambda *_: None) as chain:
+            with Chain(blocks, sound.sample_rate, values, FIXED, lambda *_: None) as chain:
                 chain.observe(tracer)
                 chain.run()
         finally:

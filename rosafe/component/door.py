@@ -122,7 +122,8 @@ class Door:
         next_look = 0.0
         while self._listener.fileno() >= 0:
             try:
-                for key, _ in self._selector.select(_TICK):
+                events = [key for key, _ in self._selector.select(_TICK)]
+                for key in sorted(events, key=lambda key: key.fileobj is self._listener):  # first those who are here
                     key.data()
                 if time.monotonic() > next_look:
                     self._look_round()

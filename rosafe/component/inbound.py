@@ -48,6 +48,7 @@ HEADER_BYTES = 65536  # of a TCPROS header; it holds the definition of a message
 HTTP_HEADER_BYTES = 16384
 BODY_BYTES = 2**18  # of an XML-RPC request; the longest is a list of publishers
 SLIP_BYTES = 2**20  # so much is read of any service request: a list that is too long gets its error by name
+DATA_BYTES = 2**30  # of a message that no rule bounds more closely, such as what is plotted or recorded
 LONG_BYTES, LONG_REQUESTS = 65536, 16  # of requests longer than this so many are read at a time
 REQUEST_SECONDS = 10.0  # from the first byte of a service request to the last
 ANSWER_SECONDS = 60.0  # for a client to take an answer
@@ -276,7 +277,7 @@ def _read_messages(self: Any, buffer: io.BytesIO, messages: list[Any], sock: soc
     buffer.seek(0)
     (size,) = _LENGTH.unpack(buffer.read(_LENGTH.size))
     buffer.seek(at)
-    limit = largest(self.recv_data_class)
+    limit = bound(self.recv_data_class)
     if size > limit:
         what = f"a message of {size} bytes, at most {limit} make sense; its publisher was disconnected"
         _report(self.resolved_name, sock.getpeername()[0], what)
@@ -290,9 +291,20 @@ _WIDTHS.update({f"{u}int{bits}": bits // 8 for u in ("", "u") for bits in (8, 16
 _WIDTHS.update(float32=4, float64=8)
 
 
+# What is made of a request's texts and lists, and what has neither.
+_REQUESTS = re.compile(r"\w+/\w+Action(Goal|Result|Feedback)|actionlib_msgs/\w+|rosgraph_msgs/Clock")
+
+
+def bound(message_class: Any) -> int:
+    """The bytes of the longest message of a topic that is taken."""
+    if hasattr(message_class, "longest_sequence") or _REQUESTS.fullmatch(message_class._type):
+        return largest(message_class)
+    return DATA_BYTES
+
+
 @functools.cache
 def largest(message_class: Any) -> int:
-    """The bytes of the longest message that makes sense.
+    """The bytes of the longest message or request that makes sense.
 
     Texts have up to MAX_STRING characters, and sequences up to MAX_SEQUENCE elements or as many as the class'
     `longest_sequence` says.

@@ -22,6 +22,7 @@ from rosafe.interface import KINDS, LAYOUTS, ROSAFE, ComponentError, Representat
 from rosafe.node import reports
 from rosafe.node.ports import OutputPort, element
 from rosafe.node.trace_port import TracePort
+from rosafe.representations import PROBLEMS
 from rosafe.tree.block import Block
 from rosafe.tree.processor import Processor
 from rosafe.tree.tree import Tree
@@ -34,6 +35,8 @@ class RosafeNode:
     """The component `rosAFE`. Make it after `rospy.init_node`."""
 
     def __init__(self, instance: str) -> None:
+        for problem in PROBLEMS:
+            rospy.logwarn(f"a representation is left out: {problem}")
         kernels.compiled()  # where they must be built first, that takes a second, which no block should wait for
         self._node = ComponentNode(ROSAFE, lambda problem: ROSAFE.error("e_badNewValue", what=str(problem)))
         self.finished = self._node.finished

@@ -121,14 +121,15 @@ class Chain:
         self._listener = _Listener(outputs, self._source, keep)
         self._tree = Tree(self._listener)
         self._processors: dict[str, Processor] = {}
-        self._longest: dict[str, Any] = {}  # of what is derived from parameters: the most elements there will be
+        self._outputs = frozenset(outputs)
+        self._derived: dict[int, dict[str, Any]] = {}  # from parameters, from which block on
         try:
             with _as_value_error():
                 self._build(_needed(outputs), parameters)
         except BaseException:
             self.close()
             raise
-        self._remember()
+        self._remember(0)
 
     def _build(self, needed: set[str], values: Mapping[str, Any]) -> None:
         for kind in KINDS.values():  # parents come first in the table
@@ -142,13 +143,10 @@ class Chain:
         """Change a (checked) parameter before block `block`; the blocks of successive calls ascend. Or ValueError."""
         with _as_value_error():
             self._tree.schedule(block, name, value)
-        self._remember()
+        self._remember(block)
 
-    def _remember(self) -> None:
-        for processor in self._processors.values():
-            for name, value in processor.derived().items():
-                if np.size(value) >= np.size(self._longest.get(name, ())):
-                    self._longest[name] = value
+    def _remember(self, block: int) -> None:
+        self._derived[block] = {k: v for p in self._processors.values() for k, v in p.derived().items()}
 
     def observe(self, observer: Observer) -> None:
         """Tell `observer` of every state that a processor enters."""
@@ -195,17 +193,20 @@ class Chain:
         return kind, int(taken[kind])
 
     def describe(self) -> dict[str, Any]:
-        """Axes and rates of what runs: `fb_cfHz` (Hz), `cc_lags` (s), `ild_frameRate` and its like (Hz).
+        """Axes of what runs, `fb_cfHz` (Hz), `cc_lags` (s); rates of the outputs, `ild_frameRate` and its like (Hz).
 
-        What is a parameter is told as it is at last, what follows from parameters as where it is longest.
+        Rates and what is a parameter are told as they are at last, what follows from parameters as where it is longest.
         """
         described: dict[str, Any] = {}
         for kind, processor in self._processors.items():
-            values = {**processor.parameters(), **self._longest}
+            parameters = processor.parameters()
             for name in processor.representation.coordinates:
-                words = any(isinstance(value, str) for value in values[name])
-                described[name] = list(values[name]) if words else np.array(values[name], np.float64)
-            if processor.signal.framed:
+                values = (
+                    parameters[name] if name in parameters else max((d[name] for d in self._derived.values()), key=len)
+                )
+                words = any(isinstance(value, str) for value in values)
+                described[name] = list(values) if words else np.array(values, np.float64)
+            if processor.signal.framed and kind in self._outputs:
                 described[f"{kind}_frameRate"] = processor.rate
         return described
 

@@ -21,6 +21,10 @@ from rosafe.sound.audiofile import AudioFile, AudioFileError
 from rosafe.tree import sizes
 from rosafe.tree.block import Block
 
+_TOO_LARGE = (
+    "one block of output would take {taken:.1f} GB, allowed are {limit:.1f} GB; "
+    "take fewer channels or lags, or a smaller --block"
+)
 _DEFAULTS = {parameter.name: parameter.default for kind in KINDS.values() for parameter in kind.parameters}
 
 
@@ -100,7 +104,8 @@ def _stream(
             progress(min(done.values()), file.frames)
 
     with Chain(_blocks(file, block_frames), file.sample_rate, values, wanted, keep) as chain:
-        _check_memory(*chain.largest_block(min(block_frames, file.frames)))
+        kind, taken = chain.largest_block(min(block_frames, file.frames))
+        sizes.refuse_over(sizes.MAX_BYTES, taken, f"{kind}: {_TOO_LARGE}", 1e9)  # several are under way at a time
         writer = NpzWriter(
             descriptor,
             {
@@ -124,15 +129,6 @@ def _blocks(file: AudioFile, block_frames: int) -> Iterator[np.ndarray]:
         if block.shape[1] != wanted:
             raise AudioFileError(f"{file.path} is cut off: {at + block.shape[1]} of {file.frames} frames are there")
         yield block
-
-
-def _check_memory(kind: str, size: int) -> None:
-    """ValueError where one block of output would fill the memory; several are under way at the same time."""
-    if size > sizes.MAX_BYTES:
-        raise ValueError(
-            f"{kind}: one block of output would take {size / 1e9:.1f} GB, allowed are {sizes.MAX_BYTES / 1e9:.1f} GB; "
-            "take fewer channels or lags, or a smaller --block"
-        )
 
 
 def _check_room(descriptor: int, size: int) -> None:

@@ -251,7 +251,7 @@ def center_frequencies(values: Mapping[str, Any]) -> FloatArray:
     if given:
         return np.array(given)
     if count == 0:
-        return low * 2.0 ** np.arange(math.floor(math.log2(high) - math.log2(low) + 1e-9) + 1)
+        return np.ldexp(low, np.arange(math.floor(math.log2(high) - math.log2(low) + 1e-9) + 1))
     return 2 ** np.linspace(math.log2(low), math.log2(high), count)
 
 

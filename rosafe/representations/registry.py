@@ -65,6 +65,10 @@ def _clash(stage: type[Stage], others: Mapping[str, type[Stage]]) -> str:
     return ""
 
 
+def _told(problem: BaseException) -> str:
+    return " ".join(f"{type(problem).__name__}: {problem}".split())
+
+
 def _plugin_modules(problems: list[str]) -> Iterator[tuple[str, ModuleType]]:
     """Each plugin's origin and module; what cannot be imported goes to `problems`."""
     for folder in plugins.folders():
@@ -78,14 +82,14 @@ def _plugin_modules(problems: list[str]) -> Iterator[tuple[str, ModuleType]]:
                 module = importlib.util.module_from_spec(spec)
                 spec.loader.exec_module(module)
             except (Exception, SystemExit) as problem:  # somebody else's code: anything can happen
-                problems.append(f"{path}: {type(problem).__name__}: {problem}")
+                problems.append(f"{path}: {_told(problem)}")
             else:
                 yield str(path), module
     for point in plugins.entry_points():
         try:
             module = importlib.import_module(point.module)
         except (Exception, SystemExit) as problem:
-            problems.append(f"{point.name} ({point.value}): {type(problem).__name__}: {problem}")
+            problems.append(f"{point.name} ({point.value}): {_told(problem)}")
         else:
             yield f"{point.name} ({point.value})", module
 

@@ -15,12 +15,14 @@ from typing import Any
 
 import pytest
 import rosAFE.msg
+import rospy
 from actionlib_msgs.msg import GoalID
 from rosgraph.network import encode_ros_handshake_header, read_ros_handshake_header
-from std_msgs.msg import Header
+from std_msgs.msg import Header, String
 
+import bass.msg
 from rosafe.component import door
-from tests.harness import PATIENCE, Graph, proc, wait_for
+from tests.harness import PATIENCE, PYTHON, Graph, proc, python_path, wait_for
 from tests.ros.attacker import HUGE, FakePublisher, Target, closed, length, pour, publisher_header
 from tests.ros.session import Session, own_node
 
@@ -353,6 +355,33 @@ def test_lists_of_publishers_that_are_not_there_cost_little(afe: tuple[Session, 
         another = session.listen()
         wait_for(lambda: another.heard)
         assert target.threads < threads + 20
+
+
+LISTENING = """
+import sys, rospy
+from rosafe.component import registration
+from bass.msg import binaudio_portStruct
+from std_msgs.msg import String
+registration.init_node("plain_listener", ["plain_listener"])
+rospy.Subscriber(sys.argv[1], binaudio_portStruct, lambda m: print("audio", len(m.left), flush=True))
+rospy.Subscriber(sys.argv[2], String, lambda m: print("text", len(m.data), flush=True))
+rospy.spin()
+"""
+
+
+def test_who_listens_to_data_gets_it_whatever_its_length(graph: Graph) -> None:
+    """The bounds of requests are not those of sound or of a trace, taken with the classes as they are generated."""
+    graph.client()
+    audio = rospy.Publisher("/long/audio", bass.msg.binaudio_portStruct, latch=True, queue_size=1)
+    text = rospy.Publisher("/long/text", String, latch=True, queue_size=1)
+    audio.publish(bass.msg.binaudio_portStruct(left=[1] * 44100, right=[2] * 44100))
+    text.publish(String("x" * 1_000_000))
+    with graph.start(PYTHON, "-c", LISTENING, "/long/audio", "/long/text", PYTHONPATH=python_path(graph)) as listener:
+        wait_for(
+            lambda: sorted(listener.out.splitlines()) == ["audio 44100", "text 1000000"], 30, lambda: str(listener)
+        )
+    audio.unregister()
+    text.unregister()
 
 
 # --- all at once ------------------------------------------------------------------------------------------------

@@ -17,7 +17,7 @@ import pytest
 import rosgraph
 
 from rosafe.component import master
-from tests.harness import PYTHON, Graph, MasterProcess, run_together, wait_for
+from tests.harness import PYTHON, Graph, MasterProcess, python_path, run_together, wait_for
 from tests.ros.session import Session, told
 
 # --- two inputs at a time ---------------------------------------------------------------------------------------
@@ -102,10 +102,6 @@ def test_the_newer_of_two_inputs_stays_wherever_the_older_one_is(graph: Graph, t
         session.wait_activities(["InputProc"])
         assert session.processors() == {"input": ["second"]}
         session.close()
-
-
-def python_path(graph: Graph) -> str:
-    return f"{Path(__file__).resolve().parents[2]}:{graph.env['PYTHONPATH']}"
 
 
 # --- the master -------------------------------------------------------------------------------------------------

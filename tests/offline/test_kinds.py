@@ -1,0 +1,167 @@
+"""Outputs of any kind: names, shapes, coordinates and rates come from the declaration alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+import rosafe
+from rosafe.dsp.framing import FramedStage, frame_parameters
+from rosafe.dsp.guard import FloatArray, limited
+from rosafe.dsp.stage import Output
+from rosafe.representations import KINDS, STAGES
+from rosafe.vocabulary.parameter import Parameter
+from rosafe.vocabulary.representation import Derived, Part, Representation
+from tests.dsp.bare import cut
+
+RATE = 16000.0
+FEW = {"fb_nChannels": 4, "fb_highFreqHz": 4000.0}
+SOUND = 0.1 * np.random.default_rng(0).standard_normal((2, 3000))
+
+
+class Shells(FramedStage):
+    """Of each frame the ears' sums, and the same in shells around the middle: more of them where that is asked for."""
+
+    REPRESENTATION = Representation(
+        kind="shells",
+        doc="A test's own",
+        parent="preProc",
+        parts=(Part("sums", ("time",)), Part("around", ("ear", "lag", "time"))),
+        parameters=(*frame_parameters("sh"), Parameter("sh_reach", "unsigned long", 1, "Shells", 0, 10)),
+        derived=(Derived("sh_shells", "sequence<double>", "From the middle"),),
+        coordinates=("sh_shells",),
+        centred="lag",
+    )
+    PREFIX = "sh"
+    INPUT = ("ear", "time")
+
+    @property
+    def derived(self) -> dict[str, Any]:
+        return {"sh_shells": self.shells.tolist()}
+
+    @property
+    def shells(self) -> FloatArray:
+        return np.arange(-self._values["sh_reach"], self._values["sh_reach"] + 1.0)
+
+    def part_rows(self, rows: tuple[int, ...]) -> tuple[tuple[int, ...], ...]:
+        return ((), (2, len(self.shells)))
+
+    def output_rows(self, rows: tuple[int, ...]) -> tuple[int, ...]:
+        return ()
+
+    def process(self, block: FloatArray, extra: FloatArray | None = None) -> Output:
+        frames = self._framing.frames(self._buffer.append(limited(self._checked(block)))).sum(axis=-1)
+        self._buffer.drop(frames.shape[-1] * self._framing.hop)
+        return frames.sum(axis=0), frames[:, np.newaxis] * self.shells[:, np.newaxis]
+
+
+@pytest.fixture
+def shells(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    monkeypatch.setitem(KINDS, "shells", Shells.REPRESENTATION)
+    monkeypatch.setitem(STAGES, "shells", Shells)
+    yield
+
+
+def test_an_entry_for_each_part(shells: None) -> None:
+    got = rosafe.process(SOUND, RATE, block_frames=700, outputs=["shells"])
+    assert list(got) == ["shells_sums", "shells_around", "sh_shells", "shells_frameRate"]
+    assert {name: np.shape(value) for name, value in got.items()} == {
+        "shells_sums": (17,),
+        "shells_around": (2, 3, 17),
+        "sh_shells": (3,),
+        "shells_frameRate": (),
+    }
+    np.testing.assert_allclose(got["shells_around"][:, 2].sum(axis=0), got["shells_sums"], rtol=0, atol=1e-12)
+
+
+def test_parts_that_grow_on_the_way(shells: None, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Around the middle, as declared; nothing else changes."""
+    monkeypatch.setattr(
+        "rosafe.interface.arguments._BY_NAME", {"sh_reach": Shells.REPRESENTATION.parameter("sh_reach")}
+    )
+    whole = rosafe.process(SOUND, RATE, block_frames=1000, outputs=["shells"])
+    got = rosafe.process(SOUND, RATE, None, 1000, [(1, "sh_reach", 3), (2, "sh_reach", 2)], ["shells"])
+    np.testing.assert_array_equal(got["sh_shells"], np.arange(-3, 4))
+    np.testing.assert_array_equal(got["shells_sums"], whole["shells_sums"])
+    around = got["shells_around"]
+    assert around.shape == (2, 7, 17)
+    np.testing.assert_array_equal(around[:, 4], whole["shells_around"][:, 2])
+    reaches = [np.flatnonzero(around[0, :, frame]).tolist() for frame in range(17)]
+    assert reaches == [[2, 4]] * 5 + [[0, 1, 2, 4, 5, 6]] * 6 + [[1, 2, 4, 5]] * 6
+
+
+def test_coordinates_are_those_that_were_in_force() -> None:
+    """Not those before a change that is made before the first block, nor those of one that comes too late."""
+    for changes, reach in (
+        ([(0, "cc_maxDelaySec", 0.0005)], 8),
+        ([(0, "cc_maxDelaySec", 0.003), (0, "cc_maxDelaySec", 0.0005)], 8),
+        ([(1, "cc_maxDelaySec", 0.0005)], 18),
+        ([(3, "cc_maxDelaySec", 0.003)], 18),
+        ([(2, "cc_maxDelaySec", 0.003), (2, "cc_maxDelaySec", 0.0005)], 18),
+        ([(1, "cc_maxDelaySec", 0.002), (2, "cc_maxDelaySec", 0.0005)], 32),
+    ):
+        got = rosafe.process(SOUND, RATE, FEW, 1000, changes, ["crossCorrelation"])
+        np.testing.assert_allclose(got["cc_lags"], np.arange(-reach, reach + 1) / RATE, err_msg=str(changes))
+        assert got["crossCorrelation"].shape[1] == 2 * reach + 1
+
+
+@pytest.mark.parametrize(
+    ("kind", "names", "shape"),
+    [
+        ("itd", {"fb_cfHz", "cc_lags"}, (4, 17)),
+        ("autocorrelation", {"fb_cfHz", "ac_lags"}, (2, 4, 319, 17)),
+        ("pitch", {"fb_cfHz", "ac_lags"}, (2, 3, 16)),
+        ("spectralFeatures", {"fb_cfHz", "sf_requests"}, (2, 14, 17)),
+        ("onsetStrength", {"fb_cfHz"}, (2, 4, 17)),
+        ("adaptation", {"fb_cfHz"}, (2, 4, 3000)),
+    ],
+)
+def test_later_kinds(kind: str, names: set[str], shape: tuple[int, ...]) -> None:
+    """What lies along the axes of all that is computed, and the rate of what is asked for."""
+    got = rosafe.process(SOUND, RATE, FEW, 333, outputs=[kind])
+    rate = set() if kind == "adaptation" else {f"{kind}_frameRate"}
+    assert set(got) == {kind} | names | rate
+    assert got[kind].shape == shape
+    whole = rosafe.process(SOUND, RATE, FEW, 3000, outputs=kind)
+    np.testing.assert_allclose(got[kind], whole[kind], rtol=1e-9, atol=1e-9 * np.nanmax(np.abs(whole[kind])))
+
+
+def test_words_are_a_list() -> None:
+    got = rosafe.process(SOUND, RATE, {**FEW, "sf_requests": ["flux", "centroid"]}, outputs=["spectralFeatures"])
+    assert got["sf_requests"] == ["flux", "centroid"]
+
+
+def test_lags_that_are_not_centred_are_aligned_at_the_first() -> None:
+    changes = [(1, "ac_wSizeSec", 0.01), (2, "ac_wSizeSec", 0.03)]
+    got = rosafe.process(SOUND, RATE, FEW, 1000, changes, ["autocorrelation"])
+    assert got["autocorrelation"].shape[:3] == (2, 4, 479)
+    np.testing.assert_allclose(got["ac_lags"], np.arange(479) / RATE)
+    stage = STAGES["autocorrelation"](STAGES["ihc"](RATE).output)
+    ihc = rosafe.process(SOUND, RATE, FEW, 1000, outputs=["ihc"])["ihc"]
+    at = 0
+    for number, block in enumerate(cut(ihc, 1000)):
+        for name, value in [(name, value) for when, name, value in changes if when == number]:
+            stage.configure(**{name: value})
+        wanted = stage.process(block)
+        assert isinstance(wanted, np.ndarray)
+        part = got["autocorrelation"][..., at : at + wanted.shape[-1]]
+        np.testing.assert_array_equal(part[:, :, : wanted.shape[2]], wanted)
+        assert not part[:, :, wanted.shape[2] :].any()
+        at += wanted.shape[-1]
+    assert at == got["autocorrelation"].shape[-1]
+
+
+def test_what_a_child_could_not_go_on_with_is_refused() -> None:
+    """Pitch needs three lags of its range; the change is the autocorrelation's."""
+    with pytest.raises(ValueError, match="pi_rangeHz: 80 to 400 Hz are 0 lags of the autocorrelation, wanted are 3"):
+        rosafe.process(SOUND, RATE, FEW, 1000, [(1, "ac_wSizeSec", 0.0005)], ["pitch"])
+    rosafe.process(SOUND, RATE, FEW, 1000, [(1, "ac_wSizeSec", 0.0005)], ["autocorrelation"])
+
+
+def test_the_original_kinds_are_the_default() -> None:
+    got = rosafe.process(SOUND[:, :400], RATE, FEW)
+    kinds = [name for name in got if name in KINDS]
+    assert kinds == ["input", "preProc", "gammatone", "ihc", "ild", "ratemap", "crossCorrelation"]

@@ -1,0 +1,437 @@
+"""Amplitude modulation spectrograms: the reference vector, scipy's filters, Fourier transforms written out, sines."""
+
+from __future__ import annotations
+
+import copy
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rosafe.dsp.signal import Signal
+from rosafe.dsp.windows import ALL_NAMES, window
+from rosafe.representations.amsfeatures import AmsFeatures, design_sections
+
+from .chain import Chain, FloatArray, cut, reference
+
+RATE = 16000.0
+SOUND = Signal(RATE, RATE, center_frequencies=(100.0, 1000.0, 3000.0), filterbank="gammatone")
+GOLDEN = (1 + math.sqrt(5)) / 2
+
+
+def framed(size: int, hop: int, ratio: int = 4, **more: Any) -> dict[str, Any]:
+    """Windows and hops in samples that are left."""
+    rate = RATE / ratio
+    return {"ams_wSizeSec": size / rate, "ams_hSizeSec": hop / rate, "ams_dsRatio": ratio, **more}
+
+
+def sound(samples: int, seed: int = 0, channels: int = 3) -> FloatArray:
+    """Half-wave rectified noise of a level that changes."""
+    x = np.maximum(np.random.default_rng(seed).standard_normal((2, channels, samples)), 0)
+    return x * (1.1 + np.sin(np.arange(samples) / 150)) * [[[1.0]], [[0.3]]]
+
+
+def by_scipy(x: FloatArray, centres: list[float], ratio: int, size: int, hop: int, name: str) -> FloatArray:
+    """The log form of (..., N), each filter on its own."""
+    rate, taken, made = RATE / ratio, x[..., ::ratio], []
+    for index, centre in enumerate(centres):
+        if index == 0:
+            b, a = scipy.signal.butter(1, centre, fs=rate)
+        else:
+            edges = [centre * (math.sqrt(1.25) - 0.5), centre * (math.sqrt(1.25) + 0.5)]
+            b, a = scipy.signal.butter(1, edges, "bandpass", fs=rate)
+        y = scipy.signal.lfilter(b, a, taken)
+        starts = range(0, y.shape[-1] - size + 1, hop)
+        made.append([np.abs(window(name, size) * y[..., k : k + size]).mean(axis=-1) for k in starts])
+    return np.moveaxis(np.array(made), (0, 1), (-2, -1))
+
+
+def test_reference_vector() -> None:
+    _, expected, got = reference("Q06_amsFeatures_log")
+    wanted = expected["amsFeatures"]
+    np.testing.assert_allclose(got["amsFeatures"], wanted, rtol=0, atol=1e-11 * wanted.max())
+
+
+# --- log ----------------------------------------------------------------------------------------------------------
+
+
+def test_the_default_centres() -> None:
+    centres = AmsFeatures(44100.0).parameters["ams_cfHz"]
+    assert len(centres) == 15
+    known = [4, 5.9440, 8.8327, 13.1254, 19.5042, 28.9832, 43.0688, 64]
+    np.testing.assert_allclose(centres[:8], known, atol=5e-5)
+    np.testing.assert_allclose(np.diff(np.log2(centres)), 8 / 14, rtol=1e-12)
+    assert centres[-1] == pytest.approx(1024, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("values", "centres"),
+    [
+        ({"ams_nFilters": 1}, [4.0]),
+        ({"ams_nFilters": 2}, [4.0, 1024.0]),
+        ({"ams_nFilters": 0}, [4.0 * 2**i for i in range(9)]),
+        ({"ams_nFilters": 0, "ams_highFreqHz": 1023.9}, [4.0 * 2**i for i in range(8)]),
+        ({"ams_nFilters": 0, "ams_lowFreqHz": 0.1, "ams_highFreqHz": 0.1 * 2**5}, [0.1 * 2**i for i in range(6)]),
+        ({"ams_nFilters": 0, "ams_lowFreqHz": 3.0, "ams_highFreqHz": 3.1}, [3.0]),
+        ({"ams_cfHz": [100.0]}, [100.0]),
+        ({"ams_cfHz": [80.0, 3.0, 500.0], "ams_nFilters": 7}, [80.0, 3.0, 500.0]),
+    ],
+    ids=str,
+)
+def test_centres(values: dict[str, Any], centres: list[float]) -> None:
+    stage = AmsFeatures(RATE, **values)
+    np.testing.assert_allclose(stage.parameters["ams_cfHz"], centres, rtol=1e-14)
+    assert stage.output_rows((2, 31)) == (2, 31, len(centres))
+    assert AmsFeatures.in_force({**AmsFeatures(RATE).parameters, "ams_cfHz": [], **values}) == stage.parameters
+
+
+@pytest.mark.parametrize("name", ALL_NAMES)
+@pytest.mark.parametrize(("size", "hop", "ratio"), [(64, 32, 4), (50, 71, 1), (130, 11, 7)])
+def test_log_is_scipys_filters(size: int, hop: int, ratio: int, name: str) -> None:
+    centres = [40.0, 4.0, 30.0, 200.0, 3.0] + [25.0 * 1.2**i for i in range(14)]  # the first is a low-pass, wherever
+    x = sound(3001)
+    stage = AmsFeatures(SOUND, ams_cfHz=centres, **framed(size, hop, ratio), ams_wname=name)
+    got, expected = stage.process(x), by_scipy(x, centres, ratio, size, hop, name)
+    assert got.shape == expected.shape
+    np.testing.assert_allclose(got, expected, rtol=0, atol=1e-10 * expected.max())
+
+
+def test_sections_are_scipys() -> None:
+    frequencies = np.array([5.0, 1e-3, 0.7, 4.0, 64.0, 1024.0, 2400.0])
+    made = design_sections(frequencies, 8000.0)
+    expected = [scipy.signal.butter(1, 5.0, fs=8000.0, output="sos")[0]]
+    for f in frequencies[1:]:
+        expected.append(scipy.signal.butter(1, [f / GOLDEN, f * GOLDEN], "bandpass", fs=8000.0, output="sos")[0])
+    np.testing.assert_allclose(made, expected, rtol=1e-9, atol=1e-12)
+    for section, f in zip(made[3:], frequencies[3:], strict=True):  # the quality is 1: 3 dB down at edges f apart
+        _, gains = scipy.signal.sosfreqz(section[np.newaxis], [f / GOLDEN, f * GOLDEN], fs=8000.0)
+        np.testing.assert_allclose(np.abs(gains), math.sqrt(0.5), rtol=1e-9)
+        assert f * GOLDEN - f / GOLDEN == pytest.approx(f)
+
+
+def test_a_sine_is_found_where_it_is() -> None:
+    """A rectified sine has a mean of 2 / pi; the filter at its frequency lets it through."""
+    time = np.arange(32000) / RATE
+    for centre in (16.0, 64.0, 256.0):
+        x = np.ones((2, 1, 1)) * (1 + np.sin(2 * np.pi * centre * time))
+        stage = AmsFeatures(RATE, ams_nFilters=9, ams_wSizeSec=0.25, ams_hSizeSec=0.25)
+        last = stage.process(x)[:, 0, :, -1]
+        at = stage.parameters["ams_cfHz"].index(pytest.approx(centre))
+        np.testing.assert_allclose(last[:, at], 2 / np.pi, rtol=2e-3)
+        assert (last[:, 1:].argmax(axis=-1) + 1 == at).all()
+
+
+# --- lin ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("size", "hop", "ratio"), [(64, 32, 4), (50, 71, 1), (66, 5, 7)])
+@pytest.mark.parametrize(("low", "high", "count"), [(0.0, 1000.0, 15), (30.0, 900.0, 1), (100.0, 120.0, 4)])
+def test_lin_is_the_formula(size: int, hop: int, ratio: int, low: float, high: float, count: int) -> None:
+    x, rate = sound(700, channels=2), RATE / ratio
+    values = {"ams_fbType": "lin", "ams_lowFreqHz": low, "ams_highFreqHz": high, "ams_nFilters": count}
+    stage = AmsFeatures(RATE, **values, **framed(size, hop, ratio), ams_wname="hamming")
+    got = stage.process(x)
+    width = (high - low) / (count + 1)
+    centres = [low + i * width for i in range(1, count + 1)]
+    np.testing.assert_allclose(stage.parameters["ams_cfHz"], centres, rtol=1e-14)
+    points = 2 ** math.ceil(math.log2(2 * size))
+    bins = np.arange(points // 2 + 1)
+    turns = np.exp(-2j * np.pi * np.outer(bins, np.arange(size)) / points)
+    taken = x[..., ::ratio]
+    frames = range(0, taken.shape[-1] - size + 1, hop)
+    assert got.shape == (2, 2, count, len(frames))
+    for ear, channel, index in np.ndindex(2, 2, len(frames)):
+        frame = window("hamming", size) * taken[ear, channel, frames[index] : frames[index] + size]
+        magnitudes = np.abs(turns @ frame) / points
+        expected = [sum(np.maximum(0, 1 - np.abs(bins * rate / points - c) / width) * magnitudes) for c in centres]
+        np.testing.assert_allclose(got[ear, channel, :, index], expected, rtol=0, atol=1e-13)
+
+
+# --- frames -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("seconds", "step", "ratio", "size", "hop"),
+    [
+        (0.032, 0.016, 4, 128, 64),
+        (0.0331, 0.016, 4, 132, 64),  # 132.4 samples
+        (0.0328, 0.016, 4, 132, 64),  # 131.2 samples are odd: the even number from half of it
+        (0.0327, 0.016, 4, 130, 64),  # of 130, not of 130.8 samples: 63.6
+        (0.0003, 0.001, 4, 2, 7),  # of 2 samples, not of 1.2: 6.67, where 0.001 s are 4
+        (0.01, 1e-6, 4, 40, 1),  # at least 1
+        (0.001, 0.3, 1, 16, 4800),
+    ],
+)
+@pytest.mark.parametrize("fb_type", ["log", "lin"])
+def test_the_step_follows_from_the_window(
+    seconds: float, step: float, ratio: int, size: int, hop: int, fb_type: str
+) -> None:
+    stage = AmsFeatures(RATE, ams_wSizeSec=seconds, ams_hSizeSec=step, ams_dsRatio=ratio, ams_fbType=fb_type)
+    assert (len(stage.window), stage.output.hop) == (size, hop * ratio)
+    assert stage.output.rate == RATE / ratio / hop
+    assert stage.output.framed and stage.output.window == (size - 1) * ratio + 1
+    samples = (size + 2 * hop - 1) * ratio + 1  # the last one that frame 2 takes in
+    assert stage.complete(samples) == 3 and stage.complete(samples - 1) == 2
+    assert stage.process(sound(samples - 1)).shape[-1] == 2
+    assert stage.process(sound(1)).shape[-1] == 1
+
+
+MODES: list[dict[str, Any]] = [
+    framed(64, 32),
+    framed(40, 77, 3, ams_wname="triang", ams_nFilters=3),
+    framed(130, 11, 1, ams_cfHz=[30.0, 2.0], ams_wname="hann"),
+    framed(64, 32, ams_fbType="lin", ams_nFilters=4),
+    framed(40, 77, 5, ams_fbType="lin", ams_lowFreqHz=0.0, ams_wname="hann"),
+]
+each_mode = pytest.mark.parametrize("parameters", MODES, ids=str)
+sizes = st.lists(st.one_of(st.sampled_from([0, 1, 2, 3, 5]), st.integers(0, 500)), min_size=1, max_size=12).filter(any)
+
+
+@each_mode
+@given(sizes=sizes)
+@settings(max_examples=15, deadline=None, database=None)
+def test_cuts_and_prefixes(parameters: dict[str, Any], sizes: list[int]) -> None:
+    x = sound(1200)
+    whole = AmsFeatures(SOUND, **parameters).process(x)
+    stage = AmsFeatures(SOUND, **parameters)
+    assert whole.shape[-1] == stage.complete(1200)
+    blocks = [stage.process(block) for block in cut(x, sizes)]
+    np.testing.assert_allclose(np.concatenate(blocks, axis=-1), whole, rtol=0, atol=1e-12)
+    first = AmsFeatures(SOUND, **parameters).process(x[..., : sizes[0]])
+    assert first.shape[-1] == stage.complete(sizes[0])
+    np.testing.assert_allclose(first, whole[..., : first.shape[-1]], rtol=0, atol=1e-12)
+
+
+def test_blocks_longer_than_spans() -> None:
+    x = sound(40_000, channels=1)
+    whole = AmsFeatures(RATE).process(x)
+    stage = AmsFeatures(RATE)
+    pieces = np.concatenate([stage.process(block) for block in cut(x, 882)], axis=-1)
+    np.testing.assert_allclose(pieces, whole, rtol=0, atol=1e-12)
+
+
+@each_mode
+def test_reset_and_other_channels_are_a_new_beginning(parameters: dict[str, Any]) -> None:
+    stage = AmsFeatures(SOUND, **parameters)
+    expected = stage.process(sound(1001))
+    assert expected.shape[-1] > 2
+    stage.reset()
+    np.testing.assert_array_equal(stage.process(sound(1001)), expected)
+    stage.receive(replace(SOUND, center_frequencies=(1.0, 2.0, 3.0)))  # as many, but others
+    np.testing.assert_array_equal(stage.process(sound(1001)), expected)
+    assert stage.output.center_frequencies == (1.0, 2.0, 3.0)
+    for channels in (5, 2):
+        x = sound(999, 2, channels)
+        np.testing.assert_array_equal(stage.process(x), AmsFeatures(RATE, **parameters).process(x))
+
+
+@each_mode
+def test_what_comes_out_is_fresh(parameters: dict[str, Any]) -> None:
+    stage = AmsFeatures(SOUND, **parameters)
+    x = sound(1000)
+    x.setflags(write=False)
+    made = stage.process(x)
+    assert made.flags.c_contiguous and made.flags.writeable and made.dtype == np.float64
+    assert made.shape[:-1] == stage.output_rows((2, 3))
+    kept = made.copy()
+    stage.process(x)
+    np.testing.assert_array_equal(made, kept)
+    assert stage.process(x[..., :0]).shape == (*stage.output_rows((2, 3)), 0)
+
+
+@pytest.mark.filterwarnings("error")
+@each_mode
+def test_silence_and_what_is_hardly_sound(parameters: dict[str, Any]) -> None:
+    assert not AmsFeatures(SOUND, **parameters).process(np.zeros((2, 3, 1000))).any()
+    one_ear = sound(1000)
+    one_ear[0] = 0
+    made = AmsFeatures(SOUND, **parameters).process(one_ear)
+    assert not made[0].any() and made[1].all()
+    rng = np.random.default_rng(0)
+    for scale in (5e-324, 1e-310, 1e-203, 1e-199, 1e70, 1e300):
+        x = scale * rng.choice([-1.0, 0.0, 1.0], (2, 3, 1000))
+        assert np.isfinite(AmsFeatures(SOUND, **parameters).process(x)).all()
+    stage = AmsFeatures(SOUND, **parameters)
+    stage.process(sound(1000))
+    for _ in range(50):  # filters ring for long
+        assert np.isfinite(stage.process(np.zeros((2, 3, 20_000)))).all()
+    assert stage.process(np.zeros((2, 3, 1000))).max() < 1e-9
+
+
+# --- parameters ---------------------------------------------------------------------------------------------------
+
+
+def test_the_defaults() -> None:
+    assert {**AmsFeatures(44100).parameters, "ams_cfHz": []} == {
+        "ams_fbType": "log",
+        "ams_nFilters": 15,
+        "ams_lowFreqHz": 4.0,
+        "ams_highFreqHz": 1024.0,
+        "ams_cfHz": [],
+        "ams_dsRatio": 4,
+        "ams_wSizeSec": 0.032,
+        "ams_hSizeSec": 0.016,
+        "ams_wname": "rectwin",
+    }
+    assert AmsFeatures(44100, ams_nFilter=3).parameters["ams_nFilters"] == 3
+    declared = AmsFeatures.REPRESENTATION
+    assert (declared.request, declared.port, declared.word) == ("ModulationProc", "amsFeaturesPort", "amsFeatures")
+    idl = {p.name: p.idl for p in declared.parameters}
+    assert idl["ams_nFilters"] == idl["ams_dsRatio"] == "unsigned long" and idl["ams_cfHz"] == "sequence<double>"
+
+
+@pytest.mark.parametrize("fb_type", ["log", "lin"])
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"ams_wname": "blackman"},
+        {"ams_wSizeSec": 0.02},
+        {"ams_wSizeSec": 0.05},
+        {"ams_hSizeSec": 0.003},
+        {"ams_hSizeSec": 0.1, "ams_wSizeSec": 0.04, "ams_wname": "hann"},
+    ],
+    ids=str,
+)
+def test_a_change_of_frames_keeps_filters_buffer_and_grid(fb_type: str, change: dict[str, Any]) -> None:
+    """The next frame starts where it would have started; filters and decimation run on."""
+    x = sound(9001)
+    before: dict[str, Any] = {**framed(128, 48), "ams_fbType": fb_type}
+    stage = AmsFeatures(SOUND, **before)
+    count = stage.process(x[..., :3333]).shape[-1]
+    assert count == (834 - 128) // 48 + 1
+    stage.configure(**change)
+    got = np.concatenate([stage.process(block) for block in cut(x[..., 3333:], 777)], axis=-1)
+    # of the filtered samples from there on, which a step of 1 shows all
+    fine = AmsFeatures(SOUND, **{**before, **change, "ams_hSizeSec": 1e-9}).process(x)
+    expected = fine[..., count * 48 :: stage.output.hop // 4]
+    np.testing.assert_allclose(got, expected[..., : got.shape[-1]], rtol=0, atol=1e-12)
+    assert got.shape[-1] == expected.shape[-1] > 1
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"ams_fbType": "lin"},
+        {"ams_nFilters": 15},  # what is set counts as changed
+        {"ams_lowFreqHz": 5.0},
+        {"ams_highFreqHz": 900.0},
+        {"ams_cfHz": [10.0, 20.0]},
+        {"ams_dsRatio": 4},
+        {"ams_dsRatio": 3},
+        {"ams_dsRatio": 3, "ams_wname": "hann"},
+    ],
+    ids=str,
+)
+def test_any_other_change_begins_anew(change: dict[str, Any]) -> None:
+    x = sound(4000)
+    stage = AmsFeatures(SOUND)
+    stage.process(x[..., :2001])  # the next sample would be left out
+    stage.configure(**change)
+    np.testing.assert_array_equal(stage.process(x[..., 2001:]), AmsFeatures(SOUND, **change).process(x[..., 2001:]))
+
+
+def test_a_list_gives_way_only_to_another_list() -> None:
+    stage = AmsFeatures(RATE, ams_cfHz=[10.0, 20.0])
+    stage.configure(ams_nFilters=4)
+    assert stage.parameters["ams_cfHz"] == [10.0, 20.0]
+    with pytest.raises(ValueError, match=r"^ams_cfHz: "):
+        stage.configure(ams_fbType="lin")
+    stage.configure(ams_cfHz=[])
+    assert len(stage.parameters["ams_cfHz"]) == 4
+    stage.configure(ams_fbType="lin")
+    assert len(stage.parameters["ams_cfHz"]) == 4
+
+
+def test_changes_on_the_way_by_the_chain() -> None:
+    """Filters are aligned at the first one; what was not computed is 0."""
+    x = np.random.default_rng(0).standard_normal((2, 9000))
+    chain = Chain(RATE, ["amsFeatures"], {"fb_cfHz": [300.0, 900.0], "in_doNormalize": False, "ams_nFilters": 3})
+    changes = [(1, "ams_nFilter", 5), (2, "ams_wname", "hann"), (2, "fb_cfHz", [500.0, 600.0, 700.0])]
+    made = chain.run(x, 3000, changes)["amsFeatures"]
+    assert made.shape == (2, 3, 5, 10 + 10 + 10)
+    assert not made[:, :, 3:, :10].any() and not made[:, 2, :, :20].any()
+    assert made[:, :2, :3].all() and made[:, :2, :, 10:].all() and made[..., 20:].all()
+    assert len(chain.coordinates()["ams_cfHz"]) == 5
+
+
+def test_copies_may_be_changed_and_thrown_away() -> None:
+    for parameters in (framed(64, 32), framed(64, 32, ams_fbType="lin")):
+        expected = AmsFeatures(SOUND, **parameters).process(sound(1500))
+        stage, made = AmsFeatures(SOUND, **parameters), []
+        for block in cut(sound(1500), 101):
+            planned = copy.copy(stage)
+            planned.configure(ams_wSizeSec=0.01, ams_hSizeSec=0.001)
+            planned.configure(ams_nFilters=2, ams_dsRatio=2)
+            planned.receive(replace(SOUND, center_frequencies=(5.0,)))
+            made.append(stage.process(block))
+        np.testing.assert_allclose(np.concatenate(made, axis=-1), expected, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("name", "changes"),
+    [
+        ("ams_fbType", {"ams_fbType": "mel"}),
+        ("ams_fbType", {"ams_fbType": ""}),
+        *(("ams_nFilters", {"ams_nFilters": value}) for value in (-1, 257, 1.5, "x")),
+        ("ams_nFilters", {"ams_nFilters": 0, "ams_fbType": "lin"}),
+        *(("ams_lowFreqHz", {"ams_lowFreqHz": value}) for value in (0, -1, 1e7, math.nan)),
+        ("ams_lowFreqHz", {"ams_lowFreqHz": 0, "ams_nFilters": 0}),
+        *(("ams_highFreqHz", {"ams_highFreqHz": value}) for value in (0, -1, 4, 3, math.inf)),
+        ("ams_highFreqHz", {"ams_highFreqHz": 2000 / GOLDEN + 1e-6}),  # at half of the rate
+        ("ams_highFreqHz", {"ams_highFreqHz": 1300, "ams_nFilters": 0, "ams_lowFreqHz": 1250}),
+        ("ams_highFreqHz", {"ams_highFreqHz": 2000.1, "ams_fbType": "lin"}),
+        ("ams_highFreqHz", {"ams_dsRatio": 8}),
+        ("ams_highFreqHz", {"ams_lowFreqHz": 700, "ams_highFreqHz": 600, "ams_fbType": "lin"}),
+        *(("ams_cfHz", {"ams_cfHz": value}) for value in ([0.0, 4.0], [-1.0], [10.0, 1300.0], "log", [math.nan])),
+        ("ams_cfHz", {"ams_cfHz": [10.0], "ams_fbType": "lin"}),
+        *(("ams_dsRatio", {"ams_dsRatio": value}) for value in (0, 1001, -1, 2.5)),
+        *((name, {name: value}) for name in ("ams_wSizeSec", "ams_hSizeSec") for value in (0, -1, 61, math.nan, "x")),
+        ("ams_wSizeSec", {"ams_wSizeSec": 1e-4}),
+        ("ams_wname", {"ams_wname": ""}),
+        ("ams_wname", {"ams_wname": "hanns"}),
+    ],
+    ids=str,
+)
+def test_refusals(name: str, changes: dict[str, Any]) -> None:
+    with pytest.raises(ValueError, match=f"^{name}: "):
+        AmsFeatures(RATE, **changes)
+    stage, twin = AmsFeatures(RATE), AmsFeatures(RATE)
+    for each in (stage, twin):
+        each.process(sound(900))
+    with pytest.raises(ValueError, match=f"^{name}: "):
+        stage.configure(**changes)
+    assert stage.parameters == twin.parameters
+    np.testing.assert_array_equal(stage.process(sound(900)), twin.process(sound(900)))
+    parameter = AmsFeatures.REPRESENTATION.parameter(name)
+    assert parameter.known_word("nonsense") == "nonsense"  # there are no old scripts: nothing is taken for it
+
+
+def test_the_highest_filter_depends_on_the_rate() -> None:
+    with pytest.raises(ValueError, match=r"^ams_highFreqHz: "):
+        AmsFeatures(8000.0)
+    AmsFeatures(8000.0, ams_dsRatio=2)
+    AmsFeatures(RATE, ams_highFreqHz=2000 / GOLDEN - 1e-6)
+    AmsFeatures(RATE, ams_highFreqHz=2000.0, ams_fbType="lin")
+    stage = AmsFeatures(SOUND)
+    with pytest.raises(ValueError, match=r"^ams_highFreqHz: "):
+        stage.receive(replace(SOUND, sample_rate=8000.0, rate=8000.0))
+    assert stage.given is SOUND
+
+
+@pytest.mark.filterwarnings("error")
+def test_frequencies_next_to_nothing() -> None:
+    for low in (5e-324, 1e-300, 1e-9):
+        for count in (0, 3):
+            stage = AmsFeatures(RATE, ams_lowFreqHz=low, ams_nFilters=count)
+            assert np.isfinite(stage.process(sound(2000))).all()
+
+
+def test_other_blocks_are_refused() -> None:
+    for block in (np.zeros((2, 5)), np.zeros((3, 3, 5)), np.zeros((1, 3, 5)), np.zeros((2, 3, 5), complex)):
+        with pytest.raises(ValueError, match=r"^block: "):
+            AmsFeatures(SOUND).process(block)
