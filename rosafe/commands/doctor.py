@@ -137,14 +137,6 @@ def _messages() -> Finding:
     return Finding(OK, f"fresh, in {where}")
 
 
-def _representations() -> Finding:
-    from rosafe.representations import KINDS, PROBLEMS
-
-    if PROBLEMS:
-        return Finding(NOTE, f"left out: {'; '.join(PROBLEMS)}", "docs/own-representation.md tells what one needs")
-    return Finding(OK, f"{len(KINDS)}")
-
-
 def _stale_in_shell() -> str:
     """What is wrong with the messages that rostopic and its like find in this shell; empty where nothing is."""
     if paths.source_root() is None:
@@ -220,7 +212,7 @@ CHECKS: dict[str, Callable[[], Finding]] = {
     "python": _python,
     "numbers": lambda: _needs(_NUMBERS),
     "kernels": _kernels,
-    "representations": _representations,
+    "plugins": _plugins,
     "sound files": lambda: _needs(_SOUND_FILES),
     "ROS": lambda: _needs(_ROS, _ROS_COMMANDS),
     "messages": _messages,

@@ -22,7 +22,6 @@ from rosafe.commands._progress import Display, bytes_text
 from rosafe.commands._workers import Interrupted, Interrupts, Report, run_together
 from rosafe.interface import FIXED, KINDS, ROSAFE, Parameter
 from rosafe.interface.arguments import check_outputs, check_parameter
-from rosafe.offline.chain import output_parts
 
 _BLOCK = ROSAFE.service("InputProc").parameter("nFramesPerBlock")
 _MAX_JOBS = 10_000
@@ -103,7 +102,7 @@ def _count(text: str, maximum: float) -> int:
 
 
 def _epilog() -> str:
-    parts = [named for kind in KINDS for named in output_parts(kind).items()]
+    parts = [named for kind in KINDS.values() for named in kind.outputs.items()]
     lines = [
         "The .npz holds, as rosafe.process returns them, of the outputs:",
         *(f"  {name} ({', '.join(part.axes)}) {part.unit}".rstrip() for name, part in parts),
