@@ -58,7 +58,7 @@ def test_a_real_run_shows_parents_children_and_siblings_at_work_at_once(afe: Ses
     path = tmp_path / "trace.json"
     command = afe.graph.start(str(SCRIPTS / "rosafe"), "trace", "--seconds", "100", "-o", str(path))
     with command:
-        wait_for(lambda: listening(afe.graph, "/rosAFE/trace"), 20.0)
+        wait_for(lambda: afe.connections("/rosAFE/trace"), 20.0)
         with afe.follow("ild") as messages:
             microphone.play(noise(BLOCK * BLOCKS))
             wait_for(lambda: messages[-1].lastFrameIndex == BLOCK * BLOCKS + 1, 30.0)
