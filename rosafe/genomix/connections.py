@@ -9,8 +9,10 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import ipaddress
+import logging
 import re
 import resource
+import time
 from collections.abc import Iterator
 from http import HTTPStatus
 from typing import Any, cast
@@ -33,6 +35,9 @@ REQUEST_SECONDS = 15.0  # for a whole request, from its first byte or, the first
 IDLE_SECONDS = 3600.0  # a connection without requests is closed after
 STALL_SECONDS = 60.0  # a client that does not take its answer is dropped after
 YIELD_SECONDS = 5.0  # and where others want the memory, after
+TELL_SECONDS = 60.0  # between two lines in the log that say there is no more room
+
+log = logging.getLogger("genomixd")
 
 _END = re.compile(rb"\r?\n\r?\n")
 _BODY = re.compile(rb"\n(?:content-length:(?![ \t]*0*[ \t]*\r?\n)|transfer-encoding:)", re.IGNORECASE)
@@ -60,6 +65,7 @@ class Connections:
         self._most = MAX_CONNECTIONS if descriptors < 0 else min(MAX_CONNECTIONS, descriptors // 2)
         self._clients: dict[str, Client] = {}
         self._count = 0
+        self._told_at = -TELL_SECONDS
         self.heads = 0  # bytes of long requests
         self._answers: dict[Connection, tuple[object, int]] = {}  # what is being taken, and its bytes
 
@@ -70,6 +76,7 @@ class Connections:
         if full or self._count >= self._most:
             crowds = [client] if full else self._clients.values()
             waiting = [crowd for crowd in crowds if crowd.waiting]
+            self._tell(client.address)
             if not waiting:
                 return None
             next(iter(max(waiting, key=lambda crowd: len(crowd.connections)).waiting)).drop()
@@ -78,6 +85,11 @@ class Connections:
         client.waiting[connection] = None
         self._count += 1
         return client
+
+    def _tell(self, address: str) -> None:
+        if time.monotonic() > self._told_at + TELL_SECONDS:
+            self._told_at = time.monotonic()
+            log.warning("as many clients are connected as may be, now from %s: idle ones are closed", address)
 
     def forget(self, connection: Connection) -> None:
         """A connection is over."""
