@@ -101,7 +101,8 @@ def test_a_client_that_was_idle_meanwhile_goes_on(world: World) -> None:
             go.touch()
             assert client.wait(30) == 0
         assert client.out.split() == ["ready", "done"]
-    assert 1 <= world.server.err.count("as many clients are connected as may be, now from loopback") < 10  # not each one
+    told = world.server.err.count("as many clients are connected as may be, now from loopback")
+    assert 1 <= told < 10  # once a minute
 
 
 def test_answers_that_nobody_reads_stop_the_requests(world: World) -> None:
