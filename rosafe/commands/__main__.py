@@ -26,12 +26,14 @@ def main(argv: list[str] | None = None) -> int:
     try:
         try:
             options, rest = _parser().parse_known_args(argv)
+            name = f"rosafe {options.command}"
+            if hasattr(options, "missing"):
+                raise Failure(options.missing)
             if hasattr(options, "interspersed"):
                 options.interspersed = [word for word in rest if not word.startswith("-")]
                 rest = [word for word in rest if word.startswith("-")]
             if rest:
                 options.usage_error(f"unrecognized arguments: {' '.join(rest)}")
-            name = f"rosafe {options.command}"
             return int(options.run(options))
         finally:
             sys.stdout.flush()
@@ -63,7 +65,12 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _add(subparsers: argparse._SubParsersAction[Parser], name: str) -> None:
-    module = importlib.import_module(f"{commands.__name__}.{name}")
+    try:
+        module = importlib.import_module(f"{commands.__name__}.{name}")
+    except ModuleNotFoundError as missing:  # the others are there all the same, `doctor` above all
+        why = f"the Python package {missing.name} is not installed; run scripts/install"
+        subparsers.add_parser(name, help=why, add_help=False).set_defaults(missing=why)
+        return
     text = inspect.getdoc(module) or ""
     subparser = subparsers.add_parser(
         name.replace("_", "-"),

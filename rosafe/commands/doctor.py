@@ -17,7 +17,8 @@ from pathlib import Path
 from typing import NamedTuple
 
 from rosafe.component import generate, master, paths
-from rosafe.interface import COMPONENTS, ComponentError
+from rosafe.vocabulary import plugins
+from rosafe.vocabulary.errors import ComponentError
 
 OK, NOTE, MISSING = "ok", "note", "MISSING"
 
@@ -128,12 +129,20 @@ def _messages() -> Finding:
         generate.ensure_messages()
     except generate.GenerationError as problem:
         return Finding(MISSING, f"the messages cannot be generated: {problem}")
-    for package in COMPONENTS:
+    for package in ("bass", "rosAFE"):
         module = importlib.import_module(f"{package}.msg")
     where = Path(str(module.__file__)).parents[2]
     if stale:
         return Finding(NOTE, f"fresh in {where}, but {stale}", f". {paths.CODE_DIR}/scripts/env.sh")
     return Finding(OK, f"fresh, in {where}")
+
+
+def _representations() -> Finding:
+    from rosafe.representations import KINDS, PROBLEMS
+
+    if PROBLEMS:
+        return Finding(NOTE, f"left out: {'; '.join(PROBLEMS)}", "docs/own-representation.md tells what one needs")
+    return Finding(OK, f"{len(KINDS)}")
 
 
 def _stale_in_shell() -> str:
@@ -176,6 +185,16 @@ def _kernels() -> Finding:
     return Finding(OK if status.compiled else NOTE, status.detail)
 
 
+def _plugins() -> Finding:
+    if not plugins.expected():
+        return Finding(OK, f"none; {plugins.FOLDERS} names folders of them")
+    from rosafe.representations import PROBLEMS, STAGES, registry
+
+    if PROBLEMS:
+        return Finding(NOTE, "; ".join(" ".join(line.split()) for line in PROBLEMS), "mend them: they are left out")
+    return Finding(OK, ", ".join(kind for kind in STAGES if kind not in registry.own()))
+
+
 def _master() -> Finding:
     environ = dict(os.environ)
     master.set_local_defaults(environ)
@@ -201,6 +220,7 @@ CHECKS: dict[str, Callable[[], Finding]] = {
     "python": _python,
     "numbers": lambda: _needs(_NUMBERS),
     "kernels": _kernels,
+    "representations": _representations,
     "sound files": lambda: _needs(_SOUND_FILES),
     "ROS": lambda: _needs(_ROS, _ROS_COMMANDS),
     "messages": _messages,

@@ -19,9 +19,10 @@ from typing import Any
 
 from rosafe.commands import Failure
 from rosafe.commands._progress import Display, bytes_text
-from rosafe.commands._workers import Interrupted, Report, Signals, run_together
-from rosafe.interface import KINDS, ROSAFE, Parameter
+from rosafe.commands._workers import Interrupted, Interrupts, Report, run_together
+from rosafe.interface import FIXED, KINDS, ROSAFE, Parameter
 from rosafe.interface.arguments import check_outputs, check_parameter
+from rosafe.offline.chain import output_parts
 
 _BLOCK = ROSAFE.service("InputProc").parameter("nFramesPerBlock")
 _MAX_JOBS = 10_000
@@ -72,7 +73,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--outputs",
         metavar="NAME,...",
-        help=f"what to keep of {', '.join(KINDS)} (default: all); what none of them needs is not computed",
+        help=f"what to keep of {', '.join(KINDS)} (default: the first {len(FIXED)}); "
+        "what none of them needs is not computed",
     )
     parser.add_argument(
         "--block",
@@ -101,11 +103,14 @@ def _count(text: str, maximum: float) -> int:
 
 
 def _epilog() -> str:
+    parts = [named for kind in KINDS for named in output_parts(kind).items()]
     lines = [
-        "The .npz holds, as rosafe.process returns them: input, preProc (2, N); gammatone, ihc (2, C, N); ild (C, F);",
-        "ratemap (2, C, F); crossCorrelation (C, L, F); fb_cfHz (C,) in Hz; cc_lags (L,) in seconds; and the frame",
-        "rates ild_frameRate, ratemap_frameRate, crossCorrelation_frameRate in Hz. Besides: sample_rate in Hz,",
-        "block_frames, and parameters, all of them with their values as JSON.",
+        "The .npz holds, as rosafe.process returns them, of the outputs:",
+        *(f"  {name} ({', '.join(part.axes)}) {part.unit}".rstrip() for name, part in parts),
+        "what lies along their axes:",
+        *textwrap.wrap(_coordinates(), 100, initial_indent="  ", subsequent_indent="  "),
+        "and KIND_frameRate in Hz of those in frames. Besides: sample_rate in Hz, block_frames, and parameters, all of",
+        "them with their values as JSON.",
         "",
         "exit status: 0 all done, 1 something failed (the other files are done), 2 wrong command line, 130 interrupted",
         "",
@@ -120,6 +125,13 @@ def _epilog() -> str:
         for parameter in kind.parameters:
             lines += _parameter_lines(parameter)
     return "\n".join(lines)
+
+
+def _coordinates() -> str:
+    units = {parameter.name: parameter.unit for kind in KINDS.values() for parameter in kind.parameters}
+    units |= {derived.name: derived.unit for kind in KINDS.values() for derived in kind.derived}
+    names = dict.fromkeys(name for kind in KINDS.values() for name in kind.coordinates)
+    return ", ".join(f"{name} ({units[name]})" if units[name] else name for name in names)
 
 
 def _parameter_lines(parameter: Parameter) -> list[str]:
@@ -153,7 +165,7 @@ def run(options: argparse.Namespace) -> int:
         outputs = check_outputs(_words(options.outputs) if options.outputs is not None else None)
     except ValueError as problem:
         raise Failure(str(problem)) from None
-    signals = Signals()
+    signals = Interrupts()
     # Once, for all processes that are forked from this one.
     from rosafe.offline.files import process_file
     from rosafe.output import OutputError

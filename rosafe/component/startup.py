@@ -12,11 +12,14 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import NoReturn, Protocol
+from typing import TYPE_CHECKING, NoReturn, Protocol
 
-from rosafe import interface
 from rosafe.component import generate, master, memory, paths, systemd
 from rosafe.version import VERSION
+from rosafe.vocabulary.errors import ComponentError
+
+if TYPE_CHECKING:
+    from rosafe.interface import Component  # which needs numpy, and `rosafe doctor` must not
 
 MASTER_SECONDS = 5.0  # `roscore & rosAFE-ros &` starts both at once, and roscore takes a second or two
 START_SECONDS = 20.0  # a node that is not up by then waits for something that does not come
@@ -42,12 +45,12 @@ class _Ended(Exception):
     """A signal came while the node was waiting for a master, as it was told to."""
 
 
-def run_server(component: interface.Component, build: Callable[[str], Node], argv: list[str] | None = None) -> int:
+def run_server(component: Component, build: Callable[[str], Node], argv: list[str] | None = None) -> int:
     """Run one component's node until a signal, its `kill` request or the master ends it.
 
     Parameters
     ----------
-    component : interface.Component
+    component : Component
         The component; its name is the instance's where the user gives none.
     build : callable
         Makes and starts the node of the instance that it is given, after `rospy.init_node`.
@@ -73,7 +76,7 @@ def run_server(component: interface.Component, build: Callable[[str], Node], arg
         node = _start(component, build, options, remappings, received)
     except _Ended:
         return 0
-    except (_Failure, generate.GenerationError, master.MasterError, interface.ComponentError, OSError) as problem:
+    except (_Failure, generate.GenerationError, master.MasterError, ComponentError, OSError) as problem:
         print(f"{component.name}-ros: {problem}", file=sys.stderr)
         watchdog(END_SECONDS, 1)
         return 1
@@ -100,7 +103,7 @@ class Parser(argparse.ArgumentParser):
         self.exit(2, f"{self.prog}: {message}; {self.prog} -h shows what is possible\n")
 
 
-def _parse(component: interface.Component, arguments: list[str]) -> argparse.Namespace:
+def _parse(component: Component, arguments: list[str]) -> argparse.Namespace:
     program = f"{component.name}-ros"
     parser = Parser(
         prog=program,
@@ -133,7 +136,7 @@ def _parse(component: interface.Component, arguments: list[str]) -> argparse.Nam
 
 
 def _start(
-    component: interface.Component,
+    component: Component,
     build: Callable[[str], Node],
     options: argparse.Namespace,
     remappings: list[str],

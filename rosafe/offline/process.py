@@ -12,7 +12,7 @@ import numpy as np
 from rosafe.dsp.stage import SAMPLE_RATE
 from rosafe.interface import KINDS
 from rosafe.interface.arguments import check_change, check_outputs, check_parameters
-from rosafe.offline.chain import Chain, output_parts
+from rosafe.offline.chain import Chain
 from rosafe.tree import sizes
 from rosafe.tree.block import Block
 
@@ -41,7 +41,7 @@ def process(
     sample_rate : float
         In Hz.
     parameters : mapping, optional
-        Any of the original's parameter names (`in_*`, `pp_*`, `fb_*`, `ihc_*`, `ild_*`, `rm_*`, `cc_*`) and its value.
+        Names and values, such as `fb_nChannels`; docs/parameters.md has them all.
         The rest takes the interface table's defaults, but for `in_doNormalize`: True for int32, False for float.
     block_frames : int or sequence of int
         Block size, or sizes that are used in turn; the last block is what is left. Only where gain control
@@ -50,16 +50,17 @@ def process(
         Parameter changes, each made before the block of that number (from 0); several for one block are made in the
         order given. Those for blocks that never come are ignored. The original's `set_rm_scailing` is known here too.
     outputs : sequence of str, optional
-        The representations to return, of `input`, `preProc`, `gammatone`, `ihc`, `ild`, `ratemap`,
-        `crossCorrelation`. All by default. What none of them depends on is not computed.
+        The representations to return, of `interface.KINDS`; `input`, `preProc`, `gammatone`, `ihc`, `ild`, `ratemap`
+        and `crossCorrelation` by default. What none of them depends on is not computed.
 
     Returns
     -------
     dict
-        `input`, `preProc` (2, N); `gammatone`, `ihc` (2, C, N); `ild` (C, F) in dB; `ratemap` (2, C, F);
-        `crossCorrelation` (C, L, F); `fb_cfHz` (C,) in Hz; `cc_lags` (L,) in seconds; `ild_frameRate`,
-        `ratemap_frameRate`, `crossCorrelation_frameRate` in Hz. Where a change alters the number of lags or channels,
-        L and C are the largest and what lies outside is 0; rates and `fb_cfHz` are the last ones.
+        Each output as float64 with the axes that `rosafe process -h` lists, such as `input`, `preProc` (2, N);
+        `gammatone`, `ihc` (2, C, N); `ild` (C, F) in dB; `ratemap` (2, C, F); `crossCorrelation` (C, L, F); one that
+        has several parts as `<kind>_<part>`. What lies along their axes, such as `fb_cfHz` (C,) in Hz and `cc_lags`
+        (L,) in seconds. `<kind>_frameRate` in Hz of those in frames. Where a change alters the number of lags or
+        channels, L and C are the largest and what lies outside is 0; rates and `fb_cfHz` are the last ones.
 
     Raises
     ------
@@ -77,7 +78,7 @@ def process(
     gathered: dict[str, _Gathered] = {}
 
     def keep(kind: str, block: Block) -> None:
-        for name, data in zip(output_parts(kind), block.parts, strict=True):
+        for name, data in zip(KINDS[kind].outputs, block.parts, strict=True):
             gathered[name].add(data)
 
     blocks = (samples[:, first:end] for first, end in itertools.pairwise((0, *ends)))
@@ -90,7 +91,7 @@ def process(
                 taken.append(_size(chain, wanted, ends))
         sizes.refuse_over(sizes.machine_memory(), max(taken), _TOO_LARGE, 1e9)
         for kind in wanted:
-            for name, part in output_parts(kind).items():
+            for name, part in KINDS[kind].outputs.items():
                 middle = part.axes.index(KINDS[kind].centred) if KINDS[kind].centred in part.axes else -1
                 gathered[name] = _Gathered(shapes[kind][name], middle)
         chain.run()

@@ -114,8 +114,9 @@ def test_a_module_is_all_that_a_command_takes(tmp_path: Path) -> None:
     refused(run("say-hello"), "rosafe say-hello", "name", code=2)
 
 
-def test_help_needs_nothing_but_python() -> None:
-    """Without Debian's packages (-S) help still comes."""
-    done = rosafe_alone("process", "-h")
-    assert done.returncode == 0, done
-    assert "fb_nERBs" in done.stdout
+def test_without_debians_packages() -> None:
+    """Each command (-S: none of them is there) says what to install; there is a list of them."""
+    done = rosafe_alone("-h")
+    assert done.returncode == 0 and "Tell what is there of all that running needs" in done.stdout, done
+    for arguments in (["-h"], ["sound.wav"]):
+        refused(rosafe_alone("process", *arguments), "rosafe process", "numpy is not installed; run scripts/install")

@@ -13,8 +13,8 @@ from rosafe.component import paths
 from tests.cli.command import environment, rosafe, rosafe_alone
 from tests.harness import ROOT, Graph, free_port
 
-EVERYTHING = ["python", "numbers", "kernels", "sound files", "ROS", "messages", "master", "address", "alsaaudio"]
-EVERYTHING += ["sound devices", "HTTP server", "Tcl", "plots"]
+EVERYTHING = ["python", "numbers", "kernels", "plugins", "sound files", "ROS", "messages", "master", "address"]
+EVERYTHING += ["alsaaudio", "sound devices", "HTTP server", "Tcl", "plots"]
 
 
 def findings(done: subprocess.CompletedProcess[str]) -> dict[str, dict[str, str]]:
@@ -122,7 +122,7 @@ def test_nothing_is_there() -> None:
 def test_alsaaudio_of_debian_cannot_capture(tmp_path: Path) -> None:
     (tmp_path / "alsaaudio.py").write_text("PCM_CAPTURE = 1\n")
     program = (
-        "import pathlib, sys; from rosafe import cli; from rosafe.component import paths;"
+        "import pathlib, sys; from rosafe.commands import __main__ as cli; from rosafe.component import paths;"
         f"paths.PYPI_DIR = pathlib.Path({str(tmp_path)!r}); sys.exit(cli.main(['doctor', '--json']))"
     )
     done = python(program)
@@ -130,6 +130,18 @@ def test_alsaaudio_of_debian_cannot_capture(tmp_path: Path) -> None:
     found = findings(done)["alsaaudio"]
     assert found["state"] == "MISSING" and "0.8, which cannot capture" in found["detail"]
     assert "scripts/install" in found["todo"]
+
+
+def test_plugins(tmp_path: Path) -> None:
+    """One that works beside one that does not."""
+    page = (ROOT / "docs" / "own-representation.md").read_text("utf-8")
+    (tmp_path / "zerocrossings.py").write_text(page.split("```python\n")[1].split("```")[0])
+    found = findings(rosafe("doctor", "--json", ROSAFE_PLUGINS=str(tmp_path)))["plugins"]
+    assert (found["state"], found["detail"]) == ("ok", "zeroCrossings")
+    (tmp_path / "broken.py").write_text("1 / 0\n")
+    found = findings(rosafe("doctor", "--json", ROSAFE_PLUGINS=str(tmp_path)))["plugins"]
+    assert found["state"] == "note" and f"{tmp_path}/broken.py: ZeroDivisionError" in found["detail"]
+    assert "left out" in found["todo"]
 
 
 def test_a_package_that_is_broken(tmp_path: Path) -> None:
@@ -142,7 +154,7 @@ def test_a_package_that_is_broken(tmp_path: Path) -> None:
 
 def test_another_python(tmp_path: Path) -> None:
     program = (
-        "import sys; sys.executable = '/opt/python3.13'; from rosafe import cli;"
+        "import sys; sys.executable = '/opt/python3.13'; from rosafe.commands import __main__ as cli;"
         "sys.exit(cli.main(['doctor', '--json']))"
     )
     found = findings(python(program))["python"]
