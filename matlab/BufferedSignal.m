@@ -94,7 +94,7 @@ classdef BufferedSignal < handle
             title(strrep([obj.Name ' ' obj.Label ' ' obj.Channel], '_', ' '));
         end
 
-        function image(obj, rows, values)
+        function picture(obj, rows, values)
             % A picture of rows over time, frames by rows, with some of the rows' values at the side.
             imagesc(seconds(obj), 1:numel(values), rows.');
             axis('xy');

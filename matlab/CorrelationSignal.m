@@ -20,7 +20,7 @@ classdef CorrelationSignal < BufferedSignal
             end
             h = place(obj, h);
             if ~isempty(obj.Data)
-                image(obj, permute(mean(obj.Data, 2), [1 3 2]), 1000 * obj.lags);
+                picture(obj, permute(mean(obj.Data, 2), [1 3 2]), 1000 * obj.lags);
                 ylabel('Lag (ms)');
             end
         end

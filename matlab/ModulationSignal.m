@@ -20,7 +20,7 @@ classdef ModulationSignal < BufferedSignal
             end
             h = place(obj, h);
             if ~isempty(obj.Data)
-                image(obj, permute(mean(obj.Data, 2), [1 3 2]), obj.modCfHz);
+                picture(obj, permute(mean(obj.Data, 2), [1 3 2]), obj.modCfHz);
                 ylabel('Modulation frequency (Hz)');
             end
         end

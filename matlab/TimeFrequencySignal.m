@@ -18,7 +18,7 @@ classdef TimeFrequencySignal < BufferedSignal
             end
             h = place(obj, h);
             if ~isempty(obj.Data)
-                image(obj, obj.Data, obj.cfHz);
+                picture(obj, obj.Data, obj.cfHz);
                 ylabel('Centre frequency (Hz)');
             end
         end

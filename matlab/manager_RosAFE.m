@@ -20,7 +20,7 @@ classdef manager_RosAFE < handle
     end
 
     properties (Access = private)
-        told = {}; % what getProcessors tells of all processors
+        told  % what getProcessors tells of all processors, [] before it was asked
     end
 
     methods
@@ -30,7 +30,6 @@ classdef manager_RosAFE < handle
             end
             mObj.dObj = dObj;
             mObj.RosAFE = dObj.RosAFE;
-            sort(mObj);
             update(mObj);
             if nargin > 1 && ~isempty(request)
                 if nargin < 3
@@ -157,7 +156,7 @@ classdef manager_RosAFE < handle
                 return
             end
             mObj.told = processors;
-            sort(mObj);
+            arrange(mObj);
             for kind = fieldnames(mObj.Processors).'
                 names = cellfun(@(processor) processor.name, mObj.Processors.(kind{1}), 'UniformOutput', false);
                 keepOnly(mObj.dObj, kind{1}, names);
@@ -171,13 +170,17 @@ classdef manager_RosAFE < handle
             end
         end
 
-        function sort(mObj)
+        function arrange(mObj)
             % Processors, by kind, with the values of their parameters.
+            about = describe(mObj.RosAFE);
+            types = about.services.request.parameters;
             mObj.Processors = structfun(@(kind) cell(1, 0), representations(mObj.dObj), 'UniformOutput', false);
             for processor = mObj.told
                 values = struct('name', processor{1}.name);
                 for parameter = processor{1}.parameters(:).'
-                    values.(parameter{1}.name) = valueOf(parameter{1}.value);
+                    name = parameter{1}.name;
+                    words = isfield(types, name) && ~isempty(strfind(types.(name).type, 'string')); %#ok<STREMP>
+                    values.(name) = valueOf(parameter{1}.value, words);
                 end
                 mObj.Processors.(processor{1}.kind){end + 1} = values;
             end
@@ -335,20 +338,17 @@ for name = {'FsHz', 'cfHz', 'lags', 'modCfHz', 'fList'}
 end
 end
 
-function value = valueOf(text)
-% The value that a text of getProcessors tells: a number, a word, or a row of them.
+function value = valueOf(text, words)
+% The value that a text of getProcessors tells: a number or, where WORDS is true, a word; or a row of them.
+value = text;
 if ~isempty(text) && text(1) == '['
-    words = strtrim(strsplit(text(2:end - 1), ','));
-    value = words(~cellfun(@isempty, words));
-    numbers = str2double(value);
-    if ~any(isnan(numbers))
-        value = num2cell(numbers);
+    value = strtrim(strsplit(text(2:end - 1), ','));
+    value = value(~cellfun(@isempty, value));
+    if ~words
+        value = num2cell(str2double(value));
     end
-else
+elseif ~words
     value = str2double(text);
-    if isnan(value)
-        value = text;
-    end
 end
 end
 

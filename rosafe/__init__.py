@@ -1,6 +1,7 @@
 """rosAFE: the Two!Ears auditory front-end for ROS 1, in Python.
 
-`rosafe.process` computes auditory representations of a signal in memory; everything else is reached through the nodes.
+`rosafe.process` computes auditory representations of a signal in memory, `rosafe.plot` draws them; everything else is
+reached through the nodes.
 """
 
 from __future__ import annotations
@@ -9,10 +10,11 @@ from typing import TYPE_CHECKING, Any
 
 from rosafe.version import VERSION as __version__
 
-__all__ = ["__version__", "process"]
+__all__ = ["__version__", "plot", "process"]
 
 if TYPE_CHECKING:
     from rosafe.offline.process import process
+    from rosafe.view.plot import plot
 
 
 def __getattr__(name: str) -> Any:
@@ -21,4 +23,8 @@ def __getattr__(name: str) -> Any:
         from rosafe.offline.process import process
 
         return process
+    if name == "plot":
+        from rosafe.view.plot import plot
+
+        return plot
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -54,7 +54,8 @@ classdef client < handle
             [about, failed] = obj.get(['/load/' genomix.wire.quote(name)], query, false);
             if failed
                 error('genomix:load', 'load %s: %s', component, genomix.request.explain(about));
-            elseif ~isstruct(about) || ~all(isfield(about, {'name', 'instance', 'services', 'ports'}))
+            elseif ~isstruct(about) || ~all(isfield(about, {'name', 'instance', 'services', 'ports'})) || ...
+                    ~isstruct(about.services) || ~isstruct(about.ports)
                 error('genomix:connection', 'what answers at %s is no genomixd', obj.address);
             end
             component = genomix.component(obj, about);

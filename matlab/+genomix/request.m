@@ -24,6 +24,9 @@ classdef request < handle
 
     methods
         function obj = request(client, told, matrices)
+            if ~(isstruct(told) && isfield(told, 'status') && ischar(told.status))
+                error('genomix:connection', 'genomixd does not say what has become of a request');
+            end
             obj.client = client;
             obj.told = told;
             obj.matrices = matrices;

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from rosafe import interface
-from rosafe.bass.sources import Source
+from rosafe.bass.sources import SoundSource
 from rosafe.bass.sources.base import hwparams_error, loss_text, wall_time_ns
 
 MAX_WINDOW = 2**24  # frames on the port, 380 s at 44.1 kHz; what goes beyond is a slip of the finger
@@ -39,7 +39,7 @@ def check_window(frames_per_chunk: int, chunks_on_port: int) -> None:
         )
 
 
-class SlidingWindow:
+class AudioWindow:
     """The newest `frames` frames of a two-channel int32 signal; before there are so many, zeros come first.
 
     Frames are appended to a buffer in which the window moves; where it ends, a new one begins. So what a view shows
@@ -82,7 +82,7 @@ class Capture:
 
     Parameters
     ----------
-    source : Source
+    source : SoundSource
         Open; it stays the caller's to close.
     frames_per_chunk, chunks_on_port : int
         Size of the window; see `check_window`.
@@ -99,7 +99,7 @@ class Capture:
 
     def __init__(
         self,
-        source: Source,
+        source: SoundSource,
         frames_per_chunk: int,
         chunks_on_port: int,
         publish: Callable[[Snapshot], None],
@@ -113,7 +113,7 @@ class Capture:
         self._time_ns = 0
         self._unpublished = 0
         try:
-            self._window = SlidingWindow(frames_per_chunk * chunks_on_port)
+            self._window = AudioWindow(frames_per_chunk * chunks_on_port)
         except MemoryError:
             raise interface.BASS.error(
                 "e_nomem", f"no memory for {chunks_on_port} chunks of {frames_per_chunk} frames"

@@ -11,7 +11,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 
 from rosafe.bass.capture import Capture, Snapshot, check_window
 from rosafe.bass.socket_server import DEFAULT_HOST, DEFAULT_PORT, DedicatedSocket
-from rosafe.bass.sources import Source, device_lines, open_source
+from rosafe.bass.sources import SoundSource, device_lines, open_source
 from rosafe.bass.sources.alsa import AlsaSource, DeviceBusyError
 from rosafe.component import master, wire
 from rosafe.component.activities import Activity
@@ -34,7 +34,7 @@ class BassNode:
         self._message_class = wire.message_class("bass", BASS.port("Audio").idl)
         self._audio = self._node.advertise("Audio", self._message_class)
         self._snapshot: Snapshot | None = None
-        self._source: Source | None = None  # of the acquisition under way
+        self._source: SoundSource | None = None  # of the acquisition under way
         self._last_end = self._last_loss = "none"
         self._log_loss = EventLog(rospy.logwarn)
         self._log_clients = EventLog(rospy.logwarn)
@@ -81,7 +81,7 @@ class BassNode:
                 self._source = None
             source.close()
 
-    def _open(self, activity: Activity, device: str, sample_rate: int, frames_per_chunk: int) -> Source:
+    def _open(self, activity: Activity, device: str, sample_rate: int, frames_per_chunk: int) -> SoundSource:
         try:
             return open_source(device, sample_rate, frames_per_chunk, activity.stop_requested)
         except DeviceBusyError:

@@ -23,7 +23,7 @@ _HEADER = struct.Struct("<iiq")
 _MOST = 2**24  # frames: no window is longer
 
 
-class Block(NamedTuple):
+class Received(NamedTuple):
     """Some frames of the stream."""
 
     first: int  # number of the first one, as bass counts; less than expected where the stream began anew
@@ -41,14 +41,14 @@ class SocketClient:
         self._connection = socket.create_connection((host, port), timeout)
         self._stream = self._connection.makefile("rb")
 
-    def read(self, frames: int, first: int) -> Block:
+    def read(self, frames: int, first: int) -> Received:
         """Up to `frames` frames from number `first` (from 1 on); none where nothing is new."""
         self._connection.sendall(b"Read Port - N %d - nfr %d\n" % (frames, first))
         count, lost, following = _HEADER.unpack(self._take(_HEADER.size))
         if not 0 <= count <= min(frames, _MOST) or lost < 0 or following < count:
             raise ConnectionError(f"what answers is no bass: {count} frames where {frames} were asked for")
         samples = np.frombuffer(self._take(8 * count), "<i4").reshape(2, count)
-        return Block(following - count, samples, lost)
+        return Received(following - count, samples, lost)
 
     def newest(self) -> int:
         """Number of the newest frame; 0 where there is none."""
@@ -80,7 +80,7 @@ def blocks(
     first: int | None = None,
     patience: float | None = None,
     stopping: threading.Event | None = None,
-) -> Generator[Block, None, None]:
+) -> Generator[Received, None, None]:
     """The stream, for ever unless told otherwise, in blocks of at most `frames` frames.
 
     Parameters

@@ -37,7 +37,7 @@ class Interrupted(SystemExit):
         super().__init__(128 + number)
 
 
-class Signals:
+class Interrupts:
     """Notes the first SIGINT, SIGTERM or SIGHUP, here and in processes that are forked from here.
 
     It is raised by those who ask. An exception out of the handler itself could come anywhere: in Thread.join, it makes
@@ -65,7 +65,7 @@ def run_together(
     jobs: int,
     failures: tuple[type[Exception], ...],
     report: Callable[[int, Report], None],
-    signals: Signals,
+    signals: Interrupts,
 ) -> None:
     """Run all `works`, at most `jobs` at a time, and wait for them; whatever ends this ends those that run, too.
 
@@ -80,7 +80,7 @@ def run_together(
         What a piece of work may fail with; the text of the exception is the report's.
     report : callable
         Called with the number of a piece of work and its `Report`: now and then, and once with its last.
-    signals : Signals
+    signals : Interrupts
         What ends it by `Interrupted`.
     """
     waiting = deque(enumerate(works))
@@ -137,7 +137,7 @@ def _receive(connection: Connection, process: multiprocessing.Process) -> Report
         return Report(0.0, failure=f"ended too early, with {how}")
 
 
-def _work(work: Work, failures: tuple[type[Exception], ...], signals: Signals, writer: Connection) -> None:
+def _work(work: Work, failures: tuple[type[Exception], ...], signals: Interrupts, writer: Connection) -> None:
     """What a process does. It ends at its next report where the one that started it is no longer there."""
     due = 0.0
 

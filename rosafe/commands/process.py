@@ -19,10 +19,9 @@ from typing import Any
 
 from rosafe.commands import Failure
 from rosafe.commands._progress import Display, bytes_text
-from rosafe.commands._workers import Interrupted, Report, Signals, run_together
+from rosafe.commands._workers import Interrupted, Interrupts, Report, run_together
 from rosafe.interface import FIXED, KINDS, ROSAFE, Parameter
 from rosafe.interface.arguments import check_outputs, check_parameter
-from rosafe.offline.chain import output_parts
 
 _BLOCK = ROSAFE.service("InputProc").parameter("nFramesPerBlock")
 _MAX_JOBS = 10_000
@@ -103,7 +102,7 @@ def _count(text: str, maximum: float) -> int:
 
 
 def _epilog() -> str:
-    parts = [named for kind in KINDS for named in output_parts(kind).items()]
+    parts = [named for kind in KINDS.values() for named in kind.outputs.items()]
     lines = [
         "The .npz holds, as rosafe.process returns them, of the outputs:",
         *(f"  {name} ({', '.join(part.axes)}) {part.unit}".rstrip() for name, part in parts),
@@ -165,7 +164,7 @@ def run(options: argparse.Namespace) -> int:
         outputs = check_outputs(_words(options.outputs) if options.outputs is not None else None)
     except ValueError as problem:
         raise Failure(str(problem)) from None
-    signals = Signals()
+    signals = Interrupts()
     # Once, for all processes that are forked from this one.
     from rosafe.offline.files import process_file
     from rosafe.output import OutputError

@@ -17,14 +17,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rosafe.commands import Failure
-from rosafe.commands._workers import Interrupted, Signals
+from rosafe.commands._workers import Interrupted, Interrupts
 from rosafe.interface import ComponentError
 from rosafe.output import PART, OutputError, Part
 
 if TYPE_CHECKING:
     from rosafe.bass.recording.outputs import Output
-    from rosafe.bass.recording.recorder import Recorder
-    from rosafe.bass.sources import Source
+    from rosafe.bass.recording.recorder import SoundRecorder
+    from rosafe.bass.sources import SoundSource
 
 _TOPIC = "/bass/Audio"
 _EARS = ("left", "right")
@@ -111,7 +111,7 @@ def run(options: argparse.Namespace) -> int:
     if options.list:
         return _list()
     path = _check(options)
-    signals, stopping = Signals(), threading.Event()
+    signals, stopping = Interrupts(), threading.Event()
     outcome: list[int | BaseException] = []
 
     def work() -> None:
@@ -170,7 +170,7 @@ def _is_input(path: Path, device: str) -> bool:
     return any(os.path.exists(os.path.expanduser(n)) and os.path.samefile(os.path.expanduser(n), path) for n in names)
 
 
-def _open_source(options: argparse.Namespace, stopping: threading.Event) -> Source:
+def _open_source(options: argparse.Namespace, stopping: threading.Event) -> SoundSource:
     try:
         if options.device is not None:
             from rosafe.bass.sources import open_source
@@ -198,7 +198,7 @@ def _open_source(options: argparse.Namespace, stopping: threading.Event) -> Sour
 
 
 def _record(path: Path | None, options: argparse.Namespace, stopping: threading.Event) -> int:
-    from rosafe.bass.recording.recorder import Recorder
+    from rosafe.bass.recording.recorder import SoundRecorder
     from rosafe.commands._meter import Meter
 
     with ExitStack() as stack:
@@ -208,7 +208,7 @@ def _record(path: Path | None, options: argparse.Namespace, stopping: threading.
         meter = Meter(sys.stdout, source.sample_rate, options.quiet)
         limit = None if options.seconds is None else max(1, round(options.seconds * source.sample_rate))
         with _opened(part, options, source) as output:
-            recorder = Recorder(source, output, limit, meter.show, meter.message)
+            recorder = SoundRecorder(source, output, limit, meter.show, meter.message)
             try:
                 ended = recorder.run(stopping)
             except ComponentError as problem:
@@ -221,7 +221,7 @@ def _record(path: Path | None, options: argparse.Namespace, stopping: threading.
 
 
 @contextmanager
-def _opened(part: Part | None, options: argparse.Namespace, source: Source) -> Iterator[Output | None]:
+def _opened(part: Part | None, options: argparse.Namespace, source: SoundSource) -> Iterator[Output | None]:
     """The output, if one is wanted; complete and in its place at the end, whatever happens, if there is sound in it."""
     if part is None:
         yield None
@@ -244,7 +244,7 @@ def _opened(part: Part | None, options: argparse.Namespace, source: Source) -> I
         raise part.error(problem) from None
 
 
-def _open_output(part: Part, options: argparse.Namespace, source: Source) -> Output:
+def _open_output(part: Part, options: argparse.Namespace, source: SoundSource) -> Output:
     from rosafe.bass.recording.outputs import BagFile, WavFile
 
     descriptor = part.begin()
@@ -255,7 +255,7 @@ def _open_output(part: Part, options: argparse.Namespace, source: Source) -> Out
     return BagFile(descriptor, source.sample_rate, chunk, source.name if options.topic else _TOPIC, newest)
 
 
-def _summary(recorder: Recorder, name: str, sample_rate: int) -> str:
+def _summary(recorder: SoundRecorder, name: str, sample_rate: int) -> str:
     if not recorder.frames:
         return "nothing was recorded"
     levels = recorder.levels

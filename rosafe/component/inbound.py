@@ -47,7 +47,7 @@ from rosafe.interface import MAX_SEQUENCE, MAX_STRING
 HEADER_BYTES = 65536  # of a TCPROS header; it holds the definition of a message
 HTTP_HEADER_BYTES = 16384
 BODY_BYTES = 2**18  # of an XML-RPC request; the longest is a list of publishers
-SLIP_BYTES = 2**20  # so much is read of any service request: a list that is too long gets its error by name
+SLIP_BYTES = 2**20  # of a service request, or of sound beyond its bound: a slip gets its error by name
 DATA_BYTES = 2**30  # of a message that no rule bounds more closely, such as what is plotted or recorded
 LONG_BYTES, LONG_REQUESTS = 65536, 16  # of requests longer than this so many are read at a time
 REQUEST_SECONDS = 10.0  # from the first byte of a service request to the last
@@ -297,9 +297,9 @@ _REQUESTS = re.compile(r"\w+/\w+Action(Goal|Result|Feedback)|actionlib_msgs/\w+|
 
 def bound(message_class: Any) -> int:
     """The bytes of the longest message of a topic that is taken."""
-    if hasattr(message_class, "longest_sequence") or _REQUESTS.fullmatch(message_class._type):
-        return largest(message_class)
-    return DATA_BYTES
+    if hasattr(message_class, "longest_sequence"):
+        return largest(message_class) + SLIP_BYTES
+    return largest(message_class) if _REQUESTS.fullmatch(message_class._type) else DATA_BYTES
 
 
 @functools.cache

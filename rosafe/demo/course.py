@@ -10,8 +10,8 @@ import numpy as np
 
 from rosafe.demo import sound as sounds
 from rosafe.demo.progress import Progress
-from rosafe.demo.recorder import Recorder
-from rosafe.demo.session import NAMES, POLL_SECONDS, DemoError, Session, acquire, requests
+from rosafe.demo.recorder import PortRecorder
+from rosafe.demo.session import NAMES, POLL_SECONDS, DemoError, GuideSession, acquire, requests
 from rosafe.demo.sound import Sound
 from rosafe.view import estimates, report
 from rosafe.view.representations import Representations
@@ -57,12 +57,12 @@ def run(
     print(f"rosAFE, the auditory front-end, on {sound.device}", flush=True)
     if sound.note:
         print(sound.note, flush=True)
-    session = Session(scratch, check)
+    session = GuideSession(scratch, check)
     try:
         print(f"master of its own at {session.uri}; starting bass-ros and rosAFE-ros", flush=True)
         session.start_nodes()
         session.join()
-        recorder = Recorder(NAMES, sound.sample_rate, sound.frames_per_block)
+        recorder = PortRecorder(NAMES, sound.sample_rate, sound.frames_per_block)
         start = _build(session, recorder, sound)
         _follow(session, recorder, sound, seconds, start)
         session.kill_nodes(_say_command)
@@ -82,8 +82,8 @@ def _say_command(command: str) -> None:
     print(f"$ {command}", flush=True)
 
 
-def _build(session: Session, recorder: Recorder, sound: Sound) -> tuple[int, int]:
-    """Make the guide's requests; returns the position (`Recorder.position`) after which to follow."""
+def _build(session: GuideSession, recorder: PortRecorder, sound: Sound) -> tuple[int, int]:
+    """Make the guide's requests; returns the position (`PortRecorder.position`) after which to follow."""
     steps = requests(sound)
     for service, arguments in steps[:-PARALLEL]:
         session.request(service, arguments, _say_command)
@@ -97,7 +97,9 @@ def _build(session: Session, recorder: Recorder, sound: Sound) -> tuple[int, int
     return position
 
 
-def _follow(session: Session, recorder: Recorder, sound: Sound, seconds: float, start: tuple[int, int]) -> None:
+def _follow(
+    session: GuideSession, recorder: PortRecorder, sound: Sound, seconds: float, start: tuple[int, int]
+) -> None:
     """Follow the ports for so long, or until the sound ends."""
     print(f"following {len(recorder.ports)} ports for {seconds:.1f} s", flush=True)
     progress = Progress(recorder, seconds)
@@ -131,7 +133,7 @@ def _axes() -> tuple[np.ndarray, np.ndarray]:
     return np.array(parameters.gammatone[0].fb_cfHz), np.array(parameters.crossCorrelation[0].cc_lags)
 
 
-def _say_ports(recorder: Recorder) -> None:
+def _say_ports(recorder: PortRecorder) -> None:
     print(f"\n{report.port_table([follower.row for follower in recorder.ports.values()])}")
     bass, audio = recorder.health["bass: capture"], recorder.health["rosAFE: audio"]
     print(
@@ -154,7 +156,7 @@ def _say_path(shown: Representations, sound: Sound) -> None:
 
 
 def _draw(shown: Representations, sound: Sound, picture: Path) -> None:
-    from rosafe.view import figure  # matplotlib takes a second to import
+    from rosafe.view import axes, figure  # matplotlib takes a second to import
 
     channels = len(shown.center_frequencies)
     subtitle = (
@@ -162,4 +164,4 @@ def _draw(shown: Representations, sound: Sound, picture: Path) -> None:
         f"{shown.times[-1] - shown.times[0]:.1f} s as they came from rosAFE's ports"
     )
     drawing = figure.draw(shown, sound.title, subtitle, sound.true_azimuth)
-    figure.save(drawing, picture)
+    axes.save(drawing, picture)

@@ -7,7 +7,7 @@ import time
 
 import numpy as np
 
-from rosafe.demo.recorder import Recorder
+from rosafe.demo.recorder import PortRecorder
 from rosafe.view import estimates, report
 
 REFRESH_SECONDS = 0.1
@@ -20,7 +20,7 @@ QUIET_DB, LOUD_DB = -70.0, -10.0
 class Progress:
     """The display of one recording of `seconds` seconds."""
 
-    def __init__(self, recorder: Recorder, seconds: float) -> None:
+    def __init__(self, recorder: PortRecorder, seconds: float) -> None:
         self._recorder = recorder
         self._seconds = seconds
         self._live = sys.stdout.isatty()

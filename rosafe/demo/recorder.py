@@ -127,7 +127,7 @@ def _reduced(kind: str, message: Any, fresh: int) -> np.ndarray:
     return np.array(message.left[..., -fresh:])
 
 
-class Recorder:
+class PortRecorder:
     """All seven ports and the nodes' own counters. Make it after `rospy.init_node`, before there are processors.
 
     Parameters

@@ -105,7 +105,7 @@ def shown(command: list[str]) -> str:
     return " ".join([*command[:-1], f'"{argument}"'])
 
 
-class Session:
+class GuideSession:
     """A private master with both nodes on it, in an environment of their own. Everything ends with `close`.
 
     Parameters
@@ -220,7 +220,7 @@ class Session:
             rospy.signal_shutdown("the demonstration is over")
         self._master.close()
 
-    def __enter__(self) -> Session:
+    def __enter__(self) -> GuideSession:
         return self
 
     def __exit__(

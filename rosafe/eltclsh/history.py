@@ -36,7 +36,7 @@ def _octal(character: str) -> str:
     return "".join(f"\\{byte:03o}" for byte in character.encode("utf-8", "replace"))
 
 
-class History:
+class LineHistory:
     """What the arrow keys go through, and where it is kept."""
 
     def __init__(self, path: Path) -> None:

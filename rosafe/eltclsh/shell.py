@@ -18,7 +18,7 @@ from rosafe.eltclsh.words import parse
 from rosafe.version import VERSION
 
 if TYPE_CHECKING:  # readline is for terminals: scripts do without
-    from rosafe.eltclsh.history import History
+    from rosafe.eltclsh.history import LineHistory
     from rosafe.eltclsh.line import LineReader
 
 COMPATIBLE_VERSION = "1.20"  # of the original, for `package require eltclsh`
@@ -53,7 +53,7 @@ class Shell:
         self.tcl = Interpreter()
         self.signals = Signals(self.tcl)
         self._reader: LineReader | None = None
-        self._history: History | None = None
+        self._history: LineHistory | None = None
         self._pending = ""
         commands: dict[str, Callable[..., Any]] = {
             "el::Exit": self.exit,
@@ -306,16 +306,16 @@ class Shell:
             self.signals.abandon()
         return ""
 
-    def _editing(self) -> tuple[LineReader, History]:
+    def _editing(self) -> tuple[LineReader, LineHistory]:
         """readline, once it is needed."""
         if self._reader is None or self._history is None:
             from rosafe.eltclsh.complete import Completer
-            from rosafe.eltclsh.history import History
+            from rosafe.eltclsh.history import LineHistory
             from rosafe.eltclsh.line import LineReader
 
             completer = Completer(self.tcl)
             self._reader = LineReader(self.tcl, lambda before, word: completer.complete(self._pending + before, word))
-            self._history = History(Path("~/.eltclhistory"))
+            self._history = LineHistory(Path("~/.eltclhistory"))
             self.tcl.command("el::Resized", self._reader.resized)
             self.signals.command("WINCH", "::el::Resized")
         return self._reader, self._history

@@ -9,8 +9,10 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import ipaddress
+import logging
 import re
 import resource
+import time
 from collections.abc import Iterator
 from http import HTTPStatus
 from typing import Any, cast
@@ -33,6 +35,9 @@ REQUEST_SECONDS = 15.0  # for a whole request, from its first byte or, the first
 IDLE_SECONDS = 3600.0  # a connection without requests is closed after
 STALL_SECONDS = 60.0  # a client that does not take its answer is dropped after
 YIELD_SECONDS = 5.0  # and where others want the memory, after
+TELL_SECONDS = 60.0  # between two lines in the log that say there is no more room
+
+log = logging.getLogger("genomixd")
 
 _END = re.compile(rb"\r?\n\r?\n")
 _BODY = re.compile(rb"\n(?:content-length:(?![ \t]*0*[ \t]*\r?\n)|transfer-encoding:)", re.IGNORECASE)
@@ -60,6 +65,7 @@ class Connections:
         self._most = MAX_CONNECTIONS if descriptors < 0 else min(MAX_CONNECTIONS, descriptors // 2)
         self._clients: dict[str, Client] = {}
         self._count = 0
+        self._told_at = -TELL_SECONDS
         self.heads = 0  # bytes of long requests
         self._answers: dict[Connection, tuple[object, int]] = {}  # what is being taken, and its bytes
 
@@ -70,6 +76,7 @@ class Connections:
         if full or self._count >= self._most:
             crowds = [client] if full else self._clients.values()
             waiting = [crowd for crowd in crowds if crowd.waiting]
+            self._tell(client.address)
             if not waiting:
                 return None
             next(iter(max(waiting, key=lambda crowd: len(crowd.connections)).waiting)).drop()
@@ -78,6 +85,11 @@ class Connections:
         client.waiting[connection] = None
         self._count += 1
         return client
+
+    def _tell(self, address: str) -> None:
+        if time.monotonic() > self._told_at + TELL_SECONDS:
+            self._told_at = time.monotonic()
+            log.warning("as many clients are connected as may be, now from %s: idle ones are closed", address)
 
     def forget(self, connection: Connection) -> None:
         """A connection is over."""
@@ -136,7 +148,6 @@ class Connection(web.RequestHandler):
         self.client = Client("")
         self.gone = asyncio.Event()
         self._connections = connections
-        self._timers = loop
         self._open = False
         self._under_way = False  # a request
         self._ahead = bytearray()  # what has come, and aiohttp has not got yet
@@ -181,12 +192,12 @@ class Connection(web.RequestHandler):
         self._connections.forget(self)
         self._ahead.clear()
         self._head = 0
-        self._count()
+        self._weigh()
         self._rest_is_here()
 
-    def _refuse(self, status: int, what: str) -> None:
+    def _refuse(self, status: int, error: ComponentError) -> None:
         self._leave()
-        self._socket.write(_refusal(status, ComponentError("::genomix::e_url", what=what)))
+        self._socket.write(_refusal(status, error))
         self.force_close()
 
     # --- requests ---
@@ -195,9 +206,9 @@ class Connection(web.RequestHandler):
         if not self._open:
             return
         self._ahead += data
-        self._count()
+        self._weigh()
         if self._counted and self._connections.heads > MAX_HEADS:
-            self._refuse(503, f"long requests take {MAX_HEADS >> 20} MiB at this moment")
+            self._refuse(503, too_many(f"long requests take {MAX_HEADS >> 20} MiB at this moment"))
         elif not self._under_way:
             self._next_request()
         elif len(self._ahead) >= SHORT:
@@ -210,7 +221,7 @@ class Connection(web.RequestHandler):
         if end is None:
             self._searched = len(self._ahead)
             if self._searched > MAX_HEAD:
-                self._refuse(400, f"a request has at most {MAX_HEAD >> 10} KiB")
+                self._refuse(400, _no_request(f"a request has at most {MAX_HEAD >> 10} KiB"))
             elif self._ahead and self._late is None:
                 self._await_rest()
             return
@@ -218,10 +229,13 @@ class Connection(web.RequestHandler):
         del self._ahead[: end.end()]
         self._searched, self._head = 0, len(head)
         if _BODY.search(head):
-            self._refuse(400 if head.startswith(b"GET ") else 405, "everything is a GET without a body; see /")
+            status = 400 if head.startswith(b"GET ") else 405
+            self._refuse(status, _no_request("everything is a GET without a body; see /"))
             return
         self._under_way = True
         self.client.waiting.pop(self, None)
+        if self._late is None:
+            self._await_rest()  # should aiohttp see no end of it
         super().data_received(head)
 
     def begun(self) -> None:
@@ -232,14 +246,14 @@ class Connection(web.RequestHandler):
         try:
             return await super().finish_response(*arguments)
         finally:
-            self._timers.call_soon(self._finished)
+            self._loop.call_soon(self._finished)
 
     def _finished(self) -> None:
         if not self._open:
             return
         self._rest_is_here()
         self._under_way, self._head = False, 0
-        self._count()
+        self._weigh()
         self.client.waiting[self] = None
         self._next_request()
         if len(self._ahead) < SHORT:
@@ -256,20 +270,20 @@ class Connection(web.RequestHandler):
         if request.writer.output_size > 0:
             raise ConnectionAbortedError("a part of another answer was sent already")
         what = (message or str(exc) or HTTPStatus(status).phrase).splitlines()[0][:200]
-        body = _body(ComponentError("::genomix::e_url", what=what))
+        body = _body(_no_request(what))
         answer = web.Response(body=body, status=status, content_type=JSON.media_type, charset="utf-8")
         answer.force_close()
         return answer
 
-    def _count(self) -> None:
+    def _weigh(self) -> None:
         size = self._head + len(self._ahead)
         counted = size if size > SHORT else 0
         self._connections.heads += counted - self._counted
         self._counted = counted
 
     def _await_rest(self) -> None:
-        told = f"no whole request within {REQUEST_SECONDS:g} s"
-        self._late = self._timers.call_later(REQUEST_SECONDS, self._refuse, 408, told)
+        error = _no_request(f"no whole request within {REQUEST_SECONDS:g} s")
+        self._late = self._loop.call_later(REQUEST_SECONDS, self._refuse, 408, error)
 
     def _rest_is_here(self) -> None:
         if self._late is not None:
@@ -280,8 +294,8 @@ class Connection(web.RequestHandler):
 
     def pause_writing(self) -> None:
         super().pause_writing()
-        self._stalled_at = self._timers.time()
-        self._stall = self._timers.call_later(STALL_SECONDS, self.drop)
+        self._stalled_at = self._loop.time()
+        self._stall = self._loop.call_later(STALL_SECONDS, self.drop)
 
     def resume_writing(self) -> None:
         super().resume_writing()
@@ -291,7 +305,7 @@ class Connection(web.RequestHandler):
 
     def stalled(self, seconds: float) -> bool:
         """Whether the client has taken nothing of its answer for so long."""
-        return self._stall is not None and self._timers.time() - self._stalled_at >= seconds
+        return self._stall is not None and self._loop.time() - self._stalled_at >= seconds
 
 
 def _address(peer: Any) -> str:
@@ -304,6 +318,10 @@ def _address(peer: Any) -> str:
             return "loopback" if address.is_loopback else str(ipaddress.ip_network((address, 64), strict=False))
         address = address.ipv4_mapped
     return "loopback" if address.is_loopback else str(address)
+
+
+def _no_request(what: str) -> ComponentError:
+    return ComponentError("::genomix::e_url", what=what)
 
 
 def _body(error: ComponentError) -> bytes:

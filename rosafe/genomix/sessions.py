@@ -349,6 +349,8 @@ class Sessions:
         ``::genomix::e_tooMany`` where there is no room for a new one.
         """
         new = 0 if request.finished.is_set() else request.size
+        if self.kept + new <= MAX_KEPT:
+            return
         sessions = set(self._sessions.values())
         while self.kept + new > MAX_KEPT and sessions:
             largest = max(sessions, key=lambda session: session.kept)

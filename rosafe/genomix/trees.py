@@ -17,7 +17,7 @@ POLL_SECONDS = 0.02
 T = TypeVar("T")
 
 
-class Component(Protocol):
+class Services(Protocol):
     """A rosAFE, by its services."""
 
     instance: str
@@ -32,7 +32,7 @@ class Component(Protocol):
         """Whether somebody publishes `topic`."""
 
 
-async def build(component: Component, values: Mapping[str, Any]) -> dict[str, Any]:
+async def build(component: Services, values: Mapping[str, Any]) -> dict[str, Any]:
     """Make or find the processors that `values` (from `rosafe.genomix.values.partial`) ask for; REQUEST's outputs.
 
     Where anything fails, or the task is cancelled, what was made is removed again, as far as nothing of others hangs on
@@ -54,7 +54,7 @@ async def build(component: Component, values: Mapping[str, Any]) -> dict[str, An
     return request.answer(wish, dependencies, made, component.instance)
 
 
-async def find(component: Component, values: Mapping[str, Any]) -> dict[str, Any]:
+async def find(component: Services, values: Mapping[str, Any]) -> dict[str, Any]:
     """What `build` would answer if all that it needs is there; ``::rosAFE::e_noSuchProcessor`` where it is not."""
     wish = await _understood(values)
     plan = request.plan(wish, await _look(component))
@@ -70,7 +70,7 @@ async def _understood(values: Mapping[str, Any]) -> Wish:
     return await asyncio.to_thread(request.understand, kind, given)  # numpy's and scipy's work, and their import
 
 
-async def _carry_out(component: Component, wish: Wish, made: list[str]) -> list[str]:
+async def _carry_out(component: Services, wish: Wish, made: list[str]) -> list[str]:
     problem = ComponentError("::genom::mwerr", what="others change the tree all the time")
     for _ in range(TRIES):
         plan = request.plan(wish, await _look(component))
@@ -88,7 +88,7 @@ async def _carry_out(component: Component, wish: Wish, made: list[str]) -> list[
     raise problem
 
 
-async def _wait_for_input(component: Component) -> None:
+async def _wait_for_input(component: Services) -> None:
     """Let another's InputProc, which has taken the place of ours, come to its end: it may be waiting for sound."""
     deadline = asyncio.get_running_loop().time() + INPUT_SECONDS
     while asyncio.get_running_loop().time() < deadline:
@@ -97,14 +97,14 @@ async def _wait_for_input(component: Component) -> None:
         await asyncio.sleep(POLL_SECONDS)
 
 
-async def _take_steps(component: Component, wish: Wish, plan: Plan, made: list[str]) -> None:
+async def _take_steps(component: Services, wish: Wish, plan: Plan, made: list[str]) -> None:
     if plan.steps and plan.steps[0].makes == plan.dependencies[0]:
         await _connect(component, wish)
     for step in plan.steps:
         await _uncancelled(_take_step(component, step, made))
 
 
-async def _take_step(component: Component, step: Step, made: list[str]) -> None:
+async def _take_step(component: Services, step: Step, made: list[str]) -> None:
     await component.outputs(step.service, step.values)
     if step.makes:
         made.append(step.makes)
@@ -120,7 +120,7 @@ async def _uncancelled(work: Awaitable[T]) -> T:
         raise
 
 
-async def _connect(component: Component, wish: Wish) -> None:
+async def _connect(component: Services, wish: Wish) -> None:
     """Connect the Audio port to the topic that the client named, or to bass where it is not connected yet."""
     topic = wish.connect
     if not topic and not await component.hears("Audio"):
@@ -130,7 +130,7 @@ async def _connect(component: Component, wish: Wish) -> None:
         await component.outputs("connect_port", {"local": "Audio", "remote": topic})
 
 
-async def _look(component: Component) -> list[Found]:
+async def _look(component: Services) -> list[Found]:
     """All processors of the kinds that are known here."""
     found = []
     for processor in (await component.outputs("getProcessors", {}))["processors"]:
@@ -142,7 +142,7 @@ async def _look(component: Component) -> list[Found]:
     return found
 
 
-async def _remove(component: Component, wish: Wish, made: list[str]) -> None:
+async def _remove(component: Services, wish: Wish, made: list[str]) -> None:
     """Remove what was made, leaves first, but nothing that others have come to use. Errors are told by what failed."""
     try:
         for name in reversed(made):

@@ -15,13 +15,6 @@ from rosafe.tree import sizes
 from rosafe.tree.block import Block
 from rosafe.tree.processor import Observer, Processor
 from rosafe.tree.tree import Tree
-from rosafe.vocabulary.representation import Part
-
-
-def output_parts(kind: str) -> dict[str, Part]:
-    """The arrays of a kind of processor by their names in a result: the kind, or with the part's name where several."""
-    parts = KINDS[kind].parts
-    return {kind if len(parts) == 1 else f"{kind}_{part.name}": part for part in parts}
 
 
 class _GatedSource:
@@ -179,7 +172,7 @@ class Chain:
         """Shape of each part of an output, for a signal of so many frames if no parameter changes on the way."""
         processor = self._processors[kind]
         count = self._count(processor, frames)
-        return dict(zip(output_parts(kind), ((*rows, count) for rows in processor.part_rows), strict=True))
+        return dict(zip(KINDS[kind].outputs, ((*rows, count) for rows in processor.part_rows), strict=True))
 
     def _count(self, processor: Processor, frames: int) -> int:
         """How many frames it puts out for so many of the signal."""

@@ -13,7 +13,7 @@ import numpy as np
 
 from rosafe.interface import KINDS
 from rosafe.interface.arguments import check_outputs, check_parameters
-from rosafe.offline.chain import Chain, output_parts
+from rosafe.offline.chain import Chain
 from rosafe.offline.npz import NpzWriter
 from rosafe.offline.process import DEFAULT_BLOCK
 from rosafe.output import OutputError, new_file
@@ -97,7 +97,7 @@ def _stream(
     telling = threading.Lock()
 
     def keep(kind: str, block: Block) -> None:
-        for name, data in zip(output_parts(kind), block.parts, strict=True):
+        for name, data in zip(KINDS[kind].outputs, block.parts, strict=True):
             writer.append(name, data)
         with telling:
             done[kind] = block.next_index

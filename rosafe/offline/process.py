@@ -12,7 +12,7 @@ import numpy as np
 from rosafe.dsp.stage import SAMPLE_RATE
 from rosafe.interface import KINDS
 from rosafe.interface.arguments import check_change, check_outputs, check_parameters
-from rosafe.offline.chain import Chain, output_parts
+from rosafe.offline.chain import Chain
 from rosafe.tree import sizes
 from rosafe.tree.block import Block
 
@@ -75,29 +75,32 @@ def process(
     changes = _checked_modifications(modifications)
     wanted = check_outputs(outputs)
 
-    gathered: dict[str, _Gathered] = {}
+    gathered: dict[str, dict[str, _Gathered]] = {}  # by kind and name
 
     def keep(kind: str, block: Block) -> None:
-        for name, data in zip(output_parts(kind), block.parts, strict=True):
+        for name, data in zip(KINDS[kind].outputs, block.parts, strict=True):
             gathered[name].add(data)
 
     blocks = (samples[:, first:end] for first, end in itertools.pairwise((0, *ends)))
     with Chain(blocks, rate, values, wanted, keep) as chain:
         taken = [_size(chain, wanted, ends)]
-        shapes = {kind: chain.shapes(kind, samples.shape[1]) for kind in wanted}
+        shapes = {kind: chain.shapes(kind, samples.shape[1]) for kind in wanted}  # before any change
         for block, name, value in changes:
             if block < len(ends):
                 chain.schedule(block, name, value)
                 taken.append(_size(chain, wanted, ends))
         sizes.refuse_over(sizes.machine_memory(), max(taken), _TOO_LARGE, 1e9)
         for kind in wanted:
-            for name, part in output_parts(kind).items():
+            for name, part in KINDS[kind].outputs.items():
                 middle = part.axes.index(KINDS[kind].centred) if KINDS[kind].centred in part.axes else -1
                 gathered[name] = _Gathered(shapes[kind][name], middle)
         chain.run()
         results: dict[str, Any] = {}
-        for name in list(gathered):
-            results[name] = gathered.pop(name).joined()
+        while gathered:
+            wholes = gathered.pop(next(iter(gathered)))
+            while wholes:
+                name = next(iter(wholes))
+                results[name] = wholes.pop(name).joined()
         results.update(chain.describe())
         return results
 
@@ -163,7 +166,7 @@ def _size(chain: Chain, wanted: list[str], ends: list[int]) -> int:
 
 
 class _Gathered:
-    """All that is released of one output. Each block goes to its place in the result at once.
+    """All that is released of one output. Each block goes to its place in the result at once, small ones together.
 
     Parameters
     ----------
@@ -173,29 +176,39 @@ class _Gathered:
         The axis whose middle stays where it is where a change alters its length; -1 for none.
     """
 
+    TOGETHER = 64  # frames: a row of one frame after the other is written many times as slowly
+
     def __init__(self, shape: tuple[int, ...], middle: int) -> None:
         self._middle = middle
         self._whole = np.empty(shape)
         self._filled = 0  # frames
         self._begun = False  # a block without frames has rows, too
-        self._others: list[np.ndarray] = []
+        self._waiting: list[np.ndarray] = []
+        self._frames = 0  # that wait
+        self._fits = True
 
     def add(self, block: np.ndarray) -> None:
         """The next block, (..., frames)."""
-        end = self._filled + block.shape[-1]
-        fits = block.shape[:-1] == self._whole.shape[:-1] and end <= self._whole.shape[-1]
-        if fits and not self._others:
-            self._whole[..., self._filled : end] = block
-            self._filled, self._begun = end, True
-        else:
-            self._others.append(block)
+        self._fits = self._fits and block.shape[:-1] == self._whole.shape[:-1]
+        self._waiting.append(block)
+        self._frames += block.shape[-1]
+        if self._frames >= self.TOGETHER and self._fits:
+            self._write()
+
+    def _write(self) -> None:
+        end = self._filled + self._frames
+        if end <= self._whole.shape[-1]:
+            np.concatenate(self._waiting, axis=-1, out=self._whole[..., self._filled : end])
+            self._waiting, self._filled, self._frames, self._begun = [], end, 0, True
 
     def joined(self) -> np.ndarray:
         """The whole."""
-        if not self._others and self._filled == self._whole.shape[-1]:
+        if self._waiting and self._fits:
+            self._write()
+        if not self._waiting and self._filled == self._whole.shape[-1]:
             return self._whole
         first = [self._whole[..., : self._filled]] if self._begun else []
-        return _join(self._middle, [*first, *self._others])
+        return _join(self._middle, [*first, *self._waiting])
 
 
 def _join(middle: int, blocks: list[np.ndarray]) -> np.ndarray:

@@ -157,7 +157,7 @@ class AmsFeatures(FramedStage):
             return self._by_spectra(limited(samples), self._triangles)
         rows = (*samples.shape[:-1], len(self._frequencies))
         if kernels.compiled():
-            frames = self._frames(samples, np.abs(self._framing.weights(squared=False)), rows)
+            frames = self._frames(samples, self._framing.weights(squared=False), rows)
             state = self._filters.started(samples.shape[:-1])
             means, self._begun = kernels.modulation(frames, self._begun, self._filters.sections, state)
             return means
@@ -232,7 +232,7 @@ def design_framing(values: Mapping[str, Any], rate: float) -> Framing:
     seconds = values["ams_wSizeSec"]
     size = 2 * sample_count("ams_wSizeSec", seconds * rate / 2)
     hop = sample_count("ams_hSizeSec", max(1.0, size / (seconds / values["ams_hSizeSec"])))
-    return Framing(window(values["ams_wname"], size), hop)
+    return Framing(np.abs(window(values["ams_wname"], size)), hop)  # rounding makes some ends less than 0
 
 
 def center_frequencies(values: Mapping[str, Any]) -> FloatArray:

@@ -129,7 +129,8 @@ class Gabor(Stage):
         memory.levels.drop(count)
         if memory.deviations.length != self._remembered:
             memory.deviations = memory.deviations.resized(self._remembered)
-        return memory.deviations.process(features.reshape(2 * len(made.places), count).T).T.reshape(features.shape)
+        deviations = memory.deviations.process(features.reshape(2 * len(made.places), count).T)
+        return np.ascontiguousarray(deviations.T).reshape(features.shape)
 
     def _levels(self, rates: FloatArray) -> FloatArray:
         """S (2, C, F) of rates that are not negative."""

@@ -6,42 +6,24 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
-from contextlib import AbstractContextManager
-from pathlib import Path
 from typing import Any
 
-import matplotlib.style
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 
-from rosafe.output import new_file
 from rosafe.view import estimates
+from rosafe.view.axes import frequency_axis, image, style
 from rosafe.view.representations import Representations
 
 RATEMAP_DB = 60.0  # dynamic range of the cochleagrams
-FREQUENCY_TICKS = 8
+TICKS = 8  # of a frequency axis, at most
 SIZE = (11.0, 10.0)  # inches
 DPI = 110
 
-_STYLE = {
-    "font.family": "DejaVu Sans",
-    "font.size": 9.5,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.titlesize": 10.5,
-    "axes.titlelocation": "left",
-    "axes.titleweight": "bold",
-    "axes.labelcolor": "#333333",
-    "text.color": "#222222",
-    "xtick.color": "#555555",
-    "ytick.color": "#555555",
-    "axes.edgecolor": "#999999",
-}
 # Dark enough at its top for the lines on it to stand out.
 _CORRELATION_COLOURS = LinearSegmentedColormap.from_list("correlation", ["#0c1020", "#1d3557", "#3d7a94", "#86bdb5"])
 _FROM_CORRELATION = "#ffffff"
@@ -73,7 +55,7 @@ def draw(
     """
     if len(shown.times) < 2:
         raise ValueError(f"{len(shown.times)} frames are too few for a picture")
-    with _style():
+    with style():
         figure = Figure(figsize=SIZE, dpi=DPI)
         FigureCanvasAgg(figure)
         figure.text(0.063, 0.972, title, fontsize=16, fontweight="bold", va="baseline")
@@ -97,43 +79,16 @@ def draw(
         return figure
 
 
-def save(figure: Figure, path: Path) -> None:
-    """Write the picture as PNG, in the place of one that is there; OutputError where that cannot be."""
-    with (
-        new_file(path, replace=True) as descriptor,
-        os.fdopen(descriptor, "wb", closefd=False) as stream,
-        _style(),  # some settings matter only now
-    ):
-        figure.savefig(stream, format="png", metadata={"Software": "rosAFE"})
-
-
-def _style() -> AbstractContextManager[None]:
-    """The picture's own settings, whatever the user's are."""
-    return matplotlib.style.context(["default", _STYLE])
-
-
 def _extent(shown: Representations, low: float, high: float) -> tuple[float, float, float, float]:
     hop = (shown.times[-1] - shown.times[0]) / (len(shown.times) - 1)
     return shown.times[0] - hop / 2, shown.times[-1] + hop / 2, low, high
 
 
-def _image(axes: Axes, data: np.ndarray, extent: tuple[float, float, float, float], **options: Any) -> Any:
-    return axes.imshow(data, extent=extent, origin="lower", aspect="auto", interpolation="nearest", **options)
-
-
-def _frequency_axis(axes: Axes, center_frequencies: np.ndarray) -> None:
-    """Channels at even distances, which is the ear's scale; the labels are real centre frequencies."""
-    count = len(center_frequencies)
-    ticks = np.unique(np.linspace(0, count - 1, min(count, FREQUENCY_TICKS)).round().astype(int))
-    axes.set_yticks(ticks, [f"{center_frequencies[channel]:.0f}" for channel in ticks])
-    axes.set_ylabel("centre frequency (Hz)")
-
-
-def _colour_bar(figure: Figure, image: Any, upper: Axes, lower: Axes, label: str, **options: Any) -> None:
+def _colour_bar(figure: Figure, shade: Any, upper: Axes, lower: Axes, label: str, **options: Any) -> None:
     """A colour bar at the right of one or of two rows."""
     top, bottom = upper.get_position(), lower.get_position()
     place = figure.add_axes((top.x1 + 0.010, bottom.y0, 0.011, top.y1 - bottom.y0))
-    figure.colorbar(image, cax=place, label=label, **options).outline.set_visible(False)
+    figure.colorbar(shade, cax=place, label=label, **options).outline.set_visible(False)
 
 
 def _draw_ratemaps(figure: Figure, left: Axes, right: Axes, shown: Representations) -> None:
@@ -141,19 +96,19 @@ def _draw_ratemaps(figure: Figure, left: Axes, right: Axes, shown: Representatio
     level = 10 * np.log10(np.maximum(shown.ratemap / loudest, 10 ** (-RATEMAP_DB / 10)))
     extent = _extent(shown, -0.5, len(shown.center_frequencies) - 0.5)
     for axes, name, data in ((left, "Left ear", level[0]), (right, "Right ear", level[1])):
-        image = _image(axes, data, extent, cmap="magma", vmin=-RATEMAP_DB, vmax=0)
+        shade = image(axes, data, extent, cmap="magma", vmin=-RATEMAP_DB, vmax=0)
         axes.set_title(f"{name}: ratemap")
-        _frequency_axis(axes, shown.center_frequencies)
-    _colour_bar(figure, image, left, right, "level (dB below the loudest)")
+        frequency_axis(axes, shown.center_frequencies, TICKS)
+    _colour_bar(figure, shade, left, right, "level (dB below the loudest)")
 
 
 def _draw_ild(figure: Figure, axes: Axes, shown: Representations) -> None:
     reach = float(np.clip(np.ceil(np.percentile(np.abs(shown.ild), 99) / 5) * 5, 5, 40))
     extent = _extent(shown, -0.5, len(shown.center_frequencies) - 0.5)
-    image = _image(axes, shown.ild, extent, cmap="RdBu_r", vmin=-reach, vmax=reach)
+    shade = image(axes, shown.ild, extent, cmap="RdBu_r", vmin=-reach, vmax=reach)
     axes.set_title("Interaural level difference")
-    _frequency_axis(axes, shown.center_frequencies)
-    _colour_bar(figure, image, axes, axes, "dB: < 0 left, > 0 right", extend="both")
+    frequency_axis(axes, shown.center_frequencies, TICKS)
+    _colour_bar(figure, shade, axes, axes, "dB: < 0 left, > 0 right", extend="both")
 
 
 def _draw_correlation(
@@ -163,7 +118,7 @@ def _draw_correlation(
     half = (lags[1] - lags[0]) / 2 if len(lags) > 1 else 0.5
     extent = _extent(shown, lags[0] - half, lags[-1] + half)
     low = float(np.percentile(shown.correlation, 2))
-    _image(axes, shown.correlation, extent, cmap=_CORRELATION_COLOURS, vmin=min(low, 0.99), vmax=1.0)
+    image(axes, shown.correlation, extent, cmap=_CORRELATION_COLOURS, vmin=min(low, 0.99), vmax=1.0)
     axes.set_title("Interaural cross-correlation, mean over the channels, and where the source is")
     axes.set_ylabel("lag (ms)")
     axes.set_xlabel("time (s)")

@@ -145,6 +145,12 @@ class Representation:
         return tuple(map(self.parameter, self.request_order)) or self.parameters
 
     @property
+    def outputs(self) -> dict[str, Part]:
+        """The parts by their names in a result: the kind, with the part's name where there are several."""
+        several = len(self.parts) > 1
+        return {f"{self.kind}_{part.name}" if several else self.kind: part for part in self.parts}
+
+    @property
     def task(self) -> str:
         """The component's task that its processors belong to in genom_state."""
         return self.request[:1].lower() + self.request[1:]

@@ -45,7 +45,11 @@ oo::class create ::genomix::Client {
         }
         set component [file rootname [file tail $component]]
         set description [my get [list load $component] $query]
-        set name [dict get $description name]
+        if {[catch {dict get $description name} name]
+            || [catch {dict size [dict get $description services]}] || [catch {dict size [dict get $description ports]}]
+        } {
+            ::genomix::Refuse "genomixd at $Host:$Port describes no component" ::genom::mwerr
+        }
         if {![regexp {^[A-Za-z]\w*$} $name] || $name in {genomix oo tcl zlib el}} {
             ::genomix::Refuse "load: \"$name\" cannot be the name of a component's namespace; use: as name"
         }
@@ -107,7 +111,7 @@ oo::class create ::genomix::Client {
         if {[catch {
             ::genomix::http::send $Channel $Host $Port $url
             lassign [::genomix::http::head $Channel] status headers
-            set body [::genomix::http::body $Channel $headers]
+            set body [::genomix::http::body $Channel $headers [join [lrange $words 1 2] ::]]
         } problem]} {
             my Disconnect
             ::genomix::Refuse "genomixd at $Host:$Port: $problem" ::genom::mwerr
@@ -134,9 +138,13 @@ oo::class create ::genomix::Client {
     # Send a request that the server tells us the end of; the words and query are those of the URL.
     method send {words query callback} {
         my Listen
-        set request [::genomix::Request create ::genomix::request[incr ::genomix::requests] [self] $callback]
+        set request [::genomix::Request create ::genomix::request[incr ::genomix::requests] [self] \
+            [join [lrange $words 1 2] ::] $callback]
         try {
             set status [my get $words $query]
+            if {[catch {list [dict get $status id] [dict get $status status]}]} {
+                ::genomix::Refuse "genomixd at $Host:$Port does not say what has become of it" ::genom::mwerr
+            }
         } on error {message options} {
             $request destroy
             return -options $options $message
@@ -179,13 +187,17 @@ oo::class create ::genomix::Client {
         while {$Events ne "" && ![catch {gets $Events line} length] && $length >= 0} {
             set line [encoding convertfrom utf-8 [string trimright $line \r]]
             if {$line eq ""} {
-                my TakeEvent $Event
+                if {[catch {my TakeEvent $Event}]} {
+                    my Lost
+                }
                 set Event {}
             } elseif {[regexp {^(event|data): ?(.*)$} $line -> field value]} {
                 dict set Event $field $value
             }
         }
-        if {$Events ne "" && ([catch {eof $Events} over] || $over)} {
+        if {$Events ne "" && (
+            [catch {eof $Events} over] || $over || [chan pending input $Events] > $::genomix::http::longestEvent
+        )} {
             my Lost
         }
     }
@@ -210,9 +222,10 @@ oo::class create ::genomix::Client {
         catch {close $Events}
         set Events ""
         set what "the connection to genomixd at $Host:$Port is lost"
+        set status [dict create status error exception [dict create ex ::genom::mwerr detail [dict create what $what]]]
+        set aloud 1 ;# once is enough
         foreach request [dict values $Requests] {
-            $request update [dict create status error exception \
-                [dict create ex ::genom::mwerr detail [dict create what $what]]]
+            set aloud [expr {![$request update $status $aloud] && $aloud}]
         }
     }
 }

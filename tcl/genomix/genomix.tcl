@@ -7,6 +7,7 @@
 #   puts [rosAFE::getParameters]
 #   puts [rosAFE::request ild {fb_nChannels 16}]      ;# all that the representation needs; docs/request.md
 #   set request [rosAFE::getSignals &]; $request wait; puts [$request result]
+#   rosAFE::modifyParameter ... & callback    ;# without a callback, an error that nobody looks at goes to bgerror
 #   rosAFE::GammatoneProc -h                  ;# tells parameters, types, defaults and ranges
 #
 # Errors: the message is a dict `ex ::rosAFE::e_noSuchProcessor ?detail {...}?`, the error code {GENOM ex detail}.
@@ -20,6 +21,7 @@ namespace eval ::genomix {
     variable root [file dirname [file normalize [info script]]]
     variable clients 0 ;# made so far; handles are genomix1, genomix2, ...
     variable requests 0 ;# in the background, made so far; their commands are ::genomix::request1, ...
+    variable attention 500 ;# ms in which a script may look at a failed request before its error is told
     variable private {} ;# the server that localhost started: {channel port}
 }
 

@@ -1,14 +1,19 @@
 # Requests in the background: commands that tell what has become of a request, and of its result.
 
 oo::class create ::genomix::Request {
-    # Client: the handle it went through.   Id: the server's name for it.   Status: sent, done or error.
-    # Output: the result, once it is here.   Exception: the error, as a dict.   Callback: a command prefix, or empty.
-    # Changed: written at the end and when patience ends; `wait` waits for that.
-    variable Client Id Status Output Exception Callback Changed
+    # Client: the handle it went through.   Command: what was called.   Id: the server's name for it.
+    # Status: sent, done or error.   Output: the result, once it is here.   Exception: the error, as a dict.
+    # Callback: a command prefix, or empty.   Changed: written at the end and when patience ends; `wait` waits for that.
+    # Seen: whether somebody has asked for the status since the end.   Timer: what will tell of an error, or empty.
+    variable Client Command Id Status Output Exception Callback Changed Seen Timer
 
-    constructor {client callback} {
-        lassign [list $client $callback] Client Callback
-        lassign {{} sent {} {} 0} Id Status Output Exception Changed
+    constructor {client command callback} {
+        lassign [list $client $command $callback] Client Command Callback
+        lassign {{} sent {} {} 0 0 {}} Id Status Output Exception Changed Seen Timer
+    }
+
+    destructor {
+        after cancel $Timer
     }
 
     # id
@@ -25,6 +30,7 @@ oo::class create ::genomix::Request {
         if {$Status eq "sent"} {
             $Client poll
         }
+        set Seen [expr {$Status ne "sent"}]
         return $Status
     }
 
@@ -58,7 +64,7 @@ oo::class create ::genomix::Request {
         }
         after cancel $timer
         set Changed 0
-        return $Status
+        return [my status]
     }
 
     # abort
@@ -80,13 +86,13 @@ oo::class create ::genomix::Request {
 
     # --- for the client ---
 
-    # Take what the server says.
-    method update {told} {
+    # Take what the server says. An error that nobody looks at, nor any callback, is told; 1 where that may happen.
+    method update {told {aloud 1}} {
         if {[dict exists $told id]} {
             set Id [dict get $told id]
         }
         if {$Status ne "sent" || [dict get $told status] eq "sent"} {
-            return
+            return 0
         }
         set Status [dict get $told status]
         if {$Status eq "error"} {
@@ -101,6 +107,26 @@ oo::class create ::genomix::Request {
         if {$Callback ne ""} {
             # As an event of its own: an error in it is the callback's, and goes to bgerror.
             after 0 [list {*}$Callback [self]]
+        } elseif {$aloud && $Status eq "error"} {
+            set Timer [after $::genomix::attention [namespace code {my Complain}]]
+            return 1
         }
+        return 0
+    }
+
+    # As Tcl tells of errors in the background, in one line.
+    method Complain {} {
+        if {$Seen} {
+            return
+        }
+        set ex [dict get $Exception ex]
+        set detail [expr {[dict exists $Exception detail] ? [dict get $Exception detail] : {}}]
+        set message "$Command &: $ex"
+        if {![catch {dict get $detail what} what]} {
+            append message ": $what"
+        }
+        set message [string map {\n { } \r {}} $message]
+        {*}[interp bgerror {}] $message \
+            [dict create -code 1 -level 0 -errorcode [list GENOM $ex $detail] -errorinfo $message]
     }
 }

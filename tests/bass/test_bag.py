@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from std_msgs.msg import String
 
-from rosafe.bass.sources import Source, base, open_source
+from rosafe.bass.sources import SoundSource, base, open_source
 from rosafe.interface import ComponentError
 from tests.bass import bags
 
@@ -27,16 +27,16 @@ def no_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(base.Pacer, "wait", lambda pacer, frames: 0.0)
 
 
-def open_bag(path: Path, options: str = "", rate: int = 0, chunk: int = CHUNK) -> Source:
+def open_bag(path: Path, options: str = "", rate: int = 0, chunk: int = CHUNK) -> SoundSource:
     return open_source(f"bag:{path}{options}", rate, chunk, threading.Event())
 
 
-def chunks(source: Source) -> Iterator[tuple[int, np.ndarray]]:
+def chunks(source: SoundSource) -> Iterator[tuple[int, np.ndarray]]:
     while (chunk := source.read()) is not None:
         yield chunk.gap, chunk.samples
 
 
-def play(source: Source) -> np.ndarray:
+def play(source: SoundSource) -> np.ndarray:
     """Everything, with zeros for gaps, (2, frames)."""
     return np.concatenate([np.pad(samples, ((0, 0), (gap, 0))) for gap, samples in chunks(source)], axis=1)
 

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rosafe.bass.capture import MAX_WINDOW, Capture, SlidingWindow, Snapshot, check_window
+from rosafe.bass.capture import MAX_WINDOW, AudioWindow, Capture, Snapshot, check_window
 from rosafe.bass.sources import Chunk
 from rosafe.interface import ComponentError
 
@@ -18,7 +18,7 @@ from rosafe.interface import ComponentError
 @settings(max_examples=100, deadline=None)
 @given(st.integers(1, 50), st.lists(st.tuples(st.integers(0, 120), st.integers(0, 80)), max_size=30))
 def test_window_is_the_tail_of_the_stream(frames: int, steps: list[tuple[int, int]]) -> None:
-    window = SlidingWindow(frames)
+    window = AudioWindow(frames)
     stream = np.zeros((2, frames), np.int32)
     kept = []
     for count, gap in steps:

@@ -17,7 +17,7 @@ import soundfile
 from rosafe.bass.recording import outputs
 from rosafe.bass.recording.levels import Levels
 from rosafe.bass.recording.outputs import BagFile, WavFile
-from rosafe.bass.recording.recorder import Recorder
+from rosafe.bass.recording.recorder import SoundRecorder
 from rosafe.bass.sources import base, open_source
 from rosafe.bass.sources.base import Chunk
 from rosafe.sound.audiofile import AudioFile
@@ -210,7 +210,7 @@ class Scripted:
 def record(path: Path | None, script: list[tuple[int, int]], frames: int | None = None) -> tuple[Any, list[str], bool]:
     reports: list[str] = []
     output = WavFile(empty(path), RATE) if path else None
-    recorder = Recorder(Scripted(script), output, frames, lambda samples, lost: None, reports.append)
+    recorder = SoundRecorder(Scripted(script), output, frames, lambda samples, lost: None, reports.append)
     ended = recorder.run(threading.Event())
     if output:
         output.close()

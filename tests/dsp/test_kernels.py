@@ -14,13 +14,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rosafe.dsp import kernels
+from rosafe.dsp.framing import FrameBuffer, Framing
 from rosafe.dsp.gammatone import GammatoneBank
 from rosafe.dsp.guard import LIMIT
 from rosafe.dsp.kernels import build
 from rosafe.dsp.signal import Signal
 from rosafe.dsp.stage import Stage
 from rosafe.dsp.windows import NAMES
-from rosafe.representations import STAGES
+from rosafe.representations import STAGES, precedence
+from rosafe.representations.amsfeatures import AmsFeatures
 from rosafe.representations.crosscorrelation import CrossCorrelation
 from rosafe.representations.haircell import METHODS, InnerHairCell
 from rosafe.representations.ild import Ild
@@ -254,8 +256,144 @@ def test_autocorrelation_of_long_windows(level: int, size: int, exponent: float)
 
 
 @each_level
+@given(
+    parameters=framing("ams"),
+    ratio=st.integers(1, 9),
+    centres=st.lists(st.floats(0.5, 400), min_size=1, max_size=35),
+    channels=st.integers(1, 6),
+    sizes=block_sizes,
+)
+@settings(max_examples=40, deadline=None, database=None)
+def test_modulation(
+    level: int, parameters: dict[str, Any], ratio: int, centres: list[float], channels: int, sizes: list[int]
+) -> None:
+    parameters = {**parameters, "ams_dsRatio": ratio, "ams_cfHz": centres}
+    parameters["ams_wSizeSec"] *= ratio
+    parameters["ams_hSizeSec"] *= ratio
+    check(level, "amsFeatures", parameters, cut(signal(channels, sum(sizes) + 3000), [*sizes, 900]))
+
+
+@each_level
+@given(parameters=framing("prec"), channels=st.integers(1, 11), sizes=block_sizes, parts=st.integers(1, 3))
+@settings(max_examples=30, deadline=None, database=None)
+def test_windowed_frames(level: int, parameters: dict[str, Any], channels: int, sizes: list[int], parts: int) -> None:
+    """Of some frames after the other, those that lie in the history, in the block and in both."""
+    window = np.random.default_rng(0).standard_normal(round(parameters["prec_wSizeSec"] * RATE))
+    framing = Framing(window, round(parameters["prec_hSizeSec"] * RATE))
+    buffer, rest = FrameBuffer(), FrameBuffer()
+    for block in cut(signal(channels, sum(sizes) + 900), [*sizes, 300]):
+        wanted = framing.frames(rest.append(block))
+        count = wanted.shape[-2]
+        rest.drop(count * framing.hop)
+        buffer.begin(block.shape[:-1])
+        skip = buffer.skip
+        history, room = buffer.advance(block.shape[-1], count * framing.hop)
+        frames = kernels.Frames(history, np.ascontiguousarray(block), room, skip, window, framing.hop, count)
+        batch = max(1, count // parts)
+        for first in range(0, count, batch):
+            number = min(batch, count - first)
+            got, expected = (kernels.Windowed.room(number, channels, len(window)) for _ in range(2))
+            with using(level):
+                kernels.windowed(frames.part(first, number), got)
+            precedence.windowed(wanted[:, :, first : first + number], window, expected)
+            for mine, theirs in zip(got, expected, strict=True):
+                agree([mine], [theirs])
+        frames.keep()
+
+
+@each_level
+@given(channels=st.integers(1, 11), frames=st.integers(1, 4), half=st.integers(1, 200), power=st.integers(2, 10))
+@settings(max_examples=40, deadline=None, database=None)
+def test_summed_spectra(level: int, channels: int, frames: int, half: int, power: int) -> None:
+    """Of any number of points that holds the samples, half of them or more; on goes what had been summed."""
+    points = max(1 << power, 1 << (2 * half - 1).bit_length())
+    rng = np.random.default_rng(half)
+    gains, sums = rng.random(channels), {}
+    for choice in (TWINS, level):
+        running = precedence.Running()
+        running.begin(np.full(channels, 500.0), points // 2 + 1, 1)
+        rng, made = np.random.default_rng(half), []
+        with using(choice):
+            add = precedence.add_spectra if choice == TWINS else kernels.add_spectra
+            for _ in range(2):
+                samples = rng.standard_normal((frames, 2, channels, 2 * half)) * 10 ** rng.uniform(-3, 3)
+                factors = np.where(rng.random((frames, 2, channels)) < 0.3, 0, rng.random((frames, 2, channels)))
+                made.append(add(samples, points, gains, factors, running.power).T)
+        rows = np.arange(2 * channels)
+        made.append(running.power[rows // kernels.TOGETHER, :, rows % kernels.TOGETHER].T)
+        sums[choice] = made
+    for got, expected in zip(sums[level], sums[TWINS], strict=True):
+        agree([got], [expected])
+
+
+@each_level
+@given(
+    rows=st.integers(1, 11),
+    frames=st.integers(1, 4),
+    size=st.one_of(st.integers(1, 40), st.integers(900, 1200)),
+    reach=st.one_of(st.integers(1, 9), st.sampled_from([45, 200, 511])),
+    alike=st.booleans(),
+    seed=st.integers(0, 1000),
+)
+@settings(max_examples=60, deadline=None, database=None)
+def test_correlations_of_filtered_frames(
+    level: int, rows: int, frames: int, size: int, reach: int, alike: bool, seed: int
+) -> None:
+    """Filters of both ways to clean, with delays up to more than a frame; some have no echo to take out."""
+    rng = np.random.default_rng(seed)
+    ears: list[tuple[FloatArray, kernels.Taps]] = []
+    made = {}
+    for _ in range(2):
+        shape = (frames, 1 if alike else rows)
+        delays = rng.integers(1, size + 20, shape)[..., np.newaxis]
+        large = rng.random((*shape, 1)) < 0.5
+        shifts = np.where(large, np.arange(6) - 6, np.arange(6)) * delays
+        values = np.where(rng.random((*shape, 6)) < 0.2, 0.0, rng.standard_normal((*shape, 6)))
+        samples = rng.standard_normal((frames, 2, rows, size))[:, 0]  # rows that do not lie one behind the other
+        ears.append((samples, kernels.Taps(shifts, values)))
+    for choice in (TWINS, level):
+        with using(choice):
+            correlate = precedence.correlate_filtered if choice == TWINS else kernels.correlate_filtered
+            made[choice] = correlate(*ears[0], *ears[1], reach)
+    for got, expected in zip(made[level], made[TWINS], strict=True):
+        agree([got], [expected], least=1.0)  # what the twin's rounding leaves of a 0 is of the size of energies
+
+
+@each_level
+@pytest.mark.parametrize("parameters", [{}, {"prec_maxDelaySec": 0.1}, {"prec_wSizeSec": 0.7}], ids=str)
+def test_precedence(level: int, parameters: dict[str, Any]) -> None:
+    """Also with more lags, or more points of a transform, than the kernels have."""
+    x = np.random.default_rng(1).standard_normal((2, 9, 16000))
+    x[1] += np.roll(x[0], 5, axis=-1)
+    made = {}
+    for turns in ([TWINS], [level], [level, TWINS, TWINS, level]):
+        stage, blocks = STAGES["precedence"](RATE, **parameters), cut(x, [3000, 1, 200])
+        parts = []
+        for block, choice in zip(blocks, turns * len(blocks), strict=False):
+            with using(choice):
+                parts.append(stage.process(np.ascontiguousarray(block)))
+        made[len(turns), turns[0]] = [np.concatenate(part, axis=-1) for part in zip(*parts, strict=True)]
+    expected = made.pop((1, TWINS))
+    assert expected[0].shape[-1] > 20
+    for got in made.values():
+        for mine, theirs in zip(got, expected, strict=True):
+            agree([mine], [theirs])
+
+
+@each_level
+@given(channels=st.integers(1, 11), sizes=st.lists(st.integers(0, 40), min_size=1, max_size=6))
+@settings(max_examples=20, deadline=None, database=None)
+def test_gabor(level: int, channels: int, sizes: list[int]) -> None:
+    """The patterns; what is made of these is the same code. Values of a few standard deviations: see the levels."""
+    rng = np.random.default_rng(channels)
+    rates = 10.0 ** rng.uniform(-3, 0, (2, channels, sum(sizes) + 60))
+    check(level, "gabor", {}, cut(rates, [*sizes, 23]), Signal(44100.0, 100.0, True, 441, 882))
+
+
+@each_level
 @pytest.mark.parametrize(
-    "kind", ["gammatone", "ihc", "ild", "ratemap", "crossCorrelation", "adaptation", "autocorrelation"]
+    "kind",
+    ["gammatone", "ihc", "ild", "ratemap", "crossCorrelation", "adaptation", "autocorrelation", "amsFeatures"],
 )
 @pytest.mark.parametrize("value", [1e300, LIMIT, 1e-160, 5e-324])
 def test_far_beyond_sound(level: int, kind: str, value: float) -> None:
@@ -273,7 +411,7 @@ def test_far_beyond_sound(level: int, kind: str, value: float) -> None:
 @each_level
 def test_changes_between_blocks(level: int) -> None:
     """A new window takes what was held; the sums of frames that had begun are then of the new window."""
-    for stage_class, prefix in ((Ild, "ild"), (Ratemap, "rm"), (CrossCorrelation, "cc")):
+    for stage_class, prefix in ((Ild, "ild"), (Ratemap, "rm"), (CrossCorrelation, "cc"), (AmsFeatures, "ams")):
         made = {}
         for choice in (TWINS, level):
             stage = stage_class(RATE)

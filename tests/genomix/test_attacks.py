@@ -79,6 +79,32 @@ def test_a_crowd_keeps_nobody_out(world: World, crowd: Crowd) -> None:
     harness.wait_for(lambda: open_files(pid) <= most, SOON, lambda: f"{open_files(pid)} files, {files} before")
 
 
+def test_a_client_that_was_idle_meanwhile_goes_on(world: World) -> None:
+    """Its connection goes for others, and it makes a new one; the one on which it hears of events stays."""
+    go = world.graph.home / "go"
+    script = world.graph.home / "idle.tcl"
+    script.write_text(f"""
+        package require genomix
+        set g [genomix::connect 127.0.0.1:{world.port}]
+        $g load bass
+        set request [bass::Acquire scene: &]
+        while {{[$request wait 100] eq "sent" && [dict get [bass::Audio] Audio lastFrameIndex] == 0}} continue
+        puts ready
+        flush stdout
+        while {{![file exists {go}]}} {{after 20}}
+        bass::Stop
+        puts [$request wait]
+    """)
+    with world.graph.start("tclsh", str(script)) as client:
+        harness.wait_for(lambda: "ready" in client.out, 30, lambda: repr(client))
+        with attacks.half_requests(world.port):
+            go.touch()
+            assert client.wait(30) == 0
+        assert client.out.split() == ["ready", "done"]
+    told = world.server.err.count("as many clients are connected as may be, now from loopback")
+    assert 1 <= told < 10  # once a minute
+
+
 def test_answers_that_nobody_reads_stop_the_requests(world: World) -> None:
     memory = resident(world.server.pid)
     with attacks.pipelined(world.port) as sent:

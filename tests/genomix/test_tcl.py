@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import subprocess
 
 import pytest
@@ -9,6 +10,7 @@ import pytest
 from tests import harness
 from tests.genomix import world as worlds
 from tests.genomix.world import World
+from tests.terminal import Terminal
 
 pytestmark = pytest.mark.ros
 
@@ -582,3 +584,101 @@ def test_slips_of_the_guide_are_accepted(world: World) -> None:
         "0",
         'invalid command name "::"',
     ]
+
+
+# --- what a person is told --------------------------------------------------------------------------------------
+
+
+def test_an_answer_that_takes_long_is_told_on_a_terminal(world: World) -> None:
+    """A line that comes and goes; in a pipe there is none."""
+    script = world.graph.home / "long.tcl"
+    script.write_text(
+        f"""
+        package require genomix
+        set g [genomix::connect 127.0.0.1:{world.port}]
+        $g load rosAFE
+        foreach ::genomix::http::patience {{0 100000}} {{
+            set port [rosAFE::gammatonePort gammatone]
+            puts "got [dict get $port gammatonePort numberOfChannels]"
+        }}
+        """,
+        "utf-8",
+    )
+    world.tcl(TREE)
+    with Terminal(["tclsh", str(script)], world.graph.env) as terminal:
+        shown = terminal.expect("got 4")
+        assert re.search(r"rosAFE::gammatonePort: \d+\.\d MB in \d s", shown)
+        assert "\r\x1b[Kgot 4" in terminal.sent.replace("\r\n", "\n")  # it is gone
+        assert "MB" not in terminal.expect("got 4")
+        assert terminal.end() == 0
+    done = world.graph.run("tclsh", str(script))
+    assert (done.stdout.split(), done.stderr) == (["got", "4"] * 2, "")
+
+
+def test_errors_in_the_background_are_told_in_one_line(world: World) -> None:
+    """Those that nobody looks at, once; in the way that a script has for all errors in the background."""
+    script = (
+        LOAD
+        + """
+        set change {nameProc nobody nameParam x newValue 1}
+        proc pass {ms} {after $ms {set ::past 1}; vwait ::past}
+        rosAFE::modifyParameter $change &
+        rosAFE::preProcPort dummyName &
+        bass::Stop &
+        pass 1500
+        # Who looks is told nothing more.
+        set r [rosAFE::modifyParameter $change &]
+        show [$r wait]
+        set r [rosAFE::modifyParameter $change &]
+        while {[$r status] eq "sent"} {update; after 10}
+        show [rosAFE::modifyParameter -ack $change] [catch {rosAFE::modifyParameter $change}]
+        show [::genomix::request6 status]
+        set r [rosAFE::modifyParameter $change & list]
+        set r [rosAFE::modifyParameter $change &]
+        $r wait 0
+        $r clean
+        pass 1500
+        proc bgerror {message} {show $message $::errorInfo $::errorCode; set ::told 1}
+        rosAFE::modifyParameter $change &
+        vwait told
+        pass 1000
+    """
+    )
+    done = world.tcl(script)
+    ex = "::rosAFE::e_noSuchProcessor"
+    message = f"rosAFE::modifyParameter &: {ex}"
+    assert done.stdout.splitlines() == [
+        "error",
+        "::genomix::request6|1",
+        "error",
+        f"{message}|{message}|GENOM {ex} {{}}",
+    ]
+    missing = "preProcPort has no element 'dummyName'; there are: none"
+    assert sorted(done.stderr.splitlines()) == [message, f"rosAFE::preProcPort &: ::genom::no_such_outport: {missing}"]
+
+
+def test_a_lost_server_is_told_once(world: World) -> None:
+    with worlds.genomixd(world.graph) as (server, port):
+        script = world.graph.home / "lost.tcl"
+        script.write_text(f"""
+            package require genomix
+            set g [genomix::connect 127.0.0.1:{port}]
+            $g load bass
+            $g load rosAFE
+            rosAFE::connect_port Audio bass/Audio
+            bass::Acquire -ack scene:
+            rosAFE::InputProc -ack {{}}
+            rosAFE::PreProc -ack {{}} & list
+            puts ready
+            flush stdout
+            after 30000 {{set past 1}}
+            proc bgerror {{message}} {{puts $message; after 1000 {{set ::past 1}}}}
+            vwait past
+        """)
+        with world.graph.start("tclsh", str(script)) as client:
+            harness.wait_for(lambda: "ready" in client.out, what=lambda: repr(client))
+            server.stop()
+            assert client.wait(40) == 0
+            told = f"::genom::mwerr: the connection to genomixd at 127.0.0.1:{port} is lost"
+            assert client.out.splitlines() == ["ready", f"bass::Acquire &: {told}"]
+            assert client.err == ""

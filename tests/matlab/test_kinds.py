@@ -92,6 +92,10 @@ def test_every_representation_comes_as_its_port_gives_it_out(world: World, sound
                 cellfun(@(signal) signal.Channel, sOut, 'UniformOutput', false), ...
                 cellfun(@(signal) signal.Name, sOut, 'UniformOutput', false)});
         end
+        for word = words
+            mObj.addProcessor(word{1}, par);
+        end
+        show('counts', structfun(@numel, mObj.Processors)); % nothing is there twice
         processors = rosAFE.getProcessors();
         processors = processors.result.processors(:).';
         full = @(processor) size(dObj.(processor.kind){1}.Data, 1) >= 0.3 * processor.rate;
@@ -134,6 +138,7 @@ def test_every_representation_comes_as_its_port_gives_it_out(world: World, sound
     )
     kinds = {kind.word: kind for kind in KINDS.values()}
     assert told["words"] == [*kinds, "zeroCrossings"]
+    assert told["counts"] == [1] * (len(kinds) + 1)
     for word, kind in kinds.items():
         label, classes, channels, names = told[f"of {word}"]
         assert label == f"{word}_0"

@@ -78,6 +78,33 @@ def test_the_manager_of_the_page(world: World) -> None:
     assert not world.http.call("rosAFE/getParameters")["parameters"]["preProc"]
 
 
+def test_pitch_and_modulations_of_the_page(world: World) -> None:
+    told = octave.shown(
+        world,
+        blocks(DOCUMENT)[3]
+        + """
+        show('kinds', {columns(hertz), isequal(class(dObj.amsFeatures{1}), 'ModulationSignal')});
+        show('changed', {mObj.Processors.pitch{1}.pi_confThres, mObj.Processors.pitch{1}.pi_rangeHz});
+        while isempty(dObj.amsFeatures{1}.Data)
+            mObj.processChunk();
+        end
+        show('size', size(dObj.amsFeatures{2}.Data)(2:3));
+        part = struct('data', []);
+        while isempty(part.data)
+            r = rosAFE.getRepresentation('-m', 'pitch_0');
+            part = r.result.parts{1};
+        end
+        frames = reshape(part.data, flipud(part.shape).'); % as the page says: time first, then features, then ears
+        right = part.data(4 * part.shape(3) + 1:end); % row-major: the right ear's rawPitch and confidence
+        show('frames', [size(frames) - flipud(part.shape).', isequaln(frames(:, 2:3, 2)(:), right)]);
+        """,
+    )
+    assert told["kinds"] == [1, True]
+    assert told["changed"] == [0.5, [80, 300]]
+    assert told["size"] == [31, 9]
+    assert told["frames"] == [0, 0, 0, 1]
+
+
 def test_the_block_of_the_readme(world: World) -> None:
     (block,) = blocks(harness.ROOT / "README.md")
     told = octave.shown(world, block.replace("pause(2)", "pause(0.5)") + "\nshow('size', size(out.ildPort.left))")

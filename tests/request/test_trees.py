@@ -45,6 +45,11 @@ def build(model: Model, representation: str, **parameters: Any) -> dict[str, Any
     return asyncio.run(trees.build(model, {"representation": representation, **parameters}))
 
 
+def find(model: Model, representation: str, **parameters: Any) -> dict[str, Any]:
+    """What there is of it."""
+    return asyncio.run(trees.find(model, {"representation": representation, **parameters}))
+
+
 def in_force(kind: str, parameters: Mapping[str, Any]) -> dict[str, Any]:
     """What a processor made with these tells of itself."""
     return stage(kind, parameters).parameters
@@ -173,6 +178,25 @@ def test_names_are_those_of_the_original_client() -> None:
         "inputProcPort",
         "/rosAFE/inputProcPort",
     )
+
+
+@pytest.mark.parametrize("word", REPRESENTATIONS)
+def test_what_is_there_is_used_again_and_found(word: str) -> None:
+    """Also where the processor tells of other values in force than it was asked for."""
+    model = Model()
+    with pytest.raises(ComponentError, match="missing: InputProc") as missing:
+        find(model, word)
+    assert missing.value.ex == "::rosAFE::e_noSuchProcessor" and not model.processors
+    told = build(model, word)
+    again = {**told, "created": [], "reused": told["created"]}
+    assert build(model, word) == find(model, word) == again
+    calls = model.calls[:]
+    if word not in ("input", "time"):
+        with pytest.raises(ComponentError, match="missing: GammatoneProc"):
+            find(model, word, fb_nChannels=7)
+        assert model.calls == [*calls, "getProcessors"]
+    with pytest.raises(ComponentError, match="which modifyParameter changes for all"):
+        find(model, word, in_doNormalize=False)
 
 
 def test_every_name_of_a_representation() -> None:

@@ -68,7 +68,17 @@ class Target:
     # --- how it is ---
 
     def assert_well(self) -> None:
-        """Whoever comes now is served at once: a service call, a subscriber, and the master or a tool."""
+        """Whoever comes now is served at once: a service call, the master or a tool, and a subscriber.
+
+        Up to three tries, for the machine may be busy just now.
+        """
+        for _ in range(3):
+            took = self._ask()
+            if max(took) < WELL_SECONDS:
+                return
+        raise AssertionError(f"service, XML-RPC, topic: {took} s; {self.process}")
+
+    def _ask(self) -> tuple[float, float, float]:
         begin = time.monotonic()
         self.graph.call(f"/{self.name}/abort_activity", activity=2**32 - 1)
         called = time.monotonic()
@@ -76,9 +86,7 @@ class Target:
         assert node.getPid("/test")[2] == self.process.pid
         asked = time.monotonic()
         self.graph.message(f"/{self.name}/genom_state", self._state)
-        seen = time.monotonic()
-        took = called - begin, asked - called, seen - asked
-        assert max(took) < WELL_SECONDS, f"service, XML-RPC, topic: {took} s; {self.process}"
+        return called - begin, asked - called, time.monotonic() - asked
 
     @property
     def descriptors(self) -> int:

@@ -22,9 +22,10 @@ from std_msgs.msg import Header, String
 
 import bass.msg
 from rosafe.component import door
+from rosafe.component.audio import MAX_WINDOW
 from tests.harness import PATIENCE, PYTHON, Graph, proc, python_path, wait_for
 from tests.ros.attacker import HUGE, FakePublisher, Target, closed, length, pour, publisher_header
-from tests.ros.session import Session, own_node
+from tests.ros.session import Session, noise, own_node
 
 PORTS = ("TCPROS", "XML-RPC")
 
@@ -355,6 +356,18 @@ def test_lists_of_publishers_that_are_not_there_cost_little(afe: tuple[Session, 
         another = session.listen()
         wait_for(lambda: another.heard)
         assert target.threads < threads + 20
+
+
+def test_a_window_that_is_a_little_too_long_is_refused_and_the_stream_goes_on(afe: tuple[Session, Target]) -> None:
+    session, _ = afe
+    microphone = session.listen()
+    wait_for(lambda: microphone.heard, 20)
+    before = int(session.health(lambda entries: int(entries["messages"]) > 0)["messages"])
+    microphone.publish_bytes(bytes(20) + 2 * (length(MAX_WINDOW + 1) + bytes(4 * (MAX_WINDOW + 1))) + bytes(8))
+    wait_for(lambda: session.health(lambda entries: entries["refused"] == "1"), 30)
+    microphone.play(noise(400))
+    health = session.health(lambda entries: int(entries["messages"]) >= before + 2)
+    assert health["refused"] == "1" and microphone.heard
 
 
 LISTENING = """

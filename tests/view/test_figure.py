@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from rosafe.bass.sources.scene import scene_azimuth
 from rosafe.output import OutputError
 from rosafe.view import estimates, figure
+from rosafe.view.axes import save
 from rosafe.view.representations import Representations
 from tests.view.conftest import WALK, represented
 
@@ -32,7 +33,7 @@ def axes_with(drawing: Figure, words: str) -> Axes:
 def test_picture_of_the_scene(walk: Representations, tmp_path: Path) -> None:
     drawing = figure.draw(walk, "A walk", "three seconds", lambda times: scene_azimuth(times, WALK))
     path = tmp_path / "walk.png"
-    figure.save(drawing, path)
+    save(drawing, path)
     image = pixels(path)
     assert image.shape[0] > 800 and image.shape[1] > 1000
     assert len(np.unique((image * 255).astype(np.uint8).reshape(-1, 3), axis=0)) > 500
@@ -77,7 +78,7 @@ def test_lines_lie_at_the_estimated_lags(walk: Representations) -> None:
 
 
 def test_silence_makes_a_picture_too(tmp_path: Path) -> None:
-    figure.save(figure.draw(represented(np.zeros((2, 16000)), 16000), "nothing"), tmp_path / "silence.png")
+    save(figure.draw(represented(np.zeros((2, 16000)), 16000), "nothing"), tmp_path / "silence.png")
     assert pixels(tmp_path / "silence.png").shape[2] == 3
 
 
@@ -92,7 +93,7 @@ def test_any_number_of_channels(channels: int, tmp_path: Path) -> None:
         np.zeros((channels, count)),
         np.random.default_rng(1).random((37, count)),
     )
-    figure.save(figure.draw(shown, "x"), tmp_path / "x.png")
+    save(figure.draw(shown, "x"), tmp_path / "x.png")
 
 
 def test_too_few_frames_are_refused(walk: Representations) -> None:
@@ -112,19 +113,19 @@ def test_failed_save_leaves_the_old_picture(
 
     monkeypatch.setattr(drawing, "savefig", full)
     with pytest.raises(OutputError, match="No space"):
-        figure.save(drawing, path)
+        save(drawing, path)
     assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
 
 
 def test_saved_picture_has_the_rights_of_any_new_file(walk: Representations, tmp_path: Path) -> None:
-    figure.save(figure.draw(walk.tail(0.5), ""), tmp_path / "a.png")
+    save(figure.draw(walk.tail(0.5), ""), tmp_path / "a.png")
     (tmp_path / "b").touch()
     assert (tmp_path / "a.png").stat().st_mode == (tmp_path / "b").stat().st_mode
 
 
 def test_users_settings_of_matplotlib_do_not_change_it(walk: Representations, tmp_path: Path) -> None:
     def png() -> bytes:
-        figure.save(figure.draw(walk.tail(0.5), "x"), tmp_path / "x.png")
+        save(figure.draw(walk.tail(0.5), "x"), tmp_path / "x.png")
         return (tmp_path / "x.png").read_bytes()
 
     plain = png()

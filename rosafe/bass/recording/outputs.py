@@ -8,7 +8,7 @@ from typing import IO, Protocol
 
 import numpy as np
 
-from rosafe.bass.capture import SlidingWindow
+from rosafe.bass.capture import AudioWindow
 
 HEADER_SECONDS = 1.0  # of sound; that much of a WAV is lost at most where the process is killed
 RIFF_LIMIT = 2**32 - 1  # bytes of a WAV; what is longer becomes an RF64
@@ -131,7 +131,7 @@ class BagFile:
         self._held = 0  # frames of the window that are of this recording
         self._time_ns = 0  # when the newest one was acquired
         self._message_class = wire.message_class("bass", BASS.port("Audio").idl)
-        self._window = SlidingWindow(BAG_CHUNKS * frames_per_chunk)
+        self._window = AudioWindow(BAG_CHUNKS * frames_per_chunk)
         self._bag = rosbag.Bag(os.fdopen(descriptor, "w+b", closefd=False), "w")
 
     def write(self, samples: np.ndarray, time_ns: int) -> None:

@@ -9,16 +9,16 @@ import numpy as np
 
 from rosafe.bass.recording.levels import Levels
 from rosafe.bass.recording.outputs import Output
-from rosafe.bass.sources import Source
+from rosafe.bass.sources import SoundSource
 from rosafe.bass.sources.base import loss_text, wall_time_ns
 
 
-class Recorder:
+class SoundRecorder:
     """One recording.
 
     Parameters
     ----------
-    source : Source
+    source : SoundSource
         Open; it stays the caller's to close.
     output : Output or None
         Where the sound goes.
@@ -41,7 +41,7 @@ class Recorder:
 
     def __init__(
         self,
-        source: Source,
+        source: SoundSource,
         output: Output | None,
         frames: int | None,
         show: Callable[[np.ndarray, int], None],

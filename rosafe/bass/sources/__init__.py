@@ -6,9 +6,9 @@ import re
 import threading
 from collections.abc import Iterator
 
-from rosafe.bass.sources.base import Chunk, Source, device_error
+from rosafe.bass.sources.base import Chunk, SoundSource, device_error
 
-__all__ = ["Chunk", "Source", "device_lines", "open_source"]
+__all__ = ["Chunk", "SoundSource", "device_lines", "open_source"]
 
 DEFAULT_RATE = 44100
 _CONTROL = re.compile("[\0-\x1f\x7f-\x9f\u2028\u2029]")  # would make several lines of a line in the log
@@ -33,7 +33,7 @@ def device_lines() -> Iterator[str]:
         yield f"hw:{card},{device} [{card_id}] [{pcm_id}]"
 
 
-def open_source(device: str, sample_rate: int, frames_per_chunk: int, stopping: threading.Event) -> Source:
+def open_source(device: str, sample_rate: int, frames_per_chunk: int, stopping: threading.Event) -> SoundSource:
     """Open `device` for reading.
 
     Parameters
@@ -44,7 +44,7 @@ def open_source(device: str, sample_rate: int, frames_per_chunk: int, stopping: 
     sample_rate : int
         Hz; 0 is the file's or bag's own rate, or 44100 with other sources.
     frames_per_chunk : int
-        Length of what `Source.read` returns.
+        Length of what `SoundSource.read` returns.
     stopping : threading.Event
         Once set, a waiting `read` returns None.
 

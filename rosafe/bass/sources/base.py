@@ -35,7 +35,7 @@ def loss_text(frames: int, index: int, sample_rate: int) -> str:
     return f"lost {frames} frames ({frames / sample_rate:.3f} s) after frame {index} ({index / sample_rate:.2f} s)"
 
 
-class Source(Protocol):
+class SoundSource(Protocol):
     """Something to read sound from, already open."""
 
     name: str

@@ -1,0 +1,157 @@
+"""The Tcl and Octave clients before a server that is no genomixd, or one that lies: an error, at once."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import struct
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from rosafe.genomix import packed
+from tests import harness
+from tests.matlab import octave
+
+OK = b"HTTP/1.1 200 OK\r\n"
+CHUNKED = OK + b"Transfer-Encoding: chunked\r\n\r\n"
+ENDLESS = 64 * 2**20  # bytes that are sent where a client reads on and on
+
+
+class Stranger:
+    """A server that gives every request the same answer, and closes the connection."""
+
+    def __init__(self, answer: bytes, endless: bytes = b"") -> None:
+        self._answer, self._endless = answer, endless
+        self._socket = socket.create_server(("127.0.0.1", 0))
+        self.port = int(self._socket.getsockname()[1])
+        self.swallowed = 0  # bytes of what has no end that the client took
+        self._thread = threading.Thread(target=self._serve, daemon=True)
+        self._thread.start()
+
+    def _serve(self) -> None:
+        while True:
+            try:
+                connection, _ = self._socket.accept()
+            except OSError:
+                return
+            with connection, contextlib.suppress(OSError):
+                connection.settimeout(30)
+                connection.recv(65536)
+                connection.sendall(self._answer)
+                block = self._endless * (65536 // max(1, len(self._endless)))
+                while block and self.swallowed < ENDLESS:
+                    connection.sendall(block)
+                    self.swallowed += len(block)
+
+    def close(self) -> None:
+        # shutdown ends an accept that waits; close alone does not
+        with contextlib.suppress(OSError):
+            self._socket.shutdown(socket.SHUT_RDWR)
+        self._socket.close()
+        self._thread.join(40)
+
+
+@contextlib.contextmanager
+def stranger(answer: bytes, endless: bytes = b"") -> Iterator[Stranger]:
+    """A server for the time of the block."""
+    server = Stranger(answer, endless)
+    try:
+        yield server
+    finally:
+        server.close()
+
+
+def length(told: object, body: bytes = b"abc") -> bytes:
+    return OK + f"Content-Length: {told}\r\n\r\n".encode() + body
+
+
+LIES = {
+    "silence": (b"", b""),
+    "ssh": (b"SSH-2.0-OpenSSH_9.2\r\n", b""),
+    "too long": (length(10**9), b""),
+    "far too long": (length(10**30), b""),
+    "negative": (length(-5), b""),
+    "no number": (length("abc"), b""),
+    "no length": (OK + b"\r\nabc", b""),
+    "large chunk": (CHUNKED + b"ffffffff\r\nabc", b""),
+    "larger chunk": (CHUNKED + b"fffffffffffffffff\r\nabc", b""),
+    "negative chunk": (CHUNKED + b"-5\r\nabc", b""),
+    "no chunk": (CHUNKED + b"zz\r\nabc", b""),
+    "half a chunk": (CHUNKED + b"5\r\nabc", b""),
+    "no last chunk": (CHUNKED + b"3\r\nabc\r\n", b""),
+    "cut head": (b"HTTP/1.1 200 OK\r\nContent-Le", b""),
+    "endless line": (b"", b"x"),
+    "endless header": (OK + b"X: ", b"x"),
+    "endless headers": (OK, b"X: y\r\n"),
+    "endless chunk line": (CHUNKED, b"0"),
+}
+
+
+@pytest.mark.parametrize("lie", LIES)
+def test_tcl(lie: str, tmp_path: Path) -> None:
+    with stranger(*LIES[lie]) as server:
+        script = tmp_path / "script.tcl"
+        script.write_text(f"""
+            package require genomix
+            puts [catch {{genomix::connect 127.0.0.1:{server.port}}} message options]
+            puts [dict get $options -errorcode]
+        """)
+        graph = harness.Graph("http://127.0.0.1:9", tmp_path)
+        failed, code = graph.run("tclsh", str(script)).stdout.splitlines()
+        assert failed == "1"
+        assert code.startswith(f"GENOM ::genom::mwerr {{what {{genomixd at 127.0.0.1:{server.port}: ")
+    assert server.swallowed < ENDLESS / 4  # some is in the kernel
+
+
+@pytest.mark.parametrize(
+    ("body", "told"),
+    [
+        (b"unbalanced {", "describes no component"),
+        (b"name", "describes no component"),
+        (b"name x services y", "describes no component"),
+        (b"name x services {a {}} ports {b", "describes no component"),
+        (b"name {a b} services {} ports {}", "cannot be the name"),
+        (b"name ::oo services {} ports {}", "cannot be the name"),
+    ],
+)
+def test_tcl_is_told_nonsense(body: bytes, told: str, tmp_path: Path) -> None:
+    with stranger(length(len(body), body)) as server:
+        script = tmp_path / "script.tcl"
+        script.write_text(f"""
+            package require genomix
+            set g [genomix::connect 127.0.0.1:{server.port}]
+            catch {{$g load rosAFE}} message options
+            puts [lindex [dict get $options -errorcode] 0]$message
+        """)
+        shown = harness.Graph("http://127.0.0.1:9", tmp_path).run("tclsh", str(script)).stdout
+        assert shown.startswith("GENOM") and told in shown
+
+
+STRANGE = {
+    "web page": b"<html>hello</html>",
+    "52 bytes": packed.SIGNAL
+    + struct.pack("<I", 3)
+    + b"".join(packed.text(name) + struct.pack("<I", size) for name, size in (("a", 2**32 - 1), ("b", 1), ("c", 0))),
+    "cut": packed.plain({"name": "rosAFE"})[:-3],
+    "number": packed.plain(7),
+    "other structure": packed.plain({"a": 1}),
+    "no structures": packed.plain({"name": "x", "instance": "x", "services": 1, "ports": 2}),
+}
+
+
+@pytest.mark.ros
+def test_octave(tmp_path: Path) -> None:
+    with contextlib.ExitStack() as stack:
+        servers = {name: stack.enter_context(stranger(length(len(body), body))) for name, body in STRANGE.items()}
+        script = "".join(
+            f"show('{name}', message(@() genomix.client('127.0.0.1:{server.port}').load('rosAFE')));\n"
+            for name, server in servers.items()
+        )
+        graph = harness.Graph("http://127.0.0.1:9", tmp_path)
+        told = octave.values(graph.run(*octave.command(tmp_path, script), timeout=60, LANG="C.UTF-8").stdout)
+    assert list(told) == list(STRANGE)
+    for name, text in told.items():
+        assert text.startswith("genomix:connection ") and "\n" not in text, (name, text)
