@@ -149,7 +149,7 @@ def test_dash_without_proc(copy: Path) -> None:
     probe = hidden("true", Path("/"))
     if probe.returncode != 0:
         pytest.skip(f"no mount namespace here: {probe.stderr}")
-    for folder in (copy, copy / "rosafe" / "ros"):
+    for folder in (copy, copy / "rosafe" / "node"):
         assert variables(hidden(f"{source(copy)}; {SHOW}", folder))["PATH"].startswith(f"{copy}/scripts:")
     done = hidden(f"{source(copy)}; echo $?", Path("/"))
     assert done.stdout == "1\n"
