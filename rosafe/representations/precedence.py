@@ -20,7 +20,8 @@ import scipy
 from rosafe.dsp import kernels
 from rosafe.dsp.framing import FrameBuffer, FramedStage, frame_parameters
 from rosafe.dsp.guard import SQUARE_TINY, TINY, FloatArray, limited
-from rosafe.dsp.kernels import TAPS, TOGETHER, Taps, Windowed
+from rosafe.dsp.kernels import precedence as by_kernel
+from rosafe.dsp.kernels.precedence import TAPS, TOGETHER, Taps, Windowed
 from rosafe.dsp.rounding import MAX_SAMPLES, round_half_away
 from rosafe.dsp.signal import Signal
 from rosafe.vocabulary.parameter import Parameter
@@ -148,14 +149,14 @@ class Precedence(FramedStage):
             views = self._framing.frames(self._buffer.append(limited(samples, SQUARE_TINY)))
             count = views.shape[-2]
         itd, ild = np.empty((channels, count)), np.empty((channels, count))
-        cc = np.zeros((channels, 2 * self._max_lag + 1, count))
+        cc = np.empty((channels, 2 * self._max_lag + 1, count))
         at_once = min(count, max(1, BATCH // max(1, channels * self._size)))
         room = Windowed.room(at_once, channels, self._size)
         for first in range(0, count, max(1, at_once)):
             part = slice(first, min(first + at_once, count))
             taken = room.first(part.stop - first)
             if compiled:
-                kernels.windowed(frames.part(first, part.stop - first), taken)
+                by_kernel.windowed(frames.part(first, part.stop - first), taken)
             else:
                 windowed(views[..., part, :], self._framing.window, taken)
             self._localise(taken, itd[:, part], ild[:, part], cc[..., part])
@@ -187,6 +188,7 @@ class Precedence(FramedStage):
         self._size = len(self._framing.window)
         self._max_lag, self._pair_reach = math.ceil(lag), math.ceil(rate / 1000)
         self._first_delay, self._last_delay = first_delay, round_half_away(SECONDS * rate)
+        self._fading = fading(np.arange(self._last_delay + 1), round_half_away(rate / 1000))
         self._points = 1 << (self._size + self._last_delay - 1).bit_length()
         self._running = Running()
 
@@ -227,7 +229,7 @@ class Precedence(FramedStage):
         active = (frames.peaks > LOUD * frames.peaks.max(axis=-1, keepdims=True)).sum(axis=-1, keepdims=True)
         strong = energies > np.maximum(FAINT * energies.max(axis=-1, keepdims=True), TINY)
         factors = np.where(active > FEW, 1.0, np.divide(1.0, energies, out=np.zeros_like(energies), where=strong))
-        add = kernels.add_spectra if kernels.compiled() and self._points <= kernels.MOST_POINTS else add_spectra
+        add = by_kernel.add_spectra if kernels.compiled() and self._points <= kernels.MOST_POINTS else add_spectra
         spectra = add(frames.samples, self._points, running.gains, factors, running.power)
         lags: FloatArray = scipy.fft.irfft(spectra, self._points)
         lags = lags[..., : self._last_delay + 1]
@@ -242,7 +244,7 @@ class Precedence(FramedStage):
         echo = np.take_along_axis(lags, delays[..., np.newaxis], axis=-1)[..., 0]
         ratios = np.divide(echo, largest, out=np.zeros_like(echo), where=largest > 0).clip(0.0, 0.5)
         gains = np.minimum(GAINS[np.searchsorted(RATIOS, ratios)], MOST_GAIN)[..., np.newaxis]
-        faded = fading(delays, round_half_away(self.sample_rate / 1000))[..., np.newaxis]
+        faded = self._fading[delays][..., np.newaxis]
         order = np.arange(TAPS)
         back = TAPS - order
         small, large = (-gains * faded) ** order, (-1.0) ** (order + 1) * gains**back * faded ** (back - 1)
@@ -251,8 +253,8 @@ class Precedence(FramedStage):
     def _correlate(
         self, left: FloatArray, left_taps: Taps, right: FloatArray, right_taps: Taps, reach: int
     ) -> tuple[FloatArray, FloatArray]:
-        by_kernel = kernels.compiled() and 2 * reach + 1 <= kernels.MOST_LAGS
-        correlate = kernels.correlate_filtered if by_kernel else correlate_filtered
+        few_lags = 2 * reach + 1 <= kernels.MOST_LAGS
+        correlate = by_kernel.correlate_filtered if kernels.compiled() and few_lags else correlate_filtered
         return correlate(left, left_taps, right, right_taps, reach)
 
 

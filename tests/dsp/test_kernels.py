@@ -18,6 +18,7 @@ from rosafe.dsp.framing import FrameBuffer, Framing
 from rosafe.dsp.gammatone import GammatoneBank
 from rosafe.dsp.guard import LIMIT
 from rosafe.dsp.kernels import build
+from rosafe.dsp.kernels import precedence as by_kernel
 from rosafe.dsp.signal import Signal
 from rosafe.dsp.stage import Stage
 from rosafe.dsp.windows import NAMES
@@ -292,9 +293,9 @@ def test_windowed_frames(level: int, parameters: dict[str, Any], channels: int, 
         batch = max(1, count // parts)
         for first in range(0, count, batch):
             number = min(batch, count - first)
-            got, expected = (kernels.Windowed.room(number, channels, len(window)) for _ in range(2))
+            got, expected = (by_kernel.Windowed.room(number, channels, len(window)) for _ in range(2))
             with using(level):
-                kernels.windowed(frames.part(first, number), got)
+                by_kernel.windowed(frames.part(first, number), got)
             precedence.windowed(wanted[:, :, first : first + number], window, expected)
             for mine, theirs in zip(got, expected, strict=True):
                 agree([mine], [theirs])
@@ -314,13 +315,13 @@ def test_summed_spectra(level: int, channels: int, frames: int, half: int, power
         running.begin(np.full(channels, 500.0), points // 2 + 1, 1)
         rng, made = np.random.default_rng(half), []
         with using(choice):
-            add = precedence.add_spectra if choice == TWINS else kernels.add_spectra
+            add = precedence.add_spectra if choice == TWINS else by_kernel.add_spectra
             for _ in range(2):
                 samples = rng.standard_normal((frames, 2, channels, 2 * half)) * 10 ** rng.uniform(-3, 3)
                 factors = np.where(rng.random((frames, 2, channels)) < 0.3, 0, rng.random((frames, 2, channels)))
                 made.append(add(samples, points, gains, factors, running.power).T)
         rows = np.arange(2 * channels)
-        made.append(running.power[rows // kernels.TOGETHER, :, rows % kernels.TOGETHER].T)
+        made.append(running.power[rows // by_kernel.TOGETHER, :, rows % by_kernel.TOGETHER].T)
         sums[choice] = made
     for got, expected in zip(sums[level], sums[TWINS], strict=True):
         agree([got], [expected])
@@ -341,7 +342,7 @@ def test_correlations_of_filtered_frames(
 ) -> None:
     """Filters of both ways to clean, with delays up to more than a frame; some have no echo to take out."""
     rng = np.random.default_rng(seed)
-    ears: list[tuple[FloatArray, kernels.Taps]] = []
+    ears: list[tuple[FloatArray, by_kernel.Taps]] = []
     made = {}
     for _ in range(2):
         shape = (frames, 1 if alike else rows)
@@ -350,10 +351,10 @@ def test_correlations_of_filtered_frames(
         shifts = np.where(large, np.arange(6) - 6, np.arange(6)) * delays
         values = np.where(rng.random((*shape, 6)) < 0.2, 0.0, rng.standard_normal((*shape, 6)))
         samples = rng.standard_normal((frames, 2, rows, size))[:, 0]  # rows that do not lie one behind the other
-        ears.append((samples, kernels.Taps(shifts, values)))
+        ears.append((samples, by_kernel.Taps(shifts, values)))
     for choice in (TWINS, level):
         with using(choice):
-            correlate = precedence.correlate_filtered if choice == TWINS else kernels.correlate_filtered
+            correlate = precedence.correlate_filtered if choice == TWINS else by_kernel.correlate_filtered
             made[choice] = correlate(*ears[0], *ears[1], reach)
     for got, expected in zip(made[level], made[TWINS], strict=True):
         agree([got], [expected], least=1.0)  # what the twin's rounding leaves of a 0 is of the size of energies
@@ -481,8 +482,8 @@ def test_constants_are_those_of_the_sources() -> None:
     assert f"MOST_SECTIONS = {kernels.MOST_SECTIONS} " in sources["biquads.c"]
     assert f"MOST_LAGS = {kernels.MOST_LAGS}," in sources["products.h"]
     assert f"MOST_POINTS = {kernels.MOST_POINTS // 2} " in sources["fourier.h"]
-    assert f"TAPS = {kernels.TAPS} " in sources["precedence.c"]
-    assert f"TOGETHER = {kernels.TOGETHER} " in sources["precedence.c"]
+    assert f"TAPS = {by_kernel.TAPS} " in sources["precedence.c"]
+    assert f"TOGETHER = {by_kernel.TOGETHER} " in sources["precedence.c"]
     assert f"MOST_LOOPS = {kernels.MOST_LOOPS} " in sources["adaptation.c"]
     assert f"MOST_SIZE = {kernels.MOST_SIZE} " in sources["autocorrelation.c"]
     assert kernels.CLIPPINGS == ("clp", "clc", "sgn")

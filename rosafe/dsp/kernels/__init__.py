@@ -30,11 +30,9 @@ MOST_LAGS = 1024  # of a correlation; FFT is faster beyond
 MOST_LOOPS = 32  # of adaptation
 MOST_SIZE = 4096  # samples of a frame whose autocorrelation is made
 MOST_POINTS = 8192  # real ones of a Fourier transform
-TAPS = 6  # of a filter that takes an echo out
 
 REAL_SIZE = 8  # bytes of a float64
 MOST_LANES = 8  # float64 in a register
-TOGETHER = 8  # rows that lie in memory sample by sample
 
 CLIPPINGS = ("clp", "clc", "sgn")
 RECTIFICATIONS = ("none", "halfwave", "fullwave", "square", "compressed")
@@ -350,90 +348,6 @@ class Transform(NamedTuple):
         k = np.arange(points // 2 + 1)
         places = np.ascontiguousarray(np.stack((place[k], place[-k % points]), axis=1))
         return cls(points, np.concatenate(twiddles), places, np.exp(1j * np.pi / points * k))
-
-
-class Windowed(NamedTuple):
-    """Frames of the two ears times a window, and what can be said of them at once."""
-
-    samples: FloatArray  # (F, 2, C, w)
-    sums: FloatArray  # over channels, (F, 2, w)
-    peaks: FloatArray  # the largest sample of each, (F, 2, C)
-    energies: FloatArray  # the sum of squares of each, (F, 2, C)
-
-    @classmethod
-    def room(cls, frames: int, channels: int, size: int) -> Windowed:
-        """To be filled."""
-        each = (frames, 2, channels)
-        return cls(np.empty((*each, size)), np.empty((frames, 2, size)), np.empty(each), np.empty(each))
-
-    def first(self, frames: int) -> Windowed:
-        """That of the first frames."""
-        return Windowed(*(array[:frames] for array in self))
-
-
-class Taps(NamedTuple):
-    """Filters y[t] = sum_i values[i] x[t - shifts[i]]; y begins where x does and is shifts[-1] samples longer."""
-
-    shifts: NDArray[np.int64]  # (..., TAPS), ascending
-    values: FloatArray  # (..., TAPS)
-
-    def of(self, *place: Any) -> Taps:
-        """Those at `place`."""
-        return Taps(self.shifts[place], self.values[place])
-
-
-def windowed(frames: Frames, output: Windowed) -> None:
-    """The frames of (2, C, N), windowed by their weights, to `output`; the tail is left alone.
-
-    The twin is `rosafe.representations.precedence.windowed`.
-    """
-    _function("rosafe_windowed")(*_arguments(frames), *map(_address, output))
-
-
-def add_spectra(
-    samples: FloatArray, points: int, gains: FloatArray, factors: FloatArray, power: FloatArray
-) -> FloatArray:
-    """As `rosafe.representations.precedence.add_spectra`, of a power of 2 up to MOST_POINTS points; w is even."""
-    count, ears, channels, size = samples.shape
-    transform = Transform.of(points)
-    sums, factors = np.empty((count, ears, power.shape[1])), np.ascontiguousarray(factors)
-    _function("rosafe_add_spectra")(
-        _address(samples),
-        channels,
-        count,
-        size,
-        *map(_address, (gains, factors)),
-        transform.points,
-        *map(_address, (transform.twiddles, transform.places, transform.turns, power, sums)),
-    )
-    return sums
-
-
-def correlate_filtered(
-    left: FloatArray, left_taps: Taps, right: FloatArray, right_taps: Taps, reach: int
-) -> tuple[FloatArray, FloatArray]:
-    """As `rosafe.representations.precedence.correlate_filtered`, of at most MOST_LAGS lags."""
-    count, rows, size = left.shape
-    correlations, energies = np.empty((count, rows, 2 * reach + 1)), np.empty((2, count, rows))
-    longest = size + max(0, int(left_taps.shifts.max(initial=0)), int(right_taps.shifts.max(initial=0)))
-    scratch = np.empty(2 * MOST_LANES * (size + reach) + 2 * longest)
-    filters = [np.ascontiguousarray(array) for taps in (left_taps, right_taps) for array in taps]
-    _function("rosafe_correlate_filtered")(
-        left.ctypes.data,
-        *(step // REAL_SIZE for step in left.strides[:2]),
-        *map(_address, filters[:2]),
-        right.ctypes.data,
-        *(step // REAL_SIZE for step in right.strides[:2]),
-        *map(_address, filters[2:]),
-        count,
-        rows,
-        size,
-        left_taps.shifts.shape[1] < rows,
-        reach,
-        longest,
-        *map(_address, (scratch, correlations, energies)),
-    )
-    return correlations, energies
 
 
 def patterns(levels: FloatArray, count: int, reach: int, places: NDArray[np.int64], weights: FloatArray) -> FloatArray:
