@@ -45,7 +45,12 @@ class _Ended(Exception):
     """A signal came while the node was waiting for a master, as it was told to."""
 
 
-def run_server(component: Component, build: Callable[[str], Node], argv: list[str] | None = None) -> int:
+def run_server(
+    component: Component,
+    build: Callable[[str], Node],
+    argv: list[str] | None = None,
+    prepare: Callable[[], object] = lambda: None,
+) -> int:
     """Run one component's node until a signal, its `kill` request or the master ends it.
 
     Parameters
@@ -56,6 +61,8 @@ def run_server(component: Component, build: Callable[[str], Node], argv: list[st
         Makes and starts the node of the instance that it is given, after `rospy.init_node`.
     argv : list of str, optional
         The command line without the program; by default that of this process.
+    prepare : callable, optional
+        Called before that, and may take its time: compile something, say.
 
     Returns
     -------
@@ -73,7 +80,7 @@ def run_server(component: Component, build: Callable[[str], Node], argv: list[st
     for number in ending_signals():
         signal.signal(number, lambda number, frame: received.append(number))
     try:
-        node = _start(component, build, options, remappings, received)
+        node = _start(component, build, options, remappings, received, prepare)
     except _Ended:
         return 0
     except (_Failure, generate.GenerationError, master.MasterError, ComponentError, OSError) as problem:
@@ -141,6 +148,7 @@ def _start(
     options: argparse.Namespace,
     remappings: list[str],
     received: list[int],
+    prepare: Callable[[], object],
 ) -> Node:
     mappings = dict(remapping.split(":=", 1) for remapping in remappings)
     instance = mappings.get("__name", options.instance)
@@ -159,6 +167,7 @@ def _start(
     generate.ensure_messages()
     paths.prefer_pypi_packages()
     ensure_log_directory()
+    prepare()
     limit = watchdog(
         START_SECONDS,
         1,

@@ -37,7 +37,6 @@ class RosafeNode:
     def __init__(self, instance: str) -> None:
         for problem in PROBLEMS:
             rospy.logwarn(f"a representation is left out: {problem}")
-        kernels.compiled()  # where they must be built first, that takes a second, which no block should wait for
         self._node = ComponentNode(ROSAFE, lambda problem: ROSAFE.error("e_badNewValue", what=str(problem)))
         self.finished = self._node.finished
         self._tree = Tree(self)
@@ -238,4 +237,4 @@ class RosafeNode:
 
 def main(argv: list[str] | None = None) -> int:
     """Run the node; the `rosAFE-ros` command."""
-    return run_server(interface.ROSAFE, RosafeNode, argv)
+    return run_server(interface.ROSAFE, RosafeNode, argv, kernels.compiled)

@@ -78,8 +78,8 @@ def process(
     gathered: dict[str, dict[str, _Gathered]] = {}  # by kind and name
 
     def keep(kind: str, block: Block) -> None:
-        for name, data in zip(KINDS[kind].outputs, block.parts, strict=True):
-            gathered[name].add(data)
+        for whole, data in zip(gathered[kind].values(), block.parts, strict=True):
+            whole.add(data)
 
     blocks = (samples[:, first:end] for first, end in itertools.pairwise((0, *ends)))
     with Chain(blocks, rate, values, wanted, keep) as chain:
@@ -91,9 +91,9 @@ def process(
                 taken.append(_size(chain, wanted, ends))
         sizes.refuse_over(sizes.machine_memory(), max(taken), _TOO_LARGE, 1e9)
         for kind in wanted:
-            for name, part in KINDS[kind].outputs.items():
-                middle = part.axes.index(KINDS[kind].centred) if KINDS[kind].centred in part.axes else -1
-                gathered[name] = _Gathered(shapes[kind][name], middle)
+            centred, parts = KINDS[kind].centred, KINDS[kind].outputs
+            middles = {name: part.axes.index(centred) if centred in part.axes else -1 for name, part in parts.items()}
+            gathered[kind] = {name: _Gathered(shape, middles[name]) for name, shape in shapes[kind].items()}
         chain.run()
         results: dict[str, Any] = {}
         while gathered:
