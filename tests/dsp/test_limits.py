@@ -174,3 +174,14 @@ def test_all_zero_blocks_stay_exactly_zero() -> None:
     for stage in (PreProc(RATE, pp_bMiddleEarFiltering=True, pp_bNormalizeRMS=True), Filterbank(RATE), Ratemap(RATE)):
         kind = next(kind for kind, made in STAGES.items() if isinstance(stage, made))
         assert not single(stage.process(np.zeros((*rows(kind), 700)))).any()
+
+
+@pytest.mark.parametrize(("samples", "span"), [(2.4, 2), (2.5, 3), (3.5, 4), (0.2, 1)])
+def test_gain_control_starts_from_whole_samples(samples: float, span: int) -> None:
+    """As many as the time constant has, rounded half away from zero, and at least one."""
+    sound = np.random.default_rng(4).standard_normal((2, 8))
+    sound[1] = 0.0
+    retention = np.exp(-1 / samples)
+    power = retention * np.mean(sound[0, :span] ** 2) + (1 - retention) * sound[0, 0] ** 2
+    out = PreProc(1000.0, pp_bNormalizeRMS=True, pp_intTimeSecRMS=samples / 1000).process(sound)
+    np.testing.assert_allclose(out[0, 0], sound[0, 0] / (np.sqrt(power) + 1e-8), rtol=1e-12)

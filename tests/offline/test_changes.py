@@ -111,3 +111,10 @@ def inner(kind: str, array: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any
 
 def test_every_parameter_is_tried() -> None:
     assert CHANGES.keys() == KIND_OF.keys()
+
+
+def test_what_was_in_force_for_no_block_is_not_in_the_result() -> None:
+    """A change before the first block: the number of channels is the new one, not the larger one of before."""
+    sound = np.random.default_rng(8).standard_normal((2, 500))
+    changed = rosafe.process(sound, 44100, modifications=[(0, "fb_nChannels", 3)], outputs=["gammatone"])
+    np.testing.assert_array_equal(changed["gammatone"], rosafe.process(sound, 44100, {"fb_nChannels": 3})["gammatone"])
