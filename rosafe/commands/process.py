@@ -12,38 +12,21 @@ import os
 import sys
 import textwrap
 import time
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from rosafe.commands import Failure
+from rosafe.commands._parameters import add_settings, parameters_of, words
 from rosafe.commands._progress import Display, bytes_text
 from rosafe.commands._workers import Interrupted, Interrupts, Report, run_together
 from rosafe.interface import FIXED, KINDS, ROSAFE, Parameter
-from rosafe.interface.arguments import check_outputs, check_parameter
+from rosafe.interface.arguments import check_outputs
 
 _BLOCK = ROSAFE.service("InputProc").parameter("nFramesPerBlock")
 _MAX_JOBS = 10_000
 
 # --- the command line -------------------------------------------------------------------------------------------
-
-
-class _Settings(argparse.Action):
-    """Words after --set: settings as far as they look so, the others are input files."""
-
-    def __call__(
-        self,
-        parser: argparse.ArgumentParser,
-        namespace: argparse.Namespace,
-        values: str | Sequence[Any] | None,
-        option_string: str | None = None,
-    ) -> None:
-        words = list(values or ())
-        if "=" not in words[0]:
-            parser.error(f"--set {words[0]}: wanted is NAME=VALUE")
-        namespace.settings = namespace.settings + [word for word in words if "=" in word]
-        namespace.more_inputs = namespace.more_inputs + [word for word in words if "=" not in word]
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -60,15 +43,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help="output file, replaced where there is one; or the folder for all outputs, there already or ending in / "
         "(it is made then; default: beside each input); files in it are named as the inputs, with .npz",
     )
-    parser.add_argument(
-        "--set",
-        dest="settings",
-        nargs="+",
-        action=_Settings,
-        default=[],
-        metavar="NAME=VALUE",
-        help="change parameters from their defaults; see below",
-    )
+    add_settings(parser, "see below")
     parser.add_argument(
         "--outputs",
         metavar="NAME,...",
@@ -92,7 +67,6 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--force", action="store_true", help="replace outputs that -o does not name")
     parser.add_argument("-q", "--quiet", action="store_true", help="say nothing unless something is wrong")
     parser.epilog = _epilog()
-    parser.set_defaults(more_inputs=[])
 
 
 def _count(text: str, maximum: float) -> int:
@@ -160,8 +134,8 @@ def run(options: argparse.Namespace) -> int:
         options.usage_error("no sound file is named")
     targets, named = _targets(inputs, options.output)
     try:
-        parameters = _parameters(options.settings)
-        outputs = check_outputs(_words(options.outputs) if options.outputs is not None else None)
+        parameters = parameters_of(options.settings)
+        outputs = check_outputs(words(options.outputs))
     except ValueError as problem:
         raise Failure(str(problem)) from None
     signals = Interrupts()
@@ -236,22 +210,6 @@ def _targets(inputs: list[Path], output: str | None) -> tuple[list[Path], bool]:
         if other is not path:
             raise Failure(f"{other} and {path} would both go to {target}")
     return targets, False
-
-
-def _parameters(settings: list[str]) -> dict[str, Any]:
-    """The values by name; ValueError for what cannot be, and for a name that is there twice."""
-    values: dict[str, Any] = {}
-    for setting in settings:
-        name, _, text = setting.partition("=")
-        name, value = check_parameter(name, text, text=True)
-        if name in values:
-            raise ValueError(f"{name} is given twice")
-        values[name] = value
-    return values
-
-
-def _words(text: str) -> list[str]:
-    return [word.strip() for word in text.split(",")]
 
 
 def _size(path: Path) -> float:

@@ -98,23 +98,24 @@ def draw(
     ear: str | None = None,
     **options: float | None,
 ) -> Figure:
-    """As `plot`, into a figure, whose size becomes what that needs: two columns, with both ears side by side."""
+    """As `plot`, into a figure, whose size becomes what that needs: two columns, both ears side by side."""
     panels = [_Panel(result, name, **options) for name in _chosen(result, outputs)]
     one = ear is not None or not any(panel.ears for panel in panels)
-    cells: list[tuple[_Panel, int] | None] = []
+    if not one:  # no gaps beside those of both ears together
+        panels.sort(key=lambda panel: not panel.ears)
+    cells: list[tuple[_Panel, int]] = []
     for panel in panels:
         if one or not panel.ears:
             cells.append((panel, EARS.index(ear or EARS[0])))
         else:  # the ears in one row
-            cells += [None] * (len(cells) % 2) + [(panel, index) for index in range(panel.ears)]
+            cells += [(panel, index) for index in range(panel.ears)]
     columns = 1 if one else 2
     with style():
         figure.set_size_inches(8.0 if one else 13.0, 0.3 + 2.1 * -(-len(cells) // columns))
         figure.set_layout_engine("constrained")
         grid = figure.add_gridspec(-(-len(cells) // columns), columns)
-        for place, cell in zip(grid, cells, strict=False):
-            if cell is not None:
-                cell[0].draw(figure.add_subplot(place), cell[1])
+        for place, (panel, index) in zip(grid, cells, strict=False):
+            panel.draw(figure.add_subplot(place), index)
     return figure
 
 
@@ -174,18 +175,18 @@ class _Panel:
                 return 1 / float(np.diff(self.result[name][:2])[0])
         raise ValueError(f"{self.name}: the result does not tell the sample rate; give it as sample_rate (Hz)")
 
-    def along(self, axis: str) -> Any:
+    def along(self, axis: str) -> np.ndarray:
         """What the declaration says of an axis: frequencies (Hz), lags (ms) or words; numbers from 0 where nothing."""
         size = self.data.shape[self.axes.index(axis)]
         kind = self.kind  # the one that brought the axis in
         while kind.parent and any(axis in part.axes for part in KINDS[kind.parent].parts):
             kind = KINDS[kind.parent]
         wanted = {"channel": "Hz", "filter": "Hz", "lag": "s", "feature": ""}[axis]
-        units = {one.name: one.unit for one in (*kind.parameters, *kind.derived)}
+        units = {one.name: one.unit for one in kind.parameters} | {one.name: one.unit for one in kind.derived}
         for name in kind.coordinates:
             values = self.result.get(name, ())
             if units[name] == wanted and len(values) == size:
-                return 1e3 * np.asarray(values) if axis == "lag" else values
+                return 1e3 * np.asarray(values) if axis == "lag" else np.asarray(values)
         return np.arange(size)
 
     # --- drawing ---
@@ -231,7 +232,7 @@ class _Panel:
             axes.set(xlabel="time (s)", ylabel="pitch (Hz)")
             return
         self.under._draw_image(axes, ear)
-        frequencies = np.asarray(self.under.along("channel"), np.float64)
+        frequencies = self.under.along("channel")
         order = np.argsort(frequencies)
         height = np.interp(pitch, frequencies[order], order, left=np.nan, right=np.nan)
         axes.plot(self.times, height, ".", color="#00e5ff", markersize=4)
@@ -257,8 +258,8 @@ class _Panel:
         shade = image(axes, shown, (left, right, bottom, top), **{**limits, **options})
         if across == "time" and len(self.times) > 1:
             axes.set_xlim(left, self.times[-1] + (self.times[1] - self.times[0]) / 2)
-        clipped = np.array([np.min(data) < limits["vmin"], np.max(data) > limits["vmax"]])
-        extend = {(0, 0): "neither", (1, 0): "min", (0, 1): "max", (1, 1): "both"}[tuple(clipped.astype(int))]
+        below, above = np.min(data) < limits["vmin"], np.max(data) > limits["vmax"]
+        extend = ("both" if above else "min") if below else ("max" if above else "neither")
         axes.figure.colorbar(shade, ax=axes, label=label, extend=extend, pad=0.015, aspect=14)
 
     @cached_property
@@ -271,7 +272,7 @@ class _Panel:
         if len(axes) > 2 and "filter" in axes and moment is None and self.channel is None:
             moment = float(self.times[np.abs(data).sum(axis=tuple(range(data.ndim - 1))).argmax()])
         if len(axes) > 2 and self.channel is not None and "channel" in axes:
-            frequencies = np.asarray(self.along("channel"))
+            frequencies = self.along("channel")
             nearest = int(np.abs(frequencies - self.channel).argmin())
             data = np.take(data, nearest, axis=first + axes.index("channel"))
             axes.remove("channel")
@@ -307,7 +308,7 @@ class _Panel:
             size = np.abs(data)
             level = LEVELS[self.kind.kind] * np.log10(np.maximum(size, 1e-200) / max(float(size.max()), 1e-200))
             return np.maximum(level, -RANGE_DB), "dB re loudest", {"cmap": "magma", "vmin": -RANGE_DB, "vmax": 0.0}
-        if "feature" in axes and isinstance(self.along("feature"), list):  # of different units
+        if "feature" in axes and self.along("feature").dtype.kind == "U":  # of different units
             whole = np.moveaxis(data, 0, -1) if self.ears else data[..., np.newaxis]
             low, high = np.percentile(whole, (1, 99), axis=(1, 2), keepdims=True)
             scaled = np.clip((whole - low) / np.where(high > low, high - low, 1.0), 0, 1)
@@ -334,11 +335,11 @@ class _Panel:
             half = (values[1] - values[0]) / 2
             axes.set(**{f"{which}label": _AXIS_NAMES[axis]})
             return float(values[0] - half), float(values[-1] + half)
-        if isinstance(values, list):
+        if values.dtype.kind == "U":
             axes.set(**{f"{which}ticks": np.arange(len(values)), f"{which}ticklabels": values})
             axes.tick_params(which, labelsize="x-small")
         elif np.array_equal(values, np.arange(len(values))):
             axes.set(**{f"{which}label": axis})
         else:
-            frequency_axis(axes, np.asarray(values), TICKS, _AXIS_NAMES[axis], which)
+            frequency_axis(axes, values, TICKS, _AXIS_NAMES[axis], which)
         return -0.5, len(values) - 0.5

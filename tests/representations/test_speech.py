@@ -1,4 +1,4 @@
-"""What the representations of frames say of real speech: a talker off to one side, without a room and in one."""
+"""What the representations of frames say of real speech, without a room and in one; and of syllables that are known."""
 
 from __future__ import annotations
 
@@ -67,3 +67,54 @@ def test_onsets_lie_where_the_level_rises_and_offsets_where_it_falls(made: dict[
             assert len(there) > 20
             assert np.median(there) > {"anechoic": 10, "room": 1}[place]
             assert np.mean(there > 0) > np.mean(sign * changes > 0) + 0.15
+
+
+# --- syllables whose truth is known -----------------------------------------------------------------------------
+
+RATE = 16000
+STARTS = np.array([0.3, 0.75, 1.2, 1.65])  # s
+LENGTH = 0.25  # s
+
+
+def syllables() -> FloatArray:
+    """A voice that glides up by half an octave in each syllable, over faint noise; the left ear is 0.25 ms late."""
+    time = np.arange(int(2.2 * RATE)) / RATE
+    sound = 1e-4 * np.random.default_rng(1).standard_normal(len(time))
+    for start in STARTS:
+        within = (time >= start) & (time < start + LENGTH)
+        since = time[within] - start
+        phase = np.cumsum(_glide(since)) / RATE
+        edges = np.clip(np.minimum(since, LENGTH - since) / 0.01, 0.0, 1.0)
+        sound[within] += 0.1 * edges * sum(np.cos(2 * np.pi * h * phase) / h**0.5 for h in range(1, 16))
+    return np.stack((np.roll(sound, 4), sound))
+
+
+def _glide(since: FloatArray) -> FloatArray:
+    """The pitch (Hz) so long (s) after a syllable's start."""
+    hertz: FloatArray = 130.0 * 2 ** (0.5 * since / LENGTH)
+    return hertz
+
+
+def test_syllables() -> None:
+    """Onsets at their starts, offsets at their ends, the pitch of the voice inside and none outside."""
+    window = 0.04
+    parameters = {"fb_highFreqHz": 6500.0, "ac_wSizeSec": window}
+    got = process(syllables(), RATE, ["pitch", "onsetMap", "offsetMap"], parameters, 1000)
+    for kind, edges, late in (("onsetMap", STARTS, 0.03), ("offsetMap", STARTS + LENGTH, 0.06)):
+        for ear in got[kind]:
+            # ends of frames: the first that hold something of the sound, and the channels' own delay
+            at = 0.02 + np.nonzero(ear.sum(axis=0) >= 8)[0] / got[f"{kind}_frameRate"]
+            nearest = edges[np.abs(at[:, np.newaxis] - edges).argmin(axis=1)]
+            assert set(nearest) == set(edges)
+            assert np.all(at - nearest > -0.01) and np.all(at - nearest < late)
+    middle = np.arange(got["pitch"].shape[-1]) / got["pitch_frameRate"] + window / 2
+    since = middle - STARTS[:, np.newaxis]
+    for found in got["pitch"][:, 0]:
+        for one in since:
+            inside = (one > 0.6 * window) & (one < LENGTH - 0.6 * window)
+            assert np.mean(~np.isnan(found[inside])) > 0.9
+            voiced = inside & ~np.isnan(found)
+            np.testing.assert_allclose(found[voiced], _glide(one[voiced]), rtol=0.02)
+        # before the first syllable nothing clearer has come, and noise may have a pitch
+        silent = np.all((since < -window) | (since > LENGTH + window), axis=0) & (since[0] > 0)
+        assert silent.sum() > 30 and np.isnan(found[silent]).all()

@@ -1,0 +1,97 @@
+"""Draw the representations of a sound file, or of what `rosafe process` has made of one.
+
+The picture is a PNG beside it, or where -o says: time in seconds, channels at their centre frequencies, colours with
+their units. Correlations are means over the channels, modulation spectrograms are those of the loudest moment, unless
+--at or --channel says otherwise. Pitch lies over the ratemap, maps over strengths."""
+
+from __future__ import annotations
+
+import argparse
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from rosafe.commands import Failure
+from rosafe.commands._parameters import add_settings, parameters_of, words
+from rosafe.interface import KINDS
+from rosafe.interface.arguments import check_outputs
+
+_DEFAULT = ("input", "ratemap", "pitch", "onsetMap", "ild", "itd")  # of a sound
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments."""
+    parser.usage = (
+        "rosafe plot SOUND|RESULT.npz [-o PNG] [--outputs NAME,...] [--set NAME=VALUE ...]\n"
+        "                   [--ear left|right] [--at S] [--channel HZ] [--force]"
+    )
+    parser.add_argument("inputs", nargs="*", metavar="SOUND|RESULT", help="sound file, or .npz of rosafe process")
+    parser.add_argument("-o", "--output", metavar="PNG", help="the picture, replaced if it is there (default: beside)")
+    parser.add_argument(
+        "--outputs",
+        metavar="NAME,...",
+        help=f"what to draw of {', '.join(KINDS)} (default: {','.join(_DEFAULT)} of a sound, all of a result)",
+    )
+    add_settings(parser, "rosafe process -h tells them; for sounds only")
+    parser.add_argument("--ear", choices=("left", "right"), help="draw one ear only")
+    parser.add_argument("--at", type=float, metavar="S", help="draw channels against lags, or filters, at this time")
+    parser.add_argument("--channel", type=float, metavar="HZ", help="draw lags, or filters, of this channel over time")
+    parser.add_argument("--force", action="store_true", help="replace a picture that -o does not name")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Draw it."""
+    inputs = [*options.inputs, *options.more_inputs]
+    if len(inputs) != 1:
+        options.usage_error("wanted is one sound file, or one result")
+    source = Path(inputs[0])
+    target = Path(options.output or source.with_suffix(".png"))
+    from matplotlib.figure import Figure
+
+    from rosafe.sound.audiofile import AudioFileError
+    from rosafe.view.axes import save
+    from rosafe.view.plot import draw
+
+    names = words(options.outputs)
+    try:
+        if source.suffix == ".npz":
+            result = _result(source, options.settings)
+        else:
+            names = check_outputs(names or _DEFAULT)
+            result = _computed(source, names, parameters_of(options.settings))
+        figure = draw(Figure(), result, names, options.ear, at=options.at, channel=options.channel)
+    except (AudioFileError, ValueError) as problem:
+        raise Failure(str(problem)) from None
+    save(figure, target, options.output is not None or options.force)
+    return 0
+
+
+def _result(path: Path, settings: list[str]) -> Mapping[str, Any]:
+    from rosafe.offline.npz import memory_map
+
+    if settings:
+        raise ValueError("--set: a result is drawn as it is; name the sound instead")
+    try:
+        return memory_map(path)
+    except OSError as problem:
+        raise ValueError(f"{path}: {problem.strerror}") from None
+    except zipfile.BadZipFile:
+        raise ValueError(f"{path} is no result of rosafe process") from None
+
+
+def _computed(path: Path, names: list[str], parameters: dict[str, Any]) -> Mapping[str, Any]:
+    """The wanted outputs of a sound, and those that lie under them."""
+    from rosafe.offline.process import process
+    from rosafe.sound.audiofile import AudioFile, AudioFileError
+    from rosafe.view.plot import UNDER
+
+    file = AudioFile(path)
+    try:
+        if file.channels != 2:
+            raise AudioFileError(f"{path} has {file.channels} channels; wanted are two: left and right ear")
+        sound, rate = file.read(file.frames), file.sample_rate
+    finally:
+        file.close()
+    outputs = {*names, *(UNDER[name] for name in names if name in UNDER)}
+    return {**process(sound, rate, parameters, outputs=list(outputs)), "sample_rate": rate}

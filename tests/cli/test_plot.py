@@ -1,0 +1,79 @@
+"""`rosafe plot`: a picture of a sound or of a result, and clear words where there is none."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import matplotlib.image
+import numpy as np
+import pytest
+
+from tests.cli.command import SMALL, noise, refused, rosafe, write
+from tests.harness import shared
+
+
+def size(path: Path) -> tuple[int, int]:
+    """Height and width of a picture with something in it."""
+    picture = matplotlib.image.imread(path)
+    assert len(np.unique((255 * picture).astype(np.uint8).reshape(-1, picture.shape[2]), axis=0)) > 20
+    height, width, _ = picture.shape
+    return height, width
+
+
+def test_speech(tmp_path: Path) -> None:
+    speech = shared("audio", "speech_anechoic_16k.wav")
+    done = rosafe("plot", speech, "-o", tmp_path / "speech.png", "--set", "fb_highFreqHz=7200")
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+    height, width = size(tmp_path / "speech.png")
+    assert height > 800 and width > 1000
+    assert [path.name for path in tmp_path.iterdir()] == ["speech.png"]
+
+
+def test_result_and_sound_give_the_same_picture(tmp_path: Path) -> None:
+    sound = write(tmp_path / "sound.wav", noise(8000))
+    outputs = ("--outputs", "gammatone,spectralFeatures,amsFeatures,precedence")
+    assert rosafe("process", sound, *outputs, *SMALL).returncode == 0
+    assert rosafe("plot", tmp_path / "sound.npz", "--at", "0.2").stderr == ""
+    assert rosafe("plot", sound, "-o", tmp_path / "same.png", "--at", "0.2", *outputs, *SMALL).stderr == ""
+    assert (tmp_path / "sound.png").read_bytes() == (tmp_path / "same.png").read_bytes()
+
+
+def test_what_is_there_is_kept(tmp_path: Path) -> None:
+    sound = write(tmp_path / "sound.wav", noise(4000))
+    (tmp_path / "sound.png").write_bytes(b"old")
+    few = ("--outputs", "ild", *SMALL)
+    refused(rosafe("plot", sound, *few), "sound.png is there already; --force replaces it")
+    assert (tmp_path / "sound.png").read_bytes() == b"old"
+    assert rosafe("plot", sound, "--force", *few).returncode == 0
+    assert size(tmp_path / "sound.png")[0] > 100
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["sound.wav", "--outputs", "speech"], ["unknown output 'speech'"]),
+        (["sound.wav", "--set", "fb_nChannels=-1"], ["fb_nChannels"]),
+        (["sound.wav"], ["fb_highFreqHz"]),  # the default's channels lie too high for 8 kHz
+        (["mono.wav"], ["1 channels"]),
+        (["nothing.wav"], ["nothing.wav"]),
+        (["nothing.npz"], ["nothing.npz: No such file or directory"]),
+        (["text.npz"], ["text.npz is no result of rosafe process"]),
+        (["other.npz"], ["holds no output that can be drawn"]),
+        (["other.npz", "--set", "fb_nChannels=3"], ["--set: a result is drawn as it is"]),
+        (["other.npz", "--outputs", "ild"], ["no output 'ild' in the result"]),
+    ],
+)
+def test_refusals(tmp_path: Path, arguments: list[str], words: list[str]) -> None:
+    write(tmp_path / "sound.wav", noise(4000), 8000)
+    write(tmp_path / "mono.wav", noise(4000)[:1])
+    (tmp_path / "text.npz").write_text("no zip file")
+    np.savez(tmp_path / "other.npz", x=np.zeros(3))
+    before = sorted(tmp_path.iterdir())
+    refused(rosafe("plot", *arguments, cwd=tmp_path), *words)
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_wrong_command_lines() -> None:
+    refused(rosafe("plot"), "one sound file", code=2)
+    refused(rosafe("plot", "a.wav", "b.wav"), "one sound file", code=2)
+    refused(rosafe("plot", "a.wav", "--ear", "third"), "--ear", code=2)

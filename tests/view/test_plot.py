@@ -1,0 +1,266 @@
+"""`rosafe.plot`: what is drawn are the numbers of the result, at their times, frequencies and lags, with units."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import matplotlib
+import numpy as np
+import pytest
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+
+import rosafe
+from rosafe.bass.sources.scene import Scene
+from rosafe.interface import KINDS, Representation
+from rosafe.view import plot as module
+from rosafe.view.plot import draw, plot
+
+RATE = 16000
+
+
+@pytest.fixture(scope="module")
+def result() -> dict[str, Any]:
+    """Everything, of a short walk; a voice that is found everywhere."""
+    sound = Scene(RATE, seconds=1).frames(RATE)
+    parameters = {"fb_highFreqHz": 6500.0, "pi_confThres": 0.2, "ac_wSizeSec": 0.03}
+    return {**rosafe.process(sound, RATE, parameters, outputs=list(KINDS)), "sample_rate": RATE}
+
+
+@pytest.fixture
+def ax() -> Axes:
+    """Axes to draw into."""
+    return Figure().add_subplot()
+
+
+def bar(axes: Axes) -> Any:
+    """The colour bar beside it."""
+    return axes.get_images()[0].colorbar
+
+
+def shown(axes: Axes) -> np.ndarray:
+    """The numbers of its image."""
+    return np.asarray(axes.get_images()[0].get_array())
+
+
+def middle(result: dict[str, Any], kind: str) -> np.ndarray:
+    """The middle of each frame (s): windows are two hops."""
+    return (np.arange(result[kind].shape[-1]) + 1) / result[f"{kind}_frameRate"]
+
+
+@pytest.mark.parametrize("name", [name for kind in KINDS.values() for name in kind.outputs])
+def test_each_is_drawn_and_labelled(result: dict[str, Any], ax: Axes, name: str) -> None:
+    plot(result, name, ax)
+    assert ax.get_title("left").startswith(name)
+    assert ax.get_ylabel() or len(ax.get_yticklabels()) == len(result["sf_requests"])
+    assert ax.get_xlabel() == ("time (s)" if name != "amsFeatures" else "modulation frequency (Hz)")
+    if name != "amsFeatures":
+        assert ax.get_xlim()[0] >= -0.01 and 0.8 < ax.get_xlim()[1] < 1.02
+    unit = next(kind.outputs[name].unit for kind in KINDS.values() if name in kind.outputs)
+    if ax.get_images() and unit:
+        assert bar(ax).ax.get_ylabel() == {"s": "ms"}.get(unit, unit)
+        assert np.ptp(ax.get_images()[0].get_clim()) > 0
+    FigureCanvasAgg(ax.figure).draw()
+
+
+def test_differences_of_the_ears(result: dict[str, Any], ax: Axes) -> None:
+    plot(result, "itd", ax)
+    np.testing.assert_array_equal(shown(ax), 1e3 * result["itd"])
+    low, high = ax.get_images()[0].get_clim()
+    assert low == -high and high == pytest.approx(1e3 * np.percentile(np.abs(result["itd"]), 99))
+    left, right, bottom, top = ax.get_images()[0].get_extent()
+    times = middle(result, "itd")
+    assert (left, right) == pytest.approx((times[0] - 0.005, times[-1] + 0.005))
+    assert (bottom, top) == (-0.5, len(result["fb_cfHz"]) - 0.5)
+    for tick, label in zip(ax.get_yticks(), ax.get_yticklabels(), strict=True):
+        assert float(label.get_text()) == pytest.approx(result["fb_cfHz"][int(tick)], abs=0.5)
+    assert float(ax.get_yticklabels()[0].get_text()) == 80 and len(ax.get_yticks()) > 4
+
+
+@pytest.mark.parametrize(("name", "decibels"), [("ratemap", 10), ("ihc", 20), ("gammatone", 20)])
+@pytest.mark.parametrize("ear", ["left", "right"])
+def test_levels_are_below_the_loudest_of_both_ears(
+    result: dict[str, Any], ax: Axes, name: str, decibels: int, ear: str
+) -> None:
+    plot(result, name, ax, ear=ear)
+    size = np.abs(result[name])
+    level = np.maximum(decibels * np.log10(np.maximum(size, 1e-200) / size.max()), -60)[int(ear == "right")]
+    if name == "ratemap":
+        np.testing.assert_allclose(shown(ax), level, atol=1e-9)
+    else:  # more samples than columns: the largest of each
+        each = -(-RATE // module.COLUMNS)
+        for column in (0, 100, 1400):
+            expected = level[:, column * each : (column + 1) * each].max(axis=1)
+            np.testing.assert_allclose(shown(ax)[:, column], expected, atol=1e-9)
+    assert bar(ax).ax.get_ylabel() == "dB re loudest" and ear in ax.get_title("left")
+
+
+def test_lags_are_in_milliseconds(result: dict[str, Any], ax: Axes) -> None:
+    plot(result, "crossCorrelation", ax)
+    np.testing.assert_allclose(shown(ax), result["crossCorrelation"].mean(axis=0), atol=1e-12)
+    half = 500 / RATE
+    assert ax.get_ylim() == pytest.approx((1e3 * result["cc_lags"][0] - half, 1e3 * result["cc_lags"][-1] + half))
+    assert ax.get_ylabel() == "lag (ms)" and "mean over the channels" in ax.get_title("left")
+
+
+def test_a_chosen_channel_and_a_chosen_time(result: dict[str, Any]) -> None:
+    channel, frame = int(np.abs(result["fb_cfHz"] - 500).argmin()), 40
+    for name in ("autocorrelation", "amsFeatures"):
+        over_time, moment = (Figure().add_subplot() for _ in range(2))
+        plot(result, name, over_time, channel=500.0, ear="right")
+        plot(result, name, moment, at=(frame + 1.2) / result[f"{name}_frameRate"])
+        expected = [result[name][1, channel], result[name][0, :, :, frame]]
+        if name == "amsFeatures":
+            expected = [
+                np.maximum(20 * np.log10(np.maximum(part, 1e-200) / whole.max()), -60)
+                for part, whole in zip(expected, (result[name][:, channel], result[name][..., frame]), strict=True)
+            ]
+            labels = [float(label.get_text()) for label in over_time.get_yticklabels()]
+            assert labels[0] == 4 and labels[-1] == 1024
+        np.testing.assert_allclose(shown(over_time), expected[0], atol=1e-9)
+        np.testing.assert_allclose(shown(moment), expected[1], atol=1e-9)
+        assert f"{result['fb_cfHz'][channel]:.0f} Hz" in over_time.get_title("left")
+        assert moment.get_ylabel() == "centre frequency (Hz)"
+
+
+def test_modulation_is_of_the_loudest_moment(result: dict[str, Any], ax: Axes) -> None:
+    plot(result, "amsFeatures", ax)
+    loudest = result["amsFeatures"].sum(axis=(0, 1, 2)).argmax()
+    assert f"at {middle(result, 'amsFeatures')[loudest]:.2f} s" in ax.get_title("left")
+    strongest = np.unravel_index(shown(ax).argmax(), shown(ax).shape)
+    assert strongest == np.unravel_index(result["amsFeatures"][0, ..., loudest].argmax(), shown(ax).shape)
+
+
+def test_pitch_lies_over_the_ratemap(result: dict[str, Any], ax: Axes) -> None:
+    plot(result, "pitch", ax)
+    times, heights = ax.get_lines()[0].get_data()
+    hertz = np.interp(heights, np.arange(len(result["fb_cfHz"])), result["fb_cfHz"])
+    found = ~np.isnan(result["pitch"][0, 0])
+    assert found.sum() > 30
+    np.testing.assert_array_equal(~np.isnan(heights), found)
+    np.testing.assert_allclose(hertz[found], result["pitch"][0, 0][found])
+    np.testing.assert_allclose(times, middle(result, "pitch"))
+    assert "dB" in bar(ax).ax.get_ylabel()
+    assert ax.get_ylim()[1] < len(result["fb_cfHz"]) and np.nanmax(heights) < ax.get_ylim()[1]
+    alone = Figure().add_subplot()
+    plot({name: data for name, data in result.items() if name != "ratemap"}, "pitch", alone)
+    assert not alone.get_images() and alone.get_ylabel() == "pitch (Hz)"
+    np.testing.assert_array_equal(alone.get_lines()[0].get_ydata(), result["pitch"][0, 0])
+
+
+@pytest.mark.parametrize(("name", "under"), [("onsetMap", "onsetStrength"), ("offsetMap", "offsetStrength")])
+def test_maps_lie_over_strengths(result: dict[str, Any], ax: Axes, name: str, under: str) -> None:
+    plot(result, name, ax, ear="right")
+    np.testing.assert_array_equal(shown(ax), result[under][1])
+    times, channels = ax.get_lines()[0].get_data()
+    there = np.zeros_like(result[name][1])
+    there[np.asarray(channels, int), np.rint(times * result[f"{name}_frameRate"]).astype(int) - 1] = 1
+    assert there.sum() > 20
+    np.testing.assert_array_equal(there, result[name][1])
+    alone = Figure().add_subplot()
+    plot({key: data for key, data in result.items() if key != under}, name, alone, ear="right")
+    np.testing.assert_array_equal(shown(alone), result[name][1])
+
+
+def test_each_feature_has_its_own_range(result: dict[str, Any], ax: Axes) -> None:
+    plot(result, "spectralFeatures", ax)
+    assert [label.get_text() for label in ax.get_yticklabels()] == result["sf_requests"]
+    row = result["sf_requests"].index("centroid")
+    both = result["spectralFeatures"][:, row]
+    low, high = np.percentile(both, (1, 99))
+    np.testing.assert_allclose(shown(ax)[row], np.clip((both[0] - low) / (high - low), 0, 1), atol=1e-9)
+
+
+def test_waves_keep_their_extremes(result: dict[str, Any], ax: Axes) -> None:
+    plot(result, "input", ax)
+    times, wave = ax.get_lines()[0].get_data()
+    assert len(wave) <= 2 * module.COLUMNS
+    assert (wave.min(), wave.max()) == (result["input"][0].min(), result["input"][0].max())
+    assert times[wave.argmax()] == pytest.approx(result["input"][0].argmax() / RATE, abs=2e-3)
+
+
+def test_a_figure_of_several(result: dict[str, Any]) -> None:
+    drawing = draw(Figure(), result, ["itd", "ratemap", "ild"])
+    titles = [axes.get_title("left") for axes in drawing.axes if axes.get_title("left")]
+    assert titles == ["ratemap, left ear", "ratemap, right ear", "itd", "ild"]
+    limits = {axes.get_images()[0].get_clim() for axes in drawing.axes if "ratemap" in axes.get_title("left")}
+    assert len(limits) == 1
+    one = draw(Figure(), result, ["precedence", "moc"], "right")
+    titles = [axes.get_title("left") for axes in one.axes if axes.get_title("left")]
+    assert titles == ["precedence_itd", "precedence_ild", "precedence_cc, mean over the channels", "moc, right ear"]
+    assert len({axes.get_position().x0 for axes in one.axes if axes.get_title("left")}) == 1
+
+
+def test_a_figure_of_pyplot(result: dict[str, Any]) -> None:
+    with matplotlib.rc_context({"backend": "agg"}):
+        from matplotlib import pyplot
+
+        figure = rosafe.plot(result, "ild")
+        assert figure.number in pyplot.get_fignums()
+        pyplot.close(figure)
+
+
+def test_times_that_the_result_tells_rule(result: dict[str, Any], ax: Axes) -> None:
+    times = 7.0 + np.arange(result["itd"].shape[-1]) / 100
+    plot({**result, "itd_time": times}, "itd", ax)
+    assert ax.get_xlim() == pytest.approx((times[0] - 0.005, times[-1] + 0.005))
+
+
+def test_the_sample_rate(result: dict[str, Any]) -> None:
+    bare = {"input": result["input"]}
+    with pytest.raises(ValueError, match="sample_rate"):
+        plot(bare, "input", Figure().add_subplot())
+    for known in ({**bare, "cc_lags": result["cc_lags"]}, {**bare, "sample_rate": np.array(16000.0)}):
+        axes = Figure().add_subplot()
+        plot(known, "input", axes)
+        assert axes.get_xlim()[1] == pytest.approx(1.0, abs=1e-3)
+    axes = Figure().add_subplot()
+    plot(bare, "input", axes, sample_rate=8000)
+    assert axes.get_xlim()[1] == pytest.approx(2.0, abs=1e-3)
+
+
+@pytest.mark.parametrize("seconds", [0.0, 0.025, 0.035])
+def test_silence_and_next_to_nothing(seconds: float) -> None:
+    outputs = [name for name in KINDS if name != "pitch" or seconds > 0.03]
+    made = rosafe.process(np.zeros((2, round(seconds * RATE))), RATE, {"fb_highFreqHz": 6500.0}, outputs=outputs)
+    drawing = draw(Figure(), {**made, "sample_rate": RATE})
+    FigureCanvasAgg(drawing).draw()
+    words = [text.get_text() for axes in drawing.axes for text in axes.texts]
+    assert ("no frames" in words) and (seconds == 0.0) == (len(words) > 30)
+
+
+def test_a_plugin_is_drawn_too(ax: Axes, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From its declaration alone: axes of its own, and those of what it hangs on."""
+    mine = Representation("mine", "Mine", "ratemap", ("ear", "channel", "feature", "time"), "1/s")
+    monkeypatch.setitem(KINDS, "mine", mine)
+    monkeypatch.setitem(module._OUTPUTS, "mine", (mine, mine.parts[0]))
+    data = np.random.default_rng(2).random((2, 3, 5, 20))
+    made = {"mine": data, "mine_frameRate": 50.0, "fb_cfHz": np.array([100.0, 200.0, 400.0])}
+    plot(made, "mine", ax)
+    np.testing.assert_allclose(shown(ax), data[0].mean(axis=0))
+    assert (ax.get_ylabel(), bar(ax).ax.get_ylabel()) == ("feature", "1/s")
+    assert ax.get_xlim() == pytest.approx((0.01, 0.41))
+    plot(made, "mine", moment := Figure().add_subplot(), at=0.1)
+    assert [label.get_text() for label in moment.get_yticklabels()] == ["100", "200", "400"]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"outputs": "speech"}, "no output 'speech' in the result; there are: input, "),
+        ({"outputs": []}, "no output"),
+        ({"outputs": ["itd", "ild"]}, "it takes one output"),
+        ({"outputs": "itd", "ear": "middle"}, "'middle' is not one of left, right"),
+    ],
+)
+def test_refusals(result: dict[str, Any], ax: Axes, arguments: dict[str, Any], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        plot(result, ax=ax, **arguments)
+
+
+def test_arrays_of_another_shape_are_refused(ax: Axes) -> None:
+    with pytest.raises(ValueError, match="itd has shape"):
+        plot({"itd": np.zeros(5)}, "itd", ax)
+    with pytest.raises(ValueError, match="there are: none"):
+        plot({"fb_cfHz": np.zeros(5)}, "itd", ax)
