@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from rosafe.bass import socket_client
-from rosafe.bass.socket_client import Block, SocketClient, blocks
+from rosafe.bass.socket_client import Received, SocketClient, blocks
 from tests.bass.test_socket import Server, port_content
 from tests.harness import PATIENCE
 
@@ -24,7 +24,7 @@ def server() -> Iterator[Server]:
     running.thread.join(PATIENCE)
 
 
-def numbers(block: Block) -> list[int]:
+def numbers(block: Received) -> list[int]:
     assert np.array_equal(block.samples[1], -block.samples[0])
     return [int(number) for number in block.samples[0]]
 
