@@ -128,7 +128,7 @@ class Chain:
         for kind in KINDS.values():  # parents come first in the table
             mine = {p.name: values[p.name] for p in kind.parameters if p.name in values}
             if not kind.parent:
-                self._processors[kind.kind] = self._tree.add_input(kind.kind, self._source, 1, 0.0, 0.0, mine)
+                self._processors[kind.kind] = self._tree.add_input(kind.kind, self._source, 0, 0.0, 0.0, mine)
             elif kind.kind in needed:
                 self._processors[kind.kind] = self._tree.add(kind.kind, kind.kind, kind.parent, mine)
 

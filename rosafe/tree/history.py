@@ -49,6 +49,9 @@ class History:
 
     def append(self, block: Block) -> None:
         """Remember a block."""
+        if not self.seconds:
+            self.next_index = block.next_index
+            return
         with self._lock:
             rows = tuple(part.shape[:-1] for part in block.parts)
             if block.signal is not self._signal:

@@ -11,7 +11,7 @@ from typing import Any, Protocol
 from numpy.typing import NDArray
 
 from rosafe.dsp.signal import Signal
-from rosafe.dsp.stage import Stage, parts_of
+from rosafe.dsp.stage import Stage
 from rosafe.tree.block import Block
 from rosafe.tree.changes import Changes
 from rosafe.tree.history import History, Taken
@@ -128,6 +128,7 @@ class Processor(StateMachine):
     ) -> None:
         super().__init__(parent)
         self.name = name
+        self.kind = stage.REPRESENTATION.kind
         self.error: BaseException | None = None
         self.blocks = 0
         self.busy = 0.0
@@ -135,11 +136,12 @@ class Processor(StateMachine):
         self.changes = Changes(stage)
         self.history = History(self.part_rows, stage.output, history_seconds)
         self._company = company
+        self._listener = company.listener
+        self.observers = company.observers
         self._workers = company.workers
         self._lock = company.workers.lock
         self._source = source
         self._started = False
-        self._taken: Block | None = None
         self._usual_telling = 0.0  # seconds that the listener took for the last block
         self._telling = threading.Lock()  # `released` and `ended` exclude each other
 
@@ -157,10 +159,6 @@ class Processor(StateMachine):
     def representation(self) -> Representation:
         """The declaration of what it computes."""
         return self.stage.REPRESENTATION
-
-    @property
-    def kind(self) -> str:
-        return self.representation.kind
 
     @property
     def given_rows(self) -> tuple[int, ...]:
@@ -217,17 +215,15 @@ class Processor(StateMachine):
             self._workers.enter()  # nothing is attached where the system has no thread left
             self._started = True
             self.attach()
-            self.called = self._source is not None
-            self.rouse()
             self._workers.wake()
         if self._source is not None:
-            self._source.open(self._call)
+            self._source.open(self._wake)
+            self._wake()
 
-    def _call(self) -> None:
+    def _wake(self) -> None:
         """The source may have something."""
         with self._lock:
-            self.called = True
-            self.rouse()
+            self.call()
             self._workers.wake()
 
     def end(self) -> None:
@@ -240,7 +236,7 @@ class Processor(StateMachine):
         if self._source is not None:
             self._source.stop()
         with self._telling:
-            self._company.listener.ended(self)
+            self._listener.ended(self)
 
     def join(self, timeout: float | None = None) -> bool:
         """Wait until nobody works on it and nobody will; whether that is so."""
@@ -248,45 +244,33 @@ class Processor(StateMachine):
             return bool(self._company.over.wait_for(lambda: self.over, timeout))
 
     def rouse(self) -> None:
-        if self.ready:
-            self._workers.push(self)
+        self._workers.push(self)
 
-    def entered(self, state: State, number: int | None) -> None:
-        for observer in self._company.observers:
-            observer(self, state, number)
-        if self.over:
-            self._company.over.notify_all()
+    def settle(self) -> None:
+        self._company.over.notify_all()
 
     # --- what workers do ---
-
-    def begin(self) -> Block | None:
-        self._taken = super().begin()
-        return self._taken
-
-    def rest(self) -> None:
-        super().rest()
-        if self.over:
-            self._company.over.notify_all()
 
     def work(self) -> None:
         """Take the next step: tell of the last block, or compute the next one."""
         try:
             if self.untold is not None:
-                self._tell()
-            elif self._source is not None:
+                self._tell(self.untold)
+                return
+            if self._source is not None:
                 self._read(self._source)
-            elif self._taken is not None:
-                self._compute(self._taken)
+            if self.taken is not None:
+                self._compute(self.taken)
         except BaseException as problem:  # whatever it was: the tree must hear of it, and nobody may wait for this one
             self.error = problem
             with self._lock:
                 self.finish()
             self.held_up_since = time.monotonic()  # by requests
             self._company.failed(self)
-        self._taken = None
-        self.held_up_since = 0.0
+            self.held_up_since = 0.0
 
     def _read(self, source: Source) -> None:
+        """Take the next block of the source, if there is one, or come to the end with it."""
         self.held_up_since = time.monotonic()
         while True:
             ended = source.ended  # looked at first: what has come before the end is read
@@ -294,27 +278,23 @@ class Processor(StateMachine):
             if got is not None or ended == source.ended:
                 break
         self.held_up_since = 0.0
-        if got is not None:
-            with self._lock:
-                self.read(self.blocks)
-            self._compute(Block(self.blocks, (got[0],), got[1], self.stage.given))
-        elif ended:
-            with self._lock:
+        with self._lock:
+            if got is not None:
+                self.read(Block(self.blocks, (got[0],), got[1], self.stage.given))
+            elif ended:
                 self.finish()
 
     def _compute(self, taken: Block) -> None:
-        begun = time.perf_counter()
+        begun = time.monotonic()
         private = self._process(taken)
-        seconds = time.perf_counter() - begun
+        seconds = time.monotonic() - begun
         self.blocks += 1
         self.busy += seconds
         with self._lock:
-            self.give_back()
-            if private is not None:
-                self.hold(private)
-        self._company.listener.executed(self, seconds)
+            self.done(private)
+        self._listener.executed(self, seconds)
         if self.untold is not None and self._usual_telling < SHORT:
-            self._tell()
+            self._tell(self.untold)
 
     def _process(self, taken: Block) -> Block | None:
         """What comes out for a block; None where that cannot be used."""
@@ -328,18 +308,20 @@ class Processor(StateMachine):
             stage.provide = frozenset(wanted.intersection(stage.PROVIDES))
         needs = stage.needs
         output = stage.process(taken.data, taken.extras[needs]) if needs else stage.process(taken.data)
-        next_index = max(0, taken.next_index - stage.look_ahead * stage.given.hop)
-        return Block(taken.number, tuple(parts_of(output)), next_index, stage.output, stage.provided)
+        parts = output if isinstance(output, tuple) else (output,)
+        next_index = taken.next_index
+        if look_ahead := stage.look_ahead:
+            next_index = max(0, next_index - look_ahead * stage.given.hop)
+        return Block(taken.number, parts, next_index, stage.output, stage.provided)
 
-    def _tell(self) -> None:
+    def _tell(self, block: Block) -> None:
         """Tell the world of the block that was released last."""
-        block, self.untold = self.untold, None
-        assert block is not None
+        self.untold = None
         self.held_up_since = begun = time.monotonic()
         with self._telling:
-            if not self.gone:
+            if self.state is not State.REMOVED:
                 self.history.append(block)
-                self._company.listener.released(self, block)
+                self._listener.released(self, block)
         self.held_up_since = 0.0
         self._usual_telling = time.monotonic() - begun
 

@@ -1,6 +1,6 @@
 """What a processor is at, and the tokens that it exchanges with its parent and its children. No threads in here.
 
-    waitExec --begin--> exec --hold--> waitRelease --once no child holds the last block--> release --rest--> waitExec
+    waitExec --begin--> exec --done--> waitRelease --once no child holds the last block--> release --rest--> waitExec
 
 A parent releases a block only while nobody holds a token of its last one; every child then gets a token of its own,
 takes the block with it, and gives it back when done. Children read the parent's memory.
@@ -9,6 +9,8 @@ takes the block with it, and gives it back when done. Children read the parent's
 from __future__ import annotations
 
 import enum
+from collections.abc import Callable, Sequence
+from typing import Any
 
 from rosafe.tree.block import Block
 
@@ -38,11 +40,17 @@ class StateMachine:
         A worker is at it, from `begin` to `rest`.
     called : bool
         Of the input: there may be sound to read.
+    taken : Block or None
+        What the worker has to work on.
     shared : Block or None
         Released last; children read it.
     untold : Block or None
         The same until the world has been told of it.
+    observers : sequence of callable
+        Get the processor, the state that it enters, and the number of the block at hand, or None. No waiting.
     """
+
+    observers: Sequence[Callable[[Any, State, int | None], None]] = ()
 
     def __init__(self, parent: StateMachine | None) -> None:
         self.parent = parent
@@ -50,33 +58,38 @@ class StateMachine:
         self.depth: int = 0 if parent is None else parent.depth + 1
         self.state = State.WAIT_EXEC
         self.at_work = self.called = False
+        self.taken: Block | None = None
         self.shared: Block | None = None
         self.untold: Block | None = None
         self._private: Block | None = None  # computed, and to be released as soon as no child holds the last one
         self._token: Block | None = None  # the parent's, not taken yet
-        self._reading: StateMachine | None = (
-            None  # the parent whose block it holds; the input may be replaced meanwhile
-        )
+        self._reading: StateMachine | None = None  # whose block it holds: the input may be replaced meanwhile
         self._holders: set[StateMachine] = set()  # children that have not given the last block back
 
     # --- what a processor adds ---
 
     def rouse(self) -> None:
-        """Perhaps it has become ready."""
+        """It has become ready."""
 
-    def entered(self, state: State, number: int | None) -> None:
-        """It has entered a state, with the block of that number at hand."""
+    def settle(self) -> None:
+        """It is `over`."""
 
     # --- coming and going ---
 
     def attach(self) -> None:
         """Become a child of its parent, and begin with the block that this has released last, if there is one."""
-        if self.parent is not None:
-            self.parent.children.append(self)
-            if self.parent.shared is not None:
-                self.parent._hand(self)
-            self._end_if_exhausted()
-        self.rouse()
+        if self.parent is None:
+            return
+        self.parent.children.append(self)
+        if self.parent.shared is not None:
+            self.parent._hand(self)
+        self._end_if_exhausted()
+
+    def call(self) -> None:
+        """There may be sound to read."""
+        self.called = True
+        if self.ready:
+            self.rouse()
 
     def move(self, parent: StateMachine) -> None:
         """Become a child of another parent, which has released nothing yet; a block that was not taken is dropped."""
@@ -89,6 +102,8 @@ class StateMachine:
         self._enter(State.REMOVED)
         self.shared = self._private = self._token = None
         self._leave()
+        if not self.at_work:
+            self.settle()
 
     def finish(self) -> None:
         """Nothing more will come of it; children may still take the block released last."""
@@ -96,6 +111,8 @@ class StateMachine:
         self._enter(State.DONE)
         for child in self.children:
             child._end_if_exhausted()
+        if not self.at_work:
+            self.settle()
 
     def _leave(self) -> None:
         if self.parent is not None and self in self.parent.children:
@@ -103,8 +120,9 @@ class StateMachine:
             self.parent._freed_by(self)
 
     def _end_if_exhausted(self) -> None:
-        alive = self.parent is None or self.parent.state is not State.DONE or self._token is not None
-        if not alive and not self.at_work and self.state is State.WAIT_EXEC:
+        if self.parent is None or self.parent.state is not State.DONE or self._token is not None:
+            return
+        if not self.at_work and self.state is State.WAIT_EXEC:
             self.finish()
 
     @property
@@ -128,22 +146,30 @@ class StateMachine:
             return self.called or self._token is not None
         return self.state is State.RELEASE
 
-    def begin(self) -> Block | None:
-        """Somebody works on it from now on. Returns the block that is taken, if it was waiting for one."""
+    def begin(self) -> None:
+        """Somebody works on it from now on, and takes the block that waits for it, if there is one."""
         self.at_work = True
-        if self.state is not State.WAIT_EXEC:
-            return None
-        self.called = False
-        taken, self._token = self._token, None
-        if taken is not None:
-            self._reading = self.parent
-            self._enter(State.EXEC, taken.number)
-        return taken
+        if self.state is State.WAIT_EXEC:
+            self.called = False
+            self.taken, self._token = self._token, None
+            if self.taken is not None:
+                self._reading = self.parent
+                self._enter(State.EXEC, self.taken.number)
 
-    def read(self, number: int) -> None:
-        """The input has read its block of that number, and works on it."""
+    def read(self, block: Block) -> None:
+        """The input has read a block."""
         self.called = True  # perhaps there is more
-        self._enter(State.EXEC, number)
+        self.taken = block
+        self._enter(State.EXEC, block.number)
+
+    def done(self, private: Block | None) -> None:
+        """It has computed `private`, or nothing: that is released at once or as soon as no child holds the last one."""
+        self.give_back()
+        if private is not None:
+            self._enter(State.WAIT_RELEASE, private.number)
+            self._private = private
+            if not self._holders:
+                self._release()
 
     def give_back(self) -> None:
         """Return the parent's block, which may release its next one then."""
@@ -151,27 +177,26 @@ class StateMachine:
             reading, self._reading = self._reading, None
             reading._freed_by(self)
 
-    def hold(self, private: Block) -> None:
-        """It has computed `private`, which is released at once or as soon as no child holds the last one."""
-        self._enter(State.WAIT_RELEASE, private.number)
-        self._private = private
-        self._release_if_free()
-
     def rest(self) -> None:
         """Nobody works on it any more."""
-        self.at_work = False
+        self.at_work, self.taken = False, None
         if self.state is State.EXEC or (self.state is State.RELEASE and self.untold is None):
             self._enter(State.WAIT_EXEC)
-        self._end_if_exhausted()
-        self.rouse()
+        if self.ready:
+            self.rouse()
+        elif self.state in ENDS:
+            self.settle()
+        else:
+            self._end_if_exhausted()
 
     def _freed_by(self, child: StateMachine) -> None:
         self._holders.discard(child)
-        self._release_if_free()
+        if not self._holders:
+            self._release()
 
-    def _release_if_free(self) -> None:
-        """Called by whoever may have made it possible, which is mostly a child."""
-        if self.state is not State.WAIT_RELEASE or self._holders:
+    def _release(self) -> None:
+        """Called, while no child holds a block, by whoever has made that possible, which is mostly a child."""
+        if self.state is not State.WAIT_RELEASE:
             return
         block, self._private = self._private, None
         assert block is not None
@@ -179,14 +204,17 @@ class StateMachine:
         self.shared = self.untold = block
         for child in self.children:
             self._hand(child)
-        self.rouse()
+        if not self.at_work:
+            self.rouse()
 
     def _hand(self, child: StateMachine) -> None:
         self._holders.add(child)
         child._token = self.shared
-        child.rouse()
+        if child.ready:
+            child.rouse()
 
     def _enter(self, state: State, number: int | None = None) -> None:
-        if not self.gone:
+        if self.state is not State.REMOVED:
             self.state = state
-            self.entered(state, number)
+            for observer in self.observers:
+                observer(self, state, number)

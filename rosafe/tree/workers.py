@@ -171,7 +171,16 @@ class Workers:
             self._idle -= 1
             self._called -= 1
             while (task := self._next()) is not None:
-                self._do(me, task)
+                me.task, me.seated = task, True
+                task.begin()
+                self.lock.release()
+                try:
+                    task.work()
+                finally:
+                    self.lock.acquire()
+                    self._free += me.seated
+                    me.task, me.seated = None, False
+                    task.rest()
             self._workers.remove(me)
             del self._threads[name]
 
@@ -180,7 +189,8 @@ class Workers:
         while self._members:
             if self._free and (task := self._pop()) is not None:
                 self._free -= 1
-                self.wake()
+                if self._waiting and self._free:
+                    self.wake()
                 return task
             if self._idle >= self.count:  # others have come in the place of those that were held up
                 break
@@ -189,18 +199,6 @@ class Workers:
             self._idle -= 1
             self._called = max(0, self._called - 1)
         return None
-
-    def _do(self, me: _Worker, task: Task) -> None:
-        me.task, me.seated = task, True
-        task.begin()
-        self.lock.release()
-        try:
-            task.work()
-        finally:
-            self.lock.acquire()
-            self._free += me.seated
-            me.task, me.seated = None, False
-            task.rest()
 
     def _keep_watch(self) -> None:
         """Give the seats of those that are held up to others."""

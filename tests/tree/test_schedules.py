@@ -297,13 +297,13 @@ def test_any_order_of_events(scenario: Scenario, delays: int, count: int, monkey
 
 def test_the_exploration_finds_a_parent_that_does_not_wait(monkeypatch: pytest.MonkeyPatch) -> None:
     """It releases while a child holds the last block, or has not taken it."""
-    release = StateMachine._release_if_free
+    done = StateMachine.done
 
-    def release_anyway(self: StateMachine) -> None:
+    def release_anyway(self: StateMachine, private: Block | None) -> None:
         self._holders.clear()
-        release(self)
+        done(self, private)
 
-    monkeypatch.setattr(StateMachine, "_release_if_free", release_anyway)
+    monkeypatch.setattr(StateMachine, "done", release_anyway)
     with pytest.raises(AssertionError, match="released"):
         go(monkeypatch, grow, 2, 1, WALKS)
 
@@ -311,16 +311,14 @@ def test_the_exploration_finds_a_parent_that_does_not_wait(monkeypatch: pytest.M
 def test_the_exploration_finds_a_look_at_tokens_that_is_out_of_date(monkeypatch: pytest.MonkeyPatch) -> None:
     """A child that looks whether there is a token, and takes it later: there may be another one meanwhile."""
 
-    def take_later(self: Processor) -> Block | None:
+    def take_later(self: Processor) -> None:
         self.at_work = True
-        taken = self._token
+        self.taken = self._token
         self._lock.release()
         self._lock.acquire()
         self.called, self._token, self._reading = False, None, self.parent
-        if taken is not None:
-            self._enter(State.EXEC, taken.number)
-        self._taken = taken
-        return taken
+        if self.taken is not None:
+            self._enter(State.EXEC, self.taken.number)
 
     monkeypatch.setattr(Processor, "begin", take_later)
     with pytest.raises(AssertionError, match=r"released|deadlock"):
