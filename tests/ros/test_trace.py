@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import os
 import signal
 import threading
 from collections.abc import Callable
@@ -35,14 +36,15 @@ def listening(graph: Graph, topic: str) -> bool:
     }
 
 
-def spans(path: Path) -> dict[str, list[tuple[str, int | None, int, int]]]:
-    """State, block, begin and end of all spans by row."""
+def spans(path: Path, of_workers: bool = False) -> dict[str, list[tuple[str, int | None, int, int]]]:
+    """State, block, begin and end of all spans by row, of the processors or of the workers."""
     events = json.loads(path.read_text())["traceEvents"]
-    rows = {e["tid"]: e["args"]["name"] for e in events if e["name"] == "thread_name"}
+    named = {(e["pid"], e["tid"]): e["args"]["name"] for e in events if e["name"] == "thread_name"}
+    rows = {row: name for row, name in named.items() if name.startswith("worker ") == of_workers}
     found: dict[str, list[tuple[str, int | None, int, int]]] = {name: [] for name in rows.values()}
     for e in events:
-        if e["ph"] == "X":
-            found[rows[e["tid"]]].append((e["cat"], e["args"].get("block"), e["ts"], e["ts"] + e["dur"]))
+        if e["ph"] == "X" and (e["pid"], e["tid"]) in rows:
+            found[rows[e["pid"], e["tid"]]].append((e["cat"], e["args"].get("block"), e["ts"], e["ts"] + e["dur"]))
     return found
 
 
@@ -66,7 +68,9 @@ def test_a_real_run_shows_parents_children_and_siblings_at_work_at_once(afe: Ses
         with afe.graph.collect("/rosAFE/trace", String) as told:
             wait_for(lambda: len(told) > 2, what="two rounds in which the command hears the rest")
         assert command.stop(signal.SIGINT) == 0, command
-    rows = spans(path)
+    rows, workers = spans(path), spans(path, of_workers=True)
+    assert 1 <= len(workers) <= len(os.sched_getaffinity(0)) + 1
+    assert sum(len(row) for row in workers.values()) >= BLOCKS * len(rows), "each block is some worker's"
     assert list(rows) == [
         f"{name} ({kind})" for kind, name in zip(FIXED, [*list(FIXED)[:-1], "crosscorrelation"], strict=True)
     ]
@@ -141,7 +145,7 @@ def test_nobody_listens_nothing_is_traced(graph: Graph) -> None:
         begun[-1](processor, State.EXEC, 3)
         wait_for(lambda: any(read(m) for m in got))  # noqa: B023
         (event,) = (event for message in got for event in read(message))
-        assert event[1:] == ("p", "ild", "", "exec", 3)
+        assert event[1:] == ("p", "ild", "", "exec", 3, "")
         subscriber.unregister()
         assert ended.wait(PATIENCE), "the last subscriber has left"
     assert len(begun) == 2
