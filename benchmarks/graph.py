@@ -16,7 +16,7 @@ HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parent))
 
 from rosafe.demo.processes import Child, Children  # noqa: E402
-from rosafe.demo.session import NAMES, Session  # noqa: E402
+from rosafe.demo.session import NAMES, GuideSession  # noqa: E402
 from rosafe.interface import FIXED, ROSAFE  # noqa: E402
 
 PYTHON = "/usr/bin/python3"
@@ -49,7 +49,7 @@ class Subscriber:
 class Bench:
     """The running nodes; `bench` makes one."""
 
-    def __init__(self, session: Session, children: Children, folder: str) -> None:
+    def __init__(self, session: GuideSession, children: Children, folder: str) -> None:
         self.session = session
         self._children = children
         self._folder = folder
@@ -96,7 +96,7 @@ def resident(pid: int) -> float:
 @contextmanager
 def bench() -> Iterator[Bench]:
     """Both nodes on a private master; everything ends with it."""
-    with tempfile.TemporaryDirectory() as folder, Session(folder, lambda: None) as session:
+    with tempfile.TemporaryDirectory() as folder, GuideSession(folder, lambda: None) as session:
         session.start_nodes()
         session.join()
         with Children(os.environ) as children:

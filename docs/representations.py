@@ -1,4 +1,3 @@
-#!/usr/bin/python3
 """Draws docs/representations.png: two seconds of the built-in scene in every representation."""
 
 from __future__ import annotations

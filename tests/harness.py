@@ -348,6 +348,10 @@ def shared_graph(home: Path) -> Iterator[Graph]:
             sys.modules["rospy"].signal_shutdown("end of the tests")  # while the master still listens
 
 
+class PortTakenError(Exception):
+    """A port that was free a moment ago is not any more."""
+
+
 class MasterProcess:
     """A master in a process of its own, which can be killed and started again at the same address."""
 
@@ -361,6 +365,10 @@ class MasterProcess:
         from rosafe.component.master import MasterError, check_master
 
         def answers() -> bool:
+            assert self.process is not None
+            if "already in use" in self.process.out:
+                self.kill()
+                raise PortTakenError(self.uri)
             try:
                 check_master(self.uri)
             except MasterError:
@@ -381,9 +389,15 @@ class MasterProcess:
 @contextmanager
 def private_graph(home: Path) -> Iterator[tuple[Graph, MasterProcess]]:
     """A graph with a master process of its own."""
-    master = MasterProcess()
-    graph = Graph(master.uri, home)
-    master.start(graph.env)
+    for attempts_left in reversed(range(5)):
+        master = MasterProcess()
+        graph = Graph(master.uri, home)
+        try:
+            master.start(graph.env)
+            break
+        except PortTakenError:  # somebody else was quicker
+            if not attempts_left:
+                raise
     try:
         yield graph, master
     finally:

@@ -20,7 +20,7 @@ from rosafe.interface import ComponentError
 from tests import harness
 from tests.genomix import attacks
 from tests.genomix import world as worlds
-from tests.genomix.test_fuzz import open_files, resident
+from tests.genomix.test_fuzz import LINKS, open_files, resident
 from tests.genomix.test_server import start_tree
 from tests.genomix.world import HttpError, World
 
@@ -75,7 +75,7 @@ def test_a_crowd_keeps_nobody_out(world: World, crowd: Crowd) -> None:
         harness.wait_for(lambda: world.http.raw("/components")[0] == 200, SOON)  # once the last of them is looked at
         served(world)
     served(world)
-    most = files + 100  # connections to the components, which it has loaded meanwhile
+    most = files + LINKS  # connections to the components, which it has loaded meanwhile
     harness.wait_for(lambda: open_files(pid) <= most, SOON, lambda: f"{open_files(pid)} files, {files} before")
 
 
@@ -200,7 +200,7 @@ def test_answers_that_nobody_takes_are_dropped(world: World) -> None:
             assert resident(pid) < memory + 2 * MUCH
             assert other.http.raw("/components")[0] == 200
             # All of them go; those to the component stay.
-            harness.wait_for(lambda: open_files(pid) < files + 80, SOON, lambda: f"{open_files(pid)} files")
+            harness.wait_for(lambda: open_files(pid) < files + LINKS, SOON, lambda: f"{open_files(pid)} files")
 
 
 def test_answers_together_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -24,7 +24,9 @@ pytestmark = pytest.mark.ros
 LONG = float(os.environ.get("GENOMIX_FUZZ", "0"))
 
 # Four connections to each of 26 services, and four topics of each of 10 actions, when all were used.
-MAX_FILES = 200
+# sockets between genomixd and the components that it has loaded: of five topics for each activity, both ways, and more
+LINKS = 9 * sum(len(component.activities) for component in interface.COMPONENTS.values())
+MAX_FILES = 100 + LINKS
 
 texts = st.text(max_size=20)
 services = [f"{c.name}/{s.name}" for c, s in interface.all_services() if s.name != "kill"]

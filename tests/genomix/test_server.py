@@ -29,7 +29,7 @@ def start_tree(http: Http) -> None:
 def test_load_tells_the_interface(world: World) -> None:
     told = world.http.get("/load/rosAFE", s="load")
     assert (told["name"], told["component"], told["instance"]) == ("rosAFE", "rosAFE", "rosAFE")
-    assert list(told["services"]) == [*(s.name for s in interface.ROSAFE.services), "request"]
+    assert list(told["services"]) == [s.name for s in (*interface.ROSAFE.services, *interface.ROSAFE.composites)]
     assert told["services"]["getSignals"]["aliases"] == ["getSignal"]
     parameter = told["services"]["PreProc"]["parameters"]["pp_refSPLdB"]
     assert parameter["default"] == 100.0

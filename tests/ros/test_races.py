@@ -26,7 +26,8 @@ from tests.ros.session import Session, told
 STALLING = """
 import sys, threading
 from pathlib import Path
-from rosafe.component import audio, node
+from rosafe.component import audio
+from rosafe.node import node
 where, folder = sys.argv.pop(1), Path(sys.argv.pop(1))
 
 def stall():
