@@ -41,7 +41,7 @@ CASES: dict[str, Case] = {
         },
     },
 }
-DEFAULTS = {
+DEFAULTS: Case = {
     "pp_bRemoveDC": False,
     "pp_bPreEmphasis": False,
     "pp_coefPreEmphasis": 0.97,
@@ -75,7 +75,8 @@ def half_up(value: float) -> int:
 
 def preproc(x: np.ndarray, rate: float, p: Case) -> np.ndarray:
     if p["pp_bRemoveDC"]:
-        x = by_partial_fractions(*scipy.signal.butter(4, 20.0, "highpass", fs=rate, output="zpk"), x)
+        zeros, poles, gain = scipy.signal.butter(4, 20.0, "highpass", fs=rate, output="zpk")
+        x = by_partial_fractions(zeros, poles, gain, x)
     if p["pp_bPreEmphasis"]:
         x = x - p["pp_coefPreEmphasis"] * np.concatenate((np.zeros((2, 1)), x[:, :-1]), axis=1)
     return x * 10 ** ((100 - p["pp_refSPLdB"]) / 20) if p["pp_bLevelScaling"] else x
