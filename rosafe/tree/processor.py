@@ -10,6 +10,7 @@ from typing import Any, Protocol
 
 from numpy.typing import NDArray
 
+from rosafe.dsp.guard import FloatArray
 from rosafe.dsp.signal import Signal
 from rosafe.dsp.stage import Stage
 from rosafe.tree.block import Block
@@ -112,6 +113,8 @@ class Processor(StateMachine):
         That it has worked on, and
     busy : float
         the seconds that it took for them.
+    place : callable or None
+        Gets the frames that it has taken, and tells where its stage may write the output (`Stage.place`).
     """
 
     parent: Processor | None
@@ -142,6 +145,7 @@ class Processor(StateMachine):
         self._lock = company.workers.lock
         self._source = source
         self._started = False
+        self.place: Callable[[int], FloatArray | None] | None = None
         self._usual_telling = 0.0  # seconds that the listener took for the last block
         self._telling = threading.Lock()  # `released` and `ended` exclude each other
 
@@ -306,6 +310,8 @@ class Processor(StateMachine):
                 children = list(self.children)
             wanted = {child.changes.needs(taken.number) for child in children}
             stage.provide = frozenset(wanted.intersection(stage.PROVIDES))
+        if self.place is not None and not self.children:  # who take blocks in one piece
+            stage.place = self.place(taken.data.shape[-1])
         needs = stage.needs
         output = stage.process(taken.data, taken.extras[needs]) if needs else stage.process(taken.data)
         parts = output if isinstance(output, tuple) else (output,)
