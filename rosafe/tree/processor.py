@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -13,9 +14,9 @@ from rosafe.dsp.stage import Stage
 from rosafe.tree.block import Block, Source
 from rosafe.tree.member import Member
 from rosafe.tree.states import State
-from rosafe.tree.workers import Workers
+from rosafe.tree.workers import SHORT, Workers
 
-SHORT = 1.5e-4  # seconds: a listener that takes so long is called once nothing deeper in the tree is ready
+RISE = 2.0  # what a processor usually takes is the least of late; that is forgotten at this pace per block
 
 
 class Listener(Protocol):
@@ -87,6 +88,7 @@ class Processor(Member):
         super().__init__(name, stage, parent, history_seconds)
         self.observers = company.observers
         self.held_up_since = 0.0
+        self.usual = math.inf
         self.place: Callable[[int], FloatArray | None] | None = None
         self._company = company
         self._listener = company.listener
@@ -180,10 +182,11 @@ class Processor(Member):
         seconds = time.monotonic() - begun
         self.blocks += 1
         self.busy += seconds
+        self.usual = min(seconds, RISE * self.usual)
         with self._lock:
             self.done(private)
         self._listener.executed(self, seconds)
-        if self.untold is not None and self._usual_telling < SHORT:
+        if self.untold is not None and self._usual_telling < SHORT:  # else once nothing deeper in the tree is ready
             self._tell(self.untold)
 
     def _process(self, taken: Block) -> Block | None:
