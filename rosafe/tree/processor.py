@@ -202,7 +202,8 @@ class Processor(Member):
         if self.place is not None and not self.children:  # who take blocks in one piece
             stage.place = self.place(taken.data.shape[-1])
         needs = stage.needs
-        output = stage.process(taken.data, taken.extras[needs]) if needs else stage.process(taken.data)
+        data = taken.parts[0]
+        output = stage.process(data, taken.extras[needs]) if needs else stage.process(data)
         parts = output if isinstance(output, tuple) else (output,)
         next_index = taken.next_index
         if look_ahead := stage.look_ahead:

@@ -404,10 +404,11 @@ _ANYTHING = ctypes.c_char * 0
 
 
 def _address(array: NDArray[Any]) -> int:
-    if array.flags.writeable:
-        return ctypes.addressof(_ANYTHING.from_buffer(array.data))  # takes half of the time of the other way
-    address: int = array.ctypes.data
-    return address
+    try:
+        return ctypes.addressof(_ANYTHING.from_buffer(array))  # takes a fifth of the time of the other way
+    except TypeError:  # it cannot be written to, or not in one piece
+        address: int = array.ctypes.data
+        return address
 
 
 def rows_apart(array: FloatArray) -> bool:
@@ -419,8 +420,7 @@ def rows_apart(array: FloatArray) -> bool:
 
 def _rows(array: FloatArray) -> tuple[int, int]:
     """Address of an array whose rows may lie apart, and how far."""
-    address = _address(array) if array.flags.c_contiguous else array.ctypes.data
-    return address, array.strides[-2] // REAL_SIZE
+    return _address(array), array.strides[-2] // REAL_SIZE
 
 
 def _arguments(frames: Frames, rows: int | None = None) -> tuple[int, ...]:
