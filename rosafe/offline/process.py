@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from rosafe.dsp import kernels
 from rosafe.dsp.stage import SAMPLE_RATE
 from rosafe.interface import KINDS
 from rosafe.interface.arguments import check_change, check_outputs, check_parameters
@@ -210,7 +211,7 @@ class _Gathered:
     def _write(self) -> None:
         end = self._filled + self._frames
         if end <= self._whole.shape[-1]:
-            np.concatenate(self._waiting, axis=-1, out=self._whole[..., self._filled : end])
+            kernels.join(self._waiting, self._whole[..., self._filled : end])
             self._waiting, self._filled, self._frames, self._begun = [], end, 0, True
 
     def joined(self) -> np.ndarray:
