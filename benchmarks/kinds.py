@@ -106,15 +106,22 @@ def measure(rounds: int) -> dict[str, dict[str, float]]:
 
 def table(found: dict[str, dict[str, float]]) -> list[list[str]]:
     """A row for each, the head first."""
-    rows = [["representation", "plain", *(f"blocks of {block}" for block in BLOCKS), "times as fast", "bound", "differ"]]
+    rows = [
+        ["representation", "plain", *(f"blocks of {block}" for block in BLOCKS), "times as fast", "bound", "differ"]
+    ]
     for kind, cost in found.items():
         bound = {**BOUNDS, REST: REST_BOUND}.get(kind)
         ours = [cost[str(block)] for block in BLOCKS]
         verdict = "" if bound is None else f"{bound:.0f}" + ("" if max(ours) <= bound else " (over)")
         apart = "" if kind == REST else f"{cost['apart']:.0e}" + ("" if agrees(kind, cost) else " (too much)")
         rows.append(
-            [kind, f"{cost['plain']:.2f}", *(f"{ms:.2f}" for ms in ours), f"{cost['plain'] / ours[0]:.1f}", verdict, apart]
+            [
+                kind,
+                f"{cost['plain']:.2f}",
+                *(f"{ms:.2f}" for ms in ours),
+                f"{cost['plain'] / ours[0]:.1f}",
+                verdict,
+                apart,
+            ]
         )
     return rows
-
-

@@ -43,7 +43,10 @@ class Report:
         except ValueError:
             load = os.getloadavg()[0]
         if load > BUSY and not options.loaded:
-            print(f"{name}: the load is {load:.2f}, above {BUSY}: wait until it is quiet, or give --loaded", file=sys.stderr)
+            print(
+                f"{name}: the load is {load:.2f}, above {BUSY}: wait until it is quiet, or give --loaded",
+                file=sys.stderr,
+            )
             sys.exit(1)
         self._folder: Path = options.results
         self._lines = [f"# {title}", "", f"By benchmarks/{name}.", ""]

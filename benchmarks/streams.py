@@ -191,7 +191,9 @@ def main() -> int:
         parser.error("--most: 1 to 200")
     page = report.Report(options, "Many trees at once")
     cores = sorted(os.sched_getaffinity(0))[:2]
-    page.say(f"Default trees at {RATE} Hz on {len(cores)} cores, in real time, blocks of {options.block} frames. Latency")
+    page.say(
+        f"Default trees at {RATE} Hz on {len(cores)} cores, in real time, blocks of {options.block} frames. Latency"
+    )
     page.say("is from the last sample of a block to its ILD.")
     page.say()
     page.say("## One core, one process: what each tree costs")

@@ -26,6 +26,7 @@ from rosafe.representations import PROBLEMS
 from rosafe.tree.block import Block
 from rosafe.tree.processor import Processor
 from rosafe.tree.tree import Tree
+from rosafe.tree.workers import workers_to_use
 from rosafe.vocabulary.parameter import MAX_STRING, shown
 
 FIRST_AUDIO_SECONDS = 1.0  # how long InputProc waits for a first message
@@ -39,7 +40,7 @@ class RosafeNode:
             rospy.logwarn(f"a representation is left out: {problem}")
         self._node = ComponentNode(ROSAFE, lambda problem: ROSAFE.error("e_badNewValue", what=str(problem)))
         self.finished = self._node.finished
-        self._tree = Tree(self)
+        self._tree = Tree(self, _workers())
         self._ring = AudioRing(EventLog(rospy.logwarn))
         self._audio: rospy.Subscriber | None = None
         self._audio_topic = ""
@@ -230,9 +231,22 @@ class RosafeNode:
     def _tree_health(self, status: Any) -> Any:
         processors = self._tree.processors
         status.summary(DiagnosticStatus.OK, f"{len(processors)} processors")
+        status.add("workers", str(self._tree.workers))
         for processor in processors:
             status.add(processor.name, f"{processor.kind}, {processor.state.value}, {processor.blocks} blocks")
         return status
+
+
+def _workers() -> int:
+    """How many workers: what the private parameter `workers` says, else the environment, else one for each core."""
+    wanted = rospy.get_param("~workers", None)
+    if isinstance(wanted, bool) or not isinstance(wanted, int | str | None):
+        wanted = str(wanted)
+    try:
+        return workers_to_use(wanted)
+    except ValueError as problem:
+        where = "" if wanted is None else f"the parameter {rospy.resolve_name('~workers')}: "
+        raise ROSAFE.error("e_badNewValue", what=f"{where}{problem}") from None
 
 
 def main(argv: list[str] | None = None) -> int:
