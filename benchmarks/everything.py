@@ -1,8 +1,8 @@
 """All twenty-one representations live through the node: frames lost on any of their ports.
 
-``/usr/bin/python3 benchmarks/everything.py`` starts real nodes on a master of its own, builds one processor of each kind
-with its defaults, and subscribes from another process to all their ports, which are as long as a block. The exit code is
-1 where a frame was lost on a port, or where the node says that it has lost sound.
+``/usr/bin/python3 benchmarks/everything.py`` starts real nodes on a master of its own, builds one processor of each
+kind with its defaults, and subscribes from another process to all their ports, which are as long as a block. The exit
+code is 1 where a frame was lost on a port, or where the node says that it has lost sound.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """The other fourteen representations as plain numpy and scipy do them, at their defaults, on a whole signal at once.
 
-To measure `rosafe` against, as benchmarks/yardstick.py is for the default chain. A whole signal at once is the best that
-can happen to them: nothing is carried from block to block. They know the defaults only and check nothing. Precedence is
-the twin of its kernels, which does as much as numpy can.
+To measure `rosafe` against, as benchmarks/yardstick.py is for the default chain. A whole signal at once is the best
+that can happen to them: nothing is carried from block to block. They know the defaults only and check nothing.
+Precedence is the twin of its kernels, which does as much as numpy can.
 """
 
 from __future__ import annotations

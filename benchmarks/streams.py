@@ -2,9 +2,9 @@
 
 ``/usr/bin/python3 benchmarks/streams.py`` plays sound in real time into the ring that a rosAFE node reads, with so many
 default trees under one input: filterbank to cross-correlation, 44.1 kHz. It looks for the largest number with short
-trials, holds that for a minute, and tells how latency grows with the number and what a tree costs on one core. ROS takes
-no part: what ports and subscribers cost more is for benchmarks/ports.py. About four minutes; `--seconds` and `--trial`
-make it shorter.
+trials, holds that for a minute, and tells how latency grows with the number and what a tree costs on one core. ROS
+takes no part: what ports and subscribers cost more is for benchmarks/ports.py. About four minutes; `--seconds` and
+`--trial` make it shorter.
 """
 
 from __future__ import annotations
