@@ -418,8 +418,8 @@ _ANYTHING = ctypes.c_char * 0
 
 
 def _address(array: NDArray[Any]) -> int:
-    try:
-        return ctypes.addressof(_ANYTHING.from_buffer(array))  # type: ignore[arg-type]  # takes a fifth of the time of the other way
+    try:  # takes a fifth of the time of the other way
+        return ctypes.addressof(_ANYTHING.from_buffer(array))  # type: ignore[arg-type]
     except TypeError:  # it cannot be written to, or not in one piece
         address: int = array.ctypes.data
         return address
