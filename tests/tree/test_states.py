@@ -69,7 +69,7 @@ class Machine(StateMachine):
             *(number(some) for some in (self.taken, self.shared, self.untold, self._private, self._token)),
             *(None if one is None else str(one) for one in (self.parent, self._reading)),
             *(tuple(sorted(map(str, group))) for group in (self.children, self._holders)),
-            *(tuple(self.seen), tuple(self.released), tuple(self.told), self.begins),
+            *(tuple(self.seen), tuple(self.released), tuple(self.told)),
         )
 
 
@@ -262,9 +262,9 @@ def explore(start: World) -> tuple[int, int]:
             ends += 1
         for name, step in steps:
             following = world.after(name, step)
+            following.check()
             mark = fingerprint(following)
             if mark not in known:
-                following.check()
                 known.add(mark)
                 unexplored.append(following)
     return len(known), ends
