@@ -124,7 +124,8 @@ async def _make(instance: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
             topic = "/" + str(values.get("connect", REQUEST.parameter("connect").default)).lstrip("/")
             start = "" if await proxy.published(topic) else "bass-ros -b; "
             acquire = f"rosservice call {topic.rpartition('/')[0]}/Acquire \"{{device: 'scene:'}}\""
-            raise Failure(f"{_told(problem)}; start the sound first: {start}{acquire}") from None
+            silent = f"{problem.ex}: {ROSAFE.exceptions['e_noData']}"
+            raise Failure(f"{silent}; start the sound first: {start}{acquire}") from None
         finally:
             await proxy.close()
     finally:
@@ -133,7 +134,7 @@ async def _make(instance: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
 
 def _told(problem: ComponentError) -> str:
     """The exception in one line: its name, and what it is about."""
-    what = problem.detail.get("what") or ROSAFE.exceptions.get(problem.ex.rpartition("::")[2], "")
+    what = problem.what or ROSAFE.exceptions.get(problem.ex.rpartition("::")[2], "")
     return problem.ex + (f": {what}" if what else "")
 
 
