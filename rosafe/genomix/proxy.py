@@ -32,6 +32,7 @@ from rosafe.interface import (
     ros_type,
 )
 from rosafe.interface.signals import LEVELS
+from rosafe.vocabulary.words import meant
 
 CALL_SECONDS = 60.0  # for the answer to one request
 APPEAR_SECONDS = 2.0  # that `load` waits for a component that is just starting
@@ -142,8 +143,8 @@ class Proxy:
         try:
             return self.component.service(name)
         except KeyError:
-            known = ", ".join(s.name for s in (*self.component.services, *self.component.composites))
-            what = f"{self.component.name} has no service {name[:80]!r}; it has {known}"
+            known = [s.name for s in (*self.component.services, *self.component.composites)]
+            what = f"{self.component.name} has no service {name[:80]!r}; it has {', '.join(known)}{meant(name, known)}"
             raise ComponentError("::genom::no_such_service", what=what) from None
 
     def arguments(self, service: Service, given: Any) -> dict[str, Any]:
