@@ -24,20 +24,8 @@ from tests.packaging.clone import environment, fresh_copy, run
 
 DEBIAN = Path("/usr/lib/python3/dist-packages")
 NEEDED = ["numpy", "scipy", "soundfile.py", "_soundfile.py", "cffi", "_cffi_backend*.so", "pycparser", "ply"]
-FOR_TESTS = ["pytest", "_pytest", "py", "py.py", "pluggy", "iniconfig", "packaging", "attr", "hypothesis"]
-FOR_TESTS += ["attrs", "sortedcontainers"]
-    "pytest",
-    "_pytest",
-    "py",
-    "py.py",
-    "pluggy",
-    "iniconfig",
-    "packaging",
-    "attr",
-    "attrs",
-    "hypothesis",
-    "sortedcontainers",
-]
+FOR_TESTS = ["pytest", "_pytest", "py", "py.py", "pluggy", "iniconfig", "packaging", "attr", "attrs", "hypothesis"]
+FOR_TESTS += ["sortedcontainers"]
 BUILD = "import setuptools.build_meta as backend, sys; getattr(backend, sys.argv[1])(sys.argv[2])"
 
 
