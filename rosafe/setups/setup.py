@@ -117,10 +117,8 @@ def wanted(found: Found) -> Wanted:
     defaults = _defaults(kind.parameters)
     given = _given(found.kind, told, defaults)
     if not kind.parent:
-        told_of_input = {p.name: found.values[p.name] for p in BLOCK_AND_BUFFERS if p.name in found.values}
-        given = {
-            p.name: v for p in BLOCK_AND_BUFFERS if (v := told_of_input.get(p.name, p.default)) != p.default
-        } | given
+        of_the_input = {p.name: found.values.get(p.name, p.default) for p in BLOCK_AND_BUFFERS}
+        given = {p.name: of_the_input[p.name] for p in BLOCK_AND_BUFFERS if of_the_input[p.name] != p.default} | given
     return Wanted(found.name, found.kind, found.parent, given)
 
 

@@ -31,7 +31,8 @@ class Parameter:
     """One member of a request, or one parameter of a processor.
 
     `minimum` and `maximum` are inclusive unless `open_minimum` says otherwise; they bind the elements of a sequence,
-    `least` and `most` its length, `longest` the characters of a text. `choices` are the known words of an enumerated string, or of a list of words.
+    `least` and `most` its length, `longest` the characters of a text. `choices` are the known words of an enumerated
+    string, or of a list of words.
     Requests from the ROS graph may hold any word: `known_word` says what is taken for it, the original's `fallback`;
     where there is none, unknown words are refused there as everywhere else.
     """

@@ -1,4 +1,4 @@
-"""Setups as files: what is written reads back the same, what is wrong is told with its line, hostile texts are refused."""
+"""Setups as files: what is written reads back the same, what is wrong is told with its line, bombs are refused."""
 
 from __future__ import annotations
 
