@@ -47,9 +47,10 @@ class _Ended(Exception):
 
 def run_server(
     component: Component,
-    build: Callable[[str], Node],
+    build: Callable[[str, argparse.Namespace], Node],
     argv: list[str] | None = None,
     prepare: Callable[[], object] = lambda: None,
+    configure: Callable[[argparse.ArgumentParser], str] = lambda parser: "",
 ) -> int:
     """Run one component's node until a signal, its `kill` request or the master ends it.
 
@@ -58,11 +59,13 @@ def run_server(
     component : Component
         The component; its name is the instance's where the user gives none.
     build : callable
-        Makes and starts the node of the instance that it is given, after `rospy.init_node`.
+        Makes and starts the node of the instance that it is given, after `rospy.init_node`; gets the options too.
     argv : list of str, optional
         The command line without the program; by default that of this process.
     prepare : callable, optional
         Called before that, and may take its time: compile something, say.
+    configure : callable, optional
+        Adds options of the node's own, and returns what the usage says of them.
 
     Returns
     -------
@@ -71,7 +74,7 @@ def run_server(
         raises SystemExit(2), and -h and --version SystemExit(0).
     """
     arguments = sys.argv[1:] if argv is None else argv
-    options = _parse(component, [a for a in arguments if ":=" not in a])
+    options = _parse(component, [a for a in arguments if ":=" not in a], configure)
     remappings = [a for a in arguments if ":=" in a]
     told = Background() if options.background else None
     if told is not None and told.in_parent:
@@ -110,11 +113,12 @@ class Parser(argparse.ArgumentParser):
         self.exit(2, f"{self.prog}: {message}; {self.prog} -h shows what is possible\n")
 
 
-def _parse(component: Component, arguments: list[str]) -> argparse.Namespace:
+def _parse(
+    component: Component, arguments: list[str], configure: Callable[[argparse.ArgumentParser], str]
+) -> argparse.Namespace:
     program = f"{component.name}-ros"
     parser = Parser(
         prog=program,
-        usage=f"{program} [-b] [-i NAME] [--wait] [-h] [--version] [NAME:=VALUE ...]",
         description=f"{component.doc}.",
         epilog=f"ROS remappings are taken too: topics (a:=b) and __name, __ns, __master, __ip, __hostname, __log.\n\n"
         f"example:\n  {program} -b -i left        # serves /left/...; returns once the node is up",
@@ -135,7 +139,9 @@ def _parse(component: Component, arguments: list[str]) -> argparse.Namespace:
         action="store_true",
         help=f"wait for a ROS master for ever, as a service at boot must (default: for {MASTER_SECONDS:g} s)",
     )
+    own = configure(parser)
     parser.add_argument("--version", action="version", version=f"{component.name} {VERSION}")
+    parser.usage = f"{program} [-b] [-i NAME] [--wait]{own and ' ' + own} [-h] [--version] [NAME:=VALUE ...]"
     return parser.parse_args(arguments)
 
 
@@ -144,7 +150,7 @@ def _parse(component: Component, arguments: list[str]) -> argparse.Namespace:
 
 def _start(
     component: Component,
-    build: Callable[[str], Node],
+    build: Callable[[str, argparse.Namespace], Node],
     options: argparse.Namespace,
     remappings: list[str],
     received: list[int],
@@ -184,7 +190,7 @@ def _start(
     except (rospy.ROSException, ValueError) as problem:
         raise _Failure(f"cannot start the node: {problem}") from problem
     log_to_stderr()
-    node = build(instance)
+    node = build(instance, options)
     gc.freeze()  # a look at all that the modules made stops every thread for tens of milliseconds, and finds nothing
     limit.cancel()
     return node
