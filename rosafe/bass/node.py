@@ -159,4 +159,4 @@ class BassNode:
 
 def main(argv: list[str] | None = None) -> int:
     """Run `bass-ros`; returns its exit code."""
-    return run_server(BASS, lambda instance, _: BassNode(instance), argv)
+    return run_server(BASS, BassNode, argv)

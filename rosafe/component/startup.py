@@ -47,10 +47,11 @@ class _Ended(Exception):
 
 def run_server(
     component: Component,
-    build: Callable[[str, argparse.Namespace], Node],
+    build: Callable[[str], Node],
     argv: list[str] | None = None,
     prepare: Callable[[], object] = lambda: None,
     configure: Callable[[argparse.ArgumentParser], str] = lambda parser: "",
+    own: argparse.Namespace | None = None,
 ) -> int:
     """Run one component's node until a signal, its `kill` request or the master ends it.
 
@@ -59,13 +60,15 @@ def run_server(
     component : Component
         The component; its name is the instance's where the user gives none.
     build : callable
-        Makes and starts the node of the instance that it is given, after `rospy.init_node`; gets the options too.
+        Makes and starts the node of the instance that it is given, after `rospy.init_node`.
     argv : list of str, optional
         The command line without the program; by default that of this process.
     prepare : callable, optional
         Called before that, and may take its time: compile something, say.
     configure : callable, optional
         Adds options of the node's own, and returns what the usage says of them.
+    own : argparse.Namespace, optional
+        Holds all options from then on.
 
     Returns
     -------
@@ -74,7 +77,7 @@ def run_server(
         raises SystemExit(2), and -h and --version SystemExit(0).
     """
     arguments = sys.argv[1:] if argv is None else argv
-    options = _parse(component, [a for a in arguments if ":=" not in a], configure)
+    options = _parse(component, [a for a in arguments if ":=" not in a], configure, own)
     remappings = [a for a in arguments if ":=" in a]
     told = Background() if options.background else None
     if told is not None and told.in_parent:
@@ -114,7 +117,10 @@ class Parser(argparse.ArgumentParser):
 
 
 def _parse(
-    component: Component, arguments: list[str], configure: Callable[[argparse.ArgumentParser], str]
+    component: Component,
+    arguments: list[str],
+    configure: Callable[[argparse.ArgumentParser], str],
+    own: argparse.Namespace | None,
 ) -> argparse.Namespace:
     program = f"{component.name}-ros"
     parser = Parser(
@@ -139,10 +145,10 @@ def _parse(
         action="store_true",
         help=f"wait for a ROS master for ever, as a service at boot must (default: for {MASTER_SECONDS:g} s)",
     )
-    own = configure(parser)
+    usage = configure(parser)
     parser.add_argument("--version", action="version", version=f"{component.name} {VERSION}")
-    parser.usage = f"{program} [-b] [-i NAME] [--wait]{own and ' ' + own} [-h] [--version] [NAME:=VALUE ...]"
-    return parser.parse_args(arguments)
+    parser.usage = f"{program} [-b] [-i NAME] [--wait]{usage and ' ' + usage} [-h] [--version] [NAME:=VALUE ...]"
+    return parser.parse_args(arguments, own)
 
 
 # --- start ------------------------------------------------------------------------------------------------------
@@ -150,7 +156,7 @@ def _parse(
 
 def _start(
     component: Component,
-    build: Callable[[str, argparse.Namespace], Node],
+    build: Callable[[str], Node],
     options: argparse.Namespace,
     remappings: list[str],
     received: list[int],
@@ -190,7 +196,7 @@ def _start(
     except (rospy.ROSException, ValueError) as problem:
         raise _Failure(f"cannot start the node: {problem}") from problem
     log_to_stderr()
-    node = build(instance, options)
+    node = build(instance)
     gc.freeze()  # a look at all that the modules made stops every thread for tens of milliseconds, and finds nothing
     limit.cancel()
     return node

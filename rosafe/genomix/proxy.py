@@ -268,7 +268,7 @@ class Proxy:
             message = await self._read(port, element)
         value = _zero(self.component, port.idl)
         if message is not None:
-            value = {name: getattr(message, name) for name, _ in self.component.structs[port.idl]}
+            value = {name: getattr(message, name) for name, _ in self.component.members(port.idl)}
         sample = Value(self.component, ((port.name, port.idl),), {port.name: value})
         sample.data = message
         return sample
@@ -399,10 +399,10 @@ def _no_port(what: str) -> ComponentError:
 def _zero(component: Component, idl: str) -> Any:
     if idl.startswith("sequence<"):
         return []
-    if idl in component.structs:
+    if idl.startswith("::"):
         if idl in LEVELS:
             return []
-        return {name: _zero(component, kind) for name, kind in component.structs[idl]}
+        return {name: _zero(component, kind) for name, kind in component.members(idl)}
     return "" if idl == "string" else 0
 
 

@@ -67,6 +67,8 @@ class RosafeNode:
         self._restoring = ""  # why it is not there yet
         self._data_object = self._node.advertise("dataObj", wire.message_class("rosAFE", "::rosAFE::dataObjSt"))
         self._input_port = self._advertise("input")
+        self._time_class = wire.message_class("rosAFE", "::rosAFE::frameTime")
+        self._frame_time = self._node.advertise("frameTime", self._time_class)
 
         self._node.input_port("Audio", self._connect_audio)
         self._node.activity("InputProc", self._input_proc)
@@ -173,7 +175,7 @@ class RosafeNode:
                 self._give_up_coming_back()
 
     def _rebuild(self, setup: Setup) -> None:
-        again = functools.partial(self._input_proc, comes_back=True)
+        again: Handler = functools.partial(self._input_proc, comes_back=True)
         try:
             for one in setup.processors:
                 values = {"name": one.name, "upperDepName": one.parent, **one.values, **one.input_values}
@@ -275,8 +277,18 @@ class RosafeNode:
         self._node.meters[ROSAFE.service(KINDS[processor.kind].request).task].cycle(seconds)
 
     def released(self, processor: Processor, block: Block) -> None:
-        """Publish the processor's window."""
+        """Publish the processor's window; with that of the input, the time of its newest frame."""
         self._ports[processor].append(block, self._tree.port_seconds)
+        if processor.parent is None:
+            self._tell_time(block.next_index - 1)
+
+    def _tell_time(self, frame: int) -> None:
+        line = self._ring.captured(frame)
+        if line is not None:
+            seconds, nanoseconds = divmod(round(line.time * 1e9), 1_000_000_000)
+            if 0 <= seconds < 2**32:  # what anybody sends as a stamp may be beyond all times
+                stamp = {"sec": seconds, "nsec": nanoseconds}
+                self._frame_time.publish(self._time_class(stamp=stamp, frameIndex=frame, sampleRate=line.rate))
 
     def ended(self, processor: Processor) -> None:
         """Close the port and end the activity."""
@@ -373,10 +385,9 @@ def _configure(parser: argparse.ArgumentParser) -> str:
 
 def main(argv: list[str] | None = None) -> int:
     """Run the node; the `rosAFE-ros` command."""
-    return run_server(
-        interface.ROSAFE,
-        lambda instance, options: RosafeNode(instance, options.keep),
-        argv,
-        kernels.compiled,
-        _configure,
-    )
+    options = argparse.Namespace()
+
+    def build(instance: str) -> RosafeNode:
+        return RosafeNode(instance, options.keep)
+
+    return run_server(interface.ROSAFE, build, argv, kernels.compiled, _configure, options)
