@@ -106,7 +106,8 @@ async def _make(instance: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
             topic = "/" + str(values.get("connect", REQUEST.parameter("connect").default)).lstrip("/")
             start = "" if await proxy.published(topic) else "bass-ros -b; "
             acquire = f"rosservice call {topic.rpartition('/')[0]}/Acquire \"{{device: 'scene:'}}\""
-            raise Failure(f"{told(problem)}; start the sound first: {start}{acquire}") from None
+            silent = f"{problem.ex}: {ROSAFE.exceptions['e_noData']}"
+            raise Failure(f"{silent}; start the sound first: {start}{acquire}") from None
 
 
 def _show(answer: Mapping[str, Any], kind: Representation) -> None:

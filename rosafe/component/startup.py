@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import functools
 import gc
 import os
 import re
@@ -10,9 +11,10 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn, Protocol
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, NoReturn, Protocol
 
 from rosafe.component import generate, master, memory, paths, systemd
 from rosafe.version import VERSION
@@ -47,11 +49,10 @@ class _Ended(Exception):
 
 def run_server(
     component: Component,
-    build: Callable[[str], Node],
+    build: Callable[..., Node],
     argv: list[str] | None = None,
     prepare: Callable[[], object] = lambda: None,
-    configure: Callable[[argparse.ArgumentParser], str] = lambda parser: "",
-    own: argparse.Namespace | None = None,
+    more_options: Mapping[str, Mapping[str, Any]] = MappingProxyType({}),
 ) -> int:
     """Run one component's node until a signal, its `kill` request or the master ends it.
 
@@ -60,15 +61,14 @@ def run_server(
     component : Component
         The component; its name is the instance's where the user gives none.
     build : callable
-        Makes and starts the node of the instance that it is given, after `rospy.init_node`.
+        Makes and starts the node of the instance that it is given, after `rospy.init_node`. It is given the values of
+        `more_options` too, by name.
     argv : list of str, optional
         The command line without the program; by default that of this process.
     prepare : callable, optional
         Called before that, and may take its time: compile something, say.
-    configure : callable, optional
-        Adds options of the node's own, and returns what the usage says of them.
-    own : argparse.Namespace, optional
-        Holds all options from then on.
+    more_options : mapping, optional
+        Options of this component alone, such as ``--strict``, and what argparse is to know of each.
 
     Returns
     -------
@@ -77,7 +77,7 @@ def run_server(
         raises SystemExit(2), and -h and --version SystemExit(0).
     """
     arguments = sys.argv[1:] if argv is None else argv
-    options = _parse(component, [a for a in arguments if ":=" not in a], configure, own)
+    options = _parse(component, [a for a in arguments if ":=" not in a], more_options)
     remappings = [a for a in arguments if ":=" in a]
     told = Background() if options.background else None
     if told is not None and told.in_parent:
@@ -86,7 +86,8 @@ def run_server(
     for number in ending_signals():
         signal.signal(number, lambda number, frame: received.append(number))
     try:
-        node = _start(component, build, options, remappings, received, prepare)
+        own = {name: getattr(options, name) for name in (flag.lstrip("-") for flag in more_options)}
+        node = _start(component, functools.partial(build, **own), options, remappings, received, prepare)
     except _Ended:
         return 0
     except (_Failure, generate.GenerationError, master.MasterError, ComponentError, OSError) as problem:
@@ -117,14 +118,13 @@ class Parser(argparse.ArgumentParser):
 
 
 def _parse(
-    component: Component,
-    arguments: list[str],
-    configure: Callable[[argparse.ArgumentParser], str],
-    own: argparse.Namespace | None,
+    component: Component, arguments: list[str], more_options: Mapping[str, Mapping[str, Any]]
 ) -> argparse.Namespace:
     program = f"{component.name}-ros"
+    more = "".join(f" [{' '.join((name, told.get('metavar', ''))).strip()}]" for name, told in more_options.items())
     parser = Parser(
         prog=program,
+        usage=f"{program} [-b] [-i NAME] [--wait]{more} [-h] [--version] [NAME:=VALUE ...]",
         description=f"{component.doc}.",
         epilog=f"ROS remappings are taken too: topics (a:=b) and __name, __ns, __master, __ip, __hostname, __log.\n\n"
         f"example:\n  {program} -b -i left        # serves /left/...; returns once the node is up",
@@ -145,10 +145,10 @@ def _parse(
         action="store_true",
         help=f"wait for a ROS master for ever, as a service at boot must (default: for {MASTER_SECONDS:g} s)",
     )
-    usage = configure(parser)
+    for name, told in more_options.items():
+        parser.add_argument(name, **told)
     parser.add_argument("--version", action="version", version=f"{component.name} {VERSION}")
-    parser.usage = f"{program} [-b] [-i NAME] [--wait]{usage and ' ' + usage} [-h] [--version] [NAME:=VALUE ...]"
-    return parser.parse_args(arguments, own)
+    return parser.parse_args(arguments)
 
 
 # --- start ------------------------------------------------------------------------------------------------------
@@ -156,7 +156,7 @@ def _parse(
 
 def _start(
     component: Component,
-    build: Callable[[str], Node],
+    build: Callable[..., Node],
     options: argparse.Namespace,
     remappings: list[str],
     received: list[int],

@@ -9,7 +9,7 @@ from typing import Any
 
 import rosgraph.names
 
-from rosafe.component import wire
+from rosafe.component import mark, wire
 from rosafe.genomix import packed, setups, syntax, trees
 from rosafe.genomix.actions import ActionClient, Goal
 from rosafe.genomix.graph import Graph, Unknown, middleware_error
@@ -58,7 +58,15 @@ class Value:
         self._component = component
         self._members = members
         self.values = values
+        self.warning = ""
         self.data: object = self  # what the values belong to, and perhaps those of others
+
+    def warn(self, warning: str) -> None:
+        """Have the component's `warning`, where there is one, among the members."""
+        if warning:
+            self.warning = warning
+            self._members = (*self._members, ("warning", "string"))
+            self.values = {**self.values, "warning": warning}
 
     def pieces(self, form: Syntax) -> Iterator[str]:
         """The text, as one nested value, in short pieces."""
@@ -163,7 +171,9 @@ class Proxy:
             response = await client.call(values, CALL_SECONDS)
         if not response.genom_success:
             raise component_exception(response.genom_exdetail)
-        return Value(self.component, service.outputs, {name: getattr(response, name) for name, _ in service.outputs})
+        value = Value(self.component, service.outputs, {name: getattr(response, name) for name, _ in service.outputs})
+        value.warn(mark.warning_in(response.genom_exdetail))
+        return value
 
     async def start(self, service: Service, values: Mapping[str, Any]) -> Goal:
         """Send an activity; its goal tells when it runs and when it has ended."""

@@ -63,7 +63,7 @@ def complete(service: Service, given: Any) -> dict[str, Any]:
     """
     values = _converted(service, _named(service, given))
     _require(service, values)
-    return {p.name: values.get(p.name, p.default) for p in service.parameters}
+    return service.completed(values)
 
 
 def partial(given: Any) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import argparse
 import functools
 import importlib
 import os
@@ -28,7 +27,8 @@ from rosafe.node import reports
 from rosafe.node.keeper import Keeper
 from rosafe.node.ports import OutputPort, element
 from rosafe.node.trace_port import TracePort
-from rosafe.representations import PROBLEMS
+from rosafe.node.words import UnknownWords
+from rosafe.representations import PROBLEMS, STAGES
 from rosafe.setups import Setup, rehearse, wanted
 from rosafe.tree.block import Block
 from rosafe.tree.processor import Processor
@@ -38,21 +38,36 @@ from rosafe.vocabulary.parameter import MAX_STRING, shown
 
 FIRST_AUDIO_SECONDS = 1.0  # how long InputProc waits for a first message
 LOOK_SECONDS = 0.1  # between two looks whether there is sound for a tree that is to come back
+OPTIONS = {
+    "--strict": {
+        "action": "store_true",
+        "help": "refuse unknown words of enumerated parameters, as the ROS parameter ~strict_words does (default: they "
+        "are taken as the original takes them, with a warning)",
+    },
+    "--keep": {
+        "metavar": "FILE",
+        "default": "",
+        "help": "write connections and processors into FILE at each change, and bring back at the start what it holds, "
+        "once there is sound (default: the ROS parameter ~keep; without it, always a fresh start)",
+    },
+}
 
 
 class RosafeNode:
     """The component `rosAFE`. Make it after `rospy.init_node`.
 
-    `keep` names a file that holds the tree at any moment; what it holds at the start comes back once there is sound.
-    Where it is empty, the ROS parameter ``keep`` in the node's namespace counts.
+    Where it is `strict`, or the ROS parameter ``strict_words`` in its namespace is true, unknown words are refused.
+    `keep`, or else the ROS parameter ``keep``, names a file that holds the tree at any moment; what it holds at the
+    start comes back once there is sound.
     """
 
-    def __init__(self, instance: str, keep: str = "") -> None:
+    def __init__(self, instance: str, strict: bool = False, keep: str = "") -> None:
         for problem in PROBLEMS:
             rospy.logwarn(f"a representation is left out: {problem}")
         self._node = ComponentNode(ROSAFE, lambda problem: ROSAFE.error("e_badNewValue", what=str(problem)))
         self.finished = self._node.finished
         self._tree = Tree(self)
+        self._words = UnknownWords(strict)
         self._ring = AudioRing(EventLog(rospy.logwarn))
         self._audio: rospy.Subscriber | None = None
         self._audio_topic = ""
@@ -198,6 +213,8 @@ class RosafeNode:
     # --- processors ---
 
     def _input_proc(self, activity: Activity, values: dict[str, Any], comes_back: bool = False) -> None:
+        if not values["name"]:
+            raise ROSAFE.error("e_badNewValue", what="name: '' is empty, and names a processor")
         if self._audio is None:
             raise ROSAFE.error("e_noData", "the Audio port is not connected: call connect_port first")
         activity.interrupt_waiting()
@@ -235,8 +252,13 @@ class RosafeNode:
 
     def _handler(self, kind: Representation) -> Handler:
         def handle(activity: Activity, values: dict[str, Any]) -> None:
-            parameters = {p.name: p.known_word(values[p.name]) for p in kind.parameters}
-            self._live(activity, self._tree.add(kind.kind, values["name"], values["upperDepName"], parameters))
+            asked = STAGES[kind.kind].asked({p.name: values[p.name] for p in kind.parameters})
+            doubts: dict[str, str] = {}
+            take = self._words.taking(doubts)
+            parameters = {p.name: take(p, asked[p.name]) for p in kind.parameters if p.name in asked}
+            processor = self._tree.add(kind.kind, values["name"], values["upperDepName"], parameters)
+            activity.warning = self._words.note(processor, doubts)
+            self._live(activity, processor)
 
         return handle
 
@@ -251,6 +273,7 @@ class RosafeNode:
         activity.stop_requested.wait()
         self._ends.pop(processor, None)
         self._tree.end(processor)
+        self._words.forget(processor)
         self._keep()
         self._node.settle()
         if processor.error is not None:
@@ -313,9 +336,12 @@ class RosafeNode:
     def _get_representation(self, values: dict[str, Any]) -> dict[str, Any]:
         return reports.response("getRepresentation", parts=reports.representation(self._tree.find(values["name"])))
 
-    def _modify_parameter(self, values: dict[str, Any]) -> None:
-        self._tree.modify(values["nameProc"], values["nameParam"], values["newValue"])
+    def _modify_parameter(self, values: dict[str, Any]) -> dict[str, Any]:
+        doubts: dict[str, str] = {}
+        take = self._words.taking(doubts)
+        processor = self._tree.modify(values["nameProc"], values["nameParam"], values["newValue"], take)
         self._keep()
+        return {"warning": self._words.note(processor, doubts)}
 
     def _remove_processor(self, values: dict[str, Any]) -> None:
         self._tree.remove(values["name"])
@@ -350,8 +376,14 @@ class RosafeNode:
         return status
 
     def _tree_health(self, status: Any) -> Any:
-        processors = self._tree.processors
-        status.summary(DiagnosticStatus.OK, f"{len(processors)} processors")
+        processors, doubts = self._tree.processors, self._words.lines
+        if doubts:
+            more = f" (and {len(doubts) - 1} more unknown words)" if len(doubts) > 1 else ""
+            status.summary(DiagnosticStatus.WARN, f"{doubts[0]}{more}")
+        else:
+            status.summary(DiagnosticStatus.OK, f"{len(processors)} processors")
+        for doubt in doubts:
+            status.add("unknown word", doubt)
         for processor in processors:
             status.add(processor.name, f"{processor.kind}, {processor.state.value}, {processor.blocks} blocks")
         return status
@@ -372,22 +404,6 @@ def _keeper(path: str, describe: Callable[[], Setup]) -> Keeper | None:
     return Keeper(Path(os.path.expanduser(path)).absolute(), describe, rospy.logerr) if path else None
 
 
-def _configure(parser: argparse.ArgumentParser) -> str:
-    parser.add_argument(
-        "--keep",
-        metavar="FILE",
-        default="",
-        help="write connections and processors into FILE at each change, and bring back at the start what it holds, "
-        "once there is sound (default: the ROS parameter ~keep; without it, always a fresh start)",
-    )
-    return "[--keep FILE]"
-
-
 def main(argv: list[str] | None = None) -> int:
     """Run the node; the `rosAFE-ros` command."""
-    options = argparse.Namespace()
-
-    def build(instance: str) -> RosafeNode:
-        return RosafeNode(instance, options.keep)
-
-    return run_server(interface.ROSAFE, build, argv, kernels.compiled, _configure, options)
+    return run_server(interface.ROSAFE, RosafeNode, argv, kernels.compiled, OPTIONS)
