@@ -17,6 +17,7 @@ from .signals import SIGNALS, layout
 
 MAX_SECONDS = 600.0  # longest port or history
 MAX_BLOCK = 10_000_000  # frames
+MAX_SETUP = 256 * 1024  # characters of a setup
 
 Kinds = Mapping[str, Representation]  # parents first
 
@@ -158,7 +159,20 @@ def _whole_trees(kinds: Kinds) -> tuple[Service, ...]:
         doc="What the request would use for a representation if all of it is there; nothing is made",
         throws=("::rosAFE::e_noSuchProcessor", "::rosAFE::e_existsAlready", "::rosAFE::e_badNewValue"),
     )
-    return build, find
+    save = Service(
+        "saveSetup",
+        "The tree of processors with its sound, as the text of a file that loadSetup takes",
+        (Parameter("full", "boolean", False, "Flag to write what has its default value, too"),),
+        outputs=(("setup", "string"),),
+    )
+    load = Service(
+        "loadSetup",
+        "Build all that a setup describes, beside what is there: wholly, or nothing is changed",
+        (Parameter("setup", "string", REQUIRED, "The text of a setup (YAML)", longest=MAX_SETUP),),
+        outputs=(("created", "sequence<string>"), ("reused", "sequence<string>"), ("sound", "string")),
+        throws=_INPUT_THROWS,
+    )
+    return build, find, save, load
 
 
 _FUNCTIONS = (
@@ -260,4 +274,4 @@ def derive(kinds: Kinds) -> Component:
 
 
 ROSAFE = derive(KINDS)
-REQUEST, FIND = ROSAFE.composites
+REQUEST, FIND, SAVE_SETUP, LOAD_SETUP = ROSAFE.composites

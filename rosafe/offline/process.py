@@ -94,6 +94,7 @@ def process(
             centred, parts = KINDS[kind].centred, KINDS[kind].outputs
             middles = {name: part.axes.index(centred) if centred in part.axes else -1 for name, part in parts.items()}
             gathered[kind] = {name: _Gathered(shape, middles[name]) for name, shape in shapes[kind].items()}
+            chain.write_into(kind, next(iter(gathered[kind].values())).place)
         chain.run()
         results: dict[str, Any] = {}
         while gathered:
@@ -186,9 +187,20 @@ class _Gathered:
         self._waiting: list[np.ndarray] = []
         self._frames = 0  # that wait
         self._fits = True
+        self._lent: np.ndarray | None = None
+
+    def place(self, frames: int) -> np.ndarray | None:
+        """Where the next block may be written, of so many frames if it has any."""
+        end = self._filled + frames
+        free = self._fits and not self._waiting and end <= self._whole.shape[-1]
+        self._lent = self._whole[..., self._filled : end] if free else None
+        return self._lent
 
     def add(self, block: np.ndarray) -> None:
         """The next block, (..., frames)."""
+        if block is self._lent:
+            self._filled, self._begun, self._lent = self._filled + block.shape[-1], True, None
+            return
         self._fits = self._fits and block.shape[:-1] == self._whole.shape[:-1]
         self._waiting.append(block)
         self._frames += block.shape[-1]

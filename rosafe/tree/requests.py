@@ -32,6 +32,7 @@ class Found(NamedTuple):
     kind: str
     parent: str
     values: Mapping[str, Any]
+    rate: float = 0.0  # frames of output per second
 
 
 class Step(NamedTuple):
@@ -170,7 +171,7 @@ def plan(wish: Wish, found: Sequence[Found]) -> Plan:
     for level in wish.levels[len(reused) :]:
         name = free_name(level.kind, names)
         names.add(name)
-        steps += _making(wish, level, name, dependencies[-1] if dependencies else "")
+        steps += making(level, name, dependencies[-1] if dependencies else "", wish.input_values)
         dependencies.append(name)
     return Plan(dependencies, steps)
 
@@ -207,8 +208,11 @@ def free_name(kind: Representation, names: Collection[str]) -> str:
     return f"{kind.word}_{number}"
 
 
-def _making(wish: Wish, level: Level, name: str, parent: str) -> list[Step]:
-    """The requests for one processor. What its own request cannot carry is set before anything hangs on it."""
+def making(level: Level, name: str, parent: str, input_values: Mapping[str, Any]) -> list[Step]:
+    """The requests for one processor. What its own request cannot carry is set before anything hangs on it.
+
+    `input_values` are those of InputProc less its name, of which only an input takes notice.
+    """
     if level.kind.parent:
         unsaid = [p for p in level.kind.parameters if _reads_as_default(p, level.values[p.name])]
         # Until then, nobody who looks may take it for one with the defaults.
@@ -216,7 +220,7 @@ def _making(wish: Wish, level: Level, name: str, parent: str) -> list[Step]:
         step = Step(level.kind.request, {"name": name, "upperDepName": parent, **sent}, name)
     else:
         unsaid = [p for p in level.kind.parameters if level.values[p.name] != p.default]
-        step = Step(level.kind.request, {"name": name, **wish.input_values}, name)
+        step = Step(level.kind.request, {"name": name, **input_values}, name)
     return [
         step,
         *(

@@ -109,6 +109,9 @@ class StateMachine:
         """Nothing more will come of it; children may still take the block released last."""
         self.give_back()
         self._enter(State.DONE)
+        if self.parent is not None and self._token is not None:  # it has failed
+            self._token = None
+            self.parent._freed_by(self)
         for child in self.children:
             child._end_if_exhausted()
         if not self.at_work:
@@ -203,7 +206,8 @@ class StateMachine:
         self._enter(State.RELEASE, block.number)
         self.shared = self.untold = block
         for child in self.children:
-            self._hand(child)
+            if child.state is not State.DONE:
+                self._hand(child)
         if not self.at_work:
             self.rouse()
 

@@ -60,7 +60,7 @@ SERVICES = {
         "modifyParameter": "972a89083cfb6e30281281ef02eaf593",
         "removeProcessor": "a04032386d532fbd9abbc736abb34893",
     },
-    "bass": {**COMMON_SERVICES, "ListDevices": EMPTY_REPLY},
+    "bass": {**COMMON_SERVICES, "ListDevices": EMPTY_REPLY, "getAcquisition": "1393f375a654c7c5f67cac5c520e194b"},
 }
 ACTIONS = {  # (package, action): (Action, Goal, ActionGoal)
     ("rosAFE", "InputProc"): (
