@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 from aiohttp import WSMsgType, web
 
 from rosafe.genomix.tasks import shared
-from rosafe.interface import ComponentError
+from rosafe.interface import MAX_SETUP, ComponentError
 from rosafe.live.hub import FLOAT, Hub, Key, View
 from rosafe.live.robot import told
 
@@ -23,7 +23,7 @@ MAX_PICTURE = 40_000  # bytes of one message
 FULL = 0.8  # of the bytes per second are for columns that go on; beyond, columns are left out
 MAX_VIEWS = 16
 MAX_PENDING = 4  # requests
-MAX_MESSAGE = 64 * 1024  # bytes of a request
+MAX_MESSAGE = 4 * MAX_SETUP  # bytes of a request, such as to load a setup
 UNSENT = 16 * 1024  # bytes that a client has not taken; while there are more, it gets nothing new
 KERNEL_BYTES = 128 * 1024  # that the kernel keeps for a client
 STALL_SECONDS = 30.0  # a client that takes nothing for so long is dropped

@@ -69,6 +69,8 @@ async def serve(options: Options) -> None:
             "usual": robot.build_usual,
             "modify": robot.modify,
             "remove": robot.remove,
+            "save": robot.save_setup,
+            "load": robot.load_setup,
         }
         server = Server(robot, hub, Health(options.instance, options.bass), door, asks, options.watch)
         news = server.news

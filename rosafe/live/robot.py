@@ -10,7 +10,7 @@ from typing import Any
 from rosafe.bass.sources import device_lines
 from rosafe.genomix.graph import Graph
 from rosafe.genomix.proxy import Proxy, describe_parameter
-from rosafe.interface import BASS, KINDS, REQUEST, ROSAFE, ComponentError
+from rosafe.interface import BASS, KINDS, LOAD_SETUP, REQUEST, ROSAFE, SAVE_SETUP, ComponentError, Service
 from rosafe.live.pictures import Processor, Tree
 from rosafe.tree import requests
 
@@ -83,7 +83,7 @@ class Robot:
         kind = KINDS.get(str(values.get("representation", "")))
         if kind is not None:
             values["representation"] = kind.word
-        return dict(await self._rosafe.outputs(REQUEST.name, self._rosafe.arguments(REQUEST, values)))
+        return await self._ask(REQUEST, values)
 
     async def build_usual(self, _: Mapping[str, Any]) -> dict[str, Any]:
         """Build all that the page shows where it is opened for the first time."""
@@ -94,15 +94,23 @@ class Robot:
 
     async def modify(self, given: Mapping[str, Any]) -> dict[str, Any]:
         """Change one parameter."""
-        service = self._rosafe.service("modifyParameter")
-        await self._rosafe.call(service, self._rosafe.arguments(service, {**given}))
-        return {}
+        return await self._ask(self._rosafe.service("modifyParameter"), given)
 
     async def remove(self, given: Mapping[str, Any]) -> dict[str, Any]:
         """Remove a processor and all below it."""
-        service = self._rosafe.service("removeProcessor")
-        await self._rosafe.call(service, self._rosafe.arguments(service, {**given}))
-        return {}
+        return await self._ask(self._rosafe.service("removeProcessor"), given)
+
+    async def save_setup(self, _: Mapping[str, Any]) -> dict[str, Any]:
+        """The tree with its sound, as the text of a setup."""
+        return await self._ask(SAVE_SETUP, {})
+
+    async def load_setup(self, given: Mapping[str, Any]) -> dict[str, Any]:
+        """Build what the text of a setup says: wholly, or nothing changes."""
+        return await self._ask(LOAD_SETUP, given)
+
+    async def _ask(self, service: Service, given: Mapping[str, Any]) -> dict[str, Any]:
+        values = self._rosafe.arguments(service, {**given})
+        return dict((await self._rosafe.call(service, values)).values)
 
 
 def catalogue() -> dict[str, Any]:

@@ -27,6 +27,7 @@ LOOK_SECONDS = 1.0  # between two looks at the components, while there is a page
 MAX_CLIENTS = 32
 MAX_CONNECTIONS = 256
 KNOCK_SECONDS = 10.0  # a connection that was not let in by then is closed
+HARMLESS = {"save"}  # what a page that only watches may ask for
 _TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
@@ -207,7 +208,7 @@ class Server:
 
 
 def _watched(ask: Ask, name: str, watch: bool) -> Ask:
-    if not watch:
+    if not watch or name in HARMLESS:
         return ask
 
     async def refuse(_: Mapping[str, Any]) -> dict[str, Any]:

@@ -36,6 +36,7 @@ function dress(theme) {
   pictures.theme = {
     dark: theme === "dark", font: getComputedStyle(document.body).fontFamily,
     cursor: theme === "dark" ? "rgba(255, 255, 255, 0.65)" : "rgba(20, 24, 30, 0.65)", track: "#ffb454",
+    letter: Math.round(0.82 * parseFloat(getComputedStyle(document.body).fontSize)),
     ...Object.fromEntries(["text", "muted", "surface", "plot", "grid", "left", "right", "accent"].map((name) => [name, colour(name)])),
   };
   at("theme").textContent = theme === "dark" ? "☾" : "☀";
@@ -43,6 +44,7 @@ function dress(theme) {
 
 const wishes = matchMedia("(prefers-color-scheme: light)");
 dress(stored("theme", wishes.matches ? "light" : "dark"));
+addEventListener("resize", () => dress(document.documentElement.dataset.theme));
 at("theme").addEventListener("click", () => {
   const theme = document.documentElement.dataset.theme === "dark" ? "light" : "dark";
   store("theme", theme);

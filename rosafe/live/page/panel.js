@@ -4,15 +4,17 @@ import { colours, roundUp, ticks } from "./colours.js";
 import { Series } from "./series.js";
 import { el, hertz, number, quantity, tick } from "./ui.js";
 
-const LEFT = 50;
-const RIGHT = 62;
+// In units of the letters' size, which grows on a wall.
+const LEFT = 4.5;
+const RIGHT = 5.6;
 const TOP = 7;
-const BOTTOM = 19;
+const BOTTOM = 1.75;
 const GAP = 12; // between the ears
 const EARS = ["left ear", "right ear"];
 const FREQUENCIES = [20, 50, 100, 200, 500, 1000, 2000, 4000, 8000, 16000, 32000];
-const TWO_SIDED = new Set(["ild", "itd"]);
+const TWO_SIDED = new Set(["ild", "itd", "gabor"]);
 const RANGE_DB = 60;
+const GROUNDS = { magma: "#08060f", deep: "#0a0c18", viridis: "#1c0424" }; // where there is nothing: as dark as their least
 const TITLES = {
   input: "Input", preProc: "Pre-processed sound", gammatone: "Filterbank", ihc: "Inner hair cells", ratemap: "Cochleagram",
   ild: "Interaural level difference", itd: "Interaural time difference", ic: "Interaural coherence",
@@ -105,12 +107,13 @@ export class Panel {
   take(piece) {
     const { from, to, anew } = this.series.append(piece);
     if (anew) for (const image of this.images) image.clear();
-    if (this.range) this.#paint(from, to);
+    if (this.range && this.view.mode === "heat") this.#paint(from, to);
   }
 
   // --- colours ---
 
   #map(theme) {
+    if (this.view.mode !== "heat") return "";
     if (this.#twoSided()) return theme.dark ? "darkSides" : "lightSides";
     if (this.view.kind === "crossCorrelation" || this.view.partName === "cc") return "deep";
     return this.view.level ? "magma" : "viridis";
@@ -206,14 +209,17 @@ export class Panel {
     const pen = canvas.getContext("2d");
     pen.setTransform(ratio, 0, 0, ratio, 0, 0);
     pen.clearRect(0, 0, width, height);
-    pen.font = `11px ${theme.font}`;
+    const letter = theme.letter;
+    this.letter = letter;
+    pen.font = `${letter}px ${theme.font}`;
     const { view } = this;
+    const bottom = BOTTOM * letter;
     const plots = view && view.mode !== "line" ? view.ears : 1;
-    const tall = (height - TOP - BOTTOM - GAP * (plots - 1)) / plots;
-    const boxes = Array.from({ length: plots }, (_, ear) => ({ x: LEFT, y: TOP + ear * (tall + GAP), w: width - LEFT - RIGHT, h: tall }));
+    const tall = (height - TOP - bottom - GAP * (plots - 1)) / plots;
+    const boxes = Array.from({ length: plots }, (_, ear) => ({ x: LEFT * letter, y: TOP + ear * (tall + GAP), w: width - (LEFT + RIGHT) * letter, h: tall }));
     this.boxes = boxes;
     for (const box of boxes) {
-      pen.fillStyle = theme.plot;
+      pen.fillStyle = GROUNDS[this.map] ?? theme.plot;
       pen.fillRect(box.x, box.y, box.w, box.h);
     }
     if (!view || head === null || !this.range) {
@@ -246,7 +252,7 @@ export class Panel {
   }
 
   #say(pen, box, theme, text) {
-    pen.font = `13px ${theme.font}`;
+    pen.font = `${1.2 * theme.letter}px ${theme.font}`;
     pen.textAlign = "center";
     pen.textBaseline = "middle";
     const wide = pen.measureText(text).width + 24;
@@ -256,7 +262,7 @@ export class Panel {
     pen.globalAlpha = 1;
     pen.fillStyle = theme.muted;
     pen.fillText(text, box.x + box.w / 2, box.y + box.h / 2);
-    pen.font = `11px ${theme.font}`;
+    pen.font = `${theme.letter}px ${theme.font}`;
   }
 
   #tag(pen, box, text) {
@@ -264,7 +270,7 @@ export class Panel {
     pen.textBaseline = "top";
     const wide = pen.measureText(text).width;
     pen.fillStyle = "rgba(8, 10, 14, 0.6)";
-    pen.fillRect(box.x + 6, box.y + 5, wide + 10, 17);
+    pen.fillRect(box.x + 6, box.y + 5, wide + 10, this.letter + 6);
     pen.fillStyle = "#e8ebef";
     pen.fillText(text, box.x + 11, box.y + 8);
   }
@@ -357,7 +363,7 @@ export class Panel {
           if (before) pen.lineTo(x, y);
           else {
             pen.moveTo(x, y);
-            pen.fillRect(x - 1, y - 1, 2, 2);
+            pen.fillRect(x - 1.5, y - 1.5, 3, 3);
           }
         }
         before = Number.isFinite(value);
@@ -369,7 +375,7 @@ export class Panel {
       pen.textAlign = "left";
       EARS.forEach((name, ear) => {
         pen.fillStyle = ear ? theme.right : theme.left;
-        pen.fillText(name, box.x + 8 + ear * 64, box.y + 6);
+        pen.fillText(name, box.x + 8 + ear * 6 * this.letter, box.y + 6);
       });
     }
   }
@@ -410,18 +416,18 @@ export class Panel {
       const wanted = view.axis === "channel" ? FREQUENCIES : [...view.along];
       for (const frequency of wanted) {
         const row = rowOf(view.along, frequency);
-        if (row !== null) label(box.y + box.h * (1 - (row + 0.5) / view.rows), frequency >= 1000 ? `${frequency / 1000}k` : tick(frequency));
+        if (row !== null) label(box.y + box.h * (1 - (row + 0.5) / view.rows), frequency >= 1000 ? `${Number((frequency / 1000).toPrecision(2))}k` : tick(frequency));
       }
       this.#unit(pen, box, "Hz");
     } else {
       const step = Math.max(1, Math.ceil(view.rows / (box.h / 18)));
-      for (let row = 0; row < view.rows; row += step) label(box.y + box.h * (1 - (row + 0.5) / view.rows), String(view.along[row]).slice(0, 8));
+      for (let row = 0; row < view.rows; row += step) label(box.y + box.h * (1 - (row + 0.5) / view.rows), typeof view.along[row] === "number" ? view.along[row].toFixed(0) : String(view.along[row]).slice(0, 8));
     }
   }
 
   #unit(pen, box, text) {
     pen.save();
-    pen.translate(9, box.y + box.h / 2);
+    pen.translate(0.8 * this.letter, box.y + box.h / 2);
     pen.rotate(-Math.PI / 2);
     pen.textAlign = "center";
     pen.fillText(text, 0, 0);
@@ -466,7 +472,7 @@ export class Panel {
     pen.textAlign = "right";
     pen.textBaseline = "top";
     const unit = this.view.unit === "s" ? "ms" : this.view.unit;
-    if (unit) pen.fillText(unit, x + RIGHT - 11, boxes.at(-1).y + boxes.at(-1).h + 5);
+    if (unit) pen.fillText(unit, x + RIGHT * this.letter - 12, boxes.at(-1).y + boxes.at(-1).h + 5);
   }
 
   // --- the cursor ---

@@ -2,7 +2,7 @@
 
 import { Panel, title } from "./panel.js";
 import { Clock, Series } from "./series.js";
-import { el, store, stored } from "./ui.js";
+import { el, offer, store, stored } from "./ui.js";
 
 const USUAL = ["ratemap", "ild", "crossCorrelation"]; // open by themselves
 const FIT = 0.5; // seconds between two looks at the range of the numbers
@@ -262,8 +262,6 @@ export class Pictures extends EventTarget {
       y += head + panel.canvas.height;
     }
     const blob = await new Promise((resolve) => sheet.toBlob(resolve, "image/png"));
-    const link = el("a", { href: URL.createObjectURL(blob), download: `rosafe-${new Date().toISOString().slice(0, 19).replace(/[:T]/g, "-")}.png` });
-    link.click();
-    setTimeout(() => URL.revokeObjectURL(link.href), 1000);
+    offer(blob, `rosafe-${new Date().toISOString().slice(0, 19).replace(/[:T]/g, "-")}.png`);
   }
 }

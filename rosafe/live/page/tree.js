@@ -1,7 +1,7 @@
 // The tree of processors: loads, states, and one processor's parameters; adding and removing.
 
 import { title } from "./panel.js";
-import { el, svg, toast, tried } from "./ui.js";
+import { el, offer, svg, toast, tried } from "./ui.js";
 
 const EYE = "M2 12s3.6-6.5 10-6.5S22 12 22 12s-3.6 6.5-10 6.5S2 12 2 12zM12 9.2a2.8 2.8 0 1 0 0 5.6 2.8 2.8 0 0 0 0-5.6z";
 
@@ -14,7 +14,12 @@ export class TreeView {
     this.rows = el("ul");
     this.rowsBy = new Map();
     const add = el("button", { class: "more", text: "Add…", title: "Add a representation", onclick: () => this.#dialog() });
-    element.replaceChildren(el("div", { class: "head" }, el("h2", { text: "Processors" }), ...(watch ? [] : [add])), this.rows);
+    const file = el("input", { type: "file", accept: ".yaml,.yml", hidden: true, id: "setup-file", onchange: () => this.#load(file) });
+    const setups = el("div", { class: "row setups" },
+      el("button", { class: "quiet", id: "save-setup", text: "Save setup", title: "Save tree and sound as a file", onclick: () => this.#save() }),
+      ...(watch ? [] : [el("button", { class: "quiet", text: "Load setup…", title: "Build what a file says, wholly or not at all", onclick: () => file.click() }), file]));
+    this.refusal = el("p", { class: "error", role: "alert" });
+    element.replaceChildren(el("div", { class: "head" }, el("h2", { text: "Processors" }), ...(watch ? [] : [add])), this.rows, setups, this.refusal);
     pictures.addEventListener("change", () => this.#eyes());
   }
 
@@ -74,6 +79,26 @@ export class TreeView {
   #state() {
     const told = this.loads[this.chosen];
     return told ? `${told.state}, ${told.blocks} blocks, ${told.load.toFixed(1)} ms/s` : "";
+  }
+
+  // --- setups ---
+
+  async #save() {
+    const saved = await tried(this.link.ask("save"));
+    if (saved) offer(new Blob([saved.setup], { type: "application/yaml" }), "setup.yaml");
+  }
+
+  async #load(file) {
+    const [chosen] = file.files;
+    file.value = "";
+    if (!chosen) return;
+    this.refusal.textContent = "";
+    try {
+      const made = await this.link.ask("load", { setup: await chosen.text() });
+      toast(made.created.length ? `built ${made.created.join(", ")}` : "all of it is there already");
+    } catch (problem) {
+      this.refusal.textContent = problem.message;
+    }
   }
 
   // --- one processor ---

@@ -75,6 +75,13 @@ export function quantity(value, unit) {
   return unit ? `${number(value)} ${unit}` : number(value);
 }
 
+// Lets the user keep a file.
+export function offer(blob, name) {
+  const link = el("a", { href: URL.createObjectURL(blob), download: name });
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 1000);
+}
+
 export function stored(name, fallback) {
   try {
     return JSON.parse(localStorage.getItem(`rosafe.${name}`)) ?? fallback;
