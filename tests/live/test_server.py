@@ -150,7 +150,7 @@ def test_pictures_are_those_of_the_port(world: World) -> None:
     ends = [np.abs(columns[:, at : at + 30] - frames[:, -30:]).max() for at in range(columns.shape[1] - 29)]
     at = int(np.argmin(ends))
     assert ends[at] <= 0.51 * step
-    first, _, end, values = pieces[0]
+    _, _, end, values = pieces[0]
     moment = end + (at + 30 - values.shape[1]) / view["rate"]  # that these columns reach up to
     assert moment == pytest.approx(newest.lastFrameIndex / 16000, abs=0.011)
 
