@@ -423,7 +423,7 @@ def _describe_service(service: Service, composite: bool) -> dict[str, Any]:
         "activity": service.activity,
         "composite": composite,
         "aliases": list(service.aliases),
-        "parameters": {p.name: _describe_parameter(p) for p in service.parameters},
+        "parameters": {p.name: describe_parameter(p) for p in service.parameters},
         "outputs": dict(service.outputs),
         "throws": list(service.throws),
     }
@@ -446,7 +446,8 @@ def _describe_representation(representation: Representation) -> dict[str, Any]:
     }
 
 
-def _describe_parameter(parameter: Parameter) -> dict[str, Any]:
+def describe_parameter(parameter: Parameter) -> dict[str, Any]:
+    """All that the table says of a parameter."""
     required = parameter.default is REQUIRED
     return {
         "type": parameter.idl,

@@ -27,6 +27,7 @@ STANDS_ON: dict[str, set[str]] = {
     "genomix": {"vocabulary", "interface", "tree", "component", "setups"},
     "eltclsh": {"vocabulary", "interface", "component", "genomix"},
     "view": {"interface", "sound"},
+    "live": {"vocabulary", "interface", "tree", "component", "bass", "genomix", "view", "sound"},
     "demo": {"interface", "tree", "component", "bass", "sound", "view", "offline", "vocabulary"},
 }
 TOP = {"commands", "testing", "ros", "__init__"}  # may use everything
