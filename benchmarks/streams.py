@@ -97,8 +97,17 @@ def play(trees: int, block: int, seconds: float, cores: list[int], begin: float)
 
     def feed(number: int) -> None:
         last = number * block
-        chunk = {"nChunksOnPort": 1, "nFramesPerChunk": block}
-        take(SimpleNamespace(sampleRate=RATE, lastFrameIndex=last, left=noise[0], right=noise[1], **chunk))
+        take(
+            SimpleNamespace(
+                sampleRate=RATE,
+                lastFrameIndex=last,
+                nChunksOnPort=1,
+                nFramesPerChunk=block,
+                left=noise[0],
+                right=noise[1],
+                stamp=SimpleNamespace(sec=0, nsec=0),
+            )
+        )
 
     feed(1)
     reader = ring.open_reader(block, 1.0, lambda: False)

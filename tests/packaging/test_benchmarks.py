@@ -1,0 +1,67 @@
+"""Benchmarks: a busy machine is refused or said, what they compare with is right, and the short form of some runs."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.harness import PYTHON, ROOT
+
+FOLDER = ROOT / "benchmarks"
+TIMED = ("all", "capture", "chain", "everything", "latency", "matlab", "ports", "streams")
+CHEAP = ("itd", "ic", "onsetStrength", "offsetStrength", "spectralFeatures", "pitch", "onsetMap", "gabor", "moc")
+
+
+def benchmark(name: str, *arguments: object, load: float = 0.1) -> subprocess.CompletedProcess[str]:
+    env = {key: value for key, value in os.environ.items() if not key.startswith("ROS_")}
+    env["ROSAFE_BENCHMARK_LOAD"] = str(load)
+    command = [PYTHON, str(FOLDER / f"{name}.py"), *map(str, arguments)]
+    return subprocess.run(command, env=env, capture_output=True, text=True, timeout=300, check=False)
+
+
+@pytest.mark.parametrize("name", TIMED)
+def test_a_busy_machine_is_refused(name: str) -> None:
+    done = benchmark(name, load=0.51)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert re.fullmatch(rf"{name}\.py: the load is 0\.51, above 0\.5: .*--loaded\n", done.stderr)
+
+
+def test_the_load_stands_at_the_top(tmp_path: Path) -> None:
+    """Of what is printed and of the file; there are few trees, for a moment."""
+    short = ("--most", 1, "--trial", 1.5, "--seconds", 1.5, "--processes", 1, "--results", tmp_path)
+    done = benchmark("streams", "--loaded", *short, load=7.25)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("* load before: 7.25, above 0.5: measured with --loaded")
+    text = (tmp_path / "streams.md").read_text("utf-8")
+    assert text.splitlines()[4].startswith("* load before: 7.25, above 0.5")
+    assert re.search(r"^\d trees \(goal 60\) held for 1\.5 s", text, re.MULTILINE)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [("streams", "--seconds", "0"), ("streams", "--most", "0"), ("everything", "--seconds", "-1")],
+    ids=" ".join,
+)
+def test_what_cannot_be_is_refused(wrong: tuple[str, ...]) -> None:
+    done = benchmark(*wrong)
+    assert done.returncode == 2 and done.stderr.splitlines()[-1].startswith(f"{wrong[0]}.py: error: --")
+
+
+@pytest.mark.parametrize("kind", CHEAP)
+def test_what_we_compare_with_makes_the_same(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "path", [str(FOLDER), *sys.path])
+    import kinds
+
+    found = kinds.one(kind, 1)
+    assert kinds.agrees(kind, found), found
+
+
+def test_all_of_them_are_told_of() -> None:
+    listed = benchmark("all", "--list").stdout
+    for name in re.findall(r"`benchmarks/(\w+\.py)`", (ROOT / "docs" / "speed.md").read_text("utf-8")):
+        assert f"benchmarks/{name} " in listed, name
