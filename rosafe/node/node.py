@@ -13,7 +13,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from rosafe import interface
 from rosafe.component import wire
 from rosafe.component.activities import Activity
-from rosafe.component.audio import MAX_WINDOW, AudioRing
+from rosafe.component.audio import AudioRing
 from rosafe.component.component import ComponentNode
 from rosafe.component.events import EventLog
 from rosafe.component.startup import run_server
@@ -24,6 +24,7 @@ from rosafe.node.ports import OutputPort, element
 from rosafe.node.trace_port import TracePort
 from rosafe.node.words import UnknownWords
 from rosafe.representations import PROBLEMS, STAGES
+from rosafe.sound.windows import MAX_WINDOW
 from rosafe.tree.block import Block
 from rosafe.tree.processor import Processor
 from rosafe.tree.tree import Tree

@@ -135,7 +135,9 @@ class Filterbank(Stage):
         return (*rows, len(self._frequencies))
 
     def process(self, block: FloatArray, extra: FloatArray | None = None) -> FloatArray:
-        output, envelope = self._bank.process(self._checked(block), "envelope" in self.provide)
+        samples = self._checked(block)
+        place = self._room((2, len(self._frequencies), samples.shape[-1]))
+        output, envelope = self._bank.process(samples, "envelope" in self.provide, place)
         self.provided = {} if envelope is None else {"envelope": envelope}
         return output
 

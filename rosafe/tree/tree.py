@@ -11,7 +11,9 @@ from rosafe.dsp.stage import Stage
 from rosafe.interface import KINDS, ROSAFE, ComponentError
 from rosafe.representations import STAGES
 from rosafe.tree import sizes
-from rosafe.tree.processor import EARS, Company, Listener, Observer, Processor, Source, subtree
+from rosafe.tree.block import Source
+from rosafe.tree.member import EARS
+from rosafe.tree.processor import Company, Listener, Observer, Processor, subtree
 from rosafe.tree.sizes import Rows
 from rosafe.tree.states import State
 from rosafe.tree.workers import Workers, workers_to_use
@@ -142,7 +144,7 @@ class Tree:
                 self.check_input(name, source.sample_rate)
                 with _refusing():
                     stage = STAGES[INPUT](source.sample_rate, **(parameters or {}))
-                    new = Processor(name, stage, None, self._company, history_seconds, source)
+                    new = Processor(name, stage, None, history_seconds, self._company, source)
                     heir = old if old is not None and old.state is not State.DONE else new
                     self._check(_planned(heir, stage, EARS, None), max(port_seconds, history_seconds), old)
             except ComponentError:
@@ -194,7 +196,7 @@ class Tree:
             parent = self.check(kind, name, parent_name)
             with _refusing():
                 stage = STAGES[kind](parent.signal, **(parameters or {}))
-                processor = Processor(name, stage, parent, self._company, self.history_seconds)
+                processor = Processor(name, stage, parent, self.history_seconds, self._company)
                 self._check(_planned(processor, stage, parent.rows, parent.stage), self._longest)
             self._begin(processor)
             return processor

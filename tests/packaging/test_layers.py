@@ -20,8 +20,8 @@ STANDS_ON: dict[str, set[str]] = {
     "interface": _NUMERICS,
     "tree": {*_NUMERICS, "interface"},
     "offline": {*_NUMERICS, "interface", "tree", "sound"},
-    "component": {"vocabulary", "representations", "interface", "tree"},
-    "node": {*_NUMERICS, "interface", "tree", "component"},
+    "component": {"vocabulary", "representations", "interface", "tree", "sound"},
+    "node": {*_NUMERICS, "interface", "tree", "component", "sound"},
     "bass": {"vocabulary", "interface", "component", "sound"},
     "genomix": {"vocabulary", "interface", "tree", "component"},
     "eltclsh": {"vocabulary", "interface", "component", "genomix"},
@@ -29,7 +29,7 @@ STANDS_ON: dict[str, set[str]] = {
     "demo": {"interface", "tree", "component", "bass", "sound", "view", "offline", "vocabulary"},
 }
 TOP = {"commands", "testing", "ros", "__init__"}  # may use everything
-EVERYWHERE = {"version", "output"}
+EVERYWHERE = {"version", "output", "missing"}
 
 
 def imports(path: Path) -> Iterator[str]:
