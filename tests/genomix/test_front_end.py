@@ -78,9 +78,12 @@ def test_in_eltclsh(world: World) -> None:
 
 
 def test_in_python(tmp_path: Path) -> None:
-    result = rosafe.process(
-        Scene(16000).frames(16000), 16000, parameters={"pi_confThres": 0.5}, outputs=["pitch", "amsFeatures"]
-    )
+    sound, wanted = Scene(16000).frames(16000), ["pitch", "amsFeatures"]
+    result = rosafe.process(sound, 16000, block_frames=8000, outputs=wanted)
+    change = [(1, "pi_confThres", 0.9)]
+    changed = rosafe.process(sound, 16000, block_frames=8000, outputs=wanted, modifications=change)
+    voiced, less = (np.isfinite(one["pitch"][:, 0]).sum() for one in (result, changed))
+    assert 0 < less < voiced
     assert result["pitch"].shape[:2] == (2, 3) and result["amsFeatures"].ndim == 4
     rosafe.plot(result).savefig(tmp_path / "both.png")
     picture(tmp_path / "both.png")
