@@ -138,7 +138,7 @@ async def _look(component: Services) -> list[Found]:
         if kind is not None:
             texts = {entry["name"]: entry["value"] for entry in processor["parameters"]}
             values = {p.name: p.parse(texts[p.name]) for p in kind.parameters}
-            found.append(Found(processor["name"], kind.kind, processor["upperDepName"], values))
+            found.append(Found(processor["name"], kind.kind, processor["upperDepName"], values, processor["rate"]))
     return found
 
 

@@ -63,7 +63,8 @@ def complete(service: Service, given: Any) -> dict[str, Any]:
     """
     values = _converted(service, _named(service, given))
     _require(service, values)
-    return {p.name: values.get(p.name, p.default) for p in service.parameters}
+    # What follows the sample rate is the component's to choose, and 0 asks it to.
+    return {p.name: values.get(p.name, 0.0 if p.follows_rate else p.default) for p in service.parameters}
 
 
 def partial(given: Any) -> dict[str, Any]:

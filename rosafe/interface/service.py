@@ -38,7 +38,10 @@ class Service:
         raise KeyError(name)
 
     def from_ros(self, request: Any) -> dict[str, Any]:
-        """The values of a ROS request or goal, not yet checked; 0, "" and [] there stand for the default."""
+        """The values of a ROS request or goal, not yet checked; 0, "" and [] there stand for the default.
+
+        Where that follows the sample rate, it is left out.
+        """
         values = {}
         for parameter in self.parameters:
             value = getattr(request, parameter.name)
@@ -46,13 +49,15 @@ class Service:
                 len(value) == 0 if hasattr(value, "__len__") else value == 0  # "" and [] have a length
             )
             if unset and parameter.zero_is_default and parameter.default is not REQUIRED:
+                if parameter.follows_rate:
+                    continue
                 value = parameter.default
             values[parameter.name] = value
         return values
 
     def check(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """All values as their parameters' Python types, or ValueError naming the first that is refused."""
-        return {p.name: p.check(p.known_word(values[p.name])) for p in self.parameters}
+        return {p.name: p.check(p.known_word(values[p.name])) for p in self.parameters if p.name in values}
 
 
 @dataclass(frozen=True)

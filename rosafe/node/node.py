@@ -132,7 +132,7 @@ class RosafeNode:
             return values
 
         def handle(activity: Activity, values: dict[str, Any]) -> None:
-            parameters = {p.name: p.known_word(values[p.name]) for p in kind.parameters}
+            parameters = {p.name: p.known_word(values[p.name]) for p in kind.parameters if p.name in values}
             self._live(activity, self._tree.add(kind.kind, values["name"], values["upperDepName"], parameters))
 
         self._node.activity(kind.request, handle, check)

@@ -26,12 +26,16 @@ OF_THE_INPUT = ("connect", *(p.name for p in ROSAFE.service("InputProc").paramet
 
 
 class Found(NamedTuple):
-    """A processor of the tree. `values` are those of getParameters; `parent` is empty for the input."""
+    """A processor of the tree. `values` are those of getParameters; `parent` is empty for the input.
+
+    `rate` is that of its output (Hz).
+    """
 
     name: str
     kind: str
     parent: str
     values: Mapping[str, Any]
+    rate: float = 0.0
 
 
 class Step(NamedTuple):
@@ -62,15 +66,19 @@ class Level:
     in_force: Mapping[str, Any]
     given: Mapping[str, Any]
 
-    def fits(self, found: Found) -> bool:
-        """Whether `found` is what is wanted: each parameter the same, to the last digit.
+    def fits(self, found: Found, sample_rate: float) -> bool:
+        """Whether `found`, at a sample rate (Hz), is what is wanted: each parameter the same, to the last digit.
 
         A structure of getParameters fits the processor that it describes, though one that was made with all that
         it names would tell otherwise of how its channels were chosen.
         """
         told = {name: found.values[name] for name in self.in_force}
         told.update({name: 0.0 for name, value in told.items() if value == ALMOST_ZERO})  # will be in a moment
-        return told in (self.in_force, {**self.in_force, **self.given})
+        in_force = self.in_force
+        if sample_rate and any(p.follows_rate for p in self.kind.parameters):
+            stage = STAGES[self.kind.kind]
+            in_force = stage.in_force(stage.at_rate(self.values, self.given, sample_rate))
+        return told in (in_force, {**in_force, **self.given})
 
 
 @dataclass(frozen=True)
@@ -164,7 +172,7 @@ def plan(wish: Wish, found: Sequence[Found]) -> Plan:
     root = next((p for p in found if not p.parent and p.kind == "input"), None)
     if root is not None:
         _check_input(root, wish.levels[0])
-    reused = _deepest(wish.levels, found)
+    reused = _deepest(wish.levels, found, root.rate if root is not None else 0.0)
     names = {p.name for p in found}
     dependencies, steps = reused[:], []
     for level in wish.levels[len(reused) :]:
@@ -183,14 +191,14 @@ def _check_input(root: Found, level: Level) -> None:
             raise ROSAFE.error("e_existsAlready", what=what)
 
 
-def _deepest(levels: Sequence[Level], found: Iterable[Found]) -> list[str]:
+def _deepest(levels: Sequence[Level], found: Iterable[Found], sample_rate: float) -> list[str]:
     """The names, from the input on, of the longest line of processors that fit."""
     lines: dict[str, list[str]] = {"": []}  # that fit so far, by the name of their last processor
     for level in levels:
         longer = {
             p.name: [*lines[p.parent], p.name]
             for p in found
-            if p.kind == level.kind.kind and p.parent in lines and (not p.parent or level.fits(p))
+            if p.kind == level.kind.kind and p.parent in lines and (not p.parent or level.fits(p, sample_rate))
         }
         if not longer:
             break
@@ -212,7 +220,8 @@ def _making(wish: Wish, level: Level, name: str, parent: str) -> list[Step]:
     if level.kind.parent:
         unsaid = [p for p in level.kind.parameters if _reads_as_default(p, level.values[p.name])]
         # Until then, nobody who looks may take it for one with the defaults.
-        sent = {**level.values, **{p.name: ALMOST_ZERO for p in unsaid}}
+        free = [p for p in level.kind.parameters if p.follows_rate and p.name not in level.given]
+        sent = {**level.values, **{p.name: ALMOST_ZERO for p in unsaid}, **{p.name: 0.0 for p in free}}
         step = Step(level.kind.request, {"name": name, "upperDepName": parent, **sent}, name)
     else:
         unsaid = [p for p in level.kind.parameters if level.values[p.name] != p.default]
