@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from rosafe.component.overlap import joined
 from rosafe.interface import KINDS, ROSAFE, ros_type
+from rosafe.sound.windows import joined
 from rosafe.view.report import PortRow
 from rosafe.view.representations import Representations
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import rosgraph.names
 
-from rosafe.component import wire
+from rosafe.component import mark, wire
 from rosafe.genomix import packed, syntax, trees
 from rosafe.genomix.actions import ActionClient, Goal
 from rosafe.genomix.graph import Graph, Unknown, middleware_error
@@ -32,6 +32,7 @@ from rosafe.interface import (
     ros_type,
 )
 from rosafe.interface.signals import LEVELS
+from rosafe.vocabulary.words import meant
 
 CALL_SECONDS = 60.0  # for the answer to one request
 APPEAR_SECONDS = 2.0  # that `load` waits for a component that is just starting
@@ -48,7 +49,15 @@ class Value:
         self._component = component
         self._members = members
         self.values = values
+        self.warning = ""
         self.data: object = self  # what the values belong to, and perhaps those of others
+
+    def warn(self, warning: str) -> None:
+        """Have the component's `warning`, where there is one, among the members."""
+        if warning:
+            self.warning = warning
+            self._members = (*self._members, ("warning", "string"))
+            self.values = {**self.values, "warning": warning}
 
     def pieces(self, form: Syntax) -> Iterator[str]:
         """The text, as one nested value, in short pieces."""
@@ -134,8 +143,8 @@ class Proxy:
         try:
             return self.component.service(name)
         except KeyError:
-            known = ", ".join(s.name for s in (*self.component.services, *self.component.composites))
-            what = f"{self.component.name} has no service {name[:80]!r}; it has {known}"
+            known = [s.name for s in (*self.component.services, *self.component.composites)]
+            what = f"{self.component.name} has no service {name[:80]!r}; it has {', '.join(known)}{meant(name, known)}"
             raise ComponentError("::genom::no_such_service", what=what) from None
 
     def arguments(self, service: Service, given: Any) -> dict[str, Any]:
@@ -153,7 +162,9 @@ class Proxy:
             response = await client.call(values, CALL_SECONDS)
         if not response.genom_success:
             raise component_exception(response.genom_exdetail)
-        return Value(self.component, service.outputs, {name: getattr(response, name) for name, _ in service.outputs})
+        value = Value(self.component, service.outputs, {name: getattr(response, name) for name, _ in service.outputs})
+        value.warn(mark.warning_in(response.genom_exdetail))
+        return value
 
     async def start(self, service: Service, values: Mapping[str, Any]) -> Goal:
         """Send an activity; its goal tells when it runs and when it has ended."""

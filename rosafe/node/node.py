@@ -13,7 +13,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from rosafe import interface
 from rosafe.component import wire
 from rosafe.component.activities import Activity
-from rosafe.component.audio import MAX_WINDOW, AudioRing
+from rosafe.component.audio import AudioRing
 from rosafe.component.component import ComponentNode
 from rosafe.component.events import EventLog
 from rosafe.component.startup import run_server
@@ -22,24 +22,37 @@ from rosafe.interface import KINDS, LAYOUTS, ROSAFE, ComponentError, Representat
 from rosafe.node import reports
 from rosafe.node.ports import OutputPort, element
 from rosafe.node.trace_port import TracePort
-from rosafe.representations import PROBLEMS
+from rosafe.node.words import UnknownWords
+from rosafe.representations import PROBLEMS, STAGES
+from rosafe.sound.windows import MAX_WINDOW
 from rosafe.tree.block import Block
 from rosafe.tree.processor import Processor
 from rosafe.tree.tree import Tree
 from rosafe.vocabulary.parameter import MAX_STRING, shown
 
 FIRST_AUDIO_SECONDS = 1.0  # how long InputProc waits for a first message
+OPTIONS = {
+    "--strict": {
+        "action": "store_true",
+        "help": "refuse unknown words of enumerated parameters, as the ROS parameter ~strict_words does (default: they "
+        "are taken as the original takes them, with a warning)",
+    }
+}
 
 
 class RosafeNode:
-    """The component `rosAFE`. Make it after `rospy.init_node`."""
+    """The component `rosAFE`. Make it after `rospy.init_node`.
 
-    def __init__(self, instance: str) -> None:
+    Where it is `strict`, or the ROS parameter ``strict_words`` in its namespace is true, unknown words are refused.
+    """
+
+    def __init__(self, instance: str, strict: bool = False) -> None:
         for problem in PROBLEMS:
             rospy.logwarn(f"a representation is left out: {problem}")
         self._node = ComponentNode(ROSAFE, lambda problem: ROSAFE.error("e_badNewValue", what=str(problem)))
         self.finished = self._node.finished
         self._tree = Tree(self)
+        self._words = UnknownWords(strict)
         self._ring = AudioRing(EventLog(rospy.logwarn))
         self._audio: rospy.Subscriber | None = None
         self._audio_topic = ""
@@ -100,6 +113,8 @@ class RosafeNode:
     # --- processors ---
 
     def _input_proc(self, activity: Activity, values: dict[str, Any]) -> None:
+        if not values["name"]:
+            raise ROSAFE.error("e_badNewValue", what="name: '' is empty, and names a processor")
         if self._audio is None:
             raise ROSAFE.error("e_noData", "the Audio port is not connected: call connect_port first")
         activity.interrupt_waiting()
@@ -132,8 +147,13 @@ class RosafeNode:
             return values
 
         def handle(activity: Activity, values: dict[str, Any]) -> None:
-            parameters = {p.name: p.known_word(values[p.name]) for p in kind.parameters if p.name in values}
-            self._live(activity, self._tree.add(kind.kind, values["name"], values["upperDepName"], parameters))
+            asked = STAGES[kind.kind].asked({p.name: values[p.name] for p in kind.parameters if p.name in values})
+            doubts: dict[str, str] = {}
+            take = self._words.taking(doubts)
+            parameters = {p.name: take(p, asked[p.name]) for p in kind.parameters if p.name in asked}
+            processor = self._tree.add(kind.kind, values["name"], values["upperDepName"], parameters)
+            activity.warning = self._words.note(processor, doubts)
+            self._live(activity, processor)
 
         self._node.activity(kind.request, handle, check)
 
@@ -147,6 +167,7 @@ class RosafeNode:
         activity.stop_requested.wait()
         self._ends.pop(processor, None)
         self._tree.end(processor)
+        self._words.forget(processor)
         self._node.settle()
         if processor.error is not None:
             raise ComponentError("::genom::unkex", what=f"{type(processor.error).__name__}: {processor.error}"[:127])
@@ -198,8 +219,11 @@ class RosafeNode:
     def _get_representation(self, values: dict[str, Any]) -> dict[str, Any]:
         return reports.response("getRepresentation", parts=reports.representation(self._tree.find(values["name"])))
 
-    def _modify_parameter(self, values: dict[str, Any]) -> None:
-        self._tree.modify(values["nameProc"], values["nameParam"], values["newValue"])
+    def _modify_parameter(self, values: dict[str, Any]) -> dict[str, Any]:
+        doubts: dict[str, str] = {}
+        take = self._words.taking(doubts)
+        processor = self._tree.modify(values["nameProc"], values["nameParam"], values["newValue"], take)
+        return {"warning": self._words.note(processor, doubts)}
 
     def _remove_processor(self, values: dict[str, Any]) -> None:
         self._tree.remove(values["name"])
@@ -228,8 +252,14 @@ class RosafeNode:
         return status
 
     def _tree_health(self, status: Any) -> Any:
-        processors = self._tree.processors
-        status.summary(DiagnosticStatus.OK, f"{len(processors)} processors")
+        processors, doubts = self._tree.processors, self._words.lines
+        if doubts:
+            more = f" (and {len(doubts) - 1} more unknown words)" if len(doubts) > 1 else ""
+            status.summary(DiagnosticStatus.WARN, f"{doubts[0]}{more}")
+        else:
+            status.summary(DiagnosticStatus.OK, f"{len(processors)} processors")
+        for doubt in doubts:
+            status.add("unknown word", doubt)
         for processor in processors:
             status.add(processor.name, f"{processor.kind}, {processor.state.value}, {processor.blocks} blocks")
         return status
@@ -237,4 +267,4 @@ class RosafeNode:
 
 def main(argv: list[str] | None = None) -> int:
     """Run the node; the `rosAFE-ros` command."""
-    return run_server(interface.ROSAFE, RosafeNode, argv, kernels.compiled)
+    return run_server(interface.ROSAFE, RosafeNode, argv, kernels.compiled, OPTIONS)

@@ -118,18 +118,18 @@ class Chain:
         self._derived: dict[int, dict[str, Any]] = {}  # from parameters, from which block on
         try:
             with _as_value_error():
-                self._build(_needed(outputs), parameters)
+                self._build(needed(outputs), parameters)
         except BaseException:
             self.close()
             raise
         self._remember(0)
 
-    def _build(self, needed: set[str], values: Mapping[str, Any]) -> None:
+    def _build(self, kinds: list[str], values: Mapping[str, Any]) -> None:
         for kind in KINDS.values():  # parents come first in the table
             mine = {p.name: values[p.name] for p in kind.parameters if p.name in values}
             if not kind.parent:
                 self._processors[kind.kind] = self._tree.add_input(kind.kind, self._source, 0, 0.0, 0.0, mine)
-            elif kind.kind in needed:
+            elif kind.kind in kinds:
                 self._processors[kind.kind] = self._tree.add(kind.kind, kind.kind, kind.parent, mine)
 
     def schedule(self, block: int, name: str, value: Any) -> None:
@@ -140,6 +140,10 @@ class Chain:
 
     def _remember(self, block: int) -> None:
         self._derived[block] = {k: v for p in self._processors.values() for k, v in p.derived().items()}
+
+    def write_into(self, kind: str, place: Callable[[int], np.ndarray | None]) -> None:
+        """Let the stage of a `kind` that nothing hangs on write where `place` says for so many frames, if it can."""
+        self._processors[kind].place = place
 
     def observe(self, observer: Observer) -> None:
         """Tell `observer` of every state that a processor enters."""
@@ -204,14 +208,14 @@ class Chain:
         return described
 
 
-def _needed(outputs: Iterable[str]) -> set[str]:
-    """The processors to run for `outputs`."""
-    needed = {kind.kind for kind in KINDS.values() if not kind.parent}
+def needed(outputs: Iterable[str]) -> list[str]:
+    """The kinds of processors to run for `outputs`, parents first."""
+    wanted = {kind.kind for kind in KINDS.values() if not kind.parent}
     for kind in outputs:
         while kind:
-            needed.add(kind)
+            wanted.add(kind)
             kind = KINDS[kind].parent
-    return needed
+    return [kind for kind in KINDS if kind in wanted]
 
 
 @contextmanager

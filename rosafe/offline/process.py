@@ -109,7 +109,7 @@ process.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
 
 
 def _named(by_place: tuple[Any, ...], options: tuple[Any, Any, Any, Any]) -> tuple[Any, Any, Any, Any]:
-    """The options, of which the first ones were given by their place, as versions before 0.3 wanted them."""
+    """The options, of which the first ones were given by their place, as it was done once."""
     if len(by_place) > len(options):
         raise TypeError(f"process() takes 2 positional arguments, and {2 + len(by_place)} were given")
     warnings.warn("give what follows the sample rate by name, as in parameters={...}", DeprecationWarning, 3)
@@ -155,6 +155,7 @@ class _Work:
                 axes = parts[name].axes
                 kept = (self.ears, *shape[1:]) if axes[0] == "ear" else shape
                 self.gathered[kind][name] = _Gathered(kept, axes.index(centred) if centred in axes else -1)
+            self.chain.write_into(kind, next(iter(self.gathered[kind].values())).place)
 
     def keep(self, kind: str, block: Block) -> None:
         """Take what has been released."""
@@ -243,9 +244,20 @@ class _Gathered:
         self._waiting: list[np.ndarray] = []
         self._frames = 0  # that wait
         self._fits = True
+        self._lent: np.ndarray | None = None
+
+    def place(self, frames: int) -> np.ndarray | None:
+        """Where the next block may be written, of so many frames if it has any."""
+        end = self._filled + frames
+        free = self._fits and not self._waiting and end <= self._whole.shape[-1]
+        self._lent = self._whole[..., self._filled : end] if free else None
+        return self._lent
 
     def add(self, block: np.ndarray) -> None:
         """The next block, (..., frames)."""
+        if block is self._lent:
+            self._filled, self._begun, self._lent = self._filled + block.shape[-1], True, None
+            return
         self._fits = self._fits and block.shape[:-1] == self._whole.shape[:-1]
         self._waiting.append(block)
         self._frames += block.shape[-1]

@@ -136,6 +136,11 @@ class Filterbank(Stage):
             return {**values, "fb_highFreqHz": HIGHEST * sample_rate}
         return dict(values)
 
+    @classmethod
+    def asked(cls, values: Mapping[str, Any]) -> dict[str, Any]:
+        listed = bool(values.get("fb_cfHz")) and values.get("fb_nERBs") == 0
+        return {name: value for name, value in values.items() if not (listed and name == "fb_nERBs")}
+
     @property
     def parameters(self) -> dict[str, Any]:
         return self.in_force(self.at_rate(self._values, self._given, self.sample_rate))
@@ -144,7 +149,9 @@ class Filterbank(Stage):
         return (*rows, len(self._frequencies))
 
     def process(self, block: FloatArray, extra: FloatArray | None = None) -> FloatArray:
-        output, envelope = self._bank.process(self._checked(block), "envelope" in self.provide)
+        samples = self._checked(block)
+        place = self._room((2, len(self._frequencies), samples.shape[-1]))
+        output, envelope = self._bank.process(samples, "envelope" in self.provide, place)
         self.provided = {} if envelope is None else {"envelope": envelope}
         return output
 

@@ -118,6 +118,14 @@ def test_coordinates_are_those_that_were_in_force() -> None:
         assert got["crossCorrelation"].shape[1] == 2 * reach + 1
 
 
+def test_blocks_without_frames_have_rows_too() -> None:
+    """The first one is shorter than a window; it had more lags than there are from the second on."""
+    got = rosafe.process(SOUND, RATE, FEW, [100, 2900], [(1, "cc_maxDelaySec", 0.0005)], ["crossCorrelation"])
+    assert got["crossCorrelation"].shape == (4, 37, 17)
+    np.testing.assert_allclose(got["cc_lags"], np.arange(-18, 19) / RATE)
+    assert not got["crossCorrelation"][:, :10].any()
+
+
 @pytest.mark.parametrize(
     ("kind", "names", "shape"),
     [

@@ -282,7 +282,8 @@ class Goal:
 def told(response: Any) -> tuple[str, Mapping[str, Any]]:
     """Exception and detail of a failed response or result, from its JSON text."""
     body = json.loads(response.genom_exdetail)
-    assert set(body) <= {"ex", "detail"}
+    assert set(body) <= {"ex", "detail", "what"}
+    assert body.get("what") or {"what", "by"} & set(body.get("detail", {})), "there is always a reason"
     assert response.genom_exdetail == json.dumps(body, separators=(",", ":"), ensure_ascii=False)
     return body["ex"], body.get("detail", {})
 

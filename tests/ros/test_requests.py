@@ -457,5 +457,6 @@ def test_the_same_name_at_once_is_given_once(afe: Session) -> None:
     afe.build("PreProc")
     responses = harness.run_together(8, lambda _: afe.call("GammatoneProc", fb_nChannels=2))
     failed = [json.loads(r.genom_exdetail) for r in responses if not r.genom_success]
-    assert failed == [{"ex": "::rosAFE::e_existsAlready"}] * 7
+    why = "'gammatone' exists already, of kind gammatone"
+    assert failed == [{"ex": "::rosAFE::e_existsAlready", "what": why}] * 7
     assert afe.processors()["gammatone"] == ["gammatone"]
