@@ -113,6 +113,7 @@ class Part:
         else:
             _rename_to_nothing(self.name, self._path)
         self.keep = True
+        _sync_folder(self._path.parent)
 
     def close(self) -> None:
         """Unlock it; what is not complete goes, unless it is to be kept or is still what somebody else has left."""
@@ -139,6 +140,14 @@ def new_file(target: str | Path, replace: bool) -> Iterator[int]:
         raise part.error(problem) from problem
     finally:
         part.close()
+
+
+def write_whole(target: str | Path, data: bytes) -> None:
+    """Put a file with `data` in the place `target`, or leave what is there: after a power cut too. OutputError."""
+    with new_file(target, replace=True) as descriptor:
+        rest = memoryview(data)
+        while rest:
+            rest = rest[os.write(descriptor, rest) :]
 
 
 def _place(target: Path, replace: bool) -> Path:
@@ -171,6 +180,16 @@ def _rename_to_nothing(name: Path, path: Path) -> None:
     if problem in (errno.EINVAL, errno.ENOSYS, errno.EEXIST):
         raise FileExistsError(errno.EEXIST, "it has come into being meanwhile")
     raise OSError(problem, os.strerror(problem))
+
+
+def _sync_folder(folder: Path) -> None:
+    """Have a new name survive a power cut, where the file system knows how."""
+    with contextlib.suppress(OSError):
+        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
 
 
 def _holder(descriptor: int) -> str:

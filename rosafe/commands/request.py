@@ -11,12 +11,12 @@ from __future__ import annotations
 import argparse
 import asyncio
 import json
-import os
 import sys
 from collections.abc import Mapping
 from typing import Any
 
 from rosafe.commands import Failure
+from rosafe.commands._component import component, prepare, told
 from rosafe.interface import REQUEST, ROSAFE, ComponentError, Representation
 from rosafe.interface.arguments import check_parameter
 from rosafe.tree import requests as request
@@ -76,14 +76,7 @@ def run(options: argparse.Namespace) -> int:
         raise Failure(str(problem)) from None
     if options.connect is not None:
         values["connect"] = options.connect
-    from rosafe.component import generate, master
-
-    master.set_local_defaults()
-    try:
-        generate.ensure_messages()
-        master.check_master(os.environ["ROS_MASTER_URI"])
-    except (generate.GenerationError, master.MasterError) as problem:
-        raise Failure(str(problem)) from None
+    prepare()
     answer = asyncio.run(_make(options.instance, values, kind))
     if options.json:
         print(json.dumps(answer, indent=2))
@@ -107,40 +100,19 @@ def _parameter(setting: str) -> tuple[str, Any]:
 
 async def _make(instance: str, values: Mapping[str, Any], kind: Representation) -> Mapping[str, Any]:
     """What the component's genomixd would answer; Failure, with what to do next, where it is refused."""
-    from rosafe.genomix.graph import Graph
-    from rosafe.genomix.proxy import Proxy, names
-
-    graph = Graph(os.environ["ROS_MASTER_URI"])
-    try:
-        try:
-            proxy = await Proxy.load(graph, names(ROSAFE.name, instance)[1])
-            await proxy.check(ROSAFE.name)
-        except ComponentError as problem:
-            named = "" if instance == ROSAFE.name else f" -i {instance}"
-            hint = f"; start it with: rosAFE-ros{named}" if problem.ex == "::genom::mwerr" else ""
-            raise Failure(_told(problem) + hint) from None
+    async with component(instance) as proxy:
         try:
             there = (await proxy.outputs("getProcessors", {}))["processors"]
             _warn(kind, values, new_input=all(processor["upperDepName"] for processor in there))
             return await proxy.outputs(REQUEST.name, values)
         except ComponentError as problem:
             if problem.ex != "::rosAFE::e_noData":
-                raise Failure(_told(problem)) from None
+                raise Failure(told(problem)) from None
             topic = "/" + str(values.get("connect", REQUEST.parameter("connect").default)).lstrip("/")
             start = "" if await proxy.published(topic) else "bass-ros -b; "
             acquire = f"rosservice call {topic.rpartition('/')[0]}/Acquire \"{{device: 'scene:'}}\""
             silent = f"{problem.ex}: {ROSAFE.exceptions['e_noData']}"
             raise Failure(f"{silent}; start the sound first: {start}{acquire}") from None
-        finally:
-            await proxy.close()
-    finally:
-        await graph.close()
-
-
-def _told(problem: ComponentError) -> str:
-    """The exception in one line: its name, and what it is about."""
-    what = problem.what or ROSAFE.exceptions.get(problem.ex.rpartition("::")[2], "")
-    return problem.ex + (f": {what}" if what else "")
 
 
 def _warn(kind: Representation, values: Mapping[str, Any], new_input: bool) -> None:

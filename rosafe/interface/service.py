@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from rosafe.vocabulary.errors import ComponentError
+from rosafe.vocabulary.idl import TIME, TIME_MEMBERS
 from rosafe.vocabulary.parameter import REQUIRED, Parameter
 
 Struct = tuple[tuple[str, str], ...]  # (member, IDL type)
@@ -95,6 +96,10 @@ class Component:
     structs: Mapping[str, Struct]  # by IDL name
     # What genomixd makes of several services, for its clients to call like one; not on the ROS graph.
     composites: tuple[Service, ...] = ()
+
+    def members(self, idl: str) -> Struct:
+        """The members of a struct, or of ROS' own time, of which no file is made."""
+        return TIME_MEMBERS if idl == TIME else self.structs[idl]
 
     def service(self, name: str) -> Service:
         """The service called `name` (aliases count), or KeyError."""

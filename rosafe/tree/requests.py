@@ -28,14 +28,13 @@ OF_THE_INPUT = ("connect", *(p.name for p in ROSAFE.service("InputProc").paramet
 class Found(NamedTuple):
     """A processor of the tree. `values` are those of getParameters; `parent` is empty for the input.
 
-    `rate` is that of its output (Hz).
     """
 
     name: str
     kind: str
     parent: str
     values: Mapping[str, Any]
-    rate: float = 0.0
+    rate: float = 0.0  # frames of output per second
 
 
 class Step(NamedTuple):
@@ -178,7 +177,7 @@ def plan(wish: Wish, found: Sequence[Found]) -> Plan:
     for level in wish.levels[len(reused) :]:
         name = free_name(level.kind, names)
         names.add(name)
-        steps += _making(wish, level, name, dependencies[-1] if dependencies else "")
+        steps += making(level, name, dependencies[-1] if dependencies else "", wish.input_values)
         dependencies.append(name)
     return Plan(dependencies, steps)
 
@@ -215,14 +214,17 @@ def free_name(kind: Representation, names: Collection[str]) -> str:
     return f"{kind.word}_{number}"
 
 
-def _making(wish: Wish, level: Level, name: str, parent: str) -> list[Step]:
-    """The requests for one processor. What that of an input cannot carry is set before anything hangs on it."""
+def making(level: Level, name: str, parent: str, input_values: Mapping[str, Any]) -> list[Step]:
+    """The requests for one processor. What that of an input cannot carry is set before anything hangs on it.
+
+    `input_values` are those of InputProc less its name, of which only an input takes notice.
+    """
     if level.kind.parent:
         free = {p.name: math.nan for p in level.kind.parameters if p.follows_rate and p.name not in level.given}
         return [Step(level.kind.request, {"name": name, "upperDepName": parent, **level.values, **free}, name)]
     changed = {p.name: level.values[p.name] for p in level.kind.parameters if level.values[p.name] != p.default}
     return [
-        Step(level.kind.request, {"name": name, **wish.input_values}, name),
+        Step(level.kind.request, {"name": name, **input_values}, name),
         *(
             Step("modifyParameter", {"nameProc": name, "nameParam": parameter, "newValue": text_of(value)})
             for parameter, value in changed.items()

@@ -12,14 +12,13 @@ from rosafe.interface import KINDS
 from rosafe.missing import require
 from rosafe.view.axes import frequency_axis, image, style
 from rosafe.view.coordinates import EARS, along, frame_times
+from rosafe.view.levels import LEVELS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-# Powers, and amplitudes: drawn as levels below the loudest, with so many dB for a factor of 10.
-LEVELS = {"gammatone": 20.0, "ihc": 20.0, "ratemap": 10.0, "amsFeatures": 20.0}
-RANGE_DB = 60.0  # of levels
+RANGE_DB = 60.0  # of levels, below the loudest
 UNDER = {"pitch": "ratemap", "onsetMap": "onsetStrength", "offsetMap": "offsetStrength"}  # what lies under them
 PITCH_TOP = 1000.0  # Hz; the ratemap under the pitch ends there
 COLUMNS = 1500  # of an image, at most

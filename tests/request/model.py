@@ -61,9 +61,9 @@ class Model:
         await asyncio.sleep(0)
         return result
 
-    async def hears(self, port: str) -> bool:
+    async def hears(self, port: str) -> str:
         assert port == "Audio"
-        return bool(self.connected)
+        return self.connected and f"/{self.connected.removeprefix('/')}"
 
     async def published(self, topic: str) -> bool:
         return topic in ("/bass/Audio", "/left/Audio")
