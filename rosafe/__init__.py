@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 from rosafe.version import VERSION as __version__
 
-__all__ = ["__version__", "plot", "process"]
+__all__ = ["__version__", "load", "plot", "process"]
 
 if TYPE_CHECKING:
+    from rosafe.offline.formats import load
     from rosafe.offline.process import process
     from rosafe.view.plot import plot
 
@@ -23,6 +24,10 @@ def __getattr__(name: str) -> Any:
         from rosafe.offline.process import process
 
         return process
+    if name == "load":
+        from rosafe.offline.formats import load
+
+        return load
     if name == "plot":
         from rosafe.view.plot import plot
 

@@ -7,7 +7,6 @@ their units. Correlations are means over the channels, modulation spectrograms a
 from __future__ import annotations
 
 import argparse
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -49,13 +48,14 @@ def run(options: argparse.Namespace) -> int:
     target = Path(options.output or source.with_suffix(".png"))
     from matplotlib.figure import Figure
 
+    from rosafe.offline.formats import FORMATS
     from rosafe.sound.audiofile import AudioFileError
     from rosafe.view.axes import save
     from rosafe.view.plot import draw
 
     names = words(options.outputs)
     try:
-        if source.suffix == ".npz":
+        if source.suffix.lower() in FORMATS:
             result = _result(source, options.settings)
         else:
             names = check_outputs(names or _DEFAULT)
@@ -68,16 +68,14 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _result(path: Path, settings: list[str]) -> Mapping[str, Any]:
-    from rosafe.offline.npz import memory_map
+    from rosafe.offline.formats import load
 
     if settings:
         raise ValueError("--set: a result is drawn as it is; name the sound instead")
     try:
-        return memory_map(path)
+        return load(path)
     except OSError as problem:
         raise ValueError(f"{path}: {problem.strerror}") from None
-    except zipfile.BadZipFile:
-        raise ValueError(f"{path} is no result of rosafe process") from None
 
 
 def _computed(path: Path, names: list[str], parameters: dict[str, Any]) -> Mapping[str, Any]:

@@ -178,6 +178,16 @@ class Chain:
         """How many frames it puts out for so many of the signal."""
         return processor.stage.complete(frames if processor.parent is None else self._count(processor.parent, frames))
 
+    def times(self, kind: str, frames: int) -> np.ndarray:
+        """When each frame of an output is, for a signal of so many frames (s from its first): the frame's middle.
+
+        Frame k of hop h and window w (in samples of sound at the rate fs) is at (k h + w / 2) / fs, sample n at n / fs.
+        """
+        processor = self._processors[kind]
+        signal, count = processor.signal, self._count(processor, frames)
+        middle = signal.window / 2 if signal.framed else 0.0
+        return np.asarray((np.arange(count) * signal.hop + middle) / self.sample_rate)
+
     def largest_block(self, frames: int) -> tuple[str, int]:
         """Which processor puts out most for one block of so many frames, and how many bytes that can be."""
         seconds = frames / self.sample_rate
