@@ -12,6 +12,7 @@ import argparse
 import contextlib
 import importlib
 import os
+import re
 import sys
 import textwrap
 import time
@@ -182,8 +183,8 @@ def run(options: argparse.Namespace) -> int:
     inputs = [Path(name) for name in (*options.inputs, *options.more_inputs)]
     if not inputs:
         options.usage_error("no sound file is named")
-    if options.dask == "":
-        options.usage_error("--dask wants the address of a scheduler, such as tcp://HOST:8786, or local")
+    if options.dask is not None and not re.fullmatch(r"local|((tcp|tls)://)?[^/\s]+:\d{1,5}", options.dask):
+        options.usage_error(f"--dask {options.dask}: wanted is a scheduler, such as tcp://HOST:8786, or local")
     folder, file = _place(inputs, options)
     # Once, for all processes that are forked from this one.
     from rosafe.offline.corpus import Settings, compute, find, named
