@@ -114,6 +114,7 @@ class Part:
         else:
             _renameat2(self.name, self._path, _RENAME_NOREPLACE)
         self.keep = True
+        _sync_folder(self._path.parent)
 
     def close(self) -> None:
         """Unlock it; what is not complete goes, unless it is to be kept or is still what somebody else has left."""
@@ -247,6 +248,14 @@ def _remove(path: Path) -> None:
         path.unlink()
 
 
+def write_whole(target: str | Path, data: bytes) -> None:
+    """Put a file with `data` in the place `target`, or leave what is there: after a power cut too. OutputError."""
+    with new_file(target, replace=True) as descriptor:
+        rest = memoryview(data)
+        while rest:
+            rest = rest[os.write(descriptor, rest) :]
+
+
 def _place(target: Path, replace: bool) -> Path:
     """Where the output goes, links followed; OutputError where that is taken or cannot be."""
     try:
@@ -277,6 +286,16 @@ def _renameat2(name: Path, path: Path, flag: int) -> None:
     if problem in (errno.EINVAL, errno.ENOSYS, errno.EEXIST):
         raise FileExistsError(errno.EEXIST, "it has come into being meanwhile")
     raise OSError(problem, os.strerror(problem))
+
+
+def _sync_folder(folder: Path) -> None:
+    """Have a new name survive a power cut, where the file system knows how."""
+    with contextlib.suppress(OSError):
+        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+        try:
+            os.fsync(descriptor)
+        finally:
+            os.close(descriptor)
 
 
 def _holder(descriptor: int) -> str:

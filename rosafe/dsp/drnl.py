@@ -52,10 +52,13 @@ class DrnlBank:
             channel.reset()
         self._last = np.zeros((2, len(self.channels), 1))
 
-    def process(self, block: FloatArray, with_envelope: bool) -> tuple[FloatArray, FloatArray | None]:
-        """Filter (2, N): output (2, C, N), and the envelope of the same shape if wanted, else None."""
+    def process(
+        self, block: FloatArray, with_envelope: bool, output: FloatArray | None = None
+    ) -> tuple[FloatArray, FloatArray | None]:
+        """Filter (2, N): output (2, C, N), into `output` where that is given; and the envelope if wanted, else None."""
         block = limited(block)
-        output = np.empty((2, len(self.channels), block.shape[-1]))
+        if output is None:
+            output = np.empty((2, len(self.channels), block.shape[-1]))
         with kernels.denormals_off():  # tails of the many filters go through them within a block
             for index, channel in enumerate(self.channels):
                 output[:, index] = channel.process(block)

@@ -49,11 +49,16 @@ class GammatoneBank:
         """All filters back to rest."""
         self._state = np.zeros((2, *self._sections.shape[:2]), np.complex128)
 
-    def process(self, block: FloatArray, with_envelope: bool) -> tuple[FloatArray, FloatArray | None]:
-        """Filter (2, N): output (2, C, N), and the envelope 2 abs(H x) of the same shape if wanted, else None."""
-        shape = (2, len(self._sections), block.shape[-1])
-        output = memory.empty(shape)
-        envelope = memory.empty(shape) if with_envelope else None
+    def process(
+        self, block: FloatArray, with_envelope: bool, output: FloatArray | None = None
+    ) -> tuple[FloatArray, FloatArray | None]:
+        """Filter (2, N): output (2, C, N), and the envelope 2 abs(H x) of the same shape if wanted, else None.
+
+        It goes into `output` where that is given; its rows may lie apart (`kernels.rows_apart`).
+        """
+        if output is None:
+            output = memory.empty((2, len(self._sections), block.shape[-1]))
+        envelope = memory.empty(output.shape) if with_envelope else None
         run = kernels.gammatone if kernels.compiled() else filter_by_scipy
         run(block, self._sections, self._state, output, envelope)
         return output, envelope

@@ -11,6 +11,7 @@ import numpy as np
 from rosafe.vocabulary.parameter import REQUIRED, Parameter
 from rosafe.vocabulary.representation import Representation
 
+from . import kernels, memory
 from .guard import FloatArray
 from .signal import Signal
 
@@ -47,6 +48,9 @@ class Stage:
         Which of `PROVIDES` whoever hangs on it needs; `process` leaves these in `provided`.
     provided : dict of str to ndarray
         Of the last block.
+    place : ndarray or None
+        Where whoever drives it wants the output for the next block, if it fits: (*rows, N) with rows evenly apart, each
+        in one piece. A stage that cannot write there returns another array, as always.
 
     Raises
     ------
@@ -64,6 +68,7 @@ class Stage:
         self.given = given
         self.provide: frozenset[str] = frozenset()
         self.provided: dict[str, FloatArray] = {}
+        self.place: FloatArray | None = None
         declared = self.REPRESENTATION.parameters
         self._values = {parameter.name: parameter.check(parameter.default) for parameter in declared}
         self._values = self._with(parameters)
@@ -76,6 +81,11 @@ class Stage:
 
         ValueError for values that go together at no sample rate.
         """
+        return dict(values)
+
+    @classmethod
+    def asked(cls, values: Mapping[str, Any]) -> dict[str, Any]:
+        """`values` as a request may hold them, without what only `in_force` tells: so one can be made like another."""
         return dict(values)
 
     # --- what it is -------------------------------------------------------------------------------------------
@@ -198,6 +208,13 @@ class Stage:
 
     def reset(self) -> None:
         """Back to the state before the first block; parameters stay."""
+
+    def _room(self, shape: tuple[int, ...]) -> FloatArray:
+        """Where to write an output of this shape: into `place`, if that is one for it."""
+        place, self.place = self.place, None
+        if place is None or place.shape != shape or place.dtype != FLOAT64 or not kernels.rows_apart(place):
+            return memory.empty(shape)
+        return place
 
     def _checked(self, block: Any) -> FloatArray:
         """`block` as contiguous float64 of the right shape, or ValueError."""

@@ -20,7 +20,7 @@ def parameters(processors: Iterable[Processor]) -> Any:
     for processor in processors:
         if processor.kind in arrays:
             struct = getattr(messages, ros_type(parameter_struct(processor.kind)))
-            values = {**processor.parameters(), **processor.derived()}
+            values = processor.values()
             arrays[processor.kind].append(struct(name=processor.name, **values))
     return messages.rosAFE_parameters(**arrays)
 
@@ -53,7 +53,7 @@ def descriptions(processors: Iterable[Processor], node: str, of_the_input: Mappi
 def _description(processor: Processor, node: str, of_the_input: Mapping[str, Any]) -> dict[str, Any]:
     kind = processor.representation
     largest = max(range(len(kind.parts)), key=lambda part: len(kind.parts[part].axes))
-    values = {**processor.parameters(), **processor.derived()}
+    values = processor.values()
     if processor.parent is None:
         values.update(of_the_input)
     return {

@@ -141,6 +141,10 @@ class Chain:
     def _remember(self, block: int) -> None:
         self._derived[block] = {k: v for p in self._processors.values() for k, v in p.derived().items()}
 
+    def write_into(self, kind: str, place: Callable[[int], np.ndarray | None]) -> None:
+        """Let the stage of a `kind` that nothing hangs on write where `place` says for so many frames, if it can."""
+        self._processors[kind].place = place
+
     def observe(self, observer: Observer) -> None:
         """Tell `observer` of every state that a processor enters."""
         self._tree.observe(observer)

@@ -11,7 +11,7 @@ from pathlib import Path, PurePath
 from typing import Any, NamedTuple
 
 from rosafe.offline.sounds import SOUNDS
-from rosafe.output import OutputError, new_file
+from rosafe.output import OutputError, write_whole
 
 FAILED = "failed.csv"
 _HEAD = ["input", "why"]
@@ -172,10 +172,7 @@ def write_failed(folder: Path, inputs: Sequence[Path], failed: Mapping[str, str]
         return
     text = io.StringIO()
     csv.writer(text, lineterminator="\n").writerows([_HEAD, *rest.items()])
-    with new_file(path, replace=True) as descriptor:
-        content = memoryview(text.getvalue().encode("utf-8", "surrogateescape"))
-        while content:
-            content = content[os.write(descriptor, content) :]
+    write_whole(path, text.getvalue().encode("utf-8", "surrogateescape"))
 
 
 def _folders(name: str) -> set[str]:

@@ -122,6 +122,11 @@ class Filterbank(Stage):
             told["fb_nERBs"] = float(erb_rate(frequencies[-1]) - erb_rate(frequencies[0])) / len(frequencies)
         return told
 
+    @classmethod
+    def asked(cls, values: Mapping[str, Any]) -> dict[str, Any]:
+        listed = bool(values.get("fb_cfHz")) and values.get("fb_nERBs") == 0
+        return {name: value for name, value in values.items() if not (listed and name == "fb_nERBs")}
+
     @property
     def parameters(self) -> dict[str, Any]:
         return self.in_force(self._values)
@@ -130,7 +135,9 @@ class Filterbank(Stage):
         return (*rows, len(self._frequencies))
 
     def process(self, block: FloatArray, extra: FloatArray | None = None) -> FloatArray:
-        output, envelope = self._bank.process(self._checked(block), "envelope" in self.provide)
+        samples = self._checked(block)
+        place = self._room((2, len(self._frequencies), samples.shape[-1]))
+        output, envelope = self._bank.process(samples, "envelope" in self.provide, place)
         self.provided = {} if envelope is None else {"envelope": envelope}
         return output
 

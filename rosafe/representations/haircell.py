@@ -101,7 +101,9 @@ class InnerHairCell(Stage):
             samples, envelope = self._checked(envelope), None
         if kernels.compiled():
             state = self._lowpass.started(samples.shape[:-1])
-            return kernels.rectify_and_filter(rectification, samples, envelope, self._lowpass.sections, state)
+            output = self._room(samples.shape)
+            kernels.rectify_and_filter(rectification, samples, envelope, self._lowpass.sections, state, output)
+            return output
         if envelope is not None:
             return self._lowpass.process(compressed(limited(samples), limited(envelope)))
         return self._lowpass.process(RECTIFIERS[rectification](limited(samples)))

@@ -33,6 +33,26 @@ def joined(new: int, window: int) -> tuple[int, int]:
     return new - shown, shown
 
 
+def new_frames(expected: float, window: np.ndarray, before: np.ndarray) -> int:
+    """How many frames a framed port's window has moved on, which is a whole number near `expected`.
+
+    The grid of the frames is not on the wire; where the windows fit onto each other is.
+
+    Parameters
+    ----------
+    expected : float
+        Of the audio frames that went by, and the port's frame rate.
+    window, before : ndarray, (..., frames)
+        What the newest message shows, and the one before.
+    """
+    frames = window.shape[-1]
+    if expected <= frames and before.shape == window.shape:
+        for count in sorted({int(expected), int(expected) + 1}, key=lambda count: abs(count - expected)):
+            if count >= frames or np.array_equal(window[..., : frames - count], before[..., count:], equal_nan=True):
+                return count
+    return round(expected)
+
+
 class WindowStream:
     """One stream of frames, out of messages (`binaudio_portStruct` with arrays) that overlap.
 

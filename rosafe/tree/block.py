@@ -1,16 +1,18 @@
-"""What processors hand each other: blocks of a signal, never written again once they are released."""
+"""Blocks of a signal: what processors hand each other, and where the first ones come from."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple, Protocol
+
+from numpy.typing import NDArray
 
 from rosafe.dsp.guard import FloatArray
 from rosafe.dsp.signal import Signal
 
 
 class Block(NamedTuple):
-    """What one processor released.
+    """What one processor released; it is never written again.
 
     Attributes
     ----------
@@ -41,3 +43,30 @@ class Block(NamedTuple):
     def rate(self) -> float:
         """Frames per second."""
         return self.signal.rate
+
+
+class Source(Protocol):
+    """Where the input reads. Called with no lock of the tree's held, and `read` by one thread at a time.
+
+    Attributes
+    ----------
+    sample_rate : float
+        In Hz.
+    ended : bool
+        Nothing more will come; what has come may still be read.
+    """
+
+    sample_rate: float
+    ended: bool
+
+    def open(self, wake: Callable[[], None]) -> None:
+        """From now on call `wake` whenever there may be a block to read, or the end. It returns at once.
+
+        There may be one already: the tree looks once without being called.
+        """
+
+    def read(self) -> tuple[NDArray[Any], int] | None:
+        """The next block, (2, n), and the index of the frame after it; None where there is none yet, or no more."""
+
+    def stop(self) -> None:
+        """Nobody will read any more."""

@@ -71,24 +71,21 @@ class Changes:
     def stage_for(self, block: Block) -> Stage | None:
         """The stage to work on `block`, after all changes that are due and go with it; None where none can."""
         stage = self._working
-        if self._waiting or block.signal is not stage.given:
-            with self._lock:
-                due = self._due(block.number)
-                for count in range(len(due), -1, -1):
-                    changed = _changed(stage, block.signal, due[:count])
-                    if changed is not None and _fits(changed, block):
-                        self._working = changed
-                        del self._waiting[:count]
-                        return changed
-            return None
-        return stage if _fits(stage, block) else None
+        if not self._waiting and block.signal is stage.given:
+            needs = stage.needs
+            return stage if not needs or needs in block.extras else None
+        with self._lock:
+            due = self._due(block.number)
+            for count in range(len(due), -1, -1):
+                changed = _changed(stage, block.signal, due[:count])
+                if changed is not None and (not changed.needs or changed.needs in block.extras):
+                    self._working = changed
+                    del self._waiting[:count]
+                    return changed
+        return None
 
     def _due(self, number: int) -> list[Change]:
         return list(itertools.takewhile(lambda change: change.block <= number, self._waiting))
-
-
-def _fits(stage: Stage, block: Block) -> bool:
-    return not stage.needs or stage.needs in block.extras
 
 
 def _changed(stage: Stage, given: Signal, changes: Sequence[Change]) -> Stage | None:

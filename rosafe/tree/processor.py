@@ -2,52 +2,22 @@
 
 from __future__ import annotations
 
+import math
 import threading
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import Any, Protocol
+from time import monotonic
+from typing import Protocol
 
-from numpy.typing import NDArray
-
-from rosafe.dsp.signal import Signal
+from rosafe.dsp.guard import FloatArray
 from rosafe.dsp.stage import Stage
-from rosafe.tree.block import Block
-from rosafe.tree.changes import Changes
-from rosafe.tree.history import History, Taken
-from rosafe.tree.states import State, StateMachine
-from rosafe.tree.workers import Workers
-from rosafe.vocabulary.representation import Representation
+from rosafe.tree.block import Block, Source
+from rosafe.tree.member import Member
+from rosafe.tree.states import State
+from rosafe.tree.workers import SHORT, Workers
 
-SHORT = 1.5e-4  # seconds: a listener that takes so long is called once nothing deeper in the tree is ready
-EARS = (2,)  # leading shape of what the input takes
-
-
-class Source(Protocol):
-    """Where the input reads. Called with no lock of the tree's held, and `read` by one thread at a time.
-
-    Attributes
-    ----------
-    sample_rate : float
-        In Hz.
-    ended : bool
-        Nothing more will come; what has come may still be read.
-    """
-
-    sample_rate: float
-    ended: bool
-
-    def open(self, wake: Callable[[], None]) -> None:
-        """From now on call `wake` whenever there may be a block to read, or the end. It returns at once.
-
-        There may be one already: the tree looks once without being called.
-        """
-
-    def read(self) -> tuple[NDArray[Any], int] | None:
-        """The next block, (2, n), and the index of the frame after it; None where there is none yet, or no more."""
-
-    def stop(self) -> None:
-        """Nobody will read any more."""
+NOTHING: frozenset[str] = frozenset()
+RISE = 2.0  # what a processor usually takes is the least of late; that is forgotten at this pace per block
 
 
 class Listener(Protocol):
@@ -84,34 +54,24 @@ class Company:
     observers: list[Observer] = field(default_factory=list)
 
 
-class Processor(StateMachine):
+class Processor(Member):
     """A node of the tree. Made and wired by `Tree`; the public members are safe from any thread.
 
     Locks are taken in this order: the tree's requests, `_telling`, the tree's lock or those of changes and history.
 
     Parameters
     ----------
-    name : str
-        The user's name for it.
-    stage : Stage
-        The numerics.
-    parent : Processor or None
-        None for the input, which reads from `source`.
+    name, stage, parent, history_seconds
+        As of `Member`.
     company : Company
         The others.
-    history_seconds : float
-        How much of its output it remembers.
+    source : Source or None
+        Where the input reads.
 
     Attributes
     ----------
-    kind : str
-        Its representation's.
-    error : BaseException or None
-        Why it came to its end.
-    blocks : int
-        That it has worked on, and
-    busy : float
-        the seconds that it took for them.
+    place : callable or None
+        Gets the frames that it has taken, and tells where its stage may write the output (`Stage.place`).
     """
 
     parent: Processor | None
@@ -122,90 +82,23 @@ class Processor(StateMachine):
         name: str,
         stage: Stage,
         parent: Processor | None,
-        company: Company,
         history_seconds: float,
+        company: Company,
         source: Source | None = None,
     ) -> None:
-        super().__init__(parent)
-        self.name = name
-        self.kind = stage.REPRESENTATION.kind
-        self.error: BaseException | None = None
-        self.blocks = 0
-        self.busy = 0.0
+        super().__init__(name, stage, parent, history_seconds)
+        self.observers = company.observers
         self.held_up_since = 0.0
-        self.changes = Changes(stage)
-        self.history = History(self.part_rows, stage.output, history_seconds)
+        self.usual = math.inf
+        self.place: Callable[[int], FloatArray | None] | None = None
         self._company = company
         self._listener = company.listener
-        self.observers = company.observers
         self._workers = company.workers
         self._lock = company.workers.lock
         self._source = source
         self._started = False
         self._usual_telling = 0.0  # seconds that the listener took for the last block
         self._telling = threading.Lock()  # `released` and `ended` exclude each other
-
-    def __repr__(self) -> str:
-        return f"<{self.kind} {self.name!r} {self.state.value}>"
-
-    # --- what it is ---
-
-    @property
-    def stage(self) -> Stage:
-        """As it will be after all changes, to be asked and not to be run."""
-        return self.changes.planned
-
-    @property
-    def representation(self) -> Representation:
-        """The declaration of what it computes."""
-        return self.stage.REPRESENTATION
-
-    @property
-    def given_rows(self) -> tuple[int, ...]:
-        """Leading shape of what it takes."""
-        return EARS if self.parent is None else self.parent.rows
-
-    @property
-    def part_rows(self) -> tuple[tuple[int, ...], ...]:
-        """Leading shape of each part of its output, such as (2, channels)."""
-        return self.stage.part_rows(self.given_rows)
-
-    @property
-    def rows(self) -> tuple[int, ...]:
-        """That of the first part, which its children take."""
-        return self.stage.output_rows(self.given_rows)
-
-    @property
-    def axes(self) -> tuple[tuple[str, ...], ...]:
-        """What lies along the dimensions of each part, time last."""
-        return tuple(part.axes for part in self.representation.parts)
-
-    @property
-    def signal(self) -> Signal:
-        """The format of its output."""
-        return self.stage.output
-
-    @property
-    def rate(self) -> float:
-        """Frames of output per second."""
-        return self.signal.rate
-
-    @property
-    def next_index(self) -> int:
-        """Of the audio frame after the newest one that its output knows of."""
-        return self.history.next_index
-
-    def parameters(self) -> dict[str, Any]:
-        """The values from the next block on, in the order of the parameter structure."""
-        return self.stage.parameters
-
-    def derived(self) -> dict[str, Any]:
-        """What follows from these."""
-        return self.stage.derived
-
-    def take(self, reader: str) -> Taken:
-        """What it released since `reader` asked last, at most the history."""
-        return self.history.take(reader)
 
     # --- life ---
 
@@ -255,7 +148,7 @@ class Processor(StateMachine):
         """Take the next step: tell of the last block, or compute the next one."""
         try:
             if self.untold is not None:
-                self._tell(self.untold)
+                self._tell(self.untold, monotonic())
                 return
             if self._source is not None:
                 self._read(self._source)
@@ -265,13 +158,13 @@ class Processor(StateMachine):
             self.error = problem
             with self._lock:
                 self.finish()
-            self.held_up_since = time.monotonic()  # by requests
+            self.held_up_since = monotonic()  # by requests
             self._company.failed(self)
             self.held_up_since = 0.0
 
     def _read(self, source: Source) -> None:
         """Take the next block of the source, if there is one, or come to the end with it."""
-        self.held_up_since = time.monotonic()
+        self.held_up_since = monotonic()
         while True:
             ended = source.ended  # looked at first: what has come before the end is read
             got = source.read()
@@ -285,16 +178,20 @@ class Processor(StateMachine):
                 self.finish()
 
     def _compute(self, taken: Block) -> None:
-        begun = time.monotonic()
+        begun = monotonic()
         private = self._process(taken)
-        seconds = time.monotonic() - begun
+        ended = monotonic()
+        seconds = ended - begun
         self.blocks += 1
         self.busy += seconds
+        limit = RISE * self.usual
+        self.usual = seconds if seconds < limit else limit
         with self._lock:
             self.done(private)
         self._listener.executed(self, seconds)
-        if self.untold is not None and self._usual_telling < SHORT:
-            self._tell(self.untold)
+        untold = self.untold
+        if untold is not None and self._usual_telling < SHORT:  # else once nothing deeper in the tree is ready
+            self._tell(untold, ended)
 
     def _process(self, taken: Block) -> Block | None:
         """What comes out for a block; None where that cannot be used."""
@@ -302,28 +199,35 @@ class Processor(StateMachine):
         if stage is None:
             return None
         if stage.PROVIDES:
-            with self._lock:
-                children = list(self.children)
-            wanted = {child.changes.needs(taken.number) for child in children}
-            stage.provide = frozenset(wanted.intersection(stage.PROVIDES))
+            stage.provide = self._wanted(stage, taken.number)
+        if self.place is not None and not self.children:  # who take blocks in one piece
+            stage.place = self.place(taken.data.shape[-1])
         needs = stage.needs
-        output = stage.process(taken.data, taken.extras[needs]) if needs else stage.process(taken.data)
+        data = taken.parts[0]
+        output = stage.process(data, taken.extras[needs]) if needs else stage.process(data)
         parts = output if isinstance(output, tuple) else (output,)
         next_index = taken.next_index
         if look_ahead := stage.look_ahead:
             next_index = max(0, next_index - look_ahead * stage.given.hop)
         return Block(taken.number, parts, next_index, stage.output, stage.provided)
 
-    def _tell(self, block: Block) -> None:
+    def _wanted(self, stage: Stage, number: int) -> frozenset[str]:
+        """The by-products that children need of block `number`."""
+        with self._lock:
+            children = list(self.children)
+        wanted = [child.changes.needs(number) for child in children]
+        return frozenset(stage.PROVIDES).intersection(wanted) if any(wanted) else NOTHING
+
+    def _tell(self, block: Block, begun: float) -> None:
         """Tell the world of the block that was released last."""
         self.untold = None
-        self.held_up_since = begun = time.monotonic()
+        self.held_up_since = begun
         with self._telling:
             if self.state is not State.REMOVED:
                 self.history.append(block)
                 self._listener.released(self, block)
         self.held_up_since = 0.0
-        self._usual_telling = time.monotonic() - begun
+        self._usual_telling = monotonic() - begun
 
 
 def subtree(processor: Processor) -> Iterator[Processor]:

@@ -1,8 +1,9 @@
 """Who runs what when: threads, as many as there are cores to use, that take up whatever task is ready.
 
 A worker that has finished a task goes on with the deepest one that is ready, mostly what it has just made ready: the
-block is still in its cache. It wakes another worker only where something is left over and one is idle. On one core no
-thread is ever switched so; on several, siblings and successive blocks are worked on at the same time.
+block is still in its cache. It wakes another worker only where something is left over and one is idle, and both
+together are worth it. On one core no thread is ever switched so; on several, siblings and successive blocks are worked
+on at the same time.
 
 Only those who compute count. A worker that somebody else holds up (a listener that does not return, a source that does
 not answer), or whose processor was removed, loses its seat to another one after `PATIENCE` seconds.
@@ -21,6 +22,7 @@ from typing import Protocol
 VARIABLE = "ROSAFE_WORKERS"
 MOST = 1024
 PATIENCE = 0.05  # seconds
+SHORT = 1.5e-4  # seconds: a call takes some ten microseconds of two workers, which then want the interpreter in turn
 WORKER = "rosafe worker"  # what the names of their threads begin with
 
 
@@ -39,6 +41,7 @@ class Task(Protocol):
     """What workers do. One works on it at a time; `begin` and `rest` are called with the lock held."""
 
     depth: int
+    usual: float  # seconds that it takes, or more than that
     held_up_since: float  # time.monotonic() at which somebody else began to hold it up; 0 where nobody does
 
     @property
@@ -140,6 +143,16 @@ class Workers:
             except RuntimeError:  # the system has none left: those that there are must do
                 return
 
+    def _worth_a_call(self, own: Task) -> bool:
+        """Whether what waits would wait too long for a worker that takes up `own` now, or keep it busy for too long."""
+        seconds = own.usual
+        for tasks in self._ready:
+            for task in tasks:
+                seconds += task.usual
+                if seconds > SHORT:
+                    return True
+        return seconds > SHORT
+
     def _pop(self) -> Task | None:
         """The deepest task that is ready."""
         for tasks in reversed(self._ready):
@@ -189,7 +202,7 @@ class Workers:
         while self._members:
             if self._free and (task := self._pop()) is not None:
                 self._free -= 1
-                if self._waiting and self._free:
+                if self._waiting and self._free and self._worth_a_call(task):
                     self.wake()
                 return task
             if self._idle >= self.count:  # others have come in the place of those that were held up

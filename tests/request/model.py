@@ -60,9 +60,9 @@ class Model:
         await asyncio.sleep(0)
         return result
 
-    async def hears(self, port: str) -> bool:
+    async def hears(self, port: str) -> str:
         assert port == "Audio"
-        return bool(self.connected)
+        return self.connected and f"/{self.connected.removeprefix('/')}"
 
     async def published(self, topic: str) -> bool:
         return topic in ("/bass/Audio", "/left/Audio")
@@ -74,8 +74,7 @@ class Model:
         return {}
 
     def _make(self, service: str, values: Mapping[str, Any]) -> dict[str, Any]:
-        # As the node reads a ROS request: 0, "" and [] are the default.
-        given = ROSAFE.service(service).from_ros(SimpleNamespace(**values))
+        given = ROSAFE.service(service).from_ros(SimpleNamespace(**values), literal=True)
         kind, name, parent = KIND_OF_SERVICE[service], given.pop("name"), given.pop("upperDepName", "")
         if not parent:
             if not (self.audio and self.connected):

@@ -47,6 +47,7 @@ def message(rate: int, index: int, left: np.ndarray, right: np.ndarray | None = 
         "nChunksOnPort": 1,
         "nFramesPerChunk": len(left),
         "problem": "",
+        "stamp": SimpleNamespace(sec=0, nsec=0),
     }
     return SimpleNamespace(**{**fields, **other})
 

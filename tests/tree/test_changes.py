@@ -184,8 +184,7 @@ def test_names_and_words_of_the_original(tree: Tree, feed: Feed) -> None:
         ("crossCorrelation", "cc_maxDelaySec", "0.00025", "cc_lags", [m / RATE for m in range(-4, 5)]),
     ):
         tree.modify(processor, parameter, text)
-        found = tree.find(processor)
-        assert {**found.parameters(), **found.derived()}[name] == value, (parameter, text)
+        assert tree.find(processor).values()[name] == value, (parameter, text)
 
 
 # --- when and how ---
@@ -261,8 +260,7 @@ def test_what_is_asked_while_others_change_it_fits_together(tree: Tree, feed: Fe
             if user < 2:
                 tree.modify("crossCorrelation", "cc_maxDelaySec", str(0.001 * (1 + (user + step) % 3)))
             else:
-                stage = correlation.stage
-                values = {**stage.parameters, **stage.derived}
+                values = correlation.values()
                 if values["cc_lags"][-1] != np.ceil(values["cc_maxDelaySec"] * RATE) / RATE:
                     return False
         return True

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable
 from functools import partial
@@ -22,7 +23,7 @@ from .support import Plain, use_plain_stages
 
 pytestmark = pytest.mark.long
 
-WALKS = 400
+WALKS = 300
 
 Check = Callable[[], None]
 Scenario = Callable[[Scheduler, int], Check]
@@ -274,6 +275,7 @@ class Failing(Plain):
 @pytest.fixture(autouse=True)
 def plain(monkeypatch: pytest.MonkeyPatch) -> None:
     use_plain_stages(monkeypatch, preProc=Failing)
+    monkeypatch.setattr(workers, "SHORT", 0.0)
 
 
 def go(patch: pytest.MonkeyPatch, scenario: Scenario, count: int, delays: int, walks: int) -> int:
@@ -283,13 +285,24 @@ def go(patch: pytest.MonkeyPatch, scenario: Scenario, count: int, delays: int, w
     return explore(run, partial(use, patch), delays, walks)
 
 
+@pytest.mark.parametrize("telling", [0.0, math.inf])
 @pytest.mark.parametrize("count", [1, 2, 3])
 @pytest.mark.parametrize(
     ("scenario", "delays"),
-    [(grow, 1), (hear, 1), (shrink, 2), (leave, 2), (replace_input, 2), (stop, 2), (fail, 2)],
+    [(grow, 1), (hear, 1), (shrink, 2), (leave, 2), (replace_input, 1), (stop, 2), (fail, 2)],
 )
-def test_any_order_of_events(scenario: Scenario, delays: int, count: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_any_order_of_events(
+    scenario: Scenario, delays: int, count: int, telling: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Other workers are called whenever there is something to do; the world is told at once, or later."""
+    monkeypatch.setattr(processor, "SHORT", telling)
     assert go(monkeypatch, scenario, count, delays, WALKS) > WALKS + 15
+
+
+@pytest.mark.parametrize("scenario", [grow, hear, shrink, replace_input])
+def test_any_order_of_events_where_calls_are_rare(scenario: Scenario, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(workers, "SHORT", math.inf)
+    assert go(monkeypatch, scenario, 2, 1, WALKS) > WALKS + 15
 
 
 # --- and it is found where they do not ---

@@ -13,7 +13,7 @@ from rosafe.tree.block import Block
 from rosafe.tree.states import ENDS, State, StateMachine
 
 SIGNAL = Signal.sound(1.0)
-STEPS = ("come", "go", "replace", "call", "begin", "skip", "compute", "tell", "rest")
+STEPS = ("come", "go", "replace", "call", "begin", "skip", "fail", "compute", "tell", "rest")
 
 
 def block(number: int) -> Block:
@@ -84,14 +84,16 @@ class World:
         That an input reads until it ends; the numbers of the second one's begin at 10.
     called_once : bool
         All are there from the start, and the input is called then and never again.
+    fails : bool
+        Each may fail.
     """
 
-    def __init__(self, parents: dict[str, str], blocks: int, called_once: bool = False) -> None:
+    def __init__(self, parents: dict[str, str], blocks: int, called_once: bool = False, fails: bool = False) -> None:
         self.machines: dict[str, Machine] = {}
         for name, parent in parents.items():
             self.machines[name] = Machine(name, self.machines.get(parent))
         self.coming = {name: [first + n for n in range(blocks)] for name, first in (("root", 0), ("new", 10))}
-        self.called_once = called_once
+        self.called_once, self.fails = called_once, fails
         self.attach(self.machines["root"])
         if called_once:
             self.call(self.machines["root"])
@@ -119,7 +121,11 @@ class World:
             return listens and not self.called_once
         if step == "begin":
             return one.roused and one.ready
-        return one.then in {"rest": ("rest", "tell"), "skip": ("compute",)}.get(step, (step,))
+        if step == "fail" and not self.fails:
+            return False
+        return one.then in {"rest": ("rest", "tell"), "skip": ("compute",), "fail": ("compute", "tell")}.get(
+            step, (step,)
+        )
 
     def after(self, name: str, step: str) -> World:
         """The world after that step."""
@@ -184,6 +190,11 @@ class World:
         one.done(None)
         one.then = "rest"
 
+    def fail(self, one: Machine) -> None:
+        """Also one that has computed, and cannot tell of it."""
+        one.finish()
+        one.then = "rest"
+
     def tell(self, one: Machine) -> None:
         if one.untold is not None:
             if not one.gone:
@@ -232,9 +243,10 @@ class World:
             if one.attached and not one.gone:
                 assert one.over and one.state is State.DONE, f"{one.name} waits for ever"
                 assert not one._holders
-                assert one.untold is None
+                assert one.untold is None or self.fails
                 if one.parent is not None and one.begins is not None and not replaced:
-                    assert one.seen[-1:] == one.parent.released[-1:]  # type: ignore[attr-defined]
+                    all_seen = one.seen[-1:] == one.parent.released[-1:]  # type: ignore[attr-defined]
+                    assert all_seen or self.fails
 
 
 def explore(start: World) -> tuple[int, int]:
@@ -288,6 +300,12 @@ def test_every_order_of_steps(parents: dict[str, str], blocks: int, least: int) 
 
 def test_all_blocks_may_be_there_before_the_first_look() -> None:
     explore(World(CHILD, 3, called_once=True))
+
+
+def test_each_may_fail() -> None:
+    """Then it is over at once, and so is, after its last block, what hangs on it."""
+    explore(World(CHILD, 2, fails=True))
+    explore(World(GRANDCHILD, 1, called_once=True, fails=True))
 
 
 def test_a_call_that_is_forgotten_while_it_tells_is_found(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import threading
 import time
@@ -13,7 +14,7 @@ import pytest
 
 from rosafe.tree import workers as pool
 from rosafe.tree.block import Block
-from rosafe.tree.processor import Processor
+from rosafe.tree.processor import RISE, Processor
 from rosafe.tree.states import State
 from rosafe.tree.tree import Tree
 from rosafe.tree.workers import MOST, VARIABLE, workers_to_use
@@ -123,6 +124,59 @@ def test_one_worker_takes_a_block_through_the_tree_before_the_next(
         assert names.index("a") == names.index("aa") - 1 == names.index("aaa") - 2
         assert names.index("b") == names.index("bb") - 1
     assert computing() == 1
+
+
+class Short:
+    """A task that takes so many seconds, as it says; it never does."""
+
+    depth = 0
+    held_up_since = 0.0
+    ready, gone = True, False
+
+    def __init__(self, usual: float) -> None:
+        self.usual = usual
+
+    def begin(self) -> None:
+        pass
+
+    def work(self) -> None:
+        pass
+
+    def rest(self) -> None:
+        pass
+
+
+@pytest.mark.parametrize(
+    ("seconds", "worth"),
+    [
+        ([1e-5, 1e-5], False),
+        ([1e-3, 1e-5], True),
+        ([1e-5, 1e-3], True),
+        ([math.inf, 1e-5], True),
+        ([1e-5, math.inf], True),
+        ([1e-5] * 10, False),
+        ([1e-5] * 100, True),
+    ],
+)
+def test_short_work_is_not_worth_a_call(seconds: list[float], worth: bool) -> None:
+    """Neither what one does oneself is long to wait for, nor all that is left over together."""
+    own, *waiting = map(Short, seconds)
+    workers = pool.Workers(threading.RLock(), 2)
+    for task in waiting:
+        workers.push(task)
+    assert workers._worth_a_call(own) == worth
+
+
+def test_what_a_processor_usually_takes(tree: Tree, feed: Feed, listener: Recorder) -> None:
+    """Unknown at first, so that nobody waits for it in vain; then the least of late."""
+    one = tree.add_input("input", feed, 1, 1.0, 1.0)
+    assert one.usual == math.inf
+    for number in range(1, 4):
+        before = one.usual
+        feed.put(count=1)
+        listener.wait_blocks(one, number)
+        assert 0 < one.usual <= RISE * before
+        assert one.usual <= one.busy
 
 
 # --- who is held up ---

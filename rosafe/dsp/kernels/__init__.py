@@ -55,23 +55,33 @@ def gammatone(
     output: FloatArray,
     envelope: FloatArray | None,
 ) -> None:
-    """Gammatone filters: as `rosafe.dsp.gammatone.filter_by_scipy`."""
+    """Gammatone filters: as `rosafe.dsp.gammatone.filter_by_scipy`. Rows of `output` may lie apart (`rows_apart`)."""
     channels, order = sections.shape[:2]
-    ends = (None if array is None else _address(array) for array in (output, envelope))
     _function("rosafe_gammatone")(
-        _address(block), block.shape[-1], channels, order, _address(sections), _address(state), *ends
+        _address(block),
+        block.shape[-1],
+        channels,
+        order,
+        _address(sections),
+        _address(state),
+        *_rows(output),
+        None if envelope is None else _address(envelope),
     )
 
 
 def rectify_and_filter(
-    rectification: str, block: FloatArray, envelope: FloatArray | None, sections: FloatArray, state: FloatArray
-) -> FloatArray:
+    rectification: str,
+    block: FloatArray,
+    envelope: FloatArray | None,
+    sections: FloatArray,
+    state: FloatArray,
+    output: FloatArray,
+) -> None:
     """Rectify (*rows, N), then filter it by second-order sections (S, 6); `state` (S, *rows, 2) as in scipy.
 
-    The envelope of the same shape is for `compressed`. The twin is `RECTIFIERS` of
-    rosafe/representations/haircell.py, or `compressed` there, and `rosafe.dsp.cascade.Cascade`.
+    The envelope of the same shape is for `compressed`. Rows of `output` may lie apart (`rows_apart`). The twin is
+    `RECTIFIERS` of rosafe/representations/haircell.py, or `compressed` there, and `rosafe.dsp.cascade.Cascade`.
     """
-    output = memory.empty(block.shape)
     _function("rosafe_biquads")(
         RECTIFICATIONS.index(rectification),
         _address(block),
@@ -81,9 +91,8 @@ def rectify_and_filter(
         _address(sections),
         len(sections),
         _address(state),
-        _address(output),
+        *_rows(output),
     )
-    return output
 
 
 def adaptation(
@@ -395,10 +404,23 @@ _ANYTHING = ctypes.c_char * 0
 
 
 def _address(array: NDArray[Any]) -> int:
-    if array.flags.writeable:
-        return ctypes.addressof(_ANYTHING.from_buffer(array.data))  # takes half of the time of the other way
-    address: int = array.ctypes.data
-    return address
+    try:
+        return ctypes.addressof(_ANYTHING.from_buffer(array))  # takes a fifth of the time of the other way
+    except TypeError:  # it cannot be written to, or not in one piece
+        address: int = array.ctypes.data
+        return address
+
+
+def rows_apart(array: FloatArray) -> bool:
+    """Whether the rows of (*rows, N) lie evenly apart, each in one piece, as the outputs of some kernels may."""
+    strides, sizes = array.strides, array.shape
+    even = all(strides[axis] == sizes[axis + 1] * strides[axis + 1] for axis in range(array.ndim - 2))
+    return even and strides[-1] == REAL_SIZE
+
+
+def _rows(array: FloatArray) -> tuple[int, int]:
+    """Address of an array whose rows may lie apart, and how far."""
+    return _address(array), array.strides[-2] // REAL_SIZE
 
 
 def _arguments(frames: Frames, rows: int | None = None) -> tuple[int, ...]:

@@ -18,7 +18,7 @@ enum { READS = 1, FILTERS = 2, WRITES = 4 }; /* what a pass does; samples that i
 typedef struct {
     const double *block, *envelope;
     double *output;
-    int64_t at[ROWS]; /* where each row begins in all of them */
+    int64_t at[ROWS], to[ROWS]; /* where each row begins in the former, and in the latter */
 } places;
 
 INLINE vec rectified(int64_t how, vec x) {
@@ -65,7 +65,7 @@ INLINE void step(const int groups, const int does, const int samples, int64_t ho
             }
         if (does & WRITES) {
             double *to[LANES];
-            UNROLL for (int k = 0; k < LANES; k++) to[k] = rows->output + rows->at[g * LANES + k];
+            UNROLL for (int k = 0; k < LANES; k++) to[k] = rows->output + rows->to[g * LANES + k];
             if (samples == 2)
                 write_pair(pair[0], pair[1], to, t);
             else
@@ -116,13 +116,14 @@ INLINE void run(const int groups, const int apart, int64_t how, const places *ro
     }
 }
 
-/* block and output (rows, n), envelope likewise, or null where it is not asked for; sections (count, 6), state (count, rows, 2). */
+/* block (rows, n), envelope likewise, or null where it is not asked for; sections (count, 6), state (count, rows, 2), output
+ * (rows, n) with rows `stride` apart. */
 void rosafe_biquads(int64_t how, const double *block, const double *envelope, int64_t rows, int64_t n,
-                    const double *sections, int64_t count, double *state, double *output) {
+                    const double *sections, int64_t count, double *state, double *output, int64_t stride) {
     uint32_t mode = denormals_off();
     /* From the end, which the filterbank has written last: in large blocks only that is in the cache still. */
     /* Rows a multiple of a page apart have the same few places in the first-level cache: fewer of them at a time then. */
-    const int64_t at_once = n % PAGE == 0 ? LANES : ROWS;
+    const int64_t at_once = n % PAGE == 0 || stride % PAGE == 0 ? LANES : ROWS;
     for (int64_t first = (rows - 1) / at_once * at_once; first >= 0 && rows > 0; first -= at_once) {
         int64_t row[ROWS]; /* lanes without a row do the last one once more */
         places places = {.block = block, .envelope = envelope, .output = output};
@@ -130,6 +131,7 @@ void rosafe_biquads(int64_t how, const double *block, const double *envelope, in
         for (int k = 0; k < ROWS; k++) {
             row[k] = least(first + k, rows - 1);
             places.at[k] = row[k] * n;
+            places.to[k] = row[k] * stride;
             for (int64_t s = 0; s < count; s++)
                 for (int i = 0; i < 2; i++)
                     states[s][i * GROUPS + k / LANES][k % LANES] = state[2 * (s * rows + row[k]) + i];

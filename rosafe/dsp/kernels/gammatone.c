@@ -48,10 +48,10 @@ static void run_some(int64_t poles, int real, complexes *samples, int64_t n, com
 INLINE double gain_of(const double *sections, int64_t number) { return sections[12 * number]; }
 INLINE const double *minus_pole_of(const double *sections, int64_t number) { return sections + 12 * number + 8; }
 
-/* block (2, n), sections (channels, order, 6) complex, state (2, channels, order) complex, output (2, channels, n),
- * envelope likewise or null. */
+/* block (2, n), sections (channels, order, 6) complex, state (2, channels, order) complex, output (2, channels, n) with
+ * rows `stride` apart, envelope (2, channels, n) or null. */
 void rosafe_gammatone(const double *block, int64_t n, int64_t channels, int64_t order, const double *sections,
-                      double *state, double *output, double *envelope) {
+                      double *state, double *output, int64_t stride, double *envelope) {
     uint32_t mode = denormals_off();
     for (int64_t first = 0; first < 2 * channels; first += LANES) {
         int64_t row[LANES], channel[LANES]; /* lanes without a row do the last one once more */
@@ -92,7 +92,7 @@ void rosafe_gammatone(const double *block, int64_t n, int64_t channels, int64_t 
                 run_some(least(TOGETHER, order - p), p == 0, samples, count, pole, states + p);
             }
             double *to[LANES];
-            for (int k = 0; k < LANES; k++) to[k] = output + row[k] * n + at;
+            for (int k = 0; k < LANES; k++) to[k] = output + row[k] * stride + at;
             write_rows(&samples[0].re, 2, count, to);
             if (envelope) {
                 for (int64_t t = 0; t < count; t++)

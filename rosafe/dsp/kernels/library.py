@@ -20,8 +20,8 @@ _FRAMES = (_ARRAY, _INTEGER, _INTEGER, _ARRAY, _INTEGER, _ARRAY, *[_INTEGER] * 4
 # frames that begin; sums of those that had begun, stride, how many are known; sums
 _SUMS = (_INTEGER, _ARRAY, _INTEGER, _INTEGER, _ARRAY)
 _ARGUMENTS = {
-    "rosafe_gammatone": (_ARRAY, *[_INTEGER] * 3, *[_ARRAY] * 4),
-    "rosafe_biquads": (_INTEGER, _ARRAY, _ARRAY, _INTEGER, _INTEGER, _ARRAY, _INTEGER, _ARRAY, _ARRAY),
+    "rosafe_gammatone": (_ARRAY, *[_INTEGER] * 3, *[_ARRAY] * 3, _INTEGER, _ARRAY),
+    "rosafe_biquads": (_INTEGER, _ARRAY, _ARRAY, _INTEGER, _INTEGER, _ARRAY, _INTEGER, _ARRAY, _ARRAY, _INTEGER),
     "rosafe_adaptation": (_ARRAY, _INTEGER, _INTEGER, _REAL, *[_ARRAY, _INTEGER] * 2, _INTEGER, _ARRAY, _ARRAY),
     "rosafe_levels": (*_FRAMES, *_SUMS, _REAL, _ARRAY),
     "rosafe_ratemap": (*_FRAMES, *_SUMS, _INTEGER, _REAL, _ARRAY, _ARRAY),

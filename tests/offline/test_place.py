@@ -1,0 +1,110 @@
+"""Results that stages write into their place themselves: the same numbers, and no second copy."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+import rosafe
+from rosafe.dsp import kernels
+from rosafe.offline.process import _Gathered
+from rosafe.representations import STAGES
+from tests.dsp.bare import Chain, cut
+
+pytestmark = pytest.mark.skipif(not kernels.compiled(), reason="numpy's twin of the hair cell's kernel returns its own")
+
+RATE = 16000.0
+FEW = {"fb_nChannels": 5, "fb_highFreqHz": 4000.0}
+SOUND = 0.1 * np.random.default_rng(2).standard_normal((2, 3000))
+
+
+@pytest.fixture
+def copied(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Frames of the blocks that were copied into a result."""
+    counts: list[int] = []
+    add = _Gathered.add
+
+    def count(self: _Gathered, block: np.ndarray) -> None:
+        if block is not self._lent:
+            counts.append(block.shape[-1])
+        add(self, block)
+
+    monkeypatch.setattr(_Gathered, "add", count)
+    return counts
+
+
+@pytest.mark.parametrize("block", [[3000], [512], [1], [700, 1, 333], [1024, 1023]])
+@pytest.mark.parametrize(
+    ("kind", "parameters"),
+    [
+        ("gammatone", {}),
+        ("gammatone", {"fb_nGamma": 7, "fb_nChannels": 1}),
+        ("gammatone", {"fb_type": "drnl"}),
+        ("ihc", {}),
+        ("ihc", {"ihc_method": "bernstein"}),
+        ("ihc", {"ihc_method": "breebart"}),
+        ("ihc", {"ihc_method": "none"}),
+    ],
+)
+def test_the_same_numbers_without_a_copy(
+    kind: str, parameters: dict[str, Any], block: list[int], copied: list[int]
+) -> None:
+    sound = SOUND[:, :200] if block == [1] else SOUND
+    got = rosafe.process(sound, RATE, {**FEW, **parameters}, block, outputs=[kind])[kind]
+    assert copied == []
+    outputs = Chain(RATE, {"in_doNormalize": False, **FEW, **parameters}).run(cut(sound, block))
+    np.testing.assert_array_equal(got, np.concatenate([output[kind] for output in outputs], axis=-1))
+
+
+def test_who_has_children_is_copied(copied: list[int]) -> None:
+    """They take blocks in one piece."""
+    alone = rosafe.process(SOUND, RATE, FEW, 1000, outputs=["gammatone"])
+    assert copied == []
+    both = rosafe.process(SOUND, RATE, FEW, 1000, outputs=["gammatone", "ihc"])
+    assert copied == [1000] * 3
+    np.testing.assert_array_equal(both["gammatone"], alone["gammatone"])
+
+
+def test_from_a_change_of_the_rows_on_nothing_is_written_there(copied: list[int]) -> None:
+    changes = [(2, "fb_nChannels", 3), (3, "fb_nChannels", 5)]
+    got = rosafe.process(SOUND, RATE, FEW, 600, changes, ["gammatone"])["gammatone"]
+    assert copied == [600] * 3
+    outputs = Chain(RATE, {"in_doNormalize": False, **FEW}).run(cut(SOUND, 600), changes)
+    for number, output in enumerate(outputs):
+        part = got[..., 600 * number : 600 * (number + 1)]
+        channels = output["gammatone"].shape[1]
+        np.testing.assert_array_equal(part[:, :channels], output["gammatone"])
+        assert not part[:, channels:].any()
+
+
+@pytest.mark.parametrize("kind", ["gammatone", "ihc"])
+@pytest.mark.parametrize("frames", [1, 40, 512, 700])
+def test_a_place_is_used_only_where_it_fits(kind: str, frames: int) -> None:
+    """Rows evenly apart, each in one piece, of the right shape and type; and for one block."""
+    block = np.random.default_rng(frames).standard_normal((2, frames) if kind == "gammatone" else (2, 5, frames))
+    parameters = FEW if kind == "gammatone" else {}
+    plain = STAGES[kind](RATE, **parameters).process(block)
+    for length in (frames, frames + 1, frames + 512, 2048):
+        whole = np.full((2, 5, length), np.nan)
+        stage = STAGES[kind](RATE, **parameters)
+        stage.place = whole[..., length - frames :]
+        assert np.shares_memory(stage.process(block), whole)
+        np.testing.assert_array_equal(whole[..., length - frames :], plain)
+        assert np.isnan(whole[..., : length - frames]).all()
+        before = whole.copy()
+        assert not np.shares_memory(stage.process(block), whole)
+        np.testing.assert_array_equal(whole, before)
+    whole = np.full((2, 9, 2 * frames), np.nan)
+    for place in (
+        whole[:, :4, :frames],
+        whole[:, :5, : frames + 1],
+        whole[:, :5, :frames] if frames > 1 else whole[:, 4::-1, :1],  # ears another distance apart than channels
+        whole[:, :5, ::2] if frames > 1 else whole[:, ::2, :1],
+        whole[:, :5, :frames].astype(np.float32),
+    ):
+        stage = STAGES[kind](RATE, **parameters)
+        stage.place = place
+        np.testing.assert_array_equal(stage.process(block), plain)
+        assert np.isnan(whole).all()
