@@ -1,7 +1,8 @@
 """rosAFE: the Two!Ears auditory front-end for ROS 1, in Python.
 
 For arrays and pictures: `process` computes auditory representations of a signal in memory, `Stream` of sound that comes
-block by block; `plot` draws them, `to_xarray` names their axes. docs/tutorial.md begins with a sound file.
+block by block; `plot` draws them, `to_xarray` names their axes; `load` reads what `rosafe process` has written.
+docs/tutorial.md begins with a sound file.
 """
 
 from __future__ import annotations
@@ -11,9 +12,10 @@ from typing import TYPE_CHECKING, Any
 
 from rosafe.version import VERSION as __version__
 
-__all__ = ["Stream", "__version__", "plot", "process", "to_xarray"]
+__all__ = ["Stream", "__version__", "load", "plot", "process", "to_xarray"]
 
 if TYPE_CHECKING:
+    from rosafe.offline.formats import load
     from rosafe.offline.process import process
     from rosafe.offline.stream import Stream
     from rosafe.view.dataset import to_xarray
@@ -22,6 +24,7 @@ if TYPE_CHECKING:
 # The numerics load numpy and scipy, which programs that only speak ROS need not wait for.
 _WHERE = {
     "Stream": "rosafe.offline.stream",
+    "load": "rosafe.offline.formats",
     "plot": "rosafe.view.plot",
     "process": "rosafe.offline.process",
     "to_xarray": "rosafe.view.dataset",

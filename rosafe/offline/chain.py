@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from rosafe.interface import KINDS, ComponentError
+from rosafe.offline.signals import frame_times
 from rosafe.tree import sizes
 from rosafe.tree.block import Block
 from rosafe.tree.processor import Observer, Processor
@@ -181,6 +182,15 @@ class Chain:
     def _count(self, processor: Processor, frames: int) -> int:
         """How many frames it puts out for so many of the signal."""
         return processor.stage.complete(frames if processor.parent is None else self._count(processor.parent, frames))
+
+    def times(self, kind: str, frames: int) -> np.ndarray:
+        """When each frame of an output is, for a signal of so many frames (s from its first): the frame's middle.
+
+        Frame k of hop h and window w (in samples of sound at the rate fs) is at (k h + w / 2) / fs, sample n at n / fs.
+        """
+        processor = self._processors[kind]
+        signal, count = processor.signal, self._count(processor, frames)
+        return frame_times(signal, 0, count)
 
     def largest_block(self, frames: int) -> tuple[str, int]:
         """Which processor puts out most for one block of so many frames, and how many bytes that can be."""

@@ -26,9 +26,7 @@ OF_THE_INPUT = ("connect", *(p.name for p in ROSAFE.service("InputProc").paramet
 
 
 class Found(NamedTuple):
-    """A processor of the tree. `values` are those of getParameters; `parent` is empty for the input.
-
-    """
+    """A processor of the tree. `values` are those of getParameters; `parent` is empty for the input."""
 
     name: str
     kind: str
