@@ -15,7 +15,7 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from rosafe.offline.contents import ABOUT, Contents, is_scalar, told
+from rosafe.offline.contents import ABOUT, Contents, is_scalar, sample_times, told
 
 HEADS = 2**18  # bytes, and more than that, of what is in a file beside the arrays' numbers
 IN_MEMORY = 2**28  # bytes of all arrays together; from there on they are on the disk
@@ -105,13 +105,14 @@ class CsvWriter(WholeWriter):
     def _write(self, file: BinaryIO) -> None:
         contents = self._contents
         (name,) = contents.shapes
-        (time,) = (key for key in contents.fixed if key.endswith("_time"))
+        time = f"{name}_time"
         fixed = {k: v if isinstance(v, float) else v.tolist() for k, v in contents.fixed.items() if k != time}
         rows = self._arrays[name].T
         head = {**contents.about, "axes": contents.axes, "units": contents.units, "fixed": fixed, "rows": len(rows)}
         lines = [f"{_CSV_HEAD}{json.dumps(head)}", ",".join([time, *self._columns(name, rows.shape[1])])]
         file.writelines(f"{line}\n".encode() for line in lines)
-        for moment, row in zip(np.asarray(contents.fixed[time]).tolist(), rows, strict=True):
+        times = contents.fixed.get(time, sample_times(len(rows), contents.about["sample_rate"]))
+        for moment, row in zip(np.asarray(times).tolist(), rows, strict=True):
             file.write((",".join(map(repr, [moment, *row.tolist()])) + "\n").encode())
 
     def _columns(self, name: str, count: int) -> list[str]:
