@@ -29,7 +29,7 @@ _TOO_LARGE = (
     "one block of output would take {taken:.1f} GB, allowed are {limit:.1f} GB; "
     "take fewer channels or lags, or a smaller --block"
 )
-_DEFAULTS = {parameter.name: parameter.default for kind in KINDS.values() for parameter in kind.parameters}
+_DEFAULTS = {p.name: p.default for kind in KINDS.values() for p in kind.parameters if not p.follows_rate}
 
 
 class Done(NamedTuple):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import math
 import os
 from collections.abc import Callable, Iterable, Mapping
@@ -11,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from rosafe.interface import KINDS
+from rosafe.missing import require
 from rosafe.offline.chunked import H5Writer, Mat73Writer, ZarrWriter, read_h5, read_mat73, read_zarr
 from rosafe.offline.contents import Contents, Writer, sample_times
 from rosafe.offline.whole import CsvWriter, Mat5Writer, NpzWriter, read_csv, read_mat5, read_npz
@@ -92,7 +92,7 @@ def format_of(path: str | os.PathLike[str]) -> Format:
 def check_format(form: Format, outputs: Iterable[str]) -> None:
     """ValueError where a format cannot hold these outputs; ModuleNotFoundError where what it needs is not installed."""
     if form.module:
-        importlib.import_module(form.module)
+        require(form.module, f"{form.extension} files")
     if form.extension == ".csv":
         parts = [part for kind in outputs for part in KINDS[kind].outputs.values()]
         if len(parts) != 1 or len(parts[0].axes) != 2:
@@ -141,7 +141,7 @@ def read(form: Format, path: Path, arrays: bool = True) -> dict[str, Any]:
     if not path.exists():
         raise FileNotFoundError(2, os.strerror(2), str(path))
     if form.module:
-        importlib.import_module(form.module)
+        require(form.module, f"{form.extension} files")
     try:
         result = form.read(path, arrays)
     except ValueError as problem:  # json.JSONDecodeError and UnicodeDecodeError, too
