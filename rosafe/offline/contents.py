@@ -25,7 +25,7 @@ class Contents:
     axes, units : dict of str
         Of these arrays.
     fixed : dict of str to ndarray or float
-        What lies along the axes, and rates.
+        What lies along the axes, and rates. The times of samples, which go without saying, are none of it.
     about : dict
         `parameters`, `sample_rate` (Hz), `block_frames`, `source` (the input's name), `rosafe_version`, and what else
         was chosen; words along an axis.
@@ -83,10 +83,17 @@ def told(flat: Mapping[str, Any]) -> dict[str, Any]:
         value = value.item() if isinstance(value, (np.ndarray, np.generic)) else value
         if isinstance(value, bytes):
             value = value.decode()
+        if isinstance(value, float) and name in ("sample_rate", "block_frames"):
+            value = int(value)
         about[name] = json.loads(value) if isinstance(value, str) and name not in _TEXTS else value
     if "axes" in about:
         about["axes"] = {name: tuple(axes) for name, axes in about["axes"].items()}
     return about
+
+
+def sample_times(count: int, sample_rate: float) -> np.ndarray:
+    """When each sample is (s), as `rosafe.offline.signals.frame_times` tells it."""
+    return np.arange(count) / sample_rate
 
 
 def is_scalar(name: str) -> bool:

@@ -187,7 +187,7 @@ def _contents(chain: Chain, about: dict[str, Any], wanted: Sequence[str], frames
     parts = {name: part for kind in wanted for name, part in KINDS[kind].outputs.items()}
     described = chain.describe()
     words = {name: value for name, value in described.items() if isinstance(value, list)}
-    times = {f"{kind}_time": chain.times(kind, frames) for kind in wanted}
+    times = {f"{kind}_time": chain.times(kind, frames) for kind in wanted if f"{kind}_frameRate" in described}
     return Contents(
         {name: shape for kind in wanted for name, shape in chain.shapes(kind, frames).items()},
         {name: part.axes for name, part in parts.items()},

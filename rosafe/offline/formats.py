@@ -12,7 +12,7 @@ from typing import Any
 from rosafe.interface import KINDS
 from rosafe.missing import require
 from rosafe.offline.chunked import H5Writer, Mat73Writer, ZarrWriter, read_h5, read_mat73, read_zarr
-from rosafe.offline.contents import Contents, Writer
+from rosafe.offline.contents import Contents, Writer, sample_times
 from rosafe.offline.whole import CsvWriter, Mat5Writer, NpzWriter, read_csv, read_mat5, read_npz
 
 MAT5_MOST = 2**30  # bytes of a variable; MATLAB's version 5 ends at 2**31, and scipy needs an array twice
@@ -129,6 +129,10 @@ def load(path: str | os.PathLike[str]) -> dict[str, Any]:
     missing = set(result["axes"]) - set(result)
     if missing:
         raise ValueError(f"{path} is damaged: {', '.join(sorted(missing))} is not in it")
+    for kind in KINDS.values():  # what has no frames has a number for each sample
+        there = [name for name in kind.outputs if name in result["axes"]]
+        if there and f"{kind.kind}_time" not in result:
+            result[f"{kind.kind}_time"] = sample_times(result[there[0]].shape[-1], result["sample_rate"])
     return result
 
 
