@@ -27,7 +27,7 @@ THREADS = 16  # that wait for rospy
 
 def main(argv: list[str] | None = None) -> int:
     """Run genomixd until a signal ends it; the exit code."""
-    options = _parse(sys.argv[1:] if argv is None else argv)
+    options = _parse(startup.without_names(sys.argv[1:] if argv is None else argv))
     _log_to_stderr(2 if options.debug else min(options.verbose, 2))
     told = startup.Background() if options.background else None
     if told is not None and told.in_parent:
