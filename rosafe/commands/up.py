@@ -29,7 +29,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.usage = "rosafe up [FILE.yaml] [--live] [--keep FILE] [--port PORT] [--live-port PORT] [--no-browser]"
     parser.add_argument("file", metavar="FILE.yaml", nargs="?", help="the setup to load (default: none)")
     parser.add_argument("--live", action="store_true", help="serve the page too, as `rosafe live` does")
-    parser.add_argument("--keep", metavar="FILE", default="", help="as of rosAFE-ros, where that is started here")
+    parser.add_argument(
+        "--keep",
+        metavar="FILE",
+        default="",
+        help="as rosAFE-ros takes it, where that is started here; FILE.yaml then gives the sound, and the first tree",
+    )
     parser.add_argument("--port", type=_port, default=8080, help="of genomixd (default: 8080)")
     parser.add_argument("--live-port", type=_port, default=8090, metavar="PORT", help="of the page (default: 8090)")
     parser.add_argument("--no-browser", action="store_true", help="open no browser")
@@ -51,10 +56,11 @@ def _port(text: str) -> int:
 def run(options: argparse.Namespace) -> int:
     """Start everything, show how it is, and end what was started."""
     from rosafe.commands._stack import Stack, environment
-    from rosafe.commands.setup import read_file
+    from rosafe.commands.setup import beside, read_file
     from rosafe.component import generate, master
 
-    setup = read_file(options.file) if options.file else None  # what is wrong with it is told before anything starts
+    # What is wrong with it is told before anything starts.
+    setup = beside(read_file(options.file), options.keep) if options.file else None
     try:
         env = environment()
         master.check_address(env["ROS_MASTER_URI"])

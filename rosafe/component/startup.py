@@ -226,7 +226,7 @@ def _await_master(uri: str, received: list[int], patient: str) -> None:
 
 
 def without_names(arguments: list[str]) -> list[str]:
-    """The command line of a program that is no node, less what roslaunch adds for nodes: ``__name:=...`` and the like."""
+    """The command line of a program that is no node, less what roslaunch adds for nodes, such as ``__name:=...``."""
     return [word for word in arguments if not re.match(r"__\w+:=", word)]
 
 
