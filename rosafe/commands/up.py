@@ -8,6 +8,7 @@ from __future__ import annotations
 import argparse
 import asyncio
 import os
+import shutil
 import sys
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -204,7 +205,7 @@ class _Screen:
         if now == self._lines:
             return
         if self._terminal:
-            width = os.get_terminal_size().columns
+            width = shutil.get_terminal_size().columns
             up = f"\x1b[{len(self._lines)}F" if self._lines else ""
             print(up + "".join(f"\x1b[2K{line[: width - 1]}\n" for line in now), end="", flush=True)
         else:

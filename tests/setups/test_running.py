@@ -40,7 +40,9 @@ def test_saved_killed_and_loaded_again(graph: Graph, file: Path, tmp_path: Path)
         assert values["pp_coefPreEmphasis"] == "0.0"
         graph.run("rosafe", "setup", "save", str(saved), "--full")
         assert graph.run("rosafe", "setup", "load", str(saved)).stdout.count("reused") == 6
-        refused = graph.run("rosafe", "setup", "load", "-", check=False, stdin=TREE.replace("0.005", "0.006"))
+        refused = graph.run(
+            "rosafe", "setup", "load", "-", check=False, stdin=file.read_text().replace("0.005", "0.006")
+        )
         assert refused.returncode == 1
         assert "'ild' is there already and has ild_hSizeSec 0.005" in refused.stderr
         assert processors(graph) == before
