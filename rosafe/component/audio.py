@@ -23,11 +23,9 @@ from typing import Any
 import numpy as np
 
 from rosafe.component.frametime import FrameTime, Line
-from rosafe.component.overlap import joined
+from rosafe.sound.windows import joined, malformed
 
 RING_SECONDS = 10.0  # how far the tree may fall behind before frames are lost
-MAX_RATE = 1_000_000  # Hz; beyond that a message is garbage, not audio
-MAX_WINDOW = 2**24  # frames in one message, as with bass
 COMPARED = 1000  # frames of a window that are compared with what came before
 
 
@@ -285,22 +283,6 @@ class AudioRing:
 def _stamp(message: Any) -> float:
     """When the newest frame of a message was captured (s since 1970); 0 where it does not say."""
     return float(message.stamp.sec + 1e-9 * message.stamp.nsec)
-
-
-def malformed(message: Any) -> str:
-    """What is wrong with a message; empty where it can be used."""
-    left, right, rate, index = len(message.left), len(message.right), message.sampleRate, message.lastFrameIndex
-    if left != right:
-        return f"{left} left and {right} right samples"
-    if not 0 < left <= MAX_WINDOW:
-        return f"{left} samples per ear, allowed are 1 to {MAX_WINDOW}"
-    if message.nChunksOnPort * message.nFramesPerChunk != left:
-        return f"{left} samples per ear, where there should be {message.nChunksOnPort} x {message.nFramesPerChunk}"
-    if not 0 < rate <= MAX_RATE:
-        return f"a sample rate of {rate} Hz, allowed are 1 to {MAX_RATE} Hz"
-    if index >= 2**63:
-        return f"lastFrameIndex {index} is beyond all ages"
-    return ""
 
 
 class AudioReader:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
 import functools
 import gc
 import os
@@ -94,6 +95,9 @@ def run_server(
         print(f"{component.name}-ros: {problem}", file=sys.stderr)
         watchdog(END_SECONDS, 1)
         return 1
+    ready = f"{component.name}-ros: ready as /{_instance(options, remappings)} at {os.environ['ROS_MASTER_URI']}"
+    with contextlib.suppress(OSError):  # whoever read that has gone
+        print(ready, file=sys.stderr, flush=True)
     if told is not None:
         told.up()
     systemd.notify("READY=1")
@@ -163,7 +167,7 @@ def _start(
     prepare: Callable[[], object],
 ) -> Node:
     mappings = dict(remapping.split(":=", 1) for remapping in remappings)
-    instance = mappings.get("__name", options.instance)
+    instance = _instance(options, remappings)
     if not re.fullmatch("[A-Za-z][A-Za-z0-9_]*", instance):
         raise _Failure(f"{instance!r} is no instance name: letters, digits and _ only, a letter first")
     for name, variable in _ENVIRONMENT_REMAPPINGS.items():
@@ -200,6 +204,11 @@ def _start(
     gc.freeze()  # a look at all that the modules made stops every thread for tens of milliseconds, and finds nothing
     limit.cancel()
     return node
+
+
+def _instance(options: argparse.Namespace, remappings: list[str]) -> str:
+    named = [remapping.partition(":=")[2] for remapping in remappings if remapping.startswith("__name:=")]
+    return str(named[-1] if named else options.instance)
 
 
 def _await_master(uri: str, received: list[int], patient: str) -> None:

@@ -35,6 +35,7 @@ from rosafe.interface import (
     ros_type,
 )
 from rosafe.interface.signals import LEVELS
+from rosafe.vocabulary.words import meant
 
 CALL_SECONDS = 60.0  # for the answer to one request
 APPEAR_SECONDS = 2.0  # that `load` waits for a component that is just starting
@@ -152,8 +153,8 @@ class Proxy:
         try:
             return self.component.service(name)
         except KeyError:
-            known = ", ".join(s.name for s in (*self.component.services, *self.component.composites))
-            what = f"{self.component.name} has no service {name[:80]!r}; it has {known}"
+            known = [s.name for s in (*self.component.services, *self.component.composites)]
+            what = f"{self.component.name} has no service {name[:80]!r}; it has {', '.join(known)}{meant(name, known)}"
             raise ComponentError("::genom::no_such_service", what=what) from None
 
     def arguments(self, service: Service, given: Any) -> dict[str, Any]:
@@ -422,7 +423,7 @@ def _describe_service(service: Service, composite: bool) -> dict[str, Any]:
         "activity": service.activity,
         "composite": composite,
         "aliases": list(service.aliases),
-        "parameters": {p.name: _describe_parameter(p) for p in service.parameters},
+        "parameters": {p.name: describe_parameter(p) for p in service.parameters},
         "outputs": dict(service.outputs),
         "throws": list(service.throws),
     }
@@ -445,7 +446,8 @@ def _describe_representation(representation: Representation) -> dict[str, Any]:
     }
 
 
-def _describe_parameter(parameter: Parameter) -> dict[str, Any]:
+def describe_parameter(parameter: Parameter) -> dict[str, Any]:
+    """All that the table says of a parameter."""
     required = parameter.default is REQUIRED
     return {
         "type": parameter.idl,

@@ -10,6 +10,7 @@ from typing import Any
 
 from rosafe.interface import KINDS, REQUEST, REQUIRED, ComponentError, Parameter, Service
 from rosafe.tree.requests import kind_of
+from rosafe.vocabulary.words import meant
 
 _WORDS = {
     **dict.fromkeys(("1", "true", "yes", "on", "t"), True),
@@ -148,7 +149,8 @@ def _parameter(service: Service, name: str) -> Parameter:
     try:
         return service.parameter(name)
     except KeyError:
-        raise refused(f"unknown parameter {name[:80]!r}; {expected(service)}") from None
+        known = [p.name for p in service.parameters]
+        raise refused(f"unknown parameter {name[:80]!r}; {expected(service)}{meant(name, known)}") from None
 
 
 def _convert(service: Service, parameter: Parameter, value: Any) -> Any:

@@ -16,8 +16,8 @@ from diagnostic_msgs.msg import DiagnosticStatus
 
 from rosafe import interface
 from rosafe.component import wire
-from rosafe.component.activities import Activity, Handler
-from rosafe.component.audio import MAX_WINDOW, AudioRing
+from rosafe.component.activities import Activity, Handler, TaskMeter
+from rosafe.component.audio import AudioRing
 from rosafe.component.component import ComponentNode
 from rosafe.component.events import EventLog
 from rosafe.component.startup import run_server
@@ -30,6 +30,7 @@ from rosafe.node.trace_port import TracePort
 from rosafe.node.words import UnknownWords
 from rosafe.representations import PROBLEMS, STAGES
 from rosafe.setups import Setup, rehearse, wanted
+from rosafe.sound.windows import MAX_WINDOW
 from rosafe.tree.block import Block
 from rosafe.tree.processor import Processor
 from rosafe.tree.requests import Found
@@ -73,6 +74,7 @@ class RosafeNode:
         self._audio_topic = ""
         self._ports: dict[Processor, OutputPort] = {}
         self._ends: dict[Processor, Activity] = {}
+        self._loads: dict[Processor, TaskMeter] = {}
         self._starting = threading.Lock()  # an InputProc that a newer one has interrupted must not replace that one's
         self._of_the_input: dict[str, Any] = {}  # what the InputProc that runs was asked for
         self._keeper = _keeper(keep, self._setup)
@@ -293,11 +295,15 @@ class RosafeNode:
             publisher = self._advertise(processor.kind, processor.name)
             port = OutputPort(processor, publisher, publisher.unregister)
         self._ports[processor] = port
+        self._loads[processor] = TaskMeter(processor.name)
         port.open(self._tree.port_seconds)
 
     def executed(self, processor: Processor, seconds: float) -> None:
-        """Count the work for genom_state."""
+        """Count the work, for genom_state and /diagnostics."""
         self._node.meters[ROSAFE.service(KINDS[processor.kind].request).task].cycle(seconds)
+        meter = self._loads.get(processor)  # None where it has ended
+        if meter is not None:
+            meter.cycle(seconds)
 
     def released(self, processor: Processor, block: Block) -> None:
         """Publish the processor's window; with that of the input, the time of its newest frame."""
@@ -315,6 +321,7 @@ class RosafeNode:
 
     def ended(self, processor: Processor) -> None:
         """Close the port and end the activity."""
+        self._loads.pop(processor, None)
         port = self._ports.pop(processor, None)  # None where it could not be opened
         if port is not None:
             port.close()
@@ -385,7 +392,10 @@ class RosafeNode:
         for doubt in doubts:
             status.add("unknown word", doubt)
         for processor in processors:
-            status.add(processor.name, f"{processor.kind}, {processor.state.value}, {processor.blocks} blocks")
+            meter = self._loads.get(processor)
+            load = 1e3 * meter.snapshot()["load"]["last"] if meter is not None else 0.0
+            told = f"{processor.kind}, {processor.state.value}, {processor.blocks} blocks, {load:.1f} ms/s"
+            status.add(processor.name, told)
         return status
 
     def _keeping_health(self, status: Any) -> Any:

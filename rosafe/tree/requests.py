@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 from rosafe.interface import BASS, KINDS, REQUEST, ROSAFE, ComponentError, Representation, text_of
 from rosafe.interface.arguments import check_parameter
 from rosafe.representations import STAGES
+from rosafe.vocabulary.words import meant
 
 HIGHEST_RATE = float(BASS.service("Acquire").parameter("sampleRate").maximum or 0)  # Hz; what is wrong there is at any
 INTERRUPTED = "::genom::interrupted"
@@ -101,8 +102,9 @@ def kind_of(representation: str) -> Representation:
     for kind in KINDS.values():
         if representation.lower() in map(str.lower, (kind.word, *kind.word_aliases, kind.kind)):
             return kind
-    known = REQUEST.parameter("representation").range_text
-    raise ValueError(f"representation: {representation[:80]!r} is not {known}")
+    parameter = REQUEST.parameter("representation")
+    hint = meant(representation, parameter.choices)
+    raise ValueError(f"representation: {representation[:80]!r} is not {parameter.range_text}{hint}")
 
 
 def chain(kind: Representation) -> list[Representation]:
@@ -227,18 +229,21 @@ def making(level: Level, name: str, parent: str, input_values: Mapping[str, Any]
 
 def answer(wish: Wish, dependencies: Sequence[str], created: Collection[str], instance: str) -> dict[str, Any]:
     """The outputs of `interface.REQUEST`, once the processors `dependencies` are there."""
-    own = {p.name for level in wish.levels for p in level.kind.parameters}
-    if dependencies[0] in created:
-        own.update(OF_THE_INPUT)
     return {
         "name": dependencies[-1],
         "dependencies": list(dependencies),
         "created": [name for name in dependencies if name in created],
         "reused": [name for name in dependencies if name not in created],
-        "unused": [name for name in wish.given if name not in own],
+        "unused": unused((level.kind for level in wish.levels), wish.given, dependencies[0] in created),
         "port": wish.levels[-1].kind.port,
         "topic": topic(instance, wish.levels[-1].kind, dependencies[-1]),
     }
+
+
+def unused(kinds: Iterable[Representation], given: Iterable[str], new_input: bool) -> list[str]:
+    """Which of the parameters `given` have no effect on a processor with these kinds from the input down to it."""
+    own = {p.name for kind in kinds for p in kind.parameters} | {*(OF_THE_INPUT if new_input else ())}
+    return [name for name in given if name not in own]
 
 
 def topic(instance: str, kind: Representation, name: str) -> str:

@@ -362,7 +362,7 @@ def test_what_is_not_there_makes_the_node_say_nothing(world: World) -> None:
             show [$request wait]
         """
         assert world.lines(script) == ["error"]
-        assert node.err == ""
+        assert node.complaints == ""
 
 
 def test_elements_that_are_superfluous_or_misspelt_as_in_the_guide(world: World) -> None:

@@ -312,7 +312,7 @@ def reader(graph: Graph, topic: str) -> Process:
 
 def expected(signal: np.ndarray, block: int, parameters: Mapping[str, Any] | None = None, rate: int = RATE) -> Any:
     """`rosafe.process` of `signal` on the same blocks."""
-    return process(signal, rate, parameters, block_frames=block)
+    return process(signal, rate, parameters=parameters, block_frames=block)
 
 
 def windowed(values: np.ndarray, seconds: float, rate: float) -> np.ndarray:

@@ -246,7 +246,7 @@ def test_parameters_come_back_exactly(afe: Session) -> None:
                 got = getattr(told, name)
                 assert (list(got) if isinstance(value, list) else got) == value, name
     flat = {name: value for values in given.values() for name, value in values.items()}
-    truth = process(noise(2000), RATE, flat)
+    truth = process(noise(2000), RATE, parameters=flat)
     assert list(parameters.gammatone[0].fb_cfHz) == list(truth["fb_cfHz"])
     assert parameters.gammatone[0].fb_nChannels == 3
     assert list(parameters.crossCorrelation[0].cc_lags) == list(truth["cc_lags"])
