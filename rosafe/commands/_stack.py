@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Awaitable, Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 from urllib.parse import urlsplit
@@ -131,8 +131,7 @@ class Stack:
         if part.child is not None and (url := _URL.search(part.child.out)):
             part.detail = url[0]
 
-    async def _until(self, part: Part, condition: object) -> None:
-        assert callable(condition)
+    async def _until(self, part: Part, condition: Callable[[], Awaitable[bool]]) -> None:
         deadline = asyncio.get_running_loop().time() + START_SECONDS
         while True:
             part.look()

@@ -10,7 +10,7 @@ import asyncio
 import os
 import shutil
 import sys
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterable
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING
 
@@ -20,6 +20,7 @@ from rosafe.setups import Setup
 
 if TYPE_CHECKING:
     from rosafe.commands._stack import Part, Stack
+    from rosafe.genomix.graph import Graph
     from rosafe.genomix.proxy import Proxy
 
 PERIOD = 1.0  # seconds between two looks at all
@@ -177,7 +178,7 @@ async def _tree(afe: Proxy) -> str:
 
 
 @asynccontextmanager
-async def _graph() -> AsyncIterator[object]:
+async def _graph() -> AsyncIterator[Graph]:
     from rosafe.genomix.graph import Graph
 
     graph = Graph(os.environ["ROS_MASTER_URI"])
@@ -199,9 +200,9 @@ class _Screen:
         """Show a line below all others."""
         self._said.append(text)
 
-    def show(self, lines: object) -> None:
+    def show(self, lines: Iterable[str]) -> None:
         """Show how it is now."""
-        now = [*list(lines), *self._said]  # type: ignore[call-overload]
+        now = [*lines, *self._said]
         if now == self._lines:
             return
         if self._terminal:

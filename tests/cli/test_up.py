@@ -160,8 +160,8 @@ def test_units_are_as_systemd_wants_them(kind: str, tmp_path: Path) -> None:
     ours = [line for line in done.stderr.splitlines() if "rosafe" in line]
     assert not ours, done.stderr
     assert done.returncode == 0, done.stderr
-    for unit in units:
-        text = Path(unit).read_text("utf-8")
+    for name in units:
+        text = Path(name).read_text("utf-8")
         if "Type=notify" in text:
             assert "WatchdogSec=" in text
             assert "Restart=always" in text

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import signal
 import urllib.error
 import urllib.parse
@@ -13,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from rosafe.setups import read
+from rosafe.setups import SetupError, read
 from tests.harness import ROOT, SCRIPTS, Graph, free_port, wait_for
 from tests.setups.test_files import TREE
 
@@ -119,8 +120,13 @@ def test_what_is_typed_wrong(graph: Graph, file: Path, arguments: tuple[str, ...
     assert file.read_bytes() == before
 
 
-def test_every_setup_that_is_shipped_can_be_read() -> None:
-    shipped = sorted((ROOT / "setups").glob("*.yaml"))
+def test_every_setup_that_is_shown_or_shipped_can_be_read() -> None:
+    shown = re.findall(r"^```yaml\n(.*?)^```$", (ROOT / "docs" / "setups.md").read_text("utf-8"), re.M | re.S)
+    shipped = [path.read_text("utf-8") for path in sorted((ROOT / "setups").glob("*.yaml"))]
+    assert shown
     assert shipped
-    for path in shipped:
-        assert read(path.read_text("utf-8")).processors
+    for text in (*shown, *shipped):
+        assert read(text).processors
+    wrong = shown[0].replace("ild_hSizeSec: 0.005", "ild_hSizeSec: -1")
+    with pytest.raises(SetupError, match="'ild': ild_hSizeSec: -1 is out of range, allowed is more than 0 to 60"):
+        read(wrong)
