@@ -74,6 +74,15 @@ class View:
             self.next, self.end = after, end
             self.oldest = max(self.oldest, after - self.capacity)
 
+    def newest(self, count: int) -> np.ndarray:
+        """The newest columns, float32 (size, count); NaN where there is nothing."""
+        columns = np.full((self.size, count), np.nan, np.float32)
+        with self._lock:
+            first = max(self.oldest, self.next - count)
+            if self.next > first:
+                columns[:, -(self.next - first) :] = self._ring[:, np.arange(first, self.next) % self.capacity]
+        return columns
+
     def piece(self, first: int, stride: int, most: int) -> tuple[int, bytes]:
         """Which column comes next, and the bytes of those from `first` on, at most so many: every `stride`-th one."""
         with self._lock:
