@@ -77,5 +77,5 @@ async def _found(graph: object, instance: str, wait: float) -> Proxy:
 
 def told(problem: ComponentError) -> str:
     """The exception in one line: its name, and what it is about."""
-    what = problem.detail.get("what") or ROSAFE.exceptions.get(problem.ex.rpartition("::")[2], "")
+    what = problem.what or ROSAFE.exceptions.get(problem.ex.rpartition("::")[2], "")
     return problem.ex + (f": {what}" if what else "")

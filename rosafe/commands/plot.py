@@ -94,4 +94,4 @@ def _computed(path: Path, names: list[str], parameters: dict[str, Any]) -> Mappi
     finally:
         file.close()
     outputs = {*names, *(UNDER[name] for name in names if name in UNDER)}
-    return {**process(sound, rate, parameters, outputs=list(outputs)), "sample_rate": rate}
+    return {**process(sound, rate, parameters=parameters, outputs=list(outputs)), "sample_rate": rate}

@@ -20,6 +20,8 @@ from rosafe.commands._component import component, prepare, told
 from rosafe.interface import REQUEST, ROSAFE, ComponentError, Representation
 from rosafe.interface.arguments import check_parameter
 from rosafe.tree import requests as request
+from rosafe.vocabulary.parameter import shown
+from rosafe.vocabulary.words import meant
 
 _SETTINGS = [p for p in REQUEST.parameters if p.name not in ("representation", "connect")]  # those have other places
 
@@ -75,7 +77,7 @@ def run(options: argparse.Namespace) -> int:
     if options.connect is not None:
         values["connect"] = options.connect
     prepare()
-    answer = asyncio.run(_make(options.instance, values))
+    answer = asyncio.run(_make(options.instance, values, kind))
     if options.json:
         print(json.dumps(answer, indent=2))
     else:
@@ -89,16 +91,19 @@ def _parameter(setting: str) -> tuple[str, Any]:
         raise ValueError(f"{setting}: wanted is NAME=VALUE")
     parameter = next((p for p in _SETTINGS if name in (p.name, *p.aliases)), None)
     if parameter is None:
-        raise ValueError(f"unknown parameter {name!r}; there are: {', '.join(p.name for p in _SETTINGS)}")
+        known = [p.name for p in _SETTINGS]
+        raise ValueError(f"unknown parameter {shown(name)}; there are: {', '.join(known)}{meant(name, known)}")
     if name in request.OF_THE_INPUT:
         return name, parameter.parse(text)
     return check_parameter(name, text, text=True)
 
 
-async def _make(instance: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
+async def _make(instance: str, values: Mapping[str, Any], kind: Representation) -> Mapping[str, Any]:
     """What the component's genomixd would answer; Failure, with what to do next, where it is refused."""
     async with component(instance) as proxy:
         try:
+            there = (await proxy.outputs("getProcessors", {}))["processors"]
+            _warn(kind, values, new_input=all(processor["upperDepName"] for processor in there))
             return await proxy.outputs(REQUEST.name, values)
         except ComponentError as problem:
             if problem.ex != "::rosAFE::e_noData":
@@ -106,19 +111,22 @@ async def _make(instance: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
             topic = "/" + str(values.get("connect", REQUEST.parameter("connect").default)).lstrip("/")
             start = "" if await proxy.published(topic) else "bass-ros -b; "
             acquire = f"rosservice call {topic.rpartition('/')[0]}/Acquire \"{{device: 'scene:'}}\""
-            raise Failure(f"{told(problem)}; start the sound first: {start}{acquire}") from None
+            silent = f"{problem.ex}: {ROSAFE.exceptions['e_noData']}"
+            raise Failure(f"{silent}; start the sound first: {start}{acquire}") from None
+
+
+def _warn(kind: Representation, values: Mapping[str, Any], new_input: bool) -> None:
+    """A line on stderr for each parameter that is given in vain, before anything is made."""
+    given = [name for name in values if name != "representation"]
+    for name in request.unused(request.chain(kind), given, new_input):
+        why = ": the input is there already" if name in request.OF_THE_INPUT else " on this representation"
+        print(f"rosafe request: {name} has no effect{why}", file=sys.stderr, flush=True)
 
 
 def _show(answer: Mapping[str, Any], kind: Representation) -> None:
-    """A line for each processor, and on stderr one for each parameter that was given in vain."""
+    """A line for each processor."""
     width = max(map(len, answer["dependencies"]))
     instance = answer["topic"].split("/")[1]
     for name, kind_there in zip(answer["dependencies"], request.chain(kind), strict=True):
         how = "created" if name in answer["created"] else "reused"
         print(f"{how:7}  {name:{width}}  {request.topic(instance, kind_there, name)}")
-    for name in answer["unused"]:
-        print(f"rosafe request: {name} has no effect{_why_unused(name)}", file=sys.stderr)
-
-
-def _why_unused(name: str) -> str:
-    return ": the input is there already" if name in request.OF_THE_INPUT else " on this representation"

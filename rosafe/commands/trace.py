@@ -1,8 +1,9 @@
 """Show what the processors do at the same time: of a running rosAFE node, or on a sound file.
 
 Prints, for each processor, its share of the time in the four states of the user guide (waitExec, exec, waitRelease,
-release), and for how long parents, children and siblings compute at the same time. With -o, every step goes into a
-file that https://ui.perfetto.dev and chrome://tracing show: a row for each processor, with the numbers of the blocks.
+release), for each worker how much of the time it computes, and for how long parents, children and siblings compute at
+the same time. With -o, every step goes into a file that https://ui.perfetto.dev and chrome://tracing show: a row for
+each processor and each worker, with the numbers of the blocks. ROSAFE_WORKERS says how many workers there are.
 
 Without SOUND it listens to a node, which traces only while this command does. Where the node keeps up, it waits for
 sound most of the time, and a parent has nothing to do while its children work. With SOUND, a file with two channels,

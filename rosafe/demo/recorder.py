@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from rosafe.component.overlap import joined, new_frames
 from rosafe.interface import KINDS, ROSAFE, ros_type
+from rosafe.sound.windows import joined, new_frames
 from rosafe.view.report import PortRow
 from rosafe.view.representations import Representations
 

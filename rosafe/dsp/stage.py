@@ -83,6 +83,11 @@ class Stage:
         """
         return dict(values)
 
+    @classmethod
+    def asked(cls, values: Mapping[str, Any]) -> dict[str, Any]:
+        """`values` as a request may hold them, without what only `in_force` tells: so one can be made like another."""
+        return dict(values)
+
     # --- what it is -------------------------------------------------------------------------------------------
 
     @property

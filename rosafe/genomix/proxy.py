@@ -9,7 +9,7 @@ from typing import Any
 
 import rosgraph.names
 
-from rosafe.component import wire
+from rosafe.component import mark, wire
 from rosafe.genomix import packed, setups, syntax, trees
 from rosafe.genomix.actions import ActionClient, Goal
 from rosafe.genomix.graph import Graph, Unknown, middleware_error
@@ -35,6 +35,7 @@ from rosafe.interface import (
     ros_type,
 )
 from rosafe.interface.signals import LEVELS
+from rosafe.vocabulary.words import meant
 
 CALL_SECONDS = 60.0  # for the answer to one request
 APPEAR_SECONDS = 2.0  # that `load` waits for a component that is just starting
@@ -58,7 +59,15 @@ class Value:
         self._component = component
         self._members = members
         self.values = values
+        self.warning = ""
         self.data: object = self  # what the values belong to, and perhaps those of others
+
+    def warn(self, warning: str) -> None:
+        """Have the component's `warning`, where there is one, among the members."""
+        if warning:
+            self.warning = warning
+            self._members = (*self._members, ("warning", "string"))
+            self.values = {**self.values, "warning": warning}
 
     def pieces(self, form: Syntax) -> Iterator[str]:
         """The text, as one nested value, in short pieces."""
@@ -144,8 +153,8 @@ class Proxy:
         try:
             return self.component.service(name)
         except KeyError:
-            known = ", ".join(s.name for s in (*self.component.services, *self.component.composites))
-            what = f"{self.component.name} has no service {name[:80]!r}; it has {known}"
+            known = [s.name for s in (*self.component.services, *self.component.composites)]
+            what = f"{self.component.name} has no service {name[:80]!r}; it has {', '.join(known)}{meant(name, known)}"
             raise ComponentError("::genom::no_such_service", what=what) from None
 
     def arguments(self, service: Service, given: Any) -> dict[str, Any]:
@@ -163,7 +172,9 @@ class Proxy:
             response = await client.call(values, CALL_SECONDS)
         if not response.genom_success:
             raise component_exception(response.genom_exdetail)
-        return Value(self.component, service.outputs, {name: getattr(response, name) for name, _ in service.outputs})
+        value = Value(self.component, service.outputs, {name: getattr(response, name) for name, _ in service.outputs})
+        value.warn(mark.warning_in(response.genom_exdetail))
+        return value
 
     async def start(self, service: Service, values: Mapping[str, Any]) -> Goal:
         """Send an activity; its goal tells when it runs and when it has ended."""
@@ -268,7 +279,7 @@ class Proxy:
             message = await self._read(port, element)
         value = _zero(self.component, port.idl)
         if message is not None:
-            value = {name: getattr(message, name) for name, _ in self.component.structs[port.idl]}
+            value = {name: getattr(message, name) for name, _ in self.component.members(port.idl)}
         sample = Value(self.component, ((port.name, port.idl),), {port.name: value})
         sample.data = message
         return sample
@@ -399,10 +410,10 @@ def _no_port(what: str) -> ComponentError:
 def _zero(component: Component, idl: str) -> Any:
     if idl.startswith("sequence<"):
         return []
-    if idl in component.structs:
+    if idl.startswith("::"):
         if idl in LEVELS:
             return []
-        return {name: _zero(component, kind) for name, kind in component.structs[idl]}
+        return {name: _zero(component, kind) for name, kind in component.members(idl)}
     return "" if idl == "string" else 0
 
 

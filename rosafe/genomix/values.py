@@ -10,6 +10,7 @@ from typing import Any
 
 from rosafe.interface import KINDS, REQUEST, REQUIRED, ComponentError, Parameter, Service
 from rosafe.tree.requests import kind_of
+from rosafe.vocabulary.words import meant
 
 _WORDS = {
     **dict.fromkeys(("1", "true", "yes", "on", "t"), True),
@@ -63,7 +64,7 @@ def complete(service: Service, given: Any) -> dict[str, Any]:
     """
     values = _converted(service, _named(service, given))
     _require(service, values)
-    return {p.name: values.get(p.name, p.default) for p in service.parameters}
+    return service.completed(values)
 
 
 def partial(given: Any) -> dict[str, Any]:
@@ -148,7 +149,8 @@ def _parameter(service: Service, name: str) -> Parameter:
     try:
         return service.parameter(name)
     except KeyError:
-        raise refused(f"unknown parameter {name[:80]!r}; {expected(service)}") from None
+        known = [p.name for p in service.parameters]
+        raise refused(f"unknown parameter {name[:80]!r}; {expected(service)}{meant(name, known)}") from None
 
 
 def _convert(service: Service, parameter: Parameter, value: Any) -> Any:

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 from rosafe.representations import KINDS
 from rosafe.representations.registry import ORIGINAL
+from rosafe.vocabulary.idl import TIME
 from rosafe.vocabulary.parameter import REQUIRED, Parameter
 from rosafe.vocabulary.representation import Representation
 
@@ -46,6 +47,7 @@ def _structs(kinds: Kinds) -> dict[str, Struct]:
         )
     structs["::rosAFE::parameters"] = tuple((kind, f"sequence<{parameter_struct(kind)}>") for kind in FIXED)
     structs["::rosAFE::dataObjSt"] = tuple((kind, f"sequence<{LAYOUTS[kind].idl}>") for kind in FIXED)
+    structs["::rosAFE::frameTime"] = (("stamp", TIME), ("frameIndex", "unsigned long long"), ("sampleRate", "double"))
     structs["::rosAFE::parameterValue"] = (("name", "string"), ("value", "string"))
     structs["::rosAFE::processor"] = (
         *((name, "string") for name in ("name", "kind", "request", "upperDepName", "port", "topic")),
@@ -254,6 +256,11 @@ def derive(kinds: Kinds) -> Component:
         ports=(
             Port("Audio", "::binaudio::portStruct", "Binaural audio to work on", output=False),
             *ports,
+            Port(
+                "frameTime",
+                "::rosAFE::frameTime",
+                "With each block, when its newest audio frame was captured, and how many frames a second come",
+            ),
             Port("dataObj", "::rosAFE::dataObjSt", "Advertised as in the original and, as there, never written"),
             GENOM_STATE_PORT,
         ),

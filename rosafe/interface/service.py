@@ -7,9 +7,17 @@ from dataclasses import dataclass
 from typing import Any
 
 from rosafe.vocabulary.errors import ComponentError
+from rosafe.vocabulary.idl import TIME, TIME_MEMBERS
 from rosafe.vocabulary.parameter import REQUIRED, Parameter
 
 Struct = tuple[tuple[str, str], ...]  # (member, IDL type)
+
+
+def _unset(parameter: Parameter, value: Any) -> bool:
+    """Whether `value` means the default in a ROS request, which carries none."""
+    if isinstance(value, bool) or not parameter.zero_is_default or parameter.default is REQUIRED:
+        return False
+    return bool(len(value) == 0 if hasattr(value, "__len__") else value == 0)  # "" and [] have a length
 
 
 @dataclass(frozen=True)
@@ -37,18 +45,19 @@ class Service:
                 return parameter
         raise KeyError(name)
 
-    def from_ros(self, request: Any) -> dict[str, Any]:
-        """The values of a ROS request or goal, not yet checked; 0, "" and [] there stand for the default."""
-        values = {}
-        for parameter in self.parameters:
-            value = getattr(request, parameter.name)
-            unset = not isinstance(value, bool) and (
-                len(value) == 0 if hasattr(value, "__len__") else value == 0  # "" and [] have a length
-            )
-            if unset and parameter.zero_is_default and parameter.default is not REQUIRED:
-                value = parameter.default
-            values[parameter.name] = value
-        return values
+    def completed(self, given: Mapping[str, Any]) -> dict[str, Any]:
+        """All values, in the order of declaration: those `given`, and the defaults of the others."""
+        return {p.name: given.get(p.name, p.default) for p in self.parameters}
+
+    def from_ros(self, request: Any, literal: bool = False) -> dict[str, Any]:
+        """The values of a ROS request or goal, not yet checked; 0, "" and [] there stand for the default.
+
+        A client that knows the defaults, and has filled them in, means all `literal`.
+        """
+        values = {p.name: getattr(request, p.name) for p in self.parameters}
+        if literal:
+            return values
+        return self.completed({p.name: values[p.name] for p in self.parameters if not _unset(p, values[p.name])})
 
     def check(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """All values as their parameters' Python types, or ValueError naming the first that is refused."""
@@ -80,6 +89,10 @@ class Component:
     structs: Mapping[str, Struct]  # by IDL name
     # What genomixd makes of several services, for its clients to call like one; not on the ROS graph.
     composites: tuple[Service, ...] = ()
+
+    def members(self, idl: str) -> Struct:
+        """The members of a struct, or of ROS' own time, of which no file is made."""
+        return TIME_MEMBERS if idl == TIME else self.structs[idl]
 
     def service(self, name: str) -> Service:
         """The service called `name` (aliases count), or KeyError."""

@@ -11,8 +11,8 @@ import numpy as np
 import rospy
 
 from rosafe.component import wire
-from rosafe.component.overlap import joined, new_frames
 from rosafe.interface import LAYOUTS
+from rosafe.sound.windows import joined, new_frames
 
 BUFFER = 2**22  # bytes that are read at a time
 AUDIO_RATE_SLACK = 0.5  # frames

@@ -122,6 +122,11 @@ class Filterbank(Stage):
             told["fb_nERBs"] = float(erb_rate(frequencies[-1]) - erb_rate(frequencies[0])) / len(frequencies)
         return told
 
+    @classmethod
+    def asked(cls, values: Mapping[str, Any]) -> dict[str, Any]:
+        listed = bool(values.get("fb_cfHz")) and values.get("fb_nERBs") == 0
+        return {name: value for name, value in values.items() if not (listed and name == "fb_nERBs")}
+
     @property
     def parameters(self) -> dict[str, Any]:
         return self.in_force(self._values)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 import threading
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from time import monotonic
 from typing import Protocol
 
 from rosafe.dsp.guard import FloatArray
@@ -16,6 +16,7 @@ from rosafe.tree.member import Member
 from rosafe.tree.states import State
 from rosafe.tree.workers import SHORT, Workers
 
+NOTHING: frozenset[str] = frozenset()
 RISE = 2.0  # what a processor usually takes is the least of late; that is forgotten at this pace per block
 
 
@@ -147,7 +148,7 @@ class Processor(Member):
         """Take the next step: tell of the last block, or compute the next one."""
         try:
             if self.untold is not None:
-                self._tell(self.untold)
+                self._tell(self.untold, monotonic())
                 return
             if self._source is not None:
                 self._read(self._source)
@@ -157,13 +158,13 @@ class Processor(Member):
             self.error = problem
             with self._lock:
                 self.finish()
-            self.held_up_since = time.monotonic()  # by requests
+            self.held_up_since = monotonic()  # by requests
             self._company.failed(self)
             self.held_up_since = 0.0
 
     def _read(self, source: Source) -> None:
         """Take the next block of the source, if there is one, or come to the end with it."""
-        self.held_up_since = time.monotonic()
+        self.held_up_since = monotonic()
         while True:
             ended = source.ended  # looked at first: what has come before the end is read
             got = source.read()
@@ -177,17 +178,20 @@ class Processor(Member):
                 self.finish()
 
     def _compute(self, taken: Block) -> None:
-        begun = time.monotonic()
+        begun = monotonic()
         private = self._process(taken)
-        seconds = time.monotonic() - begun
+        ended = monotonic()
+        seconds = ended - begun
         self.blocks += 1
         self.busy += seconds
-        self.usual = min(seconds, RISE * self.usual)
+        limit = RISE * self.usual
+        self.usual = seconds if seconds < limit else limit
         with self._lock:
             self.done(private)
         self._listener.executed(self, seconds)
-        if self.untold is not None and self._usual_telling < SHORT:  # else once nothing deeper in the tree is ready
-            self._tell(self.untold)
+        untold = self.untold
+        if untold is not None and self._usual_telling < SHORT:  # else once nothing deeper in the tree is ready
+            self._tell(untold, ended)
 
     def _process(self, taken: Block) -> Block | None:
         """What comes out for a block; None where that cannot be used."""
@@ -195,10 +199,7 @@ class Processor(Member):
         if stage is None:
             return None
         if stage.PROVIDES:
-            with self._lock:
-                children = list(self.children)
-            wanted = {child.changes.needs(taken.number) for child in children}
-            stage.provide = frozenset(wanted.intersection(stage.PROVIDES))
+            stage.provide = self._wanted(stage, taken.number)
         if self.place is not None and not self.children:  # who take blocks in one piece
             stage.place = self.place(taken.data.shape[-1])
         needs = stage.needs
@@ -210,16 +211,23 @@ class Processor(Member):
             next_index = max(0, next_index - look_ahead * stage.given.hop)
         return Block(taken.number, parts, next_index, stage.output, stage.provided)
 
-    def _tell(self, block: Block) -> None:
+    def _wanted(self, stage: Stage, number: int) -> frozenset[str]:
+        """The by-products that children need of block `number`."""
+        with self._lock:
+            children = list(self.children)
+        wanted = [child.changes.needs(number) for child in children]
+        return frozenset(stage.PROVIDES).intersection(wanted) if any(wanted) else NOTHING
+
+    def _tell(self, block: Block, begun: float) -> None:
         """Tell the world of the block that was released last."""
         self.untold = None
-        self.held_up_since = begun = time.monotonic()
+        self.held_up_since = begun
         with self._telling:
             if self.state is not State.REMOVED:
                 self.history.append(block)
                 self._listener.released(self, block)
         self.held_up_since = 0.0
-        self._usual_telling = time.monotonic() - begun
+        self._usual_telling = monotonic() - begun
 
 
 def subtree(processor: Processor) -> Iterator[Processor]:

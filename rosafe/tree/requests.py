@@ -7,20 +7,19 @@ makes them; docs/request.md has the rules.
 from __future__ import annotations
 
 import itertools
-import math
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from rosafe.interface import BASS, KINDS, REQUEST, ROSAFE, ComponentError, Parameter, Representation, text_of
+from rosafe.interface import BASS, KINDS, REQUEST, ROSAFE, ComponentError, Representation, text_of
 from rosafe.interface.arguments import check_parameter
 from rosafe.representations import STAGES
+from rosafe.vocabulary.words import meant
 
 HIGHEST_RATE = float(BASS.service("Acquire").parameter("sampleRate").maximum or 0)  # Hz; what is wrong there is at any
 INTERRUPTED = "::genom::interrupted"
 _RACES = {f"::rosAFE::{short}" for short in ("e_existsAlready", "e_noUpperDependencie", "e_noSuchProcessor")}
-ALMOST_ZERO = math.ulp(0.0)  # in place of a zero, which would mean the default, until modifyParameter has set that
 # What only the making of an input needs: the topic, and InputProc's parameters without its name.
 OF_THE_INPUT = ("connect", *(p.name for p in ROSAFE.service("InputProc").parameters[1:]))
 
@@ -70,7 +69,6 @@ class Level:
         it names would tell otherwise of how its channels were chosen.
         """
         told = {name: found.values[name] for name in self.in_force}
-        told.update({name: 0.0 for name, value in told.items() if value == ALMOST_ZERO})  # will be in a moment
         return told in (self.in_force, {**self.in_force, **self.given})
 
 
@@ -104,8 +102,9 @@ def kind_of(representation: str) -> Representation:
     for kind in KINDS.values():
         if representation.lower() in map(str.lower, (kind.word, *kind.word_aliases, kind.kind)):
             return kind
-    known = REQUEST.parameter("representation").range_text
-    raise ValueError(f"representation: {representation[:80]!r} is not {known}")
+    parameter = REQUEST.parameter("representation")
+    hint = meant(representation, parameter.choices)
+    raise ValueError(f"representation: {representation[:80]!r} is not {parameter.range_text}{hint}")
 
 
 def chain(kind: Representation) -> list[Representation]:
@@ -128,8 +127,8 @@ def understand(kind: Representation, given: Mapping[str, Any]) -> Wish:
     ComponentError
         ``::rosAFE::e_badNewValue``, as the component itself would, for what no sample rate makes possible.
     """
-    if given.get("fb_cfHz") and given.get("fb_nERBs") == 0:  # so getParameters tells of a filterbank with a list
-        given = {name: value for name, value in given.items() if name != "fb_nERBs"}
+    for above in chain(kind):
+        given = STAGES[above.kind].asked(given)
     try:
         for name in OF_THE_INPUT:
             if name in given:
@@ -209,30 +208,20 @@ def free_name(kind: Representation, names: Collection[str]) -> str:
 
 
 def making(level: Level, name: str, parent: str, input_values: Mapping[str, Any]) -> list[Step]:
-    """The requests for one processor. What its own request cannot carry is set before anything hangs on it.
+    """The requests for one processor. What that of an input cannot carry is set before anything hangs on it.
 
     `input_values` are those of InputProc less its name, of which only an input takes notice.
     """
     if level.kind.parent:
-        unsaid = [p for p in level.kind.parameters if _reads_as_default(p, level.values[p.name])]
-        # Until then, nobody who looks may take it for one with the defaults.
-        sent = {**level.values, **{p.name: ALMOST_ZERO for p in unsaid}}
-        step = Step(level.kind.request, {"name": name, "upperDepName": parent, **sent}, name)
-    else:
-        unsaid = [p for p in level.kind.parameters if level.values[p.name] != p.default]
-        step = Step(level.kind.request, {"name": name, **input_values}, name)
+        return [Step(level.kind.request, {"name": name, "upperDepName": parent, **level.values}, name)]
+    changed = {p.name: level.values[p.name] for p in level.kind.parameters if level.values[p.name] != p.default}
     return [
-        step,
+        Step(level.kind.request, {"name": name, **input_values}, name),
         *(
-            Step("modifyParameter", {"nameProc": name, "nameParam": p.name, "newValue": text_of(level.values[p.name])})
-            for p in unsaid
+            Step("modifyParameter", {"nameProc": name, "nameParam": parameter, "newValue": text_of(value)})
+            for parameter, value in changed.items()
         ),
     ]
-
-
-def _reads_as_default(parameter: Parameter, value: Any) -> bool:
-    """Whether a ROS request with this value means the default instead."""
-    return not isinstance(value, (bool, str, list)) and value == 0 != parameter.default
 
 
 # --- what has been done -----------------------------------------------------------------------------------------
@@ -240,18 +229,21 @@ def _reads_as_default(parameter: Parameter, value: Any) -> bool:
 
 def answer(wish: Wish, dependencies: Sequence[str], created: Collection[str], instance: str) -> dict[str, Any]:
     """The outputs of `interface.REQUEST`, once the processors `dependencies` are there."""
-    own = {p.name for level in wish.levels for p in level.kind.parameters}
-    if dependencies[0] in created:
-        own.update(OF_THE_INPUT)
     return {
         "name": dependencies[-1],
         "dependencies": list(dependencies),
         "created": [name for name in dependencies if name in created],
         "reused": [name for name in dependencies if name not in created],
-        "unused": [name for name in wish.given if name not in own],
+        "unused": unused((level.kind for level in wish.levels), wish.given, dependencies[0] in created),
         "port": wish.levels[-1].kind.port,
         "topic": topic(instance, wish.levels[-1].kind, dependencies[-1]),
     }
+
+
+def unused(kinds: Iterable[Representation], given: Iterable[str], new_input: bool) -> list[str]:
+    """Which of the parameters `given` have no effect on a processor with these kinds from the input down to it."""
+    own = {p.name for kind in kinds for p in kind.parameters} | {*(OF_THE_INPUT if new_input else ())}
+    return [name for name in given if name not in own]
 
 
 def topic(instance: str, kind: Representation, name: str) -> str:

@@ -26,6 +26,7 @@ class State(enum.Enum):
     REMOVED = "removed"
 
 
+WAIT_EXEC, EXEC, WAIT_RELEASE, RELEASE = State.WAIT_EXEC, State.EXEC, State.WAIT_RELEASE, State.RELEASE  # found faster
 ENDS = (State.DONE, State.REMOVED)
 
 
@@ -56,7 +57,7 @@ class StateMachine:
         self.parent = parent
         self.children: list[StateMachine] = []
         self.depth: int = 0 if parent is None else parent.depth + 1
-        self.state = State.WAIT_EXEC
+        self.state = WAIT_EXEC
         self.at_work = self.called = False
         self.taken: Block | None = None
         self.shared: Block | None = None
@@ -125,7 +126,7 @@ class StateMachine:
     def _end_if_exhausted(self) -> None:
         if self.parent is None or self.parent.state is not State.DONE or self._token is not None:
             return
-        if not self.at_work and self.state is State.WAIT_EXEC:
+        if not self.at_work and self.state is WAIT_EXEC:
             self.finish()
 
     @property
@@ -145,65 +146,65 @@ class StateMachine:
         """Whether there is something to do: a block to take, or one to tell of."""
         if self.at_work:
             return False
-        if self.state is State.WAIT_EXEC:
-            return self.called or self._token is not None
-        return self.state is State.RELEASE
+        state = self.state
+        return self._token is not None or self.called if state is WAIT_EXEC else state is RELEASE
 
     def begin(self) -> None:
         """Somebody works on it from now on, and takes the block that waits for it, if there is one."""
         self.at_work = True
-        if self.state is State.WAIT_EXEC:
+        if self.state is WAIT_EXEC:
             self.called = False
-            self.taken, self._token = self._token, None
-            if self.taken is not None:
+            self.taken = taken = self._token
+            if taken is not None:
+                self._token = None
                 self._reading = self.parent
-                self._enter(State.EXEC, self.taken.number)
+                self._enter(EXEC, taken.number)
 
     def read(self, block: Block) -> None:
         """The input has read a block."""
         self.called = True  # perhaps there is more
         self.taken = block
-        self._enter(State.EXEC, block.number)
+        self._enter(EXEC, block.number)
 
     def done(self, private: Block | None) -> None:
         """It has computed `private`, or nothing: that is released at once or as soon as no child holds the last one."""
         self.give_back()
         if private is not None:
-            self._enter(State.WAIT_RELEASE, private.number)
+            self._enter(WAIT_RELEASE, private.number)
             self._private = private
-            if not self._holders:
+            if not self._holders and self.state is WAIT_RELEASE:  # it may have been removed
                 self._release()
 
     def give_back(self) -> None:
         """Return the parent's block, which may release its next one then."""
-        if self._reading is not None:
-            reading, self._reading = self._reading, None
+        reading = self._reading
+        if reading is not None:
+            self._reading = None
             reading._freed_by(self)
 
     def rest(self) -> None:
         """Nobody works on it any more."""
         self.at_work, self.taken = False, None
-        if self.state is State.EXEC or (self.state is State.RELEASE and self.untold is None):
-            self._enter(State.WAIT_EXEC)
+        state = self.state
+        if state is EXEC or (state is RELEASE and self.untold is None):
+            self._enter(WAIT_EXEC)
         if self.ready:
             self.rouse()
-        elif self.state in ENDS:
+        elif state in ENDS:
             self.settle()
         else:
             self._end_if_exhausted()
 
     def _freed_by(self, child: StateMachine) -> None:
         self._holders.discard(child)
-        if not self._holders:
+        if not self._holders and self.state is WAIT_RELEASE:
             self._release()
 
     def _release(self) -> None:
         """Called, while no child holds a block, by whoever has made that possible, which is mostly a child."""
-        if self.state is not State.WAIT_RELEASE:
-            return
         block, self._private = self._private, None
         assert block is not None
-        self._enter(State.RELEASE, block.number)
+        self._enter(RELEASE, block.number)
         self.shared = self.untold = block
         for child in self.children:
             if child.state is not State.DONE:
@@ -220,5 +221,6 @@ class StateMachine:
     def _enter(self, state: State, number: int | None = None) -> None:
         if self.state is not State.REMOVED:
             self.state = state
-            for observer in self.observers:
-                observer(self, state, number)
+            if self.observers:
+                for observer in self.observers:
+                    observer(self, state, number)

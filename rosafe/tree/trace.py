@@ -130,7 +130,7 @@ class Trace:
         There is a row for each processor, and below them one for each worker with what it computed.
         """
         rows = {name: row for row, name in enumerate(self.processors, 1)}
-        workers = {name: row for row, name in enumerate(self.workers, 1)}
+        workers = {name: row for row, name in enumerate(self.workers, 1 + len(rows))}
         shown = [_metadata("process_name", PROCESSORS, 0, name=title)]
         for name, row in rows.items():
             shown.append(_metadata("thread_name", PROCESSORS, row, name=f"{name} ({self.processors[name].kind})"))

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
 from rosafe.interface import KINDS
+from rosafe.missing import require
 from rosafe.view.axes import frequency_axis, image, style
 from rosafe.view.levels import LEVELS
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 EARS = ("left", "right")
 RANGE_DB = 60.0  # of levels, below the loudest
@@ -78,16 +81,13 @@ def plot(
         raise ValueError(f"ear: {ear!r} is not one of {', '.join(EARS)}")
     options = {"at": at, "channel": channel, "sample_rate": sample_rate}
     if ax is None:
-        from matplotlib import pyplot
-
-        return draw(pyplot.figure(), result, names, ear, **options)
+        figure: Figure = require("matplotlib.pyplot", "rosafe.plot").figure()
+        return draw(figure, result, names, ear, **options)
     if len(names) != 1:
         raise ValueError(f"ax: it takes one output, and there are {', '.join(names)}; choose one with outputs")
     with style():
         _Panel(result, names[0], **options).draw(ax, EARS.index(ear or EARS[0]))
-    figure = ax.figure
-    assert isinstance(figure, Figure)
-    return figure
+    return ax.figure
 
 
 def draw(

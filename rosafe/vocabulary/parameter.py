@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from .idl import SCALARS, element, ros_type
+from .words import meant, nearest
 
 REQUIRED = object()  # a parameter without a default, such as connect_port's `local`
 MAX_STRING = 4096  # characters in any string that a request carries
@@ -138,7 +139,7 @@ class Parameter:
             raise self._refuse(value, f"a text of at most {self.longest} characters")
         value = self.spellings.get(value, value)
         if self.choices and value not in self.choices:
-            raise self._refuse(value, self.range_text)
+            raise self._refuse(value, self.range_text + meant(value, self.choices))
         return value
 
     def _check_range(self, number: float) -> None:
@@ -156,6 +157,14 @@ class Parameter:
         return (
             self.fallback if self.fallback and word and self.spellings.get(value, value) not in self.choices else value
         )
+
+    def doubt(self, value: Any) -> str:
+        """What is to be told where `known_word` takes another word for `value`; empty where it takes that."""
+        taken = self.known_word(value)
+        if taken is value:
+            return ""
+        near = nearest(value, self.choices)
+        return f"{self.name}: {shown(value)} is no known word, {taken} is taken; the nearest known one is {near}"
 
     # --- texts ------------------------------------------------------------------------------------------------
 

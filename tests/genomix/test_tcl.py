@@ -309,10 +309,11 @@ def test_errors_of_the_component(world: World) -> None:
     """
     )
     assert world.lines(script) == [
-        "ex ::rosAFE::e_noSuchProcessor|GENOM ::rosAFE::e_noSuchProcessor {}",
+        "ex ::rosAFE::e_noSuchProcessor what {there is no processor 'nobody'; there are: input, preProc, gammatone}"
+        "|GENOM ::rosAFE::e_noSuchProcessor {}",
         "::rosAFE::e_badNewValue|fb_nERBs: -1 is out of range, allowed is more than 0 to 100",
         "GENOM ::rosAFE::e_badNewValue",
-        "trapped|ex ::rosAFE::e_existsAlready",
+        "trapped|ex ::rosAFE::e_existsAlready what {'preProc' exists already, of kind preProc}",
     ]
 
 
@@ -646,7 +647,7 @@ def test_errors_in_the_background_are_told_in_one_line(world: World) -> None:
     )
     done = world.tcl(script)
     ex = "::rosAFE::e_noSuchProcessor"
-    message = f"rosAFE::modifyParameter &: {ex}"
+    message = f"rosAFE::modifyParameter &: {ex}: there is no processor 'nobody'; there are: none"
     assert done.stdout.splitlines() == [
         "error",
         "::genomix::request6|1",

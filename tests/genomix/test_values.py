@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from rosafe import interface
 from rosafe.genomix.values import complete, parse_input
 from rosafe.interface import BASS, REQUIRED, ROSAFE, ComponentError, Service
+from rosafe.vocabulary.idl import element
 
 GAMMATONE = ROSAFE.service("GammatoneProc")
 INPUT = ROSAFE.service("InputProc")
@@ -167,7 +168,7 @@ def test_whatever_comes_is_of_the_right_types_or_refused(data: st.DataObject) ->
     kinds = {"string": str, "boolean": bool, "double": float}
     for parameter in service.parameters:
         value = completed[parameter.name]
-        if parameter.idl.startswith("sequence"):
-            assert all(type(item) is float for item in value)
+        if of := element(parameter.idl):
+            assert all(type(item) is kinds[of] for item in value)
         elif parameter.name in (given if isinstance(given, dict) else ()):
             assert type(value) is kinds.get(parameter.idl, int)

@@ -110,6 +110,7 @@ class World:
         self.server = server
         self.port = port
         self.http = Http(port)
+        self.afe: harness.Process | None = None  # rosAFE-ros, where there are nodes
 
     def tcl(
         self, script: str, timeout: float = 120.0, check: bool = True, shell: str = "tclsh"
@@ -164,5 +165,5 @@ def world(home: Path, nodes: bool = True) -> Iterator[World]:
         if not nodes:
             yield this
             return
-        with graph.node("bass-ros"), graph.node("rosAFE-ros"):
+        with graph.node("bass-ros"), graph.node("rosAFE-ros") as this.afe:
             yield this

@@ -21,8 +21,8 @@ STANDS_ON: dict[str, set[str]] = {
     "tree": {*_NUMERICS, "interface"},
     "setups": {*_NUMERICS, "interface", "tree"},
     "offline": {*_NUMERICS, "interface", "tree", "sound"},
-    "component": {"vocabulary", "representations", "interface", "tree"},
-    "node": {*_NUMERICS, "interface", "tree", "component", "setups"},
+    "component": {"vocabulary", "representations", "interface", "tree", "sound"},
+    "node": {*_NUMERICS, "interface", "tree", "component", "sound", "setups"},
     "bass": {"vocabulary", "interface", "component", "sound"},
     "genomix": {"vocabulary", "interface", "tree", "component", "setups"},
     "eltclsh": {"vocabulary", "interface", "component", "genomix"},
@@ -31,7 +31,7 @@ STANDS_ON: dict[str, set[str]] = {
     "demo": {"interface", "tree", "component", "bass", "sound", "view", "offline", "vocabulary"},
 }
 TOP = {"commands", "testing", "ros", "__init__"}  # may use everything
-EVERYWHERE = {"version", "output"}
+EVERYWHERE = {"version", "output", "missing"}
 
 
 def imports(path: Path) -> Iterator[str]:

@@ -74,8 +74,7 @@ class Model:
         return {}
 
     def _make(self, service: str, values: Mapping[str, Any]) -> dict[str, Any]:
-        # As the node reads a ROS request: 0, "" and [] are the default.
-        given = ROSAFE.service(service).from_ros(SimpleNamespace(**values))
+        given = ROSAFE.service(service).from_ros(SimpleNamespace(**values), literal=True)
         kind, name, parent = KIND_OF_SERVICE[service], given.pop("name"), given.pop("upperDepName", "")
         if not parent:
             if not (self.audio and self.connected):

@@ -146,7 +146,7 @@ def test_whatever_step_fails_nothing_is_left() -> None:
     whole = Graph()
     load(whole, SETUP)
     steps = [number for number, call in enumerate(whole.calls) if call not in ("getProcessors", "connect_port")]
-    assert len(steps) == 8
+    assert len(steps) == 7
     for number in steps:
         graph = Graph()
         graph.fail[number] = ROSAFE.error("e_noMemory")

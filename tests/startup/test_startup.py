@@ -181,9 +181,10 @@ def test_an_address_that_nobody_can_call_is_said(
     with graph.node(program, "-i", name, *filter(None, [remapping]), ROS_IP=ip, ROS_HOSTNAME=hostname) as node:
         if why:
             assert node.err.startswith(f"{program}: warning: {why}") and "set it to 127.0.0.1" in node.err
-            assert node.err.count("\n") == 1
+            assert node.complaints.count("\n") == 1
         else:
-            assert node.err == ""
+            assert node.complaints == ""
+        wait_for(lambda: node.err.endswith(f"{program}: ready as /{name} at {graph.uri}\n"), what=lambda: str(node))
 
 
 # --- up and down ------------------------------------------------------------------------------------------------

@@ -68,6 +68,8 @@ def test_overlap_of_parent_and_child_and_of_siblings(
     for name in trace.processors:
         assert [span.block for span in trace.of(name, State.EXEC)] == list(range(last + 1))
         assert [span.block for span in trace.of(name, State.RELEASE)] == list(range(last + 1))
+    assert trace.workers == ["worker 1", "worker 2", "worker 3"]
+    assert all(span.worker in trace.workers for span in trace.spans if span.state == State.EXEC.value)
     for name in ("a", "b"):
         together = {(one.block, other.block) for one, other in trace.together("parent", name)}
         assert {(n + 1, n) for n in range(last)} <= together, "the parent at block n + 1, the child at block n"
@@ -141,6 +143,25 @@ def test_chrome_format() -> None:
         ("exec 7", 500, 400, {"block": 7}),
         ("waitRelease 7", 900, 100, {"block": 7}),
     ]
+
+
+def test_workers_have_a_row_each_and_their_share() -> None:
+    """What they computed, whoever it was for; a release is often another's work."""
+    events = [event._replace(worker=f"worker {1 + (event.name == 'child')}") for event in EVENTS]
+    trace = Trace(events)
+    shown = trace.chrome("/rosAFE")["traceEvents"]
+    processes = {e["pid"]: e["args"]["name"] for e in shown if e["name"] == "process_name"}
+    assert processes == {1: "/rosAFE", 2: "workers"}
+    rows = {e["tid"]: e["args"]["name"] for e in shown if e["name"] == "thread_name" and e["pid"] == 2}
+    spans = [(rows[e["tid"]], e["name"], e["ts"], e["dur"]) for e in shown if e["ph"] == "X" and e["pid"] == 2]
+    assert spans == [
+        ("worker 1", "root 7", 0, 400),
+        ("worker 2", "child 7", 500, 400),
+        ("worker 1", "root 8", 600, 400),
+    ]
+    assert len({e["tid"] for e in shown if e["name"] == "thread_name"}) == 4
+    lines = [line.split() for line in trace.summary() if line.startswith("worker")]
+    assert [(line[1], line[2], line[-4]) for line in lines] == [("1", "2", "80.0%"), ("2", "1", "40.0%")]
 
 
 def test_nothing_is_a_trace_too() -> None:

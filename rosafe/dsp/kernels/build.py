@@ -85,7 +85,7 @@ def _build(folder: Path) -> None:
     base = folder.parent
     gcc = shutil.which("gcc")
     if gcc is None:
-        raise BuildError("the kernels are not built, and there is no gcc to build them; run scripts/install")
+        raise BuildError("the kernels are not built, and there is no gcc to build them: install gcc")
     base.mkdir(parents=True, exist_ok=True)
     with open(base / "kernels.lock", "w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)  # given back by the kernel even if this process is killed
