@@ -60,7 +60,12 @@ async def serve(options: Options) -> None:
     publishing: asyncio.Task[None] | None = None
     try:
         await graph.become_node()
-        hub = Hub(robot.audio_topic, lambda: loop.is_closed() or loop.call_soon_threadsafe(news))
+
+        def tell_news() -> None:
+            if not loop.is_closed():
+                loop.call_soon_threadsafe(news)
+
+        hub = Hub(robot.audio_topic, tell_news)
         door = Door(own_names() | {options.host})
         asks = {
             "devices": robot.devices,

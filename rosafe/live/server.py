@@ -246,7 +246,7 @@ class Connection(web.RequestHandler):
     """One connection: only so many, and those that do not show the token soon are closed."""
 
     def __init__(self, connections: set[Connection], server: web.Server) -> None:
-        super().__init__(server, loop=asyncio.get_running_loop(), access_log=None)
+        super().__init__(server, loop=asyncio.get_running_loop(), access_log=None)  # type: ignore[arg-type]
         self._all = connections
         self._late: asyncio.TimerHandle | None = None
 

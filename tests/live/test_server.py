@@ -215,11 +215,10 @@ def test_nothing_is_subscribed_that_nobody_looks_at(world: World) -> None:
         async with page(world.live) as one, page(world.live) as two:
             await one.look(ILD, LEVELS)
             await two.look(ILD)
-            await asyncio.to_thread(
-                wait_for, lambda: {"/rosAFE/ildPort/ild_0", "/bass/Audio"} <= ports_of_the_page(world.graph)
-            )
+            both = {"/rosAFE/ildPort/ild_0", "/bass/Audio"}
+            await asyncio.to_thread(lambda: wait_for(lambda: both <= ports_of_the_page(world.graph)))
             await one.look()
-            await asyncio.to_thread(wait_for, lambda: "/bass/Audio" not in ports_of_the_page(world.graph))
+            await asyncio.to_thread(lambda: wait_for(lambda: "/bass/Audio" not in ports_of_the_page(world.graph)))
             assert "/rosAFE/ildPort/ild_0" in ports_of_the_page(world.graph)
 
     asyncio.run(scenario())
