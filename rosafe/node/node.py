@@ -255,7 +255,7 @@ class RosafeNode:
 
     def _handler(self, kind: Representation) -> Handler:
         def handle(activity: Activity, values: dict[str, Any]) -> None:
-            asked = STAGES[kind.kind].asked({p.name: values[p.name] for p in kind.parameters})
+            asked = STAGES[kind.kind].asked({p.name: values[p.name] for p in kind.parameters if p.name in values})
             doubts: dict[str, str] = {}
             take = self._words.taking(doubts)
             parameters = {p.name: take(p, asked[p.name]) for p in kind.parameters if p.name in asked}

@@ -111,7 +111,7 @@ process.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
 
 
 def _named(by_place: tuple[Any, ...], options: tuple[Any, Any, Any, Any]) -> tuple[Any, Any, Any, Any]:
-    """The options, of which the first ones were given by their place, as versions before 0.3 wanted them."""
+    """The options, of which the first ones were given by their place, as it was done once."""
     if len(by_place) > len(options):
         raise TypeError(f"process() takes 2 positional arguments, and {2 + len(by_place)} were given")
     warnings.warn("give what follows the sample rate by name, as in parameters={...}", DeprecationWarning, 3)
