@@ -291,7 +291,7 @@ def whole_chain() -> Iterator[Row]:
     """`rosafe.process` with its defaults at 16 kHz, all in one block and in many."""
     rate, few = 16000, {"fb_nERBs": 4.0}
     signal = 0.1 * noise(1800)
-    got = rosafe.process(signal, rate, few)
+    got = rosafe.process(signal, rate, parameters=few)
     shape = truth.window("hann", 320)
     banded = truth.gammatone(signal.astype(truth.Long), rate, got["fb_cfHz"], 4, 1.018)
     ihc = truth.hair_cell("dau", *banded, rate)
@@ -305,7 +305,7 @@ def whole_chain() -> Iterator[Row]:
         yield Row(f"chain: {kind}", "80 bits", unit, bound, error(got[kind], wanted))
     worst = 0.0
     for sizes in ([1], [7, 500, 1, 33], [159, 161]):
-        pieces = rosafe.process(signal, rate, few, sizes)
+        pieces = rosafe.process(signal, rate, parameters=few, block_frames=sizes)
         worst = max(worst, *(absolute(pieces[kind], got[kind]) for kind in exact))
     yield Row("chain in blocks of 1 to 500 samples", "in one block", "absolute", 1e-12, worst)
 

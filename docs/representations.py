@@ -24,7 +24,7 @@ PARAMETERS = {"ac_wSizeSec": 0.03, "pi_confThres": 0.4}  # the voice is low, and
 def main() -> None:
     sound = Scene(RATE, seconds=SECONDS).frames(RATE * SECONDS)
     kinds = {kind: stage.REPRESENTATION for kind, stage in own().items()}
-    result = {**rosafe.process(sound, RATE, PARAMETERS, outputs=list(kinds)), "sample_rate": RATE}
+    result = {**rosafe.process(sound, RATE, parameters=PARAMETERS, outputs=list(kinds)), "sample_rate": RATE}
     names = [name for kind in kinds.values() for name in kind.outputs]
     rows = -(-len(names) // COLUMNS)
     with style():

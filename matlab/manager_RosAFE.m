@@ -391,5 +391,7 @@ end
 function refuse(request)
 if strcmp(request.status, 'error')
     error('manager_RosAFE:refused', 'Error%s', genomix.request.explain(request.exception));
+elseif ~isempty(request.warning)
+    warning('manager_RosAFE:word', '%s', request.warning);
 end
 end

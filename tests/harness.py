@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -116,6 +117,11 @@ class Process:
     def err(self) -> str:
         """What it has printed on stderr so far."""
         return _contents(self._err)
+
+    @property
+    def complaints(self) -> str:
+        """`err` without the line in which a node tells that it is ready."""
+        return re.sub(r"^\w+-ros: ready as .*\n", "", self.err, flags=re.MULTILINE)
 
     @property
     def alive(self) -> bool:

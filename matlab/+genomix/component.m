@@ -143,7 +143,12 @@ classdef component < handle
             elseif failed
                 value = genomix.request(obj.client, struct('status', 'error', 'exception', answer), flags.m);
             else
-                value = genomix.request(obj.client, struct('status', 'done', 'output', answer), flags.m);
+                told = struct('status', 'done', 'output', answer);
+                if isfield(answer, 'warning')
+                    told.warning = answer.warning;
+                    told.output = rmfield(answer, 'warning');
+                end
+                value = genomix.request(obj.client, told, flags.m);
             end
         end
 

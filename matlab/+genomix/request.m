@@ -3,7 +3,10 @@ classdef request < handle
 %
 %   r.status      'sent', 'done' or 'error', as it is now
 %   r.result      a struct with the service's outputs, [] before it is done
-%   r.exception   a struct with the name of the exception in field ex and, for some, its members in detail; [] for none
+%   r.exception   a struct with the name of the exception in field ex, for some its members in detail, and the reason
+%                 in detail.what or in what; [] for none
+%   r.warning     what the component has to say of a request that it grants all the same, such as a word that it does not
+%                 know; '' for nothing
 %   r.wait(s)     waits until it is no longer 'sent', or for s seconds, and returns the status
 %   r.abort()     asks the activity to end
 %
@@ -14,6 +17,7 @@ classdef request < handle
         status
         result
         exception
+        warning
     end
 
     properties (Access = private)
@@ -53,6 +57,14 @@ classdef request < handle
             end
         end
 
+        function text = get.warning(obj)
+            refresh(obj, 0);
+            text = '';
+            if isfield(obj.told, 'warning')
+                text = obj.told.warning;
+            end
+        end
+
         function status = wait(obj, seconds)
             %WAIT  The status once it is no longer 'sent', or after some seconds (for ever by default).
             if nargin < 2
@@ -86,6 +98,9 @@ classdef request < handle
             end
             fprintf('  request with properties:\n\n');
             fprintf('%13s: %s\n', 'status', ['''' obj.told.status ''''], 'result', result, 'exception', exception);
+            if isfield(obj.told, 'warning')
+                fprintf('%13s: %s\n', 'warning', obj.told.warning);
+            end
         end
     end
 
@@ -133,6 +148,8 @@ classdef request < handle
             text = exception.ex;
             if isfield(exception, 'detail') && isfield(exception.detail, 'what')
                 text = [text ': ' exception.detail.what];
+            elseif isfield(exception, 'what')
+                text = [text ': ' exception.what];
             end
         end
     end

@@ -35,6 +35,7 @@ class BassNode:
         self._audio = self._node.advertise("Audio", self._message_class)
         self._snapshot: Snapshot | None = None
         self._source: SoundSource | None = None  # of the acquisition under way
+        self._acquired: dict[str, Any] = {}  # what that was asked for
         self._last_end = self._last_loss = "none"
         self._log_loss = EventLog(rospy.logwarn)
         self._log_clients = EventLog(rospy.logwarn)
@@ -45,6 +46,7 @@ class BassNode:
         self._node.activity("CloseSocket", lambda activity, _: activity.interrupt_others())
         self._node.function("ListDevices", self._list_devices)
         self._node.function("Stop", lambda _: None)  # the table says what it interrupts
+        self._node.function("getAcquisition", self._get_acquisition)
         self._node.diagnostics.add("capture", self._health)
         importlib.import_module("rosafe.bass.sources.scene")  # scipy takes long: before a request waits for it
         self._node.start()
@@ -64,7 +66,7 @@ class BassNode:
             capture = Capture(source, frames_per_chunk, chunks, self._publish, self._note_loss)
             activity.interrupt_others()
             activity.raise_if_interrupted()
-            self._source = source
+            self._source, self._acquired = source, values
             capture.publish()
             rospy.loginfo(f"acquiring from {device} at {source.sample_rate} Hz")
             activity.running()
@@ -111,6 +113,11 @@ class BassNode:
         )
 
     # --- the other requests ---
+
+    def _get_acquisition(self, _: dict[str, Any]) -> dict[str, Any]:
+        if self._source is None:
+            return {"running": False}
+        return {"running": True, **self._acquired}
 
     def _list_devices(self, _: dict[str, Any]) -> None:
         with self._printing:

@@ -9,7 +9,7 @@ import os
 import pkgutil
 import sys
 
-from rosafe import commands
+from rosafe import commands, missing
 from rosafe.commands import Failure
 from rosafe.component.startup import Parser
 from rosafe.output import OutputError
@@ -40,6 +40,11 @@ def main(argv: list[str] | None = None) -> int:
     except (Failure, OutputError) as problem:
         print(f"{name}: {problem}", file=sys.stderr)
         return 1
+    except ModuleNotFoundError as problem:
+        if not problem.name or problem.name.startswith("rosafe."):  # a fault of ours
+            raise
+        print(f"{name}: {missing.advice(problem.name)}", file=sys.stderr)
+        return 1
     except KeyboardInterrupt:
         return 130
     except BrokenPipeError:  # whoever read our output has had enough, as `head` does
@@ -67,8 +72,8 @@ def _parser() -> argparse.ArgumentParser:
 def _add(subparsers: argparse._SubParsersAction[Parser], name: str) -> None:
     try:
         module = importlib.import_module(f"{commands.__name__}.{name}")
-    except ModuleNotFoundError as missing:  # the others are there all the same, `doctor` above all
-        why = f"the Python package {missing.name} is not installed; run scripts/install"
+    except ModuleNotFoundError as problem:  # the others are there all the same, `doctor` above all
+        why = missing.advice(str(problem.name))
         subparsers.add_parser(name, help=why, add_help=False).set_defaults(missing=why)
         return
     text = inspect.getdoc(module) or ""

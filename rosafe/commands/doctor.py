@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import importlib.util
 import json
 import os
 import platform
@@ -16,6 +17,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
+from rosafe import missing
 from rosafe.component import generate, master, paths
 from rosafe.vocabulary import plugins
 from rosafe.vocabulary.errors import ComponentError
@@ -49,6 +51,9 @@ _PLOTS = {"matplotlib": "python3-matplotlib"}
 _HTTP = {"aiohttp": "python3-aiohttp"}
 _TCL = {"tkinter": "python3-tk"}
 _TCL_COMMANDS = {"tclsh": "tcl"}
+_EXTRAS = ("h5py", "zarr", "xarray", "distributed")  # nothing but what is named after them needs them
+# What pip does not bring, and nobody misses who uses the library.
+_OF_NODES = ("ROS", "messages", "master", "address", "alsaaudio", "sound devices", "HTTP server", "Tcl")
 
 
 class Finding(NamedTuple):
@@ -68,15 +73,21 @@ def configure(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> int:
     """Look at everything and print it; 0 if nothing is missing."""
     findings = {name: _examine(check) for name, check in CHECKS.items()}
-    missing = any(finding.state == MISSING for finding in findings.values())
+    if missing.by_pip():
+        for name in _OF_NODES:
+            if findings[name].state == MISSING:
+                findings[name] = Finding(
+                    NOTE, f"only for nodes and their clients: {findings[name].detail.split('; ')[0]}"
+                )
+    lacking = any(finding.state == MISSING for finding in findings.values())
     if options.json:
         checks = [{"name": name, **finding._asdict()} for name, finding in findings.items()]
-        print(json.dumps({"ok": not missing, "checks": checks}, indent=2))
+        print(json.dumps({"ok": not lacking, "checks": checks}, indent=2))
     else:
         width = max(map(len, findings))
         for name, (state, detail, todo) in findings.items():
             print(f"{state:8}{name:{width}}  {detail}" + (f"  ->  {todo}" if todo else ""))
-    return 1 if missing else 0
+    return 1 if lacking else 0
 
 
 def _examine(check: Callable[[], Finding]) -> Finding:
@@ -112,13 +123,14 @@ def _needs(modules: dict[str, str], commands: dict[str, str] | None = None) -> F
         else:
             wrong.append(f"{name} ({package})")
     if wrong:
-        return Finding(MISSING, "; ".join(wrong), _install_command())
+        todo = missing.install(next(iter(modules))) if missing.by_pip() else _install_command()
+        return Finding(MISSING, "; ".join(wrong), todo)
     return Finding(OK, ", ".join(found))
 
 
 def _python() -> Finding:
     text = f"Python {platform.python_version()}, {sys.executable}"
-    if os.path.realpath(sys.executable) != os.path.realpath(PYTHON):
+    if not missing.by_pip() and os.path.realpath(sys.executable) != os.path.realpath(PYTHON):
         return Finding(MISSING, text, f"run it with {PYTHON}, which Debian's ROS packages are for")
     return Finding(OK, text)
 
@@ -147,6 +159,19 @@ def _stale_in_shell() -> str:
         return "rostopic and its like do not find them in this shell"
     wanted = generate.environment()["PYTHONPATH"].split(":")[0]
     return "" if os.path.realpath(first) == os.path.realpath(wanted) else f"this shell has others, in {first}"
+
+
+def _plots() -> Finding:
+    found = _needs(_PLOTS)
+    return found._replace(state=NOTE) if found.state == MISSING and missing.by_pip() else found
+
+
+def _extras() -> Finding:
+    there = [name for name in _EXTRAS if importlib.util.find_spec(name)]
+    lacking = [f"{name} ({missing.install(name)})" for name in _EXTRAS if name not in there]
+    if lacking:
+        return Finding(NOTE, f"{', '.join(there) or 'none'}; without {', '.join(lacking)}")
+    return Finding(OK, ", ".join(there))
 
 
 def _alsaaudio() -> Finding:
@@ -222,5 +247,6 @@ CHECKS: dict[str, Callable[[], Finding]] = {
     "sound devices": _devices,
     "HTTP server": lambda: _needs(_HTTP),
     "Tcl": lambda: _needs(_TCL, _TCL_COMMANDS),
-    "plots": lambda: _needs(_PLOTS),
+    "plots": _plots,
+    "extras": _extras,
 }

@@ -11,15 +11,17 @@ from __future__ import annotations
 import argparse
 import asyncio
 import json
-import os
 import sys
 from collections.abc import Mapping
 from typing import Any
 
 from rosafe.commands import Failure
+from rosafe.commands._component import component, prepare, told
 from rosafe.interface import REQUEST, ROSAFE, ComponentError, Representation
 from rosafe.interface.arguments import check_parameter
 from rosafe.tree import requests as request
+from rosafe.vocabulary.parameter import shown
+from rosafe.vocabulary.words import meant
 
 _SETTINGS = [p for p in REQUEST.parameters if p.name not in ("representation", "connect")]  # those have other places
 
@@ -74,15 +76,8 @@ def run(options: argparse.Namespace) -> int:
         raise Failure(str(problem)) from None
     if options.connect is not None:
         values["connect"] = options.connect
-    from rosafe.component import generate, master
-
-    master.set_local_defaults()
-    try:
-        generate.ensure_messages()
-        master.check_master(os.environ["ROS_MASTER_URI"])
-    except (generate.GenerationError, master.MasterError) as problem:
-        raise Failure(str(problem)) from None
-    answer = asyncio.run(_make(options.instance, values))
+    prepare()
+    answer = asyncio.run(_make(options.instance, values, kind))
     if options.json:
         print(json.dumps(answer, indent=2))
     else:
@@ -96,57 +91,42 @@ def _parameter(setting: str) -> tuple[str, Any]:
         raise ValueError(f"{setting}: wanted is NAME=VALUE")
     parameter = next((p for p in _SETTINGS if name in (p.name, *p.aliases)), None)
     if parameter is None:
-        raise ValueError(f"unknown parameter {name!r}; there are: {', '.join(p.name for p in _SETTINGS)}")
+        known = [p.name for p in _SETTINGS]
+        raise ValueError(f"unknown parameter {shown(name)}; there are: {', '.join(known)}{meant(name, known)}")
     if name in request.OF_THE_INPUT:
         return name, parameter.parse(text)
     return check_parameter(name, text, text=True)
 
 
-async def _make(instance: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
+async def _make(instance: str, values: Mapping[str, Any], kind: Representation) -> Mapping[str, Any]:
     """What the component's genomixd would answer; Failure, with what to do next, where it is refused."""
-    from rosafe.genomix.graph import Graph
-    from rosafe.genomix.proxy import Proxy, names
-
-    graph = Graph(os.environ["ROS_MASTER_URI"])
-    try:
+    async with component(instance) as proxy:
         try:
-            proxy = await Proxy.load(graph, names(ROSAFE.name, instance)[1])
-            await proxy.check(ROSAFE.name)
-        except ComponentError as problem:
-            named = "" if instance == ROSAFE.name else f" -i {instance}"
-            hint = f"; start it with: rosAFE-ros{named}" if problem.ex == "::genom::mwerr" else ""
-            raise Failure(_told(problem) + hint) from None
-        try:
+            there = (await proxy.outputs("getProcessors", {}))["processors"]
+            _warn(kind, values, new_input=all(processor["upperDepName"] for processor in there))
             return await proxy.outputs(REQUEST.name, values)
         except ComponentError as problem:
             if problem.ex != "::rosAFE::e_noData":
-                raise Failure(_told(problem)) from None
+                raise Failure(told(problem)) from None
             topic = "/" + str(values.get("connect", REQUEST.parameter("connect").default)).lstrip("/")
             start = "" if await proxy.published(topic) else "bass-ros -b; "
             acquire = f"rosservice call {topic.rpartition('/')[0]}/Acquire \"{{device: 'scene:'}}\""
-            raise Failure(f"{_told(problem)}; start the sound first: {start}{acquire}") from None
-        finally:
-            await proxy.close()
-    finally:
-        await graph.close()
+            silent = f"{problem.ex}: {ROSAFE.exceptions['e_noData']}"
+            raise Failure(f"{silent}; start the sound first: {start}{acquire}") from None
 
 
-def _told(problem: ComponentError) -> str:
-    """The exception in one line: its name, and what it is about."""
-    what = problem.detail.get("what") or ROSAFE.exceptions.get(problem.ex.rpartition("::")[2], "")
-    return problem.ex + (f": {what}" if what else "")
+def _warn(kind: Representation, values: Mapping[str, Any], new_input: bool) -> None:
+    """A line on stderr for each parameter that is given in vain, before anything is made."""
+    given = [name for name in values if name != "representation"]
+    for name in request.unused(request.chain(kind), given, new_input):
+        why = ": the input is there already" if name in request.OF_THE_INPUT else " on this representation"
+        print(f"rosafe request: {name} has no effect{why}", file=sys.stderr, flush=True)
 
 
 def _show(answer: Mapping[str, Any], kind: Representation) -> None:
-    """A line for each processor, and on stderr one for each parameter that was given in vain."""
+    """A line for each processor."""
     width = max(map(len, answer["dependencies"]))
     instance = answer["topic"].split("/")[1]
     for name, kind_there in zip(answer["dependencies"], request.chain(kind), strict=True):
         how = "created" if name in answer["created"] else "reused"
         print(f"{how:7}  {name:{width}}  {request.topic(instance, kind_there, name)}")
-    for name in answer["unused"]:
-        print(f"rosafe request: {name} has no effect{_why_unused(name)}", file=sys.stderr)
-
-
-def _why_unused(name: str) -> str:
-    return ": the input is there already" if name in request.OF_THE_INPUT else " on this representation"

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 from rosafe.interface import MAX_ACTIVITIES, ComponentError, Service
+from rosafe.vocabulary.words import listed
 
 Handler = Callable[["Activity", dict[str, Any]], None]
 
@@ -29,6 +30,7 @@ class Activity:
         self.stop_requested = threading.Event()
         self.stopped_by = ""
         self.error: ComponentError | None = None
+        self.warning = ""  # for the requester, where it is granted all the same; to be set before it is `running`
         self.begun = threading.Event()  # running, or ended without (`error` tells why)
         self.ended = threading.Event()
         self._replaced = replaced
@@ -61,6 +63,12 @@ class Activity:
         """For handlers that have not come to `running` yet: ``::genom::interrupted`` where they were told to end."""
         if self.stop_requested.is_set():
             raise ComponentError("::genom::interrupted", by=self.stopped_by)
+
+
+def too_many(task: str) -> ComponentError:
+    """The exception of a task that has no slot left."""
+    what = f"{task} has {MAX_ACTIVITIES - 1} activities, as many as it takes: end some first"
+    return ComponentError("::genom::too_many_activities", what)
 
 
 class TaskMeter:
@@ -145,7 +153,7 @@ class Activities:
         """
         with self._lock:
             if self._full(service):
-                raise ComponentError("::genom::too_many_activities")
+                raise too_many(service.task)
             activity = Activity(next(self._numbers) % 2**32, service, self._replaced)
             self._live[activity.id] = activity
         thread = threading.Thread(
@@ -186,7 +194,7 @@ class Activities:
             error = problem
         except MemoryError as problem:
             self._crashed(activity, problem)
-            error = ComponentError("::genom::syserr", code=errno.ENOMEM)
+            error = ComponentError("::genom::syserr", "there is not enough memory for it", code=errno.ENOMEM)
         except Exception as problem:  # a fault of ours: the node lives on, the requester and the log are told
             self._crashed(activity, problem)
             error = ComponentError("::genom::unkex", what=f"{type(problem).__name__}: {problem}"[:127])
@@ -215,7 +223,8 @@ class Activities:
             try:
                 return self._live[number]
             except KeyError:
-                raise ComponentError("::genom::no_such_activity") from None
+                known = listed([str(one) for one in sorted(self._live)])
+                raise ComponentError("::genom::no_such_activity", f"no activity {number}; there are: {known}") from None
 
     def interrupt(self, which: Iterable[Activity], by: str) -> None:
         """Ask each of `which` to end."""

@@ -22,11 +22,10 @@ from typing import Any
 
 import numpy as np
 
-from rosafe.component.overlap import joined
+from rosafe.component.frametime import FrameTime, Line
+from rosafe.sound.windows import joined, malformed
 
 RING_SECONDS = 10.0  # how far the tree may fall behind before frames are lost
-MAX_RATE = 1_000_000  # Hz; beyond that a message is garbage, not audio
-MAX_WINDOW = 2**24  # frames in one message, as with bass
 COMPARED = 1000  # frames of a window that are compared with what came before
 
 
@@ -58,6 +57,7 @@ class AudioRing:
     def __init__(self, report: Callable[[str], None]) -> None:
         self.counters = Counters()
         self.sample_rate = 0  # of the stream; 0 where nothing has come yet
+        self._times = FrameTime()
         self._report = report
         self._turn = threading.Condition()
         self._samples = np.zeros((2, 0), np.int32)
@@ -102,6 +102,8 @@ class AudioRing:
                 self._lose(self._newest + 1, lost)
                 self._write(np.zeros((2, lost), np.int32))
             self._write(np.stack((message.left[window - fresh :], message.right[window - fresh :])))
+            if fresh or lost:
+                self._times.add(newest, _stamp(message) or time.time())
             self._turn.notify_all()
             waiting = [reader.wake for reader in self._readers]
         for wake in waiting:
@@ -150,6 +152,7 @@ class AudioRing:
         self._newest = max(0, newest - window)
         self._oldest = self._joint = self._newest + 1
         self.sample_rate, self._window = sample_rate, window
+        self._times.begin(sample_rate)
         self.counters.streams += 1
         for reader in self._readers:
             reader.position = self._oldest
@@ -172,6 +175,7 @@ class AudioRing:
         )
         if not fits:
             self._joint = self._newest + 1
+            self._times.begin(self.sample_rate)
             self.counters.breaks += 1
             if not self._breaking:
                 self._report(
@@ -264,6 +268,11 @@ class AudioRing:
             if reader in self._readers:
                 self._readers.remove(reader)
 
+    def captured(self, frame: int) -> Line | None:
+        """When frame `frame` of the stream was captured; None where that is not known."""
+        with self._turn:
+            return self._times.line(frame)
+
     @property
     def behind(self) -> int:
         """Frames that have come and were not read yet."""
@@ -271,20 +280,9 @@ class AudioRing:
             return self._unread()
 
 
-def malformed(message: Any) -> str:
-    """What is wrong with a message; empty where it can be used."""
-    left, right, rate, index = len(message.left), len(message.right), message.sampleRate, message.lastFrameIndex
-    if left != right:
-        return f"{left} left and {right} right samples"
-    if not 0 < left <= MAX_WINDOW:
-        return f"{left} samples per ear, allowed are 1 to {MAX_WINDOW}"
-    if message.nChunksOnPort * message.nFramesPerChunk != left:
-        return f"{left} samples per ear, where there should be {message.nChunksOnPort} x {message.nFramesPerChunk}"
-    if not 0 < rate <= MAX_RATE:
-        return f"a sample rate of {rate} Hz, allowed are 1 to {MAX_RATE} Hz"
-    if index >= 2**63:
-        return f"lastFrameIndex {index} is beyond all ages"
-    return ""
+def _stamp(message: Any) -> float:
+    """When the newest frame of a message was captured (s since 1970); 0 where it does not say."""
+    return float(message.stamp.sec + 1e-9 * message.stamp.nsec)
 
 
 class AudioReader:

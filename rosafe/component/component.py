@@ -25,12 +25,13 @@ import rospy
 from actionlib_msgs.msg import GoalStatus
 
 from rosafe import interface
-from rosafe.component import master, memory, registration
-from rosafe.component.activities import Activities, Activity, Handler, TaskMeter
+from rosafe.component import mark, master, memory, registration
+from rosafe.component.activities import Activities, Activity, Handler, TaskMeter, too_many
 from rosafe.component.publisher import Publisher
 from rosafe.component.pulse import Pulse
 from rosafe.interface import ComponentError
 from rosafe.version import VERSION
+from rosafe.vocabulary.parameter import shown
 
 STATE_PERIOD = 0.9  # seconds between two genom_state messages at the most; the contract is 1
 BURST_SECONDS = 0.005  # what changes within this makes one message, not one each
@@ -100,7 +101,7 @@ class ComponentNode:
     def function(
         self, name: str, handler: Callable[[dict[str, Any]], dict[str, Any] | None], waits: bool = False
     ) -> None:
-        """Let `handler(values)` serve the function `name`; it returns the outputs by name.
+        """Let `handler(values)` serve the function `name`; it returns the outputs by name, and perhaps a `warning`.
 
         Functions run one at a time, but for those that `waits` for others, such as the master: nobody waits for them.
         """
@@ -160,36 +161,42 @@ class ComponentNode:
 
     # --- requests ---
 
-    def _values(self, service: interface.Service, request: Any) -> dict[str, Any]:
+    def _values(self, service: interface.Service, request: Any, literal: bool) -> dict[str, Any]:
         try:
-            return self._checks[service.name](service.from_ros(request))
+            return self._checks[service.name](service.from_ros(request, literal))
         except ValueError as problem:
             raise self._bad_value(problem) from None
 
     def _begin(
-        self, service: interface.Service, request: Any, on_end: Callable[[Activity], None] | None = None
+        self,
+        service: interface.Service,
+        request: Any,
+        literal: bool,
+        on_end: Callable[[Activity], None] | None = None,
     ) -> Activity:
         if self.finished.is_set():
             raise ComponentError("::genom::disallowed", "the component is shutting down")
-        return self.activities.start(service, self._handlers[service.name], self._values(service, request), on_end)
+        values = self._values(service, request, literal)
+        return self.activities.start(service, self._handlers[service.name], values, on_end)
 
     def _serve_activity(self, service: interface.Service, request: Any) -> Any:
         response = getattr(self._srv, f"{service.name}Response")
         try:
-            activity = self._begin(service, request)
+            activity = self._begin(service, request, mark.is_marked(request))
         except ComponentError as problem:
             return response(False, self._told(service, problem))
         activity.begun.wait()
         if activity.error is not None:
             return response(False, self._told(service, activity.error))
-        return response(True, "")
+        return response(True, mark.granted(request, activity.warning))
 
     def _serve_function(self, service: interface.Service, request: Any) -> Any:
         response = getattr(self._srv, f"{service.name}Response")
         changes = self._registrar.changes
         with self._turns[service.name]:
             try:
-                outputs = self._handlers[service.name](self._values(service, request)) or {}
+                values = self._values(service, request, mark.is_marked(request))
+                outputs = self._handlers[service.name](values) or {}
             except ComponentError as problem:
                 return response(genom_success=False, genom_exdetail=self._told(service, problem))
             except Exception as problem:  # a fault of ours must reach the caller and the log, and not end the node
@@ -202,10 +209,13 @@ class ComponentNode:
             self._registrar.settle()
         self._state_changed()
         whole = outputs.pop("response", None)  # a handler may bring a response of its own, with arrays in it
-        return whole if whole is not None else response(genom_success=True, genom_exdetail="", **outputs)
+        if whole is not None:
+            return whole
+        told = mark.granted(request, outputs.pop("warning", ""))
+        return response(genom_success=True, genom_exdetail=told, **outputs)
 
     def _told(self, service: interface.Service, problem: ComponentError) -> str:
-        """The exdetail for the client; the log gets the reason, which often has no place on the wire."""
+        """The exdetail for the client; the log gets the reason too."""
         rospy.logwarn(f"{service.name}: {problem.ex}" + (f": {problem}" if str(problem) != problem.ex else ""))
         return problem.exdetail
 
@@ -219,17 +229,17 @@ class ComponentNode:
 
         def accept(goal: Any) -> None:  # actionlib calls this and `cancel` under the lock that set_succeeded needs
             if self.activities.full(service):
-                error = ComponentError("::genom::too_many_activities")
+                error = too_many(service.task)
                 goal.set_rejected(result(False, self._told(service, error)), f"too many activities in {service.task}")
                 return
 
-            def set_accepted() -> None:
+            def set_accepted(activity: Activity) -> None:
                 with server.lock:
                     if goal.get_goal_status().status in (GoalStatus.PENDING, GoalStatus.RECALLING):
-                        goal.set_accepted()
+                        goal.set_accepted(activity.warning)
 
             def end(activity: Activity) -> None:
-                set_accepted()
+                set_accepted(activity)
                 answer(goal, activity.error)
                 del running[goal.get_goal_id().id]
 
@@ -237,10 +247,10 @@ class ComponentNode:
                 # Accepted means running: a client that waits for it can make the next request, which may need this one,
                 # and what it stops from then on ends normally. But a device that hangs is no reason to say nothing.
                 activity.begun.wait(ACCEPT_SECONDS)
-                set_accepted()
+                set_accepted(activity)
 
             try:
-                activity = self._begin(service, goal.get_goal(), end)
+                activity = self._begin(service, goal.get_goal(), mark.is_marked(goal.goal), end)
             except ComponentError as problem:
                 goal.set_accepted()
                 answer(goal, problem)
@@ -266,9 +276,9 @@ class ComponentNode:
         local, remote = values["local"], values["remote"]
         if local not in self._connectors:
             known = ", ".join(sorted(self._connectors)) or "none"
-            raise ComponentError("::genom::no_such_inport", f"no input port {local!r}; there are: {known}")
+            raise ComponentError("::genom::no_such_inport", f"no input port {shown(local)}; there are: {known}")
         if not remote or not rosgraph.names.is_legal_name(remote):
-            raise ComponentError("::genom::no_such_outport", f"{remote!r} is no topic name")
+            raise ComponentError("::genom::no_such_outport", f"{shown(remote)} is no topic name")
         topic = rospy.resolve_name(remote)
         try:
             published = master.published_topics(master.uri(), self.name)

@@ -32,6 +32,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
+from rosafe import missing
 from rosafe.component import master, paths
 from rosafe.vocabulary import plugins
 
@@ -120,7 +121,7 @@ def digest(found: Sources) -> str:
     sha = hashlib.sha256(f"{found.packages['rosAFE']}\0{sys.version_info[:2]}\0{found.plugins}\0".encode())
     genpy = importlib.util.find_spec("genpy")  # found, not imported: importing it takes longer than all this
     if genpy is None or genpy.origin is None:
-        raise GenerationError("genpy is not installed; run scripts/install")
+        raise GenerationError(f"genpy is not installed; {missing.install('genpy')}")
     for path in (Path(__file__), Path(genpy.origin).with_name("generator.py"), *found.files()):
         sha.update(f"{path}\0".encode())
         sha.update(path.read_bytes())

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
+import functools
 import gc
 import os
 import re
@@ -10,9 +12,10 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn, Protocol
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, NoReturn, Protocol
 
 from rosafe.component import generate, master, memory, paths, systemd
 from rosafe.version import VERSION
@@ -47,9 +50,10 @@ class _Ended(Exception):
 
 def run_server(
     component: Component,
-    build: Callable[[str], Node],
+    build: Callable[..., Node],
     argv: list[str] | None = None,
     prepare: Callable[[], object] = lambda: None,
+    more_options: Mapping[str, Mapping[str, Any]] = MappingProxyType({}),
 ) -> int:
     """Run one component's node until a signal, its `kill` request or the master ends it.
 
@@ -58,11 +62,14 @@ def run_server(
     component : Component
         The component; its name is the instance's where the user gives none.
     build : callable
-        Makes and starts the node of the instance that it is given, after `rospy.init_node`.
+        Makes and starts the node of the instance that it is given, after `rospy.init_node`. It is given the values of
+        `more_options` too, by name.
     argv : list of str, optional
         The command line without the program; by default that of this process.
     prepare : callable, optional
         Called before that, and may take its time: compile something, say.
+    more_options : mapping, optional
+        Options of this component alone, such as ``--strict``, and what argparse is to know of each.
 
     Returns
     -------
@@ -71,7 +78,7 @@ def run_server(
         raises SystemExit(2), and -h and --version SystemExit(0).
     """
     arguments = sys.argv[1:] if argv is None else argv
-    options = _parse(component, [a for a in arguments if ":=" not in a])
+    options = _parse(component, [a for a in arguments if ":=" not in a], more_options)
     remappings = [a for a in arguments if ":=" in a]
     told = Background() if options.background else None
     if told is not None and told.in_parent:
@@ -80,13 +87,17 @@ def run_server(
     for number in ending_signals():
         signal.signal(number, lambda number, frame: received.append(number))
     try:
-        node = _start(component, build, options, remappings, received, prepare)
+        own = {name: getattr(options, name) for name in (flag.lstrip("-") for flag in more_options)}
+        node = _start(component, functools.partial(build, **own), options, remappings, received, prepare)
     except _Ended:
         return 0
     except (_Failure, generate.GenerationError, master.MasterError, ComponentError, OSError) as problem:
         print(f"{component.name}-ros: {problem}", file=sys.stderr)
         watchdog(END_SECONDS, 1)
         return 1
+    ready = f"{component.name}-ros: ready as /{_instance(options, remappings)} at {os.environ['ROS_MASTER_URI']}"
+    with contextlib.suppress(OSError):  # whoever read that has gone
+        print(ready, file=sys.stderr, flush=True)
     if told is not None:
         told.up()
     systemd.notify("READY=1")
@@ -110,11 +121,14 @@ class Parser(argparse.ArgumentParser):
         self.exit(2, f"{self.prog}: {message}; {self.prog} -h shows what is possible\n")
 
 
-def _parse(component: Component, arguments: list[str]) -> argparse.Namespace:
+def _parse(
+    component: Component, arguments: list[str], more_options: Mapping[str, Mapping[str, Any]]
+) -> argparse.Namespace:
     program = f"{component.name}-ros"
+    more = "".join(f" [{' '.join((name, told.get('metavar', ''))).strip()}]" for name, told in more_options.items())
     parser = Parser(
         prog=program,
-        usage=f"{program} [-b] [-i NAME] [--wait] [-h] [--version] [NAME:=VALUE ...]",
+        usage=f"{program} [-b] [-i NAME] [--wait]{more} [-h] [--version] [NAME:=VALUE ...]",
         description=f"{component.doc}.",
         epilog=f"ROS remappings are taken too: topics (a:=b) and __name, __ns, __master, __ip, __hostname, __log.\n\n"
         f"example:\n  {program} -b -i left        # serves /left/...; returns once the node is up",
@@ -135,6 +149,8 @@ def _parse(component: Component, arguments: list[str]) -> argparse.Namespace:
         action="store_true",
         help=f"wait for a ROS master for ever, as a service at boot must (default: for {MASTER_SECONDS:g} s)",
     )
+    for name, told in more_options.items():
+        parser.add_argument(name, **told)
     parser.add_argument("--version", action="version", version=f"{component.name} {VERSION}")
     return parser.parse_args(arguments)
 
@@ -144,14 +160,14 @@ def _parse(component: Component, arguments: list[str]) -> argparse.Namespace:
 
 def _start(
     component: Component,
-    build: Callable[[str], Node],
+    build: Callable[..., Node],
     options: argparse.Namespace,
     remappings: list[str],
     received: list[int],
     prepare: Callable[[], object],
 ) -> Node:
     mappings = dict(remapping.split(":=", 1) for remapping in remappings)
-    instance = mappings.get("__name", options.instance)
+    instance = _instance(options, remappings)
     if not re.fullmatch("[A-Za-z][A-Za-z0-9_]*", instance):
         raise _Failure(f"{instance!r} is no instance name: letters, digits and _ only, a letter first")
     for name, variable in _ENVIRONMENT_REMAPPINGS.items():
@@ -188,6 +204,11 @@ def _start(
     gc.freeze()  # a look at all that the modules made stops every thread for tens of milliseconds, and finds nothing
     limit.cancel()
     return node
+
+
+def _instance(options: argparse.Namespace, remappings: list[str]) -> str:
+    named = [remapping.partition(":=")[2] for remapping in remappings if remapping.startswith("__name:=")]
+    return str(named[-1] if named else options.instance)
 
 
 def _await_master(uri: str, received: list[int], patient: str) -> None:

@@ -147,7 +147,7 @@ def encode(out: Writer, component: interface.Component, idl: str, value: Any) ->
             for item in value:
                 encode(out, component, element, item)
     else:
-        for name, kind in component.structs[idl]:
+        for name, kind in component.members(idl):
             encode(out, component, kind, _member(value, name))
 
 
@@ -227,7 +227,7 @@ def decode(reader: _Reader, component: interface.Component, idl: str) -> Any:
         if element in _SAMPLES:
             return reader.samples(_SAMPLES[element])
         return [decode(reader, component, element) for _ in range(reader.count())]
-    return Struct((name, decode(reader, component, kind)) for name, kind in component.structs[idl])
+    return Struct((name, decode(reader, component, kind)) for name, kind in component.members(idl))
 
 
 # --- message classes --------------------------------------------------------------------------------------------
@@ -258,7 +258,7 @@ def message_class(package: str, idl: str) -> Any:
     generate.ensure_messages()
     component = interface.COMPONENTS[package]
     generated = getattr(importlib.import_module(f"{package}.msg"), interface.ros_type(idl))
-    serialize, deserialize = _codec(component, component.structs[idl])
+    serialize, deserialize = _codec(component, component.members(idl))
     return type(generated.__name__, (generated,), {"serialize": serialize, "deserialize": deserialize})
 
 

@@ -51,12 +51,17 @@ def run(
         One line says why it cannot go on.
     """
     sound = sounds.choose(argument)
-    seconds = sound.seconds_to_follow(seconds)
+    asked_seconds, seconds = seconds, sound.seconds_to_follow(seconds)
     if seconds == 0:
         raise DemoError(f"{sound.title} lasts {sound.length:.3f} s, which is too short to show anything")
     print(f"rosAFE, the auditory front-end, on {sound.device}", flush=True)
     if sound.note:
         print(sound.note, flush=True)
+    left_out = min(asked_seconds, sound.length) - seconds
+    if left_out > 0:
+        print(
+            f"its last {left_out:.2f} s fill no block of {sound.frames_per_block} frames, and are left out", flush=True
+        )
     session = GuideSession(scratch, check)
     try:
         print(f"master of its own at {session.uri}; starting bass-ros and rosAFE-ros", flush=True)

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from rosafe.component.overlap import joined
 from rosafe.interface import KINDS, ROSAFE, ros_type
+from rosafe.sound.windows import joined, new_frames
 from rosafe.view.report import PortRow
 from rosafe.view.representations import Representations
 
@@ -92,14 +92,7 @@ class PortFollower:
         if self.message is None:  # a block holds this many whole windows
             return int(self._frames_per_block / hop) - 1
         expected = (message.lastFrameIndex - self.index) / hop
-        if expected > message.framesOnPort:
-            return round(expected)
-        # The grid of the frames is not on the wire; where the windows fit onto each other is.
-        for count in sorted({int(expected), int(expected) + 1}, key=lambda count: abs(count - expected)):
-            kept = message.framesOnPort - count
-            if kept <= 0 or np.array_equal(message.left[..., :kept], self.message.left[..., count:]):
-                return count
-        return round(expected)
+        return new_frames(expected, message.left, self.message.left)
 
     @property
     def row(self) -> PortRow:

@@ -23,14 +23,19 @@ def refuse_web_pages(headers: Mapping[str, str], hosts: Collection[str]) -> None
     hosts : collection of str
         Names, besides IP addresses, by which clients may call this machine, in lower case.
     """
-    host = _host_name(headers.get("Host", ""))
-    if host not in hosts and not _is_address(host):
-        raise _forbidden(f"{host[:80]!r} is no name of this server; --host gives it one")
+    refuse_other_names(headers, hosts)
     for header in ("Origin", "Referer", "Sec-Fetch-Site", "Sec-Fetch-Mode", "Sec-Fetch-Dest"):
         if header in headers:
             raise _forbidden(f"requests of web pages and browsers are refused ({header})")
     if headers.get("User-Agent", "").startswith("Mozilla/"):
         raise _forbidden("requests of web browsers are refused (User-Agent)")
+
+
+def refuse_other_names(headers: Mapping[str, str], hosts: Collection[str]) -> None:
+    """Raise ``::genomix::e_forbidden`` for what was sent to a name that is not one of `hosts`, nor an IP address."""
+    host = _host_name(headers.get("Host", ""))
+    if host not in hosts and not _is_address(host):
+        raise _forbidden(f"{host[:80]!r} is no name of this server; --host gives it one")
 
 
 def own_names() -> set[str]:

@@ -10,6 +10,7 @@ import itertools
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from rosafe.component import mark
 from rosafe.genomix.graph import Graph, middleware_error
 from rosafe.genomix.tcpros import component_exception
 from rosafe.interface import ComponentError
@@ -33,6 +34,7 @@ class Goal:
         self.acknowledged = asyncio.Event()  # it runs, or has ended
         self.ended = asyncio.Event()
         self.error: ComponentError | None = None
+        self.warning = ""  # of the component, once it is acknowledged
 
     def cancel(self) -> None:
         """Ask the component to end the activity."""
@@ -87,7 +89,9 @@ class ActionClient:
             forward = functools.partial(self._forward, callback)
             self._subscribers.append(rospy.Subscriber(f"{self._name}/{part}", kind, forward, tcp_nodelay=True))
         for part, kind in (("cancel", GoalID), ("goal", self._goal_class)):
-            self._publishers[part] = rospy.Publisher(f"{self._name}/{part}", kind, queue_size=64, tcp_nodelay=True)
+            self._publishers[part] = rospy.Publisher(
+                f"{self._name}/{part}", kind, queue_size=64, tcp_nodelay=True, headers=mark.HEADER
+            )
 
     def _forward(self, callback: Callable[[Any], None], message: Any) -> None:
         """From rospy's thread to ours."""
@@ -156,6 +160,7 @@ class ActionClient:
                 continue
             goal.seen.set()
             if status.status in _ACTIVE:
+                goal.warning = status.text
                 goal.acknowledged.set()
             elif status.status in _ENDED:
                 self._loop.call_later(RESULT_SECONDS, self._end, goal, _without_result(status))
@@ -164,9 +169,7 @@ class ActionClient:
         goal = self._goals.get(message.status.goal_id.id)
         if goal is None:
             return
-        if message.status.status == _REJECTED:
-            self._end(goal, ComponentError("::genom::too_many_activities"))
-        elif message.result.genom_success:
+        if message.result.genom_success:
             self._end(goal, None)
         elif message.result.genom_exdetail:
             self._end(goal, component_exception(message.result.genom_exdetail))
@@ -180,5 +183,5 @@ class ActionClient:
 
 def _without_result(status: Any) -> ComponentError:
     if status.status == _REJECTED:
-        return ComponentError("::genom::too_many_activities")
+        return ComponentError("::genom::too_many_activities", status.text)
     return middleware_error(f"the activity ended without a result (actionlib status {status.status} {status.text})")

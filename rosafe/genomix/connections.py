@@ -19,7 +19,7 @@ from typing import Any, cast
 
 from aiohttp import web
 
-from rosafe.genomix.errors import error_body, too_many
+from rosafe.genomix.errors import too_many
 from rosafe.genomix.syntax import JSON, plain
 from rosafe.interface import ComponentError
 
@@ -325,7 +325,7 @@ def _no_request(what: str) -> ComponentError:
 
 
 def _body(error: ComponentError) -> bytes:
-    return plain(JSON, error_body(error)).encode("utf-8", "backslashreplace")
+    return plain(JSON, error.body).encode("utf-8", "backslashreplace")
 
 
 def _refusal(status: int, error: ComponentError) -> bytes:

@@ -42,11 +42,15 @@ def middleware_error(what: str) -> ComponentError:
 
 
 class Graph:
-    """The graph of the master at `uri`. Make it inside a running event loop; `close` it in the end."""
+    """The graph of the master at `uri`. Make it inside a running event loop; `close` it in the end.
 
-    def __init__(self, uri: str) -> None:
+    `program` is what the name of our node begins with.
+    """
+
+    def __init__(self, uri: str, program: str = "genomixd") -> None:
         self.uri = uri
-        self.name = f"/genomixd_{os.getpid()}_{int(time.time() * 1000)}"
+        self._program = program
+        self.name = f"/{program}_{os.getpid()}_{int(time.time() * 1000)}"
         self.gone = asyncio.Event()  # set where our node was told to end, as by `rosnode kill`
         self._http = aiohttp.ClientSession(
             connector=aiohttp.TCPConnector(force_close=True, limit=0),
@@ -68,7 +72,7 @@ class Graph:
         if self._is_node:
             import rospy
 
-            await asyncio.to_thread(rospy.signal_shutdown, "genomixd ends")
+            await asyncio.to_thread(rospy.signal_shutdown, f"{self._program} ends")
         await self._http.close()
 
     # --- XML-RPC ---
@@ -175,7 +179,7 @@ class Graph:
         from rosafe.component import registration
 
         loop = asyncio.get_running_loop()
-        registrar = await asyncio.to_thread(registration.init_node, self.name[1:], ["genomixd"])
+        registrar = await asyncio.to_thread(registration.init_node, self.name[1:], [self._program])
         self._is_node = True
         startup.log_to_stderr()
         rospy.on_shutdown(registrar.end)

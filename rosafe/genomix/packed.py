@@ -58,7 +58,7 @@ def pieces(component: Component, idl: str, value: Any) -> Iterator[bytes]:
             yield from pieces(component, element, item)
         yield END
     elif idl.startswith("::"):
-        yield from structure(component, component.structs[idl], value)
+        yield from structure(component, component.members(idl), value)
     elif idl == "string":
         yield TEXT + text(value)
     else:

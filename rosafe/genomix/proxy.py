@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-from collections.abc import Iterator, Mapping
+from collections.abc import AsyncIterator, Iterator, Mapping
 from typing import Any
 
 import rosgraph.names
 
-from rosafe.component import wire
-from rosafe.genomix import packed, syntax, trees
+from rosafe.component import mark, wire
+from rosafe.genomix import packed, setups, syntax, trees
 from rosafe.genomix.actions import ActionClient, Goal
 from rosafe.genomix.graph import Graph, Unknown, middleware_error
 from rosafe.genomix.syntax import Syntax
@@ -21,8 +21,11 @@ from rosafe.interface import (
     COMPONENTS,
     FIND,
     KINDS,
+    LOAD_SETUP,
+    REQUEST,
     REQUIRED,
     ROSAFE,
+    SAVE_SETUP,
     Component,
     ComponentError,
     Parameter,
@@ -32,6 +35,7 @@ from rosafe.interface import (
     ros_type,
 )
 from rosafe.interface.signals import LEVELS
+from rosafe.vocabulary.words import meant
 
 CALL_SECONDS = 60.0  # for the answer to one request
 APPEAR_SECONDS = 2.0  # that `load` waits for a component that is just starting
@@ -39,6 +43,13 @@ POLL_SECONDS = 0.1
 REGISTER_SECONDS = 20.0  # for becoming a client of an action, the first time for becoming a node too
 LATE_SECONDS = 0.5  # results that a component sent before it ended arrive within
 MAX_PENDING = 1000  # requests to one component that are not answered yet
+WHOLE_TREES = (REQUEST, FIND)  # which take parameters of any kind, and only those that are given
+_COMPOSITES = {
+    REQUEST.name: trees.build,
+    FIND.name: trees.find,
+    SAVE_SETUP.name: setups.save,
+    LOAD_SETUP.name: setups.load,
+}
 
 
 class Value:
@@ -48,7 +59,15 @@ class Value:
         self._component = component
         self._members = members
         self.values = values
+        self.warning = ""
         self.data: object = self  # what the values belong to, and perhaps those of others
+
+    def warn(self, warning: str) -> None:
+        """Have the component's `warning`, where there is one, among the members."""
+        if warning:
+            self.warning = warning
+            self._members = (*self._members, ("warning", "string"))
+            self.values = {**self.values, "warning": warning}
 
     def pieces(self, form: Syntax) -> Iterator[str]:
         """The text, as one nested value, in short pieces."""
@@ -134,26 +153,28 @@ class Proxy:
         try:
             return self.component.service(name)
         except KeyError:
-            known = ", ".join(s.name for s in (*self.component.services, *self.component.composites))
-            what = f"{self.component.name} has no service {name[:80]!r}; it has {known}"
+            known = [s.name for s in (*self.component.services, *self.component.composites)]
+            what = f"{self.component.name} has no service {name[:80]!r}; it has {', '.join(known)}{meant(name, known)}"
             raise ComponentError("::genom::no_such_service", what=what) from None
 
     def arguments(self, service: Service, given: Any) -> dict[str, Any]:
         """What `call` and `start` take, of what a client has `given`; ComponentError where that does not fit."""
-        return partial(given) if service in self.component.composites else complete(service, given)
+        return partial(given) if service in WHOLE_TREES else complete(service, given)
 
     async def call(self, service: Service, values: Mapping[str, Any]) -> Value:
         """What a function returns; an activity returns nothing, as soon as it runs."""
         with self._one_more():
             if service in self.component.composites:
                 async with self._building:
-                    answer = await (trees.find if service is FIND else trees.build)(self, values)
+                    answer = await _COMPOSITES[service.name](self, values)
                 return Value(self.component, service.outputs, answer)
             client = self._client(service.name)
             response = await client.call(values, CALL_SECONDS)
         if not response.genom_success:
             raise component_exception(response.genom_exdetail)
-        return Value(self.component, service.outputs, {name: getattr(response, name) for name, _ in service.outputs})
+        value = Value(self.component, service.outputs, {name: getattr(response, name) for name, _ in service.outputs})
+        value.warn(mark.warning_in(response.genom_exdetail))
+        return value
 
     async def start(self, service: Service, values: Mapping[str, Any]) -> Goal:
         """Send an activity; its goal tells when it runs and when it has ended."""
@@ -166,17 +187,29 @@ class Proxy:
         """The values that a service returns."""
         return (await self.call(self.service(service), values)).values
 
-    async def hears(self, port: str) -> bool:
-        """Whether an input port is connected, as the master knows: it subscribes to something of that type."""
+    async def hears(self, port: str) -> str:
+        """The topic that an input port is connected to, as the master knows: it subscribes to something of that type.
+
+        Empty where it is not connected.
+        """
         kind = ros_type(self.component.port(port).idl)
         _, subscribed, _ = await self._graph.master("getSystemState")
         types = dict(await self._graph.master("getTopicTypes"))
         topics = [topic for topic, nodes in subscribed if f"/{self.instance}" in nodes]
-        return any(types.get(topic, "").split("/")[-1] == kind for topic in topics)
+        return next((topic for topic in topics if types.get(topic, "").split("/")[-1] == kind), "")
 
     async def published(self, topic: str) -> bool:
         """Whether somebody publishes `topic`."""
         return topic in await self._graph.topics()
+
+    @contextlib.asynccontextmanager
+    async def other(self, instance: str) -> AsyncIterator[Proxy]:
+        """Another component of the graph, for a moment; ComponentError where there is none of that name."""
+        proxy = await Proxy.load(self._graph, instance)
+        try:
+            yield proxy
+        finally:
+            await proxy.close()
 
     @contextlib.contextmanager
     def _one_more(self) -> Iterator[None]:
@@ -246,7 +279,7 @@ class Proxy:
             message = await self._read(port, element)
         value = _zero(self.component, port.idl)
         if message is not None:
-            value = {name: getattr(message, name) for name, _ in self.component.structs[port.idl]}
+            value = {name: getattr(message, name) for name, _ in self.component.members(port.idl)}
         sample = Value(self.component, ((port.name, port.idl),), {port.name: value})
         sample.data = message
         return sample
@@ -294,7 +327,7 @@ class Proxy:
             "doc": component.doc,
             "services": {
                 **{s.name: _describe_service(s, composite=False) for s in component.services},
-                **{s.name: _describe_service(s, composite=True) for s in component.composites},
+                **{s.name: _describe_service(s, composite=s in WHOLE_TREES) for s in component.composites},
             },
             "ports": {
                 p.name: {
@@ -377,10 +410,10 @@ def _no_port(what: str) -> ComponentError:
 def _zero(component: Component, idl: str) -> Any:
     if idl.startswith("sequence<"):
         return []
-    if idl in component.structs:
+    if idl.startswith("::"):
         if idl in LEVELS:
             return []
-        return {name: _zero(component, kind) for name, kind in component.structs[idl]}
+        return {name: _zero(component, kind) for name, kind in component.members(idl)}
     return "" if idl == "string" else 0
 
 
@@ -390,7 +423,7 @@ def _describe_service(service: Service, composite: bool) -> dict[str, Any]:
         "activity": service.activity,
         "composite": composite,
         "aliases": list(service.aliases),
-        "parameters": {p.name: _describe_parameter(p) for p in service.parameters},
+        "parameters": {p.name: describe_parameter(p) for p in service.parameters},
         "outputs": dict(service.outputs),
         "throws": list(service.throws),
     }
@@ -413,7 +446,8 @@ def _describe_representation(representation: Representation) -> dict[str, Any]:
     }
 
 
-def _describe_parameter(parameter: Parameter) -> dict[str, Any]:
+def describe_parameter(parameter: Parameter) -> dict[str, Any]:
+    """All that the table says of a parameter."""
     required = parameter.default is REQUIRED
     return {
         "type": parameter.idl,

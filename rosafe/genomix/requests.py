@@ -5,10 +5,10 @@ from __future__ import annotations
 import asyncio
 import errno
 from collections.abc import Iterator
+from typing import Any
 
 from rosafe.genomix import packed
 from rosafe.genomix.actions import Goal
-from rosafe.genomix.errors import error_body
 from rosafe.genomix.proxy import NOTHING, Value
 from rosafe.genomix.syntax import Syntax, plain
 from rosafe.interface import ComponentError
@@ -32,6 +32,7 @@ class Request:
         self.output_size = 0
         self._told = True  # the output is part of events and of the status
         self.error: ComponentError | None = None
+        self.warning = ""  # of the component, where it grants the request all the same
         self.acknowledged = asyncio.Event()
         self.finished = asyncio.Event()
         self.forgotten = asyncio.Event()  # nobody is interested in its end
@@ -44,7 +45,7 @@ class Request:
         if self.finished.is_set():
             return
         if not self._abortable:
-            raise ComponentError("::genom::syserr", code=errno.EAGAIN)
+            raise ComponentError("::genom::syserr", f"{self.id} is no activity, and is not aborted", code=errno.EAGAIN)
         self._aborted = True
         if self._goal is not None:
             self._goal.cancel()
@@ -63,6 +64,7 @@ class Request:
     def finish(self, value: Value, error: ComponentError | None) -> None:
         """Record the end."""
         self.value, self.error, self.output_size = value, error, value.size
+        self.warning = self.warning or value.warning
         self._told = value.size <= EVENT_BYTES
         self.status = "done" if error is None else "error"
         self.acknowledged.set()
@@ -74,27 +76,36 @@ class Request:
             self.value, self._told = NOTHING, False
 
     def pieces(self, form: Syntax) -> Iterator[str]:
-        """The status as text: id, status, and output or exception once there is one."""
+        """The status as text: id, status, warning if there is one, and output or exception once there is one."""
         yield form.open("struct")
-        yield form.key(0, "id") + form.string(self.id) + form.key(1, "status") + form.string(self.status)
-        if self.error is not None:
-            yield form.key(2, "exception") + plain(form, error_body(self.error))
-        elif self.status == "done" and self._told:
-            yield form.key(2, "output")
+        told = self._told_now()
+        yield "".join(form.key(index, name) + plain(form, value) for index, (name, value) in enumerate(told.items()))
+        if self._has_output:
+            yield form.key(len(told), "output")
             yield from self.value.pieces(form)
-        elif self.status == "done":
-            yield form.key(2, "large") + str(self.output_size)
         yield form.close("struct")
 
     def packed(self) -> Iterator[bytes]:
         """The status as `pieces` tells it, packed."""
         yield packed.STRUCTURE
-        yield packed.member("id") + packed.plain(self.id) + packed.member("status") + packed.plain(self.status)
-        if self.error is not None:
-            yield packed.member("exception") + packed.plain(error_body(self.error))
-        elif self.status == "done" and self._told:
+        for name, value in self._told_now().items():
+            yield packed.member(name) + packed.plain(value)
+        if self._has_output:
             yield packed.member("output")
             yield from self.value.packed()
-        elif self.status == "done":
-            yield packed.member("large") + packed.plain(self.output_size)
         yield packed.END
+
+    def _told_now(self) -> dict[str, Any]:
+        """The status but for its output."""
+        told: dict[str, Any] = {"id": self.id, "status": self.status}
+        if self.warning:
+            told["warning"] = self.warning
+        if self.error is not None:
+            told["exception"] = self.error.body
+        elif self.status == "done" and not self._told:
+            told["large"] = self.output_size
+        return told
+
+    @property
+    def _has_output(self) -> bool:
+        return self.status == "done" and self._told

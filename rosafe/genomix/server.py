@@ -17,7 +17,6 @@ from aiohttp import web
 from rosafe.genomix import packed
 from rosafe.genomix.access import refuse_web_pages
 from rosafe.genomix.connections import Connection, Connections
-from rosafe.genomix.errors import error_body
 from rosafe.genomix.graph import middleware_error
 from rosafe.genomix.proxy import Proxy, Value
 from rosafe.genomix.requests import Request
@@ -433,9 +432,9 @@ def _small(request: web.Request, value: Any) -> web.Response:
 
 def _error(request: web.Request, error: ComponentError, status: int = 0) -> web.Response:
     if _is_packed(request):  # MATLAB and Octave lose the body of an answer with any other status
-        return _respond(request, packed.error(error_body(error)))
+        return _respond(request, packed.error(error.body))
     form = _written_in(request)
-    text = "".join(_unwrapped(form, iter((plain(form, error_body(error)),))))
+    text = "".join(_unwrapped(form, iter((plain(form, error.body),))))
     return _respond(request, _utf8(text), status or _STATUS.get(error.ex, _COMPONENT_ERROR))
 
 

@@ -201,6 +201,7 @@ class Session:
         request.begun(goal)
         try:
             await goal.acknowledged.wait()
+            request.warning = goal.warning
             request.acknowledged.set()
             turn.over()
             if not goal.ended.is_set() and request.id in self.requests:

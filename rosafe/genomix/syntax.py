@@ -134,7 +134,7 @@ def pieces(syntax: Syntax, component: Component, idl: str, value: Any) -> Iterat
         yield from _elements(syntax, component, idl[len("sequence<") : -1], value)
         yield syntax.close("sequence")
     elif idl.startswith("::"):
-        yield from structure(syntax, component, component.structs[idl], value)
+        yield from structure(syntax, component, component.members(idl), value)
     else:
         yield _scalar(syntax, idl, value)
 

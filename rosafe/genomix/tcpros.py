@@ -19,7 +19,7 @@ from typing import Any
 import genpy
 import rosgraph.network
 
-from rosafe.component import wire
+from rosafe.component import mark, wire
 from rosafe.genomix.graph import Graph, Unknown, middleware_error
 from rosafe.genomix.tasks import shared
 from rosafe.genomix.values import refused
@@ -172,6 +172,7 @@ class ServiceClient:
             "type": definition._type,
             "callerid": graph.name,
             "persistent": "1",
+            **mark.HEADER,
         }
         outputs = self._response_class.__slots__[2:]  # after genom_success and genom_exdetail
         self._limit = MAX_MESSAGE if outputs else MAX_TEXT
@@ -310,6 +311,9 @@ def component_exception(exdetail: str) -> ComponentError:
     except ValueError:
         body = exdetail
     if isinstance(body, dict) and isinstance(body.get("ex"), str):
-        detail = body.get("detail")
-        return ComponentError(body["ex"], **(detail if isinstance(detail, dict) else {}))
+        detail, what = body.get("detail"), body.get("what")
+        known = {str(name): value for name, value in detail.items()} if isinstance(detail, dict) else {}
+        error = ComponentError(body["ex"], what if isinstance(what, str) else str(known.get("what", "")))
+        error.detail = known  # whatever its members are called
+        return error
     return ComponentError("::genom::unkex", what=str(body)[:127])

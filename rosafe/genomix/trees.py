@@ -6,7 +6,7 @@ import asyncio
 from collections.abc import Awaitable, Mapping
 from typing import Any, Protocol, TypeVar
 
-from rosafe.interface import KINDS, REQUEST, ROSAFE, ComponentError
+from rosafe.interface import BLOCK_AND_BUFFERS, KINDS, REQUEST, ROSAFE, ComponentError
 from rosafe.tree import requests as request
 from rosafe.tree.requests import Found, Plan, Step, Wish
 
@@ -25,8 +25,8 @@ class Services(Protocol):
     async def outputs(self, service: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
         """What a service returns; an activity, nothing, as soon as it runs. Raises ComponentError."""
 
-    async def hears(self, port: str) -> bool:
-        """Whether an input port is connected."""
+    async def hears(self, port: str) -> str:
+        """The topic that an input port is connected to, or nothing."""
 
     async def published(self, topic: str) -> bool:
         """Whether somebody publishes `topic`."""
@@ -49,7 +49,7 @@ async def build(component: Services, values: Mapping[str, Any]) -> dict[str, Any
     try:
         dependencies = await _carry_out(component, wish, made)
     except BaseException:
-        await _uncancelled(_remove(component, wish, made))
+        await uncancelled(remove(component, made))
         raise
     return request.answer(wish, dependencies, made, component.instance)
 
@@ -57,7 +57,7 @@ async def build(component: Services, values: Mapping[str, Any]) -> dict[str, Any
 async def find(component: Services, values: Mapping[str, Any]) -> dict[str, Any]:
     """What `build` would answer if all that it needs is there; ``::rosAFE::e_noSuchProcessor`` where it is not."""
     wish = await _understood(values)
-    plan = request.plan(wish, await _look(component))
+    plan = request.plan(wish, await look(component))
     if plan.steps:
         missing = ", ".join(step.service for step in plan.steps if step.makes)
         raise ROSAFE.error("e_noSuchProcessor", what=f"there is none with these parameters; missing: {missing}")
@@ -73,7 +73,7 @@ async def _understood(values: Mapping[str, Any]) -> Wish:
 async def _carry_out(component: Services, wish: Wish, made: list[str]) -> list[str]:
     problem = ComponentError("::genom::mwerr", what="others change the tree all the time")
     for _ in range(TRIES):
-        plan = request.plan(wish, await _look(component))
+        plan = request.plan(wish, await look(component))
         try:
             await _take_steps(component, wish, plan, made)
         except ComponentError as error:
@@ -81,18 +81,18 @@ async def _carry_out(component: Services, wish: Wish, made: list[str]) -> list[s
                 raise
             problem = error
             if error.ex == request.INTERRUPTED:
-                await _wait_for_input(component)
+                await wait_for_input(component)
         else:
-            if not plan.steps or request.stands(plan.dependencies, await _look(component)):
+            if not plan.steps or request.stands(plan.dependencies, await look(component)):
                 return plan.dependencies
     raise problem
 
 
-async def _wait_for_input(component: Services) -> None:
+async def wait_for_input(component: Services) -> None:
     """Let another's InputProc, which has taken the place of ours, come to its end: it may be waiting for sound."""
     deadline = asyncio.get_running_loop().time() + INPUT_SECONDS
     while asyncio.get_running_loop().time() < deadline:
-        if await _look(component):
+        if await look(component):
             return
         await asyncio.sleep(POLL_SECONDS)
 
@@ -101,16 +101,17 @@ async def _take_steps(component: Services, wish: Wish, plan: Plan, made: list[st
     if plan.steps and plan.steps[0].makes == plan.dependencies[0]:
         await _connect(component, wish)
     for step in plan.steps:
-        await _uncancelled(_take_step(component, step, made))
+        await uncancelled(take_step(component, step, made))
 
 
-async def _take_step(component: Services, step: Step, made: list[str]) -> None:
+async def take_step(component: Services, step: Step, made: list[str]) -> None:
+    """Make one request, and note what it has made."""
     await component.outputs(step.service, step.values)
     if step.makes:
         made.append(step.makes)
 
 
-async def _uncancelled(work: Awaitable[T]) -> T:
+async def uncancelled(work: Awaitable[T]) -> T:
     """Do `work` to its end, also where the task is cancelled meanwhile: what a request made must be known."""
     task = asyncio.ensure_future(work)
     try:
@@ -130,23 +131,25 @@ async def _connect(component: Services, wish: Wish) -> None:
         await component.outputs("connect_port", {"local": "Audio", "remote": topic})
 
 
-async def _look(component: Services) -> list[Found]:
+async def look(component: Services) -> list[Found]:
     """All processors of the kinds that are known here."""
     found = []
     for processor in (await component.outputs("getProcessors", {}))["processors"]:
         kind = KINDS.get(processor["kind"])
         if kind is not None:
             texts = {entry["name"]: entry["value"] for entry in processor["parameters"]}
-            values = {p.name: p.parse(texts[p.name]) for p in kind.parameters}
-            found.append(Found(processor["name"], kind.kind, processor["upperDepName"], values))
+            declared = kind.parameters if kind.parent else (*kind.parameters, *BLOCK_AND_BUFFERS)
+            values = {p.name: p.parse(texts[p.name]) for p in declared if p.name in texts}
+            rate = float(processor.get("rate", 0.0))
+            found.append(Found(processor["name"], kind.kind, processor["upperDepName"], values, rate))
     return found
 
 
-async def _remove(component: Services, wish: Wish, made: list[str]) -> None:
+async def remove(component: Services, made: list[str]) -> None:
     """Remove what was made, leaves first, but nothing that others have come to use. Errors are told by what failed."""
     try:
         for name in reversed(made):
-            found = await _look(component)
+            found = await look(component)
             this = next((p for p in found if p.name == name), None)
             if this is None or any(p.parent == name for p in found):
                 continue

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rosafe.interface import KINDS, REQUEST, REQUIRED, ComponentError, Parameter, Service
 from rosafe.tree.requests import kind_of
+from rosafe.vocabulary.words import meant
 
 _WORDS = {
     **dict.fromkeys(("1", "true", "yes", "on", "t"), True),
@@ -63,7 +65,9 @@ def complete(service: Service, given: Any) -> dict[str, Any]:
     """
     values = _converted(service, _named(service, given))
     _require(service, values)
-    return {p.name: values.get(p.name, p.default) for p in service.parameters}
+    # What follows the sample rate is the component's to choose: no number asks it to.
+    known = service.completed(values)
+    return {p.name: known.get(p.name, math.nan) for p in service.parameters}
 
 
 def partial(given: Any) -> dict[str, Any]:
@@ -148,7 +152,8 @@ def _parameter(service: Service, name: str) -> Parameter:
     try:
         return service.parameter(name)
     except KeyError:
-        raise refused(f"unknown parameter {name[:80]!r}; {expected(service)}") from None
+        known = [p.name for p in service.parameters]
+        raise refused(f"unknown parameter {name[:80]!r}; {expected(service)}{meant(name, known)}") from None
 
 
 def _convert(service: Service, parameter: Parameter, value: Any) -> Any:

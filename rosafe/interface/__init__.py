@@ -17,7 +17,19 @@ from rosafe.vocabulary.representation import Representation
 
 from .bass import BASS
 from .genom import COMMON_SERVICES, GENOM_EXCEPTIONS, GENOM_STATE_PORT, MAX_ACTIVITIES
-from .rosafe import FIND, FIXED, LAYOUTS, MAX_BLOCK, MAX_SECONDS, REQUEST, ROSAFE
+from .rosafe import (
+    BLOCK_AND_BUFFERS,
+    FIND,
+    FIXED,
+    LAYOUTS,
+    LOAD_SETUP,
+    MAX_BLOCK,
+    MAX_SECONDS,
+    MAX_SETUP,
+    REQUEST,
+    ROSAFE,
+    SAVE_SETUP,
+)
 from .service import Component, Port, Service
 
 COMPONENTS = {c.name: c for c in (ROSAFE, BASS)}
@@ -32,6 +44,7 @@ def all_services() -> Iterator[tuple[Component, Service]]:
 
 __all__ = [
     "BASS",
+    "BLOCK_AND_BUFFERS",
     "COMMON_SERVICES",
     "COMPONENTS",
     "FIND",
@@ -40,14 +53,17 @@ __all__ = [
     "GENOM_STATE_PORT",
     "KINDS",
     "LAYOUTS",
+    "LOAD_SETUP",
     "MAX_ACTIVITIES",
     "MAX_BLOCK",
     "MAX_SECONDS",
     "MAX_SEQUENCE",
+    "MAX_SETUP",
     "MAX_STRING",
     "REQUEST",
     "REQUIRED",
     "ROSAFE",
+    "SAVE_SETUP",
     "Component",
     "ComponentError",
     "Parameter",

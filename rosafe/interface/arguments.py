@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rosafe.interface import FIXED, KINDS, Parameter
+from rosafe.vocabulary.parameter import shown
+from rosafe.vocabulary.words import meant
 
 _BY_NAME = {name: p for kind in KINDS.values() for p in kind.parameters for name in (p.name, *p.aliases)}
 _BY_FORMER_NAME = {name: p for kind in KINDS.values() for p in kind.parameters for name in p.former}
@@ -39,9 +41,15 @@ def check_change(name: Any, value: Any) -> tuple[str, Any]:
 
 def _parameter(name: Any) -> Parameter:
     if not isinstance(name, str) or name not in _BY_NAME:
-        known = ", ".join(p.name for kind in KINDS.values() for p in kind.parameters)
-        raise ValueError(f"unknown parameter {name!r}; there are: {known}")
+        known = [p.name for kind in KINDS.values() for p in kind.parameters]
+        raise ValueError(f"unknown parameter {shown(name)}; {_suggestion(name, known)}")
     return _BY_NAME[name]
+
+
+def _suggestion(name: Any, known: Sequence[str]) -> str:
+    """What may have been meant, or all that there is."""
+    hint = meant(name, known) if isinstance(name, str) else ""
+    return hint.removeprefix("; ") or f"there are: {', '.join(known)}"
 
 
 def check_outputs(outputs: Any) -> list[str]:
@@ -52,5 +60,5 @@ def check_outputs(outputs: Any) -> list[str]:
         raise ValueError(f"outputs: {outputs!r} is not a sequence of names") from None
     for name in wanted:
         if not isinstance(name, str) or name not in KINDS:
-            raise ValueError(f"unknown output {name!r}; there are: {', '.join(KINDS)}")
+            raise ValueError(f"unknown output {shown(name)}; {_suggestion(name, list(KINDS))}")
     return [kind for kind in KINDS if kind in wanted]

@@ -53,6 +53,17 @@ BASS = Component(
         ),
         Service("Stop", "Stop the acquisition", interrupts=("Acquire",)),
         Service(
+            "getAcquisition",
+            "What is acquired at the moment: the arguments of the Acquire that runs",
+            outputs=(
+                ("running", "boolean"),
+                ("device", "string"),
+                ("sampleRate", "unsigned long"),
+                ("nFramesPerChunk", "unsigned long"),
+                ("nChunksOnPort", "unsigned long"),
+            ),
+        ),
+        Service(
             "DedicatedSocket",
             "Serve the Audio port's content on TCP port 8081 until closed",
             activity=True,

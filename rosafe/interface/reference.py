@@ -18,10 +18,15 @@ Made from the interface table by `python3 -m rosafe.interface`.
 * Every request is a ROS service `/<component>/<Request>`; an *activity* is an action of that name as well, which
   answers when the activity ends.
 * ROS requests carry no defaults: an empty string, an empty list and a zero in a numeric field mean the default. (bass's
-  sampleRate is the exception: 0 has a meaning.) `modifyParameter` and `rosafe.process` take every value as it is.
-* Every answer begins with `bool genom_success` and `string genom_exdetail`, such as `{"ex":"::rosAFE::e_noData"}`.
-* Unknown words in a string with a choice become the default at the node, as in the original; `rosafe.process` refuses
-  them.
+  sampleRate is the exception: 0 has a meaning.) `modifyParameter`, `rosafe.process` and, since they have filled in the
+  defaults themselves, genomixd's clients (Tcl, MATLAB, HTTP) and `rosafe request` mean every value as it is.
+* Every answer begins with `bool genom_success` and `string genom_exdetail`, such as
+  `{"ex":"::rosAFE::e_noData","what":"the Audio port is not connected: call connect_port first"}`; `what`, the reason
+  for people, is a member of `detail` where the exception has one of that name.
+* Unknown words in a string with a choice become the default at the node, as in the original, with a warning in its log,
+  in `/diagnostics` and for genomixd's clients. `rosAFE-ros --strict`, or the ROS parameter `/rosAFE/strict_words` (any
+  time), has them refused with `e_badNewValue`. The kinds that the original did not have, `rosafe request` and
+  `rosafe.process` always refuse them.
 """
 
 

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 from rosafe.representations import KINDS
 from rosafe.representations.registry import ORIGINAL
+from rosafe.vocabulary.idl import TIME
 from rosafe.vocabulary.parameter import REQUIRED, Parameter
 from rosafe.vocabulary.representation import Representation
 
@@ -17,6 +18,7 @@ from .signals import SIGNALS, layout
 
 MAX_SECONDS = 600.0  # longest port or history
 MAX_BLOCK = 10_000_000  # frames
+MAX_SETUP = 256 * 1024  # characters of a setup
 
 Kinds = Mapping[str, Representation]  # parents first
 
@@ -45,6 +47,7 @@ def _structs(kinds: Kinds) -> dict[str, Struct]:
         )
     structs["::rosAFE::parameters"] = tuple((kind, f"sequence<{parameter_struct(kind)}>") for kind in FIXED)
     structs["::rosAFE::dataObjSt"] = tuple((kind, f"sequence<{LAYOUTS[kind].idl}>") for kind in FIXED)
+    structs["::rosAFE::frameTime"] = (("stamp", TIME), ("frameIndex", "unsigned long long"), ("sampleRate", "double"))
     structs["::rosAFE::parameterValue"] = (("name", "string"), ("value", "string"))
     structs["::rosAFE::processor"] = (
         *((name, "string") for name in ("name", "kind", "request", "upperDepName", "port", "topic")),
@@ -158,7 +161,20 @@ def _whole_trees(kinds: Kinds) -> tuple[Service, ...]:
         doc="What the request would use for a representation if all of it is there; nothing is made",
         throws=("::rosAFE::e_noSuchProcessor", "::rosAFE::e_existsAlready", "::rosAFE::e_badNewValue"),
     )
-    return build, find
+    save = Service(
+        "saveSetup",
+        "The tree of processors with its sound, as the text of a file that loadSetup takes",
+        (Parameter("full", "boolean", False, "Flag to write what has its default value, too"),),
+        outputs=(("setup", "string"),),
+    )
+    load = Service(
+        "loadSetup",
+        "Build all that a setup describes, beside what is there: wholly, or nothing is changed",
+        (Parameter("setup", "string", REQUIRED, "The text of a setup (YAML)", longest=MAX_SETUP),),
+        outputs=(("created", "sequence<string>"), ("reused", "sequence<string>"), ("sound", "string")),
+        throws=_INPUT_THROWS,
+    )
+    return build, find, save, load
 
 
 _FUNCTIONS = (
@@ -240,6 +256,11 @@ def derive(kinds: Kinds) -> Component:
         ports=(
             Port("Audio", "::binaudio::portStruct", "Binaural audio to work on", output=False),
             *ports,
+            Port(
+                "frameTime",
+                "::rosAFE::frameTime",
+                "With each block, when its newest audio frame was captured, and how many frames a second come",
+            ),
             Port("dataObj", "::rosAFE::dataObjSt", "Advertised as in the original and, as there, never written"),
             GENOM_STATE_PORT,
         ),
@@ -260,4 +281,4 @@ def derive(kinds: Kinds) -> Component:
 
 
 ROSAFE = derive(KINDS)
-REQUEST, FIND = ROSAFE.composites
+REQUEST, FIND, SAVE_SETUP, LOAD_SETUP = ROSAFE.composites

@@ -2,14 +2,23 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from rosafe.vocabulary.errors import ComponentError
+from rosafe.vocabulary.idl import TIME, TIME_MEMBERS
 from rosafe.vocabulary.parameter import REQUIRED, Parameter
 
 Struct = tuple[tuple[str, str], ...]  # (member, IDL type)
+
+
+def _unset(parameter: Parameter, value: Any) -> bool:
+    """Whether `value` means the default in a ROS request, which carries none."""
+    if isinstance(value, bool) or not parameter.zero_is_default or parameter.default is REQUIRED:
+        return False
+    return bool(len(value) == 0 if hasattr(value, "__len__") else value == 0)  # "" and [] have a length
 
 
 @dataclass(frozen=True)
@@ -37,22 +46,29 @@ class Service:
                 return parameter
         raise KeyError(name)
 
-    def from_ros(self, request: Any) -> dict[str, Any]:
-        """The values of a ROS request or goal, not yet checked; 0, "" and [] there stand for the default."""
-        values = {}
-        for parameter in self.parameters:
-            value = getattr(request, parameter.name)
-            unset = not isinstance(value, bool) and (
-                len(value) == 0 if hasattr(value, "__len__") else value == 0  # "" and [] have a length
-            )
-            if unset and parameter.zero_is_default and parameter.default is not REQUIRED:
-                value = parameter.default
-            values[parameter.name] = value
-        return values
+    def completed(self, given: Mapping[str, Any]) -> dict[str, Any]:
+        """All values, in the order of declaration: those `given`, and the defaults of the others.
+
+        Without those that follow the sample rate and are not given.
+        """
+        known = (p for p in self.parameters if p.name in given or not p.follows_rate)
+        return {p.name: given.get(p.name, p.default) for p in known}
+
+    def from_ros(self, request: Any, literal: bool = False) -> dict[str, Any]:
+        """The values of a ROS request or goal, not yet checked; 0, "" and [] there stand for the default.
+
+        A client that knows the defaults, and has filled them in, means all `literal`; for what follows the sample rate
+        it has none, and says so with NaN.
+        """
+        values = {p.name: getattr(request, p.name) for p in self.parameters}
+        if literal:
+            unknown = [p.name for p in self.parameters if p.follows_rate and math.isnan(values[p.name])]
+            return {name: value for name, value in values.items() if name not in unknown}
+        return self.completed({p.name: values[p.name] for p in self.parameters if not _unset(p, values[p.name])})
 
     def check(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """All values as their parameters' Python types, or ValueError naming the first that is refused."""
-        return {p.name: p.check(p.known_word(values[p.name])) for p in self.parameters}
+        return {p.name: p.check(p.known_word(values[p.name])) for p in self.parameters if p.name in values}
 
 
 @dataclass(frozen=True)
@@ -80,6 +96,10 @@ class Component:
     structs: Mapping[str, Struct]  # by IDL name
     # What genomixd makes of several services, for its clients to call like one; not on the ROS graph.
     composites: tuple[Service, ...] = ()
+
+    def members(self, idl: str) -> Struct:
+        """The members of a struct, or of ROS' own time, of which no file is made."""
+        return TIME_MEMBERS if idl == TIME else self.structs[idl]
 
     def service(self, name: str) -> Service:
         """The service called `name` (aliases count), or KeyError."""

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import functools
 import importlib
+import os
 import re
 import threading
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import rospy
@@ -12,43 +16,77 @@ from diagnostic_msgs.msg import DiagnosticStatus
 
 from rosafe import interface
 from rosafe.component import wire
-from rosafe.component.activities import Activity
-from rosafe.component.audio import MAX_WINDOW, AudioRing
+from rosafe.component.activities import Activity, Handler, TaskMeter
+from rosafe.component.audio import AudioRing
 from rosafe.component.component import ComponentNode
 from rosafe.component.events import EventLog
 from rosafe.component.startup import run_server
 from rosafe.dsp import kernels
-from rosafe.interface import KINDS, LAYOUTS, ROSAFE, ComponentError, Representation
+from rosafe.interface import BLOCK_AND_BUFFERS, KINDS, LAYOUTS, ROSAFE, ComponentError, Representation
 from rosafe.node import reports
+from rosafe.node.keeper import Keeper
 from rosafe.node.ports import OutputPort, element
 from rosafe.node.trace_port import TracePort
-from rosafe.representations import PROBLEMS
+from rosafe.node.words import UnknownWords
+from rosafe.representations import PROBLEMS, STAGES
+from rosafe.setups import Setup, rehearse, wanted
+from rosafe.sound.windows import MAX_WINDOW
 from rosafe.tree.block import Block
 from rosafe.tree.processor import Processor
+from rosafe.tree.requests import Found
 from rosafe.tree.tree import Tree
+from rosafe.tree.workers import workers_to_use
 from rosafe.vocabulary.parameter import MAX_STRING, shown
 
 FIRST_AUDIO_SECONDS = 1.0  # how long InputProc waits for a first message
+LOOK_SECONDS = 0.1  # between two looks whether there is sound for a tree that is to come back
+OPTIONS = {
+    "--strict": {
+        "action": "store_true",
+        "help": "refuse unknown words of enumerated parameters, as the ROS parameter ~strict_words does (default: they "
+        "are taken as the original takes them, with a warning)",
+    },
+    "--keep": {
+        "metavar": "FILE",
+        "default": "",
+        "help": "write connections and processors into FILE at each change, and bring back at the start what it holds, "
+        "once there is sound (default: the ROS parameter ~keep; without it, always a fresh start)",
+    },
+}
 
 
 class RosafeNode:
-    """The component `rosAFE`. Make it after `rospy.init_node`."""
+    """The component `rosAFE`. Make it after `rospy.init_node`.
 
-    def __init__(self, instance: str) -> None:
+    Where it is `strict`, or the ROS parameter ``strict_words`` in its namespace is true, unknown words are refused.
+    `keep`, or else the ROS parameter ``keep``, names a file that holds the tree at any moment; what it holds at the
+    start comes back once there is sound.
+    """
+
+    def __init__(self, instance: str, strict: bool = False, keep: str = "") -> None:
         for problem in PROBLEMS:
             rospy.logwarn(f"a representation is left out: {problem}")
         self._node = ComponentNode(ROSAFE, lambda problem: ROSAFE.error("e_badNewValue", what=str(problem)))
         self.finished = self._node.finished
-        self._tree = Tree(self)
+        self._tree = Tree(self, _workers())
+        self._words = UnknownWords(strict)
         self._ring = AudioRing(EventLog(rospy.logwarn))
         self._audio: rospy.Subscriber | None = None
         self._audio_topic = ""
         self._ports: dict[Processor, OutputPort] = {}
         self._ends: dict[Processor, Activity] = {}
+        self._loads: dict[Processor, TaskMeter] = {}
         self._starting = threading.Lock()  # an InputProc that a newer one has interrupted must not replace that one's
         self._of_the_input: dict[str, Any] = {}  # what the InputProc that runs was asked for
+        self._keeper = _keeper(keep, self._setup)
+        kept = Setup() if self._keeper is None else self._keeper.kept()
+        self._coming_back = Setup(None, kept.connections, kept.processors)  # what is not there yet
+        self._sound = kept.sound  # which is not ours to make; but a file that has one keeps it
+        self._restoring = ""  # why it is not there yet
         self._data_object = self._node.advertise("dataObj", wire.message_class("rosAFE", "::rosAFE::dataObjSt"))
         self._input_port = self._advertise("input")
+        self._time_class = wire.message_class("rosAFE", "::rosAFE::frameTime")
+        self._frame_time = self._node.advertise("frameTime", self._time_class)
 
         self._node.input_port("Audio", self._connect_audio)
         self._node.activity("InputProc", self._input_proc)
@@ -62,15 +100,20 @@ class RosafeNode:
         self._node.function("getDependencies", lambda v: {"dependencies": self._tree.dependencies(v["nameProc"])})
         self._node.function("modifyParameter", self._modify_parameter)
         self._node.function("removeProcessor", self._remove_processor)
-        self._node.function("Stop", lambda _: self._tree.stop())
+        self._node.function("Stop", self._stop)
         self._node.diagnostics.add("audio", self._audio_health)
         self._node.diagnostics.add("processors", self._tree_health)
+        if self._keeper is not None:
+            self._node.diagnostics.add("keep", self._keeping_health)
         self._trace = TracePort(f"{self._node.name}/trace", self._tree.observe)
+        self._begin_to_come_back()
         self._node.start()
         importlib.import_module("scipy.signal")  # whoever has started us waits no longer; no request is to wait for it
 
     def shutdown(self, by: str) -> None:
         """End all processors."""
+        if self._keeper is not None:
+            self._keeper.close()
         self._node.shutdown(by)
         self._tree.stop()
 
@@ -96,10 +139,85 @@ class RosafeNode:
             buff_size=2**22,
             tcp_nodelay=True,
         )
+        self._keep()
+
+    # --- what is kept ---
+
+    def _keep(self) -> None:
+        """Have the tree as it is now in the file, if there is one."""
+        if self._keeper is not None:
+            self._keeper.save()
+
+    def _setup(self) -> Setup:
+        """The tree, or the one that is to come back, with the connection that there is now."""
+        connections = {"Audio": self._audio_topic} if self._audio_topic else {}
+        if self._coming_back.processors:
+            return Setup(self._sound, connections, self._coming_back.processors)
+        found = (
+            Found(
+                processor.name,
+                processor.kind,
+                "" if processor.parent is None else processor.parent.name,
+                {**processor.parameters(), **({} if processor.parent is not None else self._of_the_input)},
+            )
+            for processor in self._tree.processors
+        )
+        return Setup(self._sound, connections, tuple(map(wanted, found)))
+
+    def _begin_to_come_back(self) -> None:
+        topic = self._coming_back.connections.get("Audio", "")
+        if topic:
+            self._connect_audio(topic)  # whether or not somebody publishes it yet
+        if self._coming_back.processors:
+            self._restoring = f"waiting for sound on {topic or 'the Audio port'}"
+            threading.Thread(target=self._come_back, name="come back", daemon=True).start()
+
+    def _come_back(self) -> None:
+        """Build the tree that was there, as soon as there is sound of a rate at which that is possible."""
+        tried: set[int] = set()
+        while self._coming_back.processors and not self.finished.wait(LOOK_SECONDS):
+            rate = self._ring.sample_rate
+            asked = any(activity.service.name == "InputProc" for activity in self._node.activities.live())
+            if rate == 0 or rate in tried or asked:
+                continue
+            tried.add(rate)
+            try:
+                rehearse(self._coming_back, rate)
+                self._rebuild(self._coming_back)
+            except ComponentError as problem:
+                self._restoring = str(problem)
+                if self._coming_back.processors:  # else somebody has begun another one
+                    rospy.logerr(f"the tree of {self._keeper and self._keeper.path} does not come back: {problem}")
+            else:
+                rospy.loginfo(f"{len(self._coming_back.processors)} processors are back")
+                self._give_up_coming_back()
+
+    def _rebuild(self, setup: Setup) -> None:
+        again: Handler = functools.partial(self._input_proc, comes_back=True)
+        try:
+            for one in setup.processors:
+                values = {"name": one.name, "upperDepName": one.parent, **one.values, **one.input_values}
+                handle = self._handler(one.representation) if one.parent else again
+                service = ROSAFE.service(one.representation.request)
+                activity = self._node.activities.start(service, handle, values, None)
+                activity.begun.wait()
+                if activity.error is not None:
+                    raise activity.error
+        except ComponentError:
+            if self._coming_back is setup:
+                self._tree.stop()
+            raise
+
+    def _give_up_coming_back(self) -> None:
+        """From now on what is there counts."""
+        self._coming_back, self._restoring = Setup(), ""
+        self._keep()
 
     # --- processors ---
 
-    def _input_proc(self, activity: Activity, values: dict[str, Any]) -> None:
+    def _input_proc(self, activity: Activity, values: dict[str, Any], comes_back: bool = False) -> None:
+        if not values["name"]:
+            raise ROSAFE.error("e_badNewValue", what="name: '' is empty, and names a processor")
         if self._audio is None:
             raise ROSAFE.error("e_noData", "the Audio port is not connected: call connect_port first")
         activity.interrupt_waiting()
@@ -111,10 +229,12 @@ class RosafeNode:
         try:
             with self._starting:
                 activity.raise_if_interrupted()
-                processor = self._tree.add_input(
-                    values["name"], reader, frames, values["bufferSize_s_port"], values["bufferSize_s_getSignal"]
-                )
-                self._of_the_input = {name: value for name, value in values.items() if name != "name"}
+                buffers = values["bufferSize_s_port"], values["bufferSize_s_getSignal"]
+                parameters = {p.name: values[p.name] for p in KINDS["input"].parameters if p.name in values}
+                processor = self._tree.add_input(values["name"], reader, frames, *buffers, parameters)
+                self._of_the_input = {p.name: values[p.name] for p in BLOCK_AND_BUFFERS}
+                if not comes_back:
+                    self._coming_back = Setup()  # somebody wants a tree of his own
         except BaseException:
             reader.stop()
             raise
@@ -131,11 +251,19 @@ class RosafeNode:
                 raise ROSAFE.error("e_badNewValue", what=what)
             return values
 
-        def handle(activity: Activity, values: dict[str, Any]) -> None:
-            parameters = {p.name: p.known_word(values[p.name]) for p in kind.parameters}
-            self._live(activity, self._tree.add(kind.kind, values["name"], values["upperDepName"], parameters))
+        self._node.activity(kind.request, self._handler(kind), check)
 
-        self._node.activity(kind.request, handle, check)
+    def _handler(self, kind: Representation) -> Handler:
+        def handle(activity: Activity, values: dict[str, Any]) -> None:
+            asked = STAGES[kind.kind].asked({p.name: values[p.name] for p in kind.parameters if p.name in values})
+            doubts: dict[str, str] = {}
+            take = self._words.taking(doubts)
+            parameters = {p.name: take(p, asked[p.name]) for p in kind.parameters if p.name in asked}
+            processor = self._tree.add(kind.kind, values["name"], values["upperDepName"], parameters)
+            activity.warning = self._words.note(processor, doubts)
+            self._live(activity, processor)
+
+        return handle
 
     def _live(self, activity: Activity, processor: Processor) -> None:
         """From now on the activity is the processor: they end together."""
@@ -143,10 +271,13 @@ class RosafeNode:
         if processor not in self._tree.processors:  # it may have ended before its activity was known
             activity.interrupt("")
         self._node.settle()
+        self._keep()  # before anybody is told that it runs
         activity.running()
         activity.stop_requested.wait()
         self._ends.pop(processor, None)
         self._tree.end(processor)
+        self._words.forget(processor)
+        self._keep()
         self._node.settle()
         if processor.error is not None:
             raise ComponentError("::genom::unkex", what=f"{type(processor.error).__name__}: {processor.error}"[:127])
@@ -165,18 +296,33 @@ class RosafeNode:
             publisher = self._advertise(processor.kind, processor.name)
             port = OutputPort(processor, publisher, publisher.unregister)
         self._ports[processor] = port
+        self._loads[processor] = TaskMeter(processor.name)
         port.open(self._tree.port_seconds)
 
     def executed(self, processor: Processor, seconds: float) -> None:
-        """Count the work for genom_state."""
+        """Count the work, for genom_state and /diagnostics."""
         self._node.meters[ROSAFE.service(KINDS[processor.kind].request).task].cycle(seconds)
+        meter = self._loads.get(processor)  # None where it has ended
+        if meter is not None:
+            meter.cycle(seconds)
 
     def released(self, processor: Processor, block: Block) -> None:
-        """Publish the processor's window."""
+        """Publish the processor's window; with that of the input, the time of its newest frame."""
         self._ports[processor].append(block, self._tree.port_seconds)
+        if processor.parent is None:
+            self._tell_time(block.next_index - 1)
+
+    def _tell_time(self, frame: int) -> None:
+        line = self._ring.captured(frame)
+        if line is not None:
+            seconds, nanoseconds = divmod(round(line.time * 1e9), 1_000_000_000)
+            if 0 <= seconds < 2**32:  # what anybody sends as a stamp may be beyond all times
+                stamp = {"sec": seconds, "nsec": nanoseconds}
+                self._frame_time.publish(self._time_class(stamp=stamp, frameIndex=frame, sampleRate=line.rate))
 
     def ended(self, processor: Processor) -> None:
         """Close the port and end the activity."""
+        self._loads.pop(processor, None)
         port = self._ports.pop(processor, None)  # None where it could not be opened
         if port is not None:
             port.close()
@@ -198,11 +344,21 @@ class RosafeNode:
     def _get_representation(self, values: dict[str, Any]) -> dict[str, Any]:
         return reports.response("getRepresentation", parts=reports.representation(self._tree.find(values["name"])))
 
-    def _modify_parameter(self, values: dict[str, Any]) -> None:
-        self._tree.modify(values["nameProc"], values["nameParam"], values["newValue"])
+    def _modify_parameter(self, values: dict[str, Any]) -> dict[str, Any]:
+        doubts: dict[str, str] = {}
+        take = self._words.taking(doubts)
+        processor = self._tree.modify(values["nameProc"], values["nameParam"], values["newValue"], take)
+        self._keep()
+        return {"warning": self._words.note(processor, doubts)}
 
     def _remove_processor(self, values: dict[str, Any]) -> None:
         self._tree.remove(values["name"])
+        self._keep()
+
+    def _stop(self, values: dict[str, Any]) -> None:
+        self._coming_back = Setup()
+        self._tree.stop()
+        self._keep()
 
     # --- health ---
 
@@ -228,13 +384,50 @@ class RosafeNode:
         return status
 
     def _tree_health(self, status: Any) -> Any:
-        processors = self._tree.processors
-        status.summary(DiagnosticStatus.OK, f"{len(processors)} processors")
+        processors, doubts = self._tree.processors, self._words.lines
+        if doubts:
+            more = f" (and {len(doubts) - 1} more unknown words)" if len(doubts) > 1 else ""
+            status.summary(DiagnosticStatus.WARN, f"{doubts[0]}{more}")
+        else:
+            status.summary(DiagnosticStatus.OK, f"{len(processors)} processors")
+        for doubt in doubts:
+            status.add("unknown word", doubt)
+        status.add("workers", str(self._tree.workers))
         for processor in processors:
-            status.add(processor.name, f"{processor.kind}, {processor.state.value}, {processor.blocks} blocks")
+            meter = self._loads.get(processor)
+            load = 1e3 * meter.snapshot()["load"]["last"] if meter is not None else 0.0
+            told = f"{processor.kind}, {processor.state.value}, {processor.blocks} blocks, {load:.1f} ms/s"
+            status.add(processor.name, told)
         return status
+
+    def _keeping_health(self, status: Any) -> Any:
+        assert self._keeper is not None
+        if self._keeper.problem or self._restoring:
+            status.summary(DiagnosticStatus.WARN, self._keeper.problem or self._restoring)
+        else:
+            status.summary(DiagnosticStatus.OK, "the tree is kept")
+        status.add("file", str(self._keeper.path))
+        status.add("to come back", " ".join(one.name for one in self._coming_back.processors) or "nothing")
+        return status
+
+
+def _keeper(path: str, describe: Callable[[], Setup]) -> Keeper | None:
+    path = path or str(rospy.get_param("~keep", ""))
+    return Keeper(Path(os.path.expanduser(path)).absolute(), describe, rospy.logerr) if path else None
+
+
+def _workers() -> int:
+    """How many workers: what the private parameter `workers` says, else the environment, else one for each core."""
+    wanted = rospy.get_param("~workers", None)
+    if isinstance(wanted, bool) or not isinstance(wanted, int | str | None):
+        wanted = str(wanted)
+    try:
+        return workers_to_use(wanted)
+    except ValueError as problem:
+        where = "" if wanted is None else f"the parameter {rospy.resolve_name('~workers')}: "
+        raise ROSAFE.error("e_badNewValue", what=f"{where}{problem}") from None
 
 
 def main(argv: list[str] | None = None) -> int:
     """Run the node; the `rosAFE-ros` command."""
-    return run_server(interface.ROSAFE, RosafeNode, argv, kernels.compiled)
+    return run_server(interface.ROSAFE, RosafeNode, argv, kernels.compiled, OPTIONS)

@@ -2,17 +2,22 @@
 
 from __future__ import annotations
 
+import inspect
 import itertools
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
+from rosafe.dsp import kernels
+from rosafe.dsp.signal import Signal
 from rosafe.dsp.stage import SAMPLE_RATE
 from rosafe.interface import KINDS
-from rosafe.interface.arguments import check_change, check_outputs, check_parameters
+from rosafe.interface.arguments import check_change, check_parameters
 from rosafe.offline.chain import Chain
+from rosafe.offline.signals import as_ears, frame_times, of_ears, outputs_of
 from rosafe.tree import sizes
 from rosafe.tree.block import Block
 
@@ -25,66 +30,121 @@ _TOO_LARGE = (
 
 
 def process(
-    signal: np.ndarray,
+    signal: Any,
     sample_rate: float,
+    *by_place: Any,
     parameters: Mapping[str, Any] | None = None,
     block_frames: int | Sequence[int] = DEFAULT_BLOCK,
     modifications: Sequence[tuple[int, str, Any]] = (),
-    outputs: Sequence[str] | None = None,
+    outputs: Sequence[str] | str | None = None,
 ) -> dict[str, Any]:
-    """Compute auditory representations of a binaural signal.
+    """Compute auditory representations of a signal in memory.
 
     Parameters
     ----------
-    signal : ndarray, shape (2, N), float or int32
-        Left and right ear.
+    signal : array_like, shape (2, N) or (N, 2), or (N,) or (1, N) for one ear
+        Left and right ear; float, or int32 or int16, whose full scale becomes 1. Where N is 2, (2, 2) is (2, N).
     sample_rate : float
         In Hz.
     parameters : mapping, optional
         Names and values, such as `fb_nChannels`; docs/parameters.md has them all.
-        The rest takes the interface table's defaults, but for `in_doNormalize`: True for int32, False for float.
-    block_frames : int or sequence of int
+        The rest takes the interface table's defaults, but for `in_doNormalize`: True for whole numbers, False for
+        floats.
+    block_frames : int or sequence of int, optional
         Block size, or sizes that are used in turn; the last block is what is left. Only where gain control
         (`pp_bNormalizeRMS`) starts do the numbers depend on it.
-    modifications : sequence of (block, name, value)
+    modifications : sequence of (block, name, value), optional
         Parameter changes, each made before the block of that number (from 0); several for one block are made in the
         order given. Those for blocks that never come are ignored. The original's `set_rm_scailing` is known here too.
-    outputs : sequence of str, optional
-        The representations to return, of `interface.KINDS`; `input`, `preProc`, `gammatone`, `ihc`, `ild`, `ratemap`
-        and `crossCorrelation` by default. What none of them depends on is not computed.
+    outputs : sequence of str, or str, optional
+        The representations to return: `input`, `preProc`, `gammatone`, `ihc`, `ild`, `ratemap` and `crossCorrelation`
+        by default, of one ear those that do not compare two. What none of them depends on is not computed.
 
     Returns
     -------
     dict
         Each output as float64 with the axes that `rosafe process -h` lists, such as `input`, `preProc` (2, N);
         `gammatone`, `ihc` (2, C, N); `ild` (C, F) in dB; `ratemap` (2, C, F); `crossCorrelation` (C, L, F); one that
-        has several parts as `<kind>_<part>`. What lies along their axes, such as `fb_cfHz` (C,) in Hz and `cc_lags`
-        (L,) in seconds. `<kind>_frameRate` in Hz of those in frames. Where a change alters the number of lags or
-        channels, L and C are the largest and what lies outside is 0; rates and `fb_cfHz` are the last ones.
+        has several parts as `<kind>_<part>`. Of one ear the first axis has length 1.
+        `<kind>_time` in seconds from the first sample: the middle of frame k, (k h + w / 2) / fs for a hop of h and a
+        window of w samples; n / fs for what has no frames. `<kind>_frameRate` in Hz of those in frames.
+        What lies along the other axes, such as `fb_cfHz` (C,) in Hz and `cc_lags` (L,) in seconds.
+        Where a change alters the number of lags or channels, L and C are the largest and what lies outside is 0; rates
+        and `fb_cfHz` are the last ones.
 
     Raises
     ------
     ValueError
         For anything that cannot be: a signal of the wrong shape or type or with samples that are not finite, a
         parameter or output that does not exist, a value of the wrong type or out of its range.
+
+    See Also
+    --------
+    rosafe.Stream : The same numbers of sound that comes block by block.
+
+    Notes
+    -----
+    One ear is computed as two ears that hear the same, and costs as much.
+
+    Examples
+    --------
+    >>> import numpy as np, rosafe
+    >>> noise = np.random.default_rng(1).standard_normal((2, 16000))
+    >>> result = rosafe.process(noise, 16000, parameters={"fb_nChannels": 32}, outputs=["ild", "ratemap"])
+    >>> result["ratemap"].shape
+    (2, 32, 99)
     """
-    samples = _checked_signal(signal)
-    rate = SAMPLE_RATE.check(sample_rate)
-    ends = _block_ends(block_frames, samples.shape[1])
-    values = {"in_doNormalize": samples.dtype == np.int32, **check_parameters(parameters)}
-    changes = _checked_modifications(modifications)
-    wanted = check_outputs(outputs)
+    options = (parameters, block_frames, modifications, outputs)
+    if by_place:
+        options = _named(by_place, options)
+    try:
+        work = _Work(signal, sample_rate, *options)
+    except ValueError as problem:
+        raise problem.with_traceback(None) from None  # where inside it was found helps nobody
+    return work.run()
 
-    gathered: dict[str, dict[str, _Gathered]] = {}  # by kind and name
 
-    def keep(kind: str, block: Block) -> None:
-        for whole, data in zip(gathered[kind].values(), block.parts, strict=True):
-            whole.add(data)
+process.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
+    [p for p in inspect.signature(process).parameters.values() if p.kind is not p.VAR_POSITIONAL],
+    return_annotation="dict[str, Any]",
+)
 
-    blocks = (samples[:, first:end] for first, end in itertools.pairwise((0, *ends)))
-    with Chain(blocks, rate, values, wanted, keep) as chain:
+
+def _named(by_place: tuple[Any, ...], options: tuple[Any, Any, Any, Any]) -> tuple[Any, Any, Any, Any]:
+    """The options, of which the first ones were given by their place, as it was done once."""
+    if len(by_place) > len(options):
+        raise TypeError(f"process() takes 2 positional arguments, and {2 + len(by_place)} were given")
+    warnings.warn("give what follows the sample rate by name, as in parameters={...}", DeprecationWarning, 3)
+    return (*by_place, *options[len(by_place) :])  # type: ignore[return-value]
+
+
+class _Work:
+    """One call of `process`, all of it checked; nothing has been computed."""
+
+    def __init__(self, signal: Any, sample_rate: Any, parameters: Any, sizes_: Any, changes: Any, outputs: Any) -> None:
+        samples = as_ears(signal)
+        self.ears = samples.shape[0]
+        self.rate = SAMPLE_RATE.check(sample_rate)
+        ends = _block_ends(sizes_, samples.shape[1])
+        values = {"in_doNormalize": samples.dtype == np.int32, **check_parameters(parameters)}
+        changes = _checked_modifications(changes)
+        self.wanted = outputs_of(self.ears, outputs)
+        self.gathered: dict[str, dict[str, _Gathered]] = {}  # by kind and name
+        # of each output, how many frames of each format have come, one after the other
+        self.counts: dict[str, list[tuple[Signal, list[int]]]] = {kind: [] for kind in self.wanted}
+        both = np.broadcast_to(samples, (2, samples.shape[1]))
+        blocks = (both[:, first:end] for first, end in itertools.pairwise((0, *ends)))
+        self.chain = Chain(blocks, self.rate, values, self.wanted, self.keep)
+        try:
+            self._prepare(samples.shape[1], ends, changes)
+        except BaseException:
+            self.chain.close()
+            raise
+
+    def _prepare(self, frames: int, ends: list[int], changes: list[tuple[int, str, Any]]) -> None:
+        chain, wanted = self.chain, self.wanted
         taken = [_size(chain, wanted, ends)]
-        shapes = {kind: chain.shapes(kind, samples.shape[1]) for kind in wanted}  # before any change
+        shapes = {kind: chain.shapes(kind, frames) for kind in wanted}  # before any change
         for block, name, value in changes:
             if block < len(ends):
                 chain.schedule(block, name, value)
@@ -92,39 +152,51 @@ def process(
         sizes.refuse_over(sizes.machine_memory(), max(taken), _TOO_LARGE, 1e9)
         for kind in wanted:
             centred, parts = KINDS[kind].centred, KINDS[kind].outputs
-            middles = {name: part.axes.index(centred) if centred in part.axes else -1 for name, part in parts.items()}
-            gathered[kind] = {name: _Gathered(shape, middles[name]) for name, shape in shapes[kind].items()}
-            chain.write_into(kind, next(iter(gathered[kind].values())).place)
-        chain.run()
-        results: dict[str, Any] = {}
-        while gathered:
-            wholes = gathered.pop(next(iter(gathered)))
-            while wholes:
-                name = next(iter(wholes))
-                results[name] = wholes.pop(name).joined()
-        results.update(chain.describe())
-        return results
+            self.gathered[kind] = {}
+            for name, shape in shapes[kind].items():
+                axes = parts[name].axes
+                kept = (self.ears, *shape[1:]) if axes[0] == "ear" else shape
+                self.gathered[kind][name] = _Gathered(kept, axes.index(centred) if centred in axes else -1)
+            self.chain.write_into(kind, next(iter(self.gathered[kind].values())).place)
+
+    def keep(self, kind: str, block: Block) -> None:
+        """Take what has been released."""
+        parts = block.parts
+        if self.ears == 1:
+            axes = [part.axes for part in KINDS[kind].outputs.values()]
+            parts = tuple(of_ears(self.ears, *one) for one in zip(axes, parts, strict=True))
+        for whole, data in zip(self.gathered[kind].values(), parts, strict=True):
+            whole.add(data)
+        counts = self.counts[kind]
+        if not counts or counts[-1][0] is not block.signal:
+            counts.append((block.signal, [0]))
+        counts[-1][1][0] += block.data.shape[-1]
+
+    def _times(self, kind: str) -> np.ndarray:
+        """Seconds at the middle of each frame that was kept."""
+        times, first = [np.empty(0)], 0
+        for signal, (count,) in self.counts[kind]:
+            times.append(frame_times(signal, first, count))
+            first += count * signal.hop
+        return np.concatenate(times)
+
+    def run(self) -> dict[str, Any]:
+        """Compute; what was gathered is given up."""
+        with self.chain as chain:
+            chain.run()
+            results: dict[str, Any] = {}
+            while self.gathered:
+                kind = next(iter(self.gathered))
+                wholes = self.gathered.pop(kind)
+                while wholes:
+                    name = next(iter(wholes))
+                    results[name] = wholes.pop(name).joined()
+                results[f"{kind}_time"] = self._times(kind)
+            results.update(chain.describe())
+            return results
 
 
 # --- arguments ---
-
-
-def _checked_signal(signal: Any) -> np.ndarray:
-    try:
-        array = np.asarray(signal)
-    except ValueError as problem:
-        raise ValueError(f"signal is no array: {problem}") from None
-    if array.ndim != 2 or array.shape[0] != 2:
-        raise ValueError(f"signal has shape {array.shape}, wanted is (2, frames): left and right ear")
-    if array.dtype.kind == "i" and array.dtype.itemsize == 4:
-        return np.asarray(array, np.int32)
-    if array.dtype.kind != "f":
-        raise ValueError(f"signal is of type {array.dtype}, wanted is a float type or int32")
-    with np.errstate(over="ignore"):  # a long double beyond the range of double becomes infinite
-        array = np.asarray(array, np.float64)
-    if not np.isfinite(array).all():
-        raise ValueError("signal holds NaN or infinite samples")
-    return array
 
 
 def _block_ends(block_frames: Any, frames: int) -> list[int]:
@@ -210,7 +282,7 @@ class _Gathered:
     def _write(self) -> None:
         end = self._filled + self._frames
         if end <= self._whole.shape[-1]:
-            np.concatenate(self._waiting, axis=-1, out=self._whole[..., self._filled : end])
+            kernels.join(self._waiting, self._whole[..., self._filled : end])
             self._waiting, self._filled, self._frames, self._begun = [], end, 0, True
 
     def joined(self) -> np.ndarray:

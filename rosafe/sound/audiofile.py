@@ -10,6 +10,7 @@ import numpy as np
 import soundfile
 
 FULL_SCALE = 2**31 - 1  # what 1.0 in a float file becomes
+MAX_CHANNELS = 1024  # that libsndfile opens
 _FLOAT_SUBTYPES = ("FLOAT", "DOUBLE", "VORBIS", "OPUS", "MPEG")  # the decoder's own numbers are floats
 _UNKNOWN_LENGTH = 0x7FFFF000  # a writer to a pipe leaves a data size from here up: it could not know the length
 
@@ -24,6 +25,17 @@ def to_int32(signal: np.ndarray) -> np.ndarray:
     return np.clip(np.rint(scaled), -(2**31), FULL_SCALE).astype(np.int32)
 
 
+def channel_pair(text: str) -> tuple[int, int]:
+    """The two channels, from 1, that a text such as ``3,4`` names: left and right ear; ValueError for other texts."""
+    words = text.split(",")
+    if len(words) != 2 or not all(word.isascii() and word.isdigit() and len(word) <= 4 for word in words):
+        raise ValueError(f"two channel numbers from 1 to {MAX_CHANNELS}, such as 3,4")
+    left, right = (int(word) for word in words)
+    if not (1 <= left <= MAX_CHANNELS and 1 <= right <= MAX_CHANNELS):
+        raise ValueError(f"two channel numbers from 1 to {MAX_CHANNELS}, such as 3,4")
+    return left, right
+
+
 class AudioFile:
     """A sound file of any kind that libsndfile knows (WAV, FLAC, Ogg, AIFF, MP3...), read from disk bit by bit.
 
@@ -32,7 +44,9 @@ class AudioFile:
     sample_rate : int
         Hz.
     channels, frames : int
-        Size of the file; at least 1 each.
+        Size of what is read; at least 1 each.
+    not_finite : int
+        How many samples that were read so far were NaN or infinite.
 
     Raises
     ------
@@ -53,16 +67,25 @@ class AudioFile:
         try:
             self._file = soundfile.SoundFile(str(self.path))
         except soundfile.LibsndfileError as problem:
-            raise AudioFileError(f"{self.path} is not a sound file: {problem.error_string}") from None
+            raise AudioFileError(f"{self.path} is not a sound file: {problem.error_string}{self._cure()}") from None
+        self.not_finite = 0
         self.sample_rate = int(self._file.samplerate)
         self.channels = int(self._file.channels)
         self.frames = int(self._file.frames)
         self._float = self._file.subtype.startswith(_FLOAT_SUBTYPES)
+        self._ears: list[int] | None = None
         try:
             self._check_whole()
         except AudioFileError:
             self.close()
             raise
+
+    def _cure(self) -> str:
+        """What to do where this libsndfile is too old for the file."""
+        if self.path.suffix.lower() != ".mp3" or "MP3" in soundfile.available_formats():
+            return ""
+        version = soundfile.__libsndfile_version__
+        return f" (libsndfile {version} knows no MP3, 1.1 does; `ffmpeg -i IN.mp3 OUT.wav` makes a WAV of it)"
 
     def _check_whole(self) -> None:
         if self.frames == 0:
@@ -75,6 +98,14 @@ class AudioFile:
         if self.read(1).shape[1] != 1:
             raise AudioFileError(f"{self.path} is cut off before its {self.frames} frames")
         self.seek(0)
+
+    def pick(self, ears: tuple[int, int]) -> None:
+        """From now on read these two channels (from 1); one may be named twice. AudioFileError where one is missing."""
+        if max(ears) > self.channels:
+            there = "is mono" if self.channels == 1 else f"has {self.channels} channels"
+            raise AudioFileError(f"{self.path} {there}: there is no channel {max(ears)}")
+        self._ears = [ear - 1 for ear in ears]
+        self.channels = 2
 
     def seek(self, frame: int) -> None:
         """Go on reading at `frame`, from 0 to `frames`."""
@@ -92,11 +123,15 @@ class AudioFile:
             Samples of 8, 16 or 24 bits fill the upper bits; float samples are converted by `to_int32`.
         """
         try:
-            if self._float:
-                return to_int32(self._file.read(frames, dtype="float64", always_2d=True).T)
-            return np.asarray(self._file.read(frames, dtype="int32", always_2d=True).T)
+            samples = self._file.read(frames, dtype="float64" if self._float else "int32", always_2d=True).T
         except soundfile.LibsndfileError as problem:
             raise AudioFileError(f"{self.path} is cut off or damaged: {problem.error_string}") from None
+        if self._ears is not None:
+            samples = samples[self._ears]
+        if self._float:
+            self.not_finite += samples.size - int(np.count_nonzero(np.isfinite(samples)))
+            return to_int32(samples)
+        return np.asarray(samples)
 
     def close(self) -> None:
         """Close the file."""

@@ -13,14 +13,14 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from rosafe.interface import BASS, KINDS, REQUEST, ROSAFE, ComponentError, Parameter, Representation, text_of
+from rosafe.interface import BASS, KINDS, REQUEST, ROSAFE, ComponentError, Representation, text_of
 from rosafe.interface.arguments import check_parameter
 from rosafe.representations import STAGES
+from rosafe.vocabulary.words import meant
 
 HIGHEST_RATE = float(BASS.service("Acquire").parameter("sampleRate").maximum or 0)  # Hz; what is wrong there is at any
 INTERRUPTED = "::genom::interrupted"
 _RACES = {f"::rosAFE::{short}" for short in ("e_existsAlready", "e_noUpperDependencie", "e_noSuchProcessor")}
-ALMOST_ZERO = math.ulp(0.0)  # in place of a zero, which would mean the default, until modifyParameter has set that
 # What only the making of an input needs: the topic, and InputProc's parameters without its name.
 OF_THE_INPUT = ("connect", *(p.name for p in ROSAFE.service("InputProc").parameters[1:]))
 
@@ -32,6 +32,7 @@ class Found(NamedTuple):
     kind: str
     parent: str
     values: Mapping[str, Any]
+    rate: float = 0.0  # frames of output per second
 
 
 class Step(NamedTuple):
@@ -62,15 +63,18 @@ class Level:
     in_force: Mapping[str, Any]
     given: Mapping[str, Any]
 
-    def fits(self, found: Found) -> bool:
-        """Whether `found` is what is wanted: each parameter the same, to the last digit.
+    def fits(self, found: Found, sample_rate: float) -> bool:
+        """Whether `found`, at a sample rate (Hz), is what is wanted: each parameter the same, to the last digit.
 
         A structure of getParameters fits the processor that it describes, though one that was made with all that
         it names would tell otherwise of how its channels were chosen.
         """
         told = {name: found.values[name] for name in self.in_force}
-        told.update({name: 0.0 for name, value in told.items() if value == ALMOST_ZERO})  # will be in a moment
-        return told in (self.in_force, {**self.in_force, **self.given})
+        in_force = self.in_force
+        if sample_rate and any(p.follows_rate for p in self.kind.parameters):
+            stage = STAGES[self.kind.kind]
+            in_force = stage.in_force(stage.at_rate(self.values, self.given, sample_rate))
+        return told in (in_force, {**in_force, **self.given})
 
 
 @dataclass(frozen=True)
@@ -103,8 +107,9 @@ def kind_of(representation: str) -> Representation:
     for kind in KINDS.values():
         if representation.lower() in map(str.lower, (kind.word, *kind.word_aliases, kind.kind)):
             return kind
-    known = REQUEST.parameter("representation").range_text
-    raise ValueError(f"representation: {representation[:80]!r} is not {known}")
+    parameter = REQUEST.parameter("representation")
+    hint = meant(representation, parameter.choices)
+    raise ValueError(f"representation: {representation[:80]!r} is not {parameter.range_text}{hint}")
 
 
 def chain(kind: Representation) -> list[Representation]:
@@ -127,8 +132,8 @@ def understand(kind: Representation, given: Mapping[str, Any]) -> Wish:
     ComponentError
         ``::rosAFE::e_badNewValue``, as the component itself would, for what no sample rate makes possible.
     """
-    if given.get("fb_cfHz") and given.get("fb_nERBs") == 0:  # so getParameters tells of a filterbank with a list
-        given = {name: value for name, value in given.items() if name != "fb_nERBs"}
+    for above in chain(kind):
+        given = STAGES[above.kind].asked(given)
     try:
         for name in OF_THE_INPUT:
             if name in given:
@@ -164,13 +169,13 @@ def plan(wish: Wish, found: Sequence[Found]) -> Plan:
     root = next((p for p in found if not p.parent and p.kind == "input"), None)
     if root is not None:
         _check_input(root, wish.levels[0])
-    reused = _deepest(wish.levels, found)
+    reused = _deepest(wish.levels, found, root.rate if root is not None else 0.0)
     names = {p.name for p in found}
     dependencies, steps = reused[:], []
     for level in wish.levels[len(reused) :]:
         name = free_name(level.kind, names)
         names.add(name)
-        steps += _making(wish, level, name, dependencies[-1] if dependencies else "")
+        steps += making(level, name, dependencies[-1] if dependencies else "", wish.input_values)
         dependencies.append(name)
     return Plan(dependencies, steps)
 
@@ -183,14 +188,14 @@ def _check_input(root: Found, level: Level) -> None:
             raise ROSAFE.error("e_existsAlready", what=what)
 
 
-def _deepest(levels: Sequence[Level], found: Iterable[Found]) -> list[str]:
+def _deepest(levels: Sequence[Level], found: Iterable[Found], sample_rate: float) -> list[str]:
     """The names, from the input on, of the longest line of processors that fit."""
     lines: dict[str, list[str]] = {"": []}  # that fit so far, by the name of their last processor
     for level in levels:
         longer = {
             p.name: [*lines[p.parent], p.name]
             for p in found
-            if p.kind == level.kind.kind and p.parent in lines and (not p.parent or level.fits(p))
+            if p.kind == level.kind.kind and p.parent in lines and (not p.parent or level.fits(p, sample_rate))
         }
         if not longer:
             break
@@ -207,28 +212,22 @@ def free_name(kind: Representation, names: Collection[str]) -> str:
     return f"{kind.word}_{number}"
 
 
-def _making(wish: Wish, level: Level, name: str, parent: str) -> list[Step]:
-    """The requests for one processor. What its own request cannot carry is set before anything hangs on it."""
+def making(level: Level, name: str, parent: str, input_values: Mapping[str, Any]) -> list[Step]:
+    """The requests for one processor. What that of an input cannot carry is set before anything hangs on it.
+
+    `input_values` are those of InputProc less its name, of which only an input takes notice.
+    """
     if level.kind.parent:
-        unsaid = [p for p in level.kind.parameters if _reads_as_default(p, level.values[p.name])]
-        # Until then, nobody who looks may take it for one with the defaults.
-        sent = {**level.values, **{p.name: ALMOST_ZERO for p in unsaid}}
-        step = Step(level.kind.request, {"name": name, "upperDepName": parent, **sent}, name)
-    else:
-        unsaid = [p for p in level.kind.parameters if level.values[p.name] != p.default]
-        step = Step(level.kind.request, {"name": name, **wish.input_values}, name)
+        free = {p.name: math.nan for p in level.kind.parameters if p.follows_rate and p.name not in level.given}
+        return [Step(level.kind.request, {"name": name, "upperDepName": parent, **level.values, **free}, name)]
+    changed = {p.name: level.values[p.name] for p in level.kind.parameters if level.values[p.name] != p.default}
     return [
-        step,
+        Step(level.kind.request, {"name": name, **input_values}, name),
         *(
-            Step("modifyParameter", {"nameProc": name, "nameParam": p.name, "newValue": text_of(level.values[p.name])})
-            for p in unsaid
+            Step("modifyParameter", {"nameProc": name, "nameParam": parameter, "newValue": text_of(value)})
+            for parameter, value in changed.items()
         ),
     ]
-
-
-def _reads_as_default(parameter: Parameter, value: Any) -> bool:
-    """Whether a ROS request with this value means the default instead."""
-    return not isinstance(value, (bool, str, list)) and value == 0 != parameter.default
 
 
 # --- what has been done -----------------------------------------------------------------------------------------
@@ -236,18 +235,21 @@ def _reads_as_default(parameter: Parameter, value: Any) -> bool:
 
 def answer(wish: Wish, dependencies: Sequence[str], created: Collection[str], instance: str) -> dict[str, Any]:
     """The outputs of `interface.REQUEST`, once the processors `dependencies` are there."""
-    own = {p.name for level in wish.levels for p in level.kind.parameters}
-    if dependencies[0] in created:
-        own.update(OF_THE_INPUT)
     return {
         "name": dependencies[-1],
         "dependencies": list(dependencies),
         "created": [name for name in dependencies if name in created],
         "reused": [name for name in dependencies if name not in created],
-        "unused": [name for name in wish.given if name not in own],
+        "unused": unused((level.kind for level in wish.levels), wish.given, dependencies[0] in created),
         "port": wish.levels[-1].kind.port,
         "topic": topic(instance, wish.levels[-1].kind, dependencies[-1]),
     }
+
+
+def unused(kinds: Iterable[Representation], given: Iterable[str], new_input: bool) -> list[str]:
+    """Which of the parameters `given` have no effect on a processor with these kinds from the input down to it."""
+    own = {p.name for kind in kinds for p in kind.parameters} | {*(OF_THE_INPUT if new_input else ())}
+    return [name for name in given if name not in own]
 
 
 def topic(instance: str, kind: Representation, name: str) -> str:

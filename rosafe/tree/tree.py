@@ -17,6 +17,8 @@ from rosafe.tree.processor import Company, Listener, Observer, Processor, subtre
 from rosafe.tree.sizes import Rows
 from rosafe.tree.states import State
 from rosafe.tree.workers import Workers, workers_to_use
+from rosafe.vocabulary.parameter import Parameter, shown
+from rosafe.vocabulary.words import listed, meant
 
 INPUT = next(kind for kind, representation in KINDS.items() if not representation.parent)
 
@@ -61,6 +63,11 @@ class Tree:
     # --- asking ---
 
     @property
+    def workers(self) -> int:
+        """How many may compute at the same time."""
+        return self._workers.count
+
+    @property
     def processors(self) -> list[Processor]:
         """All processors in the order of their creation."""
         with self._requests:
@@ -78,7 +85,10 @@ class Tree:
             try:
                 return self._processors[name]
             except KeyError:
-                raise ROSAFE.error("e_noSuchProcessor", f"there is no processor {name!r}") from None
+                raise ROSAFE.error("e_noSuchProcessor", self._no_processor(name)) from None
+
+    def _no_processor(self, name: str) -> str:
+        return f"there is no processor {shown(name)}; there are: {listed(self._processors)}"
 
     def dependencies(self, name: str) -> list[str]:
         """The names from the input down to `name`."""
@@ -110,7 +120,7 @@ class Tree:
         with self._requests:
             holder = self._processors.get(name)
             if holder is not None and holder.parent is not None:
-                raise ROSAFE.error("e_existsAlready", f"{name!r} exists already, of kind {holder.kind}")
+                raise ROSAFE.error("e_existsAlready", f"{shown(name)} exists already, of kind {holder.kind}")
             root = self.input
             if root is not None and root.children and sample_rate != self.sample_rate:
                 raise ROSAFE.error(
@@ -170,14 +180,20 @@ class Tree:
             wanted = KINDS[kind].parent
             parent = self._processors.get(parent_name)
             if parent is None:
-                raise ROSAFE.error("e_noUpperDependencie", f"there is no processor {parent_name!r} to hang {name!r} on")
+                raise ROSAFE.error("e_noUpperDependencie", f"{self._no_processor(parent_name)}{self._of_kind(wanted)}")
             if name in self._processors:
-                raise ROSAFE.error("e_existsAlready", f"{name!r} exists already, of kind {self._processors[name].kind}")
+                there = self._processors[name].kind
+                raise ROSAFE.error("e_existsAlready", f"{shown(name)} exists already, of kind {there}")
             if parent.kind != wanted:
                 raise ROSAFE.error(
-                    "e_noUpperDependencie", f"{parent_name!r} is of kind {parent.kind}, wanted is {wanted}"
+                    "e_noUpperDependencie",
+                    f"{shown(parent_name)} is of kind {parent.kind}, wanted is {wanted}{self._of_kind(wanted)}",
                 )
             return parent
+
+    def _of_kind(self, kind: str) -> str:
+        names = [processor.name for processor in self._processors.values() if processor.kind == kind]
+        return f"; of kind {kind}: {listed(names)}"
 
     def add(self, kind: str, name: str, parent_name: str, parameters: Mapping[str, Any] | None = None) -> Processor:
         """Add a processor of `kind` under `parent_name`; it runs when this returns."""
@@ -219,20 +235,31 @@ class Tree:
 
     # --- changing ---
 
-    def modify(self, name: str, parameter_name: str, text: str) -> None:
-        """modifyParameter: change one parameter, given as text, from the processor's next block on."""
+    def modify(
+        self,
+        name: str,
+        parameter_name: str,
+        text: str,
+        taken: Callable[[Parameter, Any], Any] = Parameter.known_word,
+    ) -> Processor:
+        """modifyParameter: change one parameter, given as text, from the processor's next block on.
+
+        `taken(parameter, value)` is what is taken for a value that may be an unknown word.
+        """
         with self._requests:
             processor = self.find(name)
             try:
                 parameter = processor.representation.parameter(parameter_name)
             except KeyError:
-                known = ", ".join(p.name for p in processor.representation.parameters) or "none at all"
+                known = [p.name for p in processor.representation.parameters]
                 raise ROSAFE.error(
-                    "e_noSuchParameter", f"processors of kind {processor.kind} have no {parameter_name!r}, but: {known}"
+                    "e_noSuchParameter",
+                    f"processors of kind {processor.kind} have no {shown(parameter_name)}, but: {listed(known)}"
+                    f"{meant(parameter_name, known)}",
                 ) from None
             with _refusing():
-                value = parameter.known_word(parameter.parse(text, parameter_name))
-                self._change(processor, parameter.name, value)
+                self._change(processor, parameter.name, taken(parameter, parameter.parse(text, parameter_name)))
+            return processor
 
     def schedule(self, block: int, parameter_name: str, value: Any) -> None:
         """Change a parameter, of every processor that has it, before block `block` of the input.

@@ -5,14 +5,16 @@ from __future__ import annotations
 import os
 from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import matplotlib.style
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.figure import Figure
 
+from rosafe.missing import require
 from rosafe.output import new_file
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
 
 _STYLE = {
     "font.family": "DejaVu Sans",
@@ -32,7 +34,8 @@ _STYLE = {
 
 def style() -> AbstractContextManager[None]:
     """The pictures' own settings, whatever the user's are."""
-    return matplotlib.style.context(["default", _STYLE])
+    context: AbstractContextManager[None] = require("matplotlib.style", "pictures").context(["default", _STYLE])
+    return context
 
 
 def save(figure: Figure, path: Path, replace: bool = True) -> None:

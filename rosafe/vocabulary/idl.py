@@ -39,8 +39,14 @@ def element(idl: str) -> str:
     return idl[len("sequence<") : -1] if idl.startswith("sequence<") else ""
 
 
+TIME = "::ros::time"  # the one struct that ROS has a type of its own for
+TIME_MEMBERS = (("sec", "unsigned long"), ("nsec", "unsigned long"))
+
+
 def ros_type(idl: str) -> str:
     """The ROS field type of an IDL type: ``unsigned long`` is ``uint32``, ``sequence<double>`` is ``float64[]``."""
+    if idl == TIME:
+        return "time"
     if of := element(idl):
         return ros_type(of) + "[]"
     if idl.startswith("::"):

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from .idl import SCALARS, element, ros_type
+from .words import meant, nearest
 
 REQUIRED = object()  # a parameter without a default, such as connect_port's `local`
 MAX_STRING = 4096  # characters in any string that a request carries
@@ -31,7 +32,8 @@ class Parameter:
     """One member of a request, or one parameter of a processor.
 
     `minimum` and `maximum` are inclusive unless `open_minimum` says otherwise; they bind the elements of a sequence,
-    `least` and `most` its length. `choices` are the known words of an enumerated string, or of a list of words.
+    `least` and `most` its length, `longest` the characters of a text. `choices` are the known words of an enumerated
+    string, or of a list of words.
     Requests from the ROS graph may hold any word: `known_word` says what is taken for it, the original's `fallback`;
     where there is none, unknown words are refused there as everywhere else.
     """
@@ -51,7 +53,9 @@ class Parameter:
     unit: str = ""
     least: int = 0
     most: int = MAX_SEQUENCE
+    longest: int = MAX_STRING
     zero_is_default: bool = True  # in ROS requests, which carry no defaults
+    follows_rate: bool = False  # where it is not given, the sample rate may make another one of the default
 
     @property
     def ros(self) -> str:
@@ -133,11 +137,11 @@ class Parameter:
     def _check_word(self, value: Any) -> str:
         if not isinstance(value, str):
             raise self._refuse(value, "a string")
-        if len(value) > MAX_STRING or "\0" in value:
-            raise self._refuse(value, f"a text of at most {MAX_STRING} characters")
+        if len(value) > self.longest or "\0" in value:
+            raise self._refuse(value, f"a text of at most {self.longest} characters")
         value = self.spellings.get(value, value)
         if self.choices and value not in self.choices:
-            raise self._refuse(value, self.range_text)
+            raise self._refuse(value, self.range_text + meant(value, self.choices))
         return value
 
     def _check_range(self, number: float) -> None:
@@ -155,6 +159,14 @@ class Parameter:
         return (
             self.fallback if self.fallback and word and self.spellings.get(value, value) not in self.choices else value
         )
+
+    def doubt(self, value: Any) -> str:
+        """What is to be told where `known_word` takes another word for `value`; empty where it takes that."""
+        taken = self.known_word(value)
+        if taken is value:
+            return ""
+        near = nearest(value, self.choices)
+        return f"{self.name}: {shown(value)} is no known word, {taken} is taken; the nearest known one is {near}"
 
     # --- texts ------------------------------------------------------------------------------------------------
 

@@ -10,7 +10,8 @@
 #   rosAFE::modifyParameter ... & callback    ;# without a callback, an error that nobody looks at goes to bgerror
 #   rosAFE::GammatoneProc -h                  ;# tells parameters, types, defaults and ranges
 #
-# Errors: the message is a dict `ex ::rosAFE::e_noSuchProcessor ?detail {...}?`, the error code {GENOM ex detail}.
+# Errors: the message is a dict `ex ::rosAFE::e_noSuchProcessor ?detail {...}? ?what {...}?`, what being the reason where
+# that is no member of the detail; the error code is {GENOM ex detail}.
 # What comes from the server is data; none of it is ever evaluated.
 
 package require Tcl 8.6
@@ -78,13 +79,18 @@ proc ::genomix::StartServer {} {
     return [list $channel $port]
 }
 
-# Raise the error of a component or of the server; body is a dict ex ... ?detail {...}?.
+# Raise the error of a component or of the server; body is a dict ex ... ?detail {...}? ?what {...}?.
 proc ::genomix::Raise {body} {
     set detail {}
     if {[dict exists $body detail]} {
         set detail [dict get $body detail]
     }
     return -code error -level 2 -errorcode [list GENOM [dict get $body ex] $detail] $body
+}
+
+# A text on one line, for a terminal.
+proc ::genomix::OneLine {text} {
+    return [regsub -all {[[:cntrl:]]+} $text { }]
 }
 
 # Raise the error of something that was not even sent.

@@ -5,11 +5,12 @@ oo::class create ::genomix::Request {
     # Status: sent, done or error.   Output: the result, once it is here.   Exception: the error, as a dict.
     # Callback: a command prefix, or empty.   Changed: written at the end and when patience ends; `wait` waits for that.
     # Seen: whether somebody has asked for the status since the end.   Timer: what will tell of an error, or empty.
-    variable Client Command Id Status Output Exception Callback Changed Seen Timer
+    # Warning: of the component, or empty.
+    variable Client Command Id Status Output Exception Callback Changed Seen Timer Warning
 
     constructor {client command callback} {
         lassign [list $client $command $callback] Client Command Callback
-        lassign {{} sent {} {} 0 0 {}} Id Status Output Exception Changed Seen Timer
+        lassign {{} sent {} {} 0 0 {} {}} Id Status Output Exception Changed Seen Timer Warning
     }
 
     destructor {
@@ -46,6 +47,16 @@ oo::class create ::genomix::Request {
             set Output [list here [$Client get {request result} [dict create id $Id]]]
         }
         return [lindex $Output 1]
+    }
+
+    # warning
+    #
+    # What the component has to say of a request that it grants all the same: a word that it does not know, say.
+    method warning {} {
+        if {$Status eq "sent"} {
+            $Client poll
+        }
+        return $Warning
     }
 
     # wait ?ms?
@@ -91,6 +102,12 @@ oo::class create ::genomix::Request {
         if {[dict exists $told id]} {
             set Id [dict get $told id]
         }
+        if {$Warning eq "" && [dict exists $told warning]} {
+            set Warning [dict get $told warning]
+            if {$::tcl_interactive} {
+                puts stderr "$Command &: warning: [::genomix::OneLine $Warning]"
+            }
+        }
         if {$Status ne "sent" || [dict get $told status] eq "sent"} {
             return 0
         }
@@ -122,10 +139,10 @@ oo::class create ::genomix::Request {
         set ex [dict get $Exception ex]
         set detail [expr {[dict exists $Exception detail] ? [dict get $Exception detail] : {}}]
         set message "$Command &: $ex"
-        if {![catch {dict get $detail what} what]} {
+        if {![catch {dict get $detail what} what] || ![catch {dict get $Exception what} what]} {
             append message ": $what"
         }
-        set message [string map {\n { } \r {}} $message]
+        set message [::genomix::OneLine $message]
         {*}[interp bgerror {}] $message \
             [dict create -code 1 -level 0 -errorcode [list GENOM $ex $detail] -errorinfo $message]
     }

@@ -174,7 +174,7 @@ def bad_files(tmp_path: Path) -> Path:
         ("cut.wav", "e_device", "cut off"),
         ("cut.flac", "e_device", "cut off"),
         ("x" * 4000, "e_device", "too long"),
-        ("good.wav?speed=2", "e_device", "no option 'speed'; there are: loop, start"),
+        ("good.wav?speed=2", "e_device", "no option 'speed'; there are: channels, loop, start"),
         ("good.wav?loop=yes", "e_device", "loop=yes is not 0 or 1"),
         ("good.wav?start=nan", "e_device", "start=nan is not a number"),
         ("good.wav?start=-1", "e_device", "start=-1 is not a number"),
@@ -216,3 +216,35 @@ def test_wav_of_unknown_length_is_read(tmp_path: Path) -> None:
 def test_unreadable_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(AudioFileError, match="No such file"):
         AudioFile(tmp_path / "nothing.wav")
+
+
+def test_channels(tmp_path: Path) -> None:
+    """Any two of many, or one for both ears."""
+    samples = noise(1000, 5)
+    soundfile.write(tmp_path / "five.wav", samples, RATE, "PCM_32")
+    soundfile.write(tmp_path / "mono.wav", samples[:, 0], RATE, "PCM_32")
+    for name, chosen in {"five.wav?channels=3,4": [2, 3], "five.wav?loop=0&channels=5,1": [4, 0]}.items():
+        np.testing.assert_array_equal(read_all(f"file:{tmp_path}/{name}", 500), samples[:, chosen].T)
+    both = read_all(f"file:{tmp_path}/mono.wav?channels=1,1&start=0.00625", 350)
+    np.testing.assert_array_equal(both, samples[300:, [0, 0]].T)
+
+
+@pytest.mark.parametrize(
+    ("text", "exception", "why"),
+    [
+        ("five.wav?channels=5,6", "e_hwparams", "has 5 channels: there is no channel 6"),
+        ("mono.wav?channels=1,2", "e_hwparams", "is mono: there is no channel 2"),
+        ("five.wav?channels=0,1", "e_device", "two channel numbers from 1"),
+        ("five.wav?channels=3", "e_device", "two channel numbers from 1"),
+        ("five.wav?channels=1,2,3", "e_device", "such as 3,4"),
+        ("five.wav", "e_hwparams", "?channels=1,2 takes those"),
+        ("mono.wav", "e_hwparams", "?channels=1,1 gives it to both ears"),
+    ],
+)
+def test_channels_that_are_not_there(tmp_path: Path, text: str, exception: str, why: str) -> None:
+    soundfile.write(tmp_path / "five.wav", noise(100, 5), RATE)
+    soundfile.write(tmp_path / "mono.wav", noise(100, 1), RATE)
+    with pytest.raises(ComponentError) as caught:
+        open_source(f"file:{tmp_path}/{text}", 0, 100, threading.Event())
+    assert caught.value.ex == f"::bass::{exception}"
+    assert why in caught.value.why

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import json
 import socket
 import struct
 import time
@@ -86,7 +87,8 @@ def test_end_of_file_is_a_normal_end_of_the_action(
     assert client.get_result().genom_success and client.get_result().genom_exdetail == ""
     client.send_goal(messages.AcquireGoal(device="hw:77,0"))
     wait_for(lambda: client.get_result() is not None)
-    assert client.get_result().genom_exdetail == '{"ex":"::bass::e_device"}'
+    refused = json.loads(client.get_result().genom_exdetail)
+    assert refused["ex"] == "::bass::e_device" and refused["what"].startswith("hw:77,0: ")
     client.send_goal(messages.AcquireGoal(device="scene:"))
     graph.message("/bass/Audio", audio_class(), lambda m: m.lastFrameIndex > 0 and m.sampleRate == 44100)
     client.cancel_goal()
@@ -131,7 +133,8 @@ def test_mistakes_change_nothing(graph: Graph, bass_node: Process, wav: tuple[st
             lines = len(bass_node.err.splitlines())
             answer = graph.call("/bass/Acquire", **fields)
             assert not answer.genom_success, mistake
-            assert answer.genom_exdetail == f'{{"ex":"::bass::{exception}"}}', mistake
+            refused = json.loads(answer.genom_exdetail)
+            assert refused["ex"] == f"::bass::{exception}" and why in refused["what"], mistake
             told = bass_node.err.splitlines()[lines:]
             assert len(told) == 1 and f"::bass::{exception}" in told[0] and why in told[0], (mistake, told)
         known = len(messages)
@@ -200,8 +203,9 @@ def test_list_devices_prints_on_stdout(graph: Graph, bass_node: Process) -> None
     try:
         expected = [f"hw:{c},{d} [{card}] [{pcm}]" for c, d, card, pcm in libasound.capture_devices()]
         exdetail = ""
-    except ComponentError:
-        expected, exdetail = [], '{"ex":"::bass::e_nodevice"}'
+    except ComponentError as problem:
+        expected, exdetail = [], problem.exdetail
+        assert '"what":"no sound card (/proc/asound/card* is empty)"' in exdetail
     answer = graph.call("/bass/ListDevices")
     assert (answer.genom_success, answer.genom_exdetail) == (not exdetail, exdetail)
     lines = bass_node.out.splitlines()
@@ -211,12 +215,14 @@ def test_list_devices_prints_on_stdout(graph: Graph, bass_node: Process) -> None
 
 def test_common_requests(graph: Graph, bass_node: Process) -> None:
     assert graph.call("/bass/connect_port", local="Audio", remote="bass/Audio").genom_exdetail == (
-        '{"ex":"::genom::no_such_inport"}'
+        '{"ex":"::genom::no_such_inport","what":"no input port \'Audio\'; there are: none"}'
     )
-    assert (
-        graph.call("/bass/connect_service", local="a", remote="b").genom_exdetail == '{"ex":"::genom::no_such_remote"}'
+    assert graph.call("/bass/connect_service", local="a", remote="b").genom_exdetail == (
+        '{"ex":"::genom::no_such_remote","what":"bass has no remote services"}'
     )
-    assert graph.call("/bass/abort_activity", activity=4711).genom_exdetail == '{"ex":"::genom::no_such_activity"}'
+    assert graph.call("/bass/abort_activity", activity=4711).genom_exdetail == (
+        '{"ex":"::genom::no_such_activity","what":"no activity 4711; there are: none"}'
+    )
     assert acquire(graph, "scene:", RATE).genom_success
     state = graph.message("/bass/genom_state", accept=lambda m: any(task.activity for task in m.task))
     number = next(activity.id for task in state.task for activity in task.activity)
@@ -302,5 +308,7 @@ def test_dedicated_socket(graph: Graph, bass_node: Process, wav: tuple[str, np.n
     assert graph.call("/bass/DedicatedSocket").genom_success  # the second replaces the first
     wait_for(lambda: live(graph) == ["DedicatedSocket"])
     rospy.set_param("/bass/socket_port", "none")
-    assert graph.call("/bass/DedicatedSocket").genom_exdetail == '{"ex":"::genom::syserr","detail":{"code":22}}'
+    assert graph.call("/bass/DedicatedSocket").genom_exdetail.startswith(
+        '{"ex":"::genom::syserr","detail":{"code":22},"what":"cannot serve 127.0.0.1:none: '
+    )
     rospy.delete_param("/bass/socket_port")

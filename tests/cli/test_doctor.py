@@ -14,7 +14,7 @@ from tests.cli.command import environment, rosafe, rosafe_alone
 from tests.harness import ROOT, Graph, free_port
 
 EVERYTHING = ["python", "numbers", "kernels", "plugins", "sound files", "ROS", "messages", "master", "address"]
-EVERYTHING += ["alsaaudio", "sound devices", "HTTP server", "Tcl", "plots"]
+EVERYTHING += ["alsaaudio", "sound devices", "HTTP server", "Tcl", "plots", "extras"]
 
 
 def findings(done: subprocess.CompletedProcess[str]) -> dict[str, dict[str, str]]:

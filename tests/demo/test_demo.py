@@ -45,6 +45,7 @@ def test_telephone_quality_without_home(tmp_path: Path) -> None:
         text = finished(running)
     assert "fb_highFreqHz 3600" in text and "fb_highFreqHz: 3600" in text
     check_table(text, 8000, 2000, 2.0)
+    assert "\nits last 0.20 s fill no block of 2000 frames, and are left out\n" in text
 
 
 def test_through_a_link_with_a_dead_reader(tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import signal
+import subprocess
 from pathlib import Path
 
 import pytest
@@ -70,15 +71,15 @@ def test_a_node_that_crashes_ends_it(node: str, stage: str, tmp_path: Path) -> N
     assert not (tmp_path / "out").exists()
 
 
-def checkout_with_install(tmp_path: Path, install: str) -> Path:
-    """A checkout whose scripts/install is another; its scripts/demo."""
-    (tmp_path / "scripts").mkdir()
+def checkout_with_install(tmp_path: Path, install: str, name: str = "demo") -> Path:
+    """A checkout whose scripts/install is another; its script `name`."""
+    (tmp_path / "scripts").mkdir(parents=True)
     (tmp_path / "rosafe").symlink_to(ROOT / "rosafe")
-    shutil.copy(ROOT / "scripts" / "demo", tmp_path / "scripts")
+    shutil.copy(ROOT / "scripts" / name, tmp_path / "scripts")
     script = tmp_path / "scripts" / "install"
     script.write_text(f"#!/bin/bash\n{install}\n")
     script.chmod(0o755)
-    return tmp_path / "scripts" / "demo"
+    return tmp_path / "scripts" / name
 
 
 def test_ctrl_c_while_it_installs(tmp_path: Path) -> None:
@@ -97,3 +98,12 @@ def test_failed_installation_ends_it(tmp_path: Path) -> None:
     with Demo(script=script, cwd=tmp_path) as running:
         assert running.wait() == 1
         assert (running.out, running.err) == ("", "scripts/install: no network\n")
+
+
+@pytest.mark.parametrize("argument", ["-h", "--help"])
+def test_help_installs_nothing(tmp_path: Path, argument: str) -> None:
+    for script, told in (("demo", "scripts/demo speech.wav"), ("test", "scripts/test tests/genomix -k")):
+        copy = checkout_with_install(tmp_path / script, "echo installing; exit 1", script)
+        done = subprocess.run([copy, argument], check=True, capture_output=True, text=True)
+        assert told in done.stdout and "installing" not in done.stdout and done.stderr == ""
+    assert len(done.stdout.splitlines()) <= 10

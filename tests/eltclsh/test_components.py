@@ -41,7 +41,9 @@ def test_the_guide_typed_at_the_prompt(guide: Terminal) -> None:
     assert guide.run("::genomix::request9 result") == "dependencies {0 input 1 preProc 2 gammatone 3 ihc 4 ratemap}"
     # removeProcessor takes the whole tree below preProc
     guide.run("::genomix::request11 wait 10000")
-    assert guide.run("rosAFE::getDependencies preProc") == "ex ::rosAFE::e_noSuchProcessor"
+    assert guide.run("rosAFE::getDependencies preProc") == (
+        "ex ::rosAFE::e_noSuchProcessor what {there is no processor 'preProc'; there are: input}"
+    )
     assert guide.run("dict size [dict get [rosAFE::getParameters] parameters preProc]") == "0"
 
 
@@ -56,7 +58,9 @@ def test_an_error_in_the_background_is_told_once(guide: Terminal) -> None:
     guide.run("package require genomix; set g [genomix::connect]; $g load rosAFE; $g load bass")
     guide.press("rosAFE::modifyParameter {nameProc nobody nameParam x newValue 1} &\r")
     guide.expect("\n::genomix::request1\n")
-    guide.expect("rosAFE::modifyParameter &: ::rosAFE::e_noSuchProcessor\n")
+    guide.expect(
+        "rosAFE::modifyParameter &: ::rosAFE::e_noSuchProcessor: there is no processor 'nobody'; there are: none\n"
+    )
     guide.press("rosAFE::preProcPort dummyName &\r")
     guide.expect("preProcPort &: ::genom::no_such_outport: preProcPort has no element 'dummyName'; there are: none\n")
     assert guide.run("::genomix::request1 status") == "error"

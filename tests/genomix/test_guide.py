@@ -71,7 +71,10 @@ def test_each_command_of_the_guide_does_what_it_says(fresh_world: World, shell: 
         script.append("puts [list last [$last wait 10000] [catch {$last result} result] $result]")
     script.append("puts [list plain [lrange $results 0 3] [lrange $results 7 8]]")
     lines = run_shell(fresh_world, shell, "\n".join(script)).stdout.splitlines()
-    assert lines[0] == "modify error 1 {ex ::rosAFE::e_noSuchParameter}"
+    assert lines[0] == (
+        "modify error 1 {ex ::rosAFE::e_noSuchParameter what "
+        "{processors of kind input have no 'pp_bRemoveDC', but: in_doNormalize, in_normalizeValue}}"
+    )
     for part in (
         "pp_refSPLdB 100.0",
         "pp_middleEarModel jepsen",

@@ -228,7 +228,7 @@ def test_the_server_answers_packed(world: World) -> None:
     wanted = world.http.get("/load/rosAFE")
     assert list(about["services"]) == list(wanted["services"]) and about["doc"] == wanted["doc"]
     assert get("/call/rosAFE/removeProcessor?syntax=packed&input=[%22x%22]") == {
-        "!": {"ex": "::rosAFE::e_noSuchProcessor"}
+        "!": {"ex": "::rosAFE::e_noSuchProcessor", "what": "there is no processor 'x'; there are: none"}
     }
     assert get("/nowhere?syntax=packed")["!"]["ex"] == "::genomix::e_url"
     world.http.call("bass/Acquire", ["scene:"])

@@ -265,6 +265,12 @@ def test_the_command(sound: World) -> None:
         "rosafe request: cc_wname has no effect on this representation",
         "rosafe request: nFramesPerBlock has no effect: the input is there already",
     ]
+    # before anything is made, or refused
+    code, out, err = command(world, "ILD", "fb_highFreqHz=99999", "--connect", "foo/bar")
+    assert (code, out) == (1, "")
+    vain, refused = err.splitlines()
+    assert vain == "rosafe request: connect has no effect: the input is there already"
+    assert refused.startswith("rosafe request: ::rosAFE::e_badNewValue: fb_highFreqHz: ")
     code, out, err = command(world, "--json", "ratemap", "rm_decaySec=0.01", "fb_cfHz=500,1000,2000")
     assert (code, err) == (0, "")
     assert json.loads(out)["created"] == ["filterbank_1", "innerhaircell_1", "ratemap_0"]
@@ -280,6 +286,8 @@ def test_the_command(sound: World) -> None:
         (["ild", "fb_nChannels"], 1, "fb_nChannels: wanted is NAME=VALUE"),
         (["ild", "fb_nChannels=1", "fb_nChannels=2"], 1, "fb_nChannels is given twice"),
         (["ild", "fb_nERB=1"], 1, "unknown parameter 'fb_nERB'; there are: nFramesPerBlock"),
+        (["ild", "fb_nchannels=1"], 1, "; did you mean fb_nChannels?\n"),
+        (["rate_map"], 1, "; did you mean ratemap?\n"),
         (["ild", "representation=time"], 1, "unknown parameter 'representation'"),
         (["ild", "fb_nChannels=-1"], 1, "fb_nChannels: -1 is not"),
         (["ild", "ihc_method=hilbrt"], 1, "'hilbrt' is not one of none"),

@@ -126,7 +126,10 @@ def test_tcl_syntax(world: World) -> None:
     status, body = world.http.raw("/call/rosAFE/getDependencies?syntax=tcl&input=%5B%22preProc%22%5D")
     assert (status, body) == (200, "dependencies {0 input 1 preProc}")
     status, body = world.http.raw("/call/rosAFE/getDependencies?syntax=tcl")
-    assert (status, body) == (422, "ex ::rosAFE::e_noSuchProcessor")
+    assert (status, body) == (
+        422,
+        "ex ::rosAFE::e_noSuchProcessor what {there is no processor 'nameProc'; there are: input, preProc, gammatone}",
+    )
 
 
 # --- errors -----------------------------------------------------------------------------------------------------
@@ -315,7 +318,8 @@ def test_listeners_are_told(world: World) -> None:
 def test_listeners_may_have_tcl(world: World) -> None:
     with world.http.listening(s="tcl", syntax="tcl") as events:
         number = world.http.send("rosAFE/removeProcessor", ["x"], s="tcl")
-        told = f"id {number} status error exception {{ex ::rosAFE::e_noSuchProcessor}}"
+        why = "there is no processor 'x'; there are: none"
+        told = f"id {number} status error exception {{ex ::rosAFE::e_noSuchProcessor what {{{why}}}}}"
         assert next(events) == ("request", told)
 
 
@@ -358,7 +362,7 @@ def test_what_is_not_there_makes_the_node_say_nothing(world: World) -> None:
             show [$request wait]
         """
         assert world.lines(script) == ["error"]
-        assert node.err == ""
+        assert node.complaints == ""
 
 
 def test_elements_that_are_superfluous_or_misspelt_as_in_the_guide(world: World) -> None:

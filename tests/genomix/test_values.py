@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from rosafe import interface
 from rosafe.genomix.values import complete, parse_input
 from rosafe.interface import BASS, REQUIRED, ROSAFE, ComponentError, Service
+from rosafe.vocabulary.idl import element
 
 GAMMATONE = ROSAFE.service("GammatoneProc")
 INPUT = ROSAFE.service("InputProc")
@@ -31,8 +32,12 @@ def test_nothing_given_is_all_defaults_or_a_refusal_that_names_the_first_missing
     if required:
         assert f"{required[0]} is missing" in refusal(service, {})
     else:
-        assert complete(service, {}) == {p.name: p.default for p in service.parameters}
-        assert complete(service, []) == complete(service, {})
+        free = {p.name for p in service.parameters if p.follows_rate}
+        values = complete(service, {})
+        assert {name for name, value in values.items() if value != value} == free  # not a number: not given
+        assert list(values) == [p.name for p in service.parameters]
+        assert all(value == service.parameter(name).default for name, value in values.items() if name not in free)
+        assert str(complete(service, [])) == str(values)
 
 
 def test_partial_arguments_in_any_order_are_completed() -> None:
@@ -167,7 +172,7 @@ def test_whatever_comes_is_of_the_right_types_or_refused(data: st.DataObject) ->
     kinds = {"string": str, "boolean": bool, "double": float}
     for parameter in service.parameters:
         value = completed[parameter.name]
-        if parameter.idl.startswith("sequence"):
-            assert all(type(item) is float for item in value)
+        if of := element(parameter.idl):
+            assert all(type(item) is kinds[of] for item in value)
         elif parameter.name in (given if isinstance(given, dict) else ()):
             assert type(value) is kinds.get(parameter.idl, int)

@@ -90,26 +90,33 @@ def walked(home: Path) -> Iterator[tuple[World, dict[str, str]]]:
         yield world, dict(line.split(">", 1) for line in lines)
 
 
-NO_PROCESSOR = "error ex ::rosAFE::e_noSuchProcessor"
+TREE = "input, preProc, gammatone, ihc, ild, ratemap, crosscorrelation"
+
+
+def no_processor(name: str) -> str:
+    return f"error ex ::rosAFE::e_noSuchProcessor what {{there is no processor '{name}'; there are: {TREE}}}"
+
+
 WANTED = {
     "load": "genomix1 1 1",
     "connect before acquisition": "",
-    "input without sound": "error ex ::rosAFE::e_noData",
+    "input without sound": "error ex ::rosAFE::e_noData what {nothing has come from /bass/Audio: is bass acquiring?}",
     "input": "sent",
     "preProc at once": "sent",
     "gammatone": "",
     "ihc": "",
     "leaves": "sent sent sent",
     "leaves have data": "100 frames",
-    "modify": "error ex ::rosAFE::e_noSuchParameter",
+    "modify": "error ex ::rosAFE::e_noSuchParameter what {processors of kind input have no 'pp_bRemoveDC', but: "
+    "in_doNormalize, in_normalizeValue}",
     "modify the right one": "",
     "dependencies": "dependencies {0 input 1 preProc 2 gammatone 3 ihc 4 ratemap}",
     "signals": "{input 1} {preProc 1} {gammatone 1} {ihc 1} {ild 1} {ratemap 1} {crossCorrelation 1}",
     "signals without argument": "fine",
     "a port": "sampleRate lastFrameIndex framesOnPort left right",
-    "modify without arguments": NO_PROCESSOR,
-    "dependencies without arguments": NO_PROCESSOR,
-    "remove without arguments": NO_PROCESSOR,
+    "modify without arguments": no_processor("nameProc"),
+    "dependencies without arguments": no_processor("nameProc"),
+    "remove without arguments": no_processor("name"),
     "any order and any number": "0 500.0",
     "single zero": "3",
     "remove": "",

@@ -22,8 +22,9 @@ class HttpError(Exception):
     def __init__(self, status: int, body: dict[str, Any]) -> None:
         super().__init__(status, body)
         self.status = status
+        self.body = body
         self.ex = body.get("ex", "")
-        self.what = body.get("detail", {}).get("what", "")
+        self.what = body.get("detail", {}).get("what", "") or body.get("what", "")
 
 
 class Http:
@@ -110,6 +111,7 @@ class World:
         self.server = server
         self.port = port
         self.http = Http(port)
+        self.afe: harness.Process | None = None  # rosAFE-ros, where there are nodes
 
     def tcl(
         self, script: str, timeout: float = 120.0, check: bool = True, shell: str = "tclsh"
@@ -164,5 +166,5 @@ def world(home: Path, nodes: bool = True) -> Iterator[World]:
         if not nodes:
             yield this
             return
-        with graph.node("bass-ros"), graph.node("rosAFE-ros"):
+        with graph.node("bass-ros"), graph.node("rosAFE-ros") as this.afe:
             yield this

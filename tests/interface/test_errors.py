@@ -16,7 +16,9 @@ OUT_OF_RANGE = r"out of range|in the range of"
 
 
 def test_exdetail_without_members() -> None:
-    assert ROSAFE.error("e_noData", "no audio has come").exdetail == '{"ex":"::rosAFE::e_noData"}'
+    assert ROSAFE.error("e_noData", "no audio has come").exdetail == (
+        '{"ex":"::rosAFE::e_noData","what":"no audio has come"}'
+    )
     assert BASS.error("e_hwparams").exdetail == '{"ex":"::bass::e_hwparams"}'
 
 
@@ -26,6 +28,17 @@ def test_exdetail_with_members() -> None:
         == '{"ex":"::genom::interrupted","detail":{"by":"Stop"}}'
     )
     assert ComponentError("::genom::syserr", code=17).exdetail == '{"ex":"::genom::syserr","detail":{"code":17}}'
+    assert ComponentError("::genom::syserr", "it is busy", code=16).exdetail == (
+        '{"ex":"::genom::syserr","detail":{"code":16},"what":"it is busy"}'
+    )
+
+
+def test_the_reason_is_told_once_and_not_without_end() -> None:
+    assert ROSAFE.error("e_badNewValue", "elsewhere", what="here").body == {
+        "ex": "::rosAFE::e_badNewValue",
+        "detail": {"what": "here"},
+    }
+    assert len(ROSAFE.error("e_noData", "x" * 10**6).exdetail) < 5000
 
 
 @given(st.text())

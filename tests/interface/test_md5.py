@@ -29,6 +29,7 @@ MESSAGES = {
     "rosAFE/rosAFE_AutoCorrelationSignalPortStruct": "2f49295664727f8312963c7a96898807",
     "rosAFE/rosAFE_ModulationSignalPortStruct": "1d45c46bc079dd3bc1c3d9d3d51de506",
     "rosAFE/rosAFE_PrecedenceSignalPortStruct": "3a17e00f4f3f08698233c96fafdc599f",
+    "rosAFE/rosAFE_frameTime": "71000c3c423c07bf5aec49422c09a26b",
     "rosAFE/rosAFE_processor": "d988720cc9980c92234fa266f9bfacac",
     "rosAFE/rosAFE_parameterValue": "bc6ccc4a57f61779c8eaae61e9f422e0",
     "rosAFE/rosAFE_representation": "c0e27661a01b45de8f1cd6b85959f3f5",
@@ -60,7 +61,7 @@ SERVICES = {
         "modifyParameter": "972a89083cfb6e30281281ef02eaf593",
         "removeProcessor": "a04032386d532fbd9abbc736abb34893",
     },
-    "bass": {**COMMON_SERVICES, "ListDevices": EMPTY_REPLY},
+    "bass": {**COMMON_SERVICES, "ListDevices": EMPTY_REPLY, "getAcquisition": "1393f375a654c7c5f67cac5c520e194b"},
 }
 ACTIONS = {  # (package, action): (Action, Goal, ActionGoal)
     ("rosAFE", "InputProc"): (

@@ -103,6 +103,7 @@ DEFAULTS = {
     "DedicatedSocket": [],
     "CloseSocket": [],
     "ListDevices": [],
+    "getAcquisition": [],
     "Stop": [],
     "kill": [],
     "connect_port": [interface.REQUIRED] * 2,

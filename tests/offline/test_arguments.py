@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import itertools
 from collections.abc import Iterator
 from typing import Any
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 
 import rosafe
+from rosafe.interface import FIXED
 from rosafe.offline import process as offline
 from rosafe.tree import sizes
 
@@ -35,16 +37,18 @@ def refused(match: str, *arguments: Any, **named: Any) -> None:
 @pytest.mark.parametrize(
     ("signal", "match"),
     [
-        (np.zeros(100), r"shape \(100,\), wanted is \(2, frames\)"),
-        (np.zeros((1, 100)), r"shape \(1, 100\)"),
-        (np.zeros((100, 2)), r"shape \(100, 2\)"),
+        (
+            np.zeros((3, 100)),
+            r"shape \(3, 100\); wanted is \(N,\) or \(1, N\) for one ear, \(2, N\) or \(N, 2\) for two",
+        ),
+        (np.zeros((100, 1)), r"shape \(100, 1\)"),
+        (np.zeros((0, 3)), r"shape \(0, 3\)"),
         (np.zeros((2, 2, 100)), "shape"),
         (np.float64(0), "shape"),
-        ([], "shape"),
         (None, "shape"),
         ("sound.wav", "shape"),
         ([[1.0, 2.0], [3.0]], "signal is no array"),
-        (np.zeros((2, 10), np.int16), "type int16, wanted is a float type or int32"),
+        (np.zeros((2, 10), np.int8), "type int8, wanted is a float type, int32 or int16"),
         (np.zeros((2, 10), np.int64), "type int64"),
         (np.zeros((2, 10), np.uint32), "type uint32"),
         (np.zeros((2, 10), bool), "type bool"),
@@ -66,13 +70,17 @@ def test_sample_rates(rate: Any) -> None:
 
 
 def test_a_sample_rate_that_is_too_low_for_the_channels() -> None:
-    refused("fb_highFreqHz: a channel at .* Hz is not below half the sample rate", GOOD, 8000)
+    what = "a channel at 8000 Hz is not below half the sample rate; 7600 Hz would do"
+    for values in ({"fb_highFreqHz": 8000.0, "fb_nChannels": 16}, {"fb_cfHz": [8000.0]}):
+        refused(f"{next(iter(values))}: {what}", GOOD, RATE, parameters=values)
 
 
 @pytest.mark.parametrize(
     ("parameters", "match"),
     [
-        ({"fb_nErbs": 1}, "unknown parameter 'fb_nErbs'; there are: in_doNormalize, "),
+        ({"fb_nErbs": 1}, r"unknown parameter 'fb_nErbs'; did you mean fb_nERBs\?"),
+        ({"nchannels": 1}, r"unknown parameter 'nchannels'; did you mean fb_nChannels\?"),
+        ({"volume": 1}, "unknown parameter 'volume'; there are: in_doNormalize, "),
         ({"name": "x"}, "unknown parameter 'name'"),
         ({"set_rm_scailing": "_power"}, "unknown parameter"),
         ({5: 1}, "unknown parameter 5"),
@@ -107,7 +115,7 @@ def test_a_sample_rate_that_is_too_low_for_the_channels() -> None:
     ],
 )
 def test_parameters(parameters: Any, match: str) -> None:
-    refused(match, GOOD, RATE, parameters)
+    refused(match, GOOD, RATE, parameters=parameters)
 
 
 @pytest.mark.parametrize(
@@ -115,7 +123,12 @@ def test_parameters(parameters: Any, match: str) -> None:
     [0, -1, 1.5, 12000.0, np.nan, None, True, "100", b"100", [], (), [100, 0], [100, -1], [100, "1"], [[1, 2]], {1: 2}],
 )
 def test_block_sizes(block_frames: Any) -> None:
-    refused("^block_frames: .* is not a positive whole number, or a sequence of such$", GOOD, RATE, None, block_frames)
+    refused(
+        "^block_frames: .* is not a positive whole number, or a sequence of such$",
+        GOOD,
+        RATE,
+        block_frames=block_frames,
+    )
 
 
 @pytest.mark.parametrize(
@@ -145,13 +158,14 @@ def test_block_sizes(block_frames: Any) -> None:
     ],
 )
 def test_modifications(modifications: Any, match: str) -> None:
-    refused(match, GOOD, RATE, None, 10, modifications)
+    refused(match, GOOD, RATE, block_frames=10, modifications=modifications)
 
 
 @pytest.mark.parametrize(
     ("outputs", "match"),
     [
-        ("crosscorrelation", "unknown output 'crosscorrelation'; there are: input, preProc, "),
+        ("crosscorrelation", r"unknown output 'crosscorrelation'; did you mean crossCorrelation\?"),
+        ("loudness of it", "unknown output 'loudness of it'; there are: input, preProc, "),
         (["ild", "ILD"], "unknown output 'ILD'"),
         ([5], "unknown output 5"),
         ([["ild"]], "unknown output"),
@@ -162,22 +176,48 @@ def test_outputs(outputs: Any, match: str) -> None:
     refused(match, GOOD, RATE, outputs=outputs)
 
 
+@pytest.mark.parametrize("signal", [GOOD[0], GOOD[:1], list(GOOD[0])])
+def test_one_ear_has_no_differences(signal: Any) -> None:
+    refused("outputs: ild, crossCorrelation compare two ears, and the signal has one", signal, RATE, outputs=FIXED)
+    refused("outputs: precedence compare two ears", signal, RATE, outputs="precedence")
+
+
+def test_the_traceback_ends_where_the_user_called() -> None:
+    for named in ({"parameters": {"volume": 1}}, {"parameters": {"fb_cfHz": [8000.0]}}, {"outputs": ["x"]}):
+        with pytest.raises(ValueError) as raised:
+            rosafe.process(GOOD, RATE, **named)
+        assert [entry.name for entry in raised.traceback] == [
+            "test_the_traceback_ends_where_the_user_called",
+            "process",
+        ]
+        assert raised.value.__suppress_context__
+
+
+def test_what_follows_the_sample_rate_has_a_name() -> None:
+    kinds = [p.kind.name for p in inspect.signature(rosafe.process).parameters.values()]
+    assert kinds == ["POSITIONAL_OR_KEYWORD"] * 2 + ["KEYWORD_ONLY"] * 4
+    with pytest.warns(DeprecationWarning, match="by name"), pytest.raises(ValueError, match="fb_nERBs"):
+        rosafe.process(GOOD, RATE, {"fb_nERBs": 0})
+    with pytest.raises(TypeError, match="takes 2 positional arguments, and 7 were given"):
+        rosafe.process(GOOD, RATE, {}, 1, (), None, 5)
+
+
 def test_sizes_that_fill_the_memory() -> None:
-    refused("ild_wSizeSec: 60 s of .* MiB, more than 1024 MiB", GOOD, 96000, {"ild_wSizeSec": 60.0})
+    refused("ild_wSizeSec: 60 s of .* MiB, more than 1024 MiB", GOOD, 96000, parameters={"ild_wSizeSec": 60.0})
     refused("more than 1024 MiB", GOOD, 96000, modifications=[(0, "ild_wSizeSec", 60.0)])
 
 
 def test_results_larger_than_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sizes, "machine_memory", lambda: 2**24)
     sound, lags = np.zeros((2, 4000)), {"cc_maxDelaySec": 1.0}
-    refused("outputs: they would take .* GB of memory, this machine has", sound, RATE, lags)
+    refused("outputs: they would take .* GB of memory, this machine has", sound, RATE, parameters=lags)
     refused("outputs: they would take", sound, RATE, modifications=[(0, *change) for change in lags.items()])
     at_the_end = [(3, "cc_maxDelaySec", 1e-3)]  # smaller again, but not before it was too large
-    refused("outputs: they would take", sound, RATE, lags, 1000, at_the_end)
+    refused("outputs: they would take", sound, RATE, parameters=lags, block_frames=1000, modifications=at_the_end)
     hidden = {
         "fb_nChannels": 500,
         "fb_highFreqHz": 4000.0,
     }  # the filterbank is not kept, but all of it comes in one block
-    refused("outputs: they would take", sound, RATE, hidden, outputs=["ild"])
+    refused("outputs: they would take", sound, RATE, parameters=hidden, outputs=["ild"])
     with pytest.raises(AssertionError, match="it went as far as that"):
-        rosafe.process(sound, RATE, hidden, 100, outputs=["ild"])
+        rosafe.process(sound, RATE, parameters=hidden, block_frames=100, outputs=["ild"])

@@ -73,13 +73,13 @@ def below(kind: str) -> set[str]:
 
 @pytest.fixture(scope="module")
 def unchanged() -> dict[str, Any]:
-    return rosafe.process(SOUND, RATE, BASE, BLOCK)
+    return rosafe.process(SOUND, RATE, parameters=BASE, block_frames=BLOCK)
 
 
 @pytest.mark.parametrize("name", KIND_OF)
 def test_a_change_of(name: str, unchanged: dict[str, Any]) -> None:
     kind = KIND_OF[name]
-    got = rosafe.process(SOUND, RATE, BASE, BLOCK, [(AT, name, CHANGES[name])])
+    got = rosafe.process(SOUND, RATE, parameters=BASE, block_frames=BLOCK, modifications=[(AT, name, CHANGES[name])])
     outputs = Chain(RATE, BASE).run(cut(SOUND, BLOCK), [(AT, name, CHANGES[name])])
     for other in FIXED:
         whole = unchanged[other]
@@ -117,4 +117,6 @@ def test_what_was_in_force_for_no_block_is_not_in_the_result() -> None:
     """A change before the first block: the number of channels is the new one, not the larger one of before."""
     sound = np.random.default_rng(8).standard_normal((2, 500))
     changed = rosafe.process(sound, 44100, modifications=[(0, "fb_nChannels", 3)], outputs=["gammatone"])
-    np.testing.assert_array_equal(changed["gammatone"], rosafe.process(sound, 44100, {"fb_nChannels": 3})["gammatone"])
+    np.testing.assert_array_equal(
+        changed["gammatone"], rosafe.process(sound, 44100, parameters={"fb_nChannels": 3})["gammatone"]
+    )

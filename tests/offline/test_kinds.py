@@ -67,10 +67,11 @@ def shells(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
 
 def test_an_entry_for_each_part(shells: None) -> None:
     got = rosafe.process(SOUND, RATE, block_frames=700, outputs=["shells"])
-    assert list(got) == ["shells_sums", "shells_around", "sh_shells", "shells_frameRate"]
+    assert list(got) == ["shells_sums", "shells_around", "shells_time", "sh_shells", "shells_frameRate"]
     assert {name: np.shape(value) for name, value in got.items()} == {
         "shells_sums": (17,),
         "shells_around": (2, 3, 17),
+        "shells_time": (17,),
         "sh_shells": (3,),
         "shells_frameRate": (),
     }
@@ -83,7 +84,14 @@ def test_parts_that_grow_on_the_way(shells: None, monkeypatch: pytest.MonkeyPatc
         "rosafe.interface.arguments._BY_NAME", {"sh_reach": Shells.REPRESENTATION.parameter("sh_reach")}
     )
     whole = rosafe.process(SOUND, RATE, block_frames=1000, outputs=["shells"])
-    got = rosafe.process(SOUND, RATE, None, 1000, [(1, "sh_reach", 3), (2, "sh_reach", 2)], ["shells"])
+    got = rosafe.process(
+        SOUND,
+        RATE,
+        parameters=None,
+        block_frames=1000,
+        modifications=[(1, "sh_reach", 3), (2, "sh_reach", 2)],
+        outputs=["shells"],
+    )
     np.testing.assert_array_equal(got["sh_shells"], np.arange(-3, 4))
     np.testing.assert_array_equal(got["shells_sums"], whole["shells_sums"])
     around = got["shells_around"]
@@ -103,7 +111,9 @@ def test_coordinates_are_those_that_were_in_force() -> None:
         ([(2, "cc_maxDelaySec", 0.003), (2, "cc_maxDelaySec", 0.0005)], 18),
         ([(1, "cc_maxDelaySec", 0.002), (2, "cc_maxDelaySec", 0.0005)], 32),
     ):
-        got = rosafe.process(SOUND, RATE, FEW, 1000, changes, ["crossCorrelation"])
+        got = rosafe.process(
+            SOUND, RATE, parameters=FEW, block_frames=1000, modifications=changes, outputs=["crossCorrelation"]
+        )
         np.testing.assert_allclose(got["cc_lags"], np.arange(-reach, reach + 1) / RATE, err_msg=str(changes))
         assert got["crossCorrelation"].shape[1] == 2 * reach + 1
 
@@ -129,26 +139,30 @@ def test_blocks_without_frames_have_rows_too() -> None:
 )
 def test_later_kinds(kind: str, names: set[str], shape: tuple[int, ...]) -> None:
     """What lies along the axes of all that is computed, and the rate of what is asked for."""
-    got = rosafe.process(SOUND, RATE, FEW, 333, outputs=[kind])
+    got = rosafe.process(SOUND, RATE, parameters=FEW, block_frames=333, outputs=[kind])
     rate = set() if kind == "adaptation" else {f"{kind}_frameRate"}
-    assert set(got) == {kind} | names | rate
+    assert set(got) == {kind, f"{kind}_time"} | names | rate
     assert got[kind].shape == shape
-    whole = rosafe.process(SOUND, RATE, FEW, 3000, outputs=kind)
+    whole = rosafe.process(SOUND, RATE, parameters=FEW, block_frames=3000, outputs=kind)
     np.testing.assert_allclose(got[kind], whole[kind], rtol=1e-9, atol=1e-9 * np.nanmax(np.abs(whole[kind])))
 
 
 def test_words_are_a_list() -> None:
-    got = rosafe.process(SOUND, RATE, {**FEW, "sf_requests": ["flux", "centroid"]}, outputs=["spectralFeatures"])
+    got = rosafe.process(
+        SOUND, RATE, parameters={**FEW, "sf_requests": ["flux", "centroid"]}, outputs=["spectralFeatures"]
+    )
     assert got["sf_requests"] == ["flux", "centroid"]
 
 
 def test_lags_that_are_not_centred_are_aligned_at_the_first() -> None:
     changes = [(1, "ac_wSizeSec", 0.01), (2, "ac_wSizeSec", 0.03)]
-    got = rosafe.process(SOUND, RATE, FEW, 1000, changes, ["autocorrelation"])
+    got = rosafe.process(
+        SOUND, RATE, parameters=FEW, block_frames=1000, modifications=changes, outputs=["autocorrelation"]
+    )
     assert got["autocorrelation"].shape[:3] == (2, 4, 479)
     np.testing.assert_allclose(got["ac_lags"], np.arange(479) / RATE)
     stage = STAGES["autocorrelation"](STAGES["ihc"](RATE).output)
-    ihc = rosafe.process(SOUND, RATE, FEW, 1000, outputs=["ihc"])["ihc"]
+    ihc = rosafe.process(SOUND, RATE, parameters=FEW, block_frames=1000, outputs=["ihc"])["ihc"]
     at = 0
     for number, block in enumerate(cut(ihc, 1000)):
         for name, value in [(name, value) for when, name, value in changes if when == number]:
@@ -165,11 +179,25 @@ def test_lags_that_are_not_centred_are_aligned_at_the_first() -> None:
 def test_what_a_child_could_not_go_on_with_is_refused() -> None:
     """Pitch needs three lags of its range; the change is the autocorrelation's."""
     with pytest.raises(ValueError, match="pi_rangeHz: 80 to 400 Hz are 0 lags of the autocorrelation, wanted are 3"):
-        rosafe.process(SOUND, RATE, FEW, 1000, [(1, "ac_wSizeSec", 0.0005)], ["pitch"])
-    rosafe.process(SOUND, RATE, FEW, 1000, [(1, "ac_wSizeSec", 0.0005)], ["autocorrelation"])
+        rosafe.process(
+            SOUND,
+            RATE,
+            parameters=FEW,
+            block_frames=1000,
+            modifications=[(1, "ac_wSizeSec", 0.0005)],
+            outputs=["pitch"],
+        )
+    rosafe.process(
+        SOUND,
+        RATE,
+        parameters=FEW,
+        block_frames=1000,
+        modifications=[(1, "ac_wSizeSec", 0.0005)],
+        outputs=["autocorrelation"],
+    )
 
 
 def test_the_original_kinds_are_the_default() -> None:
-    got = rosafe.process(SOUND[:, :400], RATE, FEW)
+    got = rosafe.process(SOUND[:, :400], RATE, parameters=FEW)
     kinds = [name for name in got if name in KINDS]
     assert kinds == ["input", "preProc", "gammatone", "ihc", "ild", "ratemap", "crossCorrelation"]

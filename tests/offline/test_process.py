@@ -49,7 +49,11 @@ def test_reference_vectors(name: str) -> None:
     """Through the tree, with the changes on the way."""
     case, expected = load(name)
     results = rosafe.process(
-        expected["signal"], case["fs"], parameters(case), block_frames=case["chunks"], modifications=case["mods"]
+        expected["signal"],
+        case["fs"],
+        parameters=parameters(case),
+        block_frames=case["chunks"],
+        modifications=case["mods"],
     )
     assert_reference(case, results, expected)
 
@@ -75,12 +79,19 @@ def test_what_is_returned() -> None:
     shapes = {name: np.shape(value) for name, value in results.items()}
     assert shapes == {
         "input": (2, frames),
+        "input_time": (frames,),
         "preProc": (2, frames),
+        "preProc_time": (frames,),
         "gammatone": (2, channels, frames),
+        "gammatone_time": (frames,),
         "fb_cfHz": (31,),
         "ihc": (2, channels, frames),
+        "ihc_time": (frames,),
         "ild": (channels, 99),
+        "ild_time": (99,),
         "ild_frameRate": (),
+        "ratemap_time": (99,),
+        "crossCorrelation_time": (99,),
         "ratemap": (2, channels, 99),
         "ratemap_frameRate": (),
         "crossCorrelation": (channels, 37, 99),
@@ -93,7 +104,9 @@ def test_what_is_returned() -> None:
 
 
 def test_frame_rates_are_the_true_ones() -> None:
-    results = rosafe.process(noise(4410), 44100, {"ild_hSizeSec": 0.0125, "rm_hSizeSec": 0.003, "cc_hSizeSec": 0.007})
+    results = rosafe.process(
+        noise(4410), 44100, parameters={"ild_hSizeSec": 0.0125, "rm_hSizeSec": 0.003, "cc_hSizeSec": 0.007}
+    )
     assert [results[f"{kind}_frameRate"] for kind in FRAMED] == [44100 / 551, 44100 / 132, 44100 / 309]
 
 
@@ -102,13 +115,15 @@ def test_frame_rates_are_the_true_ones() -> None:
 def test_blocks_of_any_size_give_the_same_numbers(sizes: list[int]) -> None:
     sizes.append(max(sizes) + 100)
     sound = SOUND[:, :1500]
-    whole = rosafe.process(sound, RATE, FEW, block_frames=1500)
-    assert_same(rosafe.process(sound, RATE, FEW, block_frames=sizes), whole)
+    whole = rosafe.process(sound, RATE, parameters=FEW, block_frames=1500)
+    assert_same(rosafe.process(sound, RATE, parameters=FEW, block_frames=sizes), whole)
 
 
 def test_blocks_of_one_frame() -> None:
     sound = SOUND[:, :500]
-    assert_same(rosafe.process(sound, RATE, FEW, block_frames=1), rosafe.process(sound, RATE, FEW))
+    assert_same(
+        rosafe.process(sound, RATE, parameters=FEW, block_frames=1), rosafe.process(sound, RATE, parameters=FEW)
+    )
 
 
 def test_integers_are_normalised_and_floats_are_not() -> None:
@@ -124,7 +139,7 @@ def test_integers_are_normalised_and_floats_are_not() -> None:
         (whole.astype(float), {"in_normalizeValue": 1000}, 1),
     ]
     for signal, values, divisor in cases:
-        got = rosafe.process(signal, RATE, values, outputs=["input"])["input"]
+        got = rosafe.process(signal, RATE, parameters=values, outputs=["input"])["input"]
         np.testing.assert_array_equal(got, whole / divisor)
     full_scale = rosafe.process(np.array([[-(2**31)], [2**31 - 1]], np.int32), RATE, outputs=["input"])
     np.testing.assert_array_equal(full_scale["input"], [[-1.0000000004656613], [1.0]])
@@ -132,7 +147,9 @@ def test_integers_are_normalised_and_floats_are_not() -> None:
 
 def test_the_slip_of_the_guide() -> None:
     got, wanted = (
-        rosafe.process(SOUND, RATE, {"pp_bMiddleEarFiltering": True, "pp_middleEarModel": word}, outputs=["preProc"])
+        rosafe.process(
+            SOUND, RATE, parameters={"pp_bMiddleEarFiltering": True, "pp_middleEarModel": word}, outputs=["preProc"]
+        )
         for word in ("jespen", "jepsen")
     )
     assert_same(got, wanted, tolerance=0)
@@ -141,21 +158,25 @@ def test_the_slip_of_the_guide() -> None:
 @pytest.mark.parametrize("kind", [np.float16, np.float32, np.longdouble])
 def test_other_floats(kind: Any) -> None:
     signal = noise(500).astype(kind)
-    assert_same(rosafe.process(signal, RATE, FEW), rosafe.process(signal.astype(float), RATE, FEW), tolerance=0)
+    assert_same(
+        rosafe.process(signal, RATE, parameters=FEW),
+        rosafe.process(signal.astype(float), RATE, parameters=FEW),
+        tolerance=0,
+    )
 
 
 def test_any_memory_layout_and_lists() -> None:
     signal = noise(600)
-    wanted = rosafe.process(signal, RATE, FEW)
+    wanted = rosafe.process(signal, RATE, parameters=FEW)
     backwards = signal[:, ::-1].copy()[:, ::-1]
     for same in (np.asfortranarray(signal), backwards, signal.tolist(), signal.T.copy().T):
-        assert_same(rosafe.process(same, RATE, FEW), wanted, tolerance=0)
+        assert_same(rosafe.process(same, RATE, parameters=FEW), wanted, tolerance=0)
 
 
 def test_the_signal_stays_as_it_is_and_apart_from_the_results() -> None:
     signal = noise(600)
     before = signal.copy()
-    results = rosafe.process(signal, RATE, FEW)
+    results = rosafe.process(signal, RATE, parameters=FEW)
     np.testing.assert_array_equal(signal, before)
     arrays = [value for value in results.values() if isinstance(value, np.ndarray)]
     assert not any(np.shares_memory(signal, array) for array in arrays)
@@ -168,7 +189,7 @@ def test_the_signal_stays_as_it_is_and_apart_from_the_results() -> None:
 @pytest.mark.parametrize("frames", [0, 1, 159, 319])
 @pytest.mark.parametrize("block", [1, 100, 12000])
 def test_less_than_a_window(frames: int, block: int) -> None:
-    results = rosafe.process(noise(frames), RATE, FEW, block_frames=block, outputs=[*FRAMED, "ihc", "input"])
+    results = rosafe.process(noise(frames), RATE, parameters=FEW, block_frames=block, outputs=[*FRAMED, "ihc", "input"])
     assert {name: np.shape(results[name]) for name in ("input", "ihc", *FRAMED)} == {
         "input": (2, frames),
         "ihc": (2, 4, frames),
@@ -182,13 +203,81 @@ def test_less_than_a_window(frames: int, block: int) -> None:
 
 
 def test_one_whole_window() -> None:
-    assert rosafe.process(noise(320), RATE, FEW)["ild"].shape == (4, 1)
+    assert rosafe.process(noise(320), RATE, parameters=FEW)["ild"].shape == (4, 1)
 
 
 def test_silence() -> None:
-    results = rosafe.process(np.zeros((2, 3000)), RATE, {**FEW, "pp_bNormalizeRMS": True, "ihc_method": "bernstein"})
+    results = rosafe.process(
+        np.zeros((2, 3000)), RATE, parameters={**FEW, "pp_bNormalizeRMS": True, "ihc_method": "bernstein"}
+    )
     for name in ("preProc", "gammatone", "ihc", *FRAMED):
         assert not results[name].any(), name
+
+
+# --- shapes and types ---
+
+
+def test_two_ears_along_either_axis() -> None:
+    """As soundfile returns them; but (2, 2) is (2, N), and (1, 2) is one ear."""
+    wanted = rosafe.process(SOUND, RATE, parameters=FEW)
+    assert_same(rosafe.process(SOUND.T, RATE, parameters=FEW), wanted, tolerance=0)
+    tiny = np.array([[1.0, 2.0], [3.0, 4.0]])
+    np.testing.assert_array_equal(rosafe.process(tiny, RATE, outputs="input")["input"], tiny)
+    np.testing.assert_array_equal(rosafe.process(tiny[:1], RATE, outputs="input")["input"], tiny[:1])
+    assert rosafe.process(np.zeros((0, 2)), RATE, outputs="input")["input"].shape == (2, 0)
+
+
+@pytest.mark.parametrize("signal", [SOUND[0], SOUND[:1], SOUND[0].tolist()])
+def test_one_ear(signal: Any) -> None:
+    """Outputs per ear have one row, that of an ear of two that hear the same."""
+    changes = [(1, "fb_nChannels", 3)]
+    got = rosafe.process(signal, RATE, parameters=FEW, block_frames=1000, modifications=changes)
+    both = rosafe.process(SOUND[[0, 0]], RATE, parameters=FEW, block_frames=1000, modifications=changes)
+    per_ear = ("input", "preProc", "gammatone", "ihc", "ratemap")
+    assert {name for name in got if name in FIXED} == set(per_ear)
+    for name in per_ear:
+        np.testing.assert_array_equal(got[name], both[name][:1])
+    kinds = [kind for kind, stage in STAGES.items() if not stage.REPRESENTATION.binaural]
+    got = rosafe.process(signal[:1500] if isinstance(signal, list) else signal[..., :1500], RATE, outputs=kinds)
+    rows = [np.shape(got[name])[0] for kind in kinds for name in STAGES[kind].REPRESENTATION.outputs]
+    assert set(rows) == {1}
+
+
+def test_whole_numbers_are_scaled_as_files_are() -> None:
+    short = (2**15 * 0.9 * np.random.default_rng(5).uniform(-1, 1, (2, 500))).astype(np.int16)
+    long = short.astype(np.int32) * 2**16
+    np.testing.assert_array_equal(*(rosafe.process(x, RATE, outputs="input")["input"] for x in (short, long)))
+    raw = rosafe.process(short, RATE, parameters={"in_doNormalize": False}, outputs="input")
+    np.testing.assert_array_equal(raw["input"], long)
+
+
+# --- times ---
+
+
+def test_the_middle_of_each_frame() -> None:
+    """A click is in the frames whose middles are less than half a window away."""
+    rate = 44100
+    sound = np.zeros((2, rate // 2))
+    sound[:, 9999] = 1.0
+    values = {"fb_cfHz": [15000.0], "rm_wSizeSec": 0.013, "rm_hSizeSec": 0.004, "rm_decaySec": 1e-5, "fb_bwERBs": 4.0}
+    got = rosafe.process(sound, rate, parameters=values, outputs=["ratemap", "ihc"])
+    window, hop = 2 * round(0.0065 * rate), round(0.004 * rate)
+    np.testing.assert_allclose(got["ratemap_time"], (np.arange(got["ratemap"].shape[2]) * hop + window / 2) / rate)
+    np.testing.assert_allclose(got["ihc_time"], np.arange(rate // 2) / rate)
+    level = got["ratemap"][0, 0]
+    heard = np.abs(got["ratemap_time"] - 9999 / rate)
+    assert level[heard < 0.003].min() > 1e3 * level[heard > 0.0075].max()
+
+
+def test_times_after_a_change_of_the_hop() -> None:
+    """The next frame starts where it would have started anyway."""
+    changes = [(1, "ild_hSizeSec", 0.02), (2, "ild_wSizeSec", 0.03)]
+    got = rosafe.process(SOUND, RATE, parameters=FEW, block_frames=1000, modifications=changes, outputs=["ild"])
+    # 320 samples each 160 up to sample 1000; each 320 up to 2000; then 480 samples each 320
+    starts = [0, 160, 320, 480, 640, 800, 1120, 1440, 1760, 2080, 2400]
+    windows = [320] * 8 + [480] * 3
+    np.testing.assert_allclose(got["ild_time"], (np.array(starts) + np.array(windows) / 2) / RATE)
+    assert got["ild"].shape[1] == len(starts)
 
 
 # --- parts of the outputs ---
@@ -196,7 +285,7 @@ def test_silence() -> None:
 
 @pytest.mark.parametrize("kind", FIXED)
 def test_what_nothing_depends_on_is_not_computed(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = rosafe.process(SOUND, RATE, FEW)
+    whole = rosafe.process(SOUND, RATE, parameters=FEW)
     needed = [kind]
     while parent := FIXED[needed[-1]].parent:
         needed.append(parent)
@@ -206,8 +295,8 @@ def test_what_nothing_depends_on_is_not_computed(kind: str, monkeypatch: pytest.
 
     for other in set(STAGES) - set(needed):
         monkeypatch.setitem(STAGES, other, refuse)  # type: ignore[misc]
-    results = rosafe.process(SOUND, RATE, FEW, outputs=[kind])
-    beside = {"fb_cfHz"} if "gammatone" in needed else set()
+    results = rosafe.process(SOUND, RATE, parameters=FEW, outputs=[kind])
+    beside = {f"{kind}_time", *(["fb_cfHz"] if "gammatone" in needed else [])}
     if kind in FRAMED:
         beside.add(f"{kind}_frameRate")
     if kind == "crossCorrelation":
@@ -217,9 +306,10 @@ def test_what_nothing_depends_on_is_not_computed(kind: str, monkeypatch: pytest.
 
 
 def test_outputs_in_any_form() -> None:
-    assert set(rosafe.process(SOUND, RATE, FEW, outputs="preProc")) == {"preProc"}
-    assert set(rosafe.process(SOUND, RATE, FEW, outputs=("preProc", "input", "input"))) == {"preProc", "input"}
-    assert rosafe.process(SOUND, RATE, FEW, outputs=[]) == {}
+    assert set(rosafe.process(SOUND, RATE, parameters=FEW, outputs="preProc")) == {"preProc", "preProc_time"}
+    twice = rosafe.process(SOUND, RATE, parameters=FEW, outputs=("preProc", "input", "input"))
+    assert set(twice) == {"preProc", "preProc_time", "input", "input_time"}
+    assert rosafe.process(SOUND, RATE, parameters=FEW, outputs=[]) == {}
 
 
 def test_what_is_not_asked_for_is_not_stored() -> None:
@@ -229,7 +319,7 @@ def test_what_is_not_asked_for_is_not_stored() -> None:
         signal = noise(frames)
         tracemalloc.start()
         try:
-            rosafe.process(signal, RATE, FEW, block_frames=1000, outputs=["ild"])
+            rosafe.process(signal, RATE, parameters=FEW, block_frames=1000, outputs=["ild"])
             return tracemalloc.get_traced_memory()[1]
         finally:
             tracemalloc.stop()
@@ -256,7 +346,7 @@ def test_changes_before_their_blocks() -> None:
         (99, "ild_wSizeSec", 0.04),
         (99, "fb_highFreqHz", 9999.0),
     ]
-    results = rosafe.process(SOUND, RATE, FEW, block_frames=500, modifications=changes)
+    results = rosafe.process(SOUND, RATE, parameters=FEW, block_frames=500, modifications=changes)
     stages = Chain(RATE, {**FEW, "in_doNormalize": False})
     made = [(at, name.replace("BS", "B"), value) for at, name, value in changes if at < 6]
     outputs = stages.run(cut(SOUND, 500), sorted(made, key=lambda change: change[0]))
@@ -275,23 +365,34 @@ def test_misspelt_names_of_changes() -> None:
         (("pp_refSPLdBS", 60.0), ("pp_refSPLdB", 60.0)),
     ):
         got, wanted = (
-            rosafe.process(SOUND, RATE, {**FEW, "pp_bLevelScaling": True}, 1000, [(1, *change)], ["preProc", "ratemap"])
+            rosafe.process(
+                SOUND,
+                RATE,
+                parameters={**FEW, "pp_bLevelScaling": True},
+                block_frames=1000,
+                modifications=[(1, *change)],
+                outputs=["preProc", "ratemap"],
+            )
             for change in (wrong, right)
         )
-        unchanged = rosafe.process(SOUND, RATE, {**FEW, "pp_bLevelScaling": True}, 1000, (), ["preProc", "ratemap"])
+        unchanged = rosafe.process(
+            SOUND, RATE, parameters={**FEW, "pp_bLevelScaling": True}, block_frames=1000, outputs=["preProc", "ratemap"]
+        )
         assert_same(got, wanted, tolerance=0)
         assert not np.array_equal(got["ratemap"], unchanged["ratemap"])
 
 
 def test_changes_of_what_is_not_computed_are_none() -> None:
-    with_changes = rosafe.process(SOUND, RATE, FEW, modifications=[(0, "ild_wname", "hamming")], outputs=["preProc"])
-    assert_same(with_changes, rosafe.process(SOUND, RATE, FEW, outputs=["preProc"]), tolerance=0)
+    with_changes = rosafe.process(
+        SOUND, RATE, parameters=FEW, modifications=[(0, "ild_wname", "hamming")], outputs=["preProc"]
+    )
+    assert_same(with_changes, rosafe.process(SOUND, RATE, parameters=FEW, outputs=["preProc"]), tolerance=0)
 
 
 def test_lags_and_channels_that_change_leave_zeros_outside() -> None:
     """Lags are centred on lag zero, channels begin at the first."""
     changes = [(1, "cc_maxDelaySec", 0.002), (2, "fb_nChannels", 6), (3, "cc_maxDelaySec", 0.0005)]
-    results = rosafe.process(SOUND, RATE, FEW, block_frames=750, modifications=changes)
+    results = rosafe.process(SOUND, RATE, parameters=FEW, block_frames=750, modifications=changes)
     outputs = Chain(RATE, {**FEW, "in_doNormalize": False}).run(cut(SOUND, 750), changes)
     assert results["crossCorrelation"].shape[:2] == (6, 65)
     assert results["ihc"].shape == (2, 6, 3000)
@@ -316,7 +417,9 @@ def test_lags_and_channels_that_change_leave_zeros_outside() -> None:
 def test_a_change_in_every_block() -> None:
     """A thousand of them are checked in a moment."""
     changes = [(block, "rm_decaySec", 0.001 + 1e-5 * block) for block in range(1000)]
-    results = rosafe.process(noise(1000), RATE, FEW, block_frames=1, modifications=changes, outputs=["ratemap"])
+    results = rosafe.process(
+        noise(1000), RATE, parameters=FEW, block_frames=1, modifications=changes, outputs=["ratemap"]
+    )
     assert results["ratemap"].shape == (2, 4, 5)
 
 
@@ -325,9 +428,9 @@ def test_a_change_in_every_block() -> None:
 
 def test_several_calls_at_once() -> None:
     signals = [noise(4000, seed) for seed in range(4)]
-    alone = [rosafe.process(signal, RATE, FEW) for signal in signals]
+    alone = [rosafe.process(signal, RATE, parameters=FEW) for signal in signals]
     for got, wanted in zip(
-        harness.run_together(4, lambda user: rosafe.process(signals[user], RATE, FEW, block_frames=333)),
+        harness.run_together(4, lambda user: rosafe.process(signals[user], RATE, parameters=FEW, block_frames=333)),
         alone,
         strict=True,
     ):
@@ -358,7 +461,7 @@ def test_an_error_on_the_way_ends_it_at_once(monkeypatch: pytest.MonkeyPatch) ->
 
     monkeypatch.setattr(chain._GatedSource, "read", counting)
     with pytest.raises(Blown, match="third"):
-        rosafe.process(noise(100_000), RATE, FEW, block_frames=10)
+        rosafe.process(noise(100_000), RATE, parameters=FEW, block_frames=10)
     assert len(processed) == 3
     assert len(read) < 5000  # of 10000: the tree notices with a few blocks under way
 
@@ -390,7 +493,7 @@ def test_an_interrupt_from_the_keyboard(monkeypatch: pytest.MonkeyPatch) -> None
     before = on_signal(SIGINT, interrupt)
     try:
         with pytest.raises(KeyboardInterrupt):
-            rosafe.process(noise(20_000), RATE, FEW, block_frames=10)
+            rosafe.process(noise(20_000), RATE, parameters=FEW, block_frames=10)
     finally:
         on_signal(SIGINT, before)
     assert tree_threads() == set()

@@ -117,9 +117,7 @@ def test_no_compiler(copy: Path) -> None:
     empty.mkdir()
     compiled, status = show(copy, PATH=str(empty))
     assert not compiled
-    assert status == (
-        "numpy and scipy: the kernels are not built, and there is no gcc to build them; run scripts/install"
-    )
+    assert status == ("numpy and scipy: the kernels are not built, and there is no gcc to build them: install gcc")
     done = run(PYTHON, copy / "rosafe" / "dsp" / "kernels" / "build.py", env=environment(PATH=str(empty)))
     assert done.returncode == 1
     assert done.stderr.count("\n") == 1

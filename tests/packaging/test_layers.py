@@ -19,17 +19,19 @@ STANDS_ON: dict[str, set[str]] = {
     "representations": {"vocabulary", "dsp"},
     "interface": _NUMERICS,
     "tree": {*_NUMERICS, "interface"},
+    "setups": {*_NUMERICS, "interface", "tree"},
     "offline": {*_NUMERICS, "interface", "tree", "sound"},
-    "component": {"vocabulary", "representations", "interface", "tree"},
-    "node": {*_NUMERICS, "interface", "tree", "component"},
+    "component": {"vocabulary", "representations", "interface", "tree", "sound"},
+    "node": {*_NUMERICS, "interface", "tree", "component", "sound", "setups"},
     "bass": {"vocabulary", "interface", "component", "sound"},
-    "genomix": {"vocabulary", "interface", "tree", "component"},
+    "genomix": {"vocabulary", "interface", "tree", "component", "setups"},
     "eltclsh": {"vocabulary", "interface", "component", "genomix"},
     "view": {"interface", "sound"},
+    "live": {"vocabulary", "interface", "tree", "component", "bass", "genomix", "view", "sound"},
     "demo": {"interface", "tree", "component", "bass", "sound", "view", "offline", "vocabulary"},
 }
 TOP = {"commands", "testing", "ros", "__init__"}  # may use everything
-EVERYWHERE = {"version", "output"}
+EVERYWHERE = {"version", "output", "missing"}
 
 
 def imports(path: Path) -> Iterator[str]:

@@ -84,7 +84,8 @@ def test_its_numbers(folder: Path) -> None:
 import json, numpy as np, rosafe
 sine = np.sin(2 * np.pi * 500 * np.arange(16000) / 16000 + 0.1)
 result = rosafe.process(
-    np.stack((sine, 0 * sine)), 16000, {"fb_cfHz": [500.0]}, outputs=["zeroCrossings"], block_frames=[7, 1600],
+    np.stack((sine, 0 * sine)), 16000,
+    parameters={"fb_cfHz": [500.0]}, outputs=["zeroCrossings"], block_frames=[7, 1600],
     modifications=[(6, "zc_threshold", 1.0)],
 )
 print(json.dumps([result["zeroCrossings"][:, 0, k].tolist() for k in (10, 90)]))

@@ -29,8 +29,9 @@ class Processor:
 class Model:
     """The processors by name, and what was asked for. `fail` makes the call of that number fail."""
 
-    def __init__(self, audio: bool = True) -> None:
+    def __init__(self, audio: bool = True, sample_rate: float = RATE) -> None:
         self.instance = "rosAFE"
+        self.sample_rate = sample_rate
         self.processors: dict[str, Processor] = {}
         self.calls: list[str] = []
         self.answers: list[asyncio.Task[Mapping[str, Any]]] = []
@@ -60,9 +61,9 @@ class Model:
         await asyncio.sleep(0)
         return result
 
-    async def hears(self, port: str) -> bool:
+    async def hears(self, port: str) -> str:
         assert port == "Audio"
-        return bool(self.connected)
+        return self.connected and f"/{self.connected.removeprefix('/')}"
 
     async def published(self, topic: str) -> bool:
         return topic in ("/bass/Audio", "/left/Audio")
@@ -74,8 +75,7 @@ class Model:
         return {}
 
     def _make(self, service: str, values: Mapping[str, Any]) -> dict[str, Any]:
-        # As the node reads a ROS request: 0, "" and [] are the default.
-        given = ROSAFE.service(service).from_ros(SimpleNamespace(**values))
+        given = ROSAFE.service(service).from_ros(SimpleNamespace(**values), literal=True)
         kind, name, parent = KIND_OF_SERVICE[service], given.pop("name"), given.pop("upperDepName", "")
         if not parent:
             if not (self.audio and self.connected):
@@ -88,7 +88,7 @@ class Model:
             raise ROSAFE.error("e_existsAlready")
         try:
             checked = {p.name: p.check(given[p.name]) for p in kind.parameters if p.name in given}
-            comes: Signal | float = self.processors[parent].stage.output if parent else RATE
+            comes: Signal | float = self.processors[parent].stage.output if parent else self.sample_rate
             self.processors[name] = Processor(kind.kind, parent, STAGES[kind.kind](comes, **checked))
         except ValueError as problem:
             raise ROSAFE.error("e_badNewValue", what=str(problem)) from None
@@ -107,6 +107,7 @@ class Model:
                 {
                     "name": name,
                     "kind": processor.kind,
+                    "rate": processor.stage.output.rate,
                     "upperDepName": processor.parent,
                     "parameters": [
                         {"name": parameter, "value": text_of(value)}

@@ -268,7 +268,7 @@ def test_after_modify_parameter() -> None:
     assert build(model, "ild", pp_bRemoveDC=True)["created"] == []
 
 
-def test_literal_zeros_are_set_before_anything_hangs_on_the_processor() -> None:
+def test_zeros_are_part_of_the_request_and_what_an_input_cannot_carry_is_set_before_anything_hangs_on_it() -> None:
     model = Model()
     build(model, "filterbank", pp_coefPreEmphasis=0.0, pp_refSPLdB=0.0, in_doNormalize=False)
     made = [call for call in model.calls if not call.startswith("get")]
@@ -277,7 +277,6 @@ def test_literal_zeros_are_set_before_anything_hangs_on_the_processor() -> None:
         "InputProc",
         "modifyParameter",
         "PreProc",
-        *["modifyParameter"] * 2,
         "GammatoneProc",
     ]
     assert model.state()["time_0"][2]["pp_refSPLdB"] == 0.0

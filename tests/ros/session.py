@@ -282,7 +282,8 @@ class Goal:
 def told(response: Any) -> tuple[str, Mapping[str, Any]]:
     """Exception and detail of a failed response or result, from its JSON text."""
     body = json.loads(response.genom_exdetail)
-    assert set(body) <= {"ex", "detail"}
+    assert set(body) <= {"ex", "detail", "what"}
+    assert body.get("what") or {"what", "by"} & set(body.get("detail", {})), "there is always a reason"
     assert response.genom_exdetail == json.dumps(body, separators=(",", ":"), ensure_ascii=False)
     return body["ex"], body.get("detail", {})
 
@@ -311,7 +312,7 @@ def reader(graph: Graph, topic: str) -> Process:
 
 def expected(signal: np.ndarray, block: int, parameters: Mapping[str, Any] | None = None, rate: int = RATE) -> Any:
     """`rosafe.process` of `signal` on the same blocks."""
-    return process(signal, rate, parameters, block_frames=block)
+    return process(signal, rate, parameters=parameters, block_frames=block)
 
 
 def windowed(values: np.ndarray, seconds: float, rate: float) -> np.ndarray:

@@ -13,7 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
 
-from rosafe.component.audio import MAX_RATE, RING_SECONDS, AudioReader, AudioRing
+from rosafe.component.audio import RING_SECONDS, AudioReader, AudioRing
+from rosafe.sound.windows import MAX_RATE
 from tests.harness import PATIENCE
 
 RATE = 8  # Hz: the ring holds 80 frames
@@ -46,6 +47,7 @@ def message(rate: int, index: int, left: np.ndarray, right: np.ndarray | None = 
         "nChunksOnPort": 1,
         "nFramesPerChunk": len(left),
         "problem": "",
+        "stamp": SimpleNamespace(sec=0, nsec=0),
     }
     return SimpleNamespace(**{**fields, **other})
 
@@ -270,7 +272,7 @@ def test_malformed_messages_change_nothing_and_are_told_once(bad: Any, why: str)
 
 
 def test_a_window_beyond_all_reason_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("rosafe.component.audio.MAX_WINDOW", 100)
+    monkeypatch.setattr("rosafe.sound.windows.MAX_WINDOW", 100)
     lines: list[str] = []
     feed = AudioRing(lines.append).connect()
     feed(message(RATE, 5, np.zeros(101, np.int32)))

@@ -22,7 +22,7 @@ from std_msgs.msg import Header, String
 
 import bass.msg
 from rosafe.component import door
-from rosafe.component.audio import MAX_WINDOW
+from rosafe.sound.windows import MAX_WINDOW
 from tests.harness import PATIENCE, PYTHON, Graph, proc, python_path, wait_for
 from tests.ros.attacker import HUGE, FakePublisher, Target, closed, length, pour, publisher_header
 from tests.ros.session import Session, noise, own_node

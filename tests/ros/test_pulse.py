@@ -110,7 +110,7 @@ def test_what_takes_the_news_may_have_an_abstract_address_or_none(graph: Graph) 
             assert [what for _, what in told.told] == ["READY=1", "STOPPING=1"]
             told.told.clear()
     with graph.node("bass-ros", "-i", "unwatched", NOTIFY_SOCKET="/nowhere/at/all", WATCHDOG_USEC="3000000") as process:
-        assert process.stop(signal.SIGTERM) == 0 and process.err == ""
+        assert process.stop(signal.SIGTERM) == 0 and process.complaints == ""
 
 
 def test_the_watchdog_of_this_process(monkeypatch: pytest.MonkeyPatch) -> None:

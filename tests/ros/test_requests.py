@@ -246,7 +246,7 @@ def test_parameters_come_back_exactly(afe: Session) -> None:
                 got = getattr(told, name)
                 assert (list(got) if isinstance(value, list) else got) == value, name
     flat = {name: value for values in given.values() for name, value in values.items()}
-    truth = process(noise(2000), RATE, flat)
+    truth = process(noise(2000), RATE, parameters=flat)
     assert list(parameters.gammatone[0].fb_cfHz) == list(truth["fb_cfHz"])
     assert parameters.gammatone[0].fb_nChannels == 3
     assert list(parameters.crossCorrelation[0].cc_lags) == list(truth["cc_lags"])
@@ -457,5 +457,6 @@ def test_the_same_name_at_once_is_given_once(afe: Session) -> None:
     afe.build("PreProc")
     responses = harness.run_together(8, lambda _: afe.call("GammatoneProc", fb_nChannels=2))
     failed = [json.loads(r.genom_exdetail) for r in responses if not r.genom_success]
-    assert failed == [{"ex": "::rosAFE::e_existsAlready"}] * 7
+    why = "'gammatone' exists already, of kind gammatone"
+    assert failed == [{"ex": "::rosAFE::e_existsAlready", "what": why}] * 7
     assert afe.processors()["gammatone"] == ["gammatone"]

@@ -22,7 +22,7 @@ def test_vectors(name: str, block_frames: int | list[int]) -> None:
         expected = dict(stored)
     signal = expected.pop("signal")
     parameters = {"fb_cfHz": case["cf"], **case.get("parameters", {})}
-    got = rosafe.process(signal, case["rate"], parameters, block_frames, outputs=list(expected))
+    got = rosafe.process(signal, case["rate"], parameters=parameters, block_frames=block_frames, outputs=list(expected))
     for output, wanted in expected.items():
         found = make.kept(output, got[output])
         assert found.shape == wanted.shape, output

@@ -106,7 +106,7 @@ def test_no_frames_give_no_estimates() -> None:
 def test_series_with_other_hops_are_brought_to_one_axis() -> None:
     signal = np.random.default_rng(2).normal(0, 0.1, (2, 32000))
     result = rosafe.process(
-        signal, 16000, {"cc_hSizeSec": 0.015, "cc_wSizeSec": 0.03, "rm_hSizeSec": 0.005, "rm_wSizeSec": 0.01}
+        signal, 16000, parameters={"cc_hSizeSec": 0.015, "cc_wSizeSec": 0.03, "rm_hSizeSec": 0.005, "rm_wSizeSec": 0.01}
     )
     shown = Representations.from_process(result)
     assert shown.ild.shape[-1] == shown.ratemap.shape[-1] == shown.correlation.shape[-1] == len(shown.times) > 150

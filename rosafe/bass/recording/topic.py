@@ -13,9 +13,8 @@ import rospy
 
 from rosafe.bass.sources.base import Chunk, device_error, hwparams_error
 from rosafe.component import wire
-from rosafe.component.audio import MAX_WINDOW, malformed
-from rosafe.component.overlap import WindowStream
 from rosafe.interface import BASS, ComponentError
+from rosafe.sound.windows import MAX_WINDOW, WindowStream, malformed
 
 FIRST_SECONDS = 3.0  # for a first message
 NOBODY_SECONDS = 1.0  # for one where nobody publishes the topic

@@ -14,7 +14,7 @@ DEFAULT_RATE = 44100
 _CONTROL = re.compile("[\0-\x1f\x7f-\x9f\u2028\u2029]")  # would make several lines of a line in the log
 # What ListDevices says of the sources that need no hardware: name, contents.
 BUILT_IN = (
-    ("file:PATH", "a sound file in real time; ?loop=1 repeats it, ?start=SECONDS skips its beginning"),
+    ("file:PATH", "a sound file in real time; ?loop=1 repeats it, ?start=SECONDS skips its beginning, ?channels=3,4"),
     ("bag:PATH", "what rosbag recorded of a port Audio; ?topic=/bass/Audio, ?loop=1, ?start=SECONDS"),
     ("scene:", "a source that walks from far left to far right and back; ?seconds=10&level=-30&seed=0"),
 )

@@ -9,7 +9,7 @@ import numpy as np
 
 from rosafe.bass.sources.base import Chunk, Pacer, device_error, flag, hwparams_error, number, parse_options
 from rosafe.interface import BASS
-from rosafe.sound.audiofile import AudioFile, AudioFileError
+from rosafe.sound.audiofile import AudioFile, AudioFileError, channel_pair
 
 
 def split_path(text: str) -> tuple[str, str]:
@@ -21,16 +21,17 @@ def split_path(text: str) -> tuple[str, str]:
 
 
 _MAX_RATE = BASS.service("Acquire").parameter("sampleRate").maximum or 0
-_OPTIONS = {"loop": flag, "start": number(0, 1e9)}
+_OPTIONS = {"channels": channel_pair, "loop": flag, "start": number(0, 1e9)}
 
 
 class FileSource:
-    """A two-channel sound file, read from disk as it is played.
+    """Two channels of a sound file, read from disk as it is played.
 
     Parameters
     ----------
     text : str
         ``PATH`` or ``PATH?OPTIONS``. PATH is relative to the process's folder, ``~`` is the user's home. Options:
+        ``channels=3,4`` takes those two (from 1) of a file with more, ``channels=1,1`` one for both ears;
         ``start=SECONDS`` leaves out the beginning; ``loop=1`` goes on from there again at the end, for ever, without
         a gap. Where the whole text is the name of a file, a question mark in it is part of the name.
     sample_rate : int
@@ -56,6 +57,8 @@ class FileSource:
         self._start = self._position = round(options.get("start", 0.0) * self._file.sample_rate)
         self.sample_rate = self._file.sample_rate
         try:
+            if "channels" in options:
+                self._pick(options["channels"])
             self._check(sample_rate)
             self._file.seek(self._start)
         except BaseException:
@@ -63,6 +66,12 @@ class FileSource:
             raise
         self._frames_per_chunk = frames_per_chunk
         self._pacer = Pacer(self.sample_rate, stopping)
+
+    def _pick(self, channels: tuple[int, int]) -> None:
+        try:
+            self._file.pick(channels)
+        except AudioFileError as problem:
+            raise hwparams_error(str(problem)) from None
 
     def _check(self, sample_rate: int) -> None:
         path, channels = self._file.path, self._file.channels
@@ -72,7 +81,7 @@ class FileSource:
                 f"{path} lasts {seconds:g} s, start={self._start / self.sample_rate:g} is behind its end"
             )
         if channels != 2:
-            cure = f"`sox {path} -c 2 two.wav` makes two of it" if channels == 1 else "keep two, left and right ear"
+            cure = "?channels=1,1 gives it to both ears" if channels == 1 else "?channels=1,2 takes those"
             raise hwparams_error(f"{path} has {channels} channel{'s' * (channels > 1)}, two are needed: {cure}")
         if self.sample_rate > _MAX_RATE:
             raise hwparams_error(f"{path} has a sample rate of {self.sample_rate} Hz, at most {_MAX_RATE:.0f} go")

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from rosafe import interface
+from rosafe import interface, missing
 from rosafe.bass.sources.base import device_error
 
 _HANDLER = ctypes.CFUNCTYPE(
@@ -25,7 +25,8 @@ def load_alsaaudio() -> Any:
     try:
         module = importlib.import_module("alsaaudio")
     except ImportError as problem:
-        raise device_error(f"ALSA devices need pyalsaaudio ({problem}); scripts/install brings it") from None
+        todo = missing.install("alsaaudio")
+        raise device_error(f"ALSA devices need pyalsaaudio ({problem}); {todo}") from None
     if not hasattr(module, "asoundlib_version"):
         raise device_error(
             f"{module.__file__} is Debian's python3-alsaaudio 0.8, which cannot capture on this Python; "

@@ -12,7 +12,7 @@ from __future__ import annotations
 import ctypes
 import functools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
@@ -348,6 +348,20 @@ def patterns(levels: FloatArray, count: int, reach: int, places: NDArray[np.int6
     return sums[..., :count]
 
 
+def join(blocks: Sequence[FloatArray], whole: FloatArray) -> None:
+    """Blocks (*rows, N) one after the other into `whole`: as `numpy.concatenate`, which is the twin.
+
+    That takes many times as long where N is small. It serves other types than float64, too, and without kernels.
+    """
+    fits = whole.ndim > 1 and rows_apart(whole) and all(block.dtype == whole.dtype for block in blocks)
+    if not fits or not compiled():
+        np.concatenate(blocks, axis=-1, out=whole)
+        return
+    held = [np.ascontiguousarray(block) for block in blocks]
+    table = np.array([[_address(block) for block in held], [block.shape[-1] for block in held]], np.int64)
+    _function("rosafe_join")(len(held), *map(_address, table), math.prod(whole.shape[:-1]), *_rows(whole))
+
+
 @contextmanager
 def denormals_off() -> Iterator[None]:
     """Within this, numpy and scipy take denormal numbers for 0 on this thread, which is many times faster.
@@ -375,8 +389,8 @@ _ANYTHING = ctypes.c_char * 0
 
 
 def _address(array: NDArray[Any]) -> int:
-    try:
-        return ctypes.addressof(_ANYTHING.from_buffer(array))  # takes a fifth of the time of the other way
+    try:  # takes a fifth of the time of the other way
+        return ctypes.addressof(_ANYTHING.from_buffer(array))  # type: ignore[arg-type]
     except TypeError:  # it cannot be written to, or not in one piece
         address: int = array.ctypes.data
         return address

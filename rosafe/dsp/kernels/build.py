@@ -92,7 +92,7 @@ def _compiler() -> str:
     for name in (asked,) if asked else COMPILERS:
         if shutil.which(name):
             return name
-    raise BuildError("the kernels are not built, and there is no gcc to build them; run scripts/install")
+    raise BuildError("the kernels are not built, and there is no gcc to build them: install gcc")
 
 
 def _build(folder: Path, levels: dict[int, str]) -> None:

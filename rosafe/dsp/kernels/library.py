@@ -25,6 +25,7 @@ _ARGUMENTS = {
     "rosafe_ratemap": (*_FRAMES, _INTEGER, _REAL, _ARRAY, _ARRAY),
     "rosafe_modulation": (*_FRAMES, _INTEGER, *[_ARRAY] * 3),
     "rosafe_patterns": (_ARRAY, *[_INTEGER] * 3, _ARRAY, _INTEGER, _ARRAY, _ARRAY),
+    "rosafe_join": (_INTEGER, _ARRAY, _ARRAY, _INTEGER, _ARRAY, _INTEGER),
     "rosafe_denormals_off": (),
     "rosafe_denormals_as": (_BITS,),
     "rosafe_correlations": (*_FRAMES, _INTEGER, _REAL, _ARRAY, _INTEGER),

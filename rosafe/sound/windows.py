@@ -1,4 +1,4 @@
-"""From the sliding windows of a port back to the stream that they show: every frame once, losses declared."""
+"""Messages of a port Audio, sliding windows: which can be used, and the stream that they show, every frame once."""
 
 from __future__ import annotations
 
@@ -6,13 +6,51 @@ from typing import Any
 
 import numpy as np
 
+MAX_RATE = 1_000_000  # Hz; beyond that a message is garbage, not audio
+MAX_WINDOW = 2**24  # frames in one message, as with bass
 MAX_JUMP_SECONDS = 3600.0  # an index that jumps further is no loss but another stream
+
+
+def malformed(message: Any) -> str:
+    """What is wrong with a message; empty where it can be used."""
+    left, right, rate, index = len(message.left), len(message.right), message.sampleRate, message.lastFrameIndex
+    if left != right:
+        return f"{left} left and {right} right samples"
+    if not 0 < left <= MAX_WINDOW:
+        return f"{left} samples per ear, allowed are 1 to {MAX_WINDOW}"
+    if message.nChunksOnPort * message.nFramesPerChunk != left:
+        return f"{left} samples per ear, where there should be {message.nChunksOnPort} x {message.nFramesPerChunk}"
+    if not 0 < rate <= MAX_RATE:
+        return f"a sample rate of {rate} Hz, allowed are 1 to {MAX_RATE} Hz"
+    if index >= 2**63:
+        return f"lastFrameIndex {index} is beyond all ages"
+    return ""
 
 
 def joined(new: int, window: int) -> tuple[int, int]:
     """Of `new` frames since the last message, how many are lost, and how many a window of so many frames shows."""
     shown = min(new, window)
     return new - shown, shown
+
+
+def new_frames(expected: float, window: np.ndarray, before: np.ndarray) -> int:
+    """How many frames a framed port's window has moved on, which is a whole number near `expected`.
+
+    The grid of the frames is not on the wire; where the windows fit onto each other is.
+
+    Parameters
+    ----------
+    expected : float
+        Of the audio frames that went by, and the port's frame rate.
+    window, before : ndarray, (..., frames)
+        What the newest message shows, and the one before.
+    """
+    frames = window.shape[-1]
+    if expected <= frames and before.shape == window.shape:
+        for count in sorted({int(expected), int(expected) + 1}, key=lambda count: abs(count - expected)):
+            if count >= frames or np.array_equal(window[..., : frames - count], before[..., count:], equal_nan=True):
+                return count
+    return round(expected)
 
 
 class WindowStream:

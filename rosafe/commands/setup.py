@@ -1,0 +1,128 @@
+"""Save the tree of a running rosAFE with its sound as a file, and build it again from that.
+
+`save` writes what bass acquires, what the Audio port hears, and every processor with its parent and parameters, to the
+last digit. `load` makes all that: wholly, or nothing is changed. What is there already and the same is used; where
+something else has a name of the setup's, or bass acquires something else, it is refused. docs/setups.md describes the
+file, which is meant to be read and written by people."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+from rosafe.commands import Failure
+from rosafe.commands._component import component, prepare, told
+from rosafe.interface import MAX_SETUP, ROSAFE, ComponentError
+from rosafe.output import write_whole
+from rosafe.setups import Setup, SetupError, read, write
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments."""
+    parser.usage = "rosafe setup save|load FILE.yaml [--full] [--wait SECONDS] [-i INSTANCE]\n       rosafe setup -h"
+    parser.add_argument("action", choices=("save", "load"), help="what to do")
+    parser.add_argument("file", metavar="FILE.yaml", help="the setup; - is the standard output or input")
+    parser.add_argument("--full", action="store_true", help="save: write what has its default value, too")
+    parser.add_argument(
+        "--wait",
+        type=_seconds,
+        default=0.0,
+        metavar="SECONDS",
+        help="wait so long for master and nodes that are just starting (default: 0)",
+    )
+    parser.add_argument(
+        "-i",
+        "--instance",
+        default=ROSAFE.name,
+        metavar="INSTANCE",
+        help=f"name of the rosAFE node (default: {ROSAFE.name})",
+    )
+    parser.epilog = (
+        "exit status: 0 done, 1 refused (nothing has changed), 2 wrong command line\n\n"
+        "examples:\n"
+        "  rosafe setup save tree.yaml\n"
+        "  rosafe setup load tree.yaml\n"
+        "  rosafe setup save - --full"
+    )
+
+
+def _seconds(text: str) -> float:
+    try:
+        seconds = float(text)
+    except ValueError:
+        seconds = -1.0
+    if not 0 <= seconds <= 3600:
+        raise argparse.ArgumentTypeError(f"{text!r} is no time: seconds from 0 to 3600")
+    return seconds
+
+
+def run(options: argparse.Namespace) -> int:
+    """Save or load."""
+    if options.full and options.action == "load":
+        options.usage_error("--full is for save")
+    setup = read_file(options.file) if options.action == "load" else None
+    prepare(options.wait)
+    if setup is not None:
+        show(asyncio.run(load(setup, options.instance, options.wait)))
+    else:
+        _keep(options.file, asyncio.run(_saved(options)))
+    return 0
+
+
+def read_file(name: str) -> Setup:
+    """The setup in the file `name`; Failure, with file and line, where there is none."""
+    try:
+        if name == "-":
+            data = sys.stdin.buffer.read(4 * MAX_SETUP + 1)
+        else:
+            with Path(name).open("rb") as file:
+                data = file.read(4 * MAX_SETUP + 1)
+        return read(data.decode("utf-8-sig"))
+    except UnicodeDecodeError:
+        raise Failure(f"{name}: not a setup: the file is not UTF-8") from None
+    except OSError as problem:
+        raise Failure(f"{name}: {problem.strerror or problem}") from None
+    except SetupError as problem:
+        raise Failure(f"{name}, {problem}") from None
+
+
+async def load(setup: Setup, instance: str, wait: float = 0.0) -> dict[str, Any]:
+    """Build it on a running rosAFE; the outputs of `interface.LOAD_SETUP`, or Failure."""
+    from rosafe.genomix import setups
+
+    async with component(instance, wait) as proxy:
+        try:
+            return await setups.apply(proxy, setup, wait)
+        except ComponentError as problem:
+            raise Failure(told(problem)) from None
+
+
+async def _saved(options: argparse.Namespace) -> str:
+    from rosafe.genomix import setups
+
+    async with component(options.instance, options.wait) as proxy:
+        try:
+            return write(await setups.capture(proxy), options.full)
+        except ComponentError as problem:
+            raise Failure(told(problem)) from None
+
+
+def _keep(name: str, text: str) -> None:
+    if name == "-":
+        print(text, end="")
+    else:
+        write_whole(name, text.encode())
+        print(f"{os.fspath(name)}: {text.count(chr(10))} lines", file=sys.stderr)
+
+
+def show(answer: dict[str, Any]) -> None:
+    """A line for the sound and one for each processor."""
+    if answer["sound"]:
+        print(f"{answer['sound']:7}  sound")
+    for how in ("reused", "created"):
+        for name in answer[how]:
+            print(f"{how:7}  {name}")

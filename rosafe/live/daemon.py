@@ -1,0 +1,126 @@
+"""Runs the live page: the graph, the server, the browser, a clean end."""
+
+from __future__ import annotations
+
+import asyncio
+import errno
+import gc
+import html
+import os
+import signal
+import sys
+import tempfile
+import webbrowser
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+from rosafe.component import startup
+from rosafe.genomix.access import own_names
+from rosafe.genomix.graph import Graph
+from rosafe.live.access import Door
+from rosafe.live.health import Health
+from rosafe.live.hub import Hub
+from rosafe.live.robot import Robot
+from rosafe.live.server import Server
+
+THREADS = 8  # that wait for rospy
+EVERYWHERE = {"0.0.0.0": "127.0.0.1", "::": "[::1]", "": "127.0.0.1"}  # and where this machine finds itself then
+
+
+@dataclass(frozen=True)
+class Options:
+    """What `rosafe live` was told."""
+
+    port: int
+    host: str
+    browser: bool
+    watch: bool
+    instance: str
+    bass: str
+    images: bool = False
+
+
+class Taken(Exception):
+    """The server cannot listen; the text is one line that says why and what to do."""
+
+
+async def serve(options: Options) -> None:
+    """Serve until a signal comes; Taken, or ComponentError where there is no master."""
+    loop = asyncio.get_running_loop()
+    end = asyncio.Event()
+    for number in startup.ending_signals():
+        loop.add_signal_handler(number, end.set)
+    signal.signal(signal.SIGPIPE, signal.SIG_IGN)
+    loop.set_default_executor(ThreadPoolExecutor(THREADS, "rospy"))
+    graph = Graph(os.environ["ROS_MASTER_URI"], "rosafe_live")
+    robot = Robot(graph, options.instance, options.bass)
+    server: Server | None = None
+    opened: Path | None = None
+    try:
+        await graph.become_node()
+        hub = Hub(robot.audio_topic, lambda: loop.is_closed() or loop.call_soon_threadsafe(news))
+        door = Door(own_names() | {options.host})
+        asks = {
+            "devices": robot.devices,
+            "acquire": robot.acquire,
+            "silence": robot.silence,
+            "build": robot.build,
+            "usual": robot.build_usual,
+            "modify": robot.modify,
+            "remove": robot.remove,
+            "save": robot.save_setup,
+            "load": robot.load_setup,
+        }
+        server = Server(robot, hub, Health(options.instance, options.bass), door, asks, options.watch)
+        news = server.news
+        try:
+            port = await server.start(options.host, options.port)
+        except OSError as problem:
+            raise Taken(_why(problem, options)) from None
+        shown = EVERYWHERE.get(options.host, f"[{options.host}]" if ":" in options.host else options.host)
+        url = f"http://{shown}:{port}/?token={door.token}"
+        print(f"The live page is at\n\n    {url}\n\nWho has this address may use it. Ctrl-C ends it.", flush=True)
+        if options.browser and _has_display():
+            opened = await asyncio.to_thread(_open, url)
+        gc.freeze()
+        waits = [asyncio.create_task(event.wait()) for event in (end, graph.gone)]
+        await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
+    finally:
+        startup.watchdog(startup.END_SECONDS, 0)
+        if opened is not None:
+            opened.unlink(missing_ok=True)
+        if server is not None:
+            await server.close()
+        await robot.close()
+        await graph.close()
+
+
+def _why(problem: OSError, options: Options) -> str:
+    place = f"port {options.port} of {options.host}"
+    if problem.errno == errno.EADDRINUSE:
+        return f"{place} is taken, perhaps by another rosafe live; --port chooses another"
+    if problem.errno == errno.EACCES:
+        return f"{place} is not for this user; --port chooses another"
+    if problem.errno == errno.EADDRNOTAVAIL or (isinstance(problem, OSError) and problem.errno is None):
+        return f"{options.host} is no address of this machine; --host names one, such as 0.0.0.0 for all"
+    return f"cannot listen on {place}: {problem.strerror or problem}"
+
+
+def _has_display() -> bool:
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def _open(url: str) -> Path | None:
+    """Open the browser, by a file that only this user reads: command lines, with the token, are for all to see."""
+    descriptor, name = tempfile.mkstemp(prefix="rosafe-live-", suffix=".html")
+    with os.fdopen(descriptor, "w", encoding="utf-8") as stream:
+        stream.write(f'<!DOCTYPE html><meta http-equiv="refresh" content="0; url={html.escape(url)}">\n')
+    try:
+        if webbrowser.open(Path(name).as_uri()):
+            return Path(name)
+    except webbrowser.Error:
+        pass
+    print("no browser could be opened; open the address in one", file=sys.stderr)
+    os.unlink(name)
+    return None

@@ -1,0 +1,88 @@
+// The connection to the server: requests with answers, news by their subject, columns of pictures.
+
+const FORMAT = 1;
+const HEAD = 8;
+const PIECE = 32;
+
+export class Link extends EventTarget {
+  #socket = null;
+  #number = 0;
+  #waiting = new Map();
+  #pause = 500;
+  bytes = 0;
+  pictures = 0;
+
+  open() {
+    const socket = new WebSocket(`ws://${location.host}/socket`);
+    socket.binaryType = "arraybuffer";
+    socket.addEventListener("open", () => {
+      this.#socket = socket;
+      this.#pause = 500;
+      this.#tell("open", {});
+    });
+    socket.addEventListener("message", (event) => {
+      if (typeof event.data === "string") this.#news(JSON.parse(event.data));
+      else this.#columns(event.data);
+    });
+    socket.addEventListener("close", () => {
+      this.#socket = null;
+      for (const { reject } of this.#waiting.values()) reject(new Error("the connection to the server is lost"));
+      this.#waiting.clear();
+      this.#tell("close", {});
+      setTimeout(() => this.open(), this.#pause);
+      this.#pause = Math.min(5000, this.#pause * 1.6);
+    });
+  }
+
+  ask(what, given = {}) {
+    if (!this.#socket) return Promise.reject(new Error("there is no connection to the server"));
+    const id = ++this.#number;
+    this.#socket.send(JSON.stringify({ id, do: what, with: given }));
+    return new Promise((resolve, reject) => this.#waiting.set(id, { resolve, reject }));
+  }
+
+  #news(message) {
+    if (message.about !== "answer") {
+      this.#tell(message.about, message);
+      return;
+    }
+    const waiting = this.#waiting.get(message.id);
+    this.#waiting.delete(message.id);
+    if (message.error !== undefined) waiting?.reject(new Error(message.error));
+    else waiting?.resolve(message.ok);
+  }
+
+  #columns(buffer) {
+    const bytes = new DataView(buffer);
+    if (bytes.getUint16(0, true) !== FORMAT) return;
+    this.bytes += buffer.byteLength;
+    this.pictures += 1;
+    let at = HEAD;
+    for (let left = bytes.getUint16(2, true); left > 0; left -= 1) {
+      const piece = {
+        number: bytes.getUint32(at, true),
+        first: bytes.getUint32(at + 4, true),
+        count: bytes.getUint16(at + 8, true),
+        size: bytes.getUint16(at + 10, true),
+        stride: bytes.getUint8(at + 13),
+        end: bytes.getFloat64(at + 16, true),
+      };
+      const numbers = piece.count * piece.size;
+      const floats = bytes.getUint8(at + 12) === 1;
+      if (floats) {
+        piece.values = new Float32Array(buffer, at + PIECE, numbers);
+      } else {
+        const low = bytes.getFloat32(at + 24, true);
+        const step = (bytes.getFloat32(at + 28, true) - low) / 254;
+        const steps = new Uint8Array(buffer, at + PIECE, numbers);
+        piece.values = Float32Array.from(steps, (one) => (one === 255 ? NaN : low + one * step));
+      }
+      this.#tell("columns", piece);
+      at += PIECE + Math.ceil((numbers * (floats ? 4 : 1)) / 8) * 8;
+    }
+  }
+
+  #tell(name, detail) {
+    this.dispatchEvent(new CustomEvent(name, { detail }));
+  }
+}

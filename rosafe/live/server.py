@@ -1,0 +1,244 @@
+"""The HTTP server of the live page, on aiohttp: the files of the page, and a WebSocket for each window."""
+
+from __future__ import annotations
+
+import asyncio
+import functools
+import logging
+import time
+from collections.abc import Awaitable, Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+from aiohttp import web
+
+from rosafe.genomix.tasks import shared
+from rosafe.interface import ComponentError
+from rosafe.live.access import HEADERS, Door
+from rosafe.live.client import Ask, Client
+from rosafe.live.health import Health
+from rosafe.live.hub import Hub
+from rosafe.live.pictures import Tree
+from rosafe.live.robot import Robot, catalogue, told
+from rosafe.version import VERSION
+
+PAGE = Path(__file__).with_name("page")
+LOOK_SECONDS = 1.0  # between two looks at the components, while there is a page
+MAX_CLIENTS = 32
+MAX_CONNECTIONS = 256
+KNOCK_SECONDS = 10.0  # a connection that was not let in by then is closed
+HARMLESS = {"save"}  # what a page that only watches may ask for
+_TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
+
+Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
+log = logging.getLogger("rosafe.live")
+
+
+class Server:
+    """The live page of `robot`.
+
+    Parameters
+    ----------
+    robot : Robot
+    hub : Hub
+    health : Health
+    door : Door
+    asks : mapping
+        What the page may ask for, by name; nothing but `look` where it is read-only.
+    watch : bool
+        Whether it is read-only.
+    """
+
+    def __init__(
+        self, robot: Robot, hub: Hub, health: Health, door: Door, asks: Mapping[str, Ask], watch: bool
+    ) -> None:
+        self._robot, self._hub, self._health, self._door, self._watch = robot, hub, health, door, watch
+        self._asks = {name: _watched(ask, name, watch) for name, ask in asks.items()}
+        self._hello = {"version": VERSION, "watch": watch, **catalogue()}
+        self._clients: set[Client] = set()
+        self._tree_told: Any = None
+        self._problem = ""
+        self._again = asyncio.Event()  # look at the components now
+        self._files = {
+            path.name: (path.read_bytes(), _TYPES[path.suffix]) for path in PAGE.iterdir() if path.suffix in _TYPES
+        }
+        app = web.Application(middlewares=[self._guard], client_max_size=1024)
+        app.router.add_get("/", self._page)
+        app.router.add_get("/socket", self._socket)
+        app.router.add_get("/{name}", self._file)
+        self._runner = web.AppRunner(app, access_log=None)
+        self._connections: set[Connection] = set()
+        self._listener: asyncio.AbstractServer | None = None
+        self._looking: asyncio.Task[None] | None = None
+
+    async def start(self, host: str, port: int) -> int:
+        """Listen and return the port; OSError where that cannot be."""
+        await self._runner.setup()
+        assert self._runner.server is not None
+        connect = functools.partial(Connection, self._connections, self._runner.server)
+        self._listener = await asyncio.get_running_loop().create_server(connect, host, port)
+        self._looking = asyncio.create_task(self._look())
+        taken = int(self._listener.sockets[0].getsockname()[1])
+        self._door.cookie_name = f"rosafe_live_{taken}"
+        return taken
+
+    async def close(self) -> None:
+        """Stop listening, end all pages."""
+        if self._listener is not None:
+            self._listener.close()
+        if self._looking is not None:
+            self._looking.cancel()
+        await asyncio.gather(*(client.close() for client in self._clients), return_exceptions=True)
+        await self._runner.cleanup()
+
+    def news(self) -> None:
+        """There are new columns."""
+        for client in self._clients:
+            client.wake()
+
+    # --- who may ---
+
+    @web.middleware
+    async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+        why = self._door.refusal(request.headers, request.query, request.cookies)
+        if why:
+            return web.Response(status=403, text=f"rosafe live: {why}\n", headers={**HEADERS, "Connection": "close"})
+        protocol = request.protocol
+        if isinstance(protocol, Connection):
+            protocol.let_in()
+        try:
+            response = await handler(request)
+        except web.HTTPException as problem:
+            text = f"rosafe live: {problem.reason}\n"
+            return web.Response(status=problem.status, text=text, headers=HEADERS)
+        return response
+
+    # --- the page ---
+
+    async def _page(self, request: web.Request) -> web.StreamResponse:
+        response = self._answer("index.html")
+        if self._door.has_token(request.query):
+            response.set_cookie(self._door.cookie_name, self._door.cookie, httponly=True, samesite="Strict", path="/")
+        return response
+
+    async def _file(self, request: web.Request) -> web.StreamResponse:
+        name = request.match_info["name"]
+        if name not in self._files:
+            raise web.HTTPNotFound
+        return self._answer(name)
+
+    def _answer(self, name: str) -> web.Response:
+        body, kind = self._files[name]
+        return web.Response(body=body, content_type=kind, charset="utf-8", headers=HEADERS)
+
+    async def _socket(self, request: web.Request) -> web.StreamResponse:
+        if len(self._clients) >= MAX_CLIENTS:
+            text = f"rosafe live: {MAX_CLIENTS} pages are open, which is as many as there may be\n"
+            return web.Response(status=503, text=text, headers=HEADERS)
+        client = Client(self._hub, self._asks, self._again.set)
+        client.tell("hello", self._hello)
+        self._clients.add(client)
+        self._tree_told = None
+        self._again.set()
+        try:
+            return await client.serve(request)
+        finally:
+            self._clients.discard(client)
+
+    # --- the components ---
+
+    async def _look(self) -> None:
+        """Look at the components as long as somebody looks at the page, and tell what has changed."""
+        listening = False
+        while True:
+            if not self._clients:
+                if listening:
+                    await asyncio.to_thread(self._health.close)
+                    listening = False
+                self._again.clear()
+                await self._again.wait()
+                continue
+            self._again.clear()
+            try:
+                if not listening:
+                    await asyncio.to_thread(self._health.listen)
+                    listening = True
+                await self._look_once()
+            except Exception:  # a fault of ours must not blind the page for ever
+                log.exception("looking at the components")
+            try:
+                await asyncio.wait_for(self._again.wait(), LOOK_SECONDS)
+            except TimeoutError:
+                continue
+
+    async def _look_once(self) -> None:
+        try:
+            tree = await self._robot.tree()
+            self._problem = ""
+        except ComponentError as problem:
+            tree = Tree()
+            self._problem = told(problem)
+        changed = await asyncio.to_thread(self._hub.replant, tree)
+        shown = [
+            {"name": p.name, "kind": p.kind, "parent": p.parent, "topic": p.topic, "rate": p.rate, "values": p.values}
+            for p in tree.processors.values()
+        ]
+        if changed or shown != self._tree_told:
+            self._tree_told = shown
+            for client in list(self._clients):
+                client.tell("tree", {"processors": shown})
+                await shared(client.look_again(changed))
+        status = {"problem": self._problem, "time": time.time(), **self._health.status(), **self._sound()}
+        for client in self._clients:
+            client.tell("status", status)
+
+    def _sound(self) -> dict[str, Any]:
+        audio = self._hub.audio
+        if audio is None:
+            return {"sampleRate": 0, "silent": None, "delay": None, "latencies": {}}
+        silent = time.monotonic() - audio.heard_at if audio.heard_at else None
+        latencies = {topic: round(seconds, 4) for topic, seconds in list(self._hub.latencies.items())}
+        return {
+            "sampleRate": audio.sample_rate,
+            "silent": silent,
+            "delay": round(audio.delay, 4) if audio.heard_at else None,
+            "latencies": latencies,
+            "lostHere": self._hub.lost,
+        }
+
+
+def _watched(ask: Ask, name: str, watch: bool) -> Ask:
+    if not watch or name in HARMLESS:
+        return ask
+
+    async def refuse(_: Mapping[str, Any]) -> dict[str, Any]:
+        raise ValueError(f"{name}: this page is for watching only (rosafe live --watch)")
+
+    return refuse
+
+
+class Connection(web.RequestHandler):
+    """One connection: only so many, and those that do not show the token soon are closed."""
+
+    def __init__(self, connections: set[Connection], server: web.Server) -> None:
+        super().__init__(server, loop=asyncio.get_running_loop(), access_log=None)
+        self._all = connections
+        self._late: asyncio.TimerHandle | None = None
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        super().connection_made(transport)
+        if len(self._all) >= MAX_CONNECTIONS:
+            transport.abort()  # type: ignore[attr-defined]
+            return
+        self._all.add(self)
+        self._late = asyncio.get_running_loop().call_later(KNOCK_SECONDS, transport.close)
+
+    def let_in(self) -> None:
+        """It knows the token."""
+        if self._late is not None:
+            self._late.cancel()
+
+    def connection_lost(self, exc: BaseException | None) -> None:
+        self._all.discard(self)
+        self.let_in()
+        super().connection_lost(exc)

@@ -1,0 +1,75 @@
+"""A node's tree in a file, so that a node that was killed comes back as it was: `rosAFE-ros --keep FILE`."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+from rosafe.interface import MAX_SETUP, ROSAFE
+from rosafe.output import OutputError, write_whole
+from rosafe.setups import Setup, SetupError, read, write
+
+
+class Keeper:
+    """Writes what `describe` tells into a file, whenever `save` is called and it has changed.
+
+    The file is a setup (docs/setups.md): whole at any moment, whatever kills the process or the machine.
+
+    Parameters
+    ----------
+    path : Path
+    describe : callable
+        The setup that is in force.
+    report : callable
+        Gets one line for the log where the file cannot be written, once until it can.
+
+    Attributes
+    ----------
+    problem : str
+        Why it could not be written the last time.
+    """
+
+    def __init__(self, path: Path, describe: Callable[[], Setup], report: Callable[[str], None]) -> None:
+        self.path = path
+        self.problem = ""
+        self._describe = describe
+        self._report = report
+        self._written = ""
+        self._over = False
+        self._lock = threading.Lock()
+
+    def kept(self) -> Setup:
+        """What the file holds; an empty setup where there is none yet. ComponentError where it cannot be used."""
+        try:
+            self._written = self._text()
+            return read(self._written)
+        except FileNotFoundError:
+            return Setup()
+        except (OSError, UnicodeDecodeError, SetupError) as problem:
+            why = getattr(problem, "strerror", None) or problem
+            what = f"{self.path}, {why}: mend it, or remove it to start afresh"
+            raise ROSAFE.error("e_badNewValue", what=what) from None
+
+    def _text(self) -> str:
+        with self.path.open("rb") as file:
+            return file.read(4 * MAX_SETUP + 1).decode()
+
+    def save(self) -> None:
+        """Have all changes up to now in the file once this returns; where that fails, life goes on."""
+        with self._lock:  # who has waited here finds, as a rule, that the one before has written his change, too
+            text = "" if self._over else write(self._describe(), full=True)
+            if text in ("", self._written):
+                return
+            try:
+                write_whole(self.path, text.encode())
+                self._written, self.problem = text, ""
+            except OutputError as failure:
+                if not self.problem:
+                    self._report(f"the tree is not kept: {failure}")
+                self.problem = str(failure)
+
+    def close(self) -> None:
+        """Write nothing any more: the processors end now, and are to come back."""
+        with self._lock:
+            self._over = True

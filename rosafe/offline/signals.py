@@ -1,0 +1,80 @@
+"""Sound as users of the library hand it over: one ear or two, along either axis, of floats or whole numbers."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from rosafe.dsp.signal import Signal
+from rosafe.interface import FIXED, KINDS
+from rosafe.interface.arguments import check_outputs
+
+_WANTED = "wanted is (N,) or (1, N) for one ear, (2, N) or (N, 2) for two"
+
+
+def as_ears(signal: Any, upright: bool = False) -> np.ndarray:
+    """A signal as (1, N) or (2, N) of finite float64, or of int32 with full scale at 2**31.
+
+    Parameters
+    ----------
+    signal : array_like
+        (N,) or (1, N), one ear; (2, N) or (N, 2), two. Floats, int32 or int16.
+    upright : bool
+        Whether (2, 2) is (N, 2), as what came before it was.
+
+    Raises
+    ------
+    ValueError
+        For another shape or type, and for samples that are not finite.
+    """
+    try:
+        array = np.asarray(signal)
+    except ValueError as problem:
+        raise ValueError(f"signal is no array: {problem}") from None
+    if array.ndim == 1:
+        array = array[np.newaxis]
+    if array.ndim != 2 or not (array.shape[0] in (1, 2) or array.shape[1] == 2):
+        raise ValueError(f"signal has shape {np.shape(signal)}; {_WANTED}")
+    if is_upright(array, upright):
+        array = array.T
+    if array.dtype.kind == "i" and array.dtype.itemsize in (2, 4):
+        # as files of 16 bits are read: they fill the upper bits
+        return np.asarray(array, np.int32) << (16 if array.dtype.itemsize == 2 else 0)
+    if array.dtype.kind != "f":
+        raise ValueError(f"signal is of type {array.dtype}, wanted is a float type, int32 or int16")
+    with np.errstate(over="ignore"):  # a long double beyond the range of double becomes infinite
+        array = np.asarray(array, np.float64)
+    if not np.isfinite(array).all():
+        raise ValueError("signal holds NaN or infinite samples")
+    return array
+
+
+def is_upright(signal: np.ndarray, upright: bool = False) -> bool:
+    """Whether a signal of two axes is (N, 2), as `as_ears` takes it."""
+    return signal.shape[1] == 2 and (signal.shape[0] > 2 or signal.shape[0] == 0 or (upright and len(signal) == 2))
+
+
+def outputs_of(ears: int, outputs: Any) -> list[str]:
+    """The outputs to keep of a signal of so many ears, as `check_outputs`; ValueError where one ear is not enough."""
+    if outputs is None and ears == 1:
+        return [kind for kind in FIXED if not KINDS[kind].binaural]
+    wanted = check_outputs(outputs)
+    both = [kind for kind in wanted if KINDS[kind].binaural]
+    if ears == 1 and both:
+        raise ValueError(f"outputs: {', '.join(both)} compare two ears, and the signal has one")
+    return wanted
+
+
+def of_ears(ears: int, axes: tuple[str, ...], data: np.ndarray) -> np.ndarray:
+    """What is kept of an output, computed for two ears that heard the same where there is only one."""
+    return data[:1] if ears == 1 and axes[0] == "ear" else data
+
+
+def frame_times(signal: Signal, first: int, count: int) -> np.ndarray:
+    """Seconds from the first sample to the middle of each frame, of so many that begin `first` samples later.
+
+    (first + k hop + window / 2) / fs for frame k, n / fs for sample n.
+    """
+    middle = signal.window / 2 if signal.framed else 0.0
+    return (first + signal.hop * np.arange(count) + middle) / signal.sample_rate

@@ -1,0 +1,15 @@
+"""Setups: a tree of processors with its sound as a file that people read and write (docs/setups.md); no ROS.
+
+`read` and `write` go from text to `Setup` and back; `plan` tells what to do for one in a tree that is there already.
+rosafe/genomix/setups.py does it on a running graph.
+"""
+
+from __future__ import annotations
+
+from .markup import SetupError
+from .plan import Plan, plan, rehearse
+from .reading import read
+from .setup import Setup, Sound, Wanted, wanted
+from .writing import write
+
+__all__ = ["Plan", "Setup", "SetupError", "Sound", "Wanted", "plan", "read", "rehearse", "wanted", "write"]

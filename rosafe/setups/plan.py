@@ -1,0 +1,96 @@
+"""What to do for a setup in a tree that is there already: which processors serve, and the requests for the others."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+from rosafe.dsp.signal import Signal
+from rosafe.interface import BLOCK_AND_BUFFERS, ROSAFE, ComponentError, text_of
+from rosafe.representations import STAGES
+from rosafe.tree.requests import Found, Step, making
+
+from .setup import Setup, Wanted
+
+
+class Plan(NamedTuple):
+    """The names of the setup's processors in the tree (parents first), of those that are there, and what to do."""
+
+    names: list[str]
+    reused: list[str]
+    steps: list[Step]
+
+
+def plan(setup: Setup, found: Sequence[Found]) -> Plan:
+    """What to do for `setup` in a tree that consists of `found`.
+
+    A processor of the same name that is the same, to the last digit, is used. There is but one input, and it is used
+    under whatever name.
+
+    Raises
+    ------
+    ComponentError
+        ``::rosAFE::e_existsAlready`` where one of that name is another one.
+    """
+    there = {p.name: p for p in found}
+    names: dict[str, str] = {}  # in the tree, of those in the setup
+    reused, steps = [], []
+    for wanted in setup.processors:
+        parent = names.get(wanted.parent, "")
+        same = there.get(wanted.name)
+        if not wanted.parent:
+            same = next((p for p in found if not p.parent and p.kind == wanted.kind), same)
+        if same is None:
+            names[wanted.name] = wanted.name
+            steps += making(wanted.level, wanted.name, parent, wanted.input_values)
+        else:
+            _compare(wanted, parent, same)
+            names[wanted.name] = same.name
+            reused.append(same.name)
+    return Plan(list(names.values()), reused, steps)
+
+
+def _compare(wanted: Wanted, parent: str, there: Found) -> None:
+    """Return where `there` is what is wanted, else raise e_existsAlready with the difference."""
+    if there.kind != wanted.kind:
+        _refuse(there, f"is of kind {there.kind}, in the setup of kind {wanted.kind}")
+    if there.parent != parent:
+        _refuse(there, f"hangs on {there.parent!r}, in the setup on {wanted.parent!r}")
+    if not wanted.parent:
+        for p in BLOCK_AND_BUFFERS:
+            value = wanted.input_values[p.name]
+            if there.values.get(p.name, value) != value:
+                _differs(there, p.name, value)
+    if not wanted.level.fits(there):
+        told: Mapping[str, Any] = wanted.level.in_force
+        first = [*wanted.given, *told]  # what the setup says itself tells most
+        name = next(name for name in first if name in told and there.values[name] != told[name])
+        _differs(there, name, told[name])
+
+
+def _differs(there: Found, name: str, value: Any) -> None:
+    _refuse(there, f"has {name} {text_of(there.values.get(name))[:80]}, in the setup {text_of(value)[:80]}")
+
+
+def _refuse(there: Found, how: str) -> None:
+    what = f"{there.name!r} is there already and {how}: remove it first (the input: Stop), or load another setup"
+    raise ROSAFE.error("e_existsAlready", what=what)
+
+
+def rehearse(setup: Setup, sample_rate: float) -> None:
+    """Whether all processors of `setup` can be made for sound of `sample_rate` (Hz): ComponentError where not."""
+    formats: dict[str, Signal | float] = {"": float(sample_rate)}
+    providers: dict[str, Sequence[str]] = {"": ()}
+    for wanted in setup.processors:
+        try:
+            stage = STAGES[wanted.kind](formats[wanted.parent], **wanted.values)
+            if stage.needs and stage.needs not in providers[wanted.parent]:
+                raise ValueError(f"it needs the {stage.needs} of {wanted.parent!r}, which has none")
+        except ValueError as problem:
+            raise refused(f"{wanted.name!r} at {sample_rate:g} Hz: {problem}") from None
+        formats[wanted.name], providers[wanted.name] = stage.output, stage.PROVIDES
+
+
+def refused(why: str) -> ComponentError:
+    """The component's exception for a setup that cannot be."""
+    return ROSAFE.error("e_badNewValue", what=why)

@@ -1,0 +1,181 @@
+"""From the text of a setup to what it says, checked against the interface; errors tell the line."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
+
+from rosafe.interface import KINDS, MAX_SETUP, Parameter, Representation
+from rosafe.tree.requests import kind_of
+from rosafe.vocabulary.parameter import MAX_STRING, shown
+
+from .markup import Node, SetupError, parse
+from .setup import ACQUIRE, INPUT_PORTS, Setup, Sound, Wanted, parameters_of
+
+MAX_PROCESSORS = 1000
+_NAME = re.compile(r"\w+(/\w+)*", re.ASCII)
+_TOPIC = re.compile(r"/?[A-Za-z]\w*(/[A-Za-z]\w*)*", re.ASCII)
+_BOOLEANS = {**dict.fromkeys(("true", "yes", "on"), True), **dict.fromkeys(("false", "no", "off"), False)}
+
+
+class _Entry(NamedTuple):
+    """A processor, with the line of its name and that of its parent's."""
+
+    line: int
+    parent_line: int
+    wanted: Wanted
+
+
+def read(text: str) -> Setup:
+    """The setup that `text` (YAML, docs/setups.md) describes.
+
+    Raises
+    ------
+    SetupError
+        Where it is none, or where the interface does not allow what it says.
+    """
+    if len(text) > MAX_SETUP:
+        raise SetupError(1, f"{len(text)} characters are too many for a setup, at most {MAX_SETUP}")
+    document = parse(text)
+    sections = {name: node for name, _, node in document.members("a setup", ("sound", "connections", "processors"))}
+    nothing = Node(document.line)
+    sound = sections.get("sound", nothing)
+    return Setup(
+        None if sound.empty else Sound.of(_values(sound, ACQUIRE, "sound")),
+        dict(_connections(sections.get("connections", nothing))),
+        _ordered(_processors(sections.get("processors", nothing))),
+    )
+
+
+def _connections(node: Node) -> Iterator[tuple[str, str]]:
+    for port, _, value in node.members("connections", INPUT_PORTS):
+        topic = value.word(f"connections: {port}")
+        if len(topic) > MAX_STRING or not _TOPIC.fullmatch(topic):
+            raise SetupError(value.line, f"connections: {shown(topic)} is no name of a topic, such as bass/Audio")
+        yield port, f"/{topic.removeprefix('/')}"
+
+
+# --- parameters -------------------------------------------------------------------------------------------------
+
+
+def _values(node: Node, parameters: tuple[Parameter, ...], what: str, but: tuple[str, ...] = ()) -> dict[str, Any]:
+    """The checked values of a map of parameters, without those members that are none of them, `but` others."""
+    values: dict[str, Any] = {}
+    for name, key, value in node.members(what):
+        if name in but:
+            continue
+        parameter = next((p for p in parameters if name in (p.name, *p.aliases)), None)
+        if parameter is None:
+            known = ", ".join((*but, *(p.name for p in parameters)))
+            raise SetupError(key.line, f"{what}: unknown {shown(name)}; there are: {known}")
+        if parameter.name in values:
+            raise SetupError(key.line, f"{what}: {parameter.name} is given twice")
+        try:
+            values[parameter.name] = _value(parameter, value)
+        except ValueError as problem:
+            raise SetupError(value.line, f"{what}: {problem}") from None
+    return values
+
+
+def _value(parameter: Parameter, node: Node) -> Any:
+    sequence = parameter.idl.startswith("sequence<")
+    if node.text is not None:
+        return parameter.check(_parsed(parameter, node.text))
+    if node.items is None or not sequence:
+        raise ValueError(f"{parameter.name}: wanted is {'a list' if sequence else 'one value'}")
+    items: list[Any] = []
+    for item in node.items:
+        if item.text is None:
+            raise ValueError(f"{parameter.name}: a list has single values in it")
+        items += parameter.parse(item.text)
+    return parameter.check(items)
+
+
+def _parsed(parameter: Parameter, text: str) -> Any:
+    if parameter.idl == "string":
+        return text
+    if parameter.idl == "boolean" and text.lower() in _BOOLEANS:
+        return _BOOLEANS[text.lower()]
+    return parameter.parse(text)
+
+
+# --- processors -------------------------------------------------------------------------------------------------
+
+
+def _processors(node: Node) -> dict[str, _Entry]:
+    members = node.members("processors")
+    if len(members) > MAX_PROCESSORS:
+        raise SetupError(members[MAX_PROCESSORS][1].line, f"more than {MAX_PROCESSORS} processors")
+    return {name: _processor(name, key, value) for name, key, value in members}
+
+
+def _processor(name: str, key: Node, node: Node) -> _Entry:
+    what = shown(name)
+    members = {member: value for member, _, value in node.members(what)}
+    if "kind" not in members:
+        raise SetupError(key.line, f"{what}: kind is missing; there are: {', '.join(KINDS)}")
+    kind = _kind(members["kind"], what)
+    _check_name(name, key.line, kind)
+    parent, parent_line = KINDS[kind.parent].name if kind.parent else "", key.line
+    if "parent" in members:
+        parent, parent_line = members["parent"].word(f"{what}: parent"), members["parent"].line
+        if not kind.parent:
+            raise SetupError(parent_line, f"{what}: an input has no parent")
+    parameters = parameters_of(kind)
+    values = _values(node, parameters, what, but=("kind", "parent"))
+    given = {p.name: values[p.name] for p in parameters if p.name in values and values[p.name] != p.check(p.default)}
+    wanted = Wanted(name, kind.kind, parent, given)
+    try:
+        _ = wanted.level
+    except ValueError as problem:
+        raise SetupError(key.line, f"{what}: {problem}") from None
+    return _Entry(key.line, parent_line, wanted)
+
+
+def _kind(node: Node, what: str) -> Representation:
+    word = node.word(f"{what}: kind")
+    try:
+        return kind_of(word)
+    except ValueError:
+        raise SetupError(
+            node.line, f"{what}: {shown(word)} is no kind of processor; there are: {', '.join(KINDS)}"
+        ) from None
+
+
+def _check_name(name: str, line: int, kind: Representation) -> None:
+    if not 0 < len(name) <= MAX_STRING or "\0" in name:
+        raise SetupError(line, f"{shown(name)} is no name of a processor")
+    if kind.parent and not _NAME.fullmatch(name):
+        raise SetupError(line, f"{shown(name)} names a topic too: letters, digits and _ only")
+
+
+def _ordered(entries: Mapping[str, _Entry]) -> tuple[Wanted, ...]:
+    """The processors, each after its parent and else in the order of the setup; SetupError where they are no tree."""
+    inputs = [entry for entry in entries.values() if not entry.wanted.parent]
+    if len(inputs) > 1:
+        names = " and ".join(shown(entry.wanted.name) for entry in inputs[:2])
+        raise SetupError(inputs[1].line, f"{names} are two inputs; there can be but one")
+    ordered: dict[str, Wanted] = {}
+    for entry in entries.values():
+        _check_parent(entry, entries)
+    for entry in entries.values():
+        line = []
+        name = entry.wanted.name
+        while name and name not in ordered:  # a kind's parent is of another kind, and so on up to an input: no circle
+            line.append(entries[name].wanted)
+            name = entries[name].wanted.parent
+        ordered.update({wanted.name: wanted for wanted in reversed(line)})
+    return tuple(ordered.values())
+
+
+def _check_parent(entry: _Entry, entries: Mapping[str, _Entry]) -> None:
+    wanted = entry.wanted
+    if not wanted.parent:
+        return
+    what, kind = f"{shown(wanted.name)}: its parent {shown(wanted.parent)}", wanted.representation.parent
+    if wanted.parent not in entries:
+        raise SetupError(entry.parent_line, f"{what} is not in the setup; wanted is one of kind {kind}")
+    found = entries[wanted.parent].wanted.kind
+    if found != kind:
+        raise SetupError(entry.parent_line, f"{what} is of kind {found}, wanted is {kind}")

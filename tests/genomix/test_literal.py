@@ -1,0 +1,261 @@
+"""What genomixd's clients say is what they get: zeros are zeros; unknown words are told, or refused where asked for."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pytest
+
+from tests.genomix.world import HttpError, World
+from tests.harness import wait_for
+from tests.matlab import octave
+
+INPUT = """
+    set g [genomix::connect $address]
+    $g load bass; $g load rosAFE
+    bass::Acquire scene:
+    rosAFE::connect_port Audio bass/Audio
+    rosAFE::InputProc
+"""
+MISSPELT = "ihc: ihc_method: 'bernstien' is no known word, dau is taken; the nearest known one is bernstein"
+
+
+def start(world: World, *processors: str) -> None:
+    world.http.call("bass/Acquire", ["scene:"])
+    world.http.call("rosAFE/connect_port", ["Audio", "bass/Audio"])
+    world.http.call("rosAFE/InputProc")
+    for request in processors:
+        world.http.call(f"rosAFE/{request}")
+
+
+def told(world: World, kind: str, name: str) -> dict[str, Any]:
+    parameters = world.http.call("rosAFE/getParameters")["parameters"][kind]
+    return next(one for one in parameters if one["name"] == name)
+
+
+# --- zeros ------------------------------------------------------------------------------------------------------
+
+
+def test_a_zero_is_a_zero_by_call_and_by_send(world: World) -> None:
+    start(world)
+    world.http.call("rosAFE/PreProc", {"name": "called", "pp_coefPreEmphasis": 0, "pp_refSPLdB": 0})
+    world.http.wait(world.http.send("rosAFE/PreProc", {"name": "sent", "pp_coefPreEmphasis": 0}), "sent")
+    for name, level in (("called", 0.0), ("sent", 100.0)):
+        wait_for(lambda name=name: name in str(world.http.call("rosAFE/getParameters")))
+        assert (told(world, "preProc", name)["pp_coefPreEmphasis"], told(world, "preProc", name)["pp_refSPLdB"]) == (
+            0.0,
+            level,
+        )
+
+
+@pytest.mark.parametrize(
+    ("request_name", "given", "why"),
+    [
+        ("GammatoneProc", {"fb_lowFreqHz": 0}, "fb_lowFreqHz: 0 is out of range, allowed is more than 0 to 1000000"),
+        ("GammatoneProc", {"fb_nGamma": 0}, "fb_nGamma: 0 is out of range, allowed is from 1 to 128"),
+        ("GammatoneProc", {"fb_nERBs": 0}, "fb_nERBs: 0 is out of range"),
+        ("GammatoneProc", {"name": ""}, "name: '' names a topic too"),
+        ("InputProc", {"nFramesPerBlock": 0}, "nFramesPerBlock: 0 is out of range, allowed is from 1 to 10000000"),
+        ("InputProc", {"bufferSize_s_port": 0}, "bufferSize_s_port: 0 is out of range"),
+        ("InputProc", {"name": ""}, "name: '' is empty"),
+    ],
+)
+def test_what_cannot_be_zero_or_nothing_is_refused(world: World, request_name: str, given: Any, why: str) -> None:
+    start(world, "PreProc")
+    before = world.http.call("rosAFE/getProcessors")
+    with pytest.raises(HttpError) as refused:
+        world.http.call(f"rosAFE/{request_name}", given)
+    assert refused.value.ex == "::rosAFE::e_badNewValue" and why in refused.value.what
+    sent = world.http.send(f"rosAFE/{request_name}", given)
+    assert why in world.http.wait(sent, "error")["exception"]["detail"]["what"]
+    assert world.http.call("rosAFE/getProcessors") == before
+
+
+def test_of_what_is_nothing_the_reason_is_told(world: World) -> None:
+    start(world, "PreProc")
+    with pytest.raises(HttpError) as refused:
+        world.http.call("rosAFE/GammatoneProc", {"upperDepName": ""})
+    assert refused.value.ex == "::rosAFE::e_noUpperDependencie"
+    with pytest.raises(HttpError) as refused:
+        world.http.call("bass/Acquire", {"device": "scene:", "nFramesPerChunk": 0})
+    assert refused.value.ex == "::bass::e_hwparams"
+
+
+def test_plain_ros_clients_mean_the_defaults_still(world: World) -> None:
+    start(world)
+    done = world.graph.run("rosservice", "call", "/rosAFE/PreProc", "{name: plain, pp_coefPreEmphasis: 0}")
+    assert "genom_success: True" in done.stdout and "genom_exdetail: ''" in done.stdout
+    assert told(world, "preProc", "plain")["pp_coefPreEmphasis"] == 0.97
+
+
+def test_what_get_parameters_tells_makes_another_one_like_it(world: World) -> None:
+    """A list of centre frequencies makes it tell of a spacing of 0."""
+    start(world, "PreProc")
+    world.http.call("rosAFE/GammatoneProc", {"name": "first", "fb_cfHz": [500, 900]})
+    first = told(world, "gammatone", "first")
+    assert first["fb_nERBs"] == 0
+    world.http.call("rosAFE/GammatoneProc", {**first, "name": "second"})
+    assert told(world, "gammatone", "second") == {**first, "name": "second"}
+
+
+def test_zeros_of_tcl(world: World) -> None:
+    script = """
+        rosAFE::PreProc {name a pp_coefPreEmphasis 0}
+        set r [rosAFE::PreProc {name b pp_coefPreEmphasis 0} &]
+        while {[catch {rosAFE::getDependencies b}]} {}
+        dict for {- one} [dict get [rosAFE::getParameters] parameters preProc] {
+            show [dict get $one name] [dict get $one pp_coefPreEmphasis]
+        }
+        show [dict get [lindex [failure {rosAFE::GammatoneProc {upperDepName a fb_lowFreqHz 0}}] 0] detail what]
+    """
+    assert world.lines(INPUT + script) == [
+        "a|0.0",
+        "b|0.0",
+        "fb_lowFreqHz: 0 is out of range, allowed is more than 0 to 1000000",
+    ]
+
+
+# --- unknown words ----------------------------------------------------------------------------------------------
+
+
+# Prints the tree's entry in /diagnostics once its message has a text in it, or lacks it.
+DIAGNOSED = """
+import sys, json, rospy
+from diagnostic_msgs.msg import DiagnosticArray
+rospy.init_node("reader", anonymous=True)
+while True:
+    for status in rospy.wait_for_message("/diagnostics", DiagnosticArray, 60).status:
+        if status.name.endswith("processors") and (sys.argv[1] in status.message) == (sys.argv[2] == "in"):
+            level = status.level if isinstance(status.level, int) else status.level[0]
+            print(json.dumps([level, status.message, [v.value for v in status.values if v.key == "unknown word"]]))
+            sys.exit()
+"""
+
+
+def diagnosed(world: World, text: str, there: bool = True) -> list[Any]:
+    """Level, message and unknown words of the tree's health, once `text` is in the message, or is not any more."""
+    done = world.graph.run("python3", "-c", DIAGNOSED, text, "in" if there else "out", timeout=90)
+    return list(json.loads(done.stdout))
+
+
+def test_a_misspelt_word_is_told(world: World) -> None:
+    start(world, "PreProc", "GammatoneProc")
+    assert world.http.call("rosAFE/IhcProc", {"ihc_method": "bernstien"}) == {"warning": MISSPELT}
+    assert told(world, "ihc", "ihc")["ihc_method"] == "dau"
+    assert world.afe is not None and world.afe.err.count("[WARN]") and MISSPELT in world.afe.err
+    number = world.http.send("rosAFE/IhcProc", {"name": "two", "ihc_method": "Bernstein"})
+    wanted = MISSPELT.replace("ihc:", "two:", 1).replace("bernstien", "Bernstein")
+    wait_for(lambda: world.http.status(number).get("warning") == wanted, what=lambda: str(world.http.status(number)))
+    assert world.http.status(number) == {"id": number, "status": "sent", "warning": wanted}
+    assert diagnosed(world, "more unknown") == [1, f"{MISSPELT} (and 1 more unknown words)", [MISSPELT, wanted]]
+    change = {"nameProc": "two", "nameParam": "ihc_method", "newValue": "halfwav"}
+    change_told = "two: ihc_method: 'halfwav' is no known word, dau is taken; the nearest known one is halfwave"
+    assert world.http.call("rosAFE/modifyParameter", change) == {"warning": change_told}
+    number = world.http.send("rosAFE/modifyParameter", change)
+    assert world.http.wait(number, "done")["warning"] == change_told
+    # what is made good, or gone, is told no more
+    world.http.call("rosAFE/modifyParameter", {**change, "newValue": "halfwave"})
+    assert diagnosed(world, "more unknown", there=False) == [1, MISSPELT, [MISSPELT]]
+    world.http.call("rosAFE/removeProcessor", ["ihc"])
+    assert diagnosed(world, MISSPELT, there=False) == [0, "4 processors", []]
+
+
+def test_known_words_and_known_slips_are_nobody_s_business(world: World) -> None:
+    start(world)
+    assert world.afe is not None
+    said = len(world.afe.err)
+    assert world.http.call("rosAFE/PreProc", {"name": "slip", "pp_middleEarModel": "jespen"}) == {}
+    assert world.http.call("rosAFE/modifyParameter", ["slip", "pp_middleEarModel", "lopezpoveda"]) == {}
+    done = world.graph.run("rosservice", "call", "/rosAFE/GammatoneProc", "{upperDepName: slip, fb_type: gamma}")
+    assert "genom_success: True" in done.stdout and "genom_exdetail: ''" in done.stdout, "as in the original"
+    assert "gammatone: fb_type: 'gamma' is no known word, gammatone is taken" in world.afe.err[said:]
+    assert world.afe.err[said:].count("[WARN]") == 1
+
+
+def test_tcl_shows_it_where_somebody_looks(world: World) -> None:
+    script = """
+        rosAFE::PreProc
+        rosAFE::GammatoneProc
+        show [rosAFE::IhcProc {ihc_method bernstien}]
+        set quiet [rosAFE::IhcProc {name quiet ihc_method bernstein} &]
+        set ::tcl_interactive 1
+        set r [rosAFE::IhcProc {name two ihc_method bernstien} &]
+        while {[$r warning] eq ""} {after 10 {set go 1}; vwait go}
+        show [$r status] [$r warning]
+        show [$quiet warning]
+    """
+    done = world.tcl(INPUT + script)
+    second = MISSPELT.replace("ihc:", "two:", 1)
+    assert done.stdout.splitlines() == [f"warning {{{MISSPELT}}}", f"sent|{second}", ""]
+    assert done.stderr.splitlines() == [f"rosAFE::IhcProc &: warning: {second}"]
+
+
+def test_matlab_has_it_in_the_request(world: World) -> None:
+    start(world, "PreProc", "GammatoneProc")
+    script = """
+        client = genomix.client();
+        rosAFE = client.load('rosAFE');
+        r = rosAFE.IhcProc('ihc', 'gammatone', 'bernstien');
+        disp(r);
+        show('called', {r.status, r.warning, r.result});
+        r = rosAFE.IhcProc('-a', 'two', 'gammatone', 'bernstien');
+        show('sent', {r.status, r.warning});
+        r = rosAFE.modifyParameter('two', 'ihc_method', 'dau');
+        show('known', r.warning);
+        r = rosAFE.PreProc('zero', 'input', 0, 20, 0, 0);
+        parameters = rosAFE.getParameters().result.parameters;
+        show('zero', parameters.preProc{2}.pp_coefPreEmphasis);
+        r = rosAFE.GammatoneProc('none', 'preProc', 'gammatone', 0);
+        show('refused', {r.status, r.exception.detail.what});
+    """
+    printed = octave.run(world, script)
+    shown = octave.values(printed)
+    assert f"warning: {MISSPELT}\n" in printed
+    assert shown["called"] == ["done", MISSPELT, {}]
+    assert shown["sent"] == ["sent", MISSPELT.replace("ihc:", "two:", 1)]
+    assert shown["known"] == ""
+    assert shown["zero"] == 0
+    assert shown["refused"] == ["error", "fb_lowFreqHz: 0 is out of range, allowed is more than 0 to 1000000"]
+
+
+def test_new_kinds_refuse_unknown_words(world: World) -> None:
+    start(world, "PreProc", "GammatoneProc", "IhcProc")
+    with pytest.raises(HttpError) as refused:
+        world.http.call("rosAFE/AutocorrelationProc", {"ac_wname": "han"})
+    assert refused.value.ex == "::rosAFE::e_badNewValue"
+    assert refused.value.what.startswith("ac_wname: 'han' is not one of ")
+    assert refused.value.what.endswith("; did you mean hann?")
+
+
+@pytest.mark.parametrize("by", ["option", "parameter"])
+def test_whoever_wants_it_strict_has_them_refused(world: World, by: str) -> None:
+    name = f"strict_{by}"
+    options = ("--strict",) if by == "option" else ("_strict_words:=true",)
+    with world.graph.node("rosAFE-ros", "-i", name, *options):
+        call = world.http.call
+        call("bass/Acquire", ["scene:"])
+        call(f"{name}/connect_port", ["Audio", "bass/Audio"])
+        for request in ("InputProc", "PreProc", "GammatoneProc", "IhcProc"):
+            assert call(f"{name}/{request}") == {}
+        for request, given in (
+            ("IhcProc", {"name": "two", "ihc_method": "bernstien"}),
+            ("modifyParameter", {"nameProc": "ihc", "nameParam": "ihc_method", "newValue": "bernstien"}),
+        ):
+            with pytest.raises(HttpError) as refused:
+                call(f"{name}/{request}", given)
+            assert refused.value.ex == "::rosAFE::e_badNewValue"
+            assert refused.value.what.startswith("ihc_method: 'bernstien' is not one of ")
+            assert refused.value.what.endswith("; did you mean bernstein?")
+        assert call(f"{name}/PreProc", {"name": "slip", "pp_middleEarModel": "jespen"}) == {}
+        if by == "parameter":  # which counts as it is now
+            world.graph.run("rosparam", "set", f"/{name}/strict_words", "false")
+            wait_for(lambda: _granted(world, name), what="unknown words that are taken")
+
+
+def _granted(world: World, name: str) -> bool:
+    change = {"nameProc": "ihc", "nameParam": "ihc_method", "newValue": "bernstien"}
+    try:
+        return "dau is taken" in world.http.call(f"{name}/modifyParameter", change)["warning"]
+    except HttpError:
+        return False

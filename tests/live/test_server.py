@@ -1,0 +1,310 @@
+"""The live page's server on a real graph: who gets in, what is sent, and at what cost."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import socket
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack
+from typing import Any
+
+import aiohttp
+import numpy as np
+import pytest
+
+from rosafe.live.access import Door
+from tests.harness import Graph, Process, wait_for
+from tests.live.world import Live, build, live, page
+
+ILD = {"what": "picture", "name": "ild_0"}
+LEVELS = {"what": "levels"}
+
+
+class World:
+    """The robot and its page."""
+
+    def __init__(self, graph: Graph, bass: Process, live: Live) -> None:
+        self.graph, self.bass, self.live = graph, bass, live
+
+
+@pytest.fixture(scope="module")
+def world(graph: Graph) -> Iterator[World]:
+    """Nodes, the scene, a tree, and the page."""
+    with ExitStack() as stack:
+        bass = stack.enter_context(graph.node("bass-ros"))
+        stack.enter_context(graph.node("rosAFE-ros"))
+        build(graph)
+        yield World(graph, bass, stack.enter_context(live(graph)))
+
+
+# --- who gets in ---
+
+
+def status(world: World, path: str, method: str = "GET", **headers: str) -> tuple[int, str]:
+    """Of a request over a plain socket, and the whole answer."""
+    host, port = world.live.address.rsplit(":", 1)
+    lines = {"Host": world.live.address, "Connection": "close", **headers}
+    request = f"{method} {path} HTTP/1.1\r\n" + "".join(f"{k}: {v}\r\n" for k, v in lines.items()) + "\r\n"
+    with socket.create_connection((host, int(port)), timeout=20) as connection:
+        connection.sendall(request.encode("latin-1"))
+        answer = b""
+        while part := connection.recv(65536):
+            answer += part
+    text = answer.decode("utf-8", "replace")
+    return int(text.split()[1]), text
+
+
+def test_nothing_without_the_token(world: World) -> None:
+    for path in ("/", "/main.js", "/socket", "/?token=", "/?token=x", f"/?token={world.live.token}x", "/none"):
+        code, text = status(world, path)
+        assert code == 403 and "rosafe live" in text and world.live.token not in text, path
+
+
+def test_the_token_becomes_a_cookie_that_scripts_do_not_see(world: World) -> None:
+    code, text = status(world, f"/?token={world.live.token}")
+    assert code == 200 and world.live.token not in text
+    cookie = next(line for line in text.splitlines() if line.startswith("Set-Cookie"))
+    assert "HttpOnly" in cookie and "SameSite=Strict" in cookie and world.live.token not in cookie
+    value = cookie.split(": ", 1)[1].split(";")[0]
+    assert status(world, "/main.js", Cookie=value)[0] == 200
+    assert "default-src 'none'" in text and "frame-ancestors 'none'" in text and "no-referrer" in text
+    assert status(world, "/../server.py", Cookie=value)[0] == 404
+    assert status(world, "/%2e%2e/server.py", Cookie=value)[0] == 404
+    assert status(world, "/", "POST", Cookie=value)[0] == 405
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [
+        {"Host": "robot.evil.example"},
+        {"Origin": "http://evil.example"},
+        {"Origin": "null"},
+        {"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Mode": "no-cors"},
+    ],
+)
+def test_pages_from_elsewhere_are_refused(world: World, headers: dict[str, str]) -> None:
+    assert status(world, f"/socket?token={world.live.token}", **headers)[0] == 403
+
+
+def test_the_door_takes_no_odd_characters_for_the_token() -> None:
+    door = Door({"robot"})
+    assert door.refusal({"Host": "robot:8090"}, {"token": door.token}, {}) == ""
+    assert door.refusal({"Host": "robot"}, {"token": "\udcff\0ä"}, {})
+    assert door.refusal({"Host": "robot"}, {}, {door.cookie_name: door.token})
+
+
+def test_the_log_has_no_token(world: World) -> None:
+    status(world, f"/nothing?token={world.live.token}")
+    assert world.live.token not in world.live.process.err
+
+
+def test_a_port_that_is_taken_is_one_line(world: World) -> None:
+    port = world.live.address.rsplit(":", 1)[1]
+    done = world.graph.run("rosafe", "live", "--port", port, "--no-browser", check=False)
+    assert done.returncode == 1 and done.stderr.count("\n") == 1 and "--port" in done.stderr
+    done = world.graph.run("rosafe", "live", "--port", "0", "--host", "192.0.2.1", "--no-browser", check=False)
+    assert done.returncode == 1 and done.stderr.count("\n") == 1 and "192.0.2.1" in done.stderr
+
+
+def test_without_a_master_it_says_what_to_do(graph: Graph) -> None:
+    done = graph.run("rosafe", "live", "--no-browser", check=False, ROS_MASTER_URI="http://127.0.0.1:1")
+    assert done.returncode == 1 and done.stderr.count("\n") == 1 and "roscore" in done.stderr
+
+
+@pytest.mark.parametrize("text", ["no JSON", "[]", '{"id": 1}', '{"id": "x", "do": "look"}', "[" * 50_000])
+def test_what_is_no_request_ends_the_connection_and_nothing_else(world: World, text: str) -> None:
+    async def scenario() -> None:
+        async with page(world.live) as bad, page(world.live) as good:
+            await bad.socket.send_str(text)
+            with pytest.raises(ConnectionError):
+                while True:
+                    await bad.hear()
+            assert "there is no request" in (await good.ask("explode"))["error"]
+
+    asyncio.run(scenario())
+
+
+# --- what is sent ---
+
+
+def test_pictures_are_those_of_the_port(world: World) -> None:
+    """Every column of the level differences is a frame of the port, to within half a step of the quantiser."""
+
+    async def scenario(messages: list[Any]) -> tuple[dict[str, Any], list[tuple[int, int, float, np.ndarray]]]:
+        async with page(world.live) as client:
+            (view,) = await client.look(ILD)
+            number = view["number"]
+            while sum(piece[3].shape[1] for piece in client.pieces.get(number, [])) < 220 or len(messages) < 4:
+                await client.hear()
+            return view, client.pieces[number]
+
+    with world.graph.collect("/rosAFE/ildPort/ild_0") as messages:
+        view, pieces = asyncio.run(scenario(messages))
+    assert view["unit"] == "dB" and view["rate"] == 100 and len(view["along"]) == view["rows"]
+    columns = np.concatenate([piece[3] for piece in pieces], axis=1)
+    newest = messages[-2]
+    frames = np.array([channel.data for channel in newest.left.dataN])
+    step = max(np.nanmax(piece[3]) - np.nanmin(piece[3]) for piece in pieces) / 254
+    ends = [np.abs(columns[:, at : at + 30] - frames[:, -30:]).max() for at in range(columns.shape[1] - 29)]
+    at = int(np.argmin(ends))
+    assert ends[at] <= 0.51 * step
+    _, _, end, values = pieces[0]
+    moment = end + (at + 30 - values.shape[1]) / view["rate"]  # that these columns reach up to
+    assert moment == pytest.approx(newest.lastFrameIndex / 16000, abs=0.011)
+
+
+def test_the_direction_is_that_of_the_scene(world: World) -> None:
+    from rosafe.bass.sources.scene import scene_azimuth
+
+    async def scenario() -> tuple[dict[str, Any], list[tuple[int, int, float, np.ndarray]]]:
+        async with page(world.live) as client:
+            (view,) = await client.look({"what": "direction", "name": "crosscorrelation_0"})
+            while sum(piece[3].shape[1] for piece in client.pieces.get(view["number"], [])) < 300:
+                await client.hear()
+            return view, client.pieces[view["number"]]
+
+    view, pieces = asyncio.run(scenario())
+    assert view["from"] == ["itd_0", "ic_0"]
+    errors = []
+    for _, _, end, values in pieces:
+        times = end - (values.shape[1] - np.arange(values.shape[1])) / view["rate"]
+        azimuths = np.interp(values[0], view["lags"], view["azimuths"])
+        errors.append(np.abs(azimuths - scene_azimuth(times, 5.0)))
+    heard = np.concatenate(errors)
+    assert np.isfinite(heard).mean() > 0.5
+    assert np.nanmedian(heard) < 8
+
+
+def test_a_page_gets_at_most_25_pictures_and_200_kilobytes_a_second(world: World) -> None:
+    keys = [{"what": "picture", "name": name} for name in ("ratemap_0", "ild_0", "crosscorrelation_0", "input_0")]
+
+    async def scenario() -> tuple[float, float]:
+        async with page(world.live) as client:
+            await client.look(LEVELS, *keys)
+            begun, bytes_, pictures = time.monotonic(), client.bytes, client.pictures
+            while time.monotonic() < begun + 3:
+                await client.look(LEVELS, *keys, anew=True)  # there is always more to send than may be
+                for _ in range(5):
+                    await client.hear()
+            seconds = time.monotonic() - begun
+            return (client.bytes - bytes_) / seconds, (client.pictures - pictures) / seconds
+
+    kilobytes, pictures = asyncio.run(scenario())
+    assert 0 < pictures <= 25.5
+    assert 1000 < kilobytes <= 215_000  # a message more may lie in the time
+
+
+def ports_of_the_page(graph: Graph) -> set[str]:
+    return {topic for topic, node in graph.readers() if node.startswith("/rosafe_live")}
+
+
+def test_nothing_is_subscribed_that_nobody_looks_at(world: World) -> None:
+    wait_for(lambda: not ports_of_the_page(world.graph), what="the pages of other tests to go")
+
+    async def scenario() -> None:
+        async with page(world.live) as one, page(world.live) as two:
+            await one.look(ILD, LEVELS)
+            await two.look(ILD)
+            await asyncio.to_thread(
+                wait_for, lambda: {"/rosAFE/ildPort/ild_0", "/bass/Audio"} <= ports_of_the_page(world.graph)
+            )
+            await one.look()
+            await asyncio.to_thread(wait_for, lambda: "/bass/Audio" not in ports_of_the_page(world.graph))
+            assert "/rosAFE/ildPort/ild_0" in ports_of_the_page(world.graph)
+
+    asyncio.run(scenario())
+    wait_for(lambda: not ports_of_the_page(world.graph), what="an end of all subscriptions")
+
+
+def test_twenty_pages_see_the_same(world: World) -> None:
+    async def one(live: Live) -> set[int]:
+        async with page(live) as client:
+            (view,) = await client.look(ILD)
+            while len(client.pieces.get(view["number"], [])) < 5:
+                await client.hear()
+            return {view["number"]}
+
+    async def scenario() -> list[set[int]]:
+        return await asyncio.gather(*(one(world.live) for _ in range(20)))
+
+    assert len(set.union(*asyncio.run(scenario()))) == 1
+
+
+# --- what is asked for ---
+
+
+def test_requests_and_their_refusals(world: World) -> None:
+    async def scenario() -> None:
+        async with page(world.live) as client:
+            assert (await client.until("hello"))["kinds"]["ratemap"]["parameters"]["rm_wSizeSec"]["range"]
+            made = (await client.ask("build", representation="onsetStrength"))["ok"]
+            assert made["name"] in made["created"]
+            views = await client.look({"what": "picture", "name": made["name"]}, {"what": "picture", "name": "nobody"})
+            while "error" in views[0]:  # the tree is looked at once a second
+                await client.hear()
+                views = client.said["views"]["views"]
+            assert views[0]["kind"] == "onsetStrength" and "nobody" in views[1]["error"]
+            refused = await client.ask("modify", nameProc="ratemap_0", nameParam="rm_decaySec", newValue="-1")
+            assert "e_badNewValue" in refused["error"] and "rm_decaySec" in refused["error"]
+            assert "e_noSuchProcessor" in (await client.ask("remove", name="nobody"))["error"]
+            assert "e_device" in (await client.ask("acquire", device="hw:99,99"))["error"]
+            assert (await client.ask("remove", name=made["name"])) == {"about": "answer", "id": 6, "ok": {}}
+            assert any(one["name"] == "scene:" for one in (await client.ask("devices"))["ok"]["devices"])
+            text = (await client.ask("save"))["ok"]["setup"]
+            again = (await client.ask("load", setup=text))["ok"]
+            assert not again["created"] and "ratemap_0" in again["reused"]
+            assert "line" in (await client.ask("load", setup="processors: [nonsense"))["error"]
+
+    asyncio.run(scenario())
+
+
+def test_a_watcher_changes_nothing(world: World) -> None:
+    before = world.graph.run("rosservice", "call", "/rosAFE/getProcessors").stdout
+
+    async def scenario(live: Live) -> None:
+        async with page(live) as client:
+            assert (await client.until("hello"))["watch"] is True
+            for what in ("build", "usual", "modify", "remove", "acquire", "silence", "load", "devices"):
+                answer = await client.ask(what, name="ratemap_0", representation="pitch", device="scene:")
+                assert "--watch" in answer["error"], what
+            (view,) = await client.look(ILD)
+            while not client.pieces.get(view["number"]):
+                await client.hear()
+
+    with live(world.graph, "--watch") as watching:
+        asyncio.run(scenario(watching))
+    assert world.graph.run("rosservice", "call", "/rosAFE/getProcessors").stdout == before
+
+
+def test_loads_and_states_come_with_the_status(world: World) -> None:
+    async def scenario() -> dict[str, Any]:
+        async with page(world.live) as client:
+            await client.look(LEVELS, ILD)
+            while True:
+                client.said.pop("status", None)
+                told = await client.until("status")
+                if told["loads"].get("ratemap_0", {}).get("load", 0) > 0 and told["latencies"]:
+                    return told
+
+    told = asyncio.run(scenario())
+    assert told["device"].startswith("scene:") and told["bass"] and told["rosafe"] and told["sampleRate"] == 16000
+    assert told["loads"]["ratemap_0"]["blocks"] > 0 and 0 <= told["delay"] < 60
+    assert all(0 < seconds < 60 for seconds in told["latencies"].values())
+    assert json.dumps(told)
+
+
+def test_it_ends_in_time(world: World) -> None:
+    async def scenario(live: Live) -> int:
+        async with page(live) as client:
+            await client.look(ILD)
+            ended = asyncio.create_task(asyncio.to_thread(live.process.stop))
+            with pytest.raises((ConnectionError, aiohttp.ClientError)):
+                while True:
+                    await client.hear()
+            return await ended
+
+    with live(world.graph) as one:
+        assert asyncio.run(scenario(one)) == 0
+        assert "Traceback" not in one.process.err

@@ -1,0 +1,174 @@
+"""pip: a wheel and an sdist are built, and the library works in an environment that has neither ROS nor the rest.
+
+The environment holds what the wheel says that it depends on, taken from Debian's packages rather than from PyPI: a
+folder of links. So there is no network in this, and what is not linked is really absent.
+"""
+
+from __future__ import annotations
+
+import email
+import json
+import os
+import shutil
+import subprocess
+import tarfile
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from rosafe.version import VERSION
+from tests.harness import PYTHON, ROOT
+from tests.packaging.clone import environment, fresh_copy, run
+
+DEBIAN = Path("/usr/lib/python3/dist-packages")
+NEEDED = ["numpy", "scipy", "soundfile.py", "_soundfile.py", "cffi", "_cffi_backend*.so", "pycparser", "ply"]
+FOR_TESTS = ["pytest", "_pytest", "py", "py.py", "pluggy", "iniconfig", "packaging", "attr", "attrs", "hypothesis"]
+FOR_TESTS += ["sortedcontainers"]
+BUILD = "import setuptools.build_meta as backend, sys; getattr(backend, sys.argv[1])(sys.argv[2])"
+
+
+class Venv:
+    """An environment with the wheel in it."""
+
+    def __init__(self, folder: Path, wheel: Path) -> None:
+        self.folder = folder
+        subprocess.run([PYTHON, "-m", "venv", "--without-pip", folder], check=True, capture_output=True)
+        (self.packages,) = folder.glob("lib/python3*/site-packages")
+        for pattern in (*NEEDED, *FOR_TESTS):
+            for found in DEBIAN.glob(pattern):
+                (self.packages / found.name).symlink_to(found)
+        pip = [PYTHON, "-m", "pip", "--python", folder, "install", "--no-deps", "--no-index", "--quiet", wheel]
+        subprocess.run([*map(str, pip)], check=True, capture_output=True, env=environment())
+
+    def run(self, *command: str | Path, cwd: Path | None = None, **env: str) -> subprocess.CompletedProcess[str]:
+        """A program of the environment, without anything of this checkout."""
+        name, *arguments = command
+        path = f"{self.folder / 'bin'}:/usr/bin:/bin"
+        where = {"cwd": cwd or self.folder}
+        return run(self.folder / "bin" / name, *arguments, env=environment(**{"PATH": path, **env}), **where)
+
+    def python(self, program: str, **env: str) -> str:
+        """What a program in Python prints."""
+        done = self.run("python", "-c", program, **env)
+        assert (done.returncode, done.stderr) == (0, ""), done
+        return done.stdout.strip()
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Path]]:
+    """The wheel, and the sdist, of a fresh copy of this checkout, with Debian's setuptools."""
+    folder = tmp_path_factory.mktemp("built")
+    made = {}
+    with fresh_copy() as copy:
+        for kind in ("wheel", "sdist"):
+            done = run(PYTHON, "-c", BUILD, f"build_{kind}", folder / kind, env=environment(), cwd=copy)
+            assert done.returncode == 0, done.stderr
+            (made[kind],) = (folder / kind).iterdir()
+    yield made
+
+
+@pytest.fixture(scope="module")
+def venv(built: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> Venv:
+    return Venv(tmp_path_factory.mktemp("venv") / "of a user", built["wheel"])
+
+
+def files_of_the_package() -> set[str]:
+    return {
+        path.relative_to(ROOT).as_posix()
+        for path in (ROOT / "rosafe").rglob("*")
+        if path.is_file() and "__pycache__" not in path.parts and not path.name.endswith((".so", ".lock"))
+    }
+
+
+def test_all_files_are_in_the_wheel_and_in_the_sdist(built: dict[str, Path]) -> None:
+    """Whoever adds a folder or a kind of file is told here."""
+    with zipfile.ZipFile(built["wheel"]) as wheel:
+        names = {name for name in wheel.namelist() if name.startswith("rosafe/")}
+        metadata = email.message_from_bytes(wheel.read(f"rosafe-{VERSION}.dist-info/METADATA"))
+    libraries = {name for name in names if name.endswith(".so")}
+    assert names - libraries == files_of_the_package()
+    if shutil.which("gcc") and os.uname().machine == "x86_64":
+        assert len(libraries) == 2 and built["wheel"].name == f"rosafe-{VERSION}-py3-none-linux_x86_64.whl"
+    assert (metadata["Name"], metadata["Version"]) == ("rosafe", VERSION)
+    assert metadata["Requires-Python"] == ">=3.10" and metadata["Summary"] and metadata["Author-email"]
+    assert set(metadata.get_all("Provides-Extra", [])) == {"plot", "files", "dask", "all"}
+    with tarfile.open(built["sdist"]) as sdist:
+        sources = {name.partition("/")[2] for name in sdist.getnames()}
+    assert files_of_the_package() | {"pyproject.toml", "README.md", "LICENSE", "CHANGELOG.md"} <= sources
+    assert not any(name.endswith(".so") for name in sources)
+
+
+def test_the_version_stands_once() -> None:
+    assert VERSION not in (ROOT / "pyproject.toml").read_text("utf-8")
+
+
+def test_library_tests_in_the_environment(venv: Venv, tmp_path: Path) -> None:
+    """Some of this suite, beside no checkout: files, arguments, changes, and the same numbers as everywhere."""
+    (tmp_path / "tests").mkdir()
+    for name in ("__init__.py", "harness.py", "offline", "dsp", "representations", "tree", "vectors"):
+        there = ROOT / "tests" / name
+        (shutil.copytree if there.is_dir() else shutil.copy)(there, tmp_path / "tests" / name)
+    (tmp_path / "pytest.ini").write_text(
+        "[pytest]\naddopts = --import-mode=importlib -p no:cacheprovider\npythonpath=.\n"
+    )
+    tests = ["tests/offline/test_arguments.py", "tests/vectors", "tests/representations/test_speech.py"]
+    done = venv.run("python", "-m", "pytest", "-q", *tests, cwd=tmp_path)
+    assert done.returncode == 0, done.stdout[-3000:] + done.stderr
+    assert " passed" in done.stdout
+    assert not (tmp_path / "rosafe").exists()
+
+
+def test_it_is_the_wheel_that_works(venv: Venv) -> None:
+    """With its kernels, with the twins, and with the numbers of the checkout."""
+    program = (
+        "import json, numpy, rosafe; from rosafe.dsp import kernels; "
+        "x = numpy.random.default_rng(1).standard_normal((2, 4000)); "
+        "r = rosafe.process(x, 16000, {'fb_cfHz': [200.0, 1000.0]}, outputs=['ild', 'ratemap']); "
+        "print(json.dumps([rosafe.__file__, kernels.compiled(), float(r['ild'].sum()), float(r['ratemap'].sum())]))"
+    )
+    here = json.loads(run(PYTHON, "-c", program, env=environment(PYTHONPATH=str(ROOT))).stdout)
+    there, twins = json.loads(venv.python(program)), json.loads(venv.python(program, ROSAFE_KERNELS="0"))
+    assert Path(there[0]).is_relative_to(venv.packages)
+    assert there[1:] == here[1:]
+    assert not twins[1] and twins[2:] == pytest.approx(here[2:], rel=1e-9)
+
+
+def test_the_command_and_what_it_says_of_what_is_absent(venv: Venv, tmp_path: Path) -> None:
+    assert venv.run("rosafe", "--version").stdout == f"rosafe {VERSION}\n"
+    sound = tmp_path / "x.wav"
+    assert venv.run("rosafe", "record", sound, "--device", "scene:", "--seconds", "0.2", "-q").returncode == 0
+    done = venv.run("rosafe", "process", sound, "-o", tmp_path / "x.npz", "--outputs", "ild")
+    assert done.returncode == 0 and (tmp_path / "x.npz").stat().st_size > 0, done
+    doctor = venv.run("rosafe", "doctor", "--json")
+    told = json.loads(doctor.stdout)
+    assert doctor.returncode == 0 and told["ok"], doctor
+    state = {check["name"]: check for check in told["checks"]}
+    assert (state["python"]["state"], state["ROS"]["state"], state["plots"]["state"]) == ("ok", "note", "note")
+    assert "x86-64" in state["kernels"]["detail"] or "numpy and scipy: " in state["kernels"]["detail"]
+    for arguments, words in [
+        (["plot", sound], "matplotlib is not installed; pip install 'rosafe[plot]'"),
+        (["record", "--seconds", "1"], "is not installed; pip does not bring it: run scripts/install of a checkout"),
+        (["trace"], "is not installed; pip does not bring it"),
+    ]:
+        done = venv.run("rosafe", *arguments)
+        assert (done.returncode, done.stdout, done.stderr.count("\n")) == (1, "", 1), done
+        assert words in done.stderr
+
+
+def test_without_a_compiler(tmp_path: Path) -> None:
+    """The wheel is there all the same, for any machine, and says that the twins serve."""
+    programs = tmp_path / "bin"
+    programs.mkdir()
+    env = environment(PATH=str(programs))
+    with fresh_copy() as copy:
+        done = run(PYTHON, "-c", BUILD, "build_wheel", tmp_path, env=env, cwd=copy)
+        assert done.returncode == 0, done.stderr
+    (wheel,) = tmp_path.glob("*.whl")
+    assert wheel.name == f"rosafe-{VERSION}-py3-none-any.whl"
+    venv = Venv(tmp_path / "venv", wheel)
+    done = venv.run("rosafe", "doctor", PATH=str(programs))
+    (line,) = [line for line in done.stdout.splitlines() if "kernels" in line]
+    assert line.startswith("note") and "numpy and scipy: " in line and "install gcc" in line
+    assert done.returncode == 0, done

@@ -1,0 +1,191 @@
+"""The times of frames: a line that knows them better than the stamps do, and clients that read it."""
+
+from __future__ import annotations
+
+import json
+import urllib.request
+from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+import rospy
+from rosAFE.msg import rosAFE_frameTime, rosAFE_TimeFrequencySignalPortStruct
+
+from rosafe.component import wire
+from rosafe.component.frametime import FrameTime
+from rosafe.ros import FrameClock, array_msg
+from tests.harness import SCRIPTS, Graph, free_port, wait_for
+from tests.ros.session import Microphone, Session, noise
+
+BEGIN = 1_700_000_000.0
+
+
+def delays(kind: str, count: int, random: np.random.Generator) -> np.ndarray:
+    """How late stamps are (s)."""
+    late = random.exponential(0.002, count)
+    if kind == "spikes":
+        late[random.random(count) < 0.1] += 0.04
+    if kind == "bursts":  # a busy machine, for seconds
+        late += 0.015 * (np.sin(np.arange(count) / 60) > 0.7)
+    return late if kind != "none" else np.zeros(count)
+
+
+@pytest.mark.parametrize("kind", ["none", "plain", "spikes", "bursts"])
+@pytest.mark.parametrize("skew", [0.0, 80e-6, -80e-6])
+@pytest.mark.parametrize(("chunk", "per_block"), [(2205, 5), (441, 2), (2205, 1)])
+def test_delays_are_not_seen(kind: str, skew: float, chunk: int, per_block: int) -> None:
+    random = np.random.default_rng(3)
+    rate = 44100 * (1 + skew)
+    times = FrameTime()
+    times.begin(44100)
+    count = 150 * 44100 // chunk
+    told, true = [], []
+    for k, late in enumerate(delays(kind, count, random), 1):
+        times.add(k * chunk, BEGIN + k * chunk / rate + late)
+        if k % per_block == 0:
+            line = times.line(k * chunk)
+            assert line is not None
+            told.append(line.time - BEGIN)
+            true.append(k * chunk / rate)
+    errors = np.array(told) - true
+    seconds = np.array(true)
+    assert (np.diff(told) > 0).all()
+    steps = np.diff(errors)[seconds[1:] > 2]
+    assert np.abs(steps).max() < 2e-4, "from one answer to the next"
+    assert np.abs(errors[seconds > 30]).max() < 2e-4, "off the truth"
+    assert abs(line.rate / rate - 1) < 5e-6
+
+
+def test_a_clock_that_is_set_and_a_stream_that_begins_anew() -> None:
+    times = FrameTime()
+    times.begin(1000)
+    for step in (0.0, -3.0, 7.0):
+        first = times._points[-1][0] + 100 if times._points else 100
+        for frame in range(first, first + 20_000, 100):
+            times.add(frame, BEGIN + frame / 1000 + step)
+        line = times.line(frame)
+        assert line is not None
+        assert line.time == pytest.approx(BEGIN + frame / 1000 + step, abs=1e-6)
+    times.begin(2000)
+    assert times.line(5) is None
+    times.add(5, BEGIN)
+    line = times.line(5)
+    assert line is not None
+    assert (line.time, line.rate) == (BEGIN, 2000)
+
+
+class Stamped(Microphone):
+    """A microphone that knows when it has heard what."""
+
+    def publish(self) -> None:
+        if self.index == 0:
+            return super().publish()
+        seconds, nanoseconds = divmod(self.nanoseconds(self.index), 1_000_000_000)
+        self._publisher.publish(
+            self._message(
+                sampleRate=self.sample_rate,
+                nChunksOnPort=self.chunks,
+                nFramesPerChunk=self.chunk,
+                lastFrameIndex=self.index,
+                left=self.window[0].copy(),
+                right=self.window[1].copy(),
+                stamp={"sec": seconds, "nsec": nanoseconds},
+            )
+        )
+        return None
+
+    def nanoseconds(self, index: float) -> int:
+        """When a frame was captured."""
+        return int(1.7e18) + round(index * 1e9 / self.sample_rate)
+
+
+@pytest.fixture
+def stamped(afe: Session) -> Iterator[Stamped]:
+    microphone = Stamped(afe.graph)
+    afe.microphone = microphone
+    afe.ok("connect_port", local="Audio", remote=microphone.topic)
+    yield microphone
+
+
+def test_with_each_block(afe: Session, stamped: Stamped) -> None:
+    afe.build("PreProc", block=1000)
+    with afe.graph.collect("/rosAFE/frameTime", rosAFE_frameTime) as messages:
+        wait_for(lambda: afe.connections("/rosAFE/frameTime"), what="the connection")
+        stamped.play(noise(10_000))
+        wait_for(lambda: messages and messages[-1].frameIndex == 10_000, what=lambda: str(messages))
+        afe.read("preProc", 10_001)
+    assert [m.frameIndex for m in messages] == [*range(1000, 11_000, 1000)]
+    for message in messages:
+        assert abs(message.stamp.to_nsec() - stamped.nanoseconds(message.frameIndex)) < 2000
+        assert message.sampleRate == pytest.approx(20_000)
+
+
+def test_a_client_asks_for_a_frame_of_any_port(afe: Session, stamped: Stamped) -> None:
+    clock = FrameClock()
+    with pytest.raises(LookupError, match="frameTime"):
+        clock.time(3)
+    afe.build("PreProc", "GammatoneProc", "IhcProc", "IldProc", block=1600)  # a hop has 200 frames, a window 400
+    stamped.play(noise(8000))
+    assert clock.wait()
+    ild = afe.graph.message(
+        "/rosAFE/ildPort/ild", array_msg(rosAFE_TimeFrequencySignalPortStruct), lambda m: m.lastFrameIndex == 8001
+    )
+    wait_for(lambda: abs(clock.time(8000).wall - 1.7e9 - 0.4) < 1e-5, what="the newest line")
+    sound = SimpleNamespace(lastFrameIndex=8001, framesOnPort=20_000)
+    for frame, index in ((-1, 8000), (-20, 7981), (19_999, 8000)):
+        assert clock.of(sound, frame).wall == pytest.approx(1.7e9 + index / 20_000, abs=1e-5)
+    for frame, middle in ((-1, 7800), (-3, 7400)):  # the newest covers 7601 to 8000
+        moment = clock.of(ild, frame, window=0.02, hop=0.01)
+        assert moment.wall == pytest.approx(1.7e9 + (middle + 1) / 20_000, abs=6e-5)
+        wall_now = rospy.get_time()
+        assert abs(moment.ros.to_sec() - moment.wall) < abs(wall_now - moment.wall)
+    with pytest.raises(LookupError, match="no frame"):
+        clock.of(ild, 100_000)
+    clock.close()
+
+
+def test_tcl_and_matlab_read_it(afe: Session, stamped: Stamped) -> None:
+    port = free_port()
+    afe.build(block=1000)
+    stamped.play(noise(2000))
+    afe.graph.message("/rosAFE/frameTime", rosAFE_frameTime, lambda m: m.frameIndex == 2000)
+    with afe.graph.start(str(SCRIPTS / "genomixd"), "-p", str(port)):
+
+        def ask(syntax: str) -> bytes:
+            url = f"http://127.0.0.1:{port}/call/rosAFE/frameTime?syntax={syntax}"
+            with urllib.request.urlopen(url) as answer:
+                return bytes(answer.read())
+
+        def answered() -> Any:
+            try:
+                return json.loads(ask("json"))
+            except OSError:
+                return None
+
+        told = wait_for(answered)["frameTime"]
+        assert told == {"stamp": {"sec": 1_700_000_000, "nsec": told["stamp"]["nsec"]}, "frameIndex": 2000,
+                        "sampleRate": pytest.approx(20_000)}  # fmt: skip
+        assert told["stamp"]["nsec"] == pytest.approx(1e8, abs=2000)
+        nsec = told["stamp"]["nsec"]
+        text = f"frameTime {{stamp {{sec 1700000000 nsec {nsec}}} frameIndex 2000 sampleRate {told['sampleRate']!r}}}"
+        assert ask("tcl").decode() == text
+        assert b"stamp" in ask("packed")
+
+
+def test_the_array_class_has_the_bytes_of_the_generated_one(graph: Graph) -> None:
+    import io
+
+    both = []
+    stamp = {"sec": 7, "nsec": 9}
+    quick = wire.message_class("rosAFE", "::rosAFE::frameTime")
+    for message in (
+        rosAFE_frameTime(rospy.Time(7, 9), 11, 44100.5),
+        quick(stamp=stamp, frameIndex=11, sampleRate=44100.5),
+    ):
+        out = io.BytesIO()
+        message.serialize(out)
+        both.append(out.getvalue())
+    assert both[0] == both[1]
+    assert quick().deserialize(both[0]).stamp.nsec == 9

@@ -1,0 +1,183 @@
+"""Setups as files: what is written reads back the same, what is wrong is told with its line, bombs are refused."""
+
+from __future__ import annotations
+
+import math
+import time
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rosafe.interface import KINDS, MAX_SETUP, Parameter
+from rosafe.representations import STAGES
+from rosafe.setups import Setup, SetupError, Sound, Wanted, read, wanted, write
+from rosafe.setups.setup import parameters_of
+from rosafe.tree.requests import Found
+
+TREE = """\
+sound:
+  device: "scene:"
+connections: {Audio: bass/Audio}
+processors:
+  input: {kind: input, nFramesPerBlock: 4410}
+  time: {kind: time, parent: input}
+  bank:
+    kind: filterbank
+    parent: time
+    fb_cfHz: [500, 1e3, 2000.25]
+  ihc: {kind: ihc, parent: bank}
+  ild: {kind: ild, parent: ihc, ild_hSizeSec: 0.0050000000000000001}
+"""
+
+
+def test_what_a_person_writes() -> None:
+    setup = read(TREE)
+    assert setup.sound == Sound({"device": "scene:"})
+    assert setup.connections == {"Audio": "/bass/Audio"}
+    assert [(w.name, w.kind, w.parent, dict(w.given)) for w in setup.processors] == [
+        ("input", "input", "", {"nFramesPerBlock": 4410}),
+        ("time", "preProc", "input", {}),
+        ("bank", "gammatone", "time", {"fb_cfHz": [500.0, 1000.0, 2000.25]}),
+        ("ihc", "ihc", "bank", {}),
+        ("ild", "ild", "ihc", {"ild_hSizeSec": 0.005}),
+    ]
+    assert read(write(setup)) == setup
+    assert read(write(setup, full=True)) == setup
+
+
+def test_parents_may_come_later_and_defaults_go_without_saying() -> None:
+    setup = read("processors:\n  ild: {kind: ILD}\n  ihc: {kind: ihc}\n  gammatone: {kind: gammatone}\n"
+                 "  preProc: {kind: preProc, pp_bRemoveDC: yes}\n  input: {kind: input}\n")  # fmt: skip
+    assert [w.name for w in setup.processors] == ["input", "preProc", "gammatone", "ihc", "ild"]
+    assert setup.processors[1].given == {"pp_bRemoveDC": True}
+
+
+@pytest.mark.parametrize("text", ["", "# nothing\n", "processors:\n", "---\n...\n", "sound: ~\n"])
+def test_empty_setups(text: str) -> None:
+    assert read(text) == Setup()
+
+
+def _values(parameter: Parameter) -> st.SearchStrategy[Any]:
+    low, high = parameter.minimum, parameter.maximum
+    if parameter.idl == "boolean":
+        return st.booleans()
+    if parameter.choices:
+        words = st.sampled_from(parameter.choices)
+        return st.lists(words, min_size=1, max_size=3) if parameter.idl.startswith("sequence") else words
+    if parameter.idl in ("double", "float"):
+        numbers = st.floats(low, high, exclude_min=parameter.open_minimum, allow_nan=False, allow_infinity=False)
+        return numbers.filter(lambda value: not (value == 0 and math.copysign(1, value) < 0))
+    return st.integers(int(low or 0), int(high if high is not None else 2**31))
+
+
+_SIMPLE = [
+    kind
+    for kind in KINDS.values()
+    if STAGES[kind.kind].in_force.__func__ is STAGES["ihc"].in_force.__func__  # type: ignore[attr-defined]
+]
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.data())
+def test_every_parameter_to_the_last_digit(data: st.DataObject) -> None:
+    kind = data.draw(st.sampled_from(_SIMPLE))
+    given = {p.name: data.draw(_values(p)) for p in parameters_of(kind) if "sequence<double>" not in p.idl}
+    line = [kind]
+    while line[0].parent:
+        line.insert(0, KINDS[line[0].parent])
+    parents = ["", *(k.name for k in line[:-1])]
+    processors = [Wanted(k.name, k.kind, parent) for k, parent in zip(line, parents, strict=True)]
+    differing = {p.name: given[p.name] for p in parameters_of(kind) if given.get(p.name, p.default) != p.default}
+    processors[-1] = Wanted(kind.name, kind.kind, parents[-1], differing)
+    setup = Setup(processors=tuple(processors))
+    assert read(write(setup)) == setup
+    assert read(write(setup, full=True)) == setup
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {},
+        {"fb_nChannels": 17},
+        {"fb_nERBs": 2.0, "fb_highFreqHz": 4000.0},
+        {"fb_cfHz": [100.1, 333.3333333333333, 7999.999999999999]},
+        {"fb_type": "drnl", "fb_nChannels": 5},
+    ],
+)
+def test_a_filterbank_is_told_as_it_was_asked_for(values: dict[str, Any]) -> None:
+    kind = KINDS["gammatone"]
+    stage = STAGES["gammatone"](44100.0, **values)
+    found = wanted(Found("bank", "gammatone", "preProc", stage.parameters))
+    assert found.given == {name: value for name, value in values.items() if value != kind.parameter(name).default}
+    assert STAGES["gammatone"](44100.0, **found.values).parameters == stage.parameters
+
+
+WRONG = {
+    "processors:\n  a: {kind: input}\n  b: {kind: preProc, parent: a, pp_cutoffHzDC: -3}": (3, "pp_cutoffHzDC"),
+    "processors:\n  a: {kind: input}\n  b:\n    kind: preProc\n    parent: a\n    fb_nERBs: 3": (6, "'fb_nERBs'"),
+    "processors:\n  a: {kind: input}\n  b: {kind: preProcessor, parent: a}": (3, "'preProcessor' is no kind"),
+    "processors:\n  a: {kind: input}\n  b:\n    kind: preProc\n    parent: c": (5, "'c' is not in the setup"),
+    "processors:\n  a: {kind: input}\n  b: {kind: ihc, parent: a}": (3, "is of kind input, wanted is gammatone"),
+    "processors:\n  a: {kind: input}\n  b: {kind: input}": (3, "two inputs"),
+    "processors:\n  a: {kind: input}\n  a: {kind: input}": (3, "twice, first in line 2"),
+    "processors:\n  a: {parent: b}": (2, "kind is missing"),
+    "processors: [input]": (1, "NAME: VALUE"),
+    "processors:\n  a: {kind: input, nFramesPerBlock: 0}": (2, "nFramesPerBlock"),
+    "processors:\n  a: {kind: input, nFramesPerBlock: 1.5}": (2, "whole number"),
+    "processors:\n  a: {kind: input, nFramesPerBlock: }": (2, "nFramesPerBlock: wanted is one value"),
+    "processors:\n  a: {kind: input, in_doNormalize: perhaps}": (2, "boolean"),
+    "processors:\n  a: {kind: input}\n  'b c': {kind: preProc, parent: a}": (3, "names a topic"),
+    "sound: {device: 3, rate: 4}": (1, "'rate'"),
+    "sound:\n  sampleRate: .nan": (2, "sampleRate"),
+    "connections:\n  audio: bass/Audio": (2, "there are: Audio"),
+    "connections:\n  Audio: bass Audio": (2, "no name of a topic"),
+    "sounds: {}": (1, "there are: sound, connections, processors"),
+    "processors:\n\t- a": (2, "not YAML"),
+    "a: b: c": (1, "not YAML"),
+    "a\n---\nb": (3, "a second document"),
+    "x": (1, "NAME: VALUE"),
+}
+
+
+@pytest.mark.parametrize("text", WRONG)
+def test_what_is_wrong_is_told_with_its_line(text: str) -> None:
+    line, what = WRONG[text]
+    with pytest.raises(SetupError) as error:
+        read(text)
+    assert str(error.value).startswith(f"line {line}: ")
+    assert what in str(error.value)
+    assert "\n" not in str(error.value)
+    assert len(str(error.value)) < 1000
+
+
+HOSTILE = [
+    "a: &a [x, x]\nb: &b [*a, *a]\nc: &c [*b, *b]\n",
+    "processors: !!python/object/apply:os.system ['touch /tmp/hacked']\n",
+    "processors: {<<: {a: {kind: input}}}\n",
+    "sound: !!binary aGVsbG8=\n",
+    "processors: " + "[" * 100_000,
+    "processors: " + "{a: " * 50_000,
+    "? [a, b]\n: c\n",
+    "%YAML 9.9\n---\na: b\n",
+    "%TAG ! tag:x,2000:\n---\n!foo a: b\n",
+    "\0",
+    "\ud800",
+    "a: \x07",
+    "x" * (MAX_SETUP + 1),
+    "processors:\n" + "".join(f"  a{i}: {{kind: input}}\n" for i in range(1001)),
+    "processors:\n  a: {kind: input, nFramesPerBlock: " + "9" * 100_000 + "}\n",
+    "processors:\n  " + "a" * 100_000 + ": {kind: input}\n",
+    "processors:\n  a: {kind: input}\n  p: {kind: preProc, parent: a}\n  g: {kind: gammatone, parent: p, fb_cfHz: ["
+    + "1," * 20_000 + "]}\n",
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("text", HOSTILE, ids=range(len(HOSTILE)))
+def test_hostile_texts_are_refused_quickly(text: str) -> None:
+    begun = time.process_time()
+    with pytest.raises(SetupError) as error:
+        read(text)
+    assert time.process_time() - begun < 5
+    assert len(str(error.value)) < 1000
