@@ -9,7 +9,6 @@ these ratios is what the table has.
 
 from __future__ import annotations
 
-import argparse
 import os
 import platform
 import shutil
@@ -26,9 +25,10 @@ from typing import Any, NamedTuple
 for threads in ("OMP", "OPENBLAS", "MKL"):  # before numpy is imported: one core is one core
     os.environ[f"{threads}_NUM_THREADS"] = "1"
 HERE = Path(__file__).resolve().parent
-sys.path.insert(0, str(HERE.parent))
+sys.path[:0] = [str(HERE.parent), str(HERE)]
 
 import numpy as np  # noqa: E402
+import report  # noqa: E402
 
 from rosafe.dsp import kernels  # noqa: E402
 from rosafe.dsp.kernels import build, library  # noqa: E402
@@ -37,7 +37,6 @@ from rosafe.representations import STAGES  # noqa: E402
 
 RATE = 44100.0
 CHAIN = ("ild", "ratemap", "crossCorrelation")  # behind the hair cell
-LEAST = 0.05  # of the chain, or of the stage where that is not in it: what brings less is not kept
 
 
 class Trick(NamedTuple):
@@ -178,6 +177,12 @@ class Workshop(NamedTuple):
         """Of the compiler, beside `build.FLAGS`; what a trick leaves behind may be of no use."""
         return ("-Wno-unused", f"-march={build.LEVELS[platform.machine()][self.level]}")
 
+    def libraries(self, tricks: list[Trick]) -> list[Any]:
+        """The library with all tricks, and without each of these."""
+        objects = self.objects()
+        with ThreadPoolExecutor(os.cpu_count()) as executor:
+            return list(executor.map(lambda trick: self.library(trick, objects), (None, *tricks)))
+
     def objects(self) -> dict[str, Path]:
         """Each source with all tricks, compiled."""
         for path in sorted(build.HERE.glob("*.c")):
@@ -280,32 +285,13 @@ def measure(work: Work, with_it: Any, without: Any, rounds: int) -> float:
     return float(np.median(ratios)) - 1
 
 
-def as_markdown(shares: dict[Trick, list[float]], levels: list[int], load: float) -> str:
-    """The table."""
-    names = [build.LEVELS[platform.machine()][level] for level in levels]
-    lines = ["# What each trick in the kernels brings", ""]
-    lines += ["By benchmarks/tricks.py; docs/speed.md tells what follows.", ""]
-    lines += [f"* {kernels.status().detail.partition(';')[0]}", f"* load while it began: {load:.1f}", ""]
-    lines += ["How much more time the default chain takes without it, or a stage that is not in the chain.", ""]
-    lines += [f"| trick | in | blocks of | of | {' | '.join(names)} |", f"|---|---|--:|---|{'--:|' * len(names)}"]
-    lines += [
-        f"| {trick.text} | {trick.source} | {trick.blocks} | {trick.stage or 'the chain'} |"
-        f" {' | '.join(f'{share:.1%}' for share in found)} |"
-        for trick, found in shares.items()
-    ]
-    return "\n".join([*lines, ""])
-
-
 def main() -> int:
     """Compile, measure, print, write."""
-    parser = argparse.ArgumentParser(
-        description="Time the kernels with and without each of their tricks.",
-        epilog="example: /usr/bin/python3 benchmarks/tricks.py --rounds 30 --only Karatsuba",
-    )
-    parser.add_argument("--rounds", type=int, default=40, help="turns of each side (default %(default)s)")
+    parser = report.arguments("Time the kernels with and without each of their tricks.")
+    parser.add_argument("--rounds", type=int, default=25, help="turns of each side (default %(default)s)")
     parser.add_argument("--only", default="", metavar="TEXT", help="the tricks whose line has this; writes nothing")
     parser.add_argument("--compiler", default="gcc", help="as one types it (default %(default)s)")
-    parser.add_argument("--results", type=Path, default=HERE / "results", help="where to write (default %(default)s)")
+    parser.epilog = "example: /usr/bin/python3 benchmarks/tricks.py --rounds 50 --only Karatsuba"
     options = parser.parse_args()
     tricks = [trick for trick in TRICKS if options.only in f"{trick.text} {trick.source} {trick.stage}"]
     if options.rounds < 1 or not tricks:
@@ -314,30 +300,34 @@ def main() -> int:
         parser.error(f"there is no compiler {options.compiler!r} here")
     if not kernels.status().compiled:
         sys.exit(f"tricks.py: there are no kernels here: {kernels.status().detail}")
-    load = os.getloadavg()[0]
+    page = report.Report(options, "What each trick in the kernels brings")
+    page.say(f"* compiler: {options.compiler}; the kernels in use are {kernels.status().detail.partition(';')[0]}")
+    page.say()
+    page.say("How much more time the default chain takes without it, or a stage that is not in the chain.")
+    page.say()
     best = library.load(min(build.libraries().items())[1]).rosafe_processor_level()
     levels = [level for level in build.libraries() if best >= level >= min(best, 3)]  # SSE is nobody's any more
-    shares: dict[Trick, list[float]] = {trick: [] for trick in tricks}
+    names = [build.LEVELS[platform.machine()][level] for level in levels]
+    shares: dict[Trick, list[str]] = {trick: [] for trick in tricks}
     with tempfile.TemporaryDirectory(prefix="tricks.") as scratch:
-        for level in levels:
-            folder = Path(scratch) / str(level)
+        for level, name in zip(levels, names, strict=True):
+            folder = Path(scratch) / name
             folder.mkdir()
-            workshop = Workshop(folder, options.compiler, level)
-            objects = workshop.objects()
-            with ThreadPoolExecutor(os.cpu_count()) as executor:
-                with_all, *variants = executor.map(lambda trick: workshop.library(trick, objects), (None, *tricks))  # noqa: B023
+            with_all, *variants = Workshop(folder, options.compiler, level).libraries(tricks)
             cores = os.sched_getaffinity(0)
             os.sched_setaffinity(0, {max(cores)})
             for trick, variant in zip(tricks, variants, strict=True):
                 share = measure(Work(trick), with_all, variant, options.rounds)
-                shares[trick].append(share)
-                print(f"{build.LEVELS[platform.machine()][level]} {share:7.1%}  {trick.text}", file=sys.stderr)
+                shares[trick].append(f"{share:.1%}")
+                print(f"{name} {share:7.1%}  {trick.text}", file=sys.stderr)
             os.sched_setaffinity(0, cores)
-    text = as_markdown(shares, levels, load)
-    print(text)
+    rows = [
+        [trick.text, trick.source, str(trick.blocks), trick.stage or "the chain", *found]
+        for trick, found in shares.items()
+    ]
+    page.table(["trick", "in", "blocks of", "of", *names], rows)
     if not options.only:
-        options.results.mkdir(parents=True, exist_ok=True)
-        (options.results / "tricks.md").write_text(text)
+        page.write("tricks.md")
     return 0
 
 
