@@ -76,7 +76,7 @@ def test_states_that_are_too_large(kind: str, parameters: dict[str, Any]) -> Non
     try:
         text = f"{kind}: what it keeps of 2x1000 values takes [0-9]+ MiB, more than 1024 MiB"
         with pytest.raises(ValueError, match=text):
-            rosafe.process(np.zeros((2, 1600)), RATE, {**MANY, **parameters}, outputs=[kind])
+            rosafe.process(np.zeros((2, 1600)), RATE, parameters={**MANY, **parameters}, outputs=[kind])
         assert tracemalloc.get_traced_memory()[1] < 2**26
     finally:
         tracemalloc.stop()
