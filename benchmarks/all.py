@@ -1,4 +1,4 @@
-"""Write all tables in benchmarks/results, one benchmark after the other: some eleven minutes on a quiet machine.
+"""Write all tables in benchmarks/results, one benchmark after the other: some fifteen minutes on a quiet machine.
 
 ``/usr/bin/python3 benchmarks/all.py`` refuses a busy machine as each of them does; what counts is the load before the
 first one. The exit code is 1 where one of them has failed.
@@ -15,6 +15,7 @@ import report
 
 RUNS = (
     ("chain.py",),
+    ("tricks.py",),
     ("streams.py",),
     ("everything.py",),
     ("ports.py", "--seconds", "30"),

@@ -131,6 +131,13 @@ class Stage:
         """`output_rows` of each part."""
         return (self.output_rows(rows),)
 
+    def state_size(self, rows: tuple[int, ...]) -> int:
+        """How many numbers it keeps between blocks of leading shape `rows`, at most, besides a frame of its input.
+
+        Asked before anything of that size is made. Those that keep no more than a few for each row need not say so.
+        """
+        return 0
+
     def complete(self, count: int) -> int:
         """How many samples or frames it will have put out when `count` have come since the start."""
         return max(0, count - self.look_ahead)

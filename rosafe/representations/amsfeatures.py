@@ -148,6 +148,10 @@ class AmsFeatures(FramedStage):
     def output_rows(self, rows: tuple[int, ...]) -> tuple[int, ...]:
         return (*rows, len(self._frequencies))
 
+    def state_size(self, rows: tuple[int, ...]) -> int:
+        filters = len(self._frequencies) if self._triangles is None else 1
+        return 2 * math.prod(rows) * filters * len(self.window)  # in a store of up to twice as many
+
     def complete(self, count: int) -> int:
         return self._framing.complete(-(-count // self._decimation.ratio))
 

@@ -104,14 +104,19 @@ class Gabor(Stage):
 
     @property
     def derived(self) -> dict[str, Any]:
-        return {"gb_nFeatures": len(patterns(len(self.given.center_frequencies)).places)}
+        return {"gb_nFeatures": counted(len(self.given.center_frequencies)).features}
 
     @property
     def look_ahead(self) -> int:
         return REACH
 
     def output_rows(self, rows: tuple[int, ...]) -> tuple[int, ...]:
-        return (rows[0], len(patterns(rows[1]).places))
+        return (rows[0], counted(rows[1]).features)
+
+    def state_size(self, rows: tuple[int, ...]) -> int:
+        features, weights = counted(rows[1])
+        # of the last 5 s the features, their sums and their squares' sums; levels, in a store of up to twice as many
+        return 3 * self._remembered * 2 * features + weights + 4 * 2 * REACH * math.prod(rows)
 
     def process(self, block: FloatArray, extra: FloatArray | None = None) -> FloatArray:
         rates = np.maximum(self._checked(block), 0.0)
@@ -174,6 +179,26 @@ class Patterns(NamedTuple):
     weights: FloatArray
 
 
+class Count(NamedTuple):
+    """How many features and weights `patterns` has."""
+
+    features: int
+    weights: int
+
+
+@functools.lru_cache(maxsize=16)
+def counted(channels: int) -> Count:
+    """Those of so many channels, told without making them."""
+    features = weights = 0
+    for (length, _), (extent, _) in extents(channels):
+        half, reach = math.ceil(extent / 2) - 1, math.ceil(length / 2) - 1
+        step = max(1, (2 * half + 1) // 4)
+        for channel in range(channels // 2 % step, channels, step):
+            features += 1
+            weights += (min(channels, channel + half + 1) - max(0, channel - half)) * (2 * reach + 1)
+    return Count(features, weights)
+
+
 @functools.lru_cache(maxsize=4)
 def patterns(channels: int) -> Patterns:
     """The features of so many channels.
@@ -201,13 +226,18 @@ def patterns(channels: int) -> Patterns:
 
 def filters(channels: int) -> Iterator[NDArray[np.complex128]]:
     """All filters for so many channels, (channels, frames), both odd: by frequency in time, then along the channels."""
+    return (_filter(time, channel) for time, channel in extents(channels))
+
+
+def extents(channels: int) -> Iterator[tuple[tuple[float, float], tuple[float, float]]]:
+    """Length and frequency of each filter in time, and along the channels."""
     if channels == 0:
         return
     along = frequencies(3 * channels, CHANNEL_STEP)
     for omega in (0.0, *reversed(frequencies(LENGTH, TIME_STEP))):
         for kappa in (*(-f for f in along), 0.0, *reversed(along)):
             if omega > 0 or kappa >= 0:
-                yield _filter(_extent(omega, LENGTH), _extent(kappa, 3 * channels))
+                yield _extent(omega, LENGTH), _extent(kappa, 3 * channels)
 
 
 def frequencies(longest: int, step: float) -> list[float]:

@@ -133,6 +133,11 @@ class Precedence(FramedStage):
     def part_rows(self, rows: tuple[int, ...]) -> tuple[tuple[int, ...], ...]:
         return (rows[1:], rows[1:], (rows[1], 2 * self._max_lag + 1))
 
+    def state_size(self, rows: tuple[int, ...]) -> int:
+        bins = self._points // 2 + 1
+        groups = -(-math.prod(rows) // TOGETHER) * TOGETHER
+        return bins * (groups + 4)  # sums of spectra, and the tables of the transform
+
     def process(self, block: FloatArray, extra: FloatArray | None = None) -> tuple[FloatArray, ...]:
         samples = self._checked(block)
         channels = samples.shape[1]

@@ -6,6 +6,7 @@ organization to the cross-spectral fusion of concurrent narrow-band noises", J. 
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -84,6 +85,10 @@ class _Map(Stage):
     @property
     def look_ahead(self) -> int:
         return 2 * self._fuse + int(self._values["trm_minSpread"]) - 1
+
+    def state_size(self, rows: tuple[int, ...]) -> int:
+        frames = self.look_ahead + max(self.look_ahead, KEPT)
+        return 4 * math.prod(rows) * frames  # strengths and levels, in a store of up to twice as many
 
     def process(self, block: FloatArray, extra: FloatArray | None = None) -> FloatArray:
         strengths = self._checked(block)

@@ -1,4 +1,4 @@
-"""How much memory signals take, and what of that is too much: asked before anything of that size is made."""
+"""How much memory signals and states take, and what of that is too much: asked before anything of that size is made."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rosafe.dsp.stage import Stage
 MAX_BYTES = (
     2**30
 )  # of one output port, of one processor's history, of the samples that it keeps for a frame, of a block
-SHARE = 0.5  # of the machine's memory, for the output ports and histories of all processors together
+SHARE = 0.5  # of the machine's memory, for output ports, histories and states of all processors together
 
 Rows = tuple[int, ...]
 
@@ -27,6 +27,11 @@ def size(rows: Rows, frames: float) -> float:
     return math.prod(rows, start=8.0 * frames)
 
 
+def state_size(stage: Stage, rows: Rows) -> float:
+    """Bytes of what `stage` keeps between blocks of leading shape `rows`."""
+    return 8.0 * stage.state_size(rows)
+
+
 def output_size(stage: Stage, rows: Rows, seconds: float) -> float:
     """Bytes of so many seconds of all that `stage` puts out, given blocks of leading shape `rows`."""
     return sum(size(part, seconds * stage.output.rate) for part in stage.part_rows(rows))
@@ -39,13 +44,16 @@ def refuse_over(limit: float, taken: float, text: str, unit: float = 2**20) -> N
 
 
 def check_stage(stage: Stage, rows: Rows, seconds: float) -> None:
-    """ValueError where `seconds` of one stage's output, or what it keeps of its input for a frame, are too large."""
+    """ValueError where `seconds` of one stage's output, a frame of its input, or what it keeps, are too large."""
     for part in stage.part_rows(rows):
         _check_span("port or history", part, seconds, stage.output.rate)
     given = stage.given
     frames = (stage.output.window - given.window) / given.hop + 1
     name = f"{stage.PREFIX}_wSizeSec" if isinstance(stage, FramedStage) else "window"
     _check_span(name, rows, frames / given.rate, given.rate)
+    shape = "x".join(map(str, rows))
+    text = f"{stage.REPRESENTATION.kind}: what it keeps of {shape} values takes {{taken:.0f}} MiB"
+    refuse_over(MAX_BYTES, state_size(stage, rows), f"{text}, more than {{limit:.0f}} MiB")
 
 
 def _check_span(what: str, rows: Rows, seconds: float, rate: float) -> None:
@@ -55,7 +63,8 @@ def _check_span(what: str, rows: Rows, seconds: float, rate: float) -> None:
 
 
 def check_all(stages: Iterable[tuple[Stage, Rows]], seconds: float) -> None:
-    """ValueError where `seconds` of output of all stages together would fill the machine's memory."""
-    sizes = [output_size(stage, rows, seconds) for stage, rows in stages]
-    text = f"{seconds:g} s of output of {len(sizes)} processors take {{taken:.0f}} MiB, more than {{limit:.0f}} MiB"
+    """ValueError where `seconds` of output of all stages together, and what they keep, would fill the memory."""
+    sizes = [output_size(stage, rows, seconds) + state_size(stage, rows) for stage, rows in stages]
+    text = f"{seconds:g} s of output of {len(sizes)} processors, and their states,"
+    text = f"{text} take {{taken:.0f}} MiB, more than {{limit:.0f}} MiB"
     refuse_over(SHARE * machine_memory(), sum(sizes), f"{text}, which is {SHARE:.0%} of this machine's memory")

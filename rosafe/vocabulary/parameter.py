@@ -66,7 +66,8 @@ class Parameter:
     def range_text(self) -> str:
         """The range in words, for help texts and error messages; empty where anything goes."""
         if self.choices:
-            return "one of " + ", ".join(self.choices)
+            named = ", ".join(filter(None, self.choices))
+            return f"one of {named}" + (", or empty" if "" in self.choices else "")
         low, high = self.minimum, self.maximum
         if low is None and high is None:
             return ""

@@ -55,7 +55,7 @@ def signal(channels: int, samples: int, seed: int = 0) -> FloatArray:
     return rng.standard_normal((2, channels, samples)) * np.repeat(levels, 100)[:samples]
 
 
-def outputs(stage: Stage, blocks: Iterable[FloatArray], turns: Iterable[int]) -> list[FloatArray]:
+def outputs(stage: Stage, blocks: Iterable[FloatArray], turns: Iterable[Choice]) -> list[FloatArray]:
     """What `stage` makes of `blocks` on the implementations that have their turn."""
     made = []
     for block, level in zip(blocks, turns, strict=False):
@@ -87,7 +87,8 @@ def check(
 ) -> None:
     """The kernels give what the twins give; so does a stage that goes back and forth between the two."""
     expected = outputs(STAGES[kind](given, **parameters), blocks, [TWINS] * len(blocks))
-    for turns in ([level], [level, TWINS, TWINS, level]):
+    rounds: list[list[Choice]] = [[level], [level, TWINS, TWINS, level]]
+    for turns in rounds:
         got = outputs(STAGES[kind](given, **parameters), blocks, turns * len(blocks))
         agree(got, expected, least=least)
 
@@ -109,7 +110,7 @@ def test_gammatone(
 ) -> None:
     frequencies = np.geomspace(60.0, 7900.0, channels)
     blocks = [np.ascontiguousarray(block) for block in cut(signal(1, sum(sizes) + 50)[:, 0], [*sizes, 50])]
-    made: dict[int, list[FloatArray]] = {}
+    made: dict[Choice, list[FloatArray]] = {}
     for choice in (TWINS, level):
         bank = GammatoneBank(RATE, frequencies, order, width)
         with using(choice):
@@ -373,7 +374,8 @@ def test_precedence(level: Choice, parameters: dict[str, Any]) -> None:
     x = np.random.default_rng(1).standard_normal((2, 9, 16000))
     x[1] += np.roll(x[0], 5, axis=-1)
     made = {}
-    for turns in ([TWINS], [level], [level, TWINS, TWINS, level]):
+    rounds: list[list[Choice]] = [[TWINS], [level], [level, TWINS, TWINS, level]]
+    for turns in rounds:
         stage, blocks = STAGES["precedence"](RATE, **parameters), cut(x, [3000, 1, 200])
         parts = []
         for block, choice in zip(blocks, turns * len(blocks), strict=False):

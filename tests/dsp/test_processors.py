@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from rosafe.dsp.signal import Signal
+from rosafe.dsp.stage import Output
 from rosafe.representations import STAGES
 
 from . import foreign
-from .bare import FloatArray
+from .bare import FloatArray, single
 from .implementations import CLANG, TWINS, Choice, using
 from .test_kernels import RATE, agree, signal
 
@@ -36,16 +37,17 @@ def representations(choice: Choice) -> dict[str, FloatArray]:
     with using(choice):
         for block in np.array_split(signal(1, 9000)[:, 0], 2, axis=-1):
             block = np.ascontiguousarray(block)
-            outputs = {"gammatone": bank.process(block)}
-            outputs["ihc"] = cell.process(outputs["gammatone"])
-            outputs |= {kind: stage.process(outputs["ihc"]) for kind, stage in stages.items()}
+            filtered = single(bank.process(block))
+            inner = single(cell.process(filtered))
+            outputs: dict[str, Output] = {"gammatone": filtered, "ihc": inner}
+            outputs |= {kind: stage.process(inner) for kind, stage in stages.items()}
             for kind, output in outputs.items():
                 parts = output if isinstance(output, tuple) else (output,)
                 for number, part in enumerate(parts):
                     made.setdefault(f"{kind} {number}", []).append(part)
         rates = np.abs(signal(CHANNELS, 200))
         for kind in ("spectralFeatures", "gabor"):
-            made[kind] = [STAGES[kind](frames).process(rates)]
+            made[kind] = [single(STAGES[kind](frames).process(rates))]
     return {kind: np.concatenate(parts, axis=-1) for kind, parts in made.items()}
 
 

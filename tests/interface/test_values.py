@@ -13,6 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from rosafe.interface import BASS, MAX_SEQUENCE, REQUIRED, ROSAFE, Parameter, text_of
+from rosafe.representations import STAGES
 
 BOOLEAN = Parameter("flag", "boolean", False, "")
 UNSIGNED = Parameter("count", "unsigned long", 1, "")
@@ -264,3 +265,11 @@ def test_names_and_their_aliases() -> None:
     for lookup in (ROSAFE.service, ROSAFE.port, ROSAFE.service("Stop").parameter):
         with pytest.raises(KeyError):
             lookup("none")
+
+
+def test_the_range_of_a_word_that_may_be_empty() -> None:
+    (model,) = [p for p in STAGES["adaptation"].REPRESENTATION.parameters if p.name == "adpt_model"]
+    assert model.range_text == "one of adt_dau, adt_puschel, adt_breebaart, adt_vandorpschuitman, or empty"
+    assert model.check("") == ""
+    with pytest.raises(ValueError, match=r"one of adt_dau, .*, or empty$"):
+        model.check("dau")

@@ -15,7 +15,7 @@ try:
 except ImportError:  # before setuptools 70.1
     from wheel.bdist_wheel import bdist_wheel
 
-COMPILES = bool(shutil.which("gcc")) and (platform.system(), platform.machine()) == ("Linux", "x86_64")
+COMPILES = bool(shutil.which("gcc")) and platform.system() == "Linux" and platform.machine() in ("x86_64", "aarch64")
 
 
 class BuildPy(build_py):  # type: ignore[misc]

@@ -1,0 +1,103 @@
+"""What stages keep between blocks counts as what they put out does, and is refused before it is made."""
+
+from __future__ import annotations
+
+import tracemalloc
+from typing import Any
+
+import numpy as np
+import pytest
+
+import rosafe
+from rosafe.dsp.signal import Signal
+from rosafe.interface import ComponentError
+from rosafe.representations import STAGES
+from rosafe.tree import sizes
+from rosafe.tree.tree import Tree
+
+from .support import Feed
+
+RATE = 16000.0
+CHANNELS = 20
+FREQUENCIES = tuple(np.geomspace(80.0, 7000.0, CHANNELS))
+FRAMES = Signal(RATE, 100.0, True, 160, 320, FREQUENCIES)
+SOUND = Signal(RATE, RATE, False, 1, 1, FREQUENCIES)
+
+
+@pytest.mark.parametrize(
+    ("kind", "given", "parameters", "blocks"),
+    [
+        ("onsetMap", FRAMES, {"trm_minSpread": 1000, "trm_fuseWithinSec": 5.0}, [100] * 60),
+        ("offsetMap", FRAMES, {}, [100] * 20),
+        ("gabor", FRAMES, {}, [50] * 30),
+        ("precedence", SOUND, {"prec_wSizeSec": 0.5}, [400] * 60),
+        ("amsFeatures", SOUND, {"ams_dsRatio": 1, "ams_wSizeSec": 0.5}, [400] * 80),
+    ],
+    ids=lambda value: value if isinstance(value, str) else "",
+)
+def test_what_a_stage_keeps_is_what_it_says(
+    kind: str, given: Signal, parameters: dict[str, Any], blocks: list[int]
+) -> None:
+    rng = np.random.default_rng(0)
+    STAGES[kind](given, **parameters).process(*arguments(kind, rng, 50))  # tables that all of its kind share
+    tracemalloc.start()
+    try:
+        stage = STAGES[kind](given, **parameters)
+        for number in blocks:
+            stage.process(*arguments(kind, rng, number))
+        kept = tracemalloc.get_traced_memory()[0]
+    finally:
+        tracemalloc.stop()
+    told = sizes.state_size(stage, (2, CHANNELS))
+    window = 2 * 8.0 * 2 * CHANNELS * (stage.output.window - given.window) / given.hop  # of the input, in its store
+    assert kept <= 1.05 * (told + window) + 200_000
+    assert told <= 6 * kept
+
+
+def arguments(kind: str, rng: np.random.Generator, number: int) -> list[Any]:
+    block = rng.random((2, CHANNELS, number))
+    return [block, block] if kind.endswith("Map") else [block]
+
+
+MANY = {"fb_nChannels": 1000, "fb_highFreqHz": 7000.0}
+
+
+@pytest.mark.parametrize(
+    ("kind", "parameters"),
+    [
+        ("onsetMap", {"trm_fuseWithinSec": 10.0, "rm_hSizeSec": 0.001}),
+        ("gabor", {"rm_hSizeSec": 0.001}),
+        ("amsFeatures", {"ams_wSizeSec": 1.0}),
+    ],
+)
+def test_states_that_are_too_large(kind: str, parameters: dict[str, Any]) -> None:
+    """Nothing of that size has been made by then."""
+    tracemalloc.start()
+    try:
+        text = f"{kind}: what it keeps of 2x1000 values takes [0-9]+ MiB, more than 1024 MiB"
+        with pytest.raises(ValueError, match=text):
+            rosafe.process(np.zeros((2, 1600)), RATE, parameters={**MANY, **parameters}, outputs=[kind])
+        assert tracemalloc.get_traced_memory()[1] < 2**26
+    finally:
+        tracemalloc.stop()
+
+
+def test_the_autocorrelation_of_many_channels(tree: Tree, feed: Feed) -> None:
+    """In a tree that runs, what it puts out in ten seconds; offline there is no more than the sound is long."""
+    tree.add_input("input", feed, 160, 1.0, 10.0)
+    for kind, parent in (("preProc", "input"), ("gammatone", "preProc"), ("ihc", "gammatone")):
+        tree.add(kind, kind, parent, {"fb_nChannels": 256, "fb_highFreqHz": 7000.0} if kind == "gammatone" else {})
+    with pytest.raises(ComponentError, match="10 s of 2x256x319 values at 100 Hz take 1246 MiB") as raised:
+        tree.add("autocorrelation", "autocorrelation", "ihc")
+    assert raised.value.ex == "::rosAFE::e_badNewValue"
+    assert [p.name for p in tree.processors] == ["input", "preProc", "gammatone", "ihc"]
+
+
+def test_states_have_their_share_of_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each of them would do, and all together not."""
+    stages = [(STAGES["gabor"](FRAMES), (2, CHANNELS)) for _ in range(4)]
+    one = sizes.state_size(*stages[0]) + sizes.output_size(*stages[0], 1.0)
+    monkeypatch.setattr(sizes, "machine_memory", lambda: int(one * 3.5 / sizes.SHARE))
+    sizes.check_all(stages[:3], 1.0)
+    with pytest.raises(ValueError, match=r"4 processors, and their states, take .* of this machine's memory"):
+        sizes.check_all(stages, 1.0)
