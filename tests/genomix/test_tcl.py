@@ -711,3 +711,24 @@ def test_a_lost_server_is_told_once(world: World) -> None:
             told = f"::genom::mwerr: the connection to genomixd at 127.0.0.1:{port} is lost"
             assert client.out.splitlines() == ["ready", f"bass::Acquire &: {told}"]
             assert client.err == ""
+
+
+def test_the_highest_channel_follows_the_sample_rate_at_every_door(world: World) -> None:
+    """Where it is not given: Tcl, one request for the whole tree, which finds its own again, and plain services."""
+    script = (
+        LOAD
+        + """
+        bass::Acquire {device scene: sampleRate 16000}
+        rosAFE::InputProc
+        rosAFE::PreProc
+        rosAFE::GammatoneProc {fb_nChannels 5}
+        show [dict get [rosAFE::request gammatone {fb_nChannels 6}] name]
+        show [dict get [rosAFE::request gammatone {fb_nChannels 6}] name]
+        catch {rosAFE::GammatoneProc {name other fb_nChannels 5 fb_highFreqHz 8000}} result
+        show [string match "*7600 Hz would do*" $result]
+    """
+    )
+    assert world.lines(script) == ["filterbank_0", "filterbank_0", "1"]
+    world.graph.run("rosservice", "call", "/rosAFE/GammatoneProc", "{name: plain, fb_nChannels: 7}")
+    told = world.graph.run("rosservice", "call", "/rosAFE/getParameters", "{}").stdout
+    assert re.findall("fb_highFreqHz: (.*)", told) == ["7600.0"] * 3
