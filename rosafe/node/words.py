@@ -42,7 +42,7 @@ class UnknownWords:
         if self._strict:
             return True
         try:
-            return rospy.get_param_cached(STRICT, False) is True
+            return bool(rospy.get_param_cached(STRICT, False) == 1)  # true, or 1
         except master.FAILURES:  # nobody says so
             return False
 

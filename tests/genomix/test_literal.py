@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import json
 from typing import Any
 
@@ -34,6 +35,10 @@ def told(world: World, kind: str, name: str) -> dict[str, Any]:
     return next(one for one in parameters if one["name"] == name)
 
 
+def is_there(world: World, name: str) -> bool:
+    return name in [one["name"] for one in world.http.call("rosAFE/getProcessors")["processors"]]
+
+
 # --- zeros ------------------------------------------------------------------------------------------------------
 
 
@@ -42,7 +47,7 @@ def test_a_zero_is_a_zero_by_call_and_by_send(world: World) -> None:
     world.http.call("rosAFE/PreProc", {"name": "called", "pp_coefPreEmphasis": 0, "pp_refSPLdB": 0})
     world.http.wait(world.http.send("rosAFE/PreProc", {"name": "sent", "pp_coefPreEmphasis": 0}), "sent")
     for name, level in (("called", 0.0), ("sent", 100.0)):
-        wait_for(lambda name=name: name in str(world.http.call("rosAFE/getParameters")))
+        wait_for(functools.partial(is_there, world, name))
         assert (told(world, "preProc", name)["pp_coefPreEmphasis"], told(world, "preProc", name)["pp_refSPLdB"]) == (
             0.0,
             level,

@@ -195,6 +195,7 @@ REFUSALS = (
     ),
 )
 NUMBERED = [pytest.param(k, id=f"{k + 1}-{r.request.partition('/')[2]}") for k, r in enumerate(REFUSALS)]
+WITH_COMMAND = [k for k, refusal in enumerate(REFUSALS) if refusal.command]
 
 # As `rosservice call NAME YAML` and `rosafe WORD ...` one after the other: to start Python thirty times takes long.
 ROSSERVICE = """
@@ -326,12 +327,11 @@ def test_octave(by_octave: dict[str, Any], number: int) -> None:
 
 @pytest.fixture(scope="module")
 def by_command(world: World) -> dict[int, str]:
-    with_command = [number for number, refusal in enumerate(REFUSALS) if refusal.command]
-    done = program(world, ROSAFE, [REFUSALS[number].command for number in with_command])
-    return dict(zip(with_command, done.stderr.split("%%\n"), strict=False))
+    done = program(world, ROSAFE, [REFUSALS[number].command for number in WITH_COMMAND])
+    return dict(zip(WITH_COMMAND, done.stderr.split("%%\n"), strict=False))
 
 
-@pytest.mark.parametrize("number", [p for p in NUMBERED if REFUSALS[p.values[0]].command])  # type: ignore[index]
+@pytest.mark.parametrize("number", WITH_COMMAND)
 def test_command_line(by_command: dict[int, str], number: int) -> None:
     """In one line, with exit status 1."""
     line, code, end = by_command[number].split("\n")
