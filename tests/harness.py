@@ -259,7 +259,7 @@ class Graph:
         if not process.alive:
             raise AssertionError(f"ended at once: {process}")
         _, subscribed, served = ({entry for entry, _ in kind} for kind in self._state())
-        return {f"/{name}/{s.name}" for s in component.services} <= served and {
+        return {f"/{name}/{s.name}" for s in component.on_graph} <= served and {
             f"/{name}/{s.name}/cancel" for s in component.activities
         } <= subscribed
 

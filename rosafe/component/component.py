@@ -14,8 +14,9 @@ import re
 import threading
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, nullcontext
+from types import SimpleNamespace
 from typing import Any
 
 import actionlib
@@ -124,17 +125,29 @@ class ComponentNode:
         topic = f"{self.name}/{self.component.port(port).name}" + (f"/{element}" if element else "")
         return Publisher(topic, message_class)
 
+    def ask(self, name: str, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Do what a client asks for who means all `values` as they are; an activity runs when this returns.
+
+        Raises ComponentError.
+        """
+        service = self.component.service(name)
+        request = SimpleNamespace(**values)
+        if service.activity:
+            self._run(service, request, literal=True)
+            return {}
+        return self._answer(service, request, literal=True)
+
     def settle(self) -> None:
         """Wait until the master knows what was advertised and withdrawn, but not long, and not for a dead one."""
         self._registrar.settle()
 
     def start(self) -> None:
         """Offer all services and actions, and publish genom_state from now on."""
-        missing = {s.name for s in self.component.services} - set(self._handlers)
+        missing = {s.name for s in self.component.on_graph} - set(self._handlers)
         if missing:
             raise RuntimeError(f"no handler for {', '.join(sorted(missing))}")
         self._state = self.advertise("genom_state", self._msg.genom_state_component)
-        for service in self.component.services:
+        for service in self.component.on_graph:
             serve = self._serve_activity if service.activity else self._serve_function
             self._keep.append(
                 rospy.Service(
@@ -179,32 +192,41 @@ class ComponentNode:
         values = self._values(service, request, literal)
         return self.activities.start(service, self._handlers[service.name], values, on_end)
 
+    def _run(self, service: interface.Service, request: Any, literal: bool) -> Activity:
+        """The activity, once it runs."""
+        activity = self._begin(service, request, literal)
+        activity.begun.wait()
+        if activity.error is not None:
+            raise activity.error
+        return activity
+
+    def _answer(self, service: interface.Service, request: Any, literal: bool) -> dict[str, Any]:
+        """The outputs of a function, once what it interrupts has ended."""
+        with self._turns[service.name]:
+            outputs = self._handlers[service.name](self._values(service, request, literal)) or {}
+        if service.interrupts:
+            self.activities.interrupt_named(service.interrupts, service.name, wait=STOP_WAIT)
+        return outputs
+
     def _serve_activity(self, service: interface.Service, request: Any) -> Any:
         response = getattr(self._srv, f"{service.name}Response")
         try:
-            activity = self._begin(service, request, mark.is_marked(request))
+            activity = self._run(service, request, mark.is_marked(request))
         except ComponentError as problem:
             return response(False, self._told(service, problem))
-        activity.begun.wait()
-        if activity.error is not None:
-            return response(False, self._told(service, activity.error))
         return response(True, mark.granted(request, activity.warning))
 
     def _serve_function(self, service: interface.Service, request: Any) -> Any:
         response = getattr(self._srv, f"{service.name}Response")
         changes = self._registrar.changes
-        with self._turns[service.name]:
-            try:
-                values = self._values(service, request, mark.is_marked(request))
-                outputs = self._handlers[service.name](values) or {}
-            except ComponentError as problem:
-                return response(genom_success=False, genom_exdetail=self._told(service, problem))
-            except Exception as problem:  # a fault of ours must reach the caller and the log, and not end the node
-                rospy.logerr(f"{service.name}: {traceback.format_exc()}")
-                error = ComponentError("::genom::unkex", what=f"{type(problem).__name__}: {problem}"[:127])
-                return response(genom_success=False, genom_exdetail=error.exdetail)
-        if service.interrupts:
-            self.activities.interrupt_named(service.interrupts, service.name, wait=STOP_WAIT)
+        try:
+            outputs = self._answer(service, request, mark.is_marked(request))
+        except ComponentError as problem:
+            return response(genom_success=False, genom_exdetail=self._told(service, problem))
+        except Exception as problem:  # a fault of ours must reach the caller and the log, and not end the node
+            rospy.logerr(f"{service.name}: {traceback.format_exc()}")
+            error = ComponentError("::genom::unkex", what=f"{type(problem).__name__}: {problem}"[:127])
+            return response(genom_success=False, genom_exdetail=error.exdetail)
         if self._registrar.changes != changes:
             self._registrar.settle()
         self._state_changed()

@@ -10,7 +10,7 @@ from typing import Any
 import rosgraph.names
 
 from rosafe.component import mark, wire
-from rosafe.genomix import packed, setups, syntax, trees
+from rosafe.genomix import packed, setups, syntax
 from rosafe.genomix.actions import ActionClient, Goal
 from rosafe.genomix.graph import Graph, Unknown, middleware_error
 from rosafe.genomix.syntax import Syntax
@@ -35,6 +35,7 @@ from rosafe.interface import (
     ros_type,
 )
 from rosafe.interface.signals import LEVELS
+from rosafe.tree import building
 from rosafe.vocabulary.words import meant
 
 CALL_SECONDS = 60.0  # for the answer to one request
@@ -45,8 +46,8 @@ LATE_SECONDS = 0.5  # results that a component sent before it ended arrive withi
 MAX_PENDING = 1000  # requests to one component that are not answered yet
 WHOLE_TREES = (REQUEST, FIND)  # which take parameters of any kind, and only those that are given
 _COMPOSITES = {
-    REQUEST.name: trees.build,
-    FIND.name: trees.find,
+    REQUEST.name: building.build,
+    FIND.name: building.find,
     SAVE_SETUP.name: setups.save,
     LOAD_SETUP.name: setups.load,
 }

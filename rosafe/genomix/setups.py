@@ -8,11 +8,11 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import AbstractAsyncContextManager
 from typing import Any, Protocol
 
-from rosafe.genomix.trees import TRIES, Services, look, remove, take_step, uncancelled, wait_for_input
 from rosafe.interface import BASS, REQUEST, ROSAFE, ComponentError
 from rosafe.setups import Setup, SetupError, Sound, plan, read, rehearse, wanted, write
 from rosafe.setups.plan import refused
 from rosafe.tree import requests as request
+from rosafe.tree.building import TRIES, Services, look, remove, take_step, uncancelled, wait_for_input
 from rosafe.tree.requests import Found
 
 AUDIO = "Audio"

@@ -36,9 +36,9 @@ COMPONENTS = {c.name: c for c in (ROSAFE, BASS)}
 
 
 def all_services() -> Iterator[tuple[Component, Service]]:
-    """Every (component, service) pair."""
+    """Every (component, service) pair on the ROS graph."""
     for component in COMPONENTS.values():
-        for service in component.services:
+        for service in component.on_graph:
             yield component, service
 
 

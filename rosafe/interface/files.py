@@ -35,7 +35,7 @@ def interface_files(component: Component) -> dict[str, str]:
     files = {}
     for idl, fields in component.structs.items():
         files[f"msg/{ros_type(idl)}.msg"] = _text(f"IDL struct {idl}", fields)
-    for service in component.services:
+    for service in component.on_graph:
         files.update(_of_service(service))
     return files
 

@@ -41,7 +41,7 @@ def markdown(components: Iterable[Component], kinds: Mapping[str, Representation
 def _component(component: Component, kinds: Mapping[str, Representation]) -> Iterator[str]:
     yield f"## {component.name}\n"
     yield f"{component.doc}.\n"
-    for service in component.services:
+    for service in component.on_graph:
         yield from _service(component, service, kinds)
     yield f"### Ports of {component.name}\n"
     rows = [(_topic(component, port), f"`{ros_type(port.idl)}`", _port_doc(port)) for port in component.ports]

@@ -18,7 +18,7 @@ from .signals import SIGNALS, layout
 
 MAX_SECONDS = 600.0  # longest port or history
 MAX_BLOCK = 10_000_000  # frames
-MAX_SETUP = 256 * 1024  # characters of a setup
+MAX_SETUP = 256 * 1024  # characters of a setup, and of the parameters of a request for a whole tree
 
 Kinds = Mapping[str, Representation]  # parents first
 
@@ -177,6 +177,28 @@ def _whole_trees(kinds: Kinds) -> tuple[Service, ...]:
     return build, find, save, load
 
 
+def _plain(composites: tuple[Service, ...]) -> tuple[Service, ...]:
+    """The request for a whole tree, as a service of ROS."""
+    build = composites[0]
+    parameters = (
+        Parameter("representation", "string", REQUIRED, "What is wanted, such as ild: see request.md"),
+        Parameter(
+            "parameters",
+            "string",
+            "",
+            "Parameters of it and of all above it, as YAML: 'fb_nChannels: 16, pi_rangeHz: [80, 300]'",
+            longest=MAX_SETUP,
+        ),
+        Parameter(
+            "connect",
+            "string",
+            "",
+            "Topic for the Audio port, where a new input needs one; empty: bass/Audio, unless it is connected",
+        ),
+    )
+    return (replace(build, parameters=parameters),)
+
+
 _FUNCTIONS = (
     Service(
         "getSignals",
@@ -240,6 +262,7 @@ _FUNCTIONS = (
 def derive(kinds: Kinds) -> Component:
     """The component whose processors are of these kinds."""
     adding = tuple(_adding(kind, kinds) for kind in kinds.values())
+    composites = _whole_trees(kinds)
     stop = Service(
         "Stop",
         "Stop and remove all processors; port connections stay",
@@ -276,7 +299,8 @@ def derive(kinds: Kinds) -> Component:
             "e_badNewValue": "a value of the wrong type or out of its range",
         },
         structs={**_structs(kinds), **BINAUDIO, **GENOM_STATE},
-        composites=_whole_trees(kinds),
+        composites=composites,
+        plain=_plain(composites),
     )
 
 

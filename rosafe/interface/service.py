@@ -94,8 +94,16 @@ class Component:
     tasks: tuple[str, ...]
     exceptions: Mapping[str, str]  # short name -> meaning
     structs: Mapping[str, Struct]  # by IDL name
-    # What genomixd makes of several services, for its clients to call like one; not on the ROS graph.
+    # What genomixd makes of several services, for its clients to call like one.
     composites: tuple[Service, ...] = ()
+    # Composites that the component carries out itself, under the same names, for ROS' own tools: these fill in every
+    # field of a request, hence one text stands for all parameters. genomixd's clients do not see these.
+    plain: tuple[Service, ...] = ()
+
+    @property
+    def on_graph(self) -> tuple[Service, ...]:
+        """All that are services of ROS."""
+        return (*self.services, *self.plain)
 
     def members(self, idl: str) -> Struct:
         """The members of a struct, or of ROS' own time, of which no file is made."""
@@ -103,7 +111,7 @@ class Component:
 
     def service(self, name: str) -> Service:
         """The service called `name` (aliases count), or KeyError."""
-        for service in self.services:
+        for service in self.on_graph:
             if name == service.name or name in service.aliases:
                 return service
         raise KeyError(name)

@@ -27,6 +27,7 @@ from rosafe.node import reports
 from rosafe.node.keeper import Keeper
 from rosafe.node.ports import OutputPort, element
 from rosafe.node.trace_port import TracePort
+from rosafe.node.whole_trees import WholeTrees
 from rosafe.node.words import UnknownWords
 from rosafe.representations import PROBLEMS, STAGES
 from rosafe.setups import Setup, rehearse, wanted
@@ -101,6 +102,7 @@ class RosafeNode:
         self._node.function("modifyParameter", self._modify_parameter)
         self._node.function("removeProcessor", self._remove_processor)
         self._node.function("Stop", self._stop)
+        self._node.function("request", WholeTrees(self._node, lambda: self._audio_topic).build, waits=True)
         self._node.diagnostics.add("audio", self._audio_health)
         self._node.diagnostics.add("processors", self._tree_health)
         if self._keeper is not None:

@@ -8,8 +8,20 @@ from __future__ import annotations
 
 from .markup import SetupError
 from .plan import Plan, plan, rehearse
-from .reading import read
+from .reading import read, read_parameters
 from .setup import Setup, Sound, Wanted, wanted
 from .writing import write
 
-__all__ = ["Plan", "Setup", "SetupError", "Sound", "Wanted", "plan", "read", "rehearse", "wanted", "write"]
+__all__ = [
+    "Plan",
+    "Setup",
+    "SetupError",
+    "Sound",
+    "Wanted",
+    "plan",
+    "read",
+    "read_parameters",
+    "rehearse",
+    "wanted",
+    "write",
+]

@@ -1,4 +1,4 @@
-"""The little of YAML that setups are written in, as nodes that know their lines: scalars, lists and maps.
+"""The little of YAML that setups and lists of parameters are in: nodes that know their lines; scalars, lists, maps.
 
 Texts come from anywhere, over the network too. There are no tags, no anchors and no merging, and so nothing that grows
 or is evaluated; what a scalar means is for the parameter to say, not for YAML.
@@ -75,21 +75,21 @@ def parse(text: str) -> Node:
     except (yaml.YAMLError, UnicodeError) as problem:
         raise SetupError(1, f"not YAML: {str(problem).splitlines()[0]}") from None
     if len(documents) > 1:
-        raise SetupError(documents[1].line, "a second document; a setup is one")
+        raise SetupError(documents[1].line, "a second document; wanted is one")
     return documents[0] if documents else Node(1)
 
 
 def _build(events: Iterator[yaml.Event], event: yaml.Event, depth: int) -> Node:
     line = event.start_mark.line + 1
     if isinstance(event, yaml.AliasEvent) or event.anchor is not None:
-        raise SetupError(line, "anchors and aliases (& and *) are not taken in setups")
+        raise SetupError(line, "anchors and aliases (& and *) are not taken")
     if event.tag is not None:
-        raise SetupError(line, f"tags ({shown(event.tag)}) are not taken in setups")
+        raise SetupError(line, f"tags ({shown(event.tag)}) are not taken")
     if isinstance(event, yaml.ScalarEvent):
         nothing = event.style in (None, "") and event.value in ("", "~", "null")
         return Node(line) if nothing else Node(line, text=event.value)
     if depth == MAX_DEPTH:
-        raise SetupError(line, "nested too deeply for a setup")
+        raise SetupError(line, "nested too deeply")
     if isinstance(event, yaml.SequenceStartEvent):
         return Node(line, items=tuple(_until(events, yaml.SequenceEndEvent, depth)))
     nodes = _until(events, yaml.MappingEndEvent, depth)

@@ -6,9 +6,10 @@ import re
 from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
-from rosafe.interface import KINDS, MAX_SETUP, Parameter, Representation
+from rosafe.interface import KINDS, MAX_SETUP, REQUEST, Parameter, Representation
 from rosafe.tree.requests import kind_of
 from rosafe.vocabulary.parameter import MAX_STRING, shown
+from rosafe.vocabulary.words import meant
 
 from .markup import Node, SetupError, parse
 from .setup import ACQUIRE, INPUT_PORTS, Setup, Sound, Wanted, parameters_of
@@ -16,6 +17,7 @@ from .setup import ACQUIRE, INPUT_PORTS, Setup, Sound, Wanted, parameters_of
 MAX_PROCESSORS = 1000
 _NAME = re.compile(r"\w+(/\w+)*", re.ASCII)
 _TOPIC = re.compile(r"/?[A-Za-z]\w*(/[A-Za-z]\w*)*", re.ASCII)
+_OF_TREES = tuple(p for p in REQUEST.parameters if p.name not in ("representation", "connect"))
 _BOOLEANS = {**dict.fromkeys(("true", "yes", "on"), True), **dict.fromkeys(("false", "no", "off"), False)}
 
 
@@ -48,6 +50,22 @@ def read(text: str) -> Setup:
     )
 
 
+def read_parameters(text: str) -> dict[str, Any]:
+    """The parameters of a request for a whole tree that `text` says, checked; nothing says none.
+
+    A mapping in YAML; in one line, the braces around it may be left out.
+
+    Raises
+    ------
+    SetupError
+        Where it is none, or where the interface does not allow what it says.
+    """
+    short = text.strip()
+    if short and not short.startswith("{") and "\n" not in short:
+        text = f"{{{short}\n}}"  # a comment ends with its line
+    return _values(parse(text), _OF_TREES, "parameters")
+
+
 def _connections(node: Node) -> Iterator[tuple[str, str]]:
     for port, _, value in node.members("connections", INPUT_PORTS):
         topic = value.word(f"connections: {port}")
@@ -68,7 +86,8 @@ def _values(node: Node, parameters: tuple[Parameter, ...], what: str, but: tuple
         parameter = next((p for p in parameters if name in (p.name, *p.aliases)), None)
         if parameter is None:
             known = ", ".join((*but, *(p.name for p in parameters)))
-            raise SetupError(key.line, f"{what}: unknown {shown(name)}; there are: {known}")
+            near = meant(name, [p.name for p in parameters])
+            raise SetupError(key.line, f"{what}: unknown {shown(name)}; there are: {known}{near}")
         if parameter.name in values:
             raise SetupError(key.line, f"{what}: {parameter.name} is given twice")
         try:

@@ -1,6 +1,6 @@
 """One request for a whole tree: what a representation needs, which of it is there, and the requests for the rest.
 
-Pure: `plan` goes from what getParameters and getDependencies tell to the requests to make. rosafe/genomix/trees.py
+Pure: `plan` goes from what getParameters and getDependencies tell to the requests to make. rosafe/tree/building.py
 makes them; docs/request.md has the rules.
 """
 

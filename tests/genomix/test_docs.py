@@ -38,12 +38,14 @@ def test_the_page_names_every_url(world: World) -> None:
 
 def test_the_page_of_the_request(world: World) -> None:
     page = (harness.ROOT / "docs" / "request.md").read_text("utf-8")
-    (shell,) = re.findall(r"^```sh\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
+    shell, plain = re.findall(r"^```sh\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
     (shown,) = re.findall(r"\n\n```\n(created .*?)^```$", page, re.MULTILINE | re.DOTALL)
     (tcl,) = re.findall(r"^```tcl\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
     acquire, ild, ratemap, rates = shell.splitlines()
     assert "genom_success: True" in world.graph.run("sh", "-c", acquire).stdout
     assert world.graph.run("sh", "-c", ild).stdout == shown
     assert json.loads(world.graph.run("sh", "-c", ratemap).stdout)["created"] == ["ratemap_0"]
+    pitch, modulation = (world.graph.run("sh", "-c", command).stdout for command in plain.splitlines())
+    assert 'name: "pitch_0"' in pitch and 'name: "amsfeatures_0"' in modulation.lower()
     assert rates.startswith("rostopic hz ") and rates.split()[2] in world.graph.topics()
     assert world.lines(f"set env(GENOMIXD) $address\n{tcl}") == ["/rosAFE/ildPort/ild_1", "16"]

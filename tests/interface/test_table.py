@@ -61,7 +61,7 @@ def test_msg(component: Component) -> None:
 @COMPONENTS
 def test_no_file_is_without_an_entry(component: Component) -> None:
     assert names(component, "msg") == {interface.ros_type(idl) for idl in component.structs}
-    assert names(component, "srv") == {s.name for s in component.services}
+    assert names(component, "srv") == {s.name for s in component.on_graph}
     assert names(component, "action") == {s.name for s in component.activities}
 
 
@@ -74,7 +74,7 @@ def test_cmake_lists_every_file(component: Component) -> None:
 
 @COMPONENTS
 def test_ports_and_outputs_have_types(component: Component) -> None:
-    used = [p.idl for p in component.ports] + [idl for s in component.services for _, idl in s.outputs]
+    used = [p.idl for p in component.ports] + [idl for s in component.on_graph for _, idl in s.outputs]
     for idl in used:
         base = idl.removeprefix("sequence<").removesuffix(">")
         assert base in component.structs or base in SCALARS, idl
@@ -99,6 +99,7 @@ DEFAULTS = {
     "getRepresentation": ["name"],
     "modifyParameter": ["nameProc", "nameParam", "newValue"],
     "removeProcessor": ["name"],
+    "request": [interface.REQUIRED, "", ""],
     "Acquire": ["hw:1,0", 44100, 2205, 20],
     "DedicatedSocket": [],
     "CloseSocket": [],

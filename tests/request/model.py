@@ -1,4 +1,4 @@
-"""A rosAFE in this process, as `rosafe.genomix.trees` sees one: services that answer as the node's, without sound."""
+"""A rosAFE in this process, as `rosafe.tree.building` sees one: services that answer as the node's, without sound."""
 
 from __future__ import annotations
 

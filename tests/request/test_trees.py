@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 
 from rosafe import interface
 from rosafe.dsp.stage import Stage
-from rosafe.genomix import trees
 from rosafe.genomix.values import partial
 from rosafe.interface import KINDS, ROSAFE, ComponentError
 from rosafe.representations import STAGES
+from rosafe.tree import building
 from rosafe.tree import requests as request
 from tests.request.model import RATE, Model
 
@@ -42,12 +42,12 @@ CHANGES = st.tuples(st.integers(0, 10**6), st.sampled_from(["remove", "stop", *V
 
 def build(model: Model, representation: str, **parameters: Any) -> dict[str, Any]:
     """The answer to one request."""
-    return asyncio.run(trees.build(model, {"representation": representation, **parameters}))
+    return asyncio.run(building.build(model, {"representation": representation, **parameters}))
 
 
 def find(model: Model, representation: str, **parameters: Any) -> dict[str, Any]:
     """What there is of it."""
-    return asyncio.run(trees.find(model, {"representation": representation, **parameters}))
+    return asyncio.run(building.find(model, {"representation": representation, **parameters}))
 
 
 def in_force(kind: str, parameters: Mapping[str, Any]) -> dict[str, Any]:
@@ -115,7 +115,7 @@ def test_clients_that_do_not_know_of_each_other(wanted: list[tuple[str, dict[str
     model = Model()
 
     async def all_at_once() -> list[dict[str, Any]]:
-        return await asyncio.gather(*(trees.build(model, {"representation": r, **p}) for r, p in wanted))
+        return await asyncio.gather(*(building.build(model, {"representation": r, **p}) for r, p in wanted))
 
     answers = asyncio.run(all_at_once())
     for (representation, parameters), told in zip(wanted, answers, strict=True):
@@ -141,7 +141,7 @@ def test_nothing_is_left_of_what_fails(
     error = ComponentError("::genom::syserr", code=12)
 
     async def go() -> dict[str, Any]:
-        task = asyncio.create_task(trees.build(model, {"representation": wanted[0], **wanted[1]}))
+        task = asyncio.create_task(building.build(model, {"representation": wanted[0], **wanted[1]}))
         if cancelled:
             model.cancel[number] = model.cancel[number + again] = task
         else:
@@ -255,7 +255,7 @@ def test_a_structure_of_getparameters_means_the_processor_that_it_describes(valu
     structures: tuple[dict[str, Any], ...] = ({"filterbank": told}, {"gammatone": [told]})
     for structure in structures:
         wanted = partial({"representation": "ratemap", **structure})
-        assert asyncio.run(trees.build(model, wanted))["dependencies"][2] == "filterbank_1"
+        assert asyncio.run(building.build(model, wanted))["dependencies"][2] == "filterbank_1"
     if not values:
         assert build(model, "ratemap", fb_nChannels=31)["dependencies"][2] == "filterbank_2"
 
@@ -358,7 +358,7 @@ def test_what_others_have_come_to_use_stays() -> None:
     model = Model()
 
     async def go() -> None:
-        failing = asyncio.create_task(trees.build(model, {"representation": "ild", "fb_highFreqHz": 30000.0}))
+        failing = asyncio.create_task(building.build(model, {"representation": "ild", "fb_highFreqHz": 30000.0}))
         while "time_0" not in model.processors:
             await asyncio.sleep(0)
         defaults = {p.name: p.default for p in ROSAFE.service("GammatoneProc").parameters}

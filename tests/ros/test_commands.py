@@ -61,7 +61,7 @@ def test_rosservice_list_type_info_find_args(session: Graph) -> None:
     def run(*arguments: str) -> list[str]:
         return session.run("rosservice", *arguments).stdout.split("\n")
 
-    services = [f"/rosAFE/{service.name}" for service in ROSAFE.services]
+    services = [f"/rosAFE/{service.name}" for service in ROSAFE.on_graph]
     assert set(services) <= set(run("list"))
     assert run("type", "/rosAFE/GammatoneProc")[0] == "rosAFE/GammatoneProc"
     assert "/rosAFE/IldProc" in run("find", "rosAFE/IldProc")

@@ -33,7 +33,7 @@ class Services(Protocol):
 
 
 async def build(component: Services, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Make or find the processors that `values` (from `rosafe.genomix.values.partial`) ask for; REQUEST's outputs.
+    """Make or find the processors that `values` ask for, those of REQUEST's parameters that are given; its outputs.
 
     Where anything fails, or the task is cancelled, what was made is removed again, as far as nothing of others hangs on
     it. Others may change the tree meanwhile; a caller keeps his own requests apart, so that what one has found is not
