@@ -219,6 +219,7 @@ def run(options: argparse.Namespace) -> int:
         options.topic,
         options.force or (file is not None and not options.resume),
         options.resume,
+        folder is not None,
     )
     sources = [item.source for item in items]
     places: list[Path] = targets
@@ -235,15 +236,17 @@ def run(options: argparse.Namespace) -> int:
             _runner(options, len(works))(
                 works, options.jobs, (AudioFileError, OutputError, ValueError), corpus.report, signals
             )
-    except Interrupted:
-        left = "is removed" if not options.dask else "is left as .part, to be used up"
-        again = "; --resume goes on" if folder is not None else ""
-        corpus.display.message(f"rosafe process: interrupted; what was not finished {left}{again}")
-        raise
-    finally:
+    except BaseException as problem:
         corpus.display.clear()
+        if isinstance(problem, Interrupted):
+            left = "is left as .part, to be used up" if options.dask else "is removed"
+            again = "; --resume goes on" if folder is not None else ""
+            corpus.display.message(f"rosafe process: interrupted; what was not finished {left}{again}")
         _remove_empty({target.parent for target in targets}, folder, made)
+        raise
+    corpus.display.clear()
     corpus.end(folder, inputs)
+    _remove_empty({target.parent for target in targets}, folder, made)
     return 1 if corpus.failed else 0
 
 

@@ -184,13 +184,9 @@ class Chain:
         return processor.stage.complete(frames if processor.parent is None else self._count(processor.parent, frames))
 
     def times(self, kind: str, frames: int) -> np.ndarray:
-        """When each frame of an output is, for a signal of so many frames (s from its first): the frame's middle.
-
-        Frame k of hop h and window w (in samples of sound at the rate fs) is at (k h + w / 2) / fs, sample n at n / fs.
-        """
+        """The middle of each frame of an output (s), for a signal of so many frames."""
         processor = self._processors[kind]
-        signal, count = processor.signal, self._count(processor, frames)
-        return frame_times(signal, 0, count)
+        return frame_times(processor.signal, 0, self._count(processor, frames))
 
     def largest_block(self, frames: int) -> tuple[str, int]:
         """Which processor puts out most for one block of so many frames, and how many bytes that can be."""

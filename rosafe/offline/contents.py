@@ -83,6 +83,8 @@ def told(flat: Mapping[str, Any]) -> dict[str, Any]:
         value = value.item() if isinstance(value, (np.ndarray, np.generic)) else value
         if isinstance(value, bytes):
             value = value.decode()
+        if isinstance(value, float) and name in ("sample_rate", "block_frames"):
+            value = int(value)
         about[name] = json.loads(value) if isinstance(value, str) and name not in _TEXTS else value
     if "axes" in about:
         about["axes"] = {name: tuple(axes) for name, axes in about["axes"].items()}

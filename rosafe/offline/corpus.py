@@ -35,14 +35,16 @@ class Settings:
     topic: str | None = None
     replace: bool = False
     resume: bool = False
+    make_folders: bool = False
 
 
 def compute(source: Path, target: Path, settings: Settings, progress: Callable[[int, int], None]) -> Any:
-    """`process_file`, into a folder that is made if need be."""
+    """`process_file`, by `settings`."""
     from rosafe.offline.files import process_file
 
     try:
-        target.parent.mkdir(parents=True, exist_ok=True)
+        if settings.make_folders:
+            target.parent.mkdir(parents=True, exist_ok=True)
     except OSError as problem:
         raise OutputError(f"cannot write {target}: {problem.strerror}") from None
     return process_file(

@@ -11,12 +11,13 @@ import zipfile
 import zlib
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 
 from rosafe.offline.contents import ABOUT, Contents, is_scalar, told
 
+HEADS = 2**18  # bytes, and more than that, of what is in a file beside the arrays' numbers
 IN_MEMORY = 2**28  # bytes of all arrays together; from there on they are on the disk
 _CSV_HEAD = "# rosafe "
 
@@ -64,9 +65,14 @@ class WholeWriter:
 
     def finish(self) -> None:
         """Write the file."""
-        self._write()
+        with open(self._path, "r+b") as file:
+            # A full disk must show before numpy and scipy write, who leave files open that they cannot complete.
+            arrays = [*self._arrays.values(), *self._contents.fixed.values()]
+            os.posix_fallocate(file.fileno(), 0, HEADS + sum(np.asarray(array).nbytes for array in arrays))
+            self._write(file)
+            file.truncate()
 
-    def _write(self) -> None:
+    def _write(self, file: BinaryIO) -> None:
         raise NotImplementedError
 
     def close(self) -> None:
@@ -78,38 +84,35 @@ class WholeWriter:
 class NpzWriter(WholeWriter):
     """For numpy.load."""
 
-    def _write(self) -> None:
-        with open(self._path, "r+b") as file:
-            everything: dict[str, Any] = {**self._arrays, **self._contents.fixed, **self._contents.flat()}
-            np.savez(file, **everything)
+    def _write(self, file: BinaryIO) -> None:
+        everything: dict[str, Any] = {**self._arrays, **self._contents.fixed, **self._contents.flat()}
+        np.savez(file, **everything)
 
 
 class Mat5Writer(WholeWriter):
     """MATLAB's version 5, which Octave reads as well."""
 
-    def _write(self) -> None:
+    def _write(self, file: BinaryIO) -> None:
         from scipy.io import savemat
 
         everything: dict[str, Any] = {**self._arrays, **self._contents.fixed, **self._contents.flat()}
-        with open(self._path, "r+b") as file:
-            savemat(file, everything, long_field_names=True, oned_as="column")
+        savemat(file, everything, long_field_names=True, oned_as="column")
 
 
 class CsvWriter(WholeWriter):
     """One output of two axes: a row for each moment, which is its first column; what else there is, as JSON above."""
 
-    def _write(self) -> None:
+    def _write(self, file: BinaryIO) -> None:
         contents = self._contents
         (name,) = contents.shapes
         (time,) = (key for key in contents.fixed if key.endswith("_time"))
         fixed = {k: v if isinstance(v, float) else v.tolist() for k, v in contents.fixed.items() if k != time}
         rows = self._arrays[name].T
         head = {**contents.about, "axes": contents.axes, "units": contents.units, "fixed": fixed, "rows": len(rows)}
-        with open(self._path, "r+", encoding="utf-8", newline="\n") as file:
-            file.write(f"{_CSV_HEAD}{json.dumps(head)}\n")
-            file.write(",".join([time, *self._columns(name, rows.shape[1])]) + "\n")
-            for moment, row in zip(contents.fixed[time].tolist(), rows, strict=True):  # type: ignore[union-attr]
-                file.write(",".join(map(repr, [moment, *row.tolist()])) + "\n")
+        lines = [f"{_CSV_HEAD}{json.dumps(head)}", ",".join([time, *self._columns(name, rows.shape[1])])]
+        file.writelines(f"{line}\n".encode() for line in lines)
+        for moment, row in zip(np.asarray(contents.fixed[time]).tolist(), rows, strict=True):
+            file.write((",".join(map(repr, [moment, *row.tolist()])) + "\n").encode())
 
     def _columns(self, name: str, count: int) -> list[str]:
         if self._contents.axes[name][0] == "ear":
@@ -142,7 +145,7 @@ def read_mat5(path: Path, arrays: bool = True) -> dict[str, Any]:
 
     try:
         found = loadmat(path, variable_names=None if arrays else [*ABOUT])
-    except (TypeError, KeyError, EOFError, zlib.error, struct.error, NotImplementedError) as problem:
+    except Exception as problem:  # of half a file scipy raises whatever comes
         raise ValueError(str(problem)) from None
     found = {name: value for name, value in found.items() if not name.startswith("__")}
     texts = {name: "".join(value.ravel()) for name, value in found.items() if value.dtype.kind == "U"}

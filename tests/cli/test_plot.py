@@ -8,6 +8,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 
+from rosafe.offline.files import process_file
 from tests.cli.command import SMALL, noise, refused, rosafe, write
 from tests.harness import shared
 
@@ -68,9 +69,9 @@ def test_what_is_there_is_kept(tmp_path: Path) -> None:
         (["nothing.wav"], ["nothing.wav"]),
         (["nothing.npz"], ["nothing.npz: No such file or directory"]),
         (["text.npz"], ["text.npz is no result of rosafe process"]),
-        (["other.npz"], ["holds no output that can be drawn"]),
+        (["other.npz"], ["other.npz is no result of rosafe process"]),
         (["other.npz", "--set", "fb_nChannels=3"], ["--set: a result is drawn as it is"]),
-        (["other.npz", "--outputs", "ild"], ["no output 'ild' in the result"]),
+        (["result.npz", "--outputs", "itd"], ["no output 'itd' in the result"]),
     ],
 )
 def test_refusals(tmp_path: Path, arguments: list[str], words: list[str]) -> None:
@@ -79,6 +80,8 @@ def test_refusals(tmp_path: Path, arguments: list[str], words: list[str]) -> Non
     write(tmp_path / "three.wav", noise(4000)[[0, 1, 0]])
     (tmp_path / "text.npz").write_text("no zip file")
     np.savez(tmp_path / "other.npz", x=np.zeros(3))
+    write(tmp_path / "16k.wav", noise(4000))
+    process_file(tmp_path / "16k.wav", tmp_path / "result.npz", outputs=["ild"])
     before = sorted(tmp_path.iterdir())
     refused(rosafe("plot", *arguments, cwd=tmp_path), *words)
     assert sorted(tmp_path.iterdir()) == before
