@@ -143,8 +143,12 @@ class Chain:
         self._derived[block] = {k: v for p in self._processors.values() for k, v in p.derived().items()}
 
     def write_into(self, kind: str, place: Callable[[int], np.ndarray | None]) -> None:
-        """Let the stage of a `kind` that nothing hangs on write where `place` says for so many frames, if it can."""
-        self._processors[kind].place = place
+        """Let the stage of a `kind` that nothing hangs on write where `place` says for so many frames, if it can.
+
+        Stages that put out frames cannot, and are not asked.
+        """
+        if not self._processors[kind].signal.framed:
+            self._processors[kind].place = place
 
     def observe(self, observer: Observer) -> None:
         """Tell `observer` of every state that a processor enters."""
