@@ -57,9 +57,15 @@ async def serve(options: Options) -> None:
     robot = Robot(graph, options.instance, options.bass)
     server: Server | None = None
     opened: Path | None = None
+    publishing: asyncio.Task[None] | None = None
     try:
         await graph.become_node()
-        hub = Hub(robot.audio_topic, lambda: loop.is_closed() or loop.call_soon_threadsafe(news))
+
+        def tell_news() -> None:
+            if not loop.is_closed():
+                loop.call_soon_threadsafe(news)
+
+        hub = Hub(robot.audio_topic, tell_news)
         door = Door(own_names() | {options.host})
         asks = {
             "devices": robot.devices,
@@ -84,16 +90,34 @@ async def serve(options: Options) -> None:
         if options.browser and _has_display():
             opened = await asyncio.to_thread(_open, url)
         gc.freeze()
+        if options.images:
+            publishing = asyncio.create_task(_publish_images(hub, server))
         waits = [asyncio.create_task(event.wait()) for event in (end, graph.gone)]
         await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
     finally:
         startup.watchdog(startup.END_SECONDS, 0)
+        if publishing is not None:
+            publishing.cancel()
         if opened is not None:
             opened.unlink(missing_ok=True)
         if server is not None:
             await server.close()
         await robot.close()
         await graph.close()
+
+
+async def _publish_images(hub: Hub, server: Server) -> None:
+    from rosafe.live import images  # matplotlib's colours take a moment
+
+    lookers = await asyncio.to_thread(images.Images, hub)
+    while True:
+        if lookers.wanted:
+            server.join(lookers)
+            await lookers.publish()
+        else:
+            await lookers.publish()  # lets go
+            server.leave(lookers)
+        await asyncio.sleep(images.PERIOD)
 
 
 def _why(problem: OSError, options: Options) -> str:

@@ -74,6 +74,15 @@ class View:
             self.next, self.end = after, end
             self.oldest = max(self.oldest, after - self.capacity)
 
+    def newest(self, count: int) -> np.ndarray:
+        """The newest columns, float32 (size, count); NaN where there is nothing."""
+        columns = np.full((self.size, count), np.nan, np.float32)
+        with self._lock:
+            first = max(self.oldest, self.next - count)
+            if self.next > first:
+                columns[:, -(self.next - first) :] = self._ring[:, np.arange(first, self.next) % self.capacity]
+        return columns
+
     def piece(self, first: int, stride: int, most: int) -> tuple[int, bytes]:
         """Which column comes next, and the bytes of those from `first` on, at most so many: every `stride`-th one."""
         with self._lock:
@@ -323,26 +332,36 @@ class _Track:
         self._together("ic", port, message)
 
     def _together(self, which: str, port: Port, message: Any) -> None:
+        """Take one of the two; what both tell of is used, also of blocks that came in another order."""
         with self._lock:
-            fresh = max(1, port.fresh)
-            self._waiting[which] = (port.index, port.newest, message.left[:, -fresh:], port.end)
+            self._waiting[which] = (port.index, port.newest, message.left, port.end)
             itd, ic = self._waiting.get("itd"), self._waiting.get("ic")
             if itd is None or (self._weighted and (ic is None or ic[0] != itd[0])):
                 return
             _, newest, lags, end = itd
+            count = min(self._missing(newest, port), lags.shape[-1], lags.shape[-1] if ic is None else ic[2].shape[-1])
+            if count == 0:
+                return
+            lags = lags[:, -count:]
             weights = np.ones(lags.shape)
             if ic is not None and self._weighted:
-                count = min(lags.shape[1], ic[2].shape[1])
-                lags, coherence = lags[:, -count:], ic[2][:, -count:]
-                weights = np.maximum(coherence - COHERENT, 0.0) / (1.0 - COHERENT)
+                weights = np.maximum(ic[2][:, -count:] - COHERENT, 0.0) / (1.0 - COHERENT)
             total = weights.sum(axis=0)
             heard = total > LEAST_WEIGHT
             lag = np.divide((weights * lags).sum(axis=0), total, out=np.full(total.shape, np.nan), where=heard)
             self._put(newest, lag, end)
 
+    def _missing(self, newest: int, port: Port) -> int:
+        """How many frames up to the newest one the view does not have."""
+        following = self._view.next if 0 < self._view.next <= newest else newest - port.fresh
+        return newest - following
+
     def peak(self, port: Port, message: Any) -> None:
         """A message of the cross-correlation."""
-        curves = message.left[..., -max(1, port.fresh) :].mean(axis=1)
+        count = min(self._missing(port.newest, port), message.left.shape[-1])
+        if count == 0:
+            return
+        curves = message.left[..., -count:].mean(axis=1)
         place = curves.argmax(axis=0)
         flat = curves.max(axis=0) - curves.min(axis=0) < 1e-9
         inside = (place > 0) & (place < len(curves) - 1)
@@ -356,10 +375,8 @@ class _Track:
             self._put(port.newest, np.where(flat, np.nan, self._lags[place] + offset * width), port.end)
 
     def _put(self, newest: int, lag: np.ndarray, end: float) -> None:
-        first = max(self._view.next, newest - len(lag)) if self._view.next <= newest else newest - len(lag)
-        if newest > first:
-            self._view.append(first, lag[np.newaxis, -(newest - first) :].astype(np.float32), end)
-            self._news()
+        self._view.append(newest - len(lag), lag[np.newaxis].astype(np.float32), end)
+        self._news()
 
 
 assert COLUMNS * HISTORY_SECONDS < 2**16  # columns of a piece

@@ -65,7 +65,7 @@ class Tree:
         one: Processor | None = processor
         while one is not None and one.kind in KINDS:
             kind = KINDS[one.kind]
-            units = {p.name: p.unit for p in (*kind.parameters, *kind.derived)}
+            units = {p.name: p.unit for p in kind.parameters} | {d.name: d.unit for d in kind.derived}
             for name in kind.coordinates:
                 values = _list(kind, name, one.values.get(name, ""))
                 if units[name] == unit and len(values) == size:

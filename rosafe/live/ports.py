@@ -14,7 +14,7 @@ from rosafe.component import wire
 from rosafe.interface import LAYOUTS
 from rosafe.sound.windows import joined, new_frames
 
-BUFFER = 2**22  # bytes that are read at a time
+BUFFER = 2**17  # bytes that are read at a time: more of them cost more to make than turns do
 AUDIO_RATE_SLACK = 0.5  # frames
 
 

@@ -8,7 +8,7 @@ import logging
 import time
 from collections.abc import Awaitable, Callable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from aiohttp import web
 
@@ -17,7 +17,7 @@ from rosafe.interface import ComponentError
 from rosafe.live.access import HEADERS, Door
 from rosafe.live.client import Ask, Client
 from rosafe.live.health import Health
-from rosafe.live.hub import Hub
+from rosafe.live.hub import Hub, Key
 from rosafe.live.pictures import Tree
 from rosafe.live.robot import Robot, catalogue, told
 from rosafe.version import VERSION
@@ -32,6 +32,22 @@ _TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 log = logging.getLogger("rosafe.live")
+
+
+class Looker(Protocol):
+    """Somebody who looks at pictures: a page, or those who publish images."""
+
+    def wake(self) -> None:
+        """There are new columns."""
+
+    def tell(self, about: str, message: Mapping[str, Any]) -> None:
+        """There is news."""
+
+    async def look_again(self, changed: set[Key]) -> None:
+        """The tree has changed, and with it these views."""
+
+    async def close(self) -> None:
+        """The server ends."""
 
 
 class Server:
@@ -55,7 +71,7 @@ class Server:
         self._robot, self._hub, self._health, self._door, self._watch = robot, hub, health, door, watch
         self._asks = {name: _watched(ask, name, watch) for name, ask in asks.items()}
         self._hello = {"version": VERSION, "watch": watch, **catalogue()}
-        self._clients: set[Client] = set()
+        self._clients: set[Looker] = set()
         self._tree_told: Any = None
         self._problem = ""
         self._again = asyncio.Event()  # look at the components now
@@ -95,6 +111,17 @@ class Server:
         """There are new columns."""
         for client in self._clients:
             client.wake()
+
+    def join(self, looker: Looker) -> None:
+        """From now on somebody looks."""
+        if looker not in self._clients:
+            self._clients.add(looker)
+            self._tree_told = None
+            self._again.set()
+
+    def leave(self, looker: Looker) -> None:
+        """Somebody looks no longer."""
+        self._clients.discard(looker)
 
     # --- who may ---
 
@@ -137,13 +164,11 @@ class Server:
             return web.Response(status=503, text=text, headers=HEADERS)
         client = Client(self._hub, self._asks, self._again.set)
         client.tell("hello", self._hello)
-        self._clients.add(client)
-        self._tree_told = None
-        self._again.set()
+        self.join(client)
         try:
             return await client.serve(request)
         finally:
-            self._clients.discard(client)
+            self.leave(client)
 
     # --- the components ---
 
@@ -221,7 +246,7 @@ class Connection(web.RequestHandler):
     """One connection: only so many, and those that do not show the token soon are closed."""
 
     def __init__(self, connections: set[Connection], server: web.Server) -> None:
-        super().__init__(server, loop=asyncio.get_running_loop(), access_log=None)
+        super().__init__(server, loop=asyncio.get_running_loop(), access_log=None)  # type: ignore[arg-type]
         self._all = connections
         self._late: asyncio.TimerHandle | None = None
 

@@ -303,7 +303,7 @@ export class Panel {
     const { series, view } = this.direction;
     pen.lineWidth = 1;
     pen.strokeStyle = "rgba(255, 255, 255, 0.16)";
-    pen.fillStyle = "rgba(255, 255, 255, 0.6)";
+    pen.fillStyle = "rgba(255, 255, 255, 0.85)";
     pen.textAlign = "left";
     pen.textBaseline = "middle";
     const ahead = this.#height(view.lags[view.azimuths.indexOf(0)] ?? 0, box);
@@ -316,6 +316,11 @@ export class Panel {
       pen.lineTo(box.x + box.w, y);
       pen.stroke();
       const text = azimuth === 0 ? "ahead" : `${Math.abs(azimuth)}° ${azimuth > 0 ? "right" : "left"}`;
+      pen.save();
+      pen.lineWidth = 3;
+      pen.strokeStyle = "rgba(8, 10, 20, 0.6)";
+      pen.strokeText(text, box.x + 7, Math.max(box.y + 8, Math.min(box.y + box.h - 8, y + (azimuth < 0 ? 8 : -8))));
+      pen.restore();
       pen.fillText(text, box.x + 7, Math.max(box.y + 8, Math.min(box.y + box.h - 8, y + (azimuth < 0 ? 8 : -8))));
     }
     pen.fillStyle = theme.track;

@@ -48,7 +48,7 @@ export class TreeView {
   #row(one, level) {
     const load = el("span", { class: "load", title: "computing, per second" });
     const eye = el("button", { class: "eye", "aria-label": `picture of ${one.name}`, title: "Show or hide its picture", onclick: () => this.pictures.toggle(one) }, svg(EYE));
-    const name = el("button", { class: "name", title: this.catalogue.kinds[one.kind]?.doc ?? one.kind, onclick: () => this.#choose(this.chosen === one.name ? null : one) },
+    const name = el("button", { class: "name", title: this.catalogue.kinds[one.kind]?.doc ?? one.kind, onclick: () => this.#click(one) },
       one.name, el("span", { text: one.name === one.kind ? "" : one.kind }));
     name.style.paddingLeft = `${6 + 13 * level}px`;
     const row = el("li", { class: "node" }, name, load, eye);
@@ -102,6 +102,11 @@ export class TreeView {
   }
 
   // --- one processor ---
+
+  #click(one) {
+    this.#choose(this.chosen === one.name ? null : one);
+    if (this.chosen) this.details.scrollIntoView({ block: "nearest", behavior: "smooth" });
+  }
 
   #choose(one) {
     this.chosen = one?.name ?? null;

@@ -1,0 +1,61 @@
+"""Takes docs/live.png and its like: the live page of a robot that hears the built-in scene, in a real browser."""
+
+from __future__ import annotations
+
+import io
+import sys
+import tempfile
+from contextlib import ExitStack
+from pathlib import Path
+
+from PIL import Image
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from rosafe.component import generate
+from tests.harness import shared_graph, wait_for
+from tests.live.browser import Browser, browser
+from tests.live.world import live
+
+SHOTS = (
+    # name, width, height, theme, what is to be seen
+    ("live", 1440, 900, "dark", ""),
+    ("live-light", 1440, 1040, "light", "processor"),
+    ("live-narrow", 380, 800, "dark", ""),
+)
+FULL = (
+    "const end = (one) => JSON.parse(one.dataset.plot);"
+    "return [...document.querySelectorAll('canvas[data-plot]')].every((one) => end(one).to > arguments[0])"
+)
+CHOOSE = "[...document.querySelectorAll('.node .name')].find((one) => one.textContent.startsWith('ratemap_0')).click()"
+
+
+def main(folder: Path) -> None:
+    generate.ensure_messages()
+    with tempfile.TemporaryDirectory() as home, ExitStack() as stack:
+        graph = stack.enter_context(shared_graph(Path(home)))
+        stack.enter_context(graph.node("bass-ros"))
+        stack.enter_context(graph.node("rosAFE-ros"))
+        assert graph.call("/bass/Acquire", device="scene:").genom_success
+        for kind in ("ratemap", "ild", "itd", "ic", "pitch"):
+            graph.run("rosafe", "request", kind)
+        page = stack.enter_context(live(graph))
+        window = stack.enter_context(browser())
+        for name, width, height, theme, part in SHOTS:
+            shoot(window, page.url, width, height, theme, part, folder / f"{name}.png")
+
+
+def shoot(window: Browser, url: str, width: int, height: int, theme: str, part: str, path: Path) -> None:
+    window.resize(width, height, theme)
+    window.driver.get(url)
+    window.until("return document.querySelectorAll('canvas[data-plot]').length >= 2")
+    begun = window.run("return JSON.parse(document.querySelector('canvas[data-plot]').dataset.plot).to")
+    if part == "processor":
+        window.run(CHOOSE)
+    wait_for(lambda: window.run(FULL, begun + 11.0))
+    picture = Image.open(io.BytesIO(window.driver.get_screenshot_as_png())).convert("RGB")
+    picture.save(path, optimize=True)
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parent)
