@@ -18,7 +18,7 @@ from .signals import SIGNALS, layout
 
 MAX_SECONDS = 600.0  # longest port or history
 MAX_BLOCK = 10_000_000  # frames
-MAX_SETUP = 256 * 1024  # characters of a setup
+MAX_SETUP = 4 * 2**20  # characters of a setup; over HTTP, the length of a URL is what bounds it
 
 Kinds = Mapping[str, Representation]  # parents first
 

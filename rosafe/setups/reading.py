@@ -13,7 +13,7 @@ from rosafe.vocabulary.parameter import MAX_STRING, shown
 from .markup import Node, SetupError, parse
 from .setup import ACQUIRE, INPUT_PORTS, Setup, Sound, Wanted, parameters_of
 
-MAX_PROCESSORS = 1000
+MAX_PROCESSORS = 10_000  # more than a node takes
 _NAME = re.compile(r"\w+(/\w+)*", re.ASCII)
 _TOPIC = re.compile(r"/?[A-Za-z]\w*(/[A-Za-z]\w*)*", re.ASCII)
 _BOOLEANS = {**dict.fromkeys(("true", "yes", "on"), True), **dict.fromkeys(("false", "no", "off"), False)}
