@@ -8,7 +8,6 @@ frames that no window showed.
 
 from __future__ import annotations
 
-import argparse
 import os
 import subprocess
 import sys
@@ -18,6 +17,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+import report
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT)]
@@ -73,9 +73,10 @@ def measure(call: Any, device: str, window: float, seconds: float, pid: int, hea
 
 def main() -> None:
     """Measure all windows."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = report.arguments("What capture costs and how regular it is.")
     parser.add_argument("--seconds", type=float, default=10.0, help="for each window (default: %(default)s)")
     options = parser.parse_args()
+    page = report.Report(options, "Capture")
     generate.ensure_messages()
     with PrivateMaster() as master, tempfile.TemporaryDirectory() as folder:
         os.environ.update(ROS_MASTER_URI=master.uri, ROS_IP="127.0.0.1", ROS_HOME=folder)
@@ -106,11 +107,9 @@ def main() -> None:
                 audio = wire.message_class("bass", "::binaudio::portStruct")
                 rospy.Subscriber("/bass/Audio", audio, hear, queue_size=1, buff_size=2**26, tcp_nodelay=True)
                 device = f"file:{folder}/noise.wav?loop=1"
-                print("| window | of a core | stamps off (ms) | delay (ms) | messages | lost |")
-                print("|---|--:|--:|--:|--:|--:|")
-                for window in WINDOWS:
-                    row = measure(call, device, window, options.seconds, bass.pid, heard)
-                    print("| " + " | ".join(row) + " |", flush=True)
+                rows = [measure(call, device, window, options.seconds, bass.pid, heard) for window in WINDOWS]
+                page.table(["window", "of a core", "stamps off (ms)", "delay (ms)", "messages", "lost"], rows)
+                page.write("capture.md")
                 rospy.signal_shutdown("done")
             finally:
                 bass.terminate()

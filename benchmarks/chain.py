@@ -1,18 +1,17 @@
-"""How fast the chain is: against plain numpy and scipy, in other configurations, and what else it costs.
+"""How fast the chain is: by hand, through the tree, on a file; against plain numpy and scipy; in other configurations.
 
-``/usr/bin/python3 benchmarks/chain.py`` prints tables and writes them to benchmarks/results. Times
-are milliseconds of computing per second of sound, medians of warm blocks. On one core it is the thread's own processor
-time that counts, which other programs on the machine hardly touch; both sides take turns. For two cores it is the clock
-on the wall: let the machine be quiet.
+``/usr/bin/python3 benchmarks/chain.py`` prints tables and writes them to benchmarks/results. Times are milliseconds of
+computing per second of sound, medians of warm blocks. On one core it is processor time that counts, which other
+programs on the machine hardly touch, and all sides take turns. On two cores it is the clock on the wall: it wants a
+quiet machine.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
-import platform
+import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
@@ -26,6 +25,7 @@ HERE = Path(__file__).resolve().parent
 sys.path[:0] = [str(HERE.parent), str(HERE)]
 
 import configurations  # noqa: E402
+import kinds  # noqa: E402
 import numpy as np  # noqa: E402
 import report  # noqa: E402
 import scipy  # noqa: E402
@@ -36,11 +36,16 @@ from rosafe.dsp import kernels  # noqa: E402
 from rosafe.dsp.windows import window  # noqa: E402
 from rosafe.representations import STAGES  # noqa: E402
 from rosafe.representations.filterbank import Filterbank  # noqa: E402
+from rosafe.representations.registry import ORIGINAL  # noqa: E402
 
 RATE = 44100
-BLOCKS = (12000, 882)
+BLOCKS = (12000, 882, 220)
 FEEDERS = ("input", "preProc", "gammatone", "ihc")  # the chain goes on from these; the other three all take ihc
+LEAVES = ("ild", "ratemap", "crossCorrelation")
+SECONDS = 20  # of sound in each turn through the tree
+FILE_SECONDS = 60
 Steps = dict[str, Callable[[Any], Any]]
+Cost = tuple[float, float]  # wall clock and processor time, ms per second of sound
 
 
 def sound(samples: int, seed: int = 0) -> np.ndarray:
@@ -48,15 +53,15 @@ def sound(samples: int, seed: int = 0) -> np.ndarray:
     return (np.random.default_rng(seed).standard_normal((2, samples)) * 2e8).astype(np.int32)
 
 
-def ours(rate: float, **parameters: dict[str, Any]) -> Steps:
+def ours() -> Steps:
     """A step for each stage of `rosafe`."""
-    return {kind: stage(rate, **parameters.get(kind, {})).process for kind, stage in STAGES.items()}
+    return {kind: STAGES[kind](RATE).process for kind in ORIGINAL}
 
 
-def plain(rate: float) -> Steps:
+def plain() -> Steps:
     """The same of the yardstick."""
-    frequencies = np.array(Filterbank(rate).parameters["fb_cfHz"])
-    return yardstick.chain(rate, frequencies, window("hann", 2 * round(rate / 100)))
+    frequencies = np.array(Filterbank(RATE).parameters["fb_cfHz"])
+    return yardstick.chain(RATE, frequencies, window("hann", 2 * round(RATE / 100)))
 
 
 def run(steps: Steps, block: np.ndarray, kept: dict[str, Any], spent: dict[str, list[float]] | None = None) -> None:
@@ -73,7 +78,7 @@ def run(steps: Steps, block: np.ndarray, kept: dict[str, Any], spent: dict[str, 
 
 def one_core(block: int, rounds: int) -> dict[str, Any]:
     """Each stage and the whole chain, of both sides in turn: ms per second of sound, and how many times as fast."""
-    sides = {"yardstick": plain(RATE), "rosafe": ours(RATE)}
+    sides = {"yardstick": plain(), "rosafe": ours()}
     stages: dict[str, dict[str, list[float]]] = {side: {} for side in sides}
     chains: dict[str, list[float]] = {side: [] for side in sides}
     kept: dict[str, dict[str, Any]] = {side: {} for side in sides}
@@ -89,83 +94,230 @@ def one_core(block: int, rounds: int) -> dict[str, Any]:
                 run(steps, signal, kept[side], stages[side])
     per_second = 1000 * RATE / block
     result = {}
-    for kind in (*STAGES, "chain"):
+    for kind in (*ORIGINAL, "chain"):
         times = [chains[side] if kind == "chain" else stages[side][kind] for side in sides]
-        slow, fast = (float(np.median(spent)) * per_second for spent in times)
+        slow, fast = (_typical(spent) * per_second for spent in times)
         result[kind] = {"yardstick": slow, "rosafe": fast, "ratio": slow / fast}
     return result
 
 
-def two_cores(block: int, rounds: int, seconds: int = 10) -> dict[str, Any]:
-    """The threaded tree on all outputs of `rosafe.process` against the yardstick on one core, by the wall clock."""
-    signal = sound(seconds * RATE)
-    steps = plain(RATE)
-    kept: dict[str, Any] = {}
-    times: dict[str, list[float]] = {"yardstick": [], "rosafe": []}
-    for _ in range(rounds):
-        begin = time.perf_counter()
-        for at in range(0, 2 * RATE, block):
-            run(steps, signal[:, at : at + block], kept)
-        times["yardstick"].append((time.perf_counter() - begin) * 500)
-        begin = time.perf_counter()
-        rosafe.process(signal, RATE, block_frames=block, outputs=("ild", "ratemap", "crossCorrelation"))
-        times["rosafe"].append((time.perf_counter() - begin) * 1000 / seconds)
-    slow, fast = (float(np.median(spent)) for spent in times.values())
-    return {"yardstick": slow, "rosafe": fast, "ratio": slow / fast}
+def _typical(times: list[float]) -> float:
+    """The median; the mean where most blocks complete no frame, so that a few of them take all the time."""
+    return float(np.median(times) if np.percentile(times, 90) < 2 * np.median(times) else np.mean(times))
 
 
-def apart(function: Callable[..., dict[str, Any]], *arguments: Any) -> dict[str, Any]:
+# --- through the tree -------------------------------------------------------------------------------------------
+
+
+def _by_hand(steps: Steps, block: int, seconds: int) -> Cost:
+    signal, kept = sound(seconds * RATE), {}
+    wall, spent = time.perf_counter(), time.process_time()
+    for at in range(0, signal.shape[1], block):
+        run(steps, signal[:, at : at + block], kept)
+    return 1000 * (time.perf_counter() - wall) / seconds, 1000 * (time.process_time() - spent) / seconds
+
+
+def by_yardstick(block: int) -> Cost:
+    """The chain of plain numpy and scipy, on two seconds of sound."""
+    return _by_hand(plain(), block, 2)
+
+
+def by_hand(block: int) -> Cost:
+    """The stages called one after the other."""
+    return _by_hand(ours(), block, SECONDS)
+
+
+def through_tree(block: int, outputs: tuple[str, ...] = LEAVES) -> Cost:
+    """What `rosafe.process` takes."""
+    signal = sound(SECONDS * RATE)
+    wall, spent = time.perf_counter(), time.process_time()
+    rosafe.process(signal, RATE, block_frames=block, outputs=outputs)
+    return 1000 * (time.perf_counter() - wall) / SECONDS, 1000 * (time.process_time() - spent) / SECONDS
+
+
+def gammatone_alone(block: int) -> Cost:
+    """The same for the filterbank's output alone, the second time: memory that is new costs the system far more."""
+    through_tree(block, ("gammatone",))
+    return through_tree(block, ("gammatone",))
+
+
+class Place:
+    """A process that is bound to some cores."""
+
+    def __init__(self, cores: list[int]) -> None:
+        self.executor = ProcessPoolExecutor(
+            1, mp_context=get_context("spawn"), initializer=os.sched_setaffinity, initargs=(0, cores)
+        )
+
+    def run(self, function: Callable[..., Cost], *arguments: Any) -> Cost:
+        """What `function` gives there."""
+        return self.executor.submit(function, *arguments).result()
+
+
+def through(block: int, rounds: int, cores: list[int]) -> dict[str, float]:
+    """Medians of rounds in which all take their turn: ms per second of sound.
+
+    Two independent runs, on a core each at the same time, are the limit of two cores: each second of either counts.
+    """
+    places = [Place([core]) for core in cores]
+    both = Place(cores)
+    found: dict[str, list[float]] = {}
+    for turn in range(rounds + 1):
+        one = places[0]
+        now = {
+            "yardstick": one.run(by_yardstick, block)[1],
+            "by hand": one.run(by_hand, block)[1],
+            "tree, one core": one.run(through_tree, block)[1],
+            "gammatone only": one.run(gammatone_alone, block)[1],
+        }
+        if len(cores) > 1:
+            running = [place.executor.submit(through_tree, block) for place in places]
+            now["limit of two cores"] = float(np.mean([each.result()[0] for each in running])) / len(cores)
+            now["tree, two cores"], now["its processor time"] = both.run(through_tree, block)
+        for name, cost in now.items():
+            if turn:  # the first turn warms up
+                found.setdefault(name, []).append(cost)
+    for place in (*places, both):
+        place.executor.shutdown()
+    medians = {name: float(np.median(costs)) for name, costs in found.items()}
+    ratios = {"tree over hand": ("tree, one core", "by hand"), "times as fast": ("yardstick", "tree, one core")}
+    if len(cores) > 1:
+        ratios["of the limit"] = ("limit of two cores", "tree, two cores")
+        ratios["times as fast, two cores"] = ("yardstick", "tree, two cores")
+    for name, (over, under) in ratios.items():  # of the same minute
+        medians[name] = float(np.median(np.divide(found[over], found[under])))
+    return medians
+
+
+def offline(rounds: int) -> dict[str, float]:
+    """Seconds of `rosafe process` on a file of a minute, from its start to its end: reads a WAV file, writes NPZ."""
+    walls = []
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "minute.wav"
+        scipy.io.wavfile.write(path, RATE, sound(FILE_SECONDS * RATE).T)
+        command = [sys.executable, "-m", "rosafe.commands", "process", str(path), "-o", f"{folder}/minute.npz"]
+        command += ["--outputs", ",".join(LEAVES)]
+        for _ in range(rounds):
+            begin = time.perf_counter()
+            subprocess.run(command, cwd=HERE.parent, check=True, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+            walls.append(time.perf_counter() - begin)
+        size = Path(folder, "minute.npz").stat().st_size / 1e6
+    return {"seconds": float(np.median(walls)), "MB": size}
+
+
+def apart(function: Callable[..., Any], *arguments: Any) -> Any:
     """The result of a function in a process of its own: memory that one measurement leaves speeds up the next one."""
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as executor:
         return executor.submit(function, *arguments).result()
 
 
-def machine() -> dict[str, Any]:
-    """What it ran on."""
-    model = platform.processor() or platform.machine()
-    try:
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
-                model = line.partition(":")[2].strip()
-                break
-    except OSError as problem:
-        model = f"{model} ({problem})"
-    return {
-        "processor": model,
-        "cores": os.cpu_count(),
-        "load": os.getloadavg()[0],
-        "python": platform.python_version(),
-        "numpy": np.__version__,
-        "scipy": scipy.__version__,
-        "kernels": kernels.status().detail.partition(";")[0],
-    }
+# --- tables -----------------------------------------------------------------------------------------------------
+
+
+def _say_stages(page: report.Report, rounds: int) -> None:
+    for block in BLOCKS:
+        page.say(f"## Stage by stage on one core, blocks of {block}")
+        page.say()
+        found = apart(one_core, block, rounds)
+        rows = [[k, f"{t['yardstick']:.2f}", f"{t['rosafe']:.2f}", f"{t['ratio']:.1f}"] for k, t in found.items()]
+        page.table(["stage", "yardstick", "rosafe", "times as fast"], rows)
+
+
+def _say_tree(page: report.Report, rounds: int) -> None:
+    cores = sorted(os.sched_getaffinity(0))[:2]
+    page.say("## Through the tree: `rosafe.process`")
+    page.say()
+    page.say(f"{SECONDS} s of sound to {', '.join(LEAVES)}; on one core processor time, on two the clock on the wall.")
+    page.say("The limit is what two runs on one core each do at the same time. All took turns in the same minutes.")
+    page.say()
+    found = {block: through(block, rounds, cores) for block in BLOCKS}
+    names = list(found[BLOCKS[0]])
+    rows = [[name, *(f"{found[block][name]:.2f}" for block in BLOCKS)] for name in names]
+    page.table(["", *(f"blocks of {block}" for block in BLOCKS)], rows)
+
+
+def _say_offline(page: report.Report) -> None:
+    found = offline(3)
+    page.say("## A file of a minute")
+    page.say()
+    ratio = FILE_SECONDS / found["seconds"]
+    page.say(f"* `rosafe process` from start to end, with reading WAV and writing {found['MB']:.0f} MB of NPZ:")
+    page.say(f"  {found['seconds']:.2f} s, {1000 / ratio:.1f} ms per second of sound, {ratio:.0f} times real time")
+    page.say()
+
+
+def _say_kinds(page: report.Report, rounds: int) -> None:
+    page.say("## The other representations, each beside plain numpy and scipy")
+    page.say()
+    page.say("On one core; plain is benchmarks/plain.py on the whole signal at once. Parents are not counted.")
+    page.say("`differ` is the largest difference over the largest number, or the share of decisions that differ.")
+    page.say()
+    head, *rows = kinds.table(apart(kinds.measure, rounds))
+    page.table(head, rows)
+
+
+def _say_configurations(page: report.Report) -> None:
+    measured = apart(configurations.measure)
+    page.say("## Other configurations")
+    page.say()
+    page.say("Cost per unit of work is for one of the default's.")
+    page.say()
+    for kind, found in measured.items():
+        page.say(f"{kind}: a unit of work is {configurations.UNITS[kind]}.")
+        page.say()
+        page.table(
+            [kind, "ms", "per unit of work"],
+            [[text, f"{cost['ms']:.2f}", f"{cost['per unit']:.2f}"] for text, cost in found.items()],
+        )
+    worst = max(cost["per unit"] for found in measured.values() for cost in found.values())
+    page.say(f"The dearest unit of work costs {worst:.2f} times what the default's costs.")
+    page.say()
+
+
+def _say_rest(page: report.Report) -> None:
+    small = apart(configurations.small_blocks)
+    page.say("## Small blocks")
+    page.say()
+    page.say("Microseconds that one block of so many samples takes, 31 channels.")
+    page.say()
+    rows = [[kind, *(f"{cost:.0f}" for cost in found.values())] for kind, found in small.items()]
+    page.table(["stage", *map(str, configurations.SMALL_BLOCKS)], rows)
+    first, memory = configurations.first_block(), apart(configurations.memory)
+    page.say("## What else")
+    page.say()
+    page.say(f"* a new process loads in {first['load']:.2f} s; its first block takes {first['first block']:.3f} s")
+    page.say(f"* between blocks the default chain holds {memory['state']:.1f} MB; a stage takes up to")
+    page.say(f"  {memory['scratch']:.1f} MB more while it works, besides its output")
+    page.say()
+    page.say("What silence after sound costs, for what sound costs (the whole chain):")
+    page.say()
+    silence = apart(configurations.silence, "kernels")
+    twins = apart(configurations.silence, "twins", ("default",))
+    rows = [[name, f"{ratio:.2f}"] for name, ratio in silence.items()]
+    rows += [[f"{name}, the twins", f"{ratio:.2f}"] for name, ratio in twins.items()]
+    page.table(["chain", "silence / sound"], rows)
 
 
 def main() -> int:
     """Measure, print, write."""
-    parser = argparse.ArgumentParser(description="Time the chain, against plain numpy and scipy too.")
-    parser.add_argument("--rounds", type=int, default=7, help="how often both sides take their turn (default 7)")
-    parser.add_argument("--quick", action="store_true", help="only the default chain on one core")
-    parser.add_argument("--results", type=Path, default=HERE / "results", help="where to write (default %(default)s)")
+    parser = report.arguments("Time the chain: by hand, through the tree, on a file, against plain numpy and scipy.")
+    parser.add_argument("--rounds", type=int, default=5, help="how often all sides take their turn (default 5)")
+    parser.add_argument(
+        "--quick", action="store_true", help="only the default chain, by hand and through the tree; writes nothing"
+    )
     options = parser.parse_args()
-    measured: dict[str, Any] = {"machine": machine()}
-    measured["one core"] = {str(block): apart(one_core, block, options.rounds) for block in BLOCKS}
+    page = report.Report(options, "The chain, timed")
+    page.say(f"* kernels: {kernels.status().detail.partition(';')[0]}")
+    page.say(f"* numpy {np.__version__}, scipy {scipy.__version__}; ms of computing per second of sound, medians")
+    page.say()
+    _say_tree(page, options.rounds)
+    _say_stages(page, options.rounds)
     if not options.quick:
-        measured["two cores"] = {str(block): apart(two_cores, block, options.rounds) for block in BLOCKS}
-        measured["configurations"] = configurations.measure()
-        measured["small blocks (us)"] = configurations.small_blocks()
-        measured["first block (s)"] = configurations.first_block()
-        measured["memory (MB)"] = configurations.memory()
-        measured["silence over sound"] = {
-            "kernels": apart(configurations.silence, "kernels"),
-            "twins": apart(configurations.silence, "twins", ("default",)),
-        }
-    text = report.as_markdown(measured)
-    print(text)
-    if not options.quick:
-        options.results.mkdir(parents=True, exist_ok=True)
-        (options.results / "chain.json").write_text(json.dumps(measured, indent=2) + "\n")
-        (options.results / "chain.md").write_text(text)
+        _say_offline(page)
+        _say_kinds(page, options.rounds)
+        _say_configurations(page)
+        _say_rest(page)
+        page.write("chain.md")
     return 0
 
 

@@ -6,6 +6,7 @@ import json
 import os
 import sys
 import tempfile
+import time
 import xmlrpc.client
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -17,7 +18,7 @@ sys.path.insert(0, str(HERE.parent))
 
 from rosafe.demo.processes import Child, Children  # noqa: E402
 from rosafe.demo.session import NAMES, GuideSession  # noqa: E402
-from rosafe.interface import FIXED, ROSAFE  # noqa: E402
+from rosafe.interface import FIXED, KINDS, ROSAFE  # noqa: E402
 
 PYTHON = "/usr/bin/python3"
 AUDIO = "/bass/Audio"
@@ -27,8 +28,8 @@ UP_SECONDS = 20.0
 
 def topic(kind: str) -> str:
     """The topic of the default tree's processor of a kind."""
-    port = ROSAFE.port(FIXED[kind].port)
-    return f"/rosAFE/{port.name}" + (f"/{NAMES[kind]}" if port.multiple else "")
+    port = ROSAFE.port(KINDS[kind].port)
+    return f"/rosAFE/{port.name}" + (f"/{KINDS[kind].name}" if port.multiple else "")
 
 
 class Subscriber:
@@ -77,6 +78,18 @@ class Bench:
         subscriber = Subscriber(self._children, self._folder, topics)
         self.session.wait(lambda: "ready" in subscriber.child.out, UP_SECONDS, "the subscriber hears nothing")
         return subscriber
+
+    def health(self) -> str:
+        """What the node says of its sound on /diagnostics."""
+        import rospy
+        from diagnostic_msgs.msg import DiagnosticArray
+
+        end = time.monotonic() + UP_SECONDS
+        while time.monotonic() < end:
+            for status in rospy.wait_for_message("/diagnostics", DiagnosticArray, UP_SECONDS).status:
+                if "rosAFE" in status.name and status.name.endswith("audio"):
+                    return str(status.message)
+        raise RuntimeError("the node tells nothing on /diagnostics")
 
     @property
     def node(self) -> int:

@@ -9,13 +9,12 @@ deliver it, from the moment that bass had it.
 
 from __future__ import annotations
 
-import argparse
-import os
 import sys
 import time
 
 import graph
 import numpy as np
+from report import Report, arguments
 
 from rosafe.interface import FIXED
 
@@ -35,28 +34,33 @@ def measure(bench: graph.Bench, block: int, messages: int) -> np.ndarray:
     return latencies(timer.close())[:, -messages:]
 
 
-def report(what: str, seconds: np.ndarray) -> None:
-    """Print the result of one measurement."""
+def rows(what: str, seconds: np.ndarray) -> list[list[str]]:
+    """The result of one measurement."""
+    found = []
     for since, row in zip(("arrived", "acquired"), 1000 * seconds, strict=True):
-        median, late, worst = np.percentile(row, [50, 99, 100])
-        print(f"{what + ', since it ' + since:50} {len(row):5d} {median:8.1f} {late:8.1f} {worst:8.1f}", flush=True)
+        percentiles = np.percentile(row, [50, 99, 100])
+        found.append([f"{what}, since it {since}", str(len(row)), *(f"{ms:.1f}" for ms in percentiles)])
+    return found
 
 
 def main() -> int:
-    """Measure and print."""
-    parser = argparse.ArgumentParser(description="Latency from /bass/Audio to the ILD port in another process.")
+    """Measure, print, write."""
+    parser = arguments("Latency from /bass/Audio to the ILD port in another process.")
     parser.add_argument("--messages", type=int, default=600, help="how many ILD messages (default %(default)s)")
     parser.add_argument("--block", type=int, default=2205, help="frames per block and chunk (default %(default)s)")
     parser.add_argument("--port-seconds", type=float, default=1.0, help="length of the ports (default %(default)s)")
     options = parser.parse_args()
+    if options.messages < 1 or options.block < 1:
+        parser.error("--messages, --block: at least 1")
+    page = Report(options, "Latency")
     with graph.bench() as bench:
         bench.build(options.block, options.port_seconds, options.block)
-        print(f"load {os.getloadavg()[0]:.1f} on {os.cpu_count()} cores; blocks of {options.block}; ms")
-        print(f"{'':50} {'count':>5} {'median':>8} {'p99':>8} {'max':>8}")
-        report("only ILD subscribed", measure(bench, options.block, options.messages))
+        found = rows("only ILD subscribed", measure(bench, options.block, options.messages))
         taker = bench.subscribe(graph.topic(kind) for kind in FIXED)
-        report("all ports subscribed elsewhere", measure(bench, options.block, options.messages))
+        found += rows("all ports subscribed elsewhere", measure(bench, options.block, options.messages))
         taker.close()
+    page.table([f"blocks of {options.block}, ms", "count", "median", "p99", "max"], found)
+    page.write("latency.md")
     return 0
 
 

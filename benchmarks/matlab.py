@@ -14,6 +14,7 @@ import sys
 import time
 
 import graph
+import report
 
 from rosafe.component import generate
 from rosafe.demo.processes import Children
@@ -24,6 +25,7 @@ UP_SECONDS = 20.0
 
 def main() -> int:
     """Measure and print."""
+    report.Report(report.arguments("How long reading ports takes in Octave.").parse_args(), "Octave")
     if shutil.which("octave-cli") is None:
         print("benchmarks/matlab.py: octave-cli is not installed; scripts/install --tests brings it", file=sys.stderr)
         return 1

@@ -9,7 +9,6 @@ The exit code is 1 where frames were lost, or where a process has grown.
 
 from __future__ import annotations
 
-import argparse
 import io
 import itertools
 import socket
@@ -21,6 +20,7 @@ from typing import Any, NamedTuple
 
 import graph
 import numpy as np
+from report import Report, arguments
 
 from rosafe.component import generate
 from rosafe.interface import FIXED
@@ -151,37 +151,41 @@ def run(bench: graph.Bench, block: int, port_seconds: float, seconds: float) -> 
     return Run([count(t, [int(index) for index, _ in came[t]], block, window) for t in topics], node, subscriber)
 
 
-def report(result: Run) -> None:
+def report(page: Report, result: Run) -> None:
     """Print one run."""
-    print(f"{'port':45} {'came':>6} {'expected':>8} {'frames lost':>11}")
-    for port in result.ports:
-        print(f"{port.topic:45} {port.came:6d} {port.expected:8d} {port.lost:11d}")
+    page.table(
+        ["port", "came", "expected", "frames lost"],
+        [[port.topic, str(port.came), str(port.expected), str(port.lost)] for port in result.ports],
+    )
     for name, (first, last) in (("node", result.node), ("subscriber", result.subscriber)):
-        print(f"memory of the {name}: {first:.0f} MB at first, {last:.0f} MB at the end")
+        page.say(f"* memory of the {name}: {first:.0f} MB at first, {last:.0f} MB at the end")
+    page.say()
 
 
 def main() -> int:
-    """Measure and print."""
-    parser = argparse.ArgumentParser(description="Serialisation of large ports, and all ports subscribed for a while.")
+    """Measure, print, write."""
+    parser = arguments("Serialisation of large ports, and all ports subscribed for a while.")
     parser.add_argument("--seconds", type=float, default=60.0, help="of each run (default %(default)s)")
-    parser.add_argument("--quick", action="store_true", help="leave out the times of a single message")
+    parser.add_argument("--quick", action="store_true", help="leave out the times of a single message; writes nothing")
     options = parser.parse_args()
+    page = Report(options, "What the ports carry")
     if not options.quick:
-        print("22 MB message, median ms")
-        for what, spent in times().items():
-            print(f"{what:45} {spent:8.2f}")
+        page.table(["22 MB message", "median ms"], [[what, f"{spent:.2f}"] for what, spent in times().items()])
     lost = 0
     with graph.bench() as bench:
         for block, port_seconds, chunk in ((12000, 1.0, 2205), (882, 0.02, 882)):
-            print(f"\nblocks of {block}, ports of {port_seconds:g} s, {options.seconds:g} s", flush=True)
+            page.say(f"## Blocks of {block}, ports of {port_seconds:g} s, {options.seconds:g} s")
+            page.say()
             bench.build(block, port_seconds, chunk)
             result = run(bench, block, port_seconds, options.seconds)
-            report(result)
+            report(page, result)
             lost += result.lost
             if result.growth > GROWTH:
-                print(f"grown by {result.growth:.0f} MB")
+                page.say(f"* grown by {result.growth:.0f} MB")
                 lost += 1
             bench.call("/rosAFE/Stop")
+    if not options.quick:
+        page.write("ports.md")
     return 1 if lost else 0
 
 

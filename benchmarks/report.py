@@ -1,74 +1,85 @@
-"""What was measured, as tables in Markdown."""
+"""What all benchmarks have in common: the load that they begin with, tables, and the files that they write."""
 
 from __future__ import annotations
 
-from typing import Any
+import argparse
+import os
+import platform
+import sys
+from collections.abc import Iterable, Sequence
+from pathlib import Path
 
-import configurations
-
-
-def _table(head: list[str], rows: list[list[str]]) -> list[str]:
-    return [
-        "| " + " | ".join(head) + " |",
-        "|" + "|".join(["---"] + ["--:"] * (len(head) - 1)) + "|",
-        *("| " + " | ".join(row) + " |" for row in rows),
-        "",
-    ]
-
-
-def as_markdown(measured: dict[str, Any]) -> str:
-    """The results of chain.py."""
-    lines = ["# The chain, timed", "", "By benchmarks/chain.py: ms of computing per second of sound, medians.", ""]
-    lines += [f"* {name}: {value}" for name, value in measured["machine"].items()] + [""]
-    for block, stages in measured["one core"].items():
-        lines += [f"## One core, blocks of {block}", ""]
-        rows = [[kind, *_times(times)] for kind, times in stages.items()]
-        lines += _table(["stage", "yardstick", "rosafe", "times as fast"], rows)
-    if "two cores" in measured:
-        lines += ["## Two cores (the threaded tree; wall clock)", ""]
-        rows = [[f"blocks of {block}", *_times(times)] for block, times in measured["two cores"].items()]
-        lines += _table(["", "yardstick, one core", "rosafe", "times as fast"], rows)
-        lines += _configurations(measured["configurations"])
-        lines += _small_blocks(measured["small blocks (us)"])
-        first, memory = measured["first block (s)"], measured["memory (MB)"]
-        lines += [
-            "## What else",
-            "",
-            f"* a new process loads in {first['load']:.2f} s; from the request to the first block it takes"
-            f" {first['from request to block']:.3f} s",
-            f"* between blocks the default chain holds {memory['state']:.1f} MB; a stage takes up to"
-            f" {memory['scratch']:.1f} MB more while it works, besides its output",
-            "",
-            "What silence after sound costs, for what sound costs (the whole chain):",
-            "",
-        ]
-        silence = measured["silence over sound"]
-        rows = [[name, f"{ratio:.2f}"] for name, ratio in silence["kernels"].items()]
-        rows += [[f"{name}, the twins", f"{ratio:.2f}"] for name, ratio in silence["twins"].items()]
-        lines += _table(["chain", "silence / sound"], rows)
-    return "\n".join(lines)
+HERE = Path(__file__).resolve().parent
+RESULTS = HERE / "results"
+BUSY = 0.5  # processes on average that want a core; a machine that has more to do is not quiet
+BEFORE = "ROSAFE_BENCHMARK_LOAD"  # environment variable: the load before benchmarks/all.py began, whose own work counts
 
 
-def _times(times: dict[str, float]) -> list[str]:
-    return [f"{times['yardstick']:.2f}", f"{times['rosafe']:.2f}", f"{times['ratio']:.1f}"]
+def arguments(description: str) -> argparse.ArgumentParser:
+    """A parser with what every benchmark takes."""
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("--loaded", action="store_true", help=f"measure although the load is above {BUSY}")
+    parser.add_argument(
+        "--results", type=Path, default=RESULTS, metavar="FOLDER", help="where to write (default %(default)s)"
+    )
+    return parser
 
 
-MARK = "<!-- What follows is written by benchmarks/chain.py. -->\n"
+class Report:
+    """Prints lines and keeps them for a file. The first one tells the load; on a busy machine it ends the program.
+
+    Parameters
+    ----------
+    options : Namespace
+        Of a parser that `arguments` has made.
+    title : str
+        Of the file.
+    """
+
+    def __init__(self, options: argparse.Namespace, title: str) -> None:
+        name = Path(sys.argv[0]).name
+        try:
+            load = float(os.environ.get(BEFORE, ""))
+        except ValueError:
+            load = os.getloadavg()[0]
+        if load > BUSY and not options.loaded:
+            print(
+                f"{name}: the load is {load:.2f}, above {BUSY}: wait until it is quiet, or give --loaded",
+                file=sys.stderr,
+            )
+            sys.exit(1)
+        self._folder: Path = options.results
+        self._lines = [f"# {title}", "", f"By benchmarks/{name}.", ""]
+        loud = f", above {BUSY}: measured with --loaded, so take the numbers with care" if load > BUSY else ""
+        self.say(f"* load before: {load:.2f}{loud}")
+        self.say(f"* machine: {processor()}, {len(os.sched_getaffinity(0))} cores, Python {platform.python_version()}")
+        self.say()
+
+    def say(self, line: str = "") -> None:
+        """A line for both."""
+        print(line, flush=True)
+        self._lines.append(line)
+
+    def table(self, head: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+        """In Markdown; numbers to the right."""
+        self.say("| " + " | ".join(head) + " |")
+        self.say("|" + "|".join(["---"] + ["--:"] * (len(head) - 1)) + "|")
+        for row in rows:
+            self.say("| " + " | ".join(row) + " |")
+        self.say()
+
+    def write(self, file: str) -> None:
+        """All of it into this file of the results."""
+        self._folder.mkdir(parents=True, exist_ok=True)
+        (self._folder / file).write_text("\n".join(self._lines).rstrip() + "\n", "utf-8")
 
 
-def _configurations(measured: dict[str, dict[str, dict[str, float]]]) -> list[str]:
-    lines = ["## Other configurations", "", "Cost per unit of work is for one of the default's.", ""]
-    for kind, found in measured.items():
-        rows = [[text, f"{cost['ms']:.2f}", f"{cost['per unit']:.2f}"] for text, cost in found.items()]
-        lines += [f"{kind}: a unit of work is {configurations.UNITS[kind]}.", ""]
-        lines += _table([kind, "ms", "per unit of work"], rows)
-    worst = max(cost["per unit"] for found in measured.values() for cost in found.values())
-    return [*lines, f"The dearest unit of work costs {worst:.2f} times what the default's costs.", ""]
-
-
-def _small_blocks(measured: dict[str, dict[str, float]]) -> list[str]:
-    """A block costs a fixed part, about that of one sample, and one in proportion to its samples."""
-    sizes = list(next(iter(measured.values())))
-    rows = [[kind, *(f"{cost:.0f}" for cost in found.values())] for kind, found in measured.items()]
-    lines = ["## Small blocks", "", "Microseconds that one block of so many samples takes, 31 channels.", ""]
-    return lines + _table(["stage", *sizes], rows)
+def processor() -> str:
+    """What it runs on."""
+    try:
+        for line in Path("/proc/cpuinfo").read_text("utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    except OSError:
+        pass
+    return platform.processor() or platform.machine()

@@ -14,10 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
-from rosafe.dsp.crosscorrelation import EPSILON
 from scipy import fft, signal
 
 from rosafe.dsp.erb import bandwidth
+from rosafe.representations.crosscorrelation import EPSILON
 
 FloatArray = NDArray[np.float64]
 BATCH = 64  # frames that are transformed at a time

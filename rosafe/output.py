@@ -1,4 +1,4 @@
-"""Files that the product writes: complete or not there, never two writers in one."""
+"""Files and folders that the product writes: complete or not there, never two writers in one."""
 
 from __future__ import annotations
 
@@ -9,13 +9,14 @@ import fcntl
 import glob
 import os
 import shlex
+import shutil
 import stat
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 PART = ".part"  # what the name of an unfinished output ends with
-_AT_FDCWD, _RENAME_NOREPLACE = -100, 1  # of renameat2
+_AT_FDCWD, _RENAME_NOREPLACE, _RENAME_EXCHANGE = -100, 1, 2  # of renameat2
 
 
 class OutputError(Exception):
@@ -111,7 +112,7 @@ class Part:
         if self._replace:
             self.name.rename(self._path)
         else:
-            _rename_to_nothing(self.name, self._path)
+            _renameat2(self.name, self._path, _RENAME_NOREPLACE)
         self.keep = True
         _sync_folder(self._path.parent)
 
@@ -132,14 +133,119 @@ def new_file(target: str | Path, replace: bool) -> Iterator[int]:
 
     Raises OutputError as `Part` does, and for an OSError from within.
     """
+    with _new_part(target, replace) as part:
+        yield part.descriptor
+
+
+@contextmanager
+def new_path(target: str | Path, replace: bool) -> Iterator[Path]:
+    """As `new_file`, for those who open files by name: the name of the empty file, which must be written in place."""
+    with _new_part(target, replace) as part:
+        yield part.name
+
+
+@contextmanager
+def _new_part(target: str | Path, replace: bool) -> Iterator[Part]:
     part = Part(target, replace)
     try:
-        yield part.begin()
+        part.begin()
+        yield part
         part.complete()
     except OSError as problem:
         raise part.error(problem) from problem
     finally:
         part.close()
+
+
+@contextmanager
+def new_folder(target: str | Path, replace: bool, sign: str) -> Iterator[Path]:
+    """An empty folder that takes the place `target`, links followed, if all goes well, and else is gone.
+
+    As with `Part`, its name until then ends with ``.part``, it is locked, and what a killed process left is used up.
+
+    Parameters
+    ----------
+    target : path
+        Where the folder goes.
+    replace : bool
+        Whether it may take the place of a folder that is there, if that holds a file of the name `sign`.
+    sign : str
+        What tells such a folder from one that somebody keeps other things in.
+
+    Raises
+    ------
+    OutputError
+        The place is taken, or another process writes to it, or nothing can be written there; an OSError from within.
+    """
+    try:
+        path = Path(os.path.realpath(target))
+    except (OSError, ValueError) as problem:
+        raise OutputError(f"cannot write {target}: {getattr(problem, 'strerror', None) or problem}") from None
+    try:
+        if os.path.lexists(path):
+            _check_replaceable(Path(target), path, replace, sign)
+        elif not path.parent.is_dir():
+            raise OutputError(f"cannot write {target}: there is no folder {path.parent}")
+        part = path.with_name(path.name + PART)
+        descriptor = _locked_folder(part)
+        try:
+            for left in part.iterdir():
+                _remove(left)
+            yield part
+            os.fsync(descriptor)
+            _put_in_place(part, path, replace)
+        finally:
+            if part.exists() and os.path.samestat(part.stat(), os.fstat(descriptor)):
+                shutil.rmtree(part, ignore_errors=True)
+            os.close(descriptor)
+    except OSError as problem:
+        raise OutputError(f"cannot write {target}: {problem.strerror or problem}") from problem
+
+
+def _check_replaceable(target: Path, path: Path, replace: bool, sign: str) -> None:
+    if not path.is_dir():
+        raise OutputError(f"{target} is there already, and no folder")
+    if not replace:
+        raise OutputError(f"{target} is there already; --force replaces it")
+    if any(path.iterdir()) and not (path / sign).exists():
+        raise OutputError(f"{target} is a folder with other things in it, which stay")
+
+
+def _locked_folder(part: Path) -> int:
+    while True:
+        part.mkdir(exist_ok=True)
+        descriptor = os.open(part, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC | os.O_NOFOLLOW)
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if part.exists() and os.path.samestat(part.lstat(), os.fstat(descriptor)):
+                return descriptor
+        except BlockingIOError:
+            who = _holder(descriptor)
+            os.close(descriptor)
+            raise BlockingIOError(errno.EAGAIN, f"{who} is writing it") from None
+        except BaseException:
+            os.close(descriptor)
+            raise
+        os.close(descriptor)  # whoever had it has just finished
+
+
+def _put_in_place(part: Path, path: Path, replace: bool) -> None:
+    if not (replace and path.exists()):
+        _renameat2(part, path, _RENAME_NOREPLACE)
+        return
+    try:
+        _renameat2(part, path, _RENAME_EXCHANGE)  # the old one has the name of the part then
+    except FileExistsError:  # a file system that cannot
+        shutil.rmtree(path)
+        part.rename(path)
+    shutil.rmtree(part, ignore_errors=True)
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path)
+    else:
+        path.unlink()
 
 
 def write_whole(target: str | Path, data: bytes) -> None:
@@ -168,10 +274,10 @@ def _place(target: Path, replace: bool) -> Path:
     return path
 
 
-def _rename_to_nothing(name: Path, path: Path) -> None:
-    """Rename; FileExistsError where `path` is there."""
+def _renameat2(name: Path, path: Path, flag: int) -> None:
+    """Rename to nothing, or exchange the two; FileExistsError where `path` is there, or the file system cannot."""
     libc = ctypes.CDLL(None, use_errno=True)
-    if libc.renameat2(_AT_FDCWD, os.fsencode(name), _AT_FDCWD, os.fsencode(path), _RENAME_NOREPLACE) == 0:
+    if libc.renameat2(_AT_FDCWD, os.fsencode(name), _AT_FDCWD, os.fsencode(path), flag) == 0:
         return
     problem = ctypes.get_errno()
     if problem in (errno.EINVAL, errno.ENOSYS) and not os.path.lexists(path):  # a file system that cannot, such as NFS

@@ -11,7 +11,7 @@ import sys
 
 from rosafe import commands, missing
 from rosafe.commands import Failure
-from rosafe.component.startup import Parser
+from rosafe.component.startup import Parser, without_names
 from rosafe.output import OutputError
 from rosafe.version import VERSION
 
@@ -25,7 +25,7 @@ def main(argv: list[str] | None = None) -> int:
     name = "rosafe"
     try:
         try:
-            options, rest = _parser().parse_known_args(argv)
+            options, rest = _parser().parse_known_args(without_names(sys.argv[1:] if argv is None else argv))
             name = f"rosafe {options.command}"
             if hasattr(options, "missing"):
                 raise Failure(options.missing)

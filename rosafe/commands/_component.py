@@ -13,6 +13,7 @@ from rosafe.commands import Failure
 from rosafe.interface import ROSAFE, ComponentError
 
 if TYPE_CHECKING:
+    from rosafe.genomix.graph import Graph
     from rosafe.genomix.proxy import Proxy
 
 PAUSE = 0.2  # seconds between two looks, where a component is waited for
@@ -58,11 +59,9 @@ async def component(instance: str, wait: float = 0.0) -> AsyncIterator[Proxy]:
         await graph.close()
 
 
-async def _found(graph: object, instance: str, wait: float) -> Proxy:
-    from rosafe.genomix.graph import Graph
+async def _found(graph: Graph, instance: str, wait: float) -> Proxy:
     from rosafe.genomix.proxy import Proxy, names
 
-    assert isinstance(graph, Graph)
     deadline = time.monotonic() + wait
     while True:
         try:

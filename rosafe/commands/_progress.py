@@ -30,14 +30,21 @@ class Display:
         self._stream = stream
         self._sizes = [max(size, 1.0) for size in sizes]
         self._parts = [0.0] * len(sizes)
+        self._all = sum(self._sizes)
+        self._done = self._skipped = 0.0  # sizes
+        self._ended = self._computed = 0  # files
         self._quiet = quiet
         self._live = stream.isatty()
         self._begun = time.monotonic()
         self._due = self._begun + (0.0 if self._live else PLAIN_SECONDS)
 
-    def update(self, index: int, part: float) -> None:
-        """Of thing `index`, `part` (0 to 1) is done."""
+    def update(self, index: int, part: float, last: bool = False, skipped: bool = False) -> None:
+        """Of thing `index`, `part` (0 to 1) is done; with `last` it is over, with `skipped` without any work."""
+        self._done += self._sizes[index] * (part - self._parts[index])
         self._parts[index] = part
+        self._ended += last
+        self._computed += last and not skipped
+        self._skipped += self._sizes[index] * skipped
         now = time.monotonic()
         if self._quiet or now < self._due:
             return
@@ -65,21 +72,20 @@ class Display:
         self._stream.write(text)
         self._stream.flush()
 
-    @property
-    def _part(self) -> float:
-        return sum(size * part for size, part in zip(self._sizes, self._parts, strict=True)) / sum(self._sizes)
-
     def _bar(self) -> str:
-        full = int(self._part * BAR)
+        full = int(self._done / self._all * BAR + 1e-9)
         return "#" * full + "-" * (BAR - full)
 
     def _text(self, now: float) -> str:
-        part, passed = self._part, now - self._begun
-        text = f"{100 * part:3.0f} %"
+        passed = now - self._begun
+        text = f"{100 * self._done / self._all:3.0f} %"
         if len(self._parts) > 1:
-            text += f"  {sum(part == 1.0 for part in self._parts)} of {len(self._parts)} files"
-        if part > 0 and passed > 1:
-            text += f"  {clock(passed * (1 - part) / part)} left"
+            text += f"  {self._ended} of {len(self._parts)} files"
+            if self._computed and passed > 0:
+                text += f"  {self._computed / passed:.3g} files/s"
+        worked = self._done - self._skipped
+        if worked > 0 and passed > 1:
+            text += f"  {clock(passed * (self._all - self._done) / worked)} left"
         return text
 
 

@@ -1,11 +1,11 @@
-"""Several pieces of work at once, each in a process of its own that tells how far it is."""
+"""Many pieces of work in a few processes, which tell how far they are."""
 
 from __future__ import annotations
 
+import contextlib
 import multiprocessing
 import signal
 import time
-from collections import deque
 from collections.abc import Callable, Sequence
 from functools import partial
 from multiprocessing.connection import Connection, wait
@@ -67,15 +67,15 @@ def run_together(
     report: Callable[[int, Report], None],
     signals: Interrupts,
 ) -> None:
-    """Run all `works`, at most `jobs` at a time, and wait for them; whatever ends this ends those that run, too.
+    """Run all `works` in at most `jobs` processes, and wait for them; whatever ends this ends those that run, too.
 
     Parameters
     ----------
     works : sequence of callable
-        Called in a process of its own with a function that takes (done, all), to be called often: it ends the work by
+        Called in another process with a function that takes (done, all), to be called often: it ends the work by
         an exception once a signal has come. Returns something that can be pickled.
     jobs : int
-        Processes at a time.
+        Processes. Each does one piece of work after the other; one that dies fails with that alone.
     failures : tuple of exception types
         What a piece of work may fail with; the text of the exception is the report's.
     report : callable
@@ -83,46 +83,60 @@ def run_together(
     signals : Interrupts
         What ends it by `Interrupted`.
     """
-    waiting = deque(enumerate(works))
-    running: dict[Connection, tuple[int, multiprocessing.Process]] = {}
+    waiting = iter(range(len(works)))
+    left = len(works)
+    idle: list[Connection] = []
+    busy: dict[Connection, int] = {}  # and the work that each is at
+    processes: dict[Connection, multiprocessing.Process] = {}
     try:
-        while waiting or running:
+        while left:
             signals.check()
-            while waiting and len(running) < jobs:
-                index, work = waiting.popleft()
-                connection, process = _start(partial(_work, work, failures, signals), list(running))
-                running[connection] = index, process
-            for ready in wait(list(running), SIGNAL_SECONDS):
+            for _ in range(min(jobs, len(works)) - len(processes)):
+                connection, process = _start(partial(_serve, works, failures, signals), list(processes))
+                processes[connection] = process
+                idle.append(connection)
+            while idle and (index := next(waiting, None)) is not None:
+                connection = idle.pop()
+                busy[connection] = index
+                with contextlib.suppress(BrokenPipeError):  # it has died; its end of the pipe tells
+                    connection.send(index)
+            for ready in wait(list(busy), SIGNAL_SECONDS):
                 connection = cast(Connection, ready)
-                index, process = running[connection]
-                told = _receive(connection, process)
+                index = busy[connection]
+                told = _receive(connection, processes[connection])
                 if told.failure:
                     signals.check()  # the same Ctrl-C may have ended the child sooner than us
                 if told.last:
-                    del running[connection]
-                    process.join()
+                    left -= 1
+                    del busy[connection]
+                    if processes[connection].exitcode is None:
+                        idle.append(connection)
+                    else:
+                        del processes[connection]
                 report(index, told)
     finally:
-        for _, process in running.values():
+        for connection in processes:
+            connection.close()  # who waits for work ends
+        for process in processes.values():
             process.terminate()
-        for _, process in running.values():
+        for process in processes.values():
             process.join()
 
 
-def _start(work: Callable[[Connection], None], others: list[Connection]) -> tuple[Connection, multiprocessing.Process]:
-    """The new process, and where its reports come."""
+def _start(serve: Callable[[Connection], None], others: list[Connection]) -> tuple[Connection, multiprocessing.Process]:
+    """A new process, and the pipe to it."""
     context = multiprocessing.get_context("fork")  # no need to import everything again
-    reader, writer = context.Pipe(duplex=False)
+    ours, its = context.Pipe()
 
     def child() -> None:
-        for connection in (reader, *others):  # a pipe that nobody else reads tells when the one who does is gone
+        for connection in (ours, *others):  # a pipe that nobody else has tells when the one at its other end is gone
             connection.close()
-        work(writer)
+        serve(its)
 
     process = context.Process(target=child)
     process.start()
-    writer.close()
-    return reader, process  # type: ignore[return-value]  # a ForkProcess is a Process
+    its.close()
+    return ours, process  # type: ignore[return-value]  # a ForkProcess is a Process
 
 
 def _receive(connection: Connection, process: multiprocessing.Process) -> Report:
@@ -130,32 +144,41 @@ def _receive(connection: Connection, process: multiprocessing.Process) -> Report
         told = connection.recv()
         assert isinstance(told, Report)
         return told
-    except EOFError:
+    except (EOFError, ConnectionResetError):
         process.join()
         code = process.exitcode or 0
         how = f"signal {-code}" if code < 0 else f"exit code {code}"
         return Report(0.0, failure=f"ended too early, with {how}")
 
 
-def _work(work: Work, failures: tuple[type[Exception], ...], signals: Interrupts, writer: Connection) -> None:
-    """What a process does. It ends at its next report where the one that started it is no longer there."""
-    due = 0.0
+def _serve(
+    works: Sequence[Work], failures: tuple[type[Exception], ...], signals: Interrupts, connection: Connection
+) -> None:
+    """What a process does, until the one that started it closes the pipe or is no longer there."""
+    while True:
+        try:
+            index = connection.recv()
+        except (EOFError, ConnectionResetError):
+            return
+        _send(connection, attempt(works[index], failures, partial(_tell, connection, signals, [0.0])))
 
-    def progress(done: int, total: int) -> None:
-        nonlocal due
-        signals.check()
-        now = time.monotonic()
-        if now >= due:
-            due = now + REPORT_SECONDS
-            _send(writer, Report(done / total))
 
+def attempt(work: Work, failures: tuple[type[Exception], ...], progress: Progress) -> Report:
+    """Do one piece of work; its last report."""
     try:
-        last = Report(1.0, result=work(progress))
+        return Report(1.0, result=work(progress))
     except failures as problem:
-        last = Report(0.0, failure=str(problem))
+        return Report(0.0, failure=str(problem) or type(problem).__name__)
     except MemoryError:
-        last = Report(0.0, failure="there is not enough memory")
-    _send(writer, last)
+        return Report(0.0, failure="there is not enough memory")
+
+
+def _tell(connection: Connection, signals: Interrupts, due: list[float], done: int, total: int) -> None:
+    signals.check()
+    now = time.monotonic()
+    if now >= due[0]:
+        due[0] = now + REPORT_SECONDS
+        _send(connection, Report(done / total))
 
 
 def _send(writer: Connection, report: Report) -> None:

@@ -7,15 +7,17 @@ their units. Correlations are means over the channels, modulation spectrograms a
 from __future__ import annotations
 
 import argparse
-import zipfile
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from rosafe.commands import Failure
 from rosafe.commands._parameters import add_settings, parameters_of, words
 from rosafe.interface import KINDS
 from rosafe.interface.arguments import check_outputs
+
+if TYPE_CHECKING:
+    import numpy as np
 
 _DEFAULT = ("input", "ratemap", "pitch", "onsetMap", "ild", "itd")  # of a sound
 
@@ -49,17 +51,23 @@ def run(options: argparse.Namespace) -> int:
     target = Path(options.output or source.with_suffix(".png"))
     from matplotlib.figure import Figure
 
+    from rosafe.offline.formats import FORMATS
+    from rosafe.offline.process import process
     from rosafe.sound.audiofile import AudioFileError
     from rosafe.view.axes import save
-    from rosafe.view.plot import draw
+    from rosafe.view.plot import UNDER, draw
 
     names = words(options.outputs)
+    result: Mapping[str, Any]
     try:
-        if source.suffix == ".npz":
+        if source.suffix.lower() in FORMATS:
             result = _result(source, options.settings)
         else:
-            names = check_outputs(names or _DEFAULT)
-            result = _computed(source, names, parameters_of(options.settings))
+            sound, rate = _sound(source)
+            names = check_outputs(names) if names else _default(len(sound))
+            outputs = [*names, *(UNDER[name] for name in names if name in UNDER)]
+            made = process(sound, rate, parameters=parameters_of(options.settings), outputs=outputs)
+            result = {**made, "sample_rate": rate}
         figure = draw(Figure(), result, names, options.ear, at=options.at, channel=options.channel)
     except (AudioFileError, ValueError) as problem:
         raise Failure(str(problem)) from None
@@ -68,30 +76,28 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _result(path: Path, settings: list[str]) -> Mapping[str, Any]:
-    from rosafe.offline.npz import memory_map
+    from rosafe.offline.formats import load
 
     if settings:
         raise ValueError("--set: a result is drawn as it is; name the sound instead")
     try:
-        return memory_map(path)
+        return load(path)
     except OSError as problem:
         raise ValueError(f"{path}: {problem.strerror}") from None
-    except zipfile.BadZipFile:
-        raise ValueError(f"{path} is no result of rosafe process") from None
 
 
-def _computed(path: Path, names: list[str], parameters: dict[str, Any]) -> Mapping[str, Any]:
-    """The wanted outputs of a sound, and those that lie under them."""
-    from rosafe.offline.process import process
+def _sound(path: Path) -> tuple[np.ndarray, int]:
+    """One ear or two (ears, N), and the sample rate (Hz)."""
     from rosafe.sound.audiofile import AudioFile, AudioFileError
-    from rosafe.view.plot import UNDER
 
     file = AudioFile(path)
     try:
-        if file.channels != 2:
-            raise AudioFileError(f"{path} has {file.channels} channels; wanted are two: left and right ear")
-        sound, rate = file.read(file.frames), file.sample_rate
+        if file.channels > 2:
+            raise AudioFileError(f"{path} has {file.channels} channels; wanted are two, left and right ear, or one")
+        return file.read(file.frames), file.sample_rate
     finally:
         file.close()
-    outputs = {*names, *(UNDER[name] for name in names if name in UNDER)}
-    return {**process(sound, rate, parameters=parameters, outputs=list(outputs)), "sample_rate": rate}
+
+
+def _default(ears: int) -> list[str]:
+    return [name for name in check_outputs(_DEFAULT) if ears == 2 or not KINDS[name].binaural]

@@ -1,17 +1,22 @@
-"""Compute auditory representations of sound files.
+"""Compute auditory representations of sounds: files, and whole folders of them.
 
-Reads WAV (integer or float, any rate), FLAC and whatever else libsndfile reads, two channels: left and right ear.
-Writes an .npz for numpy.load beside each file, or where -o says, while it reads: neither has to fit into the memory.
+Reads WAV, FLAC, Ogg, MP3 and whatever else libsndfile reads, and rosbags: two channels, left and right ear, or those
+that --channels names. Writes a file of results beside each, or where -o says; rosafe.load and rosafe plot read it.
+Unless --outputs says otherwise, what is in frames is kept: ild, ratemap and crossCorrelation.
 The numbers are those of the node on the same samples and blocks, bit for bit; so samples are taken as 32-bit integers
 (float files are scaled by 2^31-1 and rounded), and in_doNormalize is true unless told otherwise."""
 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import importlib
 import os
+import re
 import sys
 import textwrap
 import time
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,6 +30,8 @@ from rosafe.interface.arguments import check_outputs
 
 _BLOCK = ROSAFE.service("InputProc").parameter("nFramesPerBlock")
 _MAX_JOBS = 10_000
+_EXTENSIONS = (".npz", ".h5", ".mat", ".zarr", ".csv")
+_NAMED = 20  # failures that are named at the end, where failed.csv has them all
 
 # --- the command line -------------------------------------------------------------------------------------------
 
@@ -32,23 +39,44 @@ _MAX_JOBS = 10_000
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     parser.usage = (
-        "rosafe process IN [IN ...] [-o OUT] [--set NAME=VALUE ...] [--outputs NAME,...]\n"
-        "                      [--block N] [--jobs N] [--force] [--quiet]"
+        "rosafe process PATH [PATH ...] [-o OUT] [--set NAME=VALUE ...] [--outputs NAME,...]\n"
+        "                      [--format EXT] [--channels A,B] [--topic NAME] [--block N]\n"
+        "                      [--resume | --force] [--jobs N | --dask ADDRESS|local] [-v | -q]"
     )
-    parser.add_argument("inputs", nargs="*", metavar="IN", help="sound file; several are processed at once")
+    parser.add_argument(
+        "inputs",
+        nargs="*",
+        metavar="PATH",
+        help="sound file, rosbag (.bag), or folder with such",
+    )
     parser.add_argument(
         "-o",
-        "--output",
+        "--to",
+        dest="to",
         metavar="OUT",
-        help="output file, replaced where there is one; or the folder for all outputs, there already or ending in / "
-        "(it is made then; default: beside each input); files in it are named as the inputs, with .npz",
+        help=f"file of results, ending in {', '.join(_EXTENSIONS)}, replaced where there is one; or, for several files "
+        "or ending in /, the folder for all results, made where there is none (default: beside each input)",
     )
     add_settings(parser, "see below")
     parser.add_argument(
         "--outputs",
         metavar="NAME,...",
-        help=f"what to keep of {', '.join(KINDS)} (default: the first {len(FIXED)}); "
-        "what none of them needs is not computed",
+        help=f"what to keep of {', '.join(KINDS)} (default: ild,ratemap,crossCorrelation; the original's seven are "
+        f"{','.join(FIXED)}); what none of them needs is not computed",
+    )
+    parser.add_argument(
+        "--format",
+        choices=[extension[1:] for extension in _EXTENSIONS],
+        help="of results whose names -o does not say (default: npz)",
+    )
+    parser.add_argument(
+        "--channels",
+        type=_channels,
+        metavar="A,B",
+        help="the channels (from 1) that are the left and the right ear; 1,1 for mono (default: 1,2 of two)",
+    )
+    parser.add_argument(
+        "--topic", metavar="NAME", help="the port Audio in rosbags (default: /bass/Audio, or the only one)"
     )
     parser.add_argument(
         "--block",
@@ -64,9 +92,27 @@ def configure(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="files processed at the same time (default: as many as there are processor cores)",
     )
-    parser.add_argument("--force", action="store_true", help="replace outputs that -o does not name")
-    parser.add_argument("-q", "--quiet", action="store_true", help="say nothing unless something is wrong")
+    parser.add_argument(
+        "--dask",
+        metavar="ADDRESS|local",
+        help="send the files to the workers of the Dask scheduler at tcp://HOST:8786; local starts --jobs workers here",
+    )
+    kept = parser.add_mutually_exclusive_group()
+    kept.add_argument("--resume", action="store_true", help="go on: leave results that are complete as they are")
+    kept.add_argument("--force", action="store_true", help="replace results that -o does not name")
+    loud = parser.add_mutually_exclusive_group()
+    loud.add_argument("-v", "--verbose", action="store_true", help="a line for each file")
+    loud.add_argument("-q", "--quiet", action="store_true", help="say nothing unless something is wrong")
     parser.epilog = _epilog()
+
+
+def _channels(text: str) -> tuple[int, int]:
+    from rosafe.sound.audiofile import channel_pair
+
+    try:
+        return channel_pair(text)
+    except ValueError as problem:
+        raise argparse.ArgumentTypeError(f"{text!r} is not {problem}") from None
 
 
 def _count(text: str, maximum: float) -> int:
@@ -78,18 +124,23 @@ def _count(text: str, maximum: float) -> int:
 def _epilog() -> str:
     parts = [named for kind in KINDS.values() for named in kind.outputs.items()]
     lines = [
-        "The .npz holds, as rosafe.process returns them, of the outputs:",
+        "A file of results holds, as rosafe.process returns them and rosafe.load reads them, of the outputs:",
         *(f"  {name} ({', '.join(part.axes)}) {part.unit}".rstrip() for name, part in parts),
         "what lies along their axes:",
         *textwrap.wrap(_coordinates(), 100, initial_indent="  ", subsequent_indent="  "),
-        "and KIND_frameRate in Hz of those in frames. Besides: sample_rate in Hz, block_frames, and parameters, all of",
-        "them with their values as JSON.",
+        "KIND_time in s of each kind, and KIND_frameRate in Hz of those in frames. Besides: sample_rate in Hz,",
+        "block_frames, parameters (all of them with their values, as JSON), source (the name of the input),",
+        "rosafe_version, axes and units. A .csv holds one output of two axes.",
+        "",
+        "In a folder -o the results lie as the inputs do in theirs. What fails is named at the end and in failed.csv",
+        "there, and does not keep the others.",
         "",
         "exit status: 0 all done, 1 something failed (the other files are done), 2 wrong command line, 130 interrupted",
         "",
         "examples:",
         "  rosafe process speech.wav --outputs ild,ratemap --set fb_nChannels=64 ihc_method=bernstein",
-        "  rosafe process *.wav -o results/ --set fb_cfHz=500,1000,2000",
+        "  rosafe process speech.flac -o speech.h5 --set fb_cfHz=500,1000,2000",
+        "  rosafe process corpus -o results --resume",
         "",
         "parameters, with their defaults:",
     ]
@@ -132,84 +183,227 @@ def run(options: argparse.Namespace) -> int:
     inputs = [Path(name) for name in (*options.inputs, *options.more_inputs)]
     if not inputs:
         options.usage_error("no sound file is named")
-    targets, named = _targets(inputs, options.output)
-    try:
-        parameters = parameters_of(options.settings)
-        outputs = check_outputs(words(options.outputs))
-    except ValueError as problem:
-        raise Failure(str(problem)) from None
-    signals = Interrupts()
+    if options.dask is not None and not re.fullmatch(r"local|((tcp|tls)://)?[^/\s]+:\d{1,5}", options.dask):
+        options.usage_error(f"--dask {options.dask}: wanted is a scheduler, such as tcp://HOST:8786, or local")
+    folder, file = _place(inputs, options)
     # Once, for all processes that are forked from this one.
-    from rosafe.offline.files import process_file
+    from rosafe.offline.corpus import Settings, compute, find, named
+    from rosafe.offline.files import OUTPUTS
+    from rosafe.offline.formats import FORMATS, check_format, format_of
     from rosafe.output import OutputError
     from rosafe.sound.audiofile import AudioFileError
 
-    if len(inputs) > 1:
-        import scipy.signal  # noqa: F401
-
-    works = [
-        partial(process_file, source, target, parameters, options.block, outputs, named or options.force)
-        for source, target in zip(inputs, targets, strict=True)
-    ]
-    display = Display(sys.stderr, [_size(path) for path in inputs], options.quiet)
-    begun = time.monotonic()
-    failed = False
-
-    def report(index: int, told: Report) -> None:
-        nonlocal failed
-        if told.failure:
-            failed = True
-            text = told.failure if str(inputs[index]) in told.failure else f"{inputs[index]}: {told.failure}"
-            display.message(f"rosafe process: {text}")
-        elif told.last and not options.quiet:
-            seconds, size = told.result
-            passed = time.monotonic() - begun
-            display.message(
-                f"{inputs[index]} -> {targets[index]}: {seconds:.1f} s of sound, {bytes_text(size)}; "
-                f"{passed:.1f} s since the start"
-            )
-        display.update(index, 1.0 if told.last else told.part)
-
-    made = _make_folder(options.output)
     try:
-        run_together(works, options.jobs, (AudioFileError, OutputError, ValueError), report, signals)
-    except Interrupted:
-        display.message("rosafe process: interrupted; what was not finished is removed")
-        raise
-    finally:
-        display.clear()
-        if made and not any(made.iterdir()):
-            made.rmdir()
-    return 1 if failed else 0
-
-
-def _make_folder(output: str | None) -> Path | None:
-    """The folder for the outputs, if it is wanted and was not there; Failure where it cannot be made."""
-    if output is None or not output.endswith("/") or os.path.isdir(output):
-        return None
-    try:
-        os.mkdir(output)
-    except OSError as problem:
-        raise Failure(f"-o {output}: {problem.strerror}") from None
-    return Path(output)
-
-
-def _targets(inputs: list[Path], output: str | None) -> tuple[list[Path], bool]:
-    """Where the output of each input goes, and whether the user named that file; Failure where two go to one place."""
-    if output is None:
-        targets = [path.with_name(path.stem + ".npz") if path.name else path for path in inputs]
-    elif output.endswith("/") or os.path.isdir(output):
-        targets = [Path(output, path.stem + ".npz") for path in inputs]
-    elif len(inputs) == 1:
-        return [Path(output)], True
+        parameters = parameters_of(options.settings)
+        outputs = check_outputs(OUTPUTS if options.outputs is None else words(options.outputs))
+        form = FORMATS[f".{options.format or 'npz'}"] if file is None else format_of(file)
+        check_format(form, outputs)
+        if options.dask:
+            importlib.import_module("distributed")
+        items, problems = find(inputs, folder)
+        if file is not None:
+            targets = [file]
+        elif folder is not None:
+            targets = named(items, folder, form.extension)
+        else:
+            targets = named([item._replace(place=item.source) for item in items], Path(), form.extension)
+    except ValueError as problem:
+        raise Failure(str(problem)) from None
+    signals = Interrupts()
+    made = _make_folder(folder)
+    settings = Settings(
+        parameters,
+        outputs,
+        options.block,
+        options.channels,
+        options.topic,
+        options.force or (file is not None and not options.resume),
+        options.resume,
+        folder is not None,
+    )
+    sources = [item.source for item in items]
+    places: list[Path] = targets
+    if options.dask:  # workers have folders of their own
+        sources, places = ([Path(os.path.abspath(path)) for path in paths] for paths in (sources, targets))
     else:
-        raise Failure(f"-o {output}: for several files, wanted is a folder, ending in / or there already")
-    taken: dict[str, Path] = {}
-    for path, target in zip(inputs, targets, strict=True):
-        other = taken.setdefault(os.path.realpath(target), path)
-        if other is not path:
-            raise Failure(f"{other} and {path} would both go to {target}")
-    return targets, False
+        importlib.import_module("scipy.signal")
+    works = [partial(compute, source, place, settings) for source, place in zip(sources, places, strict=True)]
+    corpus = _Corpus([item.source for item in items], targets, options)
+    for path, why in problems:
+        corpus.fail(str(path), why)
+    try:
+        if works:
+            _runner(options, len(works))(
+                works, options.jobs, (AudioFileError, OutputError, ValueError), corpus.report, signals
+            )
+    except BaseException as problem:
+        corpus.display.clear()
+        if isinstance(problem, Interrupted):
+            left = "is left as .part, to be used up" if options.dask else "is removed"
+            again = "; --resume goes on" if folder is not None else ""
+            corpus.display.message(f"rosafe process: interrupted; what was not finished {left}{again}")
+        _remove_empty({target.parent for target in targets}, folder, made)
+        raise
+    corpus.display.clear()
+    corpus.end(folder, inputs)
+    _remove_empty({target.parent for target in targets}, folder, made)
+    return 1 if corpus.failed else 0
+
+
+def _runner(options: argparse.Namespace, count: int) -> Any:
+    if options.dask:
+        from rosafe.commands._cluster import run_on
+
+        return partial(run_on, options.dask)
+    if count > 1:  # the cores have a process each, and its tree needs no more of them
+        from rosafe.tree.workers import VARIABLE
+
+        cores = len(os.sched_getaffinity(0))
+        os.environ.setdefault(VARIABLE, str(max(1, cores // min(options.jobs, count))))
+    return run_together
+
+
+def _place(inputs: list[Path], options: argparse.Namespace) -> tuple[Path | None, Path | None]:
+    """The folder for the results, or the file for the one; Failure where it can be neither."""
+    out = options.to
+    one = len(inputs) == 1 and not inputs[0].is_dir()
+    if out is None:
+        for path in inputs:
+            if path.is_dir():
+                raise Failure(f"{path} is a folder: name one for its results with -o")
+        return None, None
+    if out == "":
+        options.usage_error("-o wants a name")
+    extension = os.path.splitext(out)[1].lower()
+    if out.endswith("/") or (os.path.isdir(out) and not (one and extension == ".zarr")):
+        return Path(out), None
+    if one:
+        if extension not in _EXTENSIONS:
+            raise Failure(f"-o {out}: results end in {', '.join(_EXTENSIONS)}; the name of a folder ends in /")
+        if options.format and extension != f".{options.format}":
+            options.usage_error(f"-o {out} and --format {options.format} are different formats")
+        return None, Path(out)
+    if extension:
+        raise Failure(f"-o {out}: for several files, wanted is a folder, ending in / or there already")
+    return Path(out), None
+
+
+def _make_folder(folder: Path | None) -> Path | None:
+    """Make the folder for the results; the topmost one that was not there. Failure where it cannot be made."""
+    if folder is None or folder.is_dir():
+        return None
+    new = folder
+    while not os.path.lexists(new.parent):
+        new = new.parent
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as problem:
+        raise Failure(f"-o {folder}: {problem.strerror}") from None
+    return new
+
+
+def _remove_empty(parents: set[Path], folder: Path | None, made: Path | None) -> None:
+    """Folders for results that are empty, all having failed; of those that were there before, none."""
+    if folder is None:
+        return
+    for path in sorted(parents, key=lambda path: len(path.parts), reverse=True):
+        while path != folder and folder in path.parents:
+            with contextlib.suppress(OSError):
+                path.rmdir()
+            path = path.parent
+    while made is not None and (folder == made or made in folder.parents):
+        try:
+            folder.rmdir()
+        except OSError:
+            return
+        folder = folder.parent
+
+
+class _Corpus:
+    """What is said of all files together, on the way and at the end."""
+
+    def __init__(self, sources: Sequence[Path], targets: Sequence[Path], options: argparse.Namespace) -> None:
+        self.display = Display(sys.stderr, [_size(path) for path in sources], options.quiet)
+        self.failed: dict[str, str] = {}
+        self._sources, self._targets, self._options = sources, targets, options
+        self._begun = time.monotonic()
+        self._done = self._skipped = self._size = self._odd = 0
+        self._seconds = 0.0
+
+    def fail(self, name: str, why: str) -> None:
+        """Note that a file has failed."""
+        text = why if name in why else f"{name}: {why}"
+        self.failed[name] = _one_line(text)
+
+    def report(self, index: int, told: Report) -> None:
+        """How a file stands."""
+        source, target = self._sources[index], self._targets[index]
+        if told.failure:
+            self.fail(str(source), told.failure.replace("--force replaces", "--resume leaves it, --force replaces"))
+        elif told.last:
+            self._note(source, target, told.result)
+        skipped = told.last and not told.failure and told.result.skipped
+        self.display.update(index, 1.0 if told.last else told.part, told.last, skipped)
+
+    def _note(self, source: Path, target: Path, done: Any) -> None:
+        if done.skipped:
+            self._skipped += 1
+            text = f"{source} -> {target}: complete already"
+        else:
+            self._done += 1
+            self._seconds += done.seconds
+            self._size += done.size
+            self._odd += done.not_finite > 0
+            text = f"{source} -> {target}: {done.seconds:.1f} s of sound, {bytes_text(done.size)}"
+            if done.not_finite:
+                text += f"; {done.not_finite} samples that were NaN or infinite are silence or full scale"
+        if self._options.verbose or (len(self._sources) == 1 and not self._options.quiet):
+            kept = "" if self._options.outputs or done.skipped else "; ild, ratemap, crossCorrelation (see --outputs)"
+            self.display.message(_one_line(text + kept))
+
+    def end(self, folder: Path | None, inputs: Sequence[Path]) -> None:
+        """The sum, what has failed, and where all of that is listed."""
+        if len(self._sources) > 1 and not self._options.quiet:
+            self.display.message(self._summary())
+        order = {str(source): index for index, source in enumerate(self._sources)}
+        self.failed = dict(sorted(self.failed.items(), key=lambda one: order.get(one[0], -1)))
+        shown = list(self.failed.values())
+        listed = False
+        if folder is not None:
+            from rosafe.offline.corpus import FAILED, write_failed
+            from rosafe.output import OutputError
+
+            try:
+                if folder.is_dir():
+                    write_failed(folder, [*self._sources, *inputs], self.failed)
+                    listed = bool(self.failed)
+            except (OutputError, OSError) as problem:
+                shown.append(str(problem))
+                self.failed[str(folder)] = str(problem)
+        many = listed and len(shown) > _NAMED
+        for text in shown[: _NAMED if many else None]:
+            self.display.message(f"rosafe process: {text}")
+        if many:
+            self.display.message(f"rosafe process: and {len(shown) - _NAMED} more, in {folder}/{FAILED}")
+
+    def _summary(self) -> str:
+        counts = [f"{self._done} done"]
+        counts += [f"{self._skipped} complete already"] if self._skipped else []
+        counts += [f"{len(self.failed)} failed"] if self.failed else []
+        passed = time.monotonic() - self._begun
+        text = f"{len(self._sources)} files: {', '.join(counts)}"
+        if self._done:
+            text += f"; {self._seconds:.1f} s of sound, {bytes_text(self._size)}, in {passed:.1f} s"
+            if not self._options.outputs:
+                text += "; ild, ratemap, crossCorrelation (see --outputs)"
+        if self._odd:
+            text += f"; {self._odd} with NaN or infinite samples, which are silence or full scale"
+        return text
+
+
+def _one_line(text: str) -> str:
+    """Without what would end the line, or do something to the terminal: names may hold anything."""
+    return "".join(c if c.isprintable() or "\udc80" <= c <= "\udcff" else repr(c)[1:-1] for c in text)
 
 
 def _size(path: Path) -> float:

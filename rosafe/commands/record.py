@@ -8,6 +8,7 @@ is silence in its place, and reported. Ctrl-C ends it, with a file that is compl
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import sys
 import threading
@@ -22,6 +23,7 @@ from rosafe.interface import ComponentError
 from rosafe.output import PART, OutputError, Part
 
 if TYPE_CHECKING:
+    from rosafe.bass.recording.levels import Levels
     from rosafe.bass.recording.outputs import Output
     from rosafe.bass.recording.recorder import SoundRecorder
     from rosafe.bass.sources import SoundSource
@@ -30,6 +32,8 @@ _TOPIC = "/bass/Audio"
 _EARS = ("left", "right")
 _RATE = 44100  # of a device without a rate of its own
 _MAX_SECONDS = 1e7
+_CALIBRATION_SECONDS = 5.0
+_DIFFERENCE = 1.0  # dB between the ears, from where on one value is not for both
 
 # --- the command line -------------------------------------------------------------------------------------------
 
@@ -39,6 +43,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.usage = (
         "rosafe record [OUT.wav|OUT.bag] [--device NAME | --topic NAME | --socket HOST:PORT]\n"
         "                     [--rate HZ] [--seconds S] [--chunk N] [--force] [--quiet]\n"
+        "       rosafe record --calibrate SPL [--device NAME] [--seconds S]\n"
         "       rosafe record --list"
     )
     parser.add_argument("output", nargs="?", metavar="OUT", help="file to write, ending in .wav or .bag")
@@ -47,6 +52,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
     source.add_argument("--topic", metavar="NAME", help=f"the port Audio to listen to (default: {_TOPIC})")
     source.add_argument(
         "--socket", type=_address, metavar="HOST:PORT", help="ask a bass's DedicatedSocket; needs --rate"
+    )
+    parser.add_argument(
+        "--calibrate",
+        type=_spl,
+        metavar="SPL",
+        help="a calibrator of so many dB SPL is on a microphone, usually 94: say which pp_refSPLdB fits (after 5 s)",
     )
     parser.add_argument("--list", action="store_true", help="say which devices there are, and end")
     parser.add_argument(
@@ -73,7 +84,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "examples:\n"
         "  rosafe record --device plughw:1,0              # check the levels of a sound card\n"
         "  rosafe record speech.wav --device plughw:1,0   # until Ctrl-C\n"
-        "  rosafe record speech.bag --seconds 60          # what a running bass captures"
+        "  rosafe record speech.bag --seconds 60          # what a running bass captures\n"
+        "  rosafe record --calibrate 94 --device plughw:1,0"
     )
 
 
@@ -93,6 +105,16 @@ def _seconds(text: str) -> float:
         value = 0.0
     if not 0 < value <= _MAX_SECONDS:
         raise argparse.ArgumentTypeError(f"{text!r} is not a number of seconds above 0, up to {_MAX_SECONDS:.0f}")
+    return value
+
+
+def _spl(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 <= value <= 200:
+        raise argparse.ArgumentTypeError(f"{text!r} is not a level from 0 to 200 dB SPL, such as 94")
     return value
 
 
@@ -149,6 +171,8 @@ def _check(options: argparse.Namespace) -> Path | None:
     """Complete the options, and say where the output goes; Failure, or a usage error, where that cannot be."""
     if options.socket and not options.rate:
         options.usage_error("--socket needs --rate: the protocol does not tell the sample rate")
+    if options.calibrate is not None:
+        options.seconds = options.seconds or _CALIBRATION_SECONDS
     if options.chunk is None:
         options.chunk = max(1, (options.rate or _RATE) // 20)
     if "" in (options.device, options.topic):
@@ -217,7 +241,25 @@ def _record(path: Path | None, options: argparse.Namespace, stopping: threading.
                 meter.message(_summary(recorder, str(path or "heard"), source.sample_rate))
         if ended:
             meter.message(f"{source.name} has ended")
+    if options.calibrate is not None:
+        _tell_reference(options.calibrate, recorder.levels)
     return 0
+
+
+def _tell_reference(spl: float, levels: Levels) -> None:
+    """Say which level of reference makes the louder ear right; Failure where what was heard cannot tell."""
+    from rosafe.bass.recording.levels import SILENCE, reference
+
+    if any(levels.clipped):
+        raise Failure("the sound was clipped: turn the microphone down, and begin anew")
+    heard = [levels.rms(ear) for ear in range(2)]
+    if max(heard) == SILENCE:
+        raise Failure("there was only silence: is the calibrator on, and the device the right one?")
+    wanted = [reference(spl, level) for level in heard]
+    print(f"pp_refSPLdB={max(wanted):.2f}")
+    if abs(wanted[0] - wanted[1]) > _DIFFERENCE:
+        ears = ", ".join(f"{ear} {value:.2f}" for ear, value in zip(_EARS, wanted, strict=True))
+        print(f"rosafe record: the ears differ ({ears}); this is for the louder one", file=sys.stderr)
 
 
 @contextmanager

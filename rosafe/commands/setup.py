@@ -11,6 +11,7 @@ import argparse
 import asyncio
 import os
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -23,10 +24,20 @@ from rosafe.setups import Setup, SetupError, read, write
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
-    parser.usage = "rosafe setup save|load FILE.yaml [--full] [--wait SECONDS] [-i INSTANCE]\n       rosafe setup -h"
+    parser.usage = (
+        "rosafe setup save FILE.yaml [--full] [--wait SECONDS] [-i INSTANCE]\n"
+        "       rosafe setup load FILE.yaml [--keep FILE] [--wait SECONDS] [-i INSTANCE]\n"
+        "       rosafe setup -h"
+    )
     parser.add_argument("action", choices=("save", "load"), help="what to do")
     parser.add_argument("file", metavar="FILE.yaml", help="the setup; - is the standard output or input")
     parser.add_argument("--full", action="store_true", help="save: write what has its default value, too")
+    parser.add_argument(
+        "--keep",
+        metavar="FILE",
+        default="",
+        help="load: where FILE, in which the node keeps its tree, holds processors, load no others, but sound alone",
+    )
     parser.add_argument(
         "--wait",
         type=_seconds,
@@ -64,7 +75,9 @@ def run(options: argparse.Namespace) -> int:
     """Save or load."""
     if options.full and options.action == "load":
         options.usage_error("--full is for save")
-    setup = read_file(options.file) if options.action == "load" else None
+    if options.keep and options.action == "save":
+        options.usage_error("--keep is for load")
+    setup = beside(read_file(options.file), options.keep) if options.action == "load" else None
     prepare(options.wait)
     if setup is not None:
         show(asyncio.run(load(setup, options.instance, options.wait)))
@@ -88,6 +101,13 @@ def read_file(name: str) -> Setup:
         raise Failure(f"{name}: {problem.strerror or problem}") from None
     except SetupError as problem:
         raise Failure(f"{name}, {problem}") from None
+
+
+def beside(setup: Setup, keep: str) -> Setup:
+    """What is to be loaded of `setup` for a node that keeps its tree in the file `keep`: that comes back by itself."""
+    if keep and Path(keep).exists() and read_file(keep).processors:
+        return replace(setup, processors=())
+    return setup
 
 
 async def load(setup: Setup, instance: str, wait: float = 0.0) -> dict[str, Any]:

@@ -157,6 +157,9 @@ def _build_share(found: Sources, source: Path, share: Path) -> None:
             (share / "msg" / f"{name}.msg").write_text(text, "utf-8")
     shutil.copyfile(source / "package.xml", share / "package.xml")
     (share / "scripts").symlink_to(found.executables)  # where rosrun looks for them
+    for name in ("launch", "setups"):
+        if (source / name).is_dir():
+            (share / name).symlink_to(source / name)
 
 
 def _build_python(package: str, share: Path, python: Path, search: dict[str, list[str]]) -> None:

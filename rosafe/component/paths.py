@@ -22,6 +22,13 @@ def install_prefix() -> Path:
     return CODE_DIR.parents[2]
 
 
+def program(name: str) -> str:
+    """One of our commands, beside this code; its bare name, for PATH to find, where it is not there."""
+    root = source_root()
+    place = (root / "scripts" if root is not None else install_prefix() / "bin") / name
+    return str(place) if place.is_file() else name
+
+
 def put_ahead(directory: Path) -> None:
     """Make `directory` the first place that Python imports from."""
     entry = str(directory)

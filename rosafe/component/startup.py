@@ -234,6 +234,11 @@ def _await_master(uri: str, received: list[int], patient: str) -> None:
         time.sleep(0.1)
 
 
+def without_names(arguments: list[str]) -> list[str]:
+    """The command line of a program that is no node, less what roslaunch adds for nodes, such as ``__name:=...``."""
+    return [word for word in arguments if not re.match(r"__\w+:=", word)]
+
+
 def become_node(name: str) -> None:
     """Make this process a node of the graph; MasterError where there is no master, GenerationError without messages."""
     import rospy

@@ -60,11 +60,11 @@ class Children:
         self._all.append(child)
         return child
 
-    def close(self) -> None:
-        """End all that still run: gently, then by force."""
+    def close(self, seconds: float = END_SECONDS) -> None:
+        """End all that still run: gently, and by force after so many seconds."""
         for child in self._all:
             _signal_group(child, signal.SIGTERM)
-        deadline = time.monotonic() + END_SECONDS
+        deadline = time.monotonic() + seconds
         for child in self._all:
             try:
                 child.process.wait(max(0.0, deadline - time.monotonic()))

@@ -160,8 +160,6 @@ class FramedStage(Stage):
 
     PREFIX: ClassVar[str]  # of the three parameters of `frame_parameters`
 
-    _begun: kernels.Sums | None  # over what is held, where a kernel has made them
-
     def __init__(self, given: Signal | float, **parameters: Any) -> None:
         self._buffer = FrameBuffer()
         super().__init__(given, **parameters)
@@ -195,11 +193,9 @@ class FramedStage(Stage):
 
     def reset(self) -> None:
         self._buffer = FrameBuffer()
-        self._begun = None
 
     def _means(self, samples: FloatArray, squared: bool) -> FloatArray:
         """`Framing.means` of the frames that `samples` (*rows, N) complete, (*rows, F), by numpy."""
-        self._begun = None
         means = self._framing.means(self._buffer.append(samples), squared)
         self._buffer.drop(means.shape[-1] * self._framing.hop)
         return means
@@ -211,8 +207,6 @@ class FramedStage(Stage):
         """
         arriving, hop = block.shape[-1], self._framing.hop
         self._buffer.begin(block.shape[:-1] if rows is None else rows)
-        if self._buffer.held == 0:
-            self._begun = None
         skip = self._buffer.skip
         count = self._framing.complete(self._buffer.held + arriving - skip)
         history, room = self._buffer.advance(arriving, count * hop)
@@ -220,4 +214,3 @@ class FramedStage(Stage):
 
     def _build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
         self._framing = Framing.design(self.given.rate, self.PREFIX, values)
-        self._begun = None

@@ -84,6 +84,14 @@ class Stage:
         return dict(values)
 
     @classmethod
+    def at_rate(cls, values: Mapping[str, Any], given: Collection[str], sample_rate: float) -> dict[str, Any]:
+        """`values`, where the defaults of those not `given` that follow the sample rate (Hz) are what it makes of them.
+
+        These parameters are declared with `follows_rate`.
+        """
+        return dict(values)
+
+    @classmethod
     def asked(cls, values: Mapping[str, Any]) -> dict[str, Any]:
         """`values` as a request may hold them, without what only `in_force` tells: so one can be made like another."""
         return dict(values)

@@ -13,7 +13,7 @@ import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
 
-from rosafe.component import generate, master, startup
+from rosafe.component import generate, master, startup, systemd
 from rosafe.genomix.access import own_names
 from rosafe.genomix.graph import Graph
 from rosafe.genomix.server import Server
@@ -27,7 +27,7 @@ THREADS = 16  # that wait for rospy
 
 def main(argv: list[str] | None = None) -> int:
     """Run genomixd until a signal ends it; the exit code."""
-    options = _parse(sys.argv[1:] if argv is None else argv)
+    options = _parse(startup.without_names(sys.argv[1:] if argv is None else argv))
     _log_to_stderr(2 if options.debug else min(options.verbose, 2))
     told = startup.Background() if options.background else None
     if told is not None and told.in_parent:
@@ -109,13 +109,25 @@ async def _serve(options: argparse.Namespace, told: startup.Background | None) -
             threading.Thread(target=_wait_for_eof, args=(loop, end), daemon=True).start()
         if told is not None:
             told.up()
+        systemd.notify("READY=1")
+        feeding = asyncio.create_task(_feed_watchdog())
         waits = [asyncio.create_task(event.wait()) for event in (end, graph.gone)]
         await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
+        feeding.cancel()
+        systemd.notify("STOPPING=1")
     finally:
         startup.watchdog(startup.END_SECONDS, 0)
         await server.close()
         await graph.close()
     return 0
+
+
+async def _feed_watchdog() -> None:
+    """Tell systemd that requests have their turn, if it asks for that."""
+    seconds = systemd.watchdog_seconds()
+    while seconds is not None:
+        systemd.notify("WATCHDOG=1")
+        await asyncio.sleep(seconds / 3)
 
 
 def _wait_for_eof(loop: asyncio.AbstractEventLoop, end: asyncio.Event) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import re
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -64,7 +65,9 @@ def complete(service: Service, given: Any) -> dict[str, Any]:
     """
     values = _converted(service, _named(service, given))
     _require(service, values)
-    return service.completed(values)
+    # What follows the sample rate is the component's to choose: no number asks it to.
+    known = service.completed(values)
+    return {p.name: known.get(p.name, math.nan) for p in service.parameters}
 
 
 def partial(given: Any) -> dict[str, Any]:

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 from rosafe.interface import FIXED, KINDS, Parameter
 from rosafe.vocabulary.parameter import shown
+from rosafe.vocabulary.words import meant
 
 _BY_NAME = {name: p for kind in KINDS.values() for p in kind.parameters for name in (p.name, *p.aliases)}
 _BY_FORMER_NAME = {name: p for kind in KINDS.values() for p in kind.parameters for name in p.former}
@@ -48,9 +48,8 @@ def _parameter(name: Any) -> Parameter:
 
 def _suggestion(name: Any, known: Sequence[str]) -> str:
     """What may have been meant, or all that there is."""
-    spelt = {word.lower(): word for word in known}
-    near = difflib.get_close_matches(name.lower(), spelt, 1) if isinstance(name, str) else []
-    return f"did you mean {spelt[near[0]]}?" if near else f"there are: {', '.join(known)}"
+    hint = meant(name, known) if isinstance(name, str) else ""
+    return hint.removeprefix("; ") or f"there are: {', '.join(known)}"
 
 
 def check_outputs(outputs: Any) -> list[str]:

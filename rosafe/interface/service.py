@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -46,22 +47,28 @@ class Service:
         raise KeyError(name)
 
     def completed(self, given: Mapping[str, Any]) -> dict[str, Any]:
-        """All values, in the order of declaration: those `given`, and the defaults of the others."""
-        return {p.name: given.get(p.name, p.default) for p in self.parameters}
+        """All values, in the order of declaration: those `given`, and the defaults of the others.
+
+        Without those that follow the sample rate and are not given.
+        """
+        known = (p for p in self.parameters if p.name in given or not p.follows_rate)
+        return {p.name: given.get(p.name, p.default) for p in known}
 
     def from_ros(self, request: Any, literal: bool = False) -> dict[str, Any]:
         """The values of a ROS request or goal, not yet checked; 0, "" and [] there stand for the default.
 
-        A client that knows the defaults, and has filled them in, means all `literal`.
+        A client that knows the defaults, and has filled them in, means all `literal`; for what follows the sample rate
+        it has none, and says so with NaN.
         """
         values = {p.name: getattr(request, p.name) for p in self.parameters}
         if literal:
-            return values
+            unknown = [p.name for p in self.parameters if p.follows_rate and math.isnan(values[p.name])]
+            return {name: value for name, value in values.items() if name not in unknown}
         return self.completed({p.name: values[p.name] for p in self.parameters if not _unset(p, values[p.name])})
 
     def check(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """All values as their parameters' Python types, or ValueError naming the first that is refused."""
-        return {p.name: p.check(p.known_word(values[p.name])) for p in self.parameters}
+        return {p.name: p.check(p.known_word(values[p.name])) for p in self.parameters if p.name in values}
 
 
 @dataclass(frozen=True)

@@ -35,6 +35,7 @@ from rosafe.tree.block import Block
 from rosafe.tree.processor import Processor
 from rosafe.tree.requests import Found
 from rosafe.tree.tree import Tree
+from rosafe.tree.workers import workers_to_use
 from rosafe.vocabulary.parameter import MAX_STRING, shown
 
 FIRST_AUDIO_SECONDS = 1.0  # how long InputProc waits for a first message
@@ -67,7 +68,7 @@ class RosafeNode:
             rospy.logwarn(f"a representation is left out: {problem}")
         self._node = ComponentNode(ROSAFE, lambda problem: ROSAFE.error("e_badNewValue", what=str(problem)))
         self.finished = self._node.finished
-        self._tree = Tree(self)
+        self._tree = Tree(self, _workers())
         self._words = UnknownWords(strict)
         self._ring = AudioRing(EventLog(rospy.logwarn))
         self._audio: rospy.Subscriber | None = None
@@ -254,7 +255,7 @@ class RosafeNode:
 
     def _handler(self, kind: Representation) -> Handler:
         def handle(activity: Activity, values: dict[str, Any]) -> None:
-            asked = STAGES[kind.kind].asked({p.name: values[p.name] for p in kind.parameters})
+            asked = STAGES[kind.kind].asked({p.name: values[p.name] for p in kind.parameters if p.name in values})
             doubts: dict[str, str] = {}
             take = self._words.taking(doubts)
             parameters = {p.name: take(p, asked[p.name]) for p in kind.parameters if p.name in asked}
@@ -391,6 +392,7 @@ class RosafeNode:
             status.summary(DiagnosticStatus.OK, f"{len(processors)} processors")
         for doubt in doubts:
             status.add("unknown word", doubt)
+        status.add("workers", str(self._tree.workers))
         for processor in processors:
             meter = self._loads.get(processor)
             load = 1e3 * meter.snapshot()["load"]["last"] if meter is not None else 0.0
@@ -412,6 +414,18 @@ class RosafeNode:
 def _keeper(path: str, describe: Callable[[], Setup]) -> Keeper | None:
     path = path or str(rospy.get_param("~keep", ""))
     return Keeper(Path(os.path.expanduser(path)).absolute(), describe, rospy.logerr) if path else None
+
+
+def _workers() -> int:
+    """How many workers: what the private parameter `workers` says, else the environment, else one for each core."""
+    wanted = rospy.get_param("~workers", None)
+    if isinstance(wanted, bool) or not isinstance(wanted, int | str | None):
+        wanted = str(wanted)
+    try:
+        return workers_to_use(wanted)
+    except ValueError as problem:
+        where = "" if wanted is None else f"the parameter {rospy.resolve_name('~workers')}: "
+        raise ROSAFE.error("e_badNewValue", what=f"{where}{problem}") from None
 
 
 def main(argv: list[str] | None = None) -> int:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from rosafe.interface import KINDS, ComponentError
+from rosafe.offline.signals import frame_times
 from rosafe.tree import sizes
 from rosafe.tree.block import Block
 from rosafe.tree.processor import Observer, Processor
@@ -118,18 +119,18 @@ class Chain:
         self._derived: dict[int, dict[str, Any]] = {}  # from parameters, from which block on
         try:
             with _as_value_error():
-                self._build(_needed(outputs), parameters)
+                self._build(needed(outputs), parameters)
         except BaseException:
             self.close()
             raise
         self._remember(0)
 
-    def _build(self, needed: set[str], values: Mapping[str, Any]) -> None:
+    def _build(self, kinds: list[str], values: Mapping[str, Any]) -> None:
         for kind in KINDS.values():  # parents come first in the table
             mine = {p.name: values[p.name] for p in kind.parameters if p.name in values}
             if not kind.parent:
                 self._processors[kind.kind] = self._tree.add_input(kind.kind, self._source, 0, 0.0, 0.0, mine)
-            elif kind.kind in needed:
+            elif kind.kind in kinds:
                 self._processors[kind.kind] = self._tree.add(kind.kind, kind.kind, kind.parent, mine)
 
     def schedule(self, block: int, name: str, value: Any) -> None:
@@ -142,8 +143,12 @@ class Chain:
         self._derived[block] = {k: v for p in self._processors.values() for k, v in p.derived().items()}
 
     def write_into(self, kind: str, place: Callable[[int], np.ndarray | None]) -> None:
-        """Let the stage of a `kind` that nothing hangs on write where `place` says for so many frames, if it can."""
-        self._processors[kind].place = place
+        """Let the stage of a `kind` that nothing hangs on write where `place` says for so many frames, if it can.
+
+        Stages that put out frames cannot, and are not asked.
+        """
+        if not self._processors[kind].signal.framed:
+            self._processors[kind].place = place
 
     def observe(self, observer: Observer) -> None:
         """Tell `observer` of every state that a processor enters."""
@@ -182,6 +187,11 @@ class Chain:
         """How many frames it puts out for so many of the signal."""
         return processor.stage.complete(frames if processor.parent is None else self._count(processor.parent, frames))
 
+    def times(self, kind: str, frames: int) -> np.ndarray:
+        """The middle of each frame of an output (s), for a signal of so many frames."""
+        processor = self._processors[kind]
+        return frame_times(processor.signal, 0, self._count(processor, frames))
+
     def largest_block(self, frames: int) -> tuple[str, int]:
         """Which processor puts out most for one block of so many frames, and how many bytes that can be."""
         seconds = frames / self.sample_rate
@@ -208,14 +218,14 @@ class Chain:
         return described
 
 
-def _needed(outputs: Iterable[str]) -> set[str]:
-    """The processors to run for `outputs`."""
-    needed = {kind.kind for kind in KINDS.values() if not kind.parent}
+def needed(outputs: Iterable[str]) -> list[str]:
+    """The kinds of processors to run for `outputs`, parents first."""
+    wanted = {kind.kind for kind in KINDS.values() if not kind.parent}
     for kind in outputs:
         while kind:
-            needed.add(kind)
+            wanted.add(kind)
             kind = KINDS[kind].parent
-    return needed
+    return [kind for kind in KINDS if kind in wanted]
 
 
 @contextmanager

@@ -1,31 +1,44 @@
-"""`process_file`: a sound file of any length to an .npz, in memory that does not grow with it."""
+"""`process_file`: a sound file of any length to a file of results, in memory that does not grow with it."""
 
 from __future__ import annotations
 
-import json
 import os
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, closing
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from rosafe.interface import KINDS
 from rosafe.interface.arguments import check_outputs, check_parameters
 from rosafe.offline.chain import Chain
-from rosafe.offline.npz import NpzWriter
+from rosafe.offline.contents import Contents
+from rosafe.offline.formats import Format, check_format, format_of, read
 from rosafe.offline.process import DEFAULT_BLOCK
-from rosafe.output import OutputError, new_file
-from rosafe.sound.audiofile import AudioFile, AudioFileError
+from rosafe.offline.sounds import Sound, open_sound
+from rosafe.output import OutputError, new_folder, new_path
+from rosafe.sound.audiofile import AudioFileError
 from rosafe.tree import sizes
 from rosafe.tree.block import Block
+from rosafe.version import VERSION
 
+OUTPUTS = ("ild", "ratemap", "crossCorrelation")  # by default: those of the original that are in frames
 _TOO_LARGE = (
     "one block of output would take {taken:.1f} GB, allowed are {limit:.1f} GB; "
     "take fewer channels or lags, or a smaller --block"
 )
-_DEFAULTS = {parameter.name: parameter.default for kind in KINDS.values() for parameter in kind.parameters}
+_DEFAULTS = {p.name: p.default for kind in KINDS.values() for p in kind.parameters if not p.follows_rate}
+
+
+class Done(NamedTuple):
+    """What came of a file."""
+
+    seconds: float  # of sound
+    size: int  # of the output, in bytes
+    skipped: bool = False  # it was complete already
+    not_finite: int = 0  # samples that were NaN or infinite
 
 
 def process_file(
@@ -36,63 +49,118 @@ def process_file(
     outputs: Sequence[str] | None = None,
     replace: bool = False,
     progress: Callable[[int, int], None] = lambda done, frames: None,
-) -> tuple[float, int]:
-    """Compute the auditory representations of a sound file, block by block, as they come into an .npz.
+    *,
+    channels: tuple[int, int] | None = None,
+    topic: str | None = None,
+    resume: bool = False,
+) -> Done:
+    """Compute the auditory representations of a sound file, block by block, as they come into a file.
 
     The numbers are those of `rosafe.process` on the file's int32 samples, and of the node on the same samples and
-    blocks, bit for bit. The .npz holds what that returns, and `sample_rate` (Hz), `block_frames` and `parameters` (all
-    of them with their values, as a JSON object that `rosafe.process` takes).
+    blocks, bit for bit. The file holds what `rosafe.load` returns.
     Nothing of the name `target` is there before it is complete.
 
     Parameters
     ----------
     source : path
-        Sound file of two channels, left and right ear.
+        Sound file of two channels, left and right ear, or a rosbag (.bag).
     target : path
-        The .npz; where it exists it is left alone, unless `replace`.
+        The file of results; the end of its name (.npz, .h5, .mat, .zarr, .csv) is the format. Where it exists it is
+        left alone, unless `replace`.
     parameters, outputs
-        As of `rosafe.process`; `in_doNormalize` is True by default.
+        As of `rosafe.process`, but that `ild`, `ratemap` and `crossCorrelation` are the default; `in_doNormalize` is
+        True by default.
     block_frames : int
         Frames that are read and processed at a time; the output for them takes at most 1 GiB.
     progress : callable
         Called now and then with the frames that are done and those that there are. What it raises ends the work.
+    channels : tuple of two int, optional
+        Which channels of the file (from 1) are the left and the right ear; ``(1, 1)`` for mono.
+    topic : str, optional
+        The port Audio in a bag; /bass/Audio by default, or the only one.
+    resume : bool
+        Leave `target` alone where it is complete already, and replace it where it is damaged.
 
     Returns
     -------
-    tuple
-        Seconds of sound and bytes of output.
+    Done
+        Seconds of sound and bytes of output, and whether it was there already.
 
     Raises
     ------
     AudioFileError
         The file cannot be read, or has not two channels.
     ValueError
-        Parameters or outputs that cannot be, for this file's sample rate or at all.
+        Parameters or outputs that cannot be, for this file's sample rate or at all, or for this format.
     OutputError
-        The output is there already, or there is no room for it, or it cannot be written.
+        The output is there already, or (with `resume`) was made otherwise, or there is no room for it, or it cannot be
+        written.
     """
-    values, wanted = check_parameters(parameters), check_outputs(outputs)
-    file = AudioFile(source)
-    try:
-        if os.path.exists(target) and os.path.samefile(file.path, target):
+    values, wanted = check_parameters(parameters), check_outputs(OUTPUTS if outputs is None else outputs)
+    form = format_of(target)
+    check_format(form, wanted)
+    about: dict[str, Any] = {
+        "rosafe_version": VERSION,
+        "source": os.fsencode(os.path.basename(source)).decode("utf-8", "replace"),
+        "block_frames": block_frames,
+        "parameters": {**_DEFAULTS, **values},
+        **({"channels": list(channels)} if channels else {}),
+        **({"topic": topic} if topic else {}),
+    }
+    if resume and os.path.lexists(target):
+        if _complete(form, Path(target), about, wanted):
+            return Done(0.0, 0, True)
+        replace = True
+    with closing(open_sound(source, channels, topic)) as sound:
+        if os.path.exists(target) and os.path.samefile(sound.path, target):
             raise OutputError(f"{target} is the input itself")
-        if file.channels != 2:
-            kind = "is mono (one channel)" if file.channels == 1 else f"has {file.channels} channels"
-            raise AudioFileError(f"{file.path} {kind}; wanted are two: left and right ear")
-        with new_file(target, replace) as descriptor:
-            return _stream(file, descriptor, values, block_frames, wanted, progress)
-    finally:
-        file.close()
+        place: AbstractContextManager[Path] = (
+            new_folder(target, replace, form.folder) if form.folder else new_path(target, replace)
+        )
+        with place as path:
+            try:
+                _stream(sound, path, form, about, values, wanted, progress)
+            except RuntimeError as problem:  # so h5py says that it cannot write
+                raise OutputError(f"cannot write {target}: {str(problem).partition(chr(10))[0]}") from None
+            size = sum(part.stat().st_size for part in path.rglob("*")) if form.folder else path.stat().st_size
+        return Done(sound.frames / sound.sample_rate, size, False, sound.not_finite)
+
+
+def _complete(form: Format, target: Path, about: Mapping[str, Any], wanted: Sequence[str]) -> bool:
+    """Whether the output is there and whole; OutputError where it is something else."""
+    try:
+        there = read(form, target, arrays=False)
+    except ValueError:
+        if form.is_one(target):
+            return False
+        raise OutputError(f"{target} is no result of rosafe process; --force replaces it") from None
+    except OSError as problem:
+        raise OutputError(f"{target}: {problem.strerror or problem}") from None
+    names = {name for kind in wanted for name in KINDS[kind].outputs}
+    other = [name for name in about if there.get(name) != _as_read(about[name])]
+    other += [name for name in ("channels", "topic") if name in there and name not in about]
+    other += ["outputs"] if set(there["axes"]) != names else []
+    if other:
+        raise OutputError(f"{target} was made with other {other[0]}; take another -o, or --force computes it again")
+    return True
+
+
+def _as_read(value: Any) -> Any:
+    """As it comes back from a file: tuples are lists."""
+    if isinstance(value, Mapping):
+        return {name: _as_read(one) for name, one in value.items()}
+    return list(value) if isinstance(value, tuple) else value
 
 
 def _stream(
-    file: AudioFile,
-    descriptor: int,
+    sound: Sound,
+    path: Path,
+    form: Format,
+    about: Mapping[str, Any],
     values: Mapping[str, Any],
-    block_frames: int,
     wanted: list[str],
     progress: Callable[[int, int], None],
-) -> tuple[float, int]:
+) -> None:
     done = dict.fromkeys(wanted, 0)
     telling = threading.Lock()
 
@@ -101,39 +169,46 @@ def _stream(
             writer.append(name, data)
         with telling:
             done[kind] = block.next_index
-            progress(min(done.values()), file.frames)
+            progress(min(done.values()), sound.frames)
 
-    with Chain(_blocks(file, block_frames), file.sample_rate, values, wanted, keep) as chain:
-        kind, taken = chain.largest_block(min(block_frames, file.frames))
+    block_frames = about["block_frames"]
+    with Chain(_blocks(sound, block_frames), sound.sample_rate, values, wanted, keep) as chain:
+        kind, taken = chain.largest_block(min(block_frames, sound.frames))
         sizes.refuse_over(sizes.MAX_BYTES, taken, f"{kind}: {_TOO_LARGE}", 1e9)  # several are under way at a time
-        writer = NpzWriter(
-            descriptor,
-            {
-                "sample_rate": file.sample_rate,
-                "block_frames": block_frames,
-                "parameters": json.dumps({**_DEFAULTS, **values}),
-                **chain.describe(),
-            },
-            {name: shape for kind in wanted for name, shape in chain.shapes(kind, file.frames).items()},
-        )
-        _check_room(descriptor, writer.size)
-        chain.run()
-        writer.finish()
-    return file.frames / file.sample_rate, os.fstat(descriptor).st_size
+        contents = _contents(chain, {"sample_rate": sound.sample_rate, **about}, wanted, sound.frames)
+        made = form.writer(contents)
+        _check_room(path, made.size(contents))
+        with closing(made(path, contents)) as writer:
+            chain.run()
+            writer.finish()
 
 
-def _blocks(file: AudioFile, block_frames: int) -> Iterator[np.ndarray]:
-    for at in range(0, file.frames, block_frames):
-        wanted = min(block_frames, file.frames - at)
-        block = file.read(wanted)
+def _contents(chain: Chain, about: dict[str, Any], wanted: Sequence[str], frames: int) -> Contents:
+    parts = {name: part for kind in wanted for name, part in KINDS[kind].outputs.items()}
+    described = chain.describe()
+    words = {name: value for name, value in described.items() if isinstance(value, list)}
+    times = {f"{kind}_time": chain.times(kind, frames) for kind in wanted if f"{kind}_frameRate" in described}
+    return Contents(
+        {name: shape for kind in wanted for name, shape in chain.shapes(kind, frames).items()},
+        {name: part.axes for name, part in parts.items()},
+        {name: part.unit for name, part in parts.items()},
+        {**{name: value for name, value in described.items() if name not in words}, **times},
+        {**about, **words},
+    )
+
+
+def _blocks(sound: Sound, block_frames: int) -> Iterator[np.ndarray]:
+    for at in range(0, sound.frames, block_frames):
+        wanted = min(block_frames, sound.frames - at)
+        block = sound.read(wanted)
         if block.shape[1] != wanted:
-            raise AudioFileError(f"{file.path} is cut off: {at + block.shape[1]} of {file.frames} frames are there")
+            raise AudioFileError(f"{sound.path} is cut off: {at + block.shape[1]} of {sound.frames} frames are there")
         yield block
 
 
-def _check_room(descriptor: int, size: int) -> None:
+def _check_room(path: Path, size: int) -> None:
     """OutputError where the disk has less than `size` bytes left, before hours of work."""
-    disk = os.fstatvfs(descriptor)
+    disk = os.statvfs(path)
     free = disk.f_bavail * disk.f_frsize
     if size > free:
         raise OutputError(

@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from rosafe.dsp import kernels
+from rosafe.dsp.signal import Signal
 from rosafe.dsp.stage import SAMPLE_RATE
 from rosafe.interface import KINDS
 from rosafe.interface.arguments import check_change, check_parameters
@@ -109,7 +111,7 @@ process.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
 
 
 def _named(by_place: tuple[Any, ...], options: tuple[Any, Any, Any, Any]) -> tuple[Any, Any, Any, Any]:
-    """The options, of which the first ones were given by their place, as versions before 0.3 wanted them."""
+    """The options, of which the first ones were given by their place, as it was done once."""
     if len(by_place) > len(options):
         raise TypeError(f"process() takes 2 positional arguments, and {2 + len(by_place)} were given")
     warnings.warn("give what follows the sample rate by name, as in parameters={...}", DeprecationWarning, 3)
@@ -128,8 +130,8 @@ class _Work:
         changes = _checked_modifications(changes)
         self.wanted = outputs_of(self.ears, outputs)
         self.gathered: dict[str, dict[str, _Gathered]] = {}  # by kind and name
-        self.times: dict[str, list[np.ndarray]] = {kind: [] for kind in self.wanted}
-        self._next = dict.fromkeys(self.wanted, 0)  # where each output's next frame begins
+        # of each output, how many frames of each format have come, one after the other
+        self.counts: dict[str, list[tuple[Signal, list[int]]]] = {kind: [] for kind in self.wanted}
         both = np.broadcast_to(samples, (2, samples.shape[1]))
         blocks = (both[:, first:end] for first, end in itertools.pairwise((0, *ends)))
         self.chain = Chain(blocks, self.rate, values, self.wanted, self.keep)
@@ -159,11 +161,24 @@ class _Work:
 
     def keep(self, kind: str, block: Block) -> None:
         """Take what has been released."""
-        for (name, whole), data in zip(self.gathered[kind].items(), block.parts, strict=True):
-            whole.add(of_ears(self.ears, KINDS[kind].outputs[name].axes, data))
-        count = block.data.shape[-1]
-        self.times[kind].append(frame_times(block.signal, self._next[kind], count))
-        self._next[kind] += count * block.signal.hop
+        parts = block.parts
+        if self.ears == 1:
+            axes = [part.axes for part in KINDS[kind].outputs.values()]
+            parts = tuple(of_ears(self.ears, *one) for one in zip(axes, parts, strict=True))
+        for whole, data in zip(self.gathered[kind].values(), parts, strict=True):
+            whole.add(data)
+        counts = self.counts[kind]
+        if not counts or counts[-1][0] is not block.signal:
+            counts.append((block.signal, [0]))
+        counts[-1][1][0] += block.data.shape[-1]
+
+    def _times(self, kind: str) -> np.ndarray:
+        """Seconds at the middle of each frame that was kept."""
+        times, first = [np.empty(0)], 0
+        for signal, (count,) in self.counts[kind]:
+            times.append(frame_times(signal, first, count))
+            first += count * signal.hop
+        return np.concatenate(times)
 
     def run(self) -> dict[str, Any]:
         """Compute; what was gathered is given up."""
@@ -176,7 +191,7 @@ class _Work:
                 while wholes:
                     name = next(iter(wholes))
                     results[name] = wholes.pop(name).joined()
-                results[f"{kind}_time"] = np.concatenate([np.empty(0), *self.times.pop(kind)])
+                results[f"{kind}_time"] = self._times(kind)
             results.update(chain.describe())
             return results
 
@@ -267,7 +282,7 @@ class _Gathered:
     def _write(self) -> None:
         end = self._filled + self._frames
         if end <= self._whole.shape[-1]:
-            np.concatenate(self._waiting, axis=-1, out=self._whole[..., self._filled : end])
+            kernels.join(self._waiting, self._whole[..., self._filled : end])
             self._waiting, self._filled, self._frames, self._begun = [], end, 0, True
 
     def joined(self) -> np.ndarray:

@@ -159,8 +159,7 @@ class AmsFeatures(FramedStage):
         if kernels.compiled():
             frames = self._frames(samples, self._framing.weights(squared=False), rows)
             state = self._filters.started(samples.shape[:-1])
-            means, self._begun = kernels.modulation(frames, self._begun, self._filters.sections, state)
-            return means
+            return kernels.modulation(frames, self._filters.sections, state)
         parts = [np.empty((*rows, 0))]
         for first in range(0, samples.shape[-1], SPAN):  # what comes out takes much more memory than what goes in
             filtered = self._filters.process(limited(samples[..., first : first + SPAN]))
@@ -220,7 +219,6 @@ class AmsFeatures(FramedStage):
         else:
             sections = design_sections(frequencies, rate)
         self._framing, self._frequencies, self._triangles = framing, frequencies, triangles
-        self._begun = None
         if not changed <= FRAMES:
             self._decimation = Decimation(values["ams_dsRatio"])
             self._filters = Parallel(np.empty((0, 6)) if sections is None else sections)

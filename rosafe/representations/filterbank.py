@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -19,6 +19,7 @@ from rosafe.vocabulary.parameter import MAX_SEQUENCE, Parameter
 from rosafe.vocabulary.representation import Representation
 
 MAX_CHANNELS = MAX_SEQUENCE
+HIGHEST = 0.475  # of the sample rate, for channels: speech at 16 kHz has them up to 7600 Hz
 
 
 class Filterbank(Stage):
@@ -31,6 +32,9 @@ class Filterbank(Stage):
 
     `parameters` tells the channels in force: with a list, `fb_nERBs` is 0 and the range its first and last element;
     with a number of channels n, `fb_nERBs` is the width of the range divided by n, as in the original.
+
+    Where `fb_highFreqHz` has never been given and a channel at its default would lie at or above half of the sample
+    rate, 0.475 of that rate is in its place.
 
     The envelope of the output, (2, C, N), is provided to those who need it: 2 abs(H x) for gammatone; for DRNL see
     `DrnlBank`. It costs time.
@@ -57,11 +61,12 @@ class Filterbank(Stage):
                 "fb_highFreqHz",
                 "double",
                 8000.0,
-                "Highest center frequency (Hz)",
+                "Highest center frequency (Hz); not given: 0.475 of the sample rate if channels reach half of that",
                 0.0,
                 1e6,
                 open_minimum=True,
                 unit="Hz",
+                follows_rate=True,
             ),
             Parameter(
                 "fb_nERBs",
@@ -112,6 +117,8 @@ class Filterbank(Stage):
     INPUT = ("ear", "time")
     PROVIDES = ("envelope",)
 
+    _given: frozenset[str] = frozenset()  # of what follows the rate
+
     @classmethod
     def in_force(cls, values: Mapping[str, Any]) -> dict[str, Any]:
         frequencies = center_frequencies(values).tolist()
@@ -123,13 +130,20 @@ class Filterbank(Stage):
         return told
 
     @classmethod
+    def at_rate(cls, values: Mapping[str, Any], given: Collection[str], sample_rate: float) -> dict[str, Any]:
+        free = "fb_highFreqHz" not in given and not values["fb_cfHz"]
+        if free and center_frequencies(values).max() >= sample_rate / 2:
+            return {**values, "fb_highFreqHz": HIGHEST * sample_rate}
+        return dict(values)
+
+    @classmethod
     def asked(cls, values: Mapping[str, Any]) -> dict[str, Any]:
         listed = bool(values.get("fb_cfHz")) and values.get("fb_nERBs") == 0
         return {name: value for name, value in values.items() if not (listed and name == "fb_nERBs")}
 
     @property
     def parameters(self) -> dict[str, Any]:
-        return self.in_force(self._values)
+        return self.in_force(self.at_rate(self._values, self._given, self.sample_rate))
 
     def output_rows(self, rows: tuple[int, ...]) -> tuple[int, ...]:
         return (*rows, len(self._frequencies))
@@ -151,6 +165,7 @@ class Filterbank(Stage):
 
     def _merge(self, checked: dict[str, Any]) -> dict[str, Any]:
         values = super()._merge(checked)
+        self._given = self._given | ({"fb_highFreqHz"} & checked.keys())
         decides = checked.get("fb_nChannels") or {"fb_lowFreqHz", "fb_highFreqHz", "fb_nERBs"} & checked.keys()
         if decides and not checked.get("fb_cfHz"):
             values["fb_cfHz"] = []
@@ -159,10 +174,12 @@ class Filterbank(Stage):
         return values
 
     def _build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
+        values = self.at_rate(values, self._given, self.sample_rate)
         frequencies = center_frequencies(values)
         if frequencies.max() >= self.sample_rate / 2:
             raise ValueError(
-                f"{_chosen_by(values)}: a channel at {frequencies.max():.12g} Hz is not below half the sample rate"
+                f"{_chosen_by(values)}: a channel at {frequencies.max():.12g} Hz is not below half the sample rate; "
+                f"{HIGHEST * self.sample_rate:.12g} Hz would do"
             )
         bank: GammatoneBank | DrnlBank
         if values["fb_type"] == "drnl":

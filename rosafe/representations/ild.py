@@ -40,7 +40,6 @@ class Ild(FramedStage):
         samples = self._checked(block)
         if kernels.compiled():
             frames = self._frames(samples, self._framing.weights(squared=True))
-            levels, self._begun = kernels.levels(frames, self._begun, EPSILON)
-            return levels
+            return kernels.levels(frames, EPSILON)
         energies = self._means(samples, squared=True) + EPSILON
         return 10 * np.log10(energies[1] / energies[0])

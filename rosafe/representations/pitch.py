@@ -162,6 +162,18 @@ def highest_peak(curves: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
     Of equally high ones, the first. A plateau is one peak, at its middle, rounded down. The ends are no peaks, and
     below 0 there are none.
     """
+    inner = curves[..., 1:-1]
+    tops = (inner > curves[..., :-2]) & (inner >= curves[..., 2:])
+    heights = np.where(tops, inner, -np.inf)
+    place = heights.argmax(axis=-1)[..., np.newaxis]
+    height = np.take_along_axis(heights, place, axis=-1)
+    if (height > np.take_along_axis(curves, place + 2, axis=-1)).all():  # no plateaus, as mostly
+        return place[..., 0] + 1, np.maximum(height[..., 0], 0.0)
+    return _highest_of_plateaus(curves)
+
+
+def _highest_of_plateaus(curves: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
+    """As `highest_peak`, where there may be plateaus, or no peak at all."""
     here, following = curves[..., :-1], curves[..., 1:]
     rises = following > here
     number = 2 * np.arange(curves.shape[-1])

@@ -65,8 +65,7 @@ class Ratemap(FramedStage):
             return self._means(self._integrator.process(limited(samples)), power)
         frames = self._frames(samples, self._framing.weights(squared=power))
         state = self._integrator.started(samples.shape[:-1])
-        rates, self._begun = kernels.ratemap(frames, self._begun, power, self._integrator.sections, state)
-        return rates
+        return kernels.ratemap(frames, power, self._integrator.sections, state)
 
     def reset(self) -> None:
         super().reset()

@@ -7,6 +7,7 @@ makes them; docs/request.md has the rules.
 from __future__ import annotations
 
 import itertools
+import math
 import re
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -62,14 +63,18 @@ class Level:
     in_force: Mapping[str, Any]
     given: Mapping[str, Any]
 
-    def fits(self, found: Found) -> bool:
-        """Whether `found` is what is wanted: each parameter the same, to the last digit.
+    def fits(self, found: Found, sample_rate: float) -> bool:
+        """Whether `found`, at a sample rate (Hz), is what is wanted: each parameter the same, to the last digit.
 
         A structure of getParameters fits the processor that it describes, though one that was made with all that
         it names would tell otherwise of how its channels were chosen.
         """
         told = {name: found.values[name] for name in self.in_force}
-        return told in (self.in_force, {**self.in_force, **self.given})
+        in_force = self.in_force
+        if sample_rate and any(p.follows_rate for p in self.kind.parameters):
+            stage = STAGES[self.kind.kind]
+            in_force = stage.in_force(stage.at_rate(self.values, self.given, sample_rate))
+        return told in (in_force, {**in_force, **self.given})
 
 
 @dataclass(frozen=True)
@@ -164,7 +169,7 @@ def plan(wish: Wish, found: Sequence[Found]) -> Plan:
     root = next((p for p in found if not p.parent and p.kind == "input"), None)
     if root is not None:
         _check_input(root, wish.levels[0])
-    reused = _deepest(wish.levels, found)
+    reused = _deepest(wish.levels, found, root.rate if root is not None else 0.0)
     names = {p.name for p in found}
     dependencies, steps = reused[:], []
     for level in wish.levels[len(reused) :]:
@@ -183,14 +188,14 @@ def _check_input(root: Found, level: Level) -> None:
             raise ROSAFE.error("e_existsAlready", what=what)
 
 
-def _deepest(levels: Sequence[Level], found: Iterable[Found]) -> list[str]:
+def _deepest(levels: Sequence[Level], found: Iterable[Found], sample_rate: float) -> list[str]:
     """The names, from the input on, of the longest line of processors that fit."""
     lines: dict[str, list[str]] = {"": []}  # that fit so far, by the name of their last processor
     for level in levels:
         longer = {
             p.name: [*lines[p.parent], p.name]
             for p in found
-            if p.kind == level.kind.kind and p.parent in lines and (not p.parent or level.fits(p))
+            if p.kind == level.kind.kind and p.parent in lines and (not p.parent or level.fits(p, sample_rate))
         }
         if not longer:
             break
@@ -213,7 +218,8 @@ def making(level: Level, name: str, parent: str, input_values: Mapping[str, Any]
     `input_values` are those of InputProc less its name, of which only an input takes notice.
     """
     if level.kind.parent:
-        return [Step(level.kind.request, {"name": name, "upperDepName": parent, **level.values}, name)]
+        free = {p.name: math.nan for p in level.kind.parameters if p.follows_rate and p.name not in level.given}
+        return [Step(level.kind.request, {"name": name, "upperDepName": parent, **level.values, **free}, name)]
     changed = {p.name: level.values[p.name] for p in level.kind.parameters if level.values[p.name] != p.default}
     return [
         Step(level.kind.request, {"name": name, **input_values}, name),

@@ -63,6 +63,11 @@ class Tree:
     # --- asking ---
 
     @property
+    def workers(self) -> int:
+        """How many may compute at the same time."""
+        return self._workers.count
+
+    @property
     def processors(self) -> list[Processor]:
         """All processors in the order of their creation."""
         with self._requests:

@@ -26,7 +26,7 @@ SHORT = 1.5e-4  # seconds: a call takes some ten microseconds of two workers, wh
 WORKER = "rosafe worker"  # what the names of their threads begin with
 
 
-def workers_to_use(wanted: int | None = None) -> int:
+def workers_to_use(wanted: int | str | None = None) -> int:
     """How many workers there should be: `wanted`, else what ROSAFE_WORKERS says, else one for each core to use."""
     text = os.environ.get(VARIABLE, "").strip()
     name, given = ("workers", str(wanted)) if wanted is not None else (VARIABLE, text)

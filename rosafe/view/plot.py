@@ -11,13 +11,13 @@ import numpy as np
 from rosafe.interface import KINDS
 from rosafe.missing import require
 from rosafe.view.axes import frequency_axis, image, style
+from rosafe.view.coordinates import EARS, along, frame_times
 from rosafe.view.levels import LEVELS
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-EARS = ("left", "right")
 RANGE_DB = 60.0  # of levels, below the loudest
 UNDER = {"pitch": "ratemap", "onsetMap": "onsetStrength", "offsetMap": "offsetStrength"}  # what lies under them
 PITCH_TOP = 1000.0  # Hz; the ratemap under the pitch ends there
@@ -99,7 +99,7 @@ def draw(
 ) -> Figure:
     """As `plot`, into a figure, whose size becomes what that needs: two columns, both ears side by side."""
     panels = [_Panel(result, name, **options) for name in _chosen(result, outputs)]
-    one = ear is not None or not any(panel.ears for panel in panels)
+    one = ear is not None or all(panel.ears < 2 for panel in panels)
     if not one:  # no gaps beside those of both ears together
         panels.sort(key=lambda panel: not panel.ears)
     cells: list[tuple[_Panel, int]] = []
@@ -159,40 +159,19 @@ class _Panel:
     @cached_property
     def times(self) -> np.ndarray:
         """The middle of each frame (s)."""
-        count, kind = self.data.shape[-1], self.kind.kind
-        if f"{kind}_time" in self.result:
-            return np.asarray(self.result[f"{kind}_time"], np.float64)[:count]
-        if f"{kind}_frameRate" in self.result:  # exact for windows of two hops, the default
-            return (1 + np.arange(count)) / float(self.result[f"{kind}_frameRate"])
-        return np.arange(count) / self._rate()
-
-    def _rate(self) -> float:
-        if rate := self.sample_rate or self.result.get("sample_rate"):
-            return float(rate)
-        for name in ("cc_lags", "ac_lags", "prec_lags"):
-            if np.size(self.result.get(name, ())) > 1:
-                return 1 / float(np.diff(self.result[name][:2])[0])
-        raise ValueError(f"{self.name}: the result does not tell the sample rate; give it as sample_rate (Hz)")
+        return frame_times(self.result, self.kind, self.data.shape[-1], self.sample_rate)
 
     def along(self, axis: str) -> np.ndarray:
-        """What the declaration says of an axis: frequencies (Hz), lags (ms) or words; numbers from 0 where nothing."""
-        size = self.data.shape[self.axes.index(axis)]
-        kind = self.kind  # the one that brought the axis in
-        while kind.parent and any(axis in part.axes for part in KINDS[kind.parent].parts):
-            kind = KINDS[kind.parent]
-        wanted = {"channel": "Hz", "filter": "Hz", "lag": "s", "feature": ""}[axis]
-        units = {one.name: one.unit for one in kind.parameters} | {one.name: one.unit for one in kind.derived}
-        for name in kind.coordinates:
-            values = self.result.get(name, ())
-            if units[name] == wanted and len(values) == size:
-                return 1e3 * np.asarray(values) if axis == "lag" else np.asarray(values)
-        return np.arange(size)
+        """What lies along an axis: frequencies (Hz), lags (ms) or words."""
+        values = along(self.result, self.kind, axis, self.data.shape[self.axes.index(axis)])
+        return 1e3 * values if axis == "lag" and values.dtype.kind == "f" else values
 
     # --- drawing ---
 
     def draw(self, axes: Axes, ear: int) -> None:
         """Draw the numbers, of one ear where there are two."""
-        what = self.name if not self.ears else f"{self.name}, {EARS[ear]} ear"
+        what = self.name if self.ears < 2 else f"{self.name}, {EARS[ear]} ear"
+        ear = min(ear, max(self.ears - 1, 0))
         self.note = ""
         if self.data.size == 0:
             axes.text(0.5, 0.5, "no frames", ha="center", va="center", transform=axes.transAxes)

@@ -55,6 +55,7 @@ class Parameter:
     most: int = MAX_SEQUENCE
     longest: int = MAX_STRING
     zero_is_default: bool = True  # in ROS requests, which carry no defaults
+    follows_rate: bool = False  # where it is not given, the sample rate may make another one of the default
 
     @property
     def ros(self) -> str:

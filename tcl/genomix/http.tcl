@@ -112,7 +112,8 @@ proc ::genomix::http::body {channel headers what} {
     variable largest
     variable piece
     set begun [clock milliseconds]
-    lassign {"" 0 0} body told last
+    lassign {0 0 0} told last taken
+    set body [binary format {}] ;# bytes, to which bytes are appended without a look at all that is there
     try {
         while {!$last} {
             if {[dict exists $headers content-length]} {
@@ -122,7 +123,7 @@ proc ::genomix::http::body {channel headers what} {
                 scan $size %x size
                 set last [expr {$size == 0}]
             }
-            if {!$known || $size > $largest - [string length $body]} {
+            if {!$known || $size > $largest - $taken} {
                 error "an answer of no size that there is"
             }
             while {$size > 0} {
@@ -131,8 +132,9 @@ proc ::genomix::http::body {channel headers what} {
                     error "the connection ended within an answer"
                 }
                 append body $part
+                incr taken [string length $part]
                 incr size -[string length $part]
-                set told [tell $what $begun $told [string length $body]]
+                set told [tell $what $begun $told $taken]
             }
             if {![dict exists $headers content-length]} {
                 line $channel

@@ -250,6 +250,19 @@ def test_what_this_machine_defines_goes_on_under_its_plain_name(folder: Path) ->
     assert (folder / "log.raw").exists()
 
 
+def test_the_recipe_of_the_page_for_two_programs(folder: Path) -> None:
+    """libasound finds no fault in it, but that this machine has no such card."""
+    page = (ROOT / "docs" / "capture.md").read_text("utf-8")
+    (recipe,) = re.findall(r"^  ```\n(  pcm\.mics \{.*?)^  ```$", page, re.MULTILINE | re.DOTALL)
+    recipe = recipe.replace("hw:1,0", "hw:77,0")
+    with (folder / "asound.conf").open("a") as configuration:
+        configuration.write(recipe)
+    assert checked_name("ears") == "ears"
+    with pytest.raises(ComponentError) as refused:
+        open_source("ears", 44100, 2205, threading.Event())
+    assert refused.value.what == "ears: Invalid argument (Cannot get card index for 77)"
+
+
 def test_the_slave_of_plug_may_have_several_arguments(opener: Opener) -> None:
     """libasound by itself takes them for arguments of plug."""
     assert opener.tell("plug:rated:RATE=48000", checked=False).outcome.startswith("failed: No such file")

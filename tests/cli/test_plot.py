@@ -8,6 +8,7 @@ import matplotlib.image
 import numpy as np
 import pytest
 
+from rosafe.offline.files import process_file
 from tests.cli.command import SMALL, noise, refused, rosafe, write
 from tests.harness import shared
 
@@ -38,6 +39,15 @@ def test_result_and_sound_give_the_same_picture(tmp_path: Path) -> None:
     assert (tmp_path / "sound.png").read_bytes() == (tmp_path / "same.png").read_bytes()
 
 
+def test_one_ear_at_8_khz(tmp_path: Path) -> None:
+    """Without what compares two; one column."""
+    mono = write(tmp_path / "mono.wav", noise(4000)[:1], 8000)
+    done = rosafe("plot", mono)
+    assert (done.returncode, done.stderr) == (0, "")
+    height, width = size(tmp_path / "mono.png")
+    assert 600 < width < 1000 < height + 200
+
+
 def test_what_is_there_is_kept(tmp_path: Path) -> None:
     sound = write(tmp_path / "sound.wav", noise(4000))
     (tmp_path / "sound.png").write_bytes(b"old")
@@ -53,21 +63,25 @@ def test_what_is_there_is_kept(tmp_path: Path) -> None:
     [
         (["sound.wav", "--outputs", "speech"], ["unknown output 'speech'"]),
         (["sound.wav", "--set", "fb_nChannels=-1"], ["fb_nChannels"]),
-        (["sound.wav"], ["fb_highFreqHz"]),  # the default's channels lie too high for 8 kHz
-        (["mono.wav"], ["1 channels"]),
+        (["sound.wav", "--set", "fb_highFreqHz=8000"], ["fb_highFreqHz", "3800 Hz would do"]),
+        (["mono.wav", "--outputs", "ild"], ["ild compare two ears, and the signal has one"]),
+        (["three.wav"], ["3 channels; wanted are two, left and right ear, or one"]),
         (["nothing.wav"], ["nothing.wav"]),
         (["nothing.npz"], ["nothing.npz: No such file or directory"]),
         (["text.npz"], ["text.npz is no result of rosafe process"]),
-        (["other.npz"], ["holds no output that can be drawn"]),
+        (["other.npz"], ["other.npz is no result of rosafe process"]),
         (["other.npz", "--set", "fb_nChannels=3"], ["--set: a result is drawn as it is"]),
-        (["other.npz", "--outputs", "ild"], ["no output 'ild' in the result"]),
+        (["result.npz", "--outputs", "itd"], ["no output 'itd' in the result"]),
     ],
 )
 def test_refusals(tmp_path: Path, arguments: list[str], words: list[str]) -> None:
     write(tmp_path / "sound.wav", noise(4000), 8000)
     write(tmp_path / "mono.wav", noise(4000)[:1])
+    write(tmp_path / "three.wav", noise(4000)[[0, 1, 0]])
     (tmp_path / "text.npz").write_text("no zip file")
     np.savez(tmp_path / "other.npz", x=np.zeros(3))
+    write(tmp_path / "16k.wav", noise(4000))
+    process_file(tmp_path / "16k.wav", tmp_path / "result.npz", outputs=["ild"])
     before = sorted(tmp_path.iterdir())
     refused(rosafe("plot", *arguments, cwd=tmp_path), *words)
     assert sorted(tmp_path.iterdir()) == before

@@ -1,17 +1,28 @@
-"""The kernels for each level of processor, and their numpy and scipy twins, to be chosen by tests."""
+"""The kernels for each level of processor, other processors', clang's, and their twins, to be chosen by tests."""
 
 from __future__ import annotations
 
 import ctypes
+import functools
+import platform
+import shutil
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
 
 import pytest
 
 from rosafe.dsp import kernels
-from rosafe.dsp.kernels import build, library
+from rosafe.dsp.kernels import build, library, precedence
+
+from . import foreign
 
 TWINS = 0
+CLANG = "clang"  # its kernels for the highest level that runs here
+
+Choice = int | str  # a level, CLANG, or one of `foreign.MACHINES`
 
 
 def levels() -> list[int]:
@@ -20,17 +31,34 @@ def levels() -> list[int]:
         paths = build.libraries()
     except build.BuildError:
         return []
-    return [level for level in paths if level <= library.load(paths[3]).rosafe_processor_level()]
+    return [level for level in paths if level <= library.load(paths[min(paths)]).rosafe_processor_level()]
+
+
+@functools.cache
+def _by_clang() -> ctypes.CDLL:
+    if shutil.which("clang") is None:
+        pytest.skip("no clang here: scripts/install --tests brings it")
+    level = levels()[-1]
+    with tempfile.TemporaryDirectory() as folder:
+        names = {level: build.LEVELS[platform.machine()][level]}
+        return library.load(build.compile_sources("clang", names, Path(folder))[level])
 
 
 @contextmanager
-def using(level: int) -> Iterator[None]:
-    """Within this, the stages run on the kernels of this level, or on the twins."""
-    loaded: tuple[ctypes.CDLL | None, library.Status] = (None, library.Status(False, "the twins, for a test"))
-    if level != TWINS:
-        if level not in levels():
-            pytest.skip(f"no kernels of level {level} here")
-        loaded = (library.load(build.libraries()[level]), library.Status(True, f"level {level}, for a test"))
+def using(choice: Choice) -> Iterator[None]:
+    """Within this, the stages run on these kernels, or on the twins."""
+    loaded: tuple[Any, library.Status] = (None, library.Status(False, "the twins, for a test"))
     with pytest.MonkeyPatch.context() as patch:
+        if choice in foreign.MACHINES:
+            elsewhere = foreign.running(str(choice))
+            loaded = (elsewhere, library.Status(True, f"{choice}, for a test"))
+            for module in (kernels, precedence):
+                patch.setattr(module, "_address", elsewhere.address)
+        elif choice == CLANG:
+            loaded = (_by_clang(), library.Status(True, "clang's, for a test"))
+        elif isinstance(choice, int) and choice != TWINS:
+            if choice not in levels():
+                pytest.skip(f"no kernels of level {choice} here")
+            loaded = (library.load(build.libraries()[choice]), library.Status(True, f"level {choice}, for a test"))
         patch.setattr(kernels, "loaded", lambda: loaded)
         yield

@@ -32,11 +32,13 @@ from rosafe.representations.registry import ORIGINAL
 from tests.harness import ROOT
 
 from .bare import FloatArray, cut, single
-from .implementations import TWINS, levels, using
+from .implementations import TWINS, Choice, levels, using
 
 RATE = 16000.0
 
-each_level = pytest.mark.parametrize("level", [3, 4])
+each_level = pytest.mark.parametrize("level", [2, 3, 4, "aarch64"])
+each_native = pytest.mark.parametrize("level", [2, 3, 4])
+examples = settings(max_examples=20, deadline=None, database=None)
 block_sizes = st.lists(st.one_of(st.sampled_from([0, 1, 2, 3, 64]), st.integers(0, 400)), min_size=1, max_size=8)
 
 
@@ -76,7 +78,7 @@ def agree(
 
 
 def check(
-    level: int,
+    level: Choice,
     kind: str,
     parameters: dict[str, Any],
     blocks: list[FloatArray],
@@ -101,9 +103,9 @@ def check(
     sizes=block_sizes,
     envelopes=st.lists(st.booleans(), min_size=8, max_size=8),
 )
-@settings(max_examples=30, deadline=None, database=None)
+@examples
 def test_gammatone(
-    level: int, channels: int, order: int, width: float, sizes: list[int], envelopes: list[bool]
+    level: Choice, channels: int, order: int, width: float, sizes: list[int], envelopes: list[bool]
 ) -> None:
     frequencies = np.geomspace(60.0, 7900.0, channels)
     blocks = [np.ascontiguousarray(block) for block in cut(signal(1, sum(sizes) + 50)[:, 0], [*sizes, 50])]
@@ -118,14 +120,14 @@ def test_gammatone(
 
 @each_level
 @given(method=st.sampled_from(METHODS), channels=st.integers(1, 11), sizes=block_sizes)
-@settings(max_examples=30, deadline=None, database=None)
-def test_hair_cell(level: int, method: str, channels: int, sizes: list[int]) -> None:
+@examples
+def test_hair_cell(level: Choice, method: str, channels: int, sizes: list[int]) -> None:
     check(level, "ihc", {"ihc_method": method}, cut(signal(channels, sum(sizes) + 50), [*sizes, 50]))
 
 
 @each_level
 @pytest.mark.parametrize("method", METHODS)
-def test_hair_cell_of_rows_that_are_whole_pages_apart(level: int, method: str) -> None:
+def test_hair_cell_of_rows_that_are_whole_pages_apart(level: Choice, method: str) -> None:
     check(level, "ihc", {"ihc_method": method}, cut(signal(11, 1600), [512, 1024, 64]))
 
 
@@ -143,8 +145,8 @@ def framing(prefix: str) -> st.SearchStrategy[dict[str, Any]]:
 
 @each_level
 @given(parameters=framing("ild"), channels=st.integers(1, 11), sizes=block_sizes)
-@settings(max_examples=30, deadline=None, database=None)
-def test_ild(level: int, parameters: dict[str, Any], channels: int, sizes: list[int]) -> None:
+@examples
+def test_ild(level: Choice, parameters: dict[str, Any], channels: int, sizes: list[int]) -> None:
     check(level, "ild", parameters, cut(signal(channels, sum(sizes) + 500), [*sizes, 300]))
 
 
@@ -156,9 +158,9 @@ def test_ild(level: int, parameters: dict[str, Any], channels: int, sizes: list[
     channels=st.integers(1, 11),
     sizes=block_sizes,
 )
-@settings(max_examples=30, deadline=None, database=None)
+@examples
 def test_ratemap(
-    level: int, parameters: dict[str, Any], scaling: str, decay: float, channels: int, sizes: list[int]
+    level: Choice, parameters: dict[str, Any], scaling: str, decay: float, channels: int, sizes: list[int]
 ) -> None:
     parameters = {**parameters, "rm_scaling": scaling, "rm_decaySec": decay}
     check(level, "ratemap", parameters, cut(signal(channels, sum(sizes) + 500), [*sizes, 300]))
@@ -171,15 +173,17 @@ def test_ratemap(
     channels=st.integers(1, 6),
     sizes=block_sizes,
 )
-@settings(max_examples=40, deadline=None, database=None)
-def test_cross_correlation(level: int, parameters: dict[str, Any], lag: int, channels: int, sizes: list[int]) -> None:
+@examples
+def test_cross_correlation(
+    level: Choice, parameters: dict[str, Any], lag: int, channels: int, sizes: list[int]
+) -> None:
     parameters = {**parameters, "cc_maxDelaySec": (lag - 0.5) / RATE}
     check(level, "crossCorrelation", parameters, cut(signal(channels, sum(sizes) + 500), [*sizes, 300]))
 
 
 @each_level
 @pytest.mark.parametrize(("size", "lag"), [(1024, 3), (1026, 100), (2050, 511), (3000, 400), (5002, 511), (1200, 512)])
-def test_cross_correlation_of_long_windows(level: int, size: int, lag: int) -> None:
+def test_cross_correlation_of_long_windows(level: Choice, size: int, lag: int) -> None:
     """Windows that are taken in several spans, up to the most lags, and just beyond, where FFT takes over."""
     parameters = {"cc_wSizeSec": size / RATE, "cc_hSizeSec": size / 3 / RATE, "cc_maxDelaySec": (lag - 0.5) / RATE}
     check(level, "crossCorrelation", parameters, cut(signal(2, 12000), [5000, 100]))
@@ -195,9 +199,9 @@ def test_cross_correlation_of_long_windows(level: int, size: int, lag: int) -> N
     channels=st.integers(1, 19),
     sizes=block_sizes,
 )
-@settings(max_examples=40, deadline=None, database=None)
+@examples
 def test_adaptation(
-    level: int,
+    level: Choice,
     tau: list[float],
     lim: float,
     threshold: float,
@@ -213,7 +217,7 @@ def test_adaptation(
 
 
 @each_level
-def test_adaptation_by_many_loops(level: int) -> None:
+def test_adaptation_by_many_loops(level: Choice) -> None:
     tau = np.geomspace(0.001, 1.0, 32).tolist()
     for lim in (0.0, 10.0):  # the output is the last loop's, times 5e9: 1e-11 is much to ask for
         parameters = {"adpt_tau": tau, "adpt_lim": lim}
@@ -231,9 +235,9 @@ def test_adaptation_by_many_loops(level: int) -> None:
     channels=st.integers(1, 6),
     sizes=block_sizes,
 )
-@settings(max_examples=60, deadline=None, database=None)
+@examples
 def test_autocorrelation(
-    level: int,
+    level: Choice,
     parameters: dict[str, Any],
     clipping: str,
     alpha: float,
@@ -250,7 +254,7 @@ def test_autocorrelation(
 @each_level
 @pytest.mark.parametrize("size", [882, 960, 1024, 1026, 4096, 4098])
 @pytest.mark.parametrize("exponent", [2.0, 0.5])
-def test_autocorrelation_of_long_windows(level: int, size: int, exponent: float) -> None:
+def test_autocorrelation_of_long_windows(level: Choice, size: int, exponent: float) -> None:
     """Up to the longest one of the kernel, and just beyond, where scipy takes over."""
     parameters = {"ac_wSizeSec": size / RATE, "ac_hSizeSec": size / 3 / RATE, "ac_K": exponent}
     check(level, "autocorrelation", parameters, cut(signal(2, 12000), [5000, 100]))
@@ -264,9 +268,9 @@ def test_autocorrelation_of_long_windows(level: int, size: int, exponent: float)
     channels=st.integers(1, 6),
     sizes=block_sizes,
 )
-@settings(max_examples=40, deadline=None, database=None)
+@examples
 def test_modulation(
-    level: int, parameters: dict[str, Any], ratio: int, centres: list[float], channels: int, sizes: list[int]
+    level: Choice, parameters: dict[str, Any], ratio: int, centres: list[float], channels: int, sizes: list[int]
 ) -> None:
     parameters = {**parameters, "ams_dsRatio": ratio, "ams_cfHz": centres}
     parameters["ams_wSizeSec"] *= ratio
@@ -276,8 +280,10 @@ def test_modulation(
 
 @each_level
 @given(parameters=framing("prec"), channels=st.integers(1, 11), sizes=block_sizes, parts=st.integers(1, 3))
-@settings(max_examples=30, deadline=None, database=None)
-def test_windowed_frames(level: int, parameters: dict[str, Any], channels: int, sizes: list[int], parts: int) -> None:
+@examples
+def test_windowed_frames(
+    level: Choice, parameters: dict[str, Any], channels: int, sizes: list[int], parts: int
+) -> None:
     """Of some frames after the other, those that lie in the history, in the block and in both."""
     window = np.random.default_rng(0).standard_normal(round(parameters["prec_wSizeSec"] * RATE))
     framing = Framing(window, round(parameters["prec_hSizeSec"] * RATE))
@@ -304,8 +310,8 @@ def test_windowed_frames(level: int, parameters: dict[str, Any], channels: int, 
 
 @each_level
 @given(channels=st.integers(1, 11), frames=st.integers(1, 4), half=st.integers(1, 200), power=st.integers(2, 10))
-@settings(max_examples=40, deadline=None, database=None)
-def test_summed_spectra(level: int, channels: int, frames: int, half: int, power: int) -> None:
+@examples
+def test_summed_spectra(level: Choice, channels: int, frames: int, half: int, power: int) -> None:
     """Of any number of points that holds the samples, half of them or more; on goes what had been summed."""
     points = max(1 << power, 1 << (2 * half - 1).bit_length())
     rng = np.random.default_rng(half)
@@ -336,9 +342,9 @@ def test_summed_spectra(level: int, channels: int, frames: int, half: int, power
     alike=st.booleans(),
     seed=st.integers(0, 1000),
 )
-@settings(max_examples=60, deadline=None, database=None)
+@examples
 def test_correlations_of_filtered_frames(
-    level: int, rows: int, frames: int, size: int, reach: int, alike: bool, seed: int
+    level: Choice, rows: int, frames: int, size: int, reach: int, alike: bool, seed: int
 ) -> None:
     """Filters of both ways to clean, with delays up to more than a frame; some have no echo to take out."""
     rng = np.random.default_rng(seed)
@@ -362,7 +368,7 @@ def test_correlations_of_filtered_frames(
 
 @each_level
 @pytest.mark.parametrize("parameters", [{}, {"prec_maxDelaySec": 0.1}, {"prec_wSizeSec": 0.7}], ids=str)
-def test_precedence(level: int, parameters: dict[str, Any]) -> None:
+def test_precedence(level: Choice, parameters: dict[str, Any]) -> None:
     """Also with more lags, or more points of a transform, than the kernels have."""
     x = np.random.default_rng(1).standard_normal((2, 9, 16000))
     x[1] += np.roll(x[0], 5, axis=-1)
@@ -383,8 +389,8 @@ def test_precedence(level: int, parameters: dict[str, Any]) -> None:
 
 @each_level
 @given(channels=st.integers(1, 11), sizes=st.lists(st.integers(0, 40), min_size=1, max_size=6))
-@settings(max_examples=20, deadline=None, database=None)
-def test_gabor(level: int, channels: int, sizes: list[int]) -> None:
+@examples
+def test_gabor(level: Choice, channels: int, sizes: list[int]) -> None:
     """The patterns; what is made of these is the same code. Values of a few standard deviations: see the levels."""
     rng = np.random.default_rng(channels)
     rates = 10.0 ** rng.uniform(-3, 0, (2, channels, sum(sizes) + 60))
@@ -397,7 +403,7 @@ def test_gabor(level: int, channels: int, sizes: list[int]) -> None:
     ["gammatone", "ihc", "ild", "ratemap", "crossCorrelation", "adaptation", "autocorrelation", "amsFeatures"],
 )
 @pytest.mark.parametrize("value", [1e300, LIMIT, 1e-160, 5e-324])
-def test_far_beyond_sound(level: int, kind: str, value: float) -> None:
+def test_far_beyond_sound(level: Choice, kind: str, value: float) -> None:
     """Huge samples are bounded alike. Of tiny ones the kernels may make 0, which differs by less than anything."""
     sound = np.sign(signal(3, 2000)) * value
     blocks = cut(sound[:, 0] if kind == "gammatone" else sound, [700, 1, 600])
@@ -410,8 +416,8 @@ def test_far_beyond_sound(level: int, kind: str, value: float) -> None:
 
 
 @each_level
-def test_changes_between_blocks(level: int) -> None:
-    """A new window takes what was held; the sums of frames that had begun are then of the new window."""
+def test_changes_between_blocks(level: Choice) -> None:
+    """A new window takes what was held."""
     for stage_class, prefix in ((Ild, "ild"), (Ratemap, "rm"), (CrossCorrelation, "cc"), (AmsFeatures, "ams")):
         made = {}
         for choice in (TWINS, level):
@@ -423,8 +429,8 @@ def test_changes_between_blocks(level: int) -> None:
         agree(made[level], made[TWINS])
 
 
-@each_level
-def test_denormal_numbers_stay_a_matter_of_the_kernels(level: int) -> None:
+@each_native
+def test_denormal_numbers_stay_a_matter_of_the_kernels(level: Choice) -> None:
     """They are switched off inside; outside, arithmetic is as before."""
     smallest = np.array([5e-324])
     with using(level):
@@ -435,8 +441,8 @@ def test_denormal_numbers_stay_a_matter_of_the_kernels(level: int) -> None:
             assert (smallest * 1.0)[0] == 5e-324, kind
 
 
-@pytest.mark.parametrize("level", [TWINS, 3, 4])
-def test_denormal_numbers_are_off_for_numpy_where_that_is_asked_for(level: int) -> None:
+@pytest.mark.parametrize("level", [TWINS, 2, 3, 4])
+def test_denormal_numbers_are_off_for_numpy_where_that_is_asked_for(level: Choice) -> None:
     smallest = np.array([5e-324])
     with using(level):
         with kernels.denormals_off():
@@ -446,12 +452,12 @@ def test_denormal_numbers_are_off_for_numpy_where_that_is_asked_for(level: int) 
         assert (smallest * 1.0)[0] == 5e-324
 
 
-@each_level
-def test_the_interpreter_goes_on_meanwhile(level: int) -> None:
+@each_native
+def test_the_interpreter_goes_on_meanwhile(level: Choice) -> None:
     assert any(_steps_meanwhile(level) > 10 for _ in range(10)), "not one step in the middle of a call"
 
 
-def _steps_meanwhile(level: int) -> int:
+def _steps_meanwhile(level: Choice) -> int:
     """Steps of this thread in the middle of a call of another; few where the system lets others run then."""
     sound = signal(16, 100_000)
     span: list[float] = []
@@ -502,7 +508,7 @@ def test_the_processor_is_asked_without_its_newer_instructions() -> None:
     """Else the question itself would be an illegal instruction on a processor that must answer no."""
     if not levels():
         pytest.skip("the kernels cannot be built here")
-    path = build.libraries()[3]
+    path = build.libraries()[2]
     try:
         command = ["objdump", "-d", "--no-show-raw-insn", "--disassemble=rosafe_processor_level", str(path)]
         listing = subprocess.run(command, capture_output=True, text=True, check=True).stdout

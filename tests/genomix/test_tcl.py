@@ -317,6 +317,34 @@ def test_errors_of_the_component(world: World) -> None:
     ]
 
 
+def test_one_representation_is_there_at_once_and_all_of_them_are_not(world: World) -> None:
+    """A second of a full tree of 31 channels is 160 MB of text (here a quarter of that); of ILD or ratemap, little."""
+    script = (
+        LOAD
+        + """
+        bass::Acquire scene:
+        rosAFE::request ild {fb_nChannels 8}
+        rosAFE::request ratemap {fb_nChannels 8}
+        while {![dict exists [rosAFE::ildPort ild_0] ildPort lastFrameIndex]
+            || [dict get [rosAFE::ildPort ild_0] ildPort lastFrameIndex] < 50000} {after 20}
+        proc measured {script} {
+            set start [clock microseconds]
+            set length [string length [uplevel 1 $script]]
+            return [list [expr {[clock microseconds] - $start}] $length]
+        }
+        foreach name {ild_0 ratemap_0} {show {*}[measured {rosAFE::getRepresentation $name}]}
+        foreach name {ild_0 ratemap_0} {show {*}[measured {rosAFE::getRepresentation $name}]}
+        show {*}[measured rosAFE::getSignals]
+    """
+    )
+    *some, everything = ([int(word) for word in line.split("|")] for line in world.lines(script))
+    for (microseconds, length), (again, _) in zip(some[:2], some[2:], strict=True):
+        assert 10_000 < length < everything[1] / 100
+        assert microseconds < everything[0] / 5
+        assert min(microseconds, again) < 300_000
+    assert everything[1] > 30e6 and everything[0] < 60e6, "its time grows as its length, not as the square of that"
+
+
 # --- requests in the background ---------------------------------------------------------------------------------
 
 
@@ -683,3 +711,24 @@ def test_a_lost_server_is_told_once(world: World) -> None:
             told = f"::genom::mwerr: the connection to genomixd at 127.0.0.1:{port} is lost"
             assert client.out.splitlines() == ["ready", f"bass::Acquire &: {told}"]
             assert client.err == ""
+
+
+def test_the_highest_channel_follows_the_sample_rate_at_every_door(world: World) -> None:
+    """Where it is not given: Tcl, one request for the whole tree, which finds its own again, and plain services."""
+    script = (
+        LOAD
+        + """
+        bass::Acquire {device scene: sampleRate 16000}
+        rosAFE::InputProc
+        rosAFE::PreProc
+        rosAFE::GammatoneProc {fb_nChannels 5}
+        show [dict get [rosAFE::request gammatone {fb_nChannels 6}] name]
+        show [dict get [rosAFE::request gammatone {fb_nChannels 6}] name]
+        catch {rosAFE::GammatoneProc {name other fb_nChannels 5 fb_highFreqHz 8000}} result
+        show [string match "*7600 Hz would do*" $result]
+    """
+    )
+    assert world.lines(script) == ["filterbank_0", "filterbank_0", "1"]
+    world.graph.run("rosservice", "call", "/rosAFE/GammatoneProc", "{name: plain, fb_nChannels: 7}")
+    told = world.graph.run("rosservice", "call", "/rosAFE/getParameters", "{}").stdout
+    assert re.findall("fb_highFreqHz: (.*)", told) == ["7600.0"] * 3

@@ -32,8 +32,12 @@ def test_nothing_given_is_all_defaults_or_a_refusal_that_names_the_first_missing
     if required:
         assert f"{required[0]} is missing" in refusal(service, {})
     else:
-        assert complete(service, {}) == {p.name: p.default for p in service.parameters}
-        assert complete(service, []) == complete(service, {})
+        free = {p.name for p in service.parameters if p.follows_rate}
+        values = complete(service, {})
+        assert {name for name, value in values.items() if value != value} == free  # not a number: not given
+        assert list(values) == [p.name for p in service.parameters]
+        assert all(value == service.parameter(name).default for name, value in values.items() if name not in free)
+        assert str(complete(service, [])) == str(values)
 
 
 def test_partial_arguments_in_any_order_are_completed() -> None:

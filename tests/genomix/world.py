@@ -22,8 +22,9 @@ class HttpError(Exception):
     def __init__(self, status: int, body: dict[str, Any]) -> None:
         super().__init__(status, body)
         self.status = status
+        self.body = body
         self.ex = body.get("ex", "")
-        self.what = body.get("detail", {}).get("what", "")
+        self.what = body.get("detail", {}).get("what", "") or body.get("what", "")
 
 
 class Http:

@@ -70,7 +70,9 @@ def test_sample_rates(rate: Any) -> None:
 
 
 def test_a_sample_rate_that_is_too_low_for_the_channels() -> None:
-    refused("fb_highFreqHz: a channel at .* Hz is not below half the sample rate", GOOD, 8000)
+    what = "a channel at 8000 Hz is not below half the sample rate; 7600 Hz would do"
+    for values in ({"fb_highFreqHz": 8000.0, "fb_nChannels": 16}, {"fb_cfHz": [8000.0]}):
+        refused(f"{next(iter(values))}: {what}", GOOD, RATE, parameters=values)
 
 
 @pytest.mark.parametrize(

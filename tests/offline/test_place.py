@@ -108,3 +108,17 @@ def test_a_place_is_used_only_where_it_fits(kind: str, frames: int) -> None:
         stage.place = place
         np.testing.assert_array_equal(stage.process(block), plain)
         assert np.isnan(whole).all()
+
+
+@pytest.mark.parametrize("lengths", [[0], [1] * 64, [9, 8, 9, 31, 32, 33], [0, 700, 0, 1]], ids=str)
+def test_joined_as_numpy_does(lengths: list[int]) -> None:
+    rng = np.random.default_rng(len(lengths))
+    whole = np.full((3, 7, 1000), np.nan)
+    end = 20 + sum(lengths)
+    blocks = [rng.standard_normal((3, 7, length)) for length in lengths]
+    blocks[-1] = np.asfortranarray(blocks[-1])
+    kernels.join(blocks, whole[..., 20:end])
+    np.testing.assert_array_equal(whole[..., 20:end], np.concatenate(blocks, axis=-1))
+    assert np.isnan(whole[..., :20]).all() and np.isnan(whole[..., end:]).all()
+    kernels.join([block.astype(np.float32) for block in blocks], whole[..., 20:end])
+    np.testing.assert_array_equal(whole[..., 20:end], np.concatenate(blocks, axis=-1).astype(np.float32))

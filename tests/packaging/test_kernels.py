@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import platform
+import shutil
 import signal
 import subprocess
 from collections.abc import Iterator
@@ -34,7 +35,7 @@ if not kept.exists():
 shutil.copy(kept, output)
 """
 
-pytestmark = pytest.mark.skipif(platform.machine() != "x86_64", reason="the kernels are for x86-64")
+pytestmark = pytest.mark.skipif(platform.machine() != "x86_64", reason="other processors have other libraries")
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -71,12 +72,12 @@ def folders(copy: Path) -> list[str]:
     return sorted(path.name for path in (copy / ".generated").glob("kernels-*"))
 
 
-def compiler(copy: Path, body: str) -> str:
-    """A PATH on which `gcc` is a script."""
+def compiler(copy: Path, body: str, name: str = "gcc") -> str:
+    """A PATH on which a compiler is a script."""
     folder = copy.with_name("bin")
     folder.mkdir()
-    (folder / "gcc").write_text(f"#!/bin/sh\n{body}\n")
-    (folder / "gcc").chmod(0o755)
+    (folder / name).write_text(f"#!/bin/sh\n{body}\n")
+    (folder / name).chmod(0o755)
     return f"{folder}:/usr/bin:/bin"
 
 
@@ -105,7 +106,7 @@ def test_the_script_builds_where_it_is_told(copy: Path) -> None:
     script, elsewhere = copy / "rosafe" / "dsp" / "kernels" / "build.py", copy.with_name("elsewhere")
     done = run(PYTHON, script, elsewhere, env=environment())
     paths = [Path(line) for line in done.stdout.splitlines()]
-    assert (done.returncode, done.stderr, len(paths)) == (0, "", 2)
+    assert (done.returncode, done.stderr, len(paths)) == (0, "", 3)
     assert all(path.is_relative_to(elsewhere) and path.is_file() for path in paths)
     assert not (copy / ".generated").exists()
     assert run(PYTHON, script, "a", "b", env=environment()).returncode == 2
@@ -179,22 +180,41 @@ def test_read_only_tree(copy: Path) -> None:
 def test_the_switch(copy: Path) -> None:
     assert show(copy, ROSAFE_KERNELS="0") == (False, "numpy and scipy, as ROSAFE_KERNELS=0 says")
     assert not (copy / ".generated").exists()
-    compiled, status = show(copy, ROSAFE_KERNELS="3")
-    assert compiled
-    assert status.endswith("x86-64-v3.so")
+    for level in (2, 3):
+        compiled, status = show(copy, ROSAFE_KERNELS=str(level))
+        assert compiled
+        assert status.startswith(f"compiled for x86-64-v{level} by gcc 12")
+        assert status.endswith(f"x86-64-v{level}.so")
     compiled, status = show(copy, ROSAFE_KERNELS="off")
     assert compiled
-    assert "(ROSAFE_KERNELS is 'off', which means nothing: 0, 3 or 4 would)" in status
+    assert "(ROSAFE_KERNELS is 'off', which means nothing: 0, 2, 3 or 4 would)" in status
+
+
+def test_the_compiler_that_is_asked_for(copy: Path) -> None:
+    """It has a folder of its own: what another one has built stays."""
+    if shutil.which("clang") is None:
+        pytest.skip("no clang here: scripts/install --tests brings it")
+    assert "by clang " in show(copy, ROSAFE_COMPILER="clang")[1]
+    assert "by gcc " in show(copy)[1]
+    assert len(folders(copy)) == 2
+    compiled, status = show(copy, ROSAFE_COMPILER="clong")
+    assert not compiled
+    assert status.endswith("the kernels are not built, and ROSAFE_COMPILER is 'clong', which is no program here")
+
+
+def test_clang_where_there_is_no_gcc(copy: Path) -> None:
+    path = compiler(copy, 'echo "clang: error: found" >&2; exit 1', "clang")
+    assert show(copy, PATH=path.partition(":")[0])[1].endswith("clang cannot build the kernels: clang: error: found")
 
 
 def test_other_machines(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(platform, "machine", lambda: "aarch64")
-    with pytest.raises(build.BuildError, match="for x86_64, and this machine is aarch64"):
+    monkeypatch.setattr(platform, "machine", lambda: "riscv64")
+    with pytest.raises(build.BuildError, match="for x86_64 and aarch64, and this machine is riscv64"):
         build.libraries(tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize("level", [0, 3, 4])
+@pytest.mark.parametrize("level", [0, 2, 3, 4])
 def test_no_more_than_the_processor_can(monkeypatch: pytest.MonkeyPatch, level: int) -> None:
     """What is not for this processor is not even opened, but for the one that is asked."""
     opened = []
@@ -202,6 +222,9 @@ def test_no_more_than_the_processor_can(monkeypatch: pytest.MonkeyPatch, level: 
     class Library:
         def rosafe_processor_level(self) -> int:
             return level
+
+        def rosafe_compiler(self) -> bytes:
+            return b"gcc 12.2.0"
 
     def load(path: Path) -> Library:
         opened.append(path.name)
@@ -212,4 +235,5 @@ def test_no_more_than_the_processor_can(monkeypatch: pytest.MonkeyPatch, level: 
     loaded, status = library.loaded.__wrapped__()
     assert (loaded is not None) == status.compiled == (level > 0)
     assert ("x86-64-v4.so" in opened) == (level == 4)
-    assert level or "AVX2" in status.detail
+    assert ("x86-64-v3.so" in opened) == (level == 3)
+    assert level or "SSE4.2" in status.detail

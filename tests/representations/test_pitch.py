@@ -15,6 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rosafe.dsp.signal import Signal
+from rosafe.representations import pitch
 from rosafe.representations.pitch import Pitch
 
 from .chain import Chain, FloatArray, cut, process, reference
@@ -377,3 +378,17 @@ def test_a_glide() -> None:
         voiced = ~np.isnan(found)
         assert voiced.mean() > 0.95
         np.testing.assert_array_less(np.abs(found / expected - 1)[voiced], 0.02)
+
+
+@pytest.mark.parametrize("steps", [2, 3, 5, 1000])
+def test_without_plateaus_the_short_way_finds_the_same_peaks(steps: int) -> None:
+    """Few steps make plateaus, many make none."""
+    rng = np.random.default_rng(steps)
+    for size in (3, 4, 17, 100):
+        curves = rng.integers(-1, steps, (2, 5, size)) / 10
+        curves[:, 0] = 0.0
+        for some in (curves, curves[:, 1:], curves[:1, 1:2]):
+            got, wanted = pitch.highest_peak(some), pitch._highest_of_plateaus(some)
+            np.testing.assert_array_equal(got[1], wanted[1])
+            found = wanted[1] > 0
+            np.testing.assert_array_equal(got[0][found], wanted[0][found])

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from rosafe.dsp.signal import Signal
 from rosafe.representations import KINDS
 from rosafe.representations.transientmaps import KEPT, OffsetMap, OnsetMap
-from tests.dsp.implementations import TWINS, using
+from tests.dsp.implementations import TWINS, Choice, using
 
 from .chain import Chain, FloatArray, reference
 
@@ -329,7 +329,7 @@ def test_a_block_without_its_level(extra: Any) -> None:
 # --- kernel and twin --------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("level", [3, 4])
+@pytest.mark.parametrize("level", [2, 3, 4, "aarch64"])
 @pytest.mark.parametrize(
     "values",
     [
@@ -341,7 +341,7 @@ def test_a_block_without_its_level(extra: Any) -> None:
     ],
 )
 @pytest.mark.parametrize("ties", [True, False])
-def test_the_kernel_gives_what_its_twin_gives(level: int, values: dict[str, Any], ties: bool) -> None:
+def test_the_kernel_gives_what_its_twin_gives(level: Choice, values: dict[str, Any], ties: bool) -> None:
     if ties:
         strengths, levels = world(400, 9, channels=12)
     else:

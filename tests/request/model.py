@@ -29,8 +29,9 @@ class Processor:
 class Model:
     """The processors by name, and what was asked for. `fail` makes the call of that number fail."""
 
-    def __init__(self, audio: bool = True) -> None:
+    def __init__(self, audio: bool = True, sample_rate: float = RATE) -> None:
         self.instance = "rosAFE"
+        self.sample_rate = sample_rate
         self.processors: dict[str, Processor] = {}
         self.calls: list[str] = []
         self.answers: list[asyncio.Task[Mapping[str, Any]]] = []
@@ -87,7 +88,7 @@ class Model:
             raise ROSAFE.error("e_existsAlready")
         try:
             checked = {p.name: p.check(given[p.name]) for p in kind.parameters if p.name in given}
-            comes: Signal | float = self.processors[parent].stage.output if parent else RATE
+            comes: Signal | float = self.processors[parent].stage.output if parent else self.sample_rate
             self.processors[name] = Processor(kind.kind, parent, STAGES[kind.kind](comes, **checked))
         except ValueError as problem:
             raise ROSAFE.error("e_badNewValue", what=str(problem)) from None
@@ -106,6 +107,7 @@ class Model:
                 {
                     "name": name,
                     "kind": processor.kind,
+                    "rate": processor.stage.output.rate,
                     "upperDepName": processor.parent,
                     "parameters": [
                         {"name": parameter, "value": text_of(value)}

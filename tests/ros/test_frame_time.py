@@ -41,7 +41,7 @@ def test_delays_are_not_seen(kind: str, skew: float, chunk: int, per_block: int)
     times = FrameTime()
     times.begin(44100)
     count = 150 * 44100 // chunk
-    told, true = [], []
+    told, true, line = [], [], None
     for k, late in enumerate(delays(kind, count, random), 1):
         times.add(k * chunk, BEGIN + k * chunk / rate + late)
         if k % per_block == 0:
@@ -55,6 +55,7 @@ def test_delays_are_not_seen(kind: str, skew: float, chunk: int, per_block: int)
     steps = np.diff(errors)[seconds[1:] > 2]
     assert np.abs(steps).max() < 2e-4, "from one answer to the next"
     assert np.abs(errors[seconds > 30]).max() < 2e-4, "off the truth"
+    assert line is not None
     assert abs(line.rate / rate - 1) < 5e-6
 
 

@@ -324,10 +324,10 @@ def test_all_ports_for_a_while(tmp_path: Path) -> None:
     """The short form of the benchmark that runs for minutes: nothing lost, no growth."""
     proc()
     env = {k: v for k, v in os.environ.items() if not k.startswith("ROS_")}
-    command = [PYTHON, str(ROOT / "benchmarks" / "ports.py"), "--quick", "--seconds", "3"]
+    command = [PYTHON, str(ROOT / "benchmarks" / "ports.py"), "--quick", "--loaded", "--seconds", "3"]
     with Process(command, {**env, "HOME": str(tmp_path)}) as done:
         assert done.wait(200) == 0, done
-        rows = re.findall(r"^(/rosAFE/\S+) +(\d+) +(\d+) +(\d+)$", done.out, re.MULTILINE)
+        rows = re.findall(r"^\| (/rosAFE/\S+) \| (\d+) \| (\d+) \| (\d+) \|$", done.out, re.MULTILINE)
     assert len(rows) == 2 * len(FIXED)
     for topic, came, expected, lost in rows:
         assert 2 < int(came) <= int(expected) and int(lost) == 0, topic

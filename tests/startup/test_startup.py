@@ -11,8 +11,10 @@ from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
+from typing import Any
 
 import pytest
+from diagnostic_msgs.msg import DiagnosticArray
 
 from rosafe import __version__
 from tests.harness import END_SECONDS, SCRIPTS, Graph, MasterProcess, Process, free_port, wait_for
@@ -75,6 +77,43 @@ def test_wrong_instance_name(graph: Graph, name: str) -> None:
         done = graph.run("bass-ros", *arguments, check=False)
         assert (done.returncode, done.stdout) == (1, "")
         assert "no instance name" in done.stderr and done.stderr.count("\n") == 1
+
+
+# --- workers ---------------------------------------------------------------------------------------------------
+
+
+def test_number_of_workers(graph: Graph) -> None:
+    """The node's own parameter counts more than the environment."""
+    with (
+        graph.node("rosAFE-ros", "-i", "few", "_workers:=3", ROSAFE_WORKERS="2"),
+        graph.collect("/diagnostics", DiagnosticArray) as messages,
+    ):
+        wait_for(lambda: ("few", "3") in told_workers(messages), what=lambda: str(messages))
+    graph.run("rosparam", "delete", "/few/workers")
+    with (
+        graph.node("rosAFE-ros", "-i", "few", ROSAFE_WORKERS="2"),
+        graph.collect("/diagnostics", DiagnosticArray) as messages,
+    ):
+        wait_for(lambda: ("few", "2") in told_workers(messages), what=lambda: str(messages))
+
+
+def told_workers(messages: list[Any]) -> set[tuple[str, str]]:
+    """Instance and number of workers of all that was told."""
+    return {
+        (status.name.split(":")[0].strip("/ "), value.value)
+        for message in messages
+        for status in message.status
+        for value in status.values
+        if value.key == "workers"
+    }
+
+
+@pytest.mark.parametrize("number", ["0", "many", "2.5", "true", "[1, 2]", "1025"])
+def test_wrong_number_of_workers(graph: Graph, number: str) -> None:
+    done = graph.run("rosAFE-ros", "-i", "wrong", f"_workers:={number}", check=False)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert "/wrong/workers: workers: " in done.stderr and "from 1 to 1024" in done.stderr
+    assert done.stderr.count("\n") == 1
 
 
 # --- no master --------------------------------------------------------------------------------------------------

@@ -16,6 +16,14 @@ def decibels(amplitude: float) -> float:
     return 20 * math.log10(amplitude / 2.0**31) if amplitude > 0 else SILENCE
 
 
+def reference(spl: float, rms: float) -> float:
+    """`pp_refSPLdB` for a microphone at which sound of `spl` (dB SPL) has the level `rms` (dBFS).
+
+    Level scaling multiplies by 10**((100 - pp_refSPLdB) / 20), and then an RMS of 1 is to stand for 100 dB SPL.
+    """
+    return 200.0 - spl + rms
+
+
 class Levels:
     """Levels of the samples that were added. An RMS of 0 dBFS is a full square wave; a full sine has -3 dBFS."""
 

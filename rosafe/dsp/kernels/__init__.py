@@ -12,7 +12,7 @@ from __future__ import annotations
 import ctypes
 import functools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
@@ -170,69 +170,40 @@ class Frames(NamedTuple):
         self.tail.samples[...] = self.block[..., self.block.shape[-1] - length :]
 
 
-class Sums(NamedTuple):
-    """Of the frames that begin in a call's samples, (*rows, F): first the `whole` ones, then those that go on.
-
-    Given to the next call, the latter save it the sums over its history.
-    """
-
-    sums: FloatArray
-    whole: int
-
-
-def levels(frames: Frames, begun: Sums | None, epsilon: float) -> tuple[FloatArray, Sums]:
+def levels(frames: Frames, epsilon: float) -> FloatArray:
     """10 log10((R + epsilon) / (L + epsilon)) of the two ears' energies of each frame, (2, C, N) to (C, F).
 
-    Energies are weighted sums of squares. The twin is `rosafe.dsp.framing.Framing.means` with `rosafe.dsp.ild.Ild`.
+    Energies are weighted sums of squares. The twin is `rosafe.dsp.framing.Framing.means` with
+    `rosafe.representations.ild.Ild`.
     """
-    sums, arguments = _sums(frames, begun)
-    result = np.empty((frames.block.shape[1], frames.number))
-    _function("rosafe_levels")(*_arguments(frames), *arguments, epsilon, _address(result))
-    return result, sums
+    channels = frames.block.shape[1]
+    result, energies = np.empty((channels, frames.number)), np.empty((2 * channels, frames.number))
+    _function("rosafe_levels")(*_arguments(frames), epsilon, _address(energies), _address(result))
+    return result
 
 
-def ratemap(
-    frames: Frames, begun: Sums | None, squared: bool, section: FloatArray, state: FloatArray
-) -> tuple[FloatArray, Sums]:
+def ratemap(frames: Frames, squared: bool, section: FloatArray, state: FloatArray) -> FloatArray:
     """Weighted sums of what a leaky integrator makes of each frame's samples, or of the squares of that, (*rows, F).
 
     The integrator is `section` (1, 6), as of `rosafe.dsp.cascade.leaky_integrator`, with its `state` (1, *rows, 2). The
     history of `frames` has been through it, the block goes now. The twin is `rosafe.dsp.framing.Framing.means` after
     `rosafe.dsp.cascade.Cascade`.
     """
-    sums, arguments = _sums(frames, begun)
     rates = np.empty((*frames.block.shape[:-1], frames.number))
-    _function("rosafe_ratemap")(
-        *_arguments(frames), *arguments, squared, -section[0, 4], _address(state), _address(rates)
-    )
-    return rates, sums
+    _function("rosafe_ratemap")(*_arguments(frames), squared, -section[0, 4], _address(state), _address(rates))
+    return rates
 
 
-def modulation(frames: Frames, begun: Sums | None, sections: FloatArray, state: FloatArray) -> tuple[FloatArray, Sums]:
+def modulation(frames: Frames, sections: FloatArray, state: FloatArray) -> FloatArray:
     """Weighted sums of the magnitudes of what parallel sections (M, 6) make of each frame's samples, (*rows, M, F).
 
     Of samples (*rows, N), with the sections' state (M, *rows, 2). The history of `frames` is (*rows, M), and what has
     come out already, the block goes in now. The twin is `rosafe.dsp.framing.Framing.means` of the magnitudes of what
     `rosafe.dsp.cascade.Parallel` makes.
     """
-    sums, arguments = _sums(frames, begun)
     means = np.empty((*frames.tail.store.shape[:-1], frames.number))
-    _function("rosafe_modulation")(
-        *_arguments(frames), *arguments, len(sections), *map(_address, (sections, state, means))
-    )
-    return means, sums
-
-
-def _sums(frames: Frames, begun: Sums | None) -> tuple[Sums, tuple[int | None, ...]]:
-    """Room for the sums of `frames`, and the arguments that tell of it and of the sums known already."""
-    samples = frames.history.length + frames.block.shape[-1]
-    number = max(0, -((frames.skip - samples) // frames.hop))
-    sums = Sums(np.empty((*frames.tail.store.shape[:-1], number)), frames.number)
-    if begun is None:
-        return sums, (number, None, 0, 0, _address(sums.sums))
-    stride = begun.sums.shape[-1]
-    first = _address(begun.sums) + begun.whole * REAL_SIZE
-    return sums, (number, first, stride, stride - begun.whole, _address(sums.sums))
+    _function("rosafe_modulation")(*_arguments(frames), len(sections), *map(_address, (sections, state, means)))
+    return means
 
 
 def correlations(frames: Frames, reach: int, epsilon: float, output: FloatArray) -> None:
@@ -291,9 +262,9 @@ def transient_map(
         np.zeros((2, channels, 2 * spread - 1), np.int64),
         np.empty(spread, np.int64),
     )
-    peaks, *others = (array.ctypes.data for array in room)
+    peaks, *others = map(_address, room)
     _function("rosafe_transient_map")(
-        *(strengths.ctypes.data, levels.ctypes.data, strengths.strides[1] // REAL_SIZE, ears * channels, channels),
+        *(_address(strengths), _address(levels), strengths.strides[1] // REAL_SIZE, ears * channels, channels),
         *(first, count, reach, at_once, *thresholds, fuse, spread, peaks, capacity, *others, _address(output)),
     )
 
@@ -377,6 +348,20 @@ def patterns(levels: FloatArray, count: int, reach: int, places: NDArray[np.int6
     return sums[..., :count]
 
 
+def join(blocks: Sequence[FloatArray], whole: FloatArray) -> None:
+    """Blocks (*rows, N) one after the other into `whole`: as `numpy.concatenate`, which is the twin.
+
+    That takes many times as long where N is small. It serves other types than float64, too, and without kernels.
+    """
+    fits = whole.ndim > 1 and rows_apart(whole) and all(block.dtype == whole.dtype for block in blocks)
+    if not fits or not compiled():
+        np.concatenate(blocks, axis=-1, out=whole)
+        return
+    held = [np.ascontiguousarray(block) for block in blocks]
+    table = np.array([[_address(block) for block in held], [block.shape[-1] for block in held]], np.int64)
+    _function("rosafe_join")(len(held), *map(_address, table), math.prod(whole.shape[:-1]), *_rows(whole))
+
+
 @contextmanager
 def denormals_off() -> Iterator[None]:
     """Within this, numpy and scipy take denormal numbers for 0 on this thread, which is many times faster.
@@ -404,8 +389,8 @@ _ANYTHING = ctypes.c_char * 0
 
 
 def _address(array: NDArray[Any]) -> int:
-    try:
-        return ctypes.addressof(_ANYTHING.from_buffer(array))  # takes a fifth of the time of the other way
+    try:  # takes a fifth of the time of the other way
+        return ctypes.addressof(_ANYTHING.from_buffer(array))  # type: ignore[arg-type]
     except TypeError:  # it cannot be written to, or not in one piece
         address: int = array.ctypes.data
         return address

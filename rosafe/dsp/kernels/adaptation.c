@@ -103,9 +103,7 @@ void rosafe_adaptation(const double *block, int64_t rows, int64_t n, double fact
                     samples[t * GROUPS + g] = larger(x, own[g].threshold);
                 }
             }
-            if (limited && count == 5) /* the default, known to the compiler */
-                run(1, 5, loops, rates, samples, span, states, own);
-            else if (limited)
+            if (limited)
                 run(1, count, loops, rates, samples, span, states, own);
             else
                 run(0, count, loops, rates, samples, span, states, own);

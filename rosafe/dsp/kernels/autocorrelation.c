@@ -14,8 +14,7 @@ enum clipping { COMPRESS, CLIP_ONLY, SIGN };
 
 /* --- transforms --- */
 
-/* `half`: of what comes out, the upper half is not written. */
-INLINE void butterflies_back(complexes *x, int64_t n, const number *w, const int half) {
+static void butterflies_back(complexes *x, int64_t n, const number *w) {
     const int64_t q = n / 4;
     for (int64_t k = 0; k < q; k++, w += 3) {
         complexes a = x[k], b = times_conjugate(x[k + q], w[0]);
@@ -23,10 +22,8 @@ INLINE void butterflies_back(complexes *x, int64_t n, const number *w, const int
         complexes even = sum(a, c), odd = difference(a, c), even2 = sum(b, d), odd2 = times_i(difference(b, d));
         x[k] = sum(even, even2);
         x[k + q] = sum(odd, odd2);
-        if (!half) {
-            x[k + 2 * q] = difference(even, even2);
-            x[k + 3 * q] = difference(odd, odd2);
-        }
+        x[k + 2 * q] = difference(even, even2);
+        x[k + 3 * q] = difference(odd, odd2);
     }
 }
 
@@ -34,7 +31,7 @@ static void back(complexes *x, int64_t n, const number *w) {
     if (n == 2) pair(x);
     if (n < 4) return;
     for (int64_t i = 0; i < 4; i++) back(x + i * (n / 4), n / 4, w + 3 * (n / 4));
-    butterflies_back(x, n, w, 0);
+    butterflies_back(x, n, w);
 }
 
 /* From the transform of N real numbers taken for n = N / 2 complex ones, to that of the real numbers' powers taken likewise.
@@ -51,8 +48,7 @@ INLINE void to_powers(const int squared, complexes *x, int64_t n, const int64_t 
     }
 }
 
-/* The circular autocorrelation, times some number, of 2 n real numbers in x, of which the upper half is 0; the lower half of
- * that. The upper half of x need not be set where n is at least 4. */
+/* The circular autocorrelation, times some number, of 2 n real numbers in x, of which the upper half is 0. The upper half of x need not be set where n is at least 4. */
 static void autocorrelate(complexes *x, int64_t n, const number *twiddles, const int64_t (*places)[2], const number *turns,
                           double exponent) {
     there_from_half(x, n, twiddles);
@@ -60,12 +56,7 @@ static void autocorrelate(complexes *x, int64_t n, const number *twiddles, const
         to_powers(1, x, n, places, turns, exponent);
     else
         to_powers(0, x, n, places, turns, exponent);
-    if (n < 4) {
-        back(x, n, twiddles);
-    } else {
-        for (int64_t i = 0; i < 4; i++) back(x + i * (n / 4), n / 4, twiddles + 3 * (n / 4));
-        butterflies_back(x, n, twiddles, 1);
-    }
+    back(x, n, twiddles);
 }
 
 /* --- frames --- */
@@ -73,15 +64,12 @@ static void autocorrelate(complexes *x, int64_t n, const number *twiddles, const
 /* Samples of the rows, windowed, to x; returns the largest, and to *lowest the smallest. */
 INLINE vec windowed(const double *const rows[LANES], const double *window, int64_t size, vec *x, vec *lowest) {
     vec high = all(-INFINITY), low = all(INFINITY);
-    for (int64_t t = 0; t < size; t += 2) { /* sizes are even */
-        read_pair(rows, t, x + t);
-        UNROLL for (int i = 0; i < 2; i++) {
-            vec sample = bounded(x[t + i], -LIMIT, LIMIT);
-            sample = (vec)((lanes)sample & ((sample >= TINY) | (sample <= -TINY))) * all(window[t + i]);
-            high = larger(high, sample);
-            low = smaller(low, sample);
-            x[t + i] = sample;
-        }
+    for (int64_t t = 0; t < size; t++) {
+        vec sample = bounded(gathered(rows, t), -LIMIT, LIMIT);
+        sample = (vec)((lanes)sample & ((sample >= TINY) | (sample <= -TINY))) * all(window[t]);
+        high = larger(high, sample);
+        low = smaller(low, sample);
+        x[t] = sample;
     }
     *lowest = low;
     return high;

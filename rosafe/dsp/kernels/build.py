@@ -1,7 +1,7 @@
-"""Builds the kernels with gcc, once: the libraries lie in a folder named after all that went into them.
+"""Builds the kernels with gcc or clang, once: the libraries lie in a folder named after all that went into them.
 
-There is one for every x86-64 processor with AVX2 and FMA, and one for those with AVX-512, so that a folder serves any
-machine.
+On x86-64 there is one for processors with SSE4.2, one for those with AVX2 and FMA and one for those with AVX-512, so
+that a folder serves any machine; on aarch64, where all have NEON, one for all.
 
 Runs as a script too, without anything but Python: ``build.py`` builds where the kernels look for it, and
 ``build.py FOLDER`` below FOLDER. It does nothing where they are there already.
@@ -22,11 +22,14 @@ from pathlib import Path
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[2]
 
-PROCESSOR = "x86_64"
-LEVELS = {3: "x86-64-v3", 4: "x86-64-v4"}  # of the processor, and their names for gcc
-# -O3 is slower: it unrolls what is unrolled already. Without -ffp-contract=off gcc fuses products and sums as it likes.
-FLAGS = ("-std=gnu11", "-O2", "-ffp-contract=off", "-fPIC", "-shared", "-Wall", "-Wextra")
-PATIENCE = 120  # seconds for gcc, which takes about one
+COMPILER = "ROSAFE_COMPILER"  # environment variable: the compiler to take; else the first of COMPILERS that is there
+COMPILERS = ("gcc", "clang")
+# levels of processors, and their names for the compiler
+LEVELS = {"x86_64": {2: "x86-64-v2", 3: "x86-64-v3", 4: "x86-64-v4"}, "aarch64": {8: "armv8-a"}}
+# -O3 is slower: it unrolls what is unrolled already. Without -ffp-contract=off products and sums are fused at will;
+# without -fno-math-errno square roots are taken one by one.
+FLAGS = ("-std=gnu11", "-O2", "-ffp-contract=off", "-fno-math-errno", "-fPIC", "-shared", "-Wall", "-Wextra")
+PATIENCE = 120  # seconds for the compiler, which takes about three
 KEPT = 3  # folders that stay: programs of other versions may want theirs again
 
 
@@ -36,7 +39,7 @@ class BuildError(Exception):
 
 def digest() -> str:
     """A name for what the sources and flags give."""
-    sha = hashlib.sha256(f"{LEVELS} {FLAGS}\0".encode())
+    sha = hashlib.sha256(f"{LEVELS} {FLAGS} {os.environ.get(COMPILER, '')}\0".encode())
     for source in sorted(HERE.glob("*.[ch]")):
         sha.update(f"{source.name}\0".encode())
         sha.update(source.read_bytes())
@@ -49,7 +52,7 @@ def place() -> Path:
 
 
 def libraries(below: Path | None = None) -> dict[int, Path]:
-    """The library for each level of `LEVELS`. They are built if they are not there.
+    """The library for each level of this machine's kind, ascending. They are built if they are not there.
 
     Parameters
     ----------
@@ -59,42 +62,51 @@ def libraries(below: Path | None = None) -> dict[int, Path]:
     Raises
     ------
     BuildError
-        Where there are none, and no gcc, no permission to write, or the wrong processor.
+        Where there are none, and no compiler, no permission to write, or the wrong processor.
     """
+    levels = LEVELS.get(platform.machine())
+    if levels is None:
+        raise BuildError(f"the kernels are for {' and '.join(LEVELS)}, and this machine is {platform.machine()}")
     folder = (place() if below is None else below) / f"kernels-{digest()}"
     try:
-        if _lacking(folder):
-            if platform.machine() != PROCESSOR:
-                raise BuildError(f"the kernels are for {PROCESSOR}, and this machine is {platform.machine()}")
-            _build(folder)
+        if _lacking(folder, levels):
+            _build(folder, levels)
     except OSError as problem:
         raise BuildError(f"the kernels cannot be built: {problem}") from problem
-    return _paths(folder)
+    return _paths(folder, levels)
 
 
-def _paths(folder: Path) -> dict[int, Path]:
-    return {level: folder / f"{name}.so" for level, name in LEVELS.items()}
+def _paths(folder: Path, levels: dict[int, str]) -> dict[int, Path]:
+    return {level: folder / f"{name}.so" for level, name in levels.items()}
 
 
-def _lacking(folder: Path) -> list[str]:
+def _lacking(folder: Path, levels: dict[int, str]) -> list[str]:
     """The names of the libraries that are not in `folder`, or empty."""
-    return [path.name for path in _paths(folder).values() if not path.is_file() or path.stat().st_size == 0]
+    return [path.name for path in _paths(folder, levels).values() if not path.is_file() or path.stat().st_size == 0]
 
 
-def _build(folder: Path) -> None:
+def _compiler() -> str:
+    asked = os.environ.get(COMPILER)
+    if asked and shutil.which(asked) is None:
+        raise BuildError(f"the kernels are not built, and {COMPILER} is {asked[:40]!r}, which is no program here")
+    for name in (asked,) if asked else COMPILERS:
+        if shutil.which(name):
+            return name
+    raise BuildError("the kernels are not built, and there is no gcc to build them: install gcc")
+
+
+def _build(folder: Path, levels: dict[int, str]) -> None:
     base = folder.parent
-    gcc = shutil.which("gcc")
-    if gcc is None:
-        raise BuildError("the kernels are not built, and there is no gcc to build them: install gcc")
+    compiler = _compiler()
     base.mkdir(parents=True, exist_ok=True)
     with open(base / "kernels.lock", "w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)  # given back by the kernel even if this process is killed
         for orphan in base.glob("kernels-*.new-*"):  # nobody else builds now: left by one that was killed
             shutil.rmtree(orphan)
-        if _lacking(folder):
+        if _lacking(folder, levels):
             workshop = Path(tempfile.mkdtemp(prefix=f"{folder.name}.new-", dir=base))
             try:
-                _compile(gcc, workshop)
+                compile_sources(compiler, levels, workshop)
                 for path in (workshop, *workshop.iterdir()):  # for other users, too, whatever this one's umask is
                     path.chmod(0o755)
                 if folder.is_dir():  # something has been lost there
@@ -106,29 +118,39 @@ def _build(folder: Path) -> None:
         _discard_old(base)
 
 
-def _compile(gcc: str, workshop: Path) -> None:
-    """All libraries at once, each by a gcc of its own."""
-    sources = sorted(map(str, HERE.glob("*.c")))
+def compile_sources(
+    compiler: str, levels: dict[int, str], folder: Path, sources: Path = HERE, options: tuple[str, ...] = ()
+) -> dict[int, Path]:
+    """A library in `folder` for each of the `levels`, all at once, each by a compiler of its own.
+
+    Raises
+    ------
+    BuildError
+        With the first thing that the compiler has to say.
+    """
+    name, files = Path(compiler).name, sorted(map(str, sources.glob("*.c")))
     environment = {**os.environ, "LC_ALL": "C"}
+    paths = _paths(folder, levels)
     running = []
     try:
-        for level, path in _paths(workshop).items():
-            command = [gcc, *FLAGS, f"-march={LEVELS[level]}", "-o", str(path), *sources, "-lm"]
+        for level, path in paths.items():
+            command = [compiler, *FLAGS, *options, f"-march={levels[level]}", "-o", str(path), *files, "-lm"]
             running.append(subprocess.Popen(command, stdin=subprocess.DEVNULL, stderr=subprocess.PIPE, env=environment))
         for process in running:
             _, said = process.communicate(timeout=PATIENCE)
             if process.returncode != 0:
                 lines = said.decode(errors="replace").strip().splitlines()
                 errors = [line for line in lines if "error" in line] or lines or [f"status {process.returncode}"]
-                raise BuildError(f"gcc cannot build the kernels: {errors[0]}")
+                raise BuildError(f"{name} cannot build the kernels: {errors[0]}")
     except subprocess.TimeoutExpired as problem:
-        raise BuildError(f"gcc took more than {PATIENCE} seconds for the kernels") from problem
+        raise BuildError(f"{name} took more than {PATIENCE} seconds for the kernels") from problem
     finally:
         for process in running:
             process.kill()  # one that is done already takes no notice
             process.wait()
-    if missing := _lacking(workshop):
-        raise BuildError(f"gcc cannot build the kernels: it says nothing, and there is no {missing[0]}")
+    if missing := _lacking(folder, levels):
+        raise BuildError(f"{name} cannot build the kernels: it says nothing, and there is no {missing[0]}")
+    return paths
 
 
 def _discard_old(base: Path) -> None:

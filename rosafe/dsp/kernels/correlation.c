@@ -7,24 +7,22 @@
 #include <string.h>
 
 /* Samples from..until of the rows times `window` to `to` from t on; returns their energy. */
-static vec put(const double *const rows[LANES], const double *window, int64_t from, int64_t until, phases to, int64_t t) {
-    vec energy = {}, *place[MOST_PHASES]; /* of eight samples in turn; those of the next eight lie `advance` further */
-    for (int k = 0; k < MOST_PHASES; k++) place[k] = at(to, t + k);
-    int64_t i = from, advance = MOST_PHASES >> to.halvings, ahead = 0;
-    for (; i + MOST_PHASES <= until; i += MOST_PHASES, ahead += advance)
-        UNROLL for (int k = 0; k < MOST_PHASES; k += 2) {
-            vec pair[2];
-            read_pair(rows, i + k, pair);
-            UNROLL for (int j = 0; j < 2; j++) {
-                vec x = bounded(pair[j], -LIMIT, LIMIT) * all(window[i + k + j]);
-                energy = fused(x, x, energy);
-                place[k + j][ahead] = x;
-            }
+static vec put(const double *const rows[LANES], const double *window, int64_t from, int64_t until, halves to, int64_t t) {
+    vec energy = {};
+    int64_t i = from;
+    for (; i + 2 <= until; i += 2, t += 2) {
+        vec pair[2];
+        read_pair(rows, i, pair);
+        UNROLL for (int k = 0; k < 2; k++) {
+            vec x = bounded(pair[k], -LIMIT, LIMIT) * all(window[i + k]);
+            energy = fused(x, x, energy);
+            *at(to, t + k) = x;
         }
-    for (int k = 0; i + k < until; k++) {
-        vec x = bounded(gathered(rows, i + k), -LIMIT, LIMIT) * all(window[i + k]);
+    }
+    if (i < until) {
+        vec x = bounded(gathered(rows, i), -LIMIT, LIMIT) * all(window[i]);
         energy = fused(x, x, energy);
-        place[k][ahead] = x;
+        *at(to, t) = x;
     }
     return energy;
 }
@@ -36,7 +34,7 @@ typedef struct {
 } frames;
 
 /* As `put`. */
-INLINE vec put_both(const frames *of, const double *window, int64_t from, int64_t until, phases to, int64_t t) {
+INLINE vec put_both(const frames *of, const double *window, int64_t from, int64_t until, halves to, int64_t t) {
     const int64_t middle = most(from, least(until, of->border));
     vec energy = put(of->old, window, from, middle, to, t);
     return energy + put(of->new, window, middle, until, to, t + middle - from);
@@ -44,7 +42,7 @@ INLINE vec put_both(const frames *of, const double *window, int64_t from, int64_
 
 /* Samples from..until of frames that begin at different samples are joined: their borders lie apart. */
 static void join(frames *of, const int64_t starts[LANES], int64_t held, int64_t from, int64_t until,
-                 double joined[LANES][LONGEST]) {
+                 double joined[LANES][SPAN + MOST_LAGS]) {
     for (int k = 0; k < LANES; k++) {
         int64_t middle = most(from, least(until, held - starts[k]));
         memcpy(joined[k], of->old[k] + from, (middle - from) * sizeof(double));
@@ -64,16 +62,7 @@ void rosafe_correlations(const double *history, int64_t history_stride, int64_t 
                          double *output, int64_t channel_stride) {
     uint32_t mode = denormals_off();
     const int64_t lags = 2 * reach + 1, spans = (size + SPAN - 1) / SPAN, span = (size + spans - 1) / spans;
-    const int halvings = best_halvings(span, lags);
-    const int64_t count = 1 << halvings, n_r = (span + count - 1) / count, n_c = (lags + count - 1) / count;
-    const int64_t n_l = n_r + n_c - 1 + halvings;
-    vec l_samples[LONGEST], r_samples[SPAN + MOST_PHASES], c_samples[MOST_LAGS + MOST_PHASES], scratch[3 * LONGEST];
-    const phases l = {l_samples, halvings, n_l}, r = {r_samples, halvings, n_r}, c = {c_samples, halvings, n_c};
-    const vec *l_phases[MOST_PHASES], *r_phases[MOST_PHASES];
-    vec *c_phases[MOST_PHASES];
-    for (int i = 0; i < count; i++)
-        l_phases[i] = l_samples + i * n_l, r_phases[i] = r_samples + i * n_r, c_phases[i] = c_samples + i * n_c;
-
+    halves l, r, c;
     for (int64_t first = 0; first < channels * number; first += LANES) {
         vec correlation[MOST_LAGS], energy[2] = {};
         double *to[LANES];
@@ -89,7 +78,7 @@ void rosafe_correlations(const double *history, int64_t history_stride, int64_t 
             /* r from `begin` to `end`; of l, up to `reach` more on either side */
             int64_t end = least(begin + span, size), l_begin = most(0, begin - reach), l_end = least(size, end + reach);
             for (int ear = 0; ear < 2; ear++) {
-                double joined[LANES][LONGEST];
+                double joined[LANES][SPAN + MOST_LAGS];
                 frames mine = {.border = held - start[0]};
                 for (int k = 0; k < LANES; k++) {
                     int64_t row = ear * channels + channel[k];
@@ -103,13 +92,12 @@ void rosafe_correlations(const double *history, int64_t history_stride, int64_t 
                     put_both(&mine, window, l_begin, begin, l, reach - (begin - l_begin));
                     energy[0] += put_both(&mine, window, begin, end, l, reach);
                     put_both(&mine, window, end, l_end, l, reach + end - begin);
-                    put_zeros(l, reach + l_end - begin, count * n_l);
+                    put_zeros(l, reach + l_end - begin, end - begin + lags - 1);
                 } else {
                     energy[1] += put_both(&mine, window, begin, end, r, 0);
-                    put_zeros(r, end - begin, count * n_r);
                 }
             }
-            product(halvings, l_phases, r_phases, n_r, n_c, c_phases, scratch);
+            product(l, r, end - begin, lags, c);
             for (int64_t m = 0; m < lags; m++) correlation[m] += *at(c, m);
         }
         vec scale = all(1.0) / root(energy[0] * energy[1] + all(epsilon));

@@ -3,8 +3,7 @@
  * many frames there are. */
 #include "vector.h"
 
-enum { TOGETHER = 2, /* registers of frames of each ear that share the reading of a weight */
-       CHAINS = 2 };    /* sums that do not wait for one another */
+enum { TOGETHER = 2 /* registers of frames of each ear that share the reading of a weight */ };
 
 /* The channels and frames that a feature takes in, those next to frame 0 included, and where its weights begin. */
 typedef struct {
@@ -14,25 +13,20 @@ typedef struct {
 /* Of `count` registers of frames from `levels` on, of the left ear and, `ear` further, of the right one. */
 INLINE void add_products(const int count, const double *levels, int64_t ear, int64_t stride, const pattern *of,
                          const double *weights, double *left, double *right) {
-    vec sum[2][TOGETHER][CHAINS] = {};
+    vec sum[2][TOGETHER] = {};
     const double *weight = weights + of->weights;
     for (int64_t c = of->first; c < of->first + of->channels; c++) {
         const double *level = levels + c * stride - of->reach;
-        int64_t u = 0;
-        for (; u + CHAINS <= 2 * of->reach + 1; u += CHAINS, level += CHAINS, weight += CHAINS)
-            UNROLL for (int k = 0; k < CHAINS; k++)
-                UNROLL for (int i = 0; i < 2 * count; i++) {
-                    vec *mine = &sum[i / count][i % count][k];
-                    *mine = fused(all(weight[k]), load(level + k + i / count * ear + i % count * LANES), *mine);
-                }
-        for (; u < 2 * of->reach + 1; u++, level++, weight++)
-            UNROLL for (int i = 0; i < 2 * count; i++) {
-                vec *mine = &sum[i / count][i % count][0];
-                *mine = fused(all(*weight), load(level + i / count * ear + i % count * LANES), *mine);
+        for (int64_t u = 0; u < 2 * of->reach + 1; u++, level++, weight++)
+            UNROLL for (int i = 0; i < count; i++) {
+                sum[0][i] = fused(all(*weight), load(level + i * LANES), sum[0][i]);
+                sum[1][i] = fused(all(*weight), load(level + ear + i * LANES), sum[1][i]);
             }
     }
-    UNROLL for (int i = 0; i < 2 * count; i++)
-        *(vec_anywhere *)((i / count ? right : left) + i % count * LANES) = sum[i / count][i % count][0] + sum[i / count][i % count][1];
+    UNROLL for (int i = 0; i < count; i++) {
+        *(vec_anywhere *)(left + i * LANES) = sum[0][i];
+        *(vec_anywhere *)(right + i * LANES) = sum[1][i];
+    }
 }
 
 /* levels (2, channels, reach + frames + reach), where frames are a multiple of 8; patterns (features), sums (2, features,

@@ -14,15 +14,15 @@ typedef struct {
     vec re, im;
 } complexes;
 
-/* n samples through `poles` poles; `real`: the imaginary part of the input is 0 and not read. */
-INLINE void run(const int poles, const int real, complexes *samples, int64_t n, complexes pole, complexes *states) {
+/* n samples through `poles` poles. */
+INLINE void run(const int poles, complexes *samples, int64_t n, complexes pole, complexes *states) {
     complexes s[TOGETHER];
     UNROLL for (int k = 0; k < poles; k++) s[k] = states[k];
     for (int64_t t = 0; t < n; t++) {
-        vec re = samples[t].re, im = real ? (vec){} : samples[t].im;
+        vec re = samples[t].re, im = samples[t].im;
         UNROLL for (int k = 0; k < poles; k++) {
             re += s[k].re;
-            im = real && k == 0 ? s[k].im : im + s[k].im;
+            im += s[k].im;
             s[k].re = fused(pole.re, re, -(pole.im * im));
             s[k].im = fused(pole.re, im, pole.im * re);
         }
@@ -31,16 +31,12 @@ INLINE void run(const int poles, const int real, complexes *samples, int64_t n, 
     UNROLL for (int k = 0; k < poles; k++) states[k] = s[k];
 }
 
-static void run_some(int64_t poles, int real, complexes *samples, int64_t n, complexes pole, complexes *states) {
-    switch (poles * 2 + real) {
-    case 9: run(4, 1, samples, n, pole, states); break;
-    case 8: run(4, 0, samples, n, pole, states); break;
-    case 7: run(3, 1, samples, n, pole, states); break;
-    case 6: run(3, 0, samples, n, pole, states); break;
-    case 5: run(2, 1, samples, n, pole, states); break;
-    case 4: run(2, 0, samples, n, pole, states); break;
-    case 3: run(1, 1, samples, n, pole, states); break;
-    case 2: run(1, 0, samples, n, pole, states); break;
+static void run_some(int64_t poles, complexes *samples, int64_t n, complexes pole, complexes *states) {
+    switch (poles) {
+    case 4: run(4, samples, n, pole, states); break;
+    case 3: run(3, samples, n, pole, states); break;
+    case 2: run(2, samples, n, pole, states); break;
+    case 1: run(1, samples, n, pole, states); break;
     }
 }
 
@@ -79,7 +75,7 @@ void rosafe_gammatone(const double *block, int64_t n, int64_t channels, int64_t 
                     ears[ear][t] = x > -LIMIT ? x : -LIMIT;
                 }
             for (int64_t t = 0; t < count; t++)
-                samples[t].re = fused(all(ears[0][t]), left, all(ears[1][t]) * right);
+                samples[t] = (complexes){fused(all(ears[0][t]), left, all(ears[1][t]) * right), (vec){}};
             for (int64_t p = 0; p < order; p += TOGETHER) {
                 if (p > 0) {
                     vec gain;
@@ -89,7 +85,7 @@ void rosafe_gammatone(const double *block, int64_t n, int64_t channels, int64_t 
                         samples[t].im *= gain;
                     }
                 }
-                run_some(least(TOGETHER, order - p), p == 0, samples, count, pole, states + p);
+                run_some(least(TOGETHER, order - p), samples, count, pole, states + p);
             }
             double *to[LANES];
             for (int k = 0; k < LANES; k++) to[k] = output + row[k] * stride + at;

@@ -10,23 +10,22 @@ from typing import NamedTuple
 
 from . import build
 
-SWITCH = "ROSAFE_KERNELS"  # environment variable: 0 for numpy and scipy, 3 or 4 for at most that level of processor
+SWITCH = "ROSAFE_KERNELS"  # environment variable: 0 for numpy and scipy, 2, 3... for at most that level of processor
 
-INSTRUCTIONS = {3: "AVX2 and FMA", 4: "AVX-512"}  # that the levels are for
+INSTRUCTIONS = {2: "SSE4.2", 3: "AVX2 and FMA", 4: "AVX-512", 8: "NEON"}  # that the levels are for
 
 _INTEGER, _REAL, _ARRAY, _BITS = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p, ctypes.c_uint32
 # history, stride, length; block, length; tail, stride, start; rows; skip; window, size; hop; frames
 _FRAMES = (_ARRAY, _INTEGER, _INTEGER, _ARRAY, _INTEGER, _ARRAY, *[_INTEGER] * 4, _ARRAY, *[_INTEGER] * 3)
-# frames that begin; sums of those that had begun, stride, how many are known; sums
-_SUMS = (_INTEGER, _ARRAY, _INTEGER, _INTEGER, _ARRAY)
 _ARGUMENTS = {
     "rosafe_gammatone": (_ARRAY, *[_INTEGER] * 3, *[_ARRAY] * 3, _INTEGER, _ARRAY),
     "rosafe_biquads": (_INTEGER, _ARRAY, _ARRAY, _INTEGER, _INTEGER, _ARRAY, _INTEGER, _ARRAY, _ARRAY, _INTEGER),
     "rosafe_adaptation": (_ARRAY, _INTEGER, _INTEGER, _REAL, *[_ARRAY, _INTEGER] * 2, _INTEGER, _ARRAY, _ARRAY),
-    "rosafe_levels": (*_FRAMES, *_SUMS, _REAL, _ARRAY),
-    "rosafe_ratemap": (*_FRAMES, *_SUMS, _INTEGER, _REAL, _ARRAY, _ARRAY),
-    "rosafe_modulation": (*_FRAMES, *_SUMS, _INTEGER, *[_ARRAY] * 3),
+    "rosafe_levels": (*_FRAMES, _REAL, _ARRAY, _ARRAY),
+    "rosafe_ratemap": (*_FRAMES, _INTEGER, _REAL, _ARRAY, _ARRAY),
+    "rosafe_modulation": (*_FRAMES, _INTEGER, *[_ARRAY] * 3),
     "rosafe_patterns": (_ARRAY, *[_INTEGER] * 3, _ARRAY, _INTEGER, _ARRAY, _ARRAY),
+    "rosafe_join": (_INTEGER, _ARRAY, _ARRAY, _INTEGER, _ARRAY, _INTEGER),
     "rosafe_denormals_off": (),
     "rosafe_denormals_as": (_BITS,),
     "rosafe_correlations": (*_FRAMES, _INTEGER, _REAL, _ARRAY, _INTEGER),
@@ -64,16 +63,20 @@ def loaded() -> tuple[ctypes.CDLL | None, Status]:
         return None, Status(False, f"numpy and scipy, as {SWITCH}=0 says")
     try:
         paths = build.libraries()
-        # the lesser one can be asked on any processor
-        level = load(paths[3]).rosafe_processor_level()
+        least = min(paths)
+        level = load(paths[least]).rosafe_processor_level()  # which can be asked of this one on any processor
         if level not in paths:
-            raise build.BuildError("the kernels need a processor with AVX2 and FMA (x86-64-v3)")
+            raise build.BuildError(f"the kernels need a processor with {INSTRUCTIONS[least]} ({paths[least].stem})")
         reason = f"the processor has {INSTRUCTIONS[level]}"
         if switch not in ("", *map(str, paths)):
-            reason += f" ({SWITCH} is {switch[:20]!r}, which means nothing: 0, 3 or 4 would)"
+            choices = ", ".join(map(str, (0, *list(paths)[:-1])))
+            reason += f" ({SWITCH} is {switch[:20]!r}, which means nothing: {choices} or {max(paths)} would)"
         elif switch and int(switch) < level:
             level, reason = int(switch), f"{reason}, but {SWITCH} is {switch}"
-        return load(paths[level]), Status(True, f"compiled for {build.LEVELS[level]}: {reason}; {paths[level]}")
+        path = paths[level]
+        library = load(path)
+        compiler = library.rosafe_compiler().decode().strip()
+        return library, Status(True, f"compiled for {path.stem} by {compiler}: {reason}; {path}")
     except (build.BuildError, OSError) as problem:
         return None, Status(False, f"numpy and scipy: {problem}")
 
@@ -85,4 +88,5 @@ def load(path: Path) -> ctypes.CDLL:
         function = getattr(library, name)
         function.argtypes, function.restype = arguments, None
     library.rosafe_denormals_off.restype = _BITS
+    library.rosafe_compiler.restype = ctypes.c_char_p
     return library

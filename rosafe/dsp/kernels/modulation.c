@@ -47,19 +47,19 @@ INLINE void add_magnitudes(vec magnitudes[SPAN][GROUPS], int64_t at, int64_t n, 
 
 /* The arguments as in rosafe_levels, but that the samples that are held and summed are those that come out: magnitudes, in
  * rows * filters rows, `filters` of them to each of the `rows` of block. state is (filters, rows, 2), means (rows, filters,
- * whole). */
+ * number). */
 void rosafe_modulation(const double *history, int64_t history_stride, int64_t held, const double *block, int64_t n,
                        double *tail, int64_t tail_stride, int64_t tail_from, int64_t rows, int64_t skip,
-                       const double *weights, int64_t size, int64_t hop, int64_t whole, int64_t number, const double *begun,
-                       int64_t begun_stride, int64_t known, double *sums, int64_t filters, const double *b0_b1_b2_1_a1_a2,
-                       double *state, double *means) {
+                       const double *weights, int64_t size, int64_t hop, int64_t number, int64_t filters,
+                       const double *b0_b1_b2_1_a1_a2, double *state, double *means) {
     const framing frames = {skip, weights, size, hop, number};
     uint32_t mode = denormals_off();
+    memset(means, 0, rows * filters * number * sizeof(double));
     for (int64_t row = 0; row < rows; row++)
         for (int64_t first = 0; first < filters; first += FILTERS) {
             const int64_t used = least(FILTERS, filters - first), line = row * filters + first;
             section sections[GROUPS];
-            double *mine = sums + line * number;
+            double *mine = means + line * number;
             for (int k = 0; k < FILTERS; k++) { /* lanes without a filter do the last one once more */
                 const int64_t which = least(k, used - 1);
                 const double *design = b0_b1_b2_1_a1_a2 + 6 * (first + which), *before = state + 2 * ((first + which) * rows + row);
@@ -67,10 +67,8 @@ void rosafe_modulation(const double *history, int64_t history_stride, int64_t he
                 for (int i = 0; i < 3; i++) of->b[i][k % LANES] = design[i], of->a[i][k % LANES] = design[3 + i];
                 of->s1[k % LANES] = before[0], of->s2[k % LANES] = before[1];
             }
-            for (int64_t k = 0; k < used; k++) {
-                begin_sums(begun + (line + k) * begun_stride, known, number, mine + k * number);
-                if (!known) add_frames(0, history + (line + k) * history_stride, 0, held, &frames, mine + k * number);
-            }
+            for (int64_t k = 0; k < used; k++)
+                add_frames(0, history + (line + k) * history_stride, 0, held, &frames, mine + k * number);
             for (int64_t at = held, end; at < held + n; at = end) {
                 vec magnitudes[SPAN][GROUPS];
                 end = least(at + SPAN, held + n);
@@ -84,7 +82,6 @@ void rosafe_modulation(const double *history, int64_t history_stride, int64_t he
                 double *after = state + 2 * ((first + k) * rows + row);
                 after[0] = flushed(sections[k / LANES].s1[k % LANES]);
                 after[1] = flushed(sections[k / LANES].s2[k % LANES]);
-                memcpy(means + (line + k) * whole, mine + k * number, whole * sizeof(double));
             }
         }
     denormals_as(mode);

@@ -84,11 +84,7 @@ void rosafe_add_spectra(const double *samples, int64_t channels, int64_t number_
                 gain[k] = 0.25 * gains[row % channels];
                 if (first + k < rows) factor[row / channels][k] = factors[f * rows + row];
             }
-            for (int64_t t = 0; t < size; t += 2) {
-                vec two[2];
-                read_pair(from, t, two);
-                x[t / 2] = (complexes){two[0], two[1]};
-            }
+            for (int64_t t = 0; t < size; t += 2) x[t / 2] = (complexes){gathered(from, t), gathered(from, t + 1)};
             memset(x + size / 2, 0, ((half ? points / 2 : points) - size / 2) * sizeof(complexes));
             if (half)
                 there_from_half(x, points, (const number *)twiddles);
@@ -172,40 +168,16 @@ static double filtered(const double *x, int64_t size, const int64_t *shifts, con
     return energy;
 }
 
-/* n samples of each row; `until` of them are put, 0 behind. */
-INLINE void put(const double *const rows[LANES], int64_t n, int64_t until, phases to) {
-    vec *place[MOST_PHASES]; /* of eight samples in turn; those of the next eight lie `ahead` further */
-    for (int k = 0; k < MOST_PHASES; k++) place[k] = at(to, k);
-    int64_t t = 0, ahead = 0;
-    for (; t + MOST_PHASES <= n; t += MOST_PHASES, ahead += MOST_PHASES >> to.halvings)
-        UNROLL for (int k = 0; k < MOST_PHASES; k += 2) {
-            vec pair[2];
-            read_pair(rows, t + k, pair);
-            place[k][ahead] = pair[0];
-            place[k + 1][ahead] = pair[1];
-        }
-    for (; t < n; t++) *at(to, t) = gathered(rows, t);
-    put_zeros(to, n, until);
-}
-
 /* c[m] = sum_t l[t+m] r[t], n samples and `lags` lags. */
 static void correlate(const double *const l[LANES], const double *const r[LANES], int64_t n, int64_t lags, vec *c) {
-    vec l_samples[LONGEST], r_samples[SPAN + MOST_PHASES], c_samples[MOST_LAGS + MOST_PHASES], scratch[3 * LONGEST];
+    halves l_samples, r_samples, sums;
     for (int64_t m = 0; m < lags; m++) c[m] = (vec){};
     for (int64_t begin = 0; begin < n; begin += SPAN) {
         const int64_t span = least(SPAN, n - begin);
-        const int halvings = best_halvings(span, lags), count = 1 << halvings;
-        const int64_t n_r = (span + count - 1) / count, n_c = (lags + count - 1) / count, n_l = n_r + n_c - 1 + halvings;
-        const double *l_rows[LANES], *r_rows[LANES];
-        const vec *l_phases[MOST_PHASES], *r_phases[MOST_PHASES];
-        vec *c_phases[MOST_PHASES];
-        for (int k = 0; k < LANES; k++) l_rows[k] = l[k] + begin, r_rows[k] = r[k] + begin;
-        for (int i = 0; i < count; i++)
-            l_phases[i] = l_samples + i * n_l, r_phases[i] = r_samples + i * n_r, c_phases[i] = c_samples + i * n_c;
-        put(l_rows, span + lags - 1, count * n_l, (phases){l_samples, halvings, n_l});
-        put(r_rows, span, count * n_r, (phases){r_samples, halvings, n_r});
-        product(halvings, l_phases, r_phases, n_r, n_c, c_phases, scratch);
-        for (int64_t m = 0; m < lags; m++) c[m] += *at((phases){c_samples, halvings, n_c}, m);
+        for (int64_t t = 0; t < span + lags - 1; t++) *at(l_samples, t) = gathered(l, begin + t);
+        for (int64_t t = 0; t < span; t++) *at(r_samples, t) = gathered(r, begin + t);
+        product(l_samples, r_samples, span, lags, sums);
+        for (int64_t m = 0; m < lags; m++) c[m] += *at(sums, m);
     }
 }
 

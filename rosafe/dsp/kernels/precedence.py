@@ -80,10 +80,10 @@ def correlate_filtered(
     scratch = np.empty(2 * MOST_LANES * (size + reach) + 2 * longest)
     filters = [np.ascontiguousarray(array) for taps in (left_taps, right_taps) for array in taps]
     _function("rosafe_correlate_filtered")(
-        left.ctypes.data,
+        _address(left),
         *(step // REAL_SIZE for step in left.strides[:2]),
         *map(_address, filters[:2]),
-        right.ctypes.data,
+        _address(right),
         *(step // REAL_SIZE for step in right.strides[:2]),
         *map(_address, filters[2:]),
         count,

@@ -1,12 +1,26 @@
-/* Which of the libraries the processor can run, and how a thread of it takes denormal numbers. The first function is compiled
- * for any x86-64, so that it can be asked of the library for the lesser processors anywhere. */
+/* Which of the libraries the processor can run, what compiled this one, and how a thread takes denormal numbers. The first
+ * function is compiled for any x86-64, so that it can be asked of the library for the least processors anywhere. */
 #include "vector.h"
 
-/* 4 or 3 for x86-64-v4 (AVX-512) or x86-64-v3 (AVX2, FMA), 0 for less. */
+/* 4, 3 or 2 for x86-64-v4 (AVX-512), x86-64-v3 (AVX2, FMA) or x86-64-v2 (SSE4.2), 0 for less; 8 for ARMv8. */
+#ifdef __x86_64__
 __attribute__((target("arch=x86-64"))) int rosafe_processor_level(void) {
     __builtin_cpu_init();
-    if (__builtin_cpu_supports("x86-64-v4")) return 4;
-    return __builtin_cpu_supports("x86-64-v3") ? 3 : 0;
+#define HAS __builtin_cpu_supports /* clang does not know the levels' names yet */
+    if (!HAS("sse4.2") || !HAS("ssse3") || !HAS("popcnt")) return 0;
+    if (!HAS("avx2") || !HAS("fma") || !HAS("bmi") || !HAS("bmi2")) return 2;
+    return HAS("avx512f") && HAS("avx512bw") && HAS("avx512cd") && HAS("avx512dq") && HAS("avx512vl") ? 4 : 3;
+}
+#else
+int rosafe_processor_level(void) { return 8; }
+#endif
+
+const char *rosafe_compiler(void) {
+#ifdef __clang__
+    return "clang " __clang_version__;
+#else
+    return "gcc " __VERSION__;
+#endif
 }
 
 /* For what is not a kernel; returns what to give back to rosafe_denormals_as. */

@@ -7,30 +7,20 @@
 enum {
     SPAN = 1024,      /* samples at a time: all that belongs to these stays in the second-level cache */
     MOST_LAGS = 1024, /* FFT is faster beyond */
-    MOST_HALVINGS = 3,
-    MOST_PHASES = 1 << MOST_HALVINGS,
-    LONGEST = SPAN + MOST_LAGS + MOST_PHASES * (MOST_HALVINGS + 2),
+    LONGEST = (SPAN + MOST_LAGS) / 2,
 };
 
-/* How often to halve sequences r of `size` samples, at most SPAN, for so many lags. */
-INTERNAL int best_halvings(int64_t size, int64_t lags);
+/* The even samples of a sequence, and the odd ones. */
+typedef vec halves[2][LONGEST];
 
-/* Sums of sequences in 2^halvings phases: r and c with n and `lags` elements in each, l with n + lags - 1 + halvings. */
-INTERNAL void product(int halvings, const vec *const *l, const vec *const *r, int64_t n, int64_t lags, vec *const *c,
-                      vec *scratch);
+INLINE vec *at(halves of, int64_t t) { return of[t & 1] + (t >> 1); }
 
-/* Samples in 2^halvings phases, `length` in each. */
-typedef struct {
-    vec *samples;
-    int64_t halvings, length;
-} phases;
-
-INLINE vec *at(phases to, int64_t t) {
-    return to.samples + (t & ((1 << to.halvings) - 1)) * to.length + (t >> to.halvings);
-}
-
-INLINE void put_zeros(phases to, int64_t t, int64_t until) {
+INLINE void put_zeros(halves to, int64_t t, int64_t until) {
     for (; t < until; t++) *at(to, t) = (vec){};
 }
+
+/* For n samples r and `lags` lags, at most SPAN and MOST_LAGS. Behind the n + lags - 1 samples l and behind r, zeros are put
+ * where either is not even. */
+INTERNAL void product(halves l, halves r, int64_t n, int64_t lags, halves c);
 
 #endif

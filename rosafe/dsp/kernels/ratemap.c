@@ -45,9 +45,9 @@ INLINE double integrate(const integrator *by, const double *x, int64_t n, double
 }
 
 INLINE void run(const int how, const double *history, int64_t held, const double *block, int64_t n, double *tail,
-                int64_t tail_from, const framing *frames, const integrator *by, double *state, int known, double *sums) {
+                int64_t tail_from, const framing *frames, const integrator *by, double *state, double *sums) {
     double span[SPAN + LANES], s = *state;
-    if (!known) add_frames(how, history, 0, held, frames, sums);
+    add_frames(how, history, 0, held, frames, sums);
     for (int64_t at = held, end; at < held + n; at = end) {
         end = least(at + SPAN, held + n);
         s = integrate(by, block + at - held, end - at, s, span);
@@ -59,24 +59,22 @@ INLINE void run(const int how, const double *history, int64_t held, const double
 }
 
 /* The arguments as in rosafe_levels, but that the history has been integrated already, and the block has not. state is
- * (rows, 2), of which the second belongs to the twin's form; rates (rows, whole) are the sums of the complete frames. */
+ * (rows, 2), of which the second belongs to the twin's form; rates (rows, number). */
 void rosafe_ratemap(const double *history, int64_t history_stride, int64_t held, const double *block, int64_t n,
                     double *tail, int64_t tail_stride, int64_t tail_from, int64_t rows, int64_t skip,
-                    const double *weights, int64_t size, int64_t hop, int64_t whole, int64_t number, const double *begun,
-                    int64_t begun_stride, int64_t known, double *sums, int64_t squared, double retention, double *state,
-                    double *rates) {
+                    const double *weights, int64_t size, int64_t hop, int64_t number, int64_t squared, double retention,
+                    double *state, double *rates) {
     const framing frames = {skip, weights, size, hop, number};
     const integrator by = design(retention);
     uint32_t mode = denormals_off();
-    for (int64_t row = rows - 1; row >= 0; row--) { /* ILD has ended there, so that this is what is in the cache */
+    memset(rates, 0, rows * number * sizeof(double));
+    for (int64_t row = 0; row < rows; row++) {
         const double *old = history + row * history_stride, *new = block + row * n;
-        double *mine = sums + row * number, *kept = tail + row * tail_stride;
-        begin_sums(begun + row * begun_stride, known, number, mine);
+        double *kept = tail + row * tail_stride;
         if (squared)
-            run(SQUARED, old, held, new, n, kept, tail_from, &frames, &by, state + 2 * row, known > 0, mine);
+            run(SQUARED, old, held, new, n, kept, tail_from, &frames, &by, state + 2 * row, rates + row * number);
         else
-            run(0, old, held, new, n, kept, tail_from, &frames, &by, state + 2 * row, known > 0, mine);
-        memcpy(rates + row * whole, mine, whole * sizeof(double));
+            run(0, old, held, new, n, kept, tail_from, &frames, &by, state + 2 * row, rates + row * number);
     }
     denormals_as(mode);
 }

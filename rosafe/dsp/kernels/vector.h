@@ -1,9 +1,9 @@
-/* One register of doubles, in GCC's vector extensions: what all kernels are made of.
+/* One register of doubles, in vector extensions of GCC and clang: what all kernels are made of.
  *
- * Four doubles, or eight where the compiler is told of AVX-512; the kernels are written for any number of lanes. The
+ * Two doubles, four with AVX2, eight with AVX-512; the kernels are written for any number of lanes. The
  * recursive ones keep a row (an ear's channel) in each lane: the samples of one row depend on one another, those of several
- * rows do not. Rows lie far apart in memory; they are read and written two samples of all lanes at a time. Rounding is the
- * same everywhere: a product and a sum are fused where `fused` says so and nowhere else (-ffp-contract=off). */
+ * rows do not. Rounding is that of what is written: a product and a sum are fused where `fused` says so, if the processor can, and nowhere else
+ * (-ffp-contract=off). */
 #ifndef ROSAFE_VECTOR_H
 #define ROSAFE_VECTOR_H
 
@@ -11,16 +11,24 @@
 
 #define INLINE static inline __attribute__((always_inline))
 #define INTERNAL __attribute__((visibility("hidden"))) /* between the sources; not for Python */
+#ifdef __clang__
+#define UNROLL _Pragma("clang loop unroll(full)")
+#else
 #define UNROLL _Pragma("GCC unroll 32") /* -O2 leaves even loops over four things rolled */
+#endif
 
 /* As in rosafe/dsp/guard.py: samples are bounded to LIMIT; states below TINY become 0 at the end of a block. */
 #define LIMIT 1e70
 #define TINY 1e-200
 
-#ifdef __AVX512F__
+#if defined __AVX512F__
 enum { LANES = 8, STEPS = 3 /* of doubling, from 1 to LANES */ };
-#else
+#elif defined __AVX2__
 enum { LANES = 4, STEPS = 2 };
+#elif defined __aarch64__
+enum { LANES = 2, STEPS = 1 };
+#else
+enum { LANES = 2, STEPS = 1 };
 #endif
 
 typedef double vec __attribute__((vector_size(8 * LANES)));
@@ -34,49 +42,118 @@ INLINE int64_t most(int64_t a, int64_t b) { return a > b ? a : b; }
 INLINE vec load(const double *from) { return *(const vec_anywhere *)from; }
 INLINE double flushed(double state) { return state < TINY && state > -TINY ? 0.0 : state; }
 
+INLINE vec all(double x) { return x - (vec){}; }
+INLINE vec root(vec a) {
+    UNROLL for (int k = 0; k < LANES; k++) a[k] = __builtin_sqrt(a[k]);
+    return a;
+}
+
 /* --- what takes the processor's own instructions --- */
 
-INLINE quartet together(duo a, duo b) { return __builtin_shufflevector(a, b, 0, 1, 2, 3); }
+/* a b + c. GCC finds the instructions for vectors neither here nor in `smaller`, clang does. */
+INLINE vec fused(vec a, vec b, vec c) {
+#if defined __clang__ && (defined __FMA__ || defined __aarch64__)
+    UNROLL for (int k = 0; k < LANES; k++) c[k] = __builtin_fma(a[k], b[k], c[k]);
+    return c;
+#elif defined __AVX512F__
+    return __builtin_ia32_vfmaddpd512_mask(a, b, c, -1, 4 /* rounding as usual */);
+#elif defined __FMA__
+    return __builtin_ia32_vfmaddpd256(a, b, c);
+#elif defined __aarch64__
+    return __builtin_aarch64_fmav2df(a, b, c);
+#else
+    return a * b + c;
+#endif
+}
 
-#ifdef __AVX512F__
-enum { EVERY_LANE = 255, AS_USUAL = 4 /* rounding */ };
-INLINE vec all(double x) { return (vec){x, x, x, x, x, x, x, x}; }
-INLINE vec fused(vec a, vec b, vec c) { return __builtin_ia32_vfmaddpd512_mask(a, b, c, EVERY_LANE, AS_USUAL); }
-INLINE vec smaller(vec a, vec b) { return __builtin_ia32_minpd512_mask(a, b, b, EVERY_LANE, AS_USUAL); }
-INLINE vec larger(vec a, vec b) { return __builtin_ia32_maxpd512_mask(a, b, b, EVERY_LANE, AS_USUAL); }
-INLINE vec root(vec a) { return __builtin_ia32_sqrtpd512_mask(a, a, EVERY_LANE, AS_USUAL); }
+INLINE vec smaller(vec a, vec b) {
+#if defined __AVX512F__ && !defined __clang__
+    return __builtin_ia32_minpd512_mask(a, b, b, -1, 4);
+#elif defined __AVX2__ && !defined __clang__
+    return __builtin_ia32_minpd256(a, b);
+#elif defined __SSE2__ && !defined __clang__
+    return __builtin_ia32_minpd(a, b);
+#else
+    return (vec)(((lanes)a & (a < b)) | ((lanes)b & ~(a < b)));
+#endif
+}
+
+INLINE vec larger(vec a, vec b) {
+#if defined __AVX512F__ && !defined __clang__
+    return __builtin_ia32_maxpd512_mask(a, b, b, -1, 4);
+#elif defined __AVX2__ && !defined __clang__
+    return __builtin_ia32_maxpd256(a, b);
+#elif defined __SSE2__ && !defined __clang__
+    return __builtin_ia32_maxpd(a, b);
+#else
+    return (vec)(((lanes)a & (a > b)) | ((lanes)b & ~(a > b)));
+#endif
+}
+
+/* At most LANES doubles, 0 in the lanes behind them; what lies there is not touched. */
+INLINE vec load_first(const double *from, int64_t n) {
+#if defined __AVX512F__
+    return __builtin_ia32_loadupd512_mask((const void *)from, (vec){}, n < LANES ? (1 << n) - 1 : -1);
+#elif defined __AVX2__
+    return __builtin_ia32_maskloadpd256((const void *)from, (lanes){0, 1, 2, 3} < n);
+#else
+    return n < LANES ? (vec){from[0]} : load(from);
+#endif
+}
+
+/* Denormal numbers are 0 inside the kernels: they are below anything that is heard, and make arithmetic many times
+ * slower. The bits are those of the control register for "flush to zero", on x86 for "denormals are zero" too. */
+#if defined __x86_64__
+INLINE uint32_t control(void) { return __builtin_ia32_stmxcsr(); }
+INLINE void denormals_as(uint32_t before) { __builtin_ia32_ldmxcsr(before); }
+enum { DENORMALS_OFF = 0x8040 };
+#elif defined __aarch64__
+INLINE uint32_t control(void) {
+    uint64_t bits;
+    __asm__ volatile("mrs %0, fpcr" : "=r"(bits));
+    return bits;
+}
+INLINE void denormals_as(uint32_t before) { __asm__ volatile("msr fpcr, %0" : : "r"((uint64_t)before) : "memory"); }
+enum { DENORMALS_OFF = 1 << 24 };
+#endif
+INLINE uint32_t denormals_off(void) {
+    uint32_t before = control();
+    denormals_as(before | DENORMALS_OFF);
+    return before;
+}
+
+/* --- lanes in another order ---
+ *
+ * Of two registers the even ones of each pair of neighbours in turn, and the odd ones; every second pair of a column of
+ * pairs; the last lane in all; and in lane k + 2^step what lane k had, 0 in the first ones. */
+
+#if defined __AVX512F__
 INLINE vec evens(vec a, vec b) { return __builtin_shufflevector(a, b, 0, 8, 2, 10, 4, 12, 6, 14); }
 INLINE vec odds(vec a, vec b) { return __builtin_shufflevector(a, b, 1, 9, 3, 11, 5, 13, 7, 15); }
+INLINE quartet together(duo a, duo b) { return __builtin_shufflevector(a, b, 0, 1, 2, 3); }
 INLINE vec every_second(const duo row[LANES]) {
     return __builtin_shufflevector(together(row[0], row[2]), together(row[4], row[6]), 0, 1, 2, 3, 4, 5, 6, 7);
 }
 INLINE vec last(vec a) { return __builtin_shufflevector(a, a, 7, 7, 7, 7, 7, 7, 7, 7); }
-/* Lane k + 2^step has what lane k had; 0 in the first ones. */
 INLINE vec delayed(vec a, const int step) {
     return step == 0   ? __builtin_shufflevector(a, (vec){}, 8, 0, 1, 2, 3, 4, 5, 6)
            : step == 1 ? __builtin_shufflevector(a, (vec){}, 8, 9, 0, 1, 2, 3, 4, 5)
                        : __builtin_shufflevector(a, (vec){}, 8, 9, 10, 11, 0, 1, 2, 3);
 }
-/* At most LANES doubles, 0 in the lanes behind them; what lies there is not touched. */
-INLINE vec load_first(const double *from, int64_t n) {
-    return __builtin_ia32_loadupd512_mask(from, (vec){}, n < LANES ? (1 << n) - 1 : EVERY_LANE);
-}
-#else
-INLINE vec all(double x) { return (vec){x, x, x, x}; }
-INLINE vec fused(vec a, vec b, vec c) { return __builtin_ia32_vfmaddpd256(a, b, c); } /* a b + c */
-INLINE vec smaller(vec a, vec b) { return __builtin_ia32_minpd256(a, b); }
-INLINE vec larger(vec a, vec b) { return __builtin_ia32_maxpd256(a, b); }
-INLINE vec root(vec a) { return __builtin_ia32_sqrtpd256(a); }
+#elif defined __AVX2__
 INLINE vec evens(vec a, vec b) { return __builtin_shufflevector(a, b, 0, 4, 2, 6); }
 INLINE vec odds(vec a, vec b) { return __builtin_shufflevector(a, b, 1, 5, 3, 7); }
-INLINE vec every_second(const duo row[LANES]) { return together(row[0], row[2]); }
+INLINE vec every_second(const duo row[LANES]) { return __builtin_shufflevector(row[0], row[2], 0, 1, 2, 3); }
 INLINE vec last(vec a) { return __builtin_shufflevector(a, a, 3, 3, 3, 3); }
 INLINE vec delayed(vec a, const int step) {
     return step == 0 ? __builtin_shufflevector(a, (vec){}, 4, 0, 1, 2) : __builtin_shufflevector(a, (vec){}, 4, 5, 0, 1);
 }
-INLINE vec load_first(const double *from, int64_t n) {
-    return __builtin_ia32_maskloadpd256((const vec *)from, (lanes){0, 1, 2, 3} < n);
-}
+#else
+INLINE vec evens(vec a, vec b) { return __builtin_shufflevector(a, b, 0, 2); }
+INLINE vec odds(vec a, vec b) { return __builtin_shufflevector(a, b, 1, 3); }
+INLINE vec every_second(const duo row[LANES]) { return row[0]; }
+INLINE vec last(vec a) { return __builtin_shufflevector(a, a, 1, 1); }
+INLINE vec delayed(vec a, const int step) { return (void)step, __builtin_shufflevector(a, (vec){}, 2, 0); }
 #endif
 
 INLINE double total(vec x) {
@@ -86,15 +163,6 @@ INLINE double total(vec x) {
 }
 
 INLINE vec bounded(vec x, double low, double high) { return larger(smaller(x, all(high)), all(low)); }
-
-/* Denormal numbers are 0 inside the kernels: they are below anything that is heard, and make arithmetic many times
- * slower. The bits are those of the control register for "flush to zero" and "denormals are zero". */
-INLINE uint32_t denormals_off(void) {
-    uint32_t before = __builtin_ia32_stmxcsr();
-    __builtin_ia32_ldmxcsr(before | 0x8040);
-    return before;
-}
-INLINE void denormals_as(uint32_t before) { __builtin_ia32_ldmxcsr(before); }
 
 /* --- rows in memory, samples of all rows in a register --- */
 
@@ -114,32 +182,28 @@ INLINE void read_pair(const double *const rows[LANES], int64_t t, vec pair[2]) {
     pair[1] = odds(even, odd);
 }
 
-INLINE void write_pair(vec first, vec second, double *const rows[LANES], int64_t t) {
-    vec even = evens(first, second), odd = odds(first, second);
-    UNROLL for (int k = 0; k < LANES; k += 2) {
-        *(duo *)(rows[k] + t) = (duo){even[k], even[k + 1]};
-        *(duo *)(rows[k + 1] + t) = (duo){odd[k], odd[k + 1]};
-    }
-}
-
 /* n samples, bounded to low..high, to samples[0], samples[step]...; and back. */
 INLINE void read_rows(const double *const rows[LANES], int64_t n, double low, double high, vec *samples,
                       const int64_t step) {
-    int64_t t = 0;
-    for (; t + 2 <= n; t += 2) {
+    for (int64_t t = 0; t + 2 <= n; t += 2) {
         vec pair[2];
         read_pair(rows, t, pair);
         samples[t * step] = bounded(pair[0], low, high);
         samples[(t + 1) * step] = bounded(pair[1], low, high);
     }
-    if (t < n) samples[t * step] = bounded(gathered(rows, t), low, high);
+    if (n & 1) samples[(n - 1) * step] = bounded(gathered(rows, n - 1), low, high);
 }
 
 INLINE void write_rows(const vec *samples, const int64_t step, int64_t n, double *const rows[LANES]) {
-    int64_t t = 0;
-    for (; t + 2 <= n; t += 2) write_pair(samples[t * step], samples[(t + 1) * step], rows, t);
-    if (t < n)
-        UNROLL for (int k = 0; k < LANES; k++) rows[k][t] = samples[t * step][k];
+    for (int64_t t = 0; t + 2 <= n; t += 2) {
+        vec even = evens(samples[t * step], samples[(t + 1) * step]), odd = odds(samples[t * step], samples[(t + 1) * step]);
+        UNROLL for (int k = 0; k < LANES; k += 2) {
+            *(duo *)(rows[k] + t) = (duo){even[k], even[k + 1]};
+            *(duo *)(rows[k + 1] + t) = (duo){odd[k], odd[k + 1]};
+        }
+    }
+    if (n & 1)
+        UNROLL for (int k = 0; k < LANES; k++) rows[k][n - 1] = samples[(n - 1) * step][k];
 }
 
 #endif

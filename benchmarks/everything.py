@@ -1,0 +1,80 @@
+"""All twenty-one representations live through the node: frames lost on any of their ports.
+
+``/usr/bin/python3 benchmarks/everything.py`` starts real nodes on a master of its own, builds one processor of each
+kind with its defaults, and subscribes from another process to all their ports, which are as long as a block. The exit
+code is 1 where a frame was lost on a port, or where the node says that it has lost sound.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+
+import graph
+import report
+from ports import count
+
+from rosafe.interface import KINDS
+
+SILENT = 3  # messages that may still be on their way at the end
+
+
+def build(bench: graph.Bench, block: int) -> None:
+    """The sound, and one processor of each kind; ports as long as a block."""
+    seconds = block / graph.RATE
+    bench.call("/rosAFE/connect_port", local="Audio", remote=graph.AUDIO)
+    bench.call("/bass/Acquire", device="scene:", sampleRate=graph.RATE, nFramesPerChunk=block, nChunksOnPort=20)
+    bench.call("/rosAFE/InputProc", nFramesPerBlock=block, bufferSize_s_port=seconds)
+    for kind in KINDS.values():
+        if kind.parent:
+            bench.call(f"/rosAFE/{kind.request}", name=kind.name, upperDepName=KINDS[kind.parent].name)
+
+
+def main() -> int:
+    """Measure, print, write."""
+    parser = report.arguments("Run all representations live through the node, and count lost frames.")
+    parser.add_argument("--seconds", type=float, default=60.0, help="how long (default %(default)s)")
+    parser.add_argument("--block", type=int, default=4410, help="frames per block (default %(default)s)")
+    options = parser.parse_args()
+    if not 0 < options.seconds <= 86400 or not 1 <= options.block <= 441000:
+        parser.error("--seconds: more than 0, --block: 1 to 441000")
+    page = report.Report(options, "All representations at once")
+    lost = 0
+    with graph.bench() as bench:
+        build(bench, options.block)
+        topics = [graph.topic(kind) for kind in KINDS]
+        taker = bench.subscribe(topics)
+        page.say(
+            f"{len(topics)} kinds, blocks of {options.block}, {options.seconds:g} s; all ports read by one process"
+        )
+        page.say()
+        before = _seconds(bench.node)
+        time.sleep(options.seconds)
+        busy = (_seconds(bench.node) - before) / options.seconds
+        came = taker.close()
+        rows = []
+        for topic in topics:
+            port = count(topic, [int(index) for index, _ in came[topic]], options.block, options.block)
+            least = int(options.seconds * graph.RATE / options.block) - SILENT
+            missing = port.lost + max(0, least - port.came) * options.block
+            rows.append([f"`{topic}`", str(port.came), str(port.expected), str(missing)])
+            lost += missing
+        page.table(["port", "messages", "expected", "frames lost"], rows)
+        said = bench.health()
+        page.say(f"* the node: {said}")
+        page.say(f"* it took {busy:.2f} of {len(os.sched_getaffinity(0))} cores")
+        page.say(f"* frames lost on all ports: {lost}")
+    page.write("everything.md")
+    return 1 if lost or "no frames lost" not in said else 0
+
+
+def _seconds(pid: int) -> float:
+    """Processor time of a process so far."""
+    with open(f"/proc/{pid}/stat", encoding="utf-8") as file:
+        fields = file.read().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,151 @@
+"""The formats of result files, by the ends of their names; `load` reads any of them."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from rosafe.interface import KINDS
+from rosafe.missing import require
+from rosafe.offline.chunked import H5Writer, Mat73Writer, ZarrWriter, read_h5, read_mat73, read_zarr
+from rosafe.offline.contents import Contents, Writer, sample_times
+from rosafe.offline.whole import CsvWriter, Mat5Writer, NpzWriter, read_csv, read_mat5, read_npz
+
+MAT5_MOST = 2**30  # bytes of a variable; MATLAB's version 5 ends at 2**31, and scipy needs an array twice
+_MAT73_MAGIC = b"MATLAB 7.3"
+
+
+@dataclass(frozen=True)
+class Format:
+    """One of them.
+
+    Attributes
+    ----------
+    extension : str
+    writer : callable
+        The class of its writer, given the contents.
+    read : callable
+        Of a path, and whether the arrays are wanted.
+    begins : bytes
+        What its files begin with.
+    module : str
+        What must be installed.
+    folder : str
+        The name of a file that each has in it, where it is a folder.
+    """
+
+    extension: str
+    writer: Callable[[Contents], type[Writer]]
+    read: Callable[..., dict[str, Any]]
+    begins: bytes = b""
+    module: str = ""
+    folder: str = ""
+
+    def is_one(self, path: Path) -> bool:
+        """Whether what is there looks as if it were one, or the beginning of one."""
+        if self.folder:
+            return path.is_dir() and ((path / self.folder).exists() or not any(path.iterdir()))
+        if not path.is_file():
+            return False
+        with open(path, "rb") as file:
+            begin = file.read(len(self.begins))
+        return self.begins.startswith(begin) or (self.begins.startswith(b"MATLAB") and not any(begin))
+
+
+def _mat_writer(contents: Contents) -> type[Writer]:
+    largest = max((8 * math.prod(shape) for shape in contents.shapes.values()), default=0)
+    if largest > MAT5_MOST:
+        return Mat73Writer
+    return Mat5Writer
+
+
+def _read_mat(path: Path, arrays: bool = True) -> dict[str, Any]:
+    with open(path, "rb") as file:
+        new = file.read(len(_MAT73_MAGIC)) == _MAT73_MAGIC
+    return (read_mat73 if new else read_mat5)(path, arrays)
+
+
+FORMATS = {
+    one.extension: one
+    for one in (
+        Format(".npz", lambda contents: NpzWriter, read_npz, b"PK"),
+        Format(".h5", lambda contents: H5Writer, read_h5, b"\x89HDF", "h5py"),
+        Format(".mat", _mat_writer, _read_mat, b"MATLAB"),
+        Format(".zarr", lambda contents: ZarrWriter, read_zarr, module="zarr", folder=ZarrWriter.SIGN),
+        Format(".csv", lambda contents: CsvWriter, read_csv, b"# rosafe"),
+    )
+}
+
+
+def format_of(path: str | os.PathLike[str]) -> Format:
+    """The format of a result file by its name; ValueError where it is none."""
+    extension = Path(path).suffix.lower()
+    if extension not in FORMATS:
+        raise ValueError(f"{path}: results end in {', '.join(FORMATS)}; the name of a folder ends in /")
+    return FORMATS[extension]
+
+
+def check_format(form: Format, outputs: Iterable[str]) -> None:
+    """ValueError where a format cannot hold these outputs; ModuleNotFoundError where what it needs is not installed."""
+    if form.module:
+        require(form.module, f"{form.extension} files")
+    if form.extension == ".csv":
+        parts = [part for kind in outputs for part in KINDS[kind].outputs.values()]
+        if len(parts) != 1 or len(parts[0].axes) != 2:
+            able = [kind for kind, one in KINDS.items() if [len(p.axes) for p in one.outputs.values()] == [2]]
+            raise ValueError(f"a .csv holds one output of two axes: name one of {', '.join(able)} with --outputs")
+
+
+def load(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Read a file that `rosafe process` has written.
+
+    Parameters
+    ----------
+    path : path
+        It ends in .npz, .h5, .mat, .zarr or .csv.
+
+    Returns
+    -------
+    dict
+        What `rosafe.process` returns for the same samples, number for number; beside that `sample_rate` (Hz),
+        `block_frames`, `parameters` (dict: all of them, for `rosafe.process`), `source` (name of the input),
+        `channels` and `topic` where some were chosen, `rosafe_version`, and `axes` and `units` of each output.
+
+    Raises
+    ------
+    ValueError
+        It is no such file, or damaged.
+    OSError
+        It is not there, or cannot be read.
+    ModuleNotFoundError
+        h5py or zarr is not installed.
+    """
+    form = format_of(path)
+    result = read(form, Path(path))
+    missing = set(result["axes"]) - set(result)
+    if missing:
+        raise ValueError(f"{path} is damaged: {', '.join(sorted(missing))} is not in it")
+    for kind in KINDS.values():  # what has no frames has a number for each sample
+        there = [name for name in kind.outputs if name in result["axes"]]
+        if there and f"{kind.kind}_time" not in result:
+            result[f"{kind.kind}_time"] = sample_times(result[there[0]].shape[-1], result["sample_rate"])
+    return result
+
+
+def read(form: Format, path: Path, arrays: bool = True) -> dict[str, Any]:
+    """What is in a file; without its arrays, only what tells runs apart. Errors as those of `load`."""
+    if not path.exists():
+        raise FileNotFoundError(2, os.strerror(2), str(path))
+    if form.module:
+        require(form.module, f"{form.extension} files")
+    try:
+        result = form.read(path, arrays)
+    except ValueError as problem:  # json.JSONDecodeError and UnicodeDecodeError, too
+        raise ValueError(f"{path} is no result of rosafe process, or damaged: {problem}") from None
+    if not isinstance(result.get("axes"), Mapping) or not isinstance(result.get("parameters"), Mapping):
+        raise ValueError(f"{path} is no result of rosafe process")
+    return result

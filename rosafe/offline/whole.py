@@ -1,0 +1,178 @@
+"""Formats that want each array whole: .npz, MATLAB's version 5 .mat, and .csv. Large arrays wait on the disk."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import struct
+import tempfile
+import zipfile
+import zlib
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+
+from rosafe.offline.contents import ABOUT, Contents, is_scalar, sample_times, told
+
+HEADS = 2**18  # bytes, and more than that, of what is in a file beside the arrays' numbers
+IN_MEMORY = 2**28  # bytes of all arrays together; from there on they are on the disk
+_CSV_HEAD = "# rosafe "
+
+
+class WholeWriter:
+    """Gathers the arrays, and writes all at the end. Subclasses say how, in `_write`.
+
+    Parameters
+    ----------
+    path : Path
+        An empty file.
+    contents : Contents
+    """
+
+    def __init__(self, path: Path, contents: Contents) -> None:
+        self._path = path
+        self._contents = contents
+        self._at = dict.fromkeys(contents.shapes, 0)
+        self._open = ExitStack()
+        try:
+            self._arrays = {name: self._array(shape) for name, shape in contents.shapes.items()}
+        except BaseException:
+            self.close()
+            raise
+
+    @classmethod
+    def size(cls, contents: Contents) -> int:
+        """Bytes on the disk that it takes at a time."""
+        taken = sum(8 * math.prod(shape) for shape in contents.shapes.values())
+        return taken if taken <= IN_MEMORY else 2 * taken
+
+    def _array(self, shape: tuple[int, ...]) -> np.ndarray:
+        count = math.prod(shape)
+        if self.size(self._contents) <= IN_MEMORY or not count:
+            return np.empty(shape)
+        file = self._open.enter_context(tempfile.TemporaryFile(dir=self._path.parent))  # noqa: SIM115
+        os.posix_fallocate(file.fileno(), 0, 8 * count)  # a full disk must show here: in a map, it kills
+        return np.memmap(file, np.float64, "r+", 0, shape, "F")
+
+    def append(self, name: str, block: np.ndarray) -> None:
+        """The next part of an array, of its shape but for the last axis."""
+        at = self._at[name]
+        self._at[name] = at + block.shape[-1]
+        self._arrays[name][..., at : at + block.shape[-1]] = block
+
+    def finish(self) -> None:
+        """Write the file."""
+        with open(self._path, "r+b") as file:
+            # A full disk must show before numpy and scipy write, who leave files open that they cannot complete.
+            arrays = [*self._arrays.values(), *self._contents.fixed.values()]
+            os.posix_fallocate(file.fileno(), 0, HEADS + sum(np.asarray(array).nbytes for array in arrays))
+            self._write(file)
+            file.truncate()
+
+    def _write(self, file: BinaryIO) -> None:
+        raise NotImplementedError
+
+    def close(self) -> None:
+        """Let go of what waited on the disk."""
+        self._arrays = {}
+        self._open.close()
+
+
+class NpzWriter(WholeWriter):
+    """For numpy.load."""
+
+    def _write(self, file: BinaryIO) -> None:
+        everything: dict[str, Any] = {**self._arrays, **self._contents.fixed, **self._contents.flat()}
+        np.savez(file, **everything)
+
+
+class Mat5Writer(WholeWriter):
+    """MATLAB's version 5, which Octave reads as well."""
+
+    def _write(self, file: BinaryIO) -> None:
+        from scipy.io import savemat
+
+        everything: dict[str, Any] = {**self._arrays, **self._contents.fixed, **self._contents.flat()}
+        savemat(file, everything, long_field_names=True, oned_as="column")
+
+
+class CsvWriter(WholeWriter):
+    """One output of two axes: a row for each moment, which is its first column; what else there is, as JSON above."""
+
+    def _write(self, file: BinaryIO) -> None:
+        contents = self._contents
+        (name,) = contents.shapes
+        time = f"{name}_time"
+        fixed = {k: v if isinstance(v, float) else v.tolist() for k, v in contents.fixed.items() if k != time}
+        rows = self._arrays[name].T
+        head = {**contents.about, "axes": contents.axes, "units": contents.units, "fixed": fixed, "rows": len(rows)}
+        lines = [f"{_CSV_HEAD}{json.dumps(head)}", ",".join([time, *self._columns(name, rows.shape[1])])]
+        file.writelines(f"{line}\n".encode() for line in lines)
+        times = contents.fixed.get(time, sample_times(len(rows), contents.about["sample_rate"]))
+        for moment, row in zip(np.asarray(times).tolist(), rows, strict=True):
+            file.write((",".join(map(repr, [moment, *row.tolist()])) + "\n").encode())
+
+    def _columns(self, name: str, count: int) -> list[str]:
+        if self._contents.axes[name][0] == "ear":
+            return ["left", "right"][:count]
+        frequencies = self._contents.fixed["fb_cfHz"]
+        assert isinstance(frequencies, np.ndarray)
+        return [f"{frequency:.6g} Hz" for frequency in frequencies]
+
+
+# --- reading ------------------------------------------------------------------------------------------------------
+
+
+def read_npz(path: Path, arrays: bool = True) -> dict[str, Any]:
+    """What is in an .npz; without its arrays, only what `told` gives. ValueError where it is damaged."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            if isinstance(file, np.ndarray):
+                raise ValueError("an .npy is no .npz")
+            names = file.files if arrays else [name for name in file.files if name in ABOUT]
+            everything = {name: file[name] for name in names}
+    except (zipfile.BadZipFile, EOFError, zlib.error, KeyError, struct.error) as problem:
+        raise ValueError(str(problem)) from None
+    scalars = {name: value for name, value in everything.items() if value.ndim == 0}
+    return {**everything, **told(scalars)}
+
+
+def read_mat5(path: Path, arrays: bool = True) -> dict[str, Any]:
+    """As `read_npz`, for a version 5 .mat."""
+    from scipy.io import loadmat
+
+    try:
+        found = loadmat(path, variable_names=None if arrays else [*ABOUT])
+    except Exception as problem:  # of half a file scipy raises whatever comes
+        raise ValueError(str(problem)) from None
+    found = {name: value for name, value in found.items() if not name.startswith("__")}
+    texts = {name: "".join(value.ravel()) for name, value in found.items() if value.dtype.kind == "U"}
+    scalars = {name: value for name, value in found.items() if is_scalar(name)}
+    about = told({**texts, **scalars})
+    axes = about.get("axes", {})
+    others = found.keys() - about.keys()
+    return {**{name: found[name] if name in axes else found[name].ravel() for name in others}, **about}
+
+
+def read_csv(path: Path, arrays: bool = True) -> dict[str, Any]:
+    """As `read_npz`, for a .csv."""
+    with open(path, encoding="utf-8") as file:
+        head = file.readline()
+        if not head.startswith(_CSV_HEAD):
+            raise ValueError("its first line is not that of rosafe process")
+        about = json.loads(head.removeprefix(_CSV_HEAD))
+        fixed, rows = about.pop("fixed"), about.pop("rows")
+        about["axes"] = {name: tuple(axes) for name, axes in about["axes"].items()}
+        if not arrays:
+            return dict(about)
+        time, *columns = file.readline().rstrip("\n").split(",")
+        numbers = [list(map(float, line.split(","))) for line in file]
+    if len(numbers) != rows or any(len(row) != 1 + len(columns) for row in numbers):
+        raise ValueError(f"it is cut off: {len(numbers)} of {rows} rows are there")
+    table = np.array(numbers).reshape(rows, 1 + len(columns))
+    (name,) = about["axes"]
+    vectors = {k: np.array(v) if isinstance(v, list) else v for k, v in fixed.items()}
+    return {name: np.ascontiguousarray(table[:, 1:].T), time: table[:, 0].copy(), **vectors, **about}

@@ -1,0 +1,234 @@
+"""`rosafe process` on folders: all of them, each in its place, whatever some are; killed and resumed; side by side."""
+
+from __future__ import annotations
+
+import csv
+import os
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rosafe import load, process
+from tests.cli.command import (
+    ROSAFE,
+    SMALL,
+    SMALL_PARAMETERS,
+    as_int32,
+    environment,
+    noise,
+    refused,
+    rosafe,
+    start,
+    write,
+)
+from tests.harness import wait_for
+from tests.terminal import Terminal
+
+RATE = 16000
+OPTIONS = (*SMALL, "--outputs", "ild")
+
+
+def corpus(folder: Path, count: int, frames: int = 3000) -> dict[str, np.ndarray]:
+    """Sounds in folders below `folder`, by their names there less .wav."""
+    made = {}
+    for number in range(count):
+        place = ("", "sub dir/", "sub dir/ünï/")[number % 3] + f"s{number}"
+        path = folder / f"{place}.wav"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        made[place] = noise(frames, number)
+        write(path, made[place], RATE)
+    return made
+
+
+def assert_results(folder: Path, sounds: dict[str, np.ndarray], extension: str = ".npz") -> None:
+    """In the folder are the right results of these sounds, and nothing else but failed.csv."""
+    there = {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
+    assert there - {"failed.csv"} == {f"{name}{extension}" for name in sounds}
+    for name, sound in sounds.items():
+        expected = process(as_int32(sound), RATE, parameters=SMALL_PARAMETERS, outputs=["ild"])
+        np.testing.assert_array_equal(load(folder / f"{name}{extension}")["ild"], expected["ild"], err_msg=name)
+
+
+def failed(folder: Path) -> dict[str, str]:
+    with open(folder / "failed.csv", encoding="utf-8", errors="surrogateescape", newline="") as file:
+        head, *rows = csv.reader(file)
+    assert head == ["input", "why"]
+    return dict(rows)
+
+
+def test_folders_all_the_way_down(tmp_path: Path) -> None:
+    sounds = corpus(tmp_path / "corpus", 7)
+    (tmp_path / "corpus" / "notes.txt").write_text("no sound")
+    (tmp_path / "corpus" / "._s0.wav").write_text("what some systems leave")
+    done = rosafe("process", "corpus", "-o", "out", *OPTIONS, "--format", "h5", cwd=tmp_path)
+    assert done.returncode == 0 and done.stderr.startswith("7 files: 7 done; 1.3 s of sound, "), done
+    assert done.stderr.count("\n") == 1
+    assert_results(tmp_path / "out", sounds, ".h5")
+    done = rosafe("process", "corpus", "-o", "out", *OPTIONS, "--format", "h5", "--resume", "-v", cwd=tmp_path)
+    assert done.returncode == 0 and done.stderr.endswith("\n7 files: 0 done, 7 complete already\n"), done
+    assert done.stderr.count(": complete already\n") == 7
+
+
+def test_one_name_for_several_sounds(tmp_path: Path) -> None:
+    here = tmp_path / "corpus"
+    sounds = corpus(here, 1)
+    for name in ("a.wav", "a.flac", "a.wav.aiff", "failed.wav"):
+        sounds[name.removesuffix(".aiff")] = noise(3000, len(name))
+        write(here / name, sounds[name.removesuffix(".aiff")])
+    sounds["a.wav.aiff"] = sounds["a.wav"]
+    sounds["a.wav"] = noise(3000, len("a.wav"))
+    sounds["a.wav.aiff"] = noise(3000, len("a.wav.aiff"))
+    done = rosafe("process", "corpus", "-o", "out", *OPTIONS, "--format", "csv", cwd=tmp_path)
+    assert done.returncode == 0, done
+    assert_results(tmp_path / "out", sounds, ".csv")
+
+
+def test_several_folders(tmp_path: Path) -> None:
+    sounds = {f"{name}/{place}": sound for name in "ab" for place, sound in corpus(tmp_path / name, 2).items()}
+    assert rosafe("process", "a", "b/", "-o", "out", *OPTIONS, cwd=tmp_path).returncode == 0
+    assert_results(tmp_path / "out", sounds)
+    refused(rosafe("process", "a", tmp_path / "a", "-o", "other", *OPTIONS, cwd=tmp_path), "would both go to other/a/")
+    refused(rosafe("process", "a", *OPTIONS, cwd=tmp_path), "a is a folder: name one for its results with -o")
+    refused(rosafe("process", "a", "-o", "x.npz", *OPTIONS, cwd=tmp_path), "for several files, wanted is a folder")
+    refused(rosafe("process", "a", "-o", "x.v2", *OPTIONS, cwd=tmp_path), "for several files, wanted is a folder")
+
+
+def test_results_within_the_corpus(tmp_path: Path) -> None:
+    sounds = corpus(tmp_path, 3)
+    for _ in range(2):
+        done = rosafe("process", ".", "-o", "out", *OPTIONS, "--resume", cwd=tmp_path)
+        assert done.returncode == 0 and done.stderr.startswith("3 files: "), done
+        (tmp_path / "out" / "heard.wav").write_bytes((tmp_path / "s0.wav").read_bytes())  # nobody's input
+    (tmp_path / "out" / "heard.wav").unlink()
+    assert_results(tmp_path / "out", sounds)
+
+
+def test_links(tmp_path: Path) -> None:
+    """They are followed, but for those that lead back up."""
+    sounds = corpus(tmp_path / "elsewhere", 2)
+    here = tmp_path / "corpus"
+    here.mkdir()
+    (here / "linked").symlink_to(tmp_path / "elsewhere")
+    (here / "one.wav").symlink_to("linked/s0.wav")
+    (tmp_path / "elsewhere" / "up").symlink_to(here)
+    (here / "nowhere.wav").symlink_to("nothing.wav")
+    done = rosafe("process", "corpus", "-o", "out", *OPTIONS, cwd=tmp_path)
+    assert done.returncode == 1
+    wanted = {f"linked/{name}": sound for name, sound in sounds.items()} | {"one": sounds["s0"]}
+    assert_results(tmp_path / "out", wanted)
+    assert failed(tmp_path / "out") == {"corpus/nowhere.wav": "corpus/nowhere.wav: No such file or directory"}
+
+
+def test_what_fails_is_named_and_does_not_keep_the_others(tmp_path: Path) -> None:
+    here = tmp_path / "corpus"
+    sounds = corpus(here, 4)
+    (here / "empty.wav").write_bytes(b"")
+    write(here / "none.wav", np.zeros((2, 0)))
+    write(here / "new\nline.wav", noise(100)[:1])
+    (here / os.fsdecode(b"\xff.wav")).write_bytes(b"RIFF")
+    done = rosafe("process", "corpus", "-o", "out", *OPTIONS, cwd=tmp_path)
+    assert done.returncode == 1
+    summary, *lines = done.stderr.splitlines()
+    assert summary.startswith("8 files: 4 done, 4 failed; ")
+    assert [line.split(" ", 4)[:3] for line in lines] == [["rosafe", "process:", line.split()[2]] for line in lines]
+    assert lines[0] == "rosafe process: corpus/empty.wav is empty"
+    assert any("new\\nline.wav is mono" in line for line in lines) and "none.wav holds no samples" in done.stderr
+    assert len(failed(tmp_path / "out")) == 4 and "corpus/new\nline.wav" in failed(tmp_path / "out")
+    assert_results(tmp_path / "out", sounds)
+    for bad in ("none.wav", "new\nline.wav", os.fsdecode(b"\xff.wav")):
+        (here / bad).unlink()
+    done = rosafe("process", "corpus", "-o", "out", *OPTIONS, "--resume", cwd=tmp_path)
+    assert done.returncode == 1 and list(failed(tmp_path / "out")) == ["corpus/empty.wav"]
+    sounds["empty"] = noise(500)
+    write(here / "empty.wav", sounds["empty"])
+    done = rosafe("process", "corpus", "-o", "out", *OPTIONS, "--resume", cwd=tmp_path)
+    assert (done.returncode, (tmp_path / "out" / "failed.csv").exists()) == (0, False), done
+    assert_results(tmp_path / "out", sounds)
+
+
+def test_empty_folders_and_a_list_of_somebody_else(tmp_path: Path) -> None:
+    (tmp_path / "nothing").mkdir()
+    done = rosafe("process", "nothing", "-o", "out", *OPTIONS, cwd=tmp_path)
+    refused(done, "nothing: there is no sound file in this folder")
+    sounds = corpus(tmp_path / "corpus", 1)
+    (tmp_path / "out" / "failed.csv").write_text("my own list\n")
+    done = rosafe("process", "corpus", "nothing", "-o", "out", *OPTIONS, cwd=tmp_path)
+    assert done.returncode == 1 and "failed.csv is something else, and stays as it is" in done.stderr
+    assert (tmp_path / "out" / "failed.csv").read_text() == "my own list\n"
+    assert_results(tmp_path / "out", {f"corpus/{name}": sound for name, sound in sounds.items()})
+
+
+@pytest.mark.skipif(os.getuid() == 0, reason="root may read everything")
+def test_what_nobody_may_read(tmp_path: Path) -> None:
+    sounds = corpus(tmp_path / "corpus", 3)
+    (tmp_path / "corpus" / "sub dir").chmod(0)
+    done = rosafe("process", "corpus", "-o", "out", *OPTIONS, cwd=tmp_path)
+    (tmp_path / "corpus" / "sub dir").chmod(0o700)
+    assert done.returncode == 1 and "Permission denied" in failed(tmp_path / "out")["corpus/sub dir"]
+    assert_results(tmp_path / "out", {"s0": sounds["s0"]})
+
+
+def test_what_is_there_stays_unless_it_is_to_go_on(tmp_path: Path) -> None:
+    sounds = corpus(tmp_path / "corpus", 2)
+    assert rosafe("process", "corpus", "-o", "out", *OPTIONS, cwd=tmp_path).returncode == 0
+    done = rosafe("process", "corpus", "-o", "out", *OPTIONS, cwd=tmp_path)
+    assert done.returncode == 1 and done.stderr.count("is there already; --resume leaves it, --force replaces it") == 2
+    done = rosafe(
+        "process", "corpus", "-o", "out", "--set", "fb_cfHz=500", "--outputs", "ild", "--resume", cwd=tmp_path
+    )
+    assert done.returncode == 1 and done.stderr.count("was made with other parameters; take another -o") == 2
+    assert_results(tmp_path / "out", sounds)
+
+
+def test_killed_and_resumed(tmp_path: Path) -> None:
+    """Whenever it is killed, what is there is whole; and in the end all is."""
+    sounds = corpus(tmp_path / "corpus", 60)
+    out = tmp_path / "out"
+    for wanted in (5, 20, 35):
+        with start("process", "corpus", "-o", "out", *OPTIONS, "--resume", cwd=tmp_path) as command:
+            wait_for(lambda: len(list(out.rglob("*.npz"))) >= wanted, what=lambda: str(command))  # noqa: B023
+            os.killpg(command.pid, signal.SIGKILL)
+            command.wait()
+        for path in out.rglob("*.npz"):
+            assert load(path)["ild"].shape == (3, 17)
+    done = rosafe("process", "corpus", "-o", "out", *OPTIONS, "--resume", cwd=tmp_path)
+    assert done.returncode == 0 and "complete already" in done.stderr, done
+    assert_results(out, sounds)
+
+
+def test_two_runs_into_one_folder(tmp_path: Path) -> None:
+    """Halves go well together. For the same files, each is made by one; the other says so, or finds it complete."""
+    sounds = corpus(tmp_path / "corpus", 30)
+    arguments = ("process", "corpus", "-o", "out", *OPTIONS, "--resume")
+    with start(*arguments, cwd=tmp_path) as first, start(*arguments, cwd=tmp_path) as second:
+        codes = [first.wait(), second.wait()]
+    for code, run in zip(codes, (first, second), strict=True):
+        assert code == 0 or " is writing it" in run.err or "it has come into being meanwhile" in run.err, run
+    done = rosafe(*arguments, cwd=tmp_path)
+    assert done.returncode == 0 and not (tmp_path / "out" / "failed.csv").exists(), done
+    assert_results(tmp_path / "out", sounds)
+
+
+def test_interrupted(tmp_path: Path) -> None:
+    corpus(tmp_path / "corpus", 60)
+    out = tmp_path / "out"
+    with start("process", "corpus", "-o", "out", *OPTIONS, cwd=tmp_path) as command:
+        wait_for(lambda: len(list(out.rglob("*.npz"))) >= 3, what=lambda: str(command))
+        os.killpg(command.pid, signal.SIGINT)
+        assert command.wait() == 130
+    assert command.err == "rosafe process: interrupted; what was not finished is removed; --resume goes on\n"
+    assert not list(out.rglob("*.part"))
+
+
+def test_the_bar_tells_files_and_how_long_it_takes(tmp_path: Path) -> None:
+    corpus(tmp_path / "corpus", 60)
+    command = [str(ROSAFE), "process", "corpus", "-o", "out", *OPTIONS, "--jobs", "1"]
+    with Terminal(command, environment(), cwd=tmp_path, columns=100) as terminal:
+        terminal.expect(" files/s")
+        text = terminal.sent
+        terminal.press("\x03")
+        terminal.end()
+    line = text.split("\r")[-1]
+    assert "\n" not in text and line.startswith("\x1b[K[") and " of 60 files  " in line

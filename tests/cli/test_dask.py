@@ -1,0 +1,67 @@
+"""`rosafe process --dask`: the same numbers from workers of a scheduler, one of which is killed on the way."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.cli.command import refused, rosafe, start
+from tests.cli.test_corpus import OPTIONS, assert_results, corpus, failed
+from tests.harness import proc, wait_for
+
+distributed = pytest.importorskip("distributed")
+
+
+@pytest.fixture
+def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    """Two processes of one thread."""
+    with distributed.LocalCluster(
+        n_workers=2,
+        threads_per_worker=1,
+        processes=True,
+        host="127.0.0.1",
+        dashboard_address=None,
+        local_directory=str(tmp_path_factory.mktemp("dask")),
+        silence_logs=50,
+    ) as cluster:
+        yield cluster
+
+
+def test_a_worker_is_killed_on_the_way(tmp_path: Path, cluster: Any) -> None:
+    sounds = corpus(tmp_path / "corpus", 60)
+    (tmp_path / "corpus" / "bad.wav").write_bytes(b"")
+    out = tmp_path / "out"
+    with distributed.Client(cluster) as client:
+        workers = list(client.run(os.getpid).values())
+    assert len(workers) == 2
+    arguments = ("process", "corpus", "-o", "out", *OPTIONS, "--dask", cluster.scheduler_address)
+    with start(*arguments, cwd=tmp_path) as command:
+        wait_for(lambda: len(list(out.rglob("*.npz"))) >= 5, what=lambda: str(command))
+        os.kill(workers[0], signal.SIGKILL)
+        assert command.wait(120) == 1, command
+    assert command.err.startswith("61 files: 60 done, 1 failed; "), command
+    assert list(failed(out)) == ["corpus/bad.wav"]
+    assert_results(out, sounds)
+    assert not proc(workers[0]).exists() and proc(workers[1]).exists()
+
+
+def test_workers_of_ones_own(tmp_path: Path) -> None:
+    """`local`: they go with the command, and resume what was there."""
+    sounds = corpus(tmp_path / "corpus", 4)
+    assert rosafe("process", "corpus/s0.wav", "-o", "out/", *OPTIONS, cwd=tmp_path).returncode == 0
+    done = rosafe("process", "corpus", "-o", "out", *OPTIONS, "--dask", "local", "--resume", cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (0, "") and done.stderr.count("\n") == 1, done
+    assert done.stderr.startswith("4 files: 3 done, 1 complete already; "), done
+    assert_results(tmp_path / "out", sounds)
+
+
+def test_no_scheduler(tmp_path: Path) -> None:
+    corpus(tmp_path / "corpus", 1)
+    done = rosafe("process", "corpus", "-o", "out", *OPTIONS, "--dask", "tcp://127.0.0.1:1", cwd=tmp_path)
+    refused(done, "--dask tcp://127.0.0.1:1: no Dask scheduler answers there")
+    assert not (tmp_path / "out").exists()

@@ -1,0 +1,281 @@
+"""Files of results: each format gives back what `rosafe.process` gave, and says where it comes from."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from pathlib import Path
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+import soundfile
+import zarr
+
+import rosafe
+from rosafe.interface import KINDS
+from rosafe.offline import formats, whole
+from rosafe.offline.files import Done, process_file
+from rosafe.output import OutputError
+from rosafe.version import VERSION
+from tests.bass import bags
+from tests.cli.command import SMALL, SMALL_PARAMETERS, as_int32, noise, refused, write
+from tests.cli.command import rosafe as command
+
+RATE = 16000
+WHOLE = [".npz", ".h5", ".mat", ".zarr"]
+
+
+@pytest.fixture
+def sound(tmp_path: Path) -> Path:
+    return write(tmp_path / "sound.wav", noise(9000))
+
+
+def assert_same(loaded: dict[str, Any], expected: dict[str, Any]) -> None:
+    for name, value in expected.items():
+        assert type(loaded[name]) is type(value), name
+        np.testing.assert_array_equal(loaded[name], value, strict=isinstance(value, np.ndarray), err_msg=name)
+
+
+@pytest.mark.parametrize("extension", WHOLE)
+@pytest.mark.parametrize("frames", [9000, 100])  # one is too short for a frame
+@pytest.mark.parametrize("channels", [[500.0], [200.0, 800.0, 2000.0]])  # a single one has axes, too
+def test_all_outputs_come_back(tmp_path: Path, extension: str, frames: int, channels: list[float]) -> None:
+    path = write(tmp_path / "sound.wav", noise(frames))
+    target = tmp_path / f"result{extension}"
+    parameters = {"fb_cfHz": channels}
+    done = process_file(path, target, parameters, 4000, list(KINDS))
+    assert done.seconds == frames / RATE and not done.skipped
+    loaded = rosafe.load(target)
+    expected = rosafe.process(
+        as_int32(noise(frames)), RATE, parameters=parameters, block_frames=4000, outputs=list(KINDS)
+    )
+    assert_same(loaded, expected)
+    assert loaded["parameters"]["fb_cfHz"] == channels and loaded["parameters"]["in_doNormalize"] is True
+    about = {name: loaded[name] for name in ("sample_rate", "block_frames", "source", "rosafe_version")}
+    assert about == {"sample_rate": RATE, "block_frames": 4000, "source": "sound.wav", "rosafe_version": VERSION}
+    assert loaded["axes"]["crossCorrelation"] == ("channel", "lag", "time") and loaded["units"]["ild"] == "dB"
+    again = rosafe.process(as_int32(noise(frames)), RATE, parameters=loaded["parameters"], block_frames=4000)
+    np.testing.assert_array_equal(again["ild"], loaded["ild"])
+
+
+@pytest.mark.parametrize("output", ["ild", "input", "itd"])
+def test_csv(tmp_path: Path, sound: Path, output: str) -> None:
+    target = tmp_path / "result.csv"
+    process_file(sound, target, SMALL_PARAMETERS, outputs=[output])
+    expected = rosafe.process(as_int32(noise(9000)), RATE, parameters=SMALL_PARAMETERS, outputs=[output])
+    assert_same(rosafe.load(target), expected)
+    table = np.loadtxt(target, delimiter=",", skiprows=2)
+    np.testing.assert_array_equal(table[:, 0], expected[f"{output}_time"])
+    np.testing.assert_array_equal(table[:, 1:].T, expected[output])
+    head = target.read_text().splitlines()[1].split(",")
+    assert head[1:] == (["left", "right"] if output == "input" else ["200 Hz", "800 Hz", "2000 Hz"])
+
+
+@pytest.mark.parametrize("outputs", [["ratemap"], ["ild", "itd"], ["precedence"], None])
+def test_what_is_no_table_is_no_csv(tmp_path: Path, sound: Path, outputs: list[str] | None) -> None:
+    with pytest.raises(ValueError, match="one output of two axes: name one of input, preProc, ild"):
+        process_file(sound, tmp_path / "result.csv", outputs=outputs)
+    assert not (tmp_path / "result.csv").exists()
+
+
+@pytest.mark.parametrize("extension", [".npz", ".mat"])
+def test_large_arrays_wait_on_the_disk(
+    tmp_path: Path, sound: Path, extension: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    process_file(sound, tmp_path / f"a{extension}", SMALL_PARAMETERS, 1000, ["ihc", "ild"])
+    monkeypatch.setattr(whole, "IN_MEMORY", 1000)
+    process_file(sound, tmp_path / f"b{extension}", SMALL_PARAMETERS, 1000, ["ihc", "ild"])
+    assert_same(rosafe.load(tmp_path / f"b{extension}"), rosafe.load(tmp_path / f"a{extension}"))
+    assert len(list(tmp_path.iterdir())) == 3
+
+
+def test_mat_beyond_version_5(tmp_path: Path, sound: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """MATLAB's 7.3: HDF5 with its types as attributes, and its axes in the opposite order."""
+    outputs = ["ihc", "ild", "spectralFeatures"]
+    process_file(sound, tmp_path / "a.mat", SMALL_PARAMETERS, 1000, outputs)
+    monkeypatch.setattr(formats, "MAT5_MOST", 1000)
+    process_file(sound, tmp_path / "b.mat", SMALL_PARAMETERS, 1000, outputs)
+    assert_same(rosafe.load(tmp_path / "b.mat"), rosafe.load(tmp_path / "a.mat"))
+    content = (tmp_path / "b.mat").read_bytes()
+    assert content.startswith(b"MATLAB 7.3 MAT-file") and content[124:128] == b"\x00\x02IM"
+    with h5py.File(tmp_path / "b.mat") as file:
+        assert file["ihc"].shape == (9000, 3, 2) and file["ihc"].attrs["MATLAB_class"] == b"double"
+        assert file["source"].attrs["MATLAB_class"] == b"char" and file["fb_cfHz"].shape == (1, 3)
+
+
+def test_mat_in_octave(tmp_path: Path, sound: Path) -> None:
+    process_file(sound, tmp_path / "a.mat", SMALL_PARAMETERS, outputs=["ild"])
+    program = (
+        f"r = load('{tmp_path}/a.mat'); p = jsondecode(r.parameters);"
+        "printf('%s %d %d %d %.17g %g', r.source, size(r.ild), size(r.fb_cfHz, 1), r.ild(2, 5), p.fb_cfHz(3))"
+    )
+    done = subprocess.run(
+        ["octave-cli", "--no-init-file", "--eval", program], capture_output=True, text=True, timeout=120, check=False
+    )
+    ild = rosafe.load(tmp_path / "a.mat")["ild"]
+    assert done.stdout.split() == ["sound.wav", "3", "55", "3", f"{ild[1, 4]:.17g}", "2000"], done
+
+
+def test_others_find_their_way(tmp_path: Path, sound: Path) -> None:
+    """Labels of axes, units and the parameters are where readers of HDF5 and Zarr look for them."""
+    for extension in (".h5", ".zarr"):
+        process_file(sound, tmp_path / f"a{extension}", SMALL_PARAMETERS)
+    with h5py.File(tmp_path / "a.h5") as file:
+        assert [axis.label for axis in file["ratemap"].dims] == ["ear", "channel", "time"]
+        assert file["ild"].attrs["unit"] == "dB" and "fb_nChannels" in json.loads(file.attrs["parameters"])
+    group = zarr.open_group(str(tmp_path / "a.zarr"), mode="r")
+    assert group["ild"].attrs["_ARRAY_DIMENSIONS"] == ["channel", "ild_time"]
+    assert group["ild_time"].attrs["_ARRAY_DIMENSIONS"] == ["ild_time"]
+
+
+@pytest.mark.parametrize("extension", [*WHOLE, ".csv"])
+def test_what_is_damaged_or_none(tmp_path: Path, sound: Path, extension: str) -> None:
+    target = tmp_path / f"a{extension}"
+    with pytest.raises(FileNotFoundError):
+        rosafe.load(target)
+    if extension != ".zarr":
+        for content in (b"", b"something else " * 100):
+            target.write_bytes(content)
+            with pytest.raises(ValueError, match="is no result of rosafe process"):
+                rosafe.load(target)
+        process_file(sound, target, SMALL_PARAMETERS, outputs=["ild"], replace=True)
+        whole_file = target.read_bytes()
+        target.write_bytes(whole_file[: len(whole_file) // 2])
+        with pytest.raises(ValueError, match="is no result of rosafe process, or damaged"):
+            rosafe.load(target)
+    else:
+        target.mkdir()
+        with pytest.raises(ValueError, match="is no result of rosafe process"):
+            rosafe.load(target)
+    with pytest.raises(ValueError, match=r"a\.txt: results end in \.npz, \.h5"):
+        rosafe.load(tmp_path / "a.txt")
+
+
+@pytest.mark.parametrize("extension", [*WHOLE, ".csv"])
+def test_resume(tmp_path: Path, sound: Path, extension: str) -> None:
+    """What is complete stays; half a file is made anew; what was made otherwise, or is something else, is refused."""
+    target = tmp_path / f"a{extension}"
+
+    def go(parameters: dict[str, Any], **options: Any) -> Done:
+        return process_file(sound, target, parameters, outputs=["ild"], resume=True, **options)
+
+    assert not go(SMALL_PARAMETERS).skipped
+    before = rosafe.load(target)
+    assert go(SMALL_PARAMETERS).skipped
+    for changed in ({"parameters": {"fb_cfHz": [500.0]}}, {"block_frames": 100}, {"channels": (2, 1)}):
+        with pytest.raises(OutputError, match=f"was made with other {next(iter(changed))}; .*--force"):
+            go(**{"parameters": SMALL_PARAMETERS, **changed})
+    if extension == ".zarr":
+        return
+    content = target.read_bytes()
+    target.write_bytes(content[: len(content) // 3])
+    assert not go(SMALL_PARAMETERS).skipped
+    assert_same(rosafe.load(target), before)
+    target.write_text("somebody's own")
+    with pytest.raises(OutputError, match="is no result of rosafe process; --force replaces it"):
+        go(SMALL_PARAMETERS)
+    assert target.read_text() == "somebody's own"
+
+
+def test_a_zarr_takes_the_place_of_a_zarr_only(tmp_path: Path, sound: Path) -> None:
+    target = tmp_path / "a.zarr"
+    target.mkdir()
+    (target / "mine.txt").write_text("precious")
+    refused(command("process", sound, *SMALL, "-o", target), "a folder with other things in it, which stay")
+    assert (target / "mine.txt").read_text() == "precious"
+    (target / "mine.txt").unlink()
+    (tmp_path / "a.zarr.part").mkdir()
+    (tmp_path / "a.zarr.part" / "left").write_text("by one that was killed")
+    for outputs in ("ild", "ratemap"):
+        assert command("process", sound, *SMALL, "-o", target, "--outputs", outputs).returncode == 0
+        assert {outputs} == set(rosafe.load(target)["axes"])
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.zarr", "sound.wav"]
+
+
+# --- what goes in ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["a.flac", "a.ogg", "A.WAV"])
+def test_kinds_of_sound(tmp_path: Path, name: str) -> None:
+    signal = noise(20000) / 4
+    soundfile.write(tmp_path / name, signal.T, RATE, format="WAV" if name.endswith("WAV") else None)
+    done = command("process", name, *SMALL, "-o", "a.npz", "--outputs", "input,ild", cwd=tmp_path)
+    assert done.returncode == 0, done
+    exact = name.endswith(("flac", "WAV"))
+    kind = "int32" if exact else "float64"
+    samples = soundfile.read(tmp_path / name, dtype=kind)[0].T
+    if not exact:
+        samples = np.rint(np.clip(samples * (2**31 - 1), -(2**31), 2**31 - 1)).astype(np.int32)
+    expected = rosafe.process(
+        np.ascontiguousarray(samples), RATE, parameters=SMALL_PARAMETERS, outputs=["input", "ild"]
+    )
+    assert_same(rosafe.load(tmp_path / "a.npz"), expected)
+
+
+def test_mp3(tmp_path: Path) -> None:
+    """Its decoder dithers: the same file is never read twice the same in the last of 24 bits."""
+    soundfile.write(tmp_path / "a.mp3", noise(20000).T / 4, RATE)
+    done = command("process", "a.mp3", *SMALL, "--outputs", "input", cwd=tmp_path)
+    assert done.returncode == 0, done
+    samples = soundfile.read(tmp_path / "a.mp3")[0].T
+    np.testing.assert_allclose(rosafe.load(tmp_path / "a.npz")["input"], samples, rtol=0, atol=3e-7)
+
+
+def test_channels(tmp_path: Path) -> None:
+    five = np.random.default_rng(5).integers(-(2**15), 2**15, (5, 3000)) / 2.0**15
+    write(tmp_path / "five.wav", five)
+    write(tmp_path / "mono.wav", five[:1])
+    for name, pair in (("five", "3,4"), ("five", "5,1"), ("mono", "1,1")):
+        options = ("--channels", pair, "--outputs", "ild", "-o", "out.npz")
+        assert command("process", f"{name}.wav", *SMALL, *options, cwd=tmp_path).returncode == 0
+        left, right = (int(channel) - 1 for channel in pair.split(","))
+        samples = as_int32(five[[left, right]])
+        expected = rosafe.process(samples, RATE, parameters=SMALL_PARAMETERS, outputs=["ild"])
+        loaded = rosafe.load(tmp_path / "out.npz")
+        assert_same(loaded, expected)
+        assert loaded["channels"] == [left + 1, right + 1]
+    refused(command("process", "mono.wav", "--channels", "1,2", cwd=tmp_path), "is mono: there is no channel 2")
+    refused(command("process", "five.wav", cwd=tmp_path), "has 5 channels", "--channels 1,2 takes those")
+    refused(command("process", "mono.wav", cwd=tmp_path), "is mono", "--channels 1,1 gives it to both")
+
+
+def test_no_numbers_are_told(tmp_path: Path) -> None:
+    signal = noise(3000)
+    signal[0, 5:7] = np.nan
+    write(tmp_path / "a.wav", signal, subtype="FLOAT")
+    done = command("process", "a.wav", *SMALL, "--outputs", "input", cwd=tmp_path)
+    assert done.returncode == 0 and "; 2 samples that were NaN or infinite are silence or full scale" in done.stderr
+    assert rosafe.load(tmp_path / "a.npz")["input"][0, 5] == 0
+
+
+def test_bags(tmp_path: Path) -> None:
+    """Every frame once, from the first sound on; what was lost is silence in its place."""
+    samples = bags.stream(9000)
+    indexes = [*range(120, 6000, 100), *range(6500, 9001, 100)]  # windows of 120; between them, 380 frames are lost
+    messages = [bags.message(samples, index, 120, RATE) for index in indexes]
+    bags.write(tmp_path / "a.bag", messages)
+    bags.write(tmp_path / "left.bag", messages, "/left/Audio")
+    heard = samples.copy()
+    heard[:, 5920:6380] = 0
+    parameters: dict[str, Any] = SMALL_PARAMETERS
+    expected = rosafe.process(heard, RATE, parameters=parameters, block_frames=1000, outputs=["input", "ild"])
+    options = (*SMALL, "--outputs", "input,ild", "--block", "1000")
+    assert command("process", "a.bag", "left.bag", *options, cwd=tmp_path).returncode == 0
+    for name in ("a", "left"):
+        assert_same(rosafe.load(tmp_path / f"{name}.npz"), expected)
+    done = command("process", "left.bag", *options, "--topic", "/bass/Audio", "-o", "b.npz", cwd=tmp_path)
+    refused(done, "left.bag: no topic /bass/Audio in there; there are: /left/Audio")
+    done = command("process", "a.bag", *options, "--channels", "2,1", "-o", "b.h5", cwd=tmp_path)
+    assert done.returncode == 0
+    np.testing.assert_array_equal(rosafe.load(tmp_path / "b.h5")["input"], expected["input"][::-1])
+
+
+def test_a_bag_of_several_streams(tmp_path: Path) -> None:
+    samples = bags.stream(2000)
+    both = [bags.message(samples, index, 120, RATE) for index in (*range(100, 2001, 100), *range(100, 501, 100))]
+    bags.write(tmp_path / "a.bag", both)
+    refused(command("process", "a.bag", *SMALL, cwd=tmp_path), "a.bag holds several streams", "rosafe record OUT.wav")
+    (tmp_path / "cut.bag").write_bytes((tmp_path / "a.bag").read_bytes()[:3000])
+    refused(command("process", "cut.bag", *SMALL, cwd=tmp_path), "cut.bag was not closed by its recorder")

@@ -1,0 +1,168 @@
+"""`rosafe up`: one command starts everything, and Ctrl-C ends what it started and nothing else; roslaunch, systemd."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import pty
+import re
+import shutil
+import signal
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from rosafe.component.master import MasterError, check_master
+from tests.harness import ROOT, SCRIPTS, Graph, MasterProcess, Process, free_port, wait_for
+
+SETUP = """
+sound: {device: "scene:"}
+processors:
+  input: {kind: input, nFramesPerBlock: 4410}
+  preProc: {kind: preProc, parent: input}
+"""
+
+
+@pytest.fixture
+def alone(tmp_path: Path) -> Graph:
+    """A graph whose master nobody has started."""
+    return Graph(f"http://127.0.0.1:{free_port()}", tmp_path)
+
+
+def answers(uri: str) -> bool:
+    try:
+        check_master(uri)
+    except MasterError:
+        return False
+    return True
+
+
+def wait_until(process: Process, text: str) -> None:
+    wait_for(lambda: re.search(text, process.out) or not process.alive, what=lambda: f"{text!r} of {process}")
+    assert re.search(text, process.out), process
+
+
+def test_everything_from_nothing_and_back(alone: Graph, tmp_path: Path) -> None:
+    file = tmp_path / "tree.yaml"
+    file.write_text(SETUP)
+    keep = tmp_path / "kept.yaml"
+    for again in (False, True):
+        port = free_port()
+        command = ("rosafe", "up", str(file), "--port", str(port), "--keep", str(keep))
+        with alone.start(*command) as up:
+            wait_until(up, "Ctrl-C ends")
+            wait_until(up, f"setup +loaded +{file}: {0 if again else 2} created")
+            wait_until(up, "rosAFE +runs +2 processors")  # the second time, they have come back
+            wait_until(up, "bass +runs +acquires from scene:")
+            assert f"http://127.0.0.1:{port}" in up.out
+            assert {"/bass", "/rosAFE"} <= alone.nodes()
+            if again:
+                os.kill(up.pid, signal.SIGKILL)
+                up.wait()
+            else:
+                assert up.stop(signal.SIGINT) == 0, up
+        if not again:
+            wait_for(lambda: not answers(alone.uri), what="the end of the master")
+
+
+def test_what_was_there_stays(tmp_path: Path) -> None:
+    master = MasterProcess()
+    graph = Graph(master.uri, tmp_path)
+    file = tmp_path / "tree.yaml"
+    file.write_text(SETUP.replace("scene:", "file:/nowhere.wav"))
+    try:
+        master.start(graph.env)
+        with graph.node("bass-ros") as bass, graph.start("rosafe", "up", str(file), "--port", str(free_port())) as up:
+            wait_until(up, "roscore +runs .*was there")
+            wait_until(up, "bass +runs .*was there")
+            wait_until(up, "setup +refused +::bass::e_device")
+            assert up.stop(signal.SIGINT) == 1
+            assert bass.alive
+            assert "/rosAFE/Stop" not in graph.services()
+            assert graph.run("rosservice", "call", "/bass/Stop", "{}").stdout.startswith("genom_success: True")
+    finally:
+        master.kill()
+
+
+def test_a_file_that_is_wrong_starts_nothing(alone: Graph, tmp_path: Path) -> None:
+    file = tmp_path / "tree.yaml"
+    file.write_text("processors:\n  a: {kind: nothing}\n")
+    done = alone.run("rosafe", "up", str(file), check=False)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert f"{file}, line 2: " in done.stderr
+    assert not answers(alone.uri)
+    far = alone.run("rosafe", "up", check=False, ROS_MASTER_URI="http://192.0.2.1:11311")
+    assert far.returncode == 1
+    assert "it is for that machine to start it" in far.stderr
+
+
+def test_one_that_is_killed_is_told(alone: Graph) -> None:
+    """On a terminal, which shows one screen."""
+    ours, theirs = pty.openpty()
+    up = subprocess.Popen(
+        ["rosafe", "up", "--port", str(free_port())], env=alone.env, stdout=theirs, stderr=theirs, stdin=theirs
+    )
+    os.close(theirs)
+    os.set_blocking(ours, False)
+    shown = b""
+
+    def has(text: bytes) -> bool:
+        nonlocal shown
+        with contextlib.suppress(OSError):  # nothing yet, or nobody any more
+            while more := os.read(ours, 4096):
+                shown += more
+        return text in shown
+
+    try:
+        wait_for(lambda: has(b"Ctrl-C ends"), what=lambda: str(shown))
+        assert b"\x1b[" in shown
+        done = alone.run("rosnode", "info", "/bass")
+        os.kill(int(re.findall(r"Pid: (\d+)", done.stdout)[0]), signal.SIGKILL)
+        wait_for(lambda: has(b"killed by signal 9"), what=lambda: str(shown))
+        up.send_signal(signal.SIGINT)
+        wait_for(lambda: has(b"ending what was started") and up.poll() is not None, what=lambda: str(shown))
+        assert up.returncode == 1
+    finally:
+        up.kill()
+        os.close(ours)
+
+
+@pytest.mark.parametrize("live", ["true", "false"])
+def test_roslaunch_finds_everything(alone: Graph, live: str) -> None:
+    arguments = ("rosAFE", "rosafe.launch", "setup:=/tmp/tree.yaml", "keep:=/tmp/kept.yaml", f"live:={live}", "port:=9")
+    nodes = alone.run("roslaunch", "--nodes", *arguments).stdout.split()
+    assert sorted(nodes) == sorted(
+        ["/bass", "/rosAFE", "/genomixd", "/rosafe_setup", *(["/rosafe_live"] if live == "true" else [])]
+    )
+    line = alone.run("roslaunch", "--args", "/rosafe_setup", *arguments).stdout
+    assert "setup load --wait 60 --keep /tmp/kept.yaml /tmp/tree.yaml __name:=rosafe_setup" in line
+    assert str(SCRIPTS) in str(Path(line.split()[0]).resolve())
+    assert alone.run("rosafe", "--version", "__name:=x", "__log:=/tmp/y").stdout.startswith("rosafe ")
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="there is no systemd-analyze here")
+@pytest.mark.parametrize("kind", ["system", "user"])
+def test_units_are_as_systemd_wants_them(kind: str, tmp_path: Path) -> None:
+    units = []
+    for path in sorted((ROOT / "systemd" / kind).iterdir()):
+        unit = tmp_path / path.name
+        unit.write_text(path.read_text("utf-8").replace("/opt/rosafe/", f"{ROOT}/"))
+        units.append(str(unit))
+    assert len(units) == 6
+    done = subprocess.run(
+        ["systemd-analyze", "verify", "--man=no", *(["--user"] if kind == "user" else []), *units],
+        env={**os.environ, "XDG_RUNTIME_DIR": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    ours = [line for line in done.stderr.splitlines() if "rosafe" in line]
+    assert not ours, done.stderr
+    assert done.returncode == 0, done.stderr
+    for name in units:
+        text = Path(name).read_text("utf-8")
+        if "Type=notify" in text:
+            assert "WatchdogSec=" in text
+            assert "Restart=always" in text
+            assert "MemoryMax=" in text

@@ -1,0 +1,82 @@
+/* Calls functions of a library for another processor: reads calls with their arrays from its input, writes what came out.
+ *
+ * It runs under qemu, with the library as its argument (tests/dsp/foreign.py writes the calls). All numbers are of 8 bytes.
+ * A call: number of arrays, and of each its bytes and the contents; the function's name in 64 bytes; number of arguments, and
+ * of each its kind and two numbers. The answer: what the function gave back, and the contents of all arrays. */
+#include <dlfcn.h>
+#include <stdint.h>
+#include <stdio.h>
+#include <stdlib.h>
+#include <string.h>
+#include <sys/mman.h>
+
+enum { MOST_ARRAYS = 32, MOST_ARGUMENTS = 40, MOST_REALS = 8, PAGE = 65536 };
+
+enum kind { INTEGER, REAL, ADDRESS /* number of the array, bytes from its beginning */ };
+
+/* Numbers go to registers of their own kind and, behind eight reals, the rest to the stack in order: so it is for aarch64 and
+ * for x86-64, and a function takes what it has of each kind, wherever they stood among the arguments. */
+#define EIGHT(type) type, type, type, type, type, type, type, type
+typedef int64_t kernel(EIGHT(double), EIGHT(int64_t), EIGHT(int64_t), EIGHT(int64_t), EIGHT(int64_t), EIGHT(int64_t));
+#define FOUR_OF(x, n) x[n], x[n + 1], x[n + 2], x[n + 3]
+#define EIGHT_OF(x, n) FOUR_OF(x, n), FOUR_OF(x, n + 4)
+
+static void take(void *to, size_t bytes) {
+    if (bytes && fread(to, bytes, 1, stdin) != 1) exit(0); /* the end */
+}
+
+static int64_t take_number(void) {
+    int64_t number;
+    take(&number, sizeof number);
+    return number;
+}
+
+/* Behind the last byte lies a page that must not be touched. */
+static char *room(size_t bytes, char **begin, size_t *size) {
+    size_t pages = (bytes + PAGE - 1) / PAGE * PAGE;
+    *size = pages + PAGE;
+    *begin = mmap(0, *size, PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS, -1, 0);
+    if (*begin == MAP_FAILED || mprotect(*begin + pages, PAGE, PROT_NONE)) abort();
+    return *begin + pages - bytes;
+}
+
+int main(int count, char **arguments) {
+    void *library = count == 2 ? dlopen(arguments[1], RTLD_NOW) : NULL;
+    if (!library) {
+        fprintf(stderr, "driver: %s\n", count == 2 ? dlerror() : "usage: driver LIBRARY < CALLS > ANSWERS");
+        return 1;
+    }
+    for (;;) {
+        char *arrays[MOST_ARRAYS], *begins[MOST_ARRAYS], name[64];
+        size_t bytes[MOST_ARRAYS], sizes[MOST_ARRAYS];
+        int64_t integers[MOST_ARGUMENTS] = {0}, used = 0, reals_used = 0, number = take_number();
+        double reals[MOST_REALS] = {0};
+        if (number > MOST_ARRAYS) abort();
+        for (int64_t i = 0; i < number; i++) {
+            bytes[i] = take_number();
+            arrays[i] = room(bytes[i], &begins[i], &sizes[i]);
+            take(arrays[i], bytes[i]);
+        }
+        take(name, sizeof name);
+        for (int64_t left = take_number(); left > 0; left--) {
+            int64_t kind = take_number(), value = take_number(), offset = take_number();
+            if (kind == REAL)
+                memcpy(&reals[reals_used++], &value, sizeof value);
+            else
+                integers[used++] = kind == INTEGER ? value : (int64_t)(arrays[value] + offset);
+        }
+        kernel *function = (kernel *)dlsym(library, name);
+        if (!function) {
+            fprintf(stderr, "driver: no function %s\n", name);
+            return 1;
+        }
+        int64_t result = function(EIGHT_OF(reals, 0), EIGHT_OF(integers, 0), EIGHT_OF(integers, 8), EIGHT_OF(integers, 16),
+                                  EIGHT_OF(integers, 24), EIGHT_OF(integers, 32));
+        fwrite(&result, sizeof result, 1, stdout);
+        for (int64_t i = 0; i < number; i++) {
+            fwrite(arrays[i], bytes[i], 1, stdout);
+            munmap(begins[i], sizes[i]);
+        }
+        fflush(stdout);
+    }
+}

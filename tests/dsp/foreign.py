@@ -1,0 +1,150 @@
+"""The kernels for another processor, under qemu: tests/dsp/driver.c gets calls with their arrays, and answers."""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import platform
+import shutil
+import struct
+import subprocess
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from rosafe.dsp.kernels import build, library
+
+INTEGER, REAL, ADDRESS = range(3)  # as in driver.c
+
+
+class Machine(NamedTuple):
+    """A processor that is not this one."""
+
+    compiler: str
+    emulator: tuple[str, ...]
+    kind: str
+    level: int
+
+    @property
+    def lacking(self) -> list[str]:
+        """The programs that it takes and that are not here."""
+        return [name for name in (self.compiler, self.emulator[0]) if shutil.which(name) is None]
+
+    def library(self) -> Path:
+        """Its library, built if it is not there."""
+        if self.kind == platform.machine():
+            return build.libraries()[self.level]
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(platform, "machine", lambda: self.kind)
+            patch.setenv(build.COMPILER, self.compiler)
+            return build.libraries(build.place() / "foreign")[self.level]
+
+
+MACHINES = {
+    "aarch64": Machine("aarch64-linux-gnu-gcc", ("qemu-aarch64", "-L", "/usr/aarch64-linux-gnu"), "aarch64", 8),
+    "nehalem": Machine("gcc", ("qemu-x86_64", "-cpu", "Nehalem"), "x86_64", 2),  # it has no AVX
+}
+
+
+class Foreign:
+    """A library of kernels that runs elsewhere, in the place of a `ctypes.CDLL`."""
+
+    def __init__(self, machine: Machine) -> None:
+        folder = Path(tempfile.mkdtemp(prefix="foreign-kernels."))
+        try:
+            driver, source = folder / "driver", Path(__file__).with_name("driver.c")
+            subprocess.run([machine.compiler, "-O1", "-Wall", "-o", driver, source, "-ldl"], check=True)
+            command = [*machine.emulator, str(driver), str(machine.library())]
+            self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+            self._arrays: list[NDArray[Any]] = []
+            self.rosafe_processor_level()  # answers: all is loaded
+        finally:
+            shutil.rmtree(folder)
+
+    def address(self, array: NDArray[Any]) -> int:
+        """As `kernels._address`; the array goes with the next call."""
+        self._arrays.append(array)
+        address: int = array.ctypes.data
+        return address
+
+    def __getattr__(self, name: str) -> Callable[..., int]:
+        return functools.partial(self._call, name)
+
+    def _call(self, name: str, *arguments: float | None) -> int:
+        spans = _joined([np.byte_bounds(array) for array in self._arrays])
+        kinds = library._ARGUMENTS.get(name, ())
+        message = [struct.pack("q", len(spans))]
+        for low, high in spans:
+            message += [struct.pack("q", high - low), ctypes.string_at(low, high - low)]
+        message.append(struct.pack("64sq", name.encode(), len(arguments)))
+        for kind, value in zip(kinds, arguments, strict=True):
+            message.append(_argument(kind, value, spans))
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._process.stdin.write(b"".join(message))
+        self._process.stdin.flush()
+        size = 8 + sum(high - low for low, high in spans)
+        answer = self._process.stdout.read(size)
+        assert len(answer) == size, f"{name} has died with status {self._process.wait()}"
+        at = 8
+        for low, high in spans:
+            ctypes.memmove(low, answer[at : at + high - low], high - low)
+            at += high - low
+        self._arrays.clear()
+        return int(struct.unpack_from("q", answer)[0])
+
+    def close(self) -> None:
+        """End it."""
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._process.stdin.close()
+        assert self._process.wait() == 0
+        self._process.stdout.close()
+
+
+def _joined(spans: list[tuple[int, int]]) -> list[tuple[int, int]]:
+    """Ranges of addresses, those that overlap or touch made one: views of one store."""
+    joined: list[tuple[int, int]] = []
+    for low, high in sorted(spans):
+        if joined and low <= joined[-1][1]:
+            joined[-1] = (joined[-1][0], max(high, joined[-1][1]))
+        else:
+            joined.append((low, high))
+    return joined
+
+
+def _argument(kind: Any, value: float | None, spans: list[tuple[int, int]]) -> bytes:
+    if kind is ctypes.c_double:
+        return struct.pack("qdq", REAL, value, 0)
+    if kind is not ctypes.c_void_p or not value:
+        return struct.pack("qqq", INTEGER, int(value or 0), 0)
+    for number, (low, high) in enumerate(spans):
+        if low <= value <= high:
+            return struct.pack("qqq", ADDRESS, number, int(value) - low)
+    raise AssertionError("an address of no array that was asked for its own")
+
+
+_running: dict[str, Foreign] = {}
+
+
+def running(name: str) -> Foreign:
+    """One of `MACHINES`, started at the first call; a test for it is skipped where its tools are not here."""
+    machine = MACHINES[name]
+    if machine.lacking:
+        pytest.skip(f"no {' and no '.join(machine.lacking)} here: scripts/install --tests brings them")
+    if machine.kind == "x86_64" != platform.machine():
+        pytest.skip("for x86-64")
+    if name not in _running:
+        _running[name] = Foreign(machine)
+    return _running[name]
+
+
+def close_all() -> None:
+    """End those that run."""
+    while _running:
+        _running.popitem()[1].close()

@@ -1,0 +1,78 @@
+"""The kernels on processors that are not this one, and by the other compiler; test_kernels.py has aarch64's inputs."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from rosafe.dsp.signal import Signal
+from rosafe.representations import STAGES
+
+from . import foreign
+from .bare import FloatArray
+from .implementations import CLANG, TWINS, Choice, using
+from .test_kernels import RATE, agree, signal
+
+CHANNELS = 9
+each_processor = pytest.mark.parametrize("choice", [*foreign.MACHINES, CLANG])
+
+
+@pytest.fixture(scope="module", autouse=True)
+def implementation() -> Iterator[None]:
+    """Here, each test chooses for itself; what was started ends with the module."""
+    yield
+    foreign.close_all()
+
+
+def representations(choice: Choice) -> dict[str, FloatArray]:
+    """Every representation that has a kernel, two blocks of it, one after the other from the filterbank on."""
+    made: dict[str, list[FloatArray]] = {}
+    bank, cell = STAGES["gammatone"](RATE, fb_nChannels=CHANNELS, fb_highFreqHz=7000.0), STAGES["ihc"](RATE)
+    kinds = ("ild", "ratemap", "crossCorrelation", "adaptation", "autocorrelation", "amsFeatures", "precedence")
+    stages = {kind: STAGES[kind](RATE) for kind in kinds}
+    frames = Signal(RATE, 100.0, True, round(RATE / 100), round(RATE / 50), tuple(np.geomspace(80, 7000, CHANNELS)))
+    with using(choice):
+        for block in np.array_split(signal(1, 9000)[:, 0], 2, axis=-1):
+            block = np.ascontiguousarray(block)
+            outputs = {"gammatone": bank.process(block)}
+            outputs["ihc"] = cell.process(outputs["gammatone"])
+            outputs |= {kind: stage.process(outputs["ihc"]) for kind, stage in stages.items()}
+            for kind, output in outputs.items():
+                parts = output if isinstance(output, tuple) else (output,)
+                for number, part in enumerate(parts):
+                    made.setdefault(f"{kind} {number}", []).append(part)
+        rates = np.abs(signal(CHANNELS, 200))
+        for kind in ("spectralFeatures", "gabor"):
+            made[kind] = [STAGES[kind](frames).process(rates)]
+    return {kind: np.concatenate(parts, axis=-1) for kind, parts in made.items()}
+
+
+@each_processor
+def test_every_kernel(choice: Choice) -> None:
+    got, expected = representations(choice), representations(TWINS)
+    assert got.keys() == expected.keys()
+    assert min(array.shape[-1] for array in got.values()) > 20
+    for kind, array in got.items():
+        if not kind.startswith(
+            "precedence"
+        ):  # which decides by differences of rounding: test_precedence has sound for that
+            agree([array], [expected[kind]])
+
+
+@pytest.mark.parametrize(("machine", "level"), [("aarch64", 8), ("nehalem", 2)])
+def test_the_library_says_what_it_is_for(machine: str, level: int) -> None:
+    """On a processor without AVX, too: the question is no illegal instruction."""
+    assert foreign.running(machine).rosafe_processor_level() == level
+
+
+@pytest.mark.parametrize("machine", foreign.MACHINES)
+def test_denormal_numbers_are_off_until_they_are_given_back(machine: str) -> None:
+    elsewhere = foreign.running(machine)
+    before = elsewhere.rosafe_denormals_off() & 0xFFFFFFFF
+    off = elsewhere.rosafe_denormals_off() & 0xFFFFFFFF
+    assert off != before
+    elsewhere.rosafe_denormals_as(before)
+    assert elsewhere.rosafe_denormals_off() & 0xFFFFFFFF == before
+    elsewhere.rosafe_denormals_as(before)

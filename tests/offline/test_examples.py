@@ -1,0 +1,102 @@
+"""The tutorial and the examples: all of it runs as it stands, and does what it says."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from tests.harness import PYTHON, ROOT, SCRIPTS
+
+TUTORIAL = (ROOT / "docs" / "tutorial.md").read_text("utf-8")
+EXAMPLES = ROOT / "examples"
+
+# In the place of python3-sounddevice: microphones that give three blocks.
+SOUNDDEVICE = """
+import numpy as np
+class InputStream:
+    def __init__(self, samplerate, channels, blocksize): self.left = 3
+    def __enter__(self): return self
+    def __exit__(self, *what): pass
+    active = property(lambda self: self.left > 0)
+    def read(self, frames):
+        self.left -= 1
+        return np.random.default_rng(1).standard_normal((frames, 2)).astype(np.float32) * [1, 2], False
+"""
+
+
+def run(*command: str | Path, cwd: Path, path: str = "") -> str:
+    """What a command prints."""
+    kept = {name: value for name, value in os.environ.items() if not name.startswith(("ROS_", "PYTHON"))}
+    env = {**kept, "PATH": f"{SCRIPTS}:/usr/bin:/bin", "PYTHONPATH": f"{ROOT}:{path}", "MPLBACKEND": "Agg"}
+    done = subprocess.run([*map(str, command)], cwd=cwd, env=env, capture_output=True, text=True, timeout=300)
+    assert (done.returncode, done.stderr) == (0, ""), done
+    return done.stdout
+
+
+def blocks(language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```$", TUTORIAL, re.MULTILINE | re.DOTALL)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """With the tutorial's sound."""
+    folder = tmp_path_factory.mktemp("tutorial")
+    run("sh", "-ec", blocks("sh")[0], cwd=folder)
+    return folder
+
+
+def is_picture(path: Path) -> bool:
+    return path.read_bytes().startswith(b"\x89PNG") and path.stat().st_size > 20_000
+
+
+def test_the_tutorial(folder: Path) -> None:
+    pytest.importorskip("xarray", reason="xarray is not here: scripts/install --tests brings it")
+    (plot,) = blocks("sh")[1:]
+    run("sh", "-ec", plot, cwd=folder)
+    said = run(PYTHON, "-c", "\n".join(blocks("python")), cwd=folder)
+    low, high = map(float, re.findall(r"from (\S+) to (\S+)", said)[0])
+    assert low < -30 and high <= 90
+    assert "unknown parameter 'fb_nChanels'; did you mean fb_nChannels?" in said
+    assert "('channel', 'time') Hz" in said and "(32, 1) [2.99]" in said
+    assert is_picture(folder / "speech.png") and is_picture(folder / "ears.png")
+
+
+SAID = {
+    "ratemap.py": r"299 frames of 48 channels: ratemap.png",
+    "azimuth.py": r"0 s: .* deg from levels, .* deg from lags",
+    "pitch.py": r"0.25 s: 1[67]\d Hz\n(.*\n)+1.75 s: 2[78]\d Hz",
+    "stream_wav.py": r"  2.990 s: right ear .* dB$",
+    "stream_microphones.py": r"(right ear  \+[56]\.\d dB\n){3}",
+    "features.py": r"loudest channel: .* Hz\nright ear: .* dB\n",
+}
+
+
+@pytest.mark.parametrize("name", sorted(path.name for path in EXAMPLES.glob("*.py")))
+def test_an_example(name: str, folder: Path, tmp_path: Path) -> None:
+    if name == "features.py":
+        pytest.importorskip("xarray", reason="xarray is not here: scripts/install --tests brings it")
+    (tmp_path / "sounddevice.py").write_text(SOUNDDEVICE)
+    sound = [folder / "speech.wav"] if name == "stream_wav.py" else []
+    said = run(PYTHON, EXAMPLES / name, *sound, cwd=tmp_path, path=str(tmp_path))
+    assert re.search(SAID[name], said), said
+    if name == "ratemap.py":
+        assert is_picture(tmp_path / "ratemap.png")
+    assert f"`{name}`" in TUTORIAL
+
+
+def test_the_notebook(tmp_path: Path) -> None:
+    """Its cells, one after the other; it holds no outputs."""
+    cells = json.loads((EXAMPLES / "two_ears.ipynb").read_text("utf-8"))["cells"]
+    code = ["".join(cell["source"]) for cell in cells if cell["cell_type"] == "code"]
+    assert all(not cell["outputs"] and cell["execution_count"] is None for cell in cells if "outputs" in cell)
+    lines = [
+        *code[:-1],
+        code[-1].rpartition("\n")[0],
+        "print(" + "".join(cells[-1]["source"]).rpartition("\n")[2] + ")",
+    ]
+    assert float(run(PYTHON, "-c", "\n".join(lines), cwd=tmp_path)) < 1e-9

@@ -1,0 +1,155 @@
+"""`rosafe.Stream`: the numbers of `rosafe.process` on the same blocks, whatever comes, and what it refuses."""
+
+from __future__ import annotations
+
+import threading
+import time
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import rosafe
+from rosafe.interface import FIXED
+from rosafe.representations import STAGES
+from tests.representations.chain import Chain, cut
+
+RATE = 16000
+FEW = {"fb_nChannels": 4}
+SOUND = 0.1 * np.random.default_rng(0).standard_normal((2, 3000))
+
+
+def joined(stream: rosafe.Stream, blocks: list[Any]) -> dict[str, np.ndarray]:
+    """All that comes out for `blocks`."""
+    made = [stream.process(block) for block in blocks]
+    return {name: np.concatenate([one[name] for one in made], axis=-1) for name in made[0]}
+
+
+def assert_same(got: dict[str, Any], wanted: dict[str, Any]) -> None:
+    for name, value in got.items():
+        np.testing.assert_array_equal(value, wanted[name], err_msg=name)
+
+
+@settings(deadline=None, max_examples=15)
+@given(st.lists(st.integers(1, 900), min_size=1, max_size=5))
+def test_any_blocks_give_the_numbers_of_process(lengths: list[int]) -> None:
+    got = joined(rosafe.Stream(RATE, FEW), cut(SOUND, lengths))
+    assert set(FIXED) < set(got)
+    assert_same(got, rosafe.process(SOUND, RATE, parameters=FEW, block_frames=lengths))
+
+
+def test_all_kinds() -> None:
+    kinds = list(STAGES)
+    got = joined(rosafe.Stream(RATE, FEW, kinds), cut(SOUND, 700))
+    assert_same(got, rosafe.process(SOUND, RATE, parameters=FEW, block_frames=700, outputs=kinds))
+
+
+def test_changes_on_the_way() -> None:
+    """Among them one that needs what the filterbank has not provided so far, and one of what is not computed."""
+    changes = [(1, "ihc_method", "bernstein"), (2, "fb_lowFreqHz", 300.0), (3, "set_rm_scailing", "_magnitude")]
+    changes += [(4, "rm_hSizeSec", 0.02), (4, "ac_K", 1.0)]
+    outputs = ["ihc", "ratemap"]
+    wanted = rosafe.process(SOUND, RATE, parameters=FEW, block_frames=500, modifications=changes, outputs=outputs)
+    stream = rosafe.Stream(RATE, FEW, outputs)
+    made = []
+    for number, block in enumerate(cut(SOUND, 500)):
+        for _, name, value in (change for change in changes if change[0] == number):
+            stream.modify(name, value)
+        made.append(stream.process(block))
+    assert_same({name: np.concatenate([one[name] for one in made], axis=-1) for name in made[0]}, wanted)
+    assert stream.describe()["ratemap_frameRate"] == 50.0
+    assert stream.describe()["parameters"]["fb_lowFreqHz"] == 300.0
+
+
+def test_reset_is_a_new_beginning_with_the_same_parameters() -> None:
+    stream = rosafe.Stream(RATE, FEW)
+    stream.modify("rm_decaySec", 0.02)
+    first = joined(stream, cut(SOUND, 441))
+    stream.reset()
+    assert_same(joined(stream, cut(SOUND, 441)), first)
+    stream.reset()
+    whole = (SOUND * 2**31).astype(np.int32)
+    assert np.abs(joined(stream, cut(whole, 441))["input"] - SOUND).max() < 1e-8
+
+
+def test_one_ear_and_upright_blocks_down_to_one_frame() -> None:
+    mono = joined(rosafe.Stream(RATE, FEW), cut(SOUND[0], 333))
+    assert_same(mono, rosafe.process(SOUND[0], RATE, parameters=FEW, block_frames=333))
+    assert "ild" not in mono and mono["ratemap"].shape[0] == 1
+    lengths = [300, 2, 1, 0, 2, 700]
+    ends = np.cumsum(lengths)
+    upright = [SOUND.T[end - length : end] for end, length in zip(ends, lengths, strict=True)]
+    flat = [block.T for block in upright]
+    assert_same(joined(rosafe.Stream(RATE, FEW), upright), joined(rosafe.Stream(RATE, FEW), flat))
+    stream = rosafe.Stream(RATE, FEW)
+    joined(stream, [SOUND[0]])
+    stream.reset()
+    assert_same(joined(stream, cut(SOUND, 500)), rosafe.process(SOUND, RATE, parameters=FEW, block_frames=500))
+
+
+def test_blocks_of_16_bits_as_sounddevice_gives_them() -> None:
+    short = np.round(SOUND.T * 2**15).astype(np.int16)
+    got = joined(rosafe.Stream(RATE, FEW, "ratemap"), [short[at : at + 160] for at in range(0, 3000, 160)])
+    assert_same(got, rosafe.process(short, RATE, parameters=FEW, block_frames=160, outputs="ratemap"))
+
+
+def test_what_it_says_of_itself() -> None:
+    stream = rosafe.Stream(RATE, FEW, ["ild", "crossCorrelation"])
+    told = stream.describe()
+    assert told["sample_rate"] == RATE and told["parameters"]["fb_highFreqHz"] == told["fb_cfHz"][-1] == 7600.0
+    assert told["axes"] == {"ild": ("channel", "time"), "crossCorrelation": ("channel", "lag", "time")}
+    assert told["units"]["ild"] == "dB" and told["ild_frameRate"] == 100.0 and len(told["cc_lags"]) == 37
+
+
+@pytest.mark.parametrize(
+    ("arguments", "match"),
+    [
+        ((0,), "sample_rate: 0 is out of range"),
+        ((RATE, {"fb_nChanels": 3}), r"'fb_nChanels'; did you mean fb_nChannels\?"),
+        ((RATE, {"fb_highFreqHz": 9000.0}), "7600 Hz would do"),
+        ((RATE, None, ["ratemaps"]), r"'ratemaps'; did you mean ratemap\?"),
+        ((96000, {"ild_wSizeSec": 60.0}), "more than 1024 MiB"),
+    ],
+)
+def test_what_is_refused_at_the_start(arguments: Any, match: str) -> None:
+    with pytest.raises(ValueError, match=match) as raised:
+        rosafe.Stream(*arguments)
+    assert [entry.name for entry in raised.traceback][1:] == ["__init__"]
+
+
+def test_what_is_refused_later_has_no_effect() -> None:
+    stream, other = rosafe.Stream(RATE, FEW), rosafe.Stream(RATE, FEW)
+    for block in (SOUND[:, :500], SOUND[:, 500:]):
+        for bad in (np.zeros((3, 5)), np.full((2, 5), np.nan), "sound", np.zeros((2, 5), bool)):
+            with pytest.raises(ValueError, match="signal"):
+                stream.process(bad)
+        with pytest.raises(ValueError, match="did you mean"):
+            stream.modify("fb_nchannel", 3)
+        for name, value in (("fb_nChannels", -1), ("fb_highFreqHz", 9000.0), ("ild_wSizeSec", 1e-6)):
+            with pytest.raises(ValueError, match=name):
+                stream.modify(name, value)
+        assert_same(stream.process(block), other.process(block))
+        with pytest.raises(ValueError, match="whole numbers"):
+            stream.process(np.zeros((2, 5), np.int32))
+        with pytest.raises(ValueError, match="2 ears"):
+            stream.process(np.zeros(5))
+    with pytest.raises(ValueError, match="ild compare two ears"):
+        rosafe.Stream(RATE, FEW, ["ild"]).process(SOUND[0])
+
+
+def test_it_starts_no_thread_and_costs_what_the_stages_cost() -> None:
+    """Of the best of many turns, next to each other; benchmarks/stream.py measures it in peace."""
+    rate, frames = 44100, 441
+    sound = 0.1 * np.random.default_rng(1).standard_normal((2, 60 * frames))
+    before = threading.active_count()
+    stream, stages = rosafe.Stream(rate), Chain(float(rate), FIXED, {"in_doNormalize": False})
+    seconds: dict[Any, list[float]] = {stream: [], stages: []}
+    for block in cut(sound, frames) * 3:
+        for one, taken in seconds.items():
+            begun = time.perf_counter()
+            one.process(block)
+            taken.append(time.perf_counter() - begun)
+    assert threading.active_count() == before
+    assert np.median(seconds[stream]) < 2 * np.median(seconds[stages])  # 1.3 on a quiet machine
