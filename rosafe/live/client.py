@@ -181,7 +181,8 @@ class Client:
                     del self._looking[key]
                 if key not in self._looking:
                     await self._begin(key)
-            self._tell_views()
+            if self._wanted:
+                self._tell_views()
 
     def _tell_views(self) -> None:
         views = []

@@ -106,9 +106,15 @@ class Page:
     async def look(self, *keys: dict[str, Any], anew: bool = False) -> list[dict[str, Any]]:
         """Look at these; what the server says of the views."""
         self.said.pop("views", None)
-        assert await self.ask("look", keys=list(keys), anew=anew) == {"about": "answer", "id": self._number, "ok": {}}
-        await self.until("views")
-        return list(self.said["views"]["views"])
+        assert "ok" in await self.ask("look", keys=list(keys), anew=anew)
+        while not self._sees(len(keys)):
+            await self.hear()
+        return list(self.said.get("views", {"views": ()})["views"])
+
+    def _sees(self, count: int) -> bool:
+        """Whether all that was asked for is there; the tree is looked at once a second, and may be an old one first."""
+        views = self.said.get("views", {"views": ()})["views"]
+        return len(views) == count and all("number" in view or view["key"]["name"] == "nobody" for view in views)
 
     async def until(self, subject: str) -> dict[str, Any]:
         """The newest message about a subject, or the next one."""
