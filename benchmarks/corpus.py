@@ -42,7 +42,8 @@ def run(*commands: tuple[str | Path, ...]) -> float:
     """Seconds until all of them have ended."""
     begun = time.monotonic()
     running = [subprocess.Popen([ROSAFE, "process", *map(str, command), *OPTIONS]) for command in commands]
-    if any([process.wait() for process in running]):
+    codes = [process.wait() for process in running]  # all of them
+    if any(codes):
         raise SystemExit("a run has failed")
     return time.monotonic() - begun
 

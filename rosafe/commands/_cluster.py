@@ -70,8 +70,8 @@ def _taken(ended: queue.SimpleQueue[int]) -> Iterator[int]:
 def _client(address: str, jobs: int, stack: ExitStack) -> Any:
     from distributed import Client, LocalCluster
 
-    for logger in ("distributed", "distributed.diskutils"):
-        logging.getLogger(logger).setLevel(logging.CRITICAL)  # what goes wrong is told in one line each
+    for name in [name for name in logging.root.manager.loggerDict if name.partition(".")[0] == "distributed"]:
+        logging.getLogger(name).setLevel(logging.CRITICAL)  # what goes wrong is told in one line each
     if address == LOCAL:  # TLS with keys of its own: a Dask worker does what anybody asks it who can connect
         cluster: Any = stack.enter_context(
             LocalCluster(

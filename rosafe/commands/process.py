@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import dataclasses
 import importlib
 import os
 import re
@@ -19,7 +20,7 @@ import time
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from rosafe.commands import Failure
 from rosafe.commands._parameters import add_settings, parameters_of, words
@@ -187,49 +188,23 @@ def run(options: argparse.Namespace) -> int:
         options.usage_error(f"--dask {options.dask}: wanted is a scheduler, such as tcp://HOST:8786, or local")
     folder, file = _place(inputs, options)
     # Once, for all processes that are forked from this one.
-    from rosafe.offline.corpus import Settings, compute, find, named
-    from rosafe.offline.files import OUTPUTS
-    from rosafe.offline.formats import FORMATS, check_format, format_of
+    from rosafe.offline.corpus import compute
     from rosafe.output import OutputError
     from rosafe.sound.audiofile import AudioFileError
 
     try:
-        parameters = parameters_of(options.settings)
-        outputs = check_outputs(OUTPUTS if options.outputs is None else words(options.outputs))
-        form = FORMATS[f".{options.format or 'npz'}"] if file is None else format_of(file)
-        check_format(form, outputs)
-        if options.dask:
-            importlib.import_module("distributed")
-        items, problems = find(inputs, folder)
-        if file is not None:
-            targets = [file]
-        elif folder is not None:
-            targets = named(items, folder, form.extension)
-        else:
-            targets = named([item._replace(place=item.source) for item in items], Path(), form.extension)
+        plan = _plan(inputs, folder, file, options)
     except ValueError as problem:
         raise Failure(str(problem)) from None
     signals = Interrupts()
     made = _make_folder(folder)
-    settings = Settings(
-        parameters,
-        outputs,
-        options.block,
-        options.channels,
-        options.topic,
-        options.force or (file is not None and not options.resume),
-        options.resume,
-        folder is not None,
-    )
-    sources = [item.source for item in items]
-    places: list[Path] = targets
-    if options.dask:  # workers have folders of their own
-        sources, places = ([Path(os.path.abspath(path)) for path in paths] for paths in (sources, targets))
+    if options.dask:
+        plan = _for_dask(plan, options)
     else:
         importlib.import_module("scipy.signal")
-    works = [partial(compute, source, place, settings) for source, place in zip(sources, places, strict=True)]
-    corpus = _Corpus([item.source for item in items], targets, options)
-    for path, why in problems:
+    works = [partial(compute, *pair, plan.settings) for pair in zip(plan.sources, plan.targets, strict=True)]
+    corpus = _Corpus(plan.names, plan.targets, options)
+    for path, why in plan.problems:
         corpus.fail(str(path), why)
     try:
         if works:
@@ -242,12 +217,73 @@ def run(options: argparse.Namespace) -> int:
             left = "is left as .part, to be used up" if options.dask else "is removed"
             again = "; --resume goes on" if folder is not None else ""
             corpus.display.message(f"rosafe process: interrupted; what was not finished {left}{again}")
-        _remove_empty({target.parent for target in targets}, folder, made)
+        _remove_empty(plan.targets, folder, made)
         raise
     corpus.display.clear()
     corpus.end(folder, inputs)
-    _remove_empty({target.parent for target in targets}, folder, made)
+    _remove_empty(plan.targets, folder, made)
     return 1 if corpus.failed else 0
+
+
+class _Plan(NamedTuple):
+    """What is to be done."""
+
+    names: list[Path]  # of the inputs, as they are told of
+    sources: list[Path]
+    targets: list[Path]
+    settings: Any
+    problems: list[tuple[Path, str]]  # known before
+
+
+def _plan(inputs: list[Path], folder: Path | None, file: Path | None, options: argparse.Namespace) -> _Plan:
+    """All that is to be done, checked as far as that can be without reading the files; ValueError."""
+    from rosafe.offline.corpus import Settings, find, named
+    from rosafe.offline.files import OUTPUTS
+    from rosafe.offline.formats import FORMATS, check_format, format_of
+
+    parameters = parameters_of(options.settings)
+    outputs = check_outputs(OUTPUTS if options.outputs is None else words(options.outputs))
+    form = FORMATS[f".{options.format or 'npz'}"] if file is None else format_of(file)
+    check_format(form, outputs)
+    if options.dask:
+        importlib.import_module("distributed")
+    items, problems = find(inputs, folder)
+    if file is not None:
+        targets = [file]
+    elif folder is not None:
+        targets = named(items, folder, form.extension)
+    else:
+        targets = named([item._replace(place=item.source) for item in items], Path(), form.extension)
+    settings = Settings(
+        parameters,
+        outputs,
+        options.block,
+        options.channels,
+        options.topic,
+        options.force or (file is not None and not options.resume),
+        options.resume,
+        folder is not None,
+    )
+    sources = [item.source for item in items]
+    return _Plan(sources, sources, targets, settings, problems)
+
+
+def _for_dask(plan: _Plan, options: argparse.Namespace) -> _Plan:
+    """The same for workers, who have folders of their own.
+
+    A scheduler has done again what a worker that died had finished but not told of. So what is there already is refused
+    here, and a worker that finds a result which is complete takes it for its own.
+    """
+    names, sources, targets, problems = [], [], [], list(plan.problems)
+    for name, target in zip(plan.names, plan.targets, strict=True):
+        if not (plan.settings.replace or options.resume) and os.path.lexists(target):
+            problems.append((name, f"{name}: {target} is there already; --resume leaves it, --force replaces it"))
+            continue
+        names.append(name)
+        sources.append(Path(os.path.abspath(name)))
+        targets.append(Path(os.path.abspath(target)))
+    settings = dataclasses.replace(plan.settings, resume=not plan.settings.replace)
+    return _Plan(names, sources, targets, settings, problems)
 
 
 def _runner(options: argparse.Namespace, count: int) -> Any:
@@ -302,11 +338,11 @@ def _make_folder(folder: Path | None) -> Path | None:
     return new
 
 
-def _remove_empty(parents: set[Path], folder: Path | None, made: Path | None) -> None:
+def _remove_empty(targets: Sequence[Path], folder: Path | None, made: Path | None) -> None:
     """Folders for results that are empty, all having failed; of those that were there before, none."""
     if folder is None:
         return
-    for path in sorted(parents, key=lambda path: len(path.parts), reverse=True):
+    for path in sorted({target.parent for target in targets}, key=lambda path: len(path.parts), reverse=True):
         while path != folder and folder in path.parents:
             with contextlib.suppress(OSError):
                 path.rmdir()
@@ -346,7 +382,7 @@ class _Corpus:
         self.display.update(index, 1.0 if told.last else told.part, told.last, skipped)
 
     def _note(self, source: Path, target: Path, done: Any) -> None:
-        if done.skipped:
+        if done.skipped and self._options.resume:
             self._skipped += 1
             text = f"{source} -> {target}: complete already"
         else:
@@ -391,7 +427,7 @@ class _Corpus:
         counts += [f"{self._skipped} complete already"] if self._skipped else []
         counts += [f"{len(self.failed)} failed"] if self.failed else []
         passed = time.monotonic() - self._begun
-        text = f"{len(self._sources)} files: {', '.join(counts)}"
+        text = f"{self._done + self._skipped + len(self.failed)} files: {', '.join(counts)}"
         if self._done:
             text += f"; {self._seconds:.1f} s of sound, {bytes_text(self._size)}, in {passed:.1f} s"
             if not self._options.outputs:

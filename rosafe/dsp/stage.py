@@ -49,7 +49,7 @@ class Stage:
     provided : dict of str to ndarray
         Of the last block.
     place : ndarray or None
-        Where whoever drives it wants the output for the next block, if it fits: (*rows, N) with rows evenly apart, each
+        Where whoever drives it wants the output for the next block, if it fits: (..., N) with rows evenly apart, each
         in one piece. A stage that cannot write there returns another array, as always.
 
     Raises

@@ -8,12 +8,13 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import AbstractAsyncContextManager
 from typing import Any, Protocol
 
-from rosafe.interface import BASS, REQUEST, ROSAFE, ComponentError
+from rosafe.interface import BASS, KINDS, REQUEST, ROSAFE, ComponentError
 from rosafe.setups import Setup, SetupError, Sound, plan, read, rehearse, wanted, write
 from rosafe.setups.plan import refused
 from rosafe.tree import requests as request
 from rosafe.tree.building import TRIES, Services, look, remove, take_step, uncancelled, wait_for_input
 from rosafe.tree.requests import Found
+from rosafe.vocabulary.plugins import FOLDERS
 
 AUDIO = "Audio"
 SOUND_SECONDS = 10.0  # from Acquire to the first sound; a sound card takes a second or two
@@ -37,6 +38,11 @@ async def save(component: Component, values: Mapping[str, Any]) -> dict[str, Any
 async def capture(component: Component) -> Setup:
     """The setup that would make the tree, the connection and the acquisition that are there."""
     topic = await component.hears(AUDIO)
+    there = (await component.outputs("getProcessors", {}))["processors"]
+    for processor in there:
+        if processor["kind"] not in KINDS:
+            unknown = f"{processor['name']!r} is of kind {processor['kind']}, which is not known here"
+            raise refused(f"{unknown}: set {FOLDERS} as for the node")
     processors = [wanted(found) for found in await look(component)]
     sound = None
     if topic:

@@ -18,7 +18,8 @@ from .signals import SIGNALS, layout
 
 MAX_SECONDS = 600.0  # longest port or history
 MAX_BLOCK = 10_000_000  # frames
-MAX_SETUP = 256 * 1024  # characters of a setup, and of the parameters of a request for a whole tree
+MAX_SETUP = 4 * 2**20  # characters of a setup; over HTTP, the length of a URL is what bounds it
+MAX_PARAMETERS = 2**18  # characters of the parameters of a request for a whole tree, by a service of ROS
 
 Kinds = Mapping[str, Representation]  # parents first
 
@@ -187,7 +188,7 @@ def _plain(composites: tuple[Service, ...]) -> tuple[Service, ...]:
             "string",
             "",
             "Parameters of it and of all above it, as YAML: 'fb_nChannels: 16, pi_rangeHz: [80, 300]'",
-            longest=MAX_SETUP,
+            longest=MAX_PARAMETERS,
         ),
         Parameter(
             "connect",

@@ -152,8 +152,8 @@ class Client:
         async with self._turn:
             self._wanted = keys
             for key in [key for key in self._looking if key not in keys]:
-                del self._looking[key]
-                await asyncio.to_thread(self._hub.leave, key)
+                view = self._looking.pop(key).view
+                await asyncio.to_thread(self._hub.leave, key, view)
             for key in keys:
                 if key not in self._looking:
                     await self._begin(key)
@@ -177,11 +177,12 @@ class Client:
         """The tree has changed: these views are gone, and what was not there may be there now."""
         async with self._turn:
             for key in self._wanted:
-                if key in changed:
-                    self._looking.pop(key, None)
+                if key in changed and key in self._looking and not self._hub.shows(key, self._looking[key].view):
+                    del self._looking[key]
                 if key not in self._looking:
                     await self._begin(key)
-            self._tell_views()
+            if self._wanted:
+                self._tell_views()
 
     def _tell_views(self) -> None:
         views = []

@@ -15,7 +15,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-from rosafe.component import startup
+from rosafe.component import registration, startup
 from rosafe.genomix.access import own_names
 from rosafe.genomix.graph import Graph
 from rosafe.live.access import Door
@@ -25,6 +25,7 @@ from rosafe.live.robot import Robot
 from rosafe.live.server import Server
 
 THREADS = 8  # that wait for rospy
+LAST_WORDS_SECONDS = 1.5  # that the master has at the end
 EVERYWHERE = {"0.0.0.0": "127.0.0.1", "::": "[::1]", "": "127.0.0.1"}  # and where this machine finds itself then
 
 
@@ -102,6 +103,8 @@ async def serve(options: Options) -> None:
             opened.unlink(missing_ok=True)
         if server is not None:
             await server.close()
+            # What is let go has to reach the master, or it would know it for ever.
+            await asyncio.to_thread(registration.registrar().settle, LAST_WORDS_SECONDS)
         await robot.close()
         await graph.close()
 

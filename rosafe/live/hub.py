@@ -149,16 +149,21 @@ class Hub:
             self._views[key].users += 1
             return self._views[key], self._told[key]
 
-    def leave(self, key: Key) -> None:
-        """One user less; a port that nobody looks at any more is not subscribed."""
+    def leave(self, key: Key, left: View) -> None:
+        """One user of a view less; a port that nobody looks at any more is not subscribed."""
         with self._lock:
             view = self._views.get(key)
-            if view is None:
+            if view is not left:  # the tree has changed, and with it all views of `key`
                 return
             view.users -= 1
             if view.users <= 0:
                 del self._views[key], self._told[key]
                 self._let_go(key)
+
+    def shows(self, key: Key, view: View) -> bool:
+        """Whether `view` is that of `key` still."""
+        with self._lock:
+            return self._views.get(key) is view
 
     def _let_go(self, key: Key) -> None:
         if key.what == "levels" and self.audio is not None:

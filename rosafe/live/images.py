@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import threading
 from collections.abc import Mapping
 from typing import Any
 
@@ -34,6 +35,7 @@ class Images:
             kind: rospy.Publisher(f"/rosafe_live/{kind}", Image, queue_size=1, tcp_nodelay=True) for kind in KINDS
         }
         self._views: dict[str, tuple[Key, View, dict[str, Any]]] = {}
+        self._turn = threading.Lock()  # one thread at a time has to do with the views
 
     @property
     def wanted(self) -> bool:
@@ -53,15 +55,19 @@ class Images:
 
     async def look_again(self, changed: set[Key]) -> None:
         """The tree has changed."""
-        await asyncio.to_thread(self._look, changed)
+        await asyncio.to_thread(self._look)
 
-    def _look(self, changed: set[Key]) -> None:
+    def _look(self) -> None:
+        with self._turn:
+            self._choose()
+
+    def _choose(self) -> None:
         for kind, publisher in self._publishers.items():
-            if kind in self._views and self._views[kind][0] in changed:
+            if kind in self._views and not self._hub.shows(*self._views[kind][:2]):
                 del self._views[kind]
             wanted = publisher.get_num_connections() > 0
             if not wanted and kind in self._views:
-                self._hub.leave(self._views.pop(kind)[0])
+                self._hub.leave(*self._views.pop(kind)[:2])
             elif wanted and kind not in self._views:
                 first = next((p.name for p in self._hub.tree.processors.values() if p.kind == kind), None)
                 if first is not None:
@@ -75,8 +81,10 @@ class Images:
         await asyncio.to_thread(self._publish)
 
     def _publish(self) -> None:
-        self._look(set())
-        for kind, (_, view, told) in self._views.items():
+        with self._turn:
+            self._choose()
+            shown = dict(self._views)
+        for kind, (_, view, told) in shown.items():
             image = drawn(view.newest(round(SECONDS * view.rate)), told)
             message = Image(height=image.shape[0], width=image.shape[1], encoding="rgb8", step=3 * image.shape[1])
             message.header.stamp = rospy.Time.now()

@@ -198,11 +198,15 @@ class Server:
 
     async def _look_once(self) -> None:
         try:
-            tree = await self._robot.tree()
+            await self._replant(await self._robot.tree())
             self._problem = ""
-        except ComponentError as problem:
-            tree = Tree()
+        except ComponentError as problem:  # what was shown stays: it may only be slow
             self._problem = told(problem)
+        status = {"problem": self._problem, "time": time.time(), **self._health.status(), **self._sound()}
+        for client in self._clients:
+            client.tell("status", status)
+
+    async def _replant(self, tree: Tree) -> None:
         changed = await asyncio.to_thread(self._hub.replant, tree)
         shown = [
             {"name": p.name, "kind": p.kind, "parent": p.parent, "topic": p.topic, "rate": p.rate, "values": p.values}
@@ -213,9 +217,6 @@ class Server:
             for client in list(self._clients):
                 client.tell("tree", {"processors": shown})
                 await shared(client.look_again(changed))
-        status = {"problem": self._problem, "time": time.time(), **self._health.status(), **self._sound()}
-        for client in self._clients:
-            client.tell("status", status)
 
     def _sound(self) -> dict[str, Any]:
         audio = self._hub.audio

@@ -33,6 +33,7 @@ def plan(setup: Setup, found: Sequence[Found]) -> Plan:
         ``::rosAFE::e_existsAlready`` where one of that name is another one.
     """
     there = {p.name: p for p in found}
+    sample_rate = next((p.rate for p in found if not p.parent), 0.0)
     names: dict[str, str] = {}  # in the tree, of those in the setup
     reused, steps = [], []
     for wanted in setup.processors:
@@ -44,13 +45,13 @@ def plan(setup: Setup, found: Sequence[Found]) -> Plan:
             names[wanted.name] = wanted.name
             steps += making(wanted.level, wanted.name, parent, wanted.input_values)
         else:
-            _compare(wanted, parent, same)
+            _compare(wanted, parent, same, sample_rate)
             names[wanted.name] = same.name
             reused.append(same.name)
     return Plan(list(names.values()), reused, steps)
 
 
-def _compare(wanted: Wanted, parent: str, there: Found) -> None:
+def _compare(wanted: Wanted, parent: str, there: Found, sample_rate: float) -> None:
     """Return where `there` is what is wanted, else raise e_existsAlready with the difference."""
     if there.kind != wanted.kind:
         _refuse(there, f"is of kind {there.kind}, in the setup of kind {wanted.kind}")
@@ -61,7 +62,7 @@ def _compare(wanted: Wanted, parent: str, there: Found) -> None:
             value = wanted.input_values[p.name]
             if there.values.get(p.name, value) != value:
                 _differs(there, p.name, value)
-    if not wanted.level.fits(there):
+    if not wanted.level.fits(there, sample_rate):
         told: Mapping[str, Any] = wanted.level.in_force
         first = [*wanted.given, *told]  # what the setup says itself tells most
         name = next(name for name in first if name in told and there.values[name] != told[name])

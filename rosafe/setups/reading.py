@@ -14,7 +14,7 @@ from rosafe.vocabulary.words import meant
 from .markup import Node, SetupError, parse
 from .setup import ACQUIRE, INPUT_PORTS, Setup, Sound, Wanted, parameters_of
 
-MAX_PROCESSORS = 1000
+MAX_PROCESSORS = 10_000  # more than a node takes
 _NAME = re.compile(r"\w+(/\w+)*", re.ASCII)
 _TOPIC = re.compile(r"/?[A-Za-z]\w*(/[A-Za-z]\w*)*", re.ASCII)
 _OF_TREES = tuple(p for p in REQUEST.parameters if p.name not in ("representation", "connect"))

@@ -70,6 +70,7 @@ def plot(
     Returns
     -------
     matplotlib.figure.Figure
+        A new one, or that of `ax`.
 
     Raises
     ------

@@ -164,7 +164,8 @@ def test_resume(tmp_path: Path, sound: Path, extension: str) -> None:
     assert not go(SMALL_PARAMETERS).skipped
     before = rosafe.load(target)
     assert go(SMALL_PARAMETERS).skipped
-    for changed in ({"parameters": {"fb_cfHz": [500.0]}}, {"block_frames": 100}, {"channels": (2, 1)}):
+    changes: list[dict[str, Any]] = [{"parameters": {"fb_cfHz": [500.0]}}, {"block_frames": 100}, {"channels": (2, 1)}]
+    for changed in changes:
         with pytest.raises(OutputError, match=f"was made with other {next(iter(changed))}; .*--force"):
             go(**{"parameters": SMALL_PARAMETERS, **changed})
     if extension == ".zarr":

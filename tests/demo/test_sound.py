@@ -90,7 +90,7 @@ def test_commands_can_be_copied_into_a_shell() -> None:
     """Names with quotes and blanks reach rosservice as they are."""
     import shlex
 
-    import yaml  # type: ignore[import]
+    import yaml
 
     for device in (
         "scene:",

@@ -100,7 +100,7 @@ def world(graph: Graph) -> Iterator[World]:
 def shown(world: World) -> Browser:
     """The page, with sound and pictures."""
     if not world.processors():
-        build(world.graph)
+        build(world.graph, world.live)
     browser = world.browser
     browser.resize(1300, 900)
     browser.driver.get(world.live.url)

@@ -180,7 +180,7 @@ def test_a_slow_client_gets_the_newest_columns_and_keeps_nothing_waiting() -> No
         def look(self, key: Key) -> tuple[View, dict[str, Any]]:
             return view, {}
 
-        def leave(self, key: Key) -> None:
+        def leave(self, key: Key, left: View) -> None:
             pass
 
     async def scenario() -> list[bytes]:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import asyncio
 import json
+import re
+import shlex
 import socket
 import time
 from collections.abc import Iterator
@@ -15,7 +17,7 @@ import numpy as np
 import pytest
 
 from rosafe.live.access import Door
-from tests.harness import Graph, Process, wait_for
+from tests.harness import ROOT, Graph, Process, wait_for
 from tests.live.world import Live, build, live, page
 
 ILD = {"what": "picture", "name": "ild_0"}
@@ -35,8 +37,9 @@ def world(graph: Graph) -> Iterator[World]:
     with ExitStack() as stack:
         bass = stack.enter_context(graph.node("bass-ros"))
         stack.enter_context(graph.node("rosAFE-ros"))
-        build(graph)
-        yield World(graph, bass, stack.enter_context(live(graph)))
+        page = stack.enter_context(live(graph))
+        build(graph, page)
+        yield World(graph, bass, page)
 
 
 # --- who gets in ---
@@ -169,7 +172,8 @@ def test_the_direction_is_that_of_the_scene(world: World) -> None:
     async def scenario() -> tuple[dict[str, Any], list[tuple[int, int, float, np.ndarray]]]:
         async with page(world.live) as client:
             (view,) = await client.look({"what": "direction", "name": "crosscorrelation_0"})
-            while sum(piece[3].shape[1] for piece in client.pieces.get(view["number"], [])) < 300:
+            # of three seconds in which a source was heard; a processor that is new has heard nothing yet
+            while sum(np.isfinite(piece[3]).sum() for piece in client.pieces.get(view["number"], [])) < 300:
                 await client.hear()
             return view, client.pieces[view["number"]]
 
@@ -181,7 +185,6 @@ def test_the_direction_is_that_of_the_scene(world: World) -> None:
         azimuths = np.interp(values[0], view["lags"], view["azimuths"])
         errors.append(np.abs(azimuths - scene_azimuth(times, 5.0)))
     heard = np.concatenate(errors)
-    assert np.isfinite(heard).mean() > 0.5
     assert np.nanmedian(heard) < 8
 
 
@@ -209,7 +212,7 @@ def ports_of_the_page(graph: Graph) -> set[str]:
 
 
 def test_nothing_is_subscribed_that_nobody_looks_at(world: World) -> None:
-    wait_for(lambda: not ports_of_the_page(world.graph), what="the pages of other tests to go")
+    wait_for(lambda: not ports_of_the_page(world.graph), what=lambda: str(world.graph.readers()))
 
     async def scenario() -> None:
         async with page(world.live) as one, page(world.live) as two:
@@ -249,9 +252,6 @@ def test_requests_and_their_refusals(world: World) -> None:
             made = (await client.ask("build", representation="onsetStrength"))["ok"]
             assert made["name"] in made["created"]
             views = await client.look({"what": "picture", "name": made["name"]}, {"what": "picture", "name": "nobody"})
-            while "error" in views[0]:  # the tree is looked at once a second
-                await client.hear()
-                views = client.said["views"]["views"]
             assert views[0]["kind"] == "onsetStrength" and "nobody" in views[1]["error"]
             refused = await client.ask("modify", nameProc="ratemap_0", nameParam="rm_decaySec", newValue="-1")
             assert "e_badNewValue" in refused["error"] and "rm_decaySec" in refused["error"]
@@ -260,15 +260,16 @@ def test_requests_and_their_refusals(world: World) -> None:
             assert (await client.ask("remove", name=made["name"])) == {"about": "answer", "id": 6, "ok": {}}
             assert any(one["name"] == "scene:" for one in (await client.ask("devices"))["ok"]["devices"])
             text = (await client.ask("save"))["ok"]["setup"]
-            again = (await client.ask("load", setup=text))["ok"]
-            assert not again["created"] and "ratemap_0" in again["reused"]
+            again = await client.ask("load", setup=text)
+            assert "ok" in again, (again, text)
+            assert not again["ok"]["created"] and "ratemap_0" in again["ok"]["reused"]
             assert "line" in (await client.ask("load", setup="processors: [nonsense"))["error"]
 
     asyncio.run(scenario())
 
 
 def test_a_watcher_changes_nothing(world: World) -> None:
-    before = world.graph.run("rosservice", "call", "/rosAFE/getProcessors").stdout
+    before = world.graph.call("/rosAFE/getProcessors")
 
     async def scenario(live: Live) -> None:
         async with page(live) as client:
@@ -282,7 +283,7 @@ def test_a_watcher_changes_nothing(world: World) -> None:
 
     with live(world.graph, "--watch") as watching:
         asyncio.run(scenario(watching))
-    assert world.graph.run("rosservice", "call", "/rosAFE/getProcessors").stdout == before
+    assert world.graph.call("/rosAFE/getProcessors") == before
 
 
 def test_loads_and_states_come_with_the_status(world: World) -> None:
@@ -315,12 +316,14 @@ def test_it_ends_in_time(world: World) -> None:
     with live(world.graph) as one:
         assert asyncio.run(scenario(one)) == 0
         assert "Traceback" not in one.process.err
+    ended = f"/rosafe_live_{one.process.pid}_"
+    assert not [node for _, node in world.graph.readers() if node.startswith(ended)]
 
 
 def test_images_for_rviz_while_somebody_subscribes(world: World) -> None:
     """Ten seconds of ratemap and level differences; their newest columns have the colours of the numbers."""
     with live(world.graph, "--images") as one:
-        wait_for(lambda: not ports_of_the_page(world.graph), what="the pages of other tests to go")
+        wait_for(lambda: not ports_of_the_page(world.graph), what=lambda: str(world.graph.readers()))
         for kind, ears in (("ratemap", 2), ("ild", 1)):
             image = world.graph.message(f"/rosafe_live/{kind}", accept=lambda m: any(m.data[-3:]))
             pixels = np.frombuffer(image.data, np.uint8).reshape(image.height, image.width, 3)
@@ -328,3 +331,20 @@ def test_images_for_rviz_while_somebody_subscribes(world: World) -> None:
             assert image.height >= 160 * ears and np.unique(pixels[:, -20:].reshape(-1, 3), axis=0).shape[0] > 10
         assert one.process.alive
         wait_for(lambda: not ports_of_the_page(world.graph), what="an end of all subscriptions")
+
+
+def test_the_commands_of_the_document(world: World) -> None:
+    text = (ROOT / "docs" / "live.md").read_text("utf-8")
+    commands = [line for block in re.findall(r"^```sh\n(.*?)^```$", text, re.M | re.S) for line in block.splitlines()]
+    assert len(commands) == 3
+    with ExitStack() as stack:
+        for command in commands:
+            words = [*shlex.split(command), "--port", "0", "--no-browser"]
+            one = Live(stack.enter_context(world.graph.start(*words)))
+            assert one.process.alive
+
+
+def test_the_page_takes_nothing_from_elsewhere() -> None:
+    for path in (ROOT / "rosafe" / "live" / "page").iterdir():
+        text = path.read_text("utf-8").replace("http://www.w3.org/2000/svg", "")  # a name, not an address
+        assert not re.search(r"(https?:)?//\w+\.\w|eval\(|innerHTML|document\.write", text), path.name

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import re
 import struct
@@ -27,6 +28,7 @@ class Live:
         found = re.search(r"(http://(\S+?)/)\?token=(\S+)", process.out)
         assert found is not None
         self.root, self.address, self.token = found[1], found[2], found[3]
+        self.port = int(self.address.rpartition(":")[2])
         self.url = found[0]
 
 
@@ -37,11 +39,17 @@ def live(graph: Graph, *arguments: str) -> Iterator[Live]:
         yield Live(process)
 
 
-def build(graph: Graph) -> None:
-    """What the page shows, of the scene."""
+def build(graph: Graph, live: Live) -> None:
+    """What the page shows, of the scene; built by the page."""
     assert graph.call("/bass/Acquire", device="scene:?seconds=5", sampleRate=16000).genom_success
-    for kind in TREE:
-        graph.run("rosafe", "request", kind, "nFramesPerBlock=1600", "fb_highFreqHz=6000")
+
+    async def build_all() -> None:
+        async with page(live) as client:
+            for kind in TREE:
+                answer = await client.ask("build", representation=kind, nFramesPerBlock=1600, fb_highFreqHz=6000)
+                assert "ok" in answer, answer
+
+    asyncio.run(build_all())
 
 
 class Page:
@@ -98,9 +106,15 @@ class Page:
     async def look(self, *keys: dict[str, Any], anew: bool = False) -> list[dict[str, Any]]:
         """Look at these; what the server says of the views."""
         self.said.pop("views", None)
-        assert await self.ask("look", keys=list(keys), anew=anew) == {"about": "answer", "id": self._number, "ok": {}}
-        await self.until("views")
-        return list(self.said["views"]["views"])
+        assert "ok" in await self.ask("look", keys=list(keys), anew=anew)
+        while not self._sees(len(keys)):
+            await self.hear()
+        return list(self.said.get("views", {"views": ()})["views"])
+
+    def _sees(self, count: int) -> bool:
+        """Whether all that was asked for is there; the tree is looked at once a second, and may be an old one first."""
+        views = self.said.get("views", {"views": ()})["views"]
+        return len(views) == count and all("number" in view or view["key"]["name"] == "nobody" for view in views)
 
     async def until(self, subject: str) -> dict[str, Any]:
         """The newest message about a subject, or the next one."""

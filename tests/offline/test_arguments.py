@@ -71,7 +71,8 @@ def test_sample_rates(rate: Any) -> None:
 
 def test_a_sample_rate_that_is_too_low_for_the_channels() -> None:
     what = "a channel at 8000 Hz is not below half the sample rate; 7600 Hz would do"
-    for values in ({"fb_highFreqHz": 8000.0, "fb_nChannels": 16}, {"fb_cfHz": [8000.0]}):
+    cases: tuple[dict[str, Any], ...] = ({"fb_highFreqHz": 8000.0, "fb_nChannels": 16}, {"fb_cfHz": [8000.0]})
+    for values in cases:
         refused(f"{next(iter(values))}: {what}", GOOD, RATE, parameters=values)
 
 
@@ -183,7 +184,8 @@ def test_one_ear_has_no_differences(signal: Any) -> None:
 
 
 def test_the_traceback_ends_where_the_user_called() -> None:
-    for named in ({"parameters": {"volume": 1}}, {"parameters": {"fb_cfHz": [8000.0]}}, {"outputs": ["x"]}):
+    wrong: tuple[dict[str, Any], ...] = ({"parameters": {"volume": 1}}, {"parameters": {"fb_cfHz": [8000.0]}})
+    for named in (*wrong, {"outputs": ["x"]}):
         with pytest.raises(ValueError) as raised:
             rosafe.process(GOOD, RATE, **named)
         assert [entry.name for entry in raised.traceback] == [

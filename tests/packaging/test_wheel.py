@@ -46,12 +46,12 @@ class Venv:
         """A program of the environment, without anything of this checkout."""
         name, *arguments = command
         path = f"{self.folder / 'bin'}:/usr/bin:/bin"
-        where = {"cwd": cwd or self.folder}
-        return run(self.folder / "bin" / name, *arguments, env=environment(**{"PATH": path, **env}), **where)
+        variables = environment(**{"PATH": path, **env})
+        return run(self.folder / "bin" / name, *arguments, env=variables, cwd=cwd or self.folder)
 
     def python(self, program: str, **env: str) -> str:
         """What a program in Python prints."""
-        done = self.run("python", "-c", program, **env)
+        done = self.run("python", "-c", program, cwd=None, **env)
         assert (done.returncode, done.stderr) == (0, ""), done
         return done.stdout.strip()
 
@@ -109,7 +109,8 @@ def test_library_tests_in_the_environment(venv: Venv, tmp_path: Path) -> None:
     (tmp_path / "tests").mkdir()
     for name in ("__init__.py", "harness.py", "offline", "dsp", "representations", "tree", "vectors"):
         there = ROOT / "tests" / name
-        (shutil.copytree if there.is_dir() else shutil.copy)(there, tmp_path / "tests" / name)
+        copy = shutil.copytree if there.is_dir() else shutil.copy
+        copy(there, tmp_path / "tests" / name)  # type: ignore[operator]
     (tmp_path / "pytest.ini").write_text(
         "[pytest]\naddopts = --import-mode=importlib -p no:cacheprovider\npythonpath=.\n"
     )
@@ -147,11 +148,12 @@ def test_the_command_and_what_it_says_of_what_is_absent(venv: Venv, tmp_path: Pa
     state = {check["name"]: check for check in told["checks"]}
     assert (state["python"]["state"], state["ROS"]["state"], state["plots"]["state"]) == ("ok", "note", "note")
     assert "x86-64" in state["kernels"]["detail"] or "numpy and scipy: " in state["kernels"]["detail"]
-    for arguments, words in [
+    cases: list[tuple[list[str | Path], str]] = [
         (["plot", sound], "matplotlib is not installed; pip install 'rosafe[plot]'"),
         (["record", "--seconds", "1"], "is not installed; pip does not bring it: run scripts/install of a checkout"),
         (["trace"], "is not installed; pip does not bring it"),
-    ]:
+    ]
+    for arguments, words in cases:
         done = venv.run("rosafe", *arguments)
         assert (done.returncode, done.stdout, done.stderr.count("\n")) == (1, "", 1), done
         assert words in done.stderr

@@ -32,9 +32,16 @@ def delays(kind: str, count: int, random: np.random.Generator) -> np.ndarray:
     return late if kind != "none" else np.zeros(count)
 
 
-@pytest.mark.parametrize("kind", ["none", "plain", "spikes", "bursts"])
-@pytest.mark.parametrize("skew", [0.0, 80e-6, -80e-6])
-@pytest.mark.parametrize(("chunk", "per_block"), [(2205, 5), (441, 2), (2205, 1)])
+@pytest.mark.parametrize(
+    ("kind", "skew", "chunk", "per_block"),
+    [
+        ("none", 0.0, 2205, 5),
+        ("plain", 80e-6, 2205, 5),
+        ("spikes", -80e-6, 2205, 5),
+        ("bursts", 80e-6, 2205, 1),
+        ("spikes", 80e-6, 441, 2),
+    ],
+)
 def test_delays_are_not_seen(kind: str, skew: float, chunk: int, per_block: int) -> None:
     random = np.random.default_rng(3)
     rate = 44100 * (1 + skew)

@@ -166,7 +166,7 @@ HOSTILE = [
     "\ud800",
     "a: \x07",
     "x" * (MAX_SETUP + 1),
-    "processors:\n" + "".join(f"  a{i}: {{kind: input}}\n" for i in range(1001)),
+    "processors:\n" + "".join(f"  a{i}: {{kind: input}}\n" for i in range(10_001)),
     "processors:\n  a: {kind: input, nFramesPerBlock: " + "9" * 100_000 + "}\n",
     "processors:\n  " + "a" * 100_000 + ": {kind: input}\n",
     "processors:\n  a: {kind: input}\n  p: {kind: preProc, parent: a}\n  g: {kind: gammatone, parent: p, fb_cfHz: ["

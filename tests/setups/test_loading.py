@@ -11,8 +11,9 @@ import pytest
 
 from rosafe.genomix import setups
 from rosafe.interface import BASS, ROSAFE, ComponentError
+from rosafe.representations import STAGES
 from rosafe.setups import read, write
-from tests.request.model import Model
+from tests.request.model import Model, Processor
 
 SETUP = """
 sound: {device: "scene:", nFramesPerChunk: 441}
@@ -185,6 +186,20 @@ def test_a_cancelled_load_leaves_nothing() -> None:
     for number in range(2, 10):
         graph = asyncio.run(cancelled(number))
         assert graph.everything() == ({}, {}), number
+
+
+def test_a_kind_that_is_not_known_here_is_not_left_out() -> None:
+    class Elsewhere(Graph):
+        def _getProcessors(self, service: str, values: Mapping[str, Any]) -> dict[str, Any]:
+            told = super()._getProcessors(service, values)
+            told["processors"][-1]["kind"] = "loudness"
+            return told
+
+    graph = Elsewhere()
+    graph.connected = "bass/Audio"
+    graph.processors["loud"] = Processor("input", "", STAGES["input"](44100.0))
+    with pytest.raises(ComponentError, match="'loud' is of kind loudness, which is not known here"):
+        saved(graph)
 
 
 def test_a_text_that_is_no_setup() -> None:

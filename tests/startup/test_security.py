@@ -16,8 +16,10 @@ import pytest
 from rosafe.bass import socket_server
 from rosafe.component import door, inbound, pulse
 from rosafe.genomix import connections, daemon, sessions
+from rosafe.live import client, hub, server
 from tests.genomix.world import Http, genomixd
 from tests.harness import PYTHON, ROOT, Graph, MasterProcess, free_port, proc
+from tests.live.world import live
 
 PAGE = (ROOT / "docs" / "security.md").read_text("utf-8")
 LISTENING = "0A"
@@ -75,7 +77,7 @@ def own_address() -> str:
 @pytest.mark.ros
 @pytest.mark.parametrize("setting", ["loopback", "unset", "an address"])
 def test_what_the_page_says_listens(setting: str, tmp_path: Path) -> None:
-    """Master, nodes, genomixd and the dedicated socket, beside each other as on a robot."""
+    """Master, nodes, genomixd, the live page and the dedicated socket, beside each other as on a robot."""
     address = own_address() if setting == "an address" else LOOPBACK
     socket_port = free_port()
     master = MasterProcess()
@@ -91,11 +93,13 @@ def test_what_the_page_says_listens(setting: str, tmp_path: Path) -> None:
         graph.run("rosservice", "call", "/bass/DedicatedSocket", "{}")
         nodes["genomixd"], http_port = stack.enter_context(genomixd(graph))
         assert Http(http_port).call("bass/Stop") == {}
+        page = stack.enter_context(live(graph))
+        nodes["rosafe live"] = page.process
         assert master.process is not None
         nodes["roscore"] = master.process
         expected = promised(LOOPBACK if address == LOOPBACK else EVERYWHERE)
         assert expected.keys() == nodes.keys()
-        ports = {master.port: "11311", socket_port: "8081", http_port: "8080"}
+        ports = {master.port: "11311", socket_port: "8081", http_port: "8080", page.port: "8090"}
         for name, process in nodes.items():
             assert listening(process.pid, ports) == expected[name], name
     assert (str(daemon.DEFAULT_PORT), daemon.DEFAULT_HOST) in expected["genomixd"]
@@ -116,6 +120,9 @@ def test_the_bounds_of_the_page() -> None:
         (connections.REQUEST_SECONDS, connections.STALL_SECONDS),
         connections.MAX_ANSWERS // 2**20,
         (sessions.MAX_SESSIONS, sessions.MAX_REQUESTS),
+        (server.MAX_CLIENTS, server.MAX_CONNECTIONS, server.KNOCK_SECONDS),
+        (f"{client.MAX_MESSAGE >> 20} MiB", client.MAX_PENDING, client.MAX_VIEWS, hub.MAX_VIEWS),
+        (client.BYTES_PER_SECOND, 1 / client.PERIOD, client.STALL_SECONDS),
     ]
     shown = [
         "; ".join(f"{number:.0f}" if not isinstance(number, str) else number for number in numbers)

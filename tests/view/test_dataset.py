@@ -31,7 +31,7 @@ def test_every_number_is_found_by_its_coordinates(result: dict[str, Any]) -> Non
         for name, part in kind.outputs.items():
             np.testing.assert_array_equal(data[name].values, result[name])
             assert data[name].attrs["units"] == part.unit
-            assert [dim.partition("_")[0] for dim in data[name].dims] == list(part.axes)
+            assert [str(dim).partition("_")[0] for dim in data[name].dims] == list(part.axes)
             np.testing.assert_array_equal(data[name][data[name].dims[-1]], result[f"{kind.kind}_time"])
     assert data.ratemap.dims == ("ear", "channel", "time_ratemap"), "the first with frames is another one"
     level = data.ratemap.sel(ear="right").sel(channel=1000, time_ratemap=0.1, method="nearest")
@@ -62,7 +62,7 @@ def test_refusals(result: dict[str, Any], monkeypatch: pytest.MonkeyPatch) -> No
     with pytest.raises(ValueError, match="sample_rate"):
         rosafe.to_xarray({"input": SOUND})
     assert rosafe.to_xarray({"input": SOUND}, sample_rate=RATE).time[-1] == 7999 / RATE
-    monkeypatch.setitem(sys.modules, "xarray", None)
+    monkeypatch.setitem(sys.modules, "xarray", None)  # type: ignore[misc]
     with pytest.raises(
         ModuleNotFoundError, match="xarray is not installed; apt install python3-xarray, or pip install"
     ):

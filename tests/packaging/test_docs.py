@@ -1,0 +1,38 @@
+"""The documents and the library's reference are built by Sphinx without a warning, and the reference has everything."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from pathlib import Path
+
+import pytest
+
+import rosafe
+from tests.harness import PYTHON, ROOT
+
+
+def test_sphinx_has_nothing_to_say(tmp_path: Path) -> None:
+    for module in ("sphinx", "numpydoc", "myst_parser"):
+        pytest.importorskip(module, reason=f"{module} is not here: scripts/install --tests brings it")
+    command = [PYTHON, "-m", "sphinx", "-q", "-W", "--keep-going", "-b", "html", "-d", tmp_path / "trees"]
+    done = subprocess.run(
+        [*map(str, command), "docs", str(tmp_path / "html")],
+        cwd=ROOT,
+        env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1"},
+        capture_output=True,
+        text=True,
+        timeout=500,
+        check=False,
+    )
+    assert (done.returncode, done.stderr) == (0, ""), done.stderr
+    library = (tmp_path / "html" / "library.html").read_text("utf-8")
+    for name in set(rosafe.__all__) - {"__version__"}:
+        assert f'id="rosafe.{name}"' in library, f"docs/library.rst lacks {name}"
+    assert 'id="rosafe.Stream.process"' in library
+
+
+def test_every_page_is_in_the_contents() -> None:
+    index = (ROOT / "docs" / "index.rst").read_text("utf-8").split()
+    pages = {path.stem for path in (ROOT / "docs").glob("*.md")} - {"README"}
+    assert pages - set(index) == set()
