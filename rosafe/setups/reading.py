@@ -53,7 +53,7 @@ def read(text: str) -> Setup:
 def read_parameters(text: str) -> dict[str, Any]:
     """The parameters of a request for a whole tree that `text` says, checked; nothing says none.
 
-    A mapping in YAML; in one line, the braces around it may be left out.
+    A mapping in YAML: a line for each, or one line, of which the braces may be left out.
 
     Raises
     ------
