@@ -33,6 +33,7 @@ class Health:
         self._rosafe, self._bass = instance, bass
         self._lock = threading.Lock()
         self._subscriber: Any = None
+        self._ended = False
         self._values: dict[str, dict[str, str]] = {}
         self._messages: dict[str, str] = {}
         self._told: dict[str, float] = {}
@@ -44,12 +45,13 @@ class Health:
         from diagnostic_msgs.msg import DiagnosticArray
 
         with self._lock:
-            if self._subscriber is None:
+            if self._subscriber is None and not self._ended:
                 self._subscriber = rospy.Subscriber("/diagnostics", DiagnosticArray, self._take, queue_size=10)
 
-    def close(self) -> None:
-        """Listen no longer."""
+    def close(self, for_good: bool = False) -> None:
+        """Listen no longer, or never again, whoever is about to begin."""
         with self._lock:
+            self._ended = self._ended or for_good
             if self._subscriber is not None:
                 self._subscriber.unregister()
                 self._subscriber = None

@@ -136,6 +136,15 @@ class Hub:
         self._watched: dict[str, _Watched] = {}
         self._needs: dict[Key, list[str]] = {}  # topics
         self._lock = threading.RLock()
+        self._closed = False
+
+    def close(self) -> None:
+        """Let go of all ports, for good: who is still on the way to look at one finds none."""
+        with self._lock:
+            self._closed = True
+            for key in list(self._views):
+                del self._views[key], self._told[key]
+                self._let_go(key)
 
     # --- who looks at what ---
 
@@ -143,6 +152,8 @@ class Hub:
         """The view for `key` and its description, one user more; ValueError where there is no such thing."""
         with self._lock:
             if key not in self._views:
+                if self._closed:
+                    raise ValueError("the page ends")
                 if len(self._views) >= MAX_VIEWS:
                     raise too_many(f"{MAX_VIEWS} pictures are shown already")
                 self._begin(key)

@@ -106,6 +106,8 @@ class Server:
             self._looking.cancel()
         await asyncio.gather(*(client.close() for client in self._clients), return_exceptions=True)
         await self._runner.cleanup()
+        await asyncio.to_thread(self._hub.close)  # what a thread has begun meanwhile, too
+        await asyncio.to_thread(self._health.close, for_good=True)
 
     def news(self) -> None:
         """There are new columns."""

@@ -19,7 +19,7 @@ def test_same_numbers_as_the_node(graph: Graph, tmp_path: Path) -> None:
     signal = noise(BLOCK * BLOCKS)
     path = write(tmp_path / "in.wav", signal, RATE, "PCM_32")
     settings = [f"{name}={str(value).lower()}" for name, value in VALUES.items()]
-    done = rosafe("process", path, "--block", str(BLOCK), "--set", *settings)
+    done = rosafe("process", path, "--block", str(BLOCK), "--outputs", ",".join(FIXED), "--set", *settings)
     assert done.returncode == 0, done
     with np.load(tmp_path / "in.npz") as loaded, own_node(graph, name="besides") as node:
         seconds = BLOCK * BLOCKS / RATE

@@ -186,8 +186,9 @@ def test_reuse_changes_and_refusals(world: World) -> None:
     assert told["bad value"].startswith("manager_RosAFE:refused Error::rosAFE::e_badNewValue: ild_wSizeSec: -1")
     assert "::genom::serialization" in told["bad name"] and "'spikes' is not one of" in told["bad name"]
     assert "fb_nERB" in told["bad member"]
-    assert told["bad parameter"] == "manager_RosAFE:refused Error::rosAFE::e_noSuchParameter"
-    assert told["bad processor"] == "manager_RosAFE:refused Error::rosAFE::e_noSuchProcessor"
+    assert told["bad parameter"].startswith("manager_RosAFE:refused Error::rosAFE::e_noSuchParameter: ")
+    assert "no 'rm_scaling', but: ild_wname, " in told["bad parameter"]
+    assert told["bad processor"].startswith("manager_RosAFE:refused Error::rosAFE::e_noSuchProcessor: ")
     assert told["bad type"].startswith("manager_RosAFE:type")
     assert told["bad number"] == "manager_RosAFE:number there is no processor 99 of type 'ild'"
     assert told["two"].startswith("manager_RosAFE:arguments there are 2 structures")
