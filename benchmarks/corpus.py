@@ -1,4 +1,3 @@
-#!/usr/bin/python3
 """How well `rosafe process` uses the cores on a corpus of short files.
 
     /usr/bin/python3 benchmarks/corpus.py [--files 1000] [--seconds 1] [--rounds 3] [--dask]

@@ -1,4 +1,3 @@
-#!/usr/bin/python3
 """What `rosafe.Stream` costs beside the bare stages joined by hand, for blocks of 10 ms of the default chain."""
 
 from __future__ import annotations

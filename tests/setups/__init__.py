@@ -1,0 +1,1 @@
+"""Tests of setups: reading, writing, loading, and what starts them."""
