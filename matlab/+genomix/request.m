@@ -5,8 +5,8 @@ classdef request < handle
 %   r.result      a struct with the service's outputs, [] before it is done
 %   r.exception   a struct with the name of the exception in field ex, for some its members in detail, and the reason
 %                 in detail.what or in what; [] for none
-%   r.warning     what the component has to say of a request that it grants all the same, such as a word that it does not
-%                 know; '' for nothing
+%   r.warning     what the component has to say of a request that it grants all the same, such as a word that it does
+%                 not know; '' for nothing
 %   r.wait(s)     waits until it is no longer 'sent', or for s seconds, and returns the status
 %   r.abort()     asks the activity to end
 %
