@@ -319,6 +319,6 @@ def test_memory_counts_all_parts_and_all_below(tree: Tree, feed: Feed, monkeypat
     grow(tree, feed, pp_step=100)
     before = tree.processors
     monkeypatch.setattr("rosafe.tree.sizes.machine_memory", lambda: 2 * int(8 * RATE * (2 + 0.02 + 0.03 + 0.02 + 0.1)))
-    refused(tree, "1 s of output of 4 processors take", "coarser", "pp_step", "1")
+    refused(tree, "1 s of output of 4 processors, and their states, take", "coarser", "pp_step", "1")
     tree.modify("coarser", "pp_step", "99")
     assert tree.processors == before

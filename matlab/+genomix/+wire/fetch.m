@@ -4,8 +4,8 @@ function [answer, failed] = fetch(address, path, query, matrices, columns)
 %   [answer, failed] = genomix.wire.fetch('host:port', '/call/rosAFE/Stop', {'s', 'me'; ...}, matrices, columns)
 %
 %   QUERY is an N-by-2 cell array of names and texts; MATRICES and COLUMNS are those of genomix.wire.decode. FAILED is
-%   true where the server or the component refused, and ANSWER is the exception then (fields ex and, for some, detail and
-%   what). A server that cannot be reached raises the error genomix:connection.
+%   true where the server or the component refused, and ANSWER is the exception then (fields ex and, for some, detail
+%   and what). A server that cannot be reached raises the error genomix:connection.
 
 url = ['http://' address path '?syntax=packed'];
 for k = 1:size(query, 1)
