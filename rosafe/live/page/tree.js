@@ -19,6 +19,7 @@ export class TreeView {
       el("button", { class: "quiet", id: "save-setup", text: "Save setup", title: "Save tree and sound as a file", onclick: () => this.#save() }),
       ...(watch ? [] : [el("button", { class: "quiet", text: "Load setup…", title: "Build what a file says, wholly or not at all", onclick: () => file.click() }), file]));
     this.refusal = el("p", { class: "error", role: "alert" });
+    this.refused = new Map(); // why, by the name of the chosen processor's parameter: its fields may be made anew meanwhile
     element.replaceChildren(el("div", { class: "head" }, el("h2", { text: "Processors" }), ...(watch ? [] : [add])), this.rows, setups, this.refusal);
     pictures.addEventListener("change", () => this.#eyes());
   }
@@ -104,6 +105,7 @@ export class TreeView {
   // --- one processor ---
 
   #click(one) {
+    this.refused.clear();
     this.#choose(this.chosen === one.name ? null : one);
     if (this.chosen) this.details.scrollIntoView({ block: "nearest", behavior: "smooth" });
   }
@@ -130,7 +132,9 @@ export class TreeView {
 
   #field(one, name, parameter, fixed = false) {
     const value = one.values[name] ?? "";
-    const problem = el("p", { class: "error", role: "alert", hidden: true });
+    const why = this.refused.get(name) ?? "";
+    const problem = el("p", { class: "error", role: "alert", hidden: !why, text: why });
+    problem.id = `e-${one.name}-${name}`;
     const input = control(parameter, value);
     input.id = `p-${one.name}-${name}`;
     input.dataset.parameter = name;
@@ -140,16 +144,23 @@ export class TreeView {
     input.addEventListener("change", async () => {
       try {
         await this.link.ask("modify", { nameProc: one.name, nameParam: name, newValue: read(input) });
-        problem.hidden = true;
+        this.#tell(one, name, "");
         field.classList.add("done");
         setTimeout(() => field.classList.remove("done"), 1200);
       } catch (refusal) {
-        problem.textContent = refusal.message;
-        problem.hidden = false;
+        this.#tell(one, name, refusal.message);
         write(input, this.processors.find((each) => each.name === one.name)?.values[name] ?? value);
       }
     });
     return field;
+  }
+
+  #tell(one, name, why) {
+    if (this.chosen !== one.name) return;
+    if (why) this.refused.set(name, why);
+    else this.refused.delete(name);
+    const problem = document.getElementById(`e-${one.name}-${name}`);
+    if (problem) Object.assign(problem, { textContent: why, hidden: !why });
   }
 
   #below(name) {
