@@ -125,8 +125,10 @@ class FrameTime:
             while len(hull) > 1 and _is_above(hull[-2], hull[-1], point):
                 hull.pop()
             hull.append(point)
-        mean = sum(frame for frame, _ in self._points) / len(self._points)
-        right = next(k for k, (frame, _) in enumerate(hull) if frame >= mean)
+        total, count = sum(frame for frame, _ in self._points), len(self._points)
+        right = next(
+            k for k, (frame, _) in enumerate(hull) if frame * count >= total
+        )  # in whole numbers, which are exact
         return hull[right - 1], hull[right]
 
 

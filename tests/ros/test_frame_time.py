@@ -11,6 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 import rospy
+from hypothesis import example, given
+from hypothesis import strategies as st
 from rosAFE.msg import rosAFE_frameTime, rosAFE_TimeFrequencySignalPortStruct
 
 from rosafe.component import wire
@@ -82,6 +84,24 @@ def test_a_clock_that_is_set_and_a_stream_that_begins_anew() -> None:
     line = times.line(5)
     assert line is not None
     assert (line.time, line.rate) == (BEGIN, 2000)
+
+
+@given(
+    steps=st.lists(st.sampled_from([1, 40, 500, 100_000, 2**30, 2**62]), min_size=2, max_size=60),
+    late=st.lists(st.floats(0, 30), min_size=1, max_size=5),
+)
+@example(steps=[500, 2**62, 40, 1], late=[0.0])
+def test_any_index_has_a_time(steps: list[int], late: list[float]) -> None:
+    """Whatever a stream's index does, up to the largest there is, as much of it as messages can say."""
+    times, frame = FrameTime(), 0
+    times.begin(8)
+    for k, step in enumerate(steps):
+        if (frame := frame + step) >= 2**63:
+            break
+        times.add(frame, BEGIN + k + late[k % len(late)])
+        line = times.line(frame)
+        assert line is not None
+        assert np.isfinite(line.time) and line.rate == pytest.approx(8, rel=0.01)
 
 
 class Stamped(Microphone):
