@@ -51,7 +51,8 @@ class Trick(NamedTuple):
 
 SPLIT_ONCE = """
     const int64_t half = (n + 1) / 2, half_lags = (lags + 1) / 2;
-    vec even[SPAN + APART], odd[SPAN + APART], apart[SPAN + APART], first[SPAN / 2], second[SPAN / 2], sum[SPAN / 2];
+    vec even[SPAN + APART], odd[SPAN + APART], apart[SPAN + APART];
+    vec first[SPAN / 2 + APART], second[SPAN / 2 + APART], sum[SPAN / 2 + APART];
     vec to[2][MOST_LAGS / 2 + APART];
     put_zeros(l, n + lags - 1, 2 * (half + half_lags));
     put_zeros(r, n, 2 * half);
@@ -99,7 +100,8 @@ TRICKS = (
         (
             (
                 "vec tile[TILE]) {\n#if defined __AVX2__\n    quartet row",
-                "vec tile[TILE]) {\n    UNROLL for (int i = 0; i < TILE; i++) tile[i] = gathered(rows, t + i);\n    return;\n"
+                "vec tile[TILE]) {\n"
+                "    UNROLL for (int i = 0; i < TILE; i++) tile[i] = gathered(rows, t + i);\n    return;\n"
                 "#if defined __AVX2__\n    quartet row",
             ),
             (
