@@ -28,7 +28,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "rosafe plot SOUND|RESULT [-o PNG] [--outputs NAME,...] [--set NAME=VALUE ...]\n"
         "                   [--ear left|right] [--at S] [--channel HZ] [--force]"
     )
-    parser.add_argument("inputs", nargs="*", metavar="SOUND|RESULT", help="sound file, or what rosafe process has made of one")
+    parser.add_argument("inputs", nargs="*", metavar="SOUND|RESULT", help="sound file, or result of rosafe process")
     parser.add_argument("-o", "--output", metavar="PNG", help="the picture, replaced if it is there (default: beside)")
     parser.add_argument(
         "--outputs",
