@@ -25,10 +25,10 @@ _DEFAULT = ("input", "ratemap", "pitch", "onsetMap", "ild", "itd")  # of a sound
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     parser.usage = (
-        "rosafe plot SOUND|RESULT.npz [-o PNG] [--outputs NAME,...] [--set NAME=VALUE ...]\n"
+        "rosafe plot SOUND|RESULT [-o PNG] [--outputs NAME,...] [--set NAME=VALUE ...]\n"
         "                   [--ear left|right] [--at S] [--channel HZ] [--force]"
     )
-    parser.add_argument("inputs", nargs="*", metavar="SOUND|RESULT", help="sound file, or .npz of rosafe process")
+    parser.add_argument("inputs", nargs="*", metavar="SOUND|RESULT", help="sound file, or result of rosafe process")
     parser.add_argument("-o", "--output", metavar="PNG", help="the picture, replaced if it is there (default: beside)")
     parser.add_argument(
         "--outputs",
@@ -40,6 +40,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--at", type=float, metavar="S", help="draw channels against lags, or filters, at this time")
     parser.add_argument("--channel", type=float, metavar="HZ", help="draw lags, or filters, of this channel over time")
     parser.add_argument("--force", action="store_true", help="replace a picture that -o does not name")
+    parser.epilog = (
+        "examples:\n"
+        "  rosafe plot speech.wav\n"
+        "  rosafe plot speech.wav -o out.png --outputs amsFeatures,itd --channel 500 --set fb_nChannels=16\n"
+        "  rosafe plot speech.npz --ear left"
+    )
 
 
 def run(options: argparse.Namespace) -> int:
