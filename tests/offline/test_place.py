@@ -52,7 +52,7 @@ def test_the_same_numbers_without_a_copy(
     kind: str, parameters: dict[str, Any], block: list[int], copied: list[int]
 ) -> None:
     sound = SOUND[:, :200] if block == [1] else SOUND
-    got = rosafe.process(sound, RATE, {**FEW, **parameters}, block, outputs=[kind])[kind]
+    got = rosafe.process(sound, RATE, parameters={**FEW, **parameters}, block_frames=block, outputs=[kind])[kind]
     assert copied == []
     outputs = Chain(RATE, {"in_doNormalize": False, **FEW, **parameters}).run(cut(sound, block))
     np.testing.assert_array_equal(got, np.concatenate([output[kind] for output in outputs], axis=-1))
@@ -60,16 +60,17 @@ def test_the_same_numbers_without_a_copy(
 
 def test_who_has_children_is_copied(copied: list[int]) -> None:
     """They take blocks in one piece."""
-    alone = rosafe.process(SOUND, RATE, FEW, 1000, outputs=["gammatone"])
+    alone = rosafe.process(SOUND, RATE, parameters=FEW, block_frames=1000, outputs=["gammatone"])
     assert copied == []
-    both = rosafe.process(SOUND, RATE, FEW, 1000, outputs=["gammatone", "ihc"])
+    both = rosafe.process(SOUND, RATE, parameters=FEW, block_frames=1000, outputs=["gammatone", "ihc"])
     assert copied == [1000] * 3
     np.testing.assert_array_equal(both["gammatone"], alone["gammatone"])
 
 
 def test_from_a_change_of_the_rows_on_nothing_is_written_there(copied: list[int]) -> None:
     changes = [(2, "fb_nChannels", 3), (3, "fb_nChannels", 5)]
-    got = rosafe.process(SOUND, RATE, FEW, 600, changes, ["gammatone"])["gammatone"]
+    options: dict[str, Any] = {"block_frames": 600, "modifications": changes, "outputs": ["gammatone"]}
+    got = rosafe.process(SOUND, RATE, parameters=FEW, **options)["gammatone"]
     assert copied == [600] * 3
     outputs = Chain(RATE, {"in_doNormalize": False, **FEW}).run(cut(SOUND, 600), changes)
     for number, output in enumerate(outputs):
