@@ -11,6 +11,7 @@ import h5py
 import numpy as np
 import pytest
 import soundfile
+import xarray
 import zarr
 
 import rosafe
@@ -58,6 +59,37 @@ def test_all_outputs_come_back(tmp_path: Path, extension: str, frames: int, chan
     assert loaded["axes"]["crossCorrelation"] == ("channel", "lag", "time") and loaded["units"]["ild"] == "dB"
     again = rosafe.process(as_int32(noise(frames)), RATE, parameters=loaded["parameters"], block_frames=4000)
     np.testing.assert_array_equal(again["ild"], loaded["ild"])
+
+
+def test_zeros_are_no_missing_numbers_for_xarray(tmp_path: Path) -> None:
+    """It takes what equals an array's fill value for missing: silence, and the lag and the time 0."""
+    target = tmp_path / "silence.zarr"
+    process_file(write(tmp_path / "silence.wav", np.zeros((2, 2000))), target, SMALL_PARAMETERS, 700, list(KINDS))
+    loaded = rosafe.load(target)
+    with xarray.open_zarr(str(target), chunks=None) as dataset:
+        assert {"ratemap", "ild", "cc_lags"} <= set(dataset.variables)
+        for name, variable in dataset.variables.items():
+            np.testing.assert_array_equal(variable.values, loaded[str(name)], err_msg=str(name))
+    assert not loaded["ratemap"].any() and 0.0 in loaded["cc_lags"]
+
+
+def test_parameters_are_those_in_force(tmp_path: Path, sound: Path) -> None:
+    """Also the highest channel, where the sample rate has decided."""
+    target = tmp_path / "result.npz"
+    few = {"fb_nChannels": 3}
+    process_file(sound, target, few, outputs=["ild"])
+    told = rosafe.load(target)["parameters"]
+    assert told["fb_highFreqHz"] == rosafe.load(target)["fb_cfHz"][-1] == 7600.0
+    assert set(told) == {p.name for kind in KINDS.values() for p in kind.parameters}
+    again = rosafe.process(as_int32(noise(9000)), RATE, parameters=told, outputs=["ild"])
+    np.testing.assert_array_equal(again["ild"], rosafe.load(target)["ild"])
+    for same in (few, {**few, "fb_highFreqHz": 7600.0}):
+        assert process_file(sound, target, same, outputs=["ild"], resume=True).skipped
+    with pytest.raises(OutputError, match="was made with other parameters"):
+        process_file(sound, target, {**few, "fb_highFreqHz": 7000.0}, outputs=["ild"], resume=True)
+    process_file(sound, target, {**few, "fb_highFreqHz": 7000.0}, outputs=["ild"], replace=True)
+    with pytest.raises(OutputError, match="was made with other parameters"):
+        process_file(sound, target, few, outputs=["ild"], resume=True)
 
 
 @pytest.mark.parametrize("output", ["ild", "input", "itd"])
