@@ -226,5 +226,9 @@ def _check_room(path: Path, size: int) -> None:
     free = disk.f_bavail * disk.f_frsize
     if size > free:
         raise OutputError(
-            f"the output would take {size / 1e9:.1f} GB, {free / 1e9:.1f} GB are free there; name fewer --outputs"
+            f"the output would take {_bytes_text(size)}, {_bytes_text(free)} are free there; name fewer --outputs"
         )
+
+
+def _bytes_text(count: int) -> str:
+    return f"{count / 1e9:.1f} GB" if count >= 1e8 else f"{count / 1e6:.3f} MB"

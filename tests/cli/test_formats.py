@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import subprocess
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import h5py
@@ -16,7 +17,7 @@ import zarr
 
 import rosafe
 from rosafe.interface import KINDS
-from rosafe.offline import formats, whole
+from rosafe.offline import files, formats, whole
 from rosafe.offline.files import Done, process_file
 from rosafe.output import OutputError
 from rosafe.version import VERSION
@@ -121,6 +122,13 @@ def test_large_arrays_wait_on_the_disk(
     process_file(sound, tmp_path / f"b{extension}", SMALL_PARAMETERS, 1000, ["ihc", "ild"])
     assert_same(rosafe.load(tmp_path / f"b{extension}"), rosafe.load(tmp_path / f"a{extension}"))
     assert len(list(tmp_path.iterdir())) == 3
+
+
+def test_how_little_room_there_is(tmp_path: Path, sound: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(files.os, "statvfs", lambda path: SimpleNamespace(f_bavail=3, f_frsize=4096))
+    with pytest.raises(OutputError, match=r"would take 0\.432 MB, 0\.012 MB are free there; name fewer --outputs"):
+        process_file(sound, tmp_path / "a.h5", SMALL_PARAMETERS, outputs=["ihc"])
+    assert list(tmp_path.iterdir()) == [sound]
 
 
 def test_mat_beyond_version_5(tmp_path: Path, sound: Path, monkeypatch: pytest.MonkeyPatch) -> None:
