@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import inspect
 import itertools
 import math
-import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -17,22 +15,17 @@ from rosafe.dsp.stage import SAMPLE_RATE
 from rosafe.interface import KINDS
 from rosafe.interface.arguments import check_change, check_parameters
 from rosafe.offline.chain import Chain
+from rosafe.offline.memory import refuse_over_available
 from rosafe.offline.signals import as_ears, frame_times, of_ears, outputs_of
-from rosafe.tree import sizes
 from rosafe.tree.block import Block
 
 DEFAULT_BLOCK = 12000  # frames, as InputProc's
-# beyond the machine's memory, where the kernel would end the process
-_TOO_LARGE = (
-    "outputs: they would take {taken:.1f} GB of memory, this machine has {limit:.1f} GB; "
-    "name fewer outputs, or take fewer channels or lags"
-)
 
 
 def process(
     signal: Any,
     sample_rate: float,
-    *by_place: Any,
+    *,
     parameters: Mapping[str, Any] | None = None,
     block_frames: int | Sequence[int] = DEFAULT_BLOCK,
     modifications: Sequence[tuple[int, str, Any]] = (),
@@ -94,28 +87,11 @@ def process(
     >>> result["ratemap"].shape
     (2, 32, 99)
     """
-    options = (parameters, block_frames, modifications, outputs)
-    if by_place:
-        options = _named(by_place, options)
     try:
-        work = _Work(signal, sample_rate, *options)
+        work = _Work(signal, sample_rate, parameters, block_frames, modifications, outputs)
     except ValueError as problem:
         raise problem.with_traceback(None) from None  # where inside it was found helps nobody
     return work.run()
-
-
-process.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
-    [p for p in inspect.signature(process).parameters.values() if p.kind is not p.VAR_POSITIONAL],
-    return_annotation="dict[str, Any]",
-)
-
-
-def _named(by_place: tuple[Any, ...], options: tuple[Any, Any, Any, Any]) -> tuple[Any, Any, Any, Any]:
-    """The options, of which the first ones were given by their place, as it was done once."""
-    if len(by_place) > len(options):
-        raise TypeError(f"process() takes 2 positional arguments, and {2 + len(by_place)} were given")
-    warnings.warn("give what follows the sample rate by name, as in parameters={...}", DeprecationWarning, 3)
-    return (*by_place, *options[len(by_place) :])
 
 
 class _Work:
@@ -149,7 +125,7 @@ class _Work:
             if block < len(ends):
                 chain.schedule(block, name, value)
                 taken.append(_size(chain, wanted, ends))
-        sizes.refuse_over(sizes.machine_memory(), max(taken), _TOO_LARGE, 1e9)
+        refuse_over_available(max(taken), "outputs: they", "; name fewer outputs, or take fewer channels or lags")
         for kind in wanted:
             centred, parts = KINDS[kind].centred, KINDS[kind].outputs
             self.gathered[kind] = {}
