@@ -60,11 +60,11 @@ def pulse(tmp_path: Path) -> Iterator[PulseServer]:
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark what `scripts/test --fast` leaves out: tests on a ROS graph, and those that build, install or lint.
 
-    Their files come first, so that none of the long ones is left for one process alone at the end.
+    Their files and the other long ones come first, so that none is left for one process alone at the end.
     """
     for item in items:
         uses_graph = {"graph", "private_graph"} & set(getattr(item, "fixturenames", ()))
         if uses_graph or item.path.relative_to(harness.ROOT).parts[1] in ("demo", "packaging"):
             item.add_marker("ros")
-    slow = {item.path for item in items if item.get_closest_marker("ros")}
+    slow = {item.path for item in items if item.get_closest_marker("ros") or item.get_closest_marker("long")}
     items.sort(key=lambda item: item.path not in slow)

@@ -70,8 +70,9 @@ def let_children_have_default_signals() -> None:
 
 
 def wait_for(condition: Callable[[], T], timeout: float = PATIENCE, what: str | Callable[[], str] = "") -> T:
-    """The first true value of `condition()`, asked every 20 ms; AssertionError after `timeout` seconds."""
+    """The first true value of `condition()`, asked at first every 5 ms; AssertionError after `timeout` seconds."""
     end = time.monotonic() + timeout
+    pause = 0.005
     while True:
         value = condition()
         if value:
@@ -79,7 +80,8 @@ def wait_for(condition: Callable[[], T], timeout: float = PATIENCE, what: str | 
         if time.monotonic() > end:
             told = what() if callable(what) else what
             raise AssertionError(f"not within {timeout:g} s: {told or condition}")
-        time.sleep(0.02)
+        time.sleep(pause)
+        pause = min(1.1 * pause, 0.05)  # what takes long is not to take longer because it is asked for
 
 
 def free_port() -> int:

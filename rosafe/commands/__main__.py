@@ -25,7 +25,8 @@ def main(argv: list[str] | None = None) -> int:
     name = "rosafe"
     try:
         try:
-            options, rest = _parser().parse_known_args(without_names(sys.argv[1:] if argv is None else argv))
+            words = without_names(sys.argv[1:] if argv is None else argv)
+            options, rest = _parser(words).parse_known_args(words)
             name = f"rosafe {options.command}"
             if hasattr(options, "missing"):
                 raise Failure(options.missing)
@@ -53,7 +54,8 @@ def main(argv: list[str] | None = None) -> int:
         return 141
 
 
-def _parser() -> argparse.ArgumentParser:
+def _parser(words: list[str]) -> argparse.ArgumentParser:
+    """With the one subcommand that the command line begins with, or with all, which takes longer to import."""
     parser = Parser(
         prog="rosafe",
         description="The Two!Ears auditory front-end without ROS, and tools around it.",
@@ -63,9 +65,9 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--version", action="version", version=f"rosafe {VERSION}")
     subparsers = parser.add_subparsers(title="commands", dest="command", metavar="COMMAND", required=True)
-    for module in pkgutil.iter_modules(commands.__path__):
-        if not module.name.startswith("_"):
-            _add(subparsers, module.name)
+    names = [module.name for module in pkgutil.iter_modules(commands.__path__) if not module.name.startswith("_")]
+    for name in words[:1] if words[:1] and words[0] in names else names:
+        _add(subparsers, name)
     return parser
 
 

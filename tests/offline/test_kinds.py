@@ -181,23 +181,10 @@ def test_lags_that_are_not_centred_are_aligned_at_the_first() -> None:
 
 def test_what_a_child_could_not_go_on_with_is_refused() -> None:
     """Pitch needs three lags of its range; the change is the autocorrelation's."""
+    changed: dict[str, Any] = {"parameters": FEW, "block_frames": 1000, "modifications": [(1, "ac_wSizeSec", 0.0005)]}
     with pytest.raises(ValueError, match="pi_rangeHz: 80 to 400 Hz are 0 lags of the autocorrelation, wanted are 3"):
-        rosafe.process(
-            SOUND,
-            RATE,
-            parameters=FEW,
-            block_frames=1000,
-            modifications=[(1, "ac_wSizeSec", 0.0005)],
-            outputs=["pitch"],
-        )
-    rosafe.process(
-        SOUND,
-        RATE,
-        parameters=FEW,
-        block_frames=1000,
-        modifications=[(1, "ac_wSizeSec", 0.0005)],
-        outputs=["autocorrelation"],
-    )
+        rosafe.process(SOUND, RATE, **changed, outputs=["pitch"])
+    rosafe.process(SOUND, RATE, **changed, outputs=["autocorrelation"])
 
 
 def test_the_original_kinds_are_the_default() -> None:

@@ -14,39 +14,14 @@ import pytest
 
 from rosafe.dsp.kernels import build, library
 from tests.harness import PYTHON, run_together, wait_for
-from tests.packaging.clone import ENVIRONMENT, environment, fresh_copy, run, without_rights
+from tests.packaging.clone import environment, fresh_copy, run, without_rights
 
 SHOW = (
     "import numpy; from rosafe.dsp import kernels; from rosafe.representations.ild import Ild; "
     "print(kernels.compiled(), kernels.status(), float(Ild(44100).process(numpy.ones((2, 1, 900)))[0, 0]), sep='|')"
 )
 
-# gcc, but what it has made once of the same sources it does not make again.
-GCC = """#!/usr/bin/python3
-import hashlib, pathlib, shutil, subprocess, sys
-output = pathlib.Path(sys.argv[sys.argv.index("-o") + 1])
-sha = hashlib.sha256(repr([word for word in sys.argv[1:] if word.startswith("-")]).encode())
-for source in sorted(pathlib.Path(next(word for word in sys.argv if word.endswith(".c"))).parent.glob("*.[ch]")):
-    sha.update(source.read_bytes())
-kept = pathlib.Path(__file__).with_name(sha.hexdigest())
-if not kept.exists():
-    subprocess.run(["/usr/bin/gcc", *sys.argv[1:]], check=True)
-    shutil.copy(output, kept)
-shutil.copy(kept, output)
-"""
-
 pytestmark = pytest.mark.skipif(platform.machine() != "x86_64", reason="other processors have other libraries")
-
-
-@pytest.fixture(scope="module", autouse=True)
-def _gcc(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """The first compiler on the PATH of all that is run here, but where a test says otherwise."""
-    folder = tmp_path_factory.mktemp("gcc")
-    (folder / "gcc").write_text(GCC)
-    (folder / "gcc").chmod(0o755)
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(ENVIRONMENT, "PATH", f"{folder}:{ENVIRONMENT['PATH']}")
-        yield
 
 
 @pytest.fixture

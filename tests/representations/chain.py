@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import copy
-import itertools
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,8 +15,7 @@ from rosafe.dsp.signal import Signal
 from rosafe.dsp.stage import Output, Stage, parts_of
 from rosafe.representations import KINDS, STAGES
 from tests import harness
-
-FloatArray = NDArray[np.float64]
+from tests.dsp.bare import FloatArray, cut, single
 
 
 def kinds_of(name: str) -> list[str]:
@@ -37,16 +36,31 @@ def needed(outputs: Iterable[str]) -> list[str]:
     return [kind for kind in STAGES if kind in wanted]
 
 
-def cut(signal: NDArray[Any], sizes: int | Iterable[int]) -> list[NDArray[Any]]:
-    """`signal` in blocks of `sizes` along its last axis, used cyclically; the last block is what is left."""
-    blocks: list[NDArray[Any]] = []
-    position = 0
-    for size in itertools.cycle([sizes] if isinstance(sizes, int) else sizes):
-        if position >= signal.shape[-1]:
-            return blocks
-        blocks.append(signal[..., position : position + size])
-        position += size
-    return blocks
+def check_new_beginnings(fresh: Callable[[int], Stage], given: Signal, x: FloatArray, *others: FloatArray) -> None:
+    """A stage of `given`, after a reset, and for other channels, is as a new one, which `fresh` makes for so many."""
+    stage = fresh(x.shape[1])
+    expected = single(stage.process(x))
+    assert expected.shape[-1] > 2
+    stage.reset()
+    np.testing.assert_array_equal(stage.process(x), expected)
+    names = tuple(float(number) for number in range(1, x.shape[1] + 1))
+    stage.receive(replace(given, center_frequencies=names))  # as many, but others
+    np.testing.assert_array_equal(stage.process(x), expected)
+    for other in others:
+        np.testing.assert_array_equal(stage.process(other), fresh(other.shape[1]).process(other))
+
+
+def check_fresh_output(stage: Stage, x: FloatArray) -> None:
+    """What comes out is an array of its own, which may be written, and is not written again; `x` may not be."""
+    x.setflags(write=False)
+    made = single(stage.process(x))
+    assert made.flags.c_contiguous and made.flags.writeable and made.dtype == np.float64
+    assert made.shape[:-1] == stage.output_rows(x.shape[:-1])
+    kept = made.copy()
+    stage.process(x)
+    np.testing.assert_array_equal(made, kept)
+    frame = single(stage.process(x[..., :1]))
+    assert frame.flags.c_contiguous and frame.flags.writeable
 
 
 class Chain:

@@ -16,7 +16,7 @@ from rosafe.dsp.signal import Signal
 from rosafe.dsp.windows import ALL_NAMES, window
 from rosafe.representations.autocorrelation import Autocorrelation
 
-from .chain import Chain, FloatArray, cut, reference
+from .chain import Chain, FloatArray, check_fresh_output, check_new_beginnings, cut, reference
 
 RATE = 8000.0
 SOUND = Signal(RATE, RATE, center_frequencies=(100.0, 1000.0, 3000.0), filterbank="gammatone")
@@ -204,29 +204,15 @@ def test_first_blocks_that_complete_no_frame() -> None:
 
 @each_mode
 def test_reset_and_other_channels_are_a_new_beginning(parameters: dict[str, Any]) -> None:
-    stage = Autocorrelation(SOUND, **parameters)
-    expected = stage.process(sound(333))
-    stage.reset()
-    np.testing.assert_array_equal(stage.process(sound(333)), expected)
-    stage.receive(replace(SOUND, center_frequencies=(1.0, 2.0, 3.0)))  # as many, but others
-    np.testing.assert_array_equal(stage.process(sound(333)), expected)
-    assert stage.output.center_frequencies == (1.0, 2.0, 3.0)
-    for channels in (5, 2):
-        x = sound(400, 2, channels)
-        np.testing.assert_array_equal(stage.process(x), Autocorrelation(RATE, **parameters).process(x))
+    def fresh(channels: int) -> Autocorrelation:
+        return Autocorrelation(SOUND if channels == 3 else RATE, **parameters)
+
+    check_new_beginnings(fresh, SOUND, sound(333), sound(400, 2, 5), sound(400, 2, 2))
 
 
 @each_mode
 def test_what_comes_out_is_fresh(parameters: dict[str, Any]) -> None:
-    stage = Autocorrelation(SOUND, **parameters)
-    x = sound(500)
-    x.setflags(write=False)
-    made = stage.process(x)
-    assert made.flags.c_contiguous and made.flags.writeable and made.dtype == np.float64
-    assert made.shape[:-1] == stage.output_rows((2, 3))
-    kept = made.copy()
-    stage.process(x)
-    np.testing.assert_array_equal(made, kept)
+    check_fresh_output(Autocorrelation(SOUND, **parameters), sound(500))
 
 
 def test_the_format_of_the_output() -> None:

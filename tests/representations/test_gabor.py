@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import math
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,7 +14,7 @@ from hypothesis import strategies as st
 from rosafe.dsp.signal import Signal
 from rosafe.representations.gabor import Deviations, Gabor, filters, patterns
 
-from .chain import Chain, FloatArray, cut, reference
+from .chain import Chain, FloatArray, check_fresh_output, check_new_beginnings, cut, reference
 
 REACH = 19
 
@@ -254,31 +253,14 @@ def test_frames_are_held_back() -> None:
 
 
 def test_reset_and_other_channels_are_a_new_beginning() -> None:
+    check_new_beginnings(lambda n: Gabor(given_signal(n)), given_signal(5), rates(60), rates(60, 6), rates(60, 2))
     stage = Gabor(given_signal(5))
-    expected = stage.process(rates(60))
-    stage.reset()
-    np.testing.assert_array_equal(stage.process(rates(60)), expected)
-    stage.receive(replace(given_signal(5), center_frequencies=(1.0, 2.0, 3.0, 4.0, 5.0)))  # as many, but others
-    np.testing.assert_array_equal(stage.process(rates(60)), expected)
-    for channels in (6, 2):
-        x = rates(60, channels)
-        np.testing.assert_array_equal(stage.process(x), Gabor(given_signal(channels)).process(x))
     stage.receive(given_signal(7))
     assert stage.derived["gb_nFeatures"] == len(spelt_out_weights(7))
 
 
 def test_what_comes_out_is_fresh() -> None:
-    stage = Gabor(given_signal(5))
-    x = rates(60)
-    x.setflags(write=False)
-    made = stage.process(x)
-    assert made.flags.c_contiguous and made.flags.writeable and made.dtype == np.float64
-    assert made.shape[:-1] == stage.output_rows((2, 5))
-    kept = made.copy()
-    stage.process(x)
-    np.testing.assert_array_equal(made, kept)
-    single = stage.process(x[..., :1])
-    assert single.flags.c_contiguous and single.flags.writeable
+    check_fresh_output(Gabor(given_signal(5)), rates(60))
 
 
 @pytest.mark.filterwarnings("error")

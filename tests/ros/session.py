@@ -56,9 +56,13 @@ class Microphone:
                 lastFrameIndex=self.index,
                 left=self.window[0].copy(),
                 right=self.window[1].copy(),
-                stamp={"sec": 0, "nsec": 0},
+                stamp=self.stamp(),
             )
         )
+
+    def stamp(self) -> dict[str, int]:
+        """The time of the window; of a bass that knows none, 0."""
+        return {"sec": 0, "nsec": 0}
 
     def publish_bytes(self, data: bytes) -> None:
         """Send anything at all in place of a message."""

@@ -107,22 +107,11 @@ def test_any_index_has_a_time(steps: list[int], late: list[float]) -> None:
 class Stamped(Microphone):
     """A microphone that knows when it has heard what."""
 
-    def publish(self) -> None:
+    def stamp(self) -> dict[str, int]:
         if self.index == 0:
-            return super().publish()
+            return super().stamp()
         seconds, nanoseconds = divmod(self.nanoseconds(self.index), 1_000_000_000)
-        self._publisher.publish(
-            self._message(
-                sampleRate=self.sample_rate,
-                nChunksOnPort=self.chunks,
-                nFramesPerChunk=self.chunk,
-                lastFrameIndex=self.index,
-                left=self.window[0].copy(),
-                right=self.window[1].copy(),
-                stamp={"sec": seconds, "nsec": nanoseconds},
-            )
-        )
-        return None
+        return {"sec": seconds, "nsec": nanoseconds}
 
     def nanoseconds(self, index: float) -> int:
         """When a frame was captured."""

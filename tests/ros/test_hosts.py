@@ -6,7 +6,6 @@ import os
 import re
 import shutil
 import signal
-import subprocess
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from tests.harness import PYTHON, ROOT, SCRIPTS, Graph, MasterProcess, wait_for
+from tests.networks import networks
 
 # Builds a tree on /far and prints the first lastFrameIndex that is not 0.
 CLIENT = """
@@ -77,14 +77,8 @@ def net() -> Iterator[Net]:
         f"{inside} link set vf{number} up",
         f"{inside} link set lo up",
     ]
-    try:
-        for command in commands:
-            done = subprocess.run(["ip", *command.split()], capture_output=True, text=True, check=False)
-            if done.returncode:
-                pytest.skip(f"no network namespaces here: ip {command}: {done.stderr.strip()}")
+    with networks(commands, net.name):
         yield net
-    finally:
-        subprocess.run(["ip", "netns", "del", net.name], capture_output=True, check=False)  # the cable goes with it
 
 
 @pytest.mark.ros

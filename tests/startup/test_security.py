@@ -20,6 +20,7 @@ from rosafe.live import client, hub, server
 from tests.genomix.world import Http, genomixd
 from tests.harness import PYTHON, ROOT, Graph, MasterProcess, free_port, proc
 from tests.live.world import live
+from tests.networks import networks
 
 PAGE = (ROOT / "docs" / "security.md").read_text("utf-8")
 LISTENING = "0A"
@@ -168,15 +169,8 @@ def robot() -> Iterator[str]:
         *(f"-n {others} addr add 10.0.0.{host}/24 dev eth0" for host in (2, 3)),
         *(f"-n {name} link set {device} up" for name in (robot, others) for device in ("lo", "eth0")),
     ]
-    try:
-        for command in commands:
-            done = subprocess.run(["ip", *command.split()], capture_output=True, text=True, check=False)
-            if done.returncode:
-                pytest.skip(f"no network namespaces here: ip {command}: {done.stderr.strip()}")
+    with networks(commands, robot, others):
         yield robot
-    finally:
-        for name in (robot, others):
-            subprocess.run(["ip", "netns", "del", name], capture_output=True, check=False)
 
 
 def test_the_firewall_lets_in_the_partner_and_nobody_else(robot: str) -> None:
