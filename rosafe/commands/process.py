@@ -63,7 +63,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--outputs",
         metavar="NAME,...",
         help=f"what to keep of {', '.join(KINDS)} (default: ild,ratemap,crossCorrelation; the original's seven are "
-        f"{','.join(FIXED)}); what none of them needs is not computed",
+        f"{', '.join(FIXED)}); what none of them needs is not computed",
     )
     parser.add_argument(
         "--format",

@@ -168,7 +168,9 @@ class Stream:
                 self._stages["input"].configure(**{_NUMBER: whole})
             self._ears, self._whole = ears, whole
         elif ears != self._ears:
-            raise ValueError(f"block has shape {shape}; those before it were of {self._ears} ears")
+            raise ValueError(
+                f"block has shape {shape}; those before it were of {('one ear', 'two ears')[self._ears - 1]}"
+            )
         elif whole != self._whole:
             raise ValueError(f"block is of {'whole numbers' if whole else 'floats'}, and those before it were not")
         if len(shape) == 2 and shape != (2, 2):

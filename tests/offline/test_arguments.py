@@ -46,9 +46,9 @@ def refused(match: str, *arguments: Any, **named: Any) -> None:
         (np.zeros((100, 1)), r"shape \(100, 1\)"),
         (np.zeros((0, 3)), r"shape \(0, 3\)"),
         (np.zeros((2, 2, 100)), "shape"),
-        (np.float64(0), "shape"),
-        (None, "shape"),
-        ("sound.wav", "shape"),
+        (np.float64(0), "signal is no array, but float64"),
+        (None, "signal is no array, but NoneType"),
+        ("sound.wav", r"signal is no array, but str; wanted is \(N,\) or \(1, N\)"),
         ([[1.0, 2.0], [3.0]], "signal is no array"),
         (np.zeros((2, 10), np.int8), "type int8, wanted is a float type, int32 or int16"),
         (np.zeros((2, 10), np.int64), "type int64"),
@@ -179,6 +179,13 @@ def test_outputs(outputs: Any, match: str) -> None:
     refused(match, GOOD, RATE, outputs=outputs)
 
 
+def test_what_there_is_is_told_once() -> None:
+    with pytest.raises(ValueError, match="unknown parameter 'xyzzy'; there are: in_doNormalize, ") as raised:
+        rosafe.process(GOOD, RATE, parameters={"xyzzy": 1})
+    names = str(raised.value).partition("there are: ")[2].split(", ")
+    assert len(names) == len(set(names)) and "trm_minSpread" in names
+
+
 @pytest.mark.parametrize("signal", [GOOD[0], GOOD[:1], list(GOOD[0])])
 def test_one_ear_has_no_differences(signal: Any) -> None:
     refused("outputs: ild, crossCorrelation compare two ears, and the signal has one", signal, RATE, outputs=FIXED)
@@ -200,10 +207,8 @@ def test_the_traceback_ends_where_the_user_called() -> None:
 def test_what_follows_the_sample_rate_has_a_name() -> None:
     kinds = [p.kind.name for p in inspect.signature(rosafe.process).parameters.values()]
     assert kinds == ["POSITIONAL_OR_KEYWORD"] * 2 + ["KEYWORD_ONLY"] * 4
-    with pytest.warns(DeprecationWarning, match="by name"), pytest.raises(ValueError, match="fb_nERBs"):
-        rosafe.process(GOOD, RATE, {"fb_nERBs": 0})
-    with pytest.raises(TypeError, match="takes 2 positional arguments, and 7 were given"):
-        rosafe.process(GOOD, RATE, {}, 1, (), None, 5)
+    with pytest.raises(TypeError, match="takes 2 positional arguments but 3 were given"):
+        rosafe.process(GOOD, RATE, {"fb_nERBs": 2.0})  # type: ignore[misc]
 
 
 def test_sizes_that_fill_the_memory() -> None:

@@ -120,13 +120,9 @@ def test_coordinates_are_those_that_were_in_force() -> None:
 
 def test_blocks_without_frames_have_rows_too() -> None:
     """The first one is shorter than a window; it had more lags than there are from the second on."""
+    changes = [(1, "cc_maxDelaySec", 0.0005)]
     got = rosafe.process(
-        SOUND,
-        RATE,
-        parameters=FEW,
-        block_frames=[100, 2900],
-        modifications=[(1, "cc_maxDelaySec", 0.0005)],
-        outputs=["crossCorrelation"],
+        SOUND, RATE, parameters=FEW, block_frames=[100, 2900], modifications=changes, outputs=["crossCorrelation"]
     )
     assert got["crossCorrelation"].shape == (4, 37, 17)
     np.testing.assert_allclose(got["cc_lags"], np.arange(-18, 19) / RATE)

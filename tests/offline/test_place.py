@@ -69,9 +69,8 @@ def test_who_has_children_is_copied(copied: list[int]) -> None:
 
 def test_from_a_change_of_the_rows_on_nothing_is_written_there(copied: list[int]) -> None:
     changes = [(2, "fb_nChannels", 3), (3, "fb_nChannels", 5)]
-    got = rosafe.process(SOUND, RATE, parameters=FEW, block_frames=600, modifications=changes, outputs=["gammatone"])[
-        "gammatone"
-    ]
+    options: dict[str, Any] = {"block_frames": 600, "modifications": changes, "outputs": ["gammatone"]}
+    got = rosafe.process(SOUND, RATE, parameters=FEW, **options)["gammatone"]
     assert copied == [600] * 3
     outputs = Chain(RATE, {"in_doNormalize": False, **FEW}).run(cut(SOUND, 600), changes)
     for number, output in enumerate(outputs):

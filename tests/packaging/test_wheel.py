@@ -154,6 +154,10 @@ def test_the_command_and_what_it_says_of_what_is_absent(venv: Venv, tmp_path: Pa
         (["plot", sound], "matplotlib is not installed; pip install 'rosafe[plot]'"),
         (["record", "--seconds", "1"], "is not installed; pip does not bring it: run scripts/install of a checkout"),
         (["trace"], "is not installed; pip does not bring it"),
+        (["request", "ratemap"], "genpy is not installed; pip does not bring it: run scripts/install of a checkout"),
+        (["live"], "genpy is not installed; pip does not bring it"),
+        (["up"], "yaml is not installed; pip does not bring it"),
+        (["setup", "save", "x.yaml"], "yaml is not installed; pip does not bring it"),
     ]
     for arguments, words in cases:
         done = venv.run("rosafe", *arguments)
