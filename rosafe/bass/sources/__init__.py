@@ -70,13 +70,13 @@ def open_source(device: str, sample_rate: int, frames_per_chunk: int, stopping: 
         from rosafe.bass.sources.scene import SceneSource
 
         return SceneSource(device[len("scene:") :], sample_rate or DEFAULT_RATE, frames_per_chunk, stopping)
-    from rosafe.bass.sources.alsa import AlsaSource
+    from rosafe.bass.sources.alsa import AlsaSource, DeviceBusyError
 
     try:
         return AlsaSource(device, sample_rate or DEFAULT_RATE, frames_per_chunk, stopping)
     except ComponentError as problem:
         first = device.strip("'\" ").partition(":")[0]
         hint = meant(first, [name.partition(":")[0] for name, _ in BUILT_IN])
-        if problem.ex != device_error("").ex or not hint:
+        if problem.ex != device_error("").ex or isinstance(problem, DeviceBusyError) or not hint:
             raise
         raise device_error(f"{problem.what}{hint.removesuffix('?')}:?") from None
