@@ -57,7 +57,9 @@ class Stack:
 
     def __post_init__(self) -> None:
         self._children = Children(self.env)  # nodes and servers
-        self._masters = Children(self.env)  # which the others need until they have ended
+        # Which the others need until they have ended; roscore ends its rosmaster and rosout where it is told to, not
+        # where it is killed.
+        self._masters = Children(self.env, orphaned="TERM")
 
     def __enter__(self) -> Stack:
         return self

@@ -45,6 +45,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--at", type=float, metavar="S", help="draw channels against lags, or filters, at this time")
     parser.add_argument("--channel", type=float, metavar="HZ", help="draw lags, or filters, of this channel over time")
     parser.add_argument("--force", action="store_true", help="replace a picture that -o does not name")
+    parser.epilog = (
+        "examples:\n"
+        "  rosafe plot speech.wav\n"
+        "  rosafe plot speech.wav -o out.png --outputs amsFeatures,itd --channel 500 --set fb_nChannels=16\n"
+        "  rosafe plot speech.npz --ear left"
+    )
 
 
 def run(options: argparse.Namespace) -> int:

@@ -206,9 +206,11 @@ class _Screen:
         if now == self._lines:
             return
         if self._terminal:
+            # Lines are left whole for the terminal to wrap: an address is to be copied from there.
             width = shutil.get_terminal_size().columns
-            up = f"\x1b[{len(self._lines)}F" if self._lines else ""
-            print(up + "".join(f"\x1b[2K{line[: width - 1]}\n" for line in now), end="", flush=True)
+            above = sum(max(1, -(-len(line) // width)) for line in self._lines)
+            up = f"\x1b[{above}F\x1b[J" if above else ""
+            print(up + "".join(f"{line}\n" for line in now), end="", flush=True)
         else:
             print(*(line for line in now if line not in self._lines), sep="\n", flush=True)
         self._lines = now

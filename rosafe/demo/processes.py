@@ -12,19 +12,21 @@ from types import TracebackType
 from typing import IO
 
 END_SECONDS = 2.0  # for a gentle end; nobody but this process has to do with the children
-# The kernel kills the child when the thread that started it dies (setpriv); the test is for a death just before that.
-_WITH_PARENT = ("setpriv", "--pdeathsig", "KILL", "--", "sh", "-c", '[ "$PPID" = "$0" ] && exec "$@"')
+_WITH_PARENT = ("sh", "-c", '[ "$PPID" = "$0" ] && exec "$@"')  # against a death just before setpriv
 
 
 class Child:
-    """A running command with a session of its own; what it prints is kept in files that have no name."""
+    """A running command with a session of its own; what it prints is kept in files that have no name.
 
-    def __init__(self, command: list[str], env: Mapping[str, str]) -> None:
+    The kernel signals it when the thread that started it dies: `orphaned`, such as KILL.
+    """
+
+    def __init__(self, command: list[str], env: Mapping[str, str], orphaned: str) -> None:
         self.command = command
         self._out: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115  # as long as the child is of interest
         self._err: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115
         self.process = subprocess.Popen(
-            [*_WITH_PARENT, str(os.getpid()), *command],
+            ["setpriv", "--pdeathsig", orphaned, "--", *_WITH_PARENT, str(os.getpid()), *command],
             env=dict(env),
             stdin=subprocess.DEVNULL,
             stdout=self._out,
@@ -48,15 +50,19 @@ class Child:
 
 
 class Children:
-    """All children of this process, ended together. For the main thread only: the kernel watches that."""
+    """All children of this process, ended together. For the main thread only: the kernel watches that.
 
-    def __init__(self, env: Mapping[str, str]) -> None:
+    Where this process is killed, they are, too; `orphaned` is TERM for those that have children of their own to end.
+    """
+
+    def __init__(self, env: Mapping[str, str], orphaned: str = "KILL") -> None:
         self.env = env
+        self._orphaned = orphaned
         self._all: list[Child] = []
 
     def start(self, *command: str) -> Child:
         """Start a command."""
-        child = Child(list(command), self.env)
+        child = Child(list(command), self.env, self._orphaned)
         self._all.append(child)
         return child
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
-import pty
 import re
 import shutil
 import signal
@@ -15,6 +13,7 @@ import pytest
 
 from rosafe.component.master import MasterError, check_master
 from tests.harness import ROOT, SCRIPTS, Graph, MasterProcess, Process, free_port, wait_for
+from tests.terminal import Terminal
 
 SETUP = """
 sound: {device: "scene:"}
@@ -62,7 +61,6 @@ def test_everything_from_nothing_and_back(alone: Graph, tmp_path: Path) -> None:
                 up.wait()
             else:
                 assert up.stop(signal.SIGINT) == 0, up
-        if not again:
             wait_for(lambda: not answers(alone.uri), what="the end of the master")
 
 
@@ -98,34 +96,20 @@ def test_a_file_that_is_wrong_starts_nothing(alone: Graph, tmp_path: Path) -> No
 
 
 def test_one_that_is_killed_is_told(alone: Graph) -> None:
-    """On a terminal, which shows one screen."""
-    ours, theirs = pty.openpty()
-    up = subprocess.Popen(
-        ["rosafe", "up", "--port", str(free_port())], env=alone.env, stdout=theirs, stderr=theirs, stdin=theirs
-    )
-    os.close(theirs)
-    os.set_blocking(ours, False)
-    shown = b""
-
-    def has(text: bytes) -> bool:
-        nonlocal shown
-        with contextlib.suppress(OSError):  # nothing yet, or nobody any more
-            while more := os.read(ours, 4096):
-                shown += more
-        return text in shown
-
-    try:
-        wait_for(lambda: has(b"Ctrl-C ends"), what=lambda: str(shown))
-        assert b"\x1b[" in shown
+    """On a terminal, which shows one screen; the page's address whole, although it is wider."""
+    command = ["rosafe", "up", "--live", "--no-browser", "--port", str(free_port()), "--live-port", str(free_port())]
+    with Terminal(command, alone.env, columns=80) as up:
+        up.expect("Ctrl-C ends")
+        assert re.search(r"\?token=[\w-]{43}\r?\n", up.sent), up.sent
         done = alone.run("rosnode", "info", "/bass")
         os.kill(int(re.findall(r"Pid: (\d+)", done.stdout)[0]), signal.SIGKILL)
-        wait_for(lambda: has(b"killed by signal 9"), what=lambda: str(shown))
-        up.send_signal(signal.SIGINT)
-        wait_for(lambda: has(b"ending what was started") and up.poll() is not None, what=lambda: str(shown))
-        assert up.returncode == 1
-    finally:
-        up.kill()
-        os.close(ours)
+        up.expect("killed by signal 9")
+        up.press("\x03")
+        up.expect("ending what was started")
+        assert up.end() == 1
+        *_, before, last = re.split(r"\x1b\[(?=\d+F)", up.sent)
+        lines = before.partition("\x1b[J")[2].replace("\r", "").splitlines()
+        assert len(lines) == 6 and f"{len(lines) + 1}F" == last.partition("\x1b")[0], up.sent  # the address takes two
 
 
 @pytest.mark.parametrize("live", ["true", "false"])

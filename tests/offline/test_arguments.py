@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import itertools
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ import pytest
 
 import rosafe
 from rosafe.interface import FIXED
+from rosafe.offline import memory
 from rosafe.offline import process as offline
 from rosafe.tree import sizes
 
@@ -212,6 +214,19 @@ def test_what_follows_the_sample_rate_has_a_name() -> None:
 def test_sizes_that_fill_the_memory() -> None:
     refused("ild_wSizeSec: 60 s of .* MiB, more than 1024 MiB", GOOD, 96000, parameters={"ild_wSizeSec": 60.0})
     refused("more than 1024 MiB", GOOD, 96000, modifications=[(0, "ild_wSizeSec", 60.0)])
+
+
+def test_results_larger_than_the_memory_that_is_left(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """The rest of the machine's memory is in use: the kernel would end this process."""
+    meminfo = tmp_path / "meminfo"
+    meminfo.write_text("MemTotal:       24684196 kB\nMemFree: 1 kB\nMemAvailable:      12000 kB\n")
+    monkeypatch.setattr(memory, "_MEMINFO", meminfo)
+    sound, large = np.zeros((2, 4000)), {"cc_maxDelaySec": 1.0}
+    refused(r"outputs: they would take .* GB of memory, this machine has 0\.0 GB left", sound, RATE, parameters=large)
+    with pytest.raises(ValueError, match=r"would take .* GB of memory, this machine has 0\.0 GB left"):
+        rosafe.Stream(RATE, large).process(sound)
+    meminfo.unlink()  # nobody tells
+    assert memory.available() == sizes.machine_memory()
 
 
 def test_results_larger_than_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -98,13 +98,14 @@ def test_a_place_is_used_only_where_it_fits(kind: str, frames: int) -> None:
         assert not np.shares_memory(stage.process(block), whole)
         np.testing.assert_array_equal(whole, before)
     whole = np.full((2, 9, 2 * frames), np.nan)
-    for place in (
+    unfit: list[Any] = [
         whole[:, :4, :frames],
         whole[:, :5, : frames + 1],
         whole[:, :5, :frames] if frames > 1 else whole[:, 4::-1, :1],  # ears another distance apart than channels
         whole[:, :5, ::2] if frames > 1 else whole[:, ::2, :1],
         whole[:, :5, :frames].astype(np.float32),
-    ):
+    ]
+    for place in unfit:
         stage = STAGES[kind](RATE, **parameters)
         stage.place = place
         np.testing.assert_array_equal(stage.process(block), plain)

@@ -112,7 +112,7 @@ def test_library_tests_in_the_environment(venv: Venv, tmp_path: Path) -> None:
     for name in ("__init__.py", "harness.py", "offline", "dsp", "representations", "tree", "vectors"):
         there = ROOT / "tests" / name
         copy = shutil.copytree if there.is_dir() else shutil.copy
-        copy(there, tmp_path / "tests" / name)  # type: ignore[operator]
+        copy(there, tmp_path / "tests" / name)
     (tmp_path / "pytest.ini").write_text(
         "[pytest]\naddopts = --import-mode=importlib -p no:cacheprovider\npythonpath=.\n"
     )
