@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import matplotlib
@@ -287,7 +288,8 @@ def test_refusals(result: dict[str, Any], ax: Axes, arguments: dict[str, Any], w
 
 @pytest.mark.parametrize("wrong", ["speech.npz", np.zeros((2, 100)), None])
 def test_what_is_no_result(wrong: Any) -> None:
-    for takes in (rosafe.plot, rosafe.to_xarray):
+    takers: list[Callable[[Any], Any]] = [rosafe.plot, rosafe.to_xarray]
+    for takes in takers:
         with pytest.raises(ValueError, match=r"is not what rosafe\.process returns, or rosafe\.load"):
             takes(wrong)
 
