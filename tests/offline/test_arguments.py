@@ -208,7 +208,7 @@ def test_what_follows_the_sample_rate_has_a_name() -> None:
     kinds = [p.kind.name for p in inspect.signature(rosafe.process).parameters.values()]
     assert kinds == ["POSITIONAL_OR_KEYWORD"] * 2 + ["KEYWORD_ONLY"] * 4
     with pytest.raises(TypeError, match="takes 2 positional arguments but 3 were given"):
-        rosafe.process(GOOD, RATE, {"fb_nERBs": 2.0})  # type: ignore[misc]
+        rosafe.process(GOOD, RATE, {"fb_nERBs": 2.0})  # type: ignore[call-arg]
 
 
 def test_sizes_that_fill_the_memory() -> None:
