@@ -324,7 +324,8 @@ def reference_vectors() -> Iterator[Row]:
         with np.load(VECTORS / case["file"]) as arrays:
             expected = dict(arrays)
         parameters = {"pp_bUnityComp": case["all_params"]["pp_bUnityComp"], **case["params"]}
-        got = rosafe.process(expected["signal"], case["fs"], parameters, case["chunks"], case["mods"])
+        how = {"block_frames": case["chunks"], "modifications": case["mods"]}
+        got = rosafe.process(expected["signal"], case["fs"], parameters=parameters, **how)
         times, channels = expected["time_idx"], expected["chan_idx"]
         without_dc = not parameters.get("pp_bRemoveDC")
         pre = "preProc" if without_dc else "preProc with DC removal"

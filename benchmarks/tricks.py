@@ -49,22 +49,44 @@ class Trick(NamedTuple):
     stage: str = ""  # by default the chain
 
 
+SPLIT_ONCE = """
+    const int64_t half = (n + 1) / 2, half_lags = (lags + 1) / 2;
+    vec even[SPAN + APART], odd[SPAN + APART], apart[SPAN + APART];
+    vec first[SPAN / 2 + APART], second[SPAN / 2 + APART], sum[SPAN / 2 + APART];
+    vec to[2][MOST_LAGS / 2 + APART];
+    put_zeros(l, n + lags - 1, 2 * (half + half_lags));
+    put_zeros(r, n, 2 * half);
+    for (int64_t t = 0; t < half + half_lags; t++) even[t] = l[2 * t], odd[t] = l[2 * t + 1];
+    for (int64_t t = 0; t < half; t++) {
+        first[t] = r[2 * t], second[t] = r[2 * t + 1];
+        sum[t] = first[t] + second[t];
+    }
+    put_zeros(to[0], 0, half_lags);
+    add_products(odd, sum, half, half_lags, to[0]);
+    for (int64_t m = 0; m < half_lags; m++) to[1][m] = to[0][m];
+    for (int64_t t = 0; t < half + half_lags - 1; t++) apart[t] = even[t] - odd[t];
+    add_products(apart, first, half, half_lags, to[0]);
+    for (int64_t t = 0; t < half + half_lags - 1; t++) apart[t] = even[t + 1] - odd[t];
+    add_products(apart, second, half, half_lags, to[1]);
+    for (int64_t m = 0; m < half_lags; m++) c[2 * m] = to[0][m], c[2 * m + 1] = to[1][m];
+    return;
+"""
 TRICKS = (
     Trick(
-        "three products for four of even and odd samples (Karatsuba's way)",
+        "nine products for sixteen of every fourth sample (Karatsuba's way, twice)",
         "products.c",
         (
             (
-                "    for (int64_t t = 0; t < half; t++) sum[t] = r[0][t] + r[1][t];\n",
-                "    for (int64_t m = 0; m < half_lags; m++) c[0][m] = c[1][m] = (vec){};\n"
-                "    add_products(l[0], r[0], half, half_lags, c[0]);\n"
-                "    add_products(l[1], r[1], half, half_lags, c[0]);\n"
-                "    add_products(l[1], r[0], half, half_lags, c[1]);\n"
-                "    add_products(l[0] + 1, r[1], half, half_lags, c[1]);\n"
-                "    return;\n"
-                "    for (int64_t t = 0; t < half; t++) sum[t] = r[0][t] + r[1][t];\n",
+                "    put_zeros(l, n + lags - 1, PHASES",
+                "    put_zeros(c, 0, lags);\n    add_products(l, r, n, lags, c);\n    return;\n"
+                "    put_zeros(l, n + lags - 1, PHASES",
             ),
         ),
+    ),
+    Trick(
+        "the same, instead of three products for four of every second sample",
+        "products.c",
+        (("    put_zeros(l, n + lags - 1, PHASES", SPLIT_ONCE + "    put_zeros(l, n + lags - 1, PHASES"),),
     ),
     Trick(
         "the barrier that keeps sums of lags in registers",
@@ -73,23 +95,18 @@ TRICKS = (
     ),
     Trick("thirteen lags at a time, instead of six", "products.c", (("LAGS_AT_ONCE = 13", "LAGS_AT_ONCE = 6"),)),
     Trick(
-        "two samples of all rows at a time from and to memory, instead of one",
+        "several samples of all rows at a time from and to memory, instead of one",
         "vector.h",
         (
             (
-                "    duo row[LANES + 1];\n",
-                "    pair[0] = gathered(rows, t), pair[1] = gathered(rows, t + 1);\n    return;\n"
-                "    duo row[LANES + 1];\n",
+                "vec tile[TILE]) {\n#if defined __AVX2__\n    quartet row",
+                "vec tile[TILE]) {\n"
+                "    UNROLL for (int i = 0; i < TILE; i++) tile[i] = gathered(rows, t + i);\n    return;\n"
+                "#if defined __AVX2__\n    quartet row",
             ),
             (
-                "for (int64_t t = 0; t + 2 <= n; t += 2) {\n        vec even",
-                "for (int64_t t = 0; t < 0;) {\n        vec even",
-            ),
-            (
-                "    if (n & 1)\n"
-                "        UNROLL for (int k = 0; k < LANES; k++) rows[k][n - 1] = samples[(n - 1) * step][k];",
-                "    for (int64_t t = 0; t < n; t++)\n"
-                "        UNROLL for (int k = 0; k < LANES; k++) rows[k][t] = samples[t * step][k];",
+                "    for (; t + TILE <= n; t += TILE) {\n        vec tile[TILE];\n        UNROLL",
+                "    for (; t < 0;) {\n        vec tile[TILE];\n        UNROLL",
             ),
         ),
     ),

@@ -19,6 +19,7 @@ _PACKAGES = {
     "alsaaudio": ("pyalsaaudio", ""),
 }
 _ROS = ("ros", "bass", "genpy", "genmsg", "actionlib", "diagnostic_", "std_msgs")  # what their names begin with
+_BESIDE_ROS = ("aiohttp", "tkinter", "_tkinter", "yaml")  # what only its clients and nodes want
 
 
 @functools.cache
@@ -40,7 +41,7 @@ def install(module: str) -> str:
     pip, debian = _PACKAGES.get(top, (top, ""))
     if not by_pip():
         return f"apt install {debian}, or pip install {top}" if debian else "run scripts/install"
-    if top.startswith(_ROS) or top in ("tkinter", "_tkinter"):
+    if top.startswith(_ROS) or top in _BESIDE_ROS:
         return "pip does not bring it: run scripts/install of a checkout, on Debian 12"
     return f"pip install {pip}"
 

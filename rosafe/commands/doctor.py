@@ -67,7 +67,10 @@ class Finding(NamedTuple):
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     parser.add_argument("--json", action="store_true", help="the same as JSON, for programs")
-    parser.epilog = "exit status: 0 if all that running needs is there, 1 if something is missing"
+    parser.epilog = (
+        "exit status: 0 if all that running needs is there, 1 if something is missing\n\n"
+        "example:\n  rosafe doctor --json"
+    )
 
 
 def run(options: argparse.Namespace) -> int:

@@ -7,6 +7,7 @@ their units. Correlations are means over the channels, modulation spectrograms a
 from __future__ import annotations
 
 import argparse
+import contextlib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -25,11 +26,15 @@ _DEFAULT = ("input", "ratemap", "pitch", "onsetMap", "ild", "itd")  # of a sound
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     parser.usage = (
-        "rosafe plot SOUND|RESULT.npz [-o PNG] [--outputs NAME,...] [--set NAME=VALUE ...]\n"
+        "rosafe plot SOUND|RESULT [-o PNG] [--outputs NAME,...] [--set NAME=VALUE ...]\n"
         "                   [--ear left|right] [--at S] [--channel HZ] [--force]"
     )
-    parser.add_argument("inputs", nargs="*", metavar="SOUND|RESULT", help="sound file, or .npz of rosafe process")
-    parser.add_argument("-o", "--output", metavar="PNG", help="the picture, replaced if it is there (default: beside)")
+    parser.add_argument(
+        "inputs", nargs="*", metavar="SOUND|RESULT", help="sound file or rosbag, or result of rosafe process"
+    )
+    parser.add_argument(
+        "-o", "--to", dest="to", metavar="PNG", help="the picture, replaced if it is there (default: beside)"
+    )
     parser.add_argument(
         "--outputs",
         metavar="NAME,...",
@@ -40,6 +45,12 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--at", type=float, metavar="S", help="draw channels against lags, or filters, at this time")
     parser.add_argument("--channel", type=float, metavar="HZ", help="draw lags, or filters, of this channel over time")
     parser.add_argument("--force", action="store_true", help="replace a picture that -o does not name")
+    parser.epilog = (
+        "examples:\n"
+        "  rosafe plot speech.wav\n"
+        "  rosafe plot speech.wav -o out.png --outputs amsFeatures,itd --channel 500 --set fb_nChannels=16\n"
+        "  rosafe plot speech.npz --ear left"
+    )
 
 
 def run(options: argparse.Namespace) -> int:
@@ -48,7 +59,9 @@ def run(options: argparse.Namespace) -> int:
     if len(inputs) != 1:
         options.usage_error("wanted is one sound file, or one result")
     source = Path(inputs[0])
-    target = Path(options.output or source.with_suffix(".png"))
+    target = Path(source.with_suffix(".png") if options.to is None else options.to)
+    if target.suffix.lower() != ".png":
+        raise Failure(f"-o {target}: a picture ends in .png")
     from matplotlib.figure import Figure
 
     from rosafe.offline.formats import FORMATS
@@ -71,7 +84,7 @@ def run(options: argparse.Namespace) -> int:
         figure = draw(Figure(), result, names, options.ear, at=options.at, channel=options.channel)
     except (AudioFileError, ValueError) as problem:
         raise Failure(str(problem)) from None
-    save(figure, target, options.output is not None or options.force)
+    save(figure, target, options.to is not None or options.force)
     return 0
 
 
@@ -88,15 +101,16 @@ def _result(path: Path, settings: list[str]) -> Mapping[str, Any]:
 
 def _sound(path: Path) -> tuple[np.ndarray, int]:
     """One ear or two (ears, N), and the sample rate (Hz)."""
+    from rosafe.offline.sounds import BAG, open_sound
     from rosafe.sound.audiofile import AudioFile, AudioFileError
 
-    file = AudioFile(path)
-    try:
-        if file.channels > 2:
-            raise AudioFileError(f"{path} has {file.channels} channels; wanted are two, left and right ear, or one")
+    with contextlib.closing(open_sound(path) if path.suffix.lower() == BAG else AudioFile(path)) as file:
+        if isinstance(file, AudioFile) and file.channels > 2:
+            raise AudioFileError(
+                f"{path} has {file.channels} channels; wanted are two, left and right ear, or one: "
+                "draw what rosafe process makes of it with --channels"
+            )
         return file.read(file.frames), file.sample_rate
-    finally:
-        file.close()
 
 
 def _default(ears: int) -> list[str]:

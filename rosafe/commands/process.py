@@ -20,7 +20,7 @@ import time
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 from rosafe.commands import Failure
 from rosafe.commands._parameters import add_settings, parameters_of, words
@@ -63,7 +63,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--outputs",
         metavar="NAME,...",
         help=f"what to keep of {', '.join(KINDS)} (default: ild,ratemap,crossCorrelation; the original's seven are "
-        f"{','.join(FIXED)}); what none of them needs is not computed",
+        f"{', '.join(FIXED)}); what none of them needs is not computed",
     )
     parser.add_argument(
         "--format",
@@ -81,7 +81,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--block",
-        type=partial(_count, maximum=_BLOCK.maximum),
+        type=partial(_count, maximum=cast(float, _BLOCK.maximum)),
         default=_BLOCK.default,
         metavar="N",
         help=f"frames processed at a time, as the node's {_BLOCK.name} (default: {_BLOCK.default})",

@@ -1,8 +1,8 @@
 """Build what a representation needs in a running rosAFE, or find it there.
 
-A representation is time, filterbank, innerhaircell, ild, ratemap, crosscorrelation or input; NAME=VALUE are parameters
-of it or of anything above it, and what is not given has its default. Processors of the tree whose parameters are the
-same are used; the others are made, as ild_0, ild_1, ... If something fails, what was made is removed again.
+NAME=VALUE are parameters of the representation or of anything above it, and what is not given has its default.
+Processors of the tree whose parameters are the same are used; the others are made, as ild_0, ild_1, ... If something
+fails, what was made is removed again.
 
 Prints a line for each processor, from the input to the wanted one: created or reused, its name, its topic."""
 
@@ -32,7 +32,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "rosafe request REPRESENTATION [NAME=VALUE ...] [--connect TOPIC] [-i INSTANCE] [--json]\n"
         "       rosafe request -h"
     )
-    parser.add_argument("representation", metavar="REPRESENTATION", help="what is wanted")
+    words = ", ".join(REQUEST.parameter("representation").choices)
+    parser.add_argument("representation", metavar="REPRESENTATION", help=f"what is wanted: one of {words}")
     parser.add_argument(
         "settings",
         nargs="*",
@@ -58,6 +59,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "exit status: 0 it runs, 1 it does not, 2 wrong command line\n\n"
         "examples:\n"
         "  rosafe request ild\n"
+        "  rosafe request pitch pi_rangeHz=80,300\n"
         "  rosafe request ratemap fb_nChannels=64 rm_wSizeSec=0.03 nFramesPerBlock=4410\n"
         "  rosafe request filterbank fb_cfHz=500,1000,2000 --json"
     )

@@ -126,9 +126,7 @@ class FrameTime:
                 hull.pop()
             hull.append(point)
         total, count = sum(frame for frame, _ in self._points), len(self._points)
-        right = next(
-            k for k, (frame, _) in enumerate(hull) if frame * count >= total
-        )  # in whole numbers, which are exact
+        right = next(k for k, (frame, _) in enumerate(hull) if frame * count >= total)  # whole numbers are exact
         return hull[right - 1], hull[right]
 
 

@@ -269,6 +269,8 @@ def ensure_messages() -> None:
     A few milliseconds where there is nothing to do. Raises GenerationError.
     """
     generation = _generation()
+    if generation is None and importlib.util.find_spec("genpy") is None:  # pip, which brings nothing of ROS
+        raise GenerationError(missing.advice("genpy"))
     paths.put_ahead(paths.CODE_DIR if generation is None else generation / "python")
 
 

@@ -58,17 +58,22 @@ class Framing:
             return np.empty((*samples.shape[:-1], 0, len(self.window)))
         return sliding_window_view(samples, len(self.window), axis=-1)[..., :: self.hop, :]
 
-    def weights(self, squared: bool) -> FloatArray:
+    def weights(self, squared: bool) -> kernels.Pinned:
         """What to multiply samples, or their squares, with for the mean of a windowed frame."""
         return self._square_weights if squared else self._plain_weights
 
     @cached_property
-    def _plain_weights(self) -> FloatArray:
-        return self.window / len(self.window)
+    def _plain_weights(self) -> kernels.Pinned:
+        return kernels.Pinned.of(self.window / len(self.window))
 
     @cached_property
-    def _square_weights(self) -> FloatArray:
-        return np.square(self.window) / len(self.window)
+    def _square_weights(self) -> kernels.Pinned:
+        return kernels.Pinned.of(np.square(self.window) / len(self.window))
+
+    @cached_property
+    def pinned(self) -> kernels.Pinned:
+        """The window, for a kernel."""
+        return kernels.Pinned.of(np.ascontiguousarray(self.window, np.float64))
 
     def means(self, samples: FloatArray, squared: bool) -> FloatArray:
         """mean(window x), or mean((window x)**2), of each whole frame: (..., n) to (..., F)."""
@@ -76,7 +81,7 @@ class Framing:
             samples = np.square(limited(samples, SQUARE_TINY))
         # Not a matrix product: OpenBLAS starts threads of its own for it, and two stages at work at the same time
         # then get in each other's way: several times slower than one alone.
-        means: FloatArray = np.einsum("...fi,i->...f", self.frames(samples), self.weights(squared))
+        means: FloatArray = np.einsum("...fi,i->...f", self.frames(samples), self.weights(squared).array)
         return means
 
 
@@ -88,7 +93,8 @@ class FrameBuffer:
     """
 
     def __init__(self) -> None:
-        self._store = np.empty((0, 0))
+        self._store = kernels.Pinned.of(np.empty((0, 0)))
+        self._rows: tuple[int, ...] = (0,)
         self._start = self._stop = 0
         self.skip = 0
 
@@ -99,8 +105,9 @@ class FrameBuffer:
 
     def begin(self, rows: tuple[int, ...]) -> None:
         """A block of `rows` is about to come. Other rows than before mean a new beginning."""
-        if rows != self._store.shape[:-1]:
-            self._store = np.empty((*rows, 0))
+        if rows != self._rows:
+            self._rows = rows
+            self._make_store(0)
             self._start = self._stop = self.skip = 0
 
     def advance(self, arriving: int, count: int) -> tuple[kernels.Span, kernels.Span]:
@@ -109,39 +116,44 @@ class FrameBuffer:
         Returns the samples held till now, and room for those at the end of the block that will be held; the caller must
         fill it. The room may lie where the samples were, then each row behind the place of its own old samples.
         """
-        first = self.skip + count
-        total = self.held + arriving
-        self.skip = max(0, first - total)
-        if first < self.held:
+        held = self._stop - self._start
+        first, total = self.skip + count, held + arriving
+        kept = total - first
+        self.skip = 0 if kept > 0 else -kept
+        if first < held:
             self._make_room(total)
-            history = kernels.Span(self._store, self._start, self._stop)
-            self._start, self._stop = self._start + first, self._stop + arriving
-            return history, kernels.Span(self._store, self._stop - arriving, self._stop)
+            start, stop = self._start, self._stop
+            self._start, self._stop = start + first, stop + arriving
+            return kernels.Span(self._store, start, stop), kernels.Span(self._store, stop, stop + arriving)
         history = kernels.Span(self._store, self._start, self._stop)
-        kept = max(0, total - first)
-        if kept > self._store.shape[-1]:
-            self._store = np.empty((*self._store.shape[:-1], kept))
+        kept = max(0, kept)
+        if kept > self._store.array.shape[-1]:
+            self._make_store(kept)
         self._start, self._stop = 0, kept
         return history, kernels.Span(self._store, 0, kept)
+
+    def _make_store(self, samples: int) -> None:
+        self._store = kernels.Pinned.of(np.empty((*self._rows, samples)))
 
     def append(self, block: FloatArray) -> FloatArray:
         """Take in (*rows, N); a view of all samples from the next frame's start on, valid until the next call."""
         self.begin(block.shape[:-1])
         _, room = self.advance(block.shape[-1], 0)
         room.samples[...] = _last(block, room.length)
-        return self._store[..., self._start : self._stop]
+        return self._store.array[..., self._start : self._stop]
 
     def drop(self, count: int) -> None:
         """The next frame starts `count` samples later, be they here or still to come."""
         self.advance(0, count)
 
     def _make_room(self, needed: int) -> None:
-        if self._start + needed <= self._store.shape[-1]:
+        store = self._store.array
+        if self._start + needed <= store.shape[-1]:
             return
-        kept = self._store[..., self._start : self._stop]
-        if 2 * needed > self._store.shape[-1]:
-            self._store = np.empty((*kept.shape[:-1], 2 * needed))
-        self._store[..., : kept.shape[-1]] = kept
+        kept = store[..., self._start : self._stop]
+        if 2 * needed > store.shape[-1]:
+            self._make_store(2 * needed)
+        self._store.array[..., : kept.shape[-1]] = kept
         self._start, self._stop = 0, kept.shape[-1]
 
 
@@ -200,16 +212,19 @@ class FramedStage(Stage):
         self._buffer.drop(means.shape[-1] * self._framing.hop)
         return means
 
-    def _frames(self, block: FloatArray, weights: FloatArray, rows: tuple[int, ...] | None = None) -> kernels.Frames:
+    def _frames(
+        self, block: FloatArray, weights: kernels.Pinned, rows: tuple[int, ...] | None = None
+    ) -> kernels.Frames:
         """The frames that `block` completes, for a kernel; the buffer has moved on then.
 
         `rows` are those of what is held, where that is not what comes.
         """
-        arriving, hop = block.shape[-1], self._framing.hop
-        self._buffer.begin(block.shape[:-1] if rows is None else rows)
-        skip = self._buffer.skip
-        count = self._framing.complete(self._buffer.held + arriving - skip)
-        history, room = self._buffer.advance(arriving, count * hop)
+        shape, framing, buffer = block.shape, self._framing, self._buffer
+        arriving, hop = shape[-1], framing.hop
+        buffer.begin(shape[:-1] if rows is None else rows)
+        skip = buffer.skip
+        count = framing.complete(buffer.held + arriving - skip)
+        history, room = buffer.advance(arriving, count * hop)
         return kernels.Frames(history, block, room, skip, weights, hop, count)
 
     def _build(self, values: dict[str, Any], changed: frozenset[str]) -> None:

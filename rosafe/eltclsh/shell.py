@@ -27,6 +27,7 @@ USAGE = """usage: {name} [-package NAME]... [SCRIPT [ARGUMENT]...]
 A Tcl shell with line editing{tk}. Runs SCRIPT as tclsh does, or reads commands. {packages}
 At the prompt: TAB completes, the arrow keys go through what was typed before (~/.eltclhistory), Ctrl-D ends.
 ~/.{name}rc is run first.
+example: {name} -package genomix script.tcl
 """
 
 

@@ -41,7 +41,7 @@ def check_change(name: Any, value: Any) -> tuple[str, Any]:
 
 def _parameter(name: Any) -> Parameter:
     if not isinstance(name, str) or name not in _BY_NAME:
-        known = [p.name for kind in KINDS.values() for p in kind.parameters]
+        known = list(dict.fromkeys(p.name for kind in KINDS.values() for p in kind.parameters))
         raise ValueError(f"unknown parameter {shown(name)}; {_suggestion(name, known)}")
     return _BY_NAME[name]
 

@@ -14,6 +14,7 @@ from rosafe.offline.contents import Contents, is_scalar, told
 CHUNK = 2**19  # bytes, about; what is read and written at a time
 _MAT_HEAD = b"MATLAB 7.3 MAT-file, written by rosafe"
 _MAT_USERBLOCK = 512
+_FILL = math.nan  # of zarr's arrays: xarray takes each number that equals it for one that is missing, and shows NaN
 
 
 class _Waiting:
@@ -183,11 +184,13 @@ class ZarrWriter(ChunkedWriter):
         make = self._group.create_array if newer else self._group.create_dataset
         for name, shape in contents.shapes.items():
             chunks = (*(max(1, length) for length in shape[:-1]), max(1, self._waiting[name].frames))
-            array = make(name, shape=shape, chunks=chunks, dtype="<f8", fill_value=0.0)
+            array = make(name, shape=shape, chunks=chunks, dtype="<f8", fill_value=_FILL)
             array.attrs.update({"_ARRAY_DIMENSIONS": contents.dimensions(name), "units": contents.units[name]})
         for name, value in contents.fixed.items():
             data = np.asarray(value, np.float64)
-            array = make(name, shape=data.shape, chunks=tuple(max(1, n) for n in data.shape), dtype="<f8")
+            array = make(
+                name, shape=data.shape, chunks=tuple(max(1, n) for n in data.shape), dtype="<f8", fill_value=_FILL
+            )
             array[...] = data
             array.attrs["_ARRAY_DIMENSIONS"] = [name] if data.ndim else []
         self._group.attrs.update(contents.flat())

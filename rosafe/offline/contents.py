@@ -10,7 +10,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-ABOUT = ("parameters", "block_frames", "channels", "topic", "source", "rosafe_version", "axes")  # what tells runs apart
+# what tells runs apart
+ABOUT = ("parameters", "sample_rate", "block_frames", "channels", "topic", "source", "rosafe_version", "axes")
 _TEXTS = {"source", "topic", "rosafe_version"}  # what is told as it is; other texts are JSON
 
 

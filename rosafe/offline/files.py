@@ -13,12 +13,13 @@ import numpy as np
 
 from rosafe.interface import KINDS
 from rosafe.interface.arguments import check_outputs, check_parameters
-from rosafe.offline.chain import Chain
+from rosafe.offline.chain import Chain, needed
 from rosafe.offline.contents import Contents
 from rosafe.offline.formats import Format, check_format, format_of, read
 from rosafe.offline.process import DEFAULT_BLOCK
 from rosafe.offline.sounds import Sound, open_sound
 from rosafe.output import OutputError, new_folder, new_path
+from rosafe.representations import STAGES
 from rosafe.sound.audiofile import AudioFileError
 from rosafe.tree import sizes
 from rosafe.tree.block import Block
@@ -29,7 +30,6 @@ _TOO_LARGE = (
     "one block of output would take {taken:.1f} GB, allowed are {limit:.1f} GB; "
     "take fewer channels or lags, or a smaller --block"
 )
-_DEFAULTS = {p.name: p.default for kind in KINDS.values() for p in kind.parameters if not p.follows_rate}
 
 
 class Done(NamedTuple):
@@ -103,12 +103,11 @@ def process_file(
         "rosafe_version": VERSION,
         "source": os.fsencode(os.path.basename(source)).decode("utf-8", "replace"),
         "block_frames": block_frames,
-        "parameters": {**_DEFAULTS, **values},
         **({"channels": list(channels)} if channels else {}),
         **({"topic": topic} if topic else {}),
     }
     if resume and os.path.lexists(target):
-        if _complete(form, Path(target), about, wanted):
+        if _complete(form, Path(target), about, values, wanted):
             return Done(0.0, 0, True)
         replace = True
     with closing(open_sound(source, channels, topic)) as sound:
@@ -126,7 +125,9 @@ def process_file(
         return Done(sound.frames / sound.sample_rate, size, False, sound.not_finite)
 
 
-def _complete(form: Format, target: Path, about: Mapping[str, Any], wanted: Sequence[str]) -> bool:
+def _complete(
+    form: Format, target: Path, about: Mapping[str, Any], values: Mapping[str, Any], wanted: Sequence[str]
+) -> bool:
     """Whether the output is there and whole; OutputError where it is something else."""
     try:
         there = read(form, target, arrays=False)
@@ -137,12 +138,24 @@ def _complete(form: Format, target: Path, about: Mapping[str, Any], wanted: Sequ
     except OSError as problem:
         raise OutputError(f"{target}: {problem.strerror or problem}") from None
     names = {name for kind in wanted for name in KINDS[kind].outputs}
+    rate = there.get("sample_rate")
+    if isinstance(rate, (int, float)):
+        about = {**about, "parameters": _parameters(values, wanted, rate)}
     other = [name for name in about if there.get(name) != _as_read(about[name])]
     other += [name for name in ("channels", "topic") if name in there and name not in about]
     other += ["outputs"] if set(there["axes"]) != names else []
     if other:
         raise OutputError(f"{target} was made with other {other[0]}; take another -o, or --force computes it again")
     return True
+
+
+def _parameters(values: Mapping[str, Any], wanted: Sequence[str], sample_rate: float) -> dict[str, Any]:
+    """All parameters as they are in force, where `values` are given; what follows the rate only where it matters."""
+    told = {p.name: p.default for kind in KINDS.values() for p in kind.parameters if not p.follows_rate} | dict(values)
+    for kind in needed(wanted):
+        mine = {p.name: values.get(p.name, p.default) for p in KINDS[kind].parameters}
+        told |= STAGES[kind].at_rate(mine, values.keys(), sample_rate)
+    return told
 
 
 def _as_read(value: Any) -> Any:
@@ -175,7 +188,8 @@ def _stream(
     with Chain(_blocks(sound, block_frames), sound.sample_rate, values, wanted, keep) as chain:
         kind, taken = chain.largest_block(min(block_frames, sound.frames))
         sizes.refuse_over(sizes.MAX_BYTES, taken, f"{kind}: {_TOO_LARGE}", 1e9)  # several are under way at a time
-        contents = _contents(chain, {"sample_rate": sound.sample_rate, **about}, wanted, sound.frames)
+        rate = {"sample_rate": sound.sample_rate, "parameters": _parameters(values, wanted, sound.sample_rate)}
+        contents = _contents(chain, {**rate, **about}, wanted, sound.frames)
         made = form.writer(contents)
         _check_room(path, made.size(contents))
         with closing(made(path, contents)) as writer:
@@ -212,5 +226,9 @@ def _check_room(path: Path, size: int) -> None:
     free = disk.f_bavail * disk.f_frsize
     if size > free:
         raise OutputError(
-            f"the output would take {size / 1e9:.1f} GB, {free / 1e9:.1f} GB are free there; name fewer --outputs"
+            f"the output would take {_bytes_text(size)}, {_bytes_text(free)} are free there; name fewer --outputs"
         )
+
+
+def _bytes_text(count: int) -> str:
+    return f"{count / 1e9:.1f} GB" if count >= 1e8 else f"{count / 1e6:.3f} MB"

@@ -17,16 +17,11 @@ from rosafe.dsp.stage import SAMPLE_RATE
 from rosafe.interface import KINDS
 from rosafe.interface.arguments import check_change, check_parameters
 from rosafe.offline.chain import Chain
+from rosafe.offline.memory import refuse_over_available
 from rosafe.offline.signals import as_ears, frame_times, of_ears, outputs_of
-from rosafe.tree import sizes
 from rosafe.tree.block import Block
 
 DEFAULT_BLOCK = 12000  # frames, as InputProc's
-# beyond the machine's memory, where the kernel would end the process
-_TOO_LARGE = (
-    "outputs: they would take {taken:.1f} GB of memory, this machine has {limit:.1f} GB; "
-    "name fewer outputs, or take fewer channels or lags"
-)
 
 
 def process(
@@ -111,7 +106,7 @@ process.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
 
 
 def _named(by_place: tuple[Any, ...], options: tuple[Any, Any, Any, Any]) -> tuple[Any, Any, Any, Any]:
-    """The options, of which the first ones were given by their place, as it was done once."""
+    """The options, of which the first ones were given by their place, as it was done once and still is in programs."""
     if len(by_place) > len(options):
         raise TypeError(f"process() takes 2 positional arguments, and {2 + len(by_place)} were given")
     warnings.warn("give what follows the sample rate by name, as in parameters={...}", DeprecationWarning, 3)
@@ -149,7 +144,7 @@ class _Work:
             if block < len(ends):
                 chain.schedule(block, name, value)
                 taken.append(_size(chain, wanted, ends))
-        sizes.refuse_over(sizes.machine_memory(), max(taken), _TOO_LARGE, 1e9)
+        refuse_over_available(max(taken), "outputs: they", "; name fewer outputs, or take fewer channels or lags")
         for kind in wanted:
             centred, parts = KINDS[kind].centred, KINDS[kind].outputs
             self.gathered[kind] = {}

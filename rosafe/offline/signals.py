@@ -32,6 +32,8 @@ def as_ears(signal: Any, upright: bool = False) -> np.ndarray:
         array = np.asarray(signal)
     except ValueError as problem:
         raise ValueError(f"signal is no array: {problem}") from None
+    if array.ndim == 0:  # such as the name of a file
+        raise ValueError(f"signal is no array, but {type(signal).__name__}; {_WANTED}")
     if array.ndim == 1:
         array = array[np.newaxis]
     if array.ndim != 2 or not (array.shape[0] in (1, 2) or array.shape[1] == 2):

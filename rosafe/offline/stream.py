@@ -13,11 +13,11 @@ from rosafe.dsp.stage import SAMPLE_RATE, Stage, parts_of
 from rosafe.interface import KINDS
 from rosafe.interface.arguments import check_change, check_outputs, check_parameters
 from rosafe.offline.chain import needed
+from rosafe.offline.memory import refuse_over_available
 from rosafe.offline.signals import as_ears, frame_times, is_upright, of_ears, outputs_of
 from rosafe.representations import STAGES
 from rosafe.tree import sizes
 
-_TOO_LARGE = "block: what comes of it would take {taken:.1f} GB of memory, this machine has {limit:.1f} GB"
 _NUMBER = "in_doNormalize"
 
 
@@ -168,7 +168,9 @@ class Stream:
                 self._stages["input"].configure(**{_NUMBER: whole})
             self._ears, self._whole = ears, whole
         elif ears != self._ears:
-            raise ValueError(f"block has shape {shape}; those before it were of {self._ears} ears")
+            raise ValueError(
+                f"block has shape {shape}; those before it were of {('one ear', 'two ears')[self._ears - 1]}"
+            )
         elif whole != self._whole:
             raise ValueError(f"block is of {'whole numbers' if whole else 'floats'}, and those before it were not")
         if len(shape) == 2 and shape != (2, 2):
@@ -188,7 +190,7 @@ class Stream:
     def _check_size(self, frames: int) -> None:
         seconds = frames / self._rate
         taken = [sizes.output_size(s, self._rows[KINDS[kind].parent], seconds) for kind, s in self._stages.items()]
-        sizes.refuse_over(sizes.machine_memory(), sum(taken), _TOO_LARGE, 1e9)
+        refuse_over_available(sum(taken), "block: what comes of it")
         self._largest = frames
 
     def reset(self) -> None:

@@ -199,7 +199,7 @@ class AmsFeatures(FramedStage):
             rate=self.given.rate / ratio / self._framing.hop,
             framed=True,
             hop=self._framing.hop * ratio * self.given.hop,
-            window=(len(self._framing.window) - 1) * ratio * self.given.hop + self.given.window,
+            window=len(self._framing.window) * ratio * self.given.hop,
         )
 
     def _received(self, before: Signal) -> None:

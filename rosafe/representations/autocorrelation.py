@@ -97,7 +97,7 @@ class Autocorrelation(FramedStage):
         samples, values = self._checked(block), self._values
         clipping, alpha, exponent = values["ac_clipMethod"], values["ac_clipAlpha"], values["ac_K"]
         if kernels.compiled() and len(self.window) <= kernels.MOST_SIZE:
-            frames = self._frames(samples, self.window)
+            frames = self._frames(samples, self._framing.pinned)
             return kernels.autocorrelations(frames, clipping, alpha, exponent, self._corrections)
         whole = self._framing.frames(self._buffer.append(limited(samples)))  # (2, C, F, w)
         result = autocorrelate(whole, self.window, clipping, alpha, exponent, self._corrections)

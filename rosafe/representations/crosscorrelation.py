@@ -86,7 +86,7 @@ class CrossCorrelation(FramedStage):
         return result
 
     def _by_kernel(self, samples: FloatArray, reach: int) -> FloatArray:
-        frames = self._frames(samples, self._framing.window)
+        frames = self._frames(samples, self._framing.pinned)
         shape = (samples.shape[1], 2 * self._max_lag + 1, frames.number)
         result = memory.empty(shape) if reach == self._max_lag else np.zeros(shape)
         kernels.correlations(frames, reach, EPSILON, result)

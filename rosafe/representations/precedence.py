@@ -148,7 +148,7 @@ class Precedence(FramedStage):
             self._running.begin(frequencies if known else np.zeros(channels), bins, lags)
         compiled = kernels.compiled()
         if compiled:
-            frames = self._frames(samples, self._framing.window)
+            frames = self._frames(samples, self._framing.pinned)
             count = frames.number
         else:
             views = self._framing.frames(self._buffer.append(limited(samples, SQUARE_TINY)))

@@ -46,7 +46,8 @@ class _Strength(Stage):
         if self._last is None or self._last.shape[:-1] != levels.shape[:-1]:
             self._last = levels[..., :1]  # the first frame has changed by nothing
         before = np.concatenate((self._last, levels[..., :-1]), axis=-1)
-        np.subtract(*((levels, before) if self.RISING else (before, levels)), out=strength)
+        more, less = (levels, before) if self.RISING else (before, levels)
+        np.subtract(more, less, out=strength)
         np.maximum(strength, 0.0, out=strength)
         np.minimum(strength, self._limit, out=strength)
         self._last = levels[..., -1:].copy()

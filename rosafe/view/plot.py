@@ -22,6 +22,7 @@ RANGE_DB = 60.0  # of levels, below the loudest
 UNDER = {"pitch": "ratemap", "onsetMap": "onsetStrength", "offsetMap": "offsetStrength"}  # what lies under them
 PITCH_TOP = 1000.0  # Hz; the ratemap under the pitch ends there
 COLUMNS = 1500  # of an image, at most
+MARKED = 400  # frames, up to which marks are as wide as they can be
 TICKS = 6
 
 _OUTPUTS = {name: (kind, part) for kind in KINDS.values() for name, part in kind.outputs.items()}
@@ -176,6 +177,7 @@ class _Panel:
         self.note = ""
         if self.data.size == 0:
             axes.text(0.5, 0.5, "no frames", ha="center", va="center", transform=axes.transAxes)
+            axes.set(xticks=[], yticks=[])
         elif self.kind.kind == "pitch":
             self._draw_pitch(axes, ear)
         elif self.under is not None and self.axes == ("ear", "channel", "time"):
@@ -214,7 +216,7 @@ class _Panel:
         frequencies = self.under.along("channel")
         order = np.argsort(frequencies)
         height = np.interp(pitch, frequencies[order], order, left=np.nan, right=np.nan)
-        axes.plot(self.times, height, ".", color="#00e5ff", markersize=4)
+        axes.plot(self.times, height, ".", color="#00e5ff", markersize=self._narrowed(4.0, 1.0))
         top = int(np.searchsorted(frequencies, PITCH_TOP))
         if np.array_equal(order, np.arange(len(order))) and top > 1:
             frequency_axis(axes, frequencies[:top], TICKS)
@@ -225,8 +227,13 @@ class _Panel:
         assert self.under is not None
         self.under._draw_image(axes, ear, cmap="Greys")
         channels, frames = np.nonzero(self.data[ear])
-        axes.plot(self.times[frames], channels, "s", color="#e63946", markersize=2.5)
+        width = self._narrowed(3.5, 0.1)
+        axes.plot(self.times[frames], channels, "|", color="#e63946", markersize=3.5, markeredgewidth=width)
         self.note = f" over {self.under.name}"
+
+    def _narrowed(self, points: float, least: float) -> float:
+        """The width of a mark, so that the marks of a long sound do not hide each other."""
+        return max(least, min(points, points * MARKED / self.data.shape[-1]))
 
     def _draw_image(self, axes: Axes, ear: int, **options: Any) -> None:
         data, (upright, across), self.note = self._plane
@@ -285,7 +292,8 @@ class _Panel:
         data, axes, _ = self._plane
         if self.kind.kind in LEVELS:
             size = np.abs(data)
-            level = LEVELS[self.kind.kind] * np.log10(np.maximum(size, 1e-200) / max(float(size.max()), 1e-200))
+            loudest = float(size.max()) or 1.0  # silence is not loud
+            level = LEVELS[self.kind.kind] * np.log10(np.maximum(size, 1e-200) / loudest)
             return np.maximum(level, -RANGE_DB), "dB re loudest", {"cmap": "magma", "vmin": -RANGE_DB, "vmax": 0.0}
         if "feature" in axes and self.along("feature").dtype.kind == "U":  # of different units
             whole = np.moveaxis(data, 0, -1) if self.ears else data[..., np.newaxis]

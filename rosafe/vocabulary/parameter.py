@@ -102,11 +102,13 @@ class Parameter:
             items = [_plain(value)]
         if len(items) > self.most:
             raise ValueError(f"{self.name}: too many values, at most {self.most}")
-        if len(items) == 1 and isinstance(items[0], (int, float)) and items[0] == 0:  # [0] is "no list" likewise
-            items = []
+        if not self.least and len(items) == 1 and isinstance(items[0], (int, float)) and items[0] == 0:
+            items = []  # [0] is "no list" likewise, where there may be none
+        checked = [self._check_scalar(of, item) for item in items]
         if len(items) < self.least:
-            raise ValueError(f"{self.name}: {len(items)} values are too few, at least {self.least}")
-        return [self._check_scalar(of, item) for item in items]
+            told = "1 value" if len(items) == 1 else f"{len(items) or 'no'} values"
+            raise ValueError(f"{self.name}: {told}, wanted are {self.least}")
+        return checked
 
     def _check_scalar(self, idl: str, value: Any) -> Any:
         if idl == "string":

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import subprocess
 from pathlib import Path
 
 import pytest
 
-from rosafe import __version__
+from rosafe import __version__, commands
 from rosafe.interface import KINDS
 from tests.cli.command import ROSAFE, environment, refused, rosafe, rosafe_alone
 from tests.harness import PATIENCE, ROOT
@@ -47,6 +48,18 @@ def test_help_of_process_lists_every_parameter() -> None:
     for shown in ("fb_nERBs=1.0 (more than 0 to 100)", "in_doNormalize=true", "fb_cfHz={}", "ihc_method=dau"):
         assert shown in text
     assert max(map(len, done.stdout.splitlines())) <= 120
+
+
+@pytest.mark.parametrize("name", sorted(p.stem for p in Path(commands.__file__).parent.glob("[a-z]*.py")))
+def test_help_of_every_command_has_an_example(name: str) -> None:
+    done = rosafe(name, "-h")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert f"  rosafe {name}" in done.stdout[done.stdout.index("example") :]
+
+
+def test_help_of_request_names_every_representation() -> None:
+    told = re.split(r"[\s,]+", rosafe("request", "-h").stdout)
+    assert {kind.word for kind in KINDS.values()} - set(told) == set()
 
 
 def test_help_into_a_pipe_that_closes() -> None:

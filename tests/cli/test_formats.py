@@ -5,17 +5,19 @@ from __future__ import annotations
 import json
 import subprocess
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import h5py
 import numpy as np
 import pytest
 import soundfile
+import xarray
 import zarr
 
 import rosafe
 from rosafe.interface import KINDS
-from rosafe.offline import formats, whole
+from rosafe.offline import files, formats, whole
 from rosafe.offline.files import Done, process_file
 from rosafe.output import OutputError
 from rosafe.version import VERSION
@@ -60,6 +62,37 @@ def test_all_outputs_come_back(tmp_path: Path, extension: str, frames: int, chan
     np.testing.assert_array_equal(again["ild"], loaded["ild"])
 
 
+def test_zeros_are_no_missing_numbers_for_xarray(tmp_path: Path) -> None:
+    """It takes what equals an array's fill value for missing: silence, and the lag and the time 0."""
+    target = tmp_path / "silence.zarr"
+    process_file(write(tmp_path / "silence.wav", np.zeros((2, 2000))), target, SMALL_PARAMETERS, 700, list(KINDS))
+    loaded = rosafe.load(target)
+    with xarray.open_zarr(str(target), chunks=None) as dataset:
+        assert {"ratemap", "ild", "cc_lags"} <= set(dataset.variables)
+        for name, variable in dataset.variables.items():
+            np.testing.assert_array_equal(variable.values, loaded[str(name)], err_msg=str(name))
+    assert not loaded["ratemap"].any() and 0.0 in loaded["cc_lags"]
+
+
+def test_parameters_are_those_in_force(tmp_path: Path, sound: Path) -> None:
+    """Also the highest channel, where the sample rate has decided."""
+    target = tmp_path / "result.npz"
+    few = {"fb_nChannels": 3}
+    process_file(sound, target, few, outputs=["ild"])
+    told = rosafe.load(target)["parameters"]
+    assert told["fb_highFreqHz"] == rosafe.load(target)["fb_cfHz"][-1] == 7600.0
+    assert set(told) == {p.name for kind in KINDS.values() for p in kind.parameters}
+    again = rosafe.process(as_int32(noise(9000)), RATE, parameters=told, outputs=["ild"])
+    np.testing.assert_array_equal(again["ild"], rosafe.load(target)["ild"])
+    for same in (few, {**few, "fb_highFreqHz": 7600.0}):
+        assert process_file(sound, target, same, outputs=["ild"], resume=True).skipped
+    with pytest.raises(OutputError, match="was made with other parameters"):
+        process_file(sound, target, {**few, "fb_highFreqHz": 7000.0}, outputs=["ild"], resume=True)
+    process_file(sound, target, {**few, "fb_highFreqHz": 7000.0}, outputs=["ild"], replace=True)
+    with pytest.raises(OutputError, match="was made with other parameters"):
+        process_file(sound, target, few, outputs=["ild"], resume=True)
+
+
 @pytest.mark.parametrize("output", ["ild", "input", "itd"])
 def test_csv(tmp_path: Path, sound: Path, output: str) -> None:
     target = tmp_path / "result.csv"
@@ -89,6 +122,13 @@ def test_large_arrays_wait_on_the_disk(
     process_file(sound, tmp_path / f"b{extension}", SMALL_PARAMETERS, 1000, ["ihc", "ild"])
     assert_same(rosafe.load(tmp_path / f"b{extension}"), rosafe.load(tmp_path / f"a{extension}"))
     assert len(list(tmp_path.iterdir())) == 3
+
+
+def test_how_little_room_there_is(tmp_path: Path, sound: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(files.os, "statvfs", lambda path: SimpleNamespace(f_bavail=3, f_frsize=4096))
+    with pytest.raises(OutputError, match=r"would take 0\.432 MB, 0\.012 MB are free there; name fewer --outputs"):
+        process_file(sound, tmp_path / "a.h5", SMALL_PARAMETERS, outputs=["ihc"])
+    assert list(tmp_path.iterdir()) == [sound]
 
 
 def test_mat_beyond_version_5(tmp_path: Path, sound: Path, monkeypatch: pytest.MonkeyPatch) -> None:

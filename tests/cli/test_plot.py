@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from rosafe.offline.files import process_file
+from tests.bass import bags
 from tests.cli.command import SMALL, noise, refused, rosafe, write
 from tests.harness import shared
 
@@ -65,7 +66,9 @@ def test_what_is_there_is_kept(tmp_path: Path) -> None:
         (["sound.wav", "--set", "fb_nChannels=-1"], ["fb_nChannels"]),
         (["sound.wav", "--set", "fb_highFreqHz=8000"], ["fb_highFreqHz", "3800 Hz would do"]),
         (["mono.wav", "--outputs", "ild"], ["ild compare two ears, and the signal has one"]),
-        (["three.wav"], ["3 channels; wanted are two, left and right ear, or one"]),
+        (["three.wav"], ["3 channels; wanted are two, left and right ear, or one", "--channels"]),
+        (["mono.wav", "-o", "sound.pdf"], ["-o sound.pdf: a picture ends in .png"]),
+        (["mono.wav", "-o", "ratemap"], ["-o ratemap: a picture ends in .png"]),
         (["nothing.wav"], ["nothing.wav"]),
         (["nothing.npz"], ["nothing.npz: No such file or directory"]),
         (["text.npz"], ["text.npz is no result of rosafe process"]),
@@ -91,3 +94,15 @@ def test_wrong_command_lines() -> None:
     refused(rosafe("plot"), "one sound file", code=2)
     refused(rosafe("plot", "a.wav", "b.wav"), "one sound file", code=2)
     refused(rosafe("plot", "a.wav", "--ear", "third"), "--ear", code=2)
+    refused(
+        rosafe("plot", "a.wav", "--output", "ild"), "--output", code=2
+    )  # a slip of --outputs makes no picture "ild"
+
+
+def test_a_bag(tmp_path: Path) -> None:
+    sound = bags.stream(4000)
+    bags.write(tmp_path / "x.bag", [bags.message(sound, index, 1000, 16000, 100) for index in range(500, 4001, 500)])
+    assert rosafe("plot", tmp_path / "x.bag", "--outputs", "ild", *SMALL).stderr == ""
+    write(tmp_path / "y.wav", sound, 16000, "PCM_32")
+    assert rosafe("plot", tmp_path / "y.wav", "--outputs", "ild", *SMALL).stderr == ""
+    assert (tmp_path / "x.png").read_bytes() == (tmp_path / "y.png").read_bytes()

@@ -124,7 +124,7 @@ def test_settings_and_blocks(tmp_path: Path) -> None:
     with np.load(tmp_path / "in.npz") as loaded:
         told = json.loads(str(loaded["parameters"]))
         assert loaded["block_frames"] == 1777
-    assert set(told) == {p.name for kind in KINDS.values() for p in kind.parameters if not p.follows_rate}
+    assert set(told) == {p.name for kind in KINDS.values() for p in kind.parameters}
     assert parameters.items() <= told.items()
     again = process(samples, 16000, parameters=told, block_frames=1777)
     for name, value in expected.items():

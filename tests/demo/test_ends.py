@@ -107,3 +107,15 @@ def test_help_installs_nothing(tmp_path: Path, argument: str) -> None:
         done = subprocess.run([copy, argument], check=True, capture_output=True, text=True)
         assert told in done.stdout and "installing" not in done.stdout and done.stderr == ""
     assert len(done.stdout.splitlines()) <= 10
+
+
+@pytest.mark.parametrize("arguments", [("--fast", "-h"), ("tests/dsp", "--help")])
+def test_help_of_the_tests_at_any_place_installs_nothing(tmp_path: Path, arguments: tuple[str, ...]) -> None:
+    copy = checkout_with_install(tmp_path, "echo installing; exit 1", "test")
+    done = subprocess.run([copy, *arguments], check=True, capture_output=True, text=True)
+    assert done.stdout.startswith("usage: scripts/test") and done.stderr == ""
+
+
+def test_help_of_the_tests_names_their_folders() -> None:
+    told = subprocess.run([ROOT / "scripts" / "test", "-h"], check=True, capture_output=True, text=True).stdout.split()
+    assert {path.parent.name for path in (ROOT / "tests").glob("*/test_*.py")} - set(told) == set()

@@ -17,9 +17,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from rosafe.dsp import kernels
 from rosafe.dsp.kernels import build, library
 
 INTEGER, REAL, ADDRESS = range(3)  # as in driver.c
+MOST_PINNED = 100  # arrays that the stages at work have
 
 
 class Machine(NamedTuple):
@@ -51,6 +53,18 @@ MACHINES = {
 }
 
 
+_pinned: dict[int, kernels.Pinned] = {}  # by address
+
+
+def pin(array: NDArray[Any]) -> kernels.Pinned:
+    """As `kernels.Pinned.of`; the array goes with each call that names it, whichever kernels were in use meanwhile."""
+    pinned = kernels.Pinned(array, array.ctypes.data)
+    _pinned[pinned.address] = pinned
+    if len(_pinned) > MOST_PINNED:
+        del _pinned[next(iter(_pinned))]  # the oldest
+    return pinned
+
+
 class Foreign:
     """A library of kernels that runs elsewhere, in the place of a `ctypes.CDLL`."""
 
@@ -76,8 +90,11 @@ class Foreign:
         return functools.partial(self._call, name)
 
     def _call(self, name: str, *arguments: float | None) -> int:
-        spans = _joined([np.byte_bounds(array) for array in self._arrays])
         kinds = library._ARGUMENTS.get(name, ())
+        named = {value for kind, value in zip(kinds, arguments, strict=True) if kind is ctypes.c_void_p and value}
+        own = [np.byte_bounds(pinned.array) for pinned in _pinned.values()]
+        own = [(low, high) for low, high in own if any(low <= address <= high for address in named)]
+        spans = _joined([*map(np.byte_bounds, self._arrays), *own])
         message = [struct.pack("q", len(spans))]
         for low, high in spans:
             message += [struct.pack("q", high - low), ctypes.string_at(low, high - low)]

@@ -49,6 +49,7 @@ def using(choice: Choice) -> Iterator[None]:
     """Within this, the stages run on these kernels, or on the twins."""
     loaded: tuple[Any, library.Status] = (None, library.Status(False, "the twins, for a test"))
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(kernels.Pinned, "of", foreign.pin)
         if choice in foreign.MACHINES:
             elsewhere = foreign.running(str(choice))
             loaded = (elsewhere, library.Status(True, f"{choice}, for a test"))

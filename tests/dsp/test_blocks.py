@@ -153,7 +153,8 @@ def test_other_channel_count_starts_anew(kind: str, parameters: dict[str, Any]) 
 def test_bad_blocks(kind: str, parameters: dict[str, Any]) -> None:
     stage = STAGES[kind](RATE, **parameters)
     good = noise(kind, 10)
-    for bad in (good[0], good[:1], good[np.newaxis], np.concatenate([good, good]), good * 1j, good > 0, [["a"], ["b"]]):
+    wrong: list[Any] = [good[0], good[:1], good[np.newaxis], np.concatenate([good, good]), good * 1j, good > 0]
+    for bad in (*wrong, [["a"], ["b"]]):
         with pytest.raises(ValueError, match="block: "):
             stage.process(bad)
 

@@ -288,25 +288,28 @@ def test_windowed_frames(
     """Of some frames after the other, those that lie in the history, in the block and in both."""
     window = np.random.default_rng(0).standard_normal(round(parameters["prec_wSizeSec"] * RATE))
     framing = Framing(window, round(parameters["prec_hSizeSec"] * RATE))
-    buffer, rest = FrameBuffer(), FrameBuffer()
-    for block in cut(signal(channels, sum(sizes) + 900), [*sizes, 300]):
-        wanted = framing.frames(rest.append(block))
-        count = wanted.shape[-2]
-        rest.drop(count * framing.hop)
-        buffer.begin(block.shape[:-1])
-        skip = buffer.skip
-        history, room = buffer.advance(block.shape[-1], count * framing.hop)
-        frames = kernels.Frames(history, np.ascontiguousarray(block), room, skip, window, framing.hop, count)
-        batch = max(1, count // parts)
-        for first in range(0, count, batch):
-            number = min(batch, count - first)
-            got, expected = (by_kernel.Windowed.room(number, channels, len(window)) for _ in range(2))
-            with using(level):
-                by_kernel.windowed(frames.part(first, number), got)
-            precedence.windowed(wanted[:, :, first : first + number], window, expected)
-            for mine, theirs in zip(got, expected, strict=True):
-                agree([mine], [theirs])
-        frames.keep()
+    with using(TWINS):  # which notes where arrays are
+        buffer, rest = FrameBuffer(), FrameBuffer()
+        for block in cut(signal(channels, sum(sizes) + 900), [*sizes, 300]):
+            wanted = framing.frames(rest.append(block))
+            count = wanted.shape[-2]
+            rest.drop(count * framing.hop)
+            buffer.begin(block.shape[:-1])
+            skip = buffer.skip
+            history, room = buffer.advance(block.shape[-1], count * framing.hop)
+            frames = kernels.Frames(
+                history, np.ascontiguousarray(block), room, skip, kernels.Pinned.of(window), framing.hop, count
+            )
+            batch = max(1, count // parts)
+            for first in range(0, count, batch):
+                number = min(batch, count - first)
+                got, expected = (by_kernel.Windowed.room(number, channels, len(window)) for _ in range(2))
+                with using(level):
+                    by_kernel.windowed(frames.part(first, number), got)
+                precedence.windowed(wanted[:, :, first : first + number], window, expected)
+                for mine, theirs in zip(got, expected, strict=True):
+                    agree([mine], [theirs])
+            frames.keep()
 
 
 @each_level

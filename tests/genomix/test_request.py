@@ -87,7 +87,7 @@ def test_the_tree_and_its_numbers(sound: World) -> None:
     sound.http.call("bass/Stop")
     ild = harness.wait_for(lambda: _settled(sound, "inputProcPort", "ildPort/ild_0"))
     ears = np.array([heard()[ear]["data"] for ear in ("left", "right")])
-    expected = rosafe.process(ears, 44100, wanted, outputs=["ild"])["ild"][:, -25:]
+    expected = rosafe.process(ears, 44100, parameters=wanted, outputs=["ild"])["ild"][:, -25:]
     found = np.array([channel["data"] for channel in ild["left"]["dataN"]])[:, -25:]
     np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-6)
     assert np.ptp(found) > 1

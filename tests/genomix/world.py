@@ -48,7 +48,7 @@ class Http:
         if given is not None:
             query["input"] = json.dumps(given)
         status, body = self.raw(f"{quote(path)}?{urlencode(query)}")
-        value = json.loads(body) if body else ""
+        value: Any = json.loads(body) if body else ""
         if status != 200:
             raise HttpError(status, value)
         return value

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 import math
 from types import SimpleNamespace
@@ -199,6 +200,22 @@ def test_texts_that_are_refused(parameter: Parameter, texts: list[str]) -> None:
         with pytest.raises(ValueError, match=f"^{parameter.name}: ") as raised:
             parameter.read(text)
         assert len(str(raised.value)) < 200
+
+
+@pytest.mark.parametrize(
+    ("least", "given", "why"),
+    [
+        (1, [0], "taus: 0 is out of range, allowed is more than 0 to 9"),
+        (1, 0, "taus: 0 is out of range, allowed is more than 0 to 9"),
+        (1, [], "taus: no values, wanted are 1"),
+        (2, [3], "taus: 1 value, wanted are 2"),
+    ],
+)
+def test_a_zero_is_no_list_only_where_there_may_be_none(least: int, given: Any, why: str) -> None:
+    taus = Parameter("taus", "sequence<double>", (1.0, 2.0), "", 0.0, 9.0, open_minimum=True, least=least)
+    with pytest.raises(ValueError, match=f"^{why}$"):
+        taus.check(given)
+    assert dataclasses.replace(taus, least=0, default=()).check([0]) == []
 
 
 def test_words_that_nobody_knows() -> None:

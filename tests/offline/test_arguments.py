@@ -5,6 +5,7 @@ from __future__ import annotations
 import inspect
 import itertools
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ import pytest
 
 import rosafe
 from rosafe.interface import FIXED
+from rosafe.offline import memory
 from rosafe.offline import process as offline
 from rosafe.tree import sizes
 
@@ -44,9 +46,9 @@ def refused(match: str, *arguments: Any, **named: Any) -> None:
         (np.zeros((100, 1)), r"shape \(100, 1\)"),
         (np.zeros((0, 3)), r"shape \(0, 3\)"),
         (np.zeros((2, 2, 100)), "shape"),
-        (np.float64(0), "shape"),
-        (None, "shape"),
-        ("sound.wav", "shape"),
+        (np.float64(0), "signal is no array, but float64"),
+        (None, "signal is no array, but NoneType"),
+        ("sound.wav", r"signal is no array, but str; wanted is \(N,\) or \(1, N\)"),
         ([[1.0, 2.0], [3.0]], "signal is no array"),
         (np.zeros((2, 10), np.int8), "type int8, wanted is a float type, int32 or int16"),
         (np.zeros((2, 10), np.int64), "type int64"),
@@ -177,6 +179,13 @@ def test_outputs(outputs: Any, match: str) -> None:
     refused(match, GOOD, RATE, outputs=outputs)
 
 
+def test_what_there_is_is_told_once() -> None:
+    with pytest.raises(ValueError, match="unknown parameter 'xyzzy'; there are: in_doNormalize, ") as raised:
+        rosafe.process(GOOD, RATE, parameters={"xyzzy": 1})
+    names = str(raised.value).partition("there are: ")[2].split(", ")
+    assert len(names) == len(set(names)) and "trm_minSpread" in names
+
+
 @pytest.mark.parametrize("signal", [GOOD[0], GOOD[:1], list(GOOD[0])])
 def test_one_ear_has_no_differences(signal: Any) -> None:
     refused("outputs: ild, crossCorrelation compare two ears, and the signal has one", signal, RATE, outputs=FIXED)
@@ -207,6 +216,19 @@ def test_what_follows_the_sample_rate_has_a_name() -> None:
 def test_sizes_that_fill_the_memory() -> None:
     refused("ild_wSizeSec: 60 s of .* MiB, more than 1024 MiB", GOOD, 96000, parameters={"ild_wSizeSec": 60.0})
     refused("more than 1024 MiB", GOOD, 96000, modifications=[(0, "ild_wSizeSec", 60.0)])
+
+
+def test_results_larger_than_the_memory_that_is_left(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """The rest of the machine's memory is in use: the kernel would end this process."""
+    meminfo = tmp_path / "meminfo"
+    meminfo.write_text("MemTotal:       24684196 kB\nMemFree: 1 kB\nMemAvailable:      12000 kB\n")
+    monkeypatch.setattr(memory, "_MEMINFO", meminfo)
+    sound, large = np.zeros((2, 4000)), {"cc_maxDelaySec": 1.0}
+    refused(r"outputs: they would take .* GB of memory, this machine has 0\.0 GB left", sound, RATE, parameters=large)
+    with pytest.raises(ValueError, match=r"would take .* GB of memory, this machine has 0\.0 GB left"):
+        rosafe.Stream(RATE, large).process(sound)
+    meminfo.unlink()  # nobody tells
+    assert memory.available() == sizes.machine_memory()
 
 
 def test_results_larger_than_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -120,7 +120,10 @@ def test_coordinates_are_those_that_were_in_force() -> None:
 
 def test_blocks_without_frames_have_rows_too() -> None:
     """The first one is shorter than a window; it had more lags than there are from the second on."""
-    got = rosafe.process(SOUND, RATE, FEW, [100, 2900], [(1, "cc_maxDelaySec", 0.0005)], ["crossCorrelation"])
+    changes = [(1, "cc_maxDelaySec", 0.0005)]
+    got = rosafe.process(
+        SOUND, RATE, parameters=FEW, block_frames=[100, 2900], modifications=changes, outputs=["crossCorrelation"]
+    )
     assert got["crossCorrelation"].shape == (4, 37, 17)
     np.testing.assert_allclose(got["cc_lags"], np.arange(-18, 19) / RATE)
     assert not got["crossCorrelation"][:, :10].any()

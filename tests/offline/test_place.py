@@ -52,7 +52,7 @@ def test_the_same_numbers_without_a_copy(
     kind: str, parameters: dict[str, Any], block: list[int], copied: list[int]
 ) -> None:
     sound = SOUND[:, :200] if block == [1] else SOUND
-    got = rosafe.process(sound, RATE, {**FEW, **parameters}, block, outputs=[kind])[kind]
+    got = rosafe.process(sound, RATE, parameters={**FEW, **parameters}, block_frames=block, outputs=[kind])[kind]
     assert copied == []
     outputs = Chain(RATE, {"in_doNormalize": False, **FEW, **parameters}).run(cut(sound, block))
     np.testing.assert_array_equal(got, np.concatenate([output[kind] for output in outputs], axis=-1))
@@ -60,16 +60,17 @@ def test_the_same_numbers_without_a_copy(
 
 def test_who_has_children_is_copied(copied: list[int]) -> None:
     """They take blocks in one piece."""
-    alone = rosafe.process(SOUND, RATE, FEW, 1000, outputs=["gammatone"])
+    alone = rosafe.process(SOUND, RATE, parameters=FEW, block_frames=1000, outputs=["gammatone"])
     assert copied == []
-    both = rosafe.process(SOUND, RATE, FEW, 1000, outputs=["gammatone", "ihc"])
+    both = rosafe.process(SOUND, RATE, parameters=FEW, block_frames=1000, outputs=["gammatone", "ihc"])
     assert copied == [1000] * 3
     np.testing.assert_array_equal(both["gammatone"], alone["gammatone"])
 
 
 def test_from_a_change_of_the_rows_on_nothing_is_written_there(copied: list[int]) -> None:
     changes = [(2, "fb_nChannels", 3), (3, "fb_nChannels", 5)]
-    got = rosafe.process(SOUND, RATE, FEW, 600, changes, ["gammatone"])["gammatone"]
+    options: dict[str, Any] = {"block_frames": 600, "modifications": changes, "outputs": ["gammatone"]}
+    got = rosafe.process(SOUND, RATE, parameters=FEW, **options)["gammatone"]
     assert copied == [600] * 3
     outputs = Chain(RATE, {"in_doNormalize": False, **FEW}).run(cut(SOUND, 600), changes)
     for number, output in enumerate(outputs):
@@ -97,13 +98,14 @@ def test_a_place_is_used_only_where_it_fits(kind: str, frames: int) -> None:
         assert not np.shares_memory(stage.process(block), whole)
         np.testing.assert_array_equal(whole, before)
     whole = np.full((2, 9, 2 * frames), np.nan)
-    for place in (
+    unfit: list[Any] = [
         whole[:, :4, :frames],
         whole[:, :5, : frames + 1],
         whole[:, :5, :frames] if frames > 1 else whole[:, 4::-1, :1],  # ears another distance apart than channels
         whole[:, :5, ::2] if frames > 1 else whole[:, ::2, :1],
         whole[:, :5, :frames].astype(np.float32),
-    ):
+    ]
+    for place in unfit:
         stage = STAGES[kind](RATE, **parameters)
         stage.place = place
         np.testing.assert_array_equal(stage.process(block), plain)

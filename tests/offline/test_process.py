@@ -269,6 +269,18 @@ def test_the_middle_of_each_frame() -> None:
     assert level[heard < 0.003].min() > 1e3 * level[heard > 0.0075].max()
 
 
+@pytest.mark.parametrize("ratio", [1, 4, 5])
+def test_times_of_what_takes_every_so_manieth_sample(ratio: int) -> None:
+    """Each of these stands for all up to the next."""
+    values = {**FEW, "ams_dsRatio": ratio, "ams_wSizeSec": 0.032, "ams_hSizeSec": 0.008, "ams_cfHz": [50.0]}
+    got = rosafe.process(SOUND, RATE, parameters=values, outputs="amsFeatures")
+    window = 2 * round(0.016 * RATE / ratio) * ratio
+    hop = round(window / ratio / 4) * ratio
+    frames = got["amsFeatures"].shape[-1]
+    np.testing.assert_allclose(got["amsFeatures_time"], (np.arange(frames) * hop + window / 2) / RATE, rtol=1e-12)
+    assert frames > 3
+
+
 def test_times_after_a_change_of_the_hop() -> None:
     """The next frame starts where it would have started anyway."""
     changes = [(1, "ild_hSizeSec", 0.02), (2, "ild_wSizeSec", 0.03)]

@@ -55,7 +55,7 @@ def test_what_cannot_be_is_refused(wrong: tuple[str, ...]) -> None:
 @pytest.mark.parametrize("kind", CHEAP)
 def test_what_we_compare_with_makes_the_same(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "path", [str(FOLDER), *sys.path])
-    import kinds  # type: ignore[import]
+    import kinds  # type: ignore[import-not-found]
 
     found = kinds.one(kind, 1)
     assert kinds.agrees(kind, found), found

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import os
+import re
 import subprocess
 from pathlib import Path
 
 import pytest
 
 import rosafe
+from rosafe.interface import KINDS
 from tests.harness import PYTHON, ROOT
 
 
@@ -36,3 +38,10 @@ def test_every_page_is_in_the_contents() -> None:
     index = (ROOT / "docs" / "index.rst").read_text("utf-8").split()
     pages = {path.stem for path in (ROOT / "docs").glob("*.md")} - {"README"}
     assert pages - set(index) == set()
+
+
+def test_the_page_of_the_request_names_every_representation() -> None:
+    table = (ROOT / "docs" / "request.md").read_text("utf-8").split("## What is asked for")[1].split("\n## ")[0]
+    named = set(re.findall("`([^`]+)`", table))
+    for kind in KINDS.values():
+        assert {kind.word, kind.request, f"{kind.word}_0"} <= named, kind.kind

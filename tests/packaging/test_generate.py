@@ -22,9 +22,15 @@ IMPORT = (
 MD5_OF_INPUTPROC_ACTION = "2dc56590e981689aa1ab72a9e6db474e"
 
 
+REQUESTS = ("InputProc", "IhcProc", "Stop")  # of rosAFE in the copies; test_rosmsg_and_rossrv_know_everything has all
+
+
 @pytest.fixture
 def copy() -> Iterator[Path]:
     with fresh_copy() as path:
+        for definition in (*(path / "action").iterdir(), *(path / "srv").iterdir()):
+            if definition.stem not in REQUESTS:
+                definition.unlink()
         yield path
 
 

@@ -185,7 +185,7 @@ def test_wrong_option(machine: Machine, arguments: list[str]) -> None:
 
 def test_help(machine: Machine) -> None:
     code, out, _ = machine.install("--help")
-    assert code == 0 and "pyalsaaudio" in out
+    assert code == 0 and "pyalsaaudio" in out and "example: scripts/install" in out
     assert machine.calls.read_text() == ""
 
 
@@ -208,6 +208,29 @@ def test_uninstall(tmp_path: Path) -> None:
         assert (done.returncode, done.stderr) == (0, "")
     assert not any(folder.exists() for folder in [*goes, prefix])
     assert all(folder.exists() for folder in stays)
+
+
+@pytest.mark.parametrize(("argument", "code"), [("-h", 0), ("--help", 0), ("--hlep", 2), ("", 2)])
+def test_who_asks_uninstall_something_loses_nothing(tmp_path: Path, argument: str, code: int) -> None:
+    root = tmp_path / "tree"
+    goes = [root / ".generated", tmp_path / "home" / ".cache" / "rosafe", tmp_path / "prefix" / "python"]
+    for folder in [root / "scripts", *goes]:
+        folder.mkdir(parents=True)
+    text = (SCRIPTS / "uninstall").read_text()
+    (root / "scripts" / "uninstall").write_text(text.replace("/usr/local/lib/rosafe", str(tmp_path / "prefix")))
+    env = environment(HOME=str(tmp_path / "home"), TMPDIR=str(tmp_path))
+    done = run("/bin/bash", root / "scripts" / "uninstall", argument, env=env)
+    assert done.returncode == code
+    told = done.stderr if code else done.stdout
+    assert told.startswith("usage: scripts/uninstall") and "example: " in told
+    assert all(folder.exists() for folder in goes)
+
+
+@pytest.mark.parametrize("name", sorted({p.name for p in SCRIPTS.iterdir()} - {"env.sh", "install", "uninstall"}))
+def test_help_of_every_script_has_an_example(name: str) -> None:
+    done = run(SCRIPTS / name, "-h", env=environment())
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "usage: " in done.stdout and "example" in done.stdout
 
 
 def test_a_user_without_rights_is_told(machine: Machine) -> None:

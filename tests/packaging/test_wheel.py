@@ -112,7 +112,7 @@ def test_library_tests_in_the_environment(venv: Venv, tmp_path: Path) -> None:
     for name in ("__init__.py", "harness.py", "offline", "dsp", "representations", "tree", "vectors"):
         there = ROOT / "tests" / name
         copy = shutil.copytree if there.is_dir() else shutil.copy
-        copy(there, tmp_path / "tests" / name)  # type: ignore[operator]
+        copy(there, tmp_path / "tests" / name)
     (tmp_path / "pytest.ini").write_text(
         "[pytest]\naddopts = --import-mode=importlib -p no:cacheprovider\npythonpath=.\n"
     )
@@ -154,6 +154,10 @@ def test_the_command_and_what_it_says_of_what_is_absent(venv: Venv, tmp_path: Pa
         (["plot", sound], "matplotlib is not installed; pip install 'rosafe[plot]'"),
         (["record", "--seconds", "1"], "is not installed; pip does not bring it: run scripts/install of a checkout"),
         (["trace"], "is not installed; pip does not bring it"),
+        (["request", "ratemap"], "genpy is not installed; pip does not bring it: run scripts/install of a checkout"),
+        (["live"], "genpy is not installed; pip does not bring it"),
+        (["up"], "yaml is not installed; pip does not bring it"),
+        (["setup", "save", "x.yaml"], "yaml is not installed; pip does not bring it"),
     ]
     for arguments, words in cases:
         done = venv.run("rosafe", *arguments)

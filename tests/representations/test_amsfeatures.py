@@ -174,7 +174,7 @@ def test_the_step_follows_from_the_window(
     stage = AmsFeatures(RATE, ams_wSizeSec=seconds, ams_hSizeSec=step, ams_dsRatio=ratio, ams_fbType=fb_type)
     assert (len(stage.window), stage.output.hop) == (size, hop * ratio)
     assert stage.output.rate == RATE / ratio / hop
-    assert stage.output.framed and stage.output.window == (size - 1) * ratio + 1
+    assert stage.output.framed and stage.output.window == size * ratio
     samples = (size + 2 * hop - 1) * ratio + 1  # the last one that frame 2 takes in
     assert stage.complete(samples) == 3 and stage.complete(samples - 1) == 2
     assert stage.process(sound(samples - 1)).shape[-1] == 2

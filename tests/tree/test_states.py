@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,8 @@ from rosafe.tree.block import Block
 from rosafe.tree.states import ENDS, State, StateMachine
 
 SIGNAL = Signal.sound(1.0)
-STEPS = ("come", "go", "replace", "call", "begin", "skip", "fail", "compute", "tell", "rest")
+Saved = tuple[list[dict[str, Any]], dict[str, tuple[int, ...]]]
+STEPS = {"": (), "compute": ("compute", "skip"), "tell": ("tell", "rest"), "rest": ("rest",)}  # of a worker
 
 
 def block(number: int) -> Block:
@@ -22,7 +22,7 @@ def block(number: int) -> Block:
 
 def note_release(one: Machine, state: State, number: int | None) -> None:
     if state is State.RELEASE and number is not None:
-        one.released.append(number)
+        one.released += (number,)
 
 
 class Machine(StateMachine):
@@ -34,23 +34,20 @@ class Machine(StateMachine):
         self.attached = self.roused = self.settled = False
         self.observers = (note_release,)
         self.then = ""
-        self.seen: list[int] = []
-        self.released: list[int] = []
-        self.told: list[int] = []
+        self.seen: tuple[int, ...] = ()
+        self.released: tuple[int, ...] = ()
+        self.told: tuple[int, ...] = ()
         self.begins: int | None = None  # the first block that it should see; None: any
 
     def __str__(self) -> str:
         return self.name
 
-    def follow(self, machines: dict[str, Machine]) -> None:
-        """As a copy: know the copies of the others."""
+    def save(self) -> dict[str, Any]:
+        return {**self.__dict__, "children": tuple(self.children), "_holders": frozenset(self._holders)}
 
-        def twin(one: Any) -> Any:
-            return None if one is None else machines[one.name]
-
-        self.parent, self._reading = twin(self.parent), twin(self._reading)
-        self.children, self._holders = list(map(twin, self.children)), set(map(twin, self._holders))
-        self.seen, self.released, self.told = list(self.seen), list(self.released), list(self.told)
+    def load(self, saved: dict[str, Any]) -> None:
+        self.__dict__.update(saved)
+        self.children, self._holders = list(saved["children"]), set(saved["_holders"])
 
     def rouse(self) -> None:
         assert self.ready
@@ -61,15 +58,14 @@ class Machine(StateMachine):
         self.settled = True
 
     def fingerprint(self) -> tuple[Any, ...]:
-        def number(some: Block | None) -> int | None:
-            return None if some is None else some.number
-
+        """All that `save` keeps and that changes; of a block only its number."""
+        taken, shared, untold, private, token = self.taken, self.shared, self.untold, self._private, self._token
         return (
             *(self.state, self.at_work, self.called, self.attached, self.roused, self.settled, self.then),
-            *(number(some) for some in (self.taken, self.shared, self.untold, self._private, self._token)),
-            *(None if one is None else str(one) for one in (self.parent, self._reading)),
-            *(tuple(sorted(map(str, group))) for group in (self.children, self._holders)),
-            *(tuple(self.seen), tuple(self.released), tuple(self.told)),
+            *(taken and taken.number, shared and shared.number, untold and untold.number),
+            *(private and private.number, token and token.number),
+            *(self.parent, self._reading, frozenset(self.children), frozenset(self._holders)),
+            *(self.seen, self.released, self.told),
         )
 
 
@@ -92,8 +88,9 @@ class World:
         self.machines: dict[str, Machine] = {}
         for name, parent in parents.items():
             self.machines[name] = Machine(name, self.machines.get(parent))
-        self.coming = {name: [first + n for n in range(blocks)] for name, first in (("root", 0), ("new", 10))}
+        self.coming = {name: tuple(range(first, first + blocks)) for name, first in (("root", 0), ("new", 10))}
         self.called_once, self.fails = called_once, fails
+        self.numbers: dict[tuple[Any, ...], int] = {}  # of the fingerprints of machines
         self.attach(self.machines["root"])
         if called_once:
             self.call(self.machines["root"])
@@ -106,36 +103,42 @@ class World:
 
     def steps(self) -> list[tuple[str, str]]:
         """All that can happen next, each as a name and a step."""
-        return [(name, step) for name in self.machines for step in STEPS if self.can(self.machines[name], step)]
+        return [(name, step) for name, one in self.machines.items() for step in self.possible(one)]
 
-    def can(self, one: Machine, step: str) -> bool:
+    def possible(self, one: Machine) -> list[str]:
         above = one.parent
-        if step == "come":
-            return above is not None and not one.attached and above.attached and not above.gone  # type: ignore[attr-defined]
-        if step == "go":
-            return above is not None and one.attached and not one.gone
-        if step == "replace":
-            return one.name == "new" and not one.attached and self.machines["root"].state is not State.DONE
-        if step == "call":
-            listens = above is None and one.attached and not one.called and one.state not in ENDS
-            return listens and not self.called_once
-        if step == "begin":
-            return one.roused and one.ready
-        if step == "fail" and not self.fails:
-            return False
-        return one.then in {"rest": ("rest", "tell"), "skip": ("compute",), "fail": ("compute", "tell")}.get(
-            step, (step,)
-        )
+        if not one.attached:
+            if above is None:
+                return ["replace"] if self.machines["root"].state is not State.DONE else []
+            return ["come"] if above.attached and not above.gone else []  # type: ignore[attr-defined]
+        steps = [*STEPS[one.then]]
+        if self.fails and one.then in ("compute", "tell"):
+            steps.append("fail")
+        if above is not None and not one.gone:
+            steps.append("go")
+        if above is None and not self.called_once and not one.called and one.state not in ENDS:
+            steps.append("call")
+        if one.roused and one.ready:
+            steps.append("begin")
+        return steps
 
-    def after(self, name: str, step: str) -> World:
-        """The world after that step."""
-        world = copy.copy(self)
-        world.machines = {name: copy.copy(machine) for name, machine in self.machines.items()}
-        world.coming = {name: list(numbers) for name, numbers in self.coming.items()}
-        for machine in world.machines.values():
-            machine.follow(world.machines)
-        getattr(world, step)(world.machines[name])
-        return world
+    def save(self) -> Saved:
+        """What `load` brings back: no machine is copied, so that all go on knowing each other."""
+        return [machine.save() for machine in self.machines.values()], dict(self.coming)
+
+    def load(self, saved: Saved) -> None:
+        machines, coming = saved
+        for machine, its in zip(self.machines.values(), machines, strict=True):
+            machine.load(its)
+        self.coming = dict(coming)
+
+    def do(self, name: str, step: str) -> None:
+        getattr(self, step)(self.machines[name])
+
+    def fingerprint(self) -> tuple[int, ...]:
+        """What two worlds have in common that go on alike: a number for each machine's, of which there are few."""
+        numbers = self.numbers
+        return tuple([numbers.setdefault(one.fingerprint(), len(numbers)) for one in self.machines.values()])
 
     # requests
 
@@ -171,13 +174,16 @@ class World:
             one.then = "tell"
             return
         if one.parent is None and self.coming[one.name]:
-            one.read(block(self.coming[one.name].pop(0)))
+            first, *rest = self.coming[one.name]
+            self.coming[one.name] = tuple(rest)
+            one.read(block(first))
         elif one.parent is None:
             one.finish()
             one.then = "rest"
             return
         assert one.taken is not None
-        one.seen.append(one.taken.number)
+        assert one.seen or one.begins in (one.taken.number, None)
+        one.seen += (one.taken.number,)
         one.then = "compute"
 
     def compute(self, one: Machine) -> None:
@@ -198,7 +204,7 @@ class World:
     def tell(self, one: Machine) -> None:
         if one.untold is not None:
             if not one.gone:
-                one.told.append(one.untold.number)
+                one.told += (one.untold.number,)
             one.untold = None
         one.then = "rest"
 
@@ -217,8 +223,6 @@ class World:
                 seen = [n for n in one.seen if n in range(first, first + 10)]
                 assert not seen or seen == came[came.index(seen[0]) :][: len(seen)], f"{one.name} saw {one.seen}"
             assert one.told == one.released[: len(one.told)], f"{one.name} told {one.told} of {one.released}"
-            if one.seen and one.begins is not None:
-                assert one.seen[0] == one.begins
             if one.ready:
                 assert one.roused, f"{one.name} is ready, and nobody knows"
             reading = one._reading
@@ -249,29 +253,27 @@ class World:
                     assert all_seen or self.fails
 
 
-def explore(start: World) -> tuple[int, int]:
+def explore(world: World) -> tuple[int, int]:
     """Go through all states; their number, and that of those in which only requests are left."""
-    known = {fingerprint(start)}
-    unexplored = [start]
+    known = {world.fingerprint()}
+    unexplored = [world.save()]
     ends = 0
     while unexplored:
-        world = unexplored.pop()
+        saved = unexplored.pop()
+        world.load(saved)
         steps = world.steps()
         if all(step in ("come", "go", "replace") for _, step in steps):
             world.check_end()
             ends += 1
         for name, step in steps:
-            following = world.after(name, step)
-            following.check()
-            mark = fingerprint(following)
+            world.load(saved)
+            world.do(name, step)
+            mark = world.fingerprint()
             if mark not in known:
+                world.check()
                 known.add(mark)
-                unexplored.append(following)
+                unexplored.append(world.save())
     return len(known), ends
-
-
-def fingerprint(world: World) -> tuple[Any, ...]:
-    return tuple(machine.fingerprint() for machine in world.machines.values())
 
 
 CHILD = {"root": "", "a": "root"}

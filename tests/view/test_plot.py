@@ -230,6 +230,28 @@ def test_silence_and_next_to_nothing(seconds: float) -> None:
     FigureCanvasAgg(drawing).draw()
     words = [text.get_text() for axes in drawing.axes for text in axes.texts]
     assert ("no frames" in words) and (seconds == 0.0) == (len(words) > 30)
+    for axes in drawing.axes:
+        if axes.texts:  # no scales of nothing
+            assert not [*axes.get_xticks(), *axes.get_yticks()]
+
+
+def test_silence_is_not_the_loudest(ax: Axes) -> None:
+    made = rosafe.process(np.zeros((2, 2000)), RATE, outputs="ratemap")
+    plot(made, "ratemap", ax)
+    assert (shown(ax) == -60.0).all()
+
+
+def test_marks_of_a_long_sound_leave_room(result: dict[str, Any]) -> None:
+    """As many in a second, and a hundred times the seconds."""
+    names = ("onsetMap", "onsetStrength")
+    long = {**result, **{name: np.tile(result[name], (1, 1, 100)) for name in names}}
+    for name in names:
+        long[f"{name}_time"] = 0.01 * np.arange(1, long[name].shape[-1] + 1)
+    few, many = Figure().add_subplot(), Figure().add_subplot()
+    plot(result, "onsetMap", few)
+    plot(long, "onsetMap", many)
+    widths = [axes.get_lines()[0].get_markeredgewidth() for axes in (few, many)]
+    assert widths[0] > 3 and widths[1] < 0.2
 
 
 def test_a_plugin_is_drawn_too(ax: Axes, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -70,10 +70,10 @@ class TopicSource:
             raise device_error(f"{topic} is no port Audio, but of type {kind}")
         self._subscriber = rospy.Subscriber(topic, message_class, self._hear, buff_size=2**24, tcp_nodelay=True)
         try:
-            self._await_first(kind is not None)
-            self.sample_rate = int(self._first.sampleRate)
-            self.newest = int(self._first.lastFrameIndex)
-            self.frames_per_chunk = min(max(1, int(self._first.nFramesPerChunk)), MAX_CHUNK)
+            first = self._await_first(kind is not None)
+            self.sample_rate = int(first.sampleRate)
+            self.newest = int(first.lastFrameIndex)
+            self.frames_per_chunk = min(max(1, int(first.nFramesPerChunk)), MAX_CHUNK)
             if sample_rate not in (0, self.sample_rate):
                 raise hwparams_error(
                     f"{topic} has a sample rate of {self.sample_rate} Hz, asked for were {sample_rate}"
@@ -83,7 +83,7 @@ class TopicSource:
             raise
         self._patience = STALL_SECONDS + self.frames_per_chunk / self.sample_rate
 
-    def _await_first(self, published: bool) -> None:
+    def _await_first(self, published: bool) -> Any:
         end = time.monotonic() + (FIRST_SECONDS if published else NOBODY_SECONDS)
         while not self._arrived.wait(POLL_SECONDS) and not self._stopping.is_set():
             if time.monotonic() > end:
@@ -95,6 +95,7 @@ class TopicSource:
                 raise device_error(f"{self.name} {what}, or record a --device without ROS")
         if self._first is None:
             raise device_error(f"{self.name}: interrupted before a first message came")
+        return self._first
 
     def _hear(self, message: Any) -> None:
         if self._ended or message.problem or malformed(message):

@@ -128,10 +128,22 @@ def adaptation(
     return output
 
 
+class Pinned(NamedTuple):
+    """An array that stays, and where: to look that up takes longer than much of what is done with it."""
+
+    array: FloatArray
+    address: int
+
+    @classmethod
+    def of(cls, array: FloatArray) -> Pinned:
+        """`array`, which nobody resizes."""
+        return cls(array, _address(array))
+
+
 class Span(NamedTuple):
     """Samples `start` to `stop` of each row of a store (*rows, T)."""
 
-    store: FloatArray
+    store: Pinned
     start: int
     stop: int
 
@@ -143,7 +155,7 @@ class Span(NamedTuple):
     @property
     def samples(self) -> FloatArray:
         """A view of them, (*rows, length)."""
-        return self.store[..., self.start : self.stop]
+        return self.store.array[..., self.start : self.stop]
 
 
 class Frames(NamedTuple):
@@ -156,7 +168,7 @@ class Frames(NamedTuple):
     block: FloatArray  # (*rows, N)
     tail: Span  # to be filled with the last samples; may lie where the history does
     skip: int  # where the first frame starts
-    weights: FloatArray  # (w,), of the samples of a frame
+    weights: Pinned  # (w,), of the samples of a frame
     hop: int  # from a frame's start to that of the next one
     number: int  # of whole ones
 
@@ -201,7 +213,7 @@ def modulation(frames: Frames, sections: FloatArray, state: FloatArray) -> Float
     come out already, the block goes in now. The twin is `rosafe.dsp.framing.Framing.means` of the magnitudes of what
     `rosafe.dsp.cascade.Parallel` makes.
     """
-    means = np.empty((*frames.tail.store.shape[:-1], frames.number))
+    means = np.empty((*frames.tail.store.array.shape[:-1], frames.number))
     _function("rosafe_modulation")(*_arguments(frames), len(sections), *map(_address, (sections, state, means)))
     return means
 
@@ -279,7 +291,7 @@ def autocorrelations(
     """
     rows = frames.block.shape[:-1]
     output = memory.empty((*rows, len(corrections), frames.number))
-    transform = Transform.of(2 * len(frames.weights) - 1)
+    transform = Transform.of(2 * len(frames.weights.array) - 1)
     _function("rosafe_autocorrelations")(
         *_arguments(frames),
         CLIPPINGS.index(clipping),
@@ -410,21 +422,22 @@ def _rows(array: FloatArray) -> tuple[int, int]:
 
 def _arguments(frames: Frames, rows: int | None = None) -> tuple[int, ...]:
     """The arguments that all kernels of frames begin with; by default, the number of rows is that of the samples."""
-    history, block, tail, skip, weights, hop, number = frames
-    held, arriving = history.stop - history.start, block.shape[-1]
+    (history, start, stop), block, (tail, tail_start, tail_stop), skip, weights, hop, number = frames
+    held, shape = stop - start, block.shape
+    arriving = shape[-1]
     return (
-        _address(history.store) + history.start * REAL_SIZE,
-        history.store.shape[-1],
+        history.address + start * REAL_SIZE,
+        history.array.shape[-1],
         held,
         _address(block),
         arriving,
-        _address(tail.store) + tail.start * REAL_SIZE,
-        tail.store.shape[-1],
-        held + arriving - (tail.stop - tail.start),
-        math.prod(block.shape[:-1]) if rows is None else rows,
+        tail.address + tail_start * REAL_SIZE,
+        tail.array.shape[-1],
+        held + arriving - (tail_stop - tail_start),
+        math.prod(shape[:-1]) if rows is None else rows,
         skip,
-        _address(weights),
-        len(weights),
+        weights.address,
+        len(weights.array),
         hop,
         number,
     )

@@ -7,22 +7,22 @@
 #include <string.h>
 
 /* Samples from..until of the rows times `window` to `to` from t on; returns their energy. */
-static vec put(const double *const rows[LANES], const double *window, int64_t from, int64_t until, halves to, int64_t t) {
+static vec put(const double *const rows[LANES], const double *window, int64_t from, int64_t until, vec *to, int64_t t) {
     vec energy = {};
     int64_t i = from;
-    for (; i + 2 <= until; i += 2, t += 2) {
-        vec pair[2];
-        read_pair(rows, i, pair);
-        UNROLL for (int k = 0; k < 2; k++) {
-            vec x = bounded(pair[k], -LIMIT, LIMIT) * all(window[i + k]);
+    for (; i + TILE <= until; i += TILE, t += TILE) {
+        vec tile[TILE];
+        read_tile(rows, i, tile);
+        UNROLL for (int k = 0; k < TILE; k++) {
+            vec x = bounded(tile[k], -LIMIT, LIMIT) * all(window[i + k]);
             energy = fused(x, x, energy);
-            *at(to, t + k) = x;
+            to[t + k] = x;
         }
     }
-    if (i < until) {
+    for (; i < until; i++, t++) {
         vec x = bounded(gathered(rows, i), -LIMIT, LIMIT) * all(window[i]);
         energy = fused(x, x, energy);
-        *at(to, t) = x;
+        to[t] = x;
     }
     return energy;
 }
@@ -34,7 +34,7 @@ typedef struct {
 } frames;
 
 /* As `put`. */
-INLINE vec put_both(const frames *of, const double *window, int64_t from, int64_t until, halves to, int64_t t) {
+INLINE vec put_both(const frames *of, const double *window, int64_t from, int64_t until, vec *to, int64_t t) {
     const int64_t middle = most(from, least(until, of->border));
     vec energy = put(of->old, window, from, middle, to, t);
     return energy + put(of->new, window, middle, until, to, t + middle - from);
@@ -62,7 +62,9 @@ void rosafe_correlations(const double *history, int64_t history_stride, int64_t 
                          double *output, int64_t channel_stride) {
     uint32_t mode = denormals_off();
     const int64_t lags = 2 * reach + 1, spans = (size + SPAN - 1) / SPAN, span = (size + spans - 1) / spans;
-    halves l, r, c;
+    long_sequence l;
+    short_sequence r;
+    sums c;
     for (int64_t first = 0; first < channels * number; first += LANES) {
         vec correlation[MOST_LAGS], energy[2] = {};
         double *to[LANES];
@@ -98,7 +100,7 @@ void rosafe_correlations(const double *history, int64_t history_stride, int64_t 
                 }
             }
             product(l, r, end - begin, lags, c);
-            for (int64_t m = 0; m < lags; m++) correlation[m] += *at(c, m);
+            for (int64_t m = 0; m < lags; m++) correlation[m] += c[m];
         }
         vec scale = all(1.0) / root(energy[0] * energy[1] + all(epsilon));
         for (int64_t m = 0; m < lags; m++) {

@@ -170,14 +170,16 @@ static double filtered(const double *x, int64_t size, const int64_t *shifts, con
 
 /* c[m] = sum_t l[t+m] r[t], n samples and `lags` lags. */
 static void correlate(const double *const l[LANES], const double *const r[LANES], int64_t n, int64_t lags, vec *c) {
-    halves l_samples, r_samples, sums;
+    long_sequence l_samples;
+    short_sequence r_samples;
+    sums some;
     for (int64_t m = 0; m < lags; m++) c[m] = (vec){};
     for (int64_t begin = 0; begin < n; begin += SPAN) {
         const int64_t span = least(SPAN, n - begin);
-        for (int64_t t = 0; t < span + lags - 1; t++) *at(l_samples, t) = gathered(l, begin + t);
-        for (int64_t t = 0; t < span; t++) *at(r_samples, t) = gathered(r, begin + t);
-        product(l_samples, r_samples, span, lags, sums);
-        for (int64_t m = 0; m < lags; m++) c[m] += *at(sums, m);
+        for (int64_t t = 0; t < span + lags - 1; t++) l_samples[t] = gathered(l, begin + t);
+        for (int64_t t = 0; t < span; t++) r_samples[t] = gathered(r, begin + t);
+        product(l_samples, r_samples, span, lags, some);
+        for (int64_t m = 0; m < lags; m++) c[m] += some[m];
     }
 }
 

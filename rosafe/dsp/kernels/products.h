@@ -7,20 +7,19 @@
 enum {
     SPAN = 1024,      /* samples at a time: all that belongs to these stays in the second-level cache */
     MOST_LAGS = 1024, /* FFT is faster beyond */
-    LONGEST = (SPAN + MOST_LAGS) / 2,
+    SPARE = 16,       /* places behind a sequence, for `product` */
 };
 
-/* The even samples of a sequence, and the odd ones. */
-typedef vec halves[2][LONGEST];
+typedef vec long_sequence[SPAN + MOST_LAGS + SPARE]; /* l */
+typedef vec short_sequence[SPAN + SPARE];            /* r */
+typedef vec sums[MOST_LAGS + SPARE];                 /* c */
 
-INLINE vec *at(halves of, int64_t t) { return of[t & 1] + (t >> 1); }
-
-INLINE void put_zeros(halves to, int64_t t, int64_t until) {
-    for (; t < until; t++) *at(to, t) = (vec){};
+INLINE void put_zeros(vec *to, int64_t t, int64_t until) {
+    for (; t < until; t++) to[t] = (vec){};
 }
 
-/* For n samples r and `lags` lags, at most SPAN and MOST_LAGS. Behind the n + lags - 1 samples l and behind r, zeros are put
- * where either is not even. */
-INTERNAL void product(halves l, halves r, int64_t n, int64_t lags, halves c);
+/* For n samples r and `lags` lags, at most SPAN and MOST_LAGS. Behind the n + lags - 1 samples l, the n samples r and the
+ * sums, up to SPARE places are written. */
+INTERNAL void product(long_sequence l, short_sequence r, int64_t n, int64_t lags, sums c);
 
 #endif

@@ -22,20 +22,20 @@
 #define TINY 1e-200
 
 #if defined __AVX512F__
-enum { LANES = 8, STEPS = 3 /* of doubling, from 1 to LANES */ };
+enum { LANES = 8, STEPS = 3 /* of doubling, from 1 to LANES */, TILE = 4 /* samples to and from memory at a time */ };
 #elif defined __AVX2__
-enum { LANES = 4, STEPS = 2 };
+enum { LANES = 4, STEPS = 2, TILE = 4 };
 #elif defined __aarch64__
-enum { LANES = 2, STEPS = 1 };
+enum { LANES = 2, STEPS = 1, TILE = 2 };
 #else
-enum { LANES = 2, STEPS = 1 };
+enum { LANES = 2, STEPS = 1, TILE = 2 };
 #endif
 
 typedef double vec __attribute__((vector_size(8 * LANES)));
 typedef double vec_anywhere __attribute__((vector_size(8 * LANES), aligned(8), may_alias));
 typedef int64_t lanes __attribute__((vector_size(8 * LANES)));
-typedef double duo __attribute__((vector_size(16), aligned(8), may_alias)); /* neighbours in memory */
 typedef double quartet __attribute__((vector_size(32)));
+typedef double quartet_anywhere __attribute__((vector_size(32), aligned(8), may_alias));
 
 INLINE int64_t least(int64_t a, int64_t b) { return a < b ? a : b; }
 INLINE int64_t most(int64_t a, int64_t b) { return a > b ? a : b; }
@@ -124,15 +124,23 @@ INLINE uint32_t denormals_off(void) {
 
 /* --- lanes in another order ---
  *
- * Of two registers the even ones of each pair of neighbours in turn, and the odd ones; every second pair of a column of
- * pairs; the last lane in all; and in lane k + 2^step what lane k had, 0 in the first ones. */
+ * Of two registers the even ones of each pair of neighbours in turn, and the odd ones; of four samples of every second row the
+ * first two or the last two, a row's pair after the other; of such registers, those of a row; the last lane in all; and in
+ * lane k + 2^step what lane k had, 0 in the first ones. */
 
 #if defined __AVX512F__
 INLINE vec evens(vec a, vec b) { return __builtin_shufflevector(a, b, 0, 8, 2, 10, 4, 12, 6, 14); }
 INLINE vec odds(vec a, vec b) { return __builtin_shufflevector(a, b, 1, 9, 3, 11, 5, 13, 7, 15); }
-INLINE quartet together(duo a, duo b) { return __builtin_shufflevector(a, b, 0, 1, 2, 3); }
-INLINE vec every_second(const duo row[LANES]) {
-    return __builtin_shufflevector(together(row[0], row[2]), together(row[4], row[6]), 0, 1, 2, 3, 4, 5, 6, 7);
+INLINE vec both(quartet a, quartet b) { return __builtin_shufflevector(a, b, 0, 1, 2, 3, 4, 5, 6, 7); }
+INLINE vec pairs(const quartet *row, const int half) {
+    vec low = both(row[0], row[2]), high = both(row[4], row[6]);
+    return half ? __builtin_shufflevector(low, high, 2, 3, 6, 7, 10, 11, 14, 15)
+                : __builtin_shufflevector(low, high, 0, 1, 4, 5, 8, 9, 12, 13);
+}
+INLINE quartet row_of(vec early, vec late, const int pair) {
+    vec two = pair < 2 ? __builtin_shufflevector(early, late, 0, 1, 8, 9, 2, 3, 10, 11)
+                       : __builtin_shufflevector(early, late, 4, 5, 12, 13, 6, 7, 14, 15);
+    return pair & 1 ? __builtin_shufflevector(two, two, 4, 5, 6, 7) : __builtin_shufflevector(two, two, 0, 1, 2, 3);
 }
 INLINE vec last(vec a) { return __builtin_shufflevector(a, a, 7, 7, 7, 7, 7, 7, 7, 7); }
 INLINE vec delayed(vec a, const int step) {
@@ -143,7 +151,12 @@ INLINE vec delayed(vec a, const int step) {
 #elif defined __AVX2__
 INLINE vec evens(vec a, vec b) { return __builtin_shufflevector(a, b, 0, 4, 2, 6); }
 INLINE vec odds(vec a, vec b) { return __builtin_shufflevector(a, b, 1, 5, 3, 7); }
-INLINE vec every_second(const duo row[LANES]) { return __builtin_shufflevector(row[0], row[2], 0, 1, 2, 3); }
+INLINE vec pairs(const quartet *row, const int half) {
+    return half ? __builtin_shufflevector(row[0], row[2], 2, 3, 6, 7) : __builtin_shufflevector(row[0], row[2], 0, 1, 4, 5);
+}
+INLINE quartet row_of(vec early, vec late, const int pair) {
+    return pair ? __builtin_shufflevector(early, late, 2, 3, 6, 7) : __builtin_shufflevector(early, late, 0, 1, 4, 5);
+}
 INLINE vec last(vec a) { return __builtin_shufflevector(a, a, 3, 3, 3, 3); }
 INLINE vec delayed(vec a, const int step) {
     return step == 0 ? __builtin_shufflevector(a, (vec){}, 4, 0, 1, 2) : __builtin_shufflevector(a, (vec){}, 4, 5, 0, 1);
@@ -151,7 +164,6 @@ INLINE vec delayed(vec a, const int step) {
 #else
 INLINE vec evens(vec a, vec b) { return __builtin_shufflevector(a, b, 0, 2); }
 INLINE vec odds(vec a, vec b) { return __builtin_shufflevector(a, b, 1, 3); }
-INLINE vec every_second(const duo row[LANES]) { return row[0]; }
 INLINE vec last(vec a) { return __builtin_shufflevector(a, a, 1, 1); }
 INLINE vec delayed(vec a, const int step) { return (void)step, __builtin_shufflevector(a, (vec){}, 2, 0); }
 #endif
@@ -172,38 +184,56 @@ INLINE vec gathered(const double *const rows[LANES], int64_t t) {
     return x;
 }
 
-/* Samples t and t + 1. By pairs: transposing whole tiles takes twice the shuffles. */
-INLINE void read_pair(const double *const rows[LANES], int64_t t, vec pair[2]) {
-    duo row[LANES + 1];
-    UNROLL for (int k = 0; k < LANES; k++) row[k] = *(const duo *)(rows[k] + t);
-    row[LANES] = row[0];
-    vec even = every_second(row), odd = every_second(row + 1);
-    pair[0] = evens(even, odd);
-    pair[1] = odds(even, odd);
+/* Samples t, t + 1... t + TILE - 1; and back. */
+INLINE void read_tile(const double *const rows[LANES], int64_t t, vec tile[TILE]) {
+#if defined __AVX2__
+    quartet row[LANES];
+    UNROLL for (int k = 0; k < LANES; k++) row[k] = *(const quartet_anywhere *)(rows[k] + t);
+    UNROLL for (int half = 0; half < 2; half++) { /* of the samples */
+        vec even = pairs(row, half), odd = pairs(row + 1, half);
+        tile[2 * half] = evens(even, odd);
+        tile[2 * half + 1] = odds(even, odd);
+    }
+#else
+    vec row[LANES];
+    UNROLL for (int k = 0; k < LANES; k++) row[k] = load(rows[k] + t);
+    tile[0] = evens(row[0], row[1]);
+    tile[1] = odds(row[0], row[1]);
+#endif
+}
+
+INLINE void write_tile(const vec tile[TILE], double *const rows[LANES], int64_t t) {
+#if defined __AVX2__
+    vec early[2] = {evens(tile[0], tile[1]), odds(tile[0], tile[1])};
+    vec late[2] = {evens(tile[2], tile[3]), odds(tile[2], tile[3])};
+    UNROLL for (int k = 0; k < LANES; k++) *(quartet_anywhere *)(rows[k] + t) = row_of(early[k & 1], late[k & 1], k / 2);
+#else
+    *(vec_anywhere *)(rows[0] + t) = evens(tile[0], tile[1]);
+    *(vec_anywhere *)(rows[1] + t) = odds(tile[0], tile[1]);
+#endif
 }
 
 /* n samples, bounded to low..high, to samples[0], samples[step]...; and back. */
 INLINE void read_rows(const double *const rows[LANES], int64_t n, double low, double high, vec *samples,
                       const int64_t step) {
-    for (int64_t t = 0; t + 2 <= n; t += 2) {
-        vec pair[2];
-        read_pair(rows, t, pair);
-        samples[t * step] = bounded(pair[0], low, high);
-        samples[(t + 1) * step] = bounded(pair[1], low, high);
+    int64_t t = 0;
+    for (; t + TILE <= n; t += TILE) {
+        vec tile[TILE];
+        read_tile(rows, t, tile);
+        UNROLL for (int i = 0; i < TILE; i++) samples[(t + i) * step] = bounded(tile[i], low, high);
     }
-    if (n & 1) samples[(n - 1) * step] = bounded(gathered(rows, n - 1), low, high);
+    for (; t < n; t++) samples[t * step] = bounded(gathered(rows, t), low, high);
 }
 
 INLINE void write_rows(const vec *samples, const int64_t step, int64_t n, double *const rows[LANES]) {
-    for (int64_t t = 0; t + 2 <= n; t += 2) {
-        vec even = evens(samples[t * step], samples[(t + 1) * step]), odd = odds(samples[t * step], samples[(t + 1) * step]);
-        UNROLL for (int k = 0; k < LANES; k += 2) {
-            *(duo *)(rows[k] + t) = (duo){even[k], even[k + 1]};
-            *(duo *)(rows[k + 1] + t) = (duo){odd[k], odd[k + 1]};
-        }
+    int64_t t = 0;
+    for (; t + TILE <= n; t += TILE) {
+        vec tile[TILE];
+        UNROLL for (int i = 0; i < TILE; i++) tile[i] = samples[(t + i) * step];
+        write_tile(tile, rows, t);
     }
-    if (n & 1)
-        UNROLL for (int k = 0; k < LANES; k++) rows[k][n - 1] = samples[(n - 1) * step][k];
+    for (; t < n; t++)
+        UNROLL for (int k = 0; k < LANES; k++) rows[k][t] = samples[t * step][k];
 }
 
 #endif
