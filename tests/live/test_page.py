@@ -238,7 +238,7 @@ def test_one_picture_too_many_says_so(world: World, shown: Browser) -> None:
     last = "const [panel] = [...document.querySelectorAll('.panel canvas')].slice(-1); "
     shown.until(last + "return panel.title.includes('close another')")
     opened = "[...document.querySelectorAll('.node .eye[aria-pressed=true]')]"
-    shown.run(f"for (const one of {opened}.slice(0, 8)) one.click()")
+    shown.run(f"for (const one of {opened}.slice(0, 12)) one.click()")
     shown.until(last + "panel.scrollIntoView(); return panel.title === '' && Boolean(panel.dataset.plot)")
     for name in names:
         assert world.graph.call("/rosAFE/removeProcessor", name=name).genom_success
