@@ -23,9 +23,10 @@ SHOTS = (
     ("live-light", 1440, 1040, "light", "processor"),
     ("live-narrow", 380, 800, "dark", ""),
 )
+WALK = 10  # s; after one of them the source has gone from left to right, after two it is back
 FULL = (
-    "const end = (one) => JSON.parse(one.dataset.plot);"
-    "return [...document.querySelectorAll('canvas[data-plot]')].every((one) => end(one).to > arguments[0])"
+    "const ends = [...document.querySelectorAll('canvas[data-plot]')].map((one) => JSON.parse(one.dataset.plot).to);"
+    f"return ends.every((end) => end > arguments[0] && end % {2 * WALK} >= {WALK} && end % {2 * WALK} < {WALK + 0.5})"
 )
 CHOOSE = "[...document.querySelectorAll('.node .name')].find((one) => one.textContent.startsWith('ratemap_0')).click()"
 
@@ -52,7 +53,7 @@ def shoot(window: Browser, url: str, width: int, height: int, theme: str, part: 
     begun = window.run("return JSON.parse(document.querySelector('canvas[data-plot]').dataset.plot).to")
     if part == "processor":
         window.run(CHOOSE)
-    wait_for(lambda: window.run(FULL, begun + 11.0))
+    wait_for(lambda: window.run(FULL, begun + WALK))
     picture = Image.open(io.BytesIO(window.driver.get_screenshot_as_png())).convert("RGB")
     picture.save(path, optimize=True)
 

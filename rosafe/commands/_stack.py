@@ -43,9 +43,10 @@ class Part:
             code = self.child.process.returncode
             lines = [line for line in _COLOUR.sub("", self.child.err).splitlines() if line.strip()]
             self.state = "ended"
-            self.detail = (f"killed by signal {-code}" if code < 0 else f"exit code {code}") + (
-                f": {lines[-1].strip()}" if lines else ""
-            )
+            if code < 0:  # it had no last words
+                self.detail = f"killed by signal {-code}"
+            else:
+                self.detail = f"exit code {code}" + (f": {lines[-1].strip()}" if lines else "")
 
 
 @dataclass

@@ -155,7 +155,8 @@ class Proxy:
             return self.component.service(name)
         except KeyError:
             known = [s.name for s in (*self.component.services, *self.component.composites)]
-            what = f"{self.component.name} has no service {name[:80]!r}; it has {', '.join(known)}{meant(name, known)}"
+            hint = meant(name, [*known, *(port.name for port in self.component.ports)])  # a URL may mean either
+            what = f"{self.component.name} has no service {name[:80]!r}; it has {', '.join(known)}{hint}"
             raise ComponentError("::genom::no_such_service", what=what) from None
 
     def arguments(self, service: Service, given: Any) -> dict[str, Any]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import threading
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, closing
 from pathlib import Path
@@ -79,7 +80,7 @@ def process_file(
     topic : str, optional
         The port Audio in a bag; /bass/Audio by default, or the only one.
     resume : bool
-        Leave `target` alone where it is complete already, and replace it where it is damaged.
+        Leave `target` alone where it is complete already, and replace it where it is damaged, or older than `source`.
 
     Returns
     -------
@@ -107,7 +108,7 @@ def process_file(
         **({"topic": topic} if topic else {}),
     }
     if resume and os.path.lexists(target):
-        if _complete(form, Path(target), about, values, wanted):
+        if _complete(form, Path(target), about, values, wanted) and not _newer(source, target):
             return Done(0.0, 0, True)
         replace = True
     with closing(open_sound(source, channels, topic)) as sound:
@@ -147,6 +148,11 @@ def _complete(
     if other:
         raise OutputError(f"{target} was made with other {other[0]}; take another -o, or --force computes it again")
     return True
+
+
+def _newer(source: str | Path, target: str | Path) -> bool:
+    """Whether the input has been written since; one that has gone, or is from the future, has not."""
+    return os.path.exists(source) and os.stat(target).st_mtime_ns < os.stat(source).st_mtime_ns <= time.time_ns()
 
 
 def _parameters(values: Mapping[str, Any], wanted: Sequence[str], sample_rate: float) -> dict[str, Any]:

@@ -85,7 +85,7 @@ def format_of(path: str | os.PathLike[str]) -> Format:
     """The format of a result file by its name; ValueError where it is none."""
     extension = Path(path).suffix.lower()
     if extension not in FORMATS:
-        raise ValueError(f"{path}: results end in {', '.join(FORMATS)}; the name of a folder ends in /")
+        raise ValueError(f"{path}: results end in {', '.join(FORMATS)}")
     return FORMATS[extension]
 
 

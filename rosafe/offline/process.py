@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import inspect
 import itertools
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -25,7 +27,7 @@ DEFAULT_BLOCK = 12000  # frames, as InputProc's
 def process(
     signal: Any,
     sample_rate: float,
-    *,
+    *by_place: Any,
     parameters: Mapping[str, Any] | None = None,
     block_frames: int | Sequence[int] = DEFAULT_BLOCK,
     modifications: Sequence[tuple[int, str, Any]] = (),
@@ -87,11 +89,28 @@ def process(
     >>> result["ratemap"].shape
     (2, 32, 99)
     """
+    options = (parameters, block_frames, modifications, outputs)
+    if by_place:
+        options = _named(by_place, options)
     try:
-        work = _Work(signal, sample_rate, parameters, block_frames, modifications, outputs)
+        work = _Work(signal, sample_rate, *options)
     except ValueError as problem:
         raise problem.with_traceback(None) from None  # where inside it was found helps nobody
     return work.run()
+
+
+process.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
+    [p for p in inspect.signature(process).parameters.values() if p.kind is not p.VAR_POSITIONAL],
+    return_annotation="dict[str, Any]",
+)
+
+
+def _named(by_place: tuple[Any, ...], options: tuple[Any, Any, Any, Any]) -> tuple[Any, Any, Any, Any]:
+    """The options, of which the first ones were given by their place, as it was done once and still is in programs."""
+    if len(by_place) > len(options):
+        raise TypeError(f"process() takes 2 positional arguments, and {2 + len(by_place)} were given")
+    warnings.warn("give what follows the sample rate by name, as in parameters={...}", DeprecationWarning, 3)
+    return (*by_place, *options[len(by_place) :])  # type: ignore[return-value]
 
 
 class _Work:

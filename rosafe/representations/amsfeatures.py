@@ -123,7 +123,7 @@ class AmsFeatures(FramedStage):
                 open_minimum=True,
                 unit="Hz",
             ),
-            Parameter("ams_dsRatio", "unsigned long", 4, "Every so-manieth sample is taken", 1, 1000),
+            Parameter("ams_dsRatio", "unsigned long", 4, "One of so many samples is taken", 1, 1000),
             Parameter("ams_wSizeSec", "double", 0.032, "Window duration (s)", 0.0, MAX_FRAME_SECONDS, True, unit="s"),
             Parameter("ams_hSizeSec", "double", 0.016, "Window step size (s)", 0.0, MAX_FRAME_SECONDS, True, unit="s"),
             Parameter("ams_wname", "string", "rectwin", "Window name", choices=ALL_NAMES),

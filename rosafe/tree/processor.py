@@ -202,9 +202,9 @@ class Processor(Member):
             stage.provide = self._wanted(stage, taken.number)
         if self.place is not None and not self.children:  # who take blocks in one piece
             stage.place = self.place(taken.data.shape[-1])
-        needs = stage.needs
-        data = taken.parts[0]
-        output = stage.process(data, taken.extras[needs]) if needs else stage.process(data)
+        data, extras = taken.parts[0], taken.extras
+        needs = extras and stage.needs
+        output = stage.process(data, extras[needs]) if needs else stage.process(data)
         parts = output if isinstance(output, tuple) else (output,)
         next_index = taken.next_index
         if look_ahead := stage.look_ahead:
@@ -213,10 +213,8 @@ class Processor(Member):
 
     def _wanted(self, stage: Stage, number: int) -> frozenset[str]:
         """The by-products that children need of block `number`."""
-        with self._lock:
-            children = list(self.children)
-        wanted = [child.changes.needs(number) for child in children]
-        return frozenset(stage.PROVIDES).intersection(wanted) if any(wanted) else NOTHING
+        wanted = [needs for child in tuple(self.children) if (needs := child.changes.needs(number))]
+        return frozenset(stage.PROVIDES).intersection(wanted) if wanted else NOTHING
 
     def _tell(self, block: Block, begun: float) -> None:
         """Tell the world of the block that was released last."""

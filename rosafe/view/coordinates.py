@@ -12,6 +12,13 @@ from rosafe.interface import KINDS, Representation
 EARS = ("left", "right")
 
 
+def check_result(result: Any) -> None:
+    """ValueError where it is no result at all, but such as the name of a file."""
+    if not isinstance(result, Mapping):
+        kind = type(result).__name__
+        raise ValueError(f"result: {kind} is not what rosafe.process returns, or rosafe.load, which reads a file")
+
+
 def frame_times(
     result: Mapping[str, Any], kind: Representation, count: int, sample_rate: float | None = None
 ) -> np.ndarray:

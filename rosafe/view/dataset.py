@@ -9,7 +9,7 @@ import numpy as np
 
 from rosafe.interface import KINDS
 from rosafe.missing import require
-from rosafe.view.coordinates import EARS, along, frame_times
+from rosafe.view.coordinates import EARS, along, check_result, frame_times
 
 if TYPE_CHECKING:
     from xarray import Dataset
@@ -50,6 +50,7 @@ def to_xarray(result: Mapping[str, Any], sample_rate: float | None = None) -> Da
     ('time',)
     """
     xarray = require("xarray", "rosafe.to_xarray")
+    check_result(result)
     coordinates: dict[str, tuple[str, Any, dict[str, str]]] = {}
     variables: dict[str, tuple[tuple[str, ...], np.ndarray, dict[str, str]]] = {}
     there = [(k, name, part) for k in KINDS.values() for name, part in k.outputs.items() if name in result]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +11,7 @@ import numpy as np
 from rosafe.interface import KINDS
 from rosafe.missing import require
 from rosafe.view.axes import frequency_axis, image, style
-from rosafe.view.coordinates import EARS, along, frame_times
+from rosafe.view.coordinates import EARS, along, check_result, frame_times
 from rosafe.view.levels import LEVELS
 
 if TYPE_CHECKING:
@@ -87,6 +87,8 @@ def plot(
         return draw(figure, result, names, ear, **options)
     if len(names) != 1:
         raise ValueError(f"ax: it takes one output, and there are {', '.join(names)}; choose one with outputs")
+    if not hasattr(ax, "get_xlim"):  # such as all axes of a figure
+        raise ValueError(f"ax: {type(ax).__name__} is not matplotlib's Axes")
     with style():
         _Panel(result, names[0], **options).draw(ax, EARS.index(ear or EARS[0]))
     return ax.figure
@@ -122,9 +124,12 @@ def draw(
 
 def _chosen(result: Mapping[str, Any], outputs: Sequence[str] | str | None) -> list[str]:
     """The names in `result` of what is to be drawn, each once, in the order asked for."""
+    check_result(result)
     there = [name for name in _OUTPUTS if name in result]
     if outputs is None:
         outputs = there
+    if not isinstance(outputs, Iterable):
+        raise ValueError(f"outputs: {outputs!r} is not a sequence of names")
     names: dict[str, None] = {}
     for wanted in [outputs] if isinstance(outputs, str) else outputs:
         parts = list(KINDS[wanted].outputs) if wanted in KINDS else [wanted]

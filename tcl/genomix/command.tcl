@@ -58,6 +58,12 @@ proc ::genomix::Port {client name port args} {
 
 # Do what the switches say: wait for the result, or return a request.
 proc ::genomix::Perform {client words query switches background callback} {
+    if {$::tcl_interactive} {
+        $client poll ;# tclsh serves no events at its prompt
+        foreach request [dict keys $::genomix::failed] {
+            catch {$request overdue}
+        }
+    }
     if {[dict get $switches oneway]} {
         $client get [list send {*}$words] [dict merge $query {oneway 1}]
         return

@@ -23,6 +23,7 @@ namespace eval ::genomix {
     variable clients 0 ;# made so far; handles are genomix1, genomix2, ...
     variable requests 0 ;# in the background, made so far; their commands are ::genomix::request1, ...
     variable attention 500 ;# ms in which a script may look at a failed request before its error is told
+    variable failed {} ;# requests in the background of whose errors nobody has been told yet, as keys
     variable private {} ;# the server that localhost started: {channel port}
 }
 

@@ -5,16 +5,18 @@ oo::class create ::genomix::Request {
     # Status: sent, done or error.   Output: the result, once it is here.   Exception: the error, as a dict.
     # Callback: a command prefix, or empty.   Changed: written at the end and when patience ends; `wait` waits for that.
     # Seen: whether somebody has asked for the status since the end.   Timer: what will tell of an error, or empty.
-    # Warning: of the component, or empty.
-    variable Client Command Id Status Output Exception Callback Changed Seen Timer Warning
+    # Warning: of the component, or empty.   Made: when it was made, in ms.
+    variable Client Command Id Status Output Exception Callback Changed Seen Timer Warning Made
 
     constructor {client command callback} {
         lassign [list $client $command $callback] Client Command Callback
         lassign {{} sent {} {} 0 0 {} {}} Id Status Output Exception Changed Seen Timer Warning
+        set Made [clock milliseconds]
     }
 
     destructor {
         after cancel $Timer
+        dict unset ::genomix::failed [self]
     }
 
     # id
@@ -126,13 +128,23 @@ oo::class create ::genomix::Request {
             after 0 [list {*}$Callback [self]]
         } elseif {$aloud && $Status eq "error"} {
             set Timer [after $::genomix::attention [namespace code {my Complain}]]
+            dict set ::genomix::failed [self] 1
             return 1
         }
         return 0
     }
 
+    # Tell of the error now, where nobody serves events: at the prompt of tclsh.
+    method overdue {} {
+        if {[clock milliseconds] - $Made >= $::genomix::attention} {
+            after cancel $Timer
+            my Complain
+        }
+    }
+
     # As Tcl tells of errors in the background, in one line.
     method Complain {} {
+        dict unset ::genomix::failed [self]
         if {$Seen} {
             return
         }

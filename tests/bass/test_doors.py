@@ -104,3 +104,19 @@ def test_the_reason_is_told_and_the_acquisition_goes_on(graph: Graph, bass_node:
     newest = graph.message("/bass/Audio", audio).lastFrameIndex
     graph.message("/bass/Audio", audio, accept=lambda message: message.lastFrameIndex > newest + 800)
     assert WHY in bass_node.err and bass_node.err.count("tee:null") == 1
+
+
+def test_names_that_are_almost_right(graph: Graph, bass_node: Process) -> None:
+    listed = "see ListDevices and `arecord -L` for what there is)"
+    for name, hint in {
+        "scen:": "; did you mean scene:?",
+        "Scene:?seconds=3": "; did you mean scene:?",
+        "scene": "; did you mean scene:?",
+        "'scene:'": "; did you mean scene:?",
+        "File:/tmp/a.wav": "; did you mean file:?",
+        "bags:/tmp/a.bag": "; did you mean bag:?",
+        "hw:1.0": listed,
+        "no_such_pcm": listed,
+    }.items():
+        told = json.loads(graph.call("/bass/Acquire", device=name).genom_exdetail)
+        assert told["ex"] == "::bass::e_device" and told["what"].endswith(hint), (name, told)

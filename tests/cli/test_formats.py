@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 from pathlib import Path
 from types import SimpleNamespace
@@ -77,7 +78,7 @@ def test_zeros_are_no_missing_numbers_for_xarray(tmp_path: Path) -> None:
 def test_parameters_are_those_in_force(tmp_path: Path, sound: Path) -> None:
     """Also the highest channel, where the sample rate has decided."""
     target = tmp_path / "result.npz"
-    few = {"fb_nChannels": 3}
+    few: dict[str, Any] = {"fb_nChannels": 3}
     process_file(sound, target, few, outputs=["ild"])
     told = rosafe.load(target)["parameters"]
     assert told["fb_highFreqHz"] == rosafe.load(target)["fb_cfHz"][-1] == 7600.0
@@ -91,6 +92,21 @@ def test_parameters_are_those_in_force(tmp_path: Path, sound: Path) -> None:
     process_file(sound, target, {**few, "fb_highFreqHz": 7000.0}, outputs=["ild"], replace=True)
     with pytest.raises(OutputError, match="was made with other parameters"):
         process_file(sound, target, few, outputs=["ild"], resume=True)
+
+
+@pytest.mark.parametrize("extension", [".npz", ".zarr"])
+def test_a_result_older_than_its_input_is_made_anew(tmp_path: Path, sound: Path, extension: str) -> None:
+    target = tmp_path / f"result{extension}"
+    process_file(sound, target, SMALL_PARAMETERS, outputs=["ild"])
+    assert process_file(sound, target, SMALL_PARAMETERS, outputs=["ild"], resume=True).skipped
+    write(sound, noise(5000, 9))
+    os.utime(sound, (2e9 + 2e9, 2e9 + 2e9))  # by a wrong clock: that would be made anew for ever
+    assert process_file(sound, target, SMALL_PARAMETERS, outputs=["ild"], resume=True).skipped
+    os.utime(sound)
+    os.utime(target, (1e9, 1e9))
+    assert not process_file(sound, target, SMALL_PARAMETERS, outputs=["ild"], resume=True).skipped
+    expected = rosafe.process(as_int32(noise(5000, 9)), RATE, parameters=SMALL_PARAMETERS, outputs=["ild"])
+    np.testing.assert_array_equal(rosafe.load(target)["ild"], expected["ild"])
 
 
 @pytest.mark.parametrize("output", ["ild", "input", "itd"])

@@ -103,7 +103,7 @@ def test_one_that_is_killed_is_told(alone: Graph) -> None:
         assert re.search(r"\?token=[\w-]{43}\r?\n", up.sent), up.sent
         done = alone.run("rosnode", "info", "/bass")
         os.kill(int(re.findall(r"Pid: (\d+)", done.stdout)[0]), signal.SIGKILL)
-        up.expect("killed by signal 9")
+        up.expect("killed by signal 9\n")
         up.press("\x03")
         up.expect("ending what was started")
         assert up.end() == 1

@@ -49,3 +49,16 @@ def test_the_page_of_the_request(world: World) -> None:
     assert 'name: "pitch_0"' in pitch and 'name: "amsfeatures_0"' in modulation.lower()
     assert rates.startswith("rostopic hz ") and rates.split()[2] in world.graph.topics()
     assert world.lines(f"set env(GENOMIXD) $address\n{tcl}") == ["/rosAFE/ildPort/ild_1", "16"]
+
+
+def test_the_page_of_the_representations(world: World) -> None:
+    page = (harness.ROOT / "docs" / "representations.md").read_text("utf-8")
+    (shell,) = re.findall(r"^```sh\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
+    (tcl,) = re.findall(r"^```tcl\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
+    *calls, live = shell.splitlines()
+    assert live.startswith("rosafe live ") and len(calls) == 5
+    for call in calls:
+        assert "genom_success: True" in world.graph.run("sh", "-c", call).stdout, call
+    assert "value: 0.4" in world.graph.run("rosservice", "call", "/rosAFE/getProcessors", "{}").stdout.replace('"', "")
+    axes, shape = world.lines(f"set env(GENOMIXD) $address\n{tcl}")[-1].split(": ")
+    assert axes == "0 ear 1 feature 2 time" and shape.split()[:4] == ["0", "2", "1", "3"]

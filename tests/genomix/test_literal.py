@@ -264,3 +264,13 @@ def _granted(world: World, name: str) -> bool:
         return "dau is taken" in world.http.call(f"{name}/modifyParameter", change)["warning"]
     except HttpError:
         return False
+
+
+@pytest.mark.parametrize(
+    ("name", "meant"),
+    [("getparameters", "getParameters"), ("PitchPort", "pitchPort"), ("amsfeaturesport", "amsFeaturesPort")],
+)
+def test_a_name_in_another_case_is_told(world: World, name: str, meant: str) -> None:
+    with pytest.raises(HttpError) as refused:
+        world.http.call(f"rosAFE/{name}")
+    assert refused.value.ex == "::genom::no_such_service" and refused.value.what.endswith(f"; did you mean {meant}?")

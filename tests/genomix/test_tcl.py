@@ -686,6 +686,26 @@ def test_errors_in_the_background_are_told_in_one_line(world: World) -> None:
     assert sorted(done.stderr.splitlines()) == [message, f"rosAFE::preProcPort &: ::genom::no_such_outport: {missing}"]
 
 
+def test_errors_in_the_background_are_told_at_the_prompt_of_tclsh(world: World) -> None:
+    """It serves no events while it waits for a line: they are told with the next request, and once."""
+    with Terminal(["tclsh"], world.graph.env) as terminal:
+
+        def types(line: str) -> str:
+            terminal.press(f"{line}\n")
+            return terminal.expect("\n% ")
+
+        terminal.expect("% ")
+        types("package require genomix")
+        types(f"set g [genomix::connect 127.0.0.1:{world.port}]; $g load rosAFE")
+        types("set ::genomix::attention 0")
+        types("rosAFE::modifyParameter nobody x 1 &")
+        types("$g load rosAFE; after 100")
+        told = types("set looked [rosAFE::removeProcessor nobody2 &]")
+        assert "rosAFE::modifyParameter &: ::rosAFE::e_noSuchProcessor: there is no processor 'nobody'" in told
+        assert "error" in types("$looked wait")
+        assert "&:" not in types("rosAFE::getProcessors") and "&:" not in types("rosAFE::getProcessors")
+
+
 def test_a_lost_server_is_told_once(world: World) -> None:
     with worlds.genomixd(world.graph) as (server, port):
         script = world.graph.home / "lost.tcl"

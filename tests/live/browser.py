@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 from selenium import webdriver
@@ -60,8 +61,8 @@ class Browser:
 
 
 @contextmanager
-def browser() -> Iterator[Browser]:
-    """A browser with a folder of its own, which goes with it."""
+def browser(downloads: Path | None = None) -> Iterator[Browser]:
+    """A browser with a folder of its own, which goes with it; what it saves is in `downloads`."""
     options = Options()
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         for argument in (*ARGUMENTS, f"--user-data-dir={folder}"):
@@ -70,6 +71,9 @@ def browser() -> Iterator[Browser]:
         options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
         driver = webdriver.Chrome(service=Service("/usr/bin/chromedriver"), options=options)
         try:
+            if downloads is not None:
+                where = {"behavior": "allow", "downloadPath": str(downloads)}
+                driver.execute_cdp_cmd("Browser.setDownloadBehavior", where)
             yield Browser(driver)
         finally:
             driver.quit()

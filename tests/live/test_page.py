@@ -228,6 +228,23 @@ def test_a_representation_is_added_shown_and_removed(world: World, shown: Browse
     shown.until("return !document.querySelector('canvas[data-kind=onsetStrength]')")
 
 
+def test_one_picture_too_many_says_so(world: World, shown: Browser) -> None:
+    names = [f"ild_{number}" for number in range(90, 104)]
+    for name in names:
+        assert world.graph.call("/rosAFE/IldProc", name=name, upperDepName="innerhaircell_0").genom_success
+    count = "return document.querySelectorAll('.node').length"
+    shown.until(f"{count} >= arguments[0]", len(names) + 8)
+    shown.run("for (const one of document.querySelectorAll('.node .eye[aria-pressed=false]')) one.click()")
+    last = "const [panel] = [...document.querySelectorAll('.panel canvas')].slice(-1); "
+    shown.until(last + "return panel.title.includes('close another')")
+    opened = "[...document.querySelectorAll('.node .eye[aria-pressed=true]')]"
+    shown.run(f"for (const one of {opened}.slice(0, 8)) one.click()")
+    shown.until(last + "panel.scrollIntoView(); return panel.title === '' && Boolean(panel.dataset.plot)")
+    for name in names:
+        assert world.graph.call("/rosAFE/removeProcessor", name=name).genom_success
+    shown.run("localStorage.clear()")
+
+
 def test_two_windows_and_a_reload(world: World, shown: Browser) -> None:
     driver = shown.driver
     first = driver.current_window_handle

@@ -273,3 +273,38 @@ def test_names_and_parameters_of_the_matlab_front_end(world: World, sound: Path)
     assert "e_badNewValue: sf_requests" in told["bad word"]
     assert told["no type"].startswith("manager_RosAFE:type there is no type of processors 'spikes'; there are: input, ")
     assert "spikes" in told["no name"] and told["read only"]
+
+
+def test_pictures_of_features(world: World) -> None:
+    """The pitch lies over what it came from, in Hz; features of different units each fill their own range."""
+    told = octave.shown(
+        world,
+        """
+        startRosAFE;
+        names = {'pitch', 'rawPitch', 'confidence'};
+        pitch = FeatureSignal(10, 10, 'pitch', 'pitch_0', names, 'left');
+        pitch.appendChunk([NaN 0 0.1; 120 120 0.9; 125 125 0.8; NaN 300 0.2]);
+        figure('visible', 'off');
+        pitch.plot();
+        lines = get(gca(), 'children'); % the one on top comes first
+        show('pitch', {get(lines(1), 'ydata'), get(lines(2), 'ydata'), get(lines(1), 'xdata')});
+        show('unit', get(get(gca(), 'ylabel'), 'string'));
+        figure('visible', 'off');
+        pitch.plot([], 'confidence');
+        show('confidence', {get(get(gca(), 'children'), 'ydata'), get(get(gca(), 'ylabel'), 'string')});
+        features = FeatureSignal(10, 10, 'spectralFeatures', 'spectralFeatures_0', {'flux', 'hfc', 'crest'}, 'left');
+        figure('visible', 'off');
+        features.plot(); % nothing has come yet
+        features.appendChunk([0 1e6 5; 2 3e6 5; 1 2e6 5]);
+        figure('visible', 'off');
+        features.plot();
+        show('ranges', get(get(gca(), 'children'), 'cdata'));
+        show('features', get(gca(), 'yticklabel').');
+        """,
+    )
+    on_top, under, times = told["pitch"]
+    assert on_top == [None, 120, 125, None] and under == [None, 120, 125, 300]
+    assert times == pytest.approx([0, 0.1, 0.2, 0.3]) and told["unit"] == "Hz"
+    assert told["confidence"] == [pytest.approx([0.1, 0.9, 0.8, 0.2]), "confidence"]
+    assert told["ranges"] == [[0, 1, 0.5], [0, 1, 0.5], [0, 0, 0]]
+    assert told["features"] == ["flux", "hfc", "crest"]

@@ -207,8 +207,10 @@ def test_the_traceback_ends_where_the_user_called() -> None:
 def test_what_follows_the_sample_rate_has_a_name() -> None:
     kinds = [p.kind.name for p in inspect.signature(rosafe.process).parameters.values()]
     assert kinds == ["POSITIONAL_OR_KEYWORD"] * 2 + ["KEYWORD_ONLY"] * 4
-    with pytest.raises(TypeError, match="takes 2 positional arguments but 3 were given"):
-        rosafe.process(GOOD, RATE, {"fb_nERBs": 2.0})  # type: ignore[call-arg]
+    with pytest.warns(DeprecationWarning, match="by name"), pytest.raises(ValueError, match="fb_nERBs"):
+        rosafe.process(GOOD, RATE, {"fb_nERBs": 0})
+    with pytest.raises(TypeError, match="takes 2 positional arguments, and 7 were given"):
+        rosafe.process(GOOD, RATE, {}, 1, (), None, 5)
 
 
 def test_sizes_that_fill_the_memory() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import matplotlib
@@ -276,11 +277,21 @@ def test_a_plugin_is_drawn_too(ax: Axes, monkeypatch: pytest.MonkeyPatch) -> Non
         ({"outputs": []}, "no output"),
         ({"outputs": ["itd", "ild"]}, "it takes one output"),
         ({"outputs": "itd", "ear": "middle"}, "'middle' is not one of left, right"),
+        ({"outputs": 5}, "outputs: 5 is not a sequence of names"),
+        ({"outputs": "itd", "ax": np.array([1])}, "ax: ndarray is not matplotlib's Axes"),
     ],
 )
 def test_refusals(result: dict[str, Any], ax: Axes, arguments: dict[str, Any], words: str) -> None:
     with pytest.raises(ValueError, match=words):
-        plot(result, ax=ax, **arguments)
+        plot(result, **{"ax": ax, **arguments})
+
+
+@pytest.mark.parametrize("wrong", ["speech.npz", np.zeros((2, 100)), None])
+def test_what_is_no_result(wrong: Any) -> None:
+    takers: list[Callable[[Any], Any]] = [rosafe.plot, rosafe.to_xarray]
+    for takes in takers:
+        with pytest.raises(ValueError, match=r"is not what rosafe\.process returns, or rosafe\.load"):
+            takes(wrong)
 
 
 def test_arrays_of_another_shape_are_refused(ax: Axes) -> None:

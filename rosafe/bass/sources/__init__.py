@@ -7,6 +7,8 @@ import threading
 from collections.abc import Iterator
 
 from rosafe.bass.sources.base import Chunk, SoundSource, device_error
+from rosafe.interface import ComponentError
+from rosafe.vocabulary.words import meant
 
 __all__ = ["Chunk", "SoundSource", "device_lines", "open_source"]
 
@@ -68,6 +70,13 @@ def open_source(device: str, sample_rate: int, frames_per_chunk: int, stopping: 
         from rosafe.bass.sources.scene import SceneSource
 
         return SceneSource(device[len("scene:") :], sample_rate or DEFAULT_RATE, frames_per_chunk, stopping)
-    from rosafe.bass.sources.alsa import AlsaSource
+    from rosafe.bass.sources.alsa import AlsaSource, DeviceBusyError
 
-    return AlsaSource(device, sample_rate or DEFAULT_RATE, frames_per_chunk, stopping)
+    try:
+        return AlsaSource(device, sample_rate or DEFAULT_RATE, frames_per_chunk, stopping)
+    except ComponentError as problem:
+        first = device.strip("'\" ").partition(":")[0]
+        hint = meant(first, [name.partition(":")[0] for name, _ in BUILT_IN])
+        if problem.ex != device_error("").ex or isinstance(problem, DeviceBusyError) or not hint:
+            raise
+        raise device_error(f"{problem.what}{hint.removesuffix('?')}:?") from None

@@ -124,9 +124,11 @@ class AlsaSource:
     def _refusal(self, problem: str, heard: list[str]) -> ComponentError:
         """e_device for a PCM that is not there, is busy or broken; what libasound said of it last comes along."""
         text = problem.removesuffix(f" [{self._pcm_name}]")
+        not_there = "see ListDevices and `arecord -L` for what there is"
         hint = {
             os.strerror(errno.EBUSY): "another program uses it; see `fuser -v /dev/snd/*`",
-            os.strerror(errno.ENOENT): "see ListDevices and `arecord -L` for what there is",
+            os.strerror(errno.ENOENT): not_there,
+            os.strerror(errno.ENODEV): not_there,
             os.strerror(errno.EACCES): "put the user into the group audio",
         }.get(text)
         if text == os.strerror(errno.EINVAL) and not heard:  # an open that fails does not do so silently

@@ -13,6 +13,7 @@ const GAP = 12; // between the ears
 const EARS = ["left ear", "right ear"];
 const FREQUENCIES = [20, 50, 100, 200, 500, 1000, 2000, 4000, 8000, 16000, 32000];
 const TWO_SIDED = new Set(["ild", "itd", "gabor"]);
+const SIDES = { ild: "above 0: louder on the right", itd: "above 0: earlier on the right" };
 const RANGE_DB = 60;
 const GROUNDS = { magma: "#08060f", deep: "#0a0c18", viridis: "#1c0424" }; // where there is nothing: as dark as their least
 const TITLES = {
@@ -87,7 +88,7 @@ export class Panel {
     this.canvas.dataset.kind = view.kind;
     this.element.classList.toggle("wide", view.kind === "ratemap");
     this.heading.textContent = title(view.kind) + (kinds[view.kind]?.parts.length > 1 ? `: ${view.partName}` : "");
-    this.of.textContent = view.name;
+    this.of.textContent = view.kind in SIDES ? `${view.name} · ${SIDES[view.kind]}` : view.name;
     this.of.title = view.doc;
     this.canvas.setAttribute("aria-label", `${this.heading.textContent} of ${view.name} over time`);
     this.#offer(view, kinds);
@@ -244,6 +245,7 @@ export class Panel {
     if (view.mode === "heat") this.#bar(pen, boxes, theme);
     this.#mark(pen, boxes, theme, pointed);
     if (this.problem) this.#say(pen, boxes[0], theme, this.problem);
+    else if (canvas.title) canvas.title = "";
     const [box] = boxes;
     canvas.dataset.plot = JSON.stringify({
       x: box.x * ratio, y: box.y * ratio, w: box.w * ratio, h: box.h * ratio, from: head - span, to: head,
@@ -252,6 +254,7 @@ export class Panel {
   }
 
   #say(pen, box, theme, text) {
+    if (this.canvas.title !== text) this.canvas.title = text;
     pen.font = `${1.2 * theme.letter}px ${theme.font}`;
     pen.textAlign = "center";
     pen.textBaseline = "middle";

@@ -5,6 +5,7 @@ import { Clock, Series } from "./series.js";
 import { el, offer, store, stored } from "./ui.js";
 
 const USUAL = ["ratemap", "ild", "crossCorrelation"]; // open by themselves
+const MOST = 16; // views that the server gives a page
 const FIT = 0.5; // seconds between two looks at the range of the numbers
 
 const same = (a, b) => a.what === b.what && a.name === b.name && (a.what !== "picture" || (a.part === b.part && (a.row === b.row || a.row < 0)));
@@ -131,10 +132,12 @@ export class Pictures extends EventTarget {
   #keys() {
     const keys = [{ what: "levels" }];
     for (const panel of this.panels) {
-      keys.push({ ...panel.key });
-      if (panel.kind === "crossCorrelation") keys.push({ what: "direction", name: panel.key.name });
+      const more = [{ ...panel.key }];
+      if (panel.kind === "crossCorrelation") more.push({ what: "direction", name: panel.key.name });
+      if (keys.length + more.length <= MOST) keys.push(...more);
+      else panel.problem = "too many pictures: close another one";
     }
-    return keys.slice(0, 16);
+    return keys;
   }
 
   #asked = "";

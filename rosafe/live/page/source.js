@@ -54,7 +54,7 @@ export class Source {
     this.list = el("datalist", { id: "devices" });
     this.doc = el("p", { class: "help" });
     this.problem = el("p", { class: "error", role: "alert" });
-    this.rate = el("input", { type: "number", min: "0", max: "768000", value: "44100", "aria-label": "sample rate" });
+    this.rate = el("input", { type: "number", min: "0", max: "768000", placeholder: "its own", title: "Empty: that of the file or bag; of other devices 44100", "aria-label": "sample rate" });
     this.chunk = el("input", { type: "number", min: "1", max: "1000000", value: "2205", "aria-label": "frames per chunk" });
     this.start = el("button", { class: "primary", text: "Start", onclick: () => this.#start() });
     this.stop = el("button", { text: "Stop", onclick: () => this.#stop() });

@@ -49,9 +49,9 @@ export class TreeView {
   #row(one, level) {
     const load = el("span", { class: "load", title: "computing, per second" });
     const eye = el("button", { class: "eye", "aria-label": `picture of ${one.name}`, title: "Show or hide its picture", onclick: () => this.pictures.toggle(one) }, svg(EYE));
-    const name = el("button", { class: "name", title: this.catalogue.kinds[one.kind]?.doc ?? one.kind, onclick: () => this.#click(one) },
-      one.name, el("span", { text: one.name === one.kind ? "" : one.kind }));
-    name.style.paddingLeft = `${6 + 13 * level}px`;
+    const name = el("button", { class: "name", title: `${one.name}: ${this.catalogue.kinds[one.kind]?.doc ?? one.kind}`, onclick: () => this.#click(one) },
+      el("b", { text: one.name }), el("span", { text: one.name === one.kind ? "" : one.kind }));
+    name.style.paddingLeft = `${6 + 9 * level}px`;
     const row = el("li", { class: "node" }, name, load, eye);
     this.rowsBy.set(one.name, { row, load, eye });
     return row;
