@@ -110,7 +110,7 @@ def _named(by_place: tuple[Any, ...], options: tuple[Any, Any, Any, Any]) -> tup
     if len(by_place) > len(options):
         raise TypeError(f"process() takes 2 positional arguments, and {2 + len(by_place)} were given")
     warnings.warn("give what follows the sample rate by name, as in parameters={...}", DeprecationWarning, 3)
-    return (*by_place, *options[len(by_place) :])  # type: ignore[return-value]
+    return (*by_place, *options[len(by_place) :])
 
 
 class _Work:
