@@ -17,6 +17,7 @@ from tests.harness import PYTHON, ROOT, SCRIPTS, Process, free_port, wait_for
 
 README = (ROOT / "README.md").read_text("utf-8")
 WHOLE_SUITE = "scripts/test"  # is what runs this; .ci/run runs it from a clean clone
+START_SECONDS = 120  # of both nodes, on such a machine
 SESSION_SECONDS = 500.0  # on a machine with much other work; a tenth of that elsewhere
 
 
@@ -43,7 +44,8 @@ def place_like_the_checkout(folder: Path) -> dict[str, str]:
 PYTHONUNBUFFERED=1 /usr/bin/rostopic "$@" | grep -m 3 rate
 """,
         "rosservice": f"""cd {tools}
-[ -e up ] || until [ "$(/usr/bin/rosservice list 2>/dev/null | grep -c '^/.*/kill$')" = 2 ]; do :; done
+up='until [ "$(/usr/bin/rosservice list 2>/dev/null | grep -c /kill)" = 2 ]; do :; done'
+[ -e up ] || timeout {START_SECONDS} sh -c "$up" || exit 1
 touch up
 exec /usr/bin/rosservice "$@"
 """,
