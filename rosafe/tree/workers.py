@@ -22,7 +22,7 @@ from typing import Protocol
 VARIABLE = "ROSAFE_WORKERS"
 MOST = 1024
 PATIENCE = 0.05  # seconds
-SHORT = 1.5e-4  # seconds: a call takes some ten microseconds of two workers, which then want the interpreter in turn
+SHORT = 2.5e-4  # seconds: a call takes some ten microseconds of two workers, which then want the interpreter in turn
 WORKER = "rosafe worker"  # what the names of their threads begin with
 
 
