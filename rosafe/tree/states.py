@@ -215,7 +215,7 @@ class StateMachine:
     def _hand(self, child: StateMachine) -> None:
         self._holders.add(child)
         child._token = self.shared
-        if child.state is WAIT_EXEC and not child.at_work:
+        if child.ready:
             child.rouse()
 
     def _enter(self, state: State, number: int | None = None) -> None:
