@@ -116,12 +116,6 @@ TRICKS = (
         (("TOGETHER = 4,", "TOGETHER = 1,"), ("if (p > 0) {", "if (p > 0 && p % 4 == 0) {")),
     ),
     Trick(
-        "ratemap: what comes is fetched to the cache",
-        "ratemap.c",
-        (("__builtin_prefetch(x + t + AHEAD);", ""),),
-        blocks=12000,
-    ),
-    Trick(
         "ratemap: neighbouring samples in the lanes of the integrator",
         "ratemap.c",
         (

@@ -10,7 +10,7 @@
 
 #include <string.h>
 
-enum { SPAN = 2048, AHEAD = 512 /* of what is read, fetched to the cache: rows are too far apart for the processor to guess */ };
+enum { SPAN = 2048 };
 
 typedef struct {
     double retention;
@@ -34,7 +34,6 @@ INLINE double integrate(const integrator *by, const double *x, int64_t n, double
     vec before = all(s), now = {};
     for (int64_t t = 0; t < n; t += LANES) {
         vec sum = t + LANES <= n ? load(x + t) : load_first(x + t, n - t);
-        __builtin_prefetch(x + t + AHEAD);
         sum = bounded(sum, -LIMIT, LIMIT) * by->gain;
         UNROLL for (int i = 0; i < STEPS; i++) sum = fused(by->doubled[i], delayed(sum, i), sum);
         now = fused(by->powers, before, sum);
