@@ -11,6 +11,9 @@ from rosafe.component import generate
 from tests import harness
 from tests.bass.pulse import PulseServer
 
+STARTING = ("cli", "demo", "live", "packaging", "setups")  # folders whose tests start commands, browsers, compilers
+ELSEWHERE = ("aarch64", "nehalem", "clang")  # kernels under qemu, or of the other compiler
+
 generate.ensure_messages()  # test modules import rosAFE.msg and bass.msg at their top
 
 
@@ -64,7 +67,9 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """
     for item in items:
         uses_graph = {"graph", "private_graph"} & set(getattr(item, "fixturenames", ()))
-        if uses_graph or item.path.relative_to(harness.ROOT).parts[1] in ("demo", "packaging"):
+        if uses_graph or item.path.relative_to(harness.ROOT).parts[1] in STARTING:
             item.add_marker("ros")
+        if getattr(item, "callspec", None) and item.callspec.params.get("level") in ELSEWHERE:
+            item.add_marker("long")
     slow = {item.path for item in items if item.get_closest_marker("ros") or item.get_closest_marker("long")}
     items.sort(key=lambda item: item.path not in slow)
