@@ -69,7 +69,8 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         uses_graph = {"graph", "private_graph"} & set(getattr(item, "fixturenames", ()))
         if uses_graph or item.path.relative_to(harness.ROOT).parts[1] in STARTING:
             item.add_marker("ros")
-        if getattr(item, "callspec", None) and item.callspec.params.get("level") in ELSEWHERE:
+        call = getattr(item, "callspec", None)
+        if call is not None and call.params.get("level") in ELSEWHERE:
             item.add_marker("long")
     slow = {item.path for item in items if item.get_closest_marker("ros") or item.get_closest_marker("long")}
     items.sort(key=lambda item: item.path not in slow)
