@@ -87,13 +87,12 @@ class Processor(Member):
         source: Source | None = None,
     ) -> None:
         super().__init__(name, stage, parent, history_seconds)
+        # No more than 30 attributes in all, with those of `Member` and `StateMachine`: beyond, each takes longer.
         self.observers = company.observers
         self.held_up_since = 0.0
         self.usual = math.inf
         self.place: Callable[[int], FloatArray | None] | None = None
         self._company = company
-        self._listener = company.listener
-        self._workers = company.workers
         self._lock = company.workers.lock
         self._source = source
         self._started = False
@@ -105,10 +104,10 @@ class Processor(Member):
     def start(self) -> None:
         """Begin to work, with the block that the parent released last."""
         with self._lock:
-            self._workers.enter()  # nothing is attached where the system has no thread left
+            self._company.workers.enter()  # nothing is attached where the system has no thread left
             self._started = True
             self.attach()
-            self._workers.wake()
+            self._company.workers.wake()
         if self._source is not None:
             self._source.open(self._wake)
             self._wake()
@@ -117,19 +116,19 @@ class Processor(Member):
         """The source may have something."""
         with self._lock:
             self.call()
-            self._workers.wake()
+            self._company.workers.wake()
 
     def end(self) -> None:
         """Take it out of the tree, at once; whoever works on it still will not be heard."""
         with self._lock:
             self.remove()
             if self._started:
-                self._workers.leave()
-            self._workers.wake()
+                self._company.workers.leave()
+            self._company.workers.wake()
         if self._source is not None:
             self._source.stop()
         with self._telling:
-            self._listener.ended(self)
+            self._company.listener.ended(self)
 
     def join(self, timeout: float | None = None) -> bool:
         """Wait until nobody works on it and nobody will; whether that is so."""
@@ -137,7 +136,7 @@ class Processor(Member):
             return bool(self._company.over.wait_for(lambda: self.over, timeout))
 
     def rouse(self) -> None:
-        self._workers.push(self)
+        self._company.workers.push(self)
 
     def settle(self) -> None:
         self._company.over.notify_all()
@@ -183,15 +182,13 @@ class Processor(Member):
         ended = monotonic()
         seconds = ended - begun
         self.blocks += 1
-        self.busy += seconds
         limit = RISE * self.usual
         self.usual = seconds if seconds < limit else limit
         with self._lock:
             self.done(private)
-        self._listener.executed(self, seconds)
-        untold = self.untold
-        if untold is not None and self._usual_telling < SHORT:  # else once nothing deeper in the tree is ready
-            self._tell(untold, ended)
+        self._company.listener.executed(self, seconds)
+        if self.untold is not None and self._usual_telling < SHORT:  # else once nothing deeper in the tree is ready
+            self._tell(self.untold, ended)
 
     def _process(self, taken: Block) -> Block | None:
         """What comes out for a block; None where that cannot be used."""
@@ -223,7 +220,7 @@ class Processor(Member):
         with self._telling:
             if self.state is not State.REMOVED:
                 self.history.append(block)
-                self._listener.released(self, block)
+                self._company.listener.released(self, block)
         self.held_up_since = 0.0
         self._usual_telling = monotonic() - begun
 
