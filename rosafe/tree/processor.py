@@ -5,53 +5,18 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
 from time import monotonic
-from typing import Protocol
 
 from rosafe.dsp.guard import FloatArray
 from rosafe.dsp.stage import Stage
 from rosafe.tree.block import Block, Source
+from rosafe.tree.company import Company
 from rosafe.tree.member import Member
 from rosafe.tree.states import State
-from rosafe.tree.workers import SHORT, Workers
+from rosafe.tree.workers import SHORT
 
 NOTHING: frozenset[str] = frozenset()
 RISE = 2.0  # what a processor usually takes is the least of late; that is forgotten at this pace per block
-
-
-class Listener(Protocol):
-    """Who hears of what the processors do. Called by workers, of which others go on; must not wait for the tree."""
-
-    def added(self, processor: Processor) -> None:
-        """A processor is about to start; nothing was released yet. Where this raises, it is taken out again."""
-
-    def executed(self, processor: Processor, seconds: float) -> None:
-        """One block was computed in so many seconds; the last one perhaps after `ended`."""
-
-    def released(self, processor: Processor, block: Block) -> None:
-        """A block was released. Never called after `ended`, and for one processor by one worker at a time."""
-
-    def ended(self, processor: Processor) -> None:
-        """The processor is gone; `processor.error` tells why where it was not asked to."""
-
-
-# Gets (processor, state that it enters, number of the block at hand or None). Called under the tree's lock: no waiting.
-Observer = Callable[["Processor", State, "int | None"], None]
-
-
-@dataclass(frozen=True)
-class Company:
-    """What all processors of one tree have in common.
-
-    `failed` is called, by the worker, where a processor's `error` is set.
-    """
-
-    workers: Workers
-    listener: Listener
-    failed: Callable[[Processor], None]
-    over: threading.Condition  # on the tree's lock: somebody may have come to its end
-    observers: list[Observer] = field(default_factory=list)
 
 
 class Processor(Member):
@@ -72,6 +37,8 @@ class Processor(Member):
     ----------
     place : callable or None
         Gets the frames that it has taken, and tells where its stage may write the output (`Stage.place`).
+    heard : bool
+        The listener is told of its blocks, and its history remembers them.
     """
 
     parent: Processor | None
@@ -92,6 +59,7 @@ class Processor(Member):
         self.held_up_since = 0.0
         self.usual = math.inf
         self.place: Callable[[int], FloatArray | None] | None = None
+        self.heard = True
         self._company = company
         self._lock = company.workers.lock
         self._source = source
@@ -216,6 +184,8 @@ class Processor(Member):
     def _tell(self, block: Block, begun: float) -> None:
         """Tell the world of the block that was released last."""
         self.untold = None
+        if not self.heard:
+            return
         self.held_up_since = begun
         with self._telling:
             if self.state is not State.REMOVED:

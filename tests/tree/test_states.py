@@ -376,8 +376,9 @@ def test_a_token_is_taken_once() -> None:
     late = machine("late", parent)
     taken = []
     for _ in range(2):
-        assert late.ready == (begun := late.begin())
-        taken.append((begun, late.taken))
+        ready = late.ready
+        assert late.begin() == ready
+        taken.append((ready, late.taken))
         late.give_back()
         late.rest()
     assert taken == [(True, parent.shared), (False, None)]
