@@ -50,43 +50,33 @@ class Trick(NamedTuple):
 
 
 SPLIT_ONCE = """
-    const int64_t half = (n + 1) / 2, half_lags = (lags + 1) / 2;
-    vec even[SPAN + APART], odd[SPAN + APART], apart[SPAN + APART];
-    vec first[SPAN / 2 + APART], second[SPAN / 2 + APART], sum[SPAN / 2 + APART];
-    vec to[2][MOST_LAGS / 2 + APART];
-    put_zeros(l, n + lags - 1, 2 * (half + half_lags));
-    put_zeros(r, n, 2 * half);
-    for (int64_t t = 0; t < half + half_lags; t++) even[t] = l[2 * t], odd[t] = l[2 * t + 1];
-    for (int64_t t = 0; t < half; t++) {
-        first[t] = r[2 * t], second[t] = r[2 * t + 1];
-        sum[t] = first[t] + second[t];
+    const int64_t third = (n + WAYS - 1) / WAYS, third_lags = (lags + WAYS - 1) / WAYS;
+    vec l_thirds[POINTS][(SPAN + MOST_LAGS) / WAYS + APART], r_thirds[POINTS][SPAN / WAYS + APART];
+    vec once[POINTS][MOST_LAGS / WAYS + APART];
+    put_zeros(l, n + lags - 1, WAYS * (third + third_lags));
+    put_zeros(r, n, WAYS * third);
+    for (int64_t t = 0; t < third + third_lags - 1; t++)
+        UNROLL for (int k = 0; k < POINTS; k++) l_thirds[k][t] = third_of_l(k, l + WAYS * t);
+    for (int64_t t = 0; t < third; t++)
+        UNROLL for (int k = 0; k < POINTS; k++) r_thirds[k][t] = third_of_r(k, r + WAYS * t);
+    for (int k = 0; k < POINTS; k++) direct(l_thirds[k], r_thirds[k], third, third_lags, once[k]);
+    for (int64_t m = 0; m < third_lags; m++) {
+        vec five[POINTS];
+        UNROLL for (int k = 0; k < POINTS; k++) five[k] = once[k][m];
+        combine(five, c + WAYS * m);
     }
-    put_zeros(to[0], 0, half_lags);
-    add_products(odd, sum, half, half_lags, to[0]);
-    for (int64_t m = 0; m < half_lags; m++) to[1][m] = to[0][m];
-    for (int64_t t = 0; t < half + half_lags - 1; t++) apart[t] = even[t] - odd[t];
-    add_products(apart, first, half, half_lags, to[0]);
-    for (int64_t t = 0; t < half + half_lags - 1; t++) apart[t] = even[t + 1] - odd[t];
-    add_products(apart, second, half, half_lags, to[1]);
-    for (int64_t m = 0; m < half_lags; m++) c[2 * m] = to[0][m], c[2 * m + 1] = to[1][m];
     return;
 """
 TRICKS = (
     Trick(
-        "nine products for sixteen of every fourth sample (Karatsuba's way, twice)",
+        "25 products for 81 of every ninth sample (Toom's way, twice)",
         "products.c",
-        (
-            (
-                "    put_zeros(l, n + lags - 1, PHASES",
-                "    put_zeros(c, 0, lags);\n    add_products(l, r, n, lags, c);\n    return;\n"
-                "    put_zeros(l, n + lags - 1, PHASES",
-            ),
-        ),
+        (("    put_zeros(l, n + lags", "    direct(l, r, n, lags, c);\n    return;\n    put_zeros(l, n + lags"),),
     ),
     Trick(
-        "the same, instead of three products for four of every second sample",
+        "the same, instead of five products for nine of every third sample",
         "products.c",
-        (("    put_zeros(l, n + lags - 1, PHASES", SPLIT_ONCE + "    put_zeros(l, n + lags - 1, PHASES"),),
+        (("    put_zeros(l, n + lags", SPLIT_ONCE + "    put_zeros(l, n + lags"),),
     ),
     Trick(
         "the barrier that keeps sums of lags in registers",
@@ -302,7 +292,7 @@ def main() -> int:
     parser.add_argument("--rounds", type=int, default=25, help="turns of each side (default %(default)s)")
     parser.add_argument("--only", default="", metavar="TEXT", help="the tricks whose line has this; writes nothing")
     parser.add_argument("--compiler", default="gcc", help="as one types it (default %(default)s)")
-    parser.epilog = "example: /usr/bin/python3 benchmarks/tricks.py --rounds 50 --only Karatsuba"
+    parser.epilog = "example: /usr/bin/python3 benchmarks/tricks.py --rounds 50 --only Toom"
     options = parser.parse_args()
     tricks = [trick for trick in TRICKS if options.only in f"{trick.text} {trick.source} {trick.stage}"]
     if options.rounds < 1 or not tricks:

@@ -7,7 +7,7 @@
 enum {
     SPAN = 1024,      /* samples at a time: all that belongs to these stays in the second-level cache */
     MOST_LAGS = 1024, /* FFT is faster beyond */
-    SPARE = 16,       /* places behind a sequence, for `product` */
+    SPARE = 20,       /* places behind a sequence, for `product` */
 };
 
 typedef vec long_sequence[SPAN + MOST_LAGS + SPARE]; /* l */
