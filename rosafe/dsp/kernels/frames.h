@@ -5,14 +5,7 @@
 #ifndef ROSAFE_FRAMES_H
 #define ROSAFE_FRAMES_H
 
-#include "vector.h"
-
-typedef struct {
-    int64_t skip; /* where the first frame begins; each next one begins `hop` later */
-    const double *weights;
-    int64_t size, hop;
-    int64_t number; /* of frames */
-} framing;
+#include "framed.h"
 
 enum { BOUNDED = 1, SQUARED = 2 }; /* what to do to samples before they are summed */
 
@@ -34,7 +27,7 @@ INLINE double weighted(const int how, const double *x, const double *weights, in
 }
 
 /* The n samples x of a row, of which the first one is number `at`: adds their part to the sum of each frame. */
-INLINE void add_frames(const int how, const double *x, int64_t at, int64_t n, const framing *of, double *sums) {
+INLINE void add_frames(const int how, const double *x, int64_t at, int64_t n, const framed *of, double *sums) {
     const int64_t past = at - of->skip - of->size;
     int64_t frame = past < 0 ? 0 : past / of->hop + 1; /* none before reaches so far */
     for (int64_t begin; frame < of->number && (begin = of->skip + frame * of->hop) < at + n; frame++) {

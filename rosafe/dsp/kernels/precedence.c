@@ -1,10 +1,10 @@
 /* Precedence (rosafe/representations/precedence.py): windowed frames, spectra that are summed over frames and channels, and
  * correlations of frames from which an echo was taken out. The rest takes no time and is done in Python. */
 #include "fourier.h"
+#include "framed.h"
 #include "products.h"
 
 #include <math.h>
-#include <string.h>
 
 #define SQUARE_TINY 1e-145 /* samples below it are 0, as in rosafe/dsp/guard.py */
 
@@ -34,22 +34,20 @@ static void window_samples(const double *x, const double *window, int64_t n, dou
     }
 }
 
-/* The arguments as in rosafe_levels, but that nothing is done to the tail. windowed is (number, rows, size), peaks and
- * energies (number, rows); sums (number, 2, size), one for each half of the rows. */
-void rosafe_windowed(const double *history, int64_t history_stride, int64_t held, const double *block, int64_t n,
-                     const double *tail, int64_t tail_stride, int64_t tail_from, int64_t rows, int64_t skip,
-                     const double *window, int64_t size, int64_t hop, int64_t number, double *windowed, double *sums,
-                     double *peaks, double *energies) {
-    (void)tail, (void)tail_stride, (void)tail_from;
+/* Nothing is done to the tail. windowed is (number, rows, size), peaks and energies (number, rows); sums (number, 2, size),
+ * one for each half of the rows. */
+void rosafe_windowed(const framed *of, double *windowed, double *sums, double *peaks, double *energies) {
+    const int64_t rows = of->rows, number = of->number, held = of->held, size = of->size;
     uint32_t mode = denormals_off();
     memset(sums, 0, 2 * number * size * sizeof(double));
     for (int64_t f = 0; f < number; f++) {
-        const int64_t begin = skip + f * hop, old = most(0, least(size, held - begin)); /* samples of the history */
+        const int64_t begin = of->skip + f * of->hop, old = most(0, least(size, held - begin)); /* samples of the history */
         for (int64_t row = 0; row < rows; row++) {
             double *y = windowed + (f * rows + row) * size, *sum = sums + (2 * f + (2 * row >= rows)) * size;
             double peak = -HUGE_VAL, energy = 0.0;
-            window_samples(history + row * history_stride + begin, window, old, y, sum, &peak, &energy);
-            window_samples(block + row * n + begin + old - held, window + old, size - old, y + old, sum + old, &peak, &energy);
+            window_samples(of->history + row * of->history_stride + begin, of->weights, old, y, sum, &peak, &energy);
+            window_samples(of->block + row * of->n + begin + old - held, of->weights + old, size - old, y + old, sum + old, &peak,
+                           &energy);
             peaks[f * rows + row] = peak;
             energies[f * rows + row] = energy;
         }

@@ -8,7 +8,6 @@
  * sample is read once, and of what is integrated only the tail that is kept goes to memory. */
 #include "frames.h"
 
-#include <string.h>
 
 enum { SPAN = 2048 };
 
@@ -44,7 +43,7 @@ INLINE double integrate(const integrator *by, const double *x, int64_t n, double
 }
 
 INLINE void run(const int how, const double *history, int64_t held, const double *block, int64_t n, double *tail,
-                int64_t tail_from, const framing *frames, const integrator *by, double *state, double *sums) {
+                int64_t tail_from, const framed *frames, const integrator *by, double *state, double *sums) {
     double span[SPAN + LANES], s = *state;
     add_frames(how, history, 0, held, frames, sums);
     for (int64_t at = held, end; at < held + n; at = end) {
@@ -57,23 +56,20 @@ INLINE void run(const int how, const double *history, int64_t held, const double
     *state = flushed(s);
 }
 
-/* The arguments as in rosafe_levels, but that the history has been integrated already, and the block has not. state is
- * (rows, 2), of which the second belongs to the twin's form; rates (rows, number). */
-void rosafe_ratemap(const double *history, int64_t history_stride, int64_t held, const double *block, int64_t n,
-                    double *tail, int64_t tail_stride, int64_t tail_from, int64_t rows, int64_t skip,
-                    const double *weights, int64_t size, int64_t hop, int64_t number, int64_t squared, double retention,
-                    double *state, double *rates) {
-    const framing frames = {skip, weights, size, hop, number};
+/* The history has been integrated already, the block has not. state is (rows, 2), of which the second belongs to the twin's
+ * form; rates (rows, number). */
+void rosafe_ratemap(const framed *of, int64_t squared, double retention, double *state, double *rates) {
+    const int64_t rows = of->rows, number = of->number, held = of->held, n = of->n;
     const integrator by = design(retention);
     uint32_t mode = denormals_off();
     memset(rates, 0, rows * number * sizeof(double));
     for (int64_t row = 0; row < rows; row++) {
-        const double *old = history + row * history_stride, *new = block + row * n;
-        double *kept = tail + row * tail_stride;
+        const double *old = of->history + row * of->history_stride, *new = of->block + row * n;
+        double *kept = of->tail + row * of->tail_stride;
         if (squared)
-            run(SQUARED, old, held, new, n, kept, tail_from, &frames, &by, state + 2 * row, rates + row * number);
+            run(SQUARED, old, held, new, n, kept, of->tail_from, of, &by, state + 2 * row, rates + row * number);
         else
-            run(0, old, held, new, n, kept, tail_from, &frames, &by, state + 2 * row, rates + row * number);
+            run(0, old, held, new, n, kept, of->tail_from, of, &by, state + 2 * row, rates + row * number);
     }
     denormals_as(mode);
 }
