@@ -1,42 +1,91 @@
 /* The gammatone filterbank: per row (ear and channel) a cascade of equal complex one-pole filters.
  *
- * y[t] = x[t] + s, s = p y[t] with the complex pole p, `order` times; the input is scaled before every fourth pole. The
- * output is the real part, the envelope the modulus. (V. Hohmann (2002), Acta Acustica united with Acustica 88; direct form
- * II transposed, as in rosafe/dsp/gammatone.py.)
+ * y[t] = x[t] + s, s = p y[t] with the complex pole p = r exp(i a), `order` times; the input is scaled before every fourth
+ * pole. The output is the real part, the envelope the modulus. (V. Hohmann (2002), Acta Acustica united with Acustica 88;
+ * direct form II transposed, as in rosafe/dsp/gammatone.py.)
+ *
+ * What runs is z[t] = exp(-i a t) y[t], with the input turned likewise: there a pole takes z[t] = x[t] + r z[t-1], half of
+ * the arithmetic. Angles count from the beginning of a span of samples, so that there is a small table of turns.
  *
  * A row in each lane. Up to four poles at a time have their states in registers; between them, spans of samples stay in the
  * first-level cache, so that any order costs the same per pole. */
 #include "vector.h"
 
-enum { SPAN = 32, TOGETHER = 4, MOST_POLES = 128 };
+enum { SPAN = 64, TOGETHER = 4, MOST_POLES = 128 };
 
 typedef struct {
     vec re, im;
 } complexes;
 
-/* n samples through `poles` poles. */
-INLINE void run(const int poles, complexes *samples, int64_t n, complexes pole, complexes *states) {
-    complexes s[TOGETHER];
-    UNROLL for (int k = 0; k < poles; k++) s[k] = states[k];
-    for (int64_t t = 0; t < n; t++) {
-        vec re = samples[t].re, im = samples[t].im;
-        UNROLL for (int k = 0; k < poles; k++) {
-            re += s[k].re;
-            im += s[k].im;
-            s[k].re = fused(pole.re, re, -(pole.im * im));
-            s[k].im = fused(pole.re, im, pole.im * re);
-        }
-        samples[t] = (complexes){re, im};
-    }
-    UNROLL for (int k = 0; k < poles; k++) states[k] = s[k];
+INLINE complexes times(complexes a, complexes b) {
+    return (complexes){fused(a.re, b.re, -(a.im * b.im)), fused(a.re, b.im, a.im * b.re)};
 }
 
-static void run_some(int64_t poles, complexes *samples, int64_t n, complexes pole, complexes *states) {
+/* Of the channels in the lanes. */
+typedef struct {
+    vec radius;               /* of the pole */
+    complexes there[SPAN];    /* the turns of the input, times the first gain */
+    complexes back[SPAN + 1]; /* those of the output */
+} turns;
+
+static void design(complexes pole, vec gain, int64_t span, turns *by) {
+    const vec radius = root(fused(pole.re, pole.re, pole.im * pole.im)), none = (vec)((lanes)all(1.0) & (radius == 0));
+    by->radius = radius;
+    by->back[0] = (complexes){all(1.0), (vec){}};
+    by->back[1] = (complexes){pole.re / (radius + none) + none, pole.im / (radius + none)};
+    for (int64_t t = 2; t <= span; t++) by->back[t] = times(by->back[t / 2], by->back[t - t / 2]);
+    for (int64_t t = 0; t < span; t++) by->there[t] = (complexes){by->back[t].re * gain, by->back[t].im * -gain};
+}
+
+/* Samples on their way: from an ear's x for the first poles, to rows of `output` and perhaps `envelope` from the last ones. */
+typedef struct {
+    const double *x;
+    complexes *samples;
+    double *const *output, *const *envelope;
+} way;
+
+INLINE void write_some(const vec *samples, const int n, double *const rows[LANES], int64_t t) {
+    if (n == TILE)
+        write_tile(samples, rows, t);
+    else
+        UNROLL for (int k = 0; k < LANES; k++) rows[k][t] = samples[0][k];
+}
+
+/* n samples, 1 or TILE, from t on through `poles` poles, whose last outputs are z. */
+INLINE void step(const int poles, const int first, const int n, const turns *by, way on, int64_t t, complexes *z) {
+    vec output[TILE], envelope[TILE] = {};
+    UNROLL for (int i = 0; i < n; i++) {
+        complexes now = on.samples[t + i];
+        if (first) {
+            const vec x = all(on.x[t + i]);
+            now = (complexes){by->there[t + i].re * x, by->there[t + i].im * x};
+        }
+        UNROLL for (int k = 0; k < poles; k++) {
+            now.re = z[k].re = fused(by->radius, z[k].re, now.re);
+            now.im = z[k].im = fused(by->radius, z[k].im, now.im);
+        }
+        if (!on.output) on.samples[t + i] = now;
+        output[i] = times(now, by->back[t + i]).re;
+        if (on.envelope) envelope[i] = root(fused(now.re, now.re, now.im * now.im));
+    }
+    if (on.output) write_some(output, n, on.output, t);
+    if (on.envelope) write_some(envelope, n, on.envelope, t);
+}
+
+INLINE void run(const int poles, const int first, const turns *by, way on, int64_t n, complexes *last) {
+    complexes z[TOGETHER];
+    UNROLL for (int k = 0; k < poles; k++) z[k] = last[k];
+    int64_t t = 0;
+    for (; t + TILE <= n; t += TILE) step(poles, first, TILE, by, on, t, z);
+    for (; t < n; t++) step(poles, first, 1, by, on, t, z);
+    UNROLL for (int k = 0; k < poles; k++) last[k] = times(z[k], by->back[n]);
+}
+
+static void run_some(int64_t poles, const turns *by, way on, int64_t n, complexes *last) {
     switch (poles) {
-    case 4: run(4, samples, n, pole, states); break;
-    case 3: run(3, samples, n, pole, states); break;
-    case 2: run(2, samples, n, pole, states); break;
-    case 1: run(1, samples, n, pole, states); break;
+#define CASE(poles) case poles: on.x ? run(poles, 1, by, on, n, last) : run(poles, 0, by, on, n, last); break;
+        CASE(1) CASE(2) CASE(3) CASE(4)
+#undef CASE
     }
 }
 
@@ -49,59 +98,57 @@ INLINE const double *minus_pole_of(const double *sections, int64_t number) { ret
 void rosafe_gammatone(const double *block, int64_t n, int64_t channels, int64_t order, const double *sections,
                       double *state, double *output, int64_t stride, double *envelope) {
     uint32_t mode = denormals_off();
-    for (int64_t first = 0; first < 2 * channels; first += LANES) {
-        int64_t row[LANES], channel[LANES]; /* lanes without a row do the last one once more */
-        complexes pole, states[MOST_POLES], samples[SPAN];
-        vec left, right; /* the first gain for one ear's lanes, 0 for the other's */
+    for (int64_t first = 0; first < channels; first += LANES) {
+        turns by;
+        complexes pole;
+        vec gains[MOST_POLES / TOGETHER];
+        int64_t channel[LANES]; /* lanes without a channel do the last one once more */
         for (int k = 0; k < LANES; k++) {
-            row[k] = least(first + k, 2 * channels - 1);
-            channel[k] = row[k] % channels;
+            channel[k] = least(first + k, channels - 1);
             pole.re[k] = -minus_pole_of(sections, channel[k] * order)[0];
             pole.im[k] = -minus_pole_of(sections, channel[k] * order)[1];
-            left[k] = row[k] < channels ? gain_of(sections, channel[k] * order) : 0;
-            right[k] = row[k] < channels ? 0 : gain_of(sections, channel[k] * order);
-            for (int64_t p = 0; p < order; p++) {
-                states[p].re[k] = state[2 * (row[k] * order + p)];
-                states[p].im[k] = state[2 * (row[k] * order + p) + 1];
-            }
+            for (int64_t p = 0; p < order; p += TOGETHER) gains[p / TOGETHER][k] = gain_of(sections, channel[k] * order + p);
         }
-        for (int64_t at = 0; at < n; at += SPAN) {
-            int64_t count = least(SPAN, n - at);
-            double ears[2][SPAN];
-            for (int ear = 0; ear < 2; ear++)
-                for (int64_t t = 0; t < count; t++) {
-                    double x = block[ear * n + at + t];
-                    x = x < LIMIT ? x : LIMIT;
-                    ears[ear][t] = x > -LIMIT ? x : -LIMIT;
+        design(pole, gains[0], least(SPAN, n), &by);
+        const vec inverse = 1.0 / larger(by.radius, all(TINY));
+        for (int ear = 0; ear < 2; ear++) {
+            complexes last[MOST_POLES], samples[SPAN];
+            double *states[LANES];
+            for (int k = 0; k < LANES; k++) {
+                states[k] = state + 2 * order * (ear * channels + channel[k]);
+                for (int64_t p = 0; p < order; p++) {
+                    last[p].re[k] = states[k][2 * p] * inverse[k];
+                    last[p].im[k] = states[k][2 * p + 1] * inverse[k];
                 }
-            for (int64_t t = 0; t < count; t++)
-                samples[t] = (complexes){fused(all(ears[0][t]), left, all(ears[1][t]) * right), (vec){}};
-            for (int64_t p = 0; p < order; p += TOGETHER) {
-                if (p > 0) {
-                    vec gain;
-                    for (int k = 0; k < LANES; k++) gain[k] = gain_of(sections, channel[k] * order + p);
-                    for (int64_t t = 0; t < count; t++) {
-                        samples[t].re *= gain;
-                        samples[t].im *= gain;
+            }
+            for (int64_t at = 0; at < n; at += SPAN) {
+                const int64_t count = least(SPAN, n - at);
+                double x[SPAN], *rows[LANES], *envelopes[LANES];
+                for (int64_t t = 0; t < count; t += LANES)
+                    *(vec_anywhere *)(x + t) = bounded(load_first(block + ear * n + at + t, count - t), -LIMIT, LIMIT);
+                for (int k = 0; k < LANES; k++) {
+                    rows[k] = output + (ear * channels + channel[k]) * stride + at;
+                    if (envelope) envelopes[k] = envelope + (ear * channels + channel[k]) * n + at;
+                }
+                way on = {.x = x, .samples = samples};
+                for (int64_t p = 0; p < order; p += TOGETHER) {
+                    if (p > 0) {
+                        on.x = 0;
+                        for (int64_t t = 0; t < count; t++) {
+                            samples[t].re *= gains[p / TOGETHER];
+                            samples[t].im *= gains[p / TOGETHER];
+                        }
                     }
+                    if (p + TOGETHER >= order) on.output = rows, on.envelope = envelope ? envelopes : 0;
+                    run_some(least(TOGETHER, order - p), &by, on, count, last + p);
                 }
-                run_some(least(TOGETHER, order - p), samples, count, pole, states + p);
             }
-            double *to[LANES];
-            for (int k = 0; k < LANES; k++) to[k] = output + row[k] * stride + at;
-            write_rows(&samples[0].re, 2, count, to);
-            if (envelope) {
-                for (int64_t t = 0; t < count; t++)
-                    samples[t].re = root(fused(samples[t].re, samples[t].re, samples[t].im * samples[t].im));
-                for (int k = 0; k < LANES; k++) to[k] = envelope + row[k] * n + at;
-                write_rows(&samples[0].re, 2, count, to);
-            }
+            for (int k = 0; k < LANES; k++)
+                for (int64_t p = 0; p < order; p++) {
+                    states[k][2 * p] = flushed(last[p].re[k] * by.radius[k]);
+                    states[k][2 * p + 1] = flushed(last[p].im[k] * by.radius[k]);
+                }
         }
-        for (int k = 0; k < LANES; k++)
-            for (int64_t p = 0; p < order; p++) {
-                state[2 * (row[k] * order + p)] = flushed(states[p].re[k]);
-                state[2 * (row[k] * order + p) + 1] = flushed(states[p].im[k]);
-            }
     }
     denormals_as(mode);
 }
