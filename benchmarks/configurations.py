@@ -38,14 +38,14 @@ class Case(NamedTuple):
 
 # What a unit of work is; times are in proportion to it.
 UNITS = {
-    "gammatone": "a sample of eight rows (an ear's channel each; so many are filtered at a time) through four poles",
-    "ihc": "a sample of eight rows; with a power (bernstein), four of them",
+    "gammatone": "a sample of eight channels of an ear (so many are filtered at a time) through four poles",
+    "ihc": "a sample of eight rows (an ear's channel each); with a power (bernstein), four of them",
     "ild": "a sample, or its product with a window where there are more than two of them",
     "ratemap": "a sample, or its product with a window where there are more than two of them",
-    "crossCorrelation": "a product of two samples of a frame; a sample's window costs as much as thirty",
+    "crossCorrelation": "a product of two samples of a frame; a sample's window costs as much as sixty",
 }
 ROWS_AT_ONCE = 8
-WINDOWING = 30
+WINDOWING = 60
 
 
 def cases() -> list[Case]:
@@ -88,7 +88,8 @@ def _rows(kind: str, channels: int) -> float:
     """Rows for those of the default; filters of whole registers."""
     if kind not in ("gammatone", "ihc"):
         return channels / 31
-    registers, default = (-(-2 * n // ROWS_AT_ONCE) for n in (channels, 31))
+    ears_at_once = 1 if kind == "gammatone" else 2
+    registers, default = (-(-ears_at_once * n // ROWS_AT_ONCE) for n in (channels, 31))
     return registers / default
 
 

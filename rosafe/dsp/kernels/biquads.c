@@ -8,19 +8,17 @@
 
 #define COMPRESSION -0.77 /* of the envelope, in rosafe/dsp/haircell.py */
 
-enum { SPAN = 32, ROWS = 16, GROUPS = ROWS / LANES, MOST_SECTIONS = 8 };
+enum { SPAN = 64, ROWS = 16, GROUPS = ROWS / LANES, MOST_SECTIONS = 8 };
 
 enum rectification { NONE, HALF_WAVE, FULL_WAVE, SQUARE, COMPRESSED };
 
-/* n samples of a group of rows, (n, GROUPS), to what the sections take. */
+/* n samples of a group of rows, (n, GROUPS), to what the sections take. A half wave comes so from the rows. */
 INLINE void rectify(int64_t how, const vec *envelopes, int64_t n, vec *samples) {
     for (int64_t t = 0; t < n; t++) {
         vec x = samples[t * GROUPS];
         if (how == COMPRESSED) {
             x = bounded(x * power(envelopes[t * GROUPS], COMPRESSION), 0.0, LIMIT);
             x *= x;
-        } else if (how == HALF_WAVE) {
-            x = larger(x, (vec){});
         } else if (how == FULL_WAVE) {
             x = larger(x, -x);
         } else if (how == SQUARE) {
@@ -65,12 +63,12 @@ void rosafe_biquads(int64_t how, const double *block, const double *envelope, in
             for (int g = 0; g < GROUPS; g++) {
                 const double *from[LANES];
                 for (int k = 0; k < LANES; k++) from[k] = block + row[g * LANES + k] * n + at;
-                read_rows(from, span, -LIMIT, LIMIT, samples + g, GROUPS);
+                read_rows(from, span, how == HALF_WAVE ? 0.0 : -LIMIT, LIMIT, samples + g, GROUPS);
                 if (how == COMPRESSED) {
                     for (int k = 0; k < LANES; k++) from[k] = envelope + row[g * LANES + k] * n + at;
                     read_rows(from, span, -LIMIT, LIMIT, envelopes + g, GROUPS);
                 }
-                rectify(how, envelopes + g, span, samples + g);
+                if (how != NONE && how != HALF_WAVE) rectify(how, envelopes + g, span, samples + g);
             }
             for (int64_t s = 0; s < count; s++) filter(sections + 6 * s, span, samples, states[s]);
             for (int g = 0; g < GROUPS; g++) {
