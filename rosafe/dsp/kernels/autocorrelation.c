@@ -98,7 +98,7 @@ void rosafe_autocorrelations(const framed *of, int64_t how, double alpha, double
                              const double *twiddles, const int64_t *places, const double *turns, const double *corrections,
                              int64_t lags, double *output) {
     const int64_t rows = of->rows, number_of_frames = of->number, held = of->held, n = of->n, size = of->size;
-    uint32_t mode = denormals_off();
+    uint32_t mode = enter();
     for (int64_t first = 0; first < rows * number_of_frames; first += LANES) {
         complexes x[MOST_POINTS];
         vec *samples = &x[0].re;
@@ -136,5 +136,5 @@ void rosafe_autocorrelations(const framed *of, int64_t how, double alpha, double
         }
     }
     for (int64_t row = 0; row < rows; row++) keep_tail(of, row);
-    denormals_as(mode);
+    leave(mode);
 }

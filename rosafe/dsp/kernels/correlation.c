@@ -56,7 +56,7 @@ static void join(frames *of, const int64_t starts[LANES], int64_t held, int64_t 
 void rosafe_correlations(const framed *of, int64_t reach, double epsilon, double *output, int64_t channel_stride) {
     const int64_t channels = of->rows / 2, number = of->number, held = of->held, n = of->n, size = of->size;
     const double *window = of->weights;
-    uint32_t mode = denormals_off();
+    uint32_t mode = enter();
     const int64_t lags = 2 * reach + 1, spans = (size + SPAN - 1) / SPAN, span = (size + spans - 1) / spans;
     long_sequence l;
     short_sequence r;
@@ -105,5 +105,5 @@ void rosafe_correlations(const framed *of, int64_t reach, double epsilon, double
         }
     }
     for (int64_t row = 0; row < 2 * channels; row++) keep_tail(of, row);
-    denormals_as(mode);
+    leave(mode);
 }

@@ -7,7 +7,7 @@
  * 10 log10((right + epsilon) / (left + epsilon)); in `energies` is room for (rows, number). */
 void rosafe_levels(const framed *of, double epsilon, double *energies, double *levels) {
     const int64_t rows = of->rows, number = of->number, held = of->held, n = of->n;
-    uint32_t mode = denormals_off();
+    uint32_t mode = enter();
     memset(energies, 0, rows * number * sizeof(double));
     for (int64_t row = 0; row < rows; row++) {
         add_frames(BOUNDED | SQUARED, of->history + row * of->history_stride, 0, held, of, energies + row * number);
@@ -16,5 +16,5 @@ void rosafe_levels(const framed *of, double epsilon, double *energies, double *l
     }
     const double *left = energies, *right = energies + rows / 2 * number;
     for (int64_t i = 0; i < rows / 2 * number; i++) levels[i] = 10 * log10((right[i] + epsilon) / (left[i] + epsilon));
-    denormals_as(mode);
+    leave(mode);
 }

@@ -50,7 +50,7 @@ void rosafe_modulation(const framed *frames, int64_t filters, const double *b0_b
     const int64_t rows = frames->rows, number = frames->number, held = frames->held, n = frames->n;
     const int64_t tail_from = frames->tail_from, tail_stride = frames->tail_stride;
     double *tail = frames->tail;
-    uint32_t mode = denormals_off();
+    uint32_t mode = enter();
     memset(means, 0, rows * filters * number * sizeof(double));
     for (int64_t row = 0; row < rows; row++)
         for (int64_t first = 0; first < filters; first += FILTERS) {
@@ -81,5 +81,5 @@ void rosafe_modulation(const framed *frames, int64_t filters, const double *b0_b
                 after[1] = flushed(sections[k / LANES].s2[k % LANES]);
             }
         }
-    denormals_as(mode);
+    leave(mode);
 }

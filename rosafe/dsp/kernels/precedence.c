@@ -38,7 +38,7 @@ static void window_samples(const double *x, const double *window, int64_t n, dou
  * one for each half of the rows. */
 void rosafe_windowed(const framed *of, double *windowed, double *sums, double *peaks, double *energies) {
     const int64_t rows = of->rows, number = of->number, held = of->held, size = of->size;
-    uint32_t mode = denormals_off();
+    uint32_t mode = enter();
     memset(sums, 0, 2 * number * size * sizeof(double));
     for (int64_t f = 0; f < number; f++) {
         const int64_t begin = of->skip + f * of->hop, old = most(0, least(size, held - begin)); /* samples of the history */
@@ -52,7 +52,7 @@ void rosafe_windowed(const framed *of, double *windowed, double *sums, double *p
             energies[f * rows + row] = energy;
         }
     }
-    denormals_as(mode);
+    leave(mode);
 }
 
 /* --- spectra --- */
@@ -70,7 +70,7 @@ void rosafe_add_spectra(const double *samples, int64_t channels, int64_t number_
     const int64_t half = size <= points && points >= 4; /* the upper half is 0 and is not read */
     complexes x[MOST_POINTS];
     vec spectra[MOST_POINTS + 1], weighted[2][MOST_POINTS + 1];
-    uint32_t mode = denormals_off();
+    uint32_t mode = enter();
     for (int64_t f = 0; f < number_of_frames; f++) {
         for (int ear = 0; ear < 2; ear++) memset(weighted[ear], 0, (points + 1) * sizeof(vec));
         for (int64_t first = 0; first < rows; first += LANES) {
@@ -106,7 +106,7 @@ void rosafe_add_spectra(const double *samples, int64_t channels, int64_t number_
         for (int ear = 0; ear < 2; ear++)
             for (int64_t k = 0; k <= points; k++) sums[(2 * f + ear) * (points + 1) + k] = total(weighted[ear][k]);
     }
-    denormals_as(mode);
+    leave(mode);
 }
 
 /* --- correlations of what filters make of frames ---
@@ -193,7 +193,7 @@ void rosafe_correlate_filtered(const double *left, int64_t left_frame, int64_t l
                                double *correlations, double *energies) {
     const int64_t lags = 2 * reach + 1, pairs = rows * number, padded = size + 2 * reach;
     double *l_rows = scratch, *r_rows = l_rows + LANES * padded, *l_all = r_rows + LANES * size, *r_all = l_all + longest;
-    uint32_t mode = denormals_off();
+    uint32_t mode = enter();
     for (int64_t first = 0; first < pairs; first += LANES) {
         const double *l[LANES], *r[LANES];
         double *to[LANES];
@@ -228,5 +228,5 @@ void rosafe_correlate_filtered(const double *left, int64_t left_frame, int64_t l
         correlate(l, r, size, lags, c);
         write_rows(c, 1, lags, to);
     }
-    denormals_as(mode);
+    leave(mode);
 }

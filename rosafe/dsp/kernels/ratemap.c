@@ -61,7 +61,7 @@ INLINE void run(const int how, const double *history, int64_t held, const double
 void rosafe_ratemap(const framed *of, int64_t squared, double retention, double *state, double *rates) {
     const int64_t rows = of->rows, number = of->number, held = of->held, n = of->n;
     const integrator by = design(retention);
-    uint32_t mode = denormals_off();
+    uint32_t mode = enter();
     memset(rates, 0, rows * number * sizeof(double));
     for (int64_t row = 0; row < rows; row++) {
         const double *old = of->history + row * of->history_stride, *new = of->block + row * n;
@@ -71,5 +71,5 @@ void rosafe_ratemap(const framed *of, int64_t squared, double retention, double 
         else
             run(0, old, held, new, n, kept, of->tail_from, of, &by, state + 2 * row, rates + row * number);
     }
-    denormals_as(mode);
+    leave(mode);
 }
