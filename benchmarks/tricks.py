@@ -106,19 +106,6 @@ TRICKS = (
         (("TOGETHER = 4,", "TOGETHER = 1,"), ("if (p > 0) {", "if (p > 0 && p % 4 == 0) {")),
     ),
     Trick(
-        "ratemap: neighbouring samples in the lanes of the integrator",
-        "ratemap.c",
-        (
-            (
-                "    vec before = all(s), now = {};\n",
-                "    for (int64_t t = 0; t < n; t++) {\n"
-                "        double in = x[t] > LIMIT ? LIMIT : x[t] < -LIMIT ? -LIMIT : x[t];\n"
-                "        u[t] = s + by->gain[0] * in;\n        s = by->retention * u[t];\n    }\n    return s;\n"
-                "    vec before = all(s), now = {};\n",
-            ),
-        ),
-    ),
-    Trick(
         "ILD and ratemap: four sums that do not wait for one another",
         "frames.h",
         (("CHAINS = 4 }", "CHAINS = 1 }"), ("(sum[0] + sum[1]) + (sum[2] + sum[3])", "sum[0]")),
