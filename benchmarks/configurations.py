@@ -85,8 +85,8 @@ def _rate(kind: str, rate: int) -> dict[str, Any]:
 
 
 def _rows(kind: str, channels: int) -> float:
-    """Rows for those of the default; filters of whole registers."""
-    if kind not in ("gammatone", "ihc"):
+    """Rows for those of the default; where rows are in the lanes, whole registers."""
+    if kind not in ("gammatone", "ihc", "ratemap"):
         return channels / 31
     ears_at_once = 1 if kind == "gammatone" else 2
     registers, default = (-(-ears_at_once * n // ROWS_AT_ONCE) for n in (channels, 31))

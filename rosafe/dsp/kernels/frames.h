@@ -1,13 +1,14 @@
-/* Weighted sums over the frames of a row, of its samples or of their squares: for ILD and ratemap.
+/* Weighted sums over the frames of rows, of their samples or of the squares: for ILD, ratemap and modulation.
  *
- * No sample waits for the one before, so neighbouring samples of one row are in the lanes. Each frame is summed on its own,
- * which makes any window and hop cost the same per product. */
+ * No sample waits for the one before, so neighbouring samples of one row may be in the lanes; where rows are in the lanes
+ * already, they stay there. Each frame is summed on its own, which makes any window and hop cost the same per product. */
 #ifndef ROSAFE_FRAMES_H
 #define ROSAFE_FRAMES_H
 
 #include "framed.h"
 
 enum { BOUNDED = 1, SQUARED = 2 }; /* what to do to samples before they are summed */
+enum { CHAINS = 4 };               /* sums that do not wait for one another */
 
 INLINE vec prepared(const int how, vec x) {
     if (how & BOUNDED) x = bounded(x, -LIMIT, LIMIT);
@@ -16,7 +17,6 @@ INLINE vec prepared(const int how, vec x) {
 
 /* sum_t weights[t] x[t] */
 INLINE double weighted(const int how, const double *x, const double *weights, int64_t n) {
-    enum { CHAINS = 4 }; /* sums that do not wait for one another */
     vec sum[CHAINS] = {};
     int64_t t = 0;
     for (; t + CHAINS * LANES <= n; t += CHAINS * LANES)
@@ -26,13 +26,40 @@ INLINE double weighted(const int how, const double *x, const double *weights, in
     return total((sum[0] + sum[1]) + (sum[2] + sum[3]));
 }
 
+/* The same of rows in the lanes. */
+INLINE vec weighted_rows(const int how, const vec *x, const double *weights, int64_t n) {
+    vec sum[CHAINS] = {};
+    int64_t t = 0;
+    for (; t + CHAINS <= n; t += CHAINS)
+        UNROLL for (int c = 0; c < CHAINS; c++) sum[c] = fused(prepared(how, x[t + c]), all(weights[t + c]), sum[c]);
+    for (; t < n; t++) sum[0] = fused(prepared(how, x[t]), all(weights[t]), sum[0]);
+    return (sum[0] + sum[1]) + (sum[2] + sum[3]);
+}
+
+/* The first frame that reaches to sample `at` or beyond. */
+INLINE int64_t first_frame(const framed *of, int64_t at) {
+    const int64_t past = at - of->skip - of->size;
+    return past < 0 ? 0 : past / of->hop + 1;
+}
+
 /* The n samples x of a row, of which the first one is number `at`: adds their part to the sum of each frame. */
 INLINE void add_frames(const int how, const double *x, int64_t at, int64_t n, const framed *of, double *sums) {
-    const int64_t past = at - of->skip - of->size;
-    int64_t frame = past < 0 ? 0 : past / of->hop + 1; /* none before reaches so far */
+    int64_t frame = first_frame(of, at);
     for (int64_t begin; frame < of->number && (begin = of->skip + frame * of->hop) < at + n; frame++) {
         int64_t from = most(at, begin), until = least(at + n, begin + of->size);
         if (from < until) sums[frame] += weighted(how, x + from - at, of->weights + from - begin, until - from);
+    }
+}
+
+/* The same of the first `rows` of the lanes, whose sums lie one behind the other. */
+INLINE void add_frames_of_rows(const int how, const vec *x, int64_t at, int64_t n, const framed *of, int64_t rows,
+                               double *sums) {
+    int64_t frame = first_frame(of, at);
+    for (int64_t begin; frame < of->number && (begin = of->skip + frame * of->hop) < at + n; frame++) {
+        int64_t from = most(at, begin), until = least(at + n, begin + of->size);
+        if (from >= until) continue;
+        vec sum = weighted_rows(how, x + from - at, of->weights + from - begin, until - from);
+        for (int64_t k = 0; k < rows; k++) sums[k * of->number + frame] += sum[k];
     }
 }
 

@@ -1,75 +1,61 @@
 /* The ratemap: a leaky integrator, then sums over moving windows of its output or the square of that.
  *
- * u[t] = s + (1 - r) x[t], s = r u[t] (rosafe/dsp/ratemap.py). Neighbouring samples are in the lanes: the sums of one, two,
- * four... samples up to each lane's own are made in as many steps (as in parallel prefix sums, W. D. Hillis and
- * G. L. Steele (1986), Communications of the ACM 29), and what came before the register is added with the powers of r.
- *
- * Samples go in spans that stay in the first-level cache, and each frame that touches a span adds its part of it. So every
- * sample is read once, and of what is integrated only the tail that is kept goes to memory. */
+ * u[t] = s + (1 - r) x[t], s = r u[t] (rosafe/dsp/ratemap.py). A row in each lane. Samples go in spans that stay in the
+ * first-level cache, and each frame that touches a span adds its part of it. So every sample is read once, and of what is
+ * integrated only the tail that is kept goes to memory. */
 #include "frames.h"
 
+enum { SPAN = 128 };
 
-enum { SPAN = 2048 };
-
-typedef struct {
-    double retention;
-    vec gain;          /* 1 - r */
-    vec powers;        /* r to the power of 0, 1, 2... */
-    vec doubled[STEPS]; /* r to the power of 1, 2, 4... */
-    vec whole;         /* r to the power of LANES */
-} integrator;
-
-static integrator design(double retention) {
-    integrator made = {.retention = retention, .gain = all(1.0 - retention)};
-    double power = 1.0;
-    for (int k = 0; k < LANES; k++, power *= retention) made.powers[k] = power;
-    made.whole = all(power);
-    UNROLL for (int i = 0; i < STEPS; i++) made.doubled[i] = all(made.powers[1 << i]);
-    return made;
+/* A sample through the integrator. */
+INLINE vec integrated(vec x, double retention, vec *s) {
+    const vec in = bounded(x, -LIMIT, LIMIT) * (1.0 - retention), u = in + *s;
+    *s = fused(all(retention), *s, in * retention);
+    return u;
 }
 
-/* u of n samples and of what lies up to LANES - 1 places behind; given s before the first one, returns that behind the last. */
-INLINE double integrate(const integrator *by, const double *x, int64_t n, double s, double *u) {
-    vec before = all(s), now = {};
-    for (int64_t t = 0; t < n; t += LANES) {
-        vec sum = t + LANES <= n ? load(x + t) : load_first(x + t, n - t);
-        sum = bounded(sum, -LIMIT, LIMIT) * by->gain;
-        UNROLL for (int i = 0; i < STEPS; i++) sum = fused(by->doubled[i], delayed(sum, i), sum);
-        now = fused(by->powers, before, sum);
-        before = fused(by->whole, before, all(by->retention) * last(sum));
-        *(vec_anywhere *)(u + t) = now;
+/* u of n samples of the rows; s is that before the first one, then that behind the last. */
+INLINE void integrate(const double *const rows[LANES], int64_t n, double retention, vec *s, vec *u) {
+    int64_t t = 0;
+    for (; t + TILE <= n; t += TILE) {
+        vec tile[TILE];
+        read_tile(rows, t, tile);
+        UNROLL for (int i = 0; i < TILE; i++) u[t + i] = integrated(tile[i], retention, s);
     }
-    return by->retention * u[n - 1];
+    for (; t < n; t++) u[t] = integrated(gathered(rows, t), retention, s);
 }
 
-INLINE void run(const int how, const double *history, int64_t held, const double *block, int64_t n, double *tail,
-                int64_t tail_from, const framed *frames, const integrator *by, double *state, double *sums) {
-    double span[SPAN + LANES], s = *state;
-    add_frames(how, history, 0, held, frames, sums);
+/* As many rows as there are lanes, or fewer, from `row` on. */
+INLINE void run(const int how, const framed *of, int64_t row, double retention, double *state, double *sums) {
+    const int64_t rows = least(LANES, of->rows - row), held = of->held, n = of->n, tail_from = of->tail_from;
+    const double *from[LANES];
+    double *kept[LANES];
+    vec s, u[SPAN];
+    for (int k = 0; k < LANES; k++) s[k] = state[2 * least(k, rows - 1)]; /* lanes without a row do the last one once more */
+    for (int64_t k = 0; k < rows; k++)
+        add_frames(how, of->history + (row + k) * of->history_stride, 0, held, of, sums + k * of->number);
     for (int64_t at = held, end; at < held + n; at = end) {
         end = least(at + SPAN, held + n);
-        s = integrate(by, block + at - held, end - at, s, span);
-        add_frames(how, span, at, end - at, frames, sums);
-        int64_t from = most(at, tail_from);
-        if (from < end) memcpy(tail + from - tail_from, span + from - at, (end - from) * sizeof(double));
+        for (int k = 0; k < LANES; k++) from[k] = of->block + (row + least(k, rows - 1)) * n + at - held;
+        integrate(from, end - at, retention, &s, u);
+        add_frames_of_rows(how, u, at, end - at, of, rows, sums);
+        const int64_t first = most(at, tail_from);
+        for (int k = 0; k < LANES; k++) kept[k] = of->tail + (row + least(k, rows - 1)) * of->tail_stride + first - tail_from;
+        if (first < end) write_rows(u + first - at, 1, end - first, kept);
     }
-    *state = flushed(s);
+    for (int64_t k = 0; k < rows; k++) state[2 * k] = flushed(s[k]);
 }
 
 /* The history has been integrated already, the block has not. state is (rows, 2), of which the second belongs to the twin's
  * form; rates (rows, number). */
 void rosafe_ratemap(const framed *of, int64_t squared, double retention, double *state, double *rates) {
-    const int64_t rows = of->rows, number = of->number, held = of->held, n = of->n;
-    const integrator by = design(retention);
     uint32_t mode = enter();
-    memset(rates, 0, rows * number * sizeof(double));
-    for (int64_t row = 0; row < rows; row++) {
-        const double *old = of->history + row * of->history_stride, *new = of->block + row * n;
-        double *kept = of->tail + row * of->tail_stride;
+    memset(rates, 0, of->rows * of->number * sizeof(double));
+    for (int64_t row = 0; row < of->rows; row += LANES) {
         if (squared)
-            run(SQUARED, old, held, new, n, kept, of->tail_from, of, &by, state + 2 * row, rates + row * number);
+            run(SQUARED, of, row, retention, state + 2 * row, rates + row * of->number);
         else
-            run(0, old, held, new, n, kept, of->tail_from, of, &by, state + 2 * row, rates + row * number);
+            run(0, of, row, retention, state + 2 * row, rates + row * of->number);
     }
     leave(mode);
 }

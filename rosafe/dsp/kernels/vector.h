@@ -22,13 +22,11 @@
 #define TINY 1e-200
 
 #if defined __AVX512F__
-enum { LANES = 8, STEPS = 3 /* of doubling, from 1 to LANES */, TILE = 4 /* samples to and from memory at a time */ };
+enum { LANES = 8, TILE = 4 /* samples to and from memory at a time */ };
 #elif defined __AVX2__
-enum { LANES = 4, STEPS = 2, TILE = 4 };
-#elif defined __aarch64__
-enum { LANES = 2, STEPS = 1, TILE = 2 };
+enum { LANES = 4, TILE = 4 };
 #else
-enum { LANES = 2, STEPS = 1, TILE = 2 };
+enum { LANES = 2, TILE = 2 };
 #endif
 
 typedef double vec __attribute__((vector_size(8 * LANES)));
@@ -138,8 +136,7 @@ INLINE void leave(uint32_t before) {
 /* --- lanes in another order ---
  *
  * Of two registers the even ones of each pair of neighbours in turn, and the odd ones; of four samples of every second row the
- * first two or the last two, a row's pair after the other; of such registers, those of a row; the last lane in all; and in
- * lane k + 2^step what lane k had, 0 in the first ones. */
+ * first two or the last two, a row's pair after the other; and of such registers, those of a row. */
 
 #if defined __AVX512F__
 INLINE vec evens(vec a, vec b) { return __builtin_shufflevector(a, b, 0, 8, 2, 10, 4, 12, 6, 14); }
@@ -155,12 +152,6 @@ INLINE quartet row_of(vec early, vec late, const int pair) {
                        : __builtin_shufflevector(early, late, 4, 5, 12, 13, 6, 7, 14, 15);
     return pair & 1 ? __builtin_shufflevector(two, two, 4, 5, 6, 7) : __builtin_shufflevector(two, two, 0, 1, 2, 3);
 }
-INLINE vec last(vec a) { return __builtin_shufflevector(a, a, 7, 7, 7, 7, 7, 7, 7, 7); }
-INLINE vec delayed(vec a, const int step) {
-    return step == 0   ? __builtin_shufflevector(a, (vec){}, 8, 0, 1, 2, 3, 4, 5, 6)
-           : step == 1 ? __builtin_shufflevector(a, (vec){}, 8, 9, 0, 1, 2, 3, 4, 5)
-                       : __builtin_shufflevector(a, (vec){}, 8, 9, 10, 11, 0, 1, 2, 3);
-}
 #elif defined __AVX2__
 INLINE vec evens(vec a, vec b) { return __builtin_shufflevector(a, b, 0, 4, 2, 6); }
 INLINE vec odds(vec a, vec b) { return __builtin_shufflevector(a, b, 1, 5, 3, 7); }
@@ -170,15 +161,9 @@ INLINE vec pairs(const quartet *row, const int half) {
 INLINE quartet row_of(vec early, vec late, const int pair) {
     return pair ? __builtin_shufflevector(early, late, 2, 3, 6, 7) : __builtin_shufflevector(early, late, 0, 1, 4, 5);
 }
-INLINE vec last(vec a) { return __builtin_shufflevector(a, a, 3, 3, 3, 3); }
-INLINE vec delayed(vec a, const int step) {
-    return step == 0 ? __builtin_shufflevector(a, (vec){}, 4, 0, 1, 2) : __builtin_shufflevector(a, (vec){}, 4, 5, 0, 1);
-}
 #else
 INLINE vec evens(vec a, vec b) { return __builtin_shufflevector(a, b, 0, 2); }
 INLINE vec odds(vec a, vec b) { return __builtin_shufflevector(a, b, 1, 3); }
-INLINE vec last(vec a) { return __builtin_shufflevector(a, a, 1, 1); }
-INLINE vec delayed(vec a, const int step) { return (void)step, __builtin_shufflevector(a, (vec){}, 2, 0); }
 #endif
 
 INLINE double total(vec x) {
