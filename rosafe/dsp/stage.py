@@ -233,11 +233,12 @@ class Stage:
 
     def _checked(self, block: Any) -> FloatArray:
         """`block` as contiguous float64 of the right shape, or ValueError."""
-        array = np.asarray(block)
         ears = self.INPUT[0] == "ear"
+        if type(block) is np.ndarray and block.dtype is FLOAT64 and block.flags.c_contiguous:  # from a stage: no delay
+            if block.ndim == len(self.INPUT) and (not ears or len(block) == 2):
+                return block
+        array = np.asarray(block)
         right = array.ndim == len(self.INPUT) and (not ears or len(array) == 2)
-        if right and array.dtype is FLOAT64 and array.flags.c_contiguous:
-            return array  # what comes from a stage: no time is lost on the rest
         if not right or array.dtype.kind not in "iuf":
             axes = ", ".join("2 ears" if axis == "ear" else f"{axis}s" for axis in self.INPUT[:-1])
             raise ValueError(f"block: {array.dtype} of shape {array.shape} is not numbers in ({axes}, samples)")

@@ -14,7 +14,8 @@ from rosafe.interface import KINDS, ComponentError
 from rosafe.offline.signals import frame_times
 from rosafe.tree import sizes
 from rosafe.tree.block import Block
-from rosafe.tree.processor import Observer, Processor
+from rosafe.tree.company import Observer
+from rosafe.tree.processor import Processor
 from rosafe.tree.tree import Tree
 
 
@@ -53,10 +54,9 @@ class _GatedSource:
 
 
 class _Listener:
-    """Hands on what the wanted processors release, and keeps the first error, which ends the run."""
+    """Hands on what is released, and keeps the first error, which ends the run."""
 
-    def __init__(self, wanted: Iterable[str], source: _GatedSource, keep: Callable[[str, Block], None]) -> None:
-        self._wanted = frozenset(wanted)
+    def __init__(self, source: _GatedSource, keep: Callable[[str, Block], None]) -> None:
         self._source = source
         self._keep = keep
         self._lock = threading.Lock()
@@ -69,8 +69,7 @@ class _Listener:
         pass
 
     def released(self, processor: Processor, block: Block) -> None:
-        if processor.kind in self._wanted:
-            self._keep(processor.kind, block)
+        self._keep(processor.kind, block)
 
     def ended(self, processor: Processor) -> None:
         if processor.error is not None:
@@ -112,7 +111,7 @@ class Chain:
     ) -> None:
         self.sample_rate = sample_rate
         self._source = _GatedSource(blocks, sample_rate)
-        self._listener = _Listener(outputs, self._source, keep)
+        self._listener = _Listener(self._source, keep)
         self._tree = Tree(self._listener)
         self._processors: dict[str, Processor] = {}
         self._outputs = frozenset(outputs)
@@ -132,6 +131,8 @@ class Chain:
                 self._processors[kind.kind] = self._tree.add_input(kind.kind, self._source, 0, 0.0, 0.0, mine)
             elif kind.kind in kinds:
                 self._processors[kind.kind] = self._tree.add(kind.kind, kind.kind, kind.parent, mine)
+        for name, processor in self._processors.items():
+            processor.heard = name in self._outputs
 
     def schedule(self, block: int, name: str, value: Any) -> None:
         """Change a (checked) parameter before block `block`; the blocks of successive calls ascend. Or ValueError."""

@@ -244,7 +244,7 @@ class _Gathered:
         The axis whose middle stays where it is where a change alters its length; -1 for none.
     """
 
-    TOGETHER = 64  # frames: a row of one frame after the other is written many times as slowly
+    TOGETHER = 128  # frames: a row of one frame after the other is written many times as slowly
 
     def __init__(self, shape: tuple[int, ...], middle: int) -> None:
         self._middle = middle

@@ -35,9 +35,7 @@ class Member(StateMachine):
     error : BaseException or None
         Why it came to its end.
     blocks : int
-        That it has worked on, and
-    busy : float
-        the seconds that it took for them.
+        That it has worked on.
     """
 
     parent: Member | None
@@ -48,7 +46,6 @@ class Member(StateMachine):
         self.kind = stage.REPRESENTATION.kind
         self.error: BaseException | None = None
         self.blocks = 0
-        self.busy = 0.0
         self.changes = Changes(stage)
         self.history = History(self.part_rows, stage.output, history_seconds)
 

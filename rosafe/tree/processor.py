@@ -5,53 +5,18 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
 from time import monotonic
-from typing import Protocol
 
 from rosafe.dsp.guard import FloatArray
 from rosafe.dsp.stage import Stage
 from rosafe.tree.block import Block, Source
+from rosafe.tree.company import Company
 from rosafe.tree.member import Member
 from rosafe.tree.states import State
-from rosafe.tree.workers import SHORT, Workers
+from rosafe.tree.workers import SHORT
 
 NOTHING: frozenset[str] = frozenset()
 RISE = 2.0  # what a processor usually takes is the least of late; that is forgotten at this pace per block
-
-
-class Listener(Protocol):
-    """Who hears of what the processors do. Called by workers, of which others go on; must not wait for the tree."""
-
-    def added(self, processor: Processor) -> None:
-        """A processor is about to start; nothing was released yet. Where this raises, it is taken out again."""
-
-    def executed(self, processor: Processor, seconds: float) -> None:
-        """One block was computed in so many seconds; the last one perhaps after `ended`."""
-
-    def released(self, processor: Processor, block: Block) -> None:
-        """A block was released. Never called after `ended`, and for one processor by one worker at a time."""
-
-    def ended(self, processor: Processor) -> None:
-        """The processor is gone; `processor.error` tells why where it was not asked to."""
-
-
-# Gets (processor, state that it enters, number of the block at hand or None). Called under the tree's lock: no waiting.
-Observer = Callable[["Processor", State, "int | None"], None]
-
-
-@dataclass(frozen=True)
-class Company:
-    """What all processors of one tree have in common.
-
-    `failed` is called, by the worker, where a processor's `error` is set.
-    """
-
-    workers: Workers
-    listener: Listener
-    failed: Callable[[Processor], None]
-    over: threading.Condition  # on the tree's lock: somebody may have come to its end
-    observers: list[Observer] = field(default_factory=list)
 
 
 class Processor(Member):
@@ -72,6 +37,8 @@ class Processor(Member):
     ----------
     place : callable or None
         Gets the frames that it has taken, and tells where its stage may write the output (`Stage.place`).
+    heard : bool
+        The listener is told of its blocks, and its history remembers them.
     """
 
     parent: Processor | None
@@ -87,13 +54,13 @@ class Processor(Member):
         source: Source | None = None,
     ) -> None:
         super().__init__(name, stage, parent, history_seconds)
+        # No more than 30 attributes in all, with those of `Member` and `StateMachine`: beyond, each takes longer.
         self.observers = company.observers
         self.held_up_since = 0.0
         self.usual = math.inf
         self.place: Callable[[int], FloatArray | None] | None = None
+        self.heard = True
         self._company = company
-        self._listener = company.listener
-        self._workers = company.workers
         self._lock = company.workers.lock
         self._source = source
         self._started = False
@@ -105,10 +72,10 @@ class Processor(Member):
     def start(self) -> None:
         """Begin to work, with the block that the parent released last."""
         with self._lock:
-            self._workers.enter()  # nothing is attached where the system has no thread left
+            self._company.workers.enter()  # nothing is attached where the system has no thread left
             self._started = True
             self.attach()
-            self._workers.wake()
+            self._company.workers.wake()
         if self._source is not None:
             self._source.open(self._wake)
             self._wake()
@@ -117,19 +84,19 @@ class Processor(Member):
         """The source may have something."""
         with self._lock:
             self.call()
-            self._workers.wake()
+            self._company.workers.wake()
 
     def end(self) -> None:
         """Take it out of the tree, at once; whoever works on it still will not be heard."""
         with self._lock:
             self.remove()
             if self._started:
-                self._workers.leave()
-            self._workers.wake()
+                self._company.workers.leave()
+            self._company.workers.wake()
         if self._source is not None:
             self._source.stop()
         with self._telling:
-            self._listener.ended(self)
+            self._company.listener.ended(self)
 
     def join(self, timeout: float | None = None) -> bool:
         """Wait until nobody works on it and nobody will; whether that is so."""
@@ -137,7 +104,7 @@ class Processor(Member):
             return bool(self._company.over.wait_for(lambda: self.over, timeout))
 
     def rouse(self) -> None:
-        self._workers.push(self)
+        self._company.workers.push(self)
 
     def settle(self) -> None:
         self._company.over.notify_all()
@@ -183,15 +150,13 @@ class Processor(Member):
         ended = monotonic()
         seconds = ended - begun
         self.blocks += 1
-        self.busy += seconds
         limit = RISE * self.usual
         self.usual = seconds if seconds < limit else limit
         with self._lock:
             self.done(private)
-        self._listener.executed(self, seconds)
-        untold = self.untold
-        if untold is not None and self._usual_telling < SHORT:  # else once nothing deeper in the tree is ready
-            self._tell(untold, ended)
+        self._company.listener.executed(self, seconds)
+        if self.untold is not None and self._usual_telling < SHORT:  # else once nothing deeper in the tree is ready
+            self._tell(self.untold, ended)
 
     def _process(self, taken: Block) -> Block | None:
         """What comes out for a block; None where that cannot be used."""
@@ -219,11 +184,13 @@ class Processor(Member):
     def _tell(self, block: Block, begun: float) -> None:
         """Tell the world of the block that was released last."""
         self.untold = None
+        if not self.heard:
+            return
         self.held_up_since = begun
         with self._telling:
             if self.state is not State.REMOVED:
                 self.history.append(block)
-                self._listener.released(self, block)
+                self._company.listener.released(self, block)
         self.held_up_since = 0.0
         self._usual_telling = monotonic() - begun
 

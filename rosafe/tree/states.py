@@ -26,8 +26,9 @@ class State(enum.Enum):
     REMOVED = "removed"
 
 
-WAIT_EXEC, EXEC, WAIT_RELEASE, RELEASE = State.WAIT_EXEC, State.EXEC, State.WAIT_RELEASE, State.RELEASE  # found faster
-ENDS = (State.DONE, State.REMOVED)
+# Enumerations are slow to look up.
+WAIT_EXEC, EXEC, WAIT_RELEASE, RELEASE = State.WAIT_EXEC, State.EXEC, State.WAIT_RELEASE, State.RELEASE
+DONE, REMOVED = ENDS = (State.DONE, State.REMOVED)
 
 
 class StateMachine:
@@ -83,7 +84,7 @@ class StateMachine:
             return
         self.parent.children.append(self)
         if self.parent.shared is not None:
-            self.parent._hand(self)
+            self.parent._hand(self, self.parent.shared)
         self._end_if_exhausted()
 
     def call(self) -> None:
@@ -100,7 +101,7 @@ class StateMachine:
 
     def remove(self) -> None:
         """Gone at once: its parent waits for it no longer, and it will release nothing more."""
-        self._enter(State.REMOVED)
+        self._enter(REMOVED)
         self.shared = self._private = self._token = None
         self._leave()
         if not self.at_work:
@@ -109,7 +110,7 @@ class StateMachine:
     def finish(self) -> None:
         """Nothing more will come of it; children may still take the block released last."""
         self.give_back()
-        self._enter(State.DONE)
+        self._enter(DONE)
         if self.parent is not None and self._token is not None:  # it has failed
             self._token = None
             self.parent._freed_by(self)
@@ -124,7 +125,7 @@ class StateMachine:
             self.parent._freed_by(self)
 
     def _end_if_exhausted(self) -> None:
-        if self.parent is None or self.parent.state is not State.DONE or self._token is not None:
+        if self.parent is None or self.parent.state is not DONE or self._token is not None:
             return
         if not self.at_work and self.state is WAIT_EXEC:
             self.finish()
@@ -132,7 +133,7 @@ class StateMachine:
     @property
     def gone(self) -> bool:
         """Whether it was removed."""
-        return self.state is State.REMOVED
+        return self.state is REMOVED
 
     @property
     def over(self) -> bool:
@@ -149,16 +150,31 @@ class StateMachine:
         state = self.state
         return self._token is not None or self.called if state is WAIT_EXEC else state is RELEASE
 
-    def begin(self) -> None:
-        """Somebody works on it from now on, and takes the block that waits for it, if there is one."""
-        self.at_work = True
-        if self.state is WAIT_EXEC:
-            self.called = False
-            self.taken = taken = self._token
-            if taken is not None:
+    def begin(self) -> bool:
+        """Somebody works on it from now on, and takes the block that waits for it, if there is one.
+
+        False where there is nothing to do.
+        """
+        if self.at_work:
+            return False
+        state = self.state
+        if state is WAIT_EXEC:
+            taken = self._token
+            if taken is None:
+                if not self.called:
+                    return False
+                self.called = False
+            else:
                 self._token = None
                 self._reading = self.parent
-                self._enter(EXEC, taken.number)
+                self.state = EXEC
+                if self.observers:
+                    self._tell_observers(taken.number)
+            self.taken = taken
+        elif state is not RELEASE:
+            return False
+        self.at_work = True
+        return True
 
     def read(self, block: Block) -> None:
         """The input has read a block."""
@@ -169,11 +185,14 @@ class StateMachine:
     def done(self, private: Block | None) -> None:
         """It has computed `private`, or nothing: that is released at once or as soon as no child holds the last one."""
         self.give_back()
-        if private is not None:
-            self._enter(WAIT_RELEASE, private.number)
-            self._private = private
-            if not self._holders and self.state is WAIT_RELEASE:  # it may have been removed
-                self._release()
+        if private is not None and self.state is not REMOVED:
+            self.state = WAIT_RELEASE
+            if self.observers:
+                self._tell_observers(private.number)
+            if self._holders:
+                self._private = private
+            else:
+                self._release(private)
 
     def give_back(self) -> None:
         """Return the parent's block, which may release its next one then."""
@@ -187,40 +206,48 @@ class StateMachine:
         self.at_work, self.taken = False, None
         state = self.state
         if state is EXEC or (state is RELEASE and self.untold is None):
-            self._enter(WAIT_EXEC)
-        if self.ready:
-            self.rouse()
+            self.state = WAIT_EXEC
+            if self.observers:
+                self._tell_observers(None)
+            if self._token is not None or self.called:
+                self.rouse()
+            elif self.parent is not None and self.parent.state is DONE:
+                self._end_if_exhausted()
         elif state in ENDS:
             self.settle()
-        else:
-            self._end_if_exhausted()
+        elif self.ready:
+            self.rouse()
 
     def _freed_by(self, child: StateMachine) -> None:
         self._holders.discard(child)
         if not self._holders and self.state is WAIT_RELEASE:
-            self._release()
+            block, self._private = self._private, None
+            assert block is not None
+            self._release(block)
 
-    def _release(self) -> None:
+    def _release(self, block: Block) -> None:
         """Called, while no child holds a block, by whoever has made that possible, which is mostly a child."""
-        block, self._private = self._private, None
-        assert block is not None
-        self._enter(RELEASE, block.number)
+        self.state = RELEASE
+        if self.observers:
+            self._tell_observers(block.number)
         self.shared = self.untold = block
         for child in self.children:
-            if child.state is not State.DONE:
-                self._hand(child)
+            if child.state is not DONE:
+                self._hand(child, block)
         if not self.at_work:
             self.rouse()
 
-    def _hand(self, child: StateMachine) -> None:
+    def _hand(self, child: StateMachine, block: Block) -> None:
         self._holders.add(child)
-        child._token = self.shared
-        if child.ready:
+        child._token = block
+        if child.state is WAIT_EXEC and not child.at_work:
             child.rouse()
 
     def _enter(self, state: State, number: int | None = None) -> None:
-        if self.state is not State.REMOVED:
+        if self.state is not REMOVED:
             self.state = state
-            if self.observers:
-                for observer in self.observers:
-                    observer(self, state, number)
+            self._tell_observers(number)
+
+    def _tell_observers(self, number: int | None) -> None:
+        for observer in self.observers:
+            observer(self, self.state, number)

@@ -12,8 +12,9 @@ from rosafe.interface import KINDS, ROSAFE, ComponentError
 from rosafe.representations import STAGES
 from rosafe.tree import sizes
 from rosafe.tree.block import Source
+from rosafe.tree.company import Company, Listener, Observer
 from rosafe.tree.member import EARS
-from rosafe.tree.processor import Company, Listener, Observer, Processor, subtree
+from rosafe.tree.processor import Processor, subtree
 from rosafe.tree.sizes import Rows
 from rosafe.tree.states import State
 from rosafe.tree.workers import Workers, workers_to_use

@@ -12,6 +12,7 @@ not answer), or whose processor was removed, loses its seat to another one after
 from __future__ import annotations
 
 import functools
+import heapq
 import itertools
 import os
 import threading
@@ -38,22 +39,21 @@ def workers_to_use(wanted: int | str | None = None) -> int:
 
 
 class Task(Protocol):
-    """What workers do. One works on it at a time; `begin` and `rest` are called with the lock held."""
+    """What workers do. One works on it at a time; `begin` and `rest` are called with the lock held.
+
+    It may be pushed more often than there is something to do.
+    """
 
     depth: int
     usual: float  # seconds that it takes, or more than that
     held_up_since: float  # time.monotonic() at which somebody else began to hold it up; 0 where nobody does
 
     @property
-    def ready(self) -> bool:
-        """Whether there is something to do."""
-
-    @property
     def gone(self) -> bool:
         """Whether nobody wants the result of what is being done any more."""
 
-    def begin(self) -> object:
-        """Somebody works on it from now on."""
+    def begin(self) -> bool:
+        """Somebody works on it from now on; False where there is nothing to do."""
 
     def work(self) -> None:
         """Do it. Raises nothing."""
@@ -85,8 +85,8 @@ class Workers:
         self.lock = lock
         self.count = count
         self._members = 0
-        self._ready: list[list[Task]] = []  # by depth; what came last is taken first
-        self._waiting = 0  # tasks in there
+        self._ready: list[tuple[int, int, Task]] = []  # a heap: the deepest first, of these the one that came last
+        self._falling = itertools.count(0, -1)
         self._free = count  # seats that nobody has
         self._idle = 0  # threads that wait for a task, or are about to begin, and
         self._called = 0  # those of them that are called already
@@ -111,7 +111,7 @@ class Workers:
         """One member less."""
         self._members -= 1
         if self._members == 0:
-            self._ready, self._waiting = [], 0
+            self._ready = []
             self._turn.notify_all()
             self._watch.notify_all()
 
@@ -126,14 +126,11 @@ class Workers:
 
     def push(self, task: Task) -> None:
         """`task` is ready. Who is no worker calls `wake` after that."""
-        while len(self._ready) <= task.depth:
-            self._ready.append([])
-        self._ready[task.depth].append(task)
-        self._waiting += 1
+        heapq.heappush(self._ready, (-task.depth, next(self._falling), task))
 
     def wake(self) -> None:
         """Call an idle worker, or start one, for each task that waits, as far as there are seats."""
-        for _ in range(min(self._waiting, self._free) - self._called):
+        for _ in range(min(len(self._ready), self._free) - self._called):
             if self._idle > self._called:
                 self._called += 1
                 self._turn.notify()
@@ -146,22 +143,11 @@ class Workers:
     def _worth_a_call(self, own: Task) -> bool:
         """Whether what waits would wait too long for a worker that takes up `own` now, or keep it busy for too long."""
         seconds = own.usual
-        for tasks in self._ready:
-            for task in tasks:
-                seconds += task.usual
-                if seconds > SHORT:
-                    return True
+        for _, _, task in self._ready:
+            if seconds > SHORT:
+                break
+            seconds += task.usual
         return seconds > SHORT
-
-    def _pop(self) -> Task | None:
-        """The deepest task that is ready."""
-        for tasks in reversed(self._ready):
-            while tasks:
-                task = tasks.pop()
-                self._waiting -= 1
-                if task.ready:
-                    return task
-        return None
 
     # --- threads ---
 
@@ -180,38 +166,49 @@ class Workers:
         self._threads[name] = thread
 
     def _run(self, name: str, me: _Worker) -> None:
+        acquire, release = self.lock.acquire, self.lock.release
         with self.lock:
             self._idle -= 1
             self._called -= 1
-            while (task := self._next()) is not None:
-                me.task, me.seated = task, True
-                task.begin()
-                self.lock.release()
+            while (task := self._next(me)) is not None:
+                release()
                 try:
                     task.work()
                 finally:
-                    self.lock.acquire()
-                    self._free += me.seated
-                    me.task, me.seated = None, False
+                    acquire()
                     task.rest()
             self._workers.remove(me)
             del self._threads[name]
 
-    def _next(self) -> Task | None:
-        """A task and a seat for it, as soon as there are both; None where the thread is to end."""
+    def _next(self, me: _Worker) -> Task | None:
+        """A task that has begun, and a seat for it, as soon as there are both; None where the thread is to end."""
         while self._members:
-            if self._free and (task := self._pop()) is not None:
-                self._free -= 1
-                if self._waiting and self._free and self._worth_a_call(task):
-                    self.wake()
-                return task
+            if me.seated or self._free:
+                while self._ready:
+                    task = heapq.heappop(self._ready)[2]
+                    if not task.begin():
+                        continue
+                    me.task = task
+                    if not me.seated:
+                        me.seated = True
+                        self._free -= 1
+                    if self._ready and self._free and self._worth_a_call(task):
+                        self.wake()
+                    return task
+            self._stand(me)
             if self._idle >= self.count:  # others have come in the place of those that were held up
                 break
             self._idle += 1
             self._turn.wait()
             self._idle -= 1
             self._called = max(0, self._called - 1)
+        self._stand(me)
         return None
+
+    def _stand(self, me: _Worker) -> None:
+        """Give the seat back, if there still is one."""
+        self._free += me.seated
+        me.task, me.seated = None, False
 
     def _keep_watch(self) -> None:
         """Give the seats of those that are held up to others."""

@@ -10,9 +10,9 @@
 #include <string.h>
 #include <sys/mman.h>
 
-enum { MOST_ARRAYS = 32, MOST_ARGUMENTS = 40, MOST_REALS = 8, PAGE = 65536 };
+enum { MOST_ARRAYS = 32, MOST_ARGUMENTS = 40, MOST_REALS = 8, MOST_MEMBERS = 16, PAGE = 65536 };
 
-enum kind { INTEGER, REAL, ADDRESS /* number of the array, bytes from its beginning */ };
+enum kind { INTEGER, REAL, ADDRESS /* number of the array, bytes from its beginning */, STRUCT /* number of members, which follow */ };
 
 /* Numbers go to registers of their own kind and, behind eight reals, the rest to the stack in order: so it is for aarch64 and
  * for x86-64, and a function takes what it has of each kind, wherever they stood among the arguments. */
@@ -40,6 +40,10 @@ static char *room(size_t bytes, char **begin, size_t *size) {
     return *begin + pages - bytes;
 }
 
+static int64_t whole(int64_t kind, int64_t value, int64_t offset, char **arrays) {
+    return kind == INTEGER ? value : (int64_t)(arrays[value] + offset);
+}
+
 int main(int count, char **arguments) {
     void *library = count == 2 ? dlopen(arguments[1], RTLD_NOW) : NULL;
     if (!library) {
@@ -48,6 +52,7 @@ int main(int count, char **arguments) {
     }
     for (;;) {
         char *arrays[MOST_ARRAYS], *begins[MOST_ARRAYS], name[64];
+        int64_t members[MOST_MEMBERS];
         size_t bytes[MOST_ARRAYS], sizes[MOST_ARRAYS];
         int64_t integers[MOST_ARGUMENTS] = {0}, used = 0, reals_used = 0, number = take_number();
         double reals[MOST_REALS] = {0};
@@ -62,8 +67,15 @@ int main(int count, char **arguments) {
             int64_t kind = take_number(), value = take_number(), offset = take_number();
             if (kind == REAL)
                 memcpy(&reals[reals_used++], &value, sizeof value);
-            else
-                integers[used++] = kind == INTEGER ? value : (int64_t)(arrays[value] + offset);
+            else if (kind == STRUCT) {
+                if (value > MOST_MEMBERS) abort();
+                for (int64_t i = 0; i < value; i++) {
+                    int64_t of_member = take_number(), member = take_number(), bytes_from = take_number();
+                    members[i] = whole(of_member, member, bytes_from, arrays);
+                }
+                integers[used++] = (int64_t)members;
+            } else
+                integers[used++] = whole(kind, value, offset, arrays);
         }
         kernel *function = (kernel *)dlsym(library, name);
         if (!function) {

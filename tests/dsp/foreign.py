@@ -9,7 +9,7 @@ import shutil
 import struct
 import subprocess
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from rosafe.dsp import kernels
 from rosafe.dsp.kernels import build, library
 
-INTEGER, REAL, ADDRESS = range(3)  # as in driver.c
+INTEGER, REAL, ADDRESS, STRUCT = range(4)  # as in driver.c
 MOST_PINNED = 100  # arrays that the stages at work have
 
 
@@ -89,9 +89,9 @@ class Foreign:
     def __getattr__(self, name: str) -> Callable[..., int]:
         return functools.partial(self._call, name)
 
-    def _call(self, name: str, *arguments: float | None) -> int:
+    def _call(self, name: str, *arguments: float | bytes | None) -> int:
         kinds = library._ARGUMENTS.get(name, ())
-        named = {value for kind, value in zip(kinds, arguments, strict=True) if kind is ctypes.c_void_p and value}
+        named = set(_addresses(kinds, arguments))
         own = [np.byte_bounds(pinned.array) for pinned in _pinned.values()]
         own = [(low, high) for low, high in own if any(low <= address <= high for address in named)]
         spans = _joined([*map(np.byte_bounds, self._arrays), *own])
@@ -135,7 +135,24 @@ def _joined(spans: list[tuple[int, int]]) -> list[tuple[int, int]]:
     return joined
 
 
-def _argument(kind: Any, value: float | None, spans: list[tuple[int, int]]) -> bytes:
+def _addresses(kinds: Sequence[Any], values: Sequence[Any]) -> Iterator[int]:
+    for kind, value in zip(kinds, values, strict=True):
+        if kind is ctypes.c_char_p:
+            yield from _addresses(*_members(value))
+        elif kind is ctypes.c_void_p and value:
+            yield value
+
+
+def _members(packed: bytes) -> tuple[Sequence[Any], Sequence[int]]:
+    """Kinds and values in a struct that a kernel is given."""
+    kinds = {"P": ctypes.c_void_p, "q": ctypes.c_int64}
+    return [kinds[letter] for letter in library.FRAMES], struct.unpack(library.FRAMES, packed)
+
+
+def _argument(kind: Any, value: Any, spans: list[tuple[int, int]]) -> bytes:
+    if kind is ctypes.c_char_p:
+        members = [_argument(*member, spans) for member in zip(*_members(value), strict=True)]
+        return b"".join([struct.pack("qqq", STRUCT, len(members), 0), *members])
     if kind is ctypes.c_double:
         return struct.pack("qdq", REAL, value, 0)
     if kind is not ctypes.c_void_p or not value:

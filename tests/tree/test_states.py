@@ -169,7 +169,7 @@ class World:
     def begin(self, one: Machine) -> None:
         one.roused = False
         telling = one.state is State.RELEASE
-        one.begin()
+        assert one.begin()
         if telling:
             one.then = "tell"
             return
@@ -313,9 +313,10 @@ def test_each_may_fail() -> None:
 def test_a_call_that_is_forgotten_while_it_tells_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     begin = StateMachine.begin
 
-    def forget(self: StateMachine) -> None:
+    def forget(self: StateMachine) -> bool:
+        begun = begin(self)
         self.called = False
-        begin(self)
+        return begun
 
     monkeypatch.setattr(StateMachine, "begin", forget)
     with pytest.raises(AssertionError, match="waits for ever"):
@@ -376,7 +377,7 @@ def test_a_token_is_taken_once() -> None:
     taken = []
     for _ in range(2):
         ready = late.ready
-        late.begin()
+        assert late.begin() == ready
         taken.append((ready, late.taken))
         late.give_back()
         late.rest()

@@ -12,6 +12,7 @@ from __future__ import annotations
 import ctypes
 import functools
 import math
+import struct
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any, NamedTuple
@@ -20,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .. import memory
-from .library import Status, loaded
+from .library import FRAMES, Status, loaded
 
 FloatArray = NDArray[np.float64]
 
@@ -32,6 +33,7 @@ MOST_SIZE = 4096  # samples of a frame whose autocorrelation is made
 MOST_POINTS = 8192  # real ones of a Fourier transform
 
 REAL_SIZE = 8  # bytes of a float64
+_pack = struct.Struct(FRAMES).pack
 MOST_LANES = 8  # float64 in a register
 
 CLIPPINGS = ("clp", "clc", "sgn")
@@ -176,6 +178,29 @@ class Frames(NamedTuple):
         """Some of them, for a kernel that leaves the tail alone."""
         return self._replace(skip=self.skip + first * self.hop, number=number)
 
+    @property
+    def packed(self) -> bytes:
+        """What kernels take, which is `framed` of framed.h. It holds addresses: what they are of must stay meanwhile."""
+        (history, start, stop), block, (tail, tail_start, tail_stop), skip, weights, hop, number = self
+        held, shape = stop - start, block.shape
+        arriving = shape[-1]
+        return _pack(
+            history.address + start * REAL_SIZE,
+            history.array.shape[-1],
+            held,
+            _address(block),
+            arriving,
+            tail.address + tail_start * REAL_SIZE,
+            tail.array.shape[-1],
+            held + arriving - (tail_stop - tail_start),
+            math.prod(shape[:-1]),
+            skip,
+            weights.address,
+            len(weights.array),
+            hop,
+            number,
+        )
+
     def keep(self) -> None:
         """Fill the tail, after such kernels."""
         length = self.tail.length
@@ -190,7 +215,7 @@ def levels(frames: Frames, epsilon: float) -> FloatArray:
     """
     channels = frames.block.shape[1]
     result, energies = np.empty((channels, frames.number)), np.empty((2 * channels, frames.number))
-    _function("rosafe_levels")(*_arguments(frames), epsilon, _address(energies), _address(result))
+    _function("rosafe_levels")(frames.packed, epsilon, _address(energies), _address(result))
     return result
 
 
@@ -202,7 +227,7 @@ def ratemap(frames: Frames, squared: bool, section: FloatArray, state: FloatArra
     `rosafe.dsp.cascade.Cascade`.
     """
     rates = np.empty((*frames.block.shape[:-1], frames.number))
-    _function("rosafe_ratemap")(*_arguments(frames), squared, -section[0, 4], _address(state), _address(rates))
+    _function("rosafe_ratemap")(frames.packed, squared, -section[0, 4], _address(state), _address(rates))
     return rates
 
 
@@ -214,7 +239,7 @@ def modulation(frames: Frames, sections: FloatArray, state: FloatArray) -> Float
     `rosafe.dsp.cascade.Parallel` makes.
     """
     means = np.empty((*frames.tail.store.array.shape[:-1], frames.number))
-    _function("rosafe_modulation")(*_arguments(frames), len(sections), *map(_address, (sections, state, means)))
+    _function("rosafe_modulation")(frames.packed, len(sections), *map(_address, (sections, state, means)))
     return means
 
 
@@ -226,7 +251,7 @@ def correlations(frames: Frames, reach: int, epsilon: float, output: FloatArray)
     channels, lags, number = output.shape
     outside = lags // 2 - reach
     _function("rosafe_correlations")(
-        *_arguments(frames, channels),
+        frames.packed,
         reach,
         epsilon,
         _address(output) + outside * number * output.itemsize,
@@ -293,7 +318,7 @@ def autocorrelations(
     output = memory.empty((*rows, len(corrections), frames.number))
     transform = Transform.of(2 * len(frames.weights.array) - 1)
     _function("rosafe_autocorrelations")(
-        *_arguments(frames),
+        frames.packed,
         CLIPPINGS.index(clipping),
         alpha,
         exponent / 2,
@@ -418,26 +443,3 @@ def rows_apart(array: FloatArray) -> bool:
 def _rows(array: FloatArray) -> tuple[int, int]:
     """Address of an array whose rows may lie apart, and how far."""
     return _address(array), array.strides[-2] // REAL_SIZE
-
-
-def _arguments(frames: Frames, rows: int | None = None) -> tuple[int, ...]:
-    """The arguments that all kernels of frames begin with; by default, the number of rows is that of the samples."""
-    (history, start, stop), block, (tail, tail_start, tail_stop), skip, weights, hop, number = frames
-    held, shape = stop - start, block.shape
-    arriving = shape[-1]
-    return (
-        history.address + start * REAL_SIZE,
-        history.array.shape[-1],
-        held,
-        _address(block),
-        arriving,
-        tail.address + tail_start * REAL_SIZE,
-        tail.array.shape[-1],
-        held + arriving - (tail_stop - tail_start),
-        math.prod(shape[:-1]) if rows is None else rows,
-        skip,
-        weights.address,
-        len(weights.array),
-        hop,
-        number,
-    )

@@ -71,7 +71,7 @@ INLINE void run(const int limited, const int64_t count, const loop *loops, const
  * loops (count, 3): a, b and m, without limits where `limited` is 0; state (count, rows). */
 void rosafe_adaptation(const double *block, int64_t rows, int64_t n, double factor, const double *constants, int64_t channels,
                        const double *of_loops, int64_t count, int64_t limited, double *state, double *output) {
-    uint32_t mode = denormals_off();
+    uint32_t mode = enter();
     const loop *loops = (const loop *)of_loops;
     double rates[MOST_LOOPS];
     for (int64_t j = 0; j < count; j++) rates[j] = -2 / (loops[j].m * 0.69314718055994530942);
@@ -116,5 +116,5 @@ void rosafe_adaptation(const double *block, int64_t rows, int64_t n, double fact
         for (int k = 0; k < ROWS; k++)
             for (int64_t j = 0; j < count; j++) state[j * rows + row[k]] = states[j][k / LANES][k % LANES];
     }
-    denormals_as(mode);
+    leave(mode);
 }

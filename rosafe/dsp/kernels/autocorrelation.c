@@ -4,9 +4,8 @@
  * its way back. Out of the transform there, which halves in frequency, they come in reversed order, and the transform back,
  * which halves in time, takes them so. */
 #include "fourier.h"
+#include "framed.h"
 #include "power.h"
-
-#include <string.h>
 
 enum { MOST_SIZE = 4096 /* of a frame: as many complex points are the power of 2 above two of them */ };
 
@@ -92,17 +91,14 @@ INLINE void clip(const enum clipping how, vec *x, int64_t size, vec above, vec b
     }
 }
 
-/* The samples of a row are the `held` ones of `history` and the n of `block` behind them; the first frame begins at `skip`,
- * each next one `hop` later. Rows of the history lie history_stride apart. Samples from tail_from on, which are all of the
- * block, go to `tail`, which may be where the history was. Tables are for transforms of `points` complex numbers, of which
+/* Tables are for transforms of `points` complex numbers, of which
  * 2 points is at least 2 size - 1; the size is even. corrections (lags) are by what to multiply each lag. output is (rows,
  * lags, number). */
-void rosafe_autocorrelations(const double *history, int64_t history_stride, int64_t held, const double *block, int64_t n,
-                             double *tail, int64_t tail_stride, int64_t tail_from, int64_t rows, int64_t skip,
-                             const double *window, int64_t size, int64_t hop, int64_t number_of_frames, int64_t how,
-                             double alpha, double exponent, int64_t points, const double *twiddles, const int64_t *places,
-                             const double *turns, const double *corrections, int64_t lags, double *output) {
-    uint32_t mode = denormals_off();
+void rosafe_autocorrelations(const framed *of, int64_t how, double alpha, double exponent, int64_t points,
+                             const double *twiddles, const int64_t *places, const double *turns, const double *corrections,
+                             int64_t lags, double *output) {
+    const int64_t rows = of->rows, number_of_frames = of->number, held = of->held, n = of->n, size = of->size;
+    uint32_t mode = enter();
     for (int64_t first = 0; first < rows * number_of_frames; first += LANES) {
         complexes x[MOST_POINTS];
         vec *samples = &x[0].re;
@@ -111,17 +107,17 @@ void rosafe_autocorrelations(const double *history, int64_t history_stride, int6
         double *to[LANES];
         for (int k = 0; k < LANES; k++) { /* lanes without a frame do the last one once more */
             int64_t which = least(first + k, rows * number_of_frames - 1);
-            int64_t row = which / number_of_frames, frame = which % number_of_frames, start = skip + frame * hop;
+            int64_t row = which / number_of_frames, frame = which % number_of_frames, start = of->skip + frame * of->hop;
             to[k] = output + row * lags * number_of_frames + frame;
-            from[k] = block + row * n + start - held;
+            from[k] = of->block + row * n + start - held;
             if (start < held) {
                 int64_t old = least(held - start, size);
-                memcpy(joined[k], history + row * history_stride + start, old * sizeof(double));
-                memcpy(joined[k] + old, block + row * n, (size - old) * sizeof(double));
+                memcpy(joined[k], of->history + row * of->history_stride + start, old * sizeof(double));
+                memcpy(joined[k] + old, of->block + row * n, (size - old) * sizeof(double));
                 from[k] = joined[k];
             }
         }
-        vec lowest, highest = windowed(from, window, size, samples, &lowest);
+        vec lowest, highest = windowed(from, of->weights, size, samples, &lowest);
         vec above = all(alpha) * magnitude(highest), below = all(alpha) * magnitude(lowest);
         vec peak = larger(magnitude(highest), magnitude(lowest)), scale = all(1.0) / larger(peak, all(1e-300));
         if (how == COMPRESS)
@@ -139,7 +135,6 @@ void rosafe_autocorrelations(const double *history, int64_t history_stride, int6
             UNROLL for (int k = 0; k < LANES; k++) to[k][lag * number_of_frames] = y[k];
         }
     }
-    for (int64_t i = 0; i < rows; i++)
-        memcpy(tail + i * tail_stride, block + i * n + (tail_from - held), (held + n - tail_from) * sizeof(double));
-    denormals_as(mode);
+    for (int64_t row = 0; row < rows; row++) keep_tail(of, row);
+    leave(mode);
 }

@@ -47,7 +47,7 @@ INLINE void filter(const double *b0_b1_b2_1_a1_a2, int64_t n, vec *samples, vec 
  * (count, 6), state (count, rows, 2). */
 void rosafe_biquads(int64_t how, const double *block, const double *envelope, int64_t rows, int64_t n,
                     const double *sections, int64_t count, double *state, double *output, int64_t stride) {
-    uint32_t mode = denormals_off();
+    uint32_t mode = enter();
     for (int64_t first = 0; first < rows; first += ROWS) {
         int64_t row[ROWS]; /* lanes without a row do the last one once more */
         vec states[MOST_SECTIONS][2 * GROUPS];
@@ -82,5 +82,5 @@ void rosafe_biquads(int64_t how, const double *block, const double *envelope, in
                 for (int i = 0; i < 2; i++)
                     state[2 * (s * rows + row[k]) + i] = flushed(states[s][i * GROUPS + k / LANES][k % LANES]);
     }
-    denormals_as(mode);
+    leave(mode);
 }

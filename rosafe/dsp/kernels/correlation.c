@@ -2,9 +2,8 @@
  *
  * c[m] = sum_t l[t+m] r[t] for m from -reach to reach, over sqrt(sum l^2 sum r^2 + eps) (rosafe/dsp/crosscorrelation.py).
  * A frame, of any channel, in each lane. */
+#include "framed.h"
 #include "products.h"
-
-#include <string.h>
 
 /* Samples from..until of the rows times `window` to `to` from t on; returns their energy. */
 static vec put(const double *const rows[LANES], const double *window, int64_t from, int64_t until, vec *to, int64_t t) {
@@ -52,15 +51,12 @@ static void join(frames *of, const int64_t starts[LANES], int64_t held, int64_t 
     of->border = from;
 }
 
-/* The samples of a row are the `held` ones of `history` and the n of `block` behind them; the first frame begins at `skip`,
- * each next one `hop` later. Rows are (2, channels); those of the history lie history_stride apart. Samples from tail_from
- * on, which are all of the block, go to `tail`, which may be where the history was. output is (channels, 2 reach + 1,
- * frames), the channels channel_stride apart. 2 reach + 1 is at most MOST_LAGS. */
-void rosafe_correlations(const double *history, int64_t history_stride, int64_t held, const double *block, int64_t n,
-                         double *tail, int64_t tail_stride, int64_t tail_from, int64_t channels, int64_t skip,
-                         const double *window, int64_t size, int64_t hop, int64_t number, int64_t reach, double epsilon,
-                         double *output, int64_t channel_stride) {
-    uint32_t mode = denormals_off();
+/* Rows are (2, channels). output is (channels, 2 reach + 1, frames), the channels channel_stride apart. 2 reach + 1 is at most
+ * MOST_LAGS. */
+void rosafe_correlations(const framed *of, int64_t reach, double epsilon, double *output, int64_t channel_stride) {
+    const int64_t channels = of->rows / 2, number = of->number, held = of->held, n = of->n, size = of->size;
+    const double *window = of->weights;
+    uint32_t mode = enter();
     const int64_t lags = 2 * reach + 1, spans = (size + SPAN - 1) / SPAN, span = (size + spans - 1) / spans;
     long_sequence l;
     short_sequence r;
@@ -73,7 +69,7 @@ void rosafe_correlations(const double *history, int64_t history_stride, int64_t 
         for (int k = 0; k < LANES; k++) { /* lanes without a frame do the last one once more */
             int64_t which = least(first + k, channels * number - 1);
             channel[k] = which % channels;
-            start[k] = skip + which / channels * hop;
+            start[k] = of->skip + which / channels * of->hop;
             to[k] = output + channel[k] * channel_stride + which / channels;
         }
         for (int64_t begin = 0; begin < size; begin += span) {
@@ -84,8 +80,8 @@ void rosafe_correlations(const double *history, int64_t history_stride, int64_t 
                 frames mine = {.border = held - start[0]};
                 for (int k = 0; k < LANES; k++) {
                     int64_t row = ear * channels + channel[k];
-                    mine.old[k] = history + row * history_stride + start[k];
-                    mine.new[k] = block + row * n + start[k] - held;
+                    mine.old[k] = of->history + row * of->history_stride + start[k];
+                    mine.new[k] = of->block + row * n + start[k] - held;
                 }
                 if (start[0] != start[LANES - 1])
                     join(&mine, start, held, ear ? begin : l_begin, ear ? end : l_end, joined);
@@ -108,7 +104,6 @@ void rosafe_correlations(const double *history, int64_t history_stride, int64_t 
             UNROLL for (int k = 0; k < LANES; k++) to[k][m * number] = normalised[k];
         }
     }
-    for (int64_t i = 0; i < 2 * channels; i++)
-        memcpy(tail + i * tail_stride, block + i * n + (tail_from - held), (held + n - tail_from) * sizeof(double));
-    denormals_as(mode);
+    for (int64_t row = 0; row < 2 * channels; row++) keep_tail(of, row);
+    leave(mode);
 }

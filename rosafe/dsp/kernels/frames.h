@@ -5,14 +5,7 @@
 #ifndef ROSAFE_FRAMES_H
 #define ROSAFE_FRAMES_H
 
-#include "vector.h"
-
-typedef struct {
-    int64_t skip; /* where the first frame begins; each next one begins `hop` later */
-    const double *weights;
-    int64_t size, hop;
-    int64_t number; /* of frames */
-} framing;
+#include "framed.h"
 
 enum { BOUNDED = 1, SQUARED = 2 }; /* what to do to samples before they are summed */
 enum { CHAINS = 4 };               /* sums that do not wait for one another */
@@ -44,13 +37,13 @@ INLINE vec weighted_rows(const int how, const vec *x, const double *weights, int
 }
 
 /* The first frame that reaches to sample `at` or beyond. */
-INLINE int64_t first_frame(const framing *of, int64_t at) {
+INLINE int64_t first_frame(const framed *of, int64_t at) {
     const int64_t past = at - of->skip - of->size;
     return past < 0 ? 0 : past / of->hop + 1;
 }
 
 /* The n samples x of a row, of which the first one is number `at`: adds their part to the sum of each frame. */
-INLINE void add_frames(const int how, const double *x, int64_t at, int64_t n, const framing *of, double *sums) {
+INLINE void add_frames(const int how, const double *x, int64_t at, int64_t n, const framed *of, double *sums) {
     int64_t frame = first_frame(of, at);
     for (int64_t begin; frame < of->number && (begin = of->skip + frame * of->hop) < at + n; frame++) {
         int64_t from = most(at, begin), until = least(at + n, begin + of->size);
@@ -59,7 +52,7 @@ INLINE void add_frames(const int how, const double *x, int64_t at, int64_t n, co
 }
 
 /* The same of the first `rows` of the lanes, whose sums lie one behind the other. */
-INLINE void add_frames_of_rows(const int how, const vec *x, int64_t at, int64_t n, const framing *of, int64_t rows,
+INLINE void add_frames_of_rows(const int how, const vec *x, int64_t at, int64_t n, const framed *of, int64_t rows,
                                double *sums) {
     int64_t frame = first_frame(of, at);
     for (int64_t begin; frame < of->number && (begin = of->skip + frame * of->hop) < at + n; frame++) {

@@ -34,7 +34,7 @@ INLINE void add_products(const int count, const double *levels, int64_t ear, int
 void rosafe_patterns(const double *levels, int64_t channels, int64_t frames, int64_t reach, const pattern *patterns,
                      int64_t features, const double *weights, double *sums) {
     const int64_t stride = frames + 2 * reach, ear = channels * stride;
-    uint32_t mode = denormals_off();
+    uint32_t mode = enter();
     for (int64_t begin = 0; begin < frames; begin += TOGETHER * LANES)
         for (int64_t g = 0; g < features; g++) {
             const double *mine = levels + reach + begin;
@@ -44,5 +44,5 @@ void rosafe_patterns(const double *levels, int64_t channels, int64_t frames, int
             else
                 add_products(1, mine, ear, stride, patterns + g, weights, left, right);
         }
-    denormals_as(mode);
+    leave(mode);
 }

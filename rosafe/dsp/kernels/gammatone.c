@@ -97,7 +97,7 @@ INLINE const double *minus_pole_of(const double *sections, int64_t number) { ret
  * rows `stride` apart, envelope (2, channels, n) or null. */
 void rosafe_gammatone(const double *block, int64_t n, int64_t channels, int64_t order, const double *sections,
                       double *state, double *output, int64_t stride, double *envelope) {
-    uint32_t mode = denormals_off();
+    uint32_t mode = enter();
     for (int64_t first = 0; first < channels; first += LANES) {
         turns by;
         complexes pole;
@@ -150,5 +150,5 @@ void rosafe_gammatone(const double *block, int64_t n, int64_t channels, int64_t 
                 }
         }
     }
-    denormals_as(mode);
+    leave(mode);
 }

@@ -15,28 +15,28 @@ SWITCH = "ROSAFE_KERNELS"  # environment variable: 0 for numpy and scipy, 2, 3..
 INSTRUCTIONS = {2: "SSE4.2", 3: "AVX2 and FMA", 4: "AVX-512", 8: "NEON"}  # that the levels are for
 
 _INTEGER, _REAL, _ARRAY, _BITS = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p, ctypes.c_uint32
-# history, stride, length; block, length; tail, stride, start; rows; skip; window, size; hop; frames
-_FRAMES = (_ARRAY, _INTEGER, _INTEGER, _ARRAY, _INTEGER, _ARRAY, *[_INTEGER] * 4, _ARRAY, *[_INTEGER] * 3)
+_FRAMES = ctypes.c_char_p  # `FRAMES`, packed: one argument takes a tenth of the time of so many
+FRAMES = "PqqPqPqqqqPqqq"  # for the module struct: `framed` of framed.h; P is an address
 _ARGUMENTS = {
     "rosafe_gammatone": (_ARRAY, *[_INTEGER] * 3, *[_ARRAY] * 3, _INTEGER, _ARRAY),
     "rosafe_biquads": (_INTEGER, _ARRAY, _ARRAY, _INTEGER, _INTEGER, _ARRAY, _INTEGER, _ARRAY, _ARRAY, _INTEGER),
     "rosafe_adaptation": (_ARRAY, _INTEGER, _INTEGER, _REAL, *[_ARRAY, _INTEGER] * 2, _INTEGER, _ARRAY, _ARRAY),
-    "rosafe_levels": (*_FRAMES, _REAL, _ARRAY, _ARRAY),
-    "rosafe_ratemap": (*_FRAMES, _INTEGER, _REAL, _ARRAY, _ARRAY),
-    "rosafe_modulation": (*_FRAMES, _INTEGER, *[_ARRAY] * 3),
+    "rosafe_levels": (_FRAMES, _REAL, _ARRAY, _ARRAY),
+    "rosafe_ratemap": (_FRAMES, _INTEGER, _REAL, _ARRAY, _ARRAY),
+    "rosafe_modulation": (_FRAMES, _INTEGER, *[_ARRAY] * 3),
     "rosafe_patterns": (_ARRAY, *[_INTEGER] * 3, _ARRAY, _INTEGER, _ARRAY, _ARRAY),
     "rosafe_join": (_INTEGER, _ARRAY, _ARRAY, _INTEGER, _ARRAY, _INTEGER),
     "rosafe_denormals_off": (),
     "rosafe_denormals_as": (_BITS,),
-    "rosafe_correlations": (*_FRAMES, _INTEGER, _REAL, _ARRAY, _INTEGER),
+    "rosafe_correlations": (_FRAMES, _INTEGER, _REAL, _ARRAY, _INTEGER),
     "rosafe_spectral_features": (_ARRAY, _ARRAY, *[_INTEGER] * 3, _ARRAY, _REAL, _REAL, _ARRAY, _ARRAY),
     "rosafe_transient_map": (
         *(_ARRAY, _ARRAY, *[_INTEGER] * 7, _REAL, _REAL, _INTEGER, _INTEGER),
         *(_ARRAY, _INTEGER, *[_ARRAY] * 5),
     ),
     # clipping, alpha, exponent; points, twiddles, places, turns; corrections, lags; output
-    "rosafe_autocorrelations": (*_FRAMES, _INTEGER, _REAL, _REAL, _INTEGER, *[_ARRAY] * 4, _INTEGER, _ARRAY),
-    "rosafe_windowed": (*_FRAMES, *[_ARRAY] * 4),
+    "rosafe_autocorrelations": (_FRAMES, _INTEGER, _REAL, _REAL, _INTEGER, *[_ARRAY] * 4, _INTEGER, _ARRAY),
+    "rosafe_windowed": (_FRAMES, *[_ARRAY] * 4),
     "rosafe_correlate_filtered": (*(_ARRAY, _INTEGER, _INTEGER, _ARRAY, _ARRAY) * 2, *[_INTEGER] * 6, *[_ARRAY] * 3),
     "rosafe_add_spectra": (_ARRAY, *[_INTEGER] * 3, _ARRAY, _ARRAY, _INTEGER, *[_ARRAY] * 5),
 }

@@ -6,7 +6,6 @@
  * adds its part of it, so that only the tail that is kept goes to memory. */
 #include "frames.h"
 
-#include <string.h>
 
 enum { SPAN = 64, FILTERS = 16 /* at a time */, GROUPS = FILTERS / LANES };
 
@@ -32,7 +31,7 @@ INLINE void filter(section *sections, const double *x, int64_t n, vec magnitudes
 }
 
 /* The n magnitudes of which the first is sample `at`: adds their part to each frame's sum, of each of the lanes that are used. */
-INLINE void add_magnitudes(vec magnitudes[SPAN][GROUPS], int64_t at, int64_t n, const framing *of, int64_t used,
+INLINE void add_magnitudes(vec magnitudes[SPAN][GROUPS], int64_t at, int64_t n, const framed *of, int64_t used,
                            double *sums) {
     const int64_t past = at - of->skip - of->size;
     int64_t frame = past < 0 ? 0 : past / of->hop + 1; /* none before reaches so far */
@@ -45,15 +44,13 @@ INLINE void add_magnitudes(vec magnitudes[SPAN][GROUPS], int64_t at, int64_t n, 
     }
 }
 
-/* The arguments as in rosafe_levels, but that the samples that are held and summed are those that come out: magnitudes, in
- * rows * filters rows, `filters` of them to each of the `rows` of block. state is (filters, rows, 2), means (rows, filters,
- * number). */
-void rosafe_modulation(const double *history, int64_t history_stride, int64_t held, const double *block, int64_t n,
-                       double *tail, int64_t tail_stride, int64_t tail_from, int64_t rows, int64_t skip,
-                       const double *weights, int64_t size, int64_t hop, int64_t number, int64_t filters,
-                       const double *b0_b1_b2_1_a1_a2, double *state, double *means) {
-    const framing frames = {skip, weights, size, hop, number};
-    uint32_t mode = denormals_off();
+/* The samples that are held and summed are those that come out: magnitudes, in rows * filters rows, `filters` of them to each
+ * of the rows of the block. state is (filters, rows, 2), means (rows, filters, number). */
+void rosafe_modulation(const framed *frames, int64_t filters, const double *b0_b1_b2_1_a1_a2, double *state, double *means) {
+    const int64_t rows = frames->rows, number = frames->number, held = frames->held, n = frames->n;
+    const int64_t tail_from = frames->tail_from, tail_stride = frames->tail_stride;
+    double *tail = frames->tail;
+    uint32_t mode = enter();
     memset(means, 0, rows * filters * number * sizeof(double));
     for (int64_t row = 0; row < rows; row++)
         for (int64_t first = 0; first < filters; first += FILTERS) {
@@ -68,12 +65,12 @@ void rosafe_modulation(const double *history, int64_t history_stride, int64_t he
                 of->s1[k % LANES] = before[0], of->s2[k % LANES] = before[1];
             }
             for (int64_t k = 0; k < used; k++)
-                add_frames(0, history + (line + k) * history_stride, 0, held, &frames, mine + k * number);
+                add_frames(0, frames->history + (line + k) * frames->history_stride, 0, held, frames, mine + k * number);
             for (int64_t at = held, end; at < held + n; at = end) {
                 vec magnitudes[SPAN][GROUPS];
                 end = least(at + SPAN, held + n);
-                filter(sections, block + row * n + at - held, end - at, magnitudes);
-                add_magnitudes(magnitudes, at, end - at, &frames, used, mine);
+                filter(sections, frames->block + row * n + at - held, end - at, magnitudes);
+                add_magnitudes(magnitudes, at, end - at, frames, used, mine);
                 for (int64_t t = most(at, tail_from); t < end; t++)
                     for (int64_t k = 0; k < used; k++)
                         tail[(line + k) * tail_stride + t - tail_from] = magnitudes[t - at][k / LANES][k % LANES];
@@ -84,5 +81,5 @@ void rosafe_modulation(const double *history, int64_t history_stride, int64_t he
                 after[1] = flushed(sections[k / LANES].s2[k % LANES]);
             }
         }
-    denormals_as(mode);
+    leave(mode);
 }

@@ -1,10 +1,10 @@
 /* Precedence (rosafe/representations/precedence.py): windowed frames, spectra that are summed over frames and channels, and
  * correlations of frames from which an echo was taken out. The rest takes no time and is done in Python. */
 #include "fourier.h"
+#include "framed.h"
 #include "products.h"
 
 #include <math.h>
-#include <string.h>
 
 #define SQUARE_TINY 1e-145 /* samples below it are 0, as in rosafe/dsp/guard.py */
 
@@ -34,27 +34,25 @@ static void window_samples(const double *x, const double *window, int64_t n, dou
     }
 }
 
-/* The arguments as in rosafe_levels, but that nothing is done to the tail. windowed is (number, rows, size), peaks and
- * energies (number, rows); sums (number, 2, size), one for each half of the rows. */
-void rosafe_windowed(const double *history, int64_t history_stride, int64_t held, const double *block, int64_t n,
-                     const double *tail, int64_t tail_stride, int64_t tail_from, int64_t rows, int64_t skip,
-                     const double *window, int64_t size, int64_t hop, int64_t number, double *windowed, double *sums,
-                     double *peaks, double *energies) {
-    (void)tail, (void)tail_stride, (void)tail_from;
-    uint32_t mode = denormals_off();
+/* Nothing is done to the tail. windowed is (number, rows, size), peaks and energies (number, rows); sums (number, 2, size),
+ * one for each half of the rows. */
+void rosafe_windowed(const framed *of, double *windowed, double *sums, double *peaks, double *energies) {
+    const int64_t rows = of->rows, number = of->number, held = of->held, size = of->size;
+    uint32_t mode = enter();
     memset(sums, 0, 2 * number * size * sizeof(double));
     for (int64_t f = 0; f < number; f++) {
-        const int64_t begin = skip + f * hop, old = most(0, least(size, held - begin)); /* samples of the history */
+        const int64_t begin = of->skip + f * of->hop, old = most(0, least(size, held - begin)); /* samples of the history */
         for (int64_t row = 0; row < rows; row++) {
             double *y = windowed + (f * rows + row) * size, *sum = sums + (2 * f + (2 * row >= rows)) * size;
             double peak = -HUGE_VAL, energy = 0.0;
-            window_samples(history + row * history_stride + begin, window, old, y, sum, &peak, &energy);
-            window_samples(block + row * n + begin + old - held, window + old, size - old, y + old, sum + old, &peak, &energy);
+            window_samples(of->history + row * of->history_stride + begin, of->weights, old, y, sum, &peak, &energy);
+            window_samples(of->block + row * of->n + begin + old - held, of->weights + old, size - old, y + old, sum + old, &peak,
+                           &energy);
             peaks[f * rows + row] = peak;
             energies[f * rows + row] = energy;
         }
     }
-    denormals_as(mode);
+    leave(mode);
 }
 
 /* --- spectra --- */
@@ -72,7 +70,7 @@ void rosafe_add_spectra(const double *samples, int64_t channels, int64_t number_
     const int64_t half = size <= points && points >= 4; /* the upper half is 0 and is not read */
     complexes x[MOST_POINTS];
     vec spectra[MOST_POINTS + 1], weighted[2][MOST_POINTS + 1];
-    uint32_t mode = denormals_off();
+    uint32_t mode = enter();
     for (int64_t f = 0; f < number_of_frames; f++) {
         for (int ear = 0; ear < 2; ear++) memset(weighted[ear], 0, (points + 1) * sizeof(vec));
         for (int64_t first = 0; first < rows; first += LANES) {
@@ -108,7 +106,7 @@ void rosafe_add_spectra(const double *samples, int64_t channels, int64_t number_
         for (int ear = 0; ear < 2; ear++)
             for (int64_t k = 0; k <= points; k++) sums[(2 * f + ear) * (points + 1) + k] = total(weighted[ear][k]);
     }
-    denormals_as(mode);
+    leave(mode);
 }
 
 /* --- correlations of what filters make of frames ---
@@ -195,7 +193,7 @@ void rosafe_correlate_filtered(const double *left, int64_t left_frame, int64_t l
                                double *correlations, double *energies) {
     const int64_t lags = 2 * reach + 1, pairs = rows * number, padded = size + 2 * reach;
     double *l_rows = scratch, *r_rows = l_rows + LANES * padded, *l_all = r_rows + LANES * size, *r_all = l_all + longest;
-    uint32_t mode = denormals_off();
+    uint32_t mode = enter();
     for (int64_t first = 0; first < pairs; first += LANES) {
         const double *l[LANES], *r[LANES];
         double *to[LANES];
@@ -230,5 +228,5 @@ void rosafe_correlate_filtered(const double *left, int64_t left_frame, int64_t l
         correlate(l, r, size, lags, c);
         write_rows(c, 1, lags, to);
     }
-    denormals_as(mode);
+    leave(mode);
 }

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from . import MOST_LANES, REAL_SIZE, FloatArray, Frames, Transform, _address, _arguments, _function
+from . import MOST_LANES, REAL_SIZE, FloatArray, Frames, Transform, _address, _function
 
 TAPS = 6  # of a filter that takes an echo out
 TOGETHER = 8  # rows that lie in memory sample by sample
@@ -48,7 +48,7 @@ def windowed(frames: Frames, output: Windowed) -> None:
 
     The twin is `rosafe.representations.precedence.windowed`.
     """
-    _function("rosafe_windowed")(*_arguments(frames), *map(_address, output))
+    _function("rosafe_windowed")(frames.packed, *map(_address, output))
 
 
 def add_spectra(

@@ -5,8 +5,6 @@
  * integrated only the tail that is kept goes to memory. */
 #include "frames.h"
 
-#include <string.h>
-
 enum { SPAN = 128 };
 
 /* A sample through the integrator. */
@@ -27,44 +25,40 @@ INLINE void integrate(const double *const rows[LANES], int64_t n, double retenti
     for (; t < n; t++) u[t] = integrated(gathered(rows, t), retention, s);
 }
 
-INLINE void run(const int how, const double *history, int64_t history_stride, int64_t held, const double *block, int64_t n,
-                double *tail, int64_t tail_stride, int64_t tail_from, const framing *frames, double retention,
-                int64_t rows, double *state, double *sums) {
+/* The rows from `first` on, at most LANES of them. */
+INLINE void run(const int how, const framed *of, int64_t first, double retention, double *state, double *rates) {
+    const int64_t rows = least(LANES, of->rows - first);
     const double *from[LANES];
     double *kept[LANES];
     vec s, u[SPAN];
-    for (int k = 0; k < LANES; k++) s[k] = state[2 * least(k, rows - 1)]; /* lanes without a row do the last one once more */
     for (int64_t k = 0; k < rows; k++)
-        add_frames(how, history + k * history_stride, 0, held, frames, sums + k * frames->number);
-    for (int64_t at = held, end; at < held + n; at = end) {
-        end = least(at + SPAN, held + n);
-        for (int k = 0; k < LANES; k++) from[k] = block + least(k, rows - 1) * n + at - held;
+        add_frames(how, of->history + (first + k) * of->history_stride, 0, of->held, of, rates + (first + k) * of->number);
+    for (int k = 0; k < LANES; k++) s[k] = state[2 * least(first + k, of->rows - 1)];
+    for (int64_t at = of->held, end; at < of->held + of->n; at = end) {
+        end = least(at + SPAN, of->held + of->n);
+        const int64_t tail = most(at, of->tail_from);
+        for (int k = 0; k < LANES; k++) { /* lanes without a row do the last one once more */
+            const int64_t row = least(first + k, of->rows - 1);
+            from[k] = of->block + row * of->n + at - of->held;
+            kept[k] = of->tail + row * of->tail_stride + tail - of->tail_from;
+        }
         integrate(from, end - at, retention, &s, u);
-        add_frames_of_rows(how, u, at, end - at, frames, rows, sums);
-        const int64_t first = most(at, tail_from);
-        for (int k = 0; k < LANES; k++) kept[k] = tail + least(k, rows - 1) * tail_stride + first - tail_from;
-        if (first < end) write_rows(u + first - at, 1, end - first, kept);
+        add_frames_of_rows(how, u, at, end - at, of, rows, rates + first * of->number);
+        if (tail < end) write_rows(u + tail - at, 1, end - tail, kept);
     }
-    for (int64_t k = 0; k < rows; k++) state[2 * k] = flushed(s[k]);
+    for (int64_t k = 0; k < rows; k++) state[2 * (first + k)] = flushed(s[k]);
 }
 
-/* The arguments as in rosafe_levels, but that the history has been integrated already, and the block has not. state is
- * (rows, 2), of which the second belongs to the twin's form; rates (rows, number). */
-void rosafe_ratemap(const double *history, int64_t history_stride, int64_t held, const double *block, int64_t n,
-                    double *tail, int64_t tail_stride, int64_t tail_from, int64_t rows, int64_t skip,
-                    const double *weights, int64_t size, int64_t hop, int64_t number, int64_t squared, double retention,
-                    double *state, double *rates) {
-    const framing frames = {skip, weights, size, hop, number};
-    uint32_t mode = denormals_off();
-    memset(rates, 0, rows * number * sizeof(double));
-    for (int64_t row = 0; row < rows; row += LANES) {
-        const double *old = history + row * history_stride, *new = block + row * n;
-        double *kept = tail + row * tail_stride, *states = state + 2 * row, *sums = rates + row * number;
-        const int64_t some = least(LANES, rows - row);
+/* The history has been integrated already, the block has not. state is (rows, 2), of which the second belongs to the twin's
+ * form; rates (rows, number). */
+void rosafe_ratemap(const framed *of, int64_t squared, double retention, double *state, double *rates) {
+    uint32_t mode = enter();
+    memset(rates, 0, of->rows * of->number * sizeof(double));
+    for (int64_t first = 0; first < of->rows; first += LANES) {
         if (squared)
-            run(SQUARED, old, history_stride, held, new, n, kept, tail_stride, tail_from, &frames, retention, some, states, sums);
+            run(SQUARED, of, first, retention, state, rates);
         else
-            run(0, old, history_stride, held, new, n, kept, tail_stride, tail_from, &frames, retention, some, states, sums);
+            run(0, of, first, retention, state, rates);
     }
-    denormals_as(mode);
+    leave(mode);
 }

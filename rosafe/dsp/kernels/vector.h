@@ -120,6 +120,19 @@ INLINE uint32_t denormals_off(void) {
     return before;
 }
 
+/* --- the way into a kernel and out of it --- */
+
+INTERNAL void gate_in(void);
+INTERNAL void gate_out(void);
+INLINE uint32_t enter(void) {
+    gate_in();
+    return denormals_off();
+}
+INLINE void leave(uint32_t before) {
+    denormals_as(before);
+    gate_out();
+}
+
 /* --- lanes in another order ---
  *
  * Of two registers the even ones of each pair of neighbours in turn, and the odd ones; of four samples of every second row the

@@ -1,0 +1,32 @@
+/* What all kernels of frames take first: samples, and where the frames over them lie. */
+#ifndef ROSAFE_FRAMED_H
+#define ROSAFE_FRAMED_H
+
+#include "vector.h"
+
+#include <string.h>
+
+/* The samples of each row are the `held` ones of the history and the n of the block behind them; they are counted from the
+ * first one on. Made by `Frames.packed` of rosafe/dsp/kernels/__init__.py. */
+typedef struct {
+    const double *history;
+    int64_t history_stride; /* from a row to the next */
+    int64_t held;
+    const double *block;
+    int64_t n;
+    double *tail; /* where the samples from tail_from on go, which are all of the block; may be where the history was */
+    int64_t tail_stride, tail_from;
+    int64_t rows;          /* of the block */
+    int64_t skip;          /* where the first frame begins; each next one begins `hop` later */
+    const double *weights; /* of the samples of a frame */
+    int64_t size, hop;
+    int64_t number; /* of frames; all are complete */
+} framed;
+
+/* A row's samples of the block that are kept. */
+INLINE void keep_tail(const framed *of, int64_t row) {
+    memcpy(of->tail + row * of->tail_stride, of->block + row * of->n + (of->tail_from - of->held),
+           (of->held + of->n - of->tail_from) * sizeof(double));
+}
+
+#endif
