@@ -233,12 +233,12 @@ class Stage:
 
     def _checked(self, block: Any) -> FloatArray:
         """`block` as contiguous float64 of the right shape, or ValueError."""
-        ears = self.INPUT[0] == "ear"
-        if type(block) is np.ndarray and block.dtype is FLOAT64 and block.flags.c_contiguous:  # from a stage: no delay
-            if block.ndim == len(self.INPUT) and (not ears or len(block) == 2):
-                return block
+        ears, dimensions = self.INPUT[0] == "ear", len(self.INPUT)
+        quick = type(block) is np.ndarray and block.dtype is FLOAT64 and block.flags.c_contiguous
+        if quick and block.ndim == dimensions and (not ears or len(block) == 2):
+            return block  # what comes from a stage: no time is lost on the rest
         array = np.asarray(block)
-        right = array.ndim == len(self.INPUT) and (not ears or len(array) == 2)
+        right = array.ndim == dimensions and (not ears or len(array) == 2)
         if not right or array.dtype.kind not in "iuf":
             axes = ", ".join("2 ears" if axis == "ear" else f"{axis}s" for axis in self.INPUT[:-1])
             raise ValueError(f"block: {array.dtype} of shape {array.shape} is not numbers in ({axes}, samples)")

@@ -180,7 +180,7 @@ class Frames(NamedTuple):
 
     @property
     def packed(self) -> bytes:
-        """What kernels take, which is `framed` of framed.h. It holds addresses: what they are of must stay meanwhile."""
+        """`framed` of framed.h, which kernels take. It holds addresses: what they are of must stay meanwhile."""
         (history, start, stop), block, (tail, tail_start, tail_stop), skip, weights, hop, number = self
         held, shape = stop - start, block.shape
         arriving = shape[-1]
@@ -248,7 +248,7 @@ def correlations(frames: Frames, reach: int, epsilon: float, output: FloatArray)
 
     2 reach + 1 is at most `MOST_LAGS`. The twin is `rosafe.dsp.crosscorrelation.correlate_by_fft`.
     """
-    channels, lags, number = output.shape
+    _, lags, number = output.shape
     outside = lags // 2 - reach
     _function("rosafe_correlations")(
         frames.packed,

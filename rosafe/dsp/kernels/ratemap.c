@@ -25,28 +25,25 @@ INLINE void integrate(const double *const rows[LANES], int64_t n, double retenti
     for (; t < n; t++) u[t] = integrated(gathered(rows, t), retention, s);
 }
 
-/* The rows from `first` on, at most LANES of them. */
-INLINE void run(const int how, const framed *of, int64_t first, double retention, double *state, double *rates) {
-    const int64_t rows = least(LANES, of->rows - first);
+/* As many rows as there are lanes, or fewer, from `row` on. */
+INLINE void run(const int how, const framed *of, int64_t row, double retention, double *state, double *sums) {
+    const int64_t rows = least(LANES, of->rows - row), held = of->held, n = of->n, tail_from = of->tail_from;
     const double *from[LANES];
     double *kept[LANES];
     vec s, u[SPAN];
+    for (int k = 0; k < LANES; k++) s[k] = state[2 * least(k, rows - 1)]; /* lanes without a row do the last one once more */
     for (int64_t k = 0; k < rows; k++)
-        add_frames(how, of->history + (first + k) * of->history_stride, 0, of->held, of, rates + (first + k) * of->number);
-    for (int k = 0; k < LANES; k++) s[k] = state[2 * least(first + k, of->rows - 1)];
-    for (int64_t at = of->held, end; at < of->held + of->n; at = end) {
-        end = least(at + SPAN, of->held + of->n);
-        const int64_t tail = most(at, of->tail_from);
-        for (int k = 0; k < LANES; k++) { /* lanes without a row do the last one once more */
-            const int64_t row = least(first + k, of->rows - 1);
-            from[k] = of->block + row * of->n + at - of->held;
-            kept[k] = of->tail + row * of->tail_stride + tail - of->tail_from;
-        }
+        add_frames(how, of->history + (row + k) * of->history_stride, 0, held, of, sums + k * of->number);
+    for (int64_t at = held, end; at < held + n; at = end) {
+        end = least(at + SPAN, held + n);
+        for (int k = 0; k < LANES; k++) from[k] = of->block + (row + least(k, rows - 1)) * n + at - held;
         integrate(from, end - at, retention, &s, u);
-        add_frames_of_rows(how, u, at, end - at, of, rows, rates + first * of->number);
-        if (tail < end) write_rows(u + tail - at, 1, end - tail, kept);
+        add_frames_of_rows(how, u, at, end - at, of, rows, sums);
+        const int64_t first = most(at, tail_from);
+        for (int k = 0; k < LANES; k++) kept[k] = of->tail + (row + least(k, rows - 1)) * of->tail_stride + first - tail_from;
+        if (first < end) write_rows(u + first - at, 1, end - first, kept);
     }
-    for (int64_t k = 0; k < rows; k++) state[2 * (first + k)] = flushed(s[k]);
+    for (int64_t k = 0; k < rows; k++) state[2 * k] = flushed(s[k]);
 }
 
 /* The history has been integrated already, the block has not. state is (rows, 2), of which the second belongs to the twin's
@@ -54,11 +51,11 @@ INLINE void run(const int how, const framed *of, int64_t first, double retention
 void rosafe_ratemap(const framed *of, int64_t squared, double retention, double *state, double *rates) {
     uint32_t mode = enter();
     memset(rates, 0, of->rows * of->number * sizeof(double));
-    for (int64_t first = 0; first < of->rows; first += LANES) {
+    for (int64_t row = 0; row < of->rows; row += LANES) {
         if (squared)
-            run(SQUARED, of, first, retention, state, rates);
+            run(SQUARED, of, row, retention, state + 2 * row, rates + row * of->number);
         else
-            run(0, of, first, retention, state, rates);
+            run(0, of, row, retention, state + 2 * row, rates + row * of->number);
     }
     leave(mode);
 }
