@@ -86,7 +86,6 @@ TRICKS = (
         "products.c",
         (('if (LANES < 8) __asm__ volatile("");', ""),),
     ),
-    Trick("thirteen lags at a time, instead of six", "products.c", (("LAGS_AT_ONCE = 13", "LAGS_AT_ONCE = 6"),)),
     Trick(
         "several samples of all rows at a time from and to memory, instead of one",
         "vector.h",

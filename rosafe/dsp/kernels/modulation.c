@@ -6,7 +6,6 @@
  * adds its part of it, so that only the tail that is kept goes to memory. */
 #include "frames.h"
 
-
 enum { SPAN = 64, FILTERS = 16 /* at a time */, GROUPS = FILTERS / LANES };
 
 typedef struct {
