@@ -11,14 +11,15 @@ import numpy as np
 import pytest
 
 from rosafe.dsp import kernels
-from rosafe.representations import STAGES
+from rosafe.representations.haircell import InnerHairCell
+from rosafe.representations.ild import Ild
 
 THREADS, BLOCKS, PATIENCE = 6, 40, 60.0
 
 
 def ild(seed: int, blocks: int = BLOCKS) -> np.ndarray:
     """Of noise, by a stage of its own: two kernels for each block."""
-    random, hair_cell, stage = np.random.default_rng(seed), STAGES["ihc"](44100.0), STAGES["ild"](44100.0)
+    random, hair_cell, stage = np.random.default_rng(seed), InnerHairCell(44100.0), Ild(44100.0)
     levels = [stage.process(hair_cell.process(random.standard_normal((2, 3, 441)))) for _ in range(blocks)]
     return np.concatenate(levels, axis=-1)
 
