@@ -33,7 +33,7 @@ LOWEST = 100.0  # Hz: channels below weigh as one here
 LOUD = 10 ** (-12 / 20)  # of the highest peak of all channels: those that reach it are active
 FEW = 5  # active channels; where there are no more, each channel is normalised
 FAINT = 1e-3  # of the strongest channel; weaker ones are left out then
-NOISE = 1e-13  # of an autocorrelation's maximum: what rounding leaves of a 0
+NOISE = 1e-13  # of what a correlation can be at most: what rounding leaves of a 0
 GAINS = np.arange(101) / 100  # that an echo may have
 RATIOS = GAINS / (1 + GAINS**2)  # of an autocorrelation at the echo's delay and at lag 0
 MOST_GAIN = 0.9  # of these
@@ -260,7 +260,9 @@ class Precedence(FramedStage):
     ) -> tuple[FloatArray, FloatArray]:
         few_lags = 2 * reach + 1 <= kernels.MOST_LAGS
         correlate = by_kernel.correlate_filtered if kernels.compiled() and few_lags else correlate_filtered
-        return correlate(left, left_taps, right, right_taps, reach)
+        lags, energies = correlate(left, left_taps, right, right_taps, reach)
+        lags[np.abs(lags) < NOISE * np.sqrt(energies[0] * energies[1])[..., np.newaxis]] = 0.0
+        return lags, energies
 
 
 def fading(delays: Any, millisecond: int) -> FloatArray:

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy
 
 from rosafe.dsp.cascade import Cascade, leaky_integrator
 from rosafe.dsp.guard import LIMIT
@@ -162,12 +163,16 @@ def test_complex_states_are_flushed_too() -> None:
 
 
 def test_flush_changes_nothing_that_matters() -> None:
-    """The tail of a burst through many short blocks (many flushes) is that through one long block (one flush)."""
+    """The tail of a burst through many short blocks (many flushes) is that through one long block (one flush).
+
+    But for the rounding between two blocks: as exact as the largest number nearby.
+    """
     signal = np.zeros((2, 30000))
     signal[:, :100] = noise("gammatone", 100)
     whole = Filterbank(RATE, fb_cfHz=[80.0]).process(signal)
     pieces = run(Filterbank(RATE, fb_cfHz=[80.0]), cut(signal, 100))
-    np.testing.assert_allclose(pieces, whole, rtol=0, atol=1e-199)
+    nearby = scipy.ndimage.maximum_filter1d(np.abs(single(whole)), 1200, axis=-1)
+    assert (np.abs(single(pieces) - single(whole)) <= 1e-12 * nearby + 1e-199).all()
 
 
 def test_all_zero_blocks_stay_exactly_zero() -> None:

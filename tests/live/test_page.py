@@ -78,6 +78,10 @@ class World:
         self._bass.close()
         self.bass = self._bass.enter_context(self.graph.node("bass-ros"))
 
+    def rate(self) -> int:
+        """Of the sound that the processors take."""
+        return int(self.graph.call("/rosAFE/getSignals").signals.input[0].sampleRate)
+
     def processors(self) -> dict[str, dict[str, str]]:
         """Their parameters by name, as getProcessors tells."""
         told = self.graph.call("/rosAFE/getProcessors").processors
@@ -278,7 +282,11 @@ def test_bass_killed_and_back(world: World, shown: Browser) -> None:
     shown.until("return document.querySelector('#state').textContent.includes('bass is not running')")
     world.start_bass()
     shown.until("return document.querySelector('#state').textContent.includes('nothing is acquired')")
-    shown.run("document.querySelector('#source input').value = 'scene:?seconds=5'")
+    shown.run(
+        "document.querySelector('#source input').value = 'scene:?seconds=5';"
+        "const [rate, chunk] = document.querySelectorAll('#source input[type=number]');"
+        f"rate.value = {world.rate()}; chunk.value = 1600;"
+    )
     shown.press("#source .primary")
     shown.until("return document.querySelector('#state').dataset.state === 'live'")
     at = shown.run(f"return {END}")
