@@ -126,7 +126,7 @@ class _Work:
         self.wanted = outputs_of(self.ears, outputs)
         self.gathered: dict[str, dict[str, _Gathered]] = {}  # by kind and name
         # of each output, how many frames of each format have come, one after the other
-        self.counts: dict[str, list[tuple[Signal, list[int]]]] = {kind: [] for kind in self.wanted}
+        self.counts: dict[str, list[list[Any]]] = {kind: [[None, 0]] for kind in self.wanted}
         both = np.broadcast_to(samples, (2, samples.shape[1]))
         blocks = (both[:, first:end] for first, end in itertools.pairwise((0, *ends)))
         self.chain = Chain(blocks, self.rate, values, self.wanted, self.keep)
@@ -162,15 +162,17 @@ class _Work:
             parts = tuple(of_ears(self.ears, *one) for one in zip(axes, parts, strict=True))
         for whole, data in zip(self.gathered[kind].values(), parts, strict=True):
             whole.add(data)
-        counts = self.counts[kind]
-        if not counts or counts[-1][0] is not block.signal:
-            counts.append((block.signal, [0]))
-        counts[-1][1][0] += block.data.shape[-1]
+        signal, frames = block.signal, parts[0].shape[-1]
+        last = self.counts[kind][-1]
+        if last[0] is signal:
+            last[1] += frames
+        else:
+            self.counts[kind].append([signal, frames])
 
     def _times(self, kind: str) -> np.ndarray:
         """Seconds at the middle of each frame that was kept."""
         times, first = [np.empty(0)], 0
-        for signal, (count,) in self.counts[kind]:
+        for signal, count in self.counts[kind][1:]:
             times.append(frame_times(signal, first, count))
             first += count * signal.hop
         return np.concatenate(times)
@@ -244,11 +246,12 @@ class _Gathered:
         The axis whose middle stays where it is where a change alters its length; -1 for none.
     """
 
-    TOGETHER = 128  # frames: a row of one frame after the other is written many times as slowly
+    TOGETHER = 32  # frames: a row of one frame after the other is written many times as slowly
 
     def __init__(self, shape: tuple[int, ...], middle: int) -> None:
         self._middle = middle
         self._whole = np.empty(shape)
+        self._rows = self._whole.shape[:-1]
         self._filled = 0  # frames
         self._begun = False  # a block without frames has rows, too
         self._waiting: list[np.ndarray] = []
@@ -268,9 +271,11 @@ class _Gathered:
         if block is self._lent:
             self._filled, self._begun, self._lent = self._filled + block.shape[-1], True, None
             return
-        self._fits = self._fits and block.shape[:-1] == self._whole.shape[:-1]
+        shape = block.shape
+        if shape[:-1] != self._rows:
+            self._fits = False
         self._waiting.append(block)
-        self._frames += block.shape[-1]
+        self._frames += shape[-1]
         if self._frames >= self.TOGETHER and self._fits:
             self._write()
 
