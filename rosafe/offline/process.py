@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from rosafe.dsp import kernels
-from rosafe.dsp.signal import Signal
 from rosafe.dsp.stage import SAMPLE_RATE
 from rosafe.interface import KINDS
 from rosafe.interface.arguments import check_change, check_parameters
