@@ -152,6 +152,28 @@ def hear(scheduler: Scheduler, count: int) -> Check:
     return check
 
 
+def pass_on(scheduler: Scheduler, count: int) -> Check:
+    """Nobody hears of the input and of one below it; what hangs on them misses nothing."""
+    log = Log()
+    tree = Tree(log, count)
+    source = Numbers(range(0), ends=False)
+    root = tree.add_input("input", source, 1, 0.0, 0.0)
+    middle = tree.add("preProc", "middle", "input")
+    below = tree.add("gammatone", "below", "middle")
+    root.heard = middle.heard = False
+    source.numbers.extend(range(3))
+    source.wake()
+    source.ended = True
+    source.wake()
+    run_to_the_end(tree)
+
+    def check() -> None:
+        assert log.numbers[root] == log.numbers[middle] == []
+        log.assert_run(below, 0, 2)
+
+    return check
+
+
 def shrink(scheduler: Scheduler, count: int) -> Check:
     """One of two siblings goes with what is below it; its name is used again at once."""
     log = Log()
@@ -289,7 +311,7 @@ def go(patch: pytest.MonkeyPatch, scenario: Scenario, count: int, delays: int, w
 @pytest.mark.parametrize("count", [1, 2, 3])
 @pytest.mark.parametrize(
     ("scenario", "delays"),
-    [(grow, 1), (hear, 1), (shrink, 2), (leave, 2), (replace_input, 1), (stop, 2), (fail, 2)],
+    [(grow, 1), (hear, 1), (pass_on, 1), (shrink, 2), (leave, 2), (replace_input, 1), (stop, 2), (fail, 2)],
 )
 def test_any_order_of_events(
     scenario: Scenario, delays: int, count: int, telling: float, monkeypatch: pytest.MonkeyPatch
