@@ -50,7 +50,8 @@ class Stage:
         Of the last block.
     place : ndarray or None
         Where whoever drives it wants the output for the next block, if it fits: (..., N) with rows evenly apart, each
-        in one piece. A stage that cannot write there returns another array, as always.
+        in one piece. A stage that cannot write there returns another array, as always. Where the stage `OVERWRITES`, it
+        may be the block that comes: what would be written to other memory stays in the cache.
 
     Raises
     ------
@@ -61,6 +62,7 @@ class Stage:
     REPRESENTATION: ClassVar[Representation]
     INPUT: ClassVar[tuple[str, ...]] = ("ear", "channel", "time")  # axes of the blocks that come
     PROVIDES: ClassVar[tuple[str, ...]] = ()  # by-products that children may need, such as the envelope
+    OVERWRITES: ClassVar[bool] = False  # `place` may be the block that comes
 
     def __init__(self, given: Signal | float, **parameters: Any) -> None:
         if not isinstance(given, Signal):
@@ -216,8 +218,8 @@ class Stage:
     def process(self, block: FloatArray, extra: FloatArray | None = None) -> Output:
         """The output for the next block, (..., N) of numbers: a fresh, contiguous float64 array, or one for each part.
 
-        The input is not modified. `extra` is what `needs` names, of the same block. ValueError for another shape or
-        type.
+        The input is not modified, but where it is `place`. `extra` is what `needs` names, of the same block. ValueError
+        for another shape or type.
         """
         raise NotImplementedError
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from types import TracebackType
 from typing import Any
@@ -12,6 +12,7 @@ import numpy as np
 
 from rosafe.interface import KINDS, ComponentError
 from rosafe.offline.signals import frame_times
+from rosafe.representations import STAGES
 from rosafe.tree import sizes
 from rosafe.tree.block import Block
 from rosafe.tree.company import Observer
@@ -133,6 +134,8 @@ class Chain:
                 self._processors[kind.kind] = self._tree.add(kind.kind, kind.kind, kind.parent, mine)
         for name, processor in self._processors.items():
             processor.heard = name in self._outputs
+        for name in overwriting(kinds, self._outputs):
+            self._processors[name].place = _taken
 
     def schedule(self, block: int, name: str, value: Any) -> None:
         """Change a (checked) parameter before block `block`; the blocks of successive calls ascend. Or ValueError."""
@@ -148,8 +151,9 @@ class Chain:
 
         Stages that put out frames cannot, and are not asked.
         """
-        if not self._processors[kind].signal.framed:
-            self._processors[kind].place = place
+        processor = self._processors[kind]
+        if not processor.signal.framed and not processor.children:  # who take blocks in one piece
+            processor.place = lambda taken: place(taken.data.shape[-1])
 
     def observe(self, observer: Observer) -> None:
         """Tell `observer` of every state that a processor enters."""
@@ -227,6 +231,20 @@ def needed(outputs: Iterable[str]) -> list[str]:
             wanted.add(kind)
             kind = KINDS[kind].parent
     return [kind for kind in KINDS if kind in wanted]
+
+
+def overwriting(kinds: Collection[str], outputs: Collection[str]) -> list[str]:
+    """Of all `kinds` that run, those that may write over the blocks that they take, which nobody else wants."""
+    parents = [KINDS[kind].parent for kind in kinds]
+    return [
+        kind
+        for kind, parent in zip(kinds, parents, strict=True)
+        if STAGES[kind].OVERWRITES and parent not in outputs and parents.count(parent) == 1
+    ]
+
+
+def _taken(block: Block) -> np.ndarray:
+    return block.data
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from rosafe.dsp.signal import Signal
 from rosafe.dsp.stage import SAMPLE_RATE, Stage, parts_of
 from rosafe.interface import KINDS
 from rosafe.interface.arguments import check_change, check_outputs, check_parameters
-from rosafe.offline.chain import needed
+from rosafe.offline.chain import needed, overwriting
 from rosafe.offline.memory import refuse_over_available
 from rosafe.offline.signals import as_ears, frame_times, is_upright, of_ears, outputs_of
 from rosafe.representations import STAGES
@@ -104,8 +104,9 @@ class Stream:
     def _lay_out(self) -> None:
         """What `process` goes through for each block: names and axes only of what is returned."""
         axes = {kind: [(name, part.axes) for name, part in KINDS[kind].outputs.items()] for kind in self._stages}
+        over = overwriting(self._stages, self._next)
         self._plan = [
-            (kind, KINDS[kind].parent, stage, axes[kind] if kind in self._next else [])
+            (kind, KINDS[kind].parent, stage, kind in over, axes[kind] if kind in self._next else [])
             for kind, stage in self._stages.items()
         ]
 
@@ -137,7 +138,9 @@ class Stream:
         made: dict[str, Any] = {"": samples if self._ears == 2 else np.broadcast_to(samples, (2, samples.shape[1]))}
         times: dict[Any, np.ndarray] = {}  # most outputs have those of another one
         results: dict[str, Any] = {}
-        for kind, above, stage, axes in self._plan:
+        for kind, above, stage, over, axes in self._plan:
+            if over:
+                stage.place = made[above]
             if stage.needs:
                 parts = parts_of(stage.process(made[above], self._stages[above].provided[stage.needs]))
             else:

@@ -83,6 +83,8 @@ class InnerHairCell(Stage):
         word="innerhaircell",
     )
 
+    OVERWRITES = True
+
     @property
     def needs(self) -> str:
         return "envelope" if self._values["ihc_method"] in ENVELOPE_METHODS else ""

@@ -36,9 +36,7 @@ class Processor(Member):
     Attributes
     ----------
     place : callable or None
-        Gets the frames that it has taken, and tells where its stage may write the output (`Stage.place`).
-    heard : bool
-        The listener is told of its blocks, and its history remembers them.
+        Gets the block that it has taken, and tells where its stage may write the output (`Stage.place`).
     """
 
     parent: Processor | None
@@ -58,8 +56,7 @@ class Processor(Member):
         self.observers = company.observers
         self.held_up_since = 0.0
         self.usual = math.inf
-        self.place: Callable[[int], FloatArray | None] | None = None
-        self.heard = True
+        self.place: Callable[[Block], FloatArray | None] | None = None
         self._company = company
         self._lock = company.workers.lock
         self._source = source
@@ -165,8 +162,8 @@ class Processor(Member):
             return None
         if stage.PROVIDES:
             stage.provide = self._wanted(stage, taken.number)
-        if self.place is not None and not self.children:  # who take blocks in one piece
-            stage.place = self.place(taken.data.shape[-1])
+        if self.place is not None:
+            stage.place = self.place(taken)
         data, extras = taken.parts[0], taken.extras
         needs = extras and stage.needs
         output = stage.process(data, extras[needs]) if needs else stage.process(data)

@@ -44,8 +44,11 @@ class StateMachine:
         Of the input: there may be sound to read.
     taken : Block or None
         What the worker has to work on.
+    heard : bool
+        Somebody may want the last block later: the world is told of it, and a new child begins with it. Else its memory
+        is free, and still in the cache, as soon as the children have done with it.
     shared : Block or None
-        Released last; children read it.
+        Released last, if it is `heard`; children read it.
     untold : Block or None
         The same until the world has been told of it.
     observers : sequence of callable
@@ -61,6 +64,7 @@ class StateMachine:
         self.state = WAIT_EXEC
         self.at_work = self.called = False
         self.taken: Block | None = None
+        self.heard = True
         self.shared: Block | None = None
         self.untold: Block | None = None
         self._private: Block | None = None  # computed, and to be released as soon as no child holds the last one
@@ -230,7 +234,8 @@ class StateMachine:
         self.state = RELEASE
         if self.observers:
             self._tell_observers(block.number)
-        self.shared = self.untold = block
+        self.shared = block if self.heard else None
+        self.untold = block
         for child in self.children:
             if child.state is not DONE:
                 self._hand(child, block)

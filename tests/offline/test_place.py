@@ -11,6 +11,7 @@ import rosafe
 from rosafe.dsp import kernels
 from rosafe.offline.process import _Gathered
 from rosafe.representations import STAGES
+from rosafe.representations.haircell import METHODS, InnerHairCell
 from tests.dsp.bare import Chain, cut
 
 pytestmark = pytest.mark.skipif(not kernels.compiled(), reason="numpy's twin of the hair cell's kernel returns its own")
@@ -110,6 +111,57 @@ def test_a_place_is_used_only_where_it_fits(kind: str, frames: int) -> None:
         stage.place = place
         np.testing.assert_array_equal(stage.process(block), plain)
         assert np.isnan(whole).all()
+
+
+@pytest.fixture
+def overwritten(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
+    """Whether the hair cell wrote over what it took, block by block."""
+    seen: list[bool] = []
+    process = InnerHairCell.process
+
+    def watch(self: InnerHairCell, block: np.ndarray, extra: np.ndarray | None = None) -> np.ndarray:
+        output = process(self, block, extra)
+        seen.append(np.shares_memory(output, block))
+        return output
+
+    monkeypatch.setattr(InnerHairCell, "process", watch)
+    return seen
+
+
+@pytest.mark.parametrize("block", [[3000], [512], [1], [700, 1, 333]], ids=str)
+@pytest.mark.parametrize("kind", ["gammatone", "drnl"])
+@pytest.mark.parametrize("method", METHODS)
+def test_what_nobody_else_wants_is_written_over(
+    method: str, kind: str, block: list[int], overwritten: list[bool]
+) -> None:
+    """The same numbers, of the array and of the stream, and the sound that was given stays as it is."""
+    sound, parameters = SOUND[:, :200] if block == [1] else SOUND, {**FEW, "fb_type": kind, "ihc_method": method}
+    given, parts = sound.copy(), cut(sound, block)
+    outputs = Chain(RATE, {"in_doNormalize": False, **parameters}).run(parts)
+    assert not any(overwritten)
+    overwritten.clear()
+    wanted = ["ild", "ratemap", "crossCorrelation"]
+    got = rosafe.process(given, RATE, parameters=parameters, block_frames=block, outputs=wanted)
+    stream = rosafe.Stream(RATE, parameters=parameters, outputs=wanted)
+    streamed = [stream.process(part) for part in parts]
+    assert overwritten == [True] * 2 * len(parts)
+    np.testing.assert_array_equal(given, sound)
+    for name in wanted:
+        expected = np.concatenate([output[name] for output in outputs], axis=-1)
+        np.testing.assert_array_equal(got[name], expected)
+        np.testing.assert_array_equal(np.concatenate([part[name] for part in streamed], axis=-1), expected)
+
+
+@pytest.mark.parametrize("other", ["gammatone", "precedence"])
+def test_what_somebody_else_wants_is_not_written_over(other: str, overwritten: list[bool]) -> None:
+    options: dict[str, Any] = {"parameters": FEW, "outputs": ["ratemap", other]}
+    got = rosafe.process(SOUND, RATE, block_frames=1000, **options)
+    rosafe.Stream(RATE, **options).process(SOUND)
+    assert overwritten == [False] * 4
+    names = [name for name in got if name.startswith(other)]
+    alone = rosafe.process(SOUND, RATE, block_frames=1000, parameters=FEW, outputs=[other])
+    for name in names:
+        np.testing.assert_array_equal(got[name], alone[name])
 
 
 @pytest.mark.parametrize("lengths", [[0], [1] * 64, [9, 8, 9, 31, 32, 33], [0, 700, 0, 1]], ids=str)

@@ -6,6 +6,7 @@ import contextlib
 import random
 import sys
 import threading
+import weakref
 
 import numpy as np
 import pytest
@@ -91,6 +92,40 @@ def test_children_read_the_parents_memory(
     for child in (one, other):
         listener.wait_blocks(child, 1)
         assert listener.blocks[child][0].data is block
+
+
+def test_a_block_that_nobody_hears_of_is_gone_once_the_children_have_done_with_it(
+    tree: Tree, listener: Recorder, feed: Feed, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its memory, which is still in the cache, takes the next block. Of another one the last block stays."""
+    made: list[weakref.ref[np.ndarray]] = []
+
+    class Parent(Plain):
+        def process(self, block: np.ndarray, extra: np.ndarray | None = None) -> np.ndarray:
+            output = block.copy()
+            made.append(weakref.ref(output))
+            return output
+
+    class Child(Plain):
+        def process(self, block: np.ndarray, extra: np.ndarray | None = None) -> np.ndarray:
+            return np.empty((2, 0))
+
+    use_plain_stages(monkeypatch, preProc=Parent, gammatone=Child)
+    tree.add_input("input", feed, 1, 1.0, 1.0)
+    parent = tree.add("preProc", "parent", "input")
+    children = [tree.add("gammatone", name, "parent") for name in ("one", "other")]
+    for count, heard in ((2, False), (4, True)):
+        parent.heard = heard
+        feed.put(count=2)
+        for child in children:
+            listener.wait_blocks(child, count)
+        if not heard:
+            wait_for(lambda: [block() for block in made] == [None, None], what="all gone")
+    last = made[-1]()
+    assert last is not None
+    np.testing.assert_array_equal(last, [[3.0], [3.0]])
+    latest = tree.add("gammatone", "latest", "parent")
+    listener.wait_blocks(latest, 1)
 
 
 def test_the_four_states(tree: Tree, listener: Recorder, feed: Feed, monkeypatch: pytest.MonkeyPatch) -> None:
