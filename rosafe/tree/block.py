@@ -12,7 +12,7 @@ from rosafe.dsp.signal import Signal
 
 
 class Block(NamedTuple):
-    """What one processor released; it is never written again.
+    """What one processor released; it is not written again, but by an only child whom nobody asks for it (`place`).
 
     Attributes
     ----------
