@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ class Cascade:
     def __init__(self, sections: NDArray[Any]) -> None:
         self.sections = np.ascontiguousarray(sections)
         self.state: NDArray[Any] | None = None  # (S, *rows, 2), direct form II transposed; None is rest
+        self._position = 0
 
     def reset(self) -> None:
         """Back to rest."""
@@ -33,6 +35,7 @@ class Cascade:
         shape = (len(self.sections), *rows, 2)
         if self.state is None or self.state.shape != shape:
             self.state = np.zeros(shape, self.sections.dtype)
+            self._position = 0
         return self.state
 
     def process(self, block: NDArray[Any]) -> NDArray[Any]:
@@ -43,12 +46,13 @@ class Cascade:
         if block.size == 0:
             return np.zeros(block.shape, state.dtype)
         result = np.empty(block.shape, state.dtype)
-        for first in range(0, block.shape[-1], SPAN):
-            span = slice(first, first + SPAN)
+        for span, whole in _spans(self._position, block.shape[-1]):
             result[..., span], state = scipy.signal.sosfilt(self.sections, block[..., span], zi=state)
-            state = np.ascontiguousarray(state)
-            flush(state)
-        self.state = state
+            if whole:
+                state = np.ascontiguousarray(state)
+                flush(state)
+        self.state = np.ascontiguousarray(state)
+        self._position += block.shape[-1]
         return result
 
 
@@ -64,12 +68,14 @@ class Parallel:
     def __init__(self, sections: NDArray[np.float64]) -> None:
         self.sections = np.ascontiguousarray(sections)
         self.state = np.empty((len(sections), 0, 2))  # (M, *rows, 2), direct form II transposed
+        self._position = 0
 
     def started(self, rows: tuple[int, ...]) -> NDArray[np.float64]:
         """The states for a block of `rows`. Other rows than in the last block mean a start from rest."""
         shape = (len(self.sections), *rows, 2)
         if self.state.shape != shape:
             self.state = np.zeros(shape)
+            self._position = 0
         return self.state
 
     def process(self, block: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -77,13 +83,26 @@ class Parallel:
         states = self.started(block.shape[:-1])
         result = np.empty((*block.shape[:-1], len(self.sections), block.shape[-1]))
         for number, section in enumerate(self.sections):
-            for first in range(0, block.shape[-1], SPAN):
-                span = slice(first, first + SPAN)
+            for span, whole in _spans(self._position, block.shape[-1]):
                 state = states[number][np.newaxis]
                 result[..., number, span], state = scipy.signal.sosfilt([section], block[..., span], zi=state)
                 states[number] = state[0]
-                flush(states[number])
+                if whole:
+                    flush(states[number])
+        self._position += block.shape[-1]
         return result
+
+
+def _spans(position: int, count: int) -> Iterator[tuple[slice, bool]]:
+    """The next `count` samples, cut wherever `SPAN` of them are full, and whether that is so, behind `position` others.
+
+    States are looked at there, and nowhere else: so it leaves no trace how sound was cut into blocks.
+    """
+    first = 0
+    while first < count:
+        end = min(count, first + SPAN - (position + first) % SPAN)
+        yield slice(first, end), (position + end) % SPAN == 0
+        first = end
 
 
 def leaky_integrator(retention: float) -> NDArray[np.float64]:

@@ -90,13 +90,18 @@ class FrameBuffer:
 
     Samples are counted from the first one that is held on, through the next block: the next frame starts at `skip`,
     which is 0 but where the hop is longer than the window and samples still to come lie between two frames.
+
+    Attributes
+    ----------
+    position : int
+        How many samples came before the first one that is held, or is to come.
     """
 
     def __init__(self) -> None:
         self._store = kernels.Pinned.of(np.empty((0, 0)))
         self._rows: tuple[int, ...] = (0,)
         self._start = self._stop = 0
-        self.skip = 0
+        self.skip = self.position = 0
 
     @property
     def held(self) -> int:
@@ -108,7 +113,7 @@ class FrameBuffer:
         if rows != self._rows:
             self._rows = rows
             self._make_store(0)
-            self._start = self._stop = self.skip = 0
+            self._start = self._stop = self.skip = self.position = 0
 
     def advance(self, arriving: int, count: int) -> tuple[kernels.Span, kernels.Span]:
         """After a block of so many samples, the next frame is to start `count` samples later than it would have.
@@ -120,6 +125,7 @@ class FrameBuffer:
         first, total = self.skip + count, held + arriving
         kept = total - first
         self.skip = 0 if kept > 0 else -kept
+        self.position += min(first, total)
         if first < held:
             self._make_room(total)
             start, stop = self._start, self._stop
@@ -222,10 +228,10 @@ class FramedStage(Stage):
         shape, framing, buffer = block.shape, self._framing, self._buffer
         arriving, hop = shape[-1], framing.hop
         buffer.begin(shape[:-1] if rows is None else rows)
-        skip = buffer.skip
+        skip, position = buffer.skip, buffer.position
         count = framing.complete(buffer.held + arriving - skip)
         history, room = buffer.advance(arriving, count * hop)
-        return kernels.Frames(history, block, room, skip, weights, hop, count)
+        return kernels.Frames(history, block, room, skip, weights, hop, count, position)
 
     def _build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
         self._framing = Framing.design(self.given.rate, self.PREFIX, values)

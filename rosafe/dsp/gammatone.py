@@ -16,6 +16,7 @@ from .erb import bandwidth
 from .guard import SPAN, FloatArray, flush, limited
 
 POLES_TOGETHER = 4
+TURN_SPAN = 64  # samples, SPAN of kernels/gammatone.c
 
 
 class GammatoneBank:
@@ -48,6 +49,7 @@ class GammatoneBank:
     def reset(self) -> None:
         """All filters back to rest."""
         self._state = np.zeros((2, *self._sections.shape[:2]), np.complex128)
+        self._position = 0  # samples of a span that have come
 
     def process(
         self, block: FloatArray, with_envelope: bool, output: FloatArray | None = None
@@ -60,7 +62,8 @@ class GammatoneBank:
             output = memory.empty((2, len(self._sections), block.shape[-1]))
         envelope = memory.empty(output.shape) if with_envelope else None
         run = kernels.gammatone if kernels.compiled() else filter_by_scipy
-        run(block, self._sections, self._state, output, envelope)
+        run(block, self._sections, self._state, self._position, output, envelope)
+        self._position = (self._position + block.shape[-1]) % TURN_SPAN
         return output, envelope
 
 
@@ -82,14 +85,20 @@ def filter_by_scipy(
     block: FloatArray,
     sections: NDArray[np.complex128],
     state: NDArray[np.complex128],
+    position: int,
     output: FloatArray,
     envelope: FloatArray | None,
 ) -> None:
     """Filter (2, N) into `output` (2, C, N), and the modulus into `envelope`; the twin of `kernels.gammatone`.
 
-    `state` (2, C, order) is that of direct form II transposed, p y[n]; it runs on from block to block.
+    `state` (2, C, order) runs on from block to block: what each pole put out last, turned to frequency 0 by the pole's
+    angle for each of the `position` samples that have come since phases began anew, as they do every `TURN_SPAN`.
     """
     block = limited(block)
+    poles = -sections[..., 4]
+    lengths = np.abs(poles)
+    turns = np.divide(poles, lengths, out=np.ones_like(poles), where=lengths > 0)
+    state *= lengths * turns**position  # as that of direct form II transposed, p y[n]
     for first in range(0, block.shape[-1], SPAN):
         span = slice(first, first + SPAN)
         for channel, cascade in enumerate(sections):
@@ -101,3 +110,5 @@ def filter_by_scipy(
             if envelope is not None:
                 np.abs(analytic, out=envelope[:, channel, span])
         flush(state)
+    back = lengths * turns ** ((position + block.shape[-1]) % TURN_SPAN)
+    np.divide(state, back, out=state, where=lengths > 0)

@@ -13,7 +13,7 @@ FloatArray = NDArray[np.float64]
 # (2**31 * 1e70**2)**2 = 5e298. Sound has amplitudes around 1 (100 dB SPL), so nothing real comes near.
 LIMIT = 1e70
 
-# Samples that are smaller than this become 0, and filter states at the end of a block. The square of the smallest
+# Samples that are smaller than this become 0, and filter states now and then. The square of the smallest
 # audible amplitude is some 1e-20; the smallest normal double is 2e-308, and arithmetic below it is many times slower.
 TINY = 1e-200
 SQUARE_TINY = 1e-145  # the same where samples are squared and weighted

@@ -26,7 +26,7 @@ class Stage:
     """One processor of the chain: blocks in, blocks out, state kept between.
 
     A representation is a subclass with its declaration. It implements `_build`, `process`, `reset`, and what differs
-    from the defaults here of `output_rows`, `_output`, `complete`, `look_ahead`, `needs`.
+    from the defaults here of `output_rows`, `_output`, `complete`, `look_ahead`, `needs`, `blocks_matter`.
 
     The rule for every stage: `_build`, and so `configure` and `receive`, puts new objects in the place of what it
     changes (filters, framings, tables) and never alters those that are there. A shallow copy of a stage is therefore a
@@ -119,6 +119,11 @@ class Stage:
     def needs(self) -> str:
         """Which of the parent's by-products `process` must be given with each block; empty for none."""
         return ""
+
+    @property
+    def blocks_matter(self) -> bool:
+        """Whether the output depends on how the sound is cut into blocks, beyond what is rounded."""
+        return False
 
     @property
     def look_ahead(self) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -10,44 +11,60 @@ from typing import Any
 
 import numpy as np
 
+from rosafe.dsp import kernels
 from rosafe.interface import KINDS, ComponentError
 from rosafe.offline.signals import frame_times
-from rosafe.representations import STAGES
+from rosafe.representations import OWN, STAGES
 from rosafe.tree import sizes
 from rosafe.tree.block import Block
 from rosafe.tree.company import Observer
 from rosafe.tree.processor import Processor
 from rosafe.tree.tree import Tree
 
+TOGETHER = 2**22  # bytes: a block that is put together makes no processor put out more
+
 
 class _GatedSource:
-    """Feeds blocks to the tree, one after the other, once `let_flow` says that the whole tree stands."""
+    """Feeds blocks to the tree, one after the other, once `let_flow` says that the whole tree stands.
+
+    Those that together have no more than so many frames as that says are put together.
+    """
 
     def __init__(self, blocks: Iterable[np.ndarray], sample_rate: float) -> None:
         self.sample_rate = sample_rate
         self.ended = False
         self._blocks = iter(blocks)
+        self._next: np.ndarray | None = None  # which has been fetched already
         self._frames = 0
-        self._flowing = False
+        self._most = -1  # frames that are put together; nothing flows yet
         self._wake: Callable[[], None] = lambda: None
 
     def open(self, wake: Callable[[], None]) -> None:
         self._wake = wake
 
-    def let_flow(self) -> None:
+    def let_flow(self, most: int) -> None:
         """Let the signal flow."""
-        self._flowing = True
+        self._most = most
         self._wake()
 
     def read(self) -> tuple[np.ndarray, int] | None:
-        if not self._flowing or self.ended:
+        if self._most < 0 or self.ended:
             return None
-        block = next(self._blocks, None)
-        if block is None:
+        blocks, frames = [], 0
+        while (block := next(self._blocks, None) if self._next is None else self._next) is not None:
+            self._next = block
+            if blocks and frames + block.shape[-1] > self._most:
+                break
+            self._next = None
+            blocks.append(block)
+            frames += block.shape[-1]
+            if frames >= self._most:
+                break
+        if not blocks:
             self.stop()
             return None
-        self._frames += block.shape[-1]
-        return block, self._frames
+        self._frames += frames
+        return blocks[0] if len(blocks) == 1 else np.concatenate(blocks, axis=-1), self._frames
 
     def stop(self) -> None:
         self.ended = True
@@ -159,9 +176,12 @@ class Chain:
         """Tell `observer` of every state that a processor enters."""
         self._tree.observe(observer)
 
-    def run(self) -> None:
-        """Let the signal flow and wait for its end; raises what the first processor failed with."""
-        self._source.let_flow()
+    def run(self, together: bool = False) -> None:
+        """Let the signal flow and wait for its end; raises what the first processor failed with.
+
+        Small blocks may go through `together`, where that cannot be seen in the numbers.
+        """
+        self._source.let_flow(self._most_together() if together else 0)
         for processor in self._processors.values():
             processor.join()
         if self._listener.error is not None:
@@ -203,6 +223,19 @@ class Chain:
         taken = {kind: sizes.output_size(p.stage, p.given_rows, seconds) for kind, p in self._processors.items()}
         kind = max(taken, key=lambda kind: taken[kind])
         return kind, int(taken[kind])
+
+    def _most_together(self) -> int:
+        """Frames of the largest block that may come in the place of smaller ones; 0 where that could be seen.
+
+        It cannot where kernels run: with them, blocks leave no trace in the numbers, not in the last bits either. With
+        numpy and scipy, and in plugins, they may; and changes are made before blocks as they are.
+        """
+        processors = self._processors.values()
+        changed = len(self._derived) > 1
+        seen = not kernels.compiled() or any(p.kind not in OWN or p.stage.blocks_matter for p in processors)
+        if changed or seen:
+            return 0
+        return int(TOGETHER * self.sample_rate / self.largest_block(math.ceil(self.sample_rate))[1])
 
     def describe(self) -> dict[str, Any]:
         """Axes of what runs, `fb_cfHz` (Hz), `cc_lags` (s); rates of the outputs, `ild_frameRate` and its like (Hz).

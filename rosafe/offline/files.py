@@ -199,7 +199,7 @@ def _stream(
         made = form.writer(contents)
         _check_room(path, made.size(contents))
         with closing(made(path, contents)) as writer:
-            chain.run()
+            chain.run(together=True)
             writer.finish()
 
 

@@ -46,7 +46,8 @@ def process(
         floats.
     block_frames : int or sequence of int, optional
         Block size, or sizes that are used in turn; the last block is what is left. Only where gain control
-        (`pp_bNormalizeRMS`) starts do the numbers depend on it.
+        (`pp_bNormalizeRMS`) starts do the numbers depend on it; elsewhere small blocks go through together, which is
+        faster. Without kernels, and in plugins, the last bits depend on it too, and blocks stay as they are.
     modifications : sequence of (block, name, value), optional
         Parameter changes, each made before the block of that number (from 0); several for one block are made in the
         order given. Those for blocks that never come are ignored. The original's `set_rm_scailing` is known here too.
@@ -179,7 +180,7 @@ class _Work:
     def run(self) -> dict[str, Any]:
         """Compute; what was gathered is given up."""
         with self.chain as chain:
-            chain.run()
+            chain.run(together=True)
             results: dict[str, Any] = {}
             while self.gathered:
                 kind = next(iter(self.gathered))

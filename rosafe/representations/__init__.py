@@ -7,8 +7,8 @@ out, and said in `PROBLEMS`.
 
 from __future__ import annotations
 
-from .registry import PROBLEMS, STAGES
+from .registry import OWN, PROBLEMS, STAGES
 
 KINDS = {kind: stage.REPRESENTATION for kind, stage in STAGES.items()}
 
-__all__ = ["KINDS", "PROBLEMS", "STAGES"]
+__all__ = ["KINDS", "OWN", "PROBLEMS", "STAGES"]

@@ -112,7 +112,9 @@ def correlate_by_fft(frames: FloatArray, window: FloatArray, reach: int, result:
         channels = slice(first, first + channels_at_once)
         for begin in range(0, frame_count, at_once):
             part = slice(begin, begin + at_once)
-            correlations = _correlate(frames[:, channels, part] * window, reach, transform)
+            # in one order of memory, whatever blocks are: the order of sums follows that
+            windowed = np.multiply(frames[:, channels, part], window, order="C")
+            correlations = _correlate(windowed, reach, transform)
             result[channels, inner, part] = correlations.swapaxes(1, 2)
 
 
@@ -120,7 +122,8 @@ def _correlate(frames: FloatArray, reach: int, transform: int) -> FloatArray:
     """Windowed frames (2, C, F, w) to (C, F, 2 reach + 1)."""
     left, right = frames
     energies = np.einsum("cfi,cfi->cf", left, left) * np.einsum("cfi,cfi->cf", right, right)
-    spectrum = scipy.fft.rfft(left, transform) * np.conj(scipy.fft.rfft(right, transform))
-    circular = scipy.fft.irfft(spectrum, transform)
+    # With a name, or numpy multiplies large ones in place, which rounds otherwise.
+    of_left, of_right = scipy.fft.rfft(left, transform), np.conj(scipy.fft.rfft(right, transform))
+    circular = scipy.fft.irfft(of_left * of_right, transform)
     lags = np.concatenate((circular[..., transform - reach :], circular[..., : reach + 1]), axis=-1)
     return lags / np.sqrt(energies + EPSILON)[..., np.newaxis]

@@ -100,6 +100,10 @@ class PreProc(Stage):
     )
     INPUT = ("ear", "time")
 
+    @property
+    def blocks_matter(self) -> bool:
+        return bool(self._values["pp_bNormalizeRMS"])  # see `GainControl`
+
     def process(self, block: FloatArray, extra: FloatArray | None = None) -> FloatArray:
         if not self._steps and self._gain == 1.0:
             return self._checked(block).copy()

@@ -116,3 +116,4 @@ def find() -> tuple[dict[str, type[Stage]], list[str]]:
 
 
 STAGES, PROBLEMS = find()
+OWN = frozenset(own())  # kinds that are no plugins

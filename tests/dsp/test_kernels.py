@@ -295,10 +295,11 @@ def test_windowed_frames(
             count = wanted.shape[-2]
             rest.drop(count * framing.hop)
             buffer.begin(block.shape[:-1])
-            skip = buffer.skip
+            skip, position = buffer.skip, buffer.position
             history, room = buffer.advance(block.shape[-1], count * framing.hop)
             frames = kernels.Frames(
-                history, np.ascontiguousarray(block), room, skip, kernels.Pinned.of(window), framing.hop, count
+                *(history, np.ascontiguousarray(block), room, skip, kernels.Pinned.of(window)),
+                *(framing.hop, count, position),
             )
             batch = max(1, count // parts)
             for first in range(0, count, batch):

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import scipy
 
+from rosafe.dsp import kernels
 from rosafe.dsp.cascade import Cascade, leaky_integrator
 from rosafe.dsp.guard import LIMIT
 from rosafe.representations import STAGES
@@ -127,11 +128,11 @@ def silence_after_burst(kind: str, parameters: dict[str, Any], blocks: int) -> A
     ("kind", "parameters", "blocks"),
     [
         ("preProc", {"pp_bRemoveDC": True}, 250),
-        ("gammatone", {"fb_cfHz": [80.0, 1000.0, 7000.0]}, 40),
+        ("gammatone", {"fb_cfHz": [80.0, 1000.0, 7000.0]}, 60),
         ("gammatone", {"fb_cfHz": [100.0, 1000.0, 6000.0], "fb_type": "drnl"}, 80),
         ("ihc", {"ihc_method": "dau"}, 10),
         ("ihc", {"ihc_method": "breebart"}, 10),
-        ("ratemap", {"rm_scaling": "magnitude"}, 70),
+        ("ratemap", {"rm_scaling": "magnitude"}, 110),
     ],
 )
 def test_silence_becomes_exactly_silent(kind: str, parameters: dict[str, Any], blocks: int) -> None:
@@ -142,14 +143,17 @@ def test_silence_becomes_exactly_silent(kind: str, parameters: dict[str, Any], b
 
 
 @pytest.mark.parametrize("retention", [0.5, 0.99, 0.9999])
-def test_states_are_never_denormal_between_blocks(retention: float) -> None:
+def test_states_are_never_denormal_for_long(retention: float) -> None:
+    """They are looked at every 4096 samples, however these come."""
     cascade = Cascade(leaky_integrator(retention))
-    cascade.process(np.ones((2, 1)))
-    for _ in range(100):
-        cascade.process(np.zeros((2, 1000)))
+    cascade.process(np.ones((2, 96)))
+    for _ in range(30):
+        for samples in (1000, 2999, 1, 0, 0):
+            cascade.process(np.zeros((2, samples)))
         assert cascade.state is not None
         size = np.abs(cascade.state)
         assert ((size == 0) | (size >= 1e-200)).all()
+        cascade.process(np.zeros((2, 96)))
 
 
 def test_complex_states_are_flushed_too() -> None:
@@ -162,15 +166,17 @@ def test_complex_states_are_flushed_too() -> None:
     assert not cascade.state.any()
 
 
-def test_flush_changes_nothing_that_matters() -> None:
-    """The tail of a burst through many short blocks (many flushes) is that through one long block (one flush).
+def test_tails_are_as_exact_in_many_blocks() -> None:
+    """The tail of a burst through many short blocks is that through one long block; to the last bit with kernels.
 
-    But for the rounding between two blocks: as exact as the largest number nearby.
+    Twins round between two blocks: as exactly as the largest number nearby.
     """
     signal = np.zeros((2, 30000))
     signal[:, :100] = noise("gammatone", 100)
     whole = Filterbank(RATE, fb_cfHz=[80.0]).process(signal)
     pieces = run(Filterbank(RATE, fb_cfHz=[80.0]), cut(signal, 100))
+    if kernels.compiled():
+        np.testing.assert_array_equal(pieces, whole)
     nearby = scipy.ndimage.maximum_filter1d(np.abs(single(whole)), 1200, axis=-1)
     assert (np.abs(single(pieces) - single(whole)) <= 1e-12 * nearby + 1e-199).all()
 

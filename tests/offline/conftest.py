@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
+from rosafe.offline import chain
 from tests.tree.support import tree_threads
 
 
@@ -13,3 +14,9 @@ from tests.tree.support import tree_threads
 def no_thread_left() -> Iterator[None]:
     yield
     assert tree_threads() == set()
+
+
+@pytest.fixture
+def blocks_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    """None are put together."""
+    monkeypatch.setattr(chain, "TOGETHER", 0)

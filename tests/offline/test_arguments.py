@@ -23,7 +23,7 @@ RATE = 16000
 
 @pytest.fixture(autouse=True)
 def nothing_runs(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    def run(self: Any) -> None:
+    def run(self: Any, together: bool) -> None:
         raise AssertionError("it went as far as that")
 
     monkeypatch.setattr(offline.Chain, "run", run)

@@ -14,7 +14,10 @@ from rosafe.representations import STAGES
 from rosafe.representations.haircell import METHODS, InnerHairCell
 from tests.dsp.bare import Chain, cut
 
-pytestmark = pytest.mark.skipif(not kernels.compiled(), reason="numpy's twin of the hair cell's kernel returns its own")
+pytestmark = [
+    pytest.mark.skipif(not kernels.compiled(), reason="numpy's twin of the hair cell's kernel returns its own"),
+    pytest.mark.usefixtures("blocks_as_they_are"),
+]
 
 RATE = 16000.0
 FEW = {"fb_nChannels": 5, "fb_highFreqHz": 4000.0}

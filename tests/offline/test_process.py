@@ -10,8 +10,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import rosafe
@@ -108,22 +106,6 @@ def test_frame_rates_are_the_true_ones() -> None:
         noise(4410), 44100, parameters={"ild_hSizeSec": 0.0125, "rm_hSizeSec": 0.003, "cc_hSizeSec": 0.007}
     )
     assert [results[f"{kind}_frameRate"] for kind in FRAMED] == [44100 / 551, 44100 / 132, 44100 / 309]
-
-
-@settings(deadline=None, max_examples=20)
-@given(st.lists(st.one_of(st.integers(20, 400), st.integers(1, 2000)), min_size=1, max_size=6))
-def test_blocks_of_any_size_give_the_same_numbers(sizes: list[int]) -> None:
-    sizes.append(max(sizes) + 100)
-    sound = SOUND[:, :1500]
-    whole = rosafe.process(sound, RATE, parameters=FEW, block_frames=1500)
-    assert_same(rosafe.process(sound, RATE, parameters=FEW, block_frames=sizes), whole)
-
-
-def test_blocks_of_one_frame() -> None:
-    sound = SOUND[:, :500]
-    assert_same(
-        rosafe.process(sound, RATE, parameters=FEW, block_frames=1), rosafe.process(sound, RATE, parameters=FEW)
-    )
 
 
 def test_integers_are_normalised_and_floats_are_not() -> None:
@@ -324,6 +306,7 @@ def test_outputs_in_any_form() -> None:
     assert rosafe.process(SOUND, RATE, parameters=FEW, outputs=[]) == {}
 
 
+@pytest.mark.usefixtures("blocks_as_they_are")
 def test_what_is_not_asked_for_is_not_stored() -> None:
     """Twice the signal takes no more memory, but for a few frames of ILD."""
 
@@ -453,6 +436,7 @@ class Blown(Exception):
     pass
 
 
+@pytest.mark.usefixtures("blocks_as_they_are")
 def test_an_error_on_the_way_ends_it_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     processed = []
 
@@ -478,6 +462,7 @@ def test_an_error_on_the_way_ends_it_at_once(monkeypatch: pytest.MonkeyPatch) ->
     assert len(read) < 5000  # of 10000: the tree notices with a few blocks under way
 
 
+@pytest.mark.usefixtures("blocks_as_they_are")
 def test_an_interrupt_from_the_keyboard(monkeypatch: pytest.MonkeyPatch) -> None:
     """In the middle of the work, which ends with all its threads."""
     processed: list[int] = []

@@ -54,6 +54,7 @@ def gammatone(
     block: FloatArray,
     sections: NDArray[np.complex128],
     state: NDArray[np.complex128],
+    position: int,
     output: FloatArray,
     envelope: FloatArray | None,
 ) -> None:
@@ -66,6 +67,7 @@ def gammatone(
         order,
         _address(sections),
         _address(state),
+        position,
         *_rows(output),
         None if envelope is None else _address(envelope),
     )
@@ -173,6 +175,7 @@ class Frames(NamedTuple):
     weights: Pinned  # (w,), of the samples of a frame
     hop: int  # from a frame's start to that of the next one
     number: int  # of whole ones
+    position: int  # of the first sample, counted from where the signal began
 
     def part(self, first: int, number: int) -> Frames:
         """Some of them, for a kernel that leaves the tail alone."""
@@ -181,7 +184,7 @@ class Frames(NamedTuple):
     @property
     def packed(self) -> bytes:
         """`framed` of framed.h, which kernels take. It holds addresses: what they are of must stay meanwhile."""
-        (history, start, stop), block, (tail, tail_start, tail_stop), skip, weights, hop, number = self
+        (history, start, stop), block, (tail, tail_start, tail_stop), skip, weights, hop, number, position = self
         held, shape = stop - start, block.shape
         arriving = shape[-1]
         return _pack(
@@ -199,6 +202,7 @@ class Frames(NamedTuple):
             len(weights.array),
             hop,
             number,
+            position,
         )
 
     def keep(self) -> None:

@@ -80,7 +80,7 @@ void rosafe_biquads(int64_t how, const double *block, const double *envelope, in
         for (int64_t k = 0; k < least(ROWS, rows - first); k++)
             for (int64_t s = 0; s < count; s++)
                 for (int i = 0; i < 2; i++)
-                    state[2 * (s * rows + row[k]) + i] = flushed(states[s][i * GROUPS + k / LANES][k % LANES]);
+                    state[2 * (s * rows + row[k]) + i] = states[s][i * GROUPS + k / LANES][k % LANES];
     }
     leave(mode);
 }

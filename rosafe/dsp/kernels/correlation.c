@@ -5,9 +5,8 @@
 #include "framed.h"
 #include "products.h"
 
-/* Samples from..until of the rows times `window` to `to` from t on; returns their energy. */
-static vec put(const double *const rows[LANES], const double *window, int64_t from, int64_t until, vec *to, int64_t t) {
-    vec energy = {};
+/* Samples from..until of the rows times `window` to `to` from t on; returns `energy` and theirs. */
+static vec put(const double *const rows[LANES], const double *window, int64_t from, int64_t until, vec *to, int64_t t, vec energy) {
     int64_t i = from;
     for (; i + TILE <= until; i += TILE, t += TILE) {
         vec tile[TILE];
@@ -33,10 +32,10 @@ typedef struct {
 } frames;
 
 /* As `put`. */
-INLINE vec put_both(const frames *of, const double *window, int64_t from, int64_t until, vec *to, int64_t t) {
+INLINE vec put_both(const frames *of, const double *window, int64_t from, int64_t until, vec *to, int64_t t, vec energy) {
     const int64_t middle = most(from, least(until, of->border));
-    vec energy = put(of->old, window, from, middle, to, t);
-    return energy + put(of->new, window, middle, until, to, t + middle - from);
+    energy = put(of->old, window, from, middle, to, t, energy);
+    return put(of->new, window, middle, until, to, t + middle - from, energy);
 }
 
 /* Samples from..until of frames that begin at different samples are joined: their borders lie apart. */
@@ -87,12 +86,12 @@ void rosafe_correlations(const framed *of, int64_t reach, double epsilon, double
                     join(&mine, start, held, ear ? begin : l_begin, ear ? end : l_end, joined);
                 if (ear == 0) {
                     put_zeros(l, 0, reach - (begin - l_begin));
-                    put_both(&mine, window, l_begin, begin, l, reach - (begin - l_begin));
-                    energy[0] += put_both(&mine, window, begin, end, l, reach);
-                    put_both(&mine, window, end, l_end, l, reach + end - begin);
+                    put_both(&mine, window, l_begin, begin, l, reach - (begin - l_begin), energy[0]);
+                    energy[0] = put_both(&mine, window, begin, end, l, reach, energy[0]);
+                    put_both(&mine, window, end, l_end, l, reach + end - begin, energy[0]);
                     put_zeros(l, reach + l_end - begin, end - begin + lags - 1);
                 } else {
-                    energy[1] += put_both(&mine, window, begin, end, r, 0);
+                    energy[1] = put_both(&mine, window, begin, end, r, 0, energy[1]);
                 }
             }
             product(l, r, end - begin, lags, c);

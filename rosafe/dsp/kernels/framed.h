@@ -21,6 +21,7 @@ typedef struct {
     const double *weights; /* of the samples of a frame */
     int64_t size, hop;
     int64_t number; /* of frames; all are complete */
+    int64_t position; /* of the first sample, counted from where the signal began */
 } framed;
 
 /* A row's samples of the block that are kept. */

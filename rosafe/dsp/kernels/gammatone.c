@@ -6,6 +6,7 @@
  *
  * What runs is z[t] = exp(-i a t) y[t], with the input turned likewise: there a pole takes z[t] = x[t] + r z[t-1], half of
  * the arithmetic. Angles count from the beginning of a span of samples, so that there is a small table of turns.
+ * Spans go on from block to block, and states stay as they are: blocks leave no trace in the numbers.
  *
  * A row in each lane. Up to four poles at a time have their states in registers; between them, spans of samples stay in the
  * first-level cache, so that any order costs the same per pole. */
@@ -28,13 +29,14 @@ typedef struct {
     complexes back[SPAN + 1]; /* those of the output */
 } turns;
 
-static void design(complexes pole, vec gain, int64_t span, turns *by) {
+/* For the samples of a span that come before `until`. */
+static void design(complexes pole, vec gain, int64_t until, turns *by) {
     const vec radius = root(fused(pole.re, pole.re, pole.im * pole.im)), none = (vec)((lanes)all(1.0) & (radius == 0));
     by->radius = radius;
     by->back[0] = (complexes){all(1.0), (vec){}};
     by->back[1] = (complexes){pole.re / (radius + none) + none, pole.im / (radius + none)};
-    for (int64_t t = 2; t <= span; t++) by->back[t] = times(by->back[t / 2], by->back[t - t / 2]);
-    for (int64_t t = 0; t < span; t++) by->there[t] = (complexes){by->back[t].re * gain, by->back[t].im * -gain};
+    for (int64_t t = 2; t <= until; t++) by->back[t] = times(by->back[t / 2], by->back[t - t / 2]);
+    for (int64_t t = 0; t < until; t++) by->there[t] = (complexes){by->back[t].re * gain, by->back[t].im * -gain};
 }
 
 /* Samples on their way: from an ear's x for the first poles, to rows of `output` and perhaps `envelope` from the last ones. */
@@ -72,18 +74,18 @@ INLINE void step(const int poles, const int first, const int n, const turns *by,
     if (on.envelope) write_some(envelope, n, on.envelope, t);
 }
 
-INLINE void run(const int poles, const int first, const turns *by, way on, int64_t n, complexes *last) {
+/* The samples from t until `until` of a span; at its end the states turn to the next one. */
+INLINE void run(const int poles, const int first, const turns *by, way on, int64_t t, int64_t until, complexes *last) {
     complexes z[TOGETHER];
     UNROLL for (int k = 0; k < poles; k++) z[k] = last[k];
-    int64_t t = 0;
-    for (; t + TILE <= n; t += TILE) step(poles, first, TILE, by, on, t, z);
-    for (; t < n; t++) step(poles, first, 1, by, on, t, z);
-    UNROLL for (int k = 0; k < poles; k++) last[k] = times(z[k], by->back[n]);
+    for (; t + TILE <= until; t += TILE) step(poles, first, TILE, by, on, t, z);
+    for (; t < until; t++) step(poles, first, 1, by, on, t, z);
+    UNROLL for (int k = 0; k < poles; k++) last[k] = until < SPAN ? z[k] : times(z[k], by->back[SPAN]);
 }
 
-static void run_some(int64_t poles, const turns *by, way on, int64_t n, complexes *last) {
+static void run_some(int64_t poles, const turns *by, way on, int64_t t, int64_t until, complexes *last) {
     switch (poles) {
-#define CASE(poles) case poles: on.x ? run(poles, 1, by, on, n, last) : run(poles, 0, by, on, n, last); break;
+#define CASE(poles) case poles: on.x ? run(poles, 1, by, on, t, until, last) : run(poles, 0, by, on, t, until, last); break;
         CASE(1) CASE(2) CASE(3) CASE(4)
 #undef CASE
     }
@@ -93,10 +95,10 @@ static void run_some(int64_t poles, const turns *by, way on, int64_t n, complexe
 INLINE double gain_of(const double *sections, int64_t number) { return sections[12 * number]; }
 INLINE const double *minus_pole_of(const double *sections, int64_t number) { return sections + 12 * number + 8; }
 
-/* block (2, n), sections (channels, order, 6) complex, state (2, channels, order) complex, output (2, channels, n) with
- * rows `stride` apart, envelope (2, channels, n) or null. */
+/* block (2, n), sections (channels, order, 6) complex, state (2, channels, order) complex: z of each pole, after `position`
+ * samples of a span; output (2, channels, n) with rows `stride` apart, envelope (2, channels, n) or null. */
 void rosafe_gammatone(const double *block, int64_t n, int64_t channels, int64_t order, const double *sections,
-                      double *state, double *output, int64_t stride, double *envelope) {
+                      double *state, int64_t position, double *output, int64_t stride, double *envelope) {
     uint32_t mode = enter();
     for (int64_t first = 0; first < channels; first += LANES) {
         turns by;
@@ -109,23 +111,22 @@ void rosafe_gammatone(const double *block, int64_t n, int64_t channels, int64_t 
             pole.im[k] = -minus_pole_of(sections, channel[k] * order)[1];
             for (int64_t p = 0; p < order; p += TOGETHER) gains[p / TOGETHER][k] = gain_of(sections, channel[k] * order + p);
         }
-        design(pole, gains[0], least(SPAN, n), &by);
-        const vec inverse = 1.0 / larger(by.radius, all(TINY));
+        design(pole, gains[0], least(SPAN, position + n), &by);
         for (int ear = 0; ear < 2; ear++) {
             complexes last[MOST_POLES], samples[SPAN];
             double *states[LANES];
             for (int k = 0; k < LANES; k++) {
                 states[k] = state + 2 * order * (ear * channels + channel[k]);
                 for (int64_t p = 0; p < order; p++) {
-                    last[p].re[k] = states[k][2 * p] * inverse[k];
-                    last[p].im[k] = states[k][2 * p + 1] * inverse[k];
+                    last[p].re[k] = states[k][2 * p];
+                    last[p].im[k] = states[k][2 * p + 1];
                 }
             }
-            for (int64_t at = 0; at < n; at += SPAN) {
-                const int64_t count = least(SPAN, n - at);
-                double x[SPAN], *rows[LANES], *envelopes[LANES];
-                for (int64_t t = 0; t < count; t += LANES)
-                    *(vec_anywhere *)(x + t) = bounded(load_first(block + ear * n + at + t, count - t), -LIMIT, LIMIT);
+            for (int64_t at = -position; at < n; at += SPAN) { /* where a span begins, perhaps before the block */
+                const int64_t from = most(0, -at), until = least(SPAN, n - at);
+                double x[SPAN + LANES], *rows[LANES], *envelopes[LANES];
+                for (int64_t t = from; t < until; t += LANES)
+                    *(vec_anywhere *)(x + t) = bounded(load_first(block + ear * n + at + t, until - t), -LIMIT, LIMIT);
                 for (int k = 0; k < LANES; k++) {
                     rows[k] = output + (ear * channels + channel[k]) * stride + at;
                     if (envelope) envelopes[k] = envelope + (ear * channels + channel[k]) * n + at;
@@ -134,19 +135,19 @@ void rosafe_gammatone(const double *block, int64_t n, int64_t channels, int64_t 
                 for (int64_t p = 0; p < order; p += TOGETHER) {
                     if (p > 0) {
                         on.x = 0;
-                        for (int64_t t = 0; t < count; t++) {
+                        for (int64_t t = from; t < until; t++) {
                             samples[t].re *= gains[p / TOGETHER];
                             samples[t].im *= gains[p / TOGETHER];
                         }
                     }
                     if (p + TOGETHER >= order) on.output = rows, on.envelope = envelope ? envelopes : 0;
-                    run_some(least(TOGETHER, order - p), &by, on, count, last + p);
+                    run_some(least(TOGETHER, order - p), &by, on, from, until, last + p);
                 }
             }
             for (int k = 0; k < LANES; k++)
                 for (int64_t p = 0; p < order; p++) {
-                    states[k][2 * p] = flushed(last[p].re[k] * by.radius[k]);
-                    states[k][2 * p + 1] = flushed(last[p].im[k] * by.radius[k]);
+                    states[k][2 * p] = last[p].re[k];
+                    states[k][2 * p + 1] = last[p].im[k];
                 }
         }
     }

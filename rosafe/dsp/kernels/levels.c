@@ -8,10 +8,11 @@
 void rosafe_levels(const framed *of, double epsilon, double *energies, double *levels) {
     const int64_t rows = of->rows, number = of->number, held = of->held, n = of->n;
     uint32_t mode = enter();
-    memset(energies, 0, rows * number * sizeof(double));
     for (int64_t row = 0; row < rows; row++) {
-        add_frames(BOUNDED | SQUARED, of->history + row * of->history_stride, 0, held, of, energies + row * number);
-        add_frames(BOUNDED | SQUARED, of->block + row * n, held, n, of, energies + row * number);
+        for (int64_t frame = 0, at = of->skip; frame < number; frame++, at += of->hop) {
+            const halves mine = {of->history + row * of->history_stride + at, of->block + row * n + at - held, held - at};
+            energies[row * number + frame] = weighted(BOUNDED | SQUARED, &mine, of->weights, of->size);
+        }
         keep_tail(of, row);
     }
     const double *left = energies, *right = energies + rows / 2 * number;

@@ -16,9 +16,9 @@ INSTRUCTIONS = {2: "SSE4.2", 3: "AVX2 and FMA", 4: "AVX-512", 8: "NEON"}  # that
 
 _INTEGER, _REAL, _ARRAY, _BITS = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p, ctypes.c_uint32
 _FRAMES = ctypes.c_char_p  # `FRAMES`, packed: one argument takes a tenth of the time of so many
-FRAMES = "PqqPqPqqqqPqqq"  # for the module struct: `framed` of framed.h; P is an address
+FRAMES = "PqqPqPqqqqPqqqq"  # for the module struct: `framed` of framed.h; P is an address
 _ARGUMENTS = {
-    "rosafe_gammatone": (_ARRAY, *[_INTEGER] * 3, *[_ARRAY] * 3, _INTEGER, _ARRAY),
+    "rosafe_gammatone": (_ARRAY, *[_INTEGER] * 3, *[_ARRAY] * 2, _INTEGER, _ARRAY, _INTEGER, _ARRAY),
     "rosafe_biquads": (_INTEGER, _ARRAY, _ARRAY, _INTEGER, _INTEGER, _ARRAY, _INTEGER, _ARRAY, _ARRAY, _INTEGER),
     "rosafe_adaptation": (_ARRAY, _INTEGER, _INTEGER, _REAL, *[_ARRAY, _INTEGER] * 2, _INTEGER, _ARRAY, _ARRAY),
     "rosafe_levels": (_FRAMES, _REAL, _ARRAY, _ARRAY),

@@ -3,8 +3,8 @@
  * A filter in each lane; all get the same samples. Second-order sections in direct form II transposed, in the very order of
  * operations of scipy.signal.sosfilt: at a thousandth of the sample rate, what is rounded otherwise would show. A section's
  * sample waits for the one before it; several registers of filters fill the wait. Each frame that touches a span of samples
- * adds its part of it, so that only the tail that is kept goes to memory. */
-#include "frames.h"
+ * adds those one by one, so that only the tail that is kept goes to memory, and blocks leave no trace in the sums. */
+#include "framed.h"
 
 enum { SPAN = 64, FILTERS = 16 /* at a time */, GROUPS = FILTERS / LANES };
 
@@ -29,7 +29,7 @@ INLINE void filter(section *sections, const double *x, int64_t n, vec magnitudes
     UNROLL for (int g = 0; g < GROUPS; g++) sections[g].s1 = s1[g], sections[g].s2 = s2[g];
 }
 
-/* The n magnitudes of which the first is sample `at`: adds their part to each frame's sum, of each of the lanes that are used. */
+/* The n magnitudes of which the first is sample `at`: adds them to each frame's sum, of each of the lanes that are used. */
 INLINE void add_magnitudes(vec magnitudes[SPAN][GROUPS], int64_t at, int64_t n, const framed *of, int64_t used,
                            double *sums) {
     const int64_t past = at - of->skip - of->size;
@@ -37,9 +37,10 @@ INLINE void add_magnitudes(vec magnitudes[SPAN][GROUPS], int64_t at, int64_t n, 
     for (int64_t begin; frame < of->number && (begin = of->skip + frame * of->hop) < at + n; frame++) {
         const int64_t from = most(at, begin), until = least(at + n, begin + of->size);
         vec sum[GROUPS] = {};
+        for (int64_t k = 0; k < used; k++) sum[k / LANES][k % LANES] = sums[k * of->number + frame];
         for (int64_t t = from; t < until; t++)
             UNROLL for (int g = 0; g < GROUPS; g++) sum[g] = fused(all(of->weights[t - begin]), magnitudes[t - at][g], sum[g]);
-        for (int64_t k = 0; k < used; k++) sums[k * of->number + frame] += sum[k / LANES][k % LANES];
+        for (int64_t k = 0; k < used; k++) sums[k * of->number + frame] = sum[k / LANES][k % LANES];
     }
 }
 
@@ -63,8 +64,17 @@ void rosafe_modulation(const framed *frames, int64_t filters, const double *b0_b
                 for (int i = 0; i < 3; i++) of->b[i][k % LANES] = design[i], of->a[i][k % LANES] = design[3 + i];
                 of->s1[k % LANES] = before[0], of->s2[k % LANES] = before[1];
             }
-            for (int64_t k = 0; k < used; k++)
-                add_frames(0, frames->history + (line + k) * frames->history_stride, 0, held, frames, mine + k * number);
+            for (int64_t at = 0, end; number && at < held; at = end) {
+                vec magnitudes[SPAN][GROUPS];
+                end = least(at + SPAN, held);
+                for (int g = 0; g < GROUPS; g++) {
+                    const double *from[LANES];
+                    for (int k = 0; k < LANES; k++)
+                        from[k] = frames->history + (line + least(g * LANES + k, used - 1)) * frames->history_stride + at;
+                    read_rows(from, end - at, 0.0, 2 * LIMIT, &magnitudes[0][g], GROUPS);
+                }
+                add_magnitudes(magnitudes, at, end - at, frames, used, mine);
+            }
             for (int64_t at = held, end; at < held + n; at = end) {
                 vec magnitudes[SPAN][GROUPS];
                 end = least(at + SPAN, held + n);
@@ -76,8 +86,8 @@ void rosafe_modulation(const framed *frames, int64_t filters, const double *b0_b
             }
             for (int64_t k = 0; k < used; k++) {
                 double *after = state + 2 * ((first + k) * rows + row);
-                after[0] = flushed(sections[k / LANES].s1[k % LANES]);
-                after[1] = flushed(sections[k / LANES].s2[k % LANES]);
+                after[0] = sections[k / LANES].s1[k % LANES];
+                after[1] = sections[k / LANES].s2[k % LANES];
             }
         }
     leave(mode);

@@ -2,7 +2,7 @@
  *
  * u[t] = s + (1 - r) x[t], s = r u[t] (rosafe/dsp/ratemap.py). A row in each lane. Samples go in spans that stay in the
  * first-level cache, and each frame that touches a span adds its part of it. So every sample is read once, and of what is
- * integrated only the tail that is kept goes to memory. */
+ * integrated only the tail that is kept goes to memory. Spans are counted from where the signal began. */
 #include "frames.h"
 
 enum { SPAN = 128 };
@@ -32,18 +32,19 @@ INLINE void run(const int how, const framed *of, int64_t row, double retention, 
     double *kept[LANES];
     vec s, u[SPAN];
     for (int k = 0; k < LANES; k++) s[k] = state[2 * least(k, rows - 1)]; /* lanes without a row do the last one once more */
-    for (int64_t k = 0; k < rows; k++)
-        add_frames(how, of->history + (row + k) * of->history_stride, 0, held, of, sums + k * of->number);
-    for (int64_t at = held, end; at < held + n; at = end) {
-        end = least(at + SPAN, held + n);
-        for (int k = 0; k < LANES; k++) from[k] = of->block + (row + least(k, rows - 1)) * n + at - held;
-        integrate(from, end - at, retention, &s, u);
+    for (int64_t at = of->number ? 0 : held, end, old; at < held + n; at = end) {
+        end = least(at + SPAN - (of->position + at) % SPAN, held + n);
+        old = most(0, least(end, held) - at);
+        for (int k = 0; k < LANES; k++) from[k] = of->history + (row + least(k, rows - 1)) * of->history_stride + at;
+        read_rows(from, old, -2 * LIMIT, 2 * LIMIT, u, 1);
+        for (int k = 0; k < LANES; k++) from[k] = of->block + (row + least(k, rows - 1)) * n + at + old - held;
+        integrate(from, end - at - old, retention, &s, u + old);
         add_frames_of_rows(how, u, at, end - at, of, rows, sums);
         const int64_t first = most(at, tail_from);
         for (int k = 0; k < LANES; k++) kept[k] = of->tail + (row + least(k, rows - 1)) * of->tail_stride + first - tail_from;
         if (first < end) write_rows(u + first - at, 1, end - first, kept);
     }
-    for (int64_t k = 0; k < rows; k++) state[2 * k] = flushed(s[k]);
+    for (int64_t k = 0; k < rows; k++) state[2 * k] = s[k];
 }
 
 /* The history has been integrated already, the block has not. state is (rows, 2), of which the second belongs to the twin's

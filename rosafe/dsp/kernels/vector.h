@@ -17,7 +17,7 @@
 #define UNROLL _Pragma("GCC unroll 32") /* -O2 leaves even loops over four things rolled */
 #endif
 
-/* As in rosafe/dsp/guard.py: samples are bounded to LIMIT; states below TINY become 0 at the end of a block. */
+/* As in rosafe/dsp/guard.py: samples are bounded to LIMIT, and what is below TINY is nothing. */
 #define LIMIT 1e70
 #define TINY 1e-200
 
@@ -38,7 +38,6 @@ typedef double quartet_anywhere __attribute__((vector_size(32), aligned(8), may_
 INLINE int64_t least(int64_t a, int64_t b) { return a < b ? a : b; }
 INLINE int64_t most(int64_t a, int64_t b) { return a > b ? a : b; }
 INLINE vec load(const double *from) { return *(const vec_anywhere *)from; }
-INLINE double flushed(double state) { return state < TINY && state > -TINY ? 0.0 : state; }
 
 INLINE vec all(double x) { return x - (vec){}; }
 INLINE vec root(vec a) {

@@ -1,0 +1,144 @@
+"""Blocks leave no trace in the numbers, not in the last bit; so small ones go through the tree together."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import scipy
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+import rosafe
+from rosafe.dsp import kernels
+from rosafe.offline import chain
+from rosafe.offline.files import process_file
+from rosafe.representations import OWN
+from rosafe.representations.input import Input
+from tests.dsp.implementations import TWINS, levels, using
+
+RATE = 16000.0
+FEW = {"fb_nChannels": 5, "fb_highFreqHz": 6000.0}
+BYTES = 2 * 5 * 8  # that the filterbank puts out for a frame
+SAMPLES = 3500
+SOUND = 0.1 * np.random.default_rng(0).standard_normal((2, SAMPLES))
+SOUND[1] = 0.7 * np.roll(SOUND[0], 5) + 0.3 * SOUND[1]
+SOUND[:, 1200:1900] = 0.0
+
+with_kernels = pytest.mark.skipif(not kernels.compiled(), reason="twins round otherwise from block to block")
+sizes = st.lists(st.one_of(st.integers(60, 700), st.integers(1, 2500)), min_size=1, max_size=6)
+parameters = st.fixed_dictionaries(
+    {},
+    optional={
+        "pp_bRemoveDC": st.just(True),
+        "pp_bMiddleEarFiltering": st.just(True),
+        "fb_type": st.just("drnl"),
+        "fb_nGamma": st.integers(1, 9),
+        "fb_nChannels": st.integers(1, 9),
+        "ihc_method": st.sampled_from(["none", "hilbert", "joergensen", "breebart", "bernstein"]),
+        "rm_scaling": st.just("magnitude"),
+        "rm_hSizeSec": st.sampled_from([0.001, 0.013, 0.03]),
+        "rm_wSizeSec": st.sampled_from([0.002, 0.0301, 0.1]),
+        "ild_hSizeSec": st.sampled_from([0.0011, 0.025]),
+        "ild_wSizeSec": st.sampled_from([0.0007, 0.0301]),
+        "cc_wSizeSec": st.sampled_from([0.005, 0.06]),
+        "cc_maxDelaySec": st.sampled_from([0.0002, 0.004, 0.04]),
+        "adpt_lim": st.sampled_from([0.0, 5.0]),
+        "ams_fbType": st.just("lin"),
+        "ac_clipMethod": st.sampled_from(["clc", "sgn"]),
+    },
+)
+
+
+@contextmanager
+def at_most(size: int) -> Iterator[list[int]]:
+    """Of blocks that are put together, a processor puts out so many bytes at most; the lengths of those that come."""
+    lengths: list[int] = []
+    process = Input.process
+
+    def watch(self: Input, block: Any, extra: Any = None) -> Any:
+        lengths.append(np.shape(block)[-1])
+        return process(self, block, extra)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(chain, "TOGETHER", size)
+        patch.setattr(Input, "process", watch)
+        yield lengths
+
+
+def assert_same(got: dict[str, Any], wanted: dict[str, Any]) -> None:
+    assert got.keys() == wanted.keys()
+    for name in wanted:
+        np.testing.assert_array_equal(got[name], wanted[name], err_msg=name)
+
+
+@with_kernels
+@given(sizes=sizes, given_parameters=parameters)
+@settings(deadline=None, max_examples=40)
+def test_no_trace_in_any_representation(sizes: list[int], given_parameters: dict[str, Any]) -> None:
+    options: dict[str, Any] = {"parameters": {**FEW, **given_parameters}, "outputs": sorted(OWN)}
+    with at_most(0) as lengths:
+        whole = rosafe.process(SOUND, RATE, block_frames=SAMPLES, **options)
+        assert lengths == [SAMPLES]
+        in_blocks = rosafe.process(SOUND, RATE, block_frames=sizes, **options)
+        assert max(lengths[1:]) <= max(sizes)
+    assert_same(in_blocks, whole)
+
+
+@with_kernels
+def test_no_trace_in_blocks_of_one_frame_nor_in_long_tails() -> None:
+    sound = np.zeros((2, 9000))
+    sound[:, :300], sound[:, 8000], sound[0, 8400:8410] = SOUND[:, :300], 1e-300, 1e80
+    with at_most(0):
+        for frames, block, kind in ((700, 1, "gammatone"), (9000, 100, "gammatone"), (9000, 77, "drnl")):
+            options: dict[str, Any] = {"parameters": {**FEW, "fb_type": kind}, "outputs": sorted(OWN)}
+            whole = rosafe.process(sound[:, :frames], RATE, block_frames=frames, **options)
+            assert_same(rosafe.process(sound[:, :frames], RATE, block_frames=block, **options), whole)
+
+
+@with_kernels
+@pytest.mark.parametrize(
+    ("size", "blocks", "lengths"),
+    [
+        (2**22, 100, [3500]),
+        (1000, 100, [1000, 1000, 1000, 500]),
+        (1099, 100, [1000, 1000, 1000, 500]),
+        (199, 100, [100] * 35),
+        (0, 1000, [1000, 1000, 1000, 500]),
+        (900, 1000, [1000, 1000, 1000, 500]),  # larger ones are left as they are
+        (1000, [600, 300, 200, 900], [900, 200, 900, 900, 600]),
+    ],
+)
+def test_small_blocks_go_together(size: int, blocks: Any, lengths: list[int], tmp_path: Path) -> None:
+    """As many as there is room for."""
+    options: dict[str, Any] = {"parameters": FEW, "block_frames": blocks}
+    with at_most(0):
+        alone = rosafe.process(SOUND, RATE, **options)
+    with at_most(size * BYTES) as seen:
+        assert_same(rosafe.process(SOUND, RATE, **options), alone)
+        assert seen == lengths
+        if not isinstance(blocks, int):
+            return
+        scipy.io.wavfile.write(tmp_path / "sound.wav", int(RATE), SOUND.T.astype(np.float32))
+        seen.clear()
+        process_file(tmp_path / "sound.wav", tmp_path / "results.npz", FEW, blocks)
+        assert seen == lengths
+    assert rosafe.load(tmp_path / "results.npz")["block_frames"] == blocks
+
+
+@pytest.mark.parametrize("why", ["changes", "gain control", "a plugin", "twins"])
+def test_blocks_that_may_be_seen_stay_as_they_are(why: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    options: dict[str, Any] = {"parameters": dict(FEW), "block_frames": 1000, "outputs": ["ratemap"]}
+    if why == "changes":
+        options["modifications"] = [(2, "rm_scaling", "magnitude")]
+    elif why == "gain control":
+        options["parameters"]["pp_bNormalizeRMS"] = True
+    elif why == "a plugin":
+        monkeypatch.setattr(chain, "OWN", OWN - {"ratemap"})
+    with at_most(2**22) as seen, using(TWINS if why == "twins" else [TWINS, *levels()][-1]):
+        rosafe.process(SOUND, RATE, **options)
+    assert seen == [1000, 1000, 1000, 500]
