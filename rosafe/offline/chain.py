@@ -50,7 +50,8 @@ class _GatedSource:
     def read(self) -> tuple[np.ndarray, int] | None:
         if self._most < 0 or self.ended:
             return None
-        blocks, frames = [], 0
+        blocks: list[np.ndarray] = []
+        frames = 0
         while (block := next(self._blocks, None) if self._next is None else self._next) is not None:
             self._next = block
             if blocks and frames + block.shape[-1] > self._most:
