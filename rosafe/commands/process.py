@@ -3,7 +3,7 @@
 Reads WAV, FLAC, Ogg, MP3 and whatever else libsndfile reads, and rosbags: two channels, left and right ear, or those
 that --channels names. Writes a file of results beside each, or where -o says; rosafe.load and rosafe plot read it.
 Unless --outputs says otherwise, what is in frames is kept: ild, ratemap and crossCorrelation.
-The numbers are those of the node on the same samples and blocks, bit for bit; so samples are taken as 32-bit integers
+The numbers are those of the node on the same samples, bit for bit; so samples are taken as 32-bit integers
 (float files are scaled by 2^31-1 and rounded), and in_doNormalize is true unless told otherwise."""
 
 from __future__ import annotations

@@ -24,8 +24,9 @@ _NUMBER = "in_doNormalize"
 class Stream:
     """Auditory representations of sound that comes block by block.
 
-    The numbers are those of `rosafe.process` on the same blocks, to the last bit; other blocks change the last digits,
-    and where gain control (`pp_bNormalizeRMS`) starts. A stream belongs to one thread at a time and starts none.
+    The numbers are those of `rosafe.process`, to the last bit, whatever the blocks are; only where gain control
+    (`pp_bNormalizeRMS`) starts depends on them. (With numpy and scipy in the place of the kernels, and in plugins, the
+    last digits do, too.) A stream belongs to one thread at a time and starts none.
 
     Parameters
     ----------
