@@ -84,7 +84,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         type=partial(_count, maximum=cast(float, _BLOCK.maximum)),
         default=_BLOCK.default,
         metavar="N",
-        help=f"frames processed at a time, as the node's {_BLOCK.name} (default: {_BLOCK.default})",
+        help=f"frames at a time, as the node's {_BLOCK.name} (default: {_BLOCK.default})",
     )
     parser.add_argument(
         "--jobs",

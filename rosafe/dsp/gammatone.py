@@ -16,7 +16,7 @@ from .erb import bandwidth
 from .guard import SPAN, FloatArray, flush, limited
 
 POLES_TOGETHER = 4
-TURN_SPAN = 64  # samples, SPAN of kernels/gammatone.c
+TURN_SPAN = 64  # samples; SPAN of kernels/gammatone.c, which takes no other `position` than below it
 
 
 class GammatoneBank:

@@ -122,7 +122,7 @@ class Stage:
 
     @property
     def blocks_matter(self) -> bool:
-        """Whether the output depends on how the sound is cut into blocks, beyond what is rounded."""
+        """Whether the output depends on how sound is cut, beyond rounding. Plugins are not asked: theirs may."""
         return False
 
     @property
@@ -221,7 +221,9 @@ class Stage:
     # --- blocks -----------------------------------------------------------------------------------------------
 
     def process(self, block: FloatArray, extra: FloatArray | None = None) -> Output:
-        """The output for the next block, (..., N) of numbers: a fresh, contiguous float64 array, or one for each part.
+        """The output for the next block, (..., N) of numbers: a contiguous float64 array, or one for each part.
+
+        They are fresh, but for `place`.
 
         The input is not modified, but where it is `place`. `extra` is what `needs` names, of the same block. ValueError
         for another shape or type.

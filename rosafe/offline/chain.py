@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import threading
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -21,13 +20,15 @@ from rosafe.tree.company import Observer
 from rosafe.tree.processor import Processor
 from rosafe.tree.tree import Tree
 
-TOGETHER = 2**22  # bytes: a block that is put together makes no processor put out more
+# A block that is put together has no more frames, and no processor puts out more for it
+MOST_FRAMES = 12000  # as InputProc's blocks by default
+MOST_BYTES = 2**22
 
 
 class _GatedSource:
     """Feeds blocks to the tree, one after the other, once `let_flow` says that the whole tree stands.
 
-    Those that together have no more than so many frames as that says are put together.
+    Those that have no more than `most` frames together are put together.
     """
 
     def __init__(self, blocks: Iterable[np.ndarray], sample_rate: float) -> None:
@@ -36,19 +37,19 @@ class _GatedSource:
         self._blocks = iter(blocks)
         self._next: np.ndarray | None = None  # which has been fetched already
         self._frames = 0
-        self._most = -1  # frames that are put together; nothing flows yet
+        self._most: int | None = None  # frames that are put together; nothing flows yet
         self._wake: Callable[[], None] = lambda: None
 
     def open(self, wake: Callable[[], None]) -> None:
         self._wake = wake
 
     def let_flow(self, most: int) -> None:
-        """Let the signal flow."""
+        """Let the signal flow, in blocks of up to `most` frames where they are smaller."""
         self._most = most
         self._wake()
 
     def read(self) -> tuple[np.ndarray, int] | None:
-        if self._most < 0 or self.ended:
+        if self._most is None or self.ended:
             return None
         blocks: list[np.ndarray] = []
         frames = 0
@@ -59,7 +60,7 @@ class _GatedSource:
             self._next = None
             blocks.append(block)
             frames += block.shape[-1]
-            if frames >= self._most:
+            if frames >= self._most or self.ended:  # which somebody else says
                 break
         if not blocks:
             self.stop()
@@ -170,7 +171,7 @@ class Chain:
         Stages that put out frames cannot, and are not asked.
         """
         processor = self._processors[kind]
-        if not processor.signal.framed and not processor.children:  # who take blocks in one piece
+        if not processor.signal.framed and not processor.children:  # children take blocks in one piece
             processor.place = lambda taken: place(taken.data.shape[-1])
 
     def observe(self, observer: Observer) -> None:
@@ -236,7 +237,8 @@ class Chain:
         seen = not kernels.compiled() or any(p.kind not in OWN or p.stage.blocks_matter for p in processors)
         if changed or seen:
             return 0
-        return int(TOGETHER * self.sample_rate / self.largest_block(math.ceil(self.sample_rate))[1])
+        frame = max(sizes.output_size(p.stage, p.given_rows, 1 / self.sample_rate) for p in processors)
+        return min(MOST_FRAMES, int(MOST_BYTES / frame))
 
     def describe(self) -> dict[str, Any]:
         """Axes of what runs, `fb_cfHz` (Hz), `cc_lags` (s); rates of the outputs, `ild_frameRate` and its like (Hz).
@@ -268,7 +270,12 @@ def needed(outputs: Iterable[str]) -> list[str]:
 
 
 def overwriting(kinds: Collection[str], outputs: Collection[str]) -> list[str]:
-    """Of all `kinds` that run, those that may write over the blocks that they take, which nobody else wants."""
+    """Of all `kinds` that run, those that may write over the blocks that they take, which nobody else wants.
+
+    Kernels do; numpy does not.
+    """
+    if not kernels.compiled():
+        return []
     parents = [KINDS[kind].parent for kind in kinds]
     return [
         kind

@@ -57,8 +57,8 @@ def process_file(
 ) -> Done:
     """Compute the auditory representations of a sound file, block by block, as they come into a file.
 
-    The numbers are those of `rosafe.process` on the file's int32 samples, and of the node on the same samples and
-    blocks, bit for bit. The file holds what `rosafe.load` returns.
+    The numbers are those of `rosafe.process` on the file's int32 samples, and of the node on the same samples, bit
+    for bit. The file holds what `rosafe.load` returns.
     Nothing of the name `target` is there before it is complete.
 
     Parameters
@@ -72,7 +72,7 @@ def process_file(
         As of `rosafe.process`, but that `ild`, `ratemap` and `crossCorrelation` are the default; `in_doNormalize` is
         True by default.
     block_frames : int
-        Frames that are read and processed at a time; the output for them takes at most 1 GiB.
+        Frames that are read at a time; small blocks are processed together. The output for one takes at most 1 GiB.
     progress : callable
         Called now and then with the frames that are done and those that there are. What it raises ends the work.
     channels : tuple of two int, optional

@@ -121,7 +121,7 @@ def correlate_by_fft(frames: FloatArray, window: FloatArray, reach: int, result:
 def _correlate(frames: FloatArray, reach: int, transform: int) -> FloatArray:
     """Windowed frames (2, C, F, w) to (C, F, 2 reach + 1)."""
     left, right = frames
-    energies = np.einsum("cfi,cfi->cf", left, left) * np.einsum("cfi,cfi->cf", right, right)
+    energies = np.square(left).sum(axis=-1) * np.square(right).sum(axis=-1)
     # With a name, or numpy multiplies large ones in place, which rounds otherwise.
     of_left, of_right = scipy.fft.rfft(left, transform), np.conj(scipy.fft.rfft(right, transform))
     circular = scipy.fft.irfft(of_left * of_right, transform)

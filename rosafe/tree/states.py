@@ -12,6 +12,7 @@ import enum
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from rosafe.dsp.signal import Signal
 from rosafe.tree.block import Block
 
 
@@ -29,6 +30,8 @@ class State(enum.Enum):
 # Enumerations are slow to look up.
 WAIT_EXEC, EXEC, WAIT_RELEASE, RELEASE = State.WAIT_EXEC, State.EXEC, State.WAIT_RELEASE, State.RELEASE
 DONE, REMOVED = ENDS = (State.DONE, State.REMOVED)
+
+NOTHING = Block(0, (), 0, Signal.sound(1.0))  # to be told of a block that nobody hears of
 
 
 class StateMachine:
@@ -48,9 +51,9 @@ class StateMachine:
         Somebody may want the last block later: the world is told of it, and a new child begins with it. Else its memory
         is free, and still in the cache, as soon as the children have done with it.
     shared : Block or None
-        Released last, if it is `heard`; children read it.
+        Released last; a new child begins with it. None where it is not `heard`.
     untold : Block or None
-        The same until the world has been told of it.
+        Released last, until the world has been told of it; `NOTHING` where it is not `heard`.
     observers : sequence of callable
         Get the processor, the state that it enters, and the number of the block at hand, or None. No waiting.
     """
@@ -234,8 +237,7 @@ class StateMachine:
         self.state = RELEASE
         if self.observers:
             self._tell_observers(block.number)
-        self.shared = block if self.heard else None
-        self.untold = block
+        self.shared, self.untold = (block, block) if self.heard else (None, NOTHING)
         for child in self.children:
             if child.state is not DONE:
                 self._hand(child, block)

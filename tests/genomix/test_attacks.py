@@ -98,6 +98,7 @@ def test_a_client_that_was_idle_meanwhile_goes_on(world: World) -> None:
     with world.graph.start("tclsh", str(script)) as client:
         harness.wait_for(lambda: "ready" in client.out, 30, lambda: repr(client))
         with attacks.half_requests(world.port):
+            harness.wait_for(lambda: "idle ones are closed" in world.server.err)
             go.touch()
             assert client.wait(30) == 0
         assert client.out.split() == ["ready", "done"]

@@ -19,4 +19,4 @@ def no_thread_left() -> Iterator[None]:
 @pytest.fixture
 def blocks_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
     """None are put together."""
-    monkeypatch.setattr(chain, "TOGETHER", 0)
+    monkeypatch.setattr(chain, "MOST_BYTES", 0)

@@ -65,7 +65,7 @@ def at_most(size: int) -> Iterator[list[int]]:
         return process(self, block, extra)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(chain, "TOGETHER", size)
+        patch.setattr(chain, "MOST_BYTES", size)
         patch.setattr(Input, "process", watch)
         yield lengths
 
@@ -87,6 +87,22 @@ def test_no_trace_in_any_representation(sizes: list[int], given_parameters: dict
         in_blocks = rosafe.process(SOUND, RATE, block_frames=sizes, **options)
         assert max(lengths[1:]) <= max(sizes)
     assert_same(in_blocks, whole)
+
+
+@with_kernels
+@pytest.mark.parametrize(("channels", "block"), [(1, 100), (1, 2000), (2, 700)])
+def test_no_trace_in_sums_that_numpy_takes_in_pieces(channels: int, block: int) -> None:
+    """Over more than 8192 numbers; correlations over more than 1024 lags are by its FFT."""
+    sound = 0.1 * np.random.default_rng(1).standard_normal((2, 14_000))
+    values = {"cc_wSizeSec": 0.6, "cc_maxDelaySec": 0.04, "cc_hSizeSec": 0.05, "ac_wSizeSec": 0.6, "prec_wSizeSec": 0.6}
+    options: dict[str, Any] = {
+        "parameters": {**FEW, **values, "fb_nChannels": channels},
+        "outputs": ["crossCorrelation", "itd", "autocorrelation", "pitch", "precedence"],
+    }
+    with at_most(0):
+        whole = rosafe.process(sound, RATE, block_frames=14_000, **options)
+        assert whole["crossCorrelation"].shape[-1] > 3
+        assert_same(rosafe.process(sound, RATE, block_frames=block, **options), whole)
 
 
 @with_kernels
@@ -128,6 +144,39 @@ def test_small_blocks_go_together(size: int, blocks: Any, lengths: list[int], tm
         process_file(tmp_path / "sound.wav", tmp_path / "results.npz", FEW, blocks)
         assert seen == lengths
     assert rosafe.load(tmp_path / "results.npz")["block_frames"] == blocks
+
+
+@with_kernels
+def test_as_many_frames_as_the_default_block_has_go_together() -> None:
+    """However few channels there are: processors are to work at the same time on short sounds, too."""
+    sound = np.zeros((2, 30_000))
+    with at_most(2**22) as seen:
+        rosafe.process(sound, RATE, parameters={"fb_nChannels": 1}, block_frames=1000, outputs=["ratemap"])
+    assert seen == [12_000, 12_000, 6000]
+
+
+@with_kernels
+def test_who_is_to_end_reads_no_further() -> None:
+    """A block may take long to read."""
+    read: list[int] = []
+
+    def blocks() -> Iterator[np.ndarray]:
+        for number in range(100):
+            read.append(number)
+            if number == 5:
+                made._source.stop()
+            yield np.zeros((2, 100))
+
+    with chain.Chain(blocks(), RATE, FEW, ["ratemap"], lambda *_: None) as made:
+        made.run(together=True)
+    assert len(read) <= 7
+
+
+def test_numpy_is_asked_to_write_over_nothing() -> None:
+    with using(TWINS):
+        stream = rosafe.Stream(RATE, parameters=FEW, outputs=["ild"])
+        stream.process(SOUND)
+        assert stream._stages["ihc"].place is None
 
 
 @pytest.mark.parametrize("why", ["changes", "gain control", "a plugin", "twins"])

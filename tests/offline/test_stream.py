@@ -1,4 +1,4 @@
-"""`rosafe.Stream`: the numbers of `rosafe.process` on the same blocks, whatever comes, and what it refuses."""
+"""`rosafe.Stream`: the numbers of `rosafe.process`, whatever comes, and what it refuses."""
 
 from __future__ import annotations
 

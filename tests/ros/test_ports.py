@@ -1,4 +1,4 @@
-"""What stands on the ports: shapes, indexes and numbers, bit for bit those of rosafe.process on the same blocks."""
+"""What stands on the ports: shapes, indexes and numbers, bit for bit those of rosafe.process."""
 
 from __future__ import annotations
 

@@ -83,8 +83,9 @@ def rectify_and_filter(
 ) -> None:
     """Rectify (*rows, N), then filter it by second-order sections (S, 6); `state` (S, *rows, 2) as in scipy.
 
-    The envelope of the same shape is for `compressed`. Rows of `output` may lie apart (`rows_apart`). The twin is
-    `RECTIFIERS` of rosafe/representations/haircell.py, or `compressed` there, and `rosafe.dsp.cascade.Cascade`.
+    The envelope of the same shape is for `compressed`. Rows of `output` may lie apart (`rows_apart`); or it is
+    `block`. The twin is `RECTIFIERS` of rosafe/representations/haircell.py, or `compressed` there, and
+    `rosafe.dsp.cascade.Cascade`.
     """
     _function("rosafe_biquads")(
         RECTIFICATIONS.index(rectification),
@@ -250,7 +251,7 @@ def modulation(frames: Frames, sections: FloatArray, state: FloatArray) -> Float
 def correlations(frames: Frames, reach: int, epsilon: float, output: FloatArray) -> None:
     """Correlate the frames (2, C) of the two ears over the lags up to `reach`, into the middle of `output` (C, L, F).
 
-    2 reach + 1 is at most `MOST_LAGS`. The twin is `rosafe.dsp.crosscorrelation.correlate_by_fft`.
+    2 reach + 1 is at most `MOST_LAGS`. The twin is `rosafe.representations.crosscorrelation.correlate_by_fft`.
     """
     _, lags, number = output.shape
     outside = lags // 2 - reach

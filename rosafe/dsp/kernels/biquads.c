@@ -6,7 +6,7 @@
  * read, go through one section after the other and are written; meanwhile they stay in the first-level cache. */
 #include "power.h"
 
-#define COMPRESSION -0.77 /* of the envelope, in rosafe/dsp/haircell.py */
+#define COMPRESSION -0.77 /* of the envelope, in rosafe/representations/haircell.py */
 
 enum { SPAN = 64, ROWS = 16, GROUPS = ROWS / LANES, MOST_SECTIONS = 8 };
 
@@ -43,7 +43,8 @@ INLINE void filter(const double *b0_b1_b2_1_a1_a2, int64_t n, vec *samples, vec 
     UNROLL for (int g = 0; g < GROUPS; g++) state[g] = s1[g], state[GROUPS + g] = s2[g];
 }
 
-/* block and envelope (rows, n), envelope null where it is not asked for; output likewise, rows `stride` apart; sections
+/* block and envelope (rows, n), envelope null where it is not asked for; output likewise, rows `stride` apart, or the block
+ * itself, of which ROWS rows are read before they are written; sections
  * (count, 6), state (count, rows, 2). */
 void rosafe_biquads(int64_t how, const double *block, const double *envelope, int64_t rows, int64_t n,
                     const double *sections, int64_t count, double *state, double *output, int64_t stride) {

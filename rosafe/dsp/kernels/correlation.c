@@ -1,12 +1,13 @@
 /* Cross-correlation of the two ears' frames over few lags, in the time domain.
  *
- * c[m] = sum_t l[t+m] r[t] for m from -reach to reach, over sqrt(sum l^2 sum r^2 + eps) (rosafe/dsp/crosscorrelation.py).
+ * c[m] = sum_t l[t+m] r[t] for m from -reach to reach, over sqrt(sum l^2 sum r^2 + eps) (rosafe/representations/crosscorrelation.py).
  * A frame, of any channel, in each lane. */
 #include "framed.h"
 #include "products.h"
 
 /* Samples from..until of the rows times `window` to `to` from t on; returns `energy` and theirs. */
-static vec put(const double *const rows[LANES], const double *window, int64_t from, int64_t until, vec *to, int64_t t, vec energy) {
+static vec put(const double *const rows[LANES], const double *window, int64_t from, int64_t until, vec *to, int64_t t,
+               vec energy) {
     int64_t i = from;
     for (; i + TILE <= until; i += TILE, t += TILE) {
         vec tile[TILE];
@@ -86,9 +87,9 @@ void rosafe_correlations(const framed *of, int64_t reach, double epsilon, double
                     join(&mine, start, held, ear ? begin : l_begin, ear ? end : l_end, joined);
                 if (ear == 0) {
                     put_zeros(l, 0, reach - (begin - l_begin));
-                    put_both(&mine, window, l_begin, begin, l, reach - (begin - l_begin), energy[0]);
+                    put_both(&mine, window, l_begin, begin, l, reach - (begin - l_begin), (vec){});
                     energy[0] = put_both(&mine, window, begin, end, l, reach, energy[0]);
-                    put_both(&mine, window, end, l_end, l, reach + end - begin, energy[0]);
+                    put_both(&mine, window, end, l_end, l, reach + end - begin, (vec){});
                     put_zeros(l, reach + l_end - begin, end - begin + lags - 1);
                 } else {
                     energy[1] = put_both(&mine, window, begin, end, r, 0, energy[1]);

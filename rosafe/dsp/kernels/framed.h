@@ -24,6 +24,12 @@ typedef struct {
     int64_t position; /* of the first sample, counted from where the signal began */
 } framed;
 
+/* The first frame that reaches to sample `at` or beyond. */
+INLINE int64_t first_frame(const framed *of, int64_t at) {
+    const int64_t past = at - of->skip - of->size;
+    return past < 0 ? 0 : past / of->hop + 1;
+}
+
 /* A row's samples of the block that are kept. */
 INLINE void keep_tail(const framed *of, int64_t row) {
     memcpy(of->tail + row * of->tail_stride, of->block + row * of->n + (of->tail_from - of->held),

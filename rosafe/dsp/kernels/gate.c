@@ -7,7 +7,7 @@
 
 #include <time.h>
 
-enum { MOST = 50000 /* nanoseconds */ };
+enum { MOST = 50000 /* nanoseconds, for one other thread */, LONGEST = 20 * MOST };
 
 static int64_t outside; /* which coming out is the last one, if that thread is still out; else 0 */
 static int64_t count;   /* of all */
@@ -31,8 +31,9 @@ void gate_in(void) {
 void gate_out(void) {
     mine = __atomic_add_fetch(&count, 1, __ATOMIC_RELAXED);
     if (replaced(0, mine)) return;
-    for (int64_t other = 0, since = 0; !replaced(0, mine);) {
+    for (int64_t other = 0, since = 0, begun = now(); !replaced(0, mine);) {
         const int64_t last = __atomic_load_n(&outside, __ATOMIC_RELAXED), time = now();
+        if (time - begun > LONGEST) return;
         if (last != other)
             other = last, since = time;
         else if (time - since > MOST && replaced(other, mine))

@@ -1,7 +1,50 @@
-/* The interaural level difference: energies of windowed frames, and the ratio of the ears' in dB (rosafe/dsp/ild.py). */
-#include "frames.h"
+/* The interaural level difference: energies of windowed frames, and the ratio of the ears' in dB
+ * (rosafe/representations/ild.py).
+ *
+ * No sample waits for the one before, so neighbouring samples of a row are in the lanes. Each frame is summed on its own, which
+ * makes any window and hop cost the same per product, and in an order that knows nothing of blocks. */
+#include "framed.h"
 
 #include <math.h>
+
+enum { CHAINS = 4 /* sums that do not wait for one another */, TURN = CHAINS * LANES };
+
+INLINE vec square(vec x) {
+    x = bounded(x, -LIMIT, LIMIT);
+    return x * x;
+}
+
+/* The n samples of a frame, of which those before the border are old ones. */
+typedef struct {
+    const double *old, *new;
+    int64_t border;
+} halves;
+
+/* As many of them from t on, in one piece; `joined` has room for them. */
+INLINE const double *in_one_piece(const halves *x, int64_t t, int64_t n, double *joined) {
+    if (t >= x->border) return x->new + t;
+    if (t + n <= x->border) return x->old + t;
+    memcpy(joined, x->old + t, (x->border - t) * sizeof(double));
+    memcpy(joined + x->border - t, x->new + x->border, (t + n - x->border) * sizeof(double));
+    return joined;
+}
+
+/* sum_t weights[t] x[t]^2 */
+INLINE double weighted_energy(const halves *x, const double *weights, int64_t n) {
+    vec sum[CHAINS] = {};
+    double joined[TURN];
+    int64_t t = 0;
+    for (; t + TURN <= n; t += TURN) {
+        const double *now = in_one_piece(x, t, TURN, joined);
+        UNROLL for (int c = 0; c < CHAINS; c++)
+            sum[c] = fused(square(load(now + c * LANES)), load(weights + t + c * LANES), sum[c]);
+    }
+    for (; t < n; t += LANES) {
+        const double *now = in_one_piece(x, t, least(LANES, n - t), joined);
+        sum[0] = fused(square(load_first(now, n - t)), load_first(weights + t, n - t), sum[0]);
+    }
+    return total((sum[0] + sum[1]) + (sum[2] + sum[3]));
+}
 
 /* The rows are the left ear's channels, then the right ear's. levels is (rows / 2, number) with
  * 10 log10((right + epsilon) / (left + epsilon)); in `energies` is room for (rows, number). */
@@ -11,7 +54,7 @@ void rosafe_levels(const framed *of, double epsilon, double *energies, double *l
     for (int64_t row = 0; row < rows; row++) {
         for (int64_t frame = 0, at = of->skip; frame < number; frame++, at += of->hop) {
             const halves mine = {of->history + row * of->history_stride + at, of->block + row * n + at - held, held - at};
-            energies[row * number + frame] = weighted(BOUNDED | SQUARED, &mine, of->weights, of->size);
+            energies[row * number + frame] = weighted_energy(&mine, of->weights, of->size);
         }
         keep_tail(of, row);
     }

@@ -32,8 +32,7 @@ INLINE void filter(section *sections, const double *x, int64_t n, vec magnitudes
 /* The n magnitudes of which the first is sample `at`: adds them to each frame's sum, of each of the lanes that are used. */
 INLINE void add_magnitudes(vec magnitudes[SPAN][GROUPS], int64_t at, int64_t n, const framed *of, int64_t used,
                            double *sums) {
-    const int64_t past = at - of->skip - of->size;
-    int64_t frame = past < 0 ? 0 : past / of->hop + 1; /* none before reaches so far */
+    int64_t frame = first_frame(of, at);
     for (int64_t begin; frame < of->number && (begin = of->skip + frame * of->hop) < at + n; frame++) {
         const int64_t from = most(at, begin), until = least(at + n, begin + of->size);
         vec sum[GROUPS] = {};

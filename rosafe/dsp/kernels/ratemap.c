@@ -1,11 +1,36 @@
 /* The ratemap: a leaky integrator, then sums over moving windows of its output or the square of that.
  *
- * u[t] = s + (1 - r) x[t], s = r u[t] (rosafe/dsp/ratemap.py). A row in each lane. Samples go in spans that stay in the
- * first-level cache, and each frame that touches a span adds its part of it. So every sample is read once, and of what is
- * integrated only the tail that is kept goes to memory. Spans are counted from where the signal began. */
-#include "frames.h"
+ * u[t] = s + (1 - r) x[t], s = r u[t] (rosafe/representations/ratemap.py). A row in each lane. Samples go in spans that stay
+ * in the first-level cache, and each frame that touches a span adds its part of it. So every sample is read once, and of what
+ * is integrated only the tail that is kept goes to memory. Spans are counted from where the signal began. */
+#include "framed.h"
 
-enum { SPAN = 128 };
+enum { SPAN = 128, CHAINS = 4 /* sums that do not wait for one another */ };
+
+/* sum_t weights[t] x[t], or of the squares; rows are in the lanes. */
+INLINE vec weighted(const int squared, const vec *x, const double *weights, int64_t n) {
+    vec sum[CHAINS] = {};
+    int64_t t = 0;
+    for (; t + CHAINS <= n; t += CHAINS)
+        UNROLL for (int c = 0; c < CHAINS; c++) {
+            const vec now = x[t + c];
+            sum[c] = fused(squared ? now * now : now, all(weights[t + c]), sum[c]);
+        }
+    for (; t < n; t++) sum[0] = fused(squared ? x[t] * x[t] : x[t], all(weights[t]), sum[0]);
+    return (sum[0] + sum[1]) + (sum[2] + sum[3]);
+}
+
+/* The n samples x of the first `rows` of the lanes, of which the first is number `at`: adds their part to the sum of each
+ * frame. The sums of a row lie one behind the other. */
+INLINE void add_frames(const int squared, const vec *x, int64_t at, int64_t n, const framed *of, int64_t rows, double *sums) {
+    int64_t frame = first_frame(of, at);
+    for (int64_t begin; frame < of->number && (begin = of->skip + frame * of->hop) < at + n; frame++) {
+        int64_t from = most(at, begin), until = least(at + n, begin + of->size);
+        if (from >= until) continue;
+        vec sum = weighted(squared, x + from - at, of->weights + from - begin, until - from);
+        for (int64_t k = 0; k < rows; k++) sums[k * of->number + frame] += sum[k];
+    }
+}
 
 /* A sample through the integrator. */
 INLINE vec integrated(vec x, double retention, vec *s) {
@@ -26,7 +51,7 @@ INLINE void integrate(const double *const rows[LANES], int64_t n, double retenti
 }
 
 /* As many rows as there are lanes, or fewer, from `row` on. */
-INLINE void run(const int how, const framed *of, int64_t row, double retention, double *state, double *sums) {
+INLINE void run(const int squared, const framed *of, int64_t row, double retention, double *state, double *sums) {
     const int64_t rows = least(LANES, of->rows - row), held = of->held, n = of->n, tail_from = of->tail_from;
     const double *from[LANES];
     double *kept[LANES];
@@ -39,7 +64,7 @@ INLINE void run(const int how, const framed *of, int64_t row, double retention, 
         read_rows(from, old, -2 * LIMIT, 2 * LIMIT, u, 1);
         for (int k = 0; k < LANES; k++) from[k] = of->block + (row + least(k, rows - 1)) * n + at + old - held;
         integrate(from, end - at - old, retention, &s, u + old);
-        add_frames_of_rows(how, u, at, end - at, of, rows, sums);
+        add_frames(squared, u, at, end - at, of, rows, sums);
         const int64_t first = most(at, tail_from);
         for (int k = 0; k < LANES; k++) kept[k] = of->tail + (row + least(k, rows - 1)) * of->tail_stride + first - tail_from;
         if (first < end) write_rows(u + first - at, 1, end - first, kept);
@@ -54,7 +79,7 @@ void rosafe_ratemap(const framed *of, int64_t squared, double retention, double 
     memset(rates, 0, of->rows * of->number * sizeof(double));
     for (int64_t row = 0; row < of->rows; row += LANES) {
         if (squared)
-            run(SQUARED, of, row, retention, state + 2 * row, rates + row * of->number);
+            run(1, of, row, retention, state + 2 * row, rates + row * of->number);
         else
             run(0, of, row, retention, state + 2 * row, rates + row * of->number);
     }
