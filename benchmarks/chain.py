@@ -256,9 +256,9 @@ def _say_tree(page: report.Report, rounds: int) -> None:
     page.say(f"{SECONDS} s of sound to {', '.join(LEAVES)}; on one core processor time, on two the clock on the wall.")
     page.say("The limit is what two runs on one core each do at the same time. All took turns in the same minutes.")
     page.say(
-        f"Small blocks go through together, up to {chain.MOST_BYTES >> 20} MiB of a processor's output, as the numbers are"
+        f"Small blocks go through together, up to {chain.MOST_BYTES >> 20} MiB of a processor's output, as the numbers"
     )
-    page.say("the same to the last bit. Block by block is what the tree of the node does, which cannot wait.")
+    page.say("are the same to the last bit. Block by block is what the tree of the node does, which cannot wait.")
     page.say()
     found = {block: through(block, rounds, cores) for block in BLOCKS}
     names = list(found[BLOCKS[0]])
