@@ -63,6 +63,7 @@ class Stage:
     INPUT: ClassVar[tuple[str, ...]] = ("ear", "channel", "time")  # axes of the blocks that come
     PROVIDES: ClassVar[tuple[str, ...]] = ()  # by-products that children may need, such as the envelope
     OVERWRITES: ClassVar[bool] = False  # `place` may be the block that comes
+    APART: ClassVar[bool] = False  # what it makes of a channel depends on no other one, not even in the last bit
 
     def __init__(self, given: Signal | float, **parameters: Any) -> None:
         if not isinstance(given, Signal):

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
 import threading
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from types import TracebackType
 from typing import Any
@@ -23,6 +24,9 @@ from rosafe.tree.tree import Tree
 # A block that is put together has no more frames, and no processor puts out more for it
 MOST_FRAMES = 12000  # as InputProc's blocks by default
 MOST_BYTES = 2**22
+
+FILTERBANK = "gammatone"  # from which on there are channels
+TRUNK = ("input", "preProc")
 
 
 class _GatedSource:
@@ -76,7 +80,8 @@ class _GatedSource:
 class _Listener:
     """Hands on what is released, and keeps the first error, which ends the run."""
 
-    def __init__(self, source: _GatedSource, keep: Callable[[str, Block], None]) -> None:
+    def __init__(self, source: _GatedSource, keep: Callable[[str, int, Block], None]) -> None:
+        self.branches: dict[Processor, int] = {}
         self._source = source
         self._keep = keep
         self._lock = threading.Lock()
@@ -89,7 +94,7 @@ class _Listener:
         pass
 
     def released(self, processor: Processor, block: Block) -> None:
-        self._keep(processor.kind, block)
+        self._keep(processor.kind, self.branches[processor], block)
 
     def ended(self, processor: Processor) -> None:
         if processor.error is not None:
@@ -112,8 +117,11 @@ class Chain:
     outputs : sequence of str
         Kinds, from `rosafe.interface.arguments.check_outputs`.
     keep : callable
-        Called with the kind and each block of it, in their order, while the chain goes on with the next block; it does
-        not go on beyond that, so memory is bounded. What it raises ends the run.
+        Called with the kind, the number of the branch and each block of it, in their order, while the chain goes on
+        with the next block; it does not go on beyond that, so memory is bounded. What it raises ends the run.
+    branches : int
+        From the filterbank on, the tree has so many branches at most, of a part of the channels each, if all that is
+        computed is so `Stage.APART`. Then no parameter can be changed.
 
     Raises
     ------
@@ -127,34 +135,46 @@ class Chain:
         sample_rate: float,
         parameters: Mapping[str, Any],
         outputs: Iterable[str],
-        keep: Callable[[str, Block], None],
+        keep: Callable[[str, int, Block], None],
+        branches: int = 1,
     ) -> None:
         self.sample_rate = sample_rate
         self._source = _GatedSource(blocks, sample_rate)
         self._listener = _Listener(self._source, keep)
         self._tree = Tree(self._listener)
-        self._processors: dict[str, Processor] = {}
+        self._processors: dict[str, list[Processor]] = {}  # of each kind one, or one for each branch
         self._outputs = frozenset(outputs)
         self._derived: dict[int, dict[str, Any]] = {}  # from parameters, from which block on
         try:
             with _as_value_error():
-                self._build(needed(outputs), parameters)
+                self._build(needed(outputs), parameters, branches)
         except BaseException:
             self.close()
             raise
         self._remember(0)
 
-    def _build(self, kinds: list[str], values: Mapping[str, Any]) -> None:
-        for kind in KINDS.values():  # parents come first in the table
-            mine = {p.name: values[p.name] for p in kind.parameters if p.name in values}
-            if not kind.parent:
-                self._processors[kind.kind] = self._tree.add_input(kind.kind, self._source, 0, 0.0, 0.0, mine)
-            elif kind.kind in kinds:
-                self._processors[kind.kind] = self._tree.add(kind.kind, kind.kind, kind.parent, mine)
-        for name, processor in self._processors.items():
-            processor.heard = name in self._outputs
-        for name in overwriting(kinds, self._outputs):
-            self._processors[name].place = _taken
+    def _build(self, kinds: list[str], values: Mapping[str, Any], branches: int) -> None:
+        divided = branches > 1 and kernels.compiled() and all(STAGES[kind].APART for kind in kinds if kind not in TRUNK)
+        over = overwriting(kinds, self._outputs)
+        for kind in kinds:  # parents come first
+            parent = KINDS[kind].parent
+            mine = {p.name: values[p.name] for p in KINDS[kind].parameters if p.name in values}
+            made = self._processors[kind] = []
+            if not parent:
+                made.append(self._tree.add_input(kind, self._source, 0, 0.0, 0.0, mine))
+            elif kind == FILTERBANK and divided:
+                (above,) = self._processors[parent]
+                frequencies = STAGES[kind](above.signal, **mine).output.center_frequencies
+                for share in _shares(frequencies, branches):
+                    made.append(self._tree.add(kind, f"{kind} {len(made)}", parent, {**mine, "fb_cfHz": share}))
+            else:
+                for above in self._processors[parent]:
+                    made.append(self._tree.add(kind, above.name.replace(parent, kind), above.name, mine))
+            for branch, processor in enumerate(made):
+                self._listener.branches[processor] = branch
+                processor.heard = kind in self._outputs
+                if kind in over:
+                    processor.place = _taken
 
     def schedule(self, block: int, name: str, value: Any) -> None:
         """Change a (checked) parameter before block `block`; the blocks of successive calls ascend. Or ValueError."""
@@ -163,14 +183,14 @@ class Chain:
         self._remember(block)
 
     def _remember(self, block: int) -> None:
-        self._derived[block] = {k: v for p in self._processors.values() for k, v in p.derived().items()}
+        self._derived[block] = {k: v for p, *_ in self._processors.values() for k, v in p.derived().items()}
 
-    def write_into(self, kind: str, place: Callable[[int], np.ndarray | None]) -> None:
+    def write_into(self, kind: str, branch: int, place: Callable[[int], np.ndarray | None]) -> None:
         """Let the stage of a `kind` that nothing hangs on write where `place` says for so many frames, if it can.
 
         Stages that put out frames cannot, and are not asked.
         """
-        processor = self._processors[kind]
+        processor = self._processors[kind][branch]
         if not processor.signal.framed and not processor.children:  # children take blocks in one piece
             processor.place = lambda taken: place(taken.data.shape[-1])
 
@@ -184,7 +204,7 @@ class Chain:
         Small blocks may go through `together`, where that cannot be seen in the numbers.
         """
         self._source.let_flow(self._most_together() if together else 0)
-        for processor in self._processors.values():
+        for processor in self._all():
             processor.join()
         if self._listener.error is not None:
             raise self._listener.error
@@ -204,11 +224,18 @@ class Chain:
 
     # --- what it is ---
 
-    def shapes(self, kind: str, frames: int) -> dict[str, tuple[int, ...]]:
-        """Shape of each part of an output, for a signal of so many frames if no parameter changes on the way."""
-        processor = self._processors[kind]
-        count = self._count(processor, frames)
-        return dict(zip(KINDS[kind].outputs, ((*rows, count) for rows in processor.part_rows), strict=True))
+    def _all(self) -> list[Processor]:
+        return list(itertools.chain(*self._processors.values()))
+
+    def shapes(self, kind: str, frames: int) -> dict[str, list[tuple[int, ...]]]:
+        """Shape of each part of an output, in each branch, for so many frames if no parameter changes on the way."""
+        processors = self._processors[kind]
+        count = self._count(processors[0], frames)
+        branches = zip(*(processor.part_rows for processor in processors), strict=True)
+        return {
+            name: [(*rows, count) for rows in of_part]
+            for name, of_part in zip(KINDS[kind].outputs, branches, strict=True)
+        }
 
     def _count(self, processor: Processor, frames: int) -> int:
         """How many frames it puts out for so many of the signal."""
@@ -216,15 +243,15 @@ class Chain:
 
     def times(self, kind: str, frames: int) -> np.ndarray:
         """The middle of each frame of an output (s), for a signal of so many frames."""
-        processor = self._processors[kind]
+        processor = self._processors[kind][0]
         return frame_times(processor.signal, 0, self._count(processor, frames))
 
     def largest_block(self, frames: int) -> tuple[str, int]:
         """Which processor puts out most for one block of so many frames, and how many bytes that can be."""
         seconds = frames / self.sample_rate
-        taken = {kind: sizes.output_size(p.stage, p.given_rows, seconds) for kind, p in self._processors.items()}
-        kind = max(taken, key=lambda kind: taken[kind])
-        return kind, int(taken[kind])
+        taken = {p: sizes.output_size(p.stage, p.given_rows, seconds) for p in self._all()}
+        largest = max(taken, key=lambda processor: taken[processor])
+        return largest.kind, int(taken[largest])
 
     def _most_together(self) -> int:
         """Frames of the largest block that may come in the place of smaller ones; 0 where that could be seen.
@@ -232,7 +259,7 @@ class Chain:
         It cannot where kernels run: with them, blocks leave no trace in the numbers, not in the last bits either. With
         numpy and scipy, and in plugins, they may; and changes are made before blocks as they are.
         """
-        processors = self._processors.values()
+        processors = self._all()
         changed = len(self._derived) > 1
         seen = not kernels.compiled() or any(p.kind not in OWN or p.stage.blocks_matter for p in processors)
         if changed or seen:
@@ -246,12 +273,14 @@ class Chain:
         Rates and what is a parameter are told as they are at last, what follows from parameters as where it is longest.
         """
         described: dict[str, Any] = {}
-        for kind, processor in self._processors.items():
+        for kind, (processor, *others) in self._processors.items():
             parameters = processor.parameters()
             for name in processor.representation.coordinates:
                 values = (
                     parameters[name] if name in parameters else max((d[name] for d in self._derived.values()), key=len)
                 )
+                if kind == FILTERBANK:  # its channels
+                    values = list(itertools.chain(values, *(other.parameters()[name] for other in others)))
                 words = any(isinstance(value, str) for value in values)
                 described[name] = list(values) if words else np.array(values, np.float64)
             if processor.signal.framed and kind in self._outputs:
@@ -282,6 +311,14 @@ def overwriting(kinds: Collection[str], outputs: Collection[str]) -> list[str]:
         for kind, parent in zip(kinds, parents, strict=True)
         if STAGES[kind].OVERWRITES and parent not in outputs and parents.count(parent) == 1
     ]
+
+
+def _shares(frequencies: Sequence[float], count: int) -> list[list[float]]:
+    """`frequencies` in up to `count` parts, of as many as a kernel takes together, but for the last one."""
+    groups = -(-len(frequencies) // kernels.MOST_LANES)
+    count = min(count, groups)
+    ends = [kernels.MOST_LANES * (groups * number // count) for number in range(count + 1)]
+    return [list(frequencies[first:end]) for first, end in itertools.pairwise(ends)]
 
 
 def _taken(block: Block) -> np.ndarray:

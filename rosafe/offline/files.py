@@ -183,7 +183,7 @@ def _stream(
     done = dict.fromkeys(wanted, 0)
     telling = threading.Lock()
 
-    def keep(kind: str, block: Block) -> None:
+    def keep(kind: str, branch: int, block: Block) -> None:
         for name, data in zip(KINDS[kind].outputs, block.parts, strict=True):
             writer.append(name, data)
         with telling:
@@ -209,7 +209,7 @@ def _contents(chain: Chain, about: dict[str, Any], wanted: Sequence[str], frames
     words = {name: value for name, value in described.items() if isinstance(value, list)}
     times = {f"{kind}_time": chain.times(kind, frames) for kind in wanted if f"{kind}_frameRate" in described}
     return Contents(
-        {name: shape for kind in wanted for name, shape in chain.shapes(kind, frames).items()},
+        {name: shape for kind in wanted for name, (shape,) in chain.shapes(kind, frames).items()},
         {name: part.axes for name, part in parts.items()},
         {name: part.unit for name, part in parts.items()},
         {**{name: value for name, value in described.items() if name not in words}, **times},

@@ -15,10 +15,12 @@ from rosafe.dsp import kernels
 from rosafe.dsp.stage import SAMPLE_RATE
 from rosafe.interface import KINDS
 from rosafe.interface.arguments import check_change, check_parameters
+from rosafe.offline import chain
 from rosafe.offline.chain import Chain
 from rosafe.offline.memory import refuse_over_available
 from rosafe.offline.signals import as_ears, frame_times, of_ears, outputs_of
 from rosafe.tree.block import Block
+from rosafe.tree.workers import workers_to_use
 
 DEFAULT_BLOCK = 12000  # frames, as InputProc's
 
@@ -124,12 +126,13 @@ class _Work:
         values = {"in_doNormalize": samples.dtype == np.int32, **check_parameters(parameters)}
         changes = _checked_modifications(changes)
         self.wanted = outputs_of(self.ears, outputs)
-        self.gathered: dict[str, dict[str, _Gathered]] = {}  # by kind and name
+        self.gathered: dict[str, dict[str, list[_Gathered]]] = {}  # by kind and name, of each branch
         # of each output, how many frames of each format have come, one after the other
         self.counts: dict[str, list[list[Any]]] = {kind: [[None, 0]] for kind in self.wanted}
         both = np.broadcast_to(samples, (2, samples.shape[1]))
         blocks = (both[:, first:end] for first, end in itertools.pairwise((0, *ends)))
-        self.chain = Chain(blocks, self.rate, values, self.wanted, self.keep)
+        branches = 1 if changes or samples.shape[1] <= chain.MOST_FRAMES else workers_to_use()
+        self.chain = Chain(blocks, self.rate, values, self.wanted, self.keep, branches)
         try:
             self._prepare(samples.shape[1], ends, changes)
         except BaseException:
@@ -148,20 +151,24 @@ class _Work:
         for kind in wanted:
             centred, parts = KINDS[kind].centred, KINDS[kind].outputs
             self.gathered[kind] = {}
-            for name, shape in shapes[kind].items():
+            for name, of_branches in shapes[kind].items():
                 axes = parts[name].axes
-                kept = (self.ears, *shape[1:]) if axes[0] == "ear" else shape
-                self.gathered[kind][name] = _Gathered(kept, axes.index(centred) if centred in axes else -1)
-            self.chain.write_into(kind, next(iter(self.gathered[kind].values())).place)
+                kept = [(self.ears, *shape[1:]) if axes[0] == "ear" else shape for shape in of_branches]
+                middle = axes.index(centred) if centred in axes else -1
+                self.gathered[kind][name] = [_Gathered(place, middle) for place in _places(kept, axes)]
+            for branch, one in enumerate(next(iter(self.gathered[kind].values()))):
+                self.chain.write_into(kind, branch, one.place)
 
-    def keep(self, kind: str, block: Block) -> None:
+    def keep(self, kind: str, branch: int, block: Block) -> None:
         """Take what has been released."""
         parts = block.parts
         if self.ears == 1:
             axes = [part.axes for part in KINDS[kind].outputs.values()]
             parts = tuple(of_ears(self.ears, *one) for one in zip(axes, parts, strict=True))
-        for whole, data in zip(self.gathered[kind].values(), parts, strict=True):
-            whole.add(data)
+        for gathered, data in zip(self.gathered[kind].values(), parts, strict=True):
+            gathered[branch].add(data)
+        if branch:
+            return  # it tells of the same frames as the first one
         signal, frames = block.signal, parts[0].shape[-1]
         last = self.counts[kind][-1]
         if last[0] is signal:
@@ -187,7 +194,7 @@ class _Work:
                 wholes = self.gathered.pop(kind)
                 while wholes:
                     name = next(iter(wholes))
-                    results[name] = wholes.pop(name).joined()
+                    results[name] = _joined(wholes.pop(name))
                 results[f"{kind}_time"] = self._times(kind)
             results.update(chain.describe())
             return results
@@ -231,8 +238,28 @@ def _size(chain: Chain, wanted: list[str], ends: list[int]) -> int:
     """Bytes of the largest thing there will be at a time: all results, or one block of what is not kept."""
     frames = ends[-1] if ends else 0
     largest_block = max((end - first for first, end in itertools.pairwise((0, *ends))), default=0)
-    results = sum(8 * math.prod(shape) for kind in wanted for shape in chain.shapes(kind, frames).values())
+    shapes = (shape for kind in wanted for of_part in chain.shapes(kind, frames).values() for shape in of_part)
+    results = sum(8 * math.prod(shape) for shape in shapes)
     return max(results, chain.largest_block(largest_block)[1])
+
+
+def _places(shapes: list[tuple[int, ...]], axes: tuple[str, ...]) -> list[np.ndarray]:
+    """Parts of one array for outputs of these shapes, which lie behind each other along the channels."""
+    if len(shapes) == 1:
+        return [np.empty(shapes[0])]
+    along = axes.index("channel")
+    ends = list(itertools.accumulate(shape[along] for shape in shapes))
+    whole = np.empty((*shapes[0][:along], ends[-1], *shapes[0][along + 1 :]))
+    return np.split(whole, ends[:-1], axis=along)
+
+
+def _joined(branches: list[_Gathered]) -> np.ndarray:
+    joined = [branch.joined() for branch in branches]
+    if len(joined) == 1:
+        return joined[0]
+    whole = joined[0].base
+    assert whole is not None and all(one.base is whole for one in joined)
+    return whole
 
 
 class _Gathered:
@@ -240,17 +267,17 @@ class _Gathered:
 
     Parameters
     ----------
-    shape : tuple of int
-        Of the whole, if no parameter changes on the way. From where one does, blocks wait for the end.
+    whole : ndarray
+        Where it goes, if no parameter changes on the way. From where one does, blocks wait for the end.
     middle : int
         The axis whose middle stays where it is where a change alters its length; -1 for none.
     """
 
     TOGETHER = 32  # frames: a row of one frame after the other is written many times as slowly
 
-    def __init__(self, shape: tuple[int, ...], middle: int) -> None:
+    def __init__(self, whole: np.ndarray, middle: int) -> None:
         self._middle = middle
-        self._whole = np.empty(shape)
+        self._whole = whole
         self._rows = self._whole.shape[:-1]
         self._filled = 0  # frames
         self._begun = False  # a block without frames has rows, too

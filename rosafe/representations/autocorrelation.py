@@ -85,6 +85,7 @@ class Autocorrelation(FramedStage):
         port_doc="Autocorrelations, [lag][channel][frame]",
     )
     PREFIX = "ac"
+    APART = True
 
     @property
     def derived(self) -> dict[str, Any]:

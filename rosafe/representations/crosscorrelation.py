@@ -63,6 +63,7 @@ class CrossCorrelation(FramedStage):
         word="crosscorrelation",
     )
     PREFIX = "cc"
+    APART = True
 
     @property
     def derived(self) -> dict[str, Any]:

@@ -116,6 +116,7 @@ class Filterbank(Stage):
     )
     INPUT = ("ear", "time")
     PROVIDES = ("envelope",)
+    APART = True
 
     _given: frozenset[str] = frozenset()  # of what follows the rate
 

@@ -84,6 +84,7 @@ class InnerHairCell(Stage):
     )
 
     OVERWRITES = True
+    APART = True
 
     @property
     def needs(self) -> str:

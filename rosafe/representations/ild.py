@@ -32,6 +32,7 @@ class Ild(FramedStage):
         port_doc="Interaural level differences (dB), in `left`",
     )
     PREFIX = "ild"
+    APART = True
 
     def output_rows(self, rows: tuple[int, ...]) -> tuple[int, ...]:
         return rows[1:]

@@ -57,6 +57,7 @@ class Ratemap(FramedStage):
         port_doc="Ratemaps",
     )
     PREFIX = "rm"
+    APART = True
 
     def process(self, block: FloatArray, extra: FloatArray | None = None) -> FloatArray:
         samples = self._checked(block)

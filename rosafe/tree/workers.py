@@ -1,9 +1,9 @@
 """Who runs what when: threads, as many as there are cores to use, that take up whatever task is ready.
 
 A worker that has finished a task goes on with the deepest one that is ready, mostly what it has just made ready: the
-block is still in its cache. It wakes another worker only where something is left over and one is idle, and both
-together are worth it. On one core no thread is ever switched so; on several, siblings and successive blocks are worked
-on at the same time.
+block is still in its cache. Of several it takes one that it did the last time, whose state and memory are there. It
+wakes another worker only where something is left over and one is idle, and both together are worth it. On one core no
+thread is ever switched so; on several, siblings and successive blocks are worked on at the same time.
 
 Only those who compute count. A worker that somebody else holds up (a listener that does not return, a source that does
 not answer), or whose processor was removed, loses its seat to another one after `PATIENCE` seconds.
@@ -90,6 +90,7 @@ class Workers:
         self._free = count  # seats that nobody has
         self._idle = 0  # threads that wait for a task, or are about to begin, and
         self._called = 0  # those of them that are called already
+        self._last: dict[int, _Worker] = {}  # who did a task the last time, by its id
         self._turn = threading.Condition(lock)
         self._watch = threading.Condition(lock)
         self._workers: list[_Worker] = []
@@ -111,7 +112,7 @@ class Workers:
         """One member less."""
         self._members -= 1
         if self._members == 0:
-            self._ready = []
+            self._ready, self._last = [], {}
             self._turn.notify_all()
             self._watch.notify_all()
 
@@ -149,6 +150,20 @@ class Workers:
             seconds += task.usual
         return seconds > SHORT
 
+    def _take(self, me: _Worker) -> Task:
+        """The deepest one; of several that of `me`."""
+        ready, last = self._ready, self._last
+        depth, _, task = ready[0]
+        if len(ready) > 1 and last.get(id(task)) is not me:
+            for place, (other, _, mine) in enumerate(ready):
+                if other == depth and last.get(id(mine)) is me:
+                    del ready[place]
+                    heapq.heapify(ready)
+                    return mine
+        heapq.heappop(ready)
+        last[id(task)] = me
+        return task
+
     # --- threads ---
 
     def _start_worker(self) -> None:
@@ -185,7 +200,7 @@ class Workers:
         while self._members:
             if me.seated or self._free:
                 while self._ready:
-                    task = heapq.heappop(self._ready)[2]
+                    task = self._take(me) if self.count > 1 else heapq.heappop(self._ready)[2]
                     if not task.begin():
                         continue
                     me.task = task

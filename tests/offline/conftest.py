@@ -18,5 +18,6 @@ def no_thread_left() -> Iterator[None]:
 
 @pytest.fixture
 def blocks_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
-    """None are put together."""
+    """None are put together, and the tree has no branches."""
     monkeypatch.setattr(chain, "MOST_BYTES", 0)
+    monkeypatch.setattr(chain, "MOST_FRAMES", 10**9)

@@ -1,4 +1,4 @@
-"""Blocks leave no trace in the numbers, not in the last bit; so small ones go through the tree together."""
+"""Neither blocks nor branches leave a trace in the numbers, not in the last bit; so both are chosen to be fast."""
 
 from __future__ import annotations
 
@@ -17,8 +17,10 @@ import rosafe
 from rosafe.dsp import kernels
 from rosafe.offline import chain
 from rosafe.offline.files import process_file
-from rosafe.representations import OWN
+from rosafe.representations import OWN, STAGES
+from rosafe.representations.filterbank import Filterbank
 from rosafe.representations.input import Input
+from rosafe.representations.ratemap import Ratemap
 from tests.dsp.implementations import TWINS, levels, using
 
 RATE = 16000.0
@@ -191,3 +193,93 @@ def test_blocks_that_may_be_seen_stay_as_they_are(why: str, monkeypatch: pytest.
     with at_most(2**22) as seen, using(TWINS if why == "twins" else [TWINS, *levels()][-1]):
         rosafe.process(SOUND, RATE, **options)
     assert seen == [1000, 1000, 1000, 500]
+
+
+# --- branches ---
+
+
+@contextmanager
+def workers(count: int) -> Iterator[list[int]]:
+    """So many, for signals of any length; the number of channels of each filterbank that comes to work."""
+    channels: list[int] = []
+    process = Filterbank.process
+
+    def watch(self: Filterbank, block: Any, extra: Any = None) -> Any:
+        output = process(self, block, extra)
+        channels.append(output.shape[1])
+        return output
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("ROSAFE_WORKERS", str(count))
+        patch.setattr(chain, "MOST_FRAMES", 500)
+        patch.setattr(Filterbank, "process", watch)
+        yield channels
+
+
+APART = [kind for kind, stage in STAGES.items() if stage.APART]
+
+
+@with_kernels
+@pytest.mark.parametrize(
+    ("count", "channels", "shares"),
+    [(2, 31, [15, 16]), (2, 33, [16, 17]), (3, 40, [8, 16, 16]), (8, 17, [1, 8, 8]), (2, 8, [8]), (1, 64, [64])],
+)
+@pytest.mark.parametrize("ears", [2, 1])
+def test_a_branch_for_each_worker(count: int, channels: int, shares: list[int], ears: int) -> None:
+    """From the filterbank on, of whole groups of channels that a kernel takes together; and the same numbers."""
+    outputs = [kind for kind in APART if ears == 2 or kind not in ("ild", "crossCorrelation")]
+    parameters = {**FEW, "fb_nChannels": channels, "cc_maxDelaySec": 0.0007, "ihc_method": "bernstein"}
+    options: dict[str, Any] = {"parameters": parameters, "outputs": ["preProc", *outputs], "block_frames": 500}
+    sound = SOUND[:ears]
+    with workers(1) as seen:
+        alone = rosafe.process(sound, RATE, **options)
+        assert set(seen) == {channels}
+    with workers(count) as seen:
+        assert_same(rosafe.process(sound, RATE, **options), alone)
+        assert sorted(set(seen)) == sorted(set(shares)) and sum(seen) == 7 * channels
+
+
+@with_kernels
+@given(
+    given_parameters=parameters,
+    outputs=st.sets(st.sampled_from(APART), min_size=1),
+    count=st.integers(2, 5),
+    channels=st.integers(9, 40),
+)
+@settings(deadline=None, max_examples=30)
+def test_branches_leave_no_trace(
+    given_parameters: dict[str, Any], outputs: set[str], count: int, channels: int
+) -> None:
+    options: dict[str, Any] = {"parameters": {**FEW, **given_parameters, "fb_nChannels": channels}}
+    options["outputs"] = sorted(outputs)
+    with workers(1):
+        alone = rosafe.process(SOUND, RATE, **options)
+    with workers(count) as seen:
+        assert_same(rosafe.process(SOUND, RATE, **options), alone)
+        assert max(seen) < channels
+
+
+@with_kernels
+def test_what_takes_several_channels_has_one_branch() -> None:
+    for kind in sorted(OWN - set(APART) - {"input", "preProc"}):
+        with workers(2) as seen:
+            rosafe.process(SOUND, RATE, parameters={**FEW, "fb_nChannels": 20}, outputs=["ratemap", kind])
+        assert set(seen) == {20}, kind
+    with workers(2) as seen:
+        rosafe.process(
+            SOUND, RATE, parameters={**FEW, "fb_nChannels": 20}, outputs=["ild"], modifications=[(0, "fb_nGamma", 3)]
+        )
+    assert set(seen) == {20}
+
+
+@with_kernels
+def test_an_error_in_one_branch_ends_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Fuse(Ratemap):
+        def process(self, block: Any, extra: Any = None) -> Any:
+            if block.shape[1] == 12:
+                raise ArithmeticError("in the last branch")
+            return super().process(block, extra)
+
+    monkeypatch.setitem(STAGES, "ratemap", Fuse)
+    with workers(2), pytest.raises(ArithmeticError, match="in the last branch"):
+        rosafe.process(SOUND, RATE, parameters={**FEW, "fb_nChannels": 20}, outputs=["ratemap", "ild"])

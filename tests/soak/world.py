@@ -181,7 +181,7 @@ class World:
         end = self.graph.message("/bass/Audio").lastFrameIndex // self.size.block * self.size.block
         truth = {}
 
-        def keep(kind: str, block: Any) -> None:
+        def keep(kind: str, branch: int, block: Any) -> None:
             if kind not in truth:
                 truth[kind] = SlidingWindow(block.data.shape[:-1], frames_in(1.0, block.rate))
             truth[kind].append(block.data)
