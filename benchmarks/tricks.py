@@ -109,7 +109,7 @@ TRICKS = (
     ),
     Trick(
         "ILD and ratemap: four sums that do not wait for one another",
-        "frames.h",
+        "framed.h",
         (("CHAINS = 4 }", "CHAINS = 1 }"), ("(sum[0] + sum[1]) + (sum[2] + sum[3])", "sum[0]")),
     ),
     Trick(

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from rosafe.dsp import kernels
 from rosafe.dsp.framing import FrameBuffer, Framing
-from rosafe.dsp.gammatone import GammatoneBank
+from rosafe.dsp.gammatone import TURN_SPAN, GammatoneBank
 from rosafe.dsp.guard import LIMIT
 from rosafe.dsp.kernels import build
 from rosafe.dsp.kernels import precedence as by_kernel
@@ -492,6 +492,7 @@ def _steps_meanwhile(level: Choice) -> int:
 def test_constants_are_those_of_the_sources() -> None:
     sources = {path.name: path.read_text() for path in (ROOT / "rosafe" / "dsp" / "kernels").glob("*.[ch]")}
     assert f"MOST_POLES = {kernels.MOST_POLES} " in sources["gammatone.c"]
+    assert f"{{ SPAN = {TURN_SPAN} " in sources["gammatone.c"]
     assert f"MOST_SECTIONS = {kernels.MOST_SECTIONS} " in sources["biquads.c"]
     assert f"MOST_LAGS = {kernels.MOST_LAGS}," in sources["products.h"]
     assert f"MOST_POINTS = {kernels.MOST_POINTS // 2} " in sources["fourier.h"]

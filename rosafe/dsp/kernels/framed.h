@@ -24,6 +24,9 @@ typedef struct {
     int64_t position; /* of the first sample, counted from where the signal began */
 } framed;
 
+enum { CHAINS = 4 }; /* sums of a frame that do not wait for one another */
+INLINE vec joined_chains(const vec sum[CHAINS]) { return (sum[0] + sum[1]) + (sum[2] + sum[3]); }
+
 /* The first frame that reaches to sample `at` or beyond. */
 INLINE int64_t first_frame(const framed *of, int64_t at) {
     const int64_t past = at - of->skip - of->size;

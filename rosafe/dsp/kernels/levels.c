@@ -7,7 +7,7 @@
 
 #include <math.h>
 
-enum { CHAINS = 4 /* sums that do not wait for one another */, TURN = CHAINS * LANES };
+enum { TURN = CHAINS * LANES };
 
 INLINE vec square(vec x) {
     x = bounded(x, -LIMIT, LIMIT);
@@ -43,7 +43,7 @@ INLINE double weighted_energy(const halves *x, const double *weights, int64_t n)
         const double *now = in_one_piece(x, t, least(LANES, n - t), joined);
         sum[0] = fused(square(load_first(now, n - t)), load_first(weights + t, n - t), sum[0]);
     }
-    return total((sum[0] + sum[1]) + (sum[2] + sum[3]));
+    return total(joined_chains(sum));
 }
 
 /* The rows are the left ear's channels, then the right ear's. levels is (rows / 2, number) with

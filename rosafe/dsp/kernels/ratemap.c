@@ -5,7 +5,7 @@
  * is integrated only the tail that is kept goes to memory. Spans are counted from where the signal began. */
 #include "framed.h"
 
-enum { SPAN = 128, CHAINS = 4 /* sums that do not wait for one another */ };
+enum { SPAN = 128 };
 
 /* sum_t weights[t] x[t], or of the squares; rows are in the lanes. */
 INLINE vec weighted(const int squared, const vec *x, const double *weights, int64_t n) {
@@ -17,7 +17,7 @@ INLINE vec weighted(const int squared, const vec *x, const double *weights, int6
             sum[c] = fused(squared ? now * now : now, all(weights[t + c]), sum[c]);
         }
     for (; t < n; t++) sum[0] = fused(squared ? x[t] * x[t] : x[t], all(weights[t]), sum[0]);
-    return (sum[0] + sum[1]) + (sum[2] + sum[3]);
+    return joined_chains(sum);
 }
 
 /* The n samples x of the first `rows` of the lanes, of which the first is number `at`: adds their part to the sum of each
