@@ -21,6 +21,7 @@ POLL_SECONDS = 0.02  # between two requests where nothing is new
 RESTART_SECONDS = 1.0  # without anything new, look whether the stream began anew
 _HEADER = struct.Struct("<iiq")
 _MOST = 2**24  # frames: no window is longer
+_CLOSED = "bass has closed the connection"
 
 
 class Received(NamedTuple):
@@ -43,8 +44,12 @@ class SocketClient:
 
     def read(self, frames: int, first: int) -> Received:
         """Up to `frames` frames from number `first` (from 1 on); none where nothing is new."""
-        self._connection.sendall(b"Read Port - N %d - nfr %d\n" % (frames, first))
-        count, lost, following = _HEADER.unpack(self._take(_HEADER.size))
+        try:
+            self._connection.sendall(b"Read Port - N %d - nfr %d\n" % (frames, first))
+            header = self._take(_HEADER.size)
+        except (BrokenPipeError, ConnectionResetError):  # the latter with a request that it has not read
+            raise ConnectionError(_CLOSED) from None
+        count, lost, following = _HEADER.unpack(header)
         if not 0 <= count <= min(frames, _MOST) or lost < 0 or following < count:
             raise ConnectionError(f"what answers is no bass: {count} frames where {frames} were asked for")
         samples = np.frombuffer(self._take(8 * count), "<i4").reshape(2, count)
@@ -58,7 +63,7 @@ class SocketClient:
     def _take(self, size: int) -> bytes:
         data = self._stream.read(size)
         if len(data) != size:
-            raise ConnectionError("bass has closed the connection")
+            raise ConnectionError(_CLOSED)
         return data
 
     def close(self) -> None:

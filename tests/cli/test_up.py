@@ -108,7 +108,7 @@ def test_one_that_is_killed_is_told(alone: Graph) -> None:
         up.expect("ending what was started")
         assert up.end() == 1
         *_, before, last = re.split(r"\x1b\[(?=\d+F)", up.sent)
-        lines = before.partition("\x1b[J")[2].replace("\r", "").splitlines()
+        lines = before.partition("\x1b[J")[2].replace("\r", "").replace("^C", "").splitlines()
         assert len(lines) == 6 and f"{len(lines) + 1}F" == last.partition("\x1b")[0], up.sent  # the address takes two
 
 
