@@ -22,6 +22,7 @@ from rosafe.offline.signals import as_ears, frame_times, of_ears, outputs_of
 from rosafe.tree.block import Block
 from rosafe.tree.workers import workers_to_use
 
+_NOTHING = np.empty(0)
 DEFAULT_BLOCK = 12000  # frames, as InputProc's
 
 
@@ -313,13 +314,14 @@ class _Gathered:
             self._waiting, self._filled, self._frames, self._begun = [], end, 0, True
 
     def joined(self) -> np.ndarray:
-        """The whole."""
+        """The whole. It is not held any longer: whoever still knows of this one must not keep that from being freed."""
         if self._waiting and self._fits:
             self._write()
-        if not self._waiting and self._filled == self._whole.shape[-1]:
-            return self._whole
-        first = [self._whole[..., : self._filled]] if self._begun else []
-        return _join(self._middle, [*first, *self._waiting])
+        whole, waiting, self._whole, self._waiting, self._lent = self._whole, self._waiting, _NOTHING, [], None
+        if not waiting and self._filled == whole.shape[-1]:
+            return whole
+        first = [whole[..., : self._filled]] if self._begun else []
+        return _join(self._middle, [*first, *waiting])
 
 
 def _join(middle: int, blocks: list[np.ndarray]) -> np.ndarray:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import gc
 import threading
 import tracemalloc
+import weakref
 from signal import SIG_IGN, SIGINT, pthread_kill
 from signal import signal as on_signal
 from typing import Any
@@ -495,3 +497,20 @@ def test_an_interrupt_from_the_keyboard(monkeypatch: pytest.MonkeyPatch) -> None
         on_signal(SIGINT, before)
     assert tree_threads() == set()
     assert len(processed) < 1000
+
+
+@pytest.mark.parametrize("outputs", [["gammatone"], ["ihc"], ["ild", "ratemap", "crossCorrelation"], ["input", "ihc"]])
+@pytest.mark.parametrize("frames", [3000, 30_000])
+def test_results_are_freed_with_their_last_name(outputs: list[str], frames: int) -> None:
+    """And not when Python looks for what only holds itself: half a gigabyte may have to wait for that."""
+    gc.collect()
+    gc.disable()
+    try:
+        results = rosafe.process(noise(frames), RATE, parameters={"fb_nChannels": 20}, outputs=outputs)
+        held = {
+            name: weakref.ref(results[name] if results[name].base is None else results[name].base) for name in outputs
+        }
+        del results
+        assert [name for name, array in held.items() if array() is not None] == []
+    finally:
+        gc.enable()
