@@ -167,6 +167,8 @@ class Processor(Member):
         data, extras = taken.parts[0], taken.extras
         needs = extras and stage.needs
         output = stage.process(data, extras[needs]) if needs else stage.process(data)
+        if self.place is not None:
+            stage.place = None  # which a stage that cannot write there would hold
         parts = output if isinstance(output, tuple) else (output,)
         next_index = taken.next_index
         if look_ahead := stage.look_ahead:

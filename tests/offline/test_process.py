@@ -22,6 +22,7 @@ from rosafe.representations.haircell import InnerHairCell
 from rosafe.sound.audiofile import AudioFile
 from tests import harness
 from tests.dsp.bare import Chain, cut
+from tests.dsp.implementations import TWINS, levels, using
 from tests.dsp.test_vectors import CASES, assert_reference, load, parameters
 from tests.tree.support import tree_threads
 
@@ -501,12 +502,14 @@ def test_an_interrupt_from_the_keyboard(monkeypatch: pytest.MonkeyPatch) -> None
 
 @pytest.mark.parametrize("outputs", [["gammatone"], ["ihc"], ["ild", "ratemap", "crossCorrelation"], ["input", "ihc"]])
 @pytest.mark.parametrize("frames", [3000, 30_000])
-def test_results_are_freed_with_their_last_name(outputs: list[str], frames: int) -> None:
+@pytest.mark.parametrize("choice", [TWINS, *levels()[-1:]])
+def test_results_are_freed_with_their_last_name(outputs: list[str], frames: int, choice: int) -> None:
     """And not when Python looks for what only holds itself: half a gigabyte may have to wait for that."""
     gc.collect()
     gc.disable()
     try:
-        results = rosafe.process(noise(frames), RATE, parameters={"fb_nChannels": 20}, outputs=outputs)
+        with using(choice):
+            results = rosafe.process(noise(frames), RATE, parameters={"fb_nChannels": 20}, outputs=outputs)
         held = {
             name: weakref.ref(results[name] if results[name].base is None else results[name].base) for name in outputs
         }
