@@ -167,6 +167,28 @@ def test_short_work_is_not_worth_a_call(seconds: list[float], worth: bool) -> No
     assert workers._worth_a_call(own) == worth
 
 
+def test_a_worker_goes_on_with_what_it_did_the_last_time() -> None:
+    """Of the deepest ones; else with the deepest that came last, as the only worker does."""
+    workers = pool.Workers(threading.RLock(), 2)
+    one, other = pool._Worker(), pool._Worker()
+    first, second, deep = (Short(1e-5) for _ in range(3))
+    deep.depth = 1
+
+    def taken(worker: Any, *tasks: Short) -> list[Short]:
+        for task in tasks:
+            workers.push(task)
+        return [workers._take(worker) for _ in tasks]  # type: ignore[misc]
+
+    assert taken(one, first) == [first]
+    assert taken(other, second) == [second]
+    assert taken(one, first, second) == [first, second]
+    assert taken(other, second) == [second]
+    assert taken(one, second, first) == [first, second]
+    assert taken(other, second) == [second]
+    assert taken(other, first, second, deep) == [deep, second, first]
+    assert not workers._ready
+
+
 def test_what_a_processor_usually_takes(tree: Tree, feed: Feed, listener: Recorder) -> None:
     """Unknown at first, so that nobody waits for it in vain; then the least of late."""
     one = tree.add_input("input", feed, 1, 1.0, 1.0)
