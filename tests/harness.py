@@ -11,8 +11,10 @@ of its own in a process of its own, for tests that kill it. Everything started d
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import os
+import random
 import re
 import signal
 import socket
@@ -85,10 +87,15 @@ def wait_for(condition: Callable[[], T], timeout: float = PATIENCE, what: str | 
 
 
 def free_port() -> int:
-    """A TCP port of the loopback interface that nobody uses at the moment."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
+    """A TCP port of the loopback interface that nobody uses at the moment.
+
+    It is below those that Linux gives to connections, of which there are many meanwhile.
+    """
+    while True:
+        port = random.SystemRandom().randrange(12_000, 32_000)
+        with socket.socket() as probe, contextlib.suppress(OSError):
+            probe.bind(("127.0.0.1", port))
+            return port
 
 
 class Process:
