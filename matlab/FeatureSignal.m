@@ -1,68 +1,9 @@
-classdef FeatureSignal < BufferedSignal
-%FEATURESIGNAL  Frames by features of one ear: pitch and what it came from, spectral features. See BufferedSignal.
-
-    properties (SetAccess = private)
-        fList  % what the columns are
-    end
+classdef FeatureSignal < rosafe.FeatureSignal
+%FEATURESIGNAL  The class rosafe.FeatureSignal under the name of the original.
 
     methods
-        function obj = FeatureSignal(fs, bufferSize_s, name, label, fList, channel)
-            obj = obj@BufferedSignal(fs, bufferSize_s, name, label, numel(fList), channel);
-            obj.fList = fList(:).';
-        end
-
-        function h = plot(obj, h, feature)
-            %PLOT  Draw the features over time, or those that are named, into a figure or axes if given.
-            %
-            %   A pitch lies over the raw pitch, in Hz. Other features have different units: several are a picture, of
-            %   each the part of its own range.
-            if nargin < 2
-                h = [];
-            end
-            drawn = true(size(obj.fList));
-            if nargin > 2
-                drawn = ismember(obj.fList, feature);
-            elseif all(ismember({'pitch', 'rawPitch'}, obj.fList))
-                drawn = ismember(obj.fList, {'pitch', 'rawPitch'});
-            end
-            h = place(obj, h);
-            values = obj.Data;
-            if isempty(values)
-                values = NaN(1, numel(obj.fList)); % nothing has come yet
-            end
-            t = (0:size(values, 1) - 1) / obj.FsHz;
-            values = values(:, drawn);
-            names = strrep(obj.fList(drawn), '_', ' ');
-            if isequal(names, {'pitch', 'rawPitch'})
-                pitches(t, names, values);
-            elseif numel(names) == 1
-                plot(t, values);
-                ylabel(names{1});
-            else
-                ranges(t, names, values);
-            end
-            caption(obj);
+        function obj = FeatureSignal(varargin)
+            obj = obj@rosafe.FeatureSignal(varargin{:});
         end
     end
-end
-
-function pitches(t, names, hertz)
-    hertz(hertz == 0) = NaN; % no raw pitch
-    plot(t, hertz(:, 2), '.', 'color', [0.7 0.7 0.7], 'markersize', 4);
-    hold('on');
-    plot(t, hertz(:, 1), '.', 'color', [0.85 0.2 0.1], 'markersize', 10);
-    hold('off');
-    legend(names([2 1]));
-    ylabel('Hz');
-end
-
-function ranges(t, names, values)
-    low = min(values, [], 1);
-    span = max(values, [], 1) - low;
-    span(span == 0) = 1;
-    imagesc(t, 1:numel(names), bsxfun(@rdivide, bsxfun(@minus, values, low), span).');
-    axis('xy');
-    ticks = unique(round(linspace(1, numel(names), min(numel(names), 16))));
-    set(gca(), 'ytick', ticks, 'yticklabel', names(ticks));
-    ylabel(colorbar(), 'part of its range');
 end

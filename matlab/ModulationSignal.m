@@ -1,28 +1,9 @@
-classdef ModulationSignal < BufferedSignal
-%MODULATIONSIGNAL  Frames by channels by modulation filters of one ear. See BufferedSignal.
-
-    properties (SetAccess = private)
-        cfHz     % centre frequencies of the channels
-        modCfHz  % centre frequencies of the modulation filters
-    end
+classdef ModulationSignal < rosafe.ModulationSignal
+%MODULATIONSIGNAL  The class rosafe.ModulationSignal under the name of the original.
 
     methods
-        function obj = ModulationSignal(fs, bufferSize_s, name, label, cfHz, modCfHz, channel)
-            obj = obj@BufferedSignal(fs, bufferSize_s, name, label, [numel(cfHz) numel(modCfHz)], channel);
-            obj.cfHz = cfHz(:).';
-            obj.modCfHz = modCfHz(:).';
-        end
-
-        function h = plot(obj, h)
-            %PLOT  Draw the mean over the channels, filters over time, into a figure or axes if given.
-            if nargin < 2
-                h = [];
-            end
-            h = place(obj, h);
-            if ~isempty(obj.Data)
-                picture(obj, permute(mean(obj.Data, 2), [1 3 2]), obj.modCfHz);
-                ylabel('Modulation frequency (Hz)');
-            end
+        function obj = ModulationSignal(varargin)
+            obj = obj@rosafe.ModulationSignal(varargin{:});
         end
     end
 end

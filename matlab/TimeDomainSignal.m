@@ -1,27 +1,16 @@
-classdef TimeDomainSignal < BufferedSignal
-%TIMEDOMAINSIGNAL  Samples of one ear: the input or what pre-processing made of it. See BufferedSignal.
+classdef TimeDomainSignal < rosafe.TimeDomainSignal
+%TIMEDOMAINSIGNAL  The class rosafe.TimeDomainSignal under the name of the original.
 
     methods
-        function obj = TimeDomainSignal(fs, bufferSize_s, name, label, channel)
-            obj = obj@BufferedSignal(fs, bufferSize_s, name, label, 1, channel);
-        end
-
-        function h = plot(obj, h)
-            %PLOT  Draw the samples over time, into a figure or axes if given.
-            if nargin < 2
-                h = [];
-            end
-            h = place(obj, h);
-            plot(seconds(obj), obj.Data);
-            ylabel('Amplitude');
-            caption(obj);
+        function obj = TimeDomainSignal(varargin)
+            obj = obj@rosafe.TimeDomainSignal(varargin{:});
         end
     end
 
     methods (Static)
-        function obj = construct(fs, bufferSize_s, name, label, channel)
+        function obj = construct(varargin)
             %CONSTRUCT  As the constructor.
-            obj = TimeDomainSignal(fs, bufferSize_s, name, label, channel);
+            obj = TimeDomainSignal(varargin{:});
         end
     end
 end

@@ -1,33 +1,16 @@
-classdef TimeFrequencySignal < BufferedSignal
-%TIMEFREQUENCYSIGNAL  Frames by channels of one ear, or of both for level differences. See BufferedSignal.
-
-    properties (SetAccess = private)
-        cfHz  % centre frequencies of the channels
-    end
+classdef TimeFrequencySignal < rosafe.TimeFrequencySignal
+%TIMEFREQUENCYSIGNAL  The class rosafe.TimeFrequencySignal under the name of the original.
 
     methods
-        function obj = TimeFrequencySignal(fs, bufferSize_s, name, label, cfHz, channel)
-            obj = obj@BufferedSignal(fs, bufferSize_s, name, label, numel(cfHz), channel);
-            obj.cfHz = cfHz(:).';
-        end
-
-        function h = plot(obj, h)
-            %PLOT  Draw the channels over time, into a figure or axes if given.
-            if nargin < 2
-                h = [];
-            end
-            h = place(obj, h);
-            if ~isempty(obj.Data)
-                picture(obj, obj.Data, obj.cfHz);
-                ylabel('Centre frequency (Hz)');
-            end
+        function obj = TimeFrequencySignal(varargin)
+            obj = obj@rosafe.TimeFrequencySignal(varargin{:});
         end
     end
 
     methods (Static)
-        function obj = construct(fs, bufferSize_s, name, label, cfHz, channel)
+        function obj = construct(varargin)
             %CONSTRUCT  As the constructor.
-            obj = TimeFrequencySignal(fs, bufferSize_s, name, label, cfHz, channel);
+            obj = TimeFrequencySignal(varargin{:});
         end
     end
 end

@@ -51,7 +51,7 @@ classdef dataObject_RosAFE < handle
             about = describe(rosAFE);
             dObj.kinds = about.representations;
             dObj.held = structfun(@(kind) {}, dObj.kinds, 'UniformOutput', false);
-            dObj.acquire = acquireAudio(bass, rosAFE, sampleRate, seconds, dObj.CHUNK, inputDevice);
+            dObj.acquire = rosafe.acquire(bass, rosAFE, sampleRate, seconds, dObj.CHUNK, inputDevice);
         end
 
         function varargout = subsref(dObj, s)

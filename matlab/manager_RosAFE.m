@@ -236,15 +236,15 @@ classdef manager_RosAFE < handle
             seconds = mObj.dObj.bufferSize_s_matlab;
             along = cellfun(@(axis) coordinates(mObj, processor, axis), rows, 'UniformOutput', false);
             if isempty(rows)
-                signal = TimeDomainSignal.construct(fs, seconds, name, label, channel);
+                signal = rosafe.signal('TimeDomainSignal', fs, seconds, name, label, channel);
             elseif strcmp(rows{1}, 'feature')
-                signal = FeatureSignal(fs, seconds, name, label, along{1}, channel);
+                signal = rosafe.signal('FeatureSignal', fs, seconds, name, label, along{1}, channel);
             elseif isscalar(rows)
-                signal = TimeFrequencySignal.construct(fs, seconds, name, label, along{1}, channel);
+                signal = rosafe.signal('TimeFrequencySignal', fs, seconds, name, label, along{1}, channel);
             elseif strcmp(rows{2}, 'lag')
-                signal = CorrelationSignal(fs, seconds, name, label, along{:}, channel);
+                signal = rosafe.signal('CorrelationSignal', fs, seconds, name, label, along{:}, channel);
             else
-                signal = ModulationSignal(fs, seconds, name, label, along{:}, channel);
+                signal = rosafe.signal('ModulationSignal', fs, seconds, name, label, along{:}, channel);
             end
         end
 

@@ -3,8 +3,8 @@ classdef BufferedSignal < handle
 %
 %   TimeDomainSignal (samples, N-by-1), TimeFrequencySignal (frames by channels), FeatureSignal (frames by features),
 %   CorrelationSignal (frames by channels by lags) and ModulationSignal (frames by channels by filters) are made of it.
-%   They offer what the original's examples use of the signals of Two!Ears' MATLAB front-end, and take chunks of the
-%   same shapes; where that is ahead on the path, its own classes serve.
+%   They offer the parts of the MATLAB Auditory Front-End's signals that the original's examples use, and accept chunks
+%   of the same shapes.
 
     properties (SetAccess = private)
         Name          % of the representation: 'filterbank'

@@ -1,0 +1,20 @@
+classdef TimeDomainSignal < rosafe.BufferedSignal
+%TIMEDOMAINSIGNAL  Samples of one ear: the input or what pre-processing made of it. See rosafe.BufferedSignal.
+
+    methods
+        function obj = TimeDomainSignal(fs, bufferSize_s, name, label, channel)
+            obj = obj@rosafe.BufferedSignal(fs, bufferSize_s, name, label, 1, channel);
+        end
+
+        function h = plot(obj, h)
+            %PLOT  Draw the samples over time, into a figure or axes if given.
+            if nargin < 2
+                h = [];
+            end
+            h = place(obj, h);
+            plot(seconds(obj), obj.Data);
+            ylabel('Amplitude');
+            caption(obj);
+        end
+    end
+end

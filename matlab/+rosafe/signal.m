@@ -1,0 +1,12 @@
+function obj = signal(class_name, varargin)
+%SIGNAL  Construct one of the signal classes: rosafe.signal('FeatureSignal', fs, bufferSize_s, ...)
+%
+%   The object has the class name of the original (FeatureSignal). If another FeatureSignal comes first on the path,
+%   such as that of the MATLAB Auditory Front-End, whose constructors differ, the object is a rosafe.FeatureSignal.
+
+here = fileparts(fileparts(mfilename('fullpath')));
+if ~strcmp(which(class_name), fullfile(here, [class_name '.m']))
+    class_name = ['rosafe.' class_name];
+end
+obj = feval(class_name, varargin{:});
+end

@@ -1,0 +1,93 @@
+"""Scripts that run in the folder of the original's examples, whose functions come first on the path."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from tests.genomix.world import World
+from tests.matlab import octave
+
+pytestmark = pytest.mark.ros
+
+# The files of the original's folder. As there, acquireAudio returns nothing, and initRosAFE puts the MATLAB Auditory
+# Front-End first on the path.
+FUNCTIONS = {
+    "initRosAFE": """
+        function [bass, rosAFE, client] = initRosAFE(openRobotsMatlabPath, twoEarsPath, rosAFEPath)
+        addpath(genpath(fullfile(pwd, 'AuditoryFrontEnd')));
+        startAuditoryFrontEnd;
+        startRosAFE;
+        client = genomix.client;
+        bass = client.load('bass');
+        rosAFE = client.load('rosAFE');
+        end
+    """,
+    "acquireAudio": """
+        function acquireAudio(bass, rosAFE, sampleRate, bufferSize_s_bass, nFramesPerChunk, inputDevice)
+        error('folder:called', 'acquireAudio of the folder was called');
+        end
+    """,
+    "stopAndKill": "function stopAndKill(bass, rosAFE, client)\nerror('folder:called', 'stopAndKill');\nend\n",
+    "adaptTFS": "function adaptTFS(varargin)\nerror('folder:called', 'adaptTFS of the folder was called');\nend\n",
+    "verifyParameters": "function verifyParameters(varargin)\nerror('folder:called', 'verifyParameters');\nend\n",
+}
+# Classes of the MATLAB Auditory Front-End take a processor where ours take a rate.
+SIGNALS = ("TimeDomainSignal", "TimeFrequencySignal", "FeatureSignal", "CorrelationSignal", "ModulationSignal")
+FRONT_END = """
+classdef NAME < handle
+    methods
+        function obj = NAME(procHandle, bufferSize, channel, data)
+            if nargin ~= 4
+                error('frontEnd:called', 'NAME of the MATLAB Auditory Front-End was constructed');
+            end
+        end
+    end
+end
+"""
+CLIENT = """
+    clear all; close all; clc;
+    addpath(genpath('/home/somebody/genom_ws/rosAFE/examples'));
+    [ bass, rosAFE, client ] = initRosAFE( );
+    sampleRate = 16000;
+    dObj = dataObject_RosAFE( bass, rosAFE, 'scene:', sampleRate, 1600, 1, 1, 1, 10 );
+    mObj = manager_RosAFE(dObj);
+    mObj.addProcessor('ild');
+    mObj.addProcessor('ratemap');
+    mObj.addProcessor('pitch');
+    mObj.addProcessor('crosscorrelation', genParStruct('fb_nChannels', 4));
+    mObj.addProcessor('amsFeatures', genParStruct('fb_nChannels', 4));
+    mObj.modifyParameter( 'time_0', 'pp_bRemoveDC', '0' );
+    mObj.processChunk( );
+    while isempty(dObj.ild{1}.Data) || isempty(dObj.pitch{1}.Data) || isempty(dObj.amsFeatures{1}.Data)
+        pause(0.1);
+        mObj.processChunk( );
+    end
+    show('columns', [size(dObj.ild{1}.Data, 2), size(dObj.pitch{1}.Data, 2)]);
+    show('class', class(dObj.pitch{1}));
+    mObj.deleteProcessor( 'ild', 1 );
+    show('left', numel(mObj.Processors.ild));
+"""
+
+
+def _lines(text: str) -> str:
+    return "\n".join(line.strip() for line in text.strip().splitlines()) + "\n"
+
+
+@pytest.mark.parametrize("front_end", [False, True], ids=["alone", "MATLAB front-end first"])
+def test_the_clients_script_in_its_own_folder(world: World, tmp_path: Path, front_end: bool) -> None:
+    for name, text in FUNCTIONS.items():
+        (tmp_path / f"{name}.m").write_text(_lines(text), "utf-8")
+    folder = tmp_path / "AuditoryFrontEnd"
+    folder.mkdir()
+    (folder / "startAuditoryFrontEnd.m").write_text("function startAuditoryFrontEnd()\nend\n", "utf-8")
+    if front_end:
+        for name in SIGNALS:
+            (folder / f"{name}.m").write_text(FRONT_END.replace("NAME", name).lstrip(), "utf-8")
+    # startRosAFE, which initRosAFE calls last, puts our folder first again
+    first = "initRosAFE( );" + (" addpath(fullfile(pwd, 'AuditoryFrontEnd'));" if front_end else "")
+    shown = octave.shown(world, CLIENT.replace("initRosAFE( );", first), folder=tmp_path)
+    assert shown["columns"] == [31, 3]
+    assert shown["class"] == ("rosafe.FeatureSignal" if front_end else "FeatureSignal")
+    assert shown["left"] == 0
