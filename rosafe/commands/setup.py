@@ -17,6 +17,7 @@ from typing import Any
 
 from rosafe.commands import Failure
 from rosafe.commands._component import component, prepare, told
+from rosafe.input import read_regular
 from rosafe.interface import MAX_SETUP, ROSAFE, ComponentError
 from rosafe.output import write_whole
 from rosafe.setups import Setup, SetupError, read, write
@@ -89,11 +90,8 @@ def run(options: argparse.Namespace) -> int:
 def read_file(name: str) -> Setup:
     """The setup in the file `name`; Failure, with file and line, where there is none."""
     try:
-        if name == "-":
-            data = sys.stdin.buffer.read(4 * MAX_SETUP + 1)
-        else:
-            with Path(name).open("rb") as file:
-                data = file.read(4 * MAX_SETUP + 1)
+        limit = 4 * MAX_SETUP + 1  # bytes of that many characters, and one more
+        data = sys.stdin.buffer.read(limit) if name == "-" else read_regular(name, limit)
         return read(data.decode("utf-8-sig"))
     except UnicodeDecodeError:
         raise Failure(f"{name}: not a setup: the file is not UTF-8") from None

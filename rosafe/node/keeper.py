@@ -6,6 +6,7 @@ import threading
 from collections.abc import Callable
 from pathlib import Path
 
+from rosafe.input import read_regular
 from rosafe.interface import MAX_SETUP, ROSAFE
 from rosafe.output import OutputError, write_whole
 from rosafe.setups import Setup, SetupError, read, write
@@ -42,18 +43,14 @@ class Keeper:
     def kept(self) -> Setup:
         """What the file holds; an empty setup where there is none yet. ComponentError where it cannot be used."""
         try:
-            self._written = self._text()
+            self._written = read_regular(self.path, 4 * MAX_SETUP + 1).decode()
             return read(self._written)
         except FileNotFoundError:
             return Setup()
         except (OSError, UnicodeDecodeError, SetupError) as problem:
             why = getattr(problem, "strerror", None) or problem
-            what = f"{self.path}, {why}: mend it, or remove it to start afresh"
+            what = f"{self.path}: {why}; correct the file, or delete it to start with an empty tree"
             raise ROSAFE.error("e_badNewValue", what=what) from None
-
-    def _text(self) -> str:
-        with self.path.open("rb") as file:
-            return file.read(4 * MAX_SETUP + 1).decode()
 
     def save(self) -> None:
         """Have all changes up to now in the file once this returns; where that fails, life goes on."""

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import csv
-import io
 import os
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from io import StringIO, TextIOWrapper
 from pathlib import Path, PurePath
 from typing import Any, NamedTuple
 
+from rosafe.input import open_regular
 from rosafe.offline.sounds import SOUNDS
 from rosafe.output import OutputError, write_whole
 
@@ -163,7 +164,7 @@ def write_failed(folder: Path, inputs: Sequence[Path], failed: Mapping[str, str]
     tried = set(map(str, inputs))
     kept: dict[str, str] = {}
     if path.exists():
-        with open(path, encoding="utf-8", errors="surrogateescape", newline="") as file:
+        with TextIOWrapper(open_regular(path), "utf-8", "surrogateescape", newline="") as file:
             rows = list(csv.reader(file))
         if rows[:1] != [_HEAD]:
             raise OutputError(f"{path} is something else, and stays as it is")
@@ -172,7 +173,7 @@ def write_failed(folder: Path, inputs: Sequence[Path], failed: Mapping[str, str]
     if not rest:
         path.unlink(missing_ok=True)
         return
-    text = io.StringIO()
+    text = StringIO()
     csv.writer(text, lineterminator="\n").writerows([_HEAD, *rest.items()])
     write_whole(path, text.getvalue().encode("utf-8", "surrogateescape"))
 

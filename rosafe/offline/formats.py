@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from rosafe.input import open_descriptor, open_regular
 from rosafe.interface import KINDS
 from rosafe.missing import require
 from rosafe.offline.chunked import H5Writer, Mat73Writer, ZarrWriter, read_h5, read_mat73, read_zarr
@@ -51,7 +52,7 @@ class Format:
             return path.is_dir() and ((path / self.folder).exists() or not any(path.iterdir()))
         if not path.is_file():
             return False
-        with open(path, "rb") as file:
+        with open_regular(path) as file:
             begin = file.read(len(self.begins))
         return self.begins.startswith(begin) or (self.begins.startswith(b"MATLAB") and not any(begin))
 
@@ -64,7 +65,7 @@ def _mat_writer(contents: Contents) -> type[Writer]:
 
 
 def _read_mat(path: Path, arrays: bool = True) -> dict[str, Any]:
-    with open(path, "rb") as file:
+    with open_regular(path) as file:
         new = file.read(len(_MAT73_MAGIC)) == _MAT73_MAGIC
     return (read_mat73 if new else read_mat5)(path, arrays)
 
@@ -142,6 +143,10 @@ def read(form: Format, path: Path, arrays: bool = True) -> dict[str, Any]:
         raise FileNotFoundError(2, os.strerror(2), str(path))
     if form.module:
         require(form.module, f"{form.extension} files")
+    if form.folder and not path.is_dir():
+        raise ValueError(f"{path}: expected a directory, got a file")
+    if not form.folder:
+        os.close(open_descriptor(path))  # HDF5 opens whatever it is given
     try:
         result = form.read(path, arrays)
     except ValueError as problem:  # json.JSONDecodeError and UnicodeDecodeError, too

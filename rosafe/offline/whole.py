@@ -10,11 +10,13 @@ import tempfile
 import zipfile
 import zlib
 from contextlib import ExitStack
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 
+from rosafe.input import open_regular
 from rosafe.offline.contents import ABOUT, Contents, is_scalar, sample_times, told
 
 HEADS = 2**18  # bytes, and more than that, of what is in a file beside the arrays' numbers
@@ -129,7 +131,7 @@ class CsvWriter(WholeWriter):
 def read_npz(path: Path, arrays: bool = True) -> dict[str, Any]:
     """What is in an .npz; without its arrays, only what `told` gives. ValueError where it is damaged."""
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with open_regular(path) as stream, np.load(stream, allow_pickle=False) as file:
             if isinstance(file, np.ndarray):
                 raise ValueError("an .npy is no .npz")
             names = file.files if arrays else [name for name in file.files if name in ABOUT]
@@ -144,10 +146,11 @@ def read_mat5(path: Path, arrays: bool = True) -> dict[str, Any]:
     """As `read_npz`, for a version 5 .mat."""
     from scipy.io import loadmat
 
-    try:
-        found = loadmat(path, variable_names=None if arrays else [*ABOUT])
-    except Exception as problem:  # of half a file scipy raises whatever comes
-        raise ValueError(str(problem)) from None
+    with open_regular(path) as file:
+        try:
+            found = loadmat(file, variable_names=None if arrays else [*ABOUT])
+        except Exception as problem:  # of half a file scipy raises whatever comes
+            raise ValueError(str(problem)) from None
     found = {name: value for name, value in found.items() if not name.startswith("__")}
     texts = {name: "".join(value.ravel()) for name, value in found.items() if value.dtype.kind == "U"}
     scalars = {name: value for name, value in found.items() if is_scalar(name)}
@@ -159,7 +162,7 @@ def read_mat5(path: Path, arrays: bool = True) -> dict[str, Any]:
 
 def read_csv(path: Path, arrays: bool = True) -> dict[str, Any]:
     """As `read_npz`, for a .csv."""
-    with open(path, encoding="utf-8") as file:
+    with TextIOWrapper(open_regular(path), "utf-8") as file:
         head = file.readline()
         if not head.startswith(_CSV_HEAD):
             raise ValueError("its first line is not that of rosafe process")

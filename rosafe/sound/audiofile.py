@@ -9,6 +9,8 @@ from pathlib import Path
 import numpy as np
 import soundfile
 
+from rosafe.input import open_descriptor
+
 FULL_SCALE = 2**31 - 1  # what 1.0 in a float file becomes
 MAX_CHANNELS = 1024  # that libsndfile opens
 _FLOAT_SUBTYPES = ("FLOAT", "DOUBLE", "VORBIS", "OPUS", "MPEG")  # the decoder's own numbers are floats
@@ -57,15 +59,15 @@ class AudioFile:
     def __init__(self, path: str | Path) -> None:
         self.path = Path(os.path.expanduser(path))
         try:
-            if self.path.exists() and not self.path.is_file():  # a FIFO would block the open for ever
-                raise AudioFileError(f"{self.path} is not a regular file")
-            with self.path.open("rb") as probe:
-                if not probe.read(1):
-                    raise AudioFileError(f"{self.path} is empty")
+            descriptor = open_descriptor(self.path)
         except (OSError, ValueError) as problem:  # ValueError: a path that no file can have
             raise AudioFileError(f"{self.path}: {getattr(problem, 'strerror', None) or problem}") from None
+        if not os.fstat(descriptor).st_size:
+            os.close(descriptor)
+            raise AudioFileError(f"{self.path} is empty")
         try:
-            self._file = soundfile.SoundFile(str(self.path))
+            # Given the name, libsndfile would open resource forks too, and take any file as .gsm or .vox.
+            self._file = soundfile.SoundFile(descriptor)
         except soundfile.LibsndfileError as problem:
             raise AudioFileError(f"{self.path} is not a sound file: {problem.error_string}{self._cure()}") from None
         self.not_finite = 0

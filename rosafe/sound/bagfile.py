@@ -13,12 +13,13 @@ from __future__ import annotations
 import bz2
 import importlib
 import os
-import stat
 import struct
 import threading
 from collections.abc import Callable, Container, Iterator
 from pathlib import Path
 from typing import NamedTuple, Protocol
+
+from rosafe.input import open_descriptor
 
 MAX_HEADER = 2**20  # bytes
 MAX_CONNECTIONS = 10_000
@@ -71,9 +72,7 @@ class BagFile:
     def __init__(self, path: Path, largest: int, stopping: threading.Event) -> None:
         self._largest = largest
         self._stopping = stopping
-        if not stat.S_ISREG(path.stat().st_mode):  # a FIFO would block the open for ever
-            raise BagError("is not a regular file")
-        self._descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+        self._descriptor = open_descriptor(path)
         try:
             self._size = os.fstat(self._descriptor).st_size
             self._read_bag_header()

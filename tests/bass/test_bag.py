@@ -175,8 +175,8 @@ def bad_bags(tmp_path_factory: pytest.TempPathFactory) -> Path:
     [
         ("", "e_device", "names no file"),
         ("missing.bag", "e_device", "No such file"),
-        ("folder.bag", "e_device", "not a regular file"),
-        ("fifo.bag", "e_device", "not a regular file"),
+        ("folder.bag", "e_device", "regular file"),
+        ("fifo.bag", "e_device", "regular file"),
         ("zero.bag", "e_device", "is no whole bag"),
         ("noise.bag", "e_device", "is no whole bag"),
         ("version.bag", "e_device", "is no whole bag"),

@@ -165,8 +165,8 @@ def bad_files(tmp_path: Path) -> Path:
     [
         ("", "e_device", "names no file"),
         ("missing.wav", "e_device", "No such file"),
-        ("folder.wav", "e_device", "not a regular file"),
-        ("fifo.wav", "e_device", "not a regular file"),
+        ("folder.wav", "e_device", "regular file"),
+        ("fifo.wav", "e_device", "regular file"),
         ("empty.wav", "e_device", "is empty"),
         ("nothing.wav", "e_device", "no samples"),
         ("text.wav", "e_device", "not a sound file"),

@@ -69,7 +69,7 @@ def test_everything_else_is_a_device(name: str) -> None:
         ("mono.wav", "1 channel"),
         ("empty.wav", "is empty"),
         ("text.wav", "not a sound file"),
-        ("folder/", "not a regular file"),
+        ("folder/", "regular file"),
         ("file:missing", "No such file"),
         ("scene:?speed=3", "no option 'speed'"),
         ("scene:fast", "question mark"),

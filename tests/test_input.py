@@ -1,0 +1,140 @@
+"""Only regular files are read: a FIFO, a socket or a device is refused by name, at once, wherever a file is named."""
+
+from __future__ import annotations
+
+import errno
+import os
+import socket
+import subprocess
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+import rosafe
+from rosafe import input as inputs
+from rosafe.commands import Failure
+from rosafe.commands.setup import read_file
+from rosafe.input import open_descriptor, open_regular, read_regular
+from rosafe.interface import ComponentError
+from rosafe.node.keeper import Keeper
+from rosafe.offline.corpus import write_failed
+from rosafe.offline.files import process_file
+from rosafe.offline.formats import FORMATS
+from rosafe.setups import Setup
+from rosafe.sound.audiofile import AudioFile, AudioFileError
+from rosafe.sound.bagsound import BagSoundError, Recording
+from tests.harness import PYTHON, SCRIPTS, Graph
+
+ERRORS = (OSError, ValueError, AudioFileError, BagSoundError, ComponentError, Failure)
+READERS: dict[str, Callable[[Path], object]] = {
+    "sound": AudioFile,
+    "bag": lambda path: Recording(path, None, threading.Event()),
+    "setup": lambda path: read_file(str(path)),
+    "kept": lambda path: Keeper(path, Setup, print).kept(),
+    "offline": lambda path: process_file(path, path.with_name("out.npz")),
+    "failed.csv": lambda path: write_failed(path.parent, [], {"a": "b"}),
+    **{extension: rosafe.load for extension in FORMATS},
+}
+
+
+@pytest.fixture(params=["FIFO", "socket", "character device"])
+def odd(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    path = tmp_path / "odd"
+    if request.param == "FIFO":
+        os.mkfifo(path)
+    elif request.param == "socket":
+        with socket.socket(socket.AF_UNIX) as one:
+            one.bind(str(path))
+    else:
+        path.symlink_to("/dev/zero")
+    return path
+
+
+@pytest.mark.parametrize("reader", READERS)
+def test_refused(odd: Path, reader: str) -> None:
+    path = odd.with_name(reader if reader == "failed.csv" else f"odd{reader}" if reader in FORMATS else "odd")
+    if path != odd:
+        odd.rename(path)
+    with pytest.raises(ERRORS) as refusal:
+        READERS[reader](path)
+    text = str(refusal.value)
+    assert "\n" not in text
+    assert path.name in text
+    assert ("expected a directory" if reader == ".zarr" else "expected a regular file, got a") in text
+
+
+def test_regular_files_are_read(tmp_path: Path) -> None:
+    path = tmp_path / "file"
+    path.write_bytes(b"content")
+    with open_regular(path) as file:
+        assert file.read() == b"content"
+    assert read_regular(path, 3) == b"con"
+    with pytest.raises(IsADirectoryError, match="got a directory"):
+        open_descriptor(tmp_path)
+    with pytest.raises(FileNotFoundError):
+        open_descriptor(tmp_path / "missing")
+
+
+def test_exchanged_meanwhile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A FIFO takes the place of the file between the first look and the opening."""
+    path = tmp_path / "file"
+    path.touch()
+    check = inputs._check
+
+    def exchange(status: os.stat_result, name: Path) -> None:
+        check(status, name)
+        path.unlink()
+        os.mkfifo(path)
+
+    monkeypatch.setattr(inputs, "_check", exchange)
+    descriptors = len(os.listdir("/dev/fd"))
+    with pytest.raises(OSError, match="got a FIFO") as refusal:
+        open_descriptor(path)
+    assert refusal.value.errno == errno.EINVAL
+    assert len(os.listdir("/dev/fd")) == descriptors
+
+
+def test_a_sound_file_opens_no_other_file(tmp_path: Path) -> None:
+    """libsndfile, given a name, looks for a resource fork beside what it does not know, and waits for that FIFO."""
+    path = tmp_path / "noise.wav"
+    path.write_bytes(b"no sound " * 100)
+    os.mkfifo(tmp_path / "._noise.wav")
+    with pytest.raises(AudioFileError, match="is not a sound file"):
+        AudioFile(path)
+
+
+@pytest.mark.parametrize("extension", [".vox", ".gsm"])
+def test_a_name_makes_no_sound(tmp_path: Path, extension: str) -> None:
+    """Formats without a header would turn any file into sound."""
+    path = tmp_path / f"secret{extension}"
+    path.write_bytes(b"a secret " * 1000)
+    with pytest.raises(AudioFileError, match="is not a sound file"):
+        AudioFile(path)
+
+
+def test_commands(graph: Graph, tmp_path: Path) -> None:
+    """The commands end by themselves, with one line that names the file."""
+    fifo = tmp_path / "fifo.yaml"
+    os.mkfifo(fifo)
+    kept = graph.run("rosAFE-ros", "--keep", str(fifo), check=False)
+    loaded = graph.run("rosafe", "setup", "load", str(fifo), check=False)
+    for done in (kept, loaded):
+        assert done.returncode == 1
+        assert done.stderr.count("\n") == 1
+        assert f"{fifo}: expected a regular file, got a FIFO" in done.stderr
+
+
+def test_standard_input_may_be_a_pipe(graph: Graph) -> None:
+    """`-` is read as it is; here it is no setup, which shows that it was."""
+    done = subprocess.run(
+        [PYTHON, str(SCRIPTS / "rosafe"), "setup", "load", "-"],
+        input="nothing: here\n",
+        env=graph.env,
+        text=True,
+        capture_output=True,
+        timeout=60,
+        check=False,
+    )
+    assert (done.returncode, "unknown 'nothing'" in done.stderr) == (1, True)
