@@ -14,10 +14,10 @@ import threading
 from concurrent.futures import ThreadPoolExecutor
 
 from rosafe.component import generate, master, startup, systemd
-from rosafe.genomix.access import own_names
 from rosafe.genomix.graph import Graph
 from rosafe.genomix.server import Server
 from rosafe.genomix.sessions import Sessions
+from rosafe.http_server.access import own_names
 from rosafe.version import VERSION
 
 DEFAULT_PORT = 8080

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import functools
 import logging
 import re
 from collections.abc import Awaitable, Callable, Coroutine, Iterator
@@ -15,15 +14,17 @@ from urllib.parse import unquote_to_bytes
 from aiohttp import web
 
 from rosafe.genomix import packed
-from rosafe.genomix.access import refuse_web_pages
-from rosafe.genomix.connections import Connection, Connections
 from rosafe.genomix.graph import middleware_error
 from rosafe.genomix.proxy import Proxy, Value
 from rosafe.genomix.requests import Request
 from rosafe.genomix.sessions import Session, Sessions
-from rosafe.genomix.syntax import SYNTAXES, TCL, Syntax, plain
+from rosafe.genomix.syntax import JSON, SYNTAXES, TCL, Syntax, plain
 from rosafe.genomix.tasks import first
 from rosafe.genomix.values import parse_input, refused
+from rosafe.http_server.access import check_host, check_no_browser
+from rosafe.http_server.connections import Connections, Limits
+from rosafe.http_server.listener import HttpListener, connection_of
+from rosafe.http_server.refusal import HttpRefusal
 from rosafe.interface import ComponentError
 from rosafe.version import VERSION
 
@@ -34,6 +35,15 @@ REFUSAL_SECONDS = 0.05
 ANSWER_SECONDS = 75.0  # for any answer that is not told to wait; a component has 60 s for its part
 HEARTBEAT_SECONDS = 15.0  # between two signs of life to a listener
 LAST_WORDS_SECONDS = 1.0  # that answers under way have at the end
+
+LIMITS = Limits(
+    max_connections=2000,
+    max_url=256 * 1024,  # a list of 1024 numbers fits, percent-encoded
+    max_header_bytes=64 * 2**20,
+    max_answers=512 * 2**20,
+    request_seconds=15.0,
+    idle_seconds=3600.0,
+)
 
 log = logging.getLogger("genomixd")
 
@@ -81,7 +91,7 @@ class Server:
 
     def __init__(self, sessions: Sessions, hosts: set[str]) -> None:
         self._sessions = sessions
-        self._hosts = {"localhost", *(host.lower() for host in hosts)}
+        self._hosts = {host.lower() for host in hosts}
         app = web.Application(middlewares=[self._guard])
         for path, handler in (
             ("/", self._help),
@@ -105,29 +115,21 @@ class Server:
             ("/requests", self._requests),
         ):
             app.router.add_get(path, handler, allow_head=False)
-        self._runner = web.AppRunner(app)
-        self._connections = Connections()
-        self._listener: asyncio.AbstractServer | None = None
+        self._connections = Connections(LIMITS, _format_refusal, log)
+        self._listener = HttpListener(app, self._connections)
         # A few threads for all results: more would only fight for the interpreter.
         self._formatters = ThreadPoolExecutor(FORMATTERS, "format")
 
     async def start(self, host: str, port: int) -> int:
         """Listen and return the port; OSError where that cannot be."""
-        await self._runner.setup()
-        assert self._runner.server is not None
         access_log = log if log.isEnabledFor(logging.DEBUG) else None
-        connect = functools.partial(Connection, self._connections, self._runner.server, access_log=access_log)
-        self._listener = await asyncio.get_running_loop().create_server(connect, host, port, backlog=512)
-        return int(self._listener.sockets[0].getsockname()[1])
+        return await self._listener.start(host, port, access_log)
 
     async def close(self) -> None:
         """Stop listening, end all sessions and connections."""
-        if self._listener is not None:
-            self._listener.close()
+        self._listener.stop_listening()
         await self._sessions.close()
-        if self._runner.server is not None:
-            await self._runner.server.shutdown(LAST_WORDS_SECONDS)
-        await self._runner.cleanup()
+        await self._listener.close(LAST_WORDS_SECONDS)
         self._formatters.shutdown(wait=False, cancel_futures=True)
 
     # --- who may ---
@@ -136,9 +138,10 @@ class Server:
     async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         """Refuse what comes from a web page, and put every error into the client's syntax."""
         session: Session | None = None
-        _connection(request).begun()
+        connection_of(request).request_parsed()
         try:
-            refuse_web_pages(request.headers, self._hosts)
+            check_host(request.headers, self._hosts, "--host gives it one")
+            check_no_browser(request.headers)
             _check_url(request)
             if not _is_packed(request):
                 _syntax(request)
@@ -146,6 +149,10 @@ class Server:
                 session = self._session(request)
                 session.busy += 1
             return await handler(request)
+        except HttpRefusal as refusal:
+            answer = _error(request, _refusal_error(refusal))
+            answer.force_close()
+            return answer
         except ComponentError as problem:
             return _error(request, problem)
         except web.HTTPException as problem:
@@ -165,7 +172,7 @@ class Server:
         name = request.query.get("s", "")
         if name and not _SESSION_NAME.fullmatch(name):
             raise refused("s: a session's name has up to 100 letters, digits and . : @ _ -")
-        return self._sessions.get(name, _connection(request).client.address)
+        return self._sessions.get(name, connection_of(request).account.address)
 
     # --- sessions ---
 
@@ -182,7 +189,7 @@ class Server:
         return _text("")
 
     async def _session_listen(self, request: web.Request) -> web.StreamResponse:
-        with self._connections.held(_connection(request)):
+        with self._connections.long_poll(connection_of(request)):
             return await self._listen(request, self._session(request), _syntax(request))
 
     async def _listen(self, request: web.Request, session: Session, form: Syntax) -> web.StreamResponse:
@@ -297,8 +304,8 @@ class Server:
 
     async def _request_wait(self, request: web.Request) -> web.StreamResponse:
         known, seconds = self._known(request), _milliseconds(request) / 1000
-        connection = _connection(request)
-        with self._connections.held(connection):
+        connection = connection_of(request)
+        with self._connections.long_poll(connection):
             await first(known.finished, connection.gone, timeout=seconds)
         return _status(request, known)
 
@@ -319,7 +326,7 @@ class Server:
         pieces = _encoded(request, value)
         if value.size <= BATCH // 8:
             return _respond(request, b"".join(pieces))
-        with self._connections.taking(_connection(request), value.data, value.size):
+        with self._connections.reading_answer(connection_of(request), value.data, value.size):
             return await self._stream_pieces(request, pieces)
 
     async def _stream_pieces(self, request: web.Request, pieces: Iterator[bytes]) -> web.StreamResponse:
@@ -333,12 +340,6 @@ class Server:
 
 
 # --- reading ----------------------------------------------------------------------------------------------------
-
-
-def _connection(request: web.Request) -> Connection:
-    connection = request.protocol
-    assert isinstance(connection, Connection)
-    return connection
 
 
 def _check_url(request: web.Request) -> None:
@@ -436,6 +437,15 @@ def _error(request: web.Request, error: ComponentError, status: int = 0) -> web.
     form = _written_in(request)
     text = "".join(_unwrapped(form, iter((plain(form, error.body),))))
     return _respond(request, _utf8(text), status or _STATUS.get(error.ex, _COMPONENT_ERROR))
+
+
+def _refusal_error(refusal: HttpRefusal) -> ComponentError:
+    ex = {403: "e_forbidden", 503: "e_tooMany"}.get(refusal.status, "e_url")
+    return ComponentError(f"::genomix::{ex}", what=str(refusal))
+
+
+def _format_refusal(refusal: HttpRefusal) -> tuple[bytes, str]:
+    return _utf8(plain(JSON, _refusal_error(refusal).body)), JSON.media_type
 
 
 def _status(request: web.Request, known: Request) -> web.Response:

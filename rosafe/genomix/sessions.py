@@ -10,7 +10,6 @@ from collections import Counter
 from collections.abc import Awaitable, Callable, Mapping
 from typing import Any, TypeVar
 
-from rosafe.genomix.connections import SHARE
 from rosafe.genomix.errors import too_many
 from rosafe.genomix.graph import Graph
 from rosafe.genomix.proxy import NOTHING, Proxy, Value, names
@@ -324,7 +323,7 @@ class Sessions:
     def _make_place(self, owner: str) -> None:
         """End an idle session where there are too many: of this client, or else of the one that has most."""
         counts = Counter(session.owner for session in self._sessions.values())
-        if counts[owner] >= MAX_SESSIONS // SHARE:
+        if counts[owner] >= MAX_SESSIONS // 2:
             crowd = owner
         elif counts.total() >= MAX_SESSIONS:
             crowd = counts.most_common(1)[0][0]

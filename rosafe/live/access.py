@@ -6,8 +6,8 @@ import hmac
 import secrets
 from collections.abc import Collection, Mapping
 
-from rosafe.genomix.access import refuse_other_names
-from rosafe.interface import ComponentError
+from rosafe.http_server.access import check_host, check_same_origin
+from rosafe.http_server.refusal import HttpRefusal
 
 HEADERS = {
     "Content-Security-Policy": (
@@ -42,19 +42,15 @@ class Door:
         self.token = secrets.token_urlsafe(32)
         self.cookie_name = "rosafe_live"
         self.cookie = secrets.token_urlsafe(32)
-        self._hosts = {"localhost", *(host.lower() for host in hosts)}
+        self._hosts = {host.lower() for host in hosts}
 
     def refusal(self, headers: Mapping[str, str], query: Mapping[str, str], cookies: Mapping[str, str]) -> str:
         """Why a request is refused, in one line; empty where it is let in."""
         try:
-            refuse_other_names(headers, self._hosts)
-        except ComponentError as problem:
-            return str(problem.detail.get("what", ""))
-        origin = headers.get("Origin")
-        if origin is not None and origin.lower() != f"http://{headers.get('Host', '')}".lower():
-            return "requests of pages from elsewhere are refused (Origin)"
-        if headers.get("Sec-Fetch-Site") in ("cross-site", "same-site") and headers.get("Sec-Fetch-Mode") != "navigate":
-            return "requests of pages from elsewhere are refused (Sec-Fetch-Site)"
+            check_host(headers, self._hosts, "--host gives it one")
+            check_same_origin(headers)
+        except HttpRefusal as refusal:
+            return str(refusal)
         if not (self.has_token(query) or _equal(cookies.get(self.cookie_name, ""), self.cookie)):
             return "open the URL that `rosafe live` has printed: its token is missing here, or an old one"
         return ""

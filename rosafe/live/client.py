@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 from aiohttp import WSMsgType, web
 
 from rosafe.genomix.tasks import shared
+from rosafe.http_server.listener import connection_of
 from rosafe.interface import MAX_SETUP, ComponentError
 from rosafe.live.hub import FLOAT, Hub, Key, View
 from rosafe.live.robot import told
@@ -72,6 +73,7 @@ class Client:
     async def serve(self, request: web.Request) -> web.WebSocketResponse:
         """Until the page goes."""
         await self._socket.prepare(request)
+        connection_of(request).become_websocket()
         transport = request.transport
         if transport is None:
             return self._socket

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rosafe.component import registration, startup
-from rosafe.genomix.access import own_names
 from rosafe.genomix.graph import Graph
+from rosafe.http_server.access import own_names
 from rosafe.live.access import Door
 from rosafe.live.health import Health
 from rosafe.live.hub import Hub

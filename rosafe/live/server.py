@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import functools
 import logging
 import time
 from collections.abc import Awaitable, Callable, Mapping
@@ -13,6 +12,9 @@ from typing import Any, Protocol
 from aiohttp import web
 
 from rosafe.genomix.tasks import shared
+from rosafe.http_server.connections import Connections, Limits
+from rosafe.http_server.listener import HttpListener, connection_of
+from rosafe.http_server.refusal import HttpRefusal
 from rosafe.interface import ComponentError
 from rosafe.live.access import HEADERS, Door
 from rosafe.live.client import Ask, Client
@@ -25,8 +27,16 @@ from rosafe.version import VERSION
 PAGE = Path(__file__).with_name("page")
 LOOK_SECONDS = 1.0  # between two looks at the components, while there is a page
 MAX_CLIENTS = 32
-MAX_CONNECTIONS = 256
-KNOCK_SECONDS = 10.0  # a connection that was not let in by then is closed
+AUTH_TIMEOUT_SECONDS = 10.0  # a connection that has not sent a request with the token by then is closed
+LIMITS = Limits(
+    max_connections=256,
+    max_url=8 * 1024,
+    max_header_bytes=4 * 2**20,
+    max_answers=0,  # none is large
+    request_seconds=AUTH_TIMEOUT_SECONDS,
+    idle_seconds=75.0,
+)
+LAST_WORDS_SECONDS = 1.0  # that requests in progress have at the end
 HARMLESS = {"save"}  # what a page that only watches may ask for
 _TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
 
@@ -82,30 +92,23 @@ class Server:
         app.router.add_get("/", self._page)
         app.router.add_get("/socket", self._socket)
         app.router.add_get("/{name}", self._file)
-        self._runner = web.AppRunner(app, access_log=None)
-        self._connections: set[Connection] = set()
-        self._listener: asyncio.AbstractServer | None = None
+        self._listener = HttpListener(app, Connections(LIMITS, _format_refusal, log))
         self._looking: asyncio.Task[None] | None = None
 
     async def start(self, host: str, port: int) -> int:
         """Listen and return the port; OSError where that cannot be."""
-        await self._runner.setup()
-        assert self._runner.server is not None
-        connect = functools.partial(Connection, self._connections, self._runner.server)
-        self._listener = await asyncio.get_running_loop().create_server(connect, host, port)
+        taken = await self._listener.start(host, port)
         self._looking = asyncio.create_task(self._look())
-        taken = int(self._listener.sockets[0].getsockname()[1])
         self._door.cookie_name = f"rosafe_live_{taken}"
         return taken
 
     async def close(self) -> None:
         """Stop listening, end all pages."""
-        if self._listener is not None:
-            self._listener.close()
+        self._listener.stop_listening()
         if self._looking is not None:
             self._looking.cancel()
         await asyncio.gather(*(client.close() for client in self._clients), return_exceptions=True)
-        await self._runner.cleanup()
+        await self._listener.close(LAST_WORDS_SECONDS)
         await asyncio.to_thread(self._hub.close)  # what a thread has begun meanwhile, too
         await asyncio.to_thread(self._health.close, for_good=True)
 
@@ -129,12 +132,14 @@ class Server:
 
     @web.middleware
     async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+        connection = connection_of(request)
+        connection.request_parsed()
         why = self._door.refusal(request.headers, request.query, request.cookies)
         if why:
-            return web.Response(status=403, text=f"rosafe live: {why}\n", headers={**HEADERS, "Connection": "close"})
-        protocol = request.protocol
-        if isinstance(protocol, Connection):
-            protocol.let_in()
+            refusal = web.Response(status=403, text=f"rosafe live: {why}\n", headers=HEADERS)
+            refusal.force_close()
+            return refusal
+        connection.mark_authenticated()
         try:
             response = await handler(request)
         except web.HTTPException as problem:
@@ -245,28 +250,5 @@ def _watched(ask: Ask, name: str, watch: bool) -> Ask:
     return refuse
 
 
-class Connection(web.RequestHandler):
-    """One connection: only so many, and those that do not show the token soon are closed."""
-
-    def __init__(self, connections: set[Connection], server: web.Server) -> None:
-        super().__init__(server, loop=asyncio.get_running_loop(), access_log=None)  # type: ignore[arg-type]
-        self._all = connections
-        self._late: asyncio.TimerHandle | None = None
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        super().connection_made(transport)
-        if len(self._all) >= MAX_CONNECTIONS:
-            transport.abort()  # type: ignore[attr-defined]
-            return
-        self._all.add(self)
-        self._late = asyncio.get_running_loop().call_later(KNOCK_SECONDS, transport.close)
-
-    def let_in(self) -> None:
-        """It knows the token."""
-        if self._late is not None:
-            self._late.cancel()
-
-    def connection_lost(self, exc: BaseException | None) -> None:
-        self._all.discard(self)
-        self.let_in()
-        super().connection_lost(exc)
+def _format_refusal(refusal: HttpRefusal) -> tuple[bytes, str]:
+    return f"rosafe live: {refusal}\n".encode("utf-8", "backslashreplace"), "text/plain"

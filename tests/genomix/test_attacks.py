@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import http.client
 import json
+import logging
 import re
 import select
 import socket
@@ -12,11 +13,14 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, contextmanager, suppress
+from dataclasses import replace
+from typing import cast
 
 import pytest
 
-from rosafe.genomix import connections
-from rosafe.interface import ComponentError
+from rosafe.genomix.server import LIMITS
+from rosafe.http_server.connections import ClientAccount, Connections, HttpConnection, _address
+from rosafe.http_server.refusal import HttpRefusal
 from tests import harness
 from tests.genomix import attacks
 from tests.genomix import world as worlds
@@ -32,11 +36,12 @@ MUCH = 150  # MB that an attack may take
 # genomixd with little patience and little memory.
 HASTY = """
 import sys
-from rosafe.genomix import connections, daemon
-connections.REQUEST_SECONDS = 1.0
+from dataclasses import replace
+from rosafe.genomix import daemon, server
+from rosafe.http_server import connections
+server.LIMITS = replace(server.LIMITS, request_seconds=1.0, max_answers=50 * 2**20)
 connections.STALL_SECONDS = 1.0
 connections.YIELD_SECONDS = 0.2
-connections.MAX_ANSWERS = 50 * 2**20
 sys.exit(daemon.main(["-v", "-p", "0"]))
 """
 
@@ -98,11 +103,11 @@ def test_a_client_that_was_idle_meanwhile_goes_on(world: World) -> None:
     with world.graph.start("tclsh", str(script)) as client:
         harness.wait_for(lambda: "ready" in client.out, 30, lambda: repr(client))
         with attacks.half_requests(world.port):
-            harness.wait_for(lambda: "idle ones are closed" in world.server.err)
+            harness.wait_for(lambda: "idle connections are closed" in world.server.err)
             go.touch()
             assert client.wait(30) == 0
         assert client.out.split() == ["ready", "done"]
-    told = world.server.err.count("as many clients are connected as may be, now from loopback")
+    told = world.server.err.count("connection limit reached, now by loopback")
     assert 1 <= told < 10  # once a minute
 
 
@@ -204,21 +209,20 @@ def test_answers_that_nobody_takes_are_dropped(world: World) -> None:
             harness.wait_for(lambda: open_files(pid) < files + LINKS, SOON, lambda: f"{open_files(pid)} files")
 
 
-def test_answers_together_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(connections, "MAX_ANSWERS", 100)
-    every = connections.Connections()
+def test_answers_together_are_bounded() -> None:
+    every = connections_with(max_answers=100)
     one, two, three = (Fake(every) for _ in range(3))
     samples = object(), object(), object()
 
     def taken(client: Fake, number: int, size: int) -> AbstractContextManager[None]:
-        return every.taking(client, samples[number], size)  # type: ignore[arg-type]
+        return every.reading_answer(client, samples[number], size)  # type: ignore[arg-type]
 
     with taken(one, 0, 1000):  # one that is too large by itself is nobody's concern while it is alone
-        with pytest.raises(ComponentError, match="clients are taking"), taken(two, 1, 1):
+        with pytest.raises(HttpRefusal, match="clients are reading"), taken(two, 1, 1):
             pass
         with taken(two, 0, 1000):  # the same data
             one.stalls = True
-            with pytest.raises(ComponentError, match="clients are taking"), taken(three, 1, 1):
+            with pytest.raises(HttpRefusal, match="clients are reading"), taken(three, 1, 1):
                 pass
             assert (one.dropped, two.dropped) == (True, False)
     with taken(one, 0, 60), taken(two, 1, 40):
@@ -228,13 +232,18 @@ def test_answers_together_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
             assert (one.dropped, two.dropped) == (False, True)
 
 
+def connections_with(**limits: int) -> Connections:
+    """A server's connections, with other limits than genomixd's."""
+    return Connections(replace(LIMITS, **limits), lambda refusal: (b"", ""), logging.getLogger("test"))
+
+
 class Fake:
     """A connection as `Connections` sees it."""
 
-    def __init__(self, every: connections.Connections) -> None:
+    def __init__(self, every: Connections) -> None:
         self.stalls = False
         self.dropped = False
-        self.client = connections.Client("")
+        self.account = ClientAccount("")
         self.every = every
 
     def stalled(self, seconds: float) -> bool:
@@ -251,24 +260,31 @@ class Fake:
 class Room:
     """A server with room for eight connections, four from one address."""
 
-    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        monkeypatch.setattr(connections, "MAX_CONNECTIONS", 8)
-        self.every = connections.Connections()
+    def __init__(self) -> None:
+        self.every = connections_with(max_connections=8)
 
     def come(self, address: str, busy: bool = False) -> Fake | None:
         """A new connection, None where it is refused."""
         new = Fake(self.every)
-        client = self.every.admit(new, address)  # type: ignore[arg-type]
-        if client is None:
+        connection = cast(HttpConnection, new)
+        account = self.every.admit(connection, address)
+        if account is None:
             return None
-        new.client = client
+        new.account = account
         if busy:
-            del client.waiting[new]  # type: ignore[arg-type]
+            del account.silent[connection]
         return new
 
+    def authenticate(self, one: Fake | None) -> None:
+        """A connection has shown the token, and waits for its next request."""
+        assert one is not None
+        connection = cast(HttpConnection, one)
+        del one.account.silent[connection]
+        one.account.idle[connection] = None
 
-def test_who_waits_longest_goes_first(monkeypatch: pytest.MonkeyPatch) -> None:
-    server = Room(monkeypatch)
+
+def test_who_waits_longest_goes_first() -> None:
+    server = Room()
     mine = [server.come("me") for _ in range(2)]
     crowd = [server.come("crowd", busy=number == 0) for number in range(10)]
     # Six of the crowd had to go, but not the one that is served, and nobody else.
@@ -279,8 +295,8 @@ def test_who_waits_longest_goes_first(monkeypatch: pytest.MonkeyPatch) -> None:
     assert not any(one.dropped for one in (*mine, *others) if one)
 
 
-def test_who_is_served_stays(monkeypatch: pytest.MonkeyPatch) -> None:
-    server = Room(monkeypatch)
+def test_who_is_served_stays() -> None:
+    server = Room()
     assert all(server.come("crowd", busy=True) for _ in range(4))
     assert server.come("crowd") is None
     assert all(server.come("more", busy=True) for _ in range(3))
@@ -288,6 +304,20 @@ def test_who_is_served_stays(monkeypatch: pytest.MonkeyPatch) -> None:
     assert server.come("me") is not None
     assert last is not None and last.dropped
     assert server.come("you") is not None  # for the one before, which waits
+
+
+def test_authenticated_connections_go_last() -> None:
+    server = Room()
+    owner = [server.come("loopback") for _ in range(2)]
+    for one in owner:
+        server.authenticate(one)
+    silent = [server.come("loopback") for _ in range(4)]
+    assert [one.dropped for one in silent if one] == [True, True, False, False]
+    for one in silent[2:]:
+        server.authenticate(one)
+    assert not any(one.dropped for one in owner if one)
+    assert server.come("loopback") is not None
+    assert [one.dropped for one in owner if one] == [True, False]
 
 
 @pytest.mark.parametrize(
@@ -305,7 +335,7 @@ def test_who_is_served_stays(monkeypatch: pytest.MonkeyPatch) -> None:
     ],
 )
 def test_addresses_of_one_client(one: str, other: str, same: bool) -> None:
-    assert (connections._address((one, 1)) == connections._address((other, 2))) is same
+    assert (_address((one, 1)) == _address((other, 2))) is same
 
 
 # --- sessions and loads -----------------------------------------------------------------------------------------

@@ -24,10 +24,11 @@ STANDS_ON: dict[str, set[str]] = {
     "component": {"vocabulary", "representations", "interface", "tree", "sound"},
     "node": {*_NUMERICS, "interface", "tree", "component", "sound", "setups"},
     "bass": {"vocabulary", "interface", "component", "sound"},
-    "genomix": {"vocabulary", "interface", "tree", "component", "setups"},
+    "http_server": set(),
+    "genomix": {"vocabulary", "interface", "tree", "component", "setups", "http_server"},
     "eltclsh": {"vocabulary", "interface", "component", "genomix"},
     "view": {"interface", "sound"},
-    "live": {"vocabulary", "interface", "tree", "component", "bass", "genomix", "view", "sound"},
+    "live": {"vocabulary", "interface", "tree", "component", "bass", "http_server", "genomix", "view", "sound"},
     "demo": {"interface", "tree", "component", "bass", "sound", "view", "offline", "vocabulary"},
 }
 TOP = {"commands", "testing", "ros", "__init__"}  # may use everything

@@ -15,7 +15,9 @@ import pytest
 
 from rosafe.bass import socket_server
 from rosafe.component import door, inbound, pulse
-from rosafe.genomix import connections, daemon, sessions
+from rosafe.genomix import daemon, sessions
+from rosafe.genomix import server as api
+from rosafe.http_server import connections
 from rosafe.live import client, hub, server
 from tests.genomix.world import Http, genomixd
 from tests.harness import PYTHON, ROOT, Graph, MasterProcess, free_port, proc
@@ -117,11 +119,11 @@ def test_the_bounds_of_the_page() -> None:
         "what the longest that makes sense has",
         pulse.PERIOD,
         (socket_server.MAX_CLIENTS, socket_server.IDLE_SECONDS),
-        (connections.MAX_CONNECTIONS, connections.MAX_CONNECTIONS // connections.SHARE),
-        (connections.REQUEST_SECONDS, connections.STALL_SECONDS),
-        connections.MAX_ANSWERS // 2**20,
+        (api.LIMITS.max_connections, api.LIMITS.max_connections // 2),
+        (api.LIMITS.request_seconds, connections.STALL_SECONDS),
+        api.LIMITS.max_answers // 2**20,
         (sessions.MAX_SESSIONS, sessions.MAX_REQUESTS),
-        (server.MAX_CLIENTS, server.MAX_CONNECTIONS, server.KNOCK_SECONDS),
+        (server.MAX_CLIENTS, server.LIMITS.max_connections, server.AUTH_TIMEOUT_SECONDS),
         (f"{client.MAX_MESSAGE >> 20} MiB", client.MAX_PENDING, client.MAX_VIEWS, hub.MAX_VIEWS),
         (client.BYTES_PER_SECOND, 1 / client.PERIOD, client.STALL_SECONDS),
     ]

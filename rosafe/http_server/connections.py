@@ -1,0 +1,412 @@
+"""Connections of an HTTP server: their number, duration and memory are limited, whatever clients do.
+
+aiohttp receives complete requests, one at a time; what a client sends ahead stays in the kernel, except a small buffer.
+If there is no room for another connection, the one is closed that has been without a request for longest.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import ipaddress
+import logging
+import re
+import resource
+import time
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import dataclass
+from http import HTTPStatus
+from typing import Any, cast
+
+from aiohttp import web
+
+from rosafe.http_server.refusal import HttpRefusal
+
+BUFFER = 16 * 1024  # bytes of a request that are not counted; bytes read at a time
+HEADERS_SIZE = 64 * 1024  # bytes of all headers of a request
+STALL_SECONDS = 60.0  # a client that does not read its answer is dropped after
+YIELD_SECONDS = 5.0  # and if others need the memory, after
+LOG_SECONDS = 60.0  # between two log entries that say that the limit is reached
+
+_END = re.compile(rb"\r?\n\r?\n")
+_BODY = re.compile(rb"\n(?:content-length:(?![ \t]*0*[ \t]*\r?\n)|transfer-encoding:)", re.IGNORECASE)
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Limits of a server.
+
+    Attributes
+    ----------
+    max_connections : int
+        Or half of the file descriptors, if these are fewer. One address has at most half of them.
+    max_url : int
+        Bytes of a request line.
+    max_header_bytes : int
+        Bytes of all requests together that are longer than `BUFFER`.
+    max_answers : int
+        Bytes of all answers that clients are reading.
+    request_seconds : float
+        For a complete request, from its first byte, the first one of a connection from connecting.
+    idle_seconds : float
+        After which a connection without requests is closed.
+    """
+
+    max_connections: int
+    max_url: int
+    max_header_bytes: int
+    max_answers: int
+    request_seconds: float
+    idle_seconds: float
+
+
+class ClientAccount:
+    """The connections from one address.
+
+    `silent` and `idle` are those without a request in progress, longest first: those that have
+    not authenticated, and those that have. `long_polls` are those with a request that lasts as long as the client likes.
+    """
+
+    def __init__(self, address: str) -> None:
+        self.address = address
+        self.connections: set[HttpConnection] = set()
+        self.silent: dict[HttpConnection, None] = {}
+        self.idle: dict[HttpConnection, None] = {}
+        self.long_polls: set[HttpConnection] = set()
+
+
+class Connections:
+    """All connections of a server.
+
+    Parameters
+    ----------
+    limits : Limits
+    format_refusal : callable
+        Returns the body of a refusal and its media type.
+    log : logging.Logger
+    """
+
+    def __init__(
+        self, limits: Limits, format_refusal: Callable[[HttpRefusal], tuple[bytes, str]], log: logging.Logger
+    ) -> None:
+        descriptors, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
+        most = limits.max_connections
+        self._max = most if descriptors < 0 else min(most, descriptors // 2)
+        self._max_per_address = self._max // 2
+        self.limits = limits
+        self.format_refusal = format_refusal
+        self._log = log
+        self._accounts: dict[str, ClientAccount] = {}
+        self._count = 0
+        self._logged_at = -LOG_SECONDS
+        self.header_bytes = 0  # of long requests
+        self._answers: dict[HttpConnection, tuple[object, int]] = {}  # what is being read, and its bytes
+
+    def admit(self, connection: HttpConnection, address: str) -> ClientAccount | None:
+        """Return the account of a new connection; None if there is no room for it and none can be made."""
+        account = self._accounts.get(address) or ClientAccount(address)
+        full = len(account.connections) >= self._max_per_address
+        if full or self._count >= self._max:
+            self._log_full(account.address)
+            longest = _silent_longest([account] if full else self._accounts.values())
+            if longest is None:
+                return None
+            longest.drop()
+        self._accounts[address] = account
+        account.connections.add(connection)
+        account.silent[connection] = None
+        self._count += 1
+        return account
+
+    def _log_full(self, address: str) -> None:
+        if time.monotonic() > self._logged_at + LOG_SECONDS:
+            self._logged_at = time.monotonic()
+            self._log.warning("connection limit reached, now by %s: idle connections are closed", address)
+
+    def forget(self, connection: HttpConnection) -> None:
+        """A connection has ended."""
+        account = connection.account
+        self._answers.pop(connection, None)
+        account.long_polls.discard(connection)
+        account.silent.pop(connection, None)
+        account.idle.pop(connection, None)
+        if connection in account.connections:
+            account.connections.remove(connection)
+            self._count -= 1
+            if not account.connections:
+                self._accounts.pop(account.address, None)
+
+    @contextlib.contextmanager
+    def long_poll(self, connection: HttpConnection) -> Iterator[None]:
+        """Mark a request that lasts as long as its client likes: half of a client's connections are for other ones.
+
+        Raises
+        ------
+        HttpRefusal
+            If there are too many of them.
+        """
+        polls, most = connection.account.long_polls, self._max_per_address // 2
+        if len(polls) >= most:
+            raise HttpRefusal(503, f"{most} requests of this address are listening or waiting")
+        polls.add(connection)
+        try:
+            yield
+        finally:
+            polls.discard(connection)
+
+    @contextlib.contextmanager
+    def reading_answer(self, connection: HttpConnection, data: object, size: int) -> Iterator[None]:
+        """While a client reads an answer: `data` of `size` bytes, which others may be reading as well.
+
+        Clients that do not read theirs make room for it.
+
+        Raises
+        ------
+        HttpRefusal
+            If there is no room.
+        """
+        for other in list(self._answers):
+            if self._fits(data, size):
+                break
+            if other.stalled(YIELD_SECONDS):
+                other.drop()
+        if not self._fits(data, size):
+            raise HttpRefusal(503, f"clients are reading {self.limits.max_answers >> 20} MiB of answers at this moment")
+        self._answers[connection] = (data, size)
+        try:
+            yield
+        finally:
+            self._answers.pop(connection, None)
+
+    def _fits(self, data: object, size: int) -> bool:
+        taken = {id(one): one_size for one, one_size in self._answers.values()}
+        return not taken or id(data) in taken or sum(taken.values()) + size <= self.limits.max_answers
+
+
+def _silent_longest(accounts: Iterable[ClientAccount]) -> HttpConnection | None:
+    """Return the connection that makes room: of the address with most of them; authenticated ones only if need be."""
+    accounts = sorted(accounts, key=lambda account: len(account.connections), reverse=True)
+    for waiting in (*(account.silent for account in accounts), *(account.idle for account in accounts)):
+        if waiting:
+            return next(iter(waiting))
+    return None
+
+
+class HttpConnection(web.RequestHandler):
+    """One connection. asyncio and aiohttp call its methods, except those of the section "for the server"."""
+
+    def __init__(self, connections: Connections, server: web.Server, **options: Any) -> None:
+        loop = asyncio.get_running_loop()
+        limits = connections.limits
+        super().__init__(
+            server, loop=loop, max_line_size=limits.max_url, keepalive_timeout=limits.idle_seconds, **options
+        )
+        self.account = ClientAccount("")
+        self.gone = asyncio.Event()
+        self._connections, self._limits = connections, limits
+        self._open = False
+        self._authenticated = False
+        self._busy = False  # with a request
+        self._is_websocket = False
+        self._ahead = bytearray()  # what has come, and aiohttp has not got yet
+        self._searched = 0  # in that many bytes of it there is no end of a head
+        self._head = 0  # bytes of the request in progress
+        self._counted = 0  # bytes of both that count
+        self._deadline: asyncio.TimerHandle | None = None
+        self._stall: asyncio.TimerHandle | None = None
+        self._stalled_at = 0.0
+
+    # --- for the server ---
+
+    def request_parsed(self) -> None:
+        """aiohttp has parsed the request: its deadline is met."""
+        self._cancel_deadline()
+
+    def mark_authenticated(self) -> None:
+        """From now on connections that have not authenticated make room before this one."""
+        self._authenticated = True
+
+    def become_websocket(self) -> None:
+        """aiohttp gets everything from now on; to be called once the WebSocket is prepared."""
+        self._is_websocket = True
+        self._socket.set_write_buffer_limits()  # the WebSocket's own limits apply
+        super().data_received(bytes(self._ahead))
+        self._ahead.clear()
+        self._account_header()
+        self._socket.resume_reading()
+
+    def drop(self) -> None:
+        """Close it immediately, whatever it does; what was not read is lost."""
+        self._leave()
+        self._socket.abort()
+
+    def stalled(self, seconds: float) -> bool:
+        """Return whether the client has read nothing of its answer for so long."""
+        return self._stall is not None and self._loop.time() - self._stalled_at >= seconds
+
+    # --- the connection ---
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        self._socket = cast(asyncio.Transport, transport)
+        self._socket.set_write_buffer_limits(high=0)  # so that pause_writing reports everything that is not read
+        self._socket.max_size = BUFFER  # type: ignore[attr-defined]  # asyncio reads 256 KiB at a time
+        account = self._connections.admit(self, _address(transport.get_extra_info("peername")))
+        if account is None:
+            self._socket.write(self._refusal(HttpRefusal(503, "the connection limit is reached")))
+            self._socket.close()
+            return
+        self.account = account
+        self._open = True
+        self._start_deadline()
+        super().connection_made(transport)
+
+    def connection_lost(self, exc: BaseException | None) -> None:
+        self._leave()
+        if self._stall is not None:
+            self._stall.cancel()
+        super().connection_lost(exc)
+
+    def _leave(self) -> None:
+        """From now on others may have its place."""
+        self._open = False
+        self.gone.set()
+        self._connections.forget(self)
+        self._ahead.clear()
+        self._head = 0
+        self._account_header()
+        self._cancel_deadline()
+
+    def _refuse(self, refusal: HttpRefusal) -> None:
+        self._leave()
+        self._socket.write(self._refusal(refusal))
+        self.force_close()
+
+    def _refusal(self, refusal: HttpRefusal) -> bytes:
+        """Return a complete answer, for cases in which aiohttp is not asked."""
+        body, media_type = self._connections.format_refusal(refusal)
+        head = (
+            f"HTTP/1.1 {refusal.status} {HTTPStatus(refusal.status).phrase}\r\nContent-Type: {media_type}; "
+            f"charset=utf-8\r\nConnection: close\r\nContent-Length: {len(body)}\r\n\r\n"
+        )
+        return head.encode() + body
+
+    # --- requests ---
+
+    def data_received(self, data: bytes) -> None:
+        if not self._open:
+            return
+        if self._is_websocket:
+            super().data_received(data)
+            return
+        self._ahead += data
+        self._account_header()
+        limit = self._limits.max_header_bytes
+        if self._counted and self._connections.header_bytes > limit:
+            self._refuse(HttpRefusal(503, f"long requests take {limit >> 20} MiB at this moment"))
+        elif not self._busy:
+            self._next_request()
+        elif len(self._ahead) >= BUFFER:
+            self._socket.pause_reading()
+
+    def _next_request(self) -> None:
+        if not self._searched:
+            del self._ahead[: len(self._ahead) - len(self._ahead.lstrip(b"\r\n"))]  # as RFC 9112, 2.2 asks for
+        end = _END.search(self._ahead, max(0, self._searched - 3))
+        if end is None:
+            self._searched = len(self._ahead)
+            most = self._limits.max_url + HEADERS_SIZE
+            if self._searched > most:
+                self._refuse(HttpRefusal(400, f"a request has at most {most >> 10} KiB"))
+            elif self._ahead and self._deadline is None:
+                self._start_deadline()
+            return
+        head = bytes(self._ahead[: end.end()])
+        del self._ahead[: end.end()]
+        self._searched, self._head = 0, len(head)
+        if _BODY.search(head):
+            self._refuse(HttpRefusal(400 if head.startswith(b"GET ") else 405, "expected a GET request without a body"))
+            return
+        self._busy = True
+        self._waiting.pop(self, None)
+        if self._deadline is None:
+            self._start_deadline()  # in case that aiohttp sees no end of it
+        super().data_received(head)
+
+    async def finish_response(self, *arguments: Any) -> Any:
+        try:
+            return await super().finish_response(*arguments)
+        finally:
+            self._loop.call_soon(self._finished)
+
+    def _finished(self) -> None:
+        if not self._open:
+            return
+        self._cancel_deadline()
+        self._busy, self._head = False, 0
+        self._account_header()
+        self._waiting[self] = None
+        self._next_request()
+        if len(self._ahead) < BUFFER:
+            self._socket.resume_reading()
+
+    @property
+    def _waiting(self) -> dict[HttpConnection, None]:
+        """The connections of this client that wait for a request, as this one does."""
+        return self.account.idle if self._authenticated else self.account.silent
+
+    def handle_error(
+        self, request: web.BaseRequest, status: int = 500, exc: BaseException | None = None, message: str | None = None
+    ) -> web.Response:
+        """Return the answer to an invalid request; aiohttp's own is HTML, with a traceback in the log."""
+        if isinstance(exc, ConnectionError):  # a client that has vanished, or was dropped
+            raise exc
+        if status >= HTTPStatus.INTERNAL_SERVER_ERROR:
+            self.log_exception("cannot answer", exc_info=exc)
+        if request.writer.output_size > 0:
+            raise ConnectionAbortedError("a part of another answer was sent already")
+        reason = (message or str(exc) or HTTPStatus(status).phrase).splitlines()[0][:200]
+        body, media_type = self._connections.format_refusal(HttpRefusal(status, reason))
+        answer = web.Response(body=body, status=status, content_type=media_type, charset="utf-8")
+        answer.force_close()
+        return answer
+
+    def _account_header(self) -> None:
+        size = self._head + len(self._ahead)
+        counted = size if size > BUFFER else 0
+        self._connections.header_bytes += counted - self._counted
+        self._counted = counted
+
+    def _start_deadline(self) -> None:
+        seconds = self._limits.request_seconds
+        refusal = HttpRefusal(408, f"no complete request within {seconds:g} s")
+        self._deadline = self._loop.call_later(seconds, self._refuse, refusal)
+
+    def _cancel_deadline(self) -> None:
+        if self._deadline is not None:
+            self._deadline.cancel()
+            self._deadline = None
+
+    # --- answers ---
+
+    def pause_writing(self) -> None:
+        super().pause_writing()
+        self._stalled_at = self._loop.time()
+        self._stall = self._loop.call_later(STALL_SECONDS, self.drop)
+
+    def resume_writing(self) -> None:
+        super().resume_writing()
+        if self._stall is not None:
+            self._stall.cancel()
+            self._stall = None
+
+
+def _address(peer: Any) -> str:
+    """Return whom a connection counts for: an address, all of this machine, or the network of a host with IPv6."""
+    if not peer:
+        return ""
+    address = ipaddress.ip_address(str(peer[0]).partition("%")[0])
+    if isinstance(address, ipaddress.IPv6Address):
+        if address.ipv4_mapped is None:
+            return "loopback" if address.is_loopback else str(ipaddress.ip_network((address, 64), strict=False))
+        address = address.ipv4_mapped
+    return "loopback" if address.is_loopback else str(address)
