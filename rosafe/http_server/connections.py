@@ -63,8 +63,8 @@ class Limits:
 class ClientAccount:
     """The connections from one address.
 
-    `silent` and `idle` are those without a request in progress, longest first: those that have
-    not authenticated, and those that have. `long_polls` are those with a request that lasts as long as the client likes.
+    Those without a request in progress, longest first, are `silent` (not authenticated) or `idle` (authenticated).
+    `long_polls` are those with a request that lasts as long as the client likes.
     """
 
     def __init__(self, address: str) -> None:
