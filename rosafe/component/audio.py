@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from rosafe.component.frametime import FrameTime, Line
+from rosafe.component.lag import LagMonitor
 from rosafe.sound.windows import joined, malformed
 
 RING_SECONDS = 10.0  # how far the tree may fall behind before frames are lost
@@ -105,6 +106,9 @@ class AudioRing:
             if fresh or lost:
                 self._times.add(newest, _stamp(message) or time.time())
             self._turn.notify_all()
+            now = time.monotonic()
+            for reader in self._readers:
+                reader.lag.update(self._waiting(reader), now)
             waiting = [reader.wake for reader in self._readers]
         for wake in waiting:
             wake()
@@ -238,14 +242,20 @@ class AudioRing:
                 if left <= 0 or give_up():
                     return None
                 self._turn.wait(min(left, 0.05))
-            reader = AudioReader(self, frames_per_block, self.sample_rate, self._newest + 1)
+            lag = LagMonitor(self.sample_rate, frames_per_block, self._report)
+            reader = AudioReader(self, frames_per_block, self.sample_rate, self._newest + 1, lag)
             self._reserve(reader.room)
             self._readers.append(reader)
             return reader
 
     def _unread(self) -> int:
-        takers = [reader for reader in self._readers if reader.sample_rate == self.sample_rate]
-        return max((self._newest + 1 - max(reader.position, self._oldest) for reader in takers), default=0)
+        return max(map(self._waiting, self._readers), default=0)
+
+    def _waiting(self, reader: AudioReader) -> int:
+        """Return how many frames `reader` has not read yet."""
+        if reader.sample_rate != self.sample_rate:
+            return 0
+        return self._newest + 1 - max(reader.position, self._oldest)
 
     def read(self, reader: AudioReader) -> tuple[np.ndarray, int] | None:
         """The next block of `reader`, and the number of the frame after it; None where it has not come yet."""
@@ -259,6 +269,8 @@ class AudioRing:
             if self._newest + 1 - reader.position < count:
                 return None
             reader.position += count
+            reader.lag.block_read()
+            reader.lag.update(self._newest + 1 - reader.position, time.monotonic())
             return self._copy(reader.position - count, count), reader.position
 
     def stop(self, reader: AudioReader) -> None:
@@ -279,6 +291,12 @@ class AudioRing:
         with self._turn:
             return self._unread()
 
+    @property
+    def lag(self) -> str:
+        """One line if a reader does not keep up with the stream, else an empty text."""
+        with self._turn:
+            return next((reader.lag.problem for reader in self._readers if reader.lag.problem), "")
+
 
 def _stamp(message: Any) -> float:
     """When the newest frame of a message was captured (s since 1970); 0 where it does not say."""
@@ -291,10 +309,13 @@ class AudioReader:
     Audio at another rate than at the start is not given to the tree, which was built for that rate.
     """
 
-    def __init__(self, ring: AudioRing, frames_per_block: int, sample_rate: float, position: int) -> None:
+    def __init__(
+        self, ring: AudioRing, frames_per_block: int, sample_rate: float, position: int, lag: LagMonitor
+    ) -> None:
         self.frames_per_block = frames_per_block
         self.sample_rate = float(sample_rate)
         self.position = position  # number of the next frame to read; kept by the ring
+        self.lag = lag
         self.ended = False
         self.wake: Callable[[], None] = lambda: None
         self._ring = ring

@@ -36,7 +36,8 @@ from rosafe.vocabulary.parameter import shown
 
 STATE_PERIOD = 0.9  # seconds between two genom_state messages at the most; the contract is 1
 BURST_SECONDS = 0.005  # what changes within this makes one message, not one each
-DIAGNOSTICS_PERIOD = 1.0
+DIAGNOSTICS_PERIOD = 1.0  # s; sooner if there is news
+DIAGNOSTICS_PAUSE = 0.1  # s between two messages at least
 TRIM_ROUNDS = 20  # of diagnostics between two times that freed memory is given back to the system
 UP_SECONDS = 10.0  # until the master knows a node that starts
 ACCEPT_SECONDS = 2.0  # a goal is accepted once its activity runs, or after this: longer than InputProc waits for sound
@@ -76,6 +77,7 @@ class ComponentNode:
         self._control = threading.Lock()
         self._connecting = threading.Lock()
         self._turn = threading.Event()
+        self._health_changed = threading.Event()
         self._keep: list[Any] = []  # services and action servers, alive as long as the node
         self._digest = _digest(component)
         self._set_parameters()
@@ -167,6 +169,7 @@ class ComponentNode:
         """End all activities and wait for them (bounded); `by` is what their exceptions name."""
         self.finished.set()
         self._turn.set()
+        self._health_changed.set()
         self.activities.interrupt_named((s.name for s in self.component.activities), by, wait=STOP_WAIT)
         time.sleep(SEND_SECONDS)
         self._registrar.settle()
@@ -344,9 +347,15 @@ class ComponentNode:
             self._turn.wait(STATE_PERIOD)
             self.finished.wait(BURST_SECONDS)
 
+    def health_changed(self) -> None:
+        """Publish /diagnostics now instead of at the end of its period."""
+        self._health_changed.set()
+
     def _publish_diagnostics(self) -> None:
         rounds = itertools.count(1)
-        while not self.finished.wait(DIAGNOSTICS_PERIOD):
+        while not self.finished.wait(DIAGNOSTICS_PAUSE):
+            self._health_changed.wait(DIAGNOSTICS_PERIOD - DIAGNOSTICS_PAUSE)
+            self._health_changed.clear()
             self.diagnostics.force_update()  # `update` would ask the master for the period, and fail without one
             if next(rounds) % TRIM_ROUNDS == 0:
                 memory.give_back()

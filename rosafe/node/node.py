@@ -71,7 +71,7 @@ class RosafeNode:
         self.finished = self._node.finished
         self._tree = Tree(self, _workers())
         self._words = UnknownWords(strict)
-        self._ring = AudioRing(EventLog(rospy.logwarn))
+        self._ring = AudioRing(EventLog(self._warn))
         self._audio: rospy.Subscriber | None = None
         self._audio_topic = ""
         self._ports: dict[Processor, OutputPort] = {}
@@ -364,12 +364,18 @@ class RosafeNode:
 
     # --- health ---
 
+    def _warn(self, line: str) -> None:
+        rospy.logwarn(line)
+        self._node.health_changed()
+
     def _audio_health(self, status: Any) -> Any:
         counters, rate, root = self._ring.counters, self._ring.sample_rate, self._tree.input
         if root is not None and rate not in (0, self._tree.sample_rate):
             status.summary(
                 DiagnosticStatus.ERROR, f"Audio is at {rate} Hz, the tree at {self._tree.sample_rate:g} Hz: call Stop"
             )
+        elif lag := self._ring.lag:
+            status.summary(DiagnosticStatus.WARN, lag)
         elif counters.lost or counters.dropped or counters.refused or counters.breaks:
             status.summary(
                 DiagnosticStatus.WARN,

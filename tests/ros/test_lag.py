@@ -1,0 +1,105 @@
+"""A tree that does not keep up with the stream is reported, with a block size that does."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rosafe.component.lag import BLOCK_SIZES, LAG_SECONDS, LagMonitor
+from tests.harness import Graph, Process, wait_for
+from tests.ros.session import own_node
+
+MESSAGE = 2205  # frames between two audio messages
+RATE = 44100.0
+
+
+def run(block: int, block_seconds: float, seconds: float) -> list[tuple[float, str]]:
+    """What is reported, and when, of a tree that takes `block_seconds` for each block while a stream comes in."""
+    now = 0.0
+    lines: list[tuple[float, str]] = []
+    monitor = LagMonitor(RATE, block, lambda line: lines.append((now, line)))
+    arrived = read = 0
+    free_at = 0.0  # when the tree takes the next block
+    while now < seconds:
+        arrived += MESSAGE
+        monitor.update(arrived - read, now)
+        until = now + MESSAGE / RATE
+        free_at = max(free_at, now)
+        while arrived - read >= block and free_at < until:
+            now = free_at
+            read += block
+            monitor.block_read()
+            monitor.update(arrived - read, now)
+            free_at += block_seconds
+        now = until
+    return lines
+
+
+def proposed(line: str) -> int:
+    found = re.search(r"nFramesPerBlock (\d+)", line)
+    assert found is not None, line
+    return int(found[1])
+
+
+def test_a_tree_that_keeps_up_is_not_reported() -> None:
+    assert run(220, 0.9 * 220 / RATE, 5.0) == []
+    assert run(44100, 0.9, 20.0) == []
+
+
+@settings(deadline=None)
+@given(st.sampled_from([1, 10, 100, 220]), st.floats(1.1, 12.0))
+def test_a_short_block_is_reported_in_time_with_a_size_that_keeps_up(block: int, load: float) -> None:
+    """The cost of a block does not depend on its length here."""
+    cost = load * block / RATE
+    (when, line), *more = run(block, cost, 3.0)
+    assert when <= LAG_SECONDS + 0.5 and not more
+    assert "does not keep up" in line
+    size = proposed(line)
+    assert size in BLOCK_SIZES
+    assert run(size, cost, 3.0) == []
+
+
+def test_no_block_size_is_proposed_that_is_too_long() -> None:
+    ((_, line),) = run(12000, 2 * 12000 / RATE, 20.0)
+    assert "longer blocks do not help" in line and "channels" in line
+
+
+def test_the_end_of_a_lag_is_reported() -> None:
+    lines: list[str] = []
+    monitor = LagMonitor(RATE, 10, lines.append)
+    monitor.update(100, 0.0)
+    monitor.update(9, 0.3)
+    monitor.update(100, 0.5)
+    monitor.update(5000, 0.8)
+    assert not lines
+    monitor.update(20000, 1.0)
+    assert "keep up" in monitor.problem
+    monitor.update(30000, 2.0)
+    assert len(lines) == 1
+    monitor.update(9, 3.0)
+    assert monitor.problem == ""
+    assert lines[1:] == ["Audio: the tree has caught up"]
+
+
+@pytest.mark.ros
+def test_the_node_reports_blocks_that_are_too_short(graph: Graph, bass_node: Process) -> None:
+    """In log and /diagnostics; the size that is named removes the problem."""
+    with own_node(graph) as own:
+        assert graph.call("/bass/Acquire", device="scene:").genom_success
+        own.ok("connect_port", local="Audio", remote="bass/Audio")
+        own.ok("InputProc", nFramesPerBlock=10)
+        for request in ("PreProc", "GammatoneProc", "IhcProc", "RatemapProc", "IldProc"):
+            own.ok(request)
+        status = own.health(lambda entries: "keep up" in entries["message"])
+        assert status["level"] == "1"
+        line = wait_for(lambda: re.search(r"Audio: the tree does not keep up.*", own.process.err))
+        assert line is not None
+        size = proposed(line[0])
+        assert size == proposed(status["message"]) > 10
+        own.ok("Stop")
+        own.ok("InputProc", nFramesPerBlock=max(size, 2205))
+        own.health(lambda entries: "keep up" not in entries["message"] and int(entries["frames waiting"]) < 44100)
+        assert graph.call("/bass/Stop").genom_success
