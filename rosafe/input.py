@@ -44,7 +44,7 @@ def open_regular(path: str | os.PathLike[str]) -> BufferedReader:
 
 
 def read_regular(path: str | os.PathLike[str], limit: int) -> bytes:
-    """Return the first `limit` bytes of a regular file, fewer if it is shorter. Errors as those of `open_descriptor`."""
+    """Return the first `limit` bytes of a regular file, fewer if it is shorter. Errors as `open_descriptor`."""
     with open_regular(path) as file:
         data: bytes | None = file.read(limit)
     if data is None:  # some files of /proc and /sys are regular by name only

@@ -35,7 +35,7 @@ READERS: dict[str, Callable[[Path], object]] = {
     "kept": lambda path: Keeper(path, Setup, print).kept(),
     "offline": lambda path: process_file(path, path.with_name("out.npz")),
     "failed.csv": lambda path: write_failed(path.parent, [], {"a": "b"}),
-    **{extension: rosafe.load for extension in FORMATS},
+    **dict.fromkeys(FORMATS, rosafe.load),
 }
 
 

@@ -88,9 +88,8 @@ class BagFile:
             self._descriptor = -1
 
     def _read_bag_header(self) -> None:
-        begin = os.pread(self._descriptor, len(_MAGIC), 0)
-        if begin != _MAGIC:
-            raise BagError(f"is no whole bag: it begins with {begin!r}, not with {_MAGIC!r}")
+        if os.pread(self._descriptor, len(_MAGIC), 0) != _MAGIC:
+            raise BagError("is not a bag of format 2.0")  # without a byte of it: who asks may not be allowed to read it
         try:
             records = _Stretch(self._descriptor, len(_MAGIC), self._size)
             header = _read_header(records, _BAG)
@@ -107,7 +106,7 @@ class BagFile:
 
     def _read_connections(self) -> dict[int, Connection]:
         if self._count > MAX_CONNECTIONS:
-            raise BagError(f"is no whole bag: {self._count} connections, at most {MAX_CONNECTIONS} go")
+            raise BagError(f"is not a whole bag: {self._count} connections, at most {MAX_CONNECTIONS} go")
         records = _Stretch(self._descriptor, self._index, self._size)
         found = {}
         try:

@@ -73,7 +73,7 @@ class Recording:
     Raises
     ------
     BagSoundError
-        The file is no whole bag, or does not hold that port.
+        The file is not a whole bag, or does not hold that port.
     """
 
     def __init__(

@@ -121,6 +121,19 @@ def test_a_clean_end_keeps_a_stop_does_not_and_whoever_asks_for_an_input_begins_
         rospy.delete_param(f"/{NAME}/keep")
 
 
+def test_the_parameter_names_setups_only(graph: Graph, tmp_path: Path) -> None:
+    """Others can set it: it must not make a start-up file of the user's shell, say."""
+    file = tmp_path / ".bash_profile"
+    rospy.set_param(f"/{NAME}/keep", str(file))
+    try:
+        done = graph.run("rosAFE-ros", "-i", NAME, check=False)
+    finally:
+        rospy.delete_param(f"/{NAME}/keep")
+    assert (done.returncode, done.stderr.count("\n")) == (1, 1)
+    assert f"ROS parameter /{NAME}/keep: expected FILE.yaml, got '{file}'" in done.stderr
+    assert not file.exists()
+
+
 def test_what_cannot_be_read_is_told_and_left_alone(graph: Graph, tmp_path: Path) -> None:
     file = tmp_path / "tree.yaml"
     for text, what in (("processors:\n  a: {kind: x}\n", "line 2"), ("\x00", "not YAML")):
