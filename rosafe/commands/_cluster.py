@@ -4,12 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import multiprocessing
 import os
 import queue
+import shlex
+import sys
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from rosafe.commands import Failure
@@ -20,6 +24,7 @@ from rosafe.version import VERSION
 LOCAL = "local"
 AHEAD = 8  # pieces of work that are with the scheduler, for each thread of its workers
 CONNECT_SECONDS = 10
+MAX_STARTS = 3  # of a worker process that dies before it is ready
 
 
 def run_on(
@@ -36,7 +41,8 @@ def run_on(
     there is no scheduler, or no longer.
     """
     with ExitStack() as stack:
-        client = _client(address, min(jobs, len(works)), stack)
+        dead: list[str] = []
+        client = _client(address, min(jobs, len(works)), stack, dead)
         waiting = enumerate(works)
         ended: queue.SimpleQueue[int] = queue.SimpleQueue()
         running: dict[int, Any] = {}
@@ -44,6 +50,8 @@ def run_on(
         left = len(works)
         while left:
             signals.check()
+            if dead:
+                raise Failure(f"--dask {address}: {dead[0]}; --jobs {jobs} does the work without Dask")
             if client.status not in ("running", "connecting"):
                 raise Failure(f"the Dask scheduler at {address} is gone; --resume goes on where this ended")
             room = max(AHEAD * sum(client.nthreads().values()), AHEAD) - len(running) if not ended.qsize() else 0
@@ -67,30 +75,80 @@ def _taken(ended: queue.SimpleQueue[int]) -> Iterator[int]:
             yield ended.get_nowait()
 
 
-def _client(address: str, jobs: int, stack: ExitStack) -> Any:
-    from distributed import Client, LocalCluster
+def _client(address: str, jobs: int, stack: ExitStack, dead: list[str]) -> Any:
+    """Connect to the scheduler; for a local one, `dead` gets a line if its workers cannot be started."""
+    from distributed import Client
 
-    for name in [name for name in logging.root.manager.loggerDict if name.partition(".")[0] == "distributed"]:
-        logging.getLogger(name).setLevel(logging.CRITICAL)  # what goes wrong is told in one line each
-    if address == LOCAL:  # TLS with keys of its own: a Dask worker does what anybody asks it who can connect
-        cluster: Any = stack.enter_context(
-            LocalCluster(
-                n_workers=jobs,
-                threads_per_worker=1,
-                processes=True,
-                host="127.0.0.1",
-                dashboard_address=None,
-                local_directory=stack.enter_context(tempfile.TemporaryDirectory(prefix="rosafe-dask-")),
-                security=True,
-                silence_logs=logging.CRITICAL,
-            )
-        )
-        return stack.enter_context(Client(cluster))
+    # Dask logs errors under the names of its modules and of their callers; each failure is reported in one line instead.
+    for name in ["", *(name for name in logging.root.manager.loggerDict if name.partition(".")[0] == "distributed")]:
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+    if address == LOCAL:
+        return stack.enter_context(Client(_local_cluster(jobs, stack, dead)))
     try:
         return stack.enter_context(Client(address, timeout=CONNECT_SECONDS, set_as_default=False))
     except (OSError, ValueError, TypeError) as problem:  # the two latter: an address that is none
         why = str(problem).partition("\n")[0]
         raise Failure(f"--dask {address}: no Dask scheduler answers there ({why})") from None
+
+
+def _local_cluster(jobs: int, stack: ExitStack, dead: list[str]) -> Any:
+    """Start a scheduler and, without waiting for them, `jobs` worker processes on this machine."""
+    from distributed import LocalCluster, Nanny
+    from distributed.core import Status
+
+    class LimitedNanny(Nanny):  # type: ignore[misc]
+        """Gives up a worker that dies `MAX_STARTS` times before it is ready; Dask would restart it without end."""
+
+        failed_starts = 0
+        last_exit = ""
+
+        def _on_worker_exit_sync(self, exitcode: int) -> None:
+            self.last_exit = f"signal {-exitcode}" if exitcode < 0 else f"exit code {exitcode}"
+            super()._on_worker_exit_sync(exitcode)
+
+        async def instantiate(self) -> Any:
+            if self.failed_starts >= MAX_STARTS:
+                dead.append(
+                    f"a worker process ended {MAX_STARTS} times at its start, the last time with {self.last_exit}"
+                )
+                return Status.failed
+            self.failed_starts += 1
+            status = await super().instantiate()
+            if status == Status.running:
+                self.failed_starts = 0
+            return status
+
+    folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="rosafe-dask-"))
+    _import_nothing_from_the_working_directory(folder)
+    # TLS with keys of its own: a Dask worker executes what anyone sends who can connect to it.
+    cluster = LocalCluster(
+        n_workers=0,
+        threads_per_worker=1,
+        processes=True,
+        worker_class=LimitedNanny,
+        host="127.0.0.1",
+        dashboard_address=None,
+        local_directory=folder,
+        security=True,
+        silence_logs=logging.CRITICAL,
+    )
+    stack.enter_context(cluster)
+    cluster.scale(jobs)
+    return cluster
+
+
+def _import_nothing_from_the_working_directory(folder: str) -> None:
+    """Have Python processes that are started from here search no modules in the working directory, which may be data.
+
+    The `folder` is private to this process.
+    """
+    if sys.version_info >= (3, 11):
+        os.environ["PYTHONSAFEPATH"] = "1"
+    else:
+        python = Path(folder, "python")
+        python.write_text(f'#!/bin/sh\nexec {shlex.quote(sys.executable)} -I "$@"\n', "utf-8")
+        python.chmod(0o700)
+        multiprocessing.set_executable(str(python))
 
 
 def _attempt(work: Work, failures: tuple[type[Exception], ...], version: str) -> Report:

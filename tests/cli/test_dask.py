@@ -65,3 +65,29 @@ def test_no_scheduler(tmp_path: Path) -> None:
     done = rosafe("process", "corpus", "-o", "out", *OPTIONS, "--dask", "tcp://127.0.0.1:1", cwd=tmp_path)
     refused(done, "--dask tcp://127.0.0.1:1: no Dask scheduler answers there")
     assert not (tmp_path / "out").exists()
+
+
+def test_workers_import_nothing_from_the_corpus(tmp_path: Path) -> None:
+    """A folder of sounds is data, even if it is the working directory and holds Python files."""
+    sounds = corpus(tmp_path, 2)
+    for name in ("struct", "random", "numpy", "rosafe", "sitecustomize"):
+        (tmp_path / f"{name}.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'a').write({name!r})\n")
+    done = rosafe("process", ".", "-o", "out", *OPTIONS, "--dask", "local", cwd=tmp_path)
+    assert done.returncode == 0, done
+    assert_results(tmp_path / "out", sounds)
+    assert not (tmp_path / "ran").exists()
+
+
+def test_workers_that_die_at_their_start_end_the_run(tmp_path: Path) -> None:
+    corpus(tmp_path / "corpus", 2)
+    (tmp_path / "site").mkdir()
+    (tmp_path / "site" / "sitecustomize.py").write_text(
+        "import os, sys\n"
+        "if 'spawn_main' in ' '.join(sys.orig_argv):\n"
+        f"    open({str(tmp_path / 'starts')!r}, 'a').write('x')\n"
+        "    os._exit(3)\n"
+    )
+    arguments = ("process", "corpus", "-o", "out", *OPTIONS, "--dask", "local", "--jobs", "1")
+    done = rosafe(*arguments, cwd=tmp_path, PYTHONPATH=str(tmp_path / "site"))
+    refused(done, "--dask local: a worker process ended 3 times at its start", "exit code 3")
+    assert (tmp_path / "starts").read_text() == "xxx"
