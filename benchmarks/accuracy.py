@@ -249,7 +249,7 @@ def hair_cells() -> Iterator[Row]:
             x = noise(1500, rows=(2, 2))
             envelope = np.abs(noise(1500, seed=2, rows=(2, 2))) + np.abs(x)
             stage = InnerHairCell(rate, ihc_method=method)
-            got = stage.process(x, envelope if stage.needs else None)
+            got = stage.process(x, envelope if stage.required_extra else None)
             exact = truth.hair_cell(method, x.astype(truth.Long), envelope.astype(truth.Long), rate)
             error = max(error, of_peak(got, exact))
         yield Row(f"ihc: {method}", "80 bits", "peak", 1e-13, error)

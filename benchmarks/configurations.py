@@ -131,7 +131,7 @@ def _prepared(case: Case) -> tuple[Callable[[np.ndarray], Any], np.ndarray]:
     stage = STAGES[case.kind](case.rate, **case.parameters)
     shape = (2, case.block) if case.kind == "gammatone" else (2, case.channels, case.block)
     block = np.random.default_rng(0).standard_normal(shape)
-    if isinstance(stage, InnerHairCell) and stage.needs:
+    if isinstance(stage, InnerHairCell) and stage.required_extra:
         hair_cell, envelope = stage, np.abs(block)
         return lambda block: hair_cell.process(block, envelope), block
     return stage.process, block
@@ -197,9 +197,9 @@ def _through(stages: dict[str, Stage], block: Any) -> None:
     taken = block
     hair_cell, filterbank = stages["ihc"], stages["gammatone"]
     assert isinstance(hair_cell, InnerHairCell) and isinstance(filterbank, Filterbank)
-    filterbank.provide = frozenset({hair_cell.needs} - {""})
+    filterbank.provide = frozenset({hair_cell.required_extra} - {""})
     for kind, stage in stages.items():
-        envelope = filterbank.provided.get(hair_cell.needs)
+        envelope = filterbank.provided.get(hair_cell.required_extra)
         out: Any = hair_cell.process(taken, envelope) if stage is hair_cell else stage.process(taken)
         if kind in ("input", "preProc", "gammatone", "ihc"):
             taken = out

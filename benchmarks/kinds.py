@@ -39,8 +39,8 @@ def _blocks(kind: str, block: int) -> list[tuple[np.ndarray, ...]]:
         above.insert(0, parent)
     stages: list[Stage] = []
     for one in above:
-        stages.append(STAGES[one](stages[-1].output if stages else RATE, **_values(one)))
-    needs = STAGES[kind](stages[-1].output).needs
+        stages.append(STAGES[one](stages[-1].output_format if stages else RATE, **_values(one)))
+    needs = STAGES[kind](stages[-1].output_format).required_extra
     stages[-1].provide = frozenset({needs} - {""})
     signal, taken = sound(), []
     for first in range(0, signal.shape[1], block):
@@ -57,7 +57,7 @@ def _values(kind: str) -> dict[str, Any]:
 
 def _given(kind: str) -> Any:
     parent = KINDS[kind].parent
-    return STAGES[parent](_given(parent), **_values(parent)).output if parent else RATE
+    return STAGES[parent](_given(parent), **_values(parent)).output_format if parent else RATE
 
 
 def one(kind: str, rounds: int) -> dict[str, float]:

@@ -66,20 +66,20 @@ class _Trial:
             line.insert(0, STAGES[parent])
         made = [line[0](self.sample_rate, **({"in_doNormalize": False} if len(line) > 1 else self.parameters))]
         for stage in line[1:]:
-            made.append(stage(made[-1].output, **(self.parameters if stage is self.kind else {})))
+            made.append(stage(made[-1].output_format, **(self.parameters if stage is self.kind else {})))
         return made
 
     def run(self, sound: FloatArray, sizes: Sequence[int], stages: list[Stage] | None = None) -> list[FloatArray]:
         """The parts of the output, joined."""
         stages = stages or self.stages()
         for parent, child in itertools.pairwise(stages):
-            parent.provide = frozenset({child.needs} - {""})
+            parent.provide = frozenset({child.required_extra} - {""})
         pieces, at, turn = [], 0, 0
         while at < sound.shape[-1] or turn < len(sizes):
             size = sizes[turn % len(sizes)]
             data: Any = stages[0].process(sound[:, at : at + size])
             for parent, stage in itertools.pairwise(stages):
-                data = stage.process(parts_of(data)[0], parent.provided.get(stage.needs))
+                data = stage.process(parts_of(data)[0], parent.provided.get(stage.required_extra))
             pieces.append(parts_of(data))
             at, turn = at + size, turn + 1
         return [np.concatenate(arrays, axis=-1) for arrays in zip(*pieces, strict=True)]
@@ -89,13 +89,13 @@ class _Trial:
         stages = self.stages()
         rows: tuple[int, ...] = (2,)
         for stage in stages[:-1]:
-            rows, frames = stage.output_rows(rows), stage.complete(frames)
+            rows, frames = stage.output_rows(rows), stage.output_count(frames)
         last = stages[-1]
         parts = self.kind.REPRESENTATION.parts
         assert len(output) == len(parts), f"{len(output)} arrays where {len(parts)} parts are declared"
         for part, wanted, array in zip(parts, last.part_rows(rows), output, strict=True):
             assert array.dtype == np.float64, f"{part.name}: {array.dtype} where float64 is wanted"
-            shape = (*wanted, last.complete(frames))
+            shape = (*wanted, last.output_count(frames))
             assert array.shape == shape, f"{part.name}: shape {array.shape} where {shape} is said to come"
             assert len(shape) == len(part.axes), f"{part.name}: shape {shape} does not fit the axes {part.axes}"
             assert np.isfinite(array).all(), f"{part.name}: there are numbers that are not finite"
@@ -131,7 +131,7 @@ class _Trial:
             except ValueError:
                 continue  # what is told of a stage need not be what can be set
         one, other = (self.run(sound[:, half:], [half], stages) for stages in (touched, left))
-        _assert_equal(one, other, "a change of a shallow copy alters the stage: _build must make new objects")
+        _assert_equal(one, other, "a change of a shallow copy alters the stage: build must make new objects")
         for stage in touched:
             stage.reset()
         _assert_equal(

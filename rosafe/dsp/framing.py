@@ -176,11 +176,11 @@ class FramedStage(Stage):
     have started anyway.
     """
 
-    PREFIX: ClassVar[str]  # of the three parameters of `frame_parameters`
+    prefix: ClassVar[str]  # of the three parameters of `frame_parameters`
 
-    def __init__(self, given: Signal | float, **parameters: Any) -> None:
+    def __init__(self, input_format: Signal | float, **parameters: Any) -> None:
         self._buffer = FrameBuffer()
-        super().__init__(given, **parameters)
+        super().__init__(input_format, **parameters)
 
     def frame(self, frames: FloatArray) -> FloatArray:
         """What comes out for `frames` (..., F, w), which are not windowed yet (see `window`): (..., F)."""
@@ -191,22 +191,23 @@ class FramedStage(Stage):
         """The window (w,) in force."""
         return self._framing.window
 
-    def process(self, block: FloatArray, extra: FloatArray | None = None) -> Output:
+    def process(self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None) -> Output:
         frames = self._framing.frames(self._buffer.append(limited(self._checked(block))))
         output = np.ascontiguousarray(self.frame(frames), np.float64)
         self._buffer.drop(frames.shape[-2] * self._framing.hop)
         return output
 
-    def complete(self, count: int) -> int:
+    def output_count(self, count: int) -> int:
         return self._framing.complete(count)
 
-    def _output(self) -> Signal:
+    @cached_property
+    def output_format(self) -> Signal:
         return replace(
-            self.given,
-            rate=self.given.rate / self._framing.hop,
+            self.input_format,
+            rate=self.input_format.rate / self._framing.hop,
             framed=True,
-            hop=self._framing.hop * self.given.hop,
-            window=(len(self._framing.window) - 1) * self.given.hop + self.given.window,
+            hop=self._framing.hop * self.input_format.hop,
+            window=(len(self._framing.window) - 1) * self.input_format.hop + self.input_format.window,
         )
 
     def reset(self) -> None:
@@ -233,5 +234,5 @@ class FramedStage(Stage):
         history, room = buffer.advance(arriving, count * hop)
         return kernels.Frames(history, block, room, skip, weights, hop, count, position)
 
-    def _build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
-        self._framing = Framing.design(self.given.rate, self.PREFIX, values)
+    def build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
+        self._framing = Framing.design(self.input_format.rate, self.prefix, values)

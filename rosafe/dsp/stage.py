@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import copy
+import inspect
 from collections.abc import Collection, Mapping, Sequence
+from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
@@ -13,6 +15,7 @@ from rosafe.vocabulary.representation import Representation
 
 from . import kernels, memory
 from .guard import FloatArray
+from .old_names import OldNames
 from .signal import Signal
 
 SAMPLE_RATE = Parameter(
@@ -22,36 +25,35 @@ FLOAT64 = np.dtype(np.float64)
 Output = FloatArray | tuple[FloatArray, ...]  # a tuple where the representation has several parts
 
 
-class Stage:
+class Stage(OldNames):
     """One processor of the chain: blocks in, blocks out, state kept between.
 
-    A representation is a subclass with its declaration. It implements `_build`, `process`, `reset`, and what differs
-    from the defaults here of `output_rows`, `_output`, `complete`, `look_ahead`, `needs`, `blocks_matter`.
+    A representation is a subclass with its declaration. It implements `build`, `process`, `reset`, and what differs
+    from the defaults here of `output_rows`, `output_format`, `output_count`, `look_ahead`, `required_extra`,
+    `input_format_changed`, `state_size`, `blocks_matter`.
 
-    The rule for every stage: `_build`, and so `configure` and `receive`, puts new objects in the place of what it
+    The rule for every stage: `build`, and so `configure` and `receive`, puts new objects in the place of what it
     changes (filters, framings, tables) and never alters those that are there. A shallow copy of a stage is therefore a
     second one that may be configured while the first one works; the tree tries changes on such copies, and may throw
     them away or put them to work with the state as it is then.
 
     Parameters
     ----------
-    given : Signal or float
-        The format of the blocks that will come, or the sample rate (Hz) of sound.
+    input_format : Signal or float
+        The format of the blocks that `process` gets, or the sample rate (Hz) of sound.
     **parameters
         By their declared names; what is not given has its default.
 
     Attributes
     ----------
-    given, output : Signal
-        The formats of what comes and of what `process` returns.
+    input_format : Signal
+        The format of the blocks that `process` gets.
+    values : dict of str to object
+        The checked value of each parameter, by its name.
     provide : frozenset of str
-        Which of `PROVIDES` whoever hangs on it needs; `process` leaves these in `provided`.
+        Which of `EXTRAS` the children need; `process` stores these in `provided`.
     provided : dict of str to ndarray
-        Of the last block.
-    place : ndarray or None
-        Where whoever drives it wants the output for the next block, if it fits: (..., N) with rows evenly apart, each
-        in one piece. A stage that cannot write there returns another array, as always. Where the stage `OVERWRITES`, it
-        may be the block that comes: what would be written to other memory stays in the cache.
+        The extras of the last block.
 
     Raises
     ------
@@ -61,22 +63,26 @@ class Stage:
 
     REPRESENTATION: ClassVar[Representation]
     INPUT: ClassVar[tuple[str, ...]] = ("ear", "channel", "time")  # axes of the blocks that come
-    PROVIDES: ClassVar[tuple[str, ...]] = ()  # by-products that children may need, such as the envelope
-    OVERWRITES: ClassVar[bool] = False  # `place` may be the block that comes
+    EXTRAS: ClassVar[tuple[str, ...]] = ()  # by-products that children may need, such as the envelope
+    OVERWRITES: ClassVar[bool] = False  # `out` may be the input block
+    TAKES_OUT: ClassVar[bool]  # whether `process` has the argument `out`; determined when the class is created
     APART: ClassVar[bool] = False  # what it makes of a channel depends on no other one, not even in the last bit
 
-    def __init__(self, given: Signal | float, **parameters: Any) -> None:
-        if not isinstance(given, Signal):
-            given = Signal.sound(SAMPLE_RATE.check(given))
-        self.given = given
+    def __init_subclass__(cls, **arguments: Any) -> None:
+        super().__init_subclass__(**arguments)
+        cls.TAKES_OUT = "out" in inspect.signature(cls.process).parameters
+
+    def __init__(self, input_format: Signal | float, **parameters: Any) -> None:
+        if not isinstance(input_format, Signal):
+            input_format = Signal.sound(SAMPLE_RATE.check(input_format))
+        self.input_format = input_format
         self.provide: frozenset[str] = frozenset()
         self.provided: dict[str, FloatArray] = {}
-        self.place: FloatArray | None = None
         declared = self.REPRESENTATION.parameters
-        self._values = {parameter.name: parameter.check(parameter.default) for parameter in declared}
-        self._values = self._with(parameters)
-        self._build(self._values, frozenset(self._values))
-        self.output = self._output()
+        self.values = {parameter.name: parameter.check(parameter.default) for parameter in declared}
+        self.values = self._with(parameters)
+        self.build(self.values, frozenset(self.values))
+        self._follow()
 
     @classmethod
     def in_force(cls, values: Mapping[str, Any]) -> dict[str, Any]:
@@ -104,21 +110,26 @@ class Stage:
     @property
     def sample_rate(self) -> float:
         """Of the sound (Hz)."""
-        return self.given.sample_rate
+        return self.input_format.sample_rate
 
     @property
     def parameters(self) -> dict[str, Any]:
         """The values in force, in the order of the component's parameter structure."""
-        return dict(self._values)
+        return dict(self.values)
 
     @property
     def derived(self) -> dict[str, Any]:
         """The values of the representation's `derived`, by name."""
         return {}
 
+    @cached_property
+    def output_format(self) -> Signal:
+        """The format of what `process` returns; follows from `input_format` and `values`, and is updated after them."""
+        return self.input_format
+
     @property
-    def needs(self) -> str:
-        """Which of the parent's by-products `process` must be given with each block; empty for none."""
+    def required_extra(self) -> str:
+        """Which of the parent's `EXTRAS` `process` gets with each block; empty for none."""
         return ""
 
     @property
@@ -146,12 +157,9 @@ class Stage:
         """
         return 0
 
-    def complete(self, count: int) -> int:
-        """How many samples or frames it will have put out when `count` have come since the start."""
+    def output_count(self, count: int) -> int:
+        """The number of samples or frames returned after `count` samples or frames of input since the start."""
         return max(0, count - self.look_ahead)
-
-    def _output(self) -> Signal:
-        return self.given
 
     # --- changes ----------------------------------------------------------------------------------------------
 
@@ -161,7 +169,7 @@ class Stage:
         A parameter that is set counts as changed even where it had the value already, as in the original.
         Which states start anew is said by each stage.
         """
-        self.become(self.given, [changes])
+        self.become(self.input_format, [changes])
 
     def receive(self, given: Signal) -> None:
         """From now on blocks have the format `given`: the parent has changed. A ValueError changes nothing."""
@@ -169,34 +177,36 @@ class Stage:
 
     def become(self, given: Signal, changes: Collection[Mapping[str, Any]]) -> None:
         """`receive` and one `configure` after the other, at once: only what comes of it all must be possible."""
-        if given == self.given and not any(changes):
-            self.given = given
+        if given == self.input_format and not any(changes):
+            self.input_format = given
             return
         tried = copy.copy(self)
-        tried.given = given
+        tried.input_format = given
         changed: set[str] = set()
         for change in changes:
-            tried._values = tried._with(change)
+            tried.values = tried._with(change)
             changed.update(self._parameter(name).name for name in change)
-        if given != self.given:
-            tried._received(self.given)
+        if given != self.input_format:
+            tried.input_format_changed(self.input_format)
         if changed:
-            tried._build(tried._values, frozenset(changed))
+            tried.build(tried.values, frozenset(changed))
         tried._follow()
         self.__dict__.update(tried.__dict__)
 
-    def _received(self, before: Signal) -> None:
-        """Design anew for `given`, which was `before`; the rule of `_build` holds.
+    def input_format_changed(self, before: Signal) -> None:
+        """Design again for `input_format`, which was `before`; the rule of `build` holds.
 
-        Where nothing depends on the format there is nothing to do; blocks of other rows are noticed by `process`.
+        Override it if something that `build` computes depends on the format. A change of the number of rows is noticed
+        by `process` alone.
         """
 
     def _follow(self) -> None:
-        output = self._output()
-        if output != self.output:
-            self.output = output
+        """Compute `output_format` again. An equal one remains the same object, which is quick to compare."""
+        before = self.__dict__.pop("output_format", None)
+        if self.output_format == before:
+            self.__dict__["output_format"] = before
 
-    def _build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
+    def build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
         """Design for `values` and drop the states that the `changed` ones invalidate; ValueError before any effect.
 
         New objects replace the old ones: see the rule above.
@@ -217,29 +227,44 @@ class Stage:
             raise ValueError(f"{name}: {type(self).__name__} has no such parameter") from None
 
     def _merge(self, checked: dict[str, Any]) -> dict[str, Any]:
-        return {**self._values, **checked}
+        return {**self.values, **checked}
 
     # --- blocks -----------------------------------------------------------------------------------------------
 
-    def process(self, block: FloatArray, extra: FloatArray | None = None) -> Output:
-        """The output for the next block, (..., N) of numbers: a contiguous float64 array, or one for each part.
+    def process(self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None) -> Output:
+        """Compute the output for the next block.
 
-        They are fresh, but for `place`.
+        Parameters
+        ----------
+        block : ndarray, (..., N)
+            The parent's output. It must not be modified, except if it is `out`.
+        extra : ndarray, optional
+            The parent's by-product of the same block that `required_extra` names.
+        out : ndarray, (..., M), optional
+            Where the caller wants the output: evenly strided rows, each contiguous. It may be ignored. It can be
+            `block` if the stage `OVERWRITES`: then the output stays in the cache. A stage whose `process` does not
+            have this argument is called without it.
 
-        The input is not modified, but where it is `place`. `extra` is what `needs` names, of the same block. ValueError
-        for another shape or type.
+        Returns
+        -------
+        ndarray, (..., M), or tuple of ndarray
+            A new contiguous float64 array, or one for each part; or `out`.
+
+        Raises
+        ------
+        ValueError
+            For blocks of another shape or type.
         """
         raise NotImplementedError
 
     def reset(self) -> None:
         """Back to the state before the first block; parameters stay."""
 
-    def _room(self, shape: tuple[int, ...]) -> FloatArray:
-        """Where to write an output of this shape: into `place`, if that is one for it."""
-        place, self.place = self.place, None
-        if place is None or place.shape != shape or place.dtype != FLOAT64 or not kernels.rows_apart(place):
+    def _room(self, shape: tuple[int, ...], out: FloatArray | None = None) -> FloatArray:
+        """`out` if it is suitable for an output of this shape, otherwise a new array."""
+        if out is None or out.shape != shape or out.dtype != FLOAT64 or not kernels.rows_apart(out):
             return memory.empty(shape)
-        return place
+        return out
 
     def _checked(self, block: Any) -> FloatArray:
         """`block` as contiguous float64 of the right shape, or ValueError."""

@@ -164,7 +164,7 @@ class Chain:
                 made.append(self._tree.add_input(kind, self._source, 0, 0.0, 0.0, mine))
             elif kind == FILTERBANK and divided:
                 (above,) = self._processors[parent]
-                frequencies = STAGES[kind](above.signal, **mine).output.center_frequencies
+                frequencies = STAGES[kind](above.signal, **mine).output_format.center_frequencies
                 for share in _shares(frequencies, branches):
                     made.append(self._tree.add(kind, f"{kind} {len(made)}", parent, {**mine, "fb_cfHz": share}))
             else:
@@ -188,10 +188,12 @@ class Chain:
     def write_into(self, kind: str, branch: int, place: Callable[[int], np.ndarray | None]) -> None:
         """Let the stage of a `kind` that nothing hangs on write where `place` says for so many frames, if it can.
 
-        Stages that put out frames cannot, and are not asked.
+        Stages that return frames, and those that do not take `out`, cannot, and are not asked.
         """
         processor = self._processors[kind][branch]
-        if not processor.signal.framed and not processor.children:  # children take blocks in one piece
+        if (
+            processor.stage.TAKES_OUT and not processor.signal.framed and not processor.children
+        ):  # children take blocks in one piece
             processor.place = lambda taken: place(taken.data.shape[-1])
 
     def observe(self, observer: Observer) -> None:
@@ -239,7 +241,9 @@ class Chain:
 
     def _count(self, processor: Processor, frames: int) -> int:
         """How many frames it puts out for so many of the signal."""
-        return processor.stage.complete(frames if processor.parent is None else self._count(processor.parent, frames))
+        return processor.stage.output_count(
+            frames if processor.parent is None else self._count(processor.parent, frames)
+        )
 
     def times(self, kind: str, frames: int) -> np.ndarray:
         """The middle of each frame of an output (s), for a signal of so many frames."""
@@ -309,7 +313,7 @@ def overwriting(kinds: Collection[str], outputs: Collection[str]) -> list[str]:
     return [
         kind
         for kind, parent in zip(kinds, parents, strict=True)
-        if STAGES[kind].OVERWRITES and parent not in outputs and parents.count(parent) == 1
+        if STAGES[kind].OVERWRITES and STAGES[kind].TAKES_OUT and parent not in outputs and parents.count(parent) == 1
     ]
 
 

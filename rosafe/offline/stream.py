@@ -82,20 +82,22 @@ class Stream:
 
     def _comes_to(self, kind: str, stages: Mapping[str, Stage]) -> Signal | float:
         parent = stages.get(KINDS[kind].parent)
-        return self._rate if parent is None else parent.output
+        return self._rate if parent is None else parent.output_format
 
     def _put_to_work(self, stages: dict[str, Stage]) -> None:
         """Let these stages stand in the place of those that there are; ValueError where they would fill the memory."""
         rows: dict[str, tuple[int, ...]] = {"": (2,)}
         for kind, stage in stages.items():
             above = KINDS[kind].parent
-            if stage.needs and stage.needs not in stages[above].PROVIDES:
-                raise ValueError(f"{kind} needs the {stage.needs} of {above}, which has none")
+            if stage.required_extra and stage.required_extra not in stages[above].EXTRAS:
+                raise ValueError(f"{kind} needs the {stage.required_extra} of {above}, which has none")
             sizes.check_stage(stage, rows[above], 0.0)
             rows[kind] = stage.output_rows(rows[above])
         for kind, stage in stages.items():
             stage.provide = frozenset(
-                child.needs for name, child in stages.items() if child.needs and KINDS[name].parent == kind
+                child.required_extra
+                for name, child in stages.items()
+                if child.required_extra and KINDS[name].parent == kind
             )
         self._stages = stages
         self._rows = rows
@@ -140,21 +142,21 @@ class Stream:
         times: dict[Any, np.ndarray] = {}  # most outputs have those of another one
         results: dict[str, Any] = {}
         for kind, above, stage, over, axes in self._plan:
+            data, required = made[above], stage.required_extra
+            extra = self._stages[above].provided[required] if required else None
             if over:
-                stage.place = made[above]
-            if stage.needs:
-                parts = parts_of(stage.process(made[above], self._stages[above].provided[stage.needs]))
+                parts = parts_of(stage.process(data, extra, data))
             else:
-                parts = parts_of(stage.process(made[above]))
+                parts = parts_of(stage.process(data, extra) if required else stage.process(data))
             made[kind] = parts[0]
             if not axes:
                 continue
             for (name, along), data in zip(axes, parts, strict=True):
                 results[name] = of_ears(self._ears, along, data)
-            first, count, hop = self._next[kind], parts[0].shape[-1], stage.output.hop
-            key = first, count, hop, stage.output.window
+            first, count, hop = self._next[kind], parts[0].shape[-1], stage.output_format.hop
+            key = first, count, hop, stage.output_format.window
             if key not in times:
-                times[key] = frame_times(stage.output, first, count)
+                times[key] = frame_times(stage.output_format, first, count)
             results[f"{kind}_time"] = times[key]
             self._next[kind] = first + count * hop
         return results
@@ -262,8 +264,8 @@ class Stream:
             for name in KINDS[kind].coordinates:
                 words = any(isinstance(value, str) for value in known[name])
                 described[name] = list(known[name]) if words else np.array(known[name], np.float64)
-            if stage.output.framed and kind in self._next:
-                described[f"{kind}_frameRate"] = stage.output.rate
+            if stage.output_format.framed and kind in self._next:
+                described[f"{kind}_frameRate"] = stage.output_format.rate
         parts = {name: part for kind in self._next for name, part in KINDS[kind].outputs.items()}
         return {
             "sample_rate": self._rate,

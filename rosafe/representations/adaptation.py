@@ -108,7 +108,7 @@ class Adaptation(Stage):
 
     _state: FloatArray | None  # (n, 2, C); None is rest
 
-    def process(self, block: FloatArray, extra: FloatArray | None = None) -> FloatArray:
+    def process(self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None) -> FloatArray:
         samples = self._checked(block)
         loops, channels = self._loops, samples.shape[1]
         if len(loops.thresholds) not in (1, channels):
@@ -132,8 +132,8 @@ class Adaptation(Stage):
     def reset(self) -> None:
         self._state = None
 
-    def _received(self, before: Signal) -> None:
-        self._build(self._values, frozenset())
+    def input_format_changed(self, before: Signal) -> None:
+        self.build(self.values, frozenset())
 
     def _merge(self, checked: dict[str, Any]) -> dict[str, Any]:
         return self.in_force(super()._merge(checked))
@@ -144,18 +144,20 @@ class Adaptation(Stage):
         published = SETS.get(values["adpt_model"], {})
         return {**values, **{name: parameter(name).check(value) for name, value in published.items()}}
 
-    def _build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
+    def build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
         threshold = np.array([values["adpt_mindB"]])
         if values["adpt_model"] == TERHARDT:
-            if not self.given.center_frequencies:
+            if not self.input_format.center_frequencies:
                 raise ValueError(f"adpt_model: {TERHARDT} needs channels of known frequencies")
-            threshold = np.minimum(hearing_threshold(np.array(self.given.center_frequencies)), GREATEST_THRESHOLD_DB)
+            threshold = np.minimum(
+                hearing_threshold(np.array(self.input_format.center_frequencies)), GREATEST_THRESHOLD_DB
+            )
         self._loops = Loops.design(
             self.sample_rate,
             threshold,
             values["adpt_tau"],
             values["adpt_lim"],
-            DRNL_FACTOR if self.given.filterbank == "drnl" else 0.0,
+            DRNL_FACTOR if self.input_format.filterbank == "drnl" else 0.0,
         )
         self._state = None
 

@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -132,7 +133,7 @@ class AmsFeatures(FramedStage):
         request="ModulationProc",
         port_doc="Amplitude modulation spectrograms, [filter][channel][frame]",
     )
-    PREFIX = "ams"
+    prefix = "ams"
 
     _decimation: Decimation
     _filters: Parallel
@@ -143,7 +144,7 @@ class AmsFeatures(FramedStage):
 
     @property
     def parameters(self) -> dict[str, Any]:
-        return self.in_force(self._values)
+        return self.in_force(self.values)
 
     def output_rows(self, rows: tuple[int, ...]) -> tuple[int, ...]:
         return (*rows, len(self._frequencies))
@@ -152,10 +153,10 @@ class AmsFeatures(FramedStage):
         filters = len(self._frequencies) if self._triangles is None else 1
         return 2 * math.prod(rows) * filters * len(self.window)  # in a store of up to twice as many
 
-    def complete(self, count: int) -> int:
+    def output_count(self, count: int) -> int:
         return self._framing.complete(-(-count // self._decimation.ratio))
 
-    def process(self, block: FloatArray, extra: FloatArray | None = None) -> FloatArray:
+    def process(self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None) -> FloatArray:
         samples = self._decimation.process(self._checked(block))
         if self._triangles is not None:
             return self._by_spectra(limited(samples), self._triangles)
@@ -192,21 +193,22 @@ class AmsFeatures(FramedStage):
         self._decimation = Decimation(self._decimation.ratio)
         self._filters = Parallel(self._filters.sections)
 
-    def _output(self) -> Signal:
+    @cached_property
+    def output_format(self) -> Signal:
         ratio = self._decimation.ratio
         return replace(
-            self.given,
-            rate=self.given.rate / ratio / self._framing.hop,
+            self.input_format,
+            rate=self.input_format.rate / ratio / self._framing.hop,
             framed=True,
-            hop=self._framing.hop * ratio * self.given.hop,
-            window=len(self._framing.window) * ratio * self.given.hop,
+            hop=self._framing.hop * ratio * self.input_format.hop,
+            window=len(self._framing.window) * ratio * self.input_format.hop,
         )
 
-    def _received(self, before: Signal) -> None:
-        self._build(self._values, frozenset(self._values))
+    def input_format_changed(self, before: Signal) -> None:
+        self.build(self.values, frozenset(self.values))
 
-    def _build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
-        rate = self.given.rate / values["ams_dsRatio"]
+    def build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
+        rate = self.input_format.rate / values["ams_dsRatio"]
         framing = design_framing(values, rate)
         frequencies = center_frequencies(values)
         triangles = sections = None

@@ -12,6 +12,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -84,7 +85,7 @@ class Autocorrelation(FramedStage):
         coordinates=("ac_lags",),
         port_doc="Autocorrelations, [lag][channel][frame]",
     )
-    PREFIX = "ac"
+    prefix = "ac"
     APART = True
 
     @property
@@ -94,8 +95,8 @@ class Autocorrelation(FramedStage):
     def output_rows(self, rows: tuple[int, ...]) -> tuple[int, ...]:
         return (*rows, self._lags)
 
-    def process(self, block: FloatArray, extra: FloatArray | None = None) -> FloatArray:
-        samples, values = self._checked(block), self._values
+    def process(self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None) -> FloatArray:
+        samples, values = self._checked(block), self.values
         clipping, alpha, exponent = values["ac_clipMethod"], values["ac_clipAlpha"], values["ac_K"]
         if kernels.compiled() and len(self.window) <= kernels.MOST_SIZE:
             frames = self._frames(samples, self._framing.pinned)
@@ -109,14 +110,15 @@ class Autocorrelation(FramedStage):
     def _lags(self) -> int:
         return len(self._corrections)
 
-    def _output(self) -> Signal:
-        return replace(super()._output(), lags=self._lags - 1)
+    @cached_property
+    def output_format(self) -> Signal:
+        return replace(super().output_format, lags=self._lags - 1)
 
-    def _received(self, before: Signal) -> None:
+    def input_format_changed(self, before: Signal) -> None:
         self._buffer = FrameBuffer()
 
-    def _build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
-        super()._build(values, changed)
+    def build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
+        super().build(values, changed)
         size = len(self.window)
         self._corrections = size / (size - np.arange(size - 1.0))
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -62,20 +63,21 @@ class CrossCorrelation(FramedStage):
         port_doc="Cross-correlations, [lag][channel][frame]",
         word="crosscorrelation",
     )
-    PREFIX = "cc"
+    prefix = "cc"
     APART = True
 
     @property
     def derived(self) -> dict[str, Any]:
         return {"cc_lags": (np.arange(-self._max_lag, self._max_lag + 1) / self.sample_rate).tolist()}
 
-    def _output(self) -> Signal:
-        return replace(super()._output(), lags=self._max_lag)
+    @cached_property
+    def output_format(self) -> Signal:
+        return replace(super().output_format, lags=self._max_lag)
 
     def output_rows(self, rows: tuple[int, ...]) -> tuple[int, ...]:
         return (rows[1], 2 * self._max_lag + 1)
 
-    def process(self, block: FloatArray, extra: FloatArray | None = None) -> FloatArray:
+    def process(self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None) -> FloatArray:
         samples = self._checked(block)
         reach = min(self._max_lag, len(self._framing.window) - 1)  # beyond, frames do not overlap
         if kernels.compiled() and 2 * reach + 1 <= kernels.MOST_LAGS:
@@ -93,11 +95,11 @@ class CrossCorrelation(FramedStage):
         kernels.correlations(frames, reach, EPSILON, result)
         return result
 
-    def _build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
+    def build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
         lag = values["cc_maxDelaySec"] * self.sample_rate
         if lag > MAX_SAMPLES:
             raise ValueError(f"cc_maxDelaySec: too long, {lag:.6g} samples")
-        super()._build(values, changed)
+        super().build(values, changed)
         self._max_lag = math.ceil(lag)
 
 

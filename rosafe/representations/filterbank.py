@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Collection, Mapping
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -115,7 +116,7 @@ class Filterbank(Stage):
         word="filterbank",
     )
     INPUT = ("ear", "time")
-    PROVIDES = ("envelope",)
+    EXTRAS = ("envelope",)
     APART = True
 
     _given: frozenset[str] = frozenset()  # of what follows the rate
@@ -144,14 +145,14 @@ class Filterbank(Stage):
 
     @property
     def parameters(self) -> dict[str, Any]:
-        return self.in_force(self.at_rate(self._values, self._given, self.sample_rate))
+        return self.in_force(self.at_rate(self.values, self._given, self.sample_rate))
 
     def output_rows(self, rows: tuple[int, ...]) -> tuple[int, ...]:
         return (*rows, len(self._frequencies))
 
-    def process(self, block: FloatArray, extra: FloatArray | None = None) -> FloatArray:
+    def process(self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None) -> FloatArray:
         samples = self._checked(block)
-        place = self._room((2, len(self._frequencies), samples.shape[-1]))
+        place = self._room((2, len(self._frequencies), samples.shape[-1]), out)
         output, envelope = self._bank.process(samples, "envelope" in self.provide, place)
         self.provided = {} if envelope is None else {"envelope": envelope}
         return output
@@ -160,9 +161,10 @@ class Filterbank(Stage):
         self._bank.reset()
         self.provided = {}
 
-    def _output(self) -> Signal:
+    @cached_property
+    def output_format(self) -> Signal:
         channels = tuple(self._frequencies.tolist())
-        return replace(self.given, center_frequencies=channels, filterbank=self._values["fb_type"])
+        return replace(self.input_format, center_frequencies=channels, filterbank=self.values["fb_type"])
 
     def _merge(self, checked: dict[str, Any]) -> dict[str, Any]:
         values = super()._merge(checked)
@@ -174,7 +176,7 @@ class Filterbank(Stage):
             values["fb_nChannels"] = 0
         return values
 
-    def _build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
+    def build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
         values = self.at_rate(values, self._given, self.sample_rate)
         frequencies = center_frequencies(values)
         if frequencies.max() >= self.sample_rate / 2:

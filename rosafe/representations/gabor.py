@@ -98,13 +98,13 @@ class Gabor(Stage):
         port_doc="Gabor features",
     )
 
-    def __init__(self, given: Signal | float, **parameters: Any) -> None:
+    def __init__(self, input_format: Signal | float, **parameters: Any) -> None:
         self._memory = Memory()
-        super().__init__(given, **parameters)
+        super().__init__(input_format, **parameters)
 
     @property
     def derived(self) -> dict[str, Any]:
-        return {"gb_nFeatures": counted(len(self.given.center_frequencies)).features}
+        return {"gb_nFeatures": counted(len(self.input_format.center_frequencies)).features}
 
     @property
     def look_ahead(self) -> int:
@@ -118,7 +118,7 @@ class Gabor(Stage):
         # of the last 5 s the features, their sums and their squares' sums; levels, in a store of up to twice as many
         return 3 * self._remembered * 2 * features + weights + 4 * 2 * REACH * math.prod(rows)
 
-    def process(self, block: FloatArray, extra: FloatArray | None = None) -> FloatArray:
+    def process(self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None) -> FloatArray:
         rates = np.maximum(self._checked(block), 0.0)
         memory, made = self._memory, patterns(rates.shape[1])
         if rates.shape[1] != memory.channels:
@@ -151,14 +151,14 @@ class Gabor(Stage):
     def reset(self) -> None:
         self._memory = Memory()
 
-    def _received(self, before: Signal) -> None:
-        if self.given.center_frequencies != before.center_frequencies:
+    def input_format_changed(self, before: Signal) -> None:
+        if self.input_format.center_frequencies != before.center_frequencies:
             self._memory = Memory()
-        self._build(self._values, frozenset())
+        self.build(self.values, frozenset())
 
-    def _build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
+    def build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
         self._floor = 10 ** (-values["gb_maxDynamicRangeDB"] / 10)
-        self._remembered = max(1, round_half_away(MEMORY * self.given.rate))
+        self._remembered = max(1, round_half_away(MEMORY * self.input_format.rate))
 
 
 # --- filters ----------------------------------------------------------------------------------------------------

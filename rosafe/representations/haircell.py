@@ -87,14 +87,14 @@ class InnerHairCell(Stage):
     APART = True
 
     @property
-    def needs(self) -> str:
-        return "envelope" if self._values["ihc_method"] in ENVELOPE_METHODS else ""
+    def required_extra(self) -> str:
+        return "envelope" if self.values["ihc_method"] in ENVELOPE_METHODS else ""
 
-    def process(self, block: FloatArray, extra: FloatArray | None = None) -> FloatArray:
+    def process(self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None) -> FloatArray:
         samples, envelope = self._checked(block), extra
-        method = self._values["ihc_method"]
+        method = self.values["ihc_method"]
         rectification = RECTIFICATION.get(method, "none")
-        if not self.needs:
+        if not self.required_extra:
             envelope = None
         elif envelope is None or np.shape(envelope) != samples.shape:
             raise ValueError(f"envelope: {method} needs one of the shape of the block")
@@ -104,7 +104,7 @@ class InnerHairCell(Stage):
             samples, envelope = self._checked(envelope), None
         if kernels.compiled():
             state = self._lowpass.started(samples.shape[:-1])
-            output = self._room(samples.shape)
+            output = self._room(samples.shape, out)
             kernels.rectify_and_filter(rectification, samples, envelope, self._lowpass.sections, state, output)
             return output
         if envelope is not None:
@@ -114,7 +114,7 @@ class InnerHairCell(Stage):
     def reset(self) -> None:
         self._lowpass.reset()
 
-    def _build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
+    def build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
         method = values["ihc_method"]
         sections = np.empty((0, 6))
         if method in LOWPASS:

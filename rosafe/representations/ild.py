@@ -31,13 +31,13 @@ class Ild(FramedStage):
         parameters=frame_parameters("ild"),
         port_doc="Interaural level differences (dB), in `left`",
     )
-    PREFIX = "ild"
+    prefix = "ild"
     APART = True
 
     def output_rows(self, rows: tuple[int, ...]) -> tuple[int, ...]:
         return rows[1:]
 
-    def process(self, block: FloatArray, extra: FloatArray | None = None) -> FloatArray:
+    def process(self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None) -> FloatArray:
         samples = self._checked(block)
         if kernels.compiled():
             frames = self._frames(samples, self._framing.weights(squared=True))

@@ -35,7 +35,7 @@ class Input(Stage):
     )
     INPUT = ("ear", "time")
 
-    def process(self, block: Any, extra: FloatArray | None = None) -> FloatArray:
+    def process(self, block: Any, extra: FloatArray | None = None, out: FloatArray | None = None) -> FloatArray:
         """(2, N) of int32 or float to (2, N); ValueError for NaN and infinities."""
         samples = self._checked(block)
         if np.asarray(block).dtype.kind == "f":  # of whole numbers, all are finite and within the limit
@@ -44,5 +44,5 @@ class Input(Stage):
             samples = limited(samples)
         return samples / self._divisor
 
-    def _build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
+    def build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
         self._divisor = float(values["in_normalizeValue"]) if values["in_doNormalize"] else 1.0

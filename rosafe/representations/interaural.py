@@ -9,6 +9,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -60,8 +61,9 @@ class _OfPeaks(Stage):
     def output_rows(self, rows: tuple[int, ...]) -> tuple[int, ...]:
         return rows[:1]
 
-    def _output(self) -> Signal:
-        return replace(self.given, lags=0)
+    @cached_property
+    def output_format(self) -> Signal:
+        return replace(self.input_format, lags=0)
 
 
 class Itd(_OfPeaks):
@@ -81,7 +83,7 @@ class Itd(_OfPeaks):
         port_doc="Interaural time differences (s), in `left`",
     )
 
-    def process(self, block: FloatArray, extra: FloatArray | None = None) -> FloatArray:
+    def process(self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None) -> FloatArray:
         correlations = self._checked(block)
         peaks = Peaks.find(correlations)
         lags = peaks.place - correlations.shape[1] // 2 + peaks.offset
@@ -105,7 +107,7 @@ class Ic(_OfPeaks):
         port_doc="Interaural coherences, in `left`",
     )
 
-    def process(self, block: FloatArray, extra: FloatArray | None = None) -> FloatArray:
+    def process(self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None) -> FloatArray:
         peaks = Peaks.find(self._checked(block))
         coherence: FloatArray = peaks.value - 0.25 * peaks.slope * peaks.offset
         return coherence

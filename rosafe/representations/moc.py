@@ -74,7 +74,7 @@ class Moc(Stage):
         port_doc="Attenuations (dB)",
     )
 
-    def process(self, block: FloatArray, extra: FloatArray | None = None) -> FloatArray:
+    def process(self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None) -> FloatArray:
         rates = self._checked(block)
         levels = 20 * np.log10(np.maximum(rates, SILENCE))
         np.minimum(np.maximum(levels, self._least, out=levels), FALL, out=levels)
@@ -86,7 +86,7 @@ class Moc(Stage):
         attenuation[rates <= 0] = 0.0
         return attenuation
 
-    def _build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
+    def build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
         for name in ("moc_extIpsi", "moc_extContra"):
             if values[name] != 1:
                 raise ValueError(f"{name}: {values[name]:.12g} is not 1, and the attenuation is not fed back")

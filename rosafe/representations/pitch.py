@@ -7,6 +7,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -87,22 +88,22 @@ class Pitch(Stage):
     _frames: FloatArray  # (2, 3, n): q, rawPitch and confidence of the last frames that have been put out, then of
     _held: int  # so many that have not
 
-    def __init__(self, given: Signal | float, **parameters: Any) -> None:
+    def __init__(self, input_format: Signal | float, **parameters: Any) -> None:
         self.reset()
-        super().__init__(given, **parameters)
+        super().__init__(input_format, **parameters)
 
     @property
     def look_ahead(self) -> int:
-        return (self._values["pi_medianOrder"] - 1) // 2
+        return (self.values["pi_medianOrder"] - 1) // 2
 
     def output_rows(self, rows: tuple[int, ...]) -> tuple[int, ...]:
         return (rows[0], 3)
 
-    def process(self, block: FloatArray, extra: FloatArray | None = None) -> FloatArray:
+    def process(self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None) -> FloatArray:
         correlations = self._checked(block)
         channels, lags = correlations.shape[1:3]
-        if lags != self.given.lags + 1:
-            raise ValueError(f"block: {lags} lags, and not {self.given.lags + 1}")
+        if lags != self.input_format.lags + 1:
+            raise ValueError(f"block: {lags} lags, and not {self.input_format.lags + 1}")
         if channels != self._channels:
             self.reset()
             self._channels = channels
@@ -110,14 +111,14 @@ class Pitch(Stage):
         lag, confidence = highest_peak(np.ascontiguousarray(summary.swapaxes(1, 2)))
         raw = np.divide(self.sample_rate, lag + self._range.start, out=np.zeros(lag.shape), where=confidence > 0)
         self._confidences, greatest = running_maximum(self._confidences, confidence, self._reach)
-        chosen = np.where(confidence < self._values["pi_confThres"] * greatest, 0.0, raw)
+        chosen = np.where(confidence < self.values["pi_confThres"] * greatest, 0.0, raw)
         return self._released(np.stack((chosen, raw, confidence), axis=1))
 
     def _released(self, arriving: FloatArray) -> FloatArray:
         """What can be put out when frames (2, 3, F) of q, rawPitch and confidence have come."""
         frames = np.concatenate((self._frames, arriving), axis=-1)
         held = self._held + arriving.shape[-1]
-        count, order = max(0, held - self.look_ahead), self._values["pi_medianOrder"]
+        count, order = max(0, held - self.look_ahead), self.values["pi_medianOrder"]
         first = frames.shape[-1] - held
         output = frames[..., first : first + count].copy()
         if count:
@@ -135,25 +136,26 @@ class Pitch(Stage):
         self._frames = np.zeros((2, 3, MOST_ORDER // 2))  # as many as the longest median wants
         self._held = 0
 
-    def _output(self) -> Signal:
-        return replace(self.given, lags=0)
+    @cached_property
+    def output_format(self) -> Signal:
+        return replace(self.input_format, lags=0)
 
-    def _received(self, before: Signal) -> None:
-        self._build(self._values, frozenset())
-        channels = (self.given.center_frequencies, self.given.filterbank)
+    def input_format_changed(self, before: Signal) -> None:
+        self.build(self.values, frozenset())
+        channels = (self.input_format.center_frequencies, self.input_format.filterbank)
         if channels != (before.center_frequencies, before.filterbank):
             self.reset()
 
-    def _build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
+    def build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
         low, high = min(values["pi_rangeHz"]), max(values["pi_rangeHz"])
-        seconds = np.arange(self.given.lags + 1) / self.sample_rate
+        seconds = np.arange(self.input_format.lags + 1) / self.sample_rate
         within = np.flatnonzero((seconds >= 1 / high) & (seconds <= 1 / low))
         if len(within) < 3:
             raise ValueError(
                 f"pi_rangeHz: {low:.12g} to {high:.12g} Hz are {len(within)} lags of the autocorrelation, wanted are 3"
             )
         self._range = slice(int(within[0]), int(within[-1]) + 1)
-        self._reach = max(1, round_half_away(MEMORY_SECONDS * self.given.rate))  # frames
+        self._reach = max(1, round_half_away(MEMORY_SECONDS * self.input_format.rate))  # frames
 
 
 def highest_peak(curves: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:

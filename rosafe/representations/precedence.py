@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -121,7 +122,7 @@ class Precedence(FramedStage):
         centred="lag",
         port_doc="Interaural time differences (s), level differences (dB) and correlations of the first wave front",
     )
-    PREFIX = "prec"
+    prefix = "prec"
 
     @property
     def derived(self) -> dict[str, Any]:
@@ -138,11 +139,13 @@ class Precedence(FramedStage):
         groups = -(-math.prod(rows) // TOGETHER) * TOGETHER
         return bins * (groups + 4)  # sums of spectra, and the tables of the transform
 
-    def process(self, block: FloatArray, extra: FloatArray | None = None) -> tuple[FloatArray, ...]:
+    def process(
+        self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None
+    ) -> tuple[FloatArray, ...]:
         samples = self._checked(block)
         channels = samples.shape[1]
         if self._running.energies.shape[1] != channels:
-            frequencies = np.array(self.given.center_frequencies)
+            frequencies = np.array(self.input_format.center_frequencies)
             known = len(frequencies) == channels
             bins, lags = self._points // 2 + 1, 2 * self._pair_reach + 1
             self._running.begin(frequencies if known else np.zeros(channels), bins, lags)
@@ -175,21 +178,22 @@ class Precedence(FramedStage):
         super().reset()
         self._running = Running()
 
-    def _output(self) -> Signal:
-        return replace(super()._output(), lags=self._max_lag)
+    @cached_property
+    def output_format(self) -> Signal:
+        return replace(super().output_format, lags=self._max_lag)
 
-    def _received(self, before: Signal) -> None:
-        self._build(self._values, frozenset())
+    def input_format_changed(self, before: Signal) -> None:
+        self.build(self.values, frozenset())
         self._buffer = FrameBuffer()
 
-    def _build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
+    def build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
         rate = self.sample_rate
         lag, first_delay = values["prec_maxDelaySec"] * rate, math.floor(0.75 * rate / 1000)
         if lag > MAX_SAMPLES:
             raise ValueError(f"prec_maxDelaySec: too long, {lag:.6g} samples")
         if first_delay < 1:
             raise ValueError(f"sample_rate: {rate:.12g} Hz is too low for precedence, which needs 1334 Hz")
-        super()._build({**values, "prec_wname": "hanning"}, changed)
+        super().build({**values, "prec_wname": "hanning"}, changed)
         self._size = len(self._framing.window)
         self._max_lag, self._pair_reach = math.ceil(lag), math.ceil(rate / 1000)
         self._first_delay, self._last_delay = first_delay, round_half_away(SECONDS * rate)

@@ -102,9 +102,9 @@ class PreProc(Stage):
 
     @property
     def blocks_matter(self) -> bool:
-        return bool(self._values["pp_bNormalizeRMS"])  # see `GainControl`
+        return bool(self.values["pp_bNormalizeRMS"])  # see `GainControl`
 
-    def process(self, block: FloatArray, extra: FloatArray | None = None) -> FloatArray:
+    def process(self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None) -> FloatArray:
         if not self._steps and self._gain == 1.0:
             return self._checked(block).copy()
         samples = limited(self._checked(block))
@@ -116,7 +116,7 @@ class PreProc(Stage):
         for step in self._steps:
             step.reset()
 
-    def _build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
+    def build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
         steps: list[Cascade | PreEmphasis | GainControl | Fir] = []
         if values["pp_bRemoveDC"]:
             cutoff = values["pp_cutoffHzDC"]

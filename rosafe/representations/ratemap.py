@@ -56,12 +56,12 @@ class Ratemap(FramedStage):
         port_aliases=("ratemapProcPort",),
         port_doc="Ratemaps",
     )
-    PREFIX = "rm"
+    prefix = "rm"
     APART = True
 
-    def process(self, block: FloatArray, extra: FloatArray | None = None) -> FloatArray:
+    def process(self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None) -> FloatArray:
         samples = self._checked(block)
-        power = self._values["rm_scaling"] == "power"
+        power = self.values["rm_scaling"] == "power"
         if not kernels.compiled():
             return self._means(self._integrator.process(limited(samples)), power)
         frames = self._frames(samples, self._framing.weights(squared=power))
@@ -72,8 +72,8 @@ class Ratemap(FramedStage):
         super().reset()
         self._integrator.reset()
 
-    def _build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
-        super()._build(values, changed)
+    def build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
+        super().build(values, changed)
         if changed & {"rm_decaySec", "rm_scaling"}:
             retention = float(np.exp(-1 / (self.sample_rate * values["rm_decaySec"])))
             self._integrator = Cascade(leaky_integrator(retention))

@@ -238,15 +238,16 @@ class SpectralFeatures(Stage):
 
     @property
     def parameters(self) -> dict[str, Any]:
-        return self.in_force(self._values)
+        return self.in_force(self.values)
 
     def output_rows(self, rows: tuple[int, ...]) -> tuple[int, ...]:
         return (rows[0], len(self._words))
 
-    def _output(self) -> Signal:
-        return replace(self.given, center_frequencies=())
+    @cached_property
+    def output_format(self) -> Signal:
+        return replace(self.input_format, center_frequencies=())
 
-    def process(self, block: FloatArray, extra: FloatArray | None = None) -> FloatArray:
+    def process(self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None) -> FloatArray:
         rates = self._checked(block)
         channels, known = rates.shape[1], len(self._frequencies)
         if not channels == known > 0:
@@ -256,7 +257,7 @@ class SpectralFeatures(Stage):
         spectra = np.minimum(np.maximum(rates, 0.0), LARGEST)
         before = spectra[..., :1].copy() if self._last is None else self._last
         self._last = spectra[..., -1:].copy()
-        bright, part = self._values["sf_brCF"], self._values["sf_roPerc"]
+        bright, part = self.values["sf_brCF"], self.values["sf_roPerc"]
         if not kernels.compiled():
             extended = np.concatenate((before, spectra), axis=-1).swapaxes(0, 1)
             of = Spectra(np.ascontiguousarray(extended), self._frequencies, bright, part)
@@ -269,12 +270,12 @@ class SpectralFeatures(Stage):
     def reset(self) -> None:
         self._last = None
 
-    def _received(self, before: Signal) -> None:
-        if self.given.center_frequencies != before.center_frequencies:
+    def input_format_changed(self, before: Signal) -> None:
+        if self.input_format.center_frequencies != before.center_frequencies:
             self._last = None
-            self._frequencies = np.array(self.given.center_frequencies)
+            self._frequencies = np.array(self.input_format.center_frequencies)
 
-    def _build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
+    def build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
         words: Sequence[str] = values["sf_requests"]
         self._words = tuple(FEATURES) if "all" in words else tuple(words)
-        self._frequencies = np.array(self.given.center_frequencies)
+        self._frequencies = np.array(self.input_format.center_frequencies)

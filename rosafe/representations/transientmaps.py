@@ -73,24 +73,24 @@ class _Map(Stage):
     _rows: tuple[int, ...] = ()  # of the blocks
     _past = 0  # frames in the buffer that have been put out
 
-    def __init__(self, given: Signal | float, **parameters: Any) -> None:
+    def __init__(self, input_format: Signal | float, **parameters: Any) -> None:
         self._buffer = FrameBuffer()  # of strengths and levels, (2, 2, C)
-        super().__init__(given, **parameters)
+        super().__init__(input_format, **parameters)
 
     @property
-    def needs(self) -> str:
+    def required_extra(self) -> str:
         # also while the levels do not matter: they may, after a change, for the frames that are here already
         return "level"
 
     @property
     def look_ahead(self) -> int:
-        return 2 * self._fuse + int(self._values["trm_minSpread"]) - 1
+        return 2 * self._fuse + int(self.values["trm_minSpread"]) - 1
 
     def state_size(self, rows: tuple[int, ...]) -> int:
         frames = self.look_ahead + max(self.look_ahead, KEPT)
         return 4 * math.prod(rows) * frames  # strengths and levels, in a store of up to twice as many
 
-    def process(self, block: FloatArray, extra: FloatArray | None = None) -> FloatArray:
+    def process(self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None) -> FloatArray:
         strengths = self._checked(block)
         if extra is None or np.shape(extra) != strengths.shape:
             raise ValueError("level: wanted is one of the shape of the block")
@@ -102,7 +102,7 @@ class _Map(Stage):
         count = max(0, held.shape[-1] - self._past - reach)
         output = np.empty((*strengths.shape[:-1], count))
         if count > 0:
-            values = self._values
+            values = self.values
             thresholds = values["trm_minStrengthdB"], values["trm_minValuedB"]
             fuse = self._fuse if self._fuse > 2 else 0
             make = kernels.transient_map if kernels.compiled() else columns
@@ -117,13 +117,13 @@ class _Map(Stage):
         self._buffer = FrameBuffer()
         self._past = 0
 
-    def _received(self, before: Signal) -> None:
-        if self.given.center_frequencies != before.center_frequencies:
+    def input_format_changed(self, before: Signal) -> None:
+        if self.input_format.center_frequencies != before.center_frequencies:
             self.reset()
-        self._build(self._values, frozenset())
+        self.build(self.values, frozenset())
 
-    def _build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
-        frames = values["trm_fuseWithinSec"] * self.given.rate
+    def build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
+        frames = values["trm_fuseWithinSec"] * self.input_format.rate
         if frames > MAX_SAMPLES:
             raise ValueError(f"trm_fuseWithinSec: too long, {frames:.6g} frames")
         self._fuse = round_half_away(frames)

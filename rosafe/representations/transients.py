@@ -30,12 +30,12 @@ class _Strength(Stage):
     beginning; otherwise the last level stays, whatever changes.
     """
 
-    PROVIDES = ("level",)
+    EXTRAS = ("level",)
     RISING: ClassVar[bool]
 
     _last: FloatArray | None = None  # level of the last frame, (2, C, 1); None before the first one
 
-    def process(self, block: FloatArray, extra: FloatArray | None = None) -> FloatArray:
+    def process(self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None) -> FloatArray:
         rates = self._checked(block)
         levels: FloatArray = np.log10(np.maximum(rates, SILENCE))
         levels *= 10.0
@@ -57,11 +57,11 @@ class _Strength(Stage):
         self._last = None
         self.provided = {}
 
-    def _received(self, before: Signal) -> None:
-        if self.given.center_frequencies != before.center_frequencies:
+    def input_format_changed(self, before: Signal) -> None:
+        if self.input_format.center_frequencies != before.center_frequencies:
             self._last = None
 
-    def _build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
+    def build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
         (self._limit,) = values.values()
 
 

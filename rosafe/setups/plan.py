@@ -85,11 +85,11 @@ def rehearse(setup: Setup, sample_rate: float) -> None:
     for wanted in setup.processors:
         try:
             stage = STAGES[wanted.kind](formats[wanted.parent], **wanted.values)
-            if stage.needs and stage.needs not in providers[wanted.parent]:
-                raise ValueError(f"it needs the {stage.needs} of {wanted.parent!r}, which has none")
+            if stage.required_extra and stage.required_extra not in providers[wanted.parent]:
+                raise ValueError(f"it needs the {stage.required_extra} of {wanted.parent!r}, which has none")
         except ValueError as problem:
             raise refused(f"{wanted.name!r} at {sample_rate:g} Hz: {problem}") from None
-        formats[wanted.name], providers[wanted.name] = stage.output, stage.PROVIDES
+        formats[wanted.name], providers[wanted.name] = stage.output_format, stage.EXTRAS
 
 
 def refused(why: str) -> ComponentError:

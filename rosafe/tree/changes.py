@@ -48,7 +48,7 @@ class Changes:
 
     def follow(self, given: Signal) -> Stage:
         """The stage under a parent that puts out another format, or ValueError; `planned` where it is the same."""
-        if given == self.planned.given:
+        if given == self.planned.input_format:
             return self.planned
         stage = copy.copy(self.planned)
         stage.receive(given)
@@ -58,27 +58,27 @@ class Changes:
         """Make the change that was `planned` before block `block` of the input; blocks of successive calls ascend."""
         with self._lock:
             self.planned = planned
-            self._waiting.append(Change(block, name, value, planned.needs))
+            self._waiting.append(Change(block, name, value, planned.required_extra))
 
     def needs(self, number: int) -> str:
         """Which of the parent's by-products block `number` should carry."""
         if not self._waiting:
-            return self._working.needs
+            return self._working.required_extra
         with self._lock:
             due = self._due(number)
-            return due[-1].needs if due else self._working.needs
+            return due[-1].needs if due else self._working.required_extra
 
     def stage_for(self, block: Block) -> Stage | None:
         """The stage to work on `block`, after all changes that are due and go with it; None where none can."""
         stage = self._working
-        if not self._waiting and block.signal is stage.given:
-            needs = stage.needs
+        if not self._waiting and block.signal is stage.input_format:
+            needs = stage.required_extra
             return stage if not needs or needs in block.extras else None
         with self._lock:
             due = self._due(block.number)
             for count in range(len(due), -1, -1):
                 changed = _changed(stage, block.signal, due[:count])
-                if changed is not None and (not changed.needs or changed.needs in block.extras):
+                if changed is not None and (not changed.required_extra or changed.required_extra in block.extras):
                     self._working = changed
                     del self._waiting[:count]
                     return changed
@@ -93,7 +93,7 @@ def _changed(stage: Stage, given: Signal, changes: Sequence[Change]) -> Stage | 
 
     It shares the state of `stage`, which does not notice.
     """
-    if given == stage.given and not changes:
+    if given == stage.input_format and not changes:
         stage.receive(given)
         return stage
     changed = copy.copy(stage)

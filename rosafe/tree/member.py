@@ -47,7 +47,7 @@ class Member(StateMachine):
         self.error: BaseException | None = None
         self.blocks = 0
         self.changes = Changes(stage)
-        self.history = History(self.part_rows, stage.output, history_seconds)
+        self.history = History(self.part_rows, stage.output_format, history_seconds)
 
     def __repr__(self) -> str:
         return f"<{self.kind} {self.name!r} {self.state.value}>"
@@ -85,7 +85,7 @@ class Member(StateMachine):
     @property
     def signal(self) -> Signal:
         """The format of its output."""
-        return self.stage.output
+        return self.stage.output_format
 
     @property
     def rate(self) -> float:

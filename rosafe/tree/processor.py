@@ -36,7 +36,7 @@ class Processor(Member):
     Attributes
     ----------
     place : callable or None
-        Gets the block that it has taken, and tells where its stage may write the output (`Stage.place`).
+        Called with the input block; returns the array that `Stage.process` gets as `out`. Only for stages that take it.
     """
 
     parent: Processor | None
@@ -137,7 +137,7 @@ class Processor(Member):
         self.held_up_since = 0.0
         with self._lock:
             if got is not None:
-                self.read(Block(self.blocks, (got[0],), got[1], self.stage.given))
+                self.read(Block(self.blocks, (got[0],), got[1], self.stage.input_format))
             elif ended:
                 self.finish()
 
@@ -160,25 +160,24 @@ class Processor(Member):
         stage = self.changes.stage_for(taken)
         if stage is None:
             return None
-        if stage.PROVIDES:
+        if stage.EXTRAS:
             stage.provide = self._wanted(stage, taken.number)
-        if self.place is not None:
-            stage.place = self.place(taken)
         data, extras = taken.parts[0], taken.extras
-        needs = extras and stage.needs
-        output = stage.process(data, extras[needs]) if needs else stage.process(data)
+        required = extras and stage.required_extra
         if self.place is not None:
-            stage.place = None  # which a stage that cannot write there would hold
+            output = stage.process(data, extras[required] if required else None, self.place(taken))
+        else:
+            output = stage.process(data, extras[required]) if required else stage.process(data)
         parts = output if isinstance(output, tuple) else (output,)
         next_index = taken.next_index
         if look_ahead := stage.look_ahead:
-            next_index = max(0, next_index - look_ahead * stage.given.hop)
-        return Block(taken.number, parts, next_index, stage.output, stage.provided)
+            next_index = max(0, next_index - look_ahead * stage.input_format.hop)
+        return Block(taken.number, parts, next_index, stage.output_format, stage.provided)
 
     def _wanted(self, stage: Stage, number: int) -> frozenset[str]:
         """The by-products that children need of block `number`."""
         wanted = [needs for child in tuple(self.children) if (needs := child.changes.needs(number))]
-        return frozenset(stage.PROVIDES).intersection(wanted) if wanted else NOTHING
+        return frozenset(stage.EXTRAS).intersection(wanted) if wanted else NOTHING
 
     def _tell(self, block: Block, begun: float) -> None:
         """Tell the world of the block that was released last."""

@@ -34,7 +34,7 @@ def state_size(stage: Stage, rows: Rows) -> float:
 
 def output_size(stage: Stage, rows: Rows, seconds: float) -> float:
     """Bytes of so many seconds of all that `stage` puts out, given blocks of leading shape `rows`."""
-    return sum(size(part, seconds * stage.output.rate) for part in stage.part_rows(rows))
+    return sum(size(part, seconds * stage.output_format.rate) for part in stage.part_rows(rows))
 
 
 def refuse_over(limit: float, taken: float, text: str, unit: float = 2**20) -> None:
@@ -46,10 +46,10 @@ def refuse_over(limit: float, taken: float, text: str, unit: float = 2**20) -> N
 def check_stage(stage: Stage, rows: Rows, seconds: float) -> None:
     """ValueError where `seconds` of one stage's output, a frame of its input, or what it keeps, are too large."""
     for part in stage.part_rows(rows):
-        _check_span("port or history", part, seconds, stage.output.rate)
-    given = stage.given
-    frames = (stage.output.window - given.window) / given.hop + 1
-    name = f"{stage.PREFIX}_wSizeSec" if isinstance(stage, FramedStage) else "window"
+        _check_span("port or history", part, seconds, stage.output_format.rate)
+    given = stage.input_format
+    frames = (stage.output_format.window - given.window) / given.hop + 1
+    name = f"{stage.prefix}_wSizeSec" if isinstance(stage, FramedStage) else "window"
     _check_span(name, rows, frames / given.rate, given.rate)
     shape = "x".join(map(str, rows))
     text = f"{stage.REPRESENTATION.kind}: what it keeps of {shape} values takes {{taken:.0f}} MiB"

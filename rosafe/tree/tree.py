@@ -332,8 +332,8 @@ def _planned(processor: Processor, stage: Stage, rows: Rows, above: Stage | None
 
     `above` is the stage of its parent.
     """
-    if above is not None and stage.needs and stage.needs not in above.PROVIDES:
-        raise ValueError(f"{processor.kind} needs the {stage.needs} of {above.REPRESENTATION}, which has none")
+    if above is not None and stage.required_extra and stage.required_extra not in above.EXTRAS:
+        raise ValueError(f"{processor.kind} needs the {stage.required_extra} of {above.REPRESENTATION}, which has none")
     yield Planned(processor, stage, rows)
     for child in processor.children:
-        yield from _planned(child, child.changes.follow(stage.output), stage.output_rows(rows), stage)
+        yield from _planned(child, child.changes.follow(stage.output_format), stage.output_rows(rows), stage)

@@ -58,7 +58,7 @@ class Chain:
         filterbank, hair_cell = self.stages["gammatone"], self.stages["ihc"]
         assert isinstance(filterbank, Filterbank)
         assert isinstance(hair_cell, InnerHairCell)
-        filterbank.provide = frozenset({hair_cell.needs})
+        filterbank.provide = frozenset({hair_cell.required_extra})
         out = {"input": single(self.stages["input"].process(block))}
         out["preProc"] = single(self.stages["preProc"].process(out["input"]))
         out["gammatone"] = filterbank.process(out["preProc"])

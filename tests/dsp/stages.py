@@ -56,7 +56,7 @@ class WithEnvelope(Stage):
     def __init__(self, stage: Stage) -> None:
         self.stage = stage
 
-    def process(self, block: FloatArray, extra: FloatArray | None = None) -> FloatArray:
+    def process(self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None) -> FloatArray:
         if isinstance(self.stage, Filterbank):
             self.stage.provide = frozenset({"envelope"})
             output = self.stage.process(block)

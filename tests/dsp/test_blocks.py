@@ -173,8 +173,8 @@ def test_the_envelope_costs_only_when_asked_for() -> None:
         bank.process(noise("gammatone", 50))
         shapes.append({name: array.shape for name, array in bank.provided.items()})
     assert shapes == [{}, {"envelope": (2, 2, 50)}, {}]
-    assert InnerHairCell(RATE, ihc_method="hilbert").needs == "envelope"
-    assert not InnerHairCell(RATE).needs
+    assert InnerHairCell(RATE, ihc_method="hilbert").required_extra == "envelope"
+    assert not InnerHairCell(RATE).required_extra
     with pytest.raises(ValueError, match="envelope: bernstein"):
         InnerHairCell(RATE, ihc_method="bernstein").process(noise("ihc", 5))
     with pytest.raises(ValueError, match="envelope: hilbert"):

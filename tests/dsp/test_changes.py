@@ -115,7 +115,7 @@ def test_what_is_refused_changes_nothing(kind: str, changes: dict[str, Any]) -> 
     assert stage.parameters == twin.parameters
     block = noise(kind, 700, seed=2)
     np.testing.assert_array_equal(stage.process(block), twin.process(block))
-    assert stage.output.rate == twin.output.rate
+    assert stage.output_format.rate == twin.output_format.rate
 
 
 @pytest.mark.parametrize("kind", ORIGINAL)
@@ -216,7 +216,7 @@ def test_hair_cell_method_starts_the_filter_anew() -> None:
     stage = InnerHairCell(RATE)
     stage.process(noise("ihc", 500))
     stage.configure(ihc_method="joergensen")
-    assert stage.needs
+    assert stage.required_extra
     block = noise("ihc", 300, seed=2)
     expected = InnerHairCell(RATE, ihc_method="joergensen").process(block, np.abs(block))
     np.testing.assert_array_equal(stage.process(block, np.abs(block)), expected)
@@ -239,7 +239,7 @@ def test_window_and_hop_change_keep_the_buffer_and_the_grid() -> None:
     assert after.shape[-1] == len(starts)
     for frame, start in enumerate(starts):
         np.testing.assert_allclose(after[:, frame], ild_of(x[..., start : start + 60], "blackman"), rtol=0, atol=1e-11)
-    assert stage.output.rate == RATE / 25
+    assert stage.output_format.rate == RATE / 25
 
 
 def test_a_shorter_window_finds_its_frames_in_the_buffer() -> None:
@@ -314,7 +314,7 @@ def test_no_change_is_no_reset(kind: str, parameters: dict[str, Any]) -> None:
         def __init__(self) -> None:
             pass
 
-        def process(self, block: Any, extra: Any = None) -> Any:
+        def process(self, block: Any, extra: Any = None, out: Any = None) -> Any:
             stage.configure()
             return (
                 stage.process(block, np.abs(block) + 0.5) if isinstance(stage, InnerHairCell) else stage.process(block)

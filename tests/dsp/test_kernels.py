@@ -60,7 +60,7 @@ def outputs(stage: Stage, blocks: Iterable[FloatArray], turns: Iterable[Choice])
     made = []
     for block, level in zip(blocks, turns, strict=False):
         with using(level):
-            if isinstance(stage, InnerHairCell) and stage.needs:
+            if isinstance(stage, InnerHairCell) and stage.required_extra:
                 made.append(stage.process(block, np.abs(block) + 0.25 * np.abs(np.roll(block, 1))))
             else:
                 made.append(single(stage.process(block)))

@@ -60,7 +60,7 @@ def test_rounding_is_half_away_from_zero() -> None:
         0,
         7,
     ]
-    assert Ild(22050.0).output.rate == 22050 / 221
+    assert Ild(22050.0).output_format.rate == 22050 / 221
 
 
 @pytest.mark.parametrize("length", [2, 7, 882])
@@ -291,7 +291,7 @@ def test_hair_cell_methods() -> None:
     }
     for method, values in expected.items():
         stage = InnerHairCell(44100, ihc_method=method)
-        got = stage.process(x, envelope if stage.needs else None)
+        got = stage.process(x, envelope if stage.required_extra else None)
         np.testing.assert_allclose(got, values, rtol=0, atol=1e-12 * np.abs(values).max(), err_msg=method)
 
 

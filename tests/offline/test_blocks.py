@@ -178,7 +178,7 @@ def test_numpy_is_asked_to_write_over_nothing() -> None:
     with using(TWINS):
         stream = rosafe.Stream(RATE, parameters=FEW, outputs=["ild"])
         stream.process(SOUND)
-        assert stream._stages["ihc"].place is None
+        assert not any(over for _, _, _, over, _ in stream._plan)
 
 
 @pytest.mark.parametrize("why", ["changes", "gain control", "a plugin", "twins"])
@@ -275,7 +275,7 @@ def test_what_takes_several_channels_has_one_branch() -> None:
 @with_kernels
 def test_an_error_in_one_branch_ends_all(monkeypatch: pytest.MonkeyPatch) -> None:
     class Fuse(Ratemap):
-        def process(self, block: Any, extra: Any = None) -> Any:
+        def process(self, block: Any, extra: Any = None, out: Any = None) -> Any:
             if block.shape[1] == 12:
                 raise ArithmeticError("in the last branch")
             return super().process(block, extra)

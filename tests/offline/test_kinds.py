@@ -35,7 +35,7 @@ class Shells(FramedStage):
         coordinates=("sh_shells",),
         centred="lag",
     )
-    PREFIX = "sh"
+    prefix = "sh"
     INPUT = ("ear", "time")
 
     @property
@@ -44,7 +44,7 @@ class Shells(FramedStage):
 
     @property
     def shells(self) -> FloatArray:
-        return np.arange(-self._values["sh_reach"], self._values["sh_reach"] + 1.0)
+        return np.arange(-self.values["sh_reach"], self.values["sh_reach"] + 1.0)
 
     def part_rows(self, rows: tuple[int, ...]) -> tuple[tuple[int, ...], ...]:
         return ((), (2, len(self.shells)))
@@ -52,7 +52,7 @@ class Shells(FramedStage):
     def output_rows(self, rows: tuple[int, ...]) -> tuple[int, ...]:
         return ()
 
-    def process(self, block: FloatArray, extra: FloatArray | None = None) -> Output:
+    def process(self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None) -> Output:
         frames = self._framing.frames(self._buffer.append(limited(self._checked(block)))).sum(axis=-1)
         self._buffer.drop(frames.shape[-1] * self._framing.hop)
         return frames.sum(axis=0), frames[:, np.newaxis] * self.shells[:, np.newaxis]
@@ -164,7 +164,7 @@ def test_lags_that_are_not_centred_are_aligned_at_the_first() -> None:
     )
     assert got["autocorrelation"].shape[:3] == (2, 4, 479)
     np.testing.assert_allclose(got["ac_lags"], np.arange(479) / RATE)
-    stage = STAGES["autocorrelation"](STAGES["ihc"](RATE).output)
+    stage = STAGES["autocorrelation"](STAGES["ihc"](RATE).output_format)
     ihc = rosafe.process(SOUND, RATE, parameters=FEW, block_frames=1000, outputs=["ihc"])["ihc"]
     at = 0
     for number, block in enumerate(cut(ihc, 1000)):

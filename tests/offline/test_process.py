@@ -444,7 +444,7 @@ def test_an_error_on_the_way_ends_it_at_once(monkeypatch: pytest.MonkeyPatch) ->
     processed = []
 
     class Fuse(InnerHairCell):
-        def process(self, block: Any, envelope: Any = None) -> Any:
+        def process(self, block: Any, envelope: Any = None, out: Any = None) -> Any:
             processed.append(block)
             if len(processed) == 3:
                 raise Blown("in the third block")
@@ -483,7 +483,7 @@ def test_an_interrupt_from_the_keyboard(monkeypatch: pytest.MonkeyPatch) -> None
         return bool(seen)
 
     class Interrupting(InnerHairCell):
-        def process(self, block: Any, envelope: Any = None) -> Any:
+        def process(self, block: Any, envelope: Any = None, out: Any = None) -> Any:
             processed.append(block.shape[-1])
             if len(processed) == 3:
                 harness.wait_for(sent)

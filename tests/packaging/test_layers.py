@@ -16,6 +16,7 @@ STANDS_ON: dict[str, set[str]] = {
     "vocabulary": set(),
     "sound": set(),
     "dsp": {"vocabulary"},
+    "plugin": {"vocabulary", "dsp"},
     "representations": {"vocabulary", "dsp"},
     "interface": _NUMERICS,
     "tree": {*_NUMERICS, "interface"},

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 from unittest import mock
@@ -13,7 +12,9 @@ from unittest import mock
 import pytest
 
 from tests.genomix import world as worlds
-from tests.harness import PATIENCE, PYTHON, ROOT, wait_for
+from tests.harness import ROOT, wait_for
+
+from .support import python
 
 TEXT = (ROOT / "docs" / "own-representation.md").read_text("utf-8")
 PYTHON_BLOCKS = re.findall(r"^```python\n(.*?)^```$", TEXT, re.MULTILINE | re.DOTALL)
@@ -54,16 +55,6 @@ def folder(tmp_path: Path) -> Path:
     path.mkdir()
     (path / "zerocrossings.py").write_text(PYTHON_BLOCKS[0])
     return path
-
-
-def python(code: str, folder: Path, **env: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [PYTHON, "-c", code],
-        env={**os.environ, "PYTHONPATH": str(ROOT), "ROSAFE_PLUGINS": str(folder), **env},
-        capture_output=True,
-        text=True,
-        timeout=PATIENCE,
-    )
 
 
 def test_the_example_is_short() -> None:

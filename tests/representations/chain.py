@@ -96,7 +96,7 @@ class Chain:
 
     def _comes_to(self, kind: str, stages: Mapping[str, Stage]) -> Signal | float:
         parent = stages.get(KINDS[kind].parent)
-        return self.given if parent is None else parent.output
+        return self.given if parent is None else parent.output_format
 
     def modify(self, name: str, value: Any) -> None:
         """Change one parameter between blocks; what hangs on it hears of it. A ValueError changes nothing.
@@ -117,9 +117,9 @@ class Chain:
         for stage in self.stages.values():
             stage.provide = frozenset()
         for kind, stage in self.stages.items():
-            if stage.needs and (parent := self.stages.get(KINDS[kind].parent)):
-                assert stage.needs in parent.PROVIDES
-                parent.provide |= {stage.needs}
+            if stage.required_extra and (parent := self.stages.get(KINDS[kind].parent)):
+                assert stage.required_extra in parent.EXTRAS
+                parent.provide |= {stage.required_extra}
         made: dict[str, Output] = {}
         for kind, stage in self.stages.items():
             parent = self.stages.get(KINDS[kind].parent)
@@ -128,7 +128,7 @@ class Chain:
                 continue
             data = made[KINDS[kind].parent]
             assert not isinstance(data, tuple)
-            made[kind] = stage.process(data, parent.provided[stage.needs] if stage.needs else None)
+            made[kind] = stage.process(data, parent.provided[stage.required_extra] if stage.required_extra else None)
         return made
 
     def run(

@@ -172,11 +172,11 @@ def test_the_step_follows_from_the_window(
     seconds: float, step: float, ratio: int, size: int, hop: int, fb_type: str
 ) -> None:
     stage = AmsFeatures(RATE, ams_wSizeSec=seconds, ams_hSizeSec=step, ams_dsRatio=ratio, ams_fbType=fb_type)
-    assert (len(stage.window), stage.output.hop) == (size, hop * ratio)
-    assert stage.output.rate == RATE / ratio / hop
-    assert stage.output.framed and stage.output.window == size * ratio
+    assert (len(stage.window), stage.output_format.hop) == (size, hop * ratio)
+    assert stage.output_format.rate == RATE / ratio / hop
+    assert stage.output_format.framed and stage.output_format.window == size * ratio
     samples = (size + 2 * hop - 1) * ratio + 1  # the last one that frame 2 takes in
-    assert stage.complete(samples) == 3 and stage.complete(samples - 1) == 2
+    assert stage.output_count(samples) == 3 and stage.output_count(samples - 1) == 2
     assert stage.process(sound(samples - 1)).shape[-1] == 2
     assert stage.process(sound(1)).shape[-1] == 1
 
@@ -199,11 +199,11 @@ def test_cuts_and_prefixes(parameters: dict[str, Any], sizes: list[int]) -> None
     x = sound(1200)
     whole = AmsFeatures(SOUND, **parameters).process(x)
     stage = AmsFeatures(SOUND, **parameters)
-    assert whole.shape[-1] == stage.complete(1200)
+    assert whole.shape[-1] == stage.output_count(1200)
     blocks = [stage.process(block) for block in cut(x, sizes)]
     np.testing.assert_allclose(np.concatenate(blocks, axis=-1), whole, rtol=0, atol=1e-12)
     first = AmsFeatures(SOUND, **parameters).process(x[..., : sizes[0]])
-    assert first.shape[-1] == stage.complete(sizes[0])
+    assert first.shape[-1] == stage.output_count(sizes[0])
     np.testing.assert_allclose(first, whole[..., : first.shape[-1]], rtol=0, atol=1e-12)
 
 
@@ -294,7 +294,7 @@ def test_a_change_of_frames_keeps_filters_buffer_and_grid(fb_type: str, change: 
     got = np.concatenate([stage.process(block) for block in cut(x[..., 3333:], 777)], axis=-1)
     # of the filtered samples from there on, which a step of 1 shows all
     fine = AmsFeatures(SOUND, **{**before, **change, "ams_hSizeSec": 1e-9}).process(x)
-    expected = fine[..., count * 48 :: stage.output.hop // 4]
+    expected = fine[..., count * 48 :: stage.output_format.hop // 4]
     np.testing.assert_allclose(got, expected[..., : got.shape[-1]], rtol=0, atol=1e-12)
     assert got.shape[-1] == expected.shape[-1] > 1
 
@@ -406,7 +406,7 @@ def test_the_highest_filter_depends_on_the_rate() -> None:
     stage = AmsFeatures(SOUND)
     with pytest.raises(ValueError, match=r"^ams_highFreqHz: "):
         stage.receive(replace(SOUND, sample_rate=8000.0, rate=8000.0))
-    assert stage.given is SOUND
+    assert stage.input_format is SOUND
 
 
 @pytest.mark.filterwarnings("error")

@@ -187,11 +187,11 @@ def test_cuts_and_prefixes(parameters: dict[str, Any], sizes: list[int]) -> None
     x = sound(700)
     whole = Autocorrelation(SOUND, **parameters).process(x)
     stage = Autocorrelation(SOUND, **parameters)
-    assert whole.shape[-1] == stage.complete(700)
+    assert whole.shape[-1] == stage.output_count(700)
     blocks = [stage.process(block) for block in cut(x, sizes)]
     np.testing.assert_allclose(np.concatenate(blocks, axis=-1), whole, rtol=0, atol=1e-12)
     first = Autocorrelation(SOUND, **parameters).process(x[..., : sizes[0]])
-    assert first.shape[-1] == stage.complete(sizes[0])
+    assert first.shape[-1] == stage.output_count(sizes[0])
     np.testing.assert_allclose(first, whole[..., : first.shape[-1]], rtol=0, atol=1e-12)
 
 
@@ -217,12 +217,12 @@ def test_what_comes_out_is_fresh(parameters: dict[str, Any]) -> None:
 
 def test_the_format_of_the_output() -> None:
     stage = Autocorrelation(SOUND, **framed(160, 70))
-    output = stage.output
+    output = stage.output_format
     assert (output.framed, output.hop, output.window, output.lags) == (True, 70, 160, 158)
     assert output.rate == RATE / 70
     assert stage.derived["ac_lags"] == [lag / RATE for lag in range(159)]
     stage.configure(ac_wSizeSec=100 / RATE)
-    assert (stage.output.lags, stage.output_rows((2, 3)), len(stage.derived["ac_lags"])) == (98, (2, 3, 99), 99)
+    assert (stage.output_format.lags, stage.output_rows((2, 3)), len(stage.derived["ac_lags"])) == (98, (2, 3, 99), 99)
 
 
 # --- parameters -------------------------------------------------------------------------------------------------

@@ -235,7 +235,7 @@ def test_cuts_and_prefixes(sizes: list[int]) -> None:
     np.testing.assert_allclose(np.concatenate(blocks, axis=-1), whole, rtol=0, atol=1e-9)
     come = 0
     for block, made in zip(cut(x, sizes), blocks, strict=True):
-        assert made.shape[-1] == stage.complete(come + block.shape[-1]) - stage.complete(come)
+        assert made.shape[-1] == stage.output_count(come + block.shape[-1]) - stage.output_count(come)
         come += block.shape[-1]
     first = Gabor(given_signal(5)).process(x[..., : sizes[0]])
     np.testing.assert_allclose(first, whole[..., : first.shape[-1]], rtol=0, atol=1e-9)
@@ -244,7 +244,7 @@ def test_cuts_and_prefixes(sizes: list[int]) -> None:
 def test_frames_are_held_back() -> None:
     stage = Gabor(given_signal(5))
     assert stage.look_ahead == 19
-    assert [stage.complete(count) for count in (0, 1, 19, 20, 100)] == [0, 0, 0, 1, 81]
+    assert [stage.output_count(count) for count in (0, 1, 19, 20, 100)] == [0, 0, 0, 1, 81]
     for frames in (0, 1, 17, 1):
         assert stage.process(rates(frames)).shape == (2, stage.derived["gb_nFeatures"], 0)
     assert stage.process(rates(1)).shape[-1] == 1
@@ -292,7 +292,7 @@ def test_the_declaration() -> None:
     assert (declared.request, declared.port, declared.parent) == ("GaborProc", "gaborPort", "ratemap")
     assert Gabor(44100.0).derived == {"gb_nFeatures": 0}  # channels are not known yet
     stage = Gabor(given_signal(5))
-    assert stage.output == stage.given
+    assert stage.output_format == stage.input_format
 
 
 def test_a_change_of_the_range_keeps_everything() -> None:
@@ -317,7 +317,7 @@ def test_another_step_of_the_parent_goes_on_with_what_is_remembered() -> None:
     first = stage.process(x[..., :50])
     stage.receive(given_signal(5, 1.0))
     second = stage.process(x[..., 50:])
-    assert (stage.look_ahead, stage.output.rate) == (19, 1.0)
+    assert (stage.look_ahead, stage.output_format.rate) == (19, 1.0)
     np.testing.assert_array_equal(first, Gabor(given_signal(5, 3.0)).process(x)[..., :31])
     # a maximum 5 frames ago counts for 15 frames before the change, and for 5 after it
     expected = spelt_out(x, 80.0, 5)

@@ -170,7 +170,7 @@ def test_cuts_and_prefixes(sizes: list[int], order: int, rate: float) -> None:
     for block in cut(x, sizes):
         made.append(one.process(block))
         count += block.shape[-1]
-        assert sum(part.shape[-1] for part in made) == one.complete(count)
+        assert sum(part.shape[-1] for part in made) == one.output_count(count)
     np.testing.assert_array_equal(np.concatenate(made, axis=-1), whole)
     first = stage().process(x[..., : sizes[0]])
     np.testing.assert_array_equal(first, whole[..., : first.shape[-1]])
@@ -214,7 +214,12 @@ def test_what_comes_out() -> None:
     kept = made.copy()
     stage.process(x)
     np.testing.assert_array_equal(made, kept)
-    assert (stage.output.rate, stage.output.hop, stage.output.lags, stage.look_ahead) == (10.0, 100, 0, 1)
+    assert (stage.output_format.rate, stage.output_format.hop, stage.output_format.lags, stage.look_ahead) == (
+        10.0,
+        100,
+        0,
+        1,
+    )
 
 
 # --- parameters -------------------------------------------------------------------------------------------------
@@ -269,7 +274,7 @@ def test_another_step_of_the_parent() -> None:
     stage = Pitch(GIVEN, **WIDE, pi_medianOrder=1)
     assert not np.isnan(stage.process(peaks_at([9] * 20, [0.9] * 19 + [1.0]))[0, 0]).any()
     stage.receive(replace(GIVEN, rate=4.0, hop=250))  # 20 frames
-    assert stage.output.rate == 4.0
+    assert stage.output_format.rate == 4.0
     assert np.isnan(stage.process(peaks_at([9] * 19, [0.65] * 19))[0, 0]).all()
     stage.receive(replace(GIVEN, rate=1.0, hop=1000))  # 5 frames
     assert not np.isnan(stage.process(peaks_at([9], [0.5]))[0, 0]).any()
@@ -283,7 +288,7 @@ def test_another_window_of_the_parent() -> None:
     assert stage.process(correlations(10, lags=13)).shape == (2, 3, 10)  # with the one that was held back
     with pytest.raises(ValueError, match=r"^pi_rangeHz: .* 2 lags"):
         stage.receive(replace(GIVEN, lags=4))
-    assert stage.given.lags == 12
+    assert stage.input_format.lags == 12
     assert stage.process(correlations(10, lags=13)).shape == (2, 3, 10)
     with pytest.raises(ValueError, match=r"^block: 31 lags"):
         stage.process(correlations(10))
@@ -300,7 +305,7 @@ def test_in_a_chain() -> None:
     frames = made["autocorrelation"].shape[-1]
     assert frames == 24 + 24 + 23
     assert made["pitch"].shape[-1] == 23 + 24 + 22  # one is held back, then dropped
-    begun = Pitch(chain.stages["autocorrelation"].output).process(made["autocorrelation"][..., -23:])
+    begun = Pitch(chain.stages["autocorrelation"].output_format).process(made["autocorrelation"][..., -23:])
     np.testing.assert_allclose(made["pitch"][..., -22:], begun, rtol=1e-14)
 
 

@@ -319,7 +319,7 @@ def test_cuts_and_prefixes(parameters: dict[str, Any], sizes: list[int]) -> None
     blocks = joined([stage.process(block) for block in cut(x, sizes)])
     first = Precedence(signal, **parameters).process(x[..., : sizes[0]])
     for got, start, expected in zip(blocks, first, whole, strict=True):
-        assert expected.shape[-1] == stage.complete(700) and start.shape[-1] == stage.complete(sizes[0])
+        assert expected.shape[-1] == stage.output_count(700) and start.shape[-1] == stage.output_count(sizes[0])
         np.testing.assert_allclose(got, expected, rtol=0, atol=1e-11)
         np.testing.assert_allclose(start, expected[..., : start.shape[-1]], rtol=0, atol=1e-11)
 
@@ -354,7 +354,7 @@ def test_reset_and_other_channels_are_a_new_beginning(parameters: dict[str, Any]
     others = replace(given_signal(3), center_frequencies=(500.0, 600.0, 700.0))  # as many, but others
     stage.receive(others)
     assert same(stage.process(sound(433)), Precedence(others, **parameters).process(sound(433)))
-    assert stage.output.center_frequencies == (500.0, 600.0, 700.0)
+    assert stage.output_format.center_frequencies == (500.0, 600.0, 700.0)
     for channels in (5, 2):
         x = sound(500, channels)
         assert same(stage.process(x), Precedence(RATE, **parameters).process(x))
@@ -376,11 +376,11 @@ def test_what_comes_out_is_fresh() -> None:
 
 def test_the_format_of_the_output() -> None:
     stage = Precedence(44100.0)
-    output = stage.output
+    output = stage.output_format
     assert (output.framed, output.hop, output.window, output.rate, output.lags) == (True, 441, 882, 100.0, 45)
     assert stage.derived["prec_lags"] == [m / 44100 for m in range(-45, 46)]
     stage.configure(prec_maxDelaySec=0.0005)
-    assert (stage.output.lags, stage.part_rows((2, 31))[2]) == (23, (31, 47))
+    assert (stage.output_format.lags, stage.part_rows((2, 31))[2]) == (23, (31, 47))
     declared = Precedence.REPRESENTATION
     assert (declared.request, declared.port, declared.parent) == ("PrecedenceProc", "precedencePort", "gammatone")
     assert declared.binaural and [part.name for part in declared.parts] == list(PARTS)

@@ -189,7 +189,7 @@ def test_fewer_features_after_a_change() -> None:
     assert made.shape == (2, 14, 6)
     assert not made[:, 1:, 3:].any()
     assert chain.coordinates()["sf_requests"] == ["hfc"]
-    assert chain.stages["spectralFeatures"].output == replace(signal(), center_frequencies=())
+    assert chain.stages["spectralFeatures"].output_format == replace(signal(), center_frequencies=())
 
 
 REFUSED: list[tuple[str, list[Any]]] = [

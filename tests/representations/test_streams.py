@@ -73,7 +73,7 @@ def test_a_prefix_gives_a_prefix(kind: str, root: str, parameters: dict[str, Any
     whole = chain(kind, root, parameters).run(given_frames)[kind]
     first = chain(kind, root, parameters)
     part = first.run(given_frames[..., :number])[kind]
-    assert part.shape[-1] == first.stages[kind].complete(number)
+    assert part.shape[-1] == first.stages[kind].output_count(number)
     np.testing.assert_allclose(part, whole[..., : part.shape[-1]], rtol=1e-12, atol=1e-12 * np.abs(whole).max())
 
 
@@ -129,9 +129,9 @@ def test_other_channels_are_a_new_beginning(kind: str, root: str, parameters: di
         one = chain(kind, root, parameters)
         one.process(frames(root, 37))
         others = tuple(np.linspace(300.0, 3300.0, channels).tolist())
-        given_signal = one.stages[root].given
+        given_signal = one.stages[root].input_format
         for stage in one.stages.values():
-            stage.receive(replace(stage.given, center_frequencies=others))
+            stage.receive(replace(stage.input_format, center_frequencies=others))
         fresh = Chain(replace(given_signal, center_frequencies=others), [kind], parameters, root)
         later = frames(root, 40, 3, channels)
         np.testing.assert_array_equal(one.run(later, 13)[kind], fresh.run(later, 13)[kind])
@@ -160,7 +160,7 @@ def test_copies_may_be_changed_and_thrown_away(kind: str, root: str, parameters:
                 planned.configure(trm_minSpread=9, trm_fuseWithinSec=0.2)
             if "sf_requests" in planned.parameters:
                 planned.configure(sf_requests="hfc")
-            planned.receive(replace(stage.given, center_frequencies=(1.0,), rate=7.0))
+            planned.receive(replace(stage.input_format, center_frequencies=(1.0,), rate=7.0))
         made.append(one.process(block)[kind])
     np.testing.assert_array_equal(np.concatenate(made, axis=-1), expected)
 

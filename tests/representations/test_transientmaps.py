@@ -251,7 +251,7 @@ def test_nothing_is_a_peak_without_neighbours() -> None:
 def test_how_far(values: dict[str, Any], rate: float, expected: int) -> None:
     stage = OnsetMap(replace(GIVEN, rate=rate), **values)
     assert stage.look_ahead == expected
-    assert [stage.complete(expected + more) for more in (-1, 0, 1, 5)] == [0, 0, 1, 5]
+    assert [stage.output_count(expected + more) for more in (-1, 0, 1, 5)] == [0, 0, 1, 5]
 
 
 def test_the_next_frame_is_the_first_not_put_out_yet() -> None:
@@ -289,7 +289,7 @@ def test_other_steps_of_the_parent() -> None:
     assert first.shape[-1] == 19
     stage.receive(replace(GIVEN, rate=60.0, hop=267))  # q 3, H 7
     assert stage.look_ahead == 7
-    assert stage.output.rate == 60.0
+    assert stage.output_format.rate == 60.0
     rest = stage.process(strengths[..., 30:], levels[..., 30:])
     assert rest.shape[-1] == 34
     for k in range(19, 53):
@@ -321,7 +321,7 @@ def test_the_level_of_the_ratemap() -> None:
 @pytest.mark.parametrize("extra", [None, np.zeros((2, 4, 6)), np.zeros((2, 3, 7)), np.zeros((4, 7))])
 def test_a_block_without_its_level(extra: Any) -> None:
     stage = OnsetMap(GIVEN)
-    assert stage.needs == "level"
+    assert stage.required_extra == "level"
     with pytest.raises(ValueError, match=r"^level: "):
         stage.process(np.zeros((2, 4, 7)), extra)
 
@@ -386,7 +386,7 @@ def test_more_frames_than_can_be_meant() -> None:
     stage = OnsetMap(GIVEN, trm_fuseWithinSec=10.0)
     with pytest.raises(ValueError, match=r"^trm_fuseWithinSec: too long"):
         stage.receive(replace(GIVEN, rate=1e9))
-    assert stage.output.rate == 100.0
+    assert stage.output_format.rate == 100.0
 
 
 def test_declarations() -> None:

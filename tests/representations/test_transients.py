@@ -116,7 +116,7 @@ def test_other_steps_of_the_ratemap_keep_the_last_level(kind: type[Stage], limit
     stage = kind(GIVEN)
     stage.process(rates([0]))
     stage.receive(Signal(RATE, 50.0, True, 320, 640, (500.0, 900.0), "gammatone"))
-    assert stage.output.rate == 50.0
+    assert stage.output_format.rate == 50.0
     np.testing.assert_allclose(stage.process(rates([sign * 9])), 9.0, rtol=1e-13)
 
 

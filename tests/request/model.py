@@ -88,7 +88,7 @@ class Model:
             raise ROSAFE.error("e_existsAlready")
         try:
             checked = {p.name: p.check(given[p.name]) for p in kind.parameters if p.name in given}
-            comes: Signal | float = self.processors[parent].stage.output if parent else self.sample_rate
+            comes: Signal | float = self.processors[parent].stage.output_format if parent else self.sample_rate
             self.processors[name] = Processor(kind.kind, parent, STAGES[kind.kind](comes, **checked))
         except ValueError as problem:
             raise ROSAFE.error("e_badNewValue", what=str(problem)) from None
@@ -107,7 +107,7 @@ class Model:
                 {
                     "name": name,
                     "kind": processor.kind,
-                    "rate": processor.stage.output.rate,
+                    "rate": processor.stage.output_format.rate,
                     "upperDepName": processor.parent,
                     "parameters": [
                         {"name": parameter, "value": text_of(value)}

@@ -59,7 +59,7 @@ def stage(kind: str, parameters: Mapping[str, Any]) -> Stage:
     """A stage of this kind on all that it needs."""
     own = {p.name: parameters[p.name] for p in KINDS[kind].parameters if p.name in parameters}
     parent = KINDS[kind].parent
-    return STAGES[kind](stage(parent, parameters).output if parent else RATE, **own)
+    return STAGES[kind](stage(parent, parameters).output_format if parent else RATE, **own)
 
 
 def check(model: Model, before: Mapping[str, Any], wanted: tuple[str, Mapping[str, Any]], told: dict[str, Any]) -> None:

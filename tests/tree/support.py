@@ -114,12 +114,12 @@ class Plain(Stage):
 
     work: Callable[[np.ndarray], None] = staticmethod(lambda block: None)
 
-    def process(self, block: np.ndarray, extra: np.ndarray | None = None) -> np.ndarray:
+    def process(self, block: np.ndarray, extra: np.ndarray | None = None, out: np.ndarray | None = None) -> np.ndarray:
         self.work(block)
         return block
 
     def _with(self, changes: Mapping[str, Any]) -> dict[str, Any]:
-        return {**self._values, **changes}
+        return {**self.values, **changes}
 
 
 def tree_threads() -> set[threading.Thread]:

@@ -230,7 +230,9 @@ def test_a_change_waits_for_no_block_and_never_meets_one_half_way(
     working, go_on = threading.Event(), threading.Event()
 
     class Slow(Plain):
-        def process(self, block: np.ndarray, extra: np.ndarray | None = None) -> np.ndarray:
+        def process(
+            self, block: np.ndarray, extra: np.ndarray | None = None, out: np.ndarray | None = None
+        ) -> np.ndarray:
             before = dict(self.parameters)
             working.set()
             assert go_on.wait(PATIENCE)

@@ -37,7 +37,9 @@ def test_siblings_work_at_the_same_time(
     meeting = threading.Barrier(3)
 
     class Meeting(Plain):
-        def process(self, block: np.ndarray, extra: np.ndarray | None = None) -> np.ndarray:
+        def process(
+            self, block: np.ndarray, extra: np.ndarray | None = None, out: np.ndarray | None = None
+        ) -> np.ndarray:
             meeting.wait(PATIENCE)
             return block
 
@@ -59,14 +61,18 @@ def test_a_parent_works_on_the_next_block_while_its_child_works_on_the_last(
     turn = threading.Condition()
 
     class Parent(Plain):
-        def process(self, block: np.ndarray, extra: np.ndarray | None = None) -> np.ndarray:
+        def process(
+            self, block: np.ndarray, extra: np.ndarray | None = None, out: np.ndarray | None = None
+        ) -> np.ndarray:
             with turn:
                 computed.append(int(block[0, 0]))
                 turn.notify_all()
             return block
 
     class Child(Plain):
-        def process(self, block: np.ndarray, extra: np.ndarray | None = None) -> np.ndarray:
+        def process(
+            self, block: np.ndarray, extra: np.ndarray | None = None, out: np.ndarray | None = None
+        ) -> np.ndarray:
             with turn:
                 number = int(block[0, 0])
                 assert turn.wait_for(lambda: number == last or number + 1 in computed, PATIENCE)
@@ -101,13 +107,17 @@ def test_a_block_that_nobody_hears_of_is_gone_once_the_children_have_done_with_i
     made: list[weakref.ref[np.ndarray]] = []
 
     class Parent(Plain):
-        def process(self, block: np.ndarray, extra: np.ndarray | None = None) -> np.ndarray:
+        def process(
+            self, block: np.ndarray, extra: np.ndarray | None = None, out: np.ndarray | None = None
+        ) -> np.ndarray:
             output = block.copy()
             made.append(weakref.ref(output))
             return output
 
     class Child(Plain):
-        def process(self, block: np.ndarray, extra: np.ndarray | None = None) -> np.ndarray:
+        def process(
+            self, block: np.ndarray, extra: np.ndarray | None = None, out: np.ndarray | None = None
+        ) -> np.ndarray:
             return np.empty((2, 0))
 
     use_plain_stages(monkeypatch, preProc=Parent, gammatone=Child)
@@ -132,7 +142,9 @@ def test_the_four_states(tree: Tree, listener: Recorder, feed: Feed, monkeypatch
     working, go_on = threading.Event(), threading.Event()
 
     class Slow(Plain):
-        def process(self, block: np.ndarray, extra: np.ndarray | None = None) -> np.ndarray:
+        def process(
+            self, block: np.ndarray, extra: np.ndarray | None = None, out: np.ndarray | None = None
+        ) -> np.ndarray:
             working.set()
             assert go_on.wait(PATIENCE)
             return block
@@ -165,7 +177,9 @@ def test_nobody_waits_for_a_removed_child(
     working, go_on = threading.Event(), threading.Event()
 
     class Slow(Plain):
-        def process(self, block: np.ndarray, extra: np.ndarray | None = None) -> np.ndarray:
+        def process(
+            self, block: np.ndarray, extra: np.ndarray | None = None, out: np.ndarray | None = None
+        ) -> np.ndarray:
             if self.parameters.get("slow"):
                 working.set()
                 assert go_on.wait(PATIENCE)
@@ -201,7 +215,9 @@ def test_blocks_arrive_whole_and_in_order_whoever_comes_and_goes(
     dice = random.Random(1)
 
     class Erratic(Plain):
-        def process(self, block: np.ndarray, extra: np.ndarray | None = None) -> np.ndarray:
+        def process(
+            self, block: np.ndarray, extra: np.ndarray | None = None, out: np.ndarray | None = None
+        ) -> np.ndarray:
             for _ in range(dice.choice((0, 0, 10, 300))):
                 pass
             return block

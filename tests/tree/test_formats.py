@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from dataclasses import replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -43,23 +44,24 @@ class Coarser(Stage):
         ),
     )
     INPUT = ("ear", "time")
-    PROVIDES = ("squares",)
+    EXTRAS = ("squares",)
     computed: list[frozenset[str]]  # what was to be provided with each block
 
-    def process(self, block: FloatArray, extra: FloatArray | None = None) -> Output:
+    def process(self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None) -> Output:
         self.computed.append(self.provide)
-        frames = np.ascontiguousarray(block[:, :: self._values["pp_step"]])
+        frames = np.ascontiguousarray(block[:, :: self.values["pp_step"]])
         self.provided = {"squares": np.square(frames)} if "squares" in self.provide else {}
         return frames
 
-    def _output(self) -> Signal:
-        step = self._values["pp_step"]
+    @cached_property
+    def output_format(self) -> Signal:
+        step = self.values["pp_step"]
         return replace(
-            self.given,
-            rate=self.given.rate / step,
+            self.input_format,
+            rate=self.input_format.rate / step,
             framed=True,
-            hop=step * self.given.hop,
-            lags=self._values["pp_lags"],
+            hop=step * self.input_format.hop,
+            lags=self.values["pp_lags"],
         )
 
 
@@ -83,32 +85,32 @@ class Picky(Stage):
         super().__init__(given, **parameters)
 
     @property
-    def needs(self) -> str:
-        return "squares" if self._values["fb_squares"] else ""
+    def required_extra(self) -> str:
+        return "squares" if self.values["fb_squares"] else ""
 
     @property
     def look_ahead(self) -> int:
-        return int(self._values["fb_held"])
+        return int(self.values["fb_held"])
 
     def part_rows(self, rows: tuple[int, ...]) -> tuple[tuple[int, ...], ...]:
         return (rows, ())
 
-    def process(self, block: FloatArray, extra: FloatArray | None = None) -> Output:
-        assert (extra is not None) == bool(self.needs)
+    def process(self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None) -> Output:
+        assert (extra is not None) == bool(self.required_extra)
         come = np.concatenate((self.held, block if extra is None else extra), axis=-1)
         self.held = come[:, max(0, come.shape[1] - self.look_ahead) :]
         out = come[:, : come.shape[1] - self.held.shape[1]].copy()
         return out, out.sum(axis=0)
 
-    def _build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
+    def build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
         self._check(values)
 
-    def _received(self, before: Signal) -> None:
-        self._check(self._values)
+    def input_format_changed(self, before: Signal) -> None:
+        self._check(self.values)
 
     def _check(self, values: dict[str, Any]) -> None:
-        if self.given.lags < values["fb_least"]:
-            raise ValueError(f"fb_least: {values['fb_least']} lags are wanted, there are {self.given.lags}")
+        if self.input_format.lags < values["fb_least"]:
+            raise ValueError(f"fb_least: {values['fb_least']} lags are wanted, there are {self.input_format.lags}")
 
 
 @pytest.fixture(autouse=True)
@@ -282,7 +284,7 @@ def test_what_is_planned_is_not_changed_by_a_block_of_the_last_format() -> None:
     changes = Changes(Picky(many, fb_least=1))
     stage = changes.stage_for(Block(0, (np.zeros((2, 4)),), 4, few))
     assert stage is not None
-    assert (stage.output.lags, changes.planned.output.lags) == (5, 20)
+    assert (stage.output_format.lags, changes.planned.output_format.lags) == (5, 20)
 
 
 def test_by_products_go_to_those_that_need_them(tree: Tree, feed: Feed, listener: Recorder) -> None:
@@ -307,7 +309,7 @@ def test_a_by_product_that_the_parent_does_not_have_is_refused(
     tree: Tree, feed: Feed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     grow(tree, feed)
-    monkeypatch.setattr(Coarser, "PROVIDES", ())
+    monkeypatch.setattr(Coarser, "EXTRAS", ())
     refused(tree, "gammatone needs the squares of preProc, which has none", "picky", "fb_squares", "1")
     with pytest.raises(ComponentError, match="needs the squares"):
         tree.add("gammatone", "second", "coarser", {"fb_squares": True})

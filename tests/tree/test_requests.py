@@ -308,7 +308,7 @@ def test_three_hundred_cycles_leave_nothing_behind(tree: Tree, feed: Feed, liste
 
 
 class Failing(Plain):
-    def process(self, block: np.ndarray, extra: np.ndarray | None = None) -> np.ndarray:
+    def process(self, block: np.ndarray, extra: np.ndarray | None = None, out: np.ndarray | None = None) -> np.ndarray:
         if self.parameters.get("fails") and block[0, 0] >= 160:
             raise ArithmeticError("out of luck")
         return block

@@ -285,7 +285,7 @@ def fail(scheduler: Scheduler, count: int) -> Check:
 class Failing(Plain):
     """Fails in its second block, where it is asked to."""
 
-    def process(self, block: np.ndarray, extra: np.ndarray | None = None) -> np.ndarray:
+    def process(self, block: np.ndarray, extra: np.ndarray | None = None, out: np.ndarray | None = None) -> np.ndarray:
         if self.parameters.get("fails") and block[0, 0] == 1.0:
             raise ZeroDivisionError
         return block

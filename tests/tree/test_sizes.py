@@ -49,7 +49,9 @@ def test_what_a_stage_keeps_is_what_it_says(
     finally:
         tracemalloc.stop()
     told = sizes.state_size(stage, (2, CHANNELS))
-    window = 2 * 8.0 * 2 * CHANNELS * (stage.output.window - given.window) / given.hop  # of the input, in its store
+    window = (
+        2 * 8.0 * 2 * CHANNELS * (stage.output_format.window - given.window) / given.hop
+    )  # of the input, in its store
     assert kept <= 1.05 * (told + window) + 200_000
     assert told <= 6 * kept
 

@@ -69,7 +69,9 @@ def test_no_more_compute_than_there_are_workers(
     now = 0
 
     class Counted(Plain):
-        def process(self, block: np.ndarray, extra: np.ndarray | None = None) -> np.ndarray:
+        def process(
+            self, block: np.ndarray, extra: np.ndarray | None = None, out: np.ndarray | None = None
+        ) -> np.ndarray:
             nonlocal now
             with lock:
                 now += 1
@@ -100,7 +102,9 @@ def test_one_worker_takes_a_block_through_the_tree_before_the_next(
     order: list[tuple[str, int]] = []
 
     class Noted(Plain):
-        def process(self, block: np.ndarray, extra: np.ndarray | None = None) -> np.ndarray:
+        def process(
+            self, block: np.ndarray, extra: np.ndarray | None = None, out: np.ndarray | None = None
+        ) -> np.ndarray:
             order.append((self.parameters["name"], int(block[0, 0])))
             return block
 
@@ -262,7 +266,9 @@ def test_a_block_that_takes_long_stops_no_request(
     working, go_on = threading.Event(), threading.Event()
 
     class Long(Plain):
-        def process(self, block: np.ndarray, extra: np.ndarray | None = None) -> np.ndarray:
+        def process(
+            self, block: np.ndarray, extra: np.ndarray | None = None, out: np.ndarray | None = None
+        ) -> np.ndarray:
             if self.parameters.get("long"):
                 working.set()
                 assert go_on.wait(PATIENCE)

@@ -1,0 +1,111 @@
+"""All the names of 0.2 that an author could use: a stage with a hook each, and a child that needs its by-product."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from rosafe.dsp.framing import FramedStage, frame_parameters
+from rosafe.dsp.stage import Stage
+from rosafe.representations.ild import Ild
+from rosafe.vocabulary.parameter import Parameter
+from rosafe.vocabulary.representation import Derived, Part, Representation
+
+
+class Every(Stage):
+    """Every n-th sample, one later than it could."""
+
+    REPRESENTATION = Representation(
+        kind="everyNth",
+        doc="Every n-th sample",
+        parent="ihc",
+        axes=("ear", "channel", "time"),
+        parameters=(Parameter("ev_step", "unsigned long", 4, "Step", minimum=1, maximum=100),),
+        derived=(Derived("ev_gain", "double", "Gain"),),
+        word="nth",
+    )
+    PROVIDES = ("square",)
+
+    def process(self, block, extra=None):
+        room = self._room(block[..., ::1].shape)
+        room[...] = block
+        samples = np.concatenate((self._rest, self._checked(room)), axis=-1) if self._rest is not None else room
+        step = self._values["ev_step"]
+        count = samples.shape[-1] // step
+        self._rest = samples[..., count * step :].copy()
+        output = np.ascontiguousarray(samples[..., : count * step : step]) * self._gain
+        self.provided = {"square": output**2} if "square" in self.provide else {}
+        return output
+
+    def complete(self, count):
+        return count // self._values["ev_step"]
+
+    @property
+    def derived(self):
+        return {"ev_gain": self._gain}
+
+    def _build(self, values, changed):
+        super()._build(values, changed)
+        self._gain = 2.0 * self.given.rate / self.given.sample_rate
+        self._rest = None
+
+    def _received(self, before):
+        super()._received(before)
+        self._build(self._values, frozenset())
+
+    def _output(self):
+        step = self._values["ev_step"]
+        return replace(super()._output(), rate=self.given.rate / step, framed=True, hop=step, window=1)
+
+    def reset(self):
+        self._rest = None
+
+
+class Needing(FramedStage):
+    """The mean of a frame of the parent, and of its squares."""
+
+    REPRESENTATION = Representation(
+        kind="meanSquare",
+        doc="Mean, and mean square",
+        parent="everyNth",
+        parts=(Part("mean", ("channel", "time")), Part("square", ("channel", "time"))),
+        parameters=(*frame_parameters("ms"),),
+    )
+    PREFIX = "ms"
+
+    @property
+    def needs(self):
+        return "square"
+
+    def __init__(self, given, **parameters):
+        self._held = None
+        super().__init__(given, **parameters)
+
+    def process(self, block, extra=None):
+        both = np.concatenate((block, extra), axis=1)
+        means = super().process(both)
+        return tuple(np.ascontiguousarray(part.mean(axis=0)) for part in np.split(means, 2, axis=1))
+
+    def frame(self, frames):
+        assert self.window.shape == frames.shape[-1:]
+        return frames.mean(axis=-1)
+
+    def output_rows(self, rows):
+        return super().output_rows(rows)[1:]
+
+    def part_rows(self, rows):
+        return (self.output_rows(rows),) * 2
+
+    def complete(self, count):
+        return super().complete(count)
+
+    def _output(self):
+        return super()._output()
+
+
+class FineIld(Ild):
+    """A variant of a built-in representation: its parameters under another prefix."""
+
+    REPRESENTATION = Representation(
+        kind="fineIld", doc="ILD", parent="ihc", axes=("channel", "time"), parameters=frame_parameters("fi")
+    )
+    PREFIX = "fi"

@@ -1,0 +1,20 @@
+"""Python processes with folders of plugins."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+from pathlib import Path
+
+from tests.harness import PATIENCE, PYTHON, ROOT
+
+
+def python(code: str, folder: Path, **env: str) -> subprocess.CompletedProcess[str]:
+    """What `code` does in a process of its own whose plugins are in `folder`."""
+    return subprocess.run(
+        [PYTHON, "-c", code],
+        env={**os.environ, "PYTHONPATH": str(ROOT), "ROSAFE_PLUGINS": str(folder), **env},
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+    )
