@@ -19,6 +19,7 @@ from rosafe.component.component import ComponentNode
 from rosafe.component.events import EventLog
 from rosafe.component.startup import run_server
 from rosafe.interface import BASS, ComponentError
+from rosafe.terminal import printable
 
 
 class BassNode:
@@ -122,7 +123,7 @@ class BassNode:
     def _list_devices(self, _: dict[str, Any]) -> None:
         with self._printing:
             for line in device_lines():
-                print(line, flush=True)
+                print(printable(line), flush=True)
 
     def _dedicated_socket(self, activity: Activity, _: dict[str, Any]) -> None:
         activity.interrupt_others()  # it has the address

@@ -13,6 +13,7 @@ from rosafe import commands, missing
 from rosafe.commands import Failure
 from rosafe.component.startup import Parser, without_names
 from rosafe.output import OutputError
+from rosafe.terminal import printable
 from rosafe.version import VERSION
 
 _EPILOG = """example:
@@ -39,12 +40,12 @@ def main(argv: list[str] | None = None) -> int:
         finally:
             sys.stdout.flush()
     except (Failure, OutputError) as problem:
-        print(f"{name}: {problem}", file=sys.stderr)
+        print(f"{name}: {printable(problem)}", file=sys.stderr)
         return 1
     except ModuleNotFoundError as problem:
         if not problem.name or problem.name.startswith("rosafe."):  # a fault of ours
             raise
-        print(f"{name}: {missing.advice(problem.name)}", file=sys.stderr)
+        print(f"{name}: {printable(missing.advice(problem.name))}", file=sys.stderr)
         return 1
     except KeyboardInterrupt:
         return 130

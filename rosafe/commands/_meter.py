@@ -10,6 +10,7 @@ import numpy as np
 
 from rosafe.bass.recording.levels import EARS, Levels
 from rosafe.commands._progress import clock
+from rosafe.terminal import printable
 
 LIVE_SECONDS = 0.1  # between two looks of the live line
 PLAIN_SECONDS = 1.0  # of sound, between two plain lines
@@ -64,7 +65,7 @@ class Meter:
 
     def message(self, text: str) -> None:
         """A line that stays, in the place of the live one."""
-        self._write((_CLEAR if self._live and not self._quiet else "") + text + "\n")
+        self._write((_CLEAR if self._live and not self._quiet else "") + printable(text) + "\n")
 
     def _write(self, text: str) -> None:
         self._stream.write(text)

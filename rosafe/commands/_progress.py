@@ -7,6 +7,8 @@ import time
 from collections.abc import Sequence
 from typing import TextIO
 
+from rosafe.terminal import printable
+
 LIVE_SECONDS = 0.1  # at least, between two looks of the live line
 PLAIN_SECONDS = 10.0  # between two plain lines
 BAR = 24  # characters
@@ -59,7 +61,7 @@ class Display:
     def message(self, text: str) -> None:
         """A line that stays."""
         self.clear()
-        self._write(text + "\n")
+        self._write(printable(text) + "\n")
         if self._live:
             self._due = 0.0  # draw it again at once
 

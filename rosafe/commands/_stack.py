@@ -16,6 +16,7 @@ from rosafe.commands import Failure
 from rosafe.component import master, paths
 from rosafe.demo.processes import Child, Children
 from rosafe.interface import COMPONENTS, ComponentError
+from rosafe.terminal import printable
 
 if TYPE_CHECKING:
     from rosafe.genomix.graph import Graph
@@ -151,7 +152,7 @@ class Stack:
     def lines(self) -> Iterator[str]:
         """What the screen shows."""
         for part in self.parts.values():
-            yield f"{part.name:9} {part.state:7} {part.detail}".rstrip()
+            yield printable(f"{part.name:9} {part.state:7} {part.detail}".rstrip())
 
 
 async def _answers(uri: str) -> bool:

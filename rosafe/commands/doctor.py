@@ -19,6 +19,7 @@ from typing import NamedTuple
 
 from rosafe import missing
 from rosafe.component import generate, master, paths
+from rosafe.terminal import printable
 from rosafe.vocabulary import plugins
 from rosafe.vocabulary.errors import ComponentError
 
@@ -89,7 +90,7 @@ def run(options: argparse.Namespace) -> int:
     else:
         width = max(map(len, findings))
         for name, (state, detail, todo) in findings.items():
-            print(f"{state:8}{name:{width}}  {detail}" + (f"  ->  {todo}" if todo else ""))
+            print(printable(f"{state:8}{name:{width}}  {detail}" + (f"  ->  {todo}" if todo else "")))
     return 1 if lacking else 0
 
 

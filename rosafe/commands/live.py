@@ -62,7 +62,7 @@ def run(options: argparse.Namespace) -> int:
     except (generate.GenerationError, master.MasterError) as problem:
         raise Failure(str(problem)) from None
     except ComponentError as problem:
-        raise Failure(str(problem.detail.get("what") or problem)) from None
+        raise Failure(str(problem)) from None
     except daemon.Taken as problem:
         raise Failure(str(problem)) from None
     return 0

@@ -28,6 +28,7 @@ from rosafe.commands._progress import Display, bytes_text
 from rosafe.commands._workers import Interrupted, Interrupts, Report, run_together
 from rosafe.interface import FIXED, KINDS, ROSAFE, Parameter
 from rosafe.interface.arguments import check_outputs
+from rosafe.terminal import printable
 
 _BLOCK = ROSAFE.service("InputProc").parameter("nFramesPerBlock")
 _MAX_JOBS = 10_000
@@ -302,10 +303,10 @@ def _runner(options: argparse.Namespace, count: int) -> Any:
 def _place(inputs: list[Path], options: argparse.Namespace) -> tuple[Path | None, Path | None]:
     """The folder for the results, or the file for the one; Failure where it can be neither."""
     out = options.to
-    one = len(inputs) == 1 and not inputs[0].is_dir()
+    one = len(inputs) == 1 and not os.path.isdir(inputs[0])
     if out is None:
         for path in inputs:
-            if path.is_dir():
+            if os.path.isdir(path):
                 raise Failure(f"{path} is a folder: name one for its results with -o")
         return None, None
     if out == "":
@@ -326,13 +327,15 @@ def _place(inputs: list[Path], options: argparse.Namespace) -> tuple[Path | None
 
 def _make_folder(folder: Path | None) -> Path | None:
     """Make the folder for the results; the topmost one that was not there. Failure where it cannot be made."""
-    if folder is None or folder.is_dir():
+    if folder is None or os.path.isdir(folder):
         return None
     new = folder
     while not os.path.lexists(new.parent):
         new = new.parent
+    from rosafe.offline.corpus import make_folder
+
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        make_folder(folder)
     except OSError as problem:
         raise Failure(f"-o {folder}: {problem.strerror}") from None
     return new
@@ -342,11 +345,15 @@ def _remove_empty(targets: Sequence[Path], folder: Path | None, made: Path | Non
     """Folders for results that are empty, all having failed; of those that were there before, none."""
     if folder is None:
         return
-    for path in sorted({target.parent for target in targets}, key=lambda path: len(path.parts), reverse=True):
-        while path != folder and folder in path.parents:
-            with contextlib.suppress(OSError):
-                path.rmdir()
+    below: set[Path] = set()
+    for target in targets:
+        path = target.parent
+        while path not in below and len(path.parts) > len(folder.parts):
+            below.add(path)
             path = path.parent
+    for path in sorted(below, key=lambda path: len(path.parts), reverse=True):
+        with contextlib.suppress(OSError):
+            path.rmdir()
     while made is not None and (folder == made or made in folder.parents):
         try:
             folder.rmdir()
@@ -369,7 +376,7 @@ class _Corpus:
     def fail(self, name: str, why: str) -> None:
         """Note that a file has failed."""
         text = why if name in why else f"{name}: {why}"
-        self.failed[name] = _one_line(text)
+        self.failed[name] = printable(text)
 
     def report(self, index: int, told: Report) -> None:
         """How a file stands."""
@@ -395,7 +402,7 @@ class _Corpus:
                 text += f"; {done.not_finite} samples that were NaN or infinite are silence or full scale"
         if self._options.verbose or (len(self._sources) == 1 and not self._options.quiet):
             kept = "" if self._options.outputs or done.skipped else "; ild, ratemap, crossCorrelation (see --outputs)"
-            self.display.message(_one_line(text + kept))
+            self.display.message(text + kept)
 
     def end(self, folder: Path | None, inputs: Sequence[Path]) -> None:
         """The sum, what has failed, and where all of that is listed."""
@@ -435,11 +442,6 @@ class _Corpus:
         if self._odd:
             text += f"; {self._odd} with NaN or infinite samples, which are silence or full scale"
         return text
-
-
-def _one_line(text: str) -> str:
-    """Without what would end the line, or do something to the terminal: names may hold anything."""
-    return "".join(c if c.isprintable() or "\udc80" <= c <= "\udcff" else repr(c)[1:-1] for c in text)
 
 
 def _size(path: Path) -> float:

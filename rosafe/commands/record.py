@@ -21,6 +21,7 @@ from rosafe.commands import Failure
 from rosafe.commands._workers import Interrupted, Interrupts
 from rosafe.interface import ComponentError
 from rosafe.output import PART, OutputError, Part
+from rosafe.terminal import printable
 
 if TYPE_CHECKING:
     from rosafe.bass.recording.levels import Levels
@@ -161,9 +162,9 @@ def _list() -> int:
 
     try:
         for line in device_lines():
-            print(line)
+            print(printable(line))
     except ComponentError as problem:
-        print(f"rosafe record: {problem.why}", file=sys.stderr)
+        print(f"rosafe record: {printable(problem.why)}", file=sys.stderr)
     return 0
 
 

@@ -19,6 +19,7 @@ from rosafe.commands import Failure
 from rosafe.commands._component import component, prepare, told
 from rosafe.interface import REQUEST, ROSAFE, ComponentError, Representation
 from rosafe.interface.arguments import check_parameter
+from rosafe.terminal import printable
 from rosafe.tree import requests as request
 from rosafe.vocabulary.parameter import shown
 from rosafe.vocabulary.words import meant
@@ -131,4 +132,4 @@ def _show(answer: Mapping[str, Any], kind: Representation) -> None:
     instance = answer["topic"].split("/")[1]
     for name, kind_there in zip(answer["dependencies"], request.chain(kind), strict=True):
         how = "created" if name in answer["created"] else "reused"
-        print(f"{how:7}  {name:{width}}  {request.topic(instance, kind_there, name)}")
+        print(printable(f"{how:7}  {name:{width}}  {request.topic(instance, kind_there, name)}"))

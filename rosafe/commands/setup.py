@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import os
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -21,6 +20,7 @@ from rosafe.input import read_regular
 from rosafe.interface import MAX_SETUP, ROSAFE, ComponentError
 from rosafe.output import write_whole
 from rosafe.setups import Setup, SetupError, read, write
+from rosafe.terminal import printable
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -134,7 +134,7 @@ def _keep(name: str, text: str) -> None:
         print(text, end="")
     else:
         write_whole(name, text.encode())
-        print(f"{os.fspath(name)}: {text.count(chr(10))} lines", file=sys.stderr)
+        print(f"{printable(name)}: {text.count(chr(10))} lines", file=sys.stderr)
 
 
 def show(answer: dict[str, Any]) -> None:
@@ -143,4 +143,4 @@ def show(answer: dict[str, Any]) -> None:
         print(f"{answer['sound']:7}  sound")
     for how in ("reused", "created"):
         for name in answer[how]:
-            print(f"{how:7}  {name}")
+            print(f"{how:7}  {printable(name)}")

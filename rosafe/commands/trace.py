@@ -16,6 +16,7 @@ import json
 import math
 import os
 import queue
+import re
 import sys
 import time
 from contextlib import nullcontext
@@ -24,6 +25,7 @@ from typing import TYPE_CHECKING, Any
 
 from rosafe.commands import Failure
 from rosafe.output import new_file
+from rosafe.terminal import printable
 
 if TYPE_CHECKING:
     from rosafe.tree.trace import Event
@@ -69,9 +71,11 @@ def run(options: argparse.Namespace) -> int:
     output: Path | None = options.output
     with nullcontext() if output is None else new_file(output, options.force) as descriptor:
         if options.sound is not None:
-            title, events = str(options.sound), _compute(options.sound, options.seconds, options.block)
+            title, events = printable(options.sound), _compute(options.sound, options.seconds, options.block)
         else:
             title = f"/{options.node.strip('/')}"
+            if not re.fullmatch(r"(/[A-Za-z]\w*)+", title, re.ASCII):
+                raise Failure(f"--node: expected the name of a node, such as rosAFE, got {options.node!r}")
             events = _listen(title, options.seconds)
         from rosafe.tree.trace import Trace
 
@@ -81,10 +85,10 @@ def run(options: argparse.Namespace) -> int:
         if descriptor is not None:
             with os.fdopen(descriptor, "w", encoding="utf-8", closefd=False) as stream:
                 json.dump(trace.chrome(title), stream)
-    print(f"{title}, {(trace.end - trace.begin) / 1e6:.2f} s")
-    print("\n".join(trace.summary()))
+    print(f"{printable(title)}, {(trace.end - trace.begin) / 1e6:.2f} s")
+    print("\n".join(map(printable, trace.summary())))
     if output is not None:
-        print(f"written to {output}, which https://ui.perfetto.dev shows")
+        print(f"written to {printable(output)}, which https://ui.perfetto.dev shows")
     return 0
 
 
@@ -140,7 +144,7 @@ def _listen(node: str, seconds: float) -> list[Event]:
         while (left := deadline - time.monotonic()) > 0:
             events += read(messages.get(timeout=left + _ANSWER_SECONDS))
     except queue.Empty:
-        print(f"rosafe trace: {node} has fallen silent", file=sys.stderr)
+        print(f"rosafe trace: {printable(node)} has fallen silent", file=sys.stderr)
     except KeyboardInterrupt:
         if not events:
             raise

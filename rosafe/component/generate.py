@@ -34,6 +34,7 @@ from typing import NamedTuple
 
 from rosafe import missing
 from rosafe.component import master, paths
+from rosafe.terminal import printable
 from rosafe.vocabulary import plugins
 
 # Debian ships the messages of these without package.xml, without which rosmsg finds no message that uses them.
@@ -330,7 +331,7 @@ def main(argv: list[str] | None = None) -> int:
     try:
         variables = environment()
     except GenerationError as problem:
-        print(f"rosafe: {problem}", file=sys.stderr)
+        print(f"rosafe: {printable(problem)}", file=sys.stderr)
         return 1
     if options.shell:
         ros = dict(os.environ)

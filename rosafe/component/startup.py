@@ -18,6 +18,7 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NoReturn, Protocol
 
 from rosafe.component import generate, master, memory, paths, systemd
+from rosafe.terminal import printable
 from rosafe.version import VERSION
 from rosafe.vocabulary.errors import ComponentError
 
@@ -92,12 +93,12 @@ def run_server(
     except _Ended:
         return 0
     except (_Failure, generate.GenerationError, master.MasterError, ComponentError, OSError) as problem:
-        print(f"{component.name}-ros: {problem}", file=sys.stderr)
+        print(f"{component.name}-ros: {printable(problem)}", file=sys.stderr)
         watchdog(END_SECONDS, 1)
         return 1
     ready = f"{component.name}-ros: ready as /{_instance(options, remappings)} at {os.environ['ROS_MASTER_URI']}"
     with contextlib.suppress(OSError):  # whoever read that has gone
-        print(ready, file=sys.stderr, flush=True)
+        print(printable(ready), file=sys.stderr, flush=True)
     if told is not None:
         told.up()
     systemd.notify("READY=1")
@@ -118,7 +119,7 @@ class Parser(argparse.ArgumentParser):
     """A parser whose errors are one line."""
 
     def error(self, message: str) -> NoReturn:
-        self.exit(2, f"{self.prog}: {message}; {self.prog} -h shows what is possible\n")
+        self.exit(2, f"{self.prog}: {printable(message)}; {self.prog} -h shows what is possible\n")
 
 
 def _parse(
@@ -178,7 +179,7 @@ def _start(
     master.check_address(os.environ["ROS_MASTER_URI"])  # a wrong one does not get better
     doubt = master.unreachable()
     if doubt:
-        print(f"{component.name}-ros: warning: {doubt}", file=sys.stderr, flush=True)
+        print(f"{component.name}-ros: warning: {printable(doubt)}", file=sys.stderr, flush=True)
     _await_master(os.environ["ROS_MASTER_URI"], received, f"{component.name}-ros" if options.wait else "")
     generate.ensure_messages()
     paths.prefer_pypi_packages()
@@ -227,7 +228,7 @@ def _await_master(uri: str, received: list[int], patient: str) -> None:
             if received or (time.monotonic() > deadline and not patient):
                 raise
         if patient and not told:
-            print(f"{patient}: waiting for a ROS master at {uri}", file=sys.stderr, flush=True)
+            print(f"{patient}: waiting for a ROS master at {printable(uri)}", file=sys.stderr, flush=True)
             told = True
         if patient:
             systemd.notify(f"STATUS=waiting for a ROS master at {uri}", "EXTEND_TIMEOUT_USEC=30000000")
@@ -263,16 +264,24 @@ def ensure_log_directory() -> None:
 
 
 def log_to_stderr() -> None:
-    """Move rospy's information lines to stderr, where its warnings are: stdout belongs to what a request prints."""
+    """Move rospy's information lines to stderr, where its warnings are: stdout belongs to what a request prints.
+
+    What they quote from clients and files is escaped.
+    """
     import logging
 
     from rosgraph.roslogging import RosStreamHandler
+
+    class Handler(RosStreamHandler):
+        def emit(self, record: logging.LogRecord) -> None:
+            text = printable(record.getMessage(), keep="\n")
+            super().emit(logging.makeLogRecord({**vars(record), "msg": text, "args": ()}))
 
     rosout = logging.getLogger("rosout")
     for handler in rosout.handlers[:]:
         if isinstance(handler, RosStreamHandler):
             rosout.removeHandler(handler)
-            rosout.addHandler(RosStreamHandler(stdout=sys.stderr, stderr=sys.stderr))
+            rosout.addHandler(Handler(stdout=sys.stderr, stderr=sys.stderr))
 
 
 # --- end --------------------------------------------------------------------------------------------------------

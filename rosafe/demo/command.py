@@ -12,6 +12,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NoReturn
 
+from rosafe.terminal import printable
+
 DEFAULT_DEVICE = "scene:"
 DEFAULT_SECONDS = 10.0
 SHORTEST, LONGEST = 2.0, 600.0
@@ -167,6 +169,6 @@ def _run(options: argparse.Namespace, signals: _Signals, scratch: str) -> int:
         os.environ["MPLCONFIGDIR"] = str(cache) if writable(cache) else scratch
         course.run(options.sound, options.seconds, options.out / PICTURE, scratch, signals.check, signals.defer)
     except (course.DemoError, AudioFileError, ComponentError, GenerationError, OutputError) as problem:
-        print(f"demo: {' '.join(str(problem).split())}", file=sys.stderr)
+        print(f"demo: {printable(' '.join(str(problem).split()))}", file=sys.stderr)
         return 1
     return 0

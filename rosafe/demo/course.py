@@ -13,6 +13,7 @@ from rosafe.demo.progress import Progress
 from rosafe.demo.recorder import PortRecorder
 from rosafe.demo.session import NAMES, POLL_SECONDS, DemoError, GuideSession, acquire, requests
 from rosafe.demo.sound import Sound
+from rosafe.terminal import printable
 from rosafe.view import estimates, report
 from rosafe.view.representations import Representations
 
@@ -54,9 +55,9 @@ def run(
     asked_seconds, seconds = seconds, sound.seconds_to_follow(seconds)
     if seconds == 0:
         raise DemoError(f"{sound.title} lasts {sound.length:.3f} s, which is too short to show anything")
-    print(f"rosAFE, the auditory front-end, on {sound.device}", flush=True)
+    print(f"rosAFE, the auditory front-end, on {printable(sound.device)}", flush=True)
     if sound.note:
-        print(sound.note, flush=True)
+        print(printable(sound.note), flush=True)
     left_out = min(asked_seconds, sound.length) - seconds
     if left_out > 0:
         print(
@@ -80,11 +81,11 @@ def run(
     finally:
         defer()
         session.close()
-    print(f"\npicture: {picture}", flush=True)
+    print(f"\npicture: {printable(picture)}", flush=True)
 
 
 def _say_command(command: str) -> None:
-    print(f"$ {command}", flush=True)
+    print(f"$ {printable(command)}", flush=True)
 
 
 def _build(session: GuideSession, recorder: PortRecorder, sound: Sound) -> tuple[int, int]:
@@ -123,7 +124,7 @@ def _follow(
         problem = session.why_silent()
         if problem:
             raise DemoError(f"{sound.device}: {problem}")
-        print(f"{sound.device} has come to its end", flush=True)
+        print(f"{printable(sound.device)} has come to its end", flush=True)
     recorder.stop()
     asked = time.monotonic()
     session.wait(lambda: recorder.health_since(asked), HEALTH_SECONDS, "the nodes tell nothing on /diagnostics")

@@ -18,6 +18,7 @@ from rosafe.genomix.graph import Graph
 from rosafe.genomix.server import Server
 from rosafe.genomix.sessions import Sessions
 from rosafe.http_server.access import own_names
+from rosafe.terminal import printable
 from rosafe.version import VERSION
 
 DEFAULT_PORT = 8080
@@ -38,7 +39,7 @@ def main(argv: list[str] | None = None) -> int:
         startup.ensure_log_directory()
         return asyncio.run(_serve(options, told))
     except (generate.GenerationError, OSError, ValueError) as problem:
-        print(f"genomixd: {_told(problem, options)}", file=sys.stderr)
+        print(f"genomixd: {printable(_told(problem, options))}", file=sys.stderr)
         return 1
 
 
@@ -78,12 +79,21 @@ def _told(problem: Exception, options: argparse.Namespace) -> str:
         return f"port {options.port} of {options.host} is taken, perhaps by another genomixd; -p chooses another"
     if number == errno.EACCES:
         return f"port {options.port} of {options.host} is not for this user; -p chooses another"
+    if isinstance(problem, UnicodeError):  # of a host's name
+        return f"--host: expected a name or address of this machine, got {options.host!r}"
     return str(problem)
+
+
+class _Formatter(logging.Formatter):
+    """Escapes what a line of the log quotes from clients."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:
+        return printable(super().formatMessage(record))
 
 
 def _log_to_stderr(verbosity: int) -> None:
     handler = logging.StreamHandler()
-    handler.setFormatter(logging.Formatter("genomixd: %(message)s"))
+    handler.setFormatter(_Formatter("genomixd: %(message)s"))
     log = logging.getLogger("genomixd")
     log.addHandler(handler)
     log.setLevel((logging.WARNING, logging.INFO, logging.DEBUG)[verbosity])

@@ -308,7 +308,7 @@ def component_exception(exdetail: str) -> ComponentError:
     """The exception that a component's `genom_exdetail` names."""
     try:
         body = json.loads(exdetail)
-    except ValueError:
+    except (ValueError, RecursionError):
         body = exdetail
     if isinstance(body, dict) and isinstance(body.get("ex"), str):
         detail, what = body.get("detail"), body.get("what")

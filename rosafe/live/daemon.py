@@ -83,7 +83,7 @@ async def serve(options: Options) -> None:
         news = server.news
         try:
             port = await server.start(options.host, options.port)
-        except OSError as problem:
+        except (OSError, UnicodeError) as problem:
             raise Taken(_why(problem, options)) from None
         shown = EVERYWHERE.get(options.host, f"[{options.host}]" if ":" in options.host else options.host)
         url = f"http://{shown}:{port}/?token={door.token}"
@@ -123,15 +123,16 @@ async def _publish_images(hub: Hub, server: Server) -> None:
         await asyncio.sleep(images.PERIOD)
 
 
-def _why(problem: OSError, options: Options) -> str:
+def _why(problem: OSError | UnicodeError, options: Options) -> str:
     place = f"port {options.port} of {options.host}"
-    if problem.errno == errno.EADDRINUSE:
+    number = getattr(problem, "errno", None)
+    if number == errno.EADDRINUSE:
         return f"{place} is taken, perhaps by another rosafe live; --port chooses another"
-    if problem.errno == errno.EACCES:
+    if number == errno.EACCES:
         return f"{place} is not for this user; --port chooses another"
-    if problem.errno == errno.EADDRNOTAVAIL or (isinstance(problem, OSError) and problem.errno is None):
+    if number in (errno.EADDRNOTAVAIL, None):
         return f"{options.host} is no address of this machine; --host names one, such as 0.0.0.0 for all"
-    return f"cannot listen on {place}: {problem.strerror or problem}"
+    return f"cannot listen on {place}: {getattr(problem, 'strerror', None) or problem}"
 
 
 def _has_display() -> bool:

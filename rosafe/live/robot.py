@@ -135,5 +135,5 @@ def told(problem: ComponentError) -> str:
     """A refusal in one line: its name, and what it is about."""
     name = problem.ex.rpartition("::")[2]
     known = {**BASS.exceptions, **ROSAFE.exceptions}
-    what = problem.detail.get("what") or known.get(name, "")
+    what = problem.what or known.get(name, "")
     return f"{name}: {what}" if what else problem.ex

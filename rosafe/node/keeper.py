@@ -10,6 +10,7 @@ from rosafe.input import read_regular
 from rosafe.interface import MAX_SETUP, ROSAFE
 from rosafe.output import OutputError, write_whole
 from rosafe.setups import Setup, SetupError, read, write
+from rosafe.terminal import printable
 
 
 class Keeper:
@@ -50,7 +51,7 @@ class Keeper:
         except (OSError, UnicodeDecodeError, SetupError) as problem:
             why = getattr(problem, "strerror", None) or problem
             what = f"{self.path}: {why}; correct the file, or delete it to start with an empty tree"
-            raise ROSAFE.error("e_badNewValue", what=what) from None
+            raise ROSAFE.error("e_badNewValue", what=printable(what)) from None
 
     def save(self) -> None:
         """Have all changes up to now in the file once this returns; where that fails, life goes on."""
@@ -62,9 +63,10 @@ class Keeper:
                 write_whole(self.path, text.encode())
                 self._written, self.problem = text, ""
             except OutputError as failure:
+                why = printable(failure)  # messages of ROS have no room for bytes that are not UTF-8
                 if not self.problem:
-                    self._report(f"the tree is not kept: {failure}")
-                self.problem = str(failure)
+                    self._report(f"the tree is not kept: {why}")
+                self.problem = why
 
     def close(self) -> None:
         """Write nothing any more: the processors end now, and are to come back."""

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from io import StringIO, TextIOWrapper
+from itertools import takewhile
 from pathlib import Path, PurePath
 from typing import Any, NamedTuple
 
@@ -45,7 +48,7 @@ def compute(source: Path, target: Path, settings: Settings, progress: Callable[[
 
     try:
         if settings.make_folders:
-            target.parent.mkdir(parents=True, exist_ok=True)
+            make_folder(target.parent)
     except OSError as problem:
         raise OutputError(f"cannot write {target}: {problem.strerror}") from None
     return process_file(
@@ -68,7 +71,7 @@ def compute(source: Path, target: Path, settings: Settings, progress: Callable[[
 def find(inputs: Sequence[Path], besides: Path | None = None) -> tuple[list[Item], list[tuple[Path, str]]]:
     """The sounds that are meant by files and folders, and what is wrong with some of these.
 
-    Folders are searched all the way down, symbolic links followed, but for those back up; names that begin with a dot
+    Folders are searched all the way down, symbolic links followed, each real folder once; names that begin with a dot
     are left out. Of one folder the places are what lies below it; of several inputs those of a folder begin with its
     name.
 
@@ -82,39 +85,65 @@ def find(inputs: Sequence[Path], besides: Path | None = None) -> tuple[list[Item
     items: list[Item] = []
     problems: list[tuple[Path, str]] = []
     for path in inputs:
-        if not path.is_dir():
+        if not os.path.isdir(path):
             items.append(Item(path, PurePath(path.name or "_")))
             continue
         root = PurePath() if len(inputs) == 1 else PurePath(Path(os.path.abspath(path)).name)
         before = len(items) + len(problems)
-        for found in _sounds(path, besides, frozenset(), problems):
+        for found in _sounds(path, besides, problems):
             items.append(Item(found, root / found.relative_to(path)))
         if len(items) + len(problems) == before:
             problems.append((path, f"{path}: there is no sound file in this folder"))
     return items, problems
 
 
-def _sounds(
-    folder: Path, besides: Path | None, above: frozenset[tuple[int, int]], problems: list[tuple[Path, str]]
-) -> Iterator[Path]:
-    try:
-        status = folder.stat()
-        entries = sorted(os.scandir(folder), key=lambda entry: entry.name)
-    except OSError as problem:
-        problems.append((folder, f"{folder}: {problem.strerror}"))
-        return
-    own = (status.st_dev, status.st_ino)
-    if own in above:
-        return
-    for entry in entries:
-        path = folder / entry.name
-        if entry.name.startswith("."):
+def _sounds(folder: Path, besides: Path | None, problems: list[tuple[Path, str]]) -> list[Path]:
+    """The sounds below a folder, sorted. Folders are searched without recursion: they may be nested to any depth.
+
+    Each real folder is searched once: links are followed last, and only to folders that were not reached without them.
+    """
+    found: list[Path] = []
+    waiting, links = [folder], deque[Path]()
+    seen = _identity(besides) - _identity(folder)
+    while waiting or links:
+        path = waiting.pop() if waiting else links.popleft()
+        try:
+            status = path.stat()
+            if (identity := (status.st_dev, status.st_ino)) in seen:
+                continue
+            seen.add(identity)
+            entries = sorted(os.scandir(path), key=lambda entry: entry.name)
+        except OSError as problem:
+            problems.append((path, f"{path}: {problem.strerror}"))
             continue
-        if path.is_dir():
-            if besides is None or not (besides.is_dir() and path.samefile(besides)):
-                yield from _sounds(path, besides, above | {own}, problems)
-        elif path.suffix.lower() in SOUNDS:
-            yield path
+        for entry in entries:
+            if entry.name.startswith("."):
+                continue
+            if entry.is_dir(follow_symlinks=False):
+                waiting.append(path / entry.name)
+            elif entry.is_symlink() and os.path.isdir(entry.path):
+                links.append(path / entry.name)
+            elif PurePath(entry.name).suffix.lower() in SOUNDS:
+                found.append(path / entry.name)
+    return sorted(found, key=lambda path: path.parts)
+
+
+def _identity(folder: Path | None) -> set[tuple[int, int]]:
+    """Device and inode of a folder; empty if there is none."""
+    try:
+        status = os.stat(folder or "")
+    except OSError:
+        return set()
+    return {(status.st_dev, status.st_ino)}
+
+
+def make_folder(folder: Path) -> None:
+    """Create a folder and those above it, at any depth (`Path.mkdir` is recursive); OSError if that fails."""
+    with contextlib.suppress(FileNotFoundError):
+        os.stat(folder)  # a name that is too long is an error before anything has been created
+    missing = list(takewhile(lambda path: not os.path.isdir(path), (folder, *folder.parents)))
+    for path in reversed(missing):
+        path.mkdir(exist_ok=True)
 
 
 # --- where it goes ----------------------------------------------------------------------------------------------

@@ -102,7 +102,7 @@ def process_file(
     check_format(form, wanted)
     about: dict[str, Any] = {
         "rosafe_version": VERSION,
-        "source": os.fsencode(os.path.basename(source)).decode("utf-8", "replace"),
+        "source": os.fsencode(os.path.basename(source)).decode("utf-8", "backslashreplace"),
         "block_frames": block_frames,
         **({"channels": list(channels)} if channels else {}),
         **({"topic": topic} if topic else {}),

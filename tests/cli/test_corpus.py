@@ -5,12 +5,14 @@ from __future__ import annotations
 import csv
 import os
 import signal
+import subprocess
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from rosafe import load, process
+from rosafe.offline.corpus import find
 from tests.cli.command import (
     ROSAFE,
     SMALL,
@@ -27,6 +29,7 @@ from tests.harness import wait_for
 from tests.terminal import Terminal
 
 RATE = 16000
+STRICT = "utf-8:strict"  # in most locales stdout raises an error for bytes that are not UTF-8
 OPTIONS = (*SMALL, "--outputs", "ild")
 
 
@@ -106,7 +109,7 @@ def test_results_within_the_corpus(tmp_path: Path) -> None:
 
 
 def test_links(tmp_path: Path) -> None:
-    """They are followed, but for those that lead back up."""
+    """They are followed, but not to a folder that was searched already."""
     sounds = corpus(tmp_path / "elsewhere", 2)
     here = tmp_path / "corpus"
     here.mkdir()
@@ -119,6 +122,103 @@ def test_links(tmp_path: Path) -> None:
     wanted = {f"linked/{name}": sound for name, sound in sounds.items()} | {"one": sounds["s0"]}
     assert_results(tmp_path / "out", wanted)
     assert failed(tmp_path / "out") == {"corpus/nowhere.wav": "corpus/nowhere.wav: No such file or directory"}
+
+
+def test_folders_that_link_to_each_other(tmp_path: Path) -> None:
+    """Each real folder is searched once, by its own name if it is in the corpus."""
+    names = [f"f{number}" for number in range(9)]
+    sounds = {}
+    for number, name in enumerate(names):
+        (tmp_path / "corpus" / name).mkdir(parents=True)
+        sounds[f"{name}/s"] = noise(3000, number)
+        write(tmp_path / "corpus" / name / "s.wav", sounds[f"{name}/s"])
+        for other in names:
+            (tmp_path / "corpus" / name / f"0{other}").symlink_to(Path("..", other))
+    items, problems = find([tmp_path / "corpus"])
+    assert [str(item.place) for item in items] == [f"{name}.wav" for name in sounds] and not problems
+    items, problems = find([tmp_path / "corpus" / "f1"])  # the others are elsewhere
+    assert sorted(str(item.place) for item in items) == sorted(
+        ["s.wav", *(f"0{name}/s.wav" for name in names if name != "f1")]
+    )
+    assert not problems
+    done = rosafe("process", "corpus", "-o", "out", *OPTIONS, cwd=tmp_path)
+    assert done.returncode == 0 and done.stderr.startswith("9 files: 9 done; "), done
+    assert_results(tmp_path / "out", sounds)
+
+
+def nest(folder: Path, name: str, levels: int, every: int) -> None:
+    """Folders in each other, and `s.wav` of the folder above in one of so many; paths are too long for the system."""
+    sound = (folder / "s.wav").read_bytes()
+    at = os.open(folder, os.O_RDONLY)
+    for level in range(1, levels + 1):
+        os.mkdir(name, dir_fd=at)
+        below = os.open(name, os.O_RDONLY, dir_fd=at)
+        os.close(at)
+        at = below
+        if level % every == 0:
+            with open(os.open("s.wav", os.O_CREAT | os.O_WRONLY, 0o644, dir_fd=at), "wb") as file:
+                file.write(sound)
+    os.close(at)
+
+
+def test_very_deep_folders(tmp_path: Path) -> None:
+    here = tmp_path / "corpus"
+    here.mkdir()
+    write(here / "s.wav", noise(3000))
+    try:
+        nest(here, "d", 1500, 500)
+        done = rosafe("process", here, "-o", tmp_path / "out", *OPTIONS)
+        assert done.returncode == 0 and done.stderr.startswith("4 files: 4 done; "), done.stderr[-500:]
+        results = [tmp_path / "out" / ("d/" * depth) / "s.npz" for depth in (0, 500, 1000, 1500)]
+        for result in results[1:]:
+            np.testing.assert_array_equal(load(result)["ild"], load(results[0])["ild"])
+    finally:
+        subprocess.run(["rm", "-rf", here, tmp_path / "out"], check=True)  # shutil.rmtree is recursive
+
+
+def test_folders_whose_paths_are_too_long(tmp_path: Path) -> None:
+    """That folder is named on one line; the others are processed. A result's name that is too long leaves nothing."""
+    here = tmp_path / "corpus"
+    here.mkdir()
+    write(here / "s.wav", noise(3000))
+    try:
+        nest(here, "d" * 250, 20, 15)
+        done = rosafe("process", here, "-o", tmp_path / "out", *OPTIONS)
+        summary, *lines = done.stderr.splitlines()
+        assert done.returncode == 1 and summary.startswith("3 files: 2 done, 1 failed; "), summary
+        assert len(lines) == 1 and lines[0].endswith(": File name too long")
+        assert len(failed(tmp_path / "out")) == 1
+        longer = "/".join(["e" * 250] * 15)
+        done = rosafe("process", here, "-o", tmp_path / "other" / longer, *OPTIONS, "-q")
+        assert done.returncode == 1 and done.stderr.count(": File name too long\n") == 2, done.stderr[-500:]
+        done = rosafe("process", here, "-o", tmp_path / "none" / longer / longer, *OPTIONS)
+        assert done.returncode == 1 and done.stderr.endswith(": File name too long\n") and done.stderr.count("\n") == 1
+        assert not (tmp_path / "none").exists()
+    finally:
+        subprocess.run(["rm", "-rf", here, tmp_path / "out", tmp_path / "other"], check=True)
+
+
+@pytest.mark.parametrize("extension", [".npz", ".h5", ".mat", ".zarr", ".csv"])
+def test_names_that_are_not_utf8(tmp_path: Path, extension: str) -> None:
+    """They are read, written, resumed and plotted. Results hold the name as text, the list of failures as bytes."""
+    here = tmp_path / "corp\udcffus"
+    here.mkdir()
+    sound = noise(3000)
+    write(tmp_path / "s.wav", sound)
+    (tmp_path / "s.wav").rename(here / "s\udcfe.wav")
+    (here / "bad\udcff.wav").write_text("no sound")
+    options = ("-o", "out\udcff", *OPTIONS, "--format", extension[1:])
+    done = rosafe("process", here.name, *options, cwd=tmp_path, PYTHONIOENCODING=STRICT)
+    assert done.returncode == 1 and r"corp\xffus/bad\xff.wav" in done.stderr, done
+    result = tmp_path / "out\udcff" / f"s\udcfe{extension}"
+    expected = process(as_int32(sound), RATE, parameters=SMALL_PARAMETERS, outputs=["ild"])
+    np.testing.assert_array_equal(load(result)["ild"], expected["ild"])
+    assert load(result)["source"] == r"s\xfe.wav"
+    assert list(failed(tmp_path / "out\udcff")) == ["corp\udcffus/bad\udcff.wav"]
+    done = rosafe("process", here.name, *options, "--resume", "-v", cwd=tmp_path, PYTHONIOENCODING=STRICT)
+    assert r"s\xfe.wav -> " in done.stderr and done.stderr.count(": complete already\n") == 1, done
+    done = rosafe("plot", result, "-o", tmp_path / "p\udcff.png", PYTHONIOENCODING=STRICT)
+    assert done.returncode == 0 and not done.stderr and (tmp_path / "p\udcff.png").stat().st_size, done
 
 
 def test_what_fails_is_named_and_does_not_keep_the_others(tmp_path: Path) -> None:

@@ -256,7 +256,8 @@ def test_requests_and_their_refusals(world: World) -> None:
             refused = await client.ask("modify", nameProc="ratemap_0", nameParam="rm_decaySec", newValue="-1")
             assert "e_badNewValue" in refused["error"] and "rm_decaySec" in refused["error"]
             assert "e_noSuchProcessor" in (await client.ask("remove", name="nobody"))["error"]
-            assert "e_device" in (await client.ask("acquire", device="hw:99,99"))["error"]
+            refused = (await client.ask("acquire", device="file:/none/there.wav"))["error"]  # with bass's reason
+            assert refused == "e_device: /none/there.wav: No such file or directory"
             assert (await client.ask("remove", name=made["name"])) == {"about": "answer", "id": 6, "ok": {}}
             assert any(one["name"] == "scene:" for one in (await client.ask("devices"))["ok"]["devices"])
             text = (await client.ask("save"))["ok"]["setup"]
