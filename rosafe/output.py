@@ -11,7 +11,7 @@ import os
 import shlex
 import shutil
 import stat
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -60,7 +60,7 @@ class Part:
         self._replace = replace
         self._begun = self.keep = False
         try:
-            self.descriptor = self._locked()
+            self.descriptor = _locked(self.name, self._open)
         except OSError as problem:
             raise self.error(problem) from None
         if precious and not replace and self._left_over():
@@ -69,31 +69,14 @@ class Part:
                 f"{self.name} is what an interrupted recording has left: rename or remove it; --force replaces it"
             )
 
-    def _locked(self) -> int:
-        while True:
-            flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
-            descriptor = os.open(self.name, flags, 0o666)
-            try:
-                found = os.fstat(descriptor)
-                if not stat.S_ISREG(found.st_mode) or found.st_nlink > 1:
-                    raise OSError(errno.EEXIST, f"{self.name} is there, and no file of its own")
-                fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                if self._is_at_its_name(found):
-                    return descriptor
-            except BlockingIOError:
-                who = _holder(descriptor)
-                os.close(descriptor)
-                raise BlockingIOError(errno.EAGAIN, f"{who} is writing it") from None
-            except BaseException:
-                os.close(descriptor)
-                raise
-            os.close(descriptor)  # whoever had it has just finished, and moved or removed it
-
-    def _is_at_its_name(self, status: os.stat_result) -> bool:
-        try:
-            return os.path.samestat(self.name.lstat(), status)
-        except FileNotFoundError:
-            return False
+    def _open(self) -> int:
+        flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
+        descriptor = os.open(self.name, flags, 0o666)
+        found = os.fstat(descriptor)
+        if not stat.S_ISREG(found.st_mode) or found.st_nlink > 1:
+            os.close(descriptor)
+            raise OSError(errno.EEXIST, f"{self.name} is there, and no file of its own")
+        return descriptor
 
     def _left_over(self) -> bool:
         return not self._begun and os.fstat(self.descriptor).st_size > 0
@@ -107,7 +90,7 @@ class Part:
     def complete(self) -> None:
         """Let it take its place; OSError where it cannot, FileExistsError where that is taken now."""
         os.fsync(self.descriptor)  # else a power cut could leave an empty file of that name
-        if not self._is_at_its_name(os.fstat(self.descriptor)):
+        if not _is_at(self.name, self.descriptor):
             raise FileNotFoundError(errno.ENOENT, f"{self.name} is not there any more")
         if self._replace:
             self.name.rename(self._path)
@@ -118,7 +101,7 @@ class Part:
 
     def close(self) -> None:
         """Unlock it; what is not complete goes, unless it is to be kept or is still what somebody else has left."""
-        if not (self.keep or self._left_over()) and self._is_at_its_name(os.fstat(self.descriptor)):
+        if not (self.keep or self._left_over()) and _is_at(self.name, self.descriptor):
             self.name.unlink()
         os.close(self.descriptor)
 
@@ -177,25 +160,29 @@ def new_folder(target: str | Path, replace: bool, sign: str) -> Iterator[Path]:
     OutputError
         The place is taken, or another process writes to it, or nothing can be written there; an OSError from within.
     """
-    try:
-        path = Path(os.path.realpath(target))
-    except (OSError, ValueError) as problem:
-        raise OutputError(f"cannot write {target}: {getattr(problem, 'strerror', None) or problem}") from None
+    path = _real(target)
     try:
         if os.path.lexists(path):
             _check_replaceable(Path(target), path, replace, sign)
         elif not path.parent.is_dir():
             raise OutputError(f"cannot write {target}: there is no folder {path.parent}")
         part = path.with_name(path.name + PART)
-        descriptor = _locked_folder(part)
+        descriptor = _locked(part, lambda: _open_folder(part))
         try:
             for left in part.iterdir():
                 _remove(left)
             yield part
             os.fsync(descriptor)
-            _put_in_place(part, path, replace)
+            if not _is_at(part, descriptor):
+                raise FileNotFoundError(errno.ENOENT, f"{part} is not there any more")
+            if os.path.lexists(path):
+                _check_replaceable(Path(target), path, replace, sign)
+                _exchange(part, path)
+            else:
+                _renameat2(part, path, _RENAME_NOREPLACE)
+            _sync_folder(path.parent)
         finally:
-            if part.exists() and os.path.samestat(part.stat(), os.fstat(descriptor)):
+            if _is_at(part, descriptor):
                 shutil.rmtree(part, ignore_errors=True)
             os.close(descriptor)
     except OSError as problem:
@@ -211,13 +198,38 @@ def _check_replaceable(target: Path, path: Path, replace: bool, sign: str) -> No
         raise OutputError(f"{target} is a folder with other things in it, which stay")
 
 
-def _locked_folder(part: Path) -> int:
+def _open_folder(part: Path) -> int:
     while True:
         part.mkdir(exist_ok=True)
-        descriptor = os.open(part, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC | os.O_NOFOLLOW)
+        with contextlib.suppress(FileNotFoundError):  # another process has just removed or moved it
+            return os.open(part, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC | os.O_NOFOLLOW)
+
+
+def _exchange(part: Path, path: Path) -> None:
+    """Put a folder in the place of another, which is removed.
+
+    The old one has the name of the part meanwhile. It is locked, so that no other writer takes it for its own part.
+    """
+    old = _locked(path, lambda: os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC | os.O_NOFOLLOW))
+    try:
+        try:
+            _renameat2(part, path, _RENAME_EXCHANGE)
+        except FileExistsError:  # a file system that cannot
+            shutil.rmtree(path)
+            part.rename(path)
+        else:
+            shutil.rmtree(part, ignore_errors=True)
+    finally:
+        os.close(old)
+
+
+def _locked(name: Path, opened: Callable[[], int]) -> int:
+    """The descriptor of the file or folder `name` that `opened` returns, locked; BlockingIOError if another has it."""
+    while True:
+        descriptor = opened()
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            if part.exists() and os.path.samestat(part.lstat(), os.fstat(descriptor)):
+            if _is_at(name, descriptor):
                 return descriptor
         except BlockingIOError:
             who = _holder(descriptor)
@@ -226,19 +238,14 @@ def _locked_folder(part: Path) -> int:
         except BaseException:
             os.close(descriptor)
             raise
-        os.close(descriptor)  # whoever had it has just finished
+        os.close(descriptor)  # the process that had it has just finished, and moved or removed it
 
 
-def _put_in_place(part: Path, path: Path, replace: bool) -> None:
-    if not (replace and path.exists()):
-        _renameat2(part, path, _RENAME_NOREPLACE)
-        return
+def _is_at(name: Path, descriptor: int) -> bool:
     try:
-        _renameat2(part, path, _RENAME_EXCHANGE)  # the old one has the name of the part then
-    except FileExistsError:  # a file system that cannot
-        shutil.rmtree(path)
-        part.rename(path)
-    shutil.rmtree(part, ignore_errors=True)
+        return os.path.samestat(name.lstat(), os.fstat(descriptor))
+    except FileNotFoundError:
+        return False
 
 
 def _remove(path: Path) -> None:
@@ -258,20 +265,30 @@ def write_whole(target: str | Path, data: bytes) -> None:
 
 def _place(target: Path, replace: bool) -> Path:
     """Where the output goes, links followed; OutputError where that is taken or cannot be."""
+    path = _real(target)
     try:
-        path = Path(os.path.realpath(target))
         found = path.lstat()
     except FileNotFoundError:
         if not path.parent.is_dir():
             raise OutputError(f"cannot write {target}: there is no folder {path.parent}") from None
         return path
-    except (OSError, ValueError) as problem:
-        raise OutputError(f"cannot write {target}: {getattr(problem, 'strerror', None) or problem}") from None
+    except OSError as problem:
+        raise OutputError(f"cannot write {target}: {problem.strerror or problem}") from None
     if not stat.S_ISREG(found.st_mode):
         raise OutputError(f"{target} is not a regular file")
     if not replace:
         raise OutputError(f"{target} is there already; --force replaces it")
     return path
+
+
+def _real(target: str | Path) -> Path:
+    """The absolute path of the output, links followed; OutputError if there is none."""
+    try:
+        return Path(os.path.realpath(target))
+    except FileNotFoundError:
+        raise OutputError(f"cannot write {target}: the current directory has been deleted; change to another") from None
+    except (OSError, ValueError) as problem:
+        raise OutputError(f"cannot write {target}: {getattr(problem, 'strerror', None) or problem}") from None
 
 
 def _renameat2(name: Path, path: Path, flag: int) -> None:

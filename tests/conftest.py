@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -58,6 +59,19 @@ def pulse(tmp_path: Path) -> Iterator[PulseServer]:
     server.start()
     yield server
     server.kill()
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> tuple[Path, list[str]]:
+    """A folder, and the beginning of a command line: for that command the folder is a file system of 4 MiB."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    mount = 'mount -t tmpfs -o size=4m none "$0" && exec "$@"'
+    before = ["unshare", "--mount", "sh", "-c", mount, str(folder)]
+    tried = subprocess.run([*before, "true"], capture_output=True, text=True, check=False)
+    if tried.returncode != 0:
+        pytest.skip(f"no file system can be mounted here: {tried.stderr.strip()}")
+    return folder, before
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -284,7 +284,8 @@ def _opened(part: Part | None, options: argparse.Namespace, source: SoundSource)
     except FileExistsError:
         raise OutputError(f"{part.target} has come into being meanwhile; the recording is {part.name}") from None
     except OSError as problem:
-        raise part.error(problem) from None
+        left = f"; what was recorded is in {part.name}" if part.keep and part.name.exists() else ""
+        raise OutputError(f"{part.error(problem)}{left}") from None
 
 
 def _open_output(part: Part, options: argparse.Namespace, source: SoundSource) -> Output:

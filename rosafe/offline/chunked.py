@@ -4,16 +4,17 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
+from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from rosafe.offline.contents import Contents, is_scalar, told
+from rosafe.offline.hdf5 import Hdf5
 
 CHUNK = 2**19  # bytes, about; what is read and written at a time
 _MAT_HEAD = b"MATLAB 7.3 MAT-file, written by rosafe"
-_MAT_USERBLOCK = 512
 _FILL = math.nan  # of zarr's arrays: xarray takes each number that equals it for one that is missing, and shows NaN
 
 
@@ -58,7 +59,12 @@ class ChunkedWriter(ABC):
         self._path = path
         self._contents = contents
         self._waiting = {name: _Waiting(shape) for name, shape in contents.shapes.items()}
-        self._begin()
+        self._open = ExitStack()
+        try:
+            self._begin()
+        except BaseException:
+            self.close()
+            raise
 
     @classmethod
     def size(cls, contents: Contents) -> int:
@@ -93,81 +99,92 @@ class ChunkedWriter(ABC):
     def _end(self) -> None:
         """Complete the file."""
 
-    @abstractmethod
     def close(self) -> None:
         """Close the file, complete or not."""
+        self._open.close()
 
 
-class H5Writer(ChunkedWriter):
-    """HDF5: a dataset for each array, with its axes as labels and its unit; all else are attributes of the file."""
+class _Hdf5Writer(ChunkedWriter):
+    """Writes a file of the HDF5 library."""
+
+    USERBLOCK = 0  # bytes before the file of the library
 
     def _begin(self) -> None:
-        import h5py
+        self._file = self._open.enter_context(closing(Hdf5(self._path, userblock_size=self.USERBLOCK)))
+        self._file.call(self._create)
 
+    def _write(self, name: str, at: int, data: np.ndarray) -> None:
+        self._file.call(self._put_into, name, at, data)
+
+    def _end(self) -> None:
+        self._file.close()
+        self._file.check()
+
+    @abstractmethod
+    def _create(self, file: Any) -> None:
+        """Put everything in the open file but the arrays' numbers."""
+
+    @abstractmethod
+    def _put_into(self, file: Any, name: str, at: int, data: np.ndarray) -> None:
+        """Write a part of an array."""
+
+
+class H5Writer(_Hdf5Writer):
+    """HDF5: a dataset for each array, with its axes as labels and its unit; all else are attributes of the file."""
+
+    def _create(self, file: Any) -> None:
         contents = self._contents
-        self._file = h5py.File(self._path, "w", locking=False)  # it is locked already, by its Part
         for name, value in contents.fixed.items():
-            self._file[name] = value
+            file[name] = value
         for name, shape in contents.shapes.items():
             chunks = (*shape[:-1], self._waiting[name].frames) if math.prod(shape) else None
-            dataset = self._file.create_dataset(name, shape, np.float64, chunks=chunks)
+            dataset = file.create_dataset(name, shape, np.float64, chunks=chunks)
             dataset.attrs["unit"] = contents.units[name]
             for dimension, axis in zip(dataset.dims, contents.axes[name], strict=True):
                 dimension.label = axis
         for name, text in contents.flat().items():
-            self._file.attrs[name] = text
+            file.attrs[name] = text
 
-    def _write(self, name: str, at: int, data: np.ndarray) -> None:
-        self._file[name][..., at : at + data.shape[-1]] = data
-
-    def _end(self) -> None:
-        self._file.close()
-
-    def close(self) -> None:
-        """Close the file, complete or not."""
-        self._file.close()
+    def _put_into(self, file: Any, name: str, at: int, data: np.ndarray) -> None:
+        file[name][..., at : at + data.shape[-1]] = data
 
 
-class Mat73Writer(ChunkedWriter):
+class Mat73Writer(_Hdf5Writer):
     """MATLAB's version 7.3: HDF5 behind 512 bytes, axes in the opposite order, types as attributes."""
 
-    def _begin(self) -> None:
-        import h5py
+    USERBLOCK = 512
 
-        self._file = h5py.File(self._path, "w", userblock_size=_MAT_USERBLOCK, locking=False)
+    def _create(self, file: Any) -> None:
         for name, shape in self._contents.shapes.items():
             if math.prod(shape):
                 chunks = (self._waiting[name].frames, *shape[-2::-1])
-                dataset = self._file.create_dataset(name, shape[::-1], np.float64, chunks=chunks)
+                dataset = file.create_dataset(name, shape[::-1], np.float64, chunks=chunks)
                 dataset.attrs["MATLAB_class"] = np.bytes_("double")
             else:
-                self._add(name, np.array(shape, np.uint64), "double", MATLAB_empty=np.uint8(1))
+                self._add(file, name, np.array(shape, np.uint64), "double", MATLAB_empty=np.uint8(1))
         flat = self._contents.flat()
         texts = {name: value for name, value in flat.items() if isinstance(value, str)}
         numbers: dict[str, Any] = {**flat, **self._contents.fixed}
         for name, text in texts.items():
             codes = np.frombuffer(text.encode("utf-16-le"), np.uint16).reshape(-1, 1)
-            self._add(name, codes, "char", MATLAB_int_decode=np.int32(2))
+            self._add(file, name, codes, "char", MATLAB_int_decode=np.int32(2))
         for name in numbers.keys() - texts.keys():
-            self._add(name, np.atleast_1d(np.asarray(numbers[name], np.float64))[np.newaxis], "double")
+            self._add(file, name, np.atleast_1d(np.asarray(numbers[name], np.float64))[np.newaxis], "double")
 
-    def _add(self, name: str, data: np.ndarray, kind: str, **attributes: np.generic) -> None:
-        dataset = self._file.create_dataset(name, data=data)
+    @staticmethod
+    def _add(file: Any, name: str, data: np.ndarray, kind: str, **attributes: np.generic) -> None:
+        dataset = file.create_dataset(name, data=data)
         dataset.attrs["MATLAB_class"] = np.bytes_(kind)
         for attribute, value in attributes.items():
             dataset.attrs[attribute] = value
 
-    def _write(self, name: str, at: int, data: np.ndarray) -> None:
-        self._file[name][at : at + data.shape[-1]] = data.T
+    def _put_into(self, file: Any, name: str, at: int, data: np.ndarray) -> None:
+        file[name][at : at + data.shape[-1]] = data.T
 
     def _end(self) -> None:
-        self._file.close()
+        super()._end()
         with open(self._path, "r+b") as file:  # text, nothing of subsystems, version 2.0, the order of bytes
             file.write(_MAT_HEAD.ljust(116) + bytes(8) + b"\x00\x02IM")
-
-    def close(self) -> None:
-        """Close the file, complete or not."""
-        self._file.close()
 
 
 class ZarrWriter(ChunkedWriter):
@@ -176,11 +193,18 @@ class ZarrWriter(ChunkedWriter):
     SIGN = ".zgroup"  # a file that each such folder holds
 
     def _begin(self) -> None:
+        try:
+            self._create()
+        except KeyError as problem:  # so zarr says that it cannot make a folder
+            raise problem.__context__ if isinstance(problem.__context__, OSError) else problem from None
+
+    def _create(self) -> None:
         import zarr
 
         contents = self._contents
         newer: dict[str, Any] = {} if zarr.__version__.startswith("2.") else {"zarr_format": 2}
-        self._group = zarr.open_group(str(self._path), mode="w", **newer)
+        # The folder is empty, and stays the one that is locked: with mode="w" zarr would make another one.
+        self._group = zarr.open_group(str(self._path), mode="a", **newer)
         make = self._group.create_array if newer else self._group.create_dataset
         for name, shape in contents.shapes.items():
             chunks = (*(max(1, length) for length in shape[:-1]), max(1, self._waiting[name].frames))
@@ -203,9 +227,6 @@ class ZarrWriter(ChunkedWriter):
         import zarr
 
         zarr.consolidate_metadata(str(self._path))
-
-    def close(self) -> None:
-        """Nothing is open."""
 
 
 # --- reading ------------------------------------------------------------------------------------------------------

@@ -118,10 +118,7 @@ def process_file(
             new_folder(target, replace, form.folder) if form.folder else new_path(target, replace)
         )
         with place as path:
-            try:
-                _stream(sound, path, form, about, values, wanted, progress)
-            except RuntimeError as problem:  # so h5py says that it cannot write
-                raise OutputError(f"cannot write {target}: {str(problem).partition(chr(10))[0]}") from None
+            _stream(sound, path, form, about, values, wanted, progress)
             size = sum(part.stat().st_size for part in path.rglob("*")) if form.folder else path.stat().st_size
         return Done(sound.frames / sound.sample_rate, size, False, sound.not_finite)
 

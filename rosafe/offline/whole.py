@@ -19,7 +19,7 @@ import numpy as np
 from rosafe.input import open_regular
 from rosafe.offline.contents import ABOUT, Contents, is_scalar, sample_times, told
 
-HEADS = 2**18  # bytes, and more than that, of what is in a file beside the arrays' numbers
+HEAD = 2**10  # bytes at most in a file for each thing in it, and once more, beside its numbers or letters
 IN_MEMORY = 2**28  # bytes of all arrays together; from there on they are on the disk
 _CSV_HEAD = "# rosafe "
 
@@ -69,10 +69,13 @@ class WholeWriter:
         """Write the file."""
         with open(self._path, "r+b") as file:
             # A full disk must show before numpy and scipy write, who leave files open that they cannot complete.
-            arrays = [*self._arrays.values(), *self._contents.fixed.values()]
-            os.posix_fallocate(file.fileno(), 0, HEADS + sum(np.asarray(array).nbytes for array in arrays))
+            sizes = [np.asarray(value).nbytes for value in self._everything().values()]
+            os.posix_fallocate(file.fileno(), 0, sum(sizes) + HEAD * (len(sizes) + 1))
             self._write(file)
             file.truncate()
+
+    def _everything(self) -> dict[str, Any]:
+        return {**self._arrays, **self._contents.fixed, **self._contents.flat()}
 
     def _write(self, file: BinaryIO) -> None:
         raise NotImplementedError
@@ -87,8 +90,11 @@ class NpzWriter(WholeWriter):
     """For numpy.load."""
 
     def _write(self, file: BinaryIO) -> None:
-        everything: dict[str, Any] = {**self._arrays, **self._contents.fixed, **self._contents.flat()}
-        np.savez(file, **everything)
+        # As numpy.savez, which leaves an archive that it cannot complete to the garbage collector, and that complains.
+        with zipfile.ZipFile(file, "w") as archive:
+            for name, value in self._everything().items():
+                with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:
+                    np.lib.format.write_array(entry, np.asanyarray(value), allow_pickle=False)
 
 
 class Mat5Writer(WholeWriter):
@@ -97,8 +103,7 @@ class Mat5Writer(WholeWriter):
     def _write(self, file: BinaryIO) -> None:
         from scipy.io import savemat
 
-        everything: dict[str, Any] = {**self._arrays, **self._contents.fixed, **self._contents.flat()}
-        savemat(file, everything, long_field_names=True, oned_as="column")
+        savemat(file, self._everything(), long_field_names=True, oned_as="column")
 
 
 class CsvWriter(WholeWriter):

@@ -1,0 +1,295 @@
+"""Two writers of one result, and places that cannot take all of it: results are complete or not there."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import subprocess
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import rosafe
+from rosafe.offline.files import process_file
+from rosafe.output import OutputError
+from tests.cli.command import SMALL, SMALL_PARAMETERS, as_int32, noise, refused, write
+from tests.cli.command import rosafe as command
+from tests.harness import PYTHON, ROOT, SCRIPTS
+
+EXTENSIONS = [".npz", ".h5", ".mat", ".zarr", ".csv"]
+FORK = multiprocessing.get_context("fork")
+
+
+def process(
+    source: Path, target: Path, replace: bool = False, progress: Callable[[int, int], None] = lambda done, frames: None
+) -> str:
+    """What came of it: "done", or the text of the OutputError."""
+    try:
+        process_file(source, target, SMALL_PARAMETERS, 500, ["ild"], replace, progress)
+    except OutputError as problem:
+        return str(problem)
+    return "done"
+
+
+class Other:
+    """`process` in another process."""
+
+    def __init__(self, source: Path, target: Path, replace: bool) -> None:
+        self._answer = FORK.SimpleQueue()
+        self._process = FORK.Process(target=lambda: self._answer.put(process(source, target, replace)))
+        self._process.start()
+
+    def result(self) -> str:
+        self._process.join(60)
+        assert self._process.exitcode == 0
+        return str(self._answer.get())
+
+
+def sounds(folder: Path, count: int) -> tuple[list[Path], list[np.ndarray]]:
+    """Files, and the ild of each."""
+    signals = [noise(4000, seed) for seed in range(count)]
+    paths = [write(folder / f"{seed}.wav", signal) for seed, signal in enumerate(signals)]
+    options: dict[str, Any] = {"parameters": SMALL_PARAMETERS, "outputs": ["ild"], "block_frames": 500}
+    return paths, [rosafe.process(as_int32(signal), 16000, **options)["ild"] for signal in signals]
+
+
+# --- two writers --------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("replace", [False, True])
+@pytest.mark.parametrize("extension", EXTENSIONS)
+def test_the_second_writer_is_refused_as_long_as_the_first_one_writes(
+    tmp_path: Path, extension: str, replace: bool
+) -> None:
+    (first, second), (expected, _) = sounds(tmp_path, 2)
+    target = tmp_path / "out" / f"a{extension}"
+    target.parent.mkdir()
+    if replace:
+        process(second, target)
+    refusals = []
+
+    def meanwhile(done: int, frames: int) -> None:
+        refusals.append(Other(second, target, replace).result())
+
+    assert process(first, target, replace, meanwhile) == "done"
+    why = f"cannot write {target}: process {os.getpid()} ("
+    assert refusals and all(one.startswith(why) and one.endswith(") is writing it") for one in refusals), refusals
+    np.testing.assert_array_equal(rosafe.load(target)["ild"], expected)
+    assert os.listdir(target.parent) == [target.name]
+
+
+@pytest.mark.parametrize("extension", EXTENSIONS)
+def test_many_at_any_time(tmp_path: Path, extension: str) -> None:
+    paths, expected = sounds(tmp_path, 3)
+    out = tmp_path / "out"
+    out.mkdir()
+    for turn in range(8):
+        replace = turn % 2 == 1
+        target = out / (f"same{extension}" if replace else f"{turn}{extension}")
+        others = [Other(path, target, replace) for path in paths]
+        results = [other.result() for other in others]
+        endings = ("done", "is writing it", "is there already; --force replaces it", "has come into being meanwhile")
+        assert all(result.endswith(endings) for result in results), results
+        assert "done" in results and (replace or results.count("done") == 1)
+        own = [np.array_equal(rosafe.load(target)["ild"], one) for one in expected]
+        assert own.count(True) == 1 and results[own.index(True)] == "done"
+        assert not [name for name in os.listdir(out) if name.endswith(".part")]
+
+
+def test_a_zarr_that_is_replaced_is_nobodys_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The old folder has the name of the part for a moment."""
+    from rosafe import output
+
+    paths, expected = sounds(tmp_path, 2)
+    target = tmp_path / "a.zarr"
+    assert process(paths[1], target) == "done"
+    told = []
+    exchange = output._renameat2
+
+    def renamed(*arguments: Any) -> None:
+        exchange(*arguments)
+        told.append(Other(paths[1], target, True).result())
+
+    monkeypatch.setattr(output, "_renameat2", renamed)
+    assert process(paths[0], target, True) == "done"
+    assert len(told) == 1 and told[0].endswith("is writing it"), told
+    np.testing.assert_array_equal(rosafe.load(target)["ild"], expected[0])
+    assert not (tmp_path / "a.zarr.part").exists()
+
+
+def test_things_put_into_a_place_meanwhile_stay(tmp_path: Path) -> None:
+    (path,), _ = sounds(tmp_path, 1)
+    target = tmp_path / "a.zarr"
+
+    def meanwhile(done: int, frames: int) -> None:
+        target.mkdir(exist_ok=True)
+        (target / "precious").write_text("precious")
+
+    assert process(path, target, True, meanwhile) == f"{target} is a folder with other things in it, which stay"
+    assert os.listdir(target) == ["precious"] and not (tmp_path / "a.zarr.part").exists()
+
+
+def test_two_runs_for_one_folder(tmp_path: Path) -> None:
+    paths, expected = sounds(tmp_path, 2)
+    arguments = ["process", *map(str, paths), "-o", "out/x/", "--format", "zarr", *SMALL, "--outputs=ild", "--jobs=2"]
+    running = [
+        subprocess.Popen([str(SCRIPTS / "rosafe"), *arguments], cwd=tmp_path, stderr=subprocess.PIPE, text=True)
+        for _ in range(2)
+    ]
+    said = [process.communicate(timeout=120)[1] for process in running]
+    assert all(process.returncode in (0, 1) for process in running), said
+    assert not any("Traceback" in text for text in said), said
+    for path, one in zip(paths, expected, strict=True):
+        np.testing.assert_array_equal(rosafe.load(tmp_path / "out" / "x" / f"{path.stem}.zarr")["ild"], one)
+    assert not list(tmp_path.rglob("*.part"))
+
+
+def test_one_output_named_by_two_inputs(tmp_path: Path) -> None:
+    sounds(tmp_path, 1)
+    (tmp_path / "link.wav").symlink_to("0.wav")
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "link.zarr").symlink_to("0.zarr")
+    done = command("process", "0.wav", "link.wav", "-o", "out", "--format", "zarr", *SMALL, cwd=tmp_path)
+    refused(done, "0.wav and link.wav would both go to out/")
+
+
+# --- full disks ---------------------------------------------------------------------------------------------------
+
+_FILLED = """
+import os, sys
+from pathlib import Path
+from rosafe.offline import files
+from rosafe.output import OutputError
+
+source, room, how, *extensions = sys.argv[1:]
+room = Path(room)
+files._check_room = lambda path, size: None  # else it is refused before the work
+
+
+def fill(left=0):
+    disk = os.statvfs(room)
+    with open(room / "filler", "ab", buffering=0) as file:
+        rest = disk.f_bavail * disk.f_frsize - left
+        try:
+            while rest > 0:
+                rest -= file.write(bytes(min(rest, 2**20)))
+        except OSError:
+            pass
+
+
+def run(extension, progress=lambda done, frames: None):
+    target = room / f"out{extension}"
+    try:
+        files.process_file(
+            source, target, {"fb_cfHz": [200.0, 800.0, 2000.0]}, 500,
+            ["ild"] if extension == ".csv" else ["ild", "gammatone"], progress=progress,
+        )
+    except OutputError as problem:
+        assert str(problem).startswith(f"cannot write {target}: "), problem
+        assert "No space left" in str(problem) or "File too large" in str(problem), problem
+        assert not set(os.listdir(room)) - {"filler"}, os.listdir(room)
+        return False
+    assert set(os.listdir(room)) - {"filler"} == {target.name}
+    os.system(f"rm -rf {target}")
+    return True
+
+
+for extension in extensions:
+    if how == "limit":
+        import resource
+        for limit in (0, 1, 500, 2000, 4096, 10000, 30000, 70000, 100000, 200000, 400000, resource.RLIM_INFINITY):
+            resource.setrlimit(resource.RLIMIT_FSIZE, (limit, resource.RLIM_INFINITY))
+            written = run(extension)
+            assert not (limit == 0 and written)
+        assert written
+        continue
+    for at in (0.0, 0.5, 1.0):  # while it is written
+        assert not run(extension, lambda done, frames: fill() if done >= at * frames else None), (extension, at)
+        os.remove(room / "filler")
+    lefts = [*range(0, 12 * 4096, 4096), 20 * 4096, 40 * 4096, 80 * 4096, 160 * 4096, 3_000_000]
+    written = []
+    for left in lefts:
+        fill(left)
+        written.append(run(extension))
+        os.remove(room / "filler")
+    assert not written[0] and written[-1] and written == sorted(written), (extension, written)
+print("ended well")
+"""
+
+
+def filled(tmp_path: Path, how: str, room: Path, extension: str, before: Sequence[str] = ()) -> None:
+    source = write(tmp_path / "in.wav", noise(8000))
+    done = subprocess.run(
+        [*before, PYTHON, "-c", _FILLED, str(source), str(room), how, extension],
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+    assert done.returncode == 0 and done.stdout == "ended well\n" and done.stderr == "", done
+
+
+@pytest.mark.parametrize("extension", EXTENSIONS)
+def test_disks_that_are_full_from_any_point_on(
+    tmp_path: Path, small_disk: tuple[Path, list[str]], extension: str
+) -> None:
+    folder, before = small_disk
+    filled(tmp_path, "disk", folder, extension, before)
+
+
+@pytest.mark.parametrize("extension", EXTENSIONS)
+def test_files_that_may_not_grow(tmp_path: Path, extension: str) -> None:
+    (tmp_path / "room").mkdir()
+    filled(tmp_path, "limit", tmp_path / "room", extension)
+
+
+@pytest.mark.parametrize("name", ["H5Writer", "Mat73Writer"])
+def test_hdf5_after_a_failure_at_any_write(tmp_path: Path, name: str) -> None:
+    """Each in a process of its own, which the library used to end."""
+    from rosafe.offline import chunked
+    from rosafe.offline.contents import Contents
+
+    def attempt(fail_at: float) -> int:
+        count, pwrite = 0, os.pwrite
+
+        def counted(*arguments: Any) -> int:
+            nonlocal count
+            count += 1
+            if count >= fail_at:
+                raise OSError(5, "Input/output error")
+            return pwrite(*arguments)
+
+        os.pwrite = counted
+        contents = Contents(
+            {"ild": (31, 2000)}, {"ild": ("channel", "time")}, {"ild": "dB"}, {}, {"parameters": {"x": "y" * 30000}}
+        )
+        (tmp_path / "a").write_bytes(b"")
+        writer = getattr(chunked, name)(tmp_path / "a", contents)
+        try:
+            for _ in range(4):
+                writer.append("ild", np.zeros((31, 500)))
+            writer.finish()
+        finally:
+            writer.close()
+        return count
+
+    def child(fail_at: float) -> None:
+        try:
+            count = attempt(fail_at)
+        except OSError as problem:
+            os._exit(100 if problem.errno == 5 else 101)
+        os._exit(count)
+
+    def code(fail_at: float) -> int:
+        process = FORK.Process(target=child, args=(fail_at,))
+        process.start()
+        process.join(60)
+        return process.exitcode or 0
+
+    count = code(np.inf)
+    assert 5 < count < 90
+    assert {code(fail_at) for fail_at in range(1, count + 1)} == {100}
