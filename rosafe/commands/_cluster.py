@@ -79,7 +79,7 @@ def _client(address: str, jobs: int, stack: ExitStack, dead: list[str]) -> Any:
     """Connect to the scheduler; for a local one, `dead` gets a line if its workers cannot be started."""
     from distributed import Client
 
-    # Dask logs errors under the names of its modules and of their callers; each failure is reported in one line instead.
+    # Dask logs errors under the names of its modules and of their callers; here each failure is one line instead.
     for name in ["", *(name for name in logging.root.manager.loggerDict if name.partition(".")[0] == "distributed")]:
         logging.getLogger(name).setLevel(logging.CRITICAL)
     if address == LOCAL:
@@ -96,7 +96,7 @@ def _local_cluster(jobs: int, stack: ExitStack, dead: list[str]) -> Any:
     from distributed import LocalCluster, Nanny
     from distributed.core import Status
 
-    class LimitedNanny(Nanny):  # type: ignore[misc]
+    class LimitedNanny(Nanny):
         """Gives up a worker that dies `MAX_STARTS` times before it is ready; Dask would restart it without end."""
 
         failed_starts = 0

@@ -18,7 +18,7 @@ from rosafe.interface.arguments import check_change, check_parameters
 from rosafe.offline import chain
 from rosafe.offline.chain import Chain
 from rosafe.offline.memory import refuse_over_available
-from rosafe.offline.signals import as_ears, frame_times, of_ears, outputs_of
+from rosafe.offline.signals import as_samples, check_finite, ears_view, frame_times, of_ears, outputs_of
 from rosafe.tree.block import Block
 from rosafe.tree.workers import workers_to_use
 
@@ -120,22 +120,23 @@ class _Work:
     """One call of `process`, all of it checked; nothing has been computed."""
 
     def __init__(self, signal: Any, sample_rate: Any, parameters: Any, sizes_: Any, changes: Any, outputs: Any) -> None:
-        samples = as_ears(signal)
-        self.ears = samples.shape[0]
+        view = ears_view(signal)
+        self.ears, frames = view.shape
         self.rate = SAMPLE_RATE.check(sample_rate)
-        ends = _block_ends(sizes_, samples.shape[1])
-        values = {"in_doNormalize": samples.dtype == np.int32, **check_parameters(parameters)}
+        ends = _block_ends(sizes_, frames)
+        values = {"in_doNormalize": view.dtype.kind == "i", **check_parameters(parameters)}
         changes = _checked_modifications(changes)
         self.wanted = outputs_of(self.ears, outputs)
         self.gathered: dict[str, dict[str, list[_Gathered]]] = {}  # by kind and name, of each branch
         # of each output, how many frames of each format have come, one after the other
         self.counts: dict[str, list[list[Any]]] = {kind: [[None, 0]] for kind in self.wanted}
-        both = np.broadcast_to(samples, (2, samples.shape[1]))
-        blocks = (both[:, first:end] for first, end in itertools.pairwise((0, *ends)))
-        branches = 1 if changes or samples.shape[1] <= chain.MOST_FRAMES else workers_to_use()
+        both = np.broadcast_to(view, (2, frames))
+        blocks = (as_samples(both[:, first:end]) for first, end in itertools.pairwise((0, *ends)))
+        branches = 1 if changes or frames <= chain.MOST_FRAMES else workers_to_use()
         self.chain = Chain(blocks, self.rate, values, self.wanted, self.keep, branches)
         try:
-            self._prepare(samples.shape[1], ends, changes)
+            self._prepare(frames, ends, changes)
+            check_finite(view)  # last, as it reads the whole signal
         except BaseException:
             self.chain.close()
             raise

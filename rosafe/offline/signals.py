@@ -10,11 +10,12 @@ from rosafe.dsp.signal import Signal
 from rosafe.interface import FIXED, KINDS
 from rosafe.interface.arguments import check_outputs
 
+_CHECKED_TOGETHER = 2**18  # frames; no large array is made for the check
 _WANTED = "wanted is (N,) or (1, N) for one ear, (2, N) or (N, 2) for two"
 
 
-def as_ears(signal: Any, upright: bool = False) -> np.ndarray:
-    """A signal as (1, N) or (2, N) of finite float64, or of int32 with full scale at 2**31.
+def ears_view(signal: Any, upright: bool = False) -> np.ndarray:
+    """Return a signal as (1, N) or (2, N) of its own number type, without a copy if it is an array.
 
     Parameters
     ----------
@@ -26,8 +27,11 @@ def as_ears(signal: Any, upright: bool = False) -> np.ndarray:
     Raises
     ------
     ValueError
-        For another shape or type, and for samples that are not finite.
+        For another shape or type, and for masked arrays.
     """
+    rows = signal if isinstance(signal, (list, tuple)) else [signal]
+    if any(isinstance(row, np.ma.MaskedArray) for row in rows):
+        raise ValueError("signal: expected an array without a mask, got a masked array; call its method filled(0)")
     try:
         array = np.asarray(signal)
     except ValueError as problem:
@@ -38,22 +42,31 @@ def as_ears(signal: Any, upright: bool = False) -> np.ndarray:
         array = array[np.newaxis]
     if array.ndim != 2 or not (array.shape[0] in (1, 2) or array.shape[1] == 2):
         raise ValueError(f"signal has shape {np.shape(signal)}; {_WANTED}")
-    if is_upright(array, upright):
-        array = array.T
-    if array.dtype.kind == "i" and array.dtype.itemsize in (2, 4):
-        # as files of 16 bits are read: they fill the upper bits
-        return np.asarray(array, np.int32) << (16 if array.dtype.itemsize == 2 else 0)
-    if array.dtype.kind != "f":
+    whole = array.dtype.kind == "i" and array.dtype.itemsize in (2, 4)
+    if not whole and array.dtype.kind != "f":
         raise ValueError(f"signal is of type {array.dtype}, wanted is a float type, int32 or int16")
-    with np.errstate(over="ignore"):  # a long double beyond the range of double becomes infinite
-        array = np.asarray(array, np.float64)
-    if not np.isfinite(array).all():
-        raise ValueError("signal holds NaN or infinite samples")
-    return array
+    return array.T if is_upright(array, upright) else array
+
+
+def as_samples(ears: np.ndarray) -> np.ndarray:
+    """Return the samples of `ears_view` as float64, or as int32 with full scale at 2**31."""
+    if ears.dtype.kind == "f":
+        with np.errstate(over="ignore"):  # a long double beyond the range of double becomes infinite
+            return np.asarray(ears, np.float64)
+    whole = np.asarray(ears, np.int32)
+    return whole << 16 if ears.dtype.itemsize == 2 else whole  # as files of 16 bits, which fill the upper bits
+
+
+def check_finite(ears: np.ndarray) -> None:
+    """Raise ValueError if a signal as of `ears_view` holds NaN or infinite samples."""
+    if ears.dtype.kind == "f":
+        for first in range(0, ears.shape[1], _CHECKED_TOGETHER):
+            if not np.isfinite(as_samples(ears[:, first : first + _CHECKED_TOGETHER])).all():
+                raise ValueError("signal holds NaN or infinite samples")
 
 
 def is_upright(signal: np.ndarray, upright: bool = False) -> bool:
-    """Whether a signal of two axes is (N, 2), as `as_ears` takes it."""
+    """Whether a signal of two axes is (N, 2), as `ears_view` takes it."""
     return signal.shape[1] == 2 and (signal.shape[0] > 2 or signal.shape[0] == 0 or (upright and len(signal) == 2))
 
 

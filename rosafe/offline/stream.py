@@ -14,7 +14,7 @@ from rosafe.interface import KINDS
 from rosafe.interface.arguments import check_change, check_outputs, check_parameters
 from rosafe.offline.chain import needed, overwriting
 from rosafe.offline.memory import refuse_over_available
-from rosafe.offline.signals import as_ears, frame_times, is_upright, of_ears, outputs_of
+from rosafe.offline.signals import as_samples, check_finite, ears_view, frame_times, is_upright, of_ears, outputs_of
 from rosafe.representations import STAGES
 from rosafe.tree import sizes
 
@@ -165,39 +165,40 @@ class Stream:
         """The block as (ears, n); the first one says what all will be."""
         shape = np.shape(block)
         if self._ears == 2 and shape == (1, 2):  # one frame
-            block = np.asarray(block).T
-        samples = as_ears(block, self._upright)
-        ears, whole = samples.shape[0], samples.dtype == np.int32
+            block = np.transpose(block)
+        view = ears_view(block, self._upright)
+        (ears, frames), whole = view.shape, view.dtype.kind == "i"
+        stages, kept = self._stages, list(self._next)
         if not self._ears:
-            self._outputs_of(ears)
-            if whole != self._stages["input"].parameters[_NUMBER] and _NUMBER not in self._parameters:
-                self._stages["input"].configure(**{_NUMBER: whole})
-            self._ears, self._whole = ears, whole
+            kept = outputs_of(ears, self._asked)
+            stages = {kind: stage for kind, stage in stages.items() if kind in needed(kept)}
         elif ears != self._ears:
             raise ValueError(
                 f"block has shape {shape}; those before it were of {('one ear', 'two ears')[self._ears - 1]}"
             )
         elif whole != self._whole:
             raise ValueError(f"block is of {'whole numbers' if whole else 'floats'}, and those before it were not")
+        if frames > self._largest:
+            self._check_size(stages, frames)
+        samples = as_samples(view)
+        check_finite(samples)
+        # Nothing is refused from here on.
+        self._largest = max(self._largest, frames)
         if len(shape) == 2 and shape != (2, 2):
             self._upright = is_upright(np.asarray(block)) or shape == (1, 2)
-        if samples.shape[1] > self._largest:
-            self._check_size(samples.shape[1])
+        if not self._ears:
+            self._ears, self._whole = ears, whole
+            self._next = dict.fromkeys(kept, 0)
+            self._stages = stages
+            if whole != stages["input"].parameters[_NUMBER] and _NUMBER not in self._parameters:
+                stages["input"].configure(**{_NUMBER: whole})
+            self._lay_out()
         return samples
 
-    def _outputs_of(self, ears: int) -> None:
-        """With the first block it is known what can be put out; ValueError where that is not what was asked for."""
-        kept = outputs_of(ears, self._asked)
-        needs = needed(kept)
-        self._next = dict.fromkeys(kept, 0)
-        self._stages = {kind: stage for kind, stage in self._stages.items() if kind in needs}
-        self._lay_out()
-
-    def _check_size(self, frames: int) -> None:
+    def _check_size(self, stages: Mapping[str, Stage], frames: int) -> None:
         seconds = frames / self._rate
-        taken = [sizes.output_size(s, self._rows[KINDS[kind].parent], seconds) for kind, s in self._stages.items()]
+        taken = [sizes.output_size(s, self._rows[KINDS[kind].parent], seconds) for kind, s in stages.items()]
         refuse_over_available(sum(taken), "block: what comes of it")
-        self._largest = frames
 
     def reset(self) -> None:
         """Back to before the first block. Parameters stay as they are, and what comes next may be of another kind."""

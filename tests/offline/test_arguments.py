@@ -60,6 +60,9 @@ def refused(match: str, *arguments: Any, **named: Any) -> None:
         (np.array([[0.0, np.nan], [0.0, 0.0]]), "NaN or infinite"),
         (np.array([[0.0, 0.0], [0.0, -np.inf]]), "NaN or infinite"),
         (np.full((2, 1), np.finfo(np.longdouble).max), "NaN or infinite"),
+        (np.append(np.zeros((2, 600000)), [[0.0], [np.nan]], axis=1), "NaN or infinite"),
+        (np.ma.masked_array(np.zeros((2, 10)), np.eye(2, 10)), "without a mask"),
+        ([np.zeros(10), np.ma.masked_array(np.zeros(10), np.ones(10))], "without a mask"),
     ],
 )
 def test_signals(signal: Any, match: str) -> None:
@@ -229,6 +232,17 @@ def test_results_larger_than_the_memory_that_is_left(monkeypatch: pytest.MonkeyP
         rosafe.Stream(RATE, large).process(sound)
     meminfo.unlink()  # nobody tells
     assert memory.available() == sizes.machine_memory()
+
+
+def test_a_file_that_is_too_large_is_refused_without_reading_it(tmp_path: Path) -> None:
+    """All sizes are checked before the samples are converted or looked at."""
+    path = tmp_path / "sound.int16"
+    with open(path, "wb") as file:
+        file.truncate(4 * 10**12)  # a sparse file, larger than any memory
+    sound = np.memmap(path, np.int16, "r").reshape(-1, 2)
+    refused("outputs: they would take .* GB of memory", sound, RATE)
+    with pytest.raises(ValueError, match=r"block: what comes of it would take .* GB of memory"):
+        rosafe.Stream(RATE).process(sound)
 
 
 def test_results_larger_than_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 import rosafe
 from rosafe.interface import FIXED
+from rosafe.offline import memory
 from rosafe.representations import STAGES
 from tests.representations.chain import Chain, cut
 
@@ -137,6 +138,18 @@ def test_what_is_refused_later_has_no_effect() -> None:
             stream.process(np.zeros(5))
     with pytest.raises(ValueError, match="ild compare two ears"):
         rosafe.Stream(RATE, FEW, ["ild"]).process(SOUND[0])
+
+
+@pytest.mark.parametrize("bad", [np.full(5, np.nan), np.full((5, 2), np.inf), np.ones(2000, np.int16)])
+def test_a_refused_first_block_changes_nothing(bad: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither the number of ears, nor the number type, nor the orientation is remembered from it."""
+    stream = rosafe.Stream(RATE, FEW)
+    with monkeypatch.context() as patch:
+        patch.setattr(memory, "available", lambda: 10**5)  # bytes: too few for 2000 samples
+        with pytest.raises(ValueError, match=r"NaN|memory"):
+            stream.process(bad)
+    pair = np.array([[1.0, 2.0], [3.0, 4.0]])  # read as (2, N), which a first block of (N, 2) would change
+    assert_same(stream.process(pair), rosafe.Stream(RATE, FEW).process(pair))
 
 
 def test_it_starts_no_thread_and_costs_what_the_stages_cost() -> None:
