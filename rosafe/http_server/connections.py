@@ -6,12 +6,16 @@ If there is no room for another connection, the one is closed that has been with
 
 from __future__ import annotations
 
+import array
 import asyncio
 import contextlib
+import fcntl
 import ipaddress
+import itertools
 import logging
 import re
 import resource
+import termios
 import time
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
@@ -22,7 +26,7 @@ from aiohttp import web
 
 from rosafe.http_server.refusal import HttpRefusal
 
-BUFFER = 16 * 1024  # bytes of a request that are not counted; bytes read at a time
+BUFFER = 4 * 1024  # bytes of a request that are not counted; bytes read at a time
 HEADERS_SIZE = 64 * 1024  # bytes of all headers of a request
 STALL_SECONDS = 60.0  # a client that does not read its answer is dropped after
 YIELD_SECONDS = 5.0  # and if others need the memory, after
@@ -136,6 +140,16 @@ class Connections:
             if not account.connections:
                 self._accounts.pop(account.address, None)
 
+    def make_room_for_header(self, connection: HttpConnection) -> bool:
+        """Close the connections that have been sending a long request for longest; False if that is not enough."""
+        for account in list(self._accounts.values()):
+            for other in list(account.silent):
+                if self.header_bytes <= self.limits.max_header_bytes:
+                    return True
+                if other.has_long_header and other is not connection:
+                    other.drop()
+        return self.header_bytes <= self.limits.max_header_bytes
+
     @contextlib.contextmanager
     def long_poll(self, connection: HttpConnection) -> Iterator[None]:
         """Mark a request that lasts as long as its client likes: half of a client's connections are for other ones.
@@ -184,12 +198,14 @@ class Connections:
 
 
 def _silent_longest(accounts: Iterable[ClientAccount]) -> HttpConnection | None:
-    """Return the connection that makes room: of the address with most of them; authenticated ones only if need be."""
+    """Return the connection that makes room: of the address with most of them; authenticated ones only if need be.
+
+    Connections whose data were only not read yet are not silent.
+    """
     accounts = sorted(accounts, key=lambda account: len(account.connections), reverse=True)
-    for waiting in (*(account.silent for account in accounts), *(account.idle for account in accounts)):
-        if waiting:
-            return next(iter(waiting))
-    return None
+    waiting = [*(account.silent for account in accounts), *(account.idle for account in accounts)]
+    every = list(itertools.chain.from_iterable(waiting))
+    return next((one for one in every if not one.has_unread_data), every[0] if every else None)
 
 
 class HttpConnection(web.RequestHandler):
@@ -239,6 +255,18 @@ class HttpConnection(web.RequestHandler):
         """Close it immediately, whatever it does; what was not read is lost."""
         self._leave()
         self._socket.abort()
+
+    @property
+    def has_unread_data(self) -> bool:
+        """Whether the client has sent something that the event loop has not read yet."""
+        count = array.array("i", [0])
+        fcntl.ioctl(self._socket.get_extra_info("socket").fileno(), termios.FIONREAD, count)
+        return count[0] > 0
+
+    @property
+    def has_long_header(self) -> bool:
+        """Whether its bytes count."""
+        return self._counted > 0
 
     def stalled(self, seconds: float) -> bool:
         """Return whether the client has read nothing of its answer for so long."""
@@ -300,8 +328,8 @@ class HttpConnection(web.RequestHandler):
             return
         self._ahead += data
         self._account_header()
-        limit = self._limits.max_header_bytes
-        if self._counted and self._connections.header_bytes > limit:
+        if self._counted and not self._connections.make_room_for_header(self):
+            limit = self._limits.max_header_bytes
             self._refuse(HttpRefusal(503, f"long requests take {limit >> 20} MiB at this moment"))
         elif not self._busy:
             self._next_request()

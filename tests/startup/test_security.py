@@ -21,6 +21,7 @@ from rosafe.http_server import connections
 from rosafe.live import client, hub, server
 from tests.genomix.world import Http, genomixd
 from tests.harness import PYTHON, ROOT, Graph, MasterProcess, free_port, proc
+from tests.http_server.test_limits import MEMORY
 from tests.live.world import live
 from tests.networks import networks
 
@@ -122,8 +123,10 @@ def test_the_bounds_of_the_page() -> None:
         (api.LIMITS.max_connections, api.LIMITS.max_connections // 2),
         (api.LIMITS.request_seconds, connections.STALL_SECONDS),
         api.LIMITS.max_answers // 2**20,
+        api.LIMITS.max_header_bytes // 2**20,
         (sessions.MAX_SESSIONS, sessions.MAX_REQUESTS),
-        (server.MAX_CLIENTS, server.LIMITS.max_connections, server.AUTH_TIMEOUT_SECONDS),
+        (server.MAX_CLIENTS, server.LIMITS.max_connections, server.LIMITS.max_connections // 2),
+        (server.LIMITS.request_seconds, server.LIMITS.max_header_bytes // 2**20, MEMORY),
         (f"{client.MAX_MESSAGE >> 20} MiB", client.MAX_PENDING, client.MAX_VIEWS, hub.MAX_VIEWS),
         (client.BYTES_PER_SECOND, 1 / client.PERIOD, client.STALL_SECONDS),
     ]
@@ -133,6 +136,7 @@ def test_the_bounds_of_the_page() -> None:
     ]
     assert [bound for *_, bound in rows("Bounds")] == shown
     assert pulse.FAILURES == 2
+    assert connections.BUFFER == 4 * 1024
 
 
 # --- the firewall -----------------------------------------------------------------------------------------------

@@ -1,0 +1,1 @@
+"""What genomixd and the live page share: checks of headers, limits of connections."""
