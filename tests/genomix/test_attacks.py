@@ -240,6 +240,8 @@ def connections_with(**limits: int) -> Connections:
 class Fake:
     """A connection as `Connections` sees it."""
 
+    has_unread_data = False
+
     def __init__(self, every: Connections) -> None:
         self.stalls = False
         self.dropped = False
