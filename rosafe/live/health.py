@@ -104,6 +104,7 @@ class Health:
                 "lost": _number(audio, "lost") + _number(audio, "dropped") + _number(capture, "lost frames"),
                 "losses": list(self._losses)[::-1],
                 "loads": {name: _load(text) for name, text in tree.items()},
+                "failures": [text for key, text in tree.items() if key.startswith(("failed ", "slow "))],
             }
 
 

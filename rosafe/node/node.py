@@ -16,7 +16,7 @@ from diagnostic_msgs.msg import DiagnosticStatus
 
 from rosafe import interface
 from rosafe.component import wire
-from rosafe.component.activities import Activity, Handler, TaskMeter
+from rosafe.component.activities import Activity, Handler
 from rosafe.component.audio import AudioRing
 from rosafe.component.component import ComponentNode
 from rosafe.component.events import EventLog
@@ -26,6 +26,7 @@ from rosafe.interface import BLOCK_AND_BUFFERS, KINDS, LAYOUTS, ROSAFE, Componen
 from rosafe.node import reports
 from rosafe.node.keeper import Keeper
 from rosafe.node.ports import OutputPort, element
+from rosafe.node.processor_health import ProcessorHealth
 from rosafe.node.trace_port import TracePort
 from rosafe.node.whole_trees import WholeTrees
 from rosafe.node.words import UnknownWords
@@ -35,7 +36,7 @@ from rosafe.sound.windows import MAX_WINDOW
 from rosafe.tree.block import Block
 from rosafe.tree.processor import Processor
 from rosafe.tree.requests import Found
-from rosafe.tree.tree import Tree
+from rosafe.tree.tree import Failure, Tree
 from rosafe.tree.workers import workers_to_use
 from rosafe.vocabulary.parameter import MAX_STRING, shown
 
@@ -76,7 +77,7 @@ class RosafeNode:
         self._audio_topic = ""
         self._ports: dict[Processor, OutputPort] = {}
         self._ends: dict[Processor, Activity] = {}
-        self._loads: dict[Processor, TaskMeter] = {}
+        self._health = ProcessorHealth(self._tree, self._words)
         self._starting = threading.Lock()  # an InputProc that a newer one has interrupted must not replace that one's
         self._of_the_input: dict[str, Any] = {}  # what the InputProc that runs was asked for
         self._keeper = _keeper(keep, self._setup)
@@ -104,7 +105,7 @@ class RosafeNode:
         self._node.function("Stop", self._stop)
         self._node.function("request", WholeTrees(self._node, lambda: self._audio_topic).build, waits=True)
         self._node.diagnostics.add("audio", self._audio_health)
-        self._node.diagnostics.add("processors", self._tree_health)
+        self._node.diagnostics.add("processors", self._health.report)
         if self._keeper is not None:
             self._node.diagnostics.add("keep", self._keeping_health)
         self._trace = TracePort(f"{self._node.name}/trace", self._tree.observe)
@@ -155,16 +156,14 @@ class RosafeNode:
         connections = {"Audio": self._audio_topic} if self._audio_topic else {}
         if self._coming_back.processors:
             return Setup(self._sound, connections, self._coming_back.processors)
-        found = (
-            Found(
-                processor.name,
-                processor.kind,
-                "" if processor.parent is None else processor.parent.name,
-                {**processor.parameters(), **({} if processor.parent is not None else self._of_the_input)},
-            )
-            for processor in self._tree.processors
-        )
-        return Setup(self._sound, connections, tuple(map(wanted, found)))
+        found = [processor.ask(self._found) for processor in self._tree.processors]
+        return Setup(self._sound, connections, tuple(wanted(one) for one in found if one is not None))
+
+    def _found(self, processor: Processor) -> Found:
+        parent = processor.parent
+        of_the_input = self._of_the_input if parent is None else {}
+        values = {**processor.parameters(), **of_the_input}
+        return Found(processor.name, processor.kind, parent.name if parent is not None else "", values)
 
     def _begin_to_come_back(self) -> None:
         topic = self._coming_back.connections.get("Audio", "")
@@ -282,7 +281,7 @@ class RosafeNode:
         self._keep()
         self._node.settle()
         if processor.error is not None:
-            raise ComponentError("::genom::unkex", what=f"{type(processor.error).__name__}: {processor.error}"[:127])
+            raise ComponentError("::genom::unkex", what=str(Failure.of(processor)))
 
     # --- what the tree tells (on its threads) ---
 
@@ -298,15 +297,13 @@ class RosafeNode:
             publisher = self._advertise(processor.kind, processor.name)
             port = OutputPort(processor, publisher, publisher.unregister)
         self._ports[processor] = port
-        self._loads[processor] = TaskMeter(processor.name)
+        self._health.added(processor)
         port.open(self._tree.port_seconds)
 
     def executed(self, processor: Processor, seconds: float) -> None:
         """Count the work, for genom_state and /diagnostics."""
         self._node.meters[ROSAFE.service(KINDS[processor.kind].request).task].cycle(seconds)
-        meter = self._loads.get(processor)  # None where it has ended
-        if meter is not None:
-            meter.cycle(seconds)
+        self._health.executed(processor, seconds)
 
     def released(self, processor: Processor, block: Block) -> None:
         """Publish the processor's window; with that of the input, the time of its newest frame."""
@@ -324,12 +321,10 @@ class RosafeNode:
 
     def ended(self, processor: Processor) -> None:
         """Close the port and end the activity."""
-        self._loads.pop(processor, None)
+        self._health.ended(processor)
         port = self._ports.pop(processor, None)  # None where it could not be opened
         if port is not None:
             port.close()
-        if processor.error is not None:
-            rospy.logerr(f"{processor.kind} {processor.name!r} failed: {processor.error!r}")
         activity = self._ends.get(processor)
         if activity is not None:
             activity.interrupt("")
@@ -389,23 +384,6 @@ class RosafeNode:
         status.add("frames waiting", str(self._ring.behind))
         for name, value in vars(counters).items():
             status.add(name.replace("_", " "), str(value))
-        return status
-
-    def _tree_health(self, status: Any) -> Any:
-        processors, doubts = self._tree.processors, self._words.lines
-        if doubts:
-            more = f" (and {len(doubts) - 1} more unknown words)" if len(doubts) > 1 else ""
-            status.summary(DiagnosticStatus.WARN, f"{doubts[0]}{more}")
-        else:
-            status.summary(DiagnosticStatus.OK, f"{len(processors)} processors")
-        for doubt in doubts:
-            status.add("unknown word", doubt)
-        status.add("workers", str(self._tree.workers))
-        for processor in processors:
-            meter = self._loads.get(processor)
-            load = 1e3 * meter.snapshot()["load"]["last"] if meter is not None else 0.0
-            told = f"{processor.kind}, {processor.state.value}, {processor.blocks} blocks, {load:.1f} ms/s"
-            status.add(processor.name, told)
         return status
 
     def _keeping_health(self, status: Any) -> Any:

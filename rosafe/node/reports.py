@@ -47,7 +47,8 @@ def descriptions(processors: Iterable[Processor], node: str, of_the_input: Mappi
     of_the_input : mapping
         What InputProc was asked for, which modifyParameter does not take.
     """
-    return [_description(processor, node, of_the_input) for processor in processors]
+    told = [processor.ask(lambda one: _description(one, node, of_the_input)) for processor in processors]
+    return [description for description in told if description is not None]
 
 
 def _description(processor: Processor, node: str, of_the_input: Mapping[str, Any]) -> dict[str, Any]:

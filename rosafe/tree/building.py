@@ -7,12 +7,14 @@ from collections.abc import Awaitable, Mapping
 from typing import Any, Protocol, TypeVar
 
 from rosafe.interface import BLOCK_AND_BUFFERS, KINDS, REQUEST, ROSAFE, ComponentError
+from rosafe.representations import OWN
 from rosafe.tree import requests as request
 from rosafe.tree.requests import Found, Plan, Step, Wish
 
 TRIES = 20  # plans that others' changes of the tree may spoil before the error is told
 INPUT_SECONDS = 1.5  # longer than an InputProc waits for sound
 POLL_SECONDS = 0.02
+BEGIN_BLOCKS, BEGIN_SECONDS = 2.5, 2.0  # how long plugins are watched after they were started: blocks, at most seconds
 
 T = TypeVar("T")
 
@@ -48,10 +50,26 @@ async def build(component: Services, values: Mapping[str, Any]) -> dict[str, Any
     made: list[str] = []
     try:
         dependencies = await _carry_out(component, wish, made)
+        if set(wish.kinds) - OWN and made:
+            await _watch_begin(component, made)
     except BaseException:
         await uncancelled(remove(component, made))
         raise
     return request.answer(wish, dependencies, made, component.instance)
+
+
+async def _watch_begin(component: Services, made: list[str]) -> None:
+    """Raise ComponentError if a processor that was made fails with one of its first blocks, as plugins may."""
+    found = await look(component)
+    root = next((p for p in found if not p.parent), None)
+    block = root.values["nFramesPerBlock"] / root.rate if root is not None and root.rate else 0.0
+    deadline = asyncio.get_running_loop().time() + min(BEGIN_SECONDS, BEGIN_BLOCKS * block)
+    while True:
+        for name in made:
+            await component.outputs("getDependencies", {"nameProc": name})
+        if asyncio.get_running_loop().time() > deadline:
+            return
+        await asyncio.sleep(POLL_SECONDS)
 
 
 async def find(component: Services, values: Mapping[str, Any]) -> dict[str, Any]:

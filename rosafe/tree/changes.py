@@ -8,6 +8,7 @@ import threading
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+from rosafe.dsp.plugin_checks import PluginError
 from rosafe.dsp.signal import Signal
 from rosafe.dsp.stage import Stage
 from rosafe.tree.block import Block
@@ -99,6 +100,8 @@ def _changed(stage: Stage, given: Signal, changes: Sequence[Change]) -> Stage | 
     changed = copy.copy(stage)
     try:
         changed.become(given, [{change.name: change.value} for change in changes])
+    except PluginError:
+        raise
     except ValueError:
         return None
     return changed

@@ -6,8 +6,10 @@ import math
 import threading
 from collections.abc import Callable, Iterator
 from time import monotonic
+from typing import TypeVar
 
 from rosafe.dsp.guard import FloatArray
+from rosafe.dsp.plugin_checks import PluginError
 from rosafe.dsp.stage import Stage
 from rosafe.tree.block import Block, Source
 from rosafe.tree.company import Company
@@ -15,6 +17,7 @@ from rosafe.tree.member import Member
 from rosafe.tree.states import State
 from rosafe.tree.workers import SHORT
 
+T = TypeVar("T")
 NOTHING: frozenset[str] = frozenset()
 RISE = 2.0  # what a processor usually takes is the least of late; that is forgotten at this pace per block
 
@@ -99,6 +102,15 @@ class Processor(Member):
         """Wait until nobody works on it and nobody will; whether that is so."""
         with self._lock:
             return bool(self._company.over.wait_for(lambda: self.over, timeout))
+
+    def ask(self, question: Callable[[Processor], T]) -> T | None:
+        """`question(self)`, or None if its plugin raises instead of answering: the processor has failed then."""
+        try:
+            return question(self)
+        except PluginError as problem:
+            self.error = problem
+            self._company.failed(self)
+            return None
 
     def rouse(self) -> None:
         self._company.workers.push(self)

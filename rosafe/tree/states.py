@@ -59,6 +59,7 @@ class StateMachine:
     """
 
     observers: Sequence[Callable[[Any, State, int | None], None]] = ()
+    skipped = False  # an instance has it only during the call that `skip` was made in
 
     def __init__(self, parent: StateMachine | None) -> None:
         self.parent = parent
@@ -191,6 +192,8 @@ class StateMachine:
 
     def done(self, private: Block | None) -> None:
         """It has computed `private`, or nothing: that is released at once or as soon as no child holds the last one."""
+        if self.skipped:
+            del self.skipped
         self.give_back()
         if private is not None and self.state is not REMOVED:
             self.state = WAIT_RELEASE
@@ -200,6 +203,11 @@ class StateMachine:
                 self._private = private
             else:
                 self._release(private)
+
+    def skip(self) -> None:
+        """Release the parent's block during a long computation: siblings continue, this one misses blocks meanwhile."""
+        self.skipped = True
+        self.give_back()
 
     def give_back(self) -> None:
         """Return the parent's block, which may release its next one then."""
@@ -239,7 +247,7 @@ class StateMachine:
             self._tell_observers(block.number)
         self.shared, self.untold = (block, block) if self.heard else (None, NOTHING)
         for child in self.children:
-            if child.state is not DONE:
+            if child.state is not DONE and not child.skipped:
                 self._hand(child, block)
         if not self.at_work:
             self.rouse()

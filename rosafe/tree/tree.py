@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
+from rosafe.dsp.plugin_checks import PluginError
 from rosafe.dsp.stage import Stage
 from rosafe.interface import KINDS, ROSAFE, ComponentError
 from rosafe.representations import STAGES
@@ -22,6 +23,33 @@ from rosafe.vocabulary.parameter import Parameter, shown
 from rosafe.vocabulary.words import listed, meant
 
 INPUT = next(kind for kind, representation in KINDS.items() if not representation.parent)
+
+
+MAX_FAILURES = 20  # processors whose failures are remembered
+
+
+class Failure(NamedTuple):
+    """Why a processor ended by itself.
+
+    `children` are the processors below it, which ended with it.
+    """
+
+    name: str
+    kind: str
+    reason: str
+    children: tuple[str, ...]
+
+    @classmethod
+    def of(cls, processor: Processor) -> Failure:
+        """The failure of a processor whose `error` is set; it is still in the tree."""
+        error = processor.error
+        reason = str(error) if isinstance(error, PluginError) else f"{type(error).__name__}: {error}"
+        below = tuple(one.name for one in subtree(processor) if one is not processor)
+        return cls(processor.name, processor.kind, " ".join(reason.split()), below)
+
+    def __str__(self) -> str:
+        below = f"; ended with it: {', '.join(self.children)}" if self.children else ""
+        return f"{self.name} ({self.kind}) failed: {self.reason}{below}"
 
 
 class Planned(NamedTuple):
@@ -55,6 +83,7 @@ class Tree:
         self._processors: dict[str, Processor] = {}  # in the order of creation, as getParameters reports them
         self._lock = threading.RLock()  # guards all tokens
         self._requests = threading.RLock()  # one request at a time; taken before _lock
+        self._failures: dict[str, Failure] = {}  # by the processor's name
         self._workers = Workers(self._lock, workers_to_use(workers))
         self._company = Company(self._workers, listener, self.end, threading.Condition(self._lock))
         self.sample_rate = 0.0
@@ -80,6 +109,12 @@ class Tree:
         with self._requests:
             return next((p for p in self._processors.values() if p.parent is None), None)
 
+    @property
+    def failures(self) -> list[Failure]:
+        """The processors that ended by themselves, oldest first; without those that were created again since."""
+        with self._requests:
+            return list(self._failures.values())
+
     def find(self, name: str) -> Processor:
         """The processor called `name`, or e_noSuchProcessor."""
         with self._requests:
@@ -89,7 +124,9 @@ class Tree:
                 raise ROSAFE.error("e_noSuchProcessor", self._no_processor(name)) from None
 
     def _no_processor(self, name: str) -> str:
-        return f"there is no processor {shown(name)}; there are: {listed(self._processors)}"
+        failure = self._failures.get(name)
+        reason = f": {failure}" if failure is not None else ""
+        return f"there is no processor {shown(name)}{reason}; there are: {listed(self._processors)}"
 
     def dependencies(self, name: str) -> list[str]:
         """The names from the input down to `name`."""
@@ -161,6 +198,8 @@ class Tree:
             self.history_seconds = history_seconds
             if old is not None:
                 self._replace(old, new)
+            else:
+                self._failures.clear()
             self._begin(new)
             return new
 
@@ -209,6 +248,7 @@ class Tree:
 
     def _begin(self, processor: Processor) -> None:
         self._processors[processor.name] = processor
+        self._failures.pop(processor.name, None)
         try:
             self._company.listener.added(processor)
             processor.start()
@@ -231,8 +271,8 @@ class Tree:
         for stage, rows in coming:
             sizes.check_stage(stage, rows, seconds)
         replaced = set(subtree(instead_of)) if instead_of is not None else set()
-        staying = [(p.stage, p.given_rows) for p in self._processors.values() if p not in replaced]
-        sizes.check_all([*coming, *staying], seconds)
+        others = [p for p in self._processors.values() if p not in replaced]
+        sizes.check_all([*coming, *filter(None, [p.ask(_sized) for p in others])], seconds)
 
     # --- changing ---
 
@@ -296,7 +336,18 @@ class Tree:
         """Remove `processor` (the input too) and all below it, if it is still in the tree."""
         with self._requests:
             if self._processors.get(processor.name) is processor:
+                if processor.error is not None:
+                    self._failures[processor.name] = Failure.of(processor)
+                    for name in list(self._failures)[:-MAX_FAILURES]:
+                        del self._failures[name]
                 self._remove(processor)
+
+    def skip(self, processor: Processor, block: int) -> None:
+        """Let all others continue while `processor` still computes its block number `block`: it misses blocks then."""
+        with self._lock:
+            if processor.state is State.EXEC and processor.blocks == block and not processor.skipped:
+                processor.skip()
+                self._workers.wake()
 
     def stop(self) -> None:
         """Remove everything. Workers may still be at a block each, of which nobody will hear."""
@@ -335,5 +386,16 @@ def _planned(processor: Processor, stage: Stage, rows: Rows, above: Stage | None
     if above is not None and stage.required_extra and stage.required_extra not in above.EXTRAS:
         raise ValueError(f"{processor.kind} needs the {stage.required_extra} of {above.REPRESENTATION}, which has none")
     yield Planned(processor, stage, rows)
-    for child in processor.children:
-        yield from _planned(child, child.changes.follow(stage.output_format), stage.output_rows(rows), stage)
+    for child in list(processor.children):
+        below = child.ask(
+            lambda one: list(_planned(one, one.changes.follow(stage.output_format), stage.output_rows(rows), stage))
+        )
+        yield from below or ()
+
+
+def _sized(processor: Processor) -> tuple[Stage, Rows]:
+    """The stage of a processor and the rows of its input, once the stage has answered what its sizes are."""
+    stage, rows = processor.stage, processor.given_rows
+    sizes.output_size(stage, rows, 0.0)
+    sizes.state_size(stage, rows)
+    return stage, rows

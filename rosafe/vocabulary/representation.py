@@ -70,6 +70,8 @@ class Representation:
         What the rows along its `feature` axis are, where that never changes.
     centred : str
         The axis whose middle stays where it is when a change alters its length; others are aligned at their first.
+    allow_nan : bool
+        Whether the output of a plugin may contain NaN or infinity; otherwise such output ends the processor.
     """
 
     kind: str
@@ -84,6 +86,7 @@ class Representation:
     coordinates: tuple[str, ...] = ()
     features: tuple[str, ...] = ()
     centred: str = ""
+    allow_nan: bool = False
     name: str = ""
     name_doc: str = ""
     request: str = ""

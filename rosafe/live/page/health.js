@@ -5,8 +5,9 @@ import { el } from "./ui.js";
 export class Health {
   constructor(element) {
     this.facts = el("dl", { class: "facts" });
+    this.failures = el("ul", { class: "failures", hidden: true });
     this.losses = el("ul", { class: "losses", hidden: true });
-    element.replaceChildren(el("div", { class: "head" }, el("h2", { text: "Health" })), this.facts, this.losses);
+    element.replaceChildren(el("div", { class: "head" }, el("h2", { text: "Health" })), this.facts, this.failures, this.losses);
   }
 
   status(status, tree, link) {
@@ -20,6 +21,8 @@ export class Health {
       ["Lost frames", String(status.lost), "of the sound, since the nodes started"],
       ["To this page", `${(link.rate / 1000).toFixed(0)} kB/s`, "what this page receives"],
     ]);
+    this.failures.hidden = !status.failures.length;
+    this.failures.replaceChildren(...status.failures.map((text) => el("li", { text })));
     this.losses.hidden = !status.losses.length;
     this.losses.replaceChildren(...status.losses.map((loss) => el("li", {}, el("time", { text: new Date(loss.at * 1000).toLocaleTimeString() }), loss.what)));
   }

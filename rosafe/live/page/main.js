@@ -141,6 +141,7 @@ function told() {
   if (status.problem) return ["bad", status.problem];
   if (!status.bass && (status.silent === null || status.silent > SILENT)) return ["bad", "no sound: bass is not running"];
   if (status.silent === null || status.silent > SILENT) return ["warn", "no sound: nothing is acquired"];
+  if (status.failures.length) return ["bad", status.failures[0]];
   const heard = pictures.heard();
   const where = heard ? direction(heard.view, heard.lag) : "";
   return ["live", `${watch ? "watching" : "live"}${where ? ` · source ${where}` : ""}`];

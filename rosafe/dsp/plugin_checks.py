@@ -1,0 +1,365 @@
+"""Checks of plugins at run time: read-only input, checked results, and errors that name the plugin, its file and line.
+
+`checked` makes a subclass of a plugin's stage that does this. Stages of rosafe itself are not wrapped and pay nothing.
+"""
+
+from __future__ import annotations
+
+import inspect
+import logging
+import math
+import re
+import sys
+import types
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, ClassVar, NoReturn
+
+import numpy as np
+
+from rosafe.vocabulary.parameter import REQUIRED, Parameter
+from rosafe.vocabulary.representation import Part
+
+from .guard import FloatArray
+from .signal import Signal
+from .stage import FLOAT64, Output, Stage
+
+log = logging.getLogger("rosafe.plugin")
+Rows = tuple[int, ...]
+_PUBLIC = re.compile(r"^\s*(from|import)\s+rosafe\.plugin\b|^\s*from\s+rosafe\s+import\b.*\bplugin\b", re.MULTILINE)
+
+
+class PluginError(ValueError):
+    """A plugin's stage failed or does not do what it declares; the text names the plugin, its file and the line."""
+
+
+def checked(stage: type[Stage], file: str = "") -> type[Stage]:
+    """A subclass of a plugin's stage whose input is read-only and whose results are checked.
+
+    Parameters
+    ----------
+    stage : type
+        The plugin's class, with a declaration.
+    file : str
+        Where it is defined, for messages; by default the file of its module.
+
+    Returns
+    -------
+    type
+        `stage` itself if it is checked already. Its methods raise `PluginError` for failures and violations.
+    """
+    if issubclass(stage, CheckedStage):
+        return stage
+    path = file or getattr(sys.modules.get(stage.__module__), "__file__", None) or stage.process.__code__.co_filename
+    names = {
+        "__module__": stage.__module__,
+        "__qualname__": stage.__qualname__,
+        "__doc__": stage.__doc__,
+        "PLUGIN": stage,
+        "PLUGIN_FILE": path,
+        "PLUGIN_LINE": _line_of(stage, path),
+        "CHECKS_NAN": _checks_nan(stage, path),
+    }
+    made = types.new_class(stage.__name__, (CheckedStage, stage), {}, lambda namespace: namespace.update(names))
+    made.TAKES_OUT = stage.TAKES_OUT
+    return made
+
+
+def _checks_nan(stage: type[Stage], file: str) -> bool:
+    """Plugins written for 0.2 may return NaN."""
+    if stage.REPRESENTATION.allow_nan:
+        return False
+    try:
+        return _PUBLIC.search(Path(file).read_text("utf-8", "replace")) is not None
+    except OSError:
+        return True
+
+
+def _line_of(stage: type[Stage], file: str) -> int:
+    """Where the method that computes begins, or else the class."""
+    for name in ("frame", "process", "__init__"):
+        code = getattr(inspect.unwrap(getattr(stage, name, None) or stage), "__code__", None)
+        if code is not None and code.co_filename == file:
+            return int(code.co_firstlineno)
+    try:
+        return inspect.getsourcelines(stage)[1]
+    except (OSError, TypeError):
+        return 1
+
+
+def read_only(array: FloatArray) -> FloatArray:
+    """A view of a contiguous array that cannot be written, nor made writable again."""
+    return np.asarray(memoryview(array).toreadonly())  # type: ignore[arg-type]
+
+
+class _Count:
+    """The number of frames that a stage received and returned, compared with its `output_count`.
+
+    After a change of parameters the phase of its frames is unknown: then only their rate is compared.
+    """
+
+    def __init__(self, since_start: bool = True) -> None:
+        self._since_start = since_start
+        self._received = self._returned = 0
+        self._most = 0  # frames returned for one block
+        self._aligned = since_start  # False until the first frame after a change
+
+    def expected(self, stage: Stage, received: int, returned: int) -> int:
+        """How many frames should have been returned for the block; `returned` itself if that is plausible."""
+        self._received += received
+        self._returned += returned
+        if self._since_start:
+            return returned + _whole(stage.output_count(self._received), "output_count") - self._returned
+        self._most = max(self._most, returned)
+        if not self._aligned:
+            if returned:
+                self._aligned, self._received, self._returned = True, 0, 0
+            return returned
+        due = self._received * stage.output_format.rate / stage.input_format.rate
+        return returned if abs(self._returned - due) < 2 + self._most else returned + round(due) - self._returned
+
+
+def _whole(value: Any, name: str) -> int:
+    if isinstance(value, (int, np.integer)) and not isinstance(value, bool) and value >= 0:
+        return int(value)
+    raise TypeError(f"{name}: expected a number of frames, got {value!r:.80}")
+
+
+def _rows(value: Any, name: str) -> Rows:
+    if not isinstance(value, tuple):
+        raise TypeError(f"{name}: expected a tuple of integers, got {value!r:.80}")
+    if not all(isinstance(n, (int, np.integer)) and not isinstance(n, bool) and n >= 0 for n in value):
+        raise TypeError(f"{name}: expected a tuple of integers, got {value!r:.80}")
+    return tuple(map(int, value))
+
+
+def _values(given: Any, declared: Collection[tuple[str, str]], name: str) -> dict[str, Any]:
+    """Those of the mapping `given` that are declared as (name, type), each of its type."""
+    if not isinstance(given, Mapping):
+        raise TypeError(f"{name}: expected a dict, got {given!r:.80}")
+    missing = [key for key, _ in declared if key not in given]
+    if missing:
+        raise TypeError(f"{name}: {', '.join(missing)} is missing")
+    result = {}
+    for key, idl in declared:
+        try:
+            Parameter(key, idl, REQUIRED, "x", most=sys.maxsize).check(given[key])
+        except ValueError as problem:
+            raise TypeError(f"{name}: {problem}") from None
+        result[key] = given[key]
+    return result
+
+
+class CheckedStage(Stage):
+    """Base class, before the plugin's own, of what `checked` returns."""
+
+    PLUGIN: ClassVar[type[Stage]]
+    PLUGIN_FILE: ClassVar[str]
+    PLUGIN_LINE: ClassVar[int]
+    CHECKS_NAN: ClassVar[bool]
+    _warned: ClassVar[set[str]] = set()  # kinds whose arrays were converted
+
+    def __init__(self, *arguments: Any, **parameters: Any) -> None:
+        self.__count = _Count()
+        self.__rows: dict[Rows, tuple[Rows, ...]] = {}
+        with self._locating("__init__", refuses=True):
+            super().__init__(*arguments, **parameters)
+        self._inspect()
+
+    # --- errors ---
+
+    @classmethod
+    def describe_plugin(cls) -> str:
+        """Kind and file, for messages."""
+        return f"plugin {cls.REPRESENTATION.kind} ({cls.PLUGIN_FILE})"
+
+    @classmethod
+    def _violation(cls, what: str, line: int = 0) -> PluginError:
+        return PluginError(f"plugin {cls.REPRESENTATION.kind} ({cls.PLUGIN_FILE}:{line or cls.PLUGIN_LINE}): {what}")
+
+    @classmethod
+    @contextmanager
+    def _locating(cls, name: str, refuses: bool = False) -> Iterator[None]:
+        """Make a `PluginError` of anything that the method `name` raises.
+
+        A method that `refuses` values may raise a ValueError that begins with the name of a parameter.
+        """
+        try:
+            yield
+        except (PluginError, KeyboardInterrupt):
+            raise
+        except BaseException as problem:
+            if refuses and isinstance(problem, ValueError) and not cls._is_fault(problem):
+                raise
+            cls._raise(name, problem)
+
+    @classmethod
+    def _is_fault(cls, problem: ValueError) -> bool:
+        """Whether the plugin's own code raised it for something other than a parameter's value."""
+        names = [n for p in cls.REPRESENTATION.parameters for n in (p.name, *p.aliases, *p.former)]
+        return cls._line(problem) > 0 and not str(problem).startswith(tuple(names))
+
+    @classmethod
+    def _line(cls, problem: BaseException) -> int:
+        """The line of the plugin's file where it happened; 0 if it was not there."""
+        line, trace = 0, problem.__traceback__
+        while trace is not None:
+            if trace.tb_frame.f_code.co_filename == cls.PLUGIN_FILE:
+                line = trace.tb_lineno
+            trace = trace.tb_next
+        return line
+
+    @classmethod
+    def _raise(cls, name: str, problem: BaseException) -> NoReturn:
+        text = " ".join(f"{type(problem).__name__}: {problem}".split())
+        raise cls._violation(f"{name}: {text}", cls._line(problem)) from problem
+
+    # --- blocks ---
+
+    def process(self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None) -> Output:
+        given: list[FloatArray] = [read_only(block)]
+        if extra is not None or out is not None:
+            given.append(extra if extra is None else read_only(extra))  # type: ignore[arg-type]
+        if out is not None:
+            given.append(out)
+        try:
+            output = super().process(*given)
+        except KeyboardInterrupt:
+            raise
+        except BaseException as problem:
+            self._raise("process", problem)
+        parts = output if isinstance(output, tuple) else (output,)
+        rows = self.__rows.get(block.shape[:-1]) or self._expected_rows(block.shape[:-1])
+        if len(parts) != len(rows):
+            raise self._violation(f"process: expected {len(rows)} arrays, one for each part, got {len(parts)}")
+        shared = [block] if extra is None else [block, extra]
+        declared = self.REPRESENTATION.parts
+        parts = tuple(self._part(*each, shared, out) for each in zip(parts, rows, declared, strict=True))
+        frames = parts[0].shape[-1]
+        try:
+            expected = self.__count.expected(self, block.shape[-1], frames)
+        except Exception as problem:
+            self._raise("output_count", problem)
+        if expected != frames:
+            raise self._violation(f"process: expected {expected} frames as output_count declares, got {frames}")
+        for part, array in zip(declared, parts, strict=True):
+            if array.shape[-1] != frames:
+                raise self._violation(f"{part.name}: expected {frames} frames as in the first part, got {array.shape}")
+        for name in self.provide:
+            self._check_extra(name)
+        return parts if isinstance(output, tuple) else parts[0]
+
+    def _part(
+        self, array: Any, rows: Rows, part: Part, shared: Collection[FloatArray], out: FloatArray | None
+    ) -> FloatArray:
+        """One array of the output, checked against its declaration."""
+        if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiub":
+            told = f"{array.dtype} array" if isinstance(array, np.ndarray) else type(array).__name__
+            raise self._violation(f"{part.name}: expected a float64 array, got {told}")
+        if array.ndim == 0 or array.shape[:-1] != rows:
+            shape = ", ".join(map(str, (*rows, "frames")))
+            raise self._violation(f"{part.name}: expected shape ({shape}), got {array.shape}")
+        if any(np.may_share_memory(array, one) for one in shared):
+            raise self._violation(f"{part.name}: expected a new array, got one that shares memory with the input")
+        if array is not out and not (array.dtype is FLOAT64 and array.flags.c_contiguous and type(array) is np.ndarray):
+            array = self._converted(array, part.name)
+        if self.CHECKS_NAN:
+            with np.errstate(all="ignore"):
+                total = array.sum()
+            if not math.isfinite(total) and not np.isfinite(array).all():
+                raise self._violation(f"{part.name}: expected finite numbers, got NaN or infinity (see allow_nan)")
+        return array
+
+    def _converted(self, array: Any, name: str) -> FloatArray:
+        kind = self.REPRESENTATION.kind
+        if kind not in self._warned:
+            self._warned.add(kind)
+            got = f"one of {array.dtype}" if array.dtype != FLOAT64 else "one that is not contiguous"
+            log.warning("%s: %s: expected a contiguous float64 array, got %s", self.describe_plugin(), name, got)
+        return np.ascontiguousarray(array, np.float64)
+
+    def _check_extra(self, name: str) -> None:
+        extra = self.provided.get(name) if isinstance(self.provided, dict) else None
+        if not isinstance(extra, np.ndarray) or extra.dtype != FLOAT64:
+            raise self._violation(f"provided[{name!r}]: expected a float64 array, got {type(extra).__name__}")
+
+    def reset(self) -> None:
+        with self._locating("reset"):
+            super().reset()
+        self.__count = _Count()
+
+    # --- what it declares ---
+
+    def become(self, given: Signal, changes: Collection[Mapping[str, Any]]) -> None:
+        changed = given != self.input_format or any(changes)
+        with self._locating("build", refuses=True):
+            super().become(given, changes)
+        if changed:
+            self.__count = _Count(since_start=False)
+            self.__rows = {}
+            self._inspect()
+
+    def _inspect(self) -> None:
+        """Check all that can be asked without a block."""
+        if not isinstance(self.output_format, Signal):
+            raise self._violation(f"output_format: expected a Signal, got {type(self.output_format).__name__}")
+        for name in ("parameters", "derived", "required_extra", "look_ahead"):
+            getattr(self, name)
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        with self._locating("parameters"):
+            declared = [(p.name, p.idl) for p in self.REPRESENTATION.parameters]
+            return _values(super().parameters, declared, "parameters")
+
+    @property
+    def derived(self) -> dict[str, Any]:
+        with self._locating("derived"):
+            return _values(super().derived, [(d.name, d.idl) for d in self.REPRESENTATION.derived], "derived")
+
+    @property
+    def required_extra(self) -> str:
+        with self._locating("required_extra"):
+            name = super().required_extra
+            if not isinstance(name, str):
+                raise TypeError(f"required_extra: expected a name, got {name!r:.80}")
+            return name
+
+    @property
+    def look_ahead(self) -> int:
+        with self._locating("look_ahead"):
+            return _whole(super().look_ahead, "look_ahead")
+
+    def output_rows(self, rows: Rows) -> Rows:
+        with self._locating("output_rows"):
+            return _rows(super().output_rows(rows), "output_rows")
+
+    def part_rows(self, rows: Rows) -> tuple[Rows, ...]:
+        with self._locating("part_rows"):
+            parts = super().part_rows(rows)
+            if not isinstance(parts, tuple) or len(parts) != len(self.REPRESENTATION.parts):
+                raise TypeError(f"part_rows: expected one tuple for each part, got {parts!r:.80}")
+            checked_rows = tuple(_rows(part, "part_rows") for part in parts)
+            for part, shape in zip(self.REPRESENTATION.parts, checked_rows, strict=True):
+                if len(shape) != len(part.axes) - 1:
+                    raise TypeError(f"output_rows: expected a length for each of {part.axes[:-1]}, got {shape}")
+            return checked_rows
+
+    def _expected_rows(self, rows: Rows) -> tuple[Rows, ...]:
+        self.__rows[rows] = expected = self.part_rows(rows)
+        return expected
+
+    def state_size(self, rows: Rows) -> int:
+        with self._locating("state_size"):
+            return _whole(super().state_size(rows), "state_size")
+
+    def output_count(self, count: int) -> int:
+        with self._locating("output_count"):
+            return _whole(super().output_count(count), "output_count")
+
+
+def plugin_of(stage: Stage | type[Stage]) -> str:
+    """The plugin that a stage comes from, by kind and file; empty for a stage of rosafe itself."""
+    kind = stage if isinstance(stage, type) else type(stage)
+    return kind.describe_plugin() if issubclass(kind, CheckedStage) else ""
