@@ -51,7 +51,7 @@ def checked(stage: type[Stage], file: str = "") -> type[Stage]:
     """
     if issubclass(stage, CheckedStage):
         return stage
-    path = file or getattr(sys.modules.get(stage.__module__), "__file__", None) or stage.process.__code__.co_filename
+    path = file or getattr(sys.modules.get(stage.__module__), "__file__", None) or _file_of(stage)
     names = {
         "__module__": stage.__module__,
         "__qualname__": stage.__qualname__,
@@ -64,6 +64,12 @@ def checked(stage: type[Stage], file: str = "") -> type[Stage]:
     made = types.new_class(stage.__name__, (CheckedStage, stage), {}, lambda namespace: namespace.update(names))
     made.TAKES_OUT = stage.TAKES_OUT
     return made
+
+
+def _file_of(stage: type[Stage]) -> str:
+    """The file of the first function that the class itself defines."""
+    codes = (getattr(value, "__code__", None) for value in vars(stage).values())
+    return next((code.co_filename for code in codes if code is not None), "unknown file")
 
 
 def _checks_nan(stage: type[Stage], file: str) -> bool:
@@ -158,6 +164,7 @@ class CheckedStage(Stage):
     PLUGIN_FILE: ClassVar[str]
     PLUGIN_LINE: ClassVar[int]
     CHECKS_NAN: ClassVar[bool]
+    CONVERTS: ClassVar[bool] = True  # real arrays of another number type, and those that are not contiguous
     _warned: ClassVar[set[str]] = set()  # kinds whose arrays were converted
 
     def __init__(self, *arguments: Any, **parameters: Any) -> None:
@@ -273,10 +280,13 @@ class CheckedStage(Stage):
 
     def _converted(self, array: Any, name: str) -> FloatArray:
         kind = self.REPRESENTATION.kind
+        got = f"one of {array.dtype}" if array.dtype != FLOAT64 else "one that is not contiguous"
+        text = f"{name}: expected a contiguous float64 array, got {got}"
+        if not self.CONVERTS:
+            raise self._violation(text)
         if kind not in self._warned:
             self._warned.add(kind)
-            got = f"one of {array.dtype}" if array.dtype != FLOAT64 else "one that is not contiguous"
-            log.warning("%s: %s: expected a contiguous float64 array, got %s", self.describe_plugin(), name, got)
+            log.warning("%s: %s; it is converted", self.describe_plugin(), text)
         return np.ascontiguousarray(array, np.float64)
 
     def _check_extra(self, name: str) -> None:
