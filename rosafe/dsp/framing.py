@@ -193,7 +193,9 @@ class FramedStage(Stage):
 
     def process(self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None) -> Output:
         frames = self._framing.frames(self._buffer.append(limited(self._checked(block))))
-        output = np.ascontiguousarray(self.frame(frames), np.float64)
+        output = np.ascontiguousarray(self.frame(frames))
+        if np.may_share_memory(output, frames):  # those move when the next block comes
+            output = output.copy()
         self._buffer.drop(frames.shape[-2] * self._framing.hop)
         return output
 

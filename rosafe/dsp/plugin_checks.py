@@ -61,7 +61,9 @@ def checked(stage: type[Stage], file: str = "") -> type[Stage]:
         "PLUGIN_LINE": _line_of(stage, path),
         "CHECKS_NAN": _checks_nan(stage, path),
     }
-    made = types.new_class(stage.__name__, (CheckedStage, stage), {}, lambda namespace: namespace.update(names))
+    made: type[Stage] = types.new_class(
+        stage.__name__, (CheckedStage, stage), {}, lambda namespace: namespace.update(names)
+    )
     made.TAKES_OUT = stage.TAKES_OUT
     return made
 

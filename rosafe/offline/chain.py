@@ -305,7 +305,7 @@ def needed(outputs: Iterable[str]) -> list[str]:
 def overwriting(kinds: Collection[str], outputs: Collection[str]) -> list[str]:
     """Of all `kinds` that run, those that may write over the blocks that they take, which nobody else wants.
 
-    Kernels do; numpy does not.
+    Kernels do; numpy does not, and plugins must not.
     """
     if not kernels.compiled():
         return []
@@ -313,7 +313,7 @@ def overwriting(kinds: Collection[str], outputs: Collection[str]) -> list[str]:
     return [
         kind
         for kind, parent in zip(kinds, parents, strict=True)
-        if STAGES[kind].OVERWRITES and STAGES[kind].TAKES_OUT and parent not in outputs and parents.count(parent) == 1
+        if kind in OWN and STAGES[kind].OVERWRITES and parent not in outputs and parents.count(parent) == 1
     ]
 
 

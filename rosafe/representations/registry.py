@@ -10,6 +10,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import ModuleType
 
+from rosafe.dsp.plugin_checks import checked
 from rosafe.dsp.stage import Stage
 from rosafe.vocabulary import plugins
 from rosafe.vocabulary.representation import Representation
@@ -110,7 +111,7 @@ def find() -> tuple[dict[str, type[Stage]], list[str]]:
         if not taken:
             problems += [f"{origin}: {stage.REPRESENTATION.kind}: {_clash(stage, stages)}" for origin, stage in offered]
             break
-        stages[taken[0][1].REPRESENTATION.kind] = taken[0][1]
+        stages[taken[0][1].REPRESENTATION.kind] = checked(taken[0][1])
         offered.remove(taken[0])
     return _ordered(stages), problems
 

@@ -1,0 +1,71 @@
+"""Plugins with faults: found by the author's check, and at run time they end with one error that names their place."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import rosafe
+from rosafe.dsp.plugin_checks import checked
+from rosafe.interface import KINDS
+from rosafe.representations import STAGES
+from rosafe.testing import check_representation
+from tests.plugins.stages import FAULTS, FRAMED, PLAIN, SAMPLES, Fault, loaded, text_of
+
+SOUND = 0.1 * np.random.default_rng(1).standard_normal((2, 8000))
+RUN_TIME = [name for name, fault in FAULTS.items() if fault.at_run_time]
+
+
+@pytest.mark.parametrize("name", FAULTS)
+def test_the_check_finds_each_fault(tmp_path: Path, name: str) -> None:
+    path = tmp_path / "mine.py"
+    path.write_text(text_of(FAULTS[name]))
+    with pytest.raises(AssertionError) as caught:
+        check_representation(loaded(path), seconds=0.06)
+    assert FAULTS[name].told in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("text", [PLAIN, SAMPLES, FRAMED])
+def test_good_ones_pass(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "mine.py"
+    path.write_text(text_of(Fault(text, "", "")))
+    costs = check_representation(loaded(path), seconds=0.06)
+    assert next(iter(costs)) == "mine"
+    assert min(costs.values()) > 0
+    assert set(costs) >= {"gammatone", "precedence"}
+
+
+@pytest.fixture
+def use(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Path]:
+    """Make a plugin with a fault known to this process, as the registry does."""
+
+    def install(name: str) -> Path:
+        path = tmp_path / "mine.py"
+        path.write_text(text_of(FAULTS[name]))
+        stage = checked(loaded(path))
+        monkeypatch.setitem(STAGES, "mine", stage)
+        monkeypatch.setitem(KINDS, "mine", stage.REPRESENTATION)
+        return path
+
+    return install
+
+
+@pytest.mark.parametrize("name", RUN_TIME)
+def test_python_raises_an_error_with_kind_and_place(use: Callable[[str], Path], name: str) -> None:
+    path = use(name)
+
+    def process() -> None:
+        rosafe.process(SOUND, 16000, outputs=["ratemap", "mine"], block_frames=1600)
+
+    def stream() -> None:
+        rosafe.Stream(16000, outputs=["ratemap", "mine"]).process(SOUND)
+
+    for run in (process, stream):
+        with pytest.raises(ValueError, match=f"plugin mine .{re.escape(str(path))}:[0-9]+") as caught:
+            run()
+        assert FAULTS[name].told in str(caught.value)
