@@ -15,9 +15,10 @@ from concurrent.futures import ThreadPoolExecutor
 
 from rosafe.component import generate, master, startup, systemd
 from rosafe.genomix.graph import Graph
+from rosafe.genomix.names import Names
 from rosafe.genomix.server import Server
 from rosafe.genomix.sessions import Sessions
-from rosafe.http_server.access import own_names
+from rosafe.http_server.access import host_name, own_names
 from rosafe.terminal import printable
 from rosafe.version import VERSION
 
@@ -46,7 +47,7 @@ def main(argv: list[str] | None = None) -> int:
 def _parse(arguments: list[str]) -> argparse.Namespace:
     parser = startup.Parser(
         prog="genomixd",
-        usage="genomixd [-p PORT] [--host HOST] [-b] [-d] [-v] [-h] [--version]",
+        usage="genomixd [-p PORT] [--host HOST] [--name NAME] [-b] [-d] [-v] [-h] [--version]",
         description="HTTP server for the components of the ROS graph: Tcl, MATLAB and other clients use them by it.",
         epilog="example:\n  genomixd -p 8081 &\n  curl http://127.0.0.1:8081/call/rosAFE/getParameters\n\n"
         "Programs on this machine may use it; with --host others too, whoever can reach that address.",
@@ -55,6 +56,13 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
     )
     parser.add_argument("-p", "--port", type=_port, default=DEFAULT_PORT, help="TCP port (8080; 0: a free one)")
     parser.add_argument("--host", default=DEFAULT_HOST, help="address to listen on (default: 127.0.0.1)")
+    parser.add_argument(
+        "--name",
+        type=_name,
+        action="append",
+        default=[],
+        help="a further name by which clients call this machine, such as robot.lab; repeatable",
+    )
     parser.add_argument("-b", "--background", action="store_true", help="go to the background once it serves")
     parser.add_argument("-d", "--debug", action="store_true", help="say on stderr what is asked")
     parser.add_argument("-v", "--verbose", action="count", default=0, help="say more; twice: as -d")
@@ -65,6 +73,12 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
     )
     parser.add_argument("--version", action="version", version=f"genomixd {VERSION}")
     return parser.parse_args(arguments)
+
+
+def _name(text: str) -> str:
+    if not host_name(text):
+        raise argparse.ArgumentTypeError(f"expected the name of a host, such as robot.lab, got {text!r}")
+    return text
 
 
 def _port(text: str) -> int:
@@ -110,7 +124,7 @@ async def _serve(options: argparse.Namespace, told: startup.Background | None) -
     _allow_many_files()
     sys.setswitchinterval(startup.SWITCH_SECONDS)
     graph = Graph(os.environ["ROS_MASTER_URI"])
-    server = Server(Sessions(graph), own_names() | {options.host})
+    server = Server(Sessions(graph), Names(graph, {*own_names(), options.host, *options.name}))
     try:
         port = await server.start(options.host, options.port)
         logging.getLogger("genomixd").info("serving http://%s:%d", options.host, port)

@@ -8,6 +8,7 @@ import logging
 import re
 from collections.abc import Awaitable, Callable, Coroutine, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from http import HTTPStatus
 from typing import Any, TypeVar
 from urllib.parse import unquote_to_bytes
 
@@ -15,6 +16,7 @@ from aiohttp import web
 
 from rosafe.genomix import packed
 from rosafe.genomix.graph import middleware_error
+from rosafe.genomix.names import Names
 from rosafe.genomix.proxy import Proxy, Value
 from rosafe.genomix.requests import Request
 from rosafe.genomix.sessions import Session, Sessions
@@ -85,13 +87,13 @@ class Server:
     Parameters
     ----------
     sessions : Sessions
-    hosts : set of str
-        Names, besides IP addresses and localhost, by which clients may call this machine.
+    names : Names
+        Besides IP addresses and localhost, by which clients may call this machine.
     """
 
-    def __init__(self, sessions: Sessions, hosts: set[str]) -> None:
+    def __init__(self, sessions: Sessions, names: Names) -> None:
         self._sessions = sessions
-        self._hosts = {host.lower() for host in hosts}
+        self._names = names
         app = web.Application(middlewares=[self._guard])
         for path, handler in (
             ("/", self._help),
@@ -140,7 +142,7 @@ class Server:
         session: Session | None = None
         connection_of(request).request_parsed()
         try:
-            check_host(request.headers, self._hosts, "--host gives it one")
+            await self._check_host(request)
             check_no_browser(request.headers)
             _check_url(request)
             if not _is_packed(request):
@@ -151,6 +153,8 @@ class Server:
             return await handler(request)
         except HttpRefusal as refusal:
             answer = _error(request, _refusal_error(refusal))
+            if refusal.status == HTTPStatus.FORBIDDEN:
+                answer.set_status(refusal.status)  # also of a packed answer: the clients know what it means
             answer.force_close()
             return answer
         except ComponentError as problem:
@@ -167,6 +171,13 @@ class Server:
             if session is not None:
                 session.busy -= 1
                 session.touch()
+
+    async def _check_host(self, request: web.Request) -> None:
+        advice = "genomixd --name NAME accepts a further name"
+        try:
+            check_host(request.headers, self._names.known, advice)
+        except HttpRefusal:
+            check_host(request.headers, await self._names.from_parameter(), advice)
 
     def _session(self, request: web.Request) -> Session:
         name = request.query.get("s", "")

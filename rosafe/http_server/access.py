@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import ipaddress
+import os
 import re
 import socket
 from collections.abc import Collection, Mapping
 
 from rosafe.http_server.refusal import HttpRefusal
+
+_HOST = re.compile(r"(?:\[(?P<address>[0-9A-Fa-f:.]+)\]|(?P<name>[\w-]+(?:\.[\w-]+)*)\.?)(?::[0-9]{0,5})?", re.ASCII)
 
 
 def check_no_browser(headers: Mapping[str, str]) -> None:
@@ -39,24 +42,28 @@ def check_host(headers: Mapping[str, str], names: Collection[str], advice: str) 
     headers : mapping
         Of the HTTP request.
     names : collection of str
-        Names of this machine, in lower case; IP addresses and localhost count as well.
+        Names of this machine, as `host_name` returns them; IP addresses and localhost count as well.
     advice : str
         What the user can do, the end of the text.
     """
-    host = _host_name(headers.get("Host", ""))
+    header = headers.get("Host", "")
+    host = host_name(header)
     if host != "localhost" and host not in names and not _is_address(host):
-        raise HttpRefusal(403, f"{host[:80]!r} is not a name of this server; {advice}")
+        raise HttpRefusal(403, f"Host: {header[:80]!r} is not a name of this server; {advice}")
 
 
-def own_names() -> set[str]:
-    """Return the names of this machine, in lower case."""
-    return {socket.gethostname().lower(), socket.getfqdn().lower()}
+def own_names(environ: Mapping[str, str] = os.environ) -> set[str]:
+    """Return the names of this machine: with and without domain, with .local, and that in ROS_HOSTNAME."""
+    host = socket.gethostname()
+    short = host.partition(".")[0]
+    names = {host, socket.getfqdn(), short, f"{short}.local", environ.get("ROS_HOSTNAME", "")}
+    return {host_name(name) for name in names} - {""}
 
 
-def _host_name(header: str) -> str:
-    """Return the host of a Host header, without port and brackets."""
-    match = re.fullmatch(r"\[([^\]]+)\](:\d*)?|([^:]*)(:\d*)?", header.strip())
-    return (match[1] or match[3] or "").lower().rstrip(".") if match else header.lower()
+def host_name(text: str) -> str:
+    """Return the host of a Host header or URL in lower case, without port, brackets and final dot; "" if malformed."""
+    match = _HOST.fullmatch(text.strip(" \t"))
+    return (match["address"] or match["name"]).lower() if match else ""
 
 
 def _is_address(host: str) -> bool:

@@ -6,7 +6,7 @@ import hmac
 import secrets
 from collections.abc import Collection, Mapping
 
-from rosafe.http_server.access import check_host, check_same_origin
+from rosafe.http_server.access import check_host, check_same_origin, host_name
 from rosafe.http_server.refusal import HttpRefusal
 
 HEADERS = {
@@ -42,12 +42,12 @@ class Door:
         self.token = secrets.token_urlsafe(32)
         self.cookie_name = "rosafe_live"
         self.cookie = secrets.token_urlsafe(32)
-        self._hosts = {host.lower() for host in hosts}
+        self._hosts = {host_name(host) for host in hosts}
 
     def refusal(self, headers: Mapping[str, str], query: Mapping[str, str], cookies: Mapping[str, str]) -> str:
         """Why a request is refused, in one line; empty where it is let in."""
         try:
-            check_host(headers, self._hosts, "--host gives it one")
+            check_host(headers, self._hosts, "use its IP address")
             check_same_origin(headers)
         except HttpRefusal as refusal:
             return str(refusal)

@@ -1,0 +1,64 @@
+"""Further names of this machine, by which clients may call genomixd: `--name` and the ROS parameter `~names`."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Collection, Iterable
+from typing import Any
+
+from rosafe.genomix.graph import Graph, Unknown
+from rosafe.http_server.access import host_name
+from rosafe.interface import ComponentError
+
+PARAMETER = "names"
+READ_SECONDS = 1.0  # between two reads of the parameter, however many clients use unknown names
+
+log = logging.getLogger("genomixd")
+
+
+class Names:
+    """The names that genomixd accepts in the header Host.
+
+    Parameters
+    ----------
+    graph : Graph
+        Whose master has the parameter `~names`: a name, or a list of them.
+    names : iterable of str
+        Those that it accepts without a master.
+    """
+
+    def __init__(self, graph: Graph, names: Iterable[str]) -> None:
+        self._graph = graph
+        self.known: Collection[str] = {host_name(name) for name in names} - {""}
+        self._next_read = 0.0
+        self._value: Any = []
+        self._from_parameter: Collection[str] = ()
+
+    async def from_parameter(self) -> Collection[str]:
+        """Return the names in `~names`, read at most once a second; those of the last time if no master answers."""
+        now = asyncio.get_running_loop().time()
+        if now >= self._next_read:
+            self._next_read = now + READ_SECONDS
+            try:
+                value = await self._graph.master("getParam", f"{self._graph.name}/{PARAMETER}")
+            except Unknown:
+                value = []
+            except ComponentError:
+                return self._from_parameter
+            if value != self._value:
+                self._value = value
+                self._from_parameter = _parse(value, f"{self._graph.name}/{PARAMETER}")
+        return self._from_parameter
+
+
+def _parse(value: Any, parameter: str) -> set[str]:
+    """Return the names in the value of a ROS parameter; what is not a name is logged."""
+    names = set()
+    for text in value if isinstance(value, list) else [value]:
+        name = host_name(text) if isinstance(text, str) else ""
+        if name:
+            names.add(name)
+        else:
+            log.warning("%s: expected the name of a host, such as robot.lab, got %s", parameter, repr(text)[:80])
+    return names

@@ -1,0 +1,114 @@
+"""By which names genomixd may be called, and what its clients are told otherwise."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import xmlrpc.client
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from rosafe.genomix import names
+from rosafe.genomix.graph import Graph as RosGraph
+from tests import harness
+from tests.genomix.world import Http, port_of
+from tests.harness import Graph
+from tests.matlab import octave
+
+pytestmark = pytest.mark.ros
+
+
+def status(port: int, host: str, path: str = "/components") -> int:
+    code, body = Http(port).raw(path, headers={"Host": host})
+    assert (code == 403) == ("--name" in body), body
+    return code
+
+
+def test_names_that_are_given_and_those_of_the_machine(graph: Graph) -> None:
+    short = socket.gethostname().partition(".")[0]
+    with graph.start("genomixd", "-v", "-p", "0", "--name", "Ears.lab", "--name=other", ROS_HOSTNAME="Known") as server:
+        port = port_of(server)
+        for host in ("ears.lab", "EARS.LAB.:1234", "other", short, f"{short.upper()}.local:80", "known", "127.0.0.1"):
+            assert status(port, host) == 200, host
+        for host in ("ears", "lab", "ears.lab.example", "", "ears.lab:x", "knownn", "evil.example"):
+            assert status(port, host) == 403, host
+        assert status(port, "evil.example", "/components?syntax=packed") == 403
+
+
+def test_names_in_the_ros_parameter(
+    graph: Graph, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """They count as soon as they are set, also while genomixd runs."""
+    monkeypatch.setattr(names, "READ_SECONDS", 0.0)
+    monkeypatch.setattr(names.log, "propagate", True)
+    master = xmlrpc.client.ServerProxy(graph.uri)
+
+    async def scenario() -> None:
+        ours = RosGraph(graph.uri)
+        try:
+            known = names.Names(ours, {"Robot.", "10.0.0.1", "::1"})
+            assert known.known == {"robot", "10.0.0.1"}
+            assert await known.from_parameter() == ()
+            for value, wanted in (("Ears.lab", {"ears.lab"}), (["one", "two.lab."], {"one", "two.lab"})):
+                master.setParam("/test", f"{ours.name}/names", value)
+                assert await known.from_parameter() == wanted
+            assert not caplog.messages
+            master.setParam("/test", f"{ours.name}/names", ["a b", 7, "three"])
+            for _ in range(2):
+                assert await known.from_parameter() == {"three"}
+            assert [text.partition(": ")[2] for text in caplog.messages] == [
+                "expected the name of a host, such as robot.lab, got 'a b'",
+                "expected the name of a host, such as robot.lab, got 7",
+            ]
+            ours.uri = "http://127.0.0.1:1"  # the master is away: what it said last holds
+            assert await known.from_parameter() == {"three"}
+            ours.uri = graph.uri
+            master.deleteParam("/test", f"{ours.name}/names")
+            assert not await known.from_parameter()
+        finally:
+            await ours.close()
+
+    asyncio.run(scenario())
+
+
+@pytest.mark.parametrize("name", ["", "a b", "http://robot", "robot/x", "*"])
+def test_a_name_that_is_none(graph: Graph, name: str) -> None:
+    done = graph.run("genomixd", "--name", name, check=False)
+    assert done.returncode == 2 and done.stderr.count("\n") == 1
+    assert "--name: expected the name of a host" in done.stderr and repr(name) in done.stderr
+
+
+# --- clients ---
+
+NAMELESS = """
+import sys
+from rosafe.genomix import daemon
+daemon.own_names = lambda: set()
+sys.exit(daemon.main(["-v", "-p", "0", *sys.argv[1:]]))
+"""
+
+
+@pytest.fixture
+def nameless(graph: Graph) -> Iterator[int]:
+    """The port of a genomixd that does not know the name of this machine."""
+    code = f"import sys; sys.path.insert(0, {str(harness.ROOT)!r}){NAMELESS}"
+    with graph.start(harness.PYTHON, "-c", code) as server:
+        yield port_of(server)
+
+
+def test_clients_are_told_at_once(graph: Graph, nameless: int, tmp_path: Path) -> None:
+    name = socket.gethostname()
+    script = tmp_path / "script.tcl"
+    script.write_text(f"package require genomix\nputs [catch {{genomix::connect {name}:{nameless}}} told]$told")
+    told = graph.run("tclsh", str(script)).stdout
+    assert told.startswith("1") and "--name" in told and name in told
+    shown = octave.values(
+        graph.run(
+            *octave.command(tmp_path, f"show('told', message(@() genomix.client('{name}:{nameless}')));"),
+            timeout=60,
+            LANG="C.UTF-8",
+        ).stdout
+    )["told"]
+    assert shown.startswith("genomix:connection ") and f"--name {name}" in shown
