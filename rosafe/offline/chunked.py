@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from rosafe.offline.contents import Contents, is_scalar, told
+from rosafe.offline.contents import Contents
 from rosafe.offline.hdf5 import Hdf5
 
 CHUNK = 2**19  # bytes, about; what is read and written at a time
@@ -212,9 +212,8 @@ class ZarrWriter(ChunkedWriter):
             array.attrs.update({"_ARRAY_DIMENSIONS": contents.dimensions(name), "units": contents.units[name]})
         for name, value in contents.fixed.items():
             data = np.asarray(value, np.float64)
-            array = make(
-                name, shape=data.shape, chunks=tuple(max(1, n) for n in data.shape), dtype="<f8", fill_value=_FILL
-            )
+            chunks = tuple(min(max(1, length), CHUNK // 8) for length in data.shape)
+            array = make(name, shape=data.shape, chunks=chunks, dtype="<f8", fill_value=_FILL)
             array[...] = data
             array.attrs["_ARRAY_DIMENSIONS"] = [name] if data.ndim else []
         self._group.attrs.update(contents.flat())
@@ -227,58 +226,3 @@ class ZarrWriter(ChunkedWriter):
         import zarr
 
         zarr.consolidate_metadata(str(self._path))
-
-
-# --- reading ------------------------------------------------------------------------------------------------------
-
-
-def read_h5(path: Path, arrays: bool = True) -> dict[str, Any]:
-    """What is in an .h5; without its arrays, only what `told` gives. ValueError where it is damaged."""
-    import h5py
-
-    try:
-        with h5py.File(path, "r", locking=False) as file:
-            about = told(dict(file.attrs))
-            return {**_numbers({name: dataset[()] for name, dataset in file.items()} if arrays else {}), **about}
-    except (OSError, RuntimeError, KeyError) as problem:
-        raise ValueError(str(problem).partition("\n")[0]) from None
-
-
-def read_mat73(path: Path, arrays: bool = True) -> dict[str, Any]:
-    """As `read_h5`, for a version 7.3 .mat."""
-    import h5py
-
-    try:
-        with h5py.File(path, "r", locking=False) as file:
-            texts = {k: _text(d) for k, d in file.items() if d.attrs.get("MATLAB_class") == b"char"}
-            about = told({**texts, **{k: d[0, 0] for k, d in file.items() if is_scalar(k)}})
-            found: dict[str, Any] = {}
-            for name in file.keys() - about.keys() if arrays else ():
-                data = file[name][()]
-                if "MATLAB_empty" in file[name].attrs:
-                    found[name] = np.zeros(data.astype(int))
-                else:
-                    found[name] = np.ascontiguousarray(data.T) if name in about["axes"] else data.ravel()
-            return {**found, **about}
-    except (OSError, RuntimeError, KeyError, AttributeError) as problem:
-        raise ValueError(str(problem).partition("\n")[0]) from None
-
-
-def _text(dataset: Any) -> str:
-    return bytes(dataset[()].astype("<u2").tobytes()).decode("utf-16-le")
-
-
-def read_zarr(path: Path, arrays: bool = True) -> dict[str, Any]:
-    """As `read_h5`, for a .zarr."""
-    import zarr
-
-    try:
-        group = zarr.open_group(str(path), mode="r")
-        about = told(dict(group.attrs))
-        return {**_numbers({name: array[...] for name, array in group.arrays()} if arrays else {}), **about}
-    except (KeyError, OSError, RuntimeError) as problem:
-        raise ValueError(str(problem).partition("\n")[0]) from None
-
-
-def _numbers(arrays: dict[str, Any]) -> dict[str, Any]:
-    return {name: np.asarray(value) if np.ndim(value) else float(value) for name, value in arrays.items()}

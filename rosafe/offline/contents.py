@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 
 # what tells runs apart
 ABOUT = ("parameters", "sample_rate", "block_frames", "channels", "topic", "source", "rosafe_version", "axes")
+MAX_TEXT = 2**20  # characters of a text in a file
 _TEXTS = {"source", "topic", "rosafe_version"}  # what is told as it is; other texts are JSON
 
 
@@ -78,18 +79,95 @@ class Writer(Protocol):
 
 
 def told(flat: Mapping[str, Any]) -> dict[str, Any]:
-    """`Contents.about`, with axes and units, from what `flat` has made of it, numpy's types included."""
+    """`Contents.about`, with axes and units, from what `flat` has made of it, numpy's types included.
+
+    ValueError for values of other types than `flat` writes.
+    """
     about: dict[str, Any] = {}
     for name, value in flat.items():
         value = value.item() if isinstance(value, (np.ndarray, np.generic)) else value
         if isinstance(value, bytes):
             value = value.decode()
-        if isinstance(value, float) and name in ("sample_rate", "block_frames"):
-            value = int(value)
-        about[name] = json.loads(value) if isinstance(value, str) and name not in _TEXTS else value
+        about[name] = from_json(value) if isinstance(value, str) and name not in _TEXTS else value
+    return checked(about)
+
+
+def from_json(text: str | bytes, most: int = MAX_TEXT) -> Any:
+    """The value of a JSON text of at most `most` characters; ValueError if it is none."""
+    if len(text) > most:
+        raise ValueError(f"a text of {len(text)} characters, expected at most {most}")
+    try:
+        return json.loads(text)
+    except RecursionError:
+        raise ValueError("a text is nested too deeply") from None
+
+
+def checked(about: dict[str, Any]) -> dict[str, Any]:
+    """The same as Python has it, of the types that `Contents` says; ValueError if it is of other types."""
+    for name, (expected, fits) in _TYPES.items():
+        if name in about and not fits(about[name]):
+            raise ValueError(f"{name}: expected {expected}")
+    for name in about.keys() & {"sample_rate", "block_frames"}:
+        about[name] = int(about[name])
     if "axes" in about:
         about["axes"] = {name: tuple(axes) for name, axes in about["axes"].items()}
     return about
+
+
+def is_number(value: Any) -> bool:
+    """Whether this is a real number, which may be infinite or NaN."""
+    return isinstance(value, (int, float)) and not isinstance(value, bool)
+
+
+def _is_positive(value: Any) -> bool:
+    return is_number(value) and 1 <= value < 2**53
+
+
+def _is_text(value: Any) -> bool:
+    return isinstance(value, str)
+
+
+def is_texts(value: Any) -> bool:
+    """Whether this is a list of texts."""
+    return isinstance(value, (list, tuple)) and all(isinstance(one, str) for one in value)
+
+
+def _is_parameter(value: Any) -> bool:
+    return all(isinstance(one, (bool, int, float, str)) for one in (value if isinstance(value, list) else [value]))
+
+
+_TYPES: dict[str, tuple[str, Callable[[Any], bool]]] = {
+    "sample_rate": ("a positive number", _is_positive),
+    "block_frames": ("a positive number", _is_positive),
+    "channels": ("numbers of channels", lambda found: isinstance(found, list) and all(map(_is_positive, found))),
+    "source": ("a text", _is_text),
+    "topic": ("a text", _is_text),
+    "rosafe_version": ("a text", _is_text),
+    "parameters": (
+        "numbers, texts and lists of these, by name",
+        lambda found: isinstance(found, dict) and all(map(_is_parameter, found.values())),
+    ),
+    "axes": (
+        "a list of names for each array",
+        lambda found: isinstance(found, dict) and all(map(is_texts, found.values())),
+    ),
+    "units": ("a text for each array", lambda found: isinstance(found, dict) and all(map(_is_text, found.values()))),
+}
+
+
+def new_array(shape: tuple[int, ...], dtype: np.dtype[Any], order: Literal["C", "F"] = "C") -> np.ndarray:
+    """An array to be filled; ValueError for a shape that cannot be."""
+    try:
+        return np.empty(shape, dtype, order)
+    except (MemoryError, OverflowError):
+        raise ValueError("an array does not fit into the memory") from None
+
+
+def restored(array: np.ndarray, axes: tuple[str, ...] | None) -> np.ndarray:
+    """An array as it was before MATLAB has left out axes of length 1 at its end, or has made two axes of one."""
+    if axes is None:
+        return array.ravel()
+    return array.reshape(array.shape + (1,) * (len(axes) - array.ndim))
 
 
 def sample_times(count: int, sample_rate: float) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import math
 import os
 from collections.abc import Callable, Iterable, Mapping
@@ -9,12 +10,18 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from rosafe.input import open_descriptor, open_regular
 from rosafe.interface import KINDS
 from rosafe.missing import require
-from rosafe.offline.chunked import H5Writer, Mat73Writer, ZarrWriter, read_h5, read_mat73, read_zarr
-from rosafe.offline.contents import Contents, Writer, sample_times
-from rosafe.offline.whole import CsvWriter, Mat5Writer, NpzWriter, read_csv, read_mat5, read_npz
+from rosafe.offline.chunked import H5Writer, Mat73Writer, ZarrWriter
+from rosafe.offline.containers import read_h5, read_mat73, read_zarr
+from rosafe.offline.contents import Contents, Writer, is_number, is_texts, sample_times
+from rosafe.offline.mat5 import read_mat5
+from rosafe.offline.readers import read_csv, read_npz
+from rosafe.offline.whole import CsvWriter, Mat5Writer, NpzWriter
+from rosafe.vocabulary.parameter import shown
 
 MAT5_MOST = 2**30  # bytes of a variable; MATLAB's version 5 ends at 2**31, and scipy needs an array twice
 _MAT73_MAGIC = b"MATLAB 7.3"
@@ -127,9 +134,10 @@ def load(path: str | os.PathLike[str]) -> dict[str, Any]:
     """
     form = format_of(path)
     result = read(form, Path(path))
-    missing = set(result["axes"]) - set(result)
-    if missing:
-        raise ValueError(f"{path} is damaged: {', '.join(sorted(missing))} is not in it")
+    try:
+        _check_arrays(result)
+    except ValueError as problem:
+        raise ValueError(f"{path} is damaged: {problem}") from None
     for kind in KINDS.values():  # what has no frames has a number for each sample
         there = [name for name in kind.outputs if name in result["axes"]]
         if there and f"{kind.kind}_time" not in result:
@@ -137,11 +145,43 @@ def load(path: str | os.PathLike[str]) -> dict[str, Any]:
     return result
 
 
+def _check_arrays(result: Mapping[str, Any]) -> None:
+    """ValueError where outputs, or what lies along their axes, are missing or of another type."""
+    missing = result["axes"].keys() - result.keys()
+    if missing:
+        raise ValueError(f"{', '.join(map(shown, sorted(missing)))} is not in it")
+    for name, axes in result["axes"].items():
+        _check_array(name, result[name], len(axes))
+    for kind in KINDS.values():
+        outputs = [name for name in kind.outputs if name in result["axes"]]
+        for name in outputs:
+            if result["axes"][name] != kind.outputs[name].axes:
+                raise ValueError(f"axes: {name}: expected {', '.join(kind.outputs[name].axes)}")
+        if outputs and f"{kind.kind}_time" in result:
+            _check_array(f"{kind.kind}_time", result[f"{kind.kind}_time"], 1)
+            if any(result[name].shape[-1] != len(result[f"{kind.kind}_time"]) for name in outputs):
+                raise ValueError(f"{kind.kind}_time: its length is not that of {outputs[0]}")
+        rate = result.get(f"{kind.kind}_frameRate", 1.0)
+        if not is_number(rate) or not 0 < rate < math.inf:
+            raise ValueError(f"{kind.kind}_frameRate: expected a positive number")
+        units = {one.name: one.unit for one in (*kind.parameters, *kind.derived)}
+        for name in kind.coordinates:
+            if units[name]:
+                _check_array(name, result.get(name, np.empty(0)), 1)
+            elif not is_texts(result.get(name, ())):
+                raise ValueError(f"{name}: expected texts")
+
+
+def _check_array(name: str, value: Any, dimensions: int) -> None:
+    if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiu" or value.ndim != dimensions:
+        raise ValueError(f"{shown(name)}: expected an array of {dimensions} dimensions")
+
+
 def read(form: Format, path: Path, arrays: bool = True) -> dict[str, Any]:
     """What is in a file; without its arrays, only what tells runs apart. Errors as those of `load`."""
     if not path.exists():
         raise FileNotFoundError(2, os.strerror(2), str(path))
-    if form.module:
+    if form.module and not importlib.util.find_spec(form.module):  # it need not be imported here
         require(form.module, f"{form.extension} files")
     if form.folder and not path.is_dir():
         raise ValueError(f"{path}: expected a directory, got a file")
@@ -149,8 +189,9 @@ def read(form: Format, path: Path, arrays: bool = True) -> dict[str, Any]:
         os.close(open_descriptor(path))  # HDF5 opens whatever it is given
     try:
         result = form.read(path, arrays)
-    except ValueError as problem:  # json.JSONDecodeError and UnicodeDecodeError, too
+    except (ValueError, OverflowError, RecursionError, MemoryError) as problem:  # json.JSONDecodeError, too
         raise ValueError(f"{path} is no result of rosafe process, or damaged: {problem}") from None
-    if not isinstance(result.get("axes"), Mapping) or not isinstance(result.get("parameters"), Mapping):
-        raise ValueError(f"{path} is no result of rosafe process")
+    for name in ("axes", "parameters", "sample_rate"):
+        if name not in result:
+            raise ValueError(f"{path} is no result of rosafe process: {name} is not in it")
     return result

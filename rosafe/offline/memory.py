@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
+from rosafe.offline.isolated import check_size
 from rosafe.tree import sizes
 
 _MEMINFO = Path("/proc/meminfo")
@@ -23,3 +24,10 @@ def refuse_over_available(taken: float, what: str, advice: str = "") -> None:
     """ValueError, with `advice`, where so many bytes are more than there are: the system would end the process."""
     text = f"{what} would take {{taken:.1f}} GB of memory, this machine has {{limit:.1f}} GB left{advice}"
     sizes.refuse_over(available(), taken, text, 1e9)
+
+
+def check_arrays(before: int, size: int, taken: float) -> None:
+    """ValueError where arrays of `taken` bytes, after `before` bytes, are too large for a file of `size` bytes, or for
+    the memory that is left."""
+    check_size(before + taken, size)
+    refuse_over_available(taken, "its arrays")

@@ -5,23 +5,18 @@ from __future__ import annotations
 import json
 import math
 import os
-import struct
 import tempfile
-import zipfile
-import zlib
 from contextlib import ExitStack
-from io import TextIOWrapper
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 
-from rosafe.input import open_regular
-from rosafe.offline.contents import ABOUT, Contents, is_scalar, sample_times, told
+from rosafe.offline.contents import Contents, sample_times
 
 HEAD = 2**10  # bytes at most in a file for each thing in it, and once more, beside its numbers or letters
 IN_MEMORY = 2**28  # bytes of all arrays together; from there on they are on the disk
-_CSV_HEAD = "# rosafe "
+CSV_HEAD = "# rosafe "
 
 
 class WholeWriter:
@@ -116,7 +111,7 @@ class CsvWriter(WholeWriter):
         fixed = {k: v if isinstance(v, float) else v.tolist() for k, v in contents.fixed.items() if k != time}
         rows = self._arrays[name].T
         head = {**contents.about, "axes": contents.axes, "units": contents.units, "fixed": fixed, "rows": len(rows)}
-        lines = [f"{_CSV_HEAD}{json.dumps(head)}", ",".join([time, *self._columns(name, rows.shape[1])])]
+        lines = [f"{CSV_HEAD}{json.dumps(head)}", ",".join([time, *self._columns(name, rows.shape[1])])]
         file.writelines(f"{line}\n".encode() for line in lines)
         times = contents.fixed.get(time, sample_times(len(rows), contents.about["sample_rate"]))
         for moment, row in zip(np.asarray(times).tolist(), rows, strict=True):
@@ -128,59 +123,3 @@ class CsvWriter(WholeWriter):
         frequencies = self._contents.fixed["fb_cfHz"]
         assert isinstance(frequencies, np.ndarray)
         return [f"{frequency:.6g} Hz" for frequency in frequencies]
-
-
-# --- reading ------------------------------------------------------------------------------------------------------
-
-
-def read_npz(path: Path, arrays: bool = True) -> dict[str, Any]:
-    """What is in an .npz; without its arrays, only what `told` gives. ValueError where it is damaged."""
-    try:
-        with open_regular(path) as stream, np.load(stream, allow_pickle=False) as file:
-            if isinstance(file, np.ndarray):
-                raise ValueError("an .npy is no .npz")
-            names = file.files if arrays else [name for name in file.files if name in ABOUT]
-            everything = {name: file[name] for name in names}
-    except (zipfile.BadZipFile, EOFError, zlib.error, KeyError, struct.error) as problem:
-        raise ValueError(str(problem)) from None
-    scalars = {name: value for name, value in everything.items() if value.ndim == 0}
-    return {**everything, **told(scalars)}
-
-
-def read_mat5(path: Path, arrays: bool = True) -> dict[str, Any]:
-    """As `read_npz`, for a version 5 .mat."""
-    from scipy.io import loadmat
-
-    with open_regular(path) as file:
-        try:
-            found = loadmat(file, variable_names=None if arrays else [*ABOUT])
-        except Exception as problem:  # of half a file scipy raises whatever comes
-            raise ValueError(str(problem)) from None
-    found = {name: value for name, value in found.items() if not name.startswith("__")}
-    texts = {name: "".join(value.ravel()) for name, value in found.items() if value.dtype.kind == "U"}
-    scalars = {name: value for name, value in found.items() if is_scalar(name)}
-    about = told({**texts, **scalars})
-    axes = about.get("axes", {})
-    others = found.keys() - about.keys()
-    return {**{name: found[name] if name in axes else found[name].ravel() for name in others}, **about}
-
-
-def read_csv(path: Path, arrays: bool = True) -> dict[str, Any]:
-    """As `read_npz`, for a .csv."""
-    with TextIOWrapper(open_regular(path), "utf-8") as file:
-        head = file.readline()
-        if not head.startswith(_CSV_HEAD):
-            raise ValueError("its first line is not that of rosafe process")
-        about = json.loads(head.removeprefix(_CSV_HEAD))
-        fixed, rows = about.pop("fixed"), about.pop("rows")
-        about["axes"] = {name: tuple(axes) for name, axes in about["axes"].items()}
-        if not arrays:
-            return dict(about)
-        time, *columns = file.readline().rstrip("\n").split(",")
-        numbers = [list(map(float, line.split(","))) for line in file]
-    if len(numbers) != rows or any(len(row) != 1 + len(columns) for row in numbers):
-        raise ValueError(f"it is cut off: {len(numbers)} of {rows} rows are there")
-    table = np.array(numbers).reshape(rows, 1 + len(columns))
-    (name,) = about["axes"]
-    vectors = {k: np.array(v) if isinstance(v, list) else v for k, v in fixed.items()}
-    return {name: np.ascontiguousarray(table[:, 1:].T), time: table[:, 0].copy(), **vectors, **about}

@@ -1,0 +1,190 @@
+"""Reading of HDF5 files and Zarr folders, in a child process: a damaged file cannot crash or block this one."""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import json
+import os
+import re
+import select
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rosafe.offline.contents import is_scalar, new_array, restored, told
+from rosafe.offline.isolated import MAX_TEXT, blocks
+from rosafe.offline.memory import refuse_over_available
+
+STALL = 10  # seconds without a sign of the child process, after which the file counts as damaged
+START = 60  # seconds that the child process may take to start
+_PROGRAM = os.path.abspath(Path(__file__).with_name("isolated.py"))
+_PIPE = 2**20  # bytes that wait between the processes
+
+Arrays = dict[str, tuple[np.ndarray, dict[str, Any]]]  # with the attributes of each
+
+
+class _Ended(Exception):
+    """The child process has ended before its output was complete."""
+
+
+def read_container(kind: str, path: Path, which: str) -> tuple[dict[str, Any], Arrays]:
+    """The attributes and arrays of a file, as `rosafe.offline.isolated` sends them.
+
+    Raises
+    ------
+    ValueError
+        The file is damaged, or not allowed, or nothing more has come of it for `STALL` seconds.
+    OSError
+        The child process cannot be started.
+    """
+    modules = [os.path.abspath(folder) for folder in sys.path if folder]
+    request = {"path": os.path.abspath(path), "kind": kind, "arrays": which, "modules": modules}
+    command = [_python(), "-I", "-S", "-W", "ignore", _PROGRAM, json.dumps(request)]
+    alone = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "HDF5_PLUGIN_PRELOAD": "::"}  # no plugins of HDF5
+    with subprocess.Popen(
+        command,
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        cwd="/",
+        env={**os.environ, **alone},
+    ) as child:
+        try:
+            return _take(child)
+        finally:
+            child.kill()
+
+
+def _python() -> str:
+    """The interpreter that runs this, also inside other programs; OSError if there is none."""
+    version = f"python{sys.version_info.major}.{sys.version_info.minor}"
+    folders = (sys.exec_prefix, sys.base_exec_prefix)
+    for path in (sys.executable, *(os.path.join(folder, "bin", version) for folder in folders), shutil.which(version)):
+        if path and re.fullmatch(r"python[0-9.]*[a-z]*", os.path.basename(path)) and os.access(path, os.X_OK):
+            return path
+    raise OSError(errno.ENOENT, f"found no program {version}, which is needed to read it; install it")
+
+
+def _take(child: subprocess.Popen[bytes]) -> tuple[dict[str, Any], Arrays]:
+    pipe = _Pipe(child)
+    try:
+        pipe.read(1, START)
+    except (_Ended, TimeoutError):
+        raise OSError(errno.ENOEXEC, f"{child.args[0]} cannot be started to read it: {pipe.end()}") from None  # type: ignore[index]
+    try:
+        head = json.loads(pipe.read(int.from_bytes(pipe.read(8), "little")))
+        arrays = head["arrays"]
+        sizes = [8.0 * np.prod([float(n) for n in one["shape"]]) for one in arrays]
+        refuse_over_available(sum(sizes), "its arrays")
+        return head["attributes"], {one["name"]: (pipe.array(one), one["attributes"]) for one in arrays}
+    except _Ended:
+        raise ValueError(pipe.end()) from None
+    except TimeoutError:
+        raise ValueError(f"nothing could be read for {STALL} s") from None
+
+
+class _Pipe:
+    """Standard output of a child process."""
+
+    def __init__(self, child: subprocess.Popen[bytes]) -> None:
+        assert child.stdout
+        self._child = child
+        self._descriptor = child.stdout.fileno()
+        with contextlib.suppress(OSError):  # more than the system allows to one user
+            fcntl.fcntl(self._descriptor, fcntl.F_SETPIPE_SZ, _PIPE)
+        self._poll = select.poll()
+        self._poll.register(self._descriptor, select.POLLIN)
+
+    def fill(self, buffer: memoryview, seconds: int = STALL) -> None:
+        """Fill a buffer; `_Ended`, or TimeoutError after `seconds` without a byte."""
+        while buffer:
+            if not any(self._poll.poll(1000) for _ in range(seconds)):  # 1 s each: while stopped, no time passes
+                raise TimeoutError
+            count = os.readv(self._descriptor, [buffer])
+            if not count:
+                raise _Ended
+            buffer = buffer[count:]
+
+    def read(self, count: int, seconds: int = STALL) -> bytearray:
+        """The next `count` bytes."""
+        content = bytearray(count)
+        self.fill(memoryview(content), seconds)
+        return content
+
+    def array(self, described: dict[str, Any]) -> np.ndarray:
+        """The next array."""
+        shape, block, dtype = tuple(described["shape"]), tuple(described["block"]), np.dtype(described["dtype"])
+        array = new_array(shape, dtype)
+        for slices in blocks(shape, block):
+            part = array[slices]
+            if part.flags.c_contiguous and part.ndim:
+                self.fill(memoryview(part.reshape(-1).view(np.uint8)))
+            else:
+                buffer = np.empty(part.shape, dtype)
+                self.fill(memoryview(buffer.reshape(-1).view(np.uint8)))
+                array[slices] = buffer
+        return array
+
+    def end(self) -> str:
+        """Why the child process has ended."""
+        try:
+            _, text = self._child.communicate(timeout=1)
+        except subprocess.TimeoutExpired:
+            return f"it does not answer for {START} s"
+        code = self._child.returncode
+        if code < 0:
+            return f"the library that reads it crashed ({signal.Signals(-code).name})"
+        return (text.decode(errors="replace").splitlines() or ["it is cut off"])[-1][:MAX_TEXT]
+
+
+def read_h5(path: Path, arrays: bool = True) -> dict[str, Any]:
+    """What is in an .h5; without its arrays, only what `told` gives. ValueError where it is damaged."""
+    attributes, found = read_container("h5", path, "all" if arrays else "none")
+    return {**_numbers(found), **told(attributes)}
+
+
+def read_zarr(path: Path, arrays: bool = True) -> dict[str, Any]:
+    """As `read_h5`, for a .zarr."""
+    attributes, found = read_container("zarr", path, "all" if arrays else "none")
+    return {**_numbers(found), **told(attributes)}
+
+
+def _numbers(arrays: Arrays) -> dict[str, Any]:
+    return {name: value if value.ndim else float(value) for name, (value, _) in arrays.items()}
+
+
+def read_mat73(path: Path, arrays: bool = True) -> dict[str, Any]:
+    """As `read_h5`, for a version 7.3 .mat."""
+    _, found = read_container("mat", path, "all" if arrays else "texts")
+    texts = {name: _text(name, *one) for name, one in found.items() if one[1].get("MATLAB_class") == "char"}
+    about = told({**texts, **{name: one[0] for name, one in found.items() if is_scalar(name)}})
+    axes = about.get("axes", {})
+    result: dict[str, Any] = {}
+    for name in found.keys() - about.keys():
+        data, attributes = found[name]
+        if "MATLAB_empty" in attributes:
+            result[name] = _empty(name, data)
+        else:
+            result[name] = restored(np.ascontiguousarray(data.T), axes.get(name))
+    return {**result, **about}
+
+
+def _text(name: str, data: np.ndarray, attributes: dict[str, Any]) -> str:
+    if "MATLAB_empty" in attributes:
+        return ""
+    if data.dtype.kind != "u":
+        raise ValueError(f"{name}: expected the codes of characters")
+    return data.astype("<u2").tobytes().decode("utf-16-le")
+
+
+def _empty(name: str, shape: np.ndarray) -> np.ndarray:
+    if not (0 < shape.size <= 32 and shape.dtype.kind == "u" and not shape.all()):
+        raise ValueError(f"{name}: expected the shape of an empty array")
+    return new_array(tuple(shape.ravel().tolist()), np.dtype(np.float64))

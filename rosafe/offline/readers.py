@@ -1,0 +1,137 @@
+"""Reading of .npz and .csv: sizes and types are checked before anything of that size is read."""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+import zipfile
+import zlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import IO, Any, BinaryIO
+
+import numpy as np
+
+from rosafe.input import open_regular
+from rosafe.offline.contents import ABOUT, MAX_TEXT, checked, from_json, is_number, new_array, told
+from rosafe.offline.memory import check_arrays
+from rosafe.offline.whole import CSV_HEAD
+
+_MAX_MEMBERS = 4096  # of an .npz
+_MAX_HEADER = 4096  # bytes of the header of an array
+_BLOCK = 2**20  # bytes that are read at a time
+_MAGIC = re.compile(rb"\x93NUMPY[\x01-\x03]\x00", re.DOTALL)
+_HEADER = re.compile(
+    r"\{'descr': '([<>|=]?[biufU]\d{1,7})', 'fortran_order': (True|False), 'shape': \(([0-9, ]{0,500})\),? ?\}\s{0,500}"
+)
+_ENCRYPTED = 1  # of the flags of a member
+_LONGEST_NUMBER = 32  # characters of a number in a .csv; repr makes at most 24
+_MAX_CSV_HEAD = 2**24  # bytes
+
+
+def read_npz(path: Path, arrays: bool = True) -> dict[str, Any]:
+    """What is in an .npz; without its arrays, only what `told` gives. ValueError where it is damaged."""
+    try:
+        with open_regular(path) as stream, zipfile.ZipFile(stream) as file:
+            size = os.fstat(stream.fileno()).st_size
+            found = {name: _member(file, one) for name, one in _members(file, size, arrays)}
+    except (zipfile.BadZipFile, EOFError, zlib.error, NotImplementedError, RuntimeError, OverflowError) as problem:
+        raise ValueError(str(problem)[:300]) from None
+    return {**found, **told({name: value for name, value in found.items() if value.ndim == 0})}
+
+
+def _members(file: zipfile.ZipFile, size: int, arrays: bool) -> Iterator[tuple[str, zipfile.ZipInfo]]:
+    """Names and places of the arrays to be read, after a check of what they all take."""
+    members = file.infolist()
+    if len(members) > _MAX_MEMBERS:
+        raise ValueError(f"it holds more than {_MAX_MEMBERS} arrays")
+    for one in members:
+        if one.flag_bits & _ENCRYPTED or one.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+            raise ValueError("expected arrays that are stored or deflated, and not encrypted")
+    check_arrays(0, size, sum(one.file_size for one in members))
+    for one in members:
+        name = one.filename.removesuffix(".npy")
+        if arrays or name in ABOUT:
+            yield name, one
+
+
+def _member(file: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
+    """An array, as numpy writes it."""
+    with file.open(member) as content:
+        version = content.read(8)
+        width = 2 if version[6:7] == b"\x01" else 4
+        length = int.from_bytes(content.read(width), "little")
+        if not _MAGIC.fullmatch(version) or length > _MAX_HEADER:
+            raise ValueError("a member is not an array")
+        header = _HEADER.fullmatch(content.read(length).decode("latin-1"))
+        if not header:
+            raise ValueError("a member is not an array of numbers, or a text")
+        dtype, shape = np.dtype(header[1]), tuple(int(n) for n in re.findall(r"\d+", header[3]))
+        size = math.prod(shape) * dtype.itemsize
+        if member.file_size != len(version) + width + length + size or (shape and dtype.kind == "U"):
+            raise ValueError("the length of an array does not fit its shape")
+        array = new_array(shape, dtype, "F" if header[2] == "True" else "C")
+        _fill(content, memoryview(array.reshape(-1, order="A").view(np.uint8)) if size else memoryview(b""))
+        return array
+
+
+def _fill(content: IO[bytes], buffer: memoryview) -> None:
+    for at in range(0, len(buffer), _BLOCK):
+        part = content.read(min(_BLOCK, len(buffer) - at))
+        if len(part) != min(_BLOCK, len(buffer) - at):
+            raise ValueError("it is cut off")
+        buffer[at : at + _BLOCK] = part
+    if content.read(1):  # which checks the sum of the whole, too
+        raise ValueError("an array is longer than it says")
+
+
+def read_csv(path: Path, arrays: bool = True) -> dict[str, Any]:
+    """As `read_npz`, for a .csv."""
+    with open_regular(path) as file:
+        head = file.readline(_MAX_CSV_HEAD)
+        begin = CSV_HEAD.encode()
+        if not head.startswith(begin):
+            raise ValueError("its first line is not that of rosafe process")
+        about = from_json(head.removeprefix(begin), _MAX_CSV_HEAD)
+        if not isinstance(about, dict) or not isinstance(about.get("axes"), dict) or len(about["axes"]) != 1:
+            raise ValueError("its first line does not describe one output")
+        fixed, rows = about.pop("fixed", None), about.pop("rows", None)
+        about = checked(about)
+        if not arrays:
+            return about
+        if not isinstance(fixed, dict) or not isinstance(rows, int):
+            raise ValueError("its first line does not describe its rows")
+        vectors = {name: _vector(name, value) for name, value in fixed.items()}
+        time, *columns = file.readline(MAX_TEXT).decode().rstrip("\r\n").split(",")
+        table = _table(file, rows, 1 + len(columns))
+    (name,) = about["axes"]
+    return {name: np.ascontiguousarray(table[:, 1:].T), time: table[:, 0].copy(), **vectors, **about}
+
+
+def _vector(name: str, value: Any) -> np.ndarray | float:
+    values = value if isinstance(value, list) else [value]
+    if not all(map(is_number, values)):
+        raise ValueError(f"{ascii(name)[:80]}: expected numbers")
+    vector = np.array(values, np.float64)
+    return vector if isinstance(value, list) else float(vector[0])
+
+
+def _table(file: BinaryIO, rows: int, width: int) -> np.ndarray:
+    """The rows of a .csv, each of `width` numbers."""
+    size = os.fstat(file.fileno()).st_size
+    if not 0 <= 2 * rows * width <= size:  # a digit and a comma for each number
+        raise ValueError(f"it is cut off: {rows} rows do not fit into {size} bytes")
+    check_arrays(0, size, 16 * rows * width)
+    table = new_array((rows, width), np.dtype(np.float64))
+    for index, row in enumerate(table):
+        numbers = file.readline(_LONGEST_NUMBER * width).split(b",")
+        if len(numbers) != width:
+            raise ValueError(f"it is cut off, or damaged: row {index + 1} of {rows} has not {width} numbers")
+        try:
+            row[:] = [float(number) for number in numbers]
+        except ValueError:
+            raise ValueError(f"row {index + 1}: expected numbers") from None
+    if file.read(1):
+        raise ValueError(f"it has more than {rows} rows")
+    return table
