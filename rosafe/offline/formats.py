@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from rosafe.input import open_descriptor, open_regular
-from rosafe.interface import KINDS
+from rosafe.interface import KINDS, Representation
 from rosafe.missing import require
 from rosafe.offline.chunked import H5Writer, Mat73Writer, ZarrWriter
 from rosafe.offline.containers import read_h5, read_mat73, read_zarr
@@ -24,6 +24,7 @@ from rosafe.offline.whole import CsvWriter, Mat5Writer, NpzWriter
 from rosafe.vocabulary.parameter import shown
 
 MAT5_MOST = 2**30  # bytes of a variable; MATLAB's version 5 ends at 2**31, and scipy needs an array twice
+_MAX_EMPTY = 2**20  # along each axis of an array without numbers
 _MAT73_MAGIC = b"MATLAB 7.3"
 
 
@@ -153,28 +154,36 @@ def _check_arrays(result: Mapping[str, Any]) -> None:
     for name, axes in result["axes"].items():
         _check_array(name, result[name], len(axes))
     for kind in KINDS.values():
-        outputs = [name for name in kind.outputs if name in result["axes"]]
-        for name in outputs:
-            if result["axes"][name] != kind.outputs[name].axes:
-                raise ValueError(f"axes: {name}: expected {', '.join(kind.outputs[name].axes)}")
-        if outputs and f"{kind.kind}_time" in result:
-            _check_array(f"{kind.kind}_time", result[f"{kind.kind}_time"], 1)
-            if any(result[name].shape[-1] != len(result[f"{kind.kind}_time"]) for name in outputs):
-                raise ValueError(f"{kind.kind}_time: its length is not that of {outputs[0]}")
-        rate = result.get(f"{kind.kind}_frameRate", 1.0)
-        if not is_number(rate) or not 0 < rate < math.inf:
-            raise ValueError(f"{kind.kind}_frameRate: expected a positive number")
-        units = {one.name: one.unit for one in (*kind.parameters, *kind.derived)}
-        for name in kind.coordinates:
-            if units[name]:
-                _check_array(name, result.get(name, np.empty(0)), 1)
-            elif not is_texts(result.get(name, ())):
-                raise ValueError(f"{name}: expected texts")
+        _check_kind(kind, result)
+
+
+def _check_kind(kind: Representation, result: Mapping[str, Any]) -> None:
+    """ValueError where an output of a kind, or what lies along its axes, is not what its declaration says."""
+    outputs = [name for name in kind.outputs if name in result["axes"]]
+    for name in outputs:
+        if result["axes"][name] != kind.outputs[name].axes:
+            raise ValueError(f"axes: {name}: expected {', '.join(kind.outputs[name].axes)}")
+    time = f"{kind.kind}_time"
+    if outputs and time in result:
+        _check_array(time, result[time], 1)
+        if any(result[name].shape[-1] != len(result[time]) for name in outputs):
+            raise ValueError(f"{time}: its length is not that of {outputs[0]}")
+    rate = result.get(f"{kind.kind}_frameRate", 1.0)
+    if not is_number(rate) or not 0 < rate < math.inf:
+        raise ValueError(f"{kind.kind}_frameRate: expected a positive number")
+    units = {one.name: one.unit for one in (*kind.parameters, *kind.derived)}
+    for name in kind.coordinates:
+        if units[name]:
+            _check_array(name, result.get(name, np.empty(0)), 1)
+        elif not is_texts(result.get(name, ())):
+            raise ValueError(f"{name}: expected texts")
 
 
 def _check_array(name: str, value: Any, dimensions: int) -> None:
-    if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiu" or value.ndim != dimensions:
-        raise ValueError(f"{shown(name)}: expected an array of {dimensions} dimensions")
+    if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiu" or value.dtype.itemsize < 4:
+        raise ValueError(f"{shown(name)}: expected an array of numbers of 32 or 64 bits")
+    if value.ndim != dimensions or (not value.size and max(value.shape) > _MAX_EMPTY):
+        raise ValueError(f"{shown(name)}: expected {dimensions} axes, got the shape {value.shape}")
 
 
 def read(form: Format, path: Path, arrays: bool = True) -> dict[str, Any]:
