@@ -102,17 +102,18 @@ class _Pipe:
         self._poll = select.poll()
         self._poll.register(self._descriptor, select.POLLIN)
 
-    def fill(self, buffer: memoryview, seconds: int = STALL) -> None:
-        """Fill a buffer; `_Ended`, or TimeoutError after `seconds` without a byte."""
+    def fill(self, buffer: memoryview, seconds: int | None = None) -> None:
+        """Fill a buffer; `_Ended`, or TimeoutError after `seconds` (`STALL`) without a byte."""
         while buffer:
-            if not any(self._poll.poll(1000) for _ in range(seconds)):  # 1 s each: while stopped, no time passes
+            # of 1 s each: while the processes are stopped, no time passes
+            if not any(self._poll.poll(1000) for _ in range(seconds or STALL)):
                 raise TimeoutError
             count = os.readv(self._descriptor, [buffer])
             if not count:
                 raise _Ended
             buffer = buffer[count:]
 
-    def read(self, count: int, seconds: int = STALL) -> bytearray:
+    def read(self, count: int, seconds: int | None = None) -> bytearray:
         """The next `count` bytes."""
         content = bytearray(count)
         self.fill(memoryview(content), seconds)

@@ -17,7 +17,7 @@ from rosafe.interface import KINDS, Representation
 from rosafe.missing import require
 from rosafe.offline.chunked import H5Writer, Mat73Writer, ZarrWriter
 from rosafe.offline.containers import read_h5, read_mat73, read_zarr
-from rosafe.offline.contents import Contents, Writer, is_number, is_texts, sample_times
+from rosafe.offline.contents import Contents, Writer, checked, is_number, is_texts, sample_times
 from rosafe.offline.mat5 import read_mat5
 from rosafe.offline.readers import read_csv, read_npz
 from rosafe.offline.whole import CsvWriter, Mat5Writer, NpzWriter
@@ -197,7 +197,7 @@ def read(form: Format, path: Path, arrays: bool = True) -> dict[str, Any]:
     if not form.folder:
         os.close(open_descriptor(path))  # HDF5 opens whatever it is given
     try:
-        result = form.read(path, arrays)
+        result = checked(form.read(path, arrays))
     except (ValueError, OverflowError, RecursionError, MemoryError) as problem:  # json.JSONDecodeError, too
         raise ValueError(f"{path} is no result of rosafe process, or damaged: {problem}") from None
     for name in ("axes", "parameters", "sample_rate"):

@@ -79,13 +79,13 @@ def check_array(name: str, shape: tuple[int, ...], chunks: tuple[int, ...] | Non
 def check_size(taken: float, size: int) -> None:
     """ValueError where arrays of `taken` bytes are more than what a file of `size` bytes may hold."""
     if taken > max(MAX_SIZE, MAX_RATIO * size):
-        raise ValueError(f"its arrays would take {taken / 1e9:.1f} GB of memory, and it has {size} bytes")
+        raise ValueError(f"its arrays would take {taken / 2**20:.0f} MiB of memory, and it has {size} bytes")
 
 
 # --- HDF5 ---------------------------------------------------------------------------------------------------------
 
 
-def open_h5(path: str, texts_only: bool) -> tuple[dict[str, Any], list[Array]]:
+def open_h5(path: str) -> tuple[dict[str, Any], list[Array]]:
     """The attributes and the arrays of an HDF5 file; ValueError for what could lead out of it."""
     import h5py
 
@@ -97,11 +97,7 @@ def open_h5(path: str, texts_only: bool) -> tuple[dict[str, Any], list[Array]]:
     for name in names:
         if not isinstance(file.get(name, getlink=True), h5py.HardLink):
             raise ValueError(f"{_quoted(name)} is a link")
-    arrays = [_h5_array(file, name) for name in names]
-    attributes = _h5_attributes("the file", file)
-    if texts_only:
-        arrays = [one for one in arrays if one.attributes.get("MATLAB_class") == "char" or math.prod(one.shape) == 1]
-    return attributes, arrays
+    return _h5_attributes("the file", file), [_h5_array(file, name) for name in names]
 
 
 def _allow_no_more_files() -> None:
@@ -322,12 +318,18 @@ def _more_time() -> None:
     resource.setrlimit(resource.RLIMIT_CPU, (soft if hard == resource.RLIM_INFINITY else min(soft, hard), hard))
 
 
+def _is_text(array: Array) -> bool:
+    """Whether this is a text or a single number of MATLAB's."""
+    return array.attributes.get("MATLAB_class") == "char" or math.prod(array.shape) == 1
+
+
 def send(path: str, kind: str, which: str) -> None:
     """Check a file, and write it to the standard output."""
     size = _size_on_disk(path)
-    attributes, arrays = open_zarr(path) if kind == "zarr" else open_h5(path, which == "texts")
+    attributes, arrays = open_zarr(path) if kind == "zarr" else open_h5(path)
     check_size(sum(math.prod(array.shape) * array.dtype.itemsize for array in arrays), size)
-    arrays = [] if which == "none" else arrays
+    if which != "all":
+        arrays = [one for one in arrays if which == "texts" and _is_text(one)]
     described = [
         {"name": a.name, "shape": a.shape, "dtype": a.dtype.str, "block": a.block, "attributes": a.attributes}
         for a in arrays

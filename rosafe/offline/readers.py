@@ -25,6 +25,16 @@ _MAGIC = re.compile(rb"\x93NUMPY[\x01-\x03]\x00", re.DOTALL)
 _HEADER = re.compile(
     r"\{'descr': '([<>|=]?[biufU]\d{1,7})', 'fortran_order': (True|False), 'shape': \(([0-9, ]{0,500})\),? ?\}\s{0,500}"
 )
+_DAMAGED = (
+    zipfile.BadZipFile,
+    EOFError,
+    zlib.error,
+    NotImplementedError,
+    RuntimeError,
+    OverflowError,
+    OSError,
+    TypeError,
+)
 _ENCRYPTED = 1  # of the flags of a member
 _LONGEST_NUMBER = 32  # characters of a number in a .csv; repr makes at most 24
 _MAX_CSV_HEAD = 2**24  # bytes
@@ -32,12 +42,13 @@ _MAX_CSV_HEAD = 2**24  # bytes
 
 def read_npz(path: Path, arrays: bool = True) -> dict[str, Any]:
     """What is in an .npz; without its arrays, only what `told` gives. ValueError where it is damaged."""
-    try:
-        with open_regular(path) as stream, zipfile.ZipFile(stream) as file:
-            size = os.fstat(stream.fileno()).st_size
-            found = {name: _member(file, one) for name, one in _members(file, size, arrays)}
-    except (zipfile.BadZipFile, EOFError, zlib.error, NotImplementedError, RuntimeError, OverflowError) as problem:
-        raise ValueError(str(problem)[:300]) from None
+    with open_regular(path) as stream:
+        size = os.fstat(stream.fileno()).st_size
+        try:
+            with zipfile.ZipFile(stream) as file:
+                found = {name: _member(file, one) for name, one in _members(file, size, arrays)}
+        except _DAMAGED as problem:
+            raise ValueError(str(problem)[:300]) from None
     return {**found, **told({name: value for name, value in found.items() if value.ndim == 0})}
 
 
