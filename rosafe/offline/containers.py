@@ -6,6 +6,7 @@ import contextlib
 import errno
 import fcntl
 import json
+import math
 import os
 import re
 import select
@@ -77,12 +78,11 @@ def _take(child: subprocess.Popen[bytes]) -> tuple[dict[str, Any], Arrays]:
     try:
         pipe.read(1, START)
     except (_Ended, TimeoutError):
-        raise OSError(errno.ENOEXEC, f"{child.args[0]} cannot be started to read it: {pipe.end()}") from None  # type: ignore[index]
+        raise OSError(errno.ENOEXEC, f"{_python()} cannot be started to read it: {pipe.end()}") from None
     try:
         head = json.loads(pipe.read(int.from_bytes(pipe.read(8), "little")))
         arrays = head["arrays"]
-        sizes = [8.0 * np.prod([float(n) for n in one["shape"]]) for one in arrays]
-        refuse_over_available(sum(sizes), "its arrays")
+        refuse_over_available(sum(math.prod(one["shape"], start=8.0) for one in arrays), "its arrays")
         return head["attributes"], {one["name"]: (pipe.array(one), one["attributes"]) for one in arrays}
     except _Ended:
         raise ValueError(pipe.end()) from None
@@ -126,10 +126,10 @@ class _Pipe:
         for slices in blocks(shape, block):
             part = array[slices]
             if part.flags.c_contiguous and part.ndim:
-                self.fill(memoryview(part.reshape(-1).view(np.uint8)))
+                self.fill(part.reshape(-1).view(np.uint8).data)
             else:
                 buffer = np.empty(part.shape, dtype)
-                self.fill(memoryview(buffer.reshape(-1).view(np.uint8)))
+                self.fill(buffer.reshape(-1).view(np.uint8).data)
                 array[slices] = buffer
         return array
 

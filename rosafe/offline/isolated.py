@@ -340,7 +340,7 @@ def send(path: str, kind: str, which: str) -> None:
         for slices in blocks(array.shape, array.block):
             _more_time()
             data = np.ascontiguousarray(array.read(slices), array.dtype).reshape(-1)
-            _send(memoryview(data.view(np.uint8)))
+            _send(data.view(np.uint8).data)
 
 
 def main() -> None:

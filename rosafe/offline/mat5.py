@@ -150,7 +150,7 @@ def _matrix(source: _Source, arrays: bool, total: int, size: int) -> tuple[str, 
         return name, None
     check_arrays(total, size, count * dtype.itemsize)
     values = new_array((count,), dtype)
-    if count and source.file.readinto(memoryview(values).cast("B")) != values.nbytes:  # type: ignore[attr-defined]
+    if count and source.file.readinto(values.view(np.uint8).data) != values.nbytes:  # type: ignore[attr-defined]
         raise ValueError("it is cut off")
     return name, values.astype(_CLASSES[flags & 0xFF], copy=False).reshape(shape, order="F")
 

@@ -83,7 +83,7 @@ def _member(file: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
         if member.file_size != len(version) + width + length + size or (shape and dtype.kind == "U"):
             raise ValueError("the length of an array does not fit its shape")
         array = new_array(shape, dtype, "F" if header[2] == "True" else "C")
-        _fill(content, memoryview(array.reshape(-1, order="A").view(np.uint8)) if size else memoryview(b""))
+        _fill(content, array.reshape(-1, order="A").view(np.uint8).data if size else memoryview(b""))
         return array
 
 

@@ -6,6 +6,7 @@ import json
 import math
 import os
 import tempfile
+import zipfile
 from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, BinaryIO
