@@ -286,11 +286,11 @@ def array_msg(generated: Any) -> Any:
 
 
 @functools.cache
-def lenient_class(package: str, idl: str, longest: int) -> Any:
+def lenient_class(package: str, idl: str, longest: int = 0) -> Any:
     """As `message_class`, but what cannot be read becomes a message whose `problem` says why (else it is empty).
 
     Where deserialisation raises, rospy breaks the connection, and cannot mend it: one bad message would end a topic.
-    Its sequences have up to `longest` elements; a message that could hold more is not even read.
+    Its sequences have up to `longest` elements, if that is given; a message that could hold more is not even read.
     """
     strict = message_class(package, idl)
 
@@ -302,7 +302,8 @@ def lenient_class(package: str, idl: str, longest: int) -> Any:
             self.problem = str(problem)
         return self
 
-    return type(strict.__name__, (strict,), {"deserialize": deserialize, "longest_sequence": longest})
+    bound = {"longest_sequence": longest} if longest else {}
+    return type(strict.__name__, (strict,), {"deserialize": deserialize, **bound})
 
 
 @functools.cache

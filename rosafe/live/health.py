@@ -10,7 +10,10 @@ from typing import Any
 
 FRESH_SECONDS = 3.5  # since a node told of itself last; it does so every second
 MAX_LOSSES = 50
-_LOAD = re.compile(r"(\S+), (\w+), (\d+) blocks, ([\d.]+) ms/s")
+MAX_DIGITS = 15  # of a counter: the page has no longer whole numbers
+MAX_LOADS = 10_000  # processors
+MAX_TEXT = 500  # characters
+_LOAD = re.compile(r"(\S+), (\w+), (\d{1,15}) blocks, (\d{1,9}(?:\.\d{1,9})?) ms/s", re.ASCII)
 # counters of rosAFE's audio, and what a rise of them means
 _COUNTED = {
     "lost": "audio frames were lost on their way to rosAFE",
@@ -31,11 +34,11 @@ class Health:
 
     def __init__(self, instance: str, bass: str) -> None:
         self._rosafe, self._bass = instance, bass
+        self._names = (f"{instance}: audio", f"{instance}: processors", f"{bass}: capture")
         self._lock = threading.Lock()
         self._subscriber: Any = None
         self._ended = False
         self._values: dict[str, dict[str, str]] = {}
-        self._messages: dict[str, str] = {}
         self._told: dict[str, float] = {}
         self._losses: deque[dict[str, Any]] = deque(maxlen=MAX_LOSSES)
 
@@ -61,12 +64,13 @@ class Health:
     def _take(self, message: Any) -> None:
         now = time.monotonic()
         for status in message.status:
-            values = {entry.key: entry.value for entry in status.values}
+            if status.name not in self._names:  # of other nodes, which are as many as there may be
+                continue
+            values = {entry.key: entry.value[:MAX_TEXT] for entry in status.values[:MAX_LOADS]}
             with self._lock:
                 if self._subscriber is None:
                     return
                 before, self._values[status.name] = self._values.get(status.name), values
-                self._messages[status.name] = status.message
                 self._told[status.name] = now
             if before is not None:
                 self._compare(status.name, before, values)
@@ -110,7 +114,7 @@ class Health:
 
 def _number(values: dict[str, str], key: str) -> int:
     text = values.get(key, "0")
-    return int(text) if text.isascii() and text.isdigit() else 0
+    return int(text) if text.isascii() and text.isdigit() and len(text) <= MAX_DIGITS else 0
 
 
 def _load(text: str) -> dict[str, Any]:

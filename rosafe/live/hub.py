@@ -199,6 +199,8 @@ class Hub:
             raise ValueError(f"there is no processor {key.name!r}")
         if processor.kind not in KINDS:
             raise ValueError(f"{processor.name} is a {processor.kind}, of a plugin that is not known here")
+        if not processor.rate or len(processor.shape) < max(len(part.axes) for part in KINDS[processor.kind].parts) - 1:
+            raise ValueError(f"{processor.name}: the shape and rate of its frames are not known")
         if key.what == "direction":
             self._begin_direction(key, processor)
         else:
@@ -237,7 +239,7 @@ class Hub:
     def _watch(self, key: Key, processor: Processor, take: Callable[[Port, Any], None]) -> None:
         topic = processor.topic
         if topic not in self._watched:
-            port = Port(topic, processor.kind, processor.rate, self.tree.sample_rate, self._dispatch)
+            port = Port(processor, processor.rows(), self.tree.sample_rate, self._dispatch)
             self._watched[topic] = _Watched(port)
         self._watched[topic].takers[key] = take
         self._needs.setdefault(key, []).append(topic)
@@ -278,6 +280,13 @@ class Hub:
             told.append((one, dict(one.values)))
             one = tree.processors.get(one.parent)
         return told
+
+    @property
+    def problems(self) -> dict[str, str]:
+        """Why messages of late were ignored, by topic."""
+        audio = self.audio
+        topics = [*([audio] if audio else []), *(watched.port for watched in list(self._watched.values()))]
+        return {one.topic: problem for one in topics if (problem := one.problem)}
 
     @property
     def lost(self) -> int:

@@ -11,11 +11,13 @@ from typing import Any
 import numpy as np
 
 from rosafe.interface import KINDS, LAYOUTS, Representation
+from rosafe.sound.windows import MAX_RATE
 from rosafe.view.levels import LEVELS
 
 COLUMNS = 100.0  # per second, at most
 ROWS = 128  # of an ear, at most: more than the screen shows
 FLOOR_POWER = 1e-20  # levels end there: -200 dB
+MAX_SIZE = 2**20  # of an axis
 
 
 @dataclass(frozen=True)
@@ -32,7 +34,13 @@ class Processor:
 
     @classmethod
     def of(cls, told: Mapping[str, Any]) -> Processor:
-        """From the struct of getProcessors."""
+        """Return a processor from the struct of getProcessors; ValueError if its numbers make no sense."""
+        if not 0 <= told["rate"] <= MAX_RATE:
+            raise ValueError(f"{told['name']}: expected a frame rate up to {MAX_RATE} Hz, got {told['rate']}")
+        if max(told["shape"], default=0) > MAX_SIZE:
+            raise ValueError(
+                f"{told['name']}: expected a shape of at most {MAX_SIZE} along an axis, got {max(told['shape'])}"
+            )
         return cls(
             told["name"],
             told["kind"],
@@ -42,6 +50,19 @@ class Processor:
             tuple(map(int, told["shape"])),
             {entry["name"]: entry["value"] for entry in told["parameters"]},
         )
+
+    def sizes(self, part: int) -> dict[str, int]:
+        """Return the sizes of the axes of a part, less ear and time; getProcessors has those of the largest part."""
+        parts = KINDS[self.kind].parts
+        largest = max(parts, key=lambda one: len(one.axes))
+        known = dict(zip([axis for axis in largest.axes if axis != "time"], self.shape, strict=False))
+        return {axis: known.get(axis, 1) for axis in parts[part].axes if axis not in ("ear", "time")}
+
+    def rows(self) -> dict[str, tuple[int, ...]]:
+        """Return the shape of one frame of each field of its messages: of two axes, the second one is outermost."""
+        places = [place for place in LAYOUTS[self.kind].places if place.present]
+        sizes = [tuple(self.sizes(place.part).values()) for place in places]
+        return {place.field: (*size[1:], *size[:1]) for place, size in zip(places, sizes, strict=True)}
 
 
 class Tree:
@@ -116,8 +137,8 @@ class Picture:
         self.processor, self.kind, self.index = processor, kind, part
         self.fields = [place.field for place in LAYOUTS[kind.kind].places if place.part == part and place.present]
         self.ears = 2 if "ear" in self.part.axes else 1
-        axes = [axis for axis in self.part.axes if axis not in ("ear", "time")]
-        sizes = self._sizes(kind, axes)
+        named_sizes = processor.sizes(part)
+        axes, sizes = list(named_sizes), list(named_sizes.values())
         named = axes == ["feature"] and bool(kind.features or kind.coordinates)
         self.group = max(1, math.ceil(processor.rate / COLUMNS - 1e-9))
         self.rate = processor.rate / self.group
@@ -144,12 +165,6 @@ class Picture:
             self.rows = math.ceil(sizes[-1] / self.bundle)
             starts = range(0, sizes[-1], self.bundle)
             self.along = [_middle(labels[first : first + self.bundle]) for first in starts]
-
-    def _sizes(self, kind: Representation, axes: list[str]) -> list[int]:
-        """Of the part's axes less ear and time; getProcessors tells those of the largest part."""
-        largest = max(kind.parts, key=lambda one: len(one.axes))
-        known = dict(zip([axis for axis in largest.axes if axis != "time"], self.processor.shape, strict=False))
-        return [known.get(axis, 1) for axis in axes]
 
     def describe(self) -> dict[str, Any]:
         """What the page needs to draw it."""

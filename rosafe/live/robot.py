@@ -47,7 +47,10 @@ class Robot:
         except TimeoutError:
             name = self._rosafe.instance
             raise ComponentError("::genom::mwerr", what=f"{name} does not answer") from None
-        return Tree([Processor.of(one) for one in told["processors"]])
+        try:
+            return Tree([Processor.of(one) for one in told["processors"]])
+        except ValueError as problem:
+            raise ComponentError("::genom::mwerr", what=f"getProcessors: {problem}") from None
 
     # --- what can be asked for; each takes what the page sends and returns what it gets ---
 

@@ -84,6 +84,7 @@ class Server:
         self._clients: set[Looker] = set()
         self._tree_told: Any = None
         self._problem = ""
+        self._fault = ""  # the last one in the log
         self._again = asyncio.Event()  # look at the components now
         self._files = {
             path.name: (path.read_bytes(), _TYPES[path.suffix]) for path in PAGE.iterdir() if path.suffix in _TYPES
@@ -196,8 +197,10 @@ class Server:
                     await asyncio.to_thread(self._health.listen)
                     listening = True
                 await self._look_once()
-            except Exception:  # a fault of ours must not blind the page for ever
-                log.exception("looking at the components")
+            except Exception as fault:  # a fault of ours must not blind the page for ever
+                if (text := f"{type(fault).__name__}: {fault}") != self._fault:
+                    log.exception("looking at the components")
+                    self._fault = text
             try:
                 await asyncio.wait_for(self._again.wait(), LOOK_SECONDS)
             except TimeoutError:
@@ -209,7 +212,13 @@ class Server:
             self._problem = ""
         except ComponentError as problem:  # what was shown stays: it may only be slow
             self._problem = told(problem)
-        status = {"problem": self._problem, "time": time.time(), **self._health.status(), **self._sound()}
+        status = {
+            "problem": self._problem,
+            "malformed": self._hub.problems,
+            "time": time.time(),
+            **self._health.status(),
+            **self._sound(),
+        }
         for client in self._clients:
             client.tell("status", status)
 

@@ -8,6 +8,7 @@ import numpy as np
 
 MAX_RATE = 1_000_000  # Hz; beyond that a message is garbage, not audio
 MAX_WINDOW = 2**24  # frames in one message, as with bass
+MAX_INDEX = 2**63
 MAX_JUMP_SECONDS = 3600.0  # an index that jumps further is no loss but another stream
 
 
@@ -22,7 +23,7 @@ def malformed(message: Any) -> str:
         return f"{left} samples per ear, where there should be {message.nChunksOnPort} x {message.nFramesPerChunk}"
     if not 0 < rate <= MAX_RATE:
         return f"a sample rate of {rate} Hz, allowed are 1 to {MAX_RATE} Hz"
-    if index >= 2**63:
+    if index >= MAX_INDEX:
         return f"lastFrameIndex {index} is beyond all ages"
     return ""
 

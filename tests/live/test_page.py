@@ -118,10 +118,10 @@ def test_a_new_user_starts_everything_on_the_page(world: World) -> None:
     browser.driver.get(world.live.url)
     browser.until("return document.body.textContent.includes('There are no processors yet')")
     assert "token" not in browser.driver.current_url
-    browser.run("document.querySelector('#source input').value = 'hw:99,99'")
+    browser.run("document.querySelector('#source input').value = 'file:/none/there.wav'")
     browser.press("#source .primary")
     refused = browser.until("return document.querySelector('#source .error').textContent")
-    assert "e_device" in refused and "does not exist" in refused
+    assert refused == "e_device: /none/there.wav: No such file or directory"
     browser.run(
         "document.querySelector('#source input').value = 'scene:?seconds=5';"
         "const [rate, chunk] = document.querySelectorAll('#source input[type=number]');"

@@ -304,6 +304,70 @@ def test_loads_and_states_come_with_the_status(world: World) -> None:
     assert json.dumps(told)
 
 
+def ragged(message_class: Any) -> Any:
+    """A message of level differences whose channels differ in length, which no rosAFE sends."""
+    from rosAFE.msg import rosAFE_signalOneD
+
+    message = message_class(sampleRate=16000, lastFrameIndex=10**6, framesOnPort=3, numberOfChannels=2)
+    message.left.dataN = [rosAFE_signalOneD([1.0, 2.0, 3.0]), rosAFE_signalOneD([1.0])]
+    return message
+
+
+def test_malformed_messages_are_reported_once_and_shown(world: World) -> None:
+    """Of the sound, of a port and of the diagnostics; the page goes on."""
+    import rospy
+    from bass.msg import binaudio_portStruct
+    from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
+    from rosAFE.msg import rosAFE_TimeFrequencySignalPortStruct
+
+    world.graph.client()
+    audio = binaudio_portStruct(
+        sampleRate=16000, nChunksOnPort=1, nFramesPerChunk=5, lastFrameIndex=5, left=[1] * 5, right=[1] * 3
+    )
+    capture = [KeyValue("lost frames", "9" * 5000), KeyValue("device", "x" * 5000)]
+    loads = [KeyValue("x", "ild, on, 1 blocks, 1.2.3 ms/s"), KeyValue("y", "ild, on, 1 blocks, " + "9" * 400 + " ms/s")]
+    health = DiagnosticArray(
+        status=[
+            DiagnosticStatus(name="malformed: capture", values=capture),
+            DiagnosticStatus(name="rosAFE: processors", values=loads),
+        ]
+    )
+    messages = {
+        "/malformed/Audio": audio,
+        "/rosAFE/ildPort/ild_0": ragged(rosAFE_TimeFrequencySignalPortStruct),
+        "/diagnostics": health,
+    }
+    publishers = {topic: rospy.Publisher(topic, type(one), queue_size=1) for topic, one in messages.items()}
+
+    async def scenario(live: Live) -> dict[str, Any]:
+        async with page(live) as client:
+            await client.look(LEVELS, ILD)
+            while True:
+                for topic, publisher in publishers.items():
+                    publisher.publish(messages[topic])
+                await client.hear()
+                told = client.said.get("status", {"malformed": ()})
+                if len(told["malformed"]) == 2 and client.pieces and {"x", "y"} <= told["loads"].keys():
+                    return dict(told)
+
+    try:
+        with live(world.graph, "--bass", "malformed") as one:
+            told = asyncio.run(scenario(one))
+            assert told["malformed"] == {
+                "/malformed/Audio": "5 left and 3 right samples",
+                "/rosAFE/ildPort/ild_0": "left: expected rows of one length, got different ones",
+            }
+            assert told["problem"] == "" and 0 <= told["lost"] < 1e9 and len(told["device"]) == 500
+            assert told["loads"]["x"]["load"] == told["loads"]["y"]["load"] == 0.0
+            assert one.process.alive and "Traceback" not in one.process.err
+            for topic, why in told["malformed"].items():
+                line = f"{topic}: malformed messages are ignored: {why}"
+                assert one.process.err.count(line) == 1, one.process.err
+    finally:
+        for publisher in publishers.values():
+            publisher.unregister()
+
+
 def test_it_ends_in_time(world: World) -> None:
     async def scenario(live: Live) -> int:
         async with page(live) as client:

@@ -139,6 +139,8 @@ function tell() {
 function told() {
   if (!status) return ["bad", "no connection to the server"];
   if (status.problem) return ["bad", status.problem];
+  const malformed = Object.entries(status.malformed);
+  if (malformed.length) return ["bad", malformed.map(([topic, why]) => `${topic}: malformed messages are ignored: ${why}`).join("; ")];
   if (!status.bass && (status.silent === null || status.silent > SILENT)) return ["bad", "no sound: bass is not running"];
   if (status.silent === null || status.silent > SILENT) return ["warn", "no sound: nothing is acquired"];
   if (status.failures.length) return ["bad", status.failures[0]];
