@@ -25,7 +25,9 @@ HEADERS = {
 
 
 class Door:
-    """Lets in requests with the token in the URL, or with the cookie that the page got for it.
+    """Who may use the live page: requests under a name of this machine, not of other pages; the socket needs the token.
+
+    The files of the page contain no secret. Cookies are not used: browsers send them to every port of a host.
 
     Parameters
     ----------
@@ -34,30 +36,25 @@ class Door:
 
     Attributes
     ----------
-    cookie_name : str
-        Another one for each port: browsers send the cookies of all servers of a machine to each of them.
+    token : str
+        Part of the URL of the page and of the WebSocket.
     """
 
     def __init__(self, hosts: Collection[str]) -> None:
         self.token = secrets.token_urlsafe(32)
-        self.cookie_name = "rosafe_live"
-        self.cookie = secrets.token_urlsafe(32)
         self._hosts = {host_name(host) for host in hosts}
 
-    def refusal(self, headers: Mapping[str, str], query: Mapping[str, str], cookies: Mapping[str, str]) -> str:
-        """Why a request is refused, in one line; empty where it is let in."""
-        try:
-            check_host(headers, self._hosts, "use its IP address")
-            check_same_origin(headers)
-        except HttpRefusal as refusal:
-            return str(refusal)
-        if not (self.has_token(query) or _equal(cookies.get(self.cookie_name, ""), self.cookie)):
-            return "open the URL that `rosafe live` has printed: its token is missing here, or an old one"
-        return ""
+    def check(self, headers: Mapping[str, str], query: Mapping[str, str]) -> None:
+        """Raise HttpRefusal for requests to another name, of other pages, or with a wrong token."""
+        check_host(headers, self._hosts, "use its IP address")
+        check_same_origin(headers)
+        if "token" in query:
+            self.check_token(query)
 
-    def has_token(self, query: Mapping[str, str]) -> bool:
-        """Whether the URL has the token."""
-        return _equal(query.get("token", ""), self.token)
+    def check_token(self, query: Mapping[str, str]) -> None:
+        """Raise HttpRefusal unless the query has the token."""
+        if not _equal(query.get("token", ""), self.token):
+            raise HttpRefusal(403, "the token is missing or an old one; open the URL that `rosafe live` has printed")
 
 
 def _equal(given: str, secret: str) -> bool:

@@ -27,7 +27,7 @@ from rosafe.version import VERSION
 PAGE = Path(__file__).with_name("page")
 LOOK_SECONDS = 1.0  # between two looks at the components, while there is a page
 MAX_CLIENTS = 32
-AUTH_TIMEOUT_SECONDS = 10.0  # a connection that has not sent a request with the token by then is closed
+AUTH_TIMEOUT_SECONDS = 10.0  # a connection that has not sent a complete request by then is closed
 LIMITS = Limits(
     max_connections=256,
     max_url=8 * 1024,
@@ -100,7 +100,6 @@ class Server:
         """Listen and return the port; OSError where that cannot be."""
         taken = await self._listener.start(host, port)
         self._looking = asyncio.create_task(self._look())
-        self._door.cookie_name = f"rosafe_live_{taken}"
         return taken
 
     async def close(self) -> None:
@@ -133,28 +132,21 @@ class Server:
 
     @web.middleware
     async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        connection = connection_of(request)
-        connection.request_parsed()
-        why = self._door.refusal(request.headers, request.query, request.cookies)
-        if why:
-            refusal = web.Response(status=403, text=f"rosafe live: {why}\n", headers=HEADERS)
-            refusal.force_close()
-            return refusal
-        connection.mark_authenticated()
+        connection_of(request).request_parsed()
         try:
+            self._door.check(request.headers, request.query)
             response = await handler(request)
+        except HttpRefusal as refusal:
+            response = _refused(refusal.status, str(refusal))
         except web.HTTPException as problem:
-            text = f"rosafe live: {problem.reason}\n"
-            return web.Response(status=problem.status, text=text, headers=HEADERS)
+            response = _refused(problem.status, problem.reason)
+        response.force_close()  # only the WebSocket authenticates a connection: others are not kept open
         return response
 
     # --- the page ---
 
     async def _page(self, request: web.Request) -> web.StreamResponse:
-        response = self._answer("index.html")
-        if self._door.has_token(request.query):
-            response.set_cookie(self._door.cookie_name, self._door.cookie, httponly=True, samesite="Strict", path="/")
-        return response
+        return self._answer("index.html")
 
     async def _file(self, request: web.Request) -> web.StreamResponse:
         name = request.match_info["name"]
@@ -167,9 +159,10 @@ class Server:
         return web.Response(body=body, content_type=kind, charset="utf-8", headers=HEADERS)
 
     async def _socket(self, request: web.Request) -> web.StreamResponse:
+        self._door.check_token(request.query)
+        connection_of(request).mark_authenticated()
         if len(self._clients) >= MAX_CLIENTS:
-            text = f"rosafe live: {MAX_CLIENTS} pages are open, which is as many as there may be\n"
-            return web.Response(status=503, text=text, headers=HEADERS)
+            raise HttpRefusal(503, f"{MAX_CLIENTS} pages are open, which is as many as there may be")
         client = Client(self._hub, self._asks, self._again.set)
         client.tell("hello", self._hello)
         self.join(client)
@@ -257,6 +250,10 @@ def _watched(ask: Ask, name: str, watch: bool) -> Ask:
         raise ValueError(f"{name}: this page is for watching only (rosafe live --watch)")
 
     return refuse
+
+
+def _refused(status: int, why: str) -> web.StreamResponse:
+    return web.Response(status=status, text=f"rosafe live: {why}\n", headers=HEADERS)
 
 
 def _format_refusal(refusal: HttpRefusal) -> tuple[bytes, str]:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import signal
+import threading
 from collections.abc import Iterator
 from contextlib import ExitStack
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any
 
 import numpy as np
@@ -254,14 +256,72 @@ def test_two_windows_and_a_reload(world: World, shown: Browser) -> None:
     first = driver.current_window_handle
     driver.switch_to.new_window("window")
     shown.resize(1300, 900)
-    driver.get(world.live.root)  # the cookie is enough
+    driver.get(world.live.url)
     shown.until("return document.querySelectorAll('canvas[data-plot]').length >= 3", what="the second window")
     driver.refresh()
     shown.until("return document.querySelectorAll('canvas[data-plot]').length >= 3", what="the second one again")
+    assert "token" not in driver.current_url and driver.get_cookies() == []
     driver.close()
     driver.switch_to.window(first)
     at = shown.run(f"return {END}")
     shown.until(f"return {END} > arguments[0]", at)
+
+
+def test_the_token_goes_to_no_other_server(world: World, shown: Browser) -> None:
+    """To none of another port, and a window without it, or with an old one, is told what to do."""
+    driver, heard = shown.driver, []
+
+    class Other(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:
+            heard.append(str(self.headers) + self.path)
+            self.send_response(200)
+            self.end_headers()
+
+    first = driver.current_window_handle
+    with ThreadingHTTPServer(("127.0.0.1", 0), Other) as other:
+        thread = threading.Thread(target=other.serve_forever)
+        thread.start()
+        try:
+            driver.get(f"http://127.0.0.1:{other.server_port}/")
+            assert shown.run("return sessionStorage.length + localStorage.length") == 0
+        finally:
+            other.shutdown()
+            thread.join()
+    assert heard and not any(world.live.token in one or "cookie" in one.lower() for one in heard)
+    driver.switch_to.new_window("window")
+    state = "return document.querySelector('#state').textContent.includes('open the URL')"
+    driver.get(world.live.root)
+    shown.until(state)
+    shown.run("sessionStorage.setItem('rosafe.token', 'old')")
+    driver.refresh()
+    shown.until(state)
+    assert shown.run("return document.querySelectorAll('.node').length") == 0
+    driver.close()
+    driver.switch_to.window(first)
+    driver.get(world.live.root)  # the same window: it has the token still
+    shown.until("return document.querySelectorAll('canvas[data-plot]').length >= 3", what="pictures")
+    shown.problems()  # the refused sockets
+
+
+def test_malformed_sound_is_shown(world: World, shown: Browser) -> None:
+    import rospy
+
+    from bass.msg import binaudio_portStruct
+
+    world.graph.client()
+    message = binaudio_portStruct(sampleRate=16000, nChunksOnPort=1, nFramesPerChunk=2, left=[1, 2], right=[1])
+    publisher = rospy.Publisher("/bass/Audio", binaudio_portStruct, queue_size=1)
+
+    def told() -> bool:
+        publisher.publish(message)
+        return "2 left and 1 right samples" in str(shown.run("return document.querySelector('#state').textContent"))
+
+    try:
+        wait_for(told, what=lambda: str(world.live.process))
+    finally:
+        publisher.unregister()
+    shown.until("return document.querySelector('#state').dataset.state === 'live'")
+    assert "Traceback" not in world.live.process.err
 
 
 @pytest.mark.parametrize("width", [380, 2560])

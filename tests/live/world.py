@@ -126,9 +126,7 @@ class Page:
 @asynccontextmanager
 async def page(live: Live) -> AsyncIterator[Page]:
     """One page that is open."""
-    async with aiohttp.ClientSession(cookie_jar=aiohttp.CookieJar(unsafe=True)) as session:
-        async with session.get(live.url) as answer:
-            assert answer.status == 200
-        origin = live.root.rstrip("/")
-        async with session.ws_connect(f"{live.root}socket", headers={"Origin": origin}) as socket:
+    async with aiohttp.ClientSession() as session:
+        headers = {"Origin": live.root.rstrip("/")}
+        async with session.ws_connect(f"{live.root}socket?token={live.token}", headers=headers) as socket:
             yield Page(socket)

@@ -9,22 +9,31 @@ export class Link extends EventTarget {
   #number = 0;
   #waiting = new Map();
   #pause = 500;
+  #address;
   bytes = 0;
   pictures = 0;
+  refusal = ""; // why the server does not accept this page
+
+  constructor(token) {
+    super();
+    this.#address = `socket?token=${encodeURIComponent(token)}`;
+  }
 
   open() {
-    const socket = new WebSocket(`ws://${location.host}/socket`);
+    const socket = new WebSocket(`ws://${location.host}/${this.#address}`);
     socket.binaryType = "arraybuffer";
     socket.addEventListener("open", () => {
       this.#socket = socket;
       this.#pause = 500;
+      this.refusal = "";
       this.#tell("open", {});
     });
     socket.addEventListener("message", (event) => {
       if (typeof event.data === "string") this.#news(JSON.parse(event.data));
       else this.#columns(event.data);
     });
-    socket.addEventListener("close", () => {
+    socket.addEventListener("close", async () => {
+      if (!this.#socket) await this.#askWhy();
       this.#socket = null;
       for (const { reject } of this.#waiting.values()) reject(new Error("the connection to the server is lost"));
       this.#waiting.clear();
@@ -32,6 +41,12 @@ export class Link extends EventTarget {
       setTimeout(() => this.open(), this.#pause);
       this.#pause = Math.min(5000, this.#pause * 1.6);
     });
+  }
+
+  // Browsers do not tell scripts why a WebSocket was refused; the same request without one does.
+  async #askWhy() {
+    const answer = await fetch(this.#address, { signal: AbortSignal.timeout(3000) }).catch(() => null);
+    this.refusal = answer && [403, 503].includes(answer.status) ? (await answer.text()).trim() : "";
   }
 
   ask(what, given = {}) {

@@ -11,11 +11,18 @@ import { el, store, stored, tried } from "./ui.js";
 const SPANS = [5, 10, 30];
 const SILENT = 1.2; // seconds without sound that are worth a word
 
-// The token has done its work: it is to stay in no history and on no screen.
+// The token is to stay in no history and on no screen. It is kept for reloads, for this window and this server only.
+let token = new URLSearchParams(location.search).get("token");
+try {
+  if (token) sessionStorage.setItem("rosafe.token", token);
+  else token = sessionStorage.getItem("rosafe.token");
+} catch {
+  // a browser that keeps nothing forgets it
+}
 if (location.search) history.replaceState(null, "", location.pathname);
 
 const at = (id) => document.getElementById(id);
-const link = new Link();
+const link = new Link(token ?? "");
 const pictures = new Pictures(link, at("pictures"));
 const meters = new Meters(at("meters"));
 const health = new Health(at("health"));
@@ -137,7 +144,7 @@ function tell() {
 }
 
 function told() {
-  if (!status) return ["bad", "no connection to the server"];
+  if (!status) return ["bad", link.refusal || "no connection to the server"];
   if (status.problem) return ["bad", status.problem];
   const malformed = Object.entries(status.malformed);
   if (malformed.length) return ["bad", malformed.map(([topic, why]) => `${topic}: malformed messages are ignored: ${why}`).join("; ")];
