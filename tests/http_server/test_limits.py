@@ -113,11 +113,14 @@ def flood(port: int, sent: bytes, together: int, refill: bool = True) -> None:
 
 HOST = b"Host: 127.0.0.1\r\n"
 TOKEN = b"GET /?token=x HTTP/1.1\r\n" + HOST
+FILE = b"GET /panel.js HTTP/1.1\r\n" + HOST
 LONG = b"".join(b"x%d: " % number + b"y" * 8000 + b"\r\n" for number in range(7))
 UPGRADE = b"Upgrade: websocket\r\nConnection: Upgrade\r\nSec-WebSocket-Version: 13\r\nSec-WebSocket-Key: "
 ATTACKS = {
     "pipelined": (TOKEN + b"\r\n", 1),
     "pipelined by many": (TOKEN + b"\r\n", 100),
+    "files": (FILE + b"\r\n", 1),
+    "files by many": (FILE + b"\r\n", 250),
     "another host": (b"GET / HTTP/1.1\r\nHost: evil.example\r\n\r\n", 100),
     "long headers": (TOKEN + LONG + b"\r\n", 250),
     "many headers": (TOKEN + b"a:b\r\n" * 13_000 + b"\r\n", 250),
@@ -153,6 +156,21 @@ def test_silent_connections_keep_nobody_out(server: Server, sent: bytes) -> None
         assert [server.serves() for _ in range(10)] == [True] * 10
 
 
+def test_clients_that_do_not_read_a_file_keep_nobody_out(page: Server) -> None:
+    crowd = []
+    try:
+        for _ in range(300):
+            one = socket.socket()
+            crowd.append(one)
+            one.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 2048)
+            one.connect(("127.0.0.1", page.port))
+            one.sendall(FILE + b"\r\n")
+        assert [page.serves() for _ in range(10)] == [True] * 10
+    finally:
+        for one in crowd:
+            one.close()
+
+
 def test_connections_that_come_again_keep_nobody_out(page: Server, graph: Graph) -> None:
     """A crowd that replaces each connection that had to make room."""
     refill = (
@@ -175,7 +193,11 @@ def test_connections_that_come_again_keep_nobody_out(page: Server, graph: Graph)
 
 @pytest.mark.parametrize(
     "request_",
-    [TOKEN, b"GET /main.js HTTP/1.1\r\n" + HOST, b"GET /socket HTTP/1.1\r\n" + HOST + UPGRADE + b"A" * 22 + b"==\r\n"],
+    [
+        TOKEN,
+        b"GET /main.js?token=x HTTP/1.1\r\n" + HOST,
+        b"GET /socket HTTP/1.1\r\n" + HOST + UPGRADE + b"A" * 22 + b"==\r\n",
+    ],
 )
 def test_a_refusal_ends_the_connection(server: Server, request_: bytes) -> None:
     if server.page is None:
