@@ -91,6 +91,7 @@ async def serve(options: Options) -> None:
         if options.browser and _has_display():
             opened = await asyncio.to_thread(_open, url)
         gc.freeze()
+        sys.setswitchinterval(startup.SWITCH_SECONDS)  # to parse a setup, in a thread, must not hold up the pages
         if options.images:
             publishing = asyncio.create_task(_publish_images(hub, server))
         waits = [asyncio.create_task(event.wait()) for event in (end, graph.gone)]

@@ -1,11 +1,14 @@
 """The little of YAML that setups and lists of parameters are in: nodes that know their lines; scalars, lists, maps.
 
-Texts come from anywhere, over the network too. There are no tags, no anchors and no merging, and so nothing that grows
-or is evaluated; what a scalar means is for the parameter to say, not for YAML.
+Texts come from anywhere, over the network too. Tags, anchors and merging are refused, so that nothing grows or is
+evaluated; the meaning of a scalar is decided by its parameter, not by YAML. Directives are refused before libyaml sees
+them, because it needs quadratic time for many %TAG lines; the time for everything else is proportional to the length of
+the text and the number of its values, and both are limited.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
@@ -14,7 +17,10 @@ import yaml
 from rosafe.vocabulary.parameter import shown
 
 MAX_DEPTH = 6  # a setup has 4
+MAX_VALUES = 2**18  # scalars, lists and maps of a setup, ends of lists and maps included: less than a second of parsing
 _LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
+_DIRECTIVE = re.compile("%(?<![^\n\r\x85\u2028\u2029\ufeff]%)[^\n\r\x85\u2028\u2029]*")  # behind a break of YAML 1.1
+_VERSION = re.compile(r"%YAML[ \t]+1\.[12][ \t]*([ \t]#.*)?")
 _FRAMES = (yaml.StreamStartEvent, yaml.StreamEndEvent, yaml.DocumentStartEvent, yaml.DocumentEndEvent)
 
 
@@ -64,10 +70,11 @@ class Node(NamedTuple):
         return list(members.values())
 
 
-def parse(text: str) -> Node:
-    """The one document of `text`, or SetupError."""
+def parse(text: str, most: int = MAX_VALUES) -> Node:
+    """Return the one document of `text`. Raises SetupError, also if it has more than `most` values."""
+    _check_directives(text)
     try:
-        events = iter(yaml.parse(text, Loader=_LOADER))
+        events = _counted(yaml.parse(text, Loader=_LOADER), most)
         documents = [_build(events, event, 0) for event in events if not isinstance(event, _FRAMES)]
     except yaml.MarkedYAMLError as problem:
         mark = problem.problem_mark or problem.context_mark
@@ -79,15 +86,32 @@ def parse(text: str) -> Node:
     return documents[0] if documents else Node(1)
 
 
+def _check_directives(text: str) -> None:
+    """Raise SetupError for any directive other than one ``%YAML 1.1`` or ``%YAML 1.2``."""
+    versions = 0
+    for found in _DIRECTIVE.finditer(text):
+        versions += 1
+        if versions > 1 or not _VERSION.fullmatch(found[0]):
+            line = len(re.findall("\r\n|[\n\r\x85\u2028\u2029]", text[: found.start()])) + 1
+            raise SetupError(line, f"expected no directive but one %YAML 1.1 or 1.2, got {shown(found[0][:80])}")
+
+
+def _counted(events: Iterator[yaml.Event], most: int) -> Iterator[yaml.Event]:
+    for count, event in enumerate(events):
+        if count > most + 4:  # the four that frame a document
+            raise SetupError(event.start_mark.line + 1, f"expected at most {most} values, got more")
+        yield event
+
+
 def _build(events: Iterator[yaml.Event], event: yaml.Event, depth: int) -> Node:
     line = event.start_mark.line + 1
+    if type(event) is yaml.ScalarEvent and event.anchor is event.tag is None:  # most are
+        nothing = not event.style and event.value in ("", "~", "null")
+        return Node(line, None if nothing else event.value)
     if isinstance(event, yaml.AliasEvent) or event.anchor is not None:
         raise SetupError(line, "anchors and aliases (& and *) are not taken")
     if event.tag is not None:
         raise SetupError(line, f"tags ({shown(event.tag)}) are not taken")
-    if isinstance(event, yaml.ScalarEvent):
-        nothing = event.style in (None, "") and event.value in ("", "~", "null")
-        return Node(line) if nothing else Node(line, text=event.value)
     if depth == MAX_DEPTH:
         raise SetupError(line, "nested too deeply")
     if isinstance(event, yaml.SequenceStartEvent):

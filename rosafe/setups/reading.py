@@ -15,6 +15,7 @@ from .markup import Node, SetupError, parse
 from .setup import ACQUIRE, INPUT_PORTS, Setup, Sound, Wanted, parameters_of
 
 MAX_PROCESSORS = 10_000  # more than a node takes
+MAX_PARAMETER_VALUES = 2**15  # of a request, all of whose parameters are read while sound is processed
 _NAME = re.compile(r"\w+(/\w+)*", re.ASCII)
 _TOPIC = re.compile(r"/?[A-Za-z]\w*(/[A-Za-z]\w*)*", re.ASCII)
 _OF_TREES = tuple(p for p in REQUEST.parameters if p.name not in ("representation", "connect"))
@@ -63,7 +64,7 @@ def read_parameters(text: str) -> dict[str, Any]:
     short = text.strip()
     if short and not short.startswith("{") and "\n" not in short:
         text = f"{{{short}\n}}"  # a comment ends with its line
-    return _values(parse(text), _OF_TREES, "parameters")
+    return _values(parse(text, MAX_PARAMETER_VALUES), _OF_TREES, "parameters")
 
 
 def _connections(node: Node) -> Iterator[tuple[str, str]]:
@@ -104,6 +105,8 @@ def _value(parameter: Parameter, node: Node) -> Any:
     if node.items is None or not sequence:
         raise ValueError(f"{parameter.name}: wanted is {'a list' if sequence else 'one value'}")
     items: list[Any] = []
+    if len(node.items) > parameter.most:
+        raise ValueError(f"{parameter.name}: too many values, at most {parameter.most}")
     for item in node.items:
         if item.text is None:
             raise ValueError(f"{parameter.name}: a list has single values in it")
