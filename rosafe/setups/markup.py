@@ -88,10 +88,8 @@ def parse(text: str, most: int = MAX_VALUES) -> Node:
 
 def _check_directives(text: str) -> None:
     """Raise SetupError for any directive other than one ``%YAML 1.1`` or ``%YAML 1.2``."""
-    versions = 0
-    for found in _DIRECTIVE.finditer(text):
-        versions += 1
-        if versions > 1 or not _VERSION.fullmatch(found[0]):
+    for number, found in enumerate(_DIRECTIVE.finditer(text)):
+        if number or not _VERSION.fullmatch(found[0]):
             line = len(re.findall("\r\n|[\n\r\x85\u2028\u2029]", text[: found.start()])) + 1
             raise SetupError(line, f"expected no directive but one %YAML 1.1 or 1.2, got {shown(found[0][:80])}")
 
