@@ -11,6 +11,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from rosafe.component import mark
+from rosafe.genomix import installed_components
 from rosafe.genomix.graph import Graph, middleware_error
 from rosafe.genomix.tcpros import component_exception
 from rosafe.interface import ComponentError
@@ -35,6 +36,7 @@ class Goal:
         self.ended = asyncio.Event()
         self.error: ComponentError | None = None
         self.warning = ""  # of the component, once it is acknowledged
+        self.outputs: dict[str, Any] = {}  # once it has ended without an error
 
     def cancel(self) -> None:
         """Ask the component to end the activity."""
@@ -116,8 +118,7 @@ class ActionClient:
         self._goals[goal.id] = goal
         message = self._goal_class()
         message.goal_id.id = goal.id
-        for name, value in values.items():
-            setattr(message.goal, name, value)
+        installed_components.fill(message.goal, values)
         try:
             await asyncio.wait_for(self._hand_over(goal, message), ANSWER_SECONDS)
         except TimeoutError:
@@ -170,6 +171,7 @@ class ActionClient:
         if goal is None:
             return
         if message.result.genom_success:
+            goal.outputs = installed_components.outputs(message.result)
             self._end(goal, None)
         elif message.result.genom_exdetail:
             self._end(goal, component_exception(message.result.genom_exdetail))

@@ -126,6 +126,12 @@ class Graph:
         """All topics that somebody publishes, with their types."""
         return dict(await self.master("getPublishedTopics", ""))
 
+    async def published_by(self, instance: str) -> dict[str, str]:
+        """All topics that the node `instance` publishes, with their types."""
+        publishers, _, _ = await self.master("getSystemState")
+        types = dict(await self.master("getTopicTypes"))
+        return {topic: types.get(topic, "") for topic, nodes in publishers if f"/{instance}" in nodes}
+
     async def topic_address(self, topic: str, instance: str) -> tuple[str, int]:
         """Host and port where the node `instance` gives out `topic`, or Unknown. It is asked itself."""
         known = self._uris.get(instance)

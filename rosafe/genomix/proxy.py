@@ -9,10 +9,11 @@ from typing import Any
 
 import rosgraph.names
 
-from rosafe.component import mark, wire
-from rosafe.genomix import packed, setups, syntax
+from rosafe.component import mark
+from rosafe.genomix import installed_components, packed, setups, syntax
 from rosafe.genomix.actions import ActionClient, Goal
 from rosafe.genomix.graph import Graph, Unknown, middleware_error
+from rosafe.genomix.installed_components import cannot_load
 from rosafe.genomix.syntax import Syntax
 from rosafe.genomix.tasks import shared
 from rosafe.genomix.tcpros import Connection, Refused, ServiceClient, TopicReader, component_exception, reach
@@ -114,12 +115,12 @@ class Proxy:
     async def load(cls, graph: Graph, instance: str) -> Proxy:
         """The proxy of a component that runs, or that appears within a moment, or ComponentError."""
         package = await _package(graph, instance)
+        component = await asyncio.to_thread(installed_components.known, package)
         if package not in COMPONENTS:
-            known = ", ".join(COMPONENTS)
-            raise _cannot_load(f"/{instance} is a {package}; genomixd knows {known}")
+            component = installed_components.with_ports(component, instance, await graph.published_by(instance))
         with contextlib.suppress(Unknown, ComponentError):  # later, perhaps
             await graph.node_uri(instance)  # for its ports, should the master be away then
-        return cls(graph, COMPONENTS[package], instance)
+        return cls(graph, component, instance)
 
     def prepare(self) -> None:
         """Begin to become a client of all activities: then they can be had while the master is away, too."""
@@ -129,7 +130,7 @@ class Proxy:
     async def check(self, name: str) -> None:
         """Return if the component runs still and may be called `name`, else raise ComponentError."""
         if name not in (self.component.name, self.instance):
-            raise _cannot_load(f"/{self.instance} is a {self.component.name}, and no {name}")
+            raise cannot_load(f"/{self.instance} is a {self.component.name}, and no {name}")
         with self._one_more():
             await self._client("connect_port").check()
 
@@ -164,7 +165,9 @@ class Proxy:
         return partial(given) if service in WHOLE_TREES else complete(service, given)
 
     async def call(self, service: Service, values: Mapping[str, Any]) -> Value:
-        """What a function returns; an activity returns nothing, as soon as it runs."""
+        """What a function returns; an activity returns as soon as it runs, with its outputs if it has ended by then."""
+        if service.activity and self.component.name not in COMPONENTS:  # ours have a plain service for each activity
+            return await self._call_action(service, values)
         with self._one_more():
             if service in self.component.composites:
                 async with self._building:
@@ -177,6 +180,20 @@ class Proxy:
         value = Value(self.component, service.outputs, {name: getattr(response, name) for name, _ in service.outputs})
         value.warn(mark.warning_in(response.genom_exdetail))
         return value
+
+    async def _call_action(self, service: Service, values: Mapping[str, Any]) -> Value:
+        goal = await self.start(service, values)
+        try:
+            await goal.acknowledged.wait()
+        finally:
+            goal.forget()
+        if goal.error is not None:
+            raise goal.error
+        return self.result(service, goal)
+
+    def result(self, service: Service, goal: Goal) -> Value:
+        """The outputs of an activity."""
+        return Value(self.component, service.outputs, goal.outputs) if goal.outputs else NOTHING
 
     async def start(self, service: Service, values: Mapping[str, Any]) -> Goal:
         """Send an activity; its goal tells when it runs and when it has ended."""
@@ -301,7 +318,7 @@ class Proxy:
 
     def _reader(self, port: Port) -> TopicReader:
         if port.idl not in self._readers:
-            kind = wire.message_class(self.component.name, port.idl)
+            kind = installed_components.message_class(self.component.name, port.idl)
             self._readers[port.idl] = TopicReader(self._graph, self.instance, kind)
         return self._readers[port.idl]
 
@@ -366,7 +383,7 @@ def names(component: str, instance: str) -> tuple[str, str]:
     instance = instance.strip("/") or name
     for word in (name, instance):
         if not rosgraph.names.is_legal_base_name(word):
-            raise _cannot_load(f"{word[:80]!r} is no name of a component or instance")
+            raise cannot_load(f"{word[:80]!r} is no name of a component or instance")
     return name, instance
 
 
@@ -399,10 +416,6 @@ async def _package(graph: Graph, instance: str) -> str:
 
 def _not_running(instance: str, name: str) -> ComponentError:
     return middleware_error(f"{instance} is not running: nobody serves {name}")
-
-
-def _cannot_load(what: str) -> ComponentError:
-    return ComponentError("::genomix::e_load", what=what)
 
 
 def _no_port(what: str) -> ComponentError:

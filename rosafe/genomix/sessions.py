@@ -210,7 +210,7 @@ class Session:
             goal.forget()
         if goal.error is not None:
             raise goal.error
-        return NOTHING
+        return proxy.result(service, goal)
 
     async def _in_turn(self, work: Callable[[_Turn], Awaitable[T]]) -> T:
         turn = _Turn()

@@ -38,6 +38,30 @@ def tcl_word(text: str) -> str:
     return text.translate(_TCL_ESCAPES)
 
 
+def tcl_list(text: str) -> list[str] | None:
+    """The words of a Tcl list, or None if `text` is not one. Braces are understood, quotes and backslashes are not."""
+    words: list[str] = []
+    at = 0
+    while at < len(text):
+        if text[at].isspace():
+            at += 1
+            continue
+        begin, depth = at, 0
+        while at < len(text) and (depth or not text[at].isspace()):
+            if text[at] in '"\\':
+                return None
+            depth += (text[at] == "{") - (text[at] == "}")
+            at += 1
+            if depth <= 0 and text[at - 1] == "}":
+                break
+        word = text[begin:at]
+        braced = word.startswith("{")
+        if depth or braced != word.endswith("}") or (at < len(text) and not text[at].isspace()):
+            return None
+        words.append(word[1:-1] if braced else word)
+    return words
+
+
 class Syntax(Protocol):
     """How one output language writes scalars, sequences and structures."""
 

@@ -19,7 +19,8 @@ from typing import Any
 import genpy
 import rosgraph.network
 
-from rosafe.component import mark, wire
+from rosafe.component import mark
+from rosafe.genomix import installed_components
 from rosafe.genomix.graph import Graph, Unknown, middleware_error
 from rosafe.genomix.tasks import shared
 from rosafe.genomix.values import refused
@@ -165,7 +166,7 @@ class ServiceClient:
         self.name = f"/{instance}/{service}"
         definition = getattr(importlib.import_module(f"{package}.srv"), service)
         self._request_class = getattr(importlib.import_module(f"{package}.srv"), f"{service}Request")
-        self._response_class = wire.response_class(package, service)
+        self._response_class = installed_components.response_class(package, service)
         self._header = {
             "service": self.name,
             "md5sum": definition._md5sum,
@@ -219,7 +220,7 @@ class ServiceClient:
         """
         buffer = io.BytesIO()
         try:
-            self._request_class(**values).serialize(buffer)
+            installed_components.fill(self._request_class(), values).serialize(buffer)
         except UnicodeEncodeError:  # bytes of a command line that are no UTF-8
             raise refused(f"{self.name}: half a surrogate pair is no character") from None
         try:

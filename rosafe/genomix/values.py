@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import math
@@ -9,8 +10,11 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from rosafe.genomix.syntax import tcl_list
 from rosafe.interface import KINDS, REQUEST, REQUIRED, ComponentError, Parameter, Service
 from rosafe.tree.requests import kind_of
+from rosafe.vocabulary.idl import element
+from rosafe.vocabulary.parameter import StructParameter
 from rosafe.vocabulary.words import meant
 
 _WORDS = {
@@ -157,25 +161,64 @@ def _parameter(service: Service, name: str) -> Parameter:
 
 
 def _convert(service: Service, parameter: Parameter, value: Any) -> Any:
-    unbounded = dataclasses.replace(parameter, minimum=None, maximum=None, least=0, choices=(), spellings={})
+    checks = parameter
+    if not parameter.checked_by_client:  # the component names what it allows
+        checks = dataclasses.replace(parameter, minimum=None, maximum=None, least=0, choices=(), spellings={})
     try:
-        return unbounded.check(_typed(parameter.idl, value))
+        return checks.check(_typed_value(parameter, value))
     except ValueError as problem:
         allowed = f"; {parameter.range_text}" if parameter.range_text else ""
         raise refused(f"{service.name}: {problem} ({parameter.name} is a {parameter.idl}{allowed})") from None
 
 
+def _typed_value(parameter: Parameter, value: Any) -> Any:
+    """`value` with texts turned into what the type of the parameter asks for."""
+    if not isinstance(parameter, StructParameter):
+        return _typed(parameter.idl, value)
+    of = element(parameter.idl)
+    if isinstance(value, str):
+        value = _parse(value, sequence=bool(of))
+    if of:
+        items = _by_index(value) if isinstance(value, Mapping) else value
+        one = dataclasses.replace(parameter, idl=of)
+        return [_typed_value(one, item) for item in items] if isinstance(items, list) else items
+    return _typed_members(parameter, value) if isinstance(value, Mapping) else value
+
+
+def _typed_members(parameter: StructParameter, values: Mapping[str, Any]) -> dict[str, Any]:
+    typed = dict(values)
+    for member in parameter.members:
+        value = values.get(member.name)
+        if isinstance(value, str) and element(member.idl):
+            value = _parse(value, sequence=True)
+        if member.name in typed:
+            typed[member.name] = _typed_value(member, value)
+    return typed
+
+
+def _parse(text: str, sequence: bool) -> Any:
+    """The sequence or structure that a text is, in JSON or as a Tcl list or dict; the text itself if it is neither."""
+    with contextlib.suppress(ValueError, RecursionError):
+        parsed = json.loads(text)
+        if isinstance(parsed, list if sequence else dict):
+            return parsed
+    words = tcl_list(text)
+    if words is None or (len(words) % 2 and not sequence):
+        return text
+    return words if sequence else dict(zip(words[::2], words[1::2], strict=True))
+
+
 def _typed(idl: str, value: Any) -> Any:
     """`value` with texts turned into numbers and booleans, where the type asks for those and the text is one."""
     if idl.startswith("sequence<"):
-        element = idl[len("sequence<") : -1]
+        of = element(idl)
         if isinstance(value, Mapping):
             value = _by_index(value)
         if isinstance(value, list):
-            return [_typed(element, item) for item in value]
+            return [_typed(of, item) for item in value]
         if value == "":
             return []
-        return [_typed(element, value)] if isinstance(value, str) else value
+        return [_typed(of, value)] if isinstance(value, str) else value
     if idl == "string" or not isinstance(value, str):
         return value
     text = value.strip()

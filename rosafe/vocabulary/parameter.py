@@ -56,6 +56,7 @@ class Parameter:
     longest: int = MAX_STRING
     zero_is_default: bool = True  # in ROS requests, which carry no defaults
     follows_rate: bool = False  # where it is not given, the sample rate may make another one of the default
+    checked_by_client: bool = False  # as the component, for which it is a number, cannot name what is allowed
 
     @property
     def ros(self) -> str:
@@ -213,6 +214,19 @@ class Parameter:
     def read(self, text: str, name: str = "") -> Any:
         """`parse` and `check`: the value that a literal text says, or ValueError."""
         return self.check(self.parse(text, name))
+
+
+@dataclass(frozen=True)
+class StructParameter(Parameter):
+    """A parameter that is a structure, or a sequence of structures, with `members`."""
+
+    members: tuple[Parameter, ...] = ()
+
+    def _check_scalar(self, idl: str, value: Any) -> Any:
+        names = [member.name for member in self.members]
+        if not isinstance(value, Mapping) or sorted(map(str, value)) != sorted(names):
+            raise ValueError(f"{self.name}: expected an object with {', '.join(names)}, got {shown(value)}")
+        return {member.name: member.check(value[member.name]) for member in self.members}
 
 
 def text_of(value: Any) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tkinter
 from typing import Any
 
 import pytest
@@ -10,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rosafe import interface
+from rosafe.genomix import syntax
 from rosafe.genomix.values import complete, parse_input
 from rosafe.interface import BASS, REQUIRED, ROSAFE, ComponentError, Service
 from rosafe.vocabulary.idl import element
@@ -176,3 +178,17 @@ def test_whatever_comes_is_of_the_right_types_or_refused(data: st.DataObject) ->
             assert all(type(item) is kinds[of] for item in value)
         elif parameter.name in (given if isinstance(given, dict) else ()):
             assert type(value) is kinds.get(parameter.idl, int)
+
+
+@settings(deadline=None)
+@given(st.text(alphabet='ab {}"\\$[ ', max_size=12))
+def test_tcl_lists_are_split_as_tcl_does(text: str) -> None:
+    """Or not at all: quotes, backslashes and unbalanced braces."""
+    words = syntax.tcl_list(text)
+    try:
+        expected = list(tkinter.Tcl().splitlist(text))
+    except tkinter.TclError:
+        assert words is None
+    else:
+        assert words is None or words == expected
+        assert words is not None or any(mark in text for mark in '"\\{}')
