@@ -11,6 +11,7 @@ from tests import harness
 from tests.genomix import world as worlds
 from tests.genomix.arm.package import generate
 from tests.genomix.world import Http, HttpError, World
+from tests.matlab import octave
 
 pytestmark = pytest.mark.ros
 
@@ -163,3 +164,32 @@ def test_what_is_not_installed_is_named(robot: World, tmp_path: Path) -> None:
         for word in words:
             assert word in raised.value.what
     assert not (tmp_path / "imported").exists()
+
+
+def test_octave(robot: World) -> None:
+    shown = octave.shown(
+        robot,
+        """
+        client = genomix.client;
+        arm = client.load('arm');
+        arm.SetSpeed('FAST');
+        show('speed', arm.GetSpeed().result.speed);
+        pose = struct('position', struct('x', 1, 'y', 2), 'angles', {{0.5 0.25 0}}, 'frame', 'base');
+        r = arm.SetPose(pose, {struct('x', 1, 'y', 2)}, 1);
+        show('points', r.result.points);
+        show('x', r.result.pose.position.x);
+        state = arm.State();
+        show('state', {state.State.pose.frame, numel(state.State.path)});
+        moved = arm.Move('-a', struct('distance', 2, 'speed', 'SLOW'));
+        show('moved', {moved.wait(20), moved.result.moved});
+        show('failed', arm.SetSpeed('RAPID').exception.ex);
+        """,
+    )
+    assert shown == {
+        "speed": "::arm::FAST",
+        "points": 1,
+        "x": 1,
+        "state": ["base", 1],
+        "moved": ["done", 2],
+        "failed": "::genom::serialization",
+    }
