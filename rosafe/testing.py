@@ -15,11 +15,11 @@ from rosafe.dsp.guard import FloatArray
 from rosafe.dsp.plugin_checks import PluginError, checked
 from rosafe.dsp.stage import Stage, parts_of
 from rosafe.interface import text_of
-from rosafe.interface.signals import layout
 from rosafe.representations import OWN, STAGES
 from rosafe.tree import sizes
 from rosafe.vocabulary.idl import element
 from rosafe.vocabulary.parameter import Parameter
+from rosafe.vocabulary.signals import layout
 
 _CUTS = ([1], [7, 0, 160], [0, 0, 441], [3, 1000, 50])
 _LOUD = 2.0**31  # the samples of int32 sound that is not normalised

@@ -9,8 +9,8 @@ is the head of its own help, and two functions::
 `configure` may call `parser.set_defaults(interspersed=[])`: `run` finds there the words that stand behind an option,
 for which argparse has no place.
 
-`rosafe -h` imports them all, so what is slow to import is imported in `run`; and `doctor` works where even numpy is
-missing. `run` may raise `Failure`, and
+`rosafe -h` reads their docstrings and imports none; what is slow to import is imported in `run`; and `doctor` works
+where even numpy is missing. `run` may raise `Failure`, and
 call `options.usage_error(text)`, which exits with 2. Modules whose names
 begin with _ are parts of commands.
 """

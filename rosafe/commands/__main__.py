@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import ast
 import importlib
 import inspect
 import os
 import pkgutil
 import sys
+from pathlib import Path
 
 from rosafe import commands, missing
 from rosafe.commands import Failure
@@ -15,7 +17,9 @@ from rosafe.component.startup import Parser, without_names
 from rosafe.output import OutputError
 from rosafe.terminal import printable
 from rosafe.version import VERSION
+from rosafe.vocabulary import plugins
 
+_WITHOUT_PLUGINS = ("check", "doctor", "record", "trace")  # they compute nothing, or import plugins in another process
 _EPILOG = """example:
   rosafe process speech.wav -o speech.npz --outputs ild,ratemap --set fb_nChannels=64
   rosafe process -h          # all options and parameters"""
@@ -56,7 +60,7 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _parser(words: list[str]) -> argparse.ArgumentParser:
-    """With the one subcommand that the command line begins with, or with all, which takes longer to import."""
+    """With the one subcommand that the command line begins with; otherwise with a line on each, and no imports."""
     parser = Parser(
         prog="rosafe",
         description="The Two!Ears auditory front-end without ROS, and tools around it.",
@@ -67,9 +71,19 @@ def _parser(words: list[str]) -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"rosafe {VERSION}")
     subparsers = parser.add_subparsers(title="commands", dest="command", metavar="COMMAND", required=True)
     names = [module.name for module in pkgutil.iter_modules(commands.__path__) if not module.name.startswith("_")]
-    for name in words[:1] if words[:1] and words[0] in names else names:
-        _add(subparsers, name)
+    if words[:1] and words[0] in names:
+        if words[0] in _WITHOUT_PLUGINS:
+            plugins.disable()
+        _add(subparsers, words[0])
+    else:
+        for name in names:
+            text = ast.get_docstring(ast.parse(Path(commands.__path__[0], f"{name}.py").read_bytes())) or ""
+            subparsers.add_parser(name.replace("_", "-"), help=_summary(text), add_help=False)
     return parser
+
+
+def _summary(text: str) -> str:
+    return text.partition("\n")[0].rstrip(".")
 
 
 def _add(subparsers: argparse._SubParsersAction[Parser], name: str) -> None:
@@ -82,7 +96,7 @@ def _add(subparsers: argparse._SubParsersAction[Parser], name: str) -> None:
     text = inspect.getdoc(module) or ""
     subparser = subparsers.add_parser(
         name.replace("_", "-"),
-        help=text.partition("\n")[0].rstrip("."),
+        help=_summary(text),
         description=text,
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,

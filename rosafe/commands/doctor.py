@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import importlib.metadata
 import importlib.util
 import json
 import os
@@ -18,6 +19,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from rosafe import missing
+from rosafe.commands import _plugins as _child
 from rosafe.component import generate, master, paths
 from rosafe.terminal import printable
 from rosafe.vocabulary import plugins
@@ -161,6 +163,8 @@ def _stale_in_shell() -> str:
     first = next((Path(entry) for entry in entries if Path(entry, "rosAFE", "msg").is_dir()), None)
     if first is None:
         return "rostopic and its like do not find them in this shell"
+    if plugins.named():  # their messages are in another folder, which only a process that imports them knows
+        return ""
     wanted = generate.environment()["PYTHONPATH"].split(":")[0]
     return "" if os.path.realpath(first) == os.path.realpath(wanted) else f"this shell has others, in {first}"
 
@@ -207,13 +211,14 @@ def _kernels() -> Finding:
 
 
 def _plugins() -> Finding:
-    if not plugins.expected():
+    if not (plugins.named() or importlib.metadata.entry_points(group=plugins.ENTRY_POINTS)):
         return Finding(OK, f"none; {plugins.FOLDERS} names folders of them")
-    from rosafe.representations import PROBLEMS, STAGES, registry
-
-    if PROBLEMS:
-        return Finding(NOTE, "; ".join(" ".join(line.split()) for line in PROBLEMS), "mend them: they are left out")
-    return Finding(OK, ", ".join(kind for kind in STAGES if kind not in registry.own()))
+    report = _child.report()
+    found = ", ".join(report.kinds) or "none that can be used"
+    if report.problems:
+        remarks = "; ".join((*(f"left out: {line}" for line in report.problems), *report.warnings))
+        return Finding(NOTE, f"{found}; {remarks}", "correct them, and try each with: rosafe check FILE")
+    return Finding(NOTE if report.warnings else OK, "; ".join((found, *report.warnings)))
 
 
 def _master() -> Finding:

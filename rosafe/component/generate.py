@@ -328,6 +328,9 @@ def main(argv: list[str] | None = None) -> int:
     )
     parser.add_argument("--shell", action="store_true", help="print the environment as commands for the shell")
     options = parser.parse_args(argv)
+    sys.stdout.flush()
+    private = os.dup(1)  # the shell evaluates it: nothing that a plugin prints, now or at the end, may reach it
+    os.dup2(2, 1)
     try:
         variables = environment()
     except GenerationError as problem:
@@ -337,8 +340,9 @@ def main(argv: list[str] | None = None) -> int:
         ros = dict(os.environ)
         master.set_local_defaults(ros)
         variables |= {name: ros[name] for name in ("ROS_MASTER_URI", "ROS_IP") if ros.get(name)}
-        for name, value in variables.items():
-            print(f"export {name}={shlex.quote(value)}")
+        exports = "".join(f"export {name}={shlex.quote(value)}\n" for name, value in variables.items())
+        with os.fdopen(private, "w", encoding="utf-8", errors="surrogateescape") as output:
+            output.write(exports)
     return 0
 
 

@@ -23,9 +23,9 @@ import numpy as np
 
 from rosafe import interface
 from rosafe.component import generate
-from rosafe.interface.signals import LEVELS
 from rosafe.tree.window import WindowView
 from rosafe.vocabulary.idl import SCALARS
+from rosafe.vocabulary.signals import LEVELS
 
 _SCALARS = {idl: scalar.code for idl, scalar in SCALARS.items() if scalar.code}
 _SAMPLES: dict[str, np.dtype[Any]] = {idl: np.dtype(f"<{_SCALARS[idl]}") for idl in ("double", "long", "float")}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 from functools import cached_property
 from types import FunctionType
 from typing import Any
@@ -46,3 +47,39 @@ class OldNames:
         if isinstance(method := vars(cls).get("output_format"), FunctionType):
             cls.output_format = cached_property(method)  # type: ignore[attr-defined]
             cls.output_format.__set_name__(cls, "output_format")  # type: ignore[attr-defined]
+
+
+# Modules from which plugins of 0.2 import what is in rosafe.plugin now
+MODULES = ("rosafe.dsp.framing", "rosafe.dsp.stage", "rosafe.vocabulary.parameter", "rosafe.vocabulary.representation")
+
+
+def used(source: bytes) -> list[str]:
+    """The old names that a plugin uses, each with the present one.
+
+    Raises SyntaxError or ValueError for what is not Python.
+    """
+    renamed = {**OVERRIDES, **ATTRIBUTES}
+    found: dict[str, None] = {}
+    for node in ast.walk(ast.parse(source)):
+        names: list[str] = []
+        if isinstance(node, ast.ImportFrom):
+            if node.module in MODULES:
+                found[f"{node.module} (now rosafe.plugin)"] = None
+        elif isinstance(node, ast.ClassDef):
+            for item in node.body:
+                if isinstance(item, ast.FunctionDef):
+                    names.append(item.name)
+                elif isinstance(item, ast.Assign):
+                    names += [target.id for target in item.targets if isinstance(target, ast.Name)]
+                elif isinstance(item, ast.AnnAssign) and isinstance(item.target, ast.Name):
+                    names.append(item.target.id)
+        elif isinstance(node, ast.Attribute):
+            owner = node.value
+            is_self = isinstance(owner, ast.Name) and owner.id == "self"
+            is_super = isinstance(owner, ast.Call) and isinstance(owner.func, ast.Name) and owner.func.id == "super"
+            if (is_self or is_super) and isinstance(node.ctx, ast.Load):
+                names.append(node.attr)
+        for name in names:
+            if name in renamed:
+                found[f"{name} (now {renamed[name]})"] = None
+    return sorted(found)

@@ -70,7 +70,7 @@ class Stage(OldNames):
 
     def __init_subclass__(cls, **arguments: Any) -> None:
         super().__init_subclass__(**arguments)
-        cls.TAKES_OUT = "out" in inspect.signature(cls.process).parameters
+        cls.TAKES_OUT = callable(cls.process) and "out" in inspect.signature(cls.process).parameters
 
     def __init__(self, input_format: Signal | float, **parameters: Any) -> None:
         if not isinstance(input_format, Signal):

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from rosafe.interface import Component
-from rosafe.interface.signals import LEVELS
+from rosafe.vocabulary.signals import LEVELS
 
 STRUCTURE, SEQUENCE, END = b"{", b"[", b"."
 NUMBER, TEXT, NUMBERS, SIGNAL, ERROR = b"d", b"s", b"D", b"S", b"!"

@@ -35,8 +35,8 @@ from rosafe.interface import (
     Service,
     ros_type,
 )
-from rosafe.interface.signals import LEVELS
 from rosafe.tree import building
+from rosafe.vocabulary.signals import LEVELS
 from rosafe.vocabulary.words import meant
 
 CALL_SECONDS = 60.0  # for the answer to one request

@@ -17,7 +17,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from rosafe.interface import Component
-from rosafe.interface.signals import LEVELS
+from rosafe.vocabulary.signals import LEVELS
 
 STEP = 1024  # numbers formatted at a time: about 0.3 ms, during which no other thread runs
 

@@ -10,11 +10,11 @@ from rosafe.representations.registry import ORIGINAL
 from rosafe.vocabulary.idl import TIME
 from rosafe.vocabulary.parameter import REQUIRED, Parameter
 from rosafe.vocabulary.representation import Representation
+from rosafe.vocabulary.signals import SIGNALS, layout
 
 from .bass import BINAUDIO
 from .genom import COMMON_SERVICES, GENOM_STATE, GENOM_STATE_PORT
 from .service import Component, Port, Service, Struct
-from .signals import SIGNALS, layout
 
 MAX_SECONDS = 600.0  # longest port or history
 MAX_BLOCK = 10_000_000  # frames

@@ -10,8 +10,7 @@ from typing import Any
 from rosafe.vocabulary.errors import ComponentError
 from rosafe.vocabulary.idl import TIME, TIME_MEMBERS
 from rosafe.vocabulary.parameter import REQUIRED, Parameter
-
-Struct = tuple[tuple[str, str], ...]  # (member, IDL type)
+from rosafe.vocabulary.signals import Struct
 
 
 def _unset(parameter: Parameter, value: Any) -> bool:

@@ -30,7 +30,7 @@ from rosafe.node.processor_health import ProcessorHealth
 from rosafe.node.trace_port import TracePort
 from rosafe.node.whole_trees import WholeTrees
 from rosafe.node.words import UnknownWords
-from rosafe.representations import PROBLEMS, STAGES
+from rosafe.representations import PLUGINS, PROBLEMS, STAGES, WARNINGS
 from rosafe.setups import Setup, rehearse, wanted
 from rosafe.sound.windows import MAX_WINDOW
 from rosafe.tree.block import Block
@@ -66,8 +66,8 @@ class RosafeNode:
     """
 
     def __init__(self, instance: str, strict: bool = False, keep: str = "") -> None:
-        for problem in PROBLEMS:
-            rospy.logwarn(f"a representation is left out: {problem}")
+        for remark in (*(f"left out: {problem}" for problem in PROBLEMS), *WARNINGS):
+            rospy.logwarn(f"plugin {remark}")
         self._node = ComponentNode(ROSAFE, lambda problem: ROSAFE.error("e_badNewValue", what=str(problem)))
         self.finished = self._node.finished
         self._tree = Tree(self, _workers())
@@ -106,6 +106,7 @@ class RosafeNode:
         self._node.function("request", WholeTrees(self._node, lambda: self._audio_topic).build, waits=True)
         self._node.diagnostics.add("audio", self._audio_health)
         self._node.diagnostics.add("processors", self._health.report)
+        self._node.diagnostics.add("plugins", _plugin_health)
         if self._keeper is not None:
             self._node.diagnostics.add("keep", self._keeping_health)
         self._trace = TracePort(f"{self._node.name}/trace", self._tree.observe)
@@ -395,6 +396,20 @@ class RosafeNode:
         status.add("file", str(self._keeper.path))
         status.add("to come back", " ".join(one.name for one in self._coming_back.processors) or "nothing")
         return status
+
+
+def _plugin_health(status: Any) -> Any:
+    remarks = [*(f"left out: {problem}" for problem in PROBLEMS), *WARNINGS]
+    if remarks:
+        more = f" (and {len(remarks) - 1} more)" if len(remarks) > 1 else ""
+        status.summary(DiagnosticStatus.WARN, f"{remarks[0]}{more}")
+    else:
+        status.summary(DiagnosticStatus.OK, f"{len(PLUGINS)} plugins")
+    for remark in remarks:
+        status.add("plugin", remark)
+    for kind, origin in PLUGINS.items():
+        status.add(kind, origin)
+    return status
 
 
 def _keeper(path: str, describe: Callable[[], Setup]) -> Keeper | None:

@@ -3,31 +3,28 @@
 from __future__ import annotations
 
 import importlib
-import importlib.util
-import os
 import pkgutil
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 from rosafe.dsp.plugin_checks import checked
 from rosafe.dsp.stage import Stage
-from rosafe.vocabulary import plugins
+from rosafe.representations import checks, loading
+from rosafe.vocabulary.checks import short
 from rosafe.vocabulary.representation import Representation
 
 # The original's processors, in its order: also that of getParameters and getSignals, which report no others.
 ORIGINAL = ("input", "preProc", "gammatone", "ihc", "ild", "ratemap", "crossCorrelation")
 
 
-def _stages_in(module: ModuleType) -> dict[str, type[Stage]]:
-    """The representations that `module` itself defines, by kind."""
-    found = {}
-    for value in vars(module).values():
-        if isinstance(value, type) and issubclass(value, Stage) and value.__module__ == module.__name__:
-            declared = vars(value).get("REPRESENTATION")
-            if isinstance(declared, Representation):
-                found[declared.kind] = value
-    return found
+def _stages_in(found: Any) -> list[type[Stage]]:
+    """The classes with a declaration that a module itself defines, each once; or the class of an entry point."""
+    if not isinstance(found, ModuleType):
+        return [found]
+    own = {id(v): v for v in vars(found).values() if isinstance(v, type) and v.__module__ == found.__name__}
+    return [value for value in own.values() if "REPRESENTATION" in vars(value)]
 
 
 def own() -> dict[str, type[Stage]]:
@@ -35,7 +32,8 @@ def own() -> dict[str, type[Stage]]:
     found: dict[str, type[Stage]] = {}
     for info in pkgutil.iter_modules([str(Path(__file__).parent)]):
         if info.name != Path(__file__).stem:
-            found.update(_stages_in(importlib.import_module(f"{__package__}.{info.name}")))
+            stages = _stages_in(importlib.import_module(f"{__package__}.{info.name}"))
+            found.update({stage.REPRESENTATION.kind: stage for stage in stages})
     return _ordered(found)
 
 
@@ -49,72 +47,66 @@ def _ordered(stages: Mapping[str, type[Stage]]) -> dict[str, type[Stage]]:
     return ordered
 
 
-def _clash(stage: type[Stage], others: Mapping[str, type[Stage]]) -> str:
-    """Why `stage` cannot stand beside `others`; empty where it can."""
-    mine = stage.REPRESENTATION
-    if not mine.parent:
-        return "it has no parent"
-    if mine.parent not in others:
-        return f"its parent {mine.parent!r} is no kind of processor"
-    for other in (known.REPRESENTATION for known in others.values()):
-        for what in ("kind", "request", "port", "word", "task"):
-            if getattr(mine, what).lower() == getattr(other, what).lower():
-                return f"there is a {what} {getattr(mine, what)!r} already"
-        both = {p.name for p in mine.parameters} & {p.name for p in other.parameters}
-        if both:
-            return f"{other.kind} has a parameter {min(both)!r} too"
-    return ""
+class _Search:
+    """All representations, of plugins too.
+
+    Attributes
+    ----------
+    stages : dict of str to type
+        By kind, parents first.
+    plugins : dict of str to str
+        The origin of each plugin, by kind: the path of its file, or its entry point.
+    problems, warnings : list of str
+        A line for each plugin that is left out, and for each remark about one.
+    """
+
+    def __init__(self) -> None:
+        self.stages = own()
+        self.plugins: dict[str, str] = {}
+        self.problems: list[str] = []
+        self.warnings: list[str] = []
+        offered: list[tuple[str, type[Stage]]] = []
+        for origin, found, path in loading.load(self.problems, self.warnings):
+            names = loading.old_names_used(path)
+            stages = [stage for stage in _stages_in(found) if self._declared(origin, stage)]
+            if stages and names:
+                self.warnings.append(f"{origin}: uses old names, which the next release removes: {', '.join(names)}")
+            offered += [(origin, stage) for stage in stages]
+        self._accept(offered)
+        self.stages = _ordered(self.stages)
+
+    def _declared(self, origin: str, stage: Any) -> bool:
+        """Whether `stage` has a declaration; its absence is a problem."""
+        declared = getattr(stage, "REPRESENTATION", None)
+        if isinstance(stage, type) and isinstance(declared, Representation):
+            return True
+        name = getattr(stage, "__name__", short(stage))
+        self.problems.append(f"{origin}: {name}: REPRESENTATION: expected a Representation, got {short(declared)}")
+        return False
+
+    def _accept(self, offered: list[tuple[str, type[Stage]]]) -> None:
+        """Take those that go together; the parent of a plugin may be another one, whatever their order."""
+        while offered:
+            taken = next((one for one in offered if not checks.problem_of(one[1], self.stages)), None)
+            if taken is None:
+                break
+            origin, stage = taken
+            declared = stage.REPRESENTATION
+            if stage.INPUT is Stage.INPUT:  # which the author need not repeat
+                stage.INPUT = self.stages[declared.parent].REPRESENTATION.parts[0].axes
+            self.stages[declared.kind], self.plugins[declared.kind] = checked(stage), origin
+            self.warnings += [
+                f"{origin}: {declared.kind}: the boolean {p.name} has the default True, and a plain ROS request "
+                "cannot tell False from a value that is not given; declare the inverse parameter with the default False"
+                for p in declared.parameters
+                if p.idl == "boolean" and p.default
+            ]
+            offered.remove(taken)
+        for origin, stage in offered:
+            problem = checks.problem_of(stage, self.stages)
+            self.problems.append(f"{origin}: {stage.REPRESENTATION.kind}: {problem}")
 
 
-def _told(problem: BaseException) -> str:
-    return " ".join(f"{type(problem).__name__}: {problem}".split())
-
-
-def _plugin_modules(problems: list[str]) -> Iterator[tuple[str, ModuleType]]:
-    """Each plugin's origin and module; what cannot be imported goes to `problems`."""
-    for folder in plugins.folders():
-        if not os.path.isdir(folder):
-            problems.append(f"{folder}: named in {plugins.FOLDERS}, and no folder")
-        for path in sorted(Path(folder).glob("*.py")):
-            try:
-                spec = importlib.util.spec_from_file_location(f"rosafe_plugin_{path.stem}", path)
-                assert spec is not None
-                assert spec.loader is not None
-                module = importlib.util.module_from_spec(spec)
-                spec.loader.exec_module(module)
-            except (Exception, SystemExit) as problem:  # somebody else's code: anything can happen
-                problems.append(f"{path}: {_told(problem)}")
-            else:
-                yield str(path), module
-    for point in plugins.entry_points():
-        try:
-            module = importlib.import_module(point.module)
-        except (Exception, SystemExit) as problem:
-            problems.append(f"{point.name} ({point.value}): {_told(problem)}")
-        else:
-            yield f"{point.name} ({point.value})", module
-
-
-def find() -> tuple[dict[str, type[Stage]], list[str]]:
-    """All representations by kind, parents first, and a line for each plugin that is left out."""
-    stages = own()
-    problems: list[str] = []
-    offered = []
-    for origin, module in _plugin_modules(problems):
-        found = _stages_in(module)
-        if not found:
-            problems.append(f"{origin}: it defines no representation")
-        offered += [(origin, stage) for stage in found.values()]
-    # a plugin may hang on another one, whatever their order
-    while offered:
-        taken = [(origin, stage) for origin, stage in offered if not _clash(stage, stages)]
-        if not taken:
-            problems += [f"{origin}: {stage.REPRESENTATION.kind}: {_clash(stage, stages)}" for origin, stage in offered]
-            break
-        stages[taken[0][1].REPRESENTATION.kind] = checked(taken[0][1])
-        offered.remove(taken[0])
-    return _ordered(stages), problems
-
-
-STAGES, PROBLEMS = find()
+_SEARCH = _Search()
+STAGES, PLUGINS, PROBLEMS, WARNINGS = _SEARCH.stages, _SEARCH.plugins, _SEARCH.problems, _SEARCH.warnings
 OWN = frozenset(own())  # kinds that are no plugins

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from .checks import as_tuple, bad_name, bad_text, is_number, short, twice
 from .idl import SCALARS, element, ros_type
 from .words import meant, nearest
 
@@ -57,6 +58,68 @@ class Parameter:
     zero_is_default: bool = True  # in ROS requests, which carry no defaults
     follows_rate: bool = False  # where it is not given, the sample rate may make another one of the default
     checked_by_client: bool = False  # as the component, for which it is a number, cannot name what is allowed
+
+    def __post_init__(self) -> None:
+        for problem in self._problems():
+            raise ValueError(f"parameter {short(self.name)}: {problem}")
+
+    def _problems(self) -> Iterator[str]:
+        if problem := bad_name(self.name):
+            yield f"name: {problem}"
+        if not isinstance(self.idl, str) or (element(self.idl) or self.idl) not in SCALARS:
+            yield f"type: expected one of {', '.join(SCALARS)} or sequence<one of them>, got {short(self.idl)}"
+        if problem := bad_text(self.doc):
+            yield f"doc: {problem}"
+        for name in ("fallback", "unit"):
+            if problem := bad_text(getattr(self, name), empty=True):
+                yield f"{name}: {problem}"
+        for name in ("open_minimum", "zero_is_default", "follows_rate"):
+            if not isinstance(getattr(self, name), bool):
+                yield f"{name}: expected True or False, got {short(getattr(self, name))}"
+        yield from self._bad_limits()
+        yield from self._bad_words()
+        if self.default is not REQUIRED:
+            try:
+                checked = self.check(self.default)
+            except ValueError as problem:
+                yield f"default: {problem}"
+            if element(self.idl) and not isinstance(self.default, tuple):
+                object.__setattr__(self, "default", tuple(checked))  # a list can change, and has no hash
+
+    def _bad_limits(self) -> Iterator[str]:
+        numeric = (element(self.idl) or self.idl) not in ("string", "boolean")
+        for name in ("minimum", "maximum"):
+            limit = getattr(self, name)
+            if limit is not None and not (numeric and is_number(limit)):
+                yield f"{name}: expected {'a finite number or ' if numeric else ''}None, got {short(limit)}"
+        if self.minimum is not None and self.maximum is not None and self.minimum > self.maximum:
+            yield f"minimum: {self.minimum} is above the maximum, {self.maximum}"
+        for name in ("least", "most", "longest"):
+            if type(getattr(self, name)) is not int or getattr(self, name) < 0:
+                yield f"{name}: expected a count, got {short(getattr(self, name))}"
+        if self.least > self.most:
+            yield f"least: {self.least} is above most, {self.most}"
+
+    def _bad_words(self) -> Iterator[str]:
+        for name in ("choices", "aliases", "former"):
+            if problem := as_tuple(self, name, str, "strings"):
+                yield problem
+        if self.choices and (element(self.idl) or self.idl) != "string":
+            yield f"choices: only a string has any, not {self.idl}"
+        for word in self.choices:
+            if problem := bad_text(word, empty=True):
+                yield f"choices: {problem}"
+        if word := twice(self.choices):
+            yield f"choices: {short(word)} occurs twice"
+        if self.fallback and self.fallback not in self.choices:
+            yield f"fallback: expected one of the choices, got {short(self.fallback)}"
+        for name in self.aliases:
+            if problem := bad_name(name):
+                yield f"aliases: {problem}"
+        if not isinstance(self.spellings, Mapping) or not all(
+            isinstance(word, str) for pair in self.spellings.items() for word in pair
+        ):
+            yield f"spellings: expected a mapping of strings to strings, got {short(self.spellings)}"
 
     @property
     def ros(self) -> str:

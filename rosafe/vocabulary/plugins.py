@@ -1,24 +1,46 @@
-"""Where plugins are looked for, and whether there may be any; rosafe/representations finds and checks them."""
+"""Where plugins are searched for, and whether this process imports any; rosafe/representations loads them."""
 
 from __future__ import annotations
 
 import importlib.metadata
 import os
+from collections.abc import Callable
 
-FOLDERS = "ROSAFE_PLUGINS"  # environment variable with folders, as PATH
+FOLDERS = "ROSAFE_PLUGINS"  # environment variable: folders, or single files, separated as in PATH
 ENTRY_POINTS = "rosafe.representations"  # group of entry points of installed packages
+SKIPPED = (".", "_", "test_")  # beginnings of the names of files that are not loaded
+
+_disabled = False
+# Called with the origin of each plugin before it is imported, so that one that ends the process can be named
+before_import: Callable[[str], None] = lambda origin: None  # noqa: E731
 
 
-def folders() -> list[str]:
-    """The folders that the user names."""
+def disable() -> None:
+    """Import no plugins in this process; to be called before rosafe.representations is imported."""
+    global _disabled
+    _disabled = True
+
+
+def named() -> list[str]:
+    """The folders that the environment names."""
     return [folder for folder in os.environ.get(FOLDERS, "").split(os.pathsep) if folder]
 
 
+def folders() -> list[str]:
+    """The folders whose plugins this process imports."""
+    return [] if _disabled else named()
+
+
 def entry_points() -> importlib.metadata.EntryPoints:
-    """Those of installed packages."""
-    return importlib.metadata.entry_points(group=ENTRY_POINTS)
+    """The entry points of installed packages that this process imports."""
+    return importlib.metadata.EntryPoints() if _disabled else importlib.metadata.entry_points(group=ENTRY_POINTS)
 
 
 def expected() -> bool:
-    """Whether it is worth looking: a plugin's code is run for nothing else."""
+    """Whether there may be plugins to import."""
     return bool(folders() or entry_points())
+
+
+def where() -> str:
+    """Where this process searched, for messages."""
+    return f"{FOLDERS} is {os.pathsep.join(named())}" if named() else f"{FOLDERS} is not set"

@@ -2,14 +2,44 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 
-from .parameter import Parameter
+from .checks import as_tuple, bad_name, bad_text, short, twice
+from .idl import SCALARS, element
+from .parameter import REQUIRED, Parameter
 
 AXES = ("ear", "channel", "lag", "filter", "feature", "time")
-_WORD = re.compile(r"[A-Za-z][A-Za-z0-9_]*")
+# Other fields of the requests that a parameter goes into, and arguments of Stage
+RESERVED_PARAMETERS = frozenset(
+    [
+        "name",
+        "upperDepName",
+        "representation",
+        "connect",
+        "parameters",
+        "nFramesPerBlock",
+        "bufferSize_s_port",
+        "bufferSize_s_getSignal",
+        "input_format",
+        "given",
+        "sample_rate",
+        "block_frames",
+    ]
+)
+# Other fields of the message, and other results that begin with the kind
+RESERVED_PARTS = frozenset(
+    [
+        "sampleRate",
+        "lastFrameIndex",
+        "framesOnPort",
+        "numberOfLags",
+        "numberOfFilters",
+        "numberOfChannels",
+        "time",
+        "frameRate",
+    ]
+)
 
 
 @dataclass(frozen=True)
@@ -30,6 +60,13 @@ class Part:
     axes: tuple[str, ...]
     unit: str = ""
 
+    def __post_init__(self) -> None:
+        problem = as_tuple(self, "axes", str, "strings") or bad_text(self.unit, empty=True)
+        if name := bad_name(self.name):
+            problem = f"name: {name}"
+        if problem:
+            raise ValueError(f"part {short(self.name)}: {problem}")
+
 
 @dataclass(frozen=True)
 class Derived:
@@ -39,6 +76,13 @@ class Derived:
     idl: str
     doc: str
     unit: str = ""
+
+    def __post_init__(self) -> None:
+        problem = bad_name(self.name) or bad_text(self.doc) or bad_text(self.unit, empty=True)
+        if not isinstance(self.idl, str) or (element(self.idl) or self.idl) not in SCALARS:
+            problem = f"type: expected a type of parameters, got {short(self.idl)}"
+        if problem:
+            raise ValueError(f"derived value {short(self.name)}: {problem}")
 
 
 @dataclass(frozen=True)
@@ -98,6 +142,8 @@ class Representation:
     word_aliases: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
+        for problem in self._bad_types():
+            raise ValueError(f"representation {short(self.kind)}: {problem}")
         kind = self.kind
         capital = kind[:1].upper() + kind[1:]
         defaults = {
@@ -115,25 +161,87 @@ class Representation:
             raise ValueError(f"representation {kind!r}: {problem}")
 
     def _problems(self) -> Iterator[str]:
-        names = [self.kind, self.name, self.request, self.port, self.word, *(p.name for p in self.parameters)]
-        for name in names:
-            if not (isinstance(name, str) and _WORD.fullmatch(name)):
-                yield f"{name!r} is no name: a letter, then letters, digits and _"
-        if not self.doc or "\n" in self.doc:
-            yield "doc: wanted is one line"
+        """What is wrong with the declaration by itself; rosafe/representations checks how it fits the others."""
+        for field in ("name", "request", "port", "word"):
+            if problem := bad_name(getattr(self, field)):
+                yield f"{field}: {problem}"
+        for field in ("request_aliases", "port_aliases", "word_aliases"):
+            for name in getattr(self, field):
+                if problem := bad_name(name):
+                    yield f"{field}: {problem}"
+        for field in ("doc", "name_doc", "port_doc"):
+            if problem := bad_text(getattr(self, field)):
+                yield f"{field}: {problem}"
+        if self.parent and (problem := bad_name(self.parent)):
+            yield f"parent: {problem}"
+        if problem := bad_text(self.unit, empty=True):
+            yield f"unit: {problem}"
+        yield from self._bad_parts()
+        yield from self._bad_values()
+
+    def _bad_types(self) -> Iterator[str]:
+        if problem := bad_name(self.kind):
+            yield f"kind: {problem}"
+        for field in ("doc", "parent", "unit", "centred", "name", "name_doc", "request", "port", "port_doc", "word"):
+            if not isinstance(getattr(self, field), str):
+                yield f"{field}: expected a string, got {short(getattr(self, field))}"
+        if not isinstance(self.allow_nan, bool):
+            yield f"allow_nan: expected True or False, got {short(self.allow_nan)}"
+        words = "axes", "request_order", "coordinates", "features", "request_aliases", "port_aliases", "word_aliases"
+        kinds: tuple[tuple[str, type, str], ...] = (
+            *((field, str, "strings") for field in words),
+            ("parts", Part, "Part"),
+            ("parameters", Parameter, "Parameter"),
+            ("derived", Derived, "Derived"),
+        )
+        for field, of, what in kinds:
+            if problem := as_tuple(self, field, of, what):
+                yield problem
+
+    def _bad_parts(self) -> Iterator[str]:
         for part in self.parts:
-            if part.axes[-1:] != ("time",) or len(set(part.axes)) < len(part.axes) or not set(part.axes) <= set(AXES):
-                yield f"axes: {part.axes} are not different ones of {', '.join(AXES)}, time last"
-        own = [name for p in self.parameters for name in (p.name, *p.aliases, *p.former)]
-        if len(set(own)) < len(own):
-            yield "parameters: two have one name"
-        if self.request_order and sorted(self.request_order) != sorted(p.name for p in self.parameters):
-            yield "request_order: wanted are the names of all parameters"
-        known = {p.name for p in self.parameters} | {d.name for d in self.derived}
-        for name in set(self.coordinates) - known:
-            yield f"coordinates: there is no {name!r}"
+            axes = part.axes
+            if axes[-1:] != ("time",) or len(set(axes)) < len(axes) or not set(axes) <= set(AXES):
+                yield f"axes: expected different ones of {', '.join(AXES)}, time last, got {short(axes)}"
+            if "ear" in axes[1:]:
+                yield f"axes: expected ear first, got {short(axes)}"
+        if name := twice(part.name for part in self.parts):
+            yield f"parts: two are called {name!r}"
+        if len(self.parts) > 1:
+            for part in self.parts:
+                if part.name in RESERVED_PARTS:
+                    yield f"parts: {part.name!r} is the name of another field of the message, or of another result"
+        axes = tuple(axis for part in self.parts for axis in part.axes)
+        if self.centred and (self.centred not in axes or self.centred == "time"):
+            yield f"centred: expected one of the axes, got {short(self.centred)}"
+        if self.features:
+            if "feature" not in axes:
+                yield "features: expected none without an axis feature"
+            for name in self.features:
+                if problem := bad_text(name):
+                    yield f"features: {problem}"
+            if name := twice(self.features):
+                yield f"features: {name!r} occurs twice"
+
+    def _bad_values(self) -> Iterator[str]:
         for parameter in self.parameters:
-            parameter.check(parameter.default)
+            if parameter.default is REQUIRED:
+                yield f"parameters: {parameter.name} has no default"
+        own = [name for p in self.parameters for name in (p.name, *p.aliases, *p.former)]
+        own += [derived.name for derived in self.derived]
+        if name := twice(own):
+            yield f"parameters: two parameters, or a derived value, are called {name!r}"
+        for name in own:
+            if name in RESERVED_PARAMETERS or name.startswith("genom_"):
+                yield f"parameters: {name!r} is the name of another field of the request"
+        if self.request_order and sorted(self.request_order) != sorted(p.name for p in self.parameters):
+            yield "request_order: expected the names of all parameters, each once"
+        types = {p.name: p.idl for p in self.parameters} | {d.name: d.idl for d in self.derived}
+        for name in self.coordinates:
+            if not types.get(name, "").startswith("sequence<"):
+                yield f"coordinates: expected a parameter or derived value that is a sequence, got {name!r}"
+        if name := twice(self.coordinates):
+            yield f"coordinates: {name!r} occurs twice"
 
     def parameter(self, name: str) -> Parameter:
         """The parameter that modifyParameter calls `name`, or KeyError."""

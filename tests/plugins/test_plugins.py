@@ -23,7 +23,6 @@ BROKEN = {
     "no_such_import.py": ("import nothing_like_this", "ModuleNotFoundError"),
     "syntax.py": ("class :", "SyntaxError"),
     "leaves.py": ("import sys; sys.exit(3)", "SystemExit"),
-    "empty.py": ("", "no representation"),
     "declared_wrong.py": (
         "from rosafe.vocabulary.representation import Representation\n"
         "Representation(kind='x', doc='x', parent='ihc', axes=('channel',))\n",
@@ -39,11 +38,14 @@ from rosafe.vocabulary.representation import Representation
 class Taken(Stage):
     REPRESENTATION = Representation(kind={kind!r}, doc="x", parent={parent!r}, axes=("ear", "channel", "time"),
         parameters=(Parameter({parameter!r}, "double", 1.0, "x", 0.0, 2.0),))
+
+    def process(self, block, extra=None):
+        return block.copy()
 """
 CLASHES = {
-    "same_kind.py": (("ild", "ihc", "mine_x"), "a kind 'ild' already"),
-    "same_word.py": (("Ratemap", "ihc", "mine_x"), "already"),
-    "orphan.py": (("mine", "nobody", "mine_x"), "'nobody' is no kind"),
+    "same_kind.py": (("ild", "ihc", "mine_x"), "ild has 'ild' already"),
+    "same_word.py": (("Ratemap", "ihc", "mine_x"), "ratemap has 'Ratemap' already"),
+    "orphan.py": (("mine", "nobody", "mine_x"), "'nobody' is not a known kind"),
     "same_parameter.py": (("mine", "ihc", "fb_nERBs"), "'fb_nERBs'"),
 }
 
@@ -114,7 +116,7 @@ def test_broken_ones_are_named_and_left_out(folder: Path) -> None:
 
 def test_a_folder_that_is_not_there_is_named(tmp_path: Path) -> None:
     done = python("from rosafe.representations import PROBLEMS; print(PROBLEMS)", tmp_path / "none")
-    assert "no folder" in done.stdout
+    assert "not a folder that can be read: No such file" in done.stdout
 
 
 def test_an_installed_package(folder: Path, tmp_path: Path) -> None:

@@ -9,9 +9,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from rosafe.vocabulary.representation import Part, Representation
+from .representation import Part, Representation
 
-from .service import Struct
+Struct = tuple[tuple[str, str], ...]  # (member, IDL type)
 
 SIGNALS: dict[str, Struct] = {
     "::rosAFE::signalOneD": (("data", "sequence<double>"),),
@@ -73,13 +73,19 @@ def _type(kind: str, part: Part, single: bool) -> str:
 
 
 def layout(representation: Representation) -> Layout:
-    """How what `representation` puts out travels. ValueError where there is no message for its axes."""
+    """How what `representation` puts out travels. Raises ValueError if no message has room for its axes."""
     parts, single = representation.parts, len(representation.parts) == 1
     kind = _type(representation.kind, parts[0], single)
     largest = max(parts, key=lambda part: len(_rows(part)))
     rows = _rows(largest)
-    if len(rows) > 2 or (not single and not representation.binaural):
-        raise ValueError(f"representation {representation.kind!r}: no message has room for {largest.axes}")
+    if len(rows) > 2:
+        raise ValueError(f"axes: expected at most two besides ear and time, got {', '.join(rows)}")
+    for part in () if single else parts:
+        if "ear" in part.axes:
+            raise ValueError(
+                f"parts: {part.name!r} has the axis ear; a representation of several parts cannot have it, "
+                "so declare one representation for each part"
+            )
     if len(rows) == 1:  # of TimeFrequency, whatever the rows are
         counted = {"channel": 0}
     elif kind == "Modulation":

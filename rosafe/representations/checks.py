@@ -1,0 +1,182 @@
+"""Whether a plugin goes together with the tree and the other representations. Its fields are checked already."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+from rosafe.dsp.framing import FramedStage
+from rosafe.dsp.stage import Stage
+from rosafe.vocabulary.checks import bad_name, short
+from rosafe.vocabulary.representation import Representation
+from rosafe.vocabulary.signals import layout
+
+# What the component calls its own requests and topics, and the structures of its messages; see rosafe/interface
+REQUESTS = [
+    "Stop",
+    "abort_activity",
+    "connect_port",
+    "connect_service",
+    "find",
+    "getDependencies",
+    "getParameters",
+    "getProcessors",
+    "getRepresentation",
+    "getSignal",
+    "getSignals",
+    "kill",
+    "loadSetup",
+    "modifyParameter",
+    "removeProcessor",
+    "request",
+    "saveSetup",
+]
+PORTS = ["Audio", "dataObj", "frameTime", "genom_state", "trace"]
+STRUCTS = ["TimeDomain", "TimeFrequency", "AutoCorrelation", "CrossCorrelation", "Modulation"]
+
+# Types that every client of requests can send: Python, ROS, HTTP, Tcl, MATLAB and the live page
+TYPES = (
+    "boolean",
+    "unsigned long",
+    "unsigned long long",
+    "long",
+    "double",
+    "string",
+    "sequence<double>",
+    "sequence<string>",
+)
+# Methods that the tree calls, with their arguments
+METHODS: dict[str, tuple[Any, ...]] = {
+    "process": ("block",),
+    "reset": (),
+    "build": ("values", "changed"),
+    "input_format_changed": ("before",),
+    "output_rows": ("rows",),
+    "part_rows": ("rows",),
+    "output_count": ("count",),
+    "state_size": ("rows",),
+    "frame": ("frames",),
+}
+
+
+def problem_of(stage: Any, others: Mapping[str, type[Stage]]) -> str:
+    """Why `stage` cannot be used beside `others`; empty if it can."""
+    try:
+        return next(_problems(stage, others), "")
+    except Exception as problem:  # attributes of somebody else's class
+        return f"{type(problem).__name__}: {' '.join(str(problem).split())}"
+
+
+def _problems(stage: Any, others: Mapping[str, type[Stage]]) -> Iterator[str]:
+    mine = stage.REPRESENTATION
+    try:
+        layout(mine)
+    except ValueError as problem:
+        yield str(problem)
+    yield from _of_class(stage)
+    if not mine.parent:
+        yield "parent: expected a kind of processor, got none"
+    if mine.parent not in others:
+        yield f"parent: {mine.parent!r} is not a known kind; there are {', '.join(others)}"
+    for parameter in mine.parameters:
+        if parameter.idl not in TYPES:
+            yield f"parameters: {parameter.name} is of type {parameter.idl}; expected one of {', '.join(TYPES)}"
+    yield from _reserved(mine)
+    for other in others.values():
+        yield from _conflicts(mine, other.REPRESENTATION)
+    yield from _extras(stage, others[mine.parent])
+
+
+def _of_class(stage: Any) -> Iterator[str]:
+    """What is wrong with the class itself."""
+    mine = stage.REPRESENTATION
+    if not (isinstance(stage, type) and issubclass(stage, Stage)):
+        yield f"{stage.__name__}: expected a subclass of Stage or FramedStage"
+    for name, arguments in METHODS.items():
+        method = getattr(stage, name, None)
+        if method is None and name == "frame":
+            continue
+        try:
+            inspect.signature(method).bind(None, *arguments)  # type: ignore[arg-type]
+        except (TypeError, ValueError):
+            yield f"{name}: expected a method {name}({', '.join(('self', *arguments))}), got {short(method)}"
+    if stage.process is Stage.process or (
+        stage.process is FramedStage.process and getattr(stage, "frame", None) is FramedStage.frame
+    ):
+        yield "expected a method process, or frame in a FramedStage; there is none"
+    if issubclass(stage, FramedStage):
+        prefix = getattr(stage, "prefix", None)
+        if problem := bad_name(prefix):
+            yield f"prefix: {problem}"
+        for end in ("wname", "wSizeSec", "hSizeSec"):
+            if f"{prefix}_{end}" not in {p.name for p in mine.parameters}:
+                yield f"prefix: there is no parameter {prefix}_{end}; expected frame_parameters({prefix!r})"
+    if mine.derived and stage.derived is Stage.derived:
+        yield f"derived: {mine.derived[0].name} is declared, but the property derived is missing"
+    if len(mine.parts) > 1 and stage.part_rows is Stage.part_rows:
+        yield f"parts: {len(mine.parts)} are declared, but the method part_rows is missing"
+    if not isinstance(stage.EXTRAS, (tuple, list)) or any(bad_name(name) for name in stage.EXTRAS):
+        yield f"EXTRAS: expected a tuple of names, got {short(stage.EXTRAS)}"
+    for name, kind in (("look_ahead", int), ("required_extra", str)):
+        value = getattr(stage, name)
+        if not (hasattr(value, "__get__") and not inspect.isfunction(value)) and not isinstance(value, kind):
+            yield f"{name}: expected a property, got {short(value)}"
+
+
+def _extras(stage: type[Stage], parent: type[Stage]) -> Iterator[str]:
+    if stage.required_extra is not Stage.required_extra and len(inspect.signature(stage.process).parameters) < 3:
+        yield "required_extra: expected a method process(self, block, extra=None) that takes it"
+    needed = vars(stage).get("required_extra", "")
+    if isinstance(needed, str) and needed and needed not in parent.EXTRAS:
+        yield f"required_extra: {parent.REPRESENTATION.kind} has no {needed!r}"
+
+
+def _commands(one: Representation) -> tuple[str, ...]:
+    """Its requests and ports, which are commands of one namespace in Tcl and MATLAB."""
+    return (one.request, *one.request_aliases, one.port, *one.port_aliases)
+
+
+def _words(one: Representation) -> tuple[str, ...]:
+    return (one.kind, one.word, *one.word_aliases)
+
+
+def _results(one: Representation) -> set[str]:
+    """The keys of results of `rosafe.process`."""
+    return {*one.outputs, f"{one.kind}_time", f"{one.kind}_frameRate", *one.coordinates}
+
+
+def _values(one: Representation) -> set[str]:
+    return {name for p in one.parameters for name in (p.name, *p.aliases, *p.former)} | {d.name for d in one.derived}
+
+
+def _reserved(mine: Representation) -> Iterator[str]:
+    lower = {name.lower() for name in (*REQUESTS, *PORTS)}
+    commands = [name.lower() for name in _commands(mine)]
+    for name in _commands(mine):
+        if name.lower() in lower or name.startswith("genom_"):
+            yield f"request or port: {name!r} is one of the component's own"
+        if commands.count(name.lower()) > 1:
+            yield f"request or port: there are two called {name!r}, apart from upper and lower case"
+    if len(mine.parts) > 1 and mine.kind.lower() in {name.lower() for name in STRUCTS}:
+        yield f"kind: {mine.kind!r} is the name of another message"
+    keys = [*mine.outputs, f"{mine.kind}_time", f"{mine.kind}_frameRate", *mine.coordinates]
+    if len(set(keys)) < len(keys):
+        yield f"coordinates: two results of rosafe.process would have one name, of {', '.join(keys)}"
+
+
+def _conflicts(mine: Representation, other: Representation) -> Iterator[str]:
+    """What both would be called; case does not count where it does not in names of files and commands."""
+    for what, names in (("kind or word", _words), ("request or port", _commands), ("task", lambda one: (one.task,))):
+        taken = {name.lower() for name in names(other)}
+        for name in names(mine):
+            if name.lower() in taken:
+                yield f"{what}: {other.kind} has {name!r} already"
+    if mine.name == other.name:
+        yield f"name: {other.kind} has {mine.name!r} already"
+    if len(mine.parts) > 1 < len(other.parts) and mine.kind.lower() == other.kind.lower():
+        yield f"kind: {other.kind} has {mine.kind!r} already"
+    if both := _values(mine) & _values(other):
+        yield f"parameters: {other.kind} has {min(both)!r} already"
+    if both := _results(mine) & _results(other):
+        yield f"results: {other.kind} has {min(both)!r} already"
