@@ -185,8 +185,9 @@ class Representation:
         for field in ("doc", "parent", "unit", "centred", "name", "name_doc", "request", "port", "port_doc", "word"):
             if not isinstance(getattr(self, field), str):
                 yield f"{field}: expected a string, got {short(getattr(self, field))}"
-        if not isinstance(self.allow_nan, bool):
-            yield f"allow_nan: expected True or False, got {short(self.allow_nan)}"
+        allow_nan: object = self.allow_nan
+        if not isinstance(allow_nan, bool):
+            yield f"allow_nan: expected True or False, got {short(allow_nan)}"
         words = "axes", "request_order", "coordinates", "features", "request_aliases", "port_aliases", "word_aliases"
         kinds: tuple[tuple[str, type, str], ...] = (
             *((field, str, "strings") for field in words),
