@@ -107,7 +107,7 @@ class Proxy:
         self._actions: dict[str, asyncio.Task[ActionClient]] = {}
         self._readers: dict[str, TopicReader] = {}
         self._link: asyncio.Task[None] | None = None
-        self._building = asyncio.Lock()  # one tree at a time
+        self.turns = building.Turns()
         self.pending = 0  # requests that are not answered yet
         self.used_at = asyncio.get_running_loop().time()
 
@@ -170,7 +170,8 @@ class Proxy:
             return await self._call_action(service, values)
         with self._one_more():
             if service in self.component.composites:
-                async with self._building:
+                own = service == LOAD_SETUP  # which gives way
+                async with contextlib.nullcontext() if own else self.turns.turn():
                     answer = await _COMPOSITES[service.name](self, values)
                 return Value(self.component, service.outputs, answer)
             client = self._client(service.name)

@@ -68,7 +68,8 @@ async def load(component: Component, values: Mapping[str, Any]) -> dict[str, Any
         setup = await asyncio.to_thread(read, values["setup"])
     except SetupError as problem:
         raise refused(str(problem)) from None
-    return await apply(component, setup)
+    async with component.turns.setup(wanted.name for wanted in setup.processors), component.turns.turn():
+        return await apply(component, setup)
 
 
 async def apply(component: Component, setup: Setup, wait: float = 0.0) -> dict[str, Any]:
@@ -192,9 +193,12 @@ async def _make(component: Component, setup: Setup, made: list[str], patient: bo
         try:
             for step in now.steps:
                 await uncancelled(take_step(component, step, made))
+                if await component.turns.give_way():
+                    break  # the others may have changed the tree
         except ComponentError as error:
             if error.ex == "::rosAFE::e_noData" and asyncio.get_running_loop().time() < deadline:
                 await asyncio.sleep(PAUSE)
+                await component.turns.give_way()
                 continue
             if not request.is_race(error):
                 raise

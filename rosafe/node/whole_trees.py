@@ -25,6 +25,7 @@ class WholeTrees:
         self.instance = node.name.strip("/")
         self._node = node
         self._heard = heard
+        self.turns = building.Turns()
         self._building = threading.Lock()  # one tree at a time: what one has found is not removed by another that fails
 
     def build(self, values: Mapping[str, Any]) -> dict[str, Any]:
@@ -38,6 +39,7 @@ class WholeTrees:
         except ValueError as problem:
             raise ROSAFE.error("e_badNewValue", what=str(problem)) from None
         with self._building:
+            self.turns = building.Turns()  # of this event loop; there is nobody to give way to
             return asyncio.run(building.build(self, given))
 
     async def outputs(self, service: str, values: Mapping[str, Any]) -> Mapping[str, Any]:

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Mapping
+import math
+from collections import Counter
+from collections.abc import AsyncIterator, Awaitable, Iterable, Mapping
+from contextlib import asynccontextmanager
 from typing import Any, Protocol, TypeVar
 
 from rosafe.interface import BLOCK_AND_BUFFERS, KINDS, REQUEST, ROSAFE, ComponentError
@@ -14,15 +17,69 @@ from rosafe.tree.requests import Found, Plan, Step, Wish
 TRIES = 20  # plans that others' changes of the tree may spoil before the error is told
 INPUT_SECONDS = 1.5  # longer than an InputProc waits for sound
 POLL_SECONDS = 0.02
+LOOK_SECONDS = 0.1  # between two looks at the tree while many processors are removed
 BEGIN_BLOCKS, BEGIN_SECONDS = 2.5, 2.0  # how long plugins are watched after they were started: blocks, at most seconds
 
 T = TypeVar("T")
+
+
+class Turns:
+    """Takes turns among the builds of one component, first come, first served.
+
+    A setup is long: it gives way to waiting builds between two of its steps, and then looks at the tree again.
+
+    Attributes
+    ----------
+    reserved : frozenset of str
+        The names that a setup under way makes; other builds choose different ones.
+    kept : set of str
+        What other builds use of it; it stays also if the setup fails.
+    """
+
+    def __init__(self) -> None:
+        self.reserved: frozenset[str] = frozenset()
+        self.kept: set[str] = set()
+        self._setups = asyncio.Lock()
+        self._lock = asyncio.Lock()
+        self._waiting = 0
+
+    @asynccontextmanager
+    async def turn(self) -> AsyncIterator[None]:
+        """Have the turn inside the `async with` block."""
+        self._waiting += 1
+        try:
+            await self._lock.acquire()
+        finally:
+            self._waiting -= 1
+        try:
+            yield
+        finally:
+            self._lock.release()
+
+    @asynccontextmanager
+    async def setup(self, names: Iterable[str]) -> AsyncIterator[None]:
+        """Reserve the names of a setup inside the block. One setup at a time."""
+        async with self._setups:
+            self.reserved, self.kept = frozenset(names), set()
+            try:
+                yield
+            finally:
+                self.reserved, self.kept = frozenset(), set()
+
+    async def give_way(self) -> bool:
+        """Let all waiting builds have their turn; return whether there were any. To be called by whose turn it is."""
+        if not self._waiting:
+            return False
+        self._lock.release()
+        await uncancelled(self._lock.acquire())
+        return True
 
 
 class Services(Protocol):
     """A rosAFE, by its services."""
 
     instance: str
+    turns: Turns
 
     async def outputs(self, service: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
         """What a service returns; an activity, nothing, as soon as it runs. Raises ComponentError."""
@@ -55,6 +112,7 @@ async def build(component: Services, values: Mapping[str, Any]) -> dict[str, Any
     except BaseException:
         await uncancelled(remove(component, made))
         raise
+    component.turns.kept.update(dependencies)
     return request.answer(wish, dependencies, made, component.instance)
 
 
@@ -91,7 +149,7 @@ async def _understood(values: Mapping[str, Any]) -> Wish:
 async def _carry_out(component: Services, wish: Wish, made: list[str]) -> list[str]:
     problem = ComponentError("::genom::mwerr", what="others change the tree all the time")
     for _ in range(TRIES):
-        plan = request.plan(wish, await look(component))
+        plan = request.plan(wish, await look(component), component.turns.reserved)
         try:
             await _take_steps(component, wish, plan, made)
         except ComponentError as error:
@@ -165,15 +223,22 @@ async def look(component: Services) -> list[Found]:
 
 async def remove(component: Services, made: list[str]) -> None:
     """Remove what was made, leaves first, but nothing that others have come to use. Errors are told by what failed."""
+    clock, looked = asyncio.get_running_loop().time, -math.inf
+    found: dict[str, Found] = {}
+    children: Counter[str] = Counter()
     try:
         for name in reversed(made):
-            found = await look(component)
-            this = next((p for p in found if p.name == name), None)
-            if this is None or any(p.parent == name for p in found):
+            if await component.turns.give_way() or clock() - looked > LOOK_SECONDS:
+                found, looked = {p.name: p for p in await look(component)}, clock()
+                children = Counter(p.parent for p in found.values())
+            if name not in found or children[name] or name in component.turns.kept:
                 continue
-            if this.parent:
+            parent = found[name].parent
+            if parent:
                 await component.outputs("removeProcessor", {"name": name})
             elif len(found) == 1:
                 await component.outputs("Stop", {})
+            del found[name]
+            children[parent] -= 1
     except ComponentError:
         return

@@ -156,8 +156,8 @@ def _level(kind: Representation, checked: Mapping[str, Any]) -> Level:
 # --- what to do -------------------------------------------------------------------------------------------------
 
 
-def plan(wish: Wish, found: Sequence[Found]) -> Plan:
-    """What to do for `wish` in a tree that consists of `found`.
+def plan(wish: Wish, found: Sequence[Found], reserved: Collection[str] = ()) -> Plan:
+    """What to do for `wish` in a tree that consists of `found`; new processors get none of the names `reserved`.
 
     What is there and fits is used, as far down as possible; the rest is made below it, under new names.
 
@@ -170,7 +170,7 @@ def plan(wish: Wish, found: Sequence[Found]) -> Plan:
     if root is not None:
         _check_input(root, wish.levels[0])
     reused = _deepest(wish.levels, found, root.rate if root is not None else 0.0)
-    names = {p.name for p in found}
+    names = {*reserved, *(p.name for p in found)}
     dependencies, steps = reused[:], []
     for level in wish.levels[len(reused) :]:
         name = free_name(level.kind, names)

@@ -12,6 +12,7 @@ from rosafe.dsp.signal import Signal
 from rosafe.dsp.stage import Stage
 from rosafe.interface import KINDS, ROSAFE, ComponentError, text_of
 from rosafe.representations import STAGES
+from rosafe.tree.building import Turns
 
 RATE = 44100.0
 KIND_OF_SERVICE = {kind.request: kind for kind in KINDS.values()}
@@ -31,6 +32,7 @@ class Model:
 
     def __init__(self, audio: bool = True, sample_rate: float = RATE) -> None:
         self.instance = "rosAFE"
+        self.turns = Turns()
         self.sample_rate = sample_rate
         self.processors: dict[str, Processor] = {}
         self.calls: list[str] = []
