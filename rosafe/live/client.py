@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
+import logging
 import socket
 import struct
 from collections import deque
-from collections.abc import Awaitable, Callable, Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from typing import Any, NamedTuple
 
-from aiohttp import WSMsgType, web
+from aiohttp import WSCloseCode, WSMsgType, web
 
 from rosafe.genomix.tasks import shared
 from rosafe.http_server.listener import connection_of
@@ -31,7 +33,15 @@ STALL_SECONDS = 30.0  # a client that takes nothing for so long is dropped
 BEHIND_SECONDS = 1.0  # of columns that one gets that was slow; those before are skipped
 HEARTBEAT_SECONDS = 15.0
 HEAD = struct.Struct("<HHI")  # format, pieces, nothing
-FORMAT = 1
+FORMAT = 2
+MAX_REASON = 123  # bytes, of a WebSocket's close frame
+REASONS: dict[int, bytes] = {
+    WSCloseCode.PROTOCOL_ERROR: b"expected a valid WebSocket frame",
+    WSCloseCode.INVALID_TEXT: b"expected a text in UTF-8",
+    WSCloseCode.MESSAGE_TOO_BIG: b"expected a message of at most %d MiB" % (MAX_MESSAGE >> 20),
+}
+
+log = logging.getLogger("rosout.rosafe_live")  # stderr and /rosout, as rospy.logerr
 
 Ask = Callable[[Mapping[str, Any]], Awaitable[dict[str, Any]]]
 
@@ -41,6 +51,13 @@ class _Looking(NamedTuple):
 
     view: View
     description: dict[str, Any]
+
+
+class _Socket(web.WebSocketResponse):
+    """A WebSocket that gives a reason also if aiohttp closes it."""
+
+    async def close(self, *, code: int = WSCloseCode.OK, message: bytes = b"") -> bool:
+        return await super().close(code=code, message=message or REASONS.get(code, b""))
 
 
 class Client:
@@ -57,9 +74,7 @@ class Client:
 
     def __init__(self, hub: Hub, asks: Mapping[str, Ask], changed: Callable[[], None]) -> None:
         self._hub, self._asks, self._changed = hub, asks, changed
-        self._socket = web.WebSocketResponse(
-            max_msg_size=MAX_MESSAGE, compress=False, heartbeat=HEARTBEAT_SECONDS, timeout=2.0
-        )
+        self._socket = _Socket(max_msg_size=MAX_MESSAGE, compress=False, heartbeat=HEARTBEAT_SECONDS, timeout=2.0)
         self._wake = asyncio.Event()
         self._newest: dict[str, str] = {}  # messages of which only the last one counts
         self._answers: deque[str] = deque()  # to requests, of which there are few
@@ -69,6 +84,7 @@ class Client:
         self._cursors: dict[Key, int] = {}
         self._wanted: list[Key] = []
         self._turn = asyncio.Lock()  # for changes of what it looks at
+        self._failure: asyncio.Task[None] | None = None  # closes the connection, with its reason
 
     async def serve(self, request: web.Request) -> web.WebSocketResponse:
         """Until the page goes."""
@@ -78,23 +94,46 @@ class Client:
         if transport is None:
             return self._socket
         transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, KERNEL_BYTES)
-        sender = asyncio.create_task(self._send(transport))
+        sender = asyncio.create_task(self._keep_sending(transport))
         try:
-            async for message in self._socket:
-                if message.type != WSMsgType.TEXT:
-                    break
-                await self._receive(message.data)
+            async with self._failing("receiving"):
+                async for message in self._socket:
+                    if message.type == WSMsgType.TEXT:
+                        await self._receive(message.data)
+                    elif message.type == WSMsgType.BINARY:
+                        await self._close(WSCloseCode.UNSUPPORTED_DATA, "expected a request as text, got bytes")
+                    elif message.type == WSMsgType.ERROR:
+                        log.warning("a page's connection is closed: %s", message.data)
         finally:
             sender.cancel()
             # After what it has asked for last, which goes on: what that looks at has to be let go, too.
             gone = shared(self._look_at([], anew=False))
-            await asyncio.gather(sender, return_exceptions=True)
+            await asyncio.gather(sender, *filter(None, [self._failure]), return_exceptions=True)
             await gone
         return self._socket
 
     async def close(self) -> None:
         """The server ends."""
-        await self._socket.close(code=1001, message=b"the server ends")
+        await self._close(WSCloseCode.GOING_AWAY, "rosafe live has ended")
+
+    async def _close(self, code: WSCloseCode, reason: str) -> None:
+        """Close the WebSocket; the page shows the reason."""
+        message = reason.encode("utf-8", "replace")[:MAX_REASON].decode("utf-8", "ignore").encode()
+        await self._socket.close(code=code, message=message)
+
+    @contextlib.asynccontextmanager
+    async def _failing(self, what: str) -> AsyncIterator[None]:
+        """Close the page's connection with a reason and one log entry, whatever exception is raised in the block."""
+        try:
+            yield
+        except ConnectionError:  # the page has gone
+            return
+        except Exception as problem:
+            if self._failure is not None:
+                return
+            reason = f"{what} failed: {type(problem).__name__}: {problem}".splitlines()[0]
+            log.exception("a page's connection is closed: %s", reason[:500])
+            self._failure = asyncio.create_task(self._close(WSCloseCode.INTERNAL_ERROR, reason))
 
     def wake(self) -> None:
         """There is something new to look at."""
@@ -115,14 +154,18 @@ class Client:
             if not isinstance(number, int) or not isinstance(what, str) or not isinstance(arguments, dict):
                 raise TypeError
         except (ValueError, TypeError, KeyError, AttributeError, RecursionError):
-            await self._socket.close(code=1003, message=b"no request")
+            await self._close(WSCloseCode.UNSUPPORTED_DATA, "expected a request with id and do")
             return
         if len(self._pending) >= MAX_PENDING:
             self._answer(number, {"error": f"{MAX_PENDING} requests are under way; try again in a moment"})
             return
-        task = asyncio.create_task(self._do(number, what, arguments))
+        task = asyncio.create_task(self._answer_request(number, what, arguments))
         self._pending.add(task)
         task.add_done_callback(self._pending.discard)
+
+    async def _answer_request(self, number: int, what: str, arguments: Mapping[str, Any]) -> None:
+        async with self._failing(what[:40]):
+            await self._do(number, what, arguments)
 
     async def _do(self, number: int, what: str, arguments: Mapping[str, Any]) -> None:
         try:
@@ -177,7 +220,7 @@ class Client:
 
     async def look_again(self, changed: set[Key]) -> None:
         """The tree has changed: these views are gone, and what was not there may be there now."""
-        async with self._turn:
+        async with self._failing("an update of the tree"), self._turn:
             for key in self._wanted:
                 if key in changed and key in self._looking and not self._hub.shows(key, self._looking[key].view):
                     del self._looking[key]
@@ -198,6 +241,10 @@ class Client:
         self.tell("views", {"views": views})
 
     # --- what it gets ---
+
+    async def _keep_sending(self, transport: asyncio.Transport) -> None:
+        async with self._failing("sending"):
+            await self._send(transport)
 
     async def _send(self, transport: asyncio.Transport) -> None:
         loop = asyncio.get_running_loop()

@@ -25,8 +25,9 @@ COHERENT = 0.7  # interaural coherence below which a channel tells nothing of a 
 LEAST_WEIGHT = 0.5  # of all channels together, where there is a direction
 
 QUANTISED, FLOAT = 0, 1
-# number of the view, first column, columns, numbers in a column, form, stride, end (s), least and greatest value
-PIECE = struct.Struct("<IIHHBBxxdff")
+MAX_COLUMN = 2**53  # whole numbers that a page has
+# number of the view, columns, numbers in a column, first column, end (s), least and greatest value, form, stride
+PIECE = struct.Struct("<IHHQdffBB6x")
 
 _numbers = itertools.count(1)
 
@@ -70,9 +71,13 @@ class View:
                 self.next = self.oldest = first
             for column in range(self.next, first):
                 self._ring[:, column % self.capacity] = np.nan
-            self._ring[:, np.arange(first, after) % self.capacity] = columns
+            self._ring[:, self._places(first, after)] = columns
             self.next, self.end = after, end
             self.oldest = max(self.oldest, after - self.capacity)
+
+    def _places(self, first: int, after: int, stride: int = 1) -> np.ndarray:
+        """Where columns are in the ring; their numbers may be larger than those of numpy."""
+        return np.arange(first % self.capacity, first % self.capacity + after - first, stride) % self.capacity
 
     def newest(self, count: int) -> np.ndarray:
         """The newest columns, float32 (size, count); NaN where there is nothing."""
@@ -80,7 +85,7 @@ class View:
         with self._lock:
             first = max(self.oldest, self.next - count)
             if self.next > first:
-                columns[:, -(self.next - first) :] = self._ring[:, np.arange(first, self.next) % self.capacity]
+                columns[:, -(self.next - first) :] = self._ring[:, self._places(first, self.next)]
         return columns
 
     def piece(self, first: int, stride: int, most: int) -> tuple[int, bytes]:
@@ -94,13 +99,15 @@ class View:
             end = self.end - (self.next - first - count * stride) / self.rate
             key = (first, stride, count, self.beginning)
             if self._told[0] != key:
-                columns = self._ring[:, np.arange(first, first + count * stride, stride) % self.capacity]
+                columns = self._ring[:, self._places(first, first + count * stride, stride)]
                 low = high = 0.0
                 if self.form == QUANTISED:
                     low, high, data = quantised(columns)
                 else:
                     data = np.ascontiguousarray(columns.T, "<f4").tobytes()
-                head = PIECE.pack(self.number, first, count, self.size, self.form, stride, end, low, high)
+                if first + count * stride > MAX_COLUMN:
+                    raise ValueError(f"expected columns up to number {MAX_COLUMN}, got {first}")
+                head = PIECE.pack(self.number, count, self.size, first, end, low, high, self.form, stride)
                 self._told = key, head + data + bytes(-len(data) % 8)
             return first + count * stride, self._told[1]
 

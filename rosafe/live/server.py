@@ -41,7 +41,7 @@ HARMLESS = {"save"}  # what a page that only watches may ask for
 _TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
-log = logging.getLogger("rosafe.live")
+log = logging.getLogger("rosout.rosafe_live")  # stderr and /rosout, as rospy.logerr
 
 
 class Looker(Protocol):

@@ -119,7 +119,7 @@ def test_bytes_are_within_half_a_step() -> None:
 def piece(view: View, first: int, stride: int = 1, most: int = 10_000) -> tuple[int, tuple[Any, ...], np.ndarray]:
     after, data = view.piece(first, stride, most)
     head = PIECE.unpack_from(data)
-    return after, head, np.frombuffer(data, "<f4", head[2] * head[3], PIECE.size).reshape(head[2], head[3]).T
+    return after, head, np.frombuffer(data, "<f4", head[1] * head[2], PIECE.size).reshape(head[1], head[2]).T
 
 
 def test_a_view_keeps_the_newest_seconds_and_shows_gaps() -> None:
@@ -128,23 +128,38 @@ def test_a_view_keeps_the_newest_seconds_and_shows_gaps() -> None:
     for first in range(0, 3000, 30):
         view.append(first, series[:, first : first + 30], (first + 30) / 100)
     after, head, columns = piece(view, 0)
-    assert after == 3000 and head[1] == 3000 - view.capacity and head[6] == 30.0
+    assert after == 3000 and head[3] == 3000 - view.capacity and head[4] == 30.0
     assert np.array_equal(columns, series[:, -view.capacity :])
     view.append(3010, series[:, :5], 30.15)
     _, head, columns = piece(view, 3000)
-    assert head[2] == 15 and np.isnan(columns[:, :10]).all() and np.array_equal(columns[:, 10:], series[:, :5])
+    assert head[1] == 15 and np.isnan(columns[:, :10]).all() and np.array_equal(columns[:, 10:], series[:, :5])
     view.append(0, series[:, :7], 0.07)  # the sound began anew
     after, head, columns = piece(view, 0)
-    assert (after, head[1], head[2]) == (7, 0, 7)
+    assert (after, head[3], head[1]) == (7, 0, 7)
 
 
 def test_every_so_manyth_column_and_no_more_than_asked_for() -> None:
     view = View(1, 100.0, FLOAT)
     view.append(0, np.arange(101, dtype=np.float32)[np.newaxis], 1.01)
     after, head, columns = piece(view, 1, stride=4, most=3)
-    assert (after, head[1], head[5], head[6]) == (16, 4, 4, pytest.approx(0.16))
+    assert (after, head[3], head[8], head[4]) == (16, 4, 4, pytest.approx(0.16))
     assert np.array_equal(columns[0], [4, 8, 12])
     assert view.piece(100, 4, 9)[1] == b""  # not a whole one yet
+
+
+@pytest.mark.parametrize("start", [2**32 - 5, 2**32, 2**40 + 1, 2**53 - 100])
+def test_column_numbers_beyond_32_bits(start: int) -> None:
+    """They are exact up to 2^53, the largest whole number of a page; beyond, there is an error and no other number."""
+    view = View(1, 100.0, FLOAT)
+    numbers = np.arange(10, dtype=np.float32)
+    for first in range(start, start + 100, 10):
+        view.append(first, numbers[np.newaxis] + (first - start), (first + 10) / 100)
+    after, head, columns = piece(view, start + 3, stride=1, most=5)
+    assert (after, head[3]) == (start + 8, start + 3)
+    assert np.array_equal(columns[0], [3, 4, 5, 6, 7])
+    view.append(2**53 - 1, numbers[np.newaxis, :2], 0.0)
+    with pytest.raises(ValueError, match=f"got {2**53 - 1}"):
+        view.piece(2**53 - 1, 1, 10)
 
 
 # --- one page ---
@@ -198,7 +213,7 @@ def test_a_slow_client_gets_the_newest_columns_and_keeps_nothing_waiting() -> No
         assert not deaf.sent
         deaf.waiting = 0
         async with asyncio.timeout(20):
-            while not any(data[:1] == b"\1" for data in deaf.sent):
+            while not any(data[:1] == b"\2" for data in deaf.sent):
                 await asyncio.sleep(0.01)
         sender.cancel()
         return list(deaf.sent)
@@ -206,8 +221,8 @@ def test_a_slow_client_gets_the_newest_columns_and_keeps_nothing_waiting() -> No
     sent = asyncio.run(scenario())
     texts = [data for data in sent if data[:1] == b"{"]
     assert len(texts) == 2 and b"990" in b"".join(texts)  # the views, and the newest status alone
-    picture = next(data for data in sent if data[:1] == b"\1")
-    _, first, columns, *_ = PIECE.unpack_from(picture, 8)
+    picture = next(data for data in sent if data[:1] == b"\2")
+    _, columns, _, first, *_ = PIECE.unpack_from(picture, 8)
     assert (first, columns) == (900, 100)
 
 
@@ -229,4 +244,4 @@ def test_nonsense_is_refused(given: dict[str, Any]) -> None:
 
 
 def test_forms_are_those_of_the_protocol() -> None:
-    assert (QUANTISED, FLOAT, PIECE.size) == (0, 1, 32)
+    assert (QUANTISED, FLOAT, PIECE.size) == (0, 1, 40)

@@ -15,7 +15,7 @@ import numpy as np
 
 from tests.harness import PATIENCE, Graph, Process, wait_for
 
-PIECE = struct.Struct("<IIHHBBxxdff")  # as docs/live.md has it
+PIECE = struct.Struct("<IHHQdffBB6x")  # as docs/live.md has it
 TREE = ("ratemap", "ild", "itd", "ic")
 
 
@@ -81,10 +81,10 @@ class Page:
 
     def _take(self, data: bytes) -> None:
         form, count, _ = struct.unpack_from("<HHI", data)
-        assert form == 1
+        assert form == 2
         at = 8
         for _ in range(count):
-            number, first, columns, size, kind, stride, end, low, high = PIECE.unpack_from(data, at)
+            number, columns, size, first, end, low, high, kind, stride = PIECE.unpack_from(data, at)
             at += PIECE.size
             steps = np.frombuffer(data, np.uint8 if kind == 0 else "<f4", columns * size, at)
             values = steps.astype(float)

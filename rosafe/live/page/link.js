@@ -1,8 +1,9 @@
 // The connection to the server: requests with answers, news by their subject, columns of pictures.
 
-const FORMAT = 1;
+const FORMAT = 2;
 const HEAD = 8;
-const PIECE = 32;
+const PIECE = 40;
+const FAILED = [1002, 1003, 1007, 1009, 1011]; // codes after which another try would fail, too
 
 export class Link extends EventTarget {
   #socket = null;
@@ -32,12 +33,14 @@ export class Link extends EventTarget {
       if (typeof event.data === "string") this.#news(JSON.parse(event.data));
       else this.#columns(event.data);
     });
-    socket.addEventListener("close", async () => {
+    socket.addEventListener("close", async ({ code, reason }) => {
       if (!this.#socket) await this.#askWhy();
       this.#socket = null;
       for (const { reject } of this.#waiting.values()) reject(new Error("the connection to the server is lost"));
       this.#waiting.clear();
-      this.#tell("close", {});
+      const failed = FAILED.includes(code);
+      this.#tell("close", { reason, failed });
+      if (failed) return;
       setTimeout(() => this.open(), this.#pause);
       this.#pause = Math.min(5000, this.#pause * 1.6);
     });
@@ -76,14 +79,14 @@ export class Link extends EventTarget {
     for (let left = bytes.getUint16(2, true); left > 0; left -= 1) {
       const piece = {
         number: bytes.getUint32(at, true),
-        first: bytes.getUint32(at + 4, true),
-        count: bytes.getUint16(at + 8, true),
-        size: bytes.getUint16(at + 10, true),
-        stride: bytes.getUint8(at + 13),
+        count: bytes.getUint16(at + 4, true),
+        size: bytes.getUint16(at + 6, true),
+        first: Number(bytes.getBigUint64(at + 8, true)), // exact: the server sends none above 2^53
+        stride: bytes.getUint8(at + 33),
         end: bytes.getFloat64(at + 16, true),
       };
       const numbers = piece.count * piece.size;
-      const floats = bytes.getUint8(at + 12) === 1;
+      const floats = bytes.getUint8(at + 32) === 1;
       if (floats) {
         piece.values = new Float32Array(buffer, at + PIECE, numbers);
       } else {

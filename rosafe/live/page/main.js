@@ -134,7 +134,14 @@ link.addEventListener("status", ({ detail }) => {
 });
 link.rate = 0;
 
-link.addEventListener("close", () => { status = null; tell(); });
+let closed = "";
+link.addEventListener("open", () => { closed = ""; });
+link.addEventListener("close", ({ detail }) => {
+  status = null;
+  if (detail.reason || !closed) closed = detail.reason;
+  if (detail.failed) closed = `the server has closed the connection: ${closed || "no reason given"}; reload the page`;
+  tell();
+});
 
 function tell() {
   const [state, text] = told();
@@ -144,7 +151,7 @@ function tell() {
 }
 
 function told() {
-  if (!status) return ["bad", link.refusal || "no connection to the server"];
+  if (!status) return ["bad", closed || link.refusal || "no connection to the server"];
   if (status.problem) return ["bad", status.problem];
   const malformed = Object.entries(status.malformed);
   if (malformed.length) return ["bad", malformed.map(([topic, why]) => `${topic}: malformed messages are ignored: ${why}`).join("; ")];
