@@ -194,7 +194,10 @@ def write_failed(folder: Path, inputs: Sequence[Path], failed: Mapping[str, str]
     kept: dict[str, str] = {}
     if path.exists():
         with TextIOWrapper(open_regular(path), "utf-8", "surrogateescape", newline="") as file:
-            rows = list(csv.reader(file))
+            try:
+                rows = list(csv.reader(file))
+            except csv.Error:
+                rows = []
         if rows[:1] != [_HEAD]:
             raise OutputError(f"{path} is something else, and stays as it is")
         kept = {row[0]: row[1] for row in rows[1:] if len(row) == 2 and not tried & {row[0], *_folders(row[0])}}

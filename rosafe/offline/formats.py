@@ -159,10 +159,12 @@ def _check_arrays(result: Mapping[str, Any]) -> None:
 
 def _check_kind(kind: Representation, result: Mapping[str, Any]) -> None:
     """ValueError where an output of a kind, or what lies along its axes, is not what its declaration says."""
-    outputs = [name for name in kind.outputs if name in result["axes"]]
+    outputs = [name for name in kind.outputs if name in result]
     for name in outputs:
-        if result["axes"][name] != kind.outputs[name].axes:
+        if result["axes"].get(name) != kind.outputs[name].axes:
             raise ValueError(f"axes: {name}: expected {', '.join(kind.outputs[name].axes)}")
+        if kind.outputs[name].axes[0] == "ear" and not 1 <= len(result[name]) <= 2:
+            raise ValueError(f"{name}: expected one or two ears, got {len(result[name])}")
     time = f"{kind.kind}_time"
     if outputs and time in result:
         _check_array(time, result[time], 1)

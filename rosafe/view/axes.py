@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import os
-from contextlib import AbstractContextManager
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -32,10 +33,11 @@ _STYLE = {
 }
 
 
-def style() -> AbstractContextManager[None]:
-    """The pictures' own settings, whatever the user's are."""
-    context: AbstractContextManager[None] = require("matplotlib.style", "pictures").context(["default", _STYLE])
-    return context
+@contextmanager
+def style() -> Iterator[None]:
+    """The pictures' own settings, whatever the user's are; numbers that are too large for an axis are no warning."""
+    with require("matplotlib.style", "pictures").context(["default", _STYLE]), np.errstate(all="ignore"):
+        yield
 
 
 def save(figure: Figure, path: Path, replace: bool = True) -> None:

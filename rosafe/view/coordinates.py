@@ -10,6 +10,7 @@ import numpy as np
 from rosafe.interface import KINDS, Representation
 
 EARS = ("left", "right")
+MAX_COORDINATE = 1e12  # seconds or hertz along an axis
 
 
 def check_result(result: Any) -> None:
@@ -25,7 +26,7 @@ def frame_times(
     """The middle of each of `count` frames of a kind (s); ValueError where the result does not tell its sample rate."""
     name = kind.kind
     if f"{name}_time" in result:
-        return np.asarray(result[f"{name}_time"], np.float64)[:count]
+        return _checked(f"{name}_time", result[f"{name}_time"])[:count]
     if f"{name}_frameRate" in result:  # exact for windows of two hops, the default
         return np.asarray((1 + np.arange(count)) / float(result[f"{name}_frameRate"]))
     return np.asarray(np.arange(count) / _rate(result, name, sample_rate))
@@ -51,5 +52,13 @@ def along(result: Mapping[str, Any], kind: Representation, axis: str, size: int)
     for name in kind.coordinates:
         values = result.get(name, ())
         if units[name] == wanted and len(values) == size:
-            return np.asarray(values)
+            return _checked(name, values) if wanted else np.asarray(values)
     return np.arange(size)
+
+
+def _checked(name: str, values: Any) -> np.ndarray:
+    """Values along an axis; ValueError where they cannot be drawn."""
+    found = np.asarray(values, np.float64)
+    if found.size and not np.abs(found).max() < MAX_COORDINATE:
+        raise ValueError(f"{name}: expected numbers between -{MAX_COORDINATE:g} and {MAX_COORDINATE:g}")
+    return found

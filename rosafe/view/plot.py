@@ -24,6 +24,7 @@ PITCH_TOP = 1000.0  # Hz; the ratemap under the pitch ends there
 COLUMNS = 1500  # of an image, at most
 MARKED = 400  # frames, up to which marks are as wide as they can be
 TICKS = 6
+MAX_VALUE = 1e100  # numbers that can be drawn
 
 _OUTPUTS = {name: (kind, part) for kind in KINDS.values() for name, part in kind.outputs.items()}
 _AXIS_NAMES = {
@@ -156,6 +157,8 @@ class _Panel:
         self.kind, part = _OUTPUTS[name]
         self.axes, self.unit = part.axes, part.unit
         self.data = np.asarray(result[name], np.float64)
+        if np.any(np.isfinite(self.data) & (np.abs(self.data) > MAX_VALUE)):
+            raise ValueError(f"{name}: expected numbers between -{MAX_VALUE:g} and {MAX_VALUE:g} to draw")
         if self.data.ndim != len(self.axes):
             raise ValueError(f"{name} has shape {self.data.shape}, wanted are the axes {', '.join(self.axes)}")
         self.note = ""  # what was chosen of more than two axes

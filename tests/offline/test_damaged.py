@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import os
 import shutil
 import struct
@@ -17,11 +18,14 @@ import numpy as np
 import pytest
 import scipy.io
 import soundfile
+from matplotlib.figure import Figure
 
 import rosafe
 from rosafe.offline import containers, formats, isolated
+from rosafe.offline.corpus import write_failed
 from rosafe.offline.files import process_file
 from rosafe.output import OutputError
+from rosafe.view.plot import draw
 from tests.harness import PYTHON, ROOT
 from tests.offline.damage import VALUES, damaged, forked
 
@@ -74,7 +78,7 @@ def refused(path: Path, *words: str) -> None:
 @pytest.mark.parametrize("name", NAMES)
 def test_random_changes(tmp_path: Path, good: Path, name: str, forked: None) -> None:
     """`ROSAFE_FUZZ` sets how many."""
-    for seed in range(int(os.environ.get("ROSAFE_FUZZ", "50"))):
+    for seed in range(int(os.environ.get("ROSAFE_FUZZ", "25"))):
         path = damaged(good / name, tmp_path / name, seed)
         loaded = load(path)
         try:
@@ -142,6 +146,22 @@ def test_a_damaged_result_is_computed_again(tmp_path: Path, good: Path, name: st
             assert "\n" not in str(problem)
         else:
             assert load(path) or not (path / ".zattrs").exists()
+
+
+def test_numbers_that_cannot_be_drawn(tmp_path: Path, good: Path) -> None:
+    loaded = rosafe.load(good / "a.npz")
+    for name, value in (("ild", 1e308), ("preProc", -1e200), ("ild_time", math.nan), ("fb_cfHz", math.inf)):
+        result = {**loaded, name: np.full_like(loaded[name], value)}
+        with pytest.raises(ValueError, match=f"{name}: expected numbers between"):
+            draw(Figure(), result, name.removesuffix("_time").replace("fb_cfHz", "ild"))
+    result = {**loaded, "ild": np.full_like(loaded["ild"], math.nan)}
+    draw(Figure(), result, "ild").savefig(tmp_path / "a.png")
+
+
+def test_a_list_of_failures_that_is_damaged(tmp_path: Path) -> None:
+    (tmp_path / "failed.csv").write_text("input,why\n" + "x" * 200000)
+    with pytest.raises(OutputError, match="is something else, and stays as it is"):
+        write_failed(tmp_path, [], {"a": "b"})
 
 
 # --- .npz ---------------------------------------------------------------------------------------------------------
