@@ -23,6 +23,7 @@ from rosafe.interface import (
     FIND,
     KINDS,
     LOAD_SETUP,
+    PLUGINS,
     REQUEST,
     REQUIRED,
     ROSAFE,
@@ -36,6 +37,7 @@ from rosafe.interface import (
     ros_type,
 )
 from rosafe.tree import building
+from rosafe.vocabulary import plugins
 from rosafe.vocabulary.signals import LEVELS
 from rosafe.vocabulary.words import meant
 
@@ -158,6 +160,7 @@ class Proxy:
             known = [s.name for s in (*self.component.services, *self.component.composites)]
             hint = meant(name, [*known, *(port.name for port in self.component.ports)])  # a URL may mean either
             what = f"{self.component.name} has no service {name[:80]!r}; it has {', '.join(known)}{hint}"
+            what += f"; those of plugins depend on {plugins.FOLDERS}, also of genomixd: {plugins.where()}"
             raise ComponentError("::genom::no_such_service", what=what) from None
 
     def arguments(self, service: Service, given: Any) -> dict[str, Any]:
@@ -199,6 +202,8 @@ class Proxy:
     async def start(self, service: Service, values: Mapping[str, Any]) -> Goal:
         """Send an activity; its goal tells when it runs and when it has ended."""
         with self._one_more():
+            if service.name in {KINDS[kind].request for kind in PLUGINS}:
+                await self._client(service.name).check()  # the node may be without the plugin, or have another version
             await self._watch()
             client = await self._action(service.name)
             return await client.send(values)

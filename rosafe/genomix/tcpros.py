@@ -24,7 +24,8 @@ from rosafe.genomix import installed_components
 from rosafe.genomix.graph import Graph, Unknown, middleware_error
 from rosafe.genomix.tasks import shared
 from rosafe.genomix.values import refused
-from rosafe.interface import ComponentError
+from rosafe.interface import KINDS, PLUGINS, ComponentError
+from rosafe.vocabulary import plugins
 
 CONNECT_SECONDS = 3.0
 CONNECTIONS = 4  # at once per service or type of topic; rospy's nodes take few new ones at a time
@@ -177,6 +178,8 @@ class ServiceClient:
         }
         outputs = self._response_class.__slots__[2:]  # after genom_success and genom_exdetail
         self._limit = MAX_MESSAGE if outputs else MAX_TEXT
+        # The plugin whose request this is: it has to be there at both ends
+        self._plugin = next((kind for kind in PLUGINS if KINDS[kind].request == service), "")
         self._slots = asyncio.Semaphore(CONNECTIONS)
         self._idle: list[Connection] = []
 
@@ -195,8 +198,18 @@ class ServiceClient:
         try:
             return await reach(self._graph, self._instance, self._header)
         except Unknown:
+            if self._plugin and await self._graph.serves(f"/{self._instance}/connect_port"):
+                raise self._without_plugin() from None
             raise middleware_error(f"{self._instance} is not running: nobody serves {self.name}") from None
         except Refused as problem:
+            if self._plugin and "is not a provider of" in str(problem):
+                raise self._without_plugin() from None
+            if "md5sums do not match" in str(problem):
+                what = f"the plugin {self._plugin}" if self._plugin else "rosafe"
+                raise middleware_error(
+                    f"{self._instance} was started with another version of {what} than this program: the parameters of "
+                    f"{self.name} differ; use the same version for both, and restart them"
+                ) from None
             raise middleware_error(f"{self.name}: {problem}") from None
         except TimeoutError:
             raise middleware_error(f"{self._instance} does not answer: no connection to {self.name}") from None
@@ -205,6 +218,11 @@ class ServiceClient:
             raise middleware_error(
                 f"{self._instance} is not running any more, though the master still lists it ({why})"
             ) from None
+
+    def _without_plugin(self) -> ComponentError:
+        return middleware_error(
+            f"{self._instance} was started without the plugin {self._plugin}; set {plugins.FOLDERS} and restart it"
+        )
 
     def _keep(self, connection: Connection) -> None:
         """Take back a connection that is fit for another call."""

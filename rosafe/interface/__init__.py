@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from rosafe.representations import KINDS
+from rosafe.representations import KINDS, PLUGINS, PROBLEMS
 from rosafe.vocabulary.errors import ComponentError
 from rosafe.vocabulary.idl import ros_type
 from rosafe.vocabulary.parameter import MAX_SEQUENCE, MAX_STRING, REQUIRED, Parameter, text_of
@@ -60,6 +60,8 @@ __all__ = [
     "MAX_SEQUENCE",
     "MAX_SETUP",
     "MAX_STRING",
+    "PLUGINS",
+    "PROBLEMS",
     "REQUEST",
     "REQUIRED",
     "ROSAFE",

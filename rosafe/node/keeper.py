@@ -11,6 +11,7 @@ from rosafe.interface import MAX_SETUP, ROSAFE
 from rosafe.output import OutputError, write_whole
 from rosafe.setups import Setup, SetupError, read, write
 from rosafe.terminal import printable
+from rosafe.tree.requests import searched
 
 
 class Keeper:
@@ -30,11 +31,14 @@ class Keeper:
     ----------
     problem : str
         Why it could not be written the last time.
+    absent : str
+        Which of its processors cannot be built, because plugins are missing.
     """
 
     def __init__(self, path: Path, describe: Callable[[], Setup], report: Callable[[str], None]) -> None:
         self.path = path
         self.problem = ""
+        self.absent = ""
         self._describe = describe
         self._report = report
         self._written = ""
@@ -45,10 +49,16 @@ class Keeper:
         """What the file holds; an empty setup where there is none yet. ComponentError where it cannot be used."""
         try:
             self._written = read_regular(self.path, 4 * MAX_SETUP + 1).decode()
-            return read(self._written)
+            absent: list[str] = []
+            setup = read(self._written, absent)
+            if absent:
+                copy = self.path.with_name(f"{self.path.name}.complete")
+                write_whole(copy, self._written.encode())
+                self.absent = f"left out of the tree: {', '.join(absent)}; {searched()}; all of it is in {copy}"
+            return setup
         except FileNotFoundError:
             return Setup()
-        except (OSError, UnicodeDecodeError, SetupError) as problem:
+        except (OSError, OutputError, UnicodeDecodeError, SetupError) as problem:
             why = getattr(problem, "strerror", None) or problem
             what = f"{self.path}: {why}; correct the file, or delete it to start with an empty tree"
             raise ROSAFE.error("e_badNewValue", what=printable(what)) from None

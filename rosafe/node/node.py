@@ -82,6 +82,8 @@ class RosafeNode:
         self._of_the_input: dict[str, Any] = {}  # what the InputProc that runs was asked for
         self._keeper = _keeper(keep, self._setup)
         kept = Setup() if self._keeper is None else self._keeper.kept()
+        if self._keeper is not None and self._keeper.absent:
+            rospy.logwarn(self._keeper.absent)
         self._coming_back = Setup(None, kept.connections, kept.processors)  # what is not there yet
         self._sound = kept.sound  # which is not ours to make; but a file that has one keeps it
         self._restoring = ""  # why it is not there yet
@@ -389,8 +391,8 @@ class RosafeNode:
 
     def _keeping_health(self, status: Any) -> Any:
         assert self._keeper is not None
-        if self._keeper.problem or self._restoring:
-            status.summary(DiagnosticStatus.WARN, self._keeper.problem or self._restoring)
+        if doubt := self._keeper.problem or self._restoring or self._keeper.absent:
+            status.summary(DiagnosticStatus.WARN, doubt)
         else:
             status.summary(DiagnosticStatus.OK, "the tree is kept")
         status.add("file", str(self._keeper.path))

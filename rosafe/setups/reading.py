@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from rosafe.interface import KINDS, MAX_SETUP, REQUEST, Parameter, Representation
@@ -30,8 +30,11 @@ class _Entry(NamedTuple):
     wanted: Wanted
 
 
-def read(text: str) -> Setup:
+def read(text: str, absent: list[str] | None = None) -> Setup:
     """The setup that `text` (YAML, docs/setups.md) describes.
+
+    If `absent` is given, processors of unknown kinds, and those below them, are left out, and a line for each is
+    appended to it.
 
     Raises
     ------
@@ -47,7 +50,7 @@ def read(text: str) -> Setup:
     return Setup(
         None if sound.empty else Sound.of(_values(sound, ACQUIRE, "sound")),
         dict(_connections(sections.get("connections", nothing))),
-        _ordered(_processors(sections.get("processors", nothing))),
+        _ordered(_processors(sections.get("processors", nothing), absent)),
     )
 
 
@@ -125,11 +128,33 @@ def _parsed(parameter: Parameter, text: str) -> Any:
 # --- processors -------------------------------------------------------------------------------------------------
 
 
-def _processors(node: Node) -> dict[str, _Entry]:
+def _processors(node: Node, absent: list[str] | None) -> dict[str, _Entry]:
     members = node.members("processors")
     if len(members) > MAX_PROCESSORS:
         raise SetupError(members[MAX_PROCESSORS][1].line, f"more than {MAX_PROCESSORS} processors")
+    if absent is not None:
+        without = _of_unknown_kinds(members)
+        absent += without.values()
+        members = [member for member in members if member[0] not in without]
     return {name: _processor(name, key, value) for name, key, value in members}
+
+
+def _of_unknown_kinds(members: Sequence[tuple[str, Node, Node]]) -> dict[str, str]:
+    """A line for each processor of an unknown kind, and for each one below it, by name."""
+    without: dict[str, str] = {}
+    parents: dict[str, str] = {}
+    for name, _, node in members:
+        values = {member: value for member, _, value in node.members(shown(name))}
+        parents[name] = values["parent"].word(name) if "parent" in values else ""
+        if "kind" in values:
+            word = values["kind"].word(name)
+            try:
+                kind_of(word)
+            except ValueError:
+                without[name] = f"{name} (there is no plugin {shown(word)})"
+    while below := {name for name, parent in parents.items() if parent in without and name not in without}:
+        without |= {name: f"{name} (it is below {parents[name]})" for name in below}
+    return without
 
 
 def _processor(name: str, key: Node, node: Node) -> _Entry:

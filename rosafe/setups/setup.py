@@ -11,6 +11,7 @@ from typing import Any
 from rosafe.interface import BASS, BLOCK_AND_BUFFERS, KINDS, ROSAFE, Parameter, Representation
 from rosafe.representations import STAGES
 from rosafe.tree.requests import Found, Level
+from rosafe.vocabulary import plugins
 
 ACQUIRE = BASS.service("Acquire").parameters
 MAX_TRIED = 1000  # ways to say what a processor was made with
@@ -112,6 +113,12 @@ def wanted(found: Found) -> Wanted:
 
     What follows from others, such as the channels of a filterbank from their number, is left out.
     """
+    if found.kind not in KINDS:
+        raise ROSAFE.error(
+            "e_badNewValue",
+            what=f"{found.name!r} is a {found.kind}, of a plugin that this program was started without; "
+            f"set {plugins.FOLDERS} and restart it",
+        )
     kind = KINDS[found.kind]
     told = {p.name: found.values[p.name] for p in kind.parameters}
     defaults = _defaults(kind.parameters)

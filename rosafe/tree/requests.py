@@ -15,7 +15,8 @@ from typing import Any, NamedTuple
 
 from rosafe.interface import BASS, KINDS, REQUEST, ROSAFE, ComponentError, Representation, text_of
 from rosafe.interface.arguments import check_parameter
-from rosafe.representations import STAGES
+from rosafe.representations import PROBLEMS, STAGES
+from rosafe.vocabulary import plugins
 from rosafe.vocabulary.words import meant
 
 HIGHEST_RATE = float(BASS.service("Acquire").parameter("sampleRate").maximum or 0)  # Hz; what is wrong there is at any
@@ -109,7 +110,15 @@ def kind_of(representation: str) -> Representation:
             return kind
     parameter = REQUEST.parameter("representation")
     hint = meant(representation, parameter.choices)
-    raise ValueError(f"representation: {representation[:80]!r} is not {parameter.range_text}{hint}")
+    raise ValueError(
+        f"representation: {representation[:80]!r} is not {parameter.range_text}{hint}; those of plugins are searched "
+        f"for when a program starts: {searched()}"
+    )
+
+
+def searched() -> str:
+    """Where plugins were searched for, and which were left out."""
+    return "; left out: ".join((plugins.where(), *PROBLEMS))
 
 
 def chain(kind: Representation) -> list[Representation]:

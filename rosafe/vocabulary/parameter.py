@@ -68,7 +68,7 @@ class Parameter:
             yield f"name: {problem}"
         if not isinstance(self.idl, str) or (element(self.idl) or self.idl) not in SCALARS:
             yield f"type: expected one of {', '.join(SCALARS)} or sequence<one of them>, got {short(self.idl)}"
-        if problem := bad_text(self.doc):
+        if problem := bad_text(self.doc, empty=True):
             yield f"doc: {problem}"
         for name in ("fallback", "unit"):
             if problem := bad_text(getattr(self, name), empty=True):
@@ -111,7 +111,7 @@ class Parameter:
                 yield f"choices: {problem}"
         if word := twice(self.choices):
             yield f"choices: {short(word)} occurs twice"
-        if self.fallback and self.fallback not in self.choices:
+        if self.choices and self.fallback and self.fallback not in self.choices:
             yield f"fallback: expected one of the choices, got {short(self.fallback)}"
         for name in self.aliases:
             if problem := bad_name(name):

@@ -78,7 +78,7 @@ class Derived:
     unit: str = ""
 
     def __post_init__(self) -> None:
-        problem = bad_name(self.name) or bad_text(self.doc) or bad_text(self.unit, empty=True)
+        problem = bad_name(self.name) or bad_text(self.doc, empty=True) or bad_text(self.unit, empty=True)
         if not isinstance(self.idl, str) or (element(self.idl) or self.idl) not in SCALARS:
             problem = f"type: expected a type of parameters, got {short(self.idl)}"
         if problem:

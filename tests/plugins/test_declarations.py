@@ -152,7 +152,7 @@ CASES = [
             ('"{kind}_x", "quaternion", "Doc"', "type: expected a type of parameters"),
             ('"{kind}_x", None, "Doc"', "type: expected a type of parameters"),
             ('"", "double", "Doc"', "expected a name"),
-            ('"{kind}_x", "double", ""', "expected one line of text"),
+            ('"{kind}_x", "double", 5', "expected one line of text"),
             ('"{kind}_gain", "double", "Doc"', "or a derived value, are called"),
         )
     ),
@@ -190,7 +190,7 @@ CASES = [
             ('float, 1.0, "Doc"', "type: expected one of"),
             ('["double"], 1.0, "Doc"', "type: expected one of"),
             ('"sequence<sequence<double>>", (), "Doc"', "type: expected one of"),
-            ('"double", 1.0, ""', "doc: expected one line"),
+            ('"double", 1.0, "a\\nb"', "doc: expected one line"),
             ('"double", 1.0, None', "doc: expected one line"),
             ('"double", None, "Doc"', "default: "),
             ('"double", float("nan"), "Doc"', "default: "),

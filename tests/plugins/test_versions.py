@@ -1,0 +1,76 @@
+"""A client and a node with different plugins: both say so, and nothing ends in a traceback."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from rosafe.setups import read
+from tests.harness import Graph, wait_for
+
+from .test_declarations import GOOD
+
+pytestmark = pytest.mark.ros
+
+
+@pytest.fixture
+def folders(tmp_path: Path) -> tuple[Path, Path, Path]:
+    """Folders with no plugin, with one, and with another version of it."""
+    made = tuple(tmp_path / name for name in ("none", "first", "second"))
+    for folder in made:
+        folder.mkdir()
+    (made[1] / "mine.py").write_text(GOOD.format(kind="mine"))
+    other = GOOD.format(kind="mine").replace('"mine_gain", "double", 1.0', '"mine_gain", "string", "1"')
+    (made[2] / "mine.py").write_text(other.replace(", minimum=0.0, maximum=2.0", ""))
+    return made[0], made[1], made[2]
+
+
+@pytest.mark.parametrize(
+    ("number", "reason"),
+    [
+        (0, "was started without the plugin mine; set ROSAFE_PLUGINS and restart it"),
+        (2, "was started with another version of the plugin mine than this program"),
+    ],
+)
+def test_a_client_that_knows_another_plugin(
+    bass_node: object, graph: Graph, folders: tuple[Path, Path, Path], number: int, reason: str
+) -> None:
+    with graph.node("rosAFE-ros", "-i", "versions", ROSAFE_PLUGINS=str(folders[number])):
+        graph.call("/bass/Acquire", device="scene:")
+        done = graph.run(
+            "rosafe", "request", "mine", "-i", "versions", check=False, ROSAFE_PLUGINS=str(folders[1]), timeout=60
+        )
+        graph.call("/bass/Stop")
+    assert done.returncode == 1
+    assert f"versions {reason}" in done.stderr
+    assert "Traceback" not in done.stderr and "is not running" not in done.stderr
+
+
+def test_a_kept_tree_without_its_plugin(graph: Graph, folders: tuple[Path, Path, Path], tmp_path: Path) -> None:
+    """The rest comes back; log and /diagnostics say what is missing and where it was searched; a copy has all of it."""
+    file = tmp_path / "tree.yaml"
+    text = (
+        "connections: {Audio: /bass/Audio}\nprocessors:\n  input: {kind: input}\n  preProc: {kind: preProc}\n"
+        "  filters: {kind: gammatone}\n  hair: {kind: ihc, parent: filters}\n"
+        "  one: {kind: mine, parent: hair, mine_gain: 0.5}\n  two: {kind: grandchild, parent: one}\n"
+    )
+    file.write_text(text)
+    with graph.node("rosAFE-ros", "-i", "lacking", "--keep", str(file), ROSAFE_PLUGINS=str(folders[0])) as process:
+        wait_for(lambda: "left out of the tree" in process.err)
+        said = next(line for line in process.err.splitlines() if "left out of the tree" in line)
+        wait_for(lambda: "waiting for sound" in graph.run("rostopic", "echo", "-n", "1", "/diagnostics").stdout)
+    assert "one (there is no plugin 'mine')" in said
+    assert "two (there is no plugin 'grandchild')" in said
+    assert f"ROSAFE_PLUGINS is {folders[0]}" in said
+    assert Path(f"{file}.complete").read_text() == text
+
+
+def test_what_is_below_a_missing_one_is_left_out_too() -> None:
+    absent: list[str] = []
+    setup = read(
+        "processors: {input: {kind: input}, a: {kind: nothing, parent: input}, preProc: {kind: preProc, parent: a}}",
+        absent,
+    )
+    assert [one.name for one in setup.processors] == ["input"]
+    assert absent == ["a (there is no plugin 'nothing')", "preProc (it is below a)"]
