@@ -123,14 +123,14 @@ class _Pipe:
         """The next array."""
         shape, block, dtype = tuple(described["shape"]), tuple(described["block"]), np.dtype(described["dtype"])
         array = new_array(shape, dtype)
+        buffer = new_array((math.prod(block),), dtype)
         for slices in blocks(shape, block):
             part = array[slices]
             if part.flags.c_contiguous and part.ndim:
                 self.fill(part.reshape(-1).view(np.uint8).data)
             else:
-                buffer = np.empty(part.shape, dtype)
-                self.fill(buffer.reshape(-1).view(np.uint8).data)
-                array[slices] = buffer
+                self.fill(buffer[: part.size].view(np.uint8).data)
+                array[slices] = buffer[: part.size].reshape(part.shape)
         return array
 
     def end(self) -> str:
