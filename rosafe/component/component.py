@@ -19,7 +19,6 @@ from contextlib import AbstractContextManager, nullcontext
 from types import SimpleNamespace
 from typing import Any
 
-import actionlib
 import diagnostic_updater
 import rosgraph
 import rospy
@@ -27,6 +26,7 @@ from actionlib_msgs.msg import GoalStatus
 
 from rosafe import interface
 from rosafe.component import mark, master, memory, registration
+from rosafe.component.action_server import StatusPublisher
 from rosafe.component.activities import Activities, Activity, Handler, TaskMeter, too_many
 from rosafe.component.publisher import Publisher
 from rosafe.component.pulse import Pulse
@@ -78,10 +78,9 @@ class ComponentNode:
         self._connecting = threading.Lock()
         self._turn = threading.Event()
         self._health_changed = threading.Event()
-        self._keep: list[Any] = []  # services and action servers, alive as long as the node
+        self._keep: list[Any] = []  # services, alive as long as the node
+        self._actions = StatusPublisher(self.finished)
         self._digest = _digest(component)
-        self._set_parameters()
-        self._registrar.on_new_master(self._set_parameters)
         self.function("connect_port", self._connect_port, waits=True)
         self.function("connect_service", self._connect_service)
         self.function("abort_activity", self._abort_activity)
@@ -159,9 +158,9 @@ class ComponentNode:
                 )
             )
             if service.activity:
-                self._keep.append(self._action_server(service))
-        for task in (self._publish_state, self._publish_diagnostics):
-            threading.Thread(target=task, name=task.__name__, daemon=True).start()
+                self._serve_action(service)
+        for task in (self._publish_state, self._publish_diagnostics, self._actions.run):
+            threading.Thread(target=task, daemon=True).start()
         self._registrar.settle(UP_SECONDS)
         self._pulse.start()
 
@@ -172,8 +171,6 @@ class ComponentNode:
         self._health_changed.set()
         self.activities.interrupt_named((s.name for s in self.component.activities), by, wait=STOP_WAIT)
         time.sleep(SEND_SECONDS)
-        self._registrar.settle()
-        self._registrar.end()
 
     # --- requests ---
 
@@ -244,7 +241,7 @@ class ComponentNode:
         rospy.logwarn(f"{service.name}: {problem.ex}" + (f": {problem}" if str(problem) != problem.ex else ""))
         return problem.exdetail
 
-    def _action_server(self, service: interface.Service) -> actionlib.ActionServer:
+    def _serve_action(self, service: interface.Service) -> None:
         result = getattr(self._msg, f"{service.name}Result")
         running: dict[str, Activity] = {}  # by goal id
 
@@ -289,11 +286,8 @@ class ComponentNode:
             if activity is not None:
                 activity.interrupt("client")
 
-        server = actionlib.ActionServer(
-            f"{self.name}/{service.name}", getattr(self._msg, f"{service.name}Action"), accept, cancel, auto_start=False
-        )
-        server.start()
-        return server
+        action = getattr(self._msg, f"{service.name}Action")
+        server = self._actions.add(f"{self.name}/{service.name}", action, accept, cancel)
 
     # --- what every component answers ---
 
@@ -327,9 +321,6 @@ class ComponentNode:
         threading.Timer(SEND_SECONDS, self.finished.set).start()
 
     # --- genom_state and diagnostics ---
-
-    def _set_parameters(self) -> None:
-        rospy.set_param(f"{self.name}/actionlib_status_frequency", 0)  # status is published on change only
 
     def _state_changed(self) -> None:
         self._turn.set()

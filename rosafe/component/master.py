@@ -167,6 +167,13 @@ def published_topics(uri: str, caller: str) -> dict[str, str]:
     return dict(topics)
 
 
+def node_address(uri: str, name: str) -> str | None:
+    """The address that the master at `uri` has for a node, None if it has none; raises `FAILURES`."""
+    with proxy(uri) as master:
+        code, _, address = cast(tuple[int, str, str], master.lookupNode(name, name))
+    return address if code == 1 else None
+
+
 def reason(problem: Exception) -> str:
     """In a few words, why a call of the master came to nothing."""
     if isinstance(problem, TimeoutError):

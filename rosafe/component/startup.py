@@ -197,11 +197,17 @@ def _start(
     from rosafe.component import registration
 
     try:
-        registration.init_node(instance, [f"{component.name}-ros", *remappings])
+        registrar = registration.init_node(instance, [f"{component.name}-ros", *remappings])
     except (rospy.ROSException, ValueError) as problem:
         raise _Failure(f"cannot start the node: {problem}") from problem
     log_to_stderr()
-    node = build(instance)
+    try:
+        try:
+            node = build(instance)
+        finally:
+            registrar.up()  # whatever has failed, it fails because the node was told to end
+    except rospy.ROSException as problem:
+        raise _Failure(f"cannot start the node: {problem}") from None
     gc.freeze()  # a look at all that the modules made stops every thread for tens of milliseconds, and finds nothing
     limit.cancel()
     return node
@@ -235,23 +241,41 @@ def _await_master(uri: str, received: list[int], patient: str) -> None:
         time.sleep(0.1)
 
 
+_NAME = re.compile(r"__\w+:=")
+
+
 def without_names(arguments: list[str]) -> list[str]:
-    """The command line of a program that is no node, less what roslaunch adds for nodes, such as ``__name:=...``."""
-    return [word for word in arguments if not re.match(r"__\w+:=", word)]
+    """The command line without what roslaunch adds for nodes, such as ``__name:=...``."""
+    return [word for word in arguments if not _NAME.match(word)]
+
+
+def names_given() -> list[str]:
+    """What `without_names` leaves out of this process' command line, after the program."""
+    return [sys.argv[0], *(word for word in sys.argv[1:] if _NAME.match(word))]
 
 
 def become_node(name: str) -> None:
-    """Make this process a node of the graph; MasterError where there is no master, GenerationError without messages."""
+    """Make this process a node of the graph, whose name begins with `name` unless roslaunch gives another one.
+
+    Raises
+    ------
+    MasterError
+        There is no master.
+    GenerationError
+        There are no messages.
+    """
     import rospy
 
-    from rosafe.component import inbound
+    from rosafe.component import registration
 
     master.set_local_defaults()
     master.check_master(os.environ["ROS_MASTER_URI"])
     generate.ensure_messages()
     ensure_log_directory()
-    inbound.install()
-    rospy.init_node(name, argv=[], anonymous=True, disable_signals=True)
+    try:
+        registration.init_node(name, names_given(), anonymous=True).up()
+    except (rospy.ROSException, ValueError) as problem:
+        raise master.MasterError(f"cannot become a node: {problem}") from None
     log_to_stderr()
 
 
@@ -292,7 +316,6 @@ def _serve(node: Node, received: list[int]) -> None:
     import rospy
 
     rospy.on_shutdown(lambda: node.shutdown("kill"))  # whoever ends rospy: we, rosnode kill, a new node of this name
-    _let_registration_end_at_once()
     over = threading.Event()
     rospy.core.add_shutdown_hook(lambda reason: over.set())  # after rospy's own, which tell the master
     # An Event must not be set from a signal handler, which may interrupt the wait while that holds its lock.
@@ -302,24 +325,6 @@ def _serve(node: Node, received: list[int]) -> None:
     watchdog(END_SECONDS, 0)
     rospy.signal_shutdown("signal" if received else "kill")
     over.wait()  # another thread may be at it already; the watchdog bounds this
-
-
-def _let_registration_end_at_once() -> None:
-    """Wake rospy's registration thread, for which rospy waits at the end, once it can see that it is to end.
-
-    rospy itself wakes it before it raises the flag, and the thread then looks again half a second later.
-    """
-    import rospy
-
-    from rosafe.component import registration
-
-    turn = registration.registrar().manager.cond
-
-    def wake(reason: str) -> None:
-        with turn:
-            turn.notify_all()
-
-    rospy.core.add_shutdown_hook(wake)
 
 
 def watchdog(seconds: float, code: int, message: str = "") -> threading.Timer:

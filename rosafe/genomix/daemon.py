@@ -14,7 +14,7 @@ import threading
 from concurrent.futures import ThreadPoolExecutor
 
 from rosafe.component import generate, master, startup, systemd
-from rosafe.genomix.graph import Graph
+from rosafe.genomix.graph import JOIN_SECONDS, Graph
 from rosafe.genomix.names import Names
 from rosafe.genomix.server import Server
 from rosafe.genomix.sessions import Sessions
@@ -123,7 +123,7 @@ async def _serve(options: argparse.Namespace, told: startup.Background | None) -
     loop.set_default_executor(ThreadPoolExecutor(THREADS, "rospy"))
     _allow_many_files()
     sys.setswitchinterval(startup.SWITCH_SECONDS)
-    graph = Graph(os.environ["ROS_MASTER_URI"])
+    graph = Graph(os.environ["ROS_MASTER_URI"], server=True)
     server = Server(Sessions(graph), Names(graph, {*own_names(), options.host, *options.name}))
     try:
         port = await server.start(options.host, options.port)
@@ -131,6 +131,10 @@ async def _serve(options: argparse.Namespace, told: startup.Background | None) -
         if options.until_eof:
             print(port, flush=True)
             threading.Thread(target=_wait_for_eof, args=(loop, end), daemon=True).start()
+        joining = asyncio.create_task(graph.join())
+        ended = asyncio.create_task(graph.gone.wait())
+        # A master that is there is to know the node once it is up; one that is not may come later.
+        await asyncio.wait((joining, ended), timeout=JOIN_SECONDS, return_when=asyncio.FIRST_COMPLETED)
         if told is not None:
             told.up()
         systemd.notify("READY=1")
@@ -139,11 +143,11 @@ async def _serve(options: argparse.Namespace, told: startup.Background | None) -
         await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
         feeding.cancel()
         systemd.notify("STOPPING=1")
+        return int(graph.gone.is_set() and not graph.is_node)
     finally:
         startup.watchdog(startup.END_SECONDS, 0)
         await server.close()
         await graph.close()
-    return 0
 
 
 async def _feed_watchdog() -> None:

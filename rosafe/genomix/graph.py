@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import errno
+import functools
 import os
 import time
 import xmlrpc.client
@@ -24,6 +25,7 @@ from rosafe.interface import ComponentError
 
 RPC_SECONDS = 3.0  # for one call of the master or of a node
 NODE_SECONDS = 15.0  # for becoming a node of the graph
+JOIN_SECONDS = 1.0  # between two tries of a server to become one
 LOOK_SECONDS = 0.05  # between two looks at what the master knows, however many wait for that
 MAX_CALLS = 8  # of the master at once
 MAX_ANSWER = 16 * 2**20  # bytes of an answer of the master or a node
@@ -44,12 +46,19 @@ def middleware_error(what: str) -> ComponentError:
 class Graph:
     """The graph of the master at `uri`. Make it inside a running event loop; `close` it in the end.
 
-    `program` is what the name of our node begins with.
+    Parameters
+    ----------
+    uri : str
+    program : str
+        What the name of our node begins with, unless roslaunch gives another one.
+    server : bool
+        Whether `program` is the whole name, if no node of that name runs.
     """
 
-    def __init__(self, uri: str, program: str = "genomixd") -> None:
+    def __init__(self, uri: str, program: str = "genomixd", server: bool = False) -> None:
         self.uri = uri
         self._program = program
+        self._server = server
         self.name = f"/{program}_{os.getpid()}_{int(time.time() * 1000)}"
         self.gone = asyncio.Event()  # set where our node was told to end, as by `rosnode kill`
         self._http = aiohttp.ClientSession(
@@ -57,7 +66,7 @@ class Graph:
             timeout=aiohttp.ClientTimeout(total=RPC_SECONDS),
         )
         self._node: asyncio.Task[None] | None = None
-        self._is_node = False
+        self.is_node = False  # set once that has started
         self._calls = asyncio.Semaphore(MAX_CALLS)
         self._look: asyncio.Task[set[str]] | None = None  # the next look at the services, which has not begun yet
         self._looking = asyncio.Lock()
@@ -69,7 +78,7 @@ class Graph:
         """Leave the graph."""
         if self._node is not None:
             self._node.cancel()
-        if self._is_node:
+        if self.is_node:
             import rospy
 
             await asyncio.to_thread(rospy.signal_shutdown, f"{self._program} ends")
@@ -178,6 +187,14 @@ class Graph:
         except TimeoutError:
             raise middleware_error(f"cannot become a node of the graph at {self.uri} in {NODE_SECONDS:g} s") from None
 
+    async def join(self) -> None:
+        """Become a node as soon as there is a master."""
+        while not (self.is_node or self.gone.is_set()):
+            with contextlib.suppress(ComponentError):
+                await self.become_node()
+                return
+            await asyncio.sleep(JOIN_SECONDS)
+
     async def _start_node(self) -> None:
         await self.master("getPid")  # rospy would wait for the master without end
         import rospy
@@ -185,10 +202,17 @@ class Graph:
         from rosafe.component import registration
 
         loop = asyncio.get_running_loop()
-        registrar = await asyncio.to_thread(registration.init_node, self.name[1:], [self._program])
-        self._is_node = True
+        start = functools.partial(
+            registration.init_node, self._program, startup.names_given(), not self._server, self._server
+        )
+        try:
+            (await asyncio.to_thread(start)).up()
+        except (rospy.ROSException, ValueError) as problem:
+            if rospy.core.is_shutdown_requested():  # it cannot become one again
+                self.gone.set()
+            raise middleware_error(f"cannot become a node: {problem}") from None
+        self.is_node, self.name = True, rospy.get_name()
         startup.log_to_stderr()
-        rospy.on_shutdown(registrar.end)
         rospy.on_shutdown(lambda: loop.is_closed() or loop.call_soon_threadsafe(self.gone.set))
 
 

@@ -111,7 +111,7 @@ class Proxy:
         self._link: asyncio.Task[None] | None = None
         self.turns = building.Turns()
         self.pending = 0  # requests that are not answered yet
-        self.used_at = asyncio.get_running_loop().time()
+        self.used_at = self.answered_at = asyncio.get_running_loop().time()
 
     @classmethod
     async def load(cls, graph: Graph, instance: str) -> Proxy:
@@ -135,6 +135,14 @@ class Proxy:
             raise cannot_load(f"/{self.instance} is a {self.component.name}, and no {name}")
         with self._one_more():
             await self._client("connect_port").check()
+
+    async def is_reachable(self) -> bool:
+        """Return whether the component can be reached."""
+        try:
+            await self._client("connect_port").check()
+        except ComponentError:
+            return False
+        return True
 
     async def close(self) -> None:
         """Let go of all connections; activities go on."""

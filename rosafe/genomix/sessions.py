@@ -6,6 +6,7 @@ import asyncio
 import functools
 import itertools
 import logging
+import math
 from collections import Counter
 from collections.abc import Awaitable, Callable, Mapping
 from typing import Any, TypeVar
@@ -26,6 +27,8 @@ MAX_COMPONENTS = 64  # per session
 IDLE_SECONDS = 600.0  # a session without a listener ends so long after its last request
 LINGER_SECONDS = 10.0  # a session that lost its last listener ends so long after
 UNUSED_SECONDS = 600.0  # connections to a component that no session has loaded are kept so long
+DEAD_SECONDS = 60.0  # what was loaded without a session is forgotten if it has not answered for so long
+CHECK_SECONDS = 10.0  # between two checks of that
 SWEEP_SECONDS = 1.0
 ORDER_SECONDS = 5.0  # the next request of a session waits at most so long for the one before to be acknowledged
 
@@ -305,6 +308,7 @@ class Sessions:
         self._proxies: dict[str, Proxy] = {}
         self._tasks: set[asyncio.Task[Any]] = set()
         self.keep(asyncio.create_task(self._sweep()))
+        self.keep(asyncio.create_task(self._check_components()))
 
     def keep(self, task: asyncio.Task[Any]) -> None:
         """Hold a task until it is done; asyncio does not."""
@@ -382,6 +386,21 @@ class Sessions:
             elif now > proxy.used_at + UNUSED_SECONDS:
                 del self._proxies[instance]
                 await proxy.close()
+
+    async def _check_components(self) -> None:
+        """Unload dead components from the session without a name, which never ends."""
+        clock = asyncio.get_running_loop().time
+        while True:
+            await asyncio.sleep(CHECK_SECONDS)
+            session = self._sessions.get("")
+            if session is None:
+                continue
+            for name, proxy in list(session.components.items()):
+                if proxy.pending or await proxy.is_reachable():
+                    proxy.answered_at = clock()
+                elif clock() > proxy.answered_at + DEAD_SECONDS and session.components.get(name) is proxy:
+                    proxy.used_at = -math.inf  # `release` closes it at once
+                    await session.unload(name)
 
     async def close(self) -> None:
         """End all sessions."""

@@ -15,7 +15,7 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-from rosafe.component import registration, startup
+from rosafe.component import startup
 from rosafe.genomix.graph import Graph
 from rosafe.http_server.access import own_names
 from rosafe.live.access import Door
@@ -25,7 +25,6 @@ from rosafe.live.robot import Robot
 from rosafe.live.server import Server
 
 THREADS = 8  # that wait for rospy
-LAST_WORDS_SECONDS = 1.5  # that the master has at the end
 EVERYWHERE = {"0.0.0.0": "127.0.0.1", "::": "[::1]", "": "127.0.0.1"}  # and where this machine finds itself then
 
 
@@ -54,13 +53,12 @@ async def serve(options: Options) -> None:
         loop.add_signal_handler(number, end.set)
     signal.signal(signal.SIGPIPE, signal.SIG_IGN)
     loop.set_default_executor(ThreadPoolExecutor(THREADS, "rospy"))
-    graph = Graph(os.environ["ROS_MASTER_URI"], "rosafe_live")
+    graph = Graph(os.environ["ROS_MASTER_URI"], "rosafe_live", server=True)
     robot = Robot(graph, options.instance, options.bass)
     server: Server | None = None
     opened: Path | None = None
     publishing: asyncio.Task[None] | None = None
     try:
-        await graph.become_node()
 
         def tell_news() -> None:
             if not loop.is_closed():
@@ -85,6 +83,7 @@ async def serve(options: Options) -> None:
             port = await server.start(options.host, options.port)
         except (OSError, UnicodeError) as problem:
             raise Taken(_why(problem, options)) from None
+        await graph.become_node()  # not before: another page of this name ends then
         shown = EVERYWHERE.get(options.host, f"[{options.host}]" if ":" in options.host else options.host)
         url = f"http://{shown}:{port}/?token={door.token}"
         print(f"The live page is at\n\n    {url}\n\nWho has this address may use it. Ctrl-C ends it.", flush=True)
@@ -104,8 +103,6 @@ async def serve(options: Options) -> None:
             opened.unlink(missing_ok=True)
         if server is not None:
             await server.close()
-            # What is let go has to reach the master, or it would know it for ever.
-            await asyncio.to_thread(registration.registrar().settle, LAST_WORDS_SECONDS)
         await robot.close()
         await graph.close()
 

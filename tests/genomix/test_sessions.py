@@ -283,6 +283,39 @@ def test_what_ended_sessions_asked_for_is_forgotten() -> None:
     run(check)
 
 
+def test_a_dead_component_without_a_session_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With all its connections, unless a session has it loaded, or it comes back in time."""
+    monkeypatch.setattr(sessions, "CHECK_SECONDS", 0.005)
+
+    async def check(every: Sessions, component: Component) -> None:
+        alive, closed = True, []
+
+        async def is_reachable() -> bool:
+            return alive
+
+        async def close() -> None:
+            closed.append(True)
+
+        monkeypatch.setattr(component, "is_reachable", is_reachable)
+        monkeypatch.setattr(component, "close", close)
+        shared, named = every.get(""), every.get("named")
+        every._proxies["bass"] = shared.components["ears"] = named.components["bass"] = component
+        queue = named.listen(), shared.listen()
+        before = component.answered_at
+        await wait_until(lambda: component.answered_at > before)
+        alive = False
+        monkeypatch.setattr(sessions, "DEAD_SECONDS", 0.02)
+        await wait_until(lambda: not shared.components)
+        assert queue[1].get_nowait() == ("unload", {"component": "ears"})
+        assert named.components and queue[0].empty() and not closed and every._proxies
+        shared.components["ears"] = component
+        await named.unload("bass")
+        await wait_until(lambda: bool(closed))
+        assert not (shared.components or every._proxies)
+
+    run(check)
+
+
 # --- events -----------------------------------------------------------------------------------------------------
 
 

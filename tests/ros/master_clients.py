@@ -110,7 +110,6 @@ def come(node: str) -> None:
     seen["topics"] = sorted(name for name, _ in rospy.get_published_topics(node) if "Port/" in name)
     seen["removed"] = call["removeProcessor"](name="preProc").genom_success
     seen["left"] = sorted(name for name, _ in rospy.get_published_topics(node) if "Port/" in name)
-    seen["parameter"] = rospy.get_param(f"{node}/actionlib_status_frequency")
     print(json.dumps(seen), flush=True)
 
 

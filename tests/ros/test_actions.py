@@ -256,15 +256,3 @@ def test_genom_state_comes_each_second_and_at_every_change(afe: Session) -> None
         wait_for(lambda: "PreProc" in {a.name for t in messages[-1].task for a in t.activity})
         afe.ok("removeProcessor", name="preProc")
         wait_for(lambda: "PreProc" not in {a.name for t in messages[-1].task for a in t.activity})
-
-
-def test_the_action_status_is_published_on_change_only(afe: Session) -> None:
-    assert rospy.get_param("/rosAFE/actionlib_status_frequency") == 0
-    from actionlib_msgs.msg import GoalStatusArray
-
-    with afe.graph.collect("/rosAFE/PreProc/status", GoalStatusArray) as messages:
-        wait_for(lambda: messages, what="the latched one")
-        afe.build("PreProc")
-        with afe.graph.collect("/rosAFE/genom_state", rosAFE.msg.genom_state_component) as states:
-            wait_for(lambda: len(states) >= 3)
-        assert len(messages) == 1, "a plain service is no goal"

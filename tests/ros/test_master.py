@@ -36,7 +36,6 @@ def assert_all_is_there(graph: Graph, clients: list[str], path: str) -> None:
         "topics": ["/rosAFE/gammatonePort/late", "/rosAFE/preProcPort/preProc"],
         "removed": True,
         "left": [],
-        "parameter": 0,
     }
 
 

@@ -1,0 +1,99 @@
+"""genomixd as a node of the graph: its name, from when to when it is there, and what it leaves behind."""
+
+from __future__ import annotations
+
+import signal
+from pathlib import Path
+from typing import Any
+
+import rosgraph
+
+from tests.genomix.world import Http
+from tests.harness import END_SECONDS, Graph, free_port, private_graph, wait_for
+
+
+def registrations(graph: Graph, node: str) -> int:
+    """How many topics and services of `node` the master knows."""
+    state: Any = rosgraph.Master("/test", master_uri=graph.uri).getSystemState()
+    return sum(node in nodes for kind in state for _, nodes in kind)
+
+
+def known(graph: Graph, node: str) -> bool:
+    """Whether the master has an address for `node`."""
+    try:
+        return bool(rosgraph.Master("/test", master_uri=graph.uri).lookupNode(node))
+    except rosgraph.MasterError:
+        return False
+
+
+def test_it_leaves_the_graph_with_all_its_registrations(graph: Graph) -> None:
+    port = free_port()
+    with graph.node("bass-ros"), graph.node("rosAFE-ros"), graph.start("genomixd", "-p", str(port)) as server:
+        wait_for(lambda: "/genomixd" in graph.nodes(), what=lambda: str(server))  # without any request
+        for component in ("bass", "rosAFE"):
+            wait_for(lambda: Http(port).get(f"/load/{component}"))  # noqa: B023
+        wait_for(lambda: registrations(graph, "/genomixd") > 4 * 24)  # four topics of each action
+        assert server.stop(signal.SIGTERM, timeout=END_SECONDS) == 0
+        wait_for(lambda: not registrations(graph, "/genomixd"), 1.5)
+        assert not known(graph, "/genomixd")
+
+
+def test_names(graph: Graph) -> None:
+    """By default genomixd, unless one of that name runs; what a killed one has left does not count."""
+
+    def names() -> set[str]:
+        return {node for node in graph.nodes() if "genomixd" in node or "ears" in node}
+
+    with graph.start("genomixd", "-p", str(free_port())) as first:
+        wait_for(lambda: names() == {"/genomixd"}, what=lambda: str(first))
+        with graph.start("genomixd", "-p", str(free_port())) as second:
+            wait_for(lambda: len(names()) == 2, what=lambda: str(second))
+            assert first.alive and (names() - {"/genomixd"}).pop().startswith("/genomixd_")
+            assert second.stop() == 0
+        with graph.start("genomixd", "-p", str(free_port()), "__name:=ears", "__ns:=/robot") as third:
+            wait_for(lambda: names() == {"/genomixd", "/robot/ears"}, what=lambda: str(third))
+            assert third.stop() == 0
+        first.stop(signal.SIGKILL)
+        assert names() == {"/genomixd"}
+        with graph.start("genomixd", "-p", str(free_port())) as heir:
+            wait_for(lambda: f"Pid: {heir.pid}\n" in graph.run("rosnode", "info", "/genomixd", check=False).stdout)
+            assert heir.stop() == 0
+    assert not names()
+
+
+def test_a_master_that_comes_later(tmp_path: Path) -> None:
+    with private_graph(tmp_path) as (graph, master):
+        master.kill()
+        port = free_port()
+        with graph.start("genomixd", "-p", str(port)) as server:
+            wait_for(lambda: _answers(port), what=lambda: str(server))
+            master.start(graph.env)
+            wait_for(lambda: "/genomixd" in graph.nodes(), what=lambda: str(server))
+            assert server.stop() == 0
+            assert not known(graph, "/genomixd")
+
+
+def _answers(port: int) -> bool:
+    try:
+        return Http(port).get("/components") is not None
+    except OSError:
+        return False
+
+
+def test_rosafe_live_is_a_node_with_a_name(graph: Graph) -> None:
+    def start(*name: str) -> Any:
+        return graph.start("rosafe", "live", "--no-browser", "--port", str(free_port()), *name)
+
+    with start() as page:
+        wait_for(lambda: "/rosafe_live" in graph.nodes(), what=lambda: str(page))
+        assert page.stop() == 0
+    wait_for(lambda: not known(graph, "/rosafe_live"), 1.5)
+
+
+def test_commands_take_the_name_that_roslaunch_gives(graph: Graph, tmp_path: Path) -> None:
+    with graph.node("bass-ros"):
+        assert graph.call("/bass/Acquire", device="scene:").genom_success
+        with graph.start("rosafe", "record", str(tmp_path / "a.wav"), "__name:=ears") as recorder:
+            wait_for(lambda: ("/bass/Audio", "/ears") in graph.readers(), what=lambda: str(recorder))
+            recorder.stop(signal.SIGINT)
+        wait_for(lambda: not known(graph, "/ears"), 1.5)
