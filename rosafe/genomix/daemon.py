@@ -15,7 +15,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 from rosafe.component import generate, master, startup, systemd
 from rosafe.genomix.graph import JOIN_SECONDS, Graph
-from rosafe.genomix.names import Names
+from rosafe.genomix.names import Names, parameter_name
 from rosafe.genomix.server import Server
 from rosafe.genomix.sessions import Sessions
 from rosafe.http_server.access import host_name, own_names
@@ -124,7 +124,8 @@ async def _serve(options: argparse.Namespace, told: startup.Background | None) -
     _allow_many_files()
     sys.setswitchinterval(startup.SWITCH_SECONDS)
     graph = Graph(os.environ["ROS_MASTER_URI"], server=True)
-    server = Server(Sessions(graph), Names(graph, {*own_names(), options.host, *options.name}))
+    names = Names(graph, parameter_name(sys.argv[1:]), {*own_names(), options.host, *options.name})
+    server = Server(Sessions(graph), names)
     try:
         port = await server.start(options.host, options.port)
         logging.getLogger("genomixd").info("serving http://%s:%d", options.host, port)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import logging
-from collections.abc import Collection, Iterable
+import os
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 from rosafe.genomix.graph import Graph, Unknown
 from rosafe.http_server.access import host_name
 from rosafe.interface import ComponentError
 
-PARAMETER = "names"
 READ_SECONDS = 1.0  # between two reads of the parameter, however many clients use unknown names
 
 log = logging.getLogger("genomixd")
@@ -23,13 +23,15 @@ class Names:
     Parameters
     ----------
     graph : Graph
-        Whose master has the parameter `~names`: a name, or a list of them.
+        Whose master has the parameter.
+    parameter : str
+        The full name of `~names`: a name, or a list of them.
     names : iterable of str
         Those that it accepts without a master.
     """
 
-    def __init__(self, graph: Graph, names: Iterable[str]) -> None:
-        self._graph = graph
+    def __init__(self, graph: Graph, parameter: str, names: Iterable[str]) -> None:
+        self._graph, self._parameter = graph, parameter
         self.known: Collection[str] = {host_name(name) for name in names} - {""}
         self._next_read = 0.0
         self._value: Any = []
@@ -41,15 +43,22 @@ class Names:
         if now >= self._next_read:
             self._next_read = now + READ_SECONDS
             try:
-                value = await self._graph.master("getParam", f"{self._graph.name}/{PARAMETER}")
+                value = await self._graph.master("getParam", self._parameter)
             except Unknown:
                 value = []
             except ComponentError:
                 return self._from_parameter
             if value != self._value:
                 self._value = value
-                self._from_parameter = _parse(value, f"{self._graph.name}/{PARAMETER}")
+                self._from_parameter = _parse(value, self._parameter)
         return self._from_parameter
+
+
+def parameter_name(arguments: Sequence[str], environ: Mapping[str, str] = os.environ) -> str:
+    """Return the full name of `~names`, of the node's name that roslaunch or `__name:=` gives."""
+    given = dict(text.split(":=", 1) for text in arguments if ":=" in text)
+    place = f"{given.get('__ns', environ.get('ROS_NAMESPACE', ''))}/{given.get('__name', 'genomixd')}/names"
+    return "/" + "/".join(filter(None, place.split("/")))
 
 
 def _parse(value: Any, parameter: str) -> set[str]:

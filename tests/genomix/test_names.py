@@ -48,14 +48,14 @@ def test_names_in_the_ros_parameter(
     async def scenario() -> None:
         ours = RosGraph(graph.uri)
         try:
-            known = names.Names(ours, {"Robot.", "10.0.0.1", "::1"})
+            known = names.Names(ours, "/test_names/names", {"Robot.", "10.0.0.1", "::1"})
             assert known.known == {"robot", "10.0.0.1"}
             assert await known.from_parameter() == ()
             for value, wanted in (("Ears.lab", {"ears.lab"}), (["one", "two.lab."], {"one", "two.lab"})):
-                master.setParam("/test", f"{ours.name}/names", value)
+                master.setParam("/test", "/test_names/names", value)
                 assert await known.from_parameter() == wanted
             assert not caplog.messages
-            master.setParam("/test", f"{ours.name}/names", ["a b", 7, "three"])
+            master.setParam("/test", "/test_names/names", ["a b", 7, "three"])
             for _ in range(2):
                 assert await known.from_parameter() == {"three"}
             assert [text.partition(": ")[2] for text in caplog.messages] == [
@@ -65,12 +65,37 @@ def test_names_in_the_ros_parameter(
             ours.uri = "http://127.0.0.1:1"  # the master is away: what it said last holds
             assert await known.from_parameter() == {"three"}
             ours.uri = graph.uri
-            master.deleteParam("/test", f"{ours.name}/names")
+            master.deleteParam("/test", "/test_names/names")
             assert not await known.from_parameter()
         finally:
             await ours.close()
 
     asyncio.run(scenario())
+
+
+@pytest.mark.parametrize(
+    ("arguments", "namespace", "wanted"),
+    [
+        ([], "", "/genomixd/names"),
+        (["-v", "__name:=g", "a:=b"], "", "/g/names"),
+        (["__name:=g"], "/robot/", "/robot/g/names"),
+        (["__ns:=/left"], "robot", "/left/genomixd/names"),
+    ],
+)
+def test_the_name_of_the_parameter(arguments: list[str], namespace: str, wanted: str) -> None:
+    assert names.parameter_name(arguments, {"ROS_NAMESPACE": namespace}) == wanted
+
+
+def test_the_parameter_of_a_genomixd_that_runs(graph: Graph) -> None:
+    with graph.start("genomixd", "-v", "-p", "0", "__name:=genomixd_of_names") as server:
+        port = port_of(server)
+        master = xmlrpc.client.ServerProxy(graph.uri)
+        master.setParam("/test", "/genomixd_of_names/names", "Ears.lab")
+        try:
+            assert status(port, "ears.lab.:99") == 200
+            assert status(port, "other.lab") == 403
+        finally:
+            master.deleteParam("/test", "/genomixd_of_names/names")
 
 
 @pytest.mark.parametrize("name", ["", "a b", "http://robot", "robot/x", "*"])
