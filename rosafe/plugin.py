@@ -16,6 +16,7 @@ API_VERSION : int
 
 from rosafe.dsp.framing import FramedStage, frame_parameters
 from rosafe.dsp.stage import Stage
+from rosafe.dsp.variants import variant
 from rosafe.vocabulary.parameter import Parameter
 from rosafe.vocabulary.representation import Derived, Part, Representation
 
@@ -30,4 +31,5 @@ __all__ = [
     "Representation",
     "Stage",
     "frame_parameters",
+    "variant",
 ]

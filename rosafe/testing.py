@@ -201,7 +201,8 @@ class _Trial:
                 except PluginError:
                     raise
                 except ValueError as problem:
-                    assert str(problem).startswith(parameter.name), f"{problem}: does not begin with the parameter"
+                    names = tuple(p.name for p in self.kind.REPRESENTATION.parameters)
+                    assert str(problem).startswith(names), f"{problem}: does not begin with the name of a parameter"
                     continue
                 self.run(sound[:, half:], [160, 0, 7], stages)
 

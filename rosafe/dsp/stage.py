@@ -62,6 +62,7 @@ class Stage(OldNames):
     """
 
     REPRESENTATION: ClassVar[Representation]
+    DECLARED_WITHIN: ClassVar[Representation | None] = None  # of a variant: with the names that the stage itself uses
     INPUT: ClassVar[tuple[str, ...]] = ("ear", "channel", "time")  # axes of the blocks that come
     EXTRAS: ClassVar[tuple[str, ...]] = ()  # by-products that children may need, such as the envelope
     OVERWRITES: ClassVar[bool] = False  # `out` may be the input block
@@ -78,7 +79,7 @@ class Stage(OldNames):
         self.input_format = input_format
         self.provide: frozenset[str] = frozenset()
         self.provided: dict[str, FloatArray] = {}
-        declared = self.REPRESENTATION.parameters
+        declared = (self.DECLARED_WITHIN or self.REPRESENTATION).parameters
         self.values = {parameter.name: parameter.check(parameter.default) for parameter in declared}
         self.values = self._with(parameters)
         self.build(self.values, frozenset(self.values))
@@ -222,7 +223,7 @@ class Stage(OldNames):
 
     def _parameter(self, name: str) -> Parameter:
         try:
-            return self.REPRESENTATION.parameter(name)
+            return (self.DECLARED_WITHIN or self.REPRESENTATION).parameter(name)
         except KeyError:
             raise ValueError(f"{name}: {type(self).__name__} has no such parameter") from None
 

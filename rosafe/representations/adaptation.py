@@ -140,7 +140,7 @@ class Adaptation(Stage):
 
     @classmethod
     def in_force(cls, values: Mapping[str, Any]) -> dict[str, Any]:
-        parameter = cls.REPRESENTATION.parameter
+        parameter = (cls.DECLARED_WITHIN or cls.REPRESENTATION).parameter
         published = SETS.get(values["adpt_model"], {})
         return {**values, **{name: parameter(name).check(value) for name, value in published.items()}}
 

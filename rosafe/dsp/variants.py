@@ -1,0 +1,148 @@
+"""Variants of a representation: the same computation as another kind, with its own defaults and names of parameters."""
+
+from __future__ import annotations
+
+import re
+import sys
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import replace
+from typing import Any, ClassVar
+
+from rosafe.vocabulary.representation import Representation
+
+from .signal import Signal
+from .stage import Stage
+
+
+def variant(base: type[Stage], kind: str, prefix: str, doc: str = "", **defaults: Any) -> type[Stage]:
+    """A subclass of a representation's stage that computes the same as another kind.
+
+    Parameters
+    ----------
+    base : type
+        The stage, such as ``rosafe.representations.ratemap.Ratemap``.
+    kind : str
+        The name of the new kind.
+    prefix : str
+        What the names of its parameters begin with: ``rm_decaySec`` of a ratemap becomes ``<prefix>_decaySec``.
+    doc : str
+        What it computes, in one line; by default what `base` says.
+    **defaults
+        Default values by the new names; all others are those of `base`.
+
+    Returns
+    -------
+    type
+        The stage, which belongs to the module of the caller.
+
+    Raises
+    ------
+    ValueError
+        For a default of an unknown parameter, or out of its range.
+    """
+    known = base.REPRESENTATION
+    names = {name: _renamed(name, prefix) for name in (*(p.name for p in known.parameters), *_derived(known))}
+    unknown = set(defaults) - set(names.values())
+    if unknown:
+        raise ValueError(f"{min(unknown)}: expected one of {', '.join(names.values())}")
+    inner = tuple(replace(p, default=defaults.get(names[p.name], p.default)) for p in known.parameters)
+    single = len(known.parts) == 1
+    declared = replace(
+        known,
+        kind=kind,
+        doc=doc or known.doc,
+        axes=known.parts[0].axes if single else (),
+        unit=known.parts[0].unit if single else "",
+        parts=() if single else known.parts,
+        parameters=tuple(replace(p, name=names[p.name], aliases=(), former=()) for p in inner),
+        request_order=tuple(names[name] for name in known.request_order),
+        derived=tuple(replace(d, name=names[d.name]) for d in known.derived),
+        coordinates=tuple(names[name] for name in known.coordinates),
+        **dict.fromkeys(("name", "name_doc", "request", "port", "port_doc", "word"), ""),
+        **dict.fromkeys(("request_aliases", "port_aliases", "word_aliases"), ()),
+    )
+    attributes: dict[str, Any] = {"REPRESENTATION": declared, "NAMES": names, "DECLARED_WITHIN": replace(known, parameters=inner)}
+    attributes |= {"__doc__": base.__doc__, "__module__": sys._getframe(1).f_globals["__name__"]}
+    return type(kind[:1].upper() + kind[1:], (_Variant, base), attributes)
+
+
+def _renamed(name: str, prefix: str) -> str:
+    return f"{prefix}_{name.partition('_')[2]}"
+
+
+def _derived(known: Representation) -> Iterator[str]:
+    return (d.name for d in known.derived)
+
+
+class _Variant(Stage):
+    """Translates the names of parameters; within the stage they are those of the original."""
+
+    NAMES: ClassVar[Mapping[str, str]]  # of parameters and derived values, by those within the stage
+
+    def __init__(self, input_format: Signal | float, **parameters: Any) -> None:
+        inward = self._inward(parameters)
+        with self._translating():
+            super().__init__(input_format, **inward)
+
+    @classmethod
+    def _inward(cls, values: Mapping[str, Any]) -> dict[str, Any]:
+        inner = {new: name for name, new in cls.NAMES.items()}
+        unknown = [name for name in values if name not in inner]
+        if unknown:
+            raise ValueError(f"{unknown[0]}: {cls.REPRESENTATION.kind} has no such parameter")
+        return {inner[name]: value for name, value in values.items()}
+
+    @classmethod
+    def _is_inner(cls, values: Mapping[str, Any]) -> bool:
+        """Whether the stage's own code asks."""
+        return not set(values) <= set(cls.NAMES.values())
+
+    @classmethod
+    def _outward(cls, values: Mapping[str, Any]) -> dict[str, Any]:
+        return {cls.NAMES.get(name, name): value for name, value in values.items()}
+
+    @classmethod
+    @contextmanager
+    def _translating(cls) -> Iterator[None]:
+        """Use the names of the variant in errors."""
+        try:
+            yield
+        except ValueError as problem:
+            text = re.sub("|".join(rf"\b{name}\b" for name in cls.NAMES), lambda m: cls.NAMES[m[0]], str(problem))
+            raise ValueError(text).with_traceback(problem.__traceback__) from None
+
+    def become(self, given: Signal, changes: Collection[Mapping[str, Any]]) -> None:
+        inward = [self._inward(change) for change in changes]
+        with self._translating():
+            super().become(given, inward)
+
+    @property
+    def parameters(self) -> dict[str, Any]:
+        return self._outward(super().parameters)
+
+    @property
+    def derived(self) -> dict[str, Any]:
+        return self._outward(super().derived)
+
+    @classmethod
+    def in_force(cls, values: Mapping[str, Any]) -> dict[str, Any]:
+        if cls._is_inner(values):
+            return super().in_force(values)
+        with cls._translating():
+            return cls._outward(super().in_force(cls._inward(values)))
+
+    @classmethod
+    def at_rate(cls, values: Mapping[str, Any], given: Collection[str], sample_rate: float) -> dict[str, Any]:
+        if cls._is_inner(values):
+            return super().at_rate(values, given, sample_rate)
+        with cls._translating():
+            names = cls._inward(dict.fromkeys(given))
+            return cls._outward(super().at_rate(cls._inward(values), names, sample_rate))
+
+    @classmethod
+    def asked(cls, values: Mapping[str, Any]) -> dict[str, Any]:
+        own = {name: value for name, value in values.items() if name in cls.NAMES.values()}
+        others = {name: value for name, value in values.items() if name not in own}
+        with cls._translating():
+            return {**others, **cls._outward(super().asked(cls._inward(own)))}
