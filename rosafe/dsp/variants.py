@@ -62,7 +62,11 @@ def variant(base: type[Stage], kind: str, prefix: str, doc: str = "", **defaults
         **dict.fromkeys(("name", "name_doc", "request", "port", "port_doc", "word"), ""),
         **dict.fromkeys(("request_aliases", "port_aliases", "word_aliases"), ()),
     )
-    attributes: dict[str, Any] = {"REPRESENTATION": declared, "NAMES": names, "DECLARED_WITHIN": replace(known, parameters=inner)}
+    attributes: dict[str, Any] = {
+        "REPRESENTATION": declared,
+        "NAMES": names,
+        "DECLARED_WITHIN": replace(known, parameters=inner),
+    }
     attributes |= {"__doc__": base.__doc__, "__module__": sys._getframe(1).f_globals["__name__"]}
     return type(kind[:1].upper() + kind[1:], (_Variant, base), attributes)
 

@@ -29,9 +29,15 @@ def gated(what: str, *lines: str) -> str:
 
 
 PLUGINS = {
-    "breaks": Fault(PLAIN, gated("broken", "if self.os.path.exists(self.gate):", "    raise OSError('no more')", "return block * 2"), ""),
+    "breaks": Fault(
+        PLAIN,
+        gated("broken", "if self.os.path.exists(self.gate):", "    raise OSError('no more')", "return block * 2"),
+        "",
+    ),
     "below": BELOW,
-    "hangs": Fault(PLAIN, gated("free", "while not self.os.path.exists(self.gate):", "    np.sort(block)", "return block * 2"), ""),
+    "hangs": Fault(
+        PLAIN, gated("free", "while not self.os.path.exists(self.gate):", "    np.sort(block)", "return block * 2"), ""
+    ),
     "moody": Fault(
         PLAIN,
         gated("moody", "return block * 2")
@@ -123,7 +129,9 @@ def test_a_failure_is_an_error_that_names_the_children(world: worlds.World, fold
     status = wait_for(lambda: (now := health(world)).level == DiagnosticStatus.ERROR and now)
     (folder / "broken").unlink()
     told = next(v.value for v in status.values if v.key == "failed first")
-    assert re.match(rf"first \(breaks\) failed: plugin breaks \({folder}/breaks.py:\d+\): process: OSError: no more", told)
+    assert re.match(
+        rf"first \(breaks\) failed: plugin breaks \({folder}/breaks.py:\d+\): process: OSError: no more", told
+    )
     assert "; ended with it: second" in told
     assert {"first", "second"}.isdisjoint(names(world))
     text = log(world)

