@@ -1,11 +1,14 @@
-"""Check a plugin file: whether it can be imported, and whether its declaration is complete and free of conflicts.
+"""Check a plugin file: import, declaration, and whether its stages do what the tree relies on.
 
-The file is imported in a child process, together with the plugins that ROSAFE_PLUGINS names: one may be its parent."""
+The stages are tried on blocks of different lengths, at the limits of all parameters, on silence, loud and long sound,
+and so on; their cost is compared with that of the built-in representations. All of this happens in child processes,
+together with the plugins that ROSAFE_PLUGINS names: one may be the parent."""
 
 from __future__ import annotations
 
 import argparse
 import os
+import textwrap
 
 from rosafe.commands import Failure, _plugins
 from rosafe.terminal import printable
@@ -36,13 +39,23 @@ def run(options: argparse.Namespace) -> int:
         warnings.append(
             f"{origin}: files whose names begin with {', '.join(plugins.SKIPPED)} are not loaded from folders"
         )
-    # What a run of the stages shows is added here: only for `kinds`, and in another child process.
+    trials = _plugins.trials(kinds, extra) if kinds else []
+    errors += [f"{origin}: {trial.kind}: {trial.error}" for trial in trials if trial.error]
     for state, lines in (("ERROR", errors), ("warning", warnings)):
         for line in lines:
             print(f"{state:8}{printable(line)}")
-    for kind in kinds:
-        print(f"{'ok':8}{printable(origin)}: {kind}: the declaration is complete and has no conflicts")
+    for trial in trials:
+        if not trial.error:
+            print(f"{'ok':8}{printable(origin)}: {trial.kind}: the declaration and the stage passed all checks")
+            _print_costs(trial)
     return 1 if errors else 0
+
+
+def _print_costs(trial: _plugins.Trial) -> None:
+    """Milliseconds per second of sound, each without its parents."""
+    print(f"{'cost':8}{trial.kind} takes {trial.costs[trial.kind]:.3g} ms per second of sound at 44.1 kHz; built in:")
+    others = [f"{kind} {cost:.3g}" for kind, cost in trial.costs.items() if kind != trial.kind]
+    print(textwrap.fill(", ".join(others), 100, initial_indent=" " * 8, subsequent_indent=" " * 8))
 
 
 def _origin(file: str) -> tuple[str, str]:

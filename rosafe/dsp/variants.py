@@ -48,6 +48,10 @@ def variant(base: type[Stage], kind: str, prefix: str, doc: str = "", **defaults
         raise ValueError(f"{min(unknown)}: expected one of {', '.join(names.values())}")
     inner = tuple(replace(p, default=defaults.get(names[p.name], p.default)) for p in known.parameters)
     single = len(known.parts) == 1
+    renewed: dict[str, Any] = {
+        **dict.fromkeys(("name", "name_doc", "request", "port", "port_doc", "word"), ""),
+        **dict.fromkeys(("request_aliases", "port_aliases", "word_aliases"), ()),
+    }
     declared = replace(
         known,
         kind=kind,
@@ -59,8 +63,7 @@ def variant(base: type[Stage], kind: str, prefix: str, doc: str = "", **defaults
         request_order=tuple(names[name] for name in known.request_order),
         derived=tuple(replace(d, name=names[d.name]) for d in known.derived),
         coordinates=tuple(names[name] for name in known.coordinates),
-        **dict.fromkeys(("name", "name_doc", "request", "port", "port_doc", "word"), ""),
-        **dict.fromkeys(("request_aliases", "port_aliases", "word_aliases"), ()),
+        **renewed,
     )
     attributes: dict[str, Any] = {
         "REPRESENTATION": declared,

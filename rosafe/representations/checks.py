@@ -110,7 +110,7 @@ def _of_class(stage: Any) -> Iterator[str]:
         if problem := bad_name(prefix):
             yield f"prefix: {problem}"
         for end in ("wname", "wSizeSec", "hSizeSec"):
-            if f"{prefix}_{end}" not in {p.name for p in mine.parameters}:
+            if f"{prefix}_{end}" not in {p.name for p in (stage.DECLARED_WITHIN or mine).parameters}:
                 yield f"prefix: there is no parameter {prefix}_{end}; expected frame_parameters({prefix!r})"
     if mine.derived and stage.derived is Stage.derived:
         yield f"derived: {mine.derived[0].name} is declared, but the property derived is missing"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
 
@@ -14,7 +15,8 @@ from rosafe.dsp.plugin_checks import checked
 from rosafe.interface import KINDS
 from rosafe.representations import STAGES
 from rosafe.testing import check_representation
-from tests.plugins.stages import FAULTS, FRAMED, PLAIN, SAMPLES, Fault, loaded, text_of
+from tests.harness import PATIENCE, PYTHON, ROOT
+from tests.plugins.stages import FAULTS, FRAMED, PLAIN, SAMPLES, Fault, loaded, process, text_of
 
 SOUND = 0.1 * np.random.default_rng(1).standard_normal((2, 8000))
 RUN_TIME = [name for name, fault in FAULTS.items() if fault.at_run_time]
@@ -69,3 +71,20 @@ def test_python_raises_an_error_with_kind_and_place(use: Callable[[str], Path], 
         with pytest.raises(ValueError, match=f"plugin mine .{re.escape(str(path))}:[0-9]+") as caught:
             run()
         assert FAULTS[name].told in str(caught.value)
+
+
+def test_the_command_tries_the_stage(tmp_path: Path) -> None:
+    """One that passes, with its cost; one that depends on blocks; and one that ends the process."""
+    good, bad, ends = (tmp_path / f"{name}.py" for name in ("good", "bad", "ends"))
+    good.write_text(text_of(Fault(PLAIN, "", "")))
+    bad.write_text(text_of(FAULTS["depends on blocks"]))
+    ends.write_text(text_of(Fault(PLAIN, process("import os", "os._exit(7)"), "")))
+    for path, code, told in (
+        (good, 0, "mine takes "),
+        (bad, 1, f"{bad}: mine: the output depends on blocks"),
+        (ends, 1, f"{ends}: mine: the process that tried it ended with exit status 7"),
+    ):
+        command = ["-m", "rosafe.commands", "check", str(path)]
+        done = subprocess.run([PYTHON, *command], cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE)
+        assert (done.returncode, "Traceback" in done.stderr) == (code, False), done
+        assert told in done.stdout

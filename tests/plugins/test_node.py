@@ -1,4 +1,4 @@
-"""Plugins that fail or do not return in a running node: log, /diagnostics, `rosafe request` and the live page say so."""
+"""Plugins that fail or do not return in a running node: log, /diagnostics, `rosafe request`, live page."""
 
 from __future__ import annotations
 
@@ -41,7 +41,8 @@ PLUGINS = {
     "moody": Fault(
         PLAIN,
         gated("moody", "return block * 2")
-        + "\n\n    @property\n    def derived(self):\n        return {} if self.os.path.exists(self.gate) else {'my_count': 1}",
+        + "\n\n    @property\n    def derived(self):"
+        + "\n        return {} if self.os.path.exists(self.gate) else {'my_count': 1}",
         "",
         DERIVED,
     ),
@@ -148,8 +149,8 @@ def test_a_failure_is_an_error_that_names_the_children(world: worlds.World, fold
 
 def test_a_stage_that_does_not_return_is_named_and_stops_nobody(world: worlds.World, folder: Path) -> None:
     make(world, "hangs", "stuck", "ratemap_0")
-    status = wait_for(lambda: next((v for v in health(world).values if v.key == "slow stuck"), None))
-    assert status.value.startswith(f"stuck (plugin hangs ({folder}/hangs.py)) is slow: one call has been running for")
+    text = wait_for(lambda: next((v.value for v in health(world).values if v.key == "slow stuck"), ""))
+    assert text.startswith(f"stuck (plugin hangs ({folder}/hangs.py)) is slow: one call has been running for")
     assert "stuck (plugin hangs" in log(world)
     index = newest(world, "ratemap_0")
     wait_for(lambda: newest(world, "ratemap_0") > index + 5 * 4410)

@@ -1,0 +1,111 @@
+"""Nine plugins work through every interface: Python, ROS, HTTP, Tcl, setups and the live page."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+from pathlib import Path
+from typing import Any
+from unittest import mock
+
+import pytest
+
+from tests.genomix import world as worlds
+from tests.harness import wait_for
+from tests.live.world import live, page
+from tests.plugins.stages import FRAMED, PLAIN, SAMPLES, Fault, text_of
+from tests.plugins.support import python
+from tests.plugins.test_documents import plugins
+
+OF_THE_PAGE = ("zeroCrossings", "bands", "slowRatemap")
+OF_0_2 = ("everyNth", "meanSquare", "fineIld")
+SHORT = {"factors": PLAIN, "samples": SAMPLES, "means": FRAMED}
+KINDS = (*OF_THE_PAGE, *OF_0_2, *SHORT)
+NAMES = {kind: f"{'nth' if kind == 'everyNth' else kind}_0" for kind in KINDS}  # of the processors that are requested
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The nine plugins."""
+    path = tmp_path_factory.mktemp("plugins")
+    for name in ("zerocrossings.py", "bands.py", "slowratemap.py"):
+        (path / name).write_text(plugins()[name])
+    old = Path(__file__).with_name("plugins_0_2") / "oldnames.py"
+    (path / old.name).write_text(old.read_text())
+    for kind, text in SHORT.items():
+        plugin = text_of(Fault(text, "", "")).replace('kind="mine"', f'kind="{kind}"')
+        plugin = plugin.replace("my_", f"{kind}_").replace('"my"', f'"{kind}"')
+        (path / f"{kind}.py").write_text(plugin)
+    return path
+
+
+def test_in_python(folder: Path) -> None:
+    code = f"""
+import json, numpy as np, rosafe
+from rosafe.interface import KINDS
+sound = 0.1 * np.random.default_rng(1).standard_normal((2, 8000))
+names = {KINDS!r}
+result = rosafe.process(sound, 16000, outputs=names)
+stream = rosafe.Stream(16000, outputs=names)
+blocks = [stream.process(block) for block in np.array_split(sound, 7, axis=1)]
+outputs = [output for name in names for output in KINDS[name].outputs]
+joined = {{name: np.concatenate([block[name] for block in blocks], axis=-1) for name in outputs}}
+print(json.dumps({{name: bool(np.allclose(joined[name], result[name]) and result[name].any()) for name in outputs}}))
+"""
+    done = python(code, folder)
+    assert done.returncode == 0, done.stderr
+    told = json.loads(done.stdout)
+    assert all(told.values()) and len(told) == len(KINDS) + 2
+
+
+@pytest.mark.ros
+def test_in_a_running_node(folder: Path) -> None:
+    with mock.patch.dict(os.environ, ROSAFE_PLUGINS=str(folder)), worlds.world(folder.parent) as world:
+        world.http.send("bass/Acquire", ["scene:"])
+        world.http.call("rosAFE/connect_port", ["Audio", "bass/Audio"])
+
+        # the live page builds them, and shows a picture of each
+        async def scenario(address: Any) -> None:
+            async with page(address) as client:
+                for kind in KINDS:
+                    answer: dict[str, Any] = {}
+                    while "ok" not in answer:  # until there is sound
+                        answer = await client.ask("build", representation=kind, nFramesPerBlock=4410)
+                        assert "ok" in answer or "e_noData" in answer["error"], answer
+                views = await client.look(*({"what": "picture", "name": name} for name in NAMES.values()))
+                while not all(client.pieces.get(view["number"]) for view in views):
+                    await client.hear()
+
+        with live(world.graph) as shown:
+            asyncio.run(asyncio.wait_for(scenario(shown), 120))
+
+        # HTTP and ROS
+        there = {p["name"]: p for p in world.http.call("rosAFE/getProcessors")["processors"]}
+        topics = world.graph.topics()
+        for name in NAMES.values():
+            assert there[name]["topic"] in topics
+            parts = world.http.call("rosAFE/getRepresentation", [name])["parts"]
+            assert parts and all(part["lastFrameIndex"] > 0 for part in parts)
+        answer = world.graph.run("rosservice", "call", "/rosAFE/getDependencies", "{nameProc: meanSquare_0}").stdout
+        assert "nth_0" in answer
+
+        # Tcl
+        lines = world.lines(
+            "set g [::genomix::connect $address]\n$g load rosAFE\n"
+            + "\n".join(
+                f"show [dict exists [::rosAFE::{kind}Port {name}] {kind}Port sampleRate]"
+                for kind, name in NAMES.items()
+            )
+        )
+        assert lines[-len(KINDS) :] == ["1"] * len(KINDS)
+
+        # setups
+        setup = folder.parent / "setup.yaml"
+        world.graph.run("rosafe", "setup", "save", str(setup))
+        world.http.call("rosAFE/Stop")
+        assert world.http.call("rosAFE/getProcessors")["processors"] == []
+        world.graph.run("rosafe", "setup", "load", str(setup))
+        wait_for(
+            lambda: set(NAMES.values()) <= {p["name"] for p in world.http.call("rosAFE/getProcessors")["processors"]}
+        )
