@@ -172,7 +172,7 @@ def new_folder(target: str | Path, replace: bool, sign: str) -> Iterator[Path]:
             for left in part.iterdir():
                 _remove(left)
             yield part
-            os.fsync(descriptor)
+            sync_tree(part)
             if not _is_at(part, descriptor):
                 raise FileNotFoundError(errno.ENOENT, f"{part} is not there any more")
             if os.path.lexists(path):
@@ -305,14 +305,25 @@ def _renameat2(name: Path, path: Path, flag: int) -> None:
     raise OSError(problem, os.strerror(problem))
 
 
+def sync_tree(folder: Path) -> None:
+    """Have the folder and everything in it on the disk, so that they survive a power cut once they are renamed."""
+    for parent, _, names in os.walk(folder):
+        for name in names:
+            _sync(Path(parent, name))
+        _sync_folder(Path(parent))
+
+
 def _sync_folder(folder: Path) -> None:
-    """Have a new name survive a power cut, where the file system knows how."""
-    with contextlib.suppress(OSError):
-        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
-        try:
-            os.fsync(descriptor)
-        finally:
-            os.close(descriptor)
+    with contextlib.suppress(OSError):  # a file system that cannot
+        _sync(folder)
+
+
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def _holder(descriptor: int) -> str:

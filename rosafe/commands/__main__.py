@@ -6,12 +6,11 @@ import argparse
 import ast
 import importlib
 import inspect
-import os
 import pkgutil
 import sys
 from pathlib import Path
 
-from rosafe import commands, missing
+from rosafe import commands, missing, streams
 from rosafe.commands import Failure
 from rosafe.component.startup import Parser, without_names
 from rosafe.output import OutputError
@@ -29,20 +28,17 @@ def main(argv: list[str] | None = None) -> int:
     """Run `rosafe`; returns its exit code. A wrong command line raises SystemExit(2); -h and --version (0)."""
     name = "rosafe"
     try:
-        try:
-            words = without_names(sys.argv[1:] if argv is None else argv)
-            options, rest = _parser(words).parse_known_args(words)
-            name = f"rosafe {options.command}"
-            if hasattr(options, "missing"):
-                raise Failure(options.missing)
-            if hasattr(options, "interspersed"):
-                options.interspersed = [word for word in rest if not word.startswith("-")]
-                rest = [word for word in rest if word.startswith("-")]
-            if rest:
-                options.usage_error(f"unrecognized arguments: {' '.join(rest)}")
-            return int(options.run(options))
-        finally:
-            sys.stdout.flush()
+        words = without_names(sys.argv[1:] if argv is None else argv)
+        options, rest = _parser(words).parse_known_args(words)
+        name = f"rosafe {options.command}"
+        if hasattr(options, "missing"):
+            raise Failure(options.missing)
+        if hasattr(options, "interspersed"):
+            options.interspersed = [word for word in rest if not word.startswith("-")]
+            rest = [word for word in rest if word.startswith("-")]
+        if rest:
+            options.usage_error(f"unrecognized arguments: {' '.join(rest)}")
+        return int(options.run(options))
     except (Failure, OutputError) as problem:
         print(f"{name}: {printable(problem)}", file=sys.stderr)
         return 1
@@ -53,10 +49,6 @@ def main(argv: list[str] | None = None) -> int:
         return 1
     except KeyboardInterrupt:
         return 130
-    except BrokenPipeError:  # whoever read our output has had enough, as `head` does
-        for stream in (sys.stdout, sys.stderr):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
-        return 141
 
 
 def _parser(words: list[str]) -> argparse.ArgumentParser:
@@ -105,5 +97,10 @@ def _add(subparsers: argparse._SubParsersAction[Parser], name: str) -> None:
     module.configure(subparser)
 
 
+def program() -> int:
+    """Run `rosafe` as a program of its own, with the standard streams of this process."""
+    return streams.run("rosafe", main)
+
+
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(program())

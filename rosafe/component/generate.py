@@ -34,6 +34,7 @@ from typing import NamedTuple
 
 from rosafe import missing
 from rosafe.component import master, paths
+from rosafe.output import sync_tree
 from rosafe.terminal import printable
 from rosafe.vocabulary import plugins
 
@@ -200,7 +201,7 @@ def _build_stub(package: str, share: Path) -> None:
 def _generate(found: Sources, base: Path, name: str) -> Path:
     """The generation `name` under `base`, built if it is not there yet. One process at a time builds."""
     wanted = base / name
-    base.mkdir(parents=True, exist_ok=True)
+    base.mkdir(mode=0o755, parents=True, exist_ok=True)
     with open(base / "lock", "w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)  # given back by the kernel even if this process is killed
         for orphan in base.glob("build-*"):  # nobody else builds now: left by one that was killed
@@ -210,7 +211,10 @@ def _generate(found: Sources, base: Path, name: str) -> Path:
             try:
                 build(found, workshop)
                 compileall.compile_dir(workshop / "python", quiet=1, stripdir=workshop, prependdir=wanted)
-                workshop.chmod(0o755)
+                for path in (workshop, *workshop.rglob("*")):  # whatever this user's umask is
+                    if not path.is_symlink():
+                        path.chmod(0o755 if path.is_dir() else 0o644)
+                sync_tree(workshop)
                 workshop.rename(wanted)
             except BaseException:
                 shutil.rmtree(workshop)
@@ -254,6 +258,8 @@ def _generation() -> Path | None:
     name = digest(found)
     cache = paths.user_cache() / "messages"
     places = (cache,) if paths.source_root() is None else (found.packages["rosAFE"] / ".generated", cache)
+    # What other users can write is code of theirs.
+    places = tuple(base for base in places if not paths.foreign(base) and not paths.foreign(base / name))
     for base in places:
         if _is_readable(base / name) and (found.plugins or _is_current(base, name) or not paths.writable(base)):
             return base / name

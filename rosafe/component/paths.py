@@ -70,8 +70,18 @@ def writable(directory: Path) -> bool:
     Tried by making one: permission bits say nothing about root or about a read-only file system.
     """
     try:
-        directory.mkdir(parents=True, exist_ok=True)
+        directory.mkdir(mode=0o755, parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=directory):
             return True
     except OSError:
         return False
+
+
+def foreign(path: Path) -> bool:
+    """Whether anybody but root, this user and the owner of this program could have written what is at `path`."""
+    try:
+        found = path.stat()
+    except FileNotFoundError:
+        return False
+    others = found.st_mode & stat.S_IWOTH and not found.st_mode & stat.S_ISVTX
+    return bool(others) or found.st_uid not in (0, os.getuid(), CODE_DIR.stat().st_uid)

@@ -6,6 +6,7 @@ again: that takes as long as the filters themselves take.
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections import deque
 from typing import Any
@@ -23,22 +24,29 @@ _idle: dict[int, deque[FloatArray]] = {}
 
 def empty(shape: tuple[int, ...]) -> FloatArray:
     """As `numpy.empty`, of float64."""
-    size = 8 * math.prod(shape)
-    return np.asarray(_Loan(shape)) if SMALLEST <= size <= LARGEST else np.empty(shape)
+    count = math.prod(shape)
+    if not SMALLEST <= 8 * count <= LARGEST:
+        return np.empty(shape)
+    try:
+        memory = _idle[count].pop()
+    except (KeyError, IndexError):
+        memory = np.empty(count)
+    return np.asarray(_Loan(memory, shape))
 
 
 class _Loan:
     """The memory of one array and its views: numpy lets go of this with the last one of them."""
 
-    def __init__(self, shape: tuple[int, ...]) -> None:
-        count = math.prod(shape)
-        try:
-            self._memory = _idle[count].pop()
-        except (KeyError, IndexError):
-            self._memory = np.empty(count)
-        self.__array_interface__: dict[str, Any] = {**self._memory.__array_interface__, "shape": shape}
+    _memory: FloatArray | None = None
+
+    def __init__(self, memory: FloatArray, shape: tuple[int, ...]) -> None:
+        self.__array_interface__: dict[str, Any] = {**memory.__array_interface__, "shape": shape}
+        self._memory = memory
 
     def __del__(self) -> None:  # on any thread and at any time: single steps, which need no lock
-        _idle.setdefault(len(self._memory), deque(maxlen=KEPT)).append(self._memory)
-        for size in list(_idle)[:-SIZES]:
-            _idle.pop(size, None)
+        if self._memory is None:  # there was no memory for the rest of this
+            return
+        with contextlib.suppress(MemoryError):  # then it is freed
+            _idle.setdefault(len(self._memory), deque(maxlen=KEPT)).append(self._memory)
+            for size in list(_idle)[:-SIZES]:
+                _idle.pop(size, None)

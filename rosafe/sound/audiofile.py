@@ -23,8 +23,9 @@ class AudioFileError(Exception):
 
 def to_int32(signal: np.ndarray) -> np.ndarray:
     """Float samples, full scale 1.0, as int32: scaled by 2^31 - 1, rounded, clipped; NaN is silence."""
-    scaled = np.nan_to_num(np.asarray(signal, dtype=np.float64), posinf=1.0, neginf=-1.0) * FULL_SCALE
-    return np.clip(np.rint(scaled), -(2**31), FULL_SCALE).astype(np.int32)
+    finite = np.nan_to_num(np.asarray(signal, dtype=np.float64), posinf=1.0, neginf=-1.0)
+    limited = np.clip(finite, -2.0, 2.0)  # else 1e308 overflows
+    return np.clip(np.rint(limited * FULL_SCALE), -(2**31), FULL_SCALE).astype(np.int32)
 
 
 def channel_pair(text: str) -> tuple[int, int]:

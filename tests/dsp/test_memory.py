@@ -64,3 +64,14 @@ def test_many_threads() -> None:
     for thread in threads:
         thread.join()
     assert good == [True] * 120
+
+
+def test_a_lack_of_memory_is_one_error(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
+    def empty(*_: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(memory.np, "empty", empty)
+    with pytest.raises(MemoryError):
+        memory.empty((*ROWS, LONG))
+    memory._Loan.__new__(memory._Loan)  # as if there were no memory for its attributes
+    assert capfd.readouterr().err == ""

@@ -120,6 +120,51 @@ def test_a_compiler_that_makes_nothing(copy: Path) -> None:
     assert show(copy)[0]
 
 
+@pytest.mark.parametrize("damage", ["x86-64-v2.so", build.SUMS])
+def test_what_was_cut_off_is_built_again_or_not_loaded(copy: Path, damage: str) -> None:
+    """As after a power failure; the processor would end the process with a bus error."""
+    empty = copy.with_name("bin")
+    empty.mkdir()
+    compiled, _ = show(copy)
+    (folder,) = folders(copy)
+    damaged = copy / ".generated" / folder / damage
+    whole = damaged.read_bytes()
+    for rest in (whole[:100], bytes(len(whole))):
+        damaged.write_bytes(rest)
+        assert show(copy, PATH=str(empty))[0] is False
+        assert show(copy)[0] is compiled
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root can give files to others")
+def test_what_other_users_could_have_written_is_not_loaded(copy: Path) -> None:
+    env = environment(PYTHONPATH=str(copy))
+    old = os.umask(0)
+    try:
+        assert shown(run(PYTHON, "-c", SHOW, env=env))[0]
+    finally:
+        os.umask(old)
+    base = copy / ".generated"
+    (name,) = folders(copy)
+    for path in (base, *(base / name).rglob("*"), base / name):
+        if path != base / "kernels.lock":
+            assert not path.stat().st_mode & 0o022, path
+    for path in (base, base / name, base / name / "x86-64-v2.so"):
+        path.chmod(0o777)
+        why = f"numpy and scipy: {path}: expected that other users cannot write it, got mode 777; chmod o-w {path}"
+        assert show(copy) == (False, why)
+        path.chmod(0o755)
+        os.chown(path, 12345, 12345)
+        compiled, status = show(copy)
+        assert not compiled and f"{path}: expected that it belongs to root or to this user, got user 12345" in status
+        os.chown(path, 0, 0)
+    base.chmod(0o1777)
+    assert show(copy)[0]
+    link = copy.with_name("moved")
+    base.rename(link)
+    base.symlink_to(link)
+    assert show(copy)[0]
+
+
 def test_killed_half_way(copy: Path) -> None:
     path = compiler(copy, "exec sleep 60")
     env = environment(PYTHONPATH=str(copy), PATH=path)

@@ -14,6 +14,7 @@ import hashlib
 import os
 import platform
 import shutil
+import stat
 import subprocess
 import sys
 import tempfile
@@ -30,6 +31,7 @@ LEVELS = {"x86_64": {2: "x86-64-v2", 3: "x86-64-v3", 4: "x86-64-v4"}, "aarch64":
 # without -fno-math-errno square roots are taken one by one.
 FLAGS = ("-std=gnu11", "-O2", "-ffp-contract=off", "-fno-math-errno", "-fPIC", "-shared", "-Wall", "-Wextra")
 PATIENCE = 120  # seconds for the compiler, which takes about three
+SUMS = "libraries.sha256"  # in each folder, for sha256sum
 KEPT = 3  # folders that stay: programs of other versions may want theirs again
 
 
@@ -62,15 +64,19 @@ def libraries(below: Path | None = None) -> dict[int, Path]:
     Raises
     ------
     BuildError
-        Where there are none, and no compiler, no permission to write, or the wrong processor.
+        If there are none, and no compiler, no permission to write, or the wrong processor; or if other users could
+        have put them there.
     """
     levels = LEVELS.get(platform.machine())
     if levels is None:
         raise BuildError(f"the kernels are for {' and '.join(LEVELS)}, and this machine is {platform.machine()}")
-    folder = (place() if below is None else below) / f"kernels-{digest()}"
+    base = place() if below is None else below
+    folder = base / f"kernels-{digest()}"
     try:
+        _refuse_foreign(base, folder)
         if _lacking(folder, levels):
             _build(folder, levels)
+        _refuse_foreign(*_paths(folder, levels).values())
     except OSError as problem:
         raise BuildError(f"the kernels cannot be built: {problem}") from problem
     return _paths(folder, levels)
@@ -80,9 +86,32 @@ def _paths(folder: Path, levels: dict[int, str]) -> dict[int, Path]:
     return {level: folder / f"{name}.so" for level, name in levels.items()}
 
 
+def _refuse_foreign(*paths: Path) -> None:
+    """BuildError if anybody but root, this user and the owner of this program could have written what is there."""
+    for path in filter(os.path.lexists, paths):
+        found = path.stat()
+        if found.st_mode & stat.S_IWOTH and not found.st_mode & stat.S_ISVTX:
+            raise BuildError(
+                f"{path}: expected that other users cannot write it, got mode {found.st_mode & 0o7777:o}; "
+                f"chmod o-w {path}"
+            )
+        if found.st_uid not in (0, os.geteuid(), HERE.stat().st_uid):
+            raise BuildError(
+                f"{path}: expected that it belongs to root or to this user, got user {found.st_uid}; remove it"
+            )
+
+
 def _lacking(folder: Path, levels: dict[int, str]) -> list[str]:
-    """The names of the libraries that are not in `folder`, or empty."""
-    return [path.name for path in _paths(folder, levels).values() if not path.is_file() or path.stat().st_size == 0]
+    """The names of the libraries that are not in `folder`, or not as they were built."""
+    try:
+        sums = {line[66:]: line[:64] for line in (folder / SUMS).read_text("ascii").splitlines()}
+    except (FileNotFoundError, NotADirectoryError, UnicodeDecodeError):
+        sums = {}
+    return [p.name for p in _paths(folder, levels).values() if not p.is_file() or sums.get(p.name) != _sum(p)]
+
+
+def _sum(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def _compiler() -> str:
@@ -98,7 +127,7 @@ def _compiler() -> str:
 def _build(folder: Path, levels: dict[int, str]) -> None:
     base = folder.parent
     compiler = _compiler()
-    base.mkdir(parents=True, exist_ok=True)
+    base.mkdir(mode=0o755, parents=True, exist_ok=True)
     with open(base / "kernels.lock", "w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)  # given back by the kernel even if this process is killed
         for orphan in base.glob("kernels-*.new-*"):  # nobody else builds now: left by one that was killed
@@ -106,16 +135,27 @@ def _build(folder: Path, levels: dict[int, str]) -> None:
         if _lacking(folder, levels):
             workshop = Path(tempfile.mkdtemp(prefix=f"{folder.name}.new-", dir=base))
             try:
-                compile_sources(compiler, levels, workshop)
-                for path in (workshop, *workshop.iterdir()):  # for other users, too, whatever this one's umask is
+                built = compile_sources(compiler, levels, workshop).values()
+                (workshop / SUMS).write_text("".join(f"{_sum(path)}  {path.name}\n" for path in built), "ascii")
+                for path in (*workshop.iterdir(), workshop):  # for other users, too, whatever this one's umask is
                     path.chmod(0o755)
+                    _sync(path)  # else a power cut could leave empty files
                 if folder.is_dir():  # something has been lost there
                     shutil.rmtree(folder)
                 workshop.rename(folder)
+                _sync(base)
             except BaseException:
                 shutil.rmtree(workshop)
                 raise
         _discard_old(base)
+
+
+def _sync(path: Path) -> None:
+    descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
 
 
 def compile_sources(
@@ -148,8 +188,9 @@ def compile_sources(
         for process in running:
             process.kill()  # one that is done already takes no notice
             process.wait()
-    if missing := _lacking(folder, levels):
-        raise BuildError(f"{name} cannot build the kernels: it says nothing, and there is no {missing[0]}")
+    for path in paths.values():
+        if not path.is_file() or path.stat().st_size == 0:
+            raise BuildError(f"{name} cannot build the kernels: it says nothing, and there is no {path.name}")
     return paths
 
 
