@@ -16,7 +16,7 @@ class StreamError(Exception):
 class _Output(io.FileIO):
     """The standard output. Its errors are none of the files that a program writes: no OSError, except a closed pipe."""
 
-    def write(self, data: Any) -> int | None:
+    def write(self, data: Any, /) -> int:
         try:
             return super().write(data)
         except (BrokenPipeError, BlockingIOError):
@@ -30,7 +30,7 @@ class _Messages(io.FileIO):
 
     lost = False
 
-    def write(self, data: Any) -> int | None:
+    def write(self, data: Any, /) -> int:
         try:
             return super().write(data)
         except (BrokenPipeError, BlockingIOError):

@@ -257,9 +257,9 @@ def _generation() -> Path | None:
         return None
     name = digest(found)
     cache = paths.user_cache() / "messages"
-    places = (cache,) if paths.source_root() is None else (found.packages["rosAFE"] / ".generated", cache)
+    bases = (cache,) if paths.source_root() is None else (found.packages["rosAFE"] / ".generated", cache)
     # What other users can write is code of theirs.
-    places = tuple(base for base in places if not paths.foreign(base) and not paths.foreign(base / name))
+    places = [base for base in bases if not paths.foreign(base) and not paths.foreign(base / name)]
     for base in places:
         if _is_readable(base / name) and (found.plugins or _is_current(base, name) or not paths.writable(base)):
             return base / name

@@ -70,7 +70,7 @@ def test_a_lack_of_memory_is_one_error(monkeypatch: pytest.MonkeyPatch, capfd: p
     def empty(*_: object) -> None:
         raise MemoryError
 
-    monkeypatch.setattr(memory.np, "empty", empty)
+    monkeypatch.setattr(np, "empty", empty)
     with pytest.raises(MemoryError):
         memory.empty((*ROWS, LONG))
     memory._Loan.__new__(memory._Loan)  # as if there were no memory for its attributes

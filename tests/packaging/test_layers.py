@@ -33,7 +33,7 @@ STANDS_ON: dict[str, set[str]] = {
     "demo": {"interface", "tree", "component", "bass", "sound", "view", "offline", "vocabulary"},
 }
 TOP = {"commands", "testing", "ros", "__init__"}  # may use everything
-EVERYWHERE = {"version", "output", "input", "missing", "terminal"}
+EVERYWHERE = {"version", "output", "input", "missing", "terminal", "streams"}
 
 
 def imports(path: Path) -> Iterator[str]:
