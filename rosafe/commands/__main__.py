@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import ast
 import importlib
+import importlib.util
 import inspect
 import pkgutil
 import sys
@@ -63,14 +64,17 @@ def _parser(words: list[str]) -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"rosafe {VERSION}")
     subparsers = parser.add_subparsers(title="commands", dest="command", metavar="COMMAND", required=True)
     names = [module.name for module in pkgutil.iter_modules(commands.__path__) if not module.name.startswith("_")]
-    if words[:1] and words[0] in names:
-        if words[0] in _WITHOUT_PLUGINS:
+    chosen = words[0].replace("-", "_") if words else ""
+    if chosen in names:
+        if chosen in _WITHOUT_PLUGINS:
             plugins.disable()
-        _add(subparsers, words[0])
+        _add(subparsers, chosen)
     else:
         for name in names:
-            text = ast.get_docstring(ast.parse(Path(commands.__path__[0], f"{name}.py").read_bytes())) or ""
-            subparsers.add_parser(name.replace("_", "-"), help=_summary(text), add_help=False)
+            spec = importlib.util.find_spec(f"{commands.__name__}.{name}")
+            text = ast.get_docstring(ast.parse(Path(str(spec and spec.origin)).read_bytes())) or ""
+            listed = subparsers.add_parser(name.replace("_", "-"), help=_summary(text), add_help=False)
+            listed.set_defaults(run=lambda _: parser.error("expected the command first"), usage_error=parser.error)
     return parser
 
 

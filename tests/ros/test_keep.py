@@ -136,7 +136,7 @@ def test_the_parameter_names_setups_only(graph: Graph, tmp_path: Path) -> None:
 
 def test_what_cannot_be_read_is_told_and_left_alone(graph: Graph, tmp_path: Path) -> None:
     file = tmp_path / "tree.yaml"
-    for text, what in (("processors:\n  a: {kind: x}\n", "line 2"), ("\x00", "not YAML")):
+    for text, what in (("processors:\n  a: {nothing: x}\n", "line 2"), ("\x00", "not YAML")):
         file.write_text(text)
         done = graph.run("rosAFE-ros", "--keep", str(file), "-i", NAME, check=False)
         assert done.returncode == 1
