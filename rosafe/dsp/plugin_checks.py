@@ -120,7 +120,8 @@ class _Count:
         self._received += received
         self._returned += returned
         if self._since_start:
-            return returned + _whole(stage.output_count(self._received), "output_count") - self._returned
+            count = super(CheckedStage, stage).output_count(self._received)  # type: ignore[misc]
+            return returned + _whole(count, "output_count") - self._returned
         self._most = max(self._most, returned)
         if not self._aligned:
             if returned:
@@ -276,9 +277,7 @@ class CheckedStage(Stage):
         if array is not out and not (array.dtype is FLOAT64 and array.flags.c_contiguous and type(array) is np.ndarray):
             array = self._converted(array, part.name)
         if self.CHECKS_NAN:
-            with np.errstate(all="ignore"):
-                total = array.sum()
-            if not math.isfinite(total) and not np.isfinite(array).all():
+            if not math.isfinite(array.sum()) and not np.isfinite(array).all():
                 raise self._violation(f"{part.name}: expected finite numbers, got NaN or infinity (see allow_nan)")
         return array
 
