@@ -32,7 +32,7 @@ def test_the_check_finds_each_fault(tmp_path: Path, name: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("text", [PLAIN, SAMPLES, FRAMED])
+@pytest.mark.parametrize("text", [PLAIN, SAMPLES, FRAMED], ids=["rates", "samples", "frames"])
 def test_good_ones_pass(tmp_path: Path, text: str) -> None:
     path = tmp_path / "mine.py"
     path.write_text(text_of(Fault(text, "", "")))
