@@ -276,9 +276,8 @@ class CheckedStage(Stage):
             raise self._violation(f"{part.name}: expected a new array, got one that shares memory with the input")
         if array is not out and not (array.dtype is FLOAT64 and array.flags.c_contiguous and type(array) is np.ndarray):
             array = self._converted(array, part.name)
-        if self.CHECKS_NAN:
-            if not math.isfinite(array.sum()) and not np.isfinite(array).all():
-                raise self._violation(f"{part.name}: expected finite numbers, got NaN or infinity (see allow_nan)")
+        if self.CHECKS_NAN and not math.isfinite(array.sum()) and not np.isfinite(array).all():
+            raise self._violation(f"{part.name}: expected finite numbers, got NaN or infinity (see allow_nan)")
         return array
 
     def _converted(self, array: Any, name: str) -> FloatArray:
