@@ -66,8 +66,8 @@ class Parameter:
     def _problems(self) -> Iterator[str]:
         if problem := bad_name(self.name):
             yield f"name: {problem}"
-        if not isinstance(self.idl, str) or (element(self.idl) or self.idl) not in SCALARS:
-            yield f"type: expected one of {', '.join(SCALARS)} or sequence<one of them>, got {short(self.idl)}"
+        if problem := self._bad_type():
+            yield f"type: {problem}"
         if problem := bad_text(self.doc, empty=True):
             yield f"doc: {problem}"
         for name in ("fallback", "unit"):
@@ -85,6 +85,11 @@ class Parameter:
                 yield f"default: {problem}"
             if element(self.idl) and not isinstance(self.default, tuple):
                 object.__setattr__(self, "default", tuple(checked))  # a list can change, and has no hash
+
+    def _bad_type(self) -> str:
+        if isinstance(self.idl, str) and (element(self.idl) or self.idl) in SCALARS:
+            return ""
+        return f"expected one of {', '.join(SCALARS)} or sequence<one of them>, got {short(self.idl)}"
 
     def _bad_limits(self) -> Iterator[str]:
         numeric = (element(self.idl) or self.idl) not in ("string", "boolean")
@@ -284,6 +289,9 @@ class StructParameter(Parameter):
     """A parameter that is a structure, or a sequence of structures, with `members`."""
 
     members: tuple[Parameter, ...] = ()
+
+    def _bad_type(self) -> str:
+        return ""  # the structure's name
 
     def _check_scalar(self, idl: str, value: Any) -> Any:
         names = [member.name for member in self.members]

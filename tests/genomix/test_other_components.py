@@ -7,6 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from rosafe.genomix import installed_components
+from rosafe.interface import ComponentError
 from tests import harness
 from tests.genomix import world as worlds
 from tests.genomix.arm.package import generate
@@ -163,6 +165,21 @@ def test_what_is_not_installed_is_named(robot: World, tmp_path: Path) -> None:
         assert raised.value.ex == "::genomix::e_load"
         for word in words:
             assert word in raised.value.what
+    assert not (tmp_path / "imported").exists()
+
+
+@pytest.mark.parametrize("package", ["other.arm", ".arm", "arm.msg", "", "..", "a\0b", "a\nb", "1arm", "long"])
+def test_a_type_that_names_no_package_imports_nothing(
+    package: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Any node may claim that its service is of any type."""
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "__init__.py").write_text(f"open({str(tmp_path / 'imported')!r}, 'w')\n")
+    monkeypatch.syspath_prepend(str(generate(tmp_path)))
+    with pytest.raises(ComponentError) as raised:
+        installed_components.describe("a" * 200_000 if package == "long" else package)
+    assert raised.value.ex == "::genomix::e_load"
+    assert len(str(raised.value)) < 1000 and "PACKAGE/connect_port" in str(raised.value)
     assert not (tmp_path / "imported").exists()
 
 
