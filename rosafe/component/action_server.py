@@ -90,7 +90,7 @@ class StatusPublisher:
         """Publish at the frequency of the ROS parameter until the node ends."""
         frequency = _frequency(self._servers[0].frequency)
         message = GoalStatusArray()
-        while frequency and not self._finished.wait(1 / frequency):
+        while frequency and not self._finished.wait(min(1 / frequency, threading.TIMEOUT_MAX)):
             self._in_use.wait()
             self._in_use.clear()
             message.header.seq += 1

@@ -8,8 +8,11 @@ one thread, in calls that are bounded, until the master knows it; a master that 
 from __future__ import annotations
 
 import contextlib
+import fcntl
+import os
 import threading
 import xmlrpc.client
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -26,7 +29,7 @@ from rospy.impl.registration import (
     get_topic_manager,
 )
 
-from rosafe.component import inbound, master
+from rosafe.component import inbound, master, paths
 from rosafe.component.connector import Connector
 from rosafe.component.succession import Handler, Succession
 
@@ -256,8 +259,11 @@ def init_node(name: str, argv: list[str], anonymous: bool = False, unless_taken:
     rospy.core._xmlrpc_cache[uri] = rospy.core._LockedServerProxy(uri, transport=master.Transport())
     try:
         _read_log_parameter()
-        anonymous = anonymous or (unless_taken and _is_taken(rosgraph.names.resolve_name(name, rospy.get_name()), uri))
-        rospy.init_node(name, argv=argv, anonymous=anonymous, disable_signals=True)
+        with _turn() if unless_taken else contextlib.nullcontext():
+            anonymous = anonymous or (
+                unless_taken and _is_taken(rosgraph.names.resolve_name(name, rospy.get_name()), uri)
+            )
+            rospy.init_node(name, argv=argv, anonymous=anonymous, disable_signals=True)
         listeners = get_registration_listeners()
         with listeners.lock:
             manager = next((one for one in listeners.listeners if isinstance(one, RegManager)), None)
@@ -272,6 +278,17 @@ def init_node(name: str, argv: list[str], anonymous: bool = False, unless_taken:
     rospy.core._preshutdown_hooks.insert(0, _registrar.end)  # before rospy's own, which unregisters what is offered
     _registrar.start()
     return _registrar
+
+
+@contextlib.contextmanager
+def _turn() -> Iterator[None]:
+    """Let the servers of this user that start at the same moment find their names one after the other."""
+    with contextlib.ExitStack() as stack:
+        with contextlib.suppress(OSError):  # without a temporary folder one of them may end the others
+            folder = os.open(paths.private_temporary(), os.O_RDONLY)
+            stack.callback(os.close, folder)
+            fcntl.flock(folder, fcntl.LOCK_EX)  # given back by the kernel even if this process is killed
+        yield
 
 
 def _is_taken(name: str, uri: str) -> bool:

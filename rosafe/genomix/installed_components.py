@@ -66,6 +66,8 @@ def describe(package: str) -> Component:
         if name.endswith("Action") and goal is not None and _ends_as_genom(result):
             activity = name.removesuffix("Action")
             found[activity] = _service(activity, goal, result, structs, activity=True)
+    if "connect_port" not in found:
+        raise cannot_load(f"the ROS package {package} has no service connect_port: it is no GenoM component")
     state = Port("genom_state", _struct(messages.genom_state_component, structs), "State of the component")
     return Component(
         name=package,
@@ -93,7 +95,8 @@ def with_ports(component: Component, instance: str, topics: Mapping[str, str]) -
         package, _, message = kind.partition("/")
         name, _, element = topic.removeprefix(f"/{instance}/").partition("/")
         generated = getattr(messages, message, None) if package == component.name else None
-        if not topic.startswith(f"/{instance}/") or generated is None or message.endswith(_ACTION_PARTS):
+        is_message = isinstance(generated, type) and issubclass(generated, genpy.Message)  # any node may register it
+        if not (topic.startswith(f"/{instance}/") and is_message) or message.endswith(_ACTION_PARTS):
             continue
         ports.setdefault(name, Port(name, _struct(generated, structs), "", multiple=bool(element)))
     return dataclasses.replace(component, ports=tuple(ports.values()), structs=structs)

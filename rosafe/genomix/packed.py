@@ -6,6 +6,7 @@ everything says what it is.
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
@@ -33,7 +34,15 @@ def member(name: str) -> bytes:
 
 def number(value: float | None) -> bytes:
     """A tagged number; what is not there is NaN."""
-    return NUMBER + struct.pack("<d", float("nan") if value is None else value)
+    return NUMBER + struct.pack("<d", float("nan") if value is None else _float(value))
+
+
+def _float(value: float) -> float:
+    """A number that a component wrote as text may be larger than any float."""
+    try:
+        return float(value)
+    except OverflowError:
+        return math.inf if value > 0 else -math.inf
 
 
 def _numbers(values: Any) -> bytes:
@@ -118,7 +127,7 @@ def plain(value: Any) -> bytes:
         return STRUCTURE + b"".join(member(str(name)) + plain(v) for name, v in value.items()) + END
     if isinstance(value, (list, tuple)):
         if value and all(isinstance(v, (int, float)) for v in value):
-            return _numbers(np.array(value, "<f8"))
+            return _numbers(np.array([_float(v) for v in value], "<f8"))
         return SEQUENCE + b"".join(map(plain, value)) + END
     return TEXT + text(value) if isinstance(value, str) else number(value)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import signal
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -59,6 +60,14 @@ def test_names(graph: Graph) -> None:
             wait_for(lambda: f"Pid: {heir.pid}\n" in graph.run("rosnode", "info", "/genomixd", check=False).stdout)
             assert heir.stop() == 0
     assert not names()
+
+
+def test_servers_that_start_at_the_same_moment(graph: Graph) -> None:
+    """None of them takes the name of another one."""
+    with ExitStack() as stack:
+        servers = [stack.enter_context(graph.start("genomixd", "-p", str(free_port()))) for _ in range(5)]
+        wait_for(lambda: sum("genomixd" in node for node in graph.nodes()) == 5, what=lambda: str(servers))
+        assert all(server.alive for server in servers)
 
 
 def test_a_master_that_comes_later(tmp_path: Path) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 
+from rosafe import interface
 from rosafe.genomix import installed_components
 from rosafe.interface import ComponentError
 from tests import harness
@@ -143,6 +144,7 @@ def test_what_is_not_installed_is_named(robot: World, tmp_path: Path) -> None:
     broken = generate(tmp_path / "broken")
     (broken / "arm" / "msg" / "_arm_point.py").unlink()
     old = generate(tmp_path / "old", without=("genom_state_component",))
+    closed = generate(tmp_path / "closed", without=("connect_port",))
     foreign = tmp_path / "foreign"
     for part in ("msg", "srv"):
         (foreign / "arm" / part).mkdir(parents=True)
@@ -153,6 +155,7 @@ def test_what_is_not_installed_is_named(robot: World, tmp_path: Path) -> None:
         (empty, ["ROS package arm is not installed", "PYTHONPATH"]),
         (broken, ["arm.msg", "_arm_point"]),
         (old, ["genom_state_component"]),
+        (closed, ["connect_port"]),
         (foreign, ["ROS package arm is not installed", "genpy"]),
     ):
         path = robot.graph.env["PYTHONPATH"]
@@ -181,6 +184,18 @@ def test_a_type_that_names_no_package_imports_nothing(
     assert raised.value.ex == "::genomix::e_load"
     assert len(str(raised.value)) < 1000 and "PACKAGE/connect_port" in str(raised.value)
     assert not (tmp_path / "imported").exists()
+
+
+def test_topics_that_are_no_messages_are_no_ports(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Any node may register a topic of any type for the component."""
+    monkeypatch.syspath_prepend(str(generate(tmp_path)))
+    arm = installed_components.describe("arm")
+    kinds = ["arm/__name__", "arm/_arm_point", "arm/__dict__", "arm/", "/", "*", "arm/x/y"]
+    topics = {f"/left/{number}": kind for number, kind in enumerate(kinds)}
+    assert installed_components.with_ports(arm, "left", topics | {"/left/a": "arm/arm_point"}).ports == (
+        *arm.ports,
+        interface.Port("a", "::arm::arm_point", ""),
+    )
 
 
 def test_octave(robot: World) -> None:

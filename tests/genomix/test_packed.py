@@ -238,3 +238,10 @@ def test_the_server_answers_packed(world: World) -> None:
     audio, told = get("/call/bass/Audio?syntax=packed")["Audio"], world.http.call("bass/Audio")["Audio"]
     assert audio["left"].tolist() == told["left"] and len(told["left"]) == 44100
     assert audio["stamp"] == told["stamp"]
+
+
+def test_numbers_beyond_all_floats() -> None:
+    """A component's error may hold any number that JSON has."""
+    huge = 10**4000
+    assert packed.plain(huge) == packed.plain(math.inf)
+    assert packed.plain([-huge, 1]) == packed.plain([-math.inf, 1])

@@ -52,17 +52,19 @@ def test_the_parameter(graph: Graph, given: Any, frequency: float) -> None:
     rospy.delete_param("/other/actionlib_status_frequency")
 
 
-def test_no_status_in_periods(graph: Graph) -> None:
+@pytest.mark.parametrize("frequency", [0, 1e-12])
+def test_no_status_in_periods(graph: Graph, frequency: float) -> None:
     """0, as in every action server: only the latched one, and those that tell of changes."""
     graph.client()
-    rospy.set_param("/other/actionlib_status_frequency", 0)
-    with graph.node("bass-ros", "-i", "other"):
+    rospy.set_param("/other/actionlib_status_frequency", frequency)
+    with graph.node("bass-ros", "-i", "other") as node:
         with (
             graph.collect("/other/Acquire/status", GoalStatusArray) as messages,
             graph.collect("/other/genom_state", bass.msg.genom_state_component) as states,
         ):
             wait_for(lambda: len(states) >= 4 and messages)
         assert len(messages) == 1
+        assert "Traceback" not in node.err
     rospy.delete_param("/other/actionlib_status_frequency")
 
 

@@ -18,7 +18,10 @@ from rosafe.component import door, inbound, pulse
 from rosafe.genomix import daemon, sessions
 from rosafe.genomix import server as api
 from rosafe.http_server import connections
+from rosafe.interface import MAX_SETUP
+from rosafe.interface.rosafe import MAX_PARAMETERS
 from rosafe.live import client, hub, server
+from rosafe.setups import markup, reading
 from tests.genomix.world import Http, genomixd
 from tests.harness import PYTHON, ROOT, Graph, MasterProcess, free_port, proc
 from tests.http_server.test_limits import MEMORY
@@ -125,6 +128,8 @@ def test_the_bounds_of_the_page() -> None:
         api.LIMITS.max_answers // 2**20,
         api.LIMITS.max_header_bytes // 2**20,
         (sessions.MAX_SESSIONS, sessions.MAX_REQUESTS),
+        (f"{MAX_SETUP >> 20} MiB", markup.MAX_VALUES, 0),
+        (MAX_PARAMETERS, reading.MAX_PARAMETER_VALUES),
         (server.MAX_CLIENTS, server.LIMITS.max_connections, server.LIMITS.max_connections // 2),
         (server.LIMITS.request_seconds, server.LIMITS.max_header_bytes // 2**20, MEMORY),
         (f"{client.MAX_MESSAGE >> 20} MiB", client.MAX_PENDING, client.MAX_VIEWS, hub.MAX_VIEWS),
