@@ -97,9 +97,12 @@ def _local_cluster(jobs: int, stack: ExitStack, dead: list[str]) -> Any:
     from distributed.core import Status
 
     class LimitedNanny(Nanny):
-        """Gives up a worker that dies `MAX_STARTS` times before it is ready; Dask would restart it without end."""
+        """Gives up a worker that dies `MAX_STARTS` times before it is ready.
 
-        failed_starts = 0
+        Dask would restart it without end, or (later versions) never, without telling anybody.
+        """
+
+        starting = False
         last_exit = ""
 
         def _on_worker_exit_sync(self, exitcode: int) -> None:
@@ -107,16 +110,22 @@ def _local_cluster(jobs: int, stack: ExitStack, dead: list[str]) -> Any:
             super()._on_worker_exit_sync(exitcode)
 
         async def instantiate(self) -> Any:
-            if self.failed_starts >= MAX_STARTS:
-                dead.append(
-                    f"a worker process ended {MAX_STARTS} times at its start, the last time with {self.last_exit}"
-                )
-                return Status.failed
-            self.failed_starts += 1
-            status = await super().instantiate()
-            if status == Status.running:
-                self.failed_starts = 0
-            return status
+            if self.starting:  # Dask's own restart
+                return Status.starting
+            self.starting = True
+            try:
+                for _ in range(MAX_STARTS):
+                    status = await super().instantiate()
+                    if status == Status.running:
+                        return status
+            except Exception as problem:
+                why = f"{type(problem).__name__}: {problem}".partition("\n")[0]
+                dead.append(f"a worker process cannot be started ({why})")
+                raise
+            finally:
+                self.starting = False
+            dead.append(f"a worker process ended {MAX_STARTS} times at its start, the last time with {self.last_exit}")
+            return Status.failed
 
     folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="rosafe-dask-"))
     _import_nothing_from_the_working_directory(folder)

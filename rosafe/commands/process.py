@@ -421,8 +421,9 @@ class _Corpus:
                     write_failed(folder, [*self._sources, *inputs], self.failed)
                     listed = bool(self.failed)
             except (OutputError, OSError) as problem:
-                shown.append(str(problem))
-                self.failed[str(folder)] = str(problem)
+                why = f"{folder / FAILED}: {problem.strerror}" if isinstance(problem, OSError) else str(problem)
+                shown.append(why)
+                self.failed[str(folder)] = why
         many = listed and len(shown) > _NAMED
         for text in shown[: _NAMED if many else None]:
             self.display.message(f"rosafe process: {text}")

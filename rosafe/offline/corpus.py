@@ -194,13 +194,13 @@ def write_failed(folder: Path, inputs: Sequence[Path], failed: Mapping[str, str]
     kept: dict[str, str] = {}
     if path.exists():
         with TextIOWrapper(open_regular(path), "utf-8", "surrogateescape", newline="") as file:
+            rows = csv.reader(file)
             try:
-                rows = list(csv.reader(file))
+                if next(rows, None) != _HEAD:
+                    raise csv.Error
+                kept = {row[0]: row[1] for row in rows if len(row) == 2 and not tried & {row[0], *_folders(row[0])}}
             except csv.Error:
-                rows = []
-        if rows[:1] != [_HEAD]:
-            raise OutputError(f"{path} is something else, and stays as it is")
-        kept = {row[0]: row[1] for row in rows[1:] if len(row) == 2 and not tried & {row[0], *_folders(row[0])}}
+                raise OutputError(f"{path} is something else, and stays as it is") from None
     rest = {**kept, **failed}
     if not rest:
         path.unlink(missing_ok=True)

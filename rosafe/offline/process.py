@@ -6,7 +6,7 @@ import inspect
 import itertools
 import math
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -21,6 +21,7 @@ from rosafe.offline.memory import refuse_over_available
 from rosafe.offline.signals import as_samples, check_finite, ears_view, frame_times, of_ears, outputs_of
 from rosafe.tree.block import Block
 from rosafe.tree.workers import workers_to_use
+from rosafe.vocabulary.checks import short
 
 _NOTHING = np.empty(0)
 DEFAULT_BLOCK = 12000  # frames, as InputProc's
@@ -123,7 +124,7 @@ class _Work:
         view = ears_view(signal)
         self.ears, frames = view.shape
         self.rate = SAMPLE_RATE.check(sample_rate)
-        ends = _block_ends(sizes_, frames)
+        lengths = _block_lengths(sizes_)
         values = {"in_doNormalize": view.dtype.kind == "i", **check_parameters(parameters)}
         changes = _checked_modifications(changes)
         self.wanted = outputs_of(self.ears, outputs)
@@ -131,24 +132,26 @@ class _Work:
         # of each output, how many frames of each format have come, one after the other
         self.counts: dict[str, list[list[Any]]] = {kind: [[None, 0]] for kind in self.wanted}
         both = np.broadcast_to(view, (2, frames))
-        blocks = (as_samples(both[:, first:end]) for first, end in itertools.pairwise((0, *ends)))
+        blocks = (as_samples(both[:, first:end]) for first, end in _edges(lengths, frames))
         branches = 1 if changes or frames <= chain.MOST_FRAMES else workers_to_use()
         self.chain = Chain(blocks, self.rate, values, self.wanted, self.keep, branches)
         try:
-            self._prepare(frames, ends, changes)
+            self._prepare(frames, lengths, changes)
             check_finite(view)  # last, as it reads the whole signal
         except BaseException:
             self.chain.close()
             raise
 
-    def _prepare(self, frames: int, ends: list[int], changes: list[tuple[int, str, Any]]) -> None:
+    def _prepare(self, frames: int, lengths: list[int], changes: list[tuple[int, str, Any]]) -> None:
         chain, wanted = self.chain, self.wanted
-        taken = [_size(chain, wanted, ends)]
+        count = _block_count(lengths, frames)
+        largest = max((end - first for first, end in itertools.islice(_edges(lengths, frames), len(lengths))), default=0)
+        taken = [_size(chain, wanted, frames, largest)]
         shapes = {kind: chain.shapes(kind, frames) for kind in wanted}  # before any change
         for block, name, value in changes:
-            if block < len(ends):
+            if block < count:
                 chain.schedule(block, name, value)
-                taken.append(_size(chain, wanted, ends))
+                taken.append(_size(chain, wanted, frames, largest))
         refuse_over_available(max(taken), "outputs: they", "; name fewer outputs, or take fewer channels or lags")
         for kind in wanted:
             centred, parts = KINDS[kind].centred, KINDS[kind].outputs
@@ -205,15 +208,25 @@ class _Work:
 # --- arguments ---
 
 
-def _block_ends(block_frames: Any, frames: int) -> list[int]:
-    """The end of each block of a signal of so many frames."""
+def _block_lengths(block_frames: Any) -> list[int]:
+    """The lengths of the blocks, which are used in turn."""
     several = isinstance(block_frames, (Sequence, np.ndarray)) and not isinstance(block_frames, (str, bytes))
-    sizes = list(block_frames) if several else [block_frames]
+    sizes = list(block_frames) if several and getattr(block_frames, "ndim", 1) else [block_frames]
     whole = all(isinstance(n, (int, np.integer)) and not isinstance(n, bool) and n > 0 for n in sizes)
     if not sizes or not whole:
-        raise ValueError(f"block_frames: {block_frames!r} is not a positive whole number, or a sequence of such")
-    ends = itertools.accumulate(itertools.cycle(map(int, sizes)))
-    return [*itertools.takewhile(lambda end: end < frames, ends), frames] if frames else []
+        raise ValueError(f"block_frames: {short(block_frames)} is not a positive whole number, or a sequence of such")
+    return list(map(int, sizes))
+
+
+def _edges(lengths: list[int], frames: int) -> Iterator[tuple[int, int]]:
+    """The beginning and the end of each block of a signal of so many frames; not a list, which could be very long."""
+    ends = itertools.takewhile(lambda end: end < frames, itertools.accumulate(itertools.cycle(lengths)))
+    return itertools.pairwise(itertools.chain([0], ends, [frames] if frames else []))
+
+
+def _block_count(lengths: list[int], frames: int) -> int:
+    rounds, rest = divmod(frames, sum(lengths))
+    return rounds * len(lengths) + sum(1 for _ in _edges(lengths, rest))
 
 
 def _checked_modifications(modifications: Any) -> list[tuple[int, str, Any]]:
@@ -236,10 +249,8 @@ def _checked_modifications(modifications: Any) -> list[tuple[int, str, Any]]:
 # --- what comes out ---
 
 
-def _size(chain: Chain, wanted: list[str], ends: list[int]) -> int:
+def _size(chain: Chain, wanted: list[str], frames: int, largest_block: int) -> int:
     """Bytes of the largest thing there will be at a time: all results, or one block of what is not kept."""
-    frames = ends[-1] if ends else 0
-    largest_block = max((end - first for first, end in itertools.pairwise((0, *ends))), default=0)
     shapes = (shape for kind in wanted for of_part in chain.shapes(kind, frames).values() for shape in of_part)
     results = sum(8 * math.prod(shape) for shape in shapes)
     return max(results, chain.largest_block(largest_block)[1])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -29,13 +30,14 @@ def ears_view(signal: Any, upright: bool = False) -> np.ndarray:
     ValueError
         For another shape or type, and for masked arrays.
     """
-    rows = signal if isinstance(signal, (list, tuple)) else [signal]
-    if any(isinstance(row, np.ma.MaskedArray) for row in rows):
-        raise ValueError("signal: expected an array without a mask, got a masked array; call its method filled(0)")
     try:
-        array = np.asarray(signal)
+        array = np.asanyarray(signal)
     except ValueError as problem:
         raise ValueError(f"signal is no array: {problem}") from None
+    rows = signal if not isinstance(signal, (np.ndarray, memoryview)) and isinstance(signal, Sequence) else ()
+    if isinstance(array, np.ma.MaskedArray) or any(isinstance(row, np.ma.MaskedArray) for row in rows):
+        raise ValueError("signal: expected an array without a mask, got a masked array; call its method filled(0)")
+    array = np.asarray(array)
     if array.ndim == 0:  # such as the name of a file
         raise ValueError(f"signal is no array, but {type(signal).__name__}; {_WANTED}")
     if array.ndim == 1:

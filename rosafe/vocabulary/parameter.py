@@ -18,8 +18,10 @@ MAX_SEQUENCE = 1024  # elements in any list that a request carries, and channels
 
 
 def _plain(value: Any) -> Any:
-    """A number of numpy's, or an array without dimensions, as Python's own type."""
-    return value.item() if hasattr(value, "item") and getattr(value, "ndim", 1) == 0 else value
+    """A number of numpy's, or an array without dimensions, as Python's own type; NaN if it is masked."""
+    if not hasattr(value, "item") or getattr(value, "ndim", 1) != 0:
+        return value
+    return math.nan if getattr(value, "mask", False) else value.item()
 
 
 def shown(value: Any) -> str:

@@ -78,7 +78,9 @@ def test_workers_import_nothing_from_the_corpus(tmp_path: Path) -> None:
     assert not (tmp_path / "ran").exists()
 
 
-def test_workers_that_die_at_their_start_end_the_run(tmp_path: Path) -> None:
+@pytest.mark.parametrize("restarts", [True, False], ids=["restarted by Dask", "not restarted by Dask"])
+def test_workers_that_die_at_their_start_end_the_run(tmp_path: Path, restarts: bool) -> None:
+    """Later versions of Dask do not restart them."""
     corpus(tmp_path / "corpus", 2)
     (tmp_path / "site").mkdir()
     (tmp_path / "site" / "sitecustomize.py").write_text(
@@ -86,6 +88,10 @@ def test_workers_that_die_at_their_start_end_the_run(tmp_path: Path) -> None:
         "if 'spawn_main' in ' '.join(sys.orig_argv):\n"
         f"    open({str(tmp_path / 'starts')!r}, 'a').write('x')\n"
         "    os._exit(3)\n"
+        f"if not {restarts}:\n"
+        "    import distributed\n"
+        "    async def stay_dead(nanny, exitcode): pass\n"
+        "    distributed.Nanny._on_worker_exit = stay_dead\n"
     )
     arguments = ("process", "corpus", "-o", "out", *OPTIONS, "--dask", "local", "--jobs", "1")
     done = rosafe(*arguments, cwd=tmp_path, PYTHONPATH=str(tmp_path / "site"))

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import inspect
 import itertools
+import tracemalloc
+from collections import deque
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -19,6 +21,16 @@ from rosafe.tree import sizes
 
 GOOD = np.zeros((2, 100))
 RATE = 16000
+
+
+class Convertible:
+    """An object that numpy converts by its method."""
+
+    def __init__(self, array: Any) -> None:
+        self.array = array
+
+    def __array__(self, *arguments: Any, **named: Any) -> Any:
+        return self.array
 
 
 @pytest.fixture(autouse=True)
@@ -63,6 +75,8 @@ def refused(match: str, *arguments: Any, **named: Any) -> None:
         (np.append(np.zeros((2, 600000)), [[0.0], [np.nan]], axis=1), "NaN or infinite"),
         (np.ma.masked_array(np.zeros((2, 10)), np.eye(2, 10)), "without a mask"),
         ([np.zeros(10), np.ma.masked_array(np.zeros(10), np.ones(10))], "without a mask"),
+        (deque([np.zeros(10), np.ma.masked_array(np.zeros(10), np.ones(10))]), "without a mask"),
+        (Convertible(np.ma.masked_array(np.zeros((2, 10)), np.eye(2, 10))), "without a mask"),
     ],
 )
 def test_signals(signal: Any, match: str) -> None:
@@ -102,6 +116,8 @@ def test_a_sample_rate_that_is_too_low_for_the_channels() -> None:
         ({"fb_nChannels": -1}, "fb_nChannels: -1 is not in the range"),
         ({"fb_lowFreqHz": 9000.0}, "fb_lowFreqHz: 9000 Hz is not below fb_highFreqHz"),
         ({"fb_cfHz": [100.0, np.inf]}, "fb_cfHz: inf is not a finite number"),
+        ({"fb_cfHz": np.ma.masked}, "fb_cfHz: nan is not a finite number"),
+        ({"fb_lowFreqHz": np.ma.array(80.0, mask=True)}, "fb_lowFreqHz: nan is not a finite number"),
         ({"fb_cfHz": [[100.0]]}, r"fb_cfHz: \[100.0\] is not"),
         ({"fb_cfHz": "100"}, "fb_cfHz: '100' is not a list"),
         ({"fb_cfHz": itertools.count(1)}, "fb_cfHz: too many values, at most 1024"),
@@ -126,7 +142,10 @@ def test_parameters(parameters: Any, match: str) -> None:
 
 @pytest.mark.parametrize(
     "block_frames",
-    [0, -1, 1.5, 12000.0, np.nan, None, True, "100", b"100", [], (), [100, 0], [100, -1], [100, "1"], [[1, 2]], {1: 2}],
+    [
+        *(0, -1, 1.5, 12000.0, np.nan, None, True, "100", b"100", [], (), [100, 0], [100, -1], [100, "1"], [[1, 2]]),
+        *({1: 2}, np.array(100), np.ma.array([100, 100], mask=[True, False])),
+    ],
 )
 def test_block_sizes(block_frames: Any) -> None:
     refused(
@@ -193,6 +212,16 @@ def test_what_there_is_is_told_once() -> None:
 def test_one_ear_has_no_differences(signal: Any) -> None:
     refused("outputs: ild, crossCorrelation compare two ears, and the signal has one", signal, RATE, outputs=FIXED)
     refused("outputs: precedence compare two ears", signal, RATE, outputs="precedence")
+
+
+def test_a_signal_with_very_many_blocks_takes_no_memory() -> None:
+    signal = np.lib.stride_tricks.as_strided(np.zeros(1, np.int16), (2, 10**9), (0, 0))
+    tracemalloc.start()
+    try:
+        refused("outputs: they would take", signal, RATE, block_frames=[1, 2], outputs=["input", "gammatone"])
+        assert tracemalloc.get_traced_memory()[1] < 10e6
+    finally:
+        tracemalloc.stop()
 
 
 def test_the_traceback_ends_where_the_user_called() -> None:
