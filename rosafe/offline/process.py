@@ -145,7 +145,8 @@ class _Work:
     def _prepare(self, frames: int, lengths: list[int], changes: list[tuple[int, str, Any]]) -> None:
         chain, wanted = self.chain, self.wanted
         count = _block_count(lengths, frames)
-        largest = max((end - first for first, end in itertools.islice(_edges(lengths, frames), len(lengths))), default=0)
+        one_round = itertools.islice(_edges(lengths, frames), len(lengths))
+        largest = max((end - first for first, end in one_round), default=0)
         taken = [_size(chain, wanted, frames, largest)]
         shapes = {kind: chain.shapes(kind, frames) for kind in wanted}  # before any change
         for block, name, value in changes:
@@ -211,7 +212,7 @@ class _Work:
 def _block_lengths(block_frames: Any) -> list[int]:
     """The lengths of the blocks, which are used in turn."""
     several = isinstance(block_frames, (Sequence, np.ndarray)) and not isinstance(block_frames, (str, bytes))
-    sizes = list(block_frames) if several and getattr(block_frames, "ndim", 1) else [block_frames]
+    sizes = list(block_frames) if several and getattr(block_frames, "ndim", 1) != 0 else [block_frames]
     whole = all(isinstance(n, (int, np.integer)) and not isinstance(n, bool) and n > 0 for n in sizes)
     if not sizes or not whole:
         raise ValueError(f"block_frames: {short(block_frames)} is not a positive whole number, or a sequence of such")
