@@ -204,8 +204,8 @@ def workers(count: int) -> Iterator[list[int]]:
     channels: list[int] = []
     process = Filterbank.process
 
-    def watch(self: Filterbank, block: Any, extra: Any = None) -> Any:
-        output = process(self, block, extra)
+    def watch(self: Filterbank, block: Any, *more: Any) -> Any:
+        output = process(self, block, *more)
         channels.append(output.shape[1])
         return output
 
