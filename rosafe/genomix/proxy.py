@@ -167,8 +167,10 @@ class Proxy:
         except KeyError:
             known = [s.name for s in (*self.component.services, *self.component.composites)]
             hint = meant(name, [*known, *(port.name for port in self.component.ports)])  # a URL may mean either
-            what = f"{self.component.name} has no service {name[:80]!r}; it has {', '.join(known)}{hint}"
-            what += f"; those of plugins depend on {plugins.FOLDERS}, also of genomixd: {plugins.where()}"
+            what = f"{self.component.name} has no service {name[:80]!r}; it has {', '.join(known)}"
+            if self.component is ROSAFE:
+                what += f"; those of plugins depend on {plugins.FOLDERS}, also of genomixd: {plugins.where()}"
+            what += hint
             raise ComponentError("::genom::no_such_service", what=what) from None
 
     def arguments(self, service: Service, given: Any) -> dict[str, Any]:
