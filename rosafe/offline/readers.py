@@ -111,7 +111,7 @@ def read_csv(path: Path, arrays: bool = True) -> dict[str, Any]:
         about = checked(about)
         if not arrays:
             return about
-        if not isinstance(fixed, dict) or not isinstance(rows, int):
+        if not isinstance(fixed, dict) or type(rows) is not int:
             raise ValueError("its first line does not describe its rows")
         vectors = {name: _vector(name, value) for name, value in fixed.items()}
         time, *columns = file.readline(MAX_TEXT).decode().rstrip("\r\n").split(",")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 import os
@@ -116,6 +117,10 @@ def test_heads(tmp_path: Path, good: Path) -> None:
         head = {**json.loads(lines[0].removeprefix("# rosafe ")), name: value}
         head["fixed"] = {**head["fixed"], name: value} if name.startswith("ild") else head["fixed"]
         (tmp_path / "b.csv").write_text("".join([f"# rosafe {json.dumps(head)}\n", *lines[1:]]))
+        load(tmp_path / "b.csv")
+    head = json.loads(lines[0].removeprefix("# rosafe "))
+    for key, value in itertools.product(("rows", "fixed"), [*VALUES, False, 1.0, 10**400]):
+        (tmp_path / "b.csv").write_text("".join([f"# rosafe {json.dumps({**head, key: value})}\n", *lines[1:]]))
         load(tmp_path / "b.csv")
 
 
