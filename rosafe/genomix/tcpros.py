@@ -34,6 +34,7 @@ MAX_TEXT = 256 * 1024  # bytes of a header, with the definition of a type in it,
 SAMPLE_SECONDS = 0.3  # a latched message comes at once; where none comes there is none yet
 MESSAGE_SECONDS = 30.0  # for the rest of it
 READ_BUFFER = 2**20
+LARGE = 64 * 1024  # bytes of a message that is decoded on a thread: one with structures may take seconds
 
 _LENGTH = struct.Struct("<I")
 _GARBAGE = (asyncio.IncompleteReadError, rosgraph.network.ROSHandshakeException, ValueError, struct.error)
@@ -133,6 +134,13 @@ async def _read_body(reader: asyncio.StreamReader, prefix: bytes, limit: int) ->
             raise asyncio.IncompleteReadError(bytes(frame[:64]), length)
         frame += part
     return frame
+
+
+async def decode(message: Any, data: bytearray) -> Any:
+    """Return `message` filled from `data`; other requests go on meanwhile if that takes long."""
+    if len(data) < LARGE:
+        return message.deserialize(data)
+    return await asyncio.to_thread(message.deserialize, data)
 
 
 async def reach(graph: Graph, instance: str, header: Mapping[str, str]) -> Connection:
@@ -242,9 +250,11 @@ class ServiceClient:
         except UnicodeEncodeError:  # bytes of a command line that are no UTF-8
             raise refused(f"{self.name}: half a surrogate pair is no character") from None
         try:
-            return self._response_class().deserialize(await asyncio.wait_for(self._ask(buffer.getvalue()), timeout))
+            answer = await asyncio.wait_for(self._ask(buffer.getvalue()), timeout)
         except TimeoutError:
             raise middleware_error(f"{self._instance} did not answer {self.name} within {timeout:g} s") from None
+        try:
+            return await decode(self._response_class(), answer)
         except genpy.DeserializationError as problem:
             raise middleware_error(f"{self.name} answers garbage: {problem}") from None
 
@@ -320,7 +330,7 @@ class TopicReader:
             data = await connection.message()
         finally:
             connection.close()
-        return None if data is None else self._class().deserialize(data)
+        return None if data is None else await decode(self._class(), data)
 
 
 def component_exception(exdetail: str) -> ComponentError:

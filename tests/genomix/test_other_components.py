@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import asyncio
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 
 from rosafe import interface
-from rosafe.genomix import installed_components
+from rosafe.genomix import installed_components, tcpros
 from rosafe.interface import ComponentError
 from tests import harness
 from tests.genomix import world as worlds
@@ -196,6 +198,18 @@ def test_topics_that_are_no_messages_are_no_ports(tmp_path: Path, monkeypatch: p
         *arm.ports,
         interface.Port("a", "::arm::arm_point", ""),
     )
+
+
+@pytest.mark.parametrize("size", [tcpros.LARGE - 1, tcpros.LARGE])
+def test_a_large_message_does_not_hold_up_other_requests(size: int) -> None:
+    """Structures are decoded in Python: 300,000 of them take seconds."""
+
+    class Message:
+        def deserialize(self, data: bytearray) -> threading.Thread:
+            return threading.current_thread()
+
+    thread = asyncio.run(tcpros.decode(Message(), bytearray(size)))
+    assert (thread is threading.main_thread()) == (size < tcpros.LARGE)
 
 
 def test_octave(robot: World) -> None:
