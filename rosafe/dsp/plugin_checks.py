@@ -18,6 +18,7 @@ from typing import Any, ClassVar, NoReturn
 
 import numpy as np
 
+from rosafe.vocabulary.checks import MAX_TEXT
 from rosafe.vocabulary.parameter import REQUIRED, Parameter
 from rosafe.vocabulary.representation import Part
 
@@ -131,6 +132,14 @@ class _Count:
         return returned if abs(self._returned - due) < 2 + self._most else returned + round(due) - self._returned
 
 
+def text_of_exception(problem: BaseException) -> str:
+    """The text of an exception; some classes raise when they are asked for it."""
+    try:
+        return str(problem)
+    except Exception:
+        return "(its text cannot be read)"
+
+
 def _whole(value: Any, name: str) -> int:
     if isinstance(value, (int, np.integer)) and not isinstance(value, bool) and value >= 0:
         return int(value)
@@ -210,7 +219,7 @@ class CheckedStage(Stage):
     def _is_fault(cls, problem: ValueError) -> bool:
         """Whether the plugin's own code raised it for something other than a parameter's value."""
         names = [n for p in cls.REPRESENTATION.parameters for n in (p.name, *p.aliases, *p.former)]
-        return cls._line(problem) > 0 and not str(problem).startswith(tuple(names))
+        return cls._line(problem) > 0 and not text_of_exception(problem).startswith(tuple(names))
 
     @classmethod
     def _line(cls, problem: BaseException) -> int:
@@ -224,8 +233,8 @@ class CheckedStage(Stage):
 
     @classmethod
     def _raise(cls, name: str, problem: BaseException) -> NoReturn:
-        text = " ".join(f"{type(problem).__name__}: {problem}".split())
-        raise cls._violation(f"{name}: {text}", cls._line(problem)) from problem
+        text = " ".join(f"{type(problem).__name__}: {text_of_exception(problem)}".split())
+        raise cls._violation(f"{name}: {text[:MAX_TEXT]}", cls._line(problem)) from problem
 
     # --- blocks ---
 
@@ -314,6 +323,8 @@ class CheckedStage(Stage):
 
     def _inspect(self) -> None:
         """Check all that can be asked without a block."""
+        if not {"input_format", "values", "provide", "provided"} <= vars(self).keys():
+            raise self._violation("__init__: expected a call of super().__init__(input_format, **parameters)")
         if not isinstance(self.output_format, Signal):
             raise self._violation(f"output_format: expected a Signal, got {type(self.output_format).__name__}")
         for name in ("parameters", "derived", "required_extra", "look_ahead"):

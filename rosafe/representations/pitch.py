@@ -47,6 +47,7 @@ class Pitch(Stage):
         parent="autocorrelation",
         axes=("ear", "feature", "time"),
         features=("pitch", "rawPitch", "confidence"),
+        allow_nan=True,
         parameters=(
             Parameter(
                 "pi_rangeHz",

@@ -80,6 +80,14 @@ def _property(name: str, *lines: str) -> str:
 FAULTS: Mapping[str, Fault] = {
     "raises": Fault(PLAIN, process("return block / undefined"), "NameError"),
     "exits": Fault(PLAIN, process("raise SystemExit(3)"), "SystemExit"),
+    "raises without a text": Fault(
+        PLAIN,
+        process("raise type('Odd', (ValueError,), {'__str__': lambda self: None})()"),
+        "Odd: (its text cannot be read)",
+    ),
+    "starts wrong": Fault(
+        PLAIN, "    def __init__(self, *a, **k):\n        pass", "expected a call of super().__init__"
+    ),
     "writes": Fault(PLAIN, process("block *= 1000", "return block.copy()"), "read-only"),
     "unlocks": Fault(PLAIN, process("block.flags.writeable = True", "return block.copy()"), "WRITEABLE"),
     "writes the base": Fault(PLAIN, process("block.base[...] = 0", "return block.copy()"), "TypeError"),

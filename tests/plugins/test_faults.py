@@ -88,3 +88,18 @@ def test_the_command_tries_the_stage(tmp_path: Path) -> None:
         done = subprocess.run([PYTHON, *command], cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE)
         assert (done.returncode, "Traceback" in done.stderr) == (code, False), done
         assert told in done.stdout
+
+
+def test_a_variant_of_the_pitch_has_no_pitch_for_silence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its numbers are those of the pitch: NaN for none."""
+    path = tmp_path / "mine.py"
+    path.write_text(
+        "from rosafe.plugin import variant\nfrom rosafe.representations import pitch\n"
+        "Mine = variant(pitch.Pitch, 'mine', 'my')\n"
+    )
+    stage = checked(loaded(path))
+    monkeypatch.setitem(STAGES, "mine", stage)
+    monkeypatch.setitem(KINDS, "mine", stage.REPRESENTATION)
+    result = rosafe.process(np.zeros((2, 8000)), 16000, outputs=["pitch", "mine"])
+    assert np.isnan(result["pitch"]).any()
+    np.testing.assert_array_equal(result["mine"], result["pitch"])
