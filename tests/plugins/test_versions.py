@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from rosafe.setups import read
-from tests.harness import Graph, wait_for
+from tests.genomix.world import Http, HttpError, port_of
+from tests.harness import SCRIPTS, Graph, wait_for
 
 from .test_declarations import GOOD
 
@@ -45,6 +46,45 @@ def test_a_client_that_knows_another_plugin(
     assert done.returncode == 1
     assert f"versions {reason}" in done.stderr
     assert "Traceback" not in done.stderr and "is not running" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("number", "reason"),
+    [
+        (0, "started without the plugin mine; set ROSAFE_PLUGINS and restart it"),
+        (2, "started with another version of the plugin mine"),
+    ],
+)
+def test_genomixd_knows_another_plugin(
+    graph: Graph, folders: tuple[Path, Path, Path], number: int, reason: str
+) -> None:
+    """Called, sent, from Tcl, and as a whole tree; requests for other kinds are not concerned."""
+    command = (str(SCRIPTS / "genomixd"), "-v", "-p", "0")
+    with (
+        graph.node("rosAFE-ros", "-i", "versions", ROSAFE_PLUGINS=str(folders[number])),
+        graph.start(*command, ROSAFE_PLUGINS=str(folders[1])) as server,
+    ):
+        http = Http(port_of(server))
+        http.get("/load/rosAFE", i="versions", s="t")
+        for given in ({"name": "m", "upperDepName": "ihc"}, []):
+            with pytest.raises(HttpError) as raised:
+                http.call("versions/MineProc", given, s="t")
+            assert reason in raised.value.what
+        failed = http.wait(http.send("versions/MineProc"), "error")
+        assert reason in str(failed["exception"])
+        script = f"""
+            package require genomix
+            set g [::genomix::connect 127.0.0.1:{http.port}]
+            $g load rosAFE -i versions
+            puts [catch {{::versions::MineProc {{}}}} message]$message
+            puts [::versions::getParameters]
+        """
+        path = graph.home / "versions.tcl"
+        path.write_text(script)
+        called, parameters = graph.run("tclsh", str(path)).stdout.splitlines()
+        assert called.startswith("1") and reason in called
+        assert parameters.startswith("parameters")
+        assert "Traceback" not in server.err
 
 
 def test_a_kept_tree_without_its_plugin(graph: Graph, folders: tuple[Path, Path, Path], tmp_path: Path) -> None:
