@@ -81,7 +81,7 @@ def foreign(path: Path) -> bool:
     """Whether anybody but root, this user and the owner of this program could have written what is at `path`."""
     try:
         found = path.stat()
-    except FileNotFoundError:
+    except OSError:  # it does not exist, or this user cannot read it
         return False
     others = found.st_mode & stat.S_IWOTH and not found.st_mode & stat.S_ISVTX
     return bool(others) or found.st_uid not in (0, os.getuid(), CODE_DIR.stat().st_uid)

@@ -419,7 +419,7 @@ def _keeper(path: str, describe: Callable[[], Setup]) -> Keeper | None:
         path = str(rospy.get_param("~keep", ""))
         if path and not path.endswith((".yaml", ".yml")):  # whoever reaches the master can set it, to any file
             name = rospy.resolve_name("~keep")
-            raise ROSAFE.error("e_badNewValue", what=f"ROS parameter {name}: expected FILE.yaml, got {shown(path)}")
+            raise ROSAFE.error("e_badNewValue", what=f"ROS parameter {name}: expected FILE.yaml, got {path!r:.300}")
     return Keeper(Path(os.path.expanduser(path)).absolute(), describe, rospy.logerr) if path else None
 
 

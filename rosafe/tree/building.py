@@ -66,6 +66,11 @@ class Turns:
             finally:
                 self.reserved, self.kept = frozenset(), set()
 
+    def keep(self, names: Iterable[str]) -> None:
+        """Note that a build uses the processors of these names: a setup under way does not remove them."""
+        if self.reserved:
+            self.kept.update(names)
+
     async def give_way(self) -> bool:
         """Let all waiting builds have their turn; return whether there were any. To be called by whose turn it is."""
         if not self._waiting:
@@ -112,7 +117,7 @@ async def build(component: Services, values: Mapping[str, Any]) -> dict[str, Any
     except BaseException:
         await uncancelled(remove(component, made))
         raise
-    component.turns.kept.update(dependencies)
+    component.turns.keep(dependencies)
     return request.answer(wish, dependencies, made, component.instance)
 
 

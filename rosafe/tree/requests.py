@@ -111,8 +111,8 @@ def kind_of(representation: str) -> Representation:
     parameter = REQUEST.parameter("representation")
     hint = meant(representation, parameter.choices)
     raise ValueError(
-        f"representation: {representation[:80]!r} is not {parameter.range_text}{hint}; those of plugins are searched "
-        f"for when a program starts: {searched()}"
+        f"representation: {representation[:80]!r} is not {parameter.range_text}; plugins are loaded when a program "
+        f"starts: {searched()}{hint}"
     )
 
 

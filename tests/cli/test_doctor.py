@@ -140,8 +140,8 @@ def test_plugins(tmp_path: Path) -> None:
     assert (found["state"], found["detail"]) == ("ok", "zeroCrossings")
     (tmp_path / "broken.py").write_text("1 / 0\n")
     found = findings(rosafe("doctor", "--json", ROSAFE_PLUGINS=str(tmp_path)))["plugins"]
-    assert found["state"] == "note" and f"{tmp_path}/broken.py: ZeroDivisionError" in found["detail"]
-    assert "left out" in found["todo"]
+    assert found["state"] == "note" and f"left out: {tmp_path}/broken.py: ZeroDivisionError" in found["detail"]
+    assert "rosafe check" in found["todo"]
 
 
 def test_a_package_that_is_broken(tmp_path: Path) -> None:

@@ -156,6 +156,7 @@ def test_goals_from_the_shell(session: Graph) -> None:
 
 def test_rosnode_kill(graph: Graph) -> None:
     with graph.node("rosAFE-ros", "-i", "victim") as process:
+        wait_for(lambda: "ready as /victim" in process.err)  # a node that is ended before has not started
         graph.run("rosnode", "kill", "/victim")
         assert process.wait() == 0
         assert "Traceback" not in process.err
