@@ -111,6 +111,6 @@ def test_what_an_earlier_build_used_does_not_stay_for_ever() -> None:
         return real(service, values)
 
     graph._make = make  # type: ignore[method-assign]
-    with pytest.raises(ComponentError, match="^no$"):
+    with pytest.raises(ComponentError, match=r"^no$"):
         asyncio.run(building.build(graph, {"representation": "ild"}))
     assert not graph.processors
