@@ -329,7 +329,9 @@ def _sync(path: Path) -> None:
 def _holder(descriptor: int) -> str:
     """Which process has the file locked, for people; of those of other users nothing is known."""
     wanted = os.fstat(descriptor)
-    for opened in map(Path, glob.iglob("/proc/[0-9]*/fd/*")):
+    # This process comes last: forked from the one that writes, it has inherited the locked descriptor.
+    own = f"/proc/{os.getpid()}/"
+    for opened in map(Path, sorted(glob.iglob("/proc/[0-9]*/fd/*"), key=lambda name: name.startswith(own))):
         with contextlib.suppress(OSError):  # closed by now, or somebody else's
             process = opened.parents[1]
             if os.path.samestat(opened.stat(), wanted) and "FLOCK" in (process / "fdinfo" / opened.name).read_text():
