@@ -23,8 +23,7 @@ from tests.live import world as live
 
 pytestmark = pytest.mark.ros
 
-MEMORY = 50  # MB above that of an idle live page
-MEMORY_GENOMIXD = 64  # it has eight times as many connections
+MEMORY = 50  # MB above that of an idle server
 SENT = 30_000_000  # bytes, and
 OPENED = 600  # connections of an attack
 SECONDS = 2.0  # of an attack, at most
@@ -146,7 +145,7 @@ def test_memory_without_a_token(server: Server) -> None:
     for name, (sent, together) in ATTACKS.items():
         server.reset()
         flood(server.port, sent * max(1, 50_000 // len(sent)), together)
-        assert server.memory("VmHWM") <= idle + (MEMORY if server.page else MEMORY_GENOMIXD), name
+        assert server.memory("VmHWM") <= idle + MEMORY, name
     assert server.serves()
     assert "Traceback" not in server.process.err
 
