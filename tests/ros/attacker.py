@@ -100,10 +100,16 @@ class Target:
     def megabytes(self) -> float:
         return int(proc(self.process.pid, "statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
 
+    @property
+    def _all_imported(self) -> bool:
+        """Whether rosAFE, which imports `scipy.signal` after it has reported that it is ready, has done so."""
+        return "bass" in self.name or "scipy/signal/_peak_finding" in proc(self.process.pid, "maps").read_text()
+
     @contextmanager
     def costs_nothing(self, megabytes: float = 30.0) -> Iterator[None]:
         """What was done within is over: soon as many descriptors as before, no more memory, and the node is well."""
         self.assert_well()
+        wait_for(lambda: self._all_imported, what="the end of imports after start-up")
         descriptors, before = self.descriptors, self.megabytes
         yield
         self.assert_well()

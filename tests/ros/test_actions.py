@@ -210,12 +210,17 @@ def test_kill_ends_everything_and_the_node(graph: Graph) -> None:
 
 
 def test_a_waiting_input_is_interrupted_by_kill(graph: Graph) -> None:
-    with own_node(graph) as afe:
-        silent = silent_port(afe)
-        goal = waiting_input(afe)
-        assert afe.process.stop(signal.SIGTERM) == 0
-        assert failed(goal) == ("::genom::interrupted", {"by": "kill"})
-        silent.unregister()
+    """Three tries: on a busy machine the wait for sound (2 s) may be over before the signal arrives."""
+    for _ in range(3):
+        with own_node(graph) as afe:
+            silent = silent_port(afe)
+            goal = waiting_input(afe)
+            assert afe.process.stop(signal.SIGTERM) == 0
+            result = failed(goal)
+            silent.unregister()
+        if result[0] != "::rosAFE::e_noData":
+            break
+    assert result == ("::genom::interrupted", {"by": "kill"})
 
 
 # --- genom_state ------------------------------------------------------------------------------------------------

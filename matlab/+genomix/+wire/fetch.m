@@ -28,8 +28,8 @@ else
 end
 if ~reached && ~isempty(regexp(message, '\<403\>|response code', 'once')) % Octave tells no number
     host = regexprep(address, ':\d+$', '');
-    error('genomix:connection', ['genomixd at %s refuses the request (%s). If it does not know the name %s, start it ' ...
-        'with --name %s, or use its IP address.'], address, message, host, host);
+    error('genomix:connection', ['genomixd at %s refuses the request (%s). If it does not know the ' ...
+        'name %s, start it with --name %s, or use its IP address.'], address, message, host, host);
 elseif ~reached
     error('genomix:connection', ['no answer from genomixd at %s (%s). If it does not run, start it there: ' ...
         'genomixd &. If it runs elsewhere, say where: genomix.client(''host:8080'').'], address, message);
