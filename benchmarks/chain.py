@@ -38,7 +38,7 @@ from rosafe.dsp.windows import window  # noqa: E402
 from rosafe.offline import chain  # noqa: E402
 from rosafe.representations import STAGES  # noqa: E402
 from rosafe.representations.filterbank import Filterbank  # noqa: E402
-from rosafe.representations.registry import ORIGINAL  # noqa: E402
+from rosafe.representations.registry import CORE_KINDS  # noqa: E402
 
 RATE = 44100
 BLOCKS = (12000, 882, 220)
@@ -57,7 +57,7 @@ def sound(samples: int, seed: int = 0) -> np.ndarray:
 
 def ours() -> Steps:
     """A step for each stage of `rosafe`."""
-    return {kind: STAGES[kind](RATE).process for kind in ORIGINAL}
+    return {kind: STAGES[kind](RATE).process for kind in CORE_KINDS}
 
 
 def plain() -> Steps:
@@ -96,7 +96,7 @@ def one_core(block: int, rounds: int) -> dict[str, Any]:
                 run(steps, signal, kept[side], stages[side])
     per_second = 1000 * RATE / block
     result = {}
-    for kind in (*ORIGINAL, "chain"):
+    for kind in (*CORE_KINDS, "chain"):
         times = [chains[side] if kind == "chain" else stages[side][kind] for side in sides]
         slow, fast = (_typical(spent) * per_second for spent in times)
         result[kind] = {"yardstick": slow, "rosafe": fast, "ratio": slow / fast}

@@ -18,7 +18,7 @@ from rosafe.dsp.stage import Stage
 from rosafe.representations import STAGES
 from rosafe.representations.filterbank import Filterbank
 from rosafe.representations.haircell import METHODS, InnerHairCell
-from rosafe.representations.registry import ORIGINAL
+from rosafe.representations.registry import CORE_KINDS
 
 RATE = 44100
 BLOCK = 12000
@@ -166,11 +166,11 @@ begin = time.perf_counter()
 import numpy as np
 from rosafe.dsp import kernels
 from rosafe.representations import STAGES
-from rosafe.representations.registry import ORIGINAL
+from rosafe.representations.registry import CORE_KINDS
 kernels.compiled()
 loaded = time.perf_counter()
 taken = np.ones((2, 12000), np.int32)
-for kind in ORIGINAL:
+for kind in CORE_KINDS:
     out = STAGES[kind](44100).process(taken)
     if kind in ("input", "preProc", "gammatone", "ihc"):
         taken = out
@@ -190,7 +190,7 @@ def first_block() -> dict[str, float]:
 
 
 def _chain() -> dict[str, Stage]:
-    return {kind: STAGES[kind](RATE) for kind in ORIGINAL}
+    return {kind: STAGES[kind](RATE) for kind in CORE_KINDS}
 
 
 def _through(stages: dict[str, Stage], block: Any) -> None:
@@ -243,7 +243,7 @@ def silence(implementation: str, names: Sequence[str] = tuple(TAILS)) -> dict[st
     noise = (np.random.default_rng(0).standard_normal((2, BLOCK)) * 2e8).astype(np.int32)
     result = {}
     for name in names:
-        stages = {kind: STAGES[kind](RATE, **TAILS[name].get(kind, {})) for kind in ORIGINAL}
+        stages = {kind: STAGES[kind](RATE, **TAILS[name].get(kind, {})) for kind in CORE_KINDS}
         ratios = []
         for _ in range(5):
             sound = [_timed(stages, noise) for _ in range(8)]

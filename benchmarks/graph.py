@@ -16,9 +16,9 @@ from typing import Any
 HERE = Path(__file__).resolve().parent
 sys.path.insert(0, str(HERE.parent))
 
-from rosafe.demo.processes import Child, Children  # noqa: E402
-from rosafe.demo.session import NAMES, GuideSession  # noqa: E402
-from rosafe.interface import FIXED, KINDS, ROSAFE  # noqa: E402
+from rosafe.demo.processes import Child, ProcessGroup  # noqa: E402
+from rosafe.demo.session import NAMES, DemoSession  # noqa: E402
+from rosafe.interface import CORE_REPRESENTATIONS, KINDS, ROSAFE  # noqa: E402
 
 PYTHON = "/usr/bin/python3"
 AUDIO = "/bass/Audio"
@@ -35,7 +35,7 @@ def topic(kind: str) -> str:
 class Subscriber:
     """A process that subscribes to some topics with the zero-copy classes; `close` tells what came."""
 
-    def __init__(self, children: Children, folder: str, topics: Iterable[str]) -> None:
+    def __init__(self, children: ProcessGroup, folder: str, topics: Iterable[str]) -> None:
         self._result = Path(tempfile.mkdtemp(dir=folder)) / "result.json"
         self.child: Child = children.start(PYTHON, str(HERE / "subscriber.py"), str(self._result), *topics)
 
@@ -50,7 +50,7 @@ class Subscriber:
 class Bench:
     """The running nodes; `bench` makes one."""
 
-    def __init__(self, session: GuideSession, children: Children, folder: str) -> None:
+    def __init__(self, session: DemoSession, children: ProcessGroup, folder: str) -> None:
         self.session = session
         self._children = children
         self._folder = folder
@@ -69,7 +69,7 @@ class Bench:
         self.call("/rosAFE/connect_port", local="Audio", remote=AUDIO)
         self.call("/bass/Acquire", device=device, sampleRate=RATE, nFramesPerChunk=chunk, nChunksOnPort=20)
         self.call("/rosAFE/InputProc", nFramesPerBlock=block, bufferSize_s_port=port_seconds)
-        for kind in FIXED.values():
+        for kind in CORE_REPRESENTATIONS.values():
             if kind.parent:
                 self.call(f"/rosAFE/{kind.request}", name=NAMES[kind.kind], upperDepName=NAMES[kind.parent])
 
@@ -109,8 +109,8 @@ def resident(pid: int) -> float:
 @contextmanager
 def bench() -> Iterator[Bench]:
     """Both nodes on a private master; everything ends with it."""
-    with tempfile.TemporaryDirectory() as folder, GuideSession(folder, lambda: None) as session:
+    with tempfile.TemporaryDirectory() as folder, DemoSession(folder, lambda: None) as session:
         session.start_nodes()
         session.join()
-        with Children(os.environ) as children:
+        with ProcessGroup(os.environ) as children:
             yield Bench(session, children, folder)

@@ -16,7 +16,7 @@ import graph
 import numpy as np
 from report import Report, arguments
 
-from rosafe.interface import FIXED
+from rosafe.interface import CORE_REPRESENTATIONS
 
 
 def latencies(came: dict[str, list[list[float]]]) -> np.ndarray:
@@ -56,7 +56,7 @@ def main() -> int:
     with graph.bench() as bench:
         bench.build(options.block, options.port_seconds, options.block)
         found = rows("only ILD subscribed", measure(bench, options.block, options.messages))
-        taker = bench.subscribe(graph.topic(kind) for kind in FIXED)
+        taker = bench.subscribe(graph.topic(kind) for kind in CORE_REPRESENTATIONS)
         found += rows("all ports subscribed elsewhere", measure(bench, options.block, options.messages))
         taker.close()
     page.table([f"blocks of {options.block}, ms", "count", "median", "p99", "max"], found)

@@ -17,7 +17,7 @@ import graph
 import report
 
 from rosafe.component import generate
-from rosafe.demo.processes import Children
+from rosafe.demo.processes import ProcessGroup
 
 FULL_SECONDS = 2.0  # until the ports hold a second
 UP_SECONDS = 20.0
@@ -32,7 +32,7 @@ def main() -> int:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{probe.getsockname()[1]}"
-    with graph.bench() as bench, Children(os.environ) as children:
+    with graph.bench() as bench, ProcessGroup(os.environ) as children:
         children.start(graph.PYTHON, str(graph.HERE.parent / "scripts" / "genomixd"), "-p", address.rpartition(":")[2])
         bench.build(12000, 1.0, 2205)
         _await(address)

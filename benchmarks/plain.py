@@ -17,14 +17,14 @@ from numpy.typing import NDArray
 from scipy import fft, ndimage, signal, sparse
 
 from rosafe.dsp import kernels
-from rosafe.dsp.signal import Signal
+from rosafe.dsp.signal import SignalFormat
 from rosafe.dsp.windows import window
 from rosafe.representations import STAGES
-from rosafe.representations.gabor import REACH, patterns
+from rosafe.representations.gabor import CONTEXT_FRAMES, patterns
 from rosafe.representations.spectralfeatures import FEATURES, Spectra
 
 FloatArray = NDArray[np.float64]
-Plain = Callable[[FloatArray, Signal], FloatArray]
+Plain = Callable[[FloatArray, SignalFormat], FloatArray]
 
 SILENCE = 1e-200
 AT_ONCE = 128  # frames of one channel that are transformed at a time: they fit the cache
@@ -46,36 +46,36 @@ def _peak(correlations: FloatArray) -> tuple[FloatArray, FloatArray]:
     return place - lags // 2 + top, highest - (before - after) / 4 * top
 
 
-def itd(correlations: FloatArray, given: Signal) -> FloatArray:
+def itd(correlations: FloatArray, given: SignalFormat) -> FloatArray:
     """(C, L, F) to (C, F)."""
     place, height = _peak(correlations)
     return np.where(height > 0, place, 0) / given.sample_rate  # 0 in silence
 
 
-def ic(correlations: FloatArray, given: Signal) -> FloatArray:
+def ic(correlations: FloatArray, given: SignalFormat) -> FloatArray:
     """(C, L, F) to (C, F)."""
     return _peak(correlations)[1]
 
 
-def onset_strength(rates: FloatArray, given: Signal) -> FloatArray:
+def onset_strength(rates: FloatArray, given: SignalFormat) -> FloatArray:
     """(2, C, F) to (2, C, F)."""
     levels = _level(rates)
     return np.clip(np.diff(levels, axis=-1, prepend=levels[..., :1]), 0, 30)
 
 
-def offset_strength(rates: FloatArray, given: Signal) -> FloatArray:
+def offset_strength(rates: FloatArray, given: SignalFormat) -> FloatArray:
     """(2, C, F) to (2, C, F)."""
     levels = _level(rates)
     return np.clip(-np.diff(levels, axis=-1, prepend=levels[..., :1]), 0, 30)
 
 
-def moc(rates: FloatArray, given: Signal) -> FloatArray:
+def moc(rates: FloatArray, given: SignalFormat) -> FloatArray:
     """(2, C, F) to (2, C, F)."""
     levels = np.clip(2 * _level(rates), -180, -93.821837)
     return np.clip(np.polyval((-0.00012411, -0.051322, -6.3528, -206.11), levels), 0, 40)
 
 
-def adaptation(samples: FloatArray, given: Signal) -> FloatArray:
+def adaptation(samples: FloatArray, given: SignalFormat) -> FloatArray:
     """(2, C, N) to (2, C, N): all five loops in one operation, each on a sample later than the next one's."""
     taus, least = np.array((0.005, 0.05, 0.129, 0.253, 0.5)), 1e-5
     count, rows, number = len(taus), samples.shape[0] * samples.shape[1], samples.shape[-1]
@@ -103,7 +103,7 @@ def _frames(samples: FloatArray, size: int, hop: int) -> FloatArray:
     return sliding_window_view(samples, size, axis=-1)[..., ::hop, :]
 
 
-def autocorrelation(samples: FloatArray, given: Signal) -> FloatArray:
+def autocorrelation(samples: FloatArray, given: SignalFormat) -> FloatArray:
     """(2, C, N) to (2, C, L, F)."""
     half, hop = round(given.sample_rate / 100), round(given.sample_rate / 100)
     size = 2 * half
@@ -124,7 +124,7 @@ def autocorrelation(samples: FloatArray, given: Signal) -> FloatArray:
     return output
 
 
-def spectral_features(rates: FloatArray, given: Signal) -> FloatArray:
+def spectral_features(rates: FloatArray, given: SignalFormat) -> FloatArray:
     """(2, C, F) to (2, 14, F)."""
     spectra = np.maximum(rates, 0).swapaxes(0, 1)
     extended = np.concatenate((spectra[..., :1], spectra), axis=-1)
@@ -132,7 +132,7 @@ def spectral_features(rates: FloatArray, given: Signal) -> FloatArray:
     return np.stack([feature(of) for feature in FEATURES.values()], axis=1)
 
 
-def ams_features(samples: FloatArray, given: Signal) -> FloatArray:
+def ams_features(samples: FloatArray, given: SignalFormat) -> FloatArray:
     """(2, C, N) to (2, C, M, F): a filter over all rows, then sums by hops."""
     stage = STAGES["amsFeatures"](given)
     values = stage.parameters
@@ -152,7 +152,7 @@ def ams_features(samples: FloatArray, given: Signal) -> FloatArray:
     return np.stack(made, axis=2)
 
 
-def pitch(correlations: FloatArray, given: Signal) -> FloatArray:
+def pitch(correlations: FloatArray, given: SignalFormat) -> FloatArray:
     """(2, C, L, F) to (2, 3, F - 1)."""
     rate = given.sample_rate
     first, last = math.ceil(rate / 400), math.floor(rate / 80)
@@ -168,13 +168,13 @@ def pitch(correlations: FloatArray, given: Signal) -> FloatArray:
     return np.stack((np.where(median > 0, median, np.nan), raw, confidence), axis=1)[..., :-1]
 
 
-def precedence(samples: FloatArray, given: Signal) -> FloatArray:
+def precedence(samples: FloatArray, given: SignalFormat) -> FloatArray:
     """(2, C, N) to the ITDs (C, F)."""
     with mock.patch.object(kernels, "compiled", lambda: False):
         return STAGES["precedence"](given).process(samples)[0]
 
 
-def transient_map(strengths: FloatArray, given: Signal) -> FloatArray:
+def transient_map(strengths: FloatArray, given: SignalFormat) -> FloatArray:
     """(2, C, F) to (2, C, F)."""
     apart, least = round(0.03 * given.rate), 5
     strong = np.where(strengths < 3, 0, strengths)
@@ -194,9 +194,9 @@ def transient_map(strengths: FloatArray, given: Signal) -> FloatArray:
     return kept
 
 
-def gabor(rates: FloatArray, given: Signal) -> FloatArray:
+def gabor(rates: FloatArray, given: SignalFormat) -> FloatArray:
     """(2, C, F) to (2, G, F - 19): a sparse matrix over stretches of frames, running sums for the rest."""
-    channels, span = rates.shape[1], 2 * REACH + 1
+    channels, span = rates.shape[1], 2 * CONTEXT_FRAMES + 1
     made = patterns(channels)
     remembered = round(5 * given.rate)
     largest = ndimage.maximum_filter1d(
@@ -204,14 +204,14 @@ def gabor(rates: FloatArray, given: Signal) -> FloatArray:
     )
     levels = 10 * np.log10(np.maximum(rates, 0) + 1e-8 * largest[:, np.newaxis] + 2.2204e-16)
     columns = [
-        ((first + np.arange(number))[:, np.newaxis] * span + REACH + np.arange(-reach, reach + 1)).ravel()
+        ((first + np.arange(number))[:, np.newaxis] * span + CONTEXT_FRAMES + np.arange(-reach, reach + 1)).ravel()
         for first, number, reach, _ in made.places.tolist()
     ]
     begins = np.append(made.places[:, 3], len(made.weights))
     matrix = sparse.csr_matrix((made.weights, np.concatenate(columns), begins), (len(made.places), channels * span))
     output = []
     for ear in levels:
-        padded = np.concatenate((np.repeat(ear[:, :1], REACH, axis=1), ear), axis=1)
+        padded = np.concatenate((np.repeat(ear[:, :1], CONTEXT_FRAMES, axis=1), ear), axis=1)
         frames = sliding_window_view(padded, span, axis=-1)  # (C, F - 19, 39)
         y = matrix @ frames.swapaxes(1, 2).reshape(channels * span, -1)
         count = np.arange(1, y.shape[1] + 1)

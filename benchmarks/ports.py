@@ -23,7 +23,7 @@ import numpy as np
 from report import Report, arguments
 
 from rosafe.component import generate
-from rosafe.interface import FIXED
+from rosafe.interface import CORE_REPRESENTATIONS
 
 SETTLED = 5.0  # seconds until memory counts: windows and buffers are full by then
 GROWTH = 64.0  # MB; a leak of one window in the time would be as much as that
@@ -38,7 +38,6 @@ def times(count: int = 20) -> dict[str, float]:
     from rosAFE.msg import rosAFE_TimeFrequencySignalPortStruct
 
     from rosafe.component.publisher import send_pieces
-    from rosafe.component.wire import Gather
     from rosafe.ros import array_msg
     from rosafe.tree.window import SlidingWindow
 
@@ -138,7 +137,7 @@ class Run(NamedTuple):
 
 def run(bench: graph.Bench, block: int, port_seconds: float, seconds: float) -> Run:
     """Subscribe to all ports from another process for so long; the tree is there and runs on blocks of `block`."""
-    topics = [graph.topic(kind) for kind in FIXED]
+    topics = [graph.topic(kind) for kind in CORE_REPRESENTATIONS]
     taker = bench.subscribe(topics)
     pids = bench.node, taker.child.process.pid
     settling = min(SETTLED, seconds / 2)

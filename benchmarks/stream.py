@@ -12,7 +12,7 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import rosafe
-from rosafe.interface import FIXED
+from rosafe.interface import CORE_REPRESENTATIONS
 from tests.representations.chain import Chain, cut
 
 RATE, FRAMES, TURNS = 44100, 441, 2000
@@ -21,7 +21,7 @@ RATE, FRAMES, TURNS = 44100, 441, 2000
 def main() -> None:
     """Measure both in turn and print the medians."""
     blocks = cut(0.1 * np.random.default_rng(1).standard_normal((2, 100 * FRAMES)), FRAMES)
-    stream, stages = rosafe.Stream(RATE), Chain(float(RATE), FIXED, {"in_doNormalize": False})
+    stream, stages = rosafe.Stream(RATE), Chain(float(RATE), CORE_REPRESENTATIONS, {"in_doNormalize": False})
     seconds: dict[Any, list[float]] = {stream: [], stages: []}
     for turn in range(TURNS):
         for one, taken in seconds.items():

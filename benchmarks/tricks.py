@@ -33,7 +33,7 @@ import report  # noqa: E402
 import rosafe  # noqa: E402
 from rosafe.dsp import kernels  # noqa: E402
 from rosafe.dsp.kernels import build, library  # noqa: E402
-from rosafe.dsp.signal import Signal  # noqa: E402
+from rosafe.dsp.signal import SignalFormat  # noqa: E402
 from rosafe.representations import STAGES  # noqa: E402
 
 RATE = 44100.0
@@ -171,7 +171,7 @@ class Workshop(NamedTuple):
     @property
     def options(self) -> tuple[str, ...]:
         """Of the compiler, beside `build.FLAGS`; what a trick leaves behind may be of no use."""
-        return ("-Wno-unused", f"-march={build.LEVELS[platform.machine()][self.level]}")
+        return ("-Wno-unused", f"-march={build.ISA_LEVELS[platform.machine()][self.level]}")
 
     def libraries(self, tricks: list[Trick]) -> list[Any]:
         """The library with all tricks, and without each of these."""
@@ -213,7 +213,7 @@ class Workshop(NamedTuple):
             unchanged = []
             for path in build.HERE.glob("*.c"):
                 shutil.copy(path, folder)
-        levels = {self.level: build.LEVELS[platform.machine()][self.level]}
+        levels = {self.level: build.ISA_LEVELS[platform.machine()][self.level]}
         options = (*self.options, *unchanged)
         return library.load(build.compile_sources(self.compiler, levels, folder, folder, options)[self.level])
 
@@ -244,7 +244,7 @@ class Work:
         elif self.stage == "gabor":
             rate = 100.0
             self.given = [np.abs(block[..., :: round(RATE / rate)]).copy() for block in inner]
-            self.stages = [STAGES[self.stage](Signal(RATE, rate, True, 441, 882))]
+            self.stages = [STAGES[self.stage](SignalFormat(RATE, rate, True, 441, 882))]
         else:
             self.given = inner
             self.stages = [STAGES[self.stage](RATE)]
@@ -320,7 +320,7 @@ def main() -> int:
     page.say()
     best = library.load(min(build.libraries().items())[1]).rosafe_processor_level()
     levels = [level for level in build.libraries() if best >= level >= min(best, 3)]  # SSE is nobody's any more
-    names = [build.LEVELS[platform.machine()][level] for level in levels]
+    names = [build.ISA_LEVELS[platform.machine()][level] for level in levels]
     shares: dict[Trick, list[str]] = {trick: [] for trick in tricks}
     with tempfile.TemporaryDirectory(prefix="tricks.") as scratch:
         for level, name in zip(levels, names, strict=True):

@@ -14,7 +14,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 import rosafe
 from rosafe.bass.sources.scene import Scene
-from rosafe.representations.registry import own
+from rosafe.representations.registry import builtin_stages
 from rosafe.view.axes import style
 
 RATE, SECONDS, COLUMNS = 44100, 2, 3
@@ -23,7 +23,7 @@ PARAMETERS = {"ac_wSizeSec": 0.03, "pi_confThres": 0.4}  # the voice is low, and
 
 def main() -> None:
     sound = Scene(RATE, seconds=SECONDS).frames(RATE * SECONDS)
-    kinds = {kind: stage.REPRESENTATION for kind, stage in own().items()}
+    kinds = {kind: stage.REPRESENTATION for kind, stage in builtin_stages().items()}
     result = {**rosafe.process(sound, RATE, parameters=PARAMETERS, outputs=list(kinds)), "sample_rate": RATE}
     names = [name for kind in kinds.values() for name in kind.outputs]
     rows = -(-len(names) // COLUMNS)

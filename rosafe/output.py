@@ -23,7 +23,7 @@ class OutputError(Exception):
     """The output cannot be written; the text is one line that says why."""
 
 
-class Part:
+class AtomicOutput:
     """An output on its way, in a file beside its place whose name ends with ``.part``.
 
     That name is always the same, and the file is locked: two writers for one place notice each other, and what a killed
@@ -128,8 +128,8 @@ def new_path(target: str | Path, replace: bool) -> Iterator[Path]:
 
 
 @contextmanager
-def _new_part(target: str | Path, replace: bool) -> Iterator[Part]:
-    part = Part(target, replace)
+def _new_part(target: str | Path, replace: bool) -> Iterator[AtomicOutput]:
+    part = AtomicOutput(target, replace)
     try:
         part.begin()
         yield part

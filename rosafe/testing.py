@@ -14,8 +14,8 @@ import numpy as np
 from rosafe.dsp.guard import FloatArray
 from rosafe.dsp.plugin_checks import PluginError, checked
 from rosafe.dsp.stage import Stage, parts_of
-from rosafe.interface import text_of
-from rosafe.representations import OWN, STAGES
+from rosafe.interface import format_value
+from rosafe.representations import BUILTIN, STAGES
 from rosafe.tree import sizes
 from rosafe.vocabulary.idl import element
 from rosafe.vocabulary.parameter import Parameter
@@ -165,7 +165,7 @@ class _Trial:
         first = last.part_rows(rows)[0]
         assert last.output_rows(rows) == first, f"output_rows: expected {first} as the first of part_rows"
         for name, value in {**last.parameters, **last.derived}.items():
-            assert isinstance(text_of(value), str), f"{name}: {value!r} has no text"
+            assert isinstance(format_value(value), str), f"{name}: {value!r} has no text"
 
     # --- parameters ---
 
@@ -277,7 +277,7 @@ def _trying(what: str) -> Iterator[None]:
 
 def _strict(kind: type[Stage]) -> type[Stage]:
     """`kind` with the checks of plugins, and without conversions."""
-    if kind.REPRESENTATION.kind in OWN and STAGES[kind.REPRESENTATION.kind] is kind:
+    if kind.REPRESENTATION.kind in BUILTIN and STAGES[kind.REPRESENTATION.kind] is kind:
         return kind
     made = checked(kind)
     return type(kind.__name__, (made,), {"CONVERTS": False, "__module__": kind.__module__})
@@ -307,7 +307,7 @@ def _follow(stages: Sequence[Stage]) -> bool:
     """Hand the format of the first one down; False if one refuses it, as it may."""
     for parent, child in itertools.pairwise(stages):
         try:
-            child.receive(parent.output_format)
+            child.set_input_format(parent.output_format)
         except PluginError:
             raise
         except ValueError:
@@ -369,7 +369,7 @@ def _held(value: Any, depth: int = 4) -> int:
 def _costs(kind: type[Stage], parameters: Mapping[str, Any]) -> dict[str, float]:
     """ms of computing per second of sound, of `kind` and of the built-in representations."""
     stages: dict[str, type[Stage]] = {kind.REPRESENTATION.kind: kind}
-    for own in (stage for name, stage in STAGES.items() if name in OWN):
+    for own in (stage for name, stage in STAGES.items() if name in BUILTIN):
         stages.setdefault(own.REPRESENTATION.kind, own)
     costs: dict[str, float] = {}
     for stage in stages.values():

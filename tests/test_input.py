@@ -14,11 +14,11 @@ import pytest
 
 import rosafe
 from rosafe import input as inputs
-from rosafe.commands import Failure
+from rosafe.commands import CommandError
 from rosafe.commands.setup import read_file
 from rosafe.input import open_descriptor, open_regular, read_regular
 from rosafe.interface import ComponentError
-from rosafe.node.keeper import Keeper
+from rosafe.node.keeper import TreeStateFile
 from rosafe.offline.corpus import write_failed
 from rosafe.offline.files import process_file
 from rosafe.offline.formats import FORMATS
@@ -27,12 +27,12 @@ from rosafe.sound.audiofile import AudioFile, AudioFileError
 from rosafe.sound.bagsound import BagSoundError, Recording
 from tests.harness import PYTHON, SCRIPTS, Graph
 
-ERRORS = (OSError, ValueError, AudioFileError, BagSoundError, ComponentError, Failure)
+ERRORS = (OSError, ValueError, AudioFileError, BagSoundError, ComponentError, CommandError)
 READERS: dict[str, Callable[[Path], object]] = {
     "sound": AudioFile,
     "bag": lambda path: Recording(path, None, threading.Event()),
     "setup": lambda path: read_file(str(path)),
-    "kept": lambda path: Keeper(path, Setup, print).kept(),
+    "kept": lambda path: TreeStateFile(path, Setup, print).saved(),
     "offline": lambda path: process_file(path, path.with_name("out.npz")),
     "failed.csv": lambda path: write_failed(path.parent, [], {"a": "b"}),
     **dict.fromkeys(FORMATS, rosafe.load),

@@ -137,13 +137,13 @@ class Capture:
             self.last_frame_index += new
             self._unpublished += new
             self._time_ns = wall_time_ns(chunk.time)
-            if not self._hurries(begin - chunk.time):
+            if not self._may_defer_publish(begin - chunk.time):
                 self.publish()
             cycle(time.monotonic() - begin)
         if self._unpublished:
             self.publish()
 
-    def _hurries(self, late: float) -> bool:
+    def _may_defer_publish(self, late: float) -> bool:
         """Whether to catch up first, and publish with a later chunk; never so long that a reader could miss a frame."""
         sample_rate, _, frames_per_chunk = self._sizes
         return late * sample_rate > LATE_CHUNKS * frames_per_chunk and self._unpublished * 2 <= self._window.frames

@@ -16,7 +16,7 @@ from rosafe.bass.sources.alsa import AlsaSource, DeviceBusyError
 from rosafe.component import master, wire
 from rosafe.component.activities import Activity
 from rosafe.component.component import ComponentNode
-from rosafe.component.events import EventLog
+from rosafe.component.events import ThrottledLog
 from rosafe.component.startup import run_server
 from rosafe.interface import BASS, ComponentError
 from rosafe.terminal import printable
@@ -38,8 +38,8 @@ class BassNode:
         self._source: SoundSource | None = None  # of the acquisition under way
         self._acquired: dict[str, Any] = {}  # what that was asked for
         self._last_end = self._last_loss = "none"
-        self._log_loss = EventLog(rospy.logwarn)
-        self._log_clients = EventLog(rospy.logwarn)
+        self._log_loss = ThrottledLog(rospy.logwarn)
+        self._log_clients = ThrottledLog(rospy.logwarn)
         self._printing = threading.Lock()
 
         self._node.activity("Acquire", self._acquire)

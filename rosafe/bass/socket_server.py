@@ -121,12 +121,12 @@ class DedicatedSocket:
         """Answer clients until told to stop; then close all connections."""
         try:
             while not stopping.is_set():
-                for key, events in self._selector.select(0.01 if self._expects_quiet() else 0.05):
+                for key, events in self._selector.select(0.01 if self._has_idle_clients() else 0.05):
                     if key.fileobj is self._listener:
                         self._accept()
                     else:
-                        self._attend(key.data, events)
-                self._look_after_quiet()
+                        self._handle_client(key.data, events)
+                self._check_idle_clients()
                 self._accept_again()
         finally:
             for client in list(self._clients.values()):
@@ -134,7 +134,7 @@ class DedicatedSocket:
             self._selector.close()
             self._listener.close()
 
-    def _expects_quiet(self) -> bool:
+    def _has_idle_clients(self) -> bool:
         return any(client.pending for client in self._clients.values())
 
     def _accept(self) -> None:
@@ -179,7 +179,7 @@ class DedicatedSocket:
         self._selector.unregister(client.connection)
         client.connection.close()
 
-    def _attend(self, client: _Client, events: int) -> None:
+    def _handle_client(self, client: _Client, events: int) -> None:
         try:
             if events & selectors.EVENT_READ:
                 data = client.connection.recv(_MAX_REQUEST)
@@ -208,7 +208,7 @@ class DedicatedSocket:
         wanted = selectors.EVENT_WRITE if client.outbox else selectors.EVENT_READ
         self._selector.modify(client.connection, wanted, client)
 
-    def _look_after_quiet(self) -> None:
+    def _check_idle_clients(self) -> None:
         """Answer requests without a line end, and drop clients who do not take their answers."""
         now = time.monotonic()
         for client in list(self._clients.values()):
@@ -217,4 +217,4 @@ class DedicatedSocket:
             elif client.pending and not client.outbox and now - client.heard > QUIET_SECONDS:
                 client.pending = False
                 client.requests += take_requests(client.inbox, quiet=True)
-                self._attend(client, 0)
+                self._handle_client(client, 0)

@@ -10,7 +10,7 @@ is the head of its own help, and two functions::
 for which argparse has no place.
 
 `rosafe -h` reads their docstrings and imports none; what is slow to import is imported in `run`; and `doctor` works
-where even numpy is missing. `run` may raise `Failure`, and
+where even numpy is missing. `run` may raise `CommandError`, and
 call `options.usage_error(text)`, which exits with 2. Modules whose names
 begin with _ are parts of commands.
 """
@@ -18,5 +18,5 @@ begin with _ are parts of commands.
 from __future__ import annotations
 
 
-class Failure(Exception):
+class CommandError(Exception):
     """The command cannot do it: the text is the one line that the user gets, and the exit code is 1."""

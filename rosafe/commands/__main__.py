@@ -12,7 +12,7 @@ import sys
 from pathlib import Path
 
 from rosafe import commands, missing, streams
-from rosafe.commands import Failure
+from rosafe.commands import CommandError
 from rosafe.component.startup import Parser, without_names
 from rosafe.output import OutputError
 from rosafe.terminal import printable
@@ -33,14 +33,14 @@ def main(argv: list[str] | None = None) -> int:
         options, rest = _parser(words).parse_known_args(words)
         name = f"rosafe {options.command}"
         if hasattr(options, "missing"):
-            raise Failure(options.missing)
+            raise CommandError(options.missing)
         if hasattr(options, "interspersed"):
             options.interspersed = [word for word in rest if not word.startswith("-")]
             rest = [word for word in rest if word.startswith("-")]
         if rest:
             options.usage_error(f"unrecognized arguments: {' '.join(rest)}")
         return int(options.run(options))
-    except (Failure, OutputError) as problem:
+    except (CommandError, OutputError) as problem:
         print(f"{name}: {printable(problem)}", file=sys.stderr)
         return 1
     except ModuleNotFoundError as problem:

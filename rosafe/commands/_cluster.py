@@ -16,13 +16,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from rosafe.commands import Failure
+from rosafe.commands import CommandError
 from rosafe.commands._workers import SIGNAL_SECONDS, Interrupts, Report, Work, attempt
 from rosafe.tree.workers import VARIABLE
 from rosafe.version import VERSION
 
 LOCAL = "local"
-AHEAD = 8  # pieces of work that are with the scheduler, for each thread of its workers
+TASKS_IN_FLIGHT = 8  # pieces of work that are with the scheduler, for each thread of its workers
 CONNECT_SECONDS = 10
 MAX_STARTS = 3  # of a worker process that dies before it is ready
 
@@ -35,7 +35,7 @@ def run_on(
     report: Callable[[int, Report], None],
     signals: Interrupts,
 ) -> None:
-    """As `run_together`, on the workers of the scheduler at `address`, or on `jobs` of one's own where that is `local`.
+    """As `run_parallel`, on the workers of the scheduler at `address`, or on `jobs` of one's own where that is `local`.
 
     What a worker that dies was at, others do again, a few times: that is the scheduler's doing. Raises Failure where
     there is no scheduler, or no longer.
@@ -51,10 +51,14 @@ def run_on(
         while left:
             signals.check()
             if dead:
-                raise Failure(f"--dask {address}: {dead[0]}; --jobs {jobs} does the work without Dask")
+                raise CommandError(f"--dask {address}: {dead[0]}; --jobs {jobs} does the work without Dask")
             if client.status not in ("running", "connecting"):
-                raise Failure(f"the Dask scheduler at {address} is gone; --resume goes on where this ended")
-            room = max(AHEAD * sum(client.nthreads().values()), AHEAD) - len(running) if not ended.qsize() else 0
+                raise CommandError(f"the Dask scheduler at {address} is gone; --resume goes on where this ended")
+            room = (
+                max(TASKS_IN_FLIGHT * sum(client.nthreads().values()), TASKS_IN_FLIGHT) - len(running)
+                if not ended.qsize()
+                else 0
+            )
             for _, (index, work) in zip(range(room), waiting, strict=False):
                 running[index] = client.submit(partial(_attempt, work, failures, VERSION), pure=False)
                 running[index].add_done_callback(partial(_note, ended, index))
@@ -88,7 +92,7 @@ def _client(address: str, jobs: int, stack: ExitStack, dead: list[str]) -> Any:
         return stack.enter_context(Client(address, timeout=CONNECT_SECONDS, set_as_default=False))
     except (OSError, ValueError, TypeError) as problem:  # the two latter: an address that is none
         why = str(problem).partition("\n")[0]
-        raise Failure(f"--dask {address}: no Dask scheduler answers there ({why})") from None
+        raise CommandError(f"--dask {address}: no Dask scheduler answers there ({why})") from None
 
 
 def _local_cluster(jobs: int, stack: ExitStack, dead: list[str]) -> Any:
@@ -172,7 +176,7 @@ def _outcome(future: Any, address: str) -> Report:
     from distributed.scheduler import KilledWorker
 
     if future.cancelled():
-        raise Failure(f"the Dask scheduler at {address} is gone; --resume goes on where this ended")
+        raise CommandError(f"the Dask scheduler at {address} is gone; --resume goes on where this ended")
     problem = future.exception()
     if problem is None:
         told = future.result()

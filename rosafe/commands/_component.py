@@ -9,12 +9,12 @@ from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING
 
-from rosafe.commands import Failure
+from rosafe.commands import CommandError
 from rosafe.interface import ROSAFE, ComponentError
 
 if TYPE_CHECKING:
     from rosafe.genomix.graph import Graph
-    from rosafe.genomix.proxy import Proxy
+    from rosafe.genomix.proxy import ComponentClient
 
 PAUSE = 0.2  # seconds between two looks, where a component is waited for
 
@@ -35,11 +35,11 @@ def prepare(wait: float = 0.0) -> None:
                     raise
             time.sleep(PAUSE)
     except (generate.GenerationError, master.MasterError) as problem:
-        raise Failure(str(problem)) from None
+        raise CommandError(str(problem)) from None
 
 
 @asynccontextmanager
-async def component(instance: str, wait: float = 0.0) -> AsyncIterator[Proxy]:
+async def component(instance: str, wait: float = 0.0) -> AsyncIterator[ComponentClient]:
     """The rosAFE of that name, which may take `wait` seconds to come; Failure where there is none."""
     from rosafe.genomix.graph import Graph
 
@@ -50,7 +50,7 @@ async def component(instance: str, wait: float = 0.0) -> AsyncIterator[Proxy]:
         except ComponentError as problem:
             named = "" if instance == ROSAFE.name else f" -i {instance}"
             hint = f"; start it with: rosAFE-ros{named}" if problem.ex == "::genom::mwerr" else ""
-            raise Failure(told(problem) + hint) from None
+            raise CommandError(format_error(problem) + hint) from None
         try:
             yield proxy
         finally:
@@ -59,13 +59,13 @@ async def component(instance: str, wait: float = 0.0) -> AsyncIterator[Proxy]:
         await graph.close()
 
 
-async def _found(graph: Graph, instance: str, wait: float) -> Proxy:
-    from rosafe.genomix.proxy import Proxy, names
+async def _found(graph: Graph, instance: str, wait: float) -> ComponentClient:
+    from rosafe.genomix.proxy import ComponentClient, names
 
     deadline = time.monotonic() + wait
     while True:
         try:
-            proxy = await Proxy.load(graph, names(ROSAFE.name, instance)[1])
+            proxy = await ComponentClient.load(graph, names(ROSAFE.name, instance)[1])
             await proxy.check(ROSAFE.name)
             return proxy
         except ComponentError as problem:
@@ -74,7 +74,7 @@ async def _found(graph: Graph, instance: str, wait: float) -> Proxy:
         await asyncio.sleep(PAUSE)
 
 
-def told(problem: ComponentError) -> str:
+def format_error(problem: ComponentError) -> str:
     """The exception in one line: its name, and what it is about."""
     what = problem.what or ROSAFE.exceptions.get(problem.ex.rpartition("::")[2], "")
     return problem.ex + (f": {what}" if what else "")

@@ -8,7 +8,7 @@ from typing import TextIO
 
 import numpy as np
 
-from rosafe.bass.recording.levels import EARS, Levels
+from rosafe.bass.recording.levels import EARS, LevelMeter
 from rosafe.commands._progress import clock
 from rosafe.terminal import printable
 
@@ -38,9 +38,9 @@ class Meter:
         self._quiet = quiet
         self._live = stream.isatty()
         self._frames = 0
-        self._recent = Levels()  # since the last look
+        self._recent = LevelMeter()  # since the last look
         self._due = 0.0
-        self._held = [Levels(), Levels()]  # peaks of the hold time before, and of the one under way
+        self._held = [LevelMeter(), LevelMeter()]  # peaks of the hold time before, and of the one under way
         self._turn = 0.0
 
     def show(self, samples: np.ndarray, lost: int) -> None:
@@ -52,16 +52,16 @@ class Meter:
         if not self._live:
             if self._recent.frames >= PLAIN_SECONDS * self._rate:
                 self._write(self._plain(lost) + "\n")
-                self._recent = Levels()
+                self._recent = LevelMeter()
             return
         now = time.monotonic()
         if now >= self._turn:
-            self._held, self._turn = [self._held[1], Levels()], now + HOLD_SECONDS
+            self._held, self._turn = [self._held[1], LevelMeter()], now + HOLD_SECONDS
         self._held[1].add(samples)
         if now >= self._due:
             self._due = now + LIVE_SECONDS
             self._write(_CLEAR + self._look(lost))
-            self._recent = Levels()
+            self._recent = LevelMeter()
 
     def message(self, text: str) -> None:
         """A line that stays, in the place of the live one."""
@@ -99,7 +99,7 @@ class Meter:
         return "".join(bar)
 
 
-def _mark(parts: list[Levels], ear: int) -> str:
+def _mark(parts: list[LevelMeter], ear: int) -> str:
     return " CLIP" if any(part.clipped[ear] for part in parts) else ""
 
 

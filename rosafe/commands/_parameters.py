@@ -52,6 +52,6 @@ def parameters_of(settings: list[str]) -> dict[str, Any]:
     return values
 
 
-def words(text: str | None) -> list[str] | None:
+def parse_settings(text: str | None) -> list[str] | None:
     """The words between the commas of an option; None where it was not given."""
     return None if text is None else [word.strip() for word in text.split(",")]

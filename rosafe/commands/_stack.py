@@ -12,15 +12,15 @@ from urllib.parse import urlsplit
 
 import aiohttp
 
-from rosafe.commands import Failure
+from rosafe.commands import CommandError
 from rosafe.component import master, paths
-from rosafe.demo.processes import Child, Children
+from rosafe.demo.processes import Child, ProcessGroup
 from rosafe.interface import COMPONENTS, ComponentError
 from rosafe.terminal import printable
 
 if TYPE_CHECKING:
     from rosafe.genomix.graph import Graph
-    from rosafe.genomix.proxy import Proxy
+    from rosafe.genomix.proxy import ComponentClient
 
 START_SECONDS = 30.0
 END_SECONDS = 6.0  # a second more than our servers take
@@ -30,7 +30,7 @@ _URL = re.compile(r"http://\S+")
 
 
 @dataclass
-class Part:
+class ManagedProcess:
     """One process, as the screen shows it."""
 
     name: str
@@ -51,19 +51,19 @@ class Part:
 
 
 @dataclass
-class Stack:
+class Launcher:
     """Everything from the master to the page, in an environment `env`. Use it as a context manager."""
 
     env: Mapping[str, str]
-    parts: dict[str, Part] = field(default_factory=dict)
+    parts: dict[str, ManagedProcess] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        self._children = Children(self.env)  # nodes and servers
+        self._children = ProcessGroup(self.env)  # nodes and servers
         # Which the others need until they have ended; roscore ends its rosmaster and rosout where it is told to, not
         # where it is killed.
-        self._masters = Children(self.env, orphaned="TERM")
+        self._masters = ProcessGroup(self.env, orphaned="TERM")
 
-    def __enter__(self) -> Stack:
+    def __enter__(self) -> Launcher:
         return self
 
     def __exit__(self, *exception: object) -> None:
@@ -71,38 +71,38 @@ class Stack:
         self._masters.close(END_SECONDS)
 
     @property
-    def ended(self) -> list[Part]:
+    def ended(self) -> list[ManagedProcess]:
         """Those that were started here and have ended by themselves."""
         for part in self.parts.values():
             part.look()
         return [part for part in self.parts.values() if part.state == "ended"]
 
-    def start(self, name: str, *command: str, master: bool = False) -> Part:
+    def start(self, name: str, *command: str, master: bool = False) -> ManagedProcess:
         """Start one of the commands."""
         children = self._masters if master else self._children
-        part = self.parts[name] = Part(name, child=children.start(*command))
+        part = self.parts[name] = ManagedProcess(name, child=children.start(*command))
         return part
 
     async def start_master(self) -> None:
         """Have a ROS master; Failure where there is none, and none can be started."""
         uri = self.env["ROS_MASTER_URI"]
         if await _answers(uri):
-            self.parts["roscore"] = Part("roscore", "runs", f"{uri}, was there")
+            self.parts["roscore"] = ManagedProcess("roscore", "runs", f"{uri}, was there")
             return
         if not master.is_local(uri):
-            raise Failure(f"there is no ROS master at {uri}, and it is for that machine to start it: roscore")
+            raise CommandError(f"there is no ROS master at {uri}, and it is for that machine to start it: roscore")
         part = self.start("roscore", "roscore", "-p", str(urlsplit(uri).port or 11311), master=True)
         await self._until(part, lambda: _answers(uri))
         part.detail = uri
 
-    async def start_node(self, graph: Graph, name: str, *options: str) -> Proxy | None:
+    async def start_node(self, graph: Graph, name: str, *options: str) -> ComponentClient | None:
         """Have the component `name`, and a proxy of it; None where it does not come up."""
         there = await _proxy(graph, name) if self.parts["roscore"].child is None else None
         if there is not None:
-            self.parts[name] = Part(name, "runs", "was there")
+            self.parts[name] = ManagedProcess(name, "runs", "was there")
             return there
         part = self.start(name, paths.program(f"{name}-ros"), *options)
-        found: list[Proxy] = []
+        found: list[ComponentClient] = []
 
         async def is_up() -> bool:
             proxy = await _proxy(graph, name)
@@ -116,7 +116,7 @@ class Stack:
         """Have a genomixd on `port`."""
         url = f"http://127.0.0.1:{port}"
         if await _is_genomixd(url):
-            self.parts["genomixd"] = Part("genomixd", "runs", f"{url}, was there")
+            self.parts["genomixd"] = ManagedProcess("genomixd", "runs", f"{url}, was there")
             return
         part = self.start("genomixd", paths.program("genomixd"), "-p", str(port))
         await self._until(part, lambda: _is_genomixd(url))
@@ -135,7 +135,7 @@ class Stack:
         if part.child is not None and (url := _URL.search(part.child.out)):
             part.detail = url[0]
 
-    async def _until(self, part: Part, condition: Callable[[], Awaitable[bool]]) -> None:
+    async def _until(self, part: ManagedProcess, condition: Callable[[], Awaitable[bool]]) -> None:
         deadline = asyncio.get_running_loop().time() + START_SECONDS
         while True:
             part.look()
@@ -163,11 +163,11 @@ async def _answers(uri: str) -> bool:
     return True
 
 
-async def _proxy(graph: Graph, name: str) -> Proxy | None:
-    from rosafe.genomix.proxy import Proxy
+async def _proxy(graph: Graph, name: str) -> ComponentClient | None:
+    from rosafe.genomix.proxy import ComponentClient
 
     try:
-        proxy = await Proxy.load(graph, name)
+        proxy = await ComponentClient.load(graph, name)
         await proxy.check(COMPONENTS[name].name)
     except ComponentError:
         return None

@@ -60,7 +60,7 @@ class Interrupts:
             raise Interrupted(self._received)
 
 
-def run_together(
+def run_parallel(
     works: Sequence[Work],
     jobs: int,
     failures: tuple[type[Exception], ...],

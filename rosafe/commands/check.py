@@ -10,7 +10,7 @@ import argparse
 import os
 import textwrap
 
-from rosafe.commands import Failure, _plugins
+from rosafe.commands import CommandError, _plugins
 from rosafe.terminal import printable
 from rosafe.vocabulary import plugins
 
@@ -61,10 +61,12 @@ def _print_costs(trial: _plugins.Trial) -> None:
 def _origin(file: str) -> tuple[str, str]:
     """The path under which `file` is loaded, and the file itself unless it is in one of the folders of plugins."""
     if not (os.path.isfile(file) and file.endswith(".py")):
-        raise Failure(f"{printable(file)}: expected a Python file (.py), found none")
+        raise CommandError(f"{printable(file)}: expected a Python file (.py), found none")
     path = os.path.abspath(file)
     if os.pathsep in path:
-        raise Failure(f"{printable(path)}: expected a path without {os.pathsep}, which separates folders of plugins")
+        raise CommandError(
+            f"{printable(path)}: expected a path without {os.pathsep}, which separates folders of plugins"
+        )
     if not os.path.basename(path).startswith(plugins.SKIPPED):
         for folder in plugins.named():
             if os.path.isdir(folder) and os.path.samefile(folder, os.path.dirname(path)):

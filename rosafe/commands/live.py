@@ -11,7 +11,7 @@ import argparse
 import asyncio
 import os
 
-from rosafe.commands import Failure
+from rosafe.commands import CommandError
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
@@ -60,9 +60,9 @@ def run(options: argparse.Namespace) -> int:
         )
         asyncio.run(daemon.serve(told))
     except (generate.GenerationError, master.MasterError) as problem:
-        raise Failure(str(problem)) from None
+        raise CommandError(str(problem)) from None
     except ComponentError as problem:
-        raise Failure(str(problem)) from None
-    except daemon.Taken as problem:
-        raise Failure(str(problem)) from None
+        raise CommandError(str(problem)) from None
+    except daemon.AddressInUse as problem:
+        raise CommandError(str(problem)) from None
     return 0

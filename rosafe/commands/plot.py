@@ -12,8 +12,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rosafe.commands import Failure
-from rosafe.commands._parameters import add_settings, parameters_of, words
+from rosafe.commands import CommandError
+from rosafe.commands._parameters import add_settings, parameters_of, parse_settings
 from rosafe.interface import KINDS
 from rosafe.interface.arguments import check_outputs
 
@@ -61,7 +61,7 @@ def run(options: argparse.Namespace) -> int:
     source = Path(inputs[0])
     target = Path(source.with_suffix(".png") if options.to is None else options.to)
     if target.suffix.lower() != ".png":
-        raise Failure(f"-o {target}: a picture ends in .png")
+        raise CommandError(f"-o {target}: a picture ends in .png")
     from matplotlib.figure import Figure
 
     from rosafe.offline.formats import FORMATS
@@ -70,7 +70,7 @@ def run(options: argparse.Namespace) -> int:
     from rosafe.view.axes import save
     from rosafe.view.plot import UNDER, draw
 
-    names = words(options.outputs)
+    names = parse_settings(options.outputs)
     result: Mapping[str, Any]
     try:
         if source.suffix.lower() in FORMATS:
@@ -83,7 +83,7 @@ def run(options: argparse.Namespace) -> int:
             result = {**made, "sample_rate": rate}
         figure = draw(Figure(), result, names, options.ear, at=options.at, channel=options.channel)
     except (AudioFileError, ValueError) as problem:
-        raise Failure(str(problem)) from None
+        raise CommandError(str(problem)) from None
     save(figure, target, options.to is not None or options.force)
     return 0
 

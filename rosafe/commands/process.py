@@ -22,11 +22,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
-from rosafe.commands import Failure
-from rosafe.commands._parameters import add_settings, parameters_of, words
+from rosafe.commands import CommandError
+from rosafe.commands._parameters import add_settings, parameters_of, parse_settings
 from rosafe.commands._progress import Display, bytes_text
-from rosafe.commands._workers import Interrupted, Interrupts, Report, run_together
-from rosafe.interface import FIXED, KINDS, ROSAFE, Parameter
+from rosafe.commands._workers import Interrupted, Interrupts, Report, run_parallel
+from rosafe.interface import CORE_REPRESENTATIONS, KINDS, ROSAFE, Parameter
 from rosafe.interface.arguments import check_outputs
 from rosafe.terminal import printable
 
@@ -64,7 +64,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "--outputs",
         metavar="NAME,...",
         help=f"what to keep of {', '.join(KINDS)} (default: ild,ratemap,crossCorrelation; the original's seven are "
-        f"{', '.join(FIXED)}); what none of them needs is not computed",
+        f"{', '.join(CORE_REPRESENTATIONS)}); what none of them needs is not computed",
     )
     parser.add_argument(
         "--format",
@@ -187,7 +187,7 @@ def run(options: argparse.Namespace) -> int:
         options.usage_error("no sound file is named")
     if options.dask is not None and not re.fullmatch(r"local|((tcp|tls)://)?[^/\s]+:\d{1,5}", options.dask):
         options.usage_error(f"--dask {options.dask}: wanted is a scheduler, such as tcp://HOST:8786, or local")
-    folder, file = _place(inputs, options)
+    folder, file = _output_path(inputs, options)
     # Once, for all processes that are forked from this one.
     from rosafe.offline.corpus import compute
     from rosafe.output import OutputError
@@ -196,7 +196,7 @@ def run(options: argparse.Namespace) -> int:
     try:
         plan = _plan(inputs, folder, file, options)
     except ValueError as problem:
-        raise Failure(str(problem)) from None
+        raise CommandError(str(problem)) from None
     signals = Interrupts()
     made = _make_folder(folder)
     if options.dask:
@@ -238,12 +238,12 @@ class _Plan(NamedTuple):
 
 def _plan(inputs: list[Path], folder: Path | None, file: Path | None, options: argparse.Namespace) -> _Plan:
     """All that is to be done, checked as far as that can be without reading the files; ValueError."""
-    from rosafe.offline.corpus import Settings, find, named
+    from rosafe.offline.corpus import Settings, find, output_paths
     from rosafe.offline.files import OUTPUTS
     from rosafe.offline.formats import FORMATS, check_format, format_of
 
     parameters = parameters_of(options.settings)
-    outputs = check_outputs(OUTPUTS if options.outputs is None else words(options.outputs))
+    outputs = check_outputs(OUTPUTS if options.outputs is None else parse_settings(options.outputs))
     form = FORMATS[f".{options.format or 'npz'}"] if file is None else format_of(file)
     check_format(form, outputs)
     if options.dask:
@@ -252,9 +252,9 @@ def _plan(inputs: list[Path], folder: Path | None, file: Path | None, options: a
     if file is not None:
         targets = [file]
     elif folder is not None:
-        targets = named(items, folder, form.extension)
+        targets = output_paths(items, folder, form.extension)
     else:
-        targets = named([item._replace(place=item.source) for item in items], Path(), form.extension)
+        targets = output_paths([item._replace(place=item.source) for item in items], Path(), form.extension)
     settings = Settings(
         parameters,
         outputs,
@@ -297,17 +297,17 @@ def _runner(options: argparse.Namespace, count: int) -> Any:
 
         cores = len(os.sched_getaffinity(0))
         os.environ.setdefault(VARIABLE, str(max(1, cores // min(options.jobs, count))))
-    return run_together
+    return run_parallel
 
 
-def _place(inputs: list[Path], options: argparse.Namespace) -> tuple[Path | None, Path | None]:
+def _output_path(inputs: list[Path], options: argparse.Namespace) -> tuple[Path | None, Path | None]:
     """The folder for the results, or the file for the one; Failure where it can be neither."""
     out = options.to
     one = len(inputs) == 1 and not os.path.isdir(inputs[0])
     if out is None:
         for path in inputs:
             if os.path.isdir(path):
-                raise Failure(f"{path} is a folder: name one for its results with -o")
+                raise CommandError(f"{path} is a folder: name one for its results with -o")
         return None, None
     if out == "":
         options.usage_error("-o wants a name")
@@ -316,12 +316,12 @@ def _place(inputs: list[Path], options: argparse.Namespace) -> tuple[Path | None
         return Path(out), None
     if one:
         if extension not in _EXTENSIONS:
-            raise Failure(f"-o {out}: results end in {', '.join(_EXTENSIONS)}; the name of a folder ends in /")
+            raise CommandError(f"-o {out}: results end in {', '.join(_EXTENSIONS)}; the name of a folder ends in /")
         if options.format and extension != f".{options.format}":
             options.usage_error(f"-o {out} and --format {options.format} are different formats")
         return None, Path(out)
     if extension:
-        raise Failure(f"-o {out}: for several files, wanted is a folder, ending in / or there already")
+        raise CommandError(f"-o {out}: for several files, wanted is a folder, ending in / or there already")
     return Path(out), None
 
 
@@ -337,7 +337,7 @@ def _make_folder(folder: Path | None) -> Path | None:
     try:
         make_folder(folder)
     except OSError as problem:
-        raise Failure(f"-o {folder}: {problem.strerror}") from None
+        raise CommandError(f"-o {folder}: {problem.strerror}") from None
     return new
 
 
@@ -370,7 +370,7 @@ class _Corpus:
         self.failed: dict[str, str] = {}
         self._sources, self._targets, self._options = sources, targets, options
         self._begun = time.monotonic()
-        self._done = self._skipped = self._size = self._odd = 0
+        self._done = self._skipped = self._size = self._warnings = 0
         self._seconds = 0.0
 
     def fail(self, name: str, why: str) -> None:
@@ -396,7 +396,7 @@ class _Corpus:
             self._done += 1
             self._seconds += done.seconds
             self._size += done.size
-            self._odd += done.not_finite > 0
+            self._warnings += done.not_finite > 0
             text = f"{source} -> {target}: {done.seconds:.1f} s of sound, {bytes_text(done.size)}"
             if done.not_finite:
                 text += f"; {done.not_finite} samples that were NaN or infinite are silence or full scale"
@@ -440,8 +440,8 @@ class _Corpus:
             text += f"; {self._seconds:.1f} s of sound, {bytes_text(self._size)}, in {passed:.1f} s"
             if not self._options.outputs:
                 text += "; ild, ratemap, crossCorrelation (see --outputs)"
-        if self._odd:
-            text += f"; {self._odd} with NaN or infinite samples, which are silence or full scale"
+        if self._warnings:
+            text += f"; {self._warnings} with NaN or infinite samples, which are silence or full scale"
         return text
 
 

@@ -17,14 +17,14 @@ from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rosafe.commands import Failure
+from rosafe.commands import CommandError
 from rosafe.commands._workers import Interrupted, Interrupts
 from rosafe.interface import ComponentError
-from rosafe.output import PART, OutputError, Part
+from rosafe.output import PART, AtomicOutput, OutputError
 from rosafe.terminal import printable
 
 if TYPE_CHECKING:
-    from rosafe.bass.recording.levels import Levels
+    from rosafe.bass.recording.levels import LevelMeter
     from rosafe.bass.recording.outputs import Output
     from rosafe.bass.recording.recorder import SoundRecorder
     from rosafe.bass.sources import SoundSource
@@ -164,7 +164,7 @@ def _list() -> int:
         for line in device_lines():
             print(printable(line))
     except ComponentError as problem:
-        print(f"rosafe record: {printable(problem.why)}", file=sys.stderr)
+        print(f"rosafe record: {printable(problem.reason)}", file=sys.stderr)
     return 0
 
 
@@ -185,7 +185,7 @@ def _check(options: argparse.Namespace) -> Path | None:
         options.usage_error(f"{options.output}: wanted is a name that ends in .wav or .bag")
     for replaced in (path, path.with_name(path.name + PART)):
         if options.force and replaced.exists() and _is_input(replaced, options.device or ""):
-            raise Failure(f"{replaced} is the input itself")
+            raise CommandError(f"{replaced} is the input itself")
     return path
 
 
@@ -216,10 +216,10 @@ def _open_source(options: argparse.Namespace, stopping: threading.Event) -> Soun
         try:
             become_node("rosafe_record")
         except (MasterError, GenerationError) as problem:
-            raise Failure(f"{problem}; or record a --device without ROS") from None
+            raise CommandError(f"{problem}; or record a --device without ROS") from None
         return TopicSource(options.topic or _TOPIC, options.rate, stopping)
     except ComponentError as problem:
-        raise Failure(problem.why) from None
+        raise CommandError(problem.reason) from None
 
 
 def _record(path: Path | None, options: argparse.Namespace, stopping: threading.Event) -> int:
@@ -228,7 +228,7 @@ def _record(path: Path | None, options: argparse.Namespace, stopping: threading.
 
     with ExitStack() as stack:
         # Its place comes first, so that of two recorders the second one is told, whatever they listen to.
-        part = None if path is None else stack.enter_context(closing(Part(path, options.force, precious=True)))
+        part = None if path is None else stack.enter_context(closing(AtomicOutput(path, options.force, precious=True)))
         source = stack.enter_context(closing(_open_source(options, stopping)))
         meter = Meter(sys.stdout, source.sample_rate, options.quiet)
         limit = None if options.seconds is None else max(1, round(options.seconds * source.sample_rate))
@@ -237,7 +237,7 @@ def _record(path: Path | None, options: argparse.Namespace, stopping: threading.
             try:
                 ended = recorder.run(stopping)
             except ComponentError as problem:
-                raise Failure(problem.why) from None
+                raise CommandError(problem.reason) from None
             finally:
                 meter.message(_summary(recorder, str(path or "heard"), source.sample_rate))
         if ended:
@@ -247,15 +247,15 @@ def _record(path: Path | None, options: argparse.Namespace, stopping: threading.
     return 0
 
 
-def _tell_reference(spl: float, levels: Levels) -> None:
+def _tell_reference(spl: float, levels: LevelMeter) -> None:
     """Say which level of reference makes the louder ear right; Failure where what was heard cannot tell."""
     from rosafe.bass.recording.levels import SILENCE, reference
 
     if any(levels.clipped):
-        raise Failure("the sound was clipped: turn the microphone down, and begin anew")
+        raise CommandError("the sound was clipped: turn the microphone down, and begin anew")
     heard = [levels.rms(ear) for ear in range(2)]
     if max(heard) == SILENCE:
-        raise Failure("there was only silence: is the calibrator on, and the device the right one?")
+        raise CommandError("there was only silence: is the calibrator on, and the device the right one?")
     wanted = [reference(spl, level) for level in heard]
     print(f"pp_refSPLdB={max(wanted):.2f}")
     if abs(wanted[0] - wanted[1]) > _DIFFERENCE:
@@ -264,7 +264,7 @@ def _tell_reference(spl: float, levels: Levels) -> None:
 
 
 @contextmanager
-def _opened(part: Part | None, options: argparse.Namespace, source: SoundSource) -> Iterator[Output | None]:
+def _opened(part: AtomicOutput | None, options: argparse.Namespace, source: SoundSource) -> Iterator[Output | None]:
     """The output, if one is wanted; complete and in its place at the end, whatever happens, if there is sound in it."""
     if part is None:
         yield None
@@ -288,7 +288,7 @@ def _opened(part: Part | None, options: argparse.Namespace, source: SoundSource)
         raise OutputError(f"{part.error(problem)}{left}") from None
 
 
-def _open_output(part: Part, options: argparse.Namespace, source: SoundSource) -> Output:
+def _open_output(part: AtomicOutput, options: argparse.Namespace, source: SoundSource) -> Output:
     from rosafe.bass.recording.outputs import BagFile, WavFile
 
     descriptor = part.begin()

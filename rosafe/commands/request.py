@@ -15,14 +15,14 @@ import sys
 from collections.abc import Mapping
 from typing import Any
 
-from rosafe.commands import Failure
-from rosafe.commands._component import component, prepare, told
+from rosafe.commands import CommandError
+from rosafe.commands._component import component, format_error, prepare
 from rosafe.interface import REQUEST, ROSAFE, ComponentError, Representation
 from rosafe.interface.arguments import check_parameter
 from rosafe.terminal import printable
 from rosafe.tree import requests as request
-from rosafe.vocabulary.parameter import shown
-from rosafe.vocabulary.words import meant
+from rosafe.vocabulary.parameter import short_repr
+from rosafe.vocabulary.words import did_you_mean
 
 _SETTINGS = [p for p in REQUEST.parameters if p.name not in ("representation", "connect")]  # those have other places
 
@@ -76,7 +76,7 @@ def run(options: argparse.Namespace) -> int:
                 raise ValueError(f"{name} is given twice")
             values[name] = value
     except ValueError as problem:
-        raise Failure(str(problem)) from None
+        raise CommandError(str(problem)) from None
     if options.connect is not None:
         values["connect"] = options.connect
     prepare()
@@ -95,7 +95,9 @@ def _parameter(setting: str) -> tuple[str, Any]:
     parameter = next((p for p in _SETTINGS if name in (p.name, *p.aliases)), None)
     if parameter is None:
         known = [p.name for p in _SETTINGS]
-        raise ValueError(f"unknown parameter {shown(name)}; there are: {', '.join(known)}{meant(name, known)}")
+        raise ValueError(
+            f"unknown parameter {short_repr(name)}; there are: {', '.join(known)}{did_you_mean(name, known)}"
+        )
     if name in request.OF_THE_INPUT:
         return name, parameter.parse(text)
     return check_parameter(name, text, text=True)
@@ -110,18 +112,18 @@ async def _make(instance: str, values: Mapping[str, Any], kind: Representation) 
             return await proxy.outputs(REQUEST.name, values)
         except ComponentError as problem:
             if problem.ex != "::rosAFE::e_noData":
-                raise Failure(told(problem)) from None
+                raise CommandError(format_error(problem)) from None
             topic = "/" + str(values.get("connect", REQUEST.parameter("connect").default)).lstrip("/")
             start = "" if await proxy.published(topic) else "bass-ros -b; "
             acquire = f"rosservice call {topic.rpartition('/')[0]}/Acquire \"{{device: 'scene:'}}\""
             silent = f"{problem.ex}: {ROSAFE.exceptions['e_noData']}"
-            raise Failure(f"{silent}; start the sound first: {start}{acquire}") from None
+            raise CommandError(f"{silent}; start the sound first: {start}{acquire}") from None
 
 
 def _warn(kind: Representation, values: Mapping[str, Any], new_input: bool) -> None:
     """A line on stderr for each parameter that is given in vain, before anything is made."""
     given = [name for name in values if name != "representation"]
-    for name in request.unused(request.chain(kind), given, new_input):
+    for name in request.unused(request.ancestor_kinds(kind), given, new_input):
         why = ": the input is there already" if name in request.OF_THE_INPUT else " on this representation"
         print(f"rosafe request: {name} has no effect{why}", file=sys.stderr, flush=True)
 
@@ -130,6 +132,6 @@ def _show(answer: Mapping[str, Any], kind: Representation) -> None:
     """A line for each processor."""
     width = max(map(len, answer["dependencies"]))
     instance = answer["topic"].split("/")[1]
-    for name, kind_there in zip(answer["dependencies"], request.chain(kind), strict=True):
+    for name, kind_there in zip(answer["dependencies"], request.ancestor_kinds(kind), strict=True):
         how = "created" if name in answer["created"] else "reused"
         print(printable(f"{how:7}  {name:{width}}  {request.topic(instance, kind_there, name)}"))

@@ -14,8 +14,8 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from rosafe.commands import Failure
-from rosafe.commands._component import component, prepare, told
+from rosafe.commands import CommandError
+from rosafe.commands._component import component, format_error, prepare
 from rosafe.input import read_regular
 from rosafe.interface import MAX_SETUP, ROSAFE, ComponentError
 from rosafe.output import write_whole
@@ -78,7 +78,7 @@ def run(options: argparse.Namespace) -> int:
         options.usage_error("--full is for save")
     if options.keep and options.action == "save":
         options.usage_error("--keep is for load")
-    setup = beside(read_file(options.file), options.keep) if options.action == "load" else None
+    setup = without_saved_tree(read_file(options.file), options.keep) if options.action == "load" else None
     prepare(options.wait)
     if setup is not None:
         show(asyncio.run(load(setup, options.instance, options.wait)))
@@ -94,14 +94,14 @@ def read_file(name: str) -> Setup:
         data = sys.stdin.buffer.read(limit) if name == "-" else read_regular(name, limit)
         return read(data.decode("utf-8-sig"))
     except UnicodeDecodeError:
-        raise Failure(f"{name}: not a setup: the file is not UTF-8") from None
+        raise CommandError(f"{name}: not a setup: the file is not UTF-8") from None
     except OSError as problem:
-        raise Failure(f"{name}: {problem.strerror or problem}") from None
+        raise CommandError(f"{name}: {problem.strerror or problem}") from None
     except SetupError as problem:
-        raise Failure(f"{name}, {problem}") from None
+        raise CommandError(f"{name}, {problem}") from None
 
 
-def beside(setup: Setup, keep: str) -> Setup:
+def without_saved_tree(setup: Setup, keep: str) -> Setup:
     """What is to be loaded of `setup` for a node that keeps its tree in the file `keep`: that comes back by itself."""
     if keep and Path(keep).exists() and read_file(keep).processors:
         return replace(setup, processors=())
@@ -116,7 +116,7 @@ async def load(setup: Setup, instance: str, wait: float = 0.0) -> dict[str, Any]
         try:
             return await setups.apply(proxy, setup, wait)
         except ComponentError as problem:
-            raise Failure(told(problem)) from None
+            raise CommandError(format_error(problem)) from None
 
 
 async def _saved(options: argparse.Namespace) -> str:
@@ -126,7 +126,7 @@ async def _saved(options: argparse.Namespace) -> str:
         try:
             return write(await setups.capture(proxy), options.full)
         except ComponentError as problem:
-            raise Failure(told(problem)) from None
+            raise CommandError(format_error(problem)) from None
 
 
 def _keep(name: str, text: str) -> None:

@@ -23,7 +23,7 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rosafe.commands import Failure
+from rosafe.commands import CommandError
 from rosafe.output import new_file
 from rosafe.terminal import printable
 
@@ -75,13 +75,13 @@ def run(options: argparse.Namespace) -> int:
         else:
             title = f"/{options.node.strip('/')}"
             if not re.fullmatch(r"(/[A-Za-z]\w*)+", title, re.ASCII):
-                raise Failure(f"--node: expected the name of a node, such as rosAFE, got {options.node!r}")
+                raise CommandError(f"--node: expected the name of a node, such as rosAFE, got {options.node!r}")
             events = _listen(title, options.seconds)
         from rosafe.tree.trace import Trace
 
         trace = Trace(events)
         if not trace.spans:
-            raise Failure(f"{title} has no processors: nothing to trace")
+            raise CommandError(f"{title} has no processors: nothing to trace")
         if descriptor is not None:
             with os.fdopen(descriptor, "w", encoding="utf-8", closefd=False) as stream:
                 json.dump(trace.chrome(title), stream)
@@ -94,7 +94,7 @@ def run(options: argparse.Namespace) -> int:
 
 def _compute(path: Path, seconds: float, block: int) -> list[Event]:
     """What the default tree does on the first `seconds` of a sound file."""
-    from rosafe.interface import FIXED
+    from rosafe.interface import CORE_REPRESENTATIONS
     from rosafe.interface.arguments import check_parameters
     from rosafe.offline.chain import Chain
     from rosafe.sound.audiofile import AudioFile, AudioFileError
@@ -105,17 +105,17 @@ def _compute(path: Path, seconds: float, block: int) -> list[Event]:
         sound = AudioFile(path)
         try:
             if sound.channels != 2:
-                raise Failure(f"{path} has {sound.channels} channels, wanted are two: left and right ear")
+                raise CommandError(f"{path} has {sound.channels} channels, wanted are two: left and right ear")
             frames = min(sound.frames, math.ceil(seconds * sound.sample_rate))
             blocks = (sound.read(min(block, frames - first)) for first in range(0, frames, block))
             values = {"in_doNormalize": True, **check_parameters(None)}
-            with Chain(blocks, sound.sample_rate, values, FIXED, lambda *_: None) as chain:
+            with Chain(blocks, sound.sample_rate, values, CORE_REPRESENTATIONS, lambda *_: None) as chain:
                 chain.observe(tracer)
                 chain.run()
         finally:
             sound.close()
     except (AudioFileError, ValueError) as problem:
-        raise Failure(str(problem)) from None
+        raise CommandError(str(problem)) from None
     return tracer.take()
 
 
@@ -132,14 +132,14 @@ def _listen(node: str, seconds: float) -> list[Event]:
     try:
         become_node("rosafe_trace")
     except MasterError as problem:
-        raise Failure(str(problem)) from None
+        raise CommandError(str(problem)) from None
     subscriber = rospy.Subscriber(f"{node}/trace", String, messages.put, tcp_nodelay=True)
     events: list[Event] = []
     try:
         try:
             events += read(messages.get(timeout=_ANSWER_SECONDS))
         except queue.Empty:
-            raise Failure(f"{node} does not answer: is there a rosAFE-ros of this name?") from None
+            raise CommandError(f"{node} does not answer: is there a rosAFE-ros of this name?") from None
         deadline = time.monotonic() + seconds
         while (left := deadline - time.monotonic()) > 0:
             events += read(messages.get(timeout=left + _ANSWER_SECONDS))

@@ -14,14 +14,14 @@ from collections.abc import AsyncIterator, Iterable
 from contextlib import asynccontextmanager
 from typing import TYPE_CHECKING
 
-from rosafe.commands import Failure
+from rosafe.commands import CommandError
 from rosafe.interface import ComponentError
 from rosafe.setups import Setup
 
 if TYPE_CHECKING:
-    from rosafe.commands._stack import Part, Stack
+    from rosafe.commands._stack import Launcher, ManagedProcess
     from rosafe.genomix.graph import Graph
-    from rosafe.genomix.proxy import Proxy
+    from rosafe.genomix.proxy import ComponentClient
 
 PERIOD = 1.0  # seconds between two looks at all
 
@@ -57,19 +57,19 @@ def _port(text: str) -> int:
 
 def run(options: argparse.Namespace) -> int:
     """Start everything, show how it is, and end what was started."""
-    from rosafe.commands._stack import Stack, environment
-    from rosafe.commands.setup import beside, read_file
+    from rosafe.commands._stack import Launcher, environment
+    from rosafe.commands.setup import read_file, without_saved_tree
     from rosafe.component import generate, master
 
     # What is wrong with it is told before anything starts.
-    setup = beside(read_file(options.file), options.keep) if options.file else None
+    setup = without_saved_tree(read_file(options.file), options.keep) if options.file else None
     try:
         env = environment()
         master.check_address(env["ROS_MASTER_URI"])
         generate.ensure_messages()
     except (generate.GenerationError, master.MasterError) as problem:
-        raise Failure(str(problem)) from None
-    with Stack(env) as stack:
+        raise CommandError(str(problem)) from None
+    with Launcher(env) as stack:
         asyncio.run(_Session(options, setup, stack).run())
         if sys.stdout.isatty():
             print("ending what was started here", flush=True)
@@ -80,7 +80,7 @@ def run(options: argparse.Namespace) -> int:
 class _Session:
     """One run of the command."""
 
-    def __init__(self, options: argparse.Namespace, setup: Setup | None, stack: Stack) -> None:
+    def __init__(self, options: argparse.Namespace, setup: Setup | None, stack: Launcher) -> None:
         self._options = options
         self._setup = setup
         self._stack = stack
@@ -129,17 +129,17 @@ class _Session:
                 await stack.start_page(options.live_port, not options.no_browser)
             self._screen.say("Ctrl-C ends what was started here")
             while True:
-                await self._look(bass, afe)
+                await self._poll(bass, afe)
                 await asyncio.sleep(PERIOD)
 
-    async def _load(self, afe: Proxy | None) -> None:
-        from rosafe.commands._component import told
-        from rosafe.commands._stack import Part
+    async def _load(self, afe: ComponentClient | None) -> None:
+        from rosafe.commands._component import format_error
+        from rosafe.commands._stack import ManagedProcess
         from rosafe.genomix import setups
 
         if self._setup is None:
             return
-        part = self._stack.parts["setup"] = Part("setup", "loads", self._options.file)
+        part = self._stack.parts["setup"] = ManagedProcess("setup", "loads", self._options.file)
         if afe is None:
             part.state, part.detail = "refused", "rosAFE does not run"
             return
@@ -148,31 +148,31 @@ class _Session:
             part.state = "loaded"
             part.detail = f"{self._options.file}: {len(answer['created'])} created, {len(answer['reused'])} reused"
         except ComponentError as problem:
-            part.state, part.detail = "refused", told(problem)
+            part.state, part.detail = "refused", format_error(problem)
 
-    async def _look(self, bass: Proxy | None, afe: Proxy | None) -> None:
+    async def _poll(self, bass: ComponentClient | None, afe: ComponentClient | None) -> None:
         """Say of the nodes what they do."""
         for name, proxy in (("bass", bass), ("rosAFE", afe)):
             part = self._stack.parts[name]
             if proxy is None or part.state == "ended":
                 continue
             try:
-                part.detail = await (_acquisition if name == "bass" else _tree)(proxy) + _whence(part)
+                part.detail = await (_acquisition if name == "bass" else _tree)(proxy) + _tree_origin(part)
                 part.state = "runs"
             except ComponentError as problem:
                 part.state, part.detail = "silent", str(problem)
 
 
-def _whence(part: Part) -> str:
+def _tree_origin(part: ManagedProcess) -> str:
     return "" if part.child is not None else ", was there"
 
 
-async def _acquisition(bass: Proxy) -> str:
+async def _acquisition(bass: ComponentClient) -> str:
     now = await bass.outputs("getAcquisition", {})
     return f"acquires from {now['device']}" if now["running"] else "idle"
 
 
-async def _tree(afe: Proxy) -> str:
+async def _tree(afe: ComponentClient) -> str:
     processors = (await afe.outputs("getProcessors", {}))["processors"]
     return f"{len(processors)} processors"
 

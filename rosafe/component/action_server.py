@@ -12,7 +12,7 @@ import rospy
 from actionlib_msgs.msg import GoalStatusArray
 
 from rosafe.component.publisher import Publisher
-from rosafe.component.wire import Gather
+from rosafe.component.wire import BufferList
 
 DEFAULT_FREQUENCY = 5.0  # Hz, as of every action server
 MAX_FREQUENCY = 100.0  # Hz
@@ -54,7 +54,7 @@ class ActionServer(actionlib.ActionServer):
         if self.status_list:
             self._in_use.set()
 
-    def publish_again(self, idle: Gather) -> bool:
+    def publish_again(self, idle: BufferList) -> bool:
         """Publish the status, which is `idle` of a server without goals; return whether the server is in use."""
         if self.status_list:
             self.publish_status()
@@ -95,7 +95,7 @@ class StatusPublisher:
             self._in_use.clear()
             message.header.seq += 1
             message.header.stamp = rospy.Time.now()
-            idle = Gather()
+            idle = BufferList()
             message.serialize(idle)
             if sum(server.publish_again(idle) for server in self._servers):  # each of them publishes
                 self._in_use.set()

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable
 from typing import Any
 
 from rosafe.interface import MAX_ACTIVITIES, ComponentError, Service
-from rosafe.vocabulary.words import listed
+from rosafe.vocabulary.words import join_names
 
 Handler = Callable[["Activity", dict[str, Any]], None]
 
@@ -71,7 +71,7 @@ def too_many(task: str) -> ComponentError:
     return ComponentError("::genom::too_many_activities", what)
 
 
-class TaskMeter:
+class TaskStatistics:
     """What one task of the component measured of itself: cycles, their duration, and its load.
 
     The load is the time spent in cycles per time gone by; several processors of one task can make it more than 1.
@@ -223,7 +223,7 @@ class Activities:
             try:
                 return self._live[number]
             except KeyError:
-                known = listed([str(one) for one in sorted(self._live)])
+                known = join_names([str(one) for one in sorted(self._live)])
                 raise ComponentError("::genom::no_such_activity", f"no activity {number}; there are: {known}") from None
 
     def interrupt(self, which: Iterable[Activity], by: str) -> None:

@@ -22,12 +22,12 @@ from typing import Any
 
 import numpy as np
 
-from rosafe.component.frametime import FrameTime, Line
+from rosafe.component.frametime import FrameTime, LinearClock
 from rosafe.component.lag import LagMonitor
-from rosafe.sound.windows import joined, malformed
+from rosafe.sound.windows import split_new_frames, window_error
 
 RING_SECONDS = 10.0  # how far the tree may fall behind before frames are lost
-COMPARED = 1000  # frames of a window that are compared with what came before
+OVERLAP_CHECK_FRAMES = 1000  # frames of a window that are compared with what came before
 
 
 @dataclass
@@ -40,7 +40,7 @@ class Counters:
     gaps: int = 0  # events in which frames were lost
     streams: int = 0  # streams begun
     dropped: int = 0  # unread frames of old streams
-    breaks: int = 0  # times that the samples of a window did not fit those before
+    discontinuities: int = 0  # times that the samples of a window did not fit those before
     last_loss: str = "none"  # where the last loss was
 
 
@@ -65,10 +65,10 @@ class AudioRing:
         self._window = 0  # frames in the last message
         self._newest = 0  # number of the newest frame
         self._oldest = 1  # number of the oldest frame that the ring holds
-        self._joint = 1  # number of the first frame after the last break
+        self._discontinuity = 1  # number of the first frame after the last break
         self._readers: list[AudioReader] = []
         self._connection: object = None
-        self._refusing = self._breaking = False  # told the log so already
+        self._refusing = self._in_discontinuity = False  # told the log so already
 
     # --- the writing side: rospy's thread ---
 
@@ -90,17 +90,17 @@ class AudioRing:
             if connection is not self._connection:
                 return
             self.counters.messages += 1
-            problem = malformed(message)
+            problem = window_error(message)
             if problem:
                 self._refuse(problem)
                 return
             self._refusing = False
             newest, window = int(message.lastFrameIndex), len(message.left)
             self._join_stream(int(message.sampleRate), newest, window)
-            lost, fresh = joined(newest - self._newest, window)
+            lost, fresh = split_new_frames(newest - self._newest, window)
             self._compare(message, window - fresh)
             if lost:
-                self._lose(self._newest + 1, lost)
+                self._record_gap(self._newest + 1, lost)
                 self._write(np.zeros((2, lost), np.int32))
             self._write(np.stack((message.left[window - fresh :], message.right[window - fresh :])))
             if fresh or lost:
@@ -134,7 +134,7 @@ class AudioRing:
         elif newest < self._newest:
             why = f"its index fell from {self._newest} to {newest}"
         elif newest - self._newest > max(self._capacity, window):
-            self._lose(self._newest + 1, newest - self._newest - window)
+            self._record_gap(self._newest + 1, newest - self._newest - window)
             why = f"its index jumped from {self._newest} to {newest}"
         else:
             if window != self._window:
@@ -154,7 +154,7 @@ class AudioRing:
         self._drop_unread()
         self._samples = np.zeros((2, capacity), np.int32)
         self._newest = max(0, newest - window)
-        self._oldest = self._joint = self._newest + 1
+        self._oldest = self._discontinuity = self._newest + 1
         self.sample_rate, self._window = sample_rate, window
         self._times.begin(sample_rate)
         self.counters.streams += 1
@@ -171,24 +171,24 @@ class AudioRing:
 
     def _compare(self, message: Any, known: int) -> None:
         """Look whether the first `known` samples of a window are those that came before; few of them tell."""
-        count = min(known, self._newest + 1 - max(self._oldest, self._joint), COMPARED)
+        count = min(known, self._newest + 1 - max(self._oldest, self._discontinuity), OVERLAP_CHECK_FRAMES)
         held = self._copy(self._newest + 1 - count, count)
         fits = all(
             np.array_equal(ear, came[known - count : known])
             for ear, came in zip(held, (message.left, message.right), strict=True)
         )
         if not fits:
-            self._joint = self._newest + 1
+            self._discontinuity = self._newest + 1
             self._times.begin(self.sample_rate)
-            self.counters.breaks += 1
-            if not self._breaking:
+            self.counters.discontinuities += 1
+            if not self._in_discontinuity:
                 self._report(
                     f"Audio: the index went on to {message.lastFrameIndex}, but the samples up to {self._newest} are "
                     "not those that came before: another stream began"
                 )
-        self._breaking = not fits
+        self._in_discontinuity = not fits
 
-    def _lose(self, first: int, count: int) -> None:
+    def _record_gap(self, first: int, count: int) -> None:
         if count <= 0:
             return
         self.counters.lost += count
@@ -264,7 +264,7 @@ class AudioRing:
             if reader.ended or self.sample_rate != reader.sample_rate:
                 return None
             if reader.position < self._oldest:
-                self._lose(reader.position, self._oldest - reader.position)
+                self._record_gap(reader.position, self._oldest - reader.position)
                 reader.position = self._oldest
             if self._newest + 1 - reader.position < count:
                 return None
@@ -280,7 +280,7 @@ class AudioRing:
             if reader in self._readers:
                 self._readers.remove(reader)
 
-    def captured(self, frame: int) -> Line | None:
+    def captured(self, frame: int) -> LinearClock | None:
         """When frame `frame` of the stream was captured; None where that is not known."""
         with self._turn:
             return self._times.line(frame)

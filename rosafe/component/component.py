@@ -27,12 +27,12 @@ from actionlib_msgs.msg import GoalStatus
 from rosafe import interface
 from rosafe.component import mark, master, memory, registration
 from rosafe.component.action_server import StatusPublisher
-from rosafe.component.activities import Activities, Activity, Handler, TaskMeter, too_many
+from rosafe.component.activities import Activities, Activity, Handler, TaskStatistics, too_many
 from rosafe.component.publisher import Publisher
-from rosafe.component.pulse import Pulse
+from rosafe.component.pulse import SelfCheck
 from rosafe.interface import ComponentError
 from rosafe.version import VERSION
-from rosafe.vocabulary.parameter import shown
+from rosafe.vocabulary.parameter import short_repr
 
 STATE_PERIOD = 0.9  # seconds between two genom_state messages at the most; the contract is 1
 BURST_SECONDS = 0.005  # what changes within this makes one message, not one each
@@ -61,10 +61,10 @@ class ComponentNode:
         self.name = rospy.get_name()
         self.finished = threading.Event()
         self.activities = Activities(component.tasks, self._state_changed, self._log_crash)
-        self.meters = {task: TaskMeter(task) for task in component.tasks}
+        self.meters = {task: TaskStatistics(task) for task in component.tasks}
         self.diagnostics = diagnostic_updater.Updater()
         self.diagnostics.setHardwareID("none")
-        self._pulse = Pulse(self.finished)
+        self._pulse = SelfCheck(self.finished)
         self.diagnostics.add("calls", self._pulse.health)
         self._bad_value = bad_value
         self._srv = importlib.import_module(f"{component.name}.srv")
@@ -78,7 +78,7 @@ class ComponentNode:
         self._connecting = threading.Lock()
         self._turn = threading.Event()
         self._health_changed = threading.Event()
-        self._keep: list[Any] = []  # services, alive as long as the node
+        self._keep_alive_references: list[Any] = []  # services, alive as long as the node
         self._actions = StatusPublisher(self.finished)
         self._digest = _digest(component)
         self.function("connect_port", self._connect_port, waits=True)
@@ -126,7 +126,7 @@ class ComponentNode:
         topic = f"{self.name}/{self.component.port(port).name}" + (f"/{element}" if element else "")
         return Publisher(topic, message_class)
 
-    def ask(self, name: str, values: Mapping[str, Any]) -> dict[str, Any]:
+    def call_service(self, name: str, values: Mapping[str, Any]) -> dict[str, Any]:
         """Do what a client asks for who means all `values` as they are; an activity runs when this returns.
 
         Raises ComponentError.
@@ -150,7 +150,7 @@ class ComponentNode:
         self._state = self.advertise("genom_state", self._msg.genom_state_component)
         for service in self.component.on_graph:
             serve = self._serve_activity if service.activity else self._serve_function
-            self._keep.append(
+            self._keep_alive_references.append(
                 rospy.Service(
                     f"{self.name}/{service.name}",
                     getattr(self._srv, service.name),
@@ -211,18 +211,18 @@ class ComponentNode:
     def _serve_activity(self, service: interface.Service, request: Any) -> Any:
         response = getattr(self._srv, f"{service.name}Response")
         try:
-            activity = self._run(service, request, mark.is_marked(request))
+            activity = self._run(service, request, mark.has_explicit_defaults(request))
         except ComponentError as problem:
-            return response(False, self._told(service, problem))
-        return response(True, mark.granted(request, activity.warning))
+            return response(False, self._logged_errors(service, problem))
+        return response(True, mark.accepts_warnings(request, activity.warning))
 
     def _serve_function(self, service: interface.Service, request: Any) -> Any:
         response = getattr(self._srv, f"{service.name}Response")
         changes = self._registrar.changes
         try:
-            outputs = self._answer(service, request, mark.is_marked(request))
+            outputs = self._answer(service, request, mark.has_explicit_defaults(request))
         except ComponentError as problem:
-            return response(genom_success=False, genom_exdetail=self._told(service, problem))
+            return response(genom_success=False, genom_exdetail=self._logged_errors(service, problem))
         except Exception as problem:  # a fault of ours must reach the caller and the log, and not end the node
             rospy.logerr(f"{service.name}: {traceback.format_exc()}")
             error = ComponentError("::genom::unkex", what=f"{type(problem).__name__}: {problem}"[:127])
@@ -233,10 +233,10 @@ class ComponentNode:
         whole = outputs.pop("response", None)  # a handler may bring a response of its own, with arrays in it
         if whole is not None:
             return whole
-        told = mark.granted(request, outputs.pop("warning", ""))
+        told = mark.accepts_warnings(request, outputs.pop("warning", ""))
         return response(genom_success=True, genom_exdetail=told, **outputs)
 
-    def _told(self, service: interface.Service, problem: ComponentError) -> str:
+    def _logged_errors(self, service: interface.Service, problem: ComponentError) -> str:
         """The exdetail for the client; the log gets the reason too."""
         rospy.logwarn(f"{service.name}: {problem.ex}" + (f": {problem}" if str(problem) != problem.ex else ""))
         return problem.exdetail
@@ -246,13 +246,15 @@ class ComponentNode:
         running: dict[str, Activity] = {}  # by goal id
 
         def answer(goal: Any, error: ComponentError | None) -> None:
-            text = self._told(service, error) if error is not None else ""
+            text = self._logged_errors(service, error) if error is not None else ""
             goal.set_succeeded(result(genom_success=error is None, genom_exdetail=text))
 
         def accept(goal: Any) -> None:  # actionlib calls this and `cancel` under the lock that set_succeeded needs
             if self.activities.full(service):
                 error = too_many(service.task)
-                goal.set_rejected(result(False, self._told(service, error)), f"too many activities in {service.task}")
+                goal.set_rejected(
+                    result(False, self._logged_errors(service, error)), f"too many activities in {service.task}"
+                )
                 return
 
             def set_accepted(activity: Activity) -> None:
@@ -272,7 +274,7 @@ class ComponentNode:
                 set_accepted(activity)
 
             try:
-                activity = self._begin(service, goal.get_goal(), mark.is_marked(goal.goal), end)
+                activity = self._begin(service, goal.get_goal(), mark.has_explicit_defaults(goal.goal), end)
             except ComponentError as problem:
                 goal.set_accepted()
                 answer(goal, problem)
@@ -295,9 +297,9 @@ class ComponentNode:
         local, remote = values["local"], values["remote"]
         if local not in self._connectors:
             known = ", ".join(sorted(self._connectors)) or "none"
-            raise ComponentError("::genom::no_such_inport", f"no input port {shown(local)}; there are: {known}")
+            raise ComponentError("::genom::no_such_inport", f"no input port {short_repr(local)}; there are: {known}")
         if not remote or not rosgraph.names.is_legal_name(remote):
-            raise ComponentError("::genom::no_such_outport", f"{shown(remote)} is no topic name")
+            raise ComponentError("::genom::no_such_outport", f"{short_repr(remote)} is no topic name")
         topic = rospy.resolve_name(remote)
         try:
             published = master.published_topics(master.uri(), self.name)
@@ -349,7 +351,7 @@ class ComponentNode:
             self._health_changed.clear()
             self.diagnostics.force_update()  # `update` would ask the master for the period, and fail without one
             if next(rounds) % TRIM_ROUNDS == 0:
-                memory.give_back()
+                memory.trim()
 
     def _state_message(self) -> Any:
         msg = self._msg

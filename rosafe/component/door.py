@@ -24,7 +24,7 @@ from typing import Any
 BACKLOG = 1024  # connections that wait to be accepted
 DESCRIPTORS = 4096  # wanted at the start, as far as the hard limit allows; there is a thread for most of them
 RESERVE = 64  # descriptors that connections do not get: files, devices, and what the process itself connects to
-GUESTS = 256  # connections whose opening has not come yet
+MAX_PENDING = 256  # connections whose opening has not come yet
 OPENING_SECONDS = 5.0  # for a whole opening
 READ_BYTES = 65536  # at once
 PAUSE_SECONDS = 0.2  # between two looks whether there are descriptors again
@@ -36,7 +36,7 @@ _EXHAUSTED = {errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM}
 Report = Callable[[str, str], None]
 
 
-class Refused(ValueError):
+class HandshakeRejected(ValueError):
     """An opening that nobody can mean; the text says why. `answer` is sent before the connection is closed."""
 
     def __init__(self, why: str, answer: bytes = b"") -> None:
@@ -58,7 +58,7 @@ def _limit() -> int:
     return 2**31 if soft == resource.RLIM_INFINITY else soft
 
 
-class _Guest:
+class _PendingConnection:
     """A connection that has not said all it must yet."""
 
     def __init__(self, sock: socket.socket, address: Any, until: float, data: bytes = b"") -> None:
@@ -69,7 +69,7 @@ class _Guest:
         self.idle = False  # one that was here before and may be silent for longer
 
 
-class Door:
+class HandshakeServer:
     """Accepts connections and hands on those that have said what they must.
 
     Parameters
@@ -78,7 +78,7 @@ class Door:
         Bound and listening; `run` ends when it is closed.
     opening : callable
         Takes all bytes that have come; returns how many of them are the opening, None where more must come, or raises
-        `Refused`.
+        `HandshakeRejected`.
     enter : callable
         Takes (socket, address, opening, what came after it) on a thread of its own; from then on the socket is its to
         close. It is blocking.
@@ -97,28 +97,28 @@ class Door:
         self._opening = opening
         self._enter = enter
         self._report = report
-        self._guests: dict[int, _Guest] = {}  # the one that has waited longest first
-        self._back: deque[_Guest] = deque()
-        self._bell, self._button = socket.socketpair()
-        self._bell.setblocking(False)
-        self._button.setblocking(False)
+        self._guests: dict[int, _PendingConnection] = {}  # the one that has waited longest first
+        self._back: deque[_PendingConnection] = deque()
+        self._wake_reader, self._wake_writer = socket.socketpair()
+        self._wake_reader.setblocking(False)
+        self._wake_writer.setblocking(False)
         self._selector = selectors.DefaultSelector()
         self._paused_until = 0.0  # 0 while connections are accepted
         listener.setblocking(False)
         listener.listen(BACKLOG)
 
-    def keep(self, sock: socket.socket, address: Any, rest: bytes, seconds: float) -> None:
+    def adopt_idle(self, sock: socket.socket, address: Any, rest: bytes, seconds: float) -> None:
         """Wait up to `seconds` for another opening from a connection that had entered; for `enter`, at its end."""
-        guest = _Guest(sock, address, time.monotonic() + (OPENING_SECONDS if rest else seconds), rest)
+        guest = _PendingConnection(sock, address, time.monotonic() + (OPENING_SECONDS if rest else seconds), rest)
         guest.idle = not rest
         self._back.append(guest)
         with contextlib.suppress(OSError):  # it rings already, or all is over
-            self._button.send(b"!")
+            self._wake_writer.send(b"!")
 
     def run(self) -> None:
         """Serve until the listener is closed."""
         self._selector.register(self._listener, selectors.EVENT_READ, self._accept)
-        self._selector.register(self._bell, selectors.EVENT_READ, self._welcome_back)
+        self._selector.register(self._wake_reader, selectors.EVENT_READ, self._resume_idle)
         next_look = 0.0
         while self._listener.fileno() >= 0:
             try:
@@ -126,7 +126,7 @@ class Door:
                 for key in sorted(events, key=lambda key: key.fileobj is self._listener):  # first those who are here
                     key.data()
                 if time.monotonic() > next_look:
-                    self._look_round()
+                    self._close_expired()
                     next_look = time.monotonic() + _TICK
             except Exception:  # a fault of ours must not make the node deaf
                 if self._listener.fileno() >= 0:
@@ -134,8 +134,8 @@ class Door:
                         self._report("", f"connections: {traceback.format_exc()}")
                     time.sleep(_TICK)
         for guest in list(self._guests.values()):
-            self._dismiss(guest)
-        for sock in (self._bell, self._button, *(guest.sock for guest in self._back)):
+            self._close(guest)
+        for sock in (self._wake_reader, self._wake_writer, *(guest.sock for guest in self._back)):
             sock.close()
         self._selector.close()
 
@@ -158,14 +158,14 @@ class Door:
                     self._pause()
                     return
                 continue  # it has left already
-            self._seat(_Guest(sock, address, time.monotonic() + OPENING_SECONDS))
+            self._register(_PendingConnection(sock, address, time.monotonic() + OPENING_SECONDS))
 
     def _has_room(self) -> bool:
         """Whether another descriptor may be taken: the system gives out the lowest one that is free."""
-        if len(self._guests) >= min(GUESTS, _limit() // 4):
+        if len(self._guests) >= min(MAX_PENDING, _limit() // 4):
             return False
         try:
-            lowest = os.dup(self._bell.fileno())
+            lowest = os.dup(self._wake_reader.fileno())
         except OSError:
             return False
         os.close(lowest)
@@ -178,7 +178,7 @@ class Door:
             return False
         if not guest.idle:
             self._report("", "too many connections that say nothing: those that came first are disconnected")
-        self._dismiss(guest)
+        self._close(guest)
         return True
 
     def _pause(self) -> None:
@@ -187,25 +187,25 @@ class Door:
             self._report("", f"of {_limit()} file descriptors none is left for connections: new ones wait")
         self._paused_until = time.monotonic() + PAUSE_SECONDS
 
-    def _welcome_back(self) -> None:
-        self._bell.recv(READ_BYTES)
+    def _resume_idle(self) -> None:
+        self._wake_reader.recv(READ_BYTES)
         while self._back:
-            if len(self._guests) >= GUESTS:
+            if len(self._guests) >= MAX_PENDING:
                 self._make_room()
-            self._seat(self._back.popleft())
+            self._register(self._back.popleft())
 
-    def _seat(self, guest: _Guest) -> None:
+    def _register(self, guest: _PendingConnection) -> None:
         guest.sock.setblocking(False)
         self._guests[guest.sock.fileno()] = guest
         self._selector.register(guest.sock, selectors.EVENT_READ, lambda: self._read(guest))
         if guest.data:
-            self._consider(guest)  # who has said much at once must not make us take more and more
+            self._parse_pending(guest)  # who has said much at once must not make us take more and more
         else:
             self._read(guest)
 
     # --- what they say ---
 
-    def _read(self, guest: _Guest) -> None:
+    def _read(self, guest: _PendingConnection) -> None:
         if guest.sock.fileno() < 0:  # dismissed in this very turn
             return
         try:
@@ -215,25 +215,25 @@ class Door:
         except OSError:
             part = b""
         if not part:
-            self._dismiss(guest)
+            self._close(guest)
             return
         guest.data += part
         if guest.idle:
             guest.idle, guest.until = False, time.monotonic() + OPENING_SECONDS
-        self._consider(guest)
+        self._parse_pending(guest)
 
-    def _consider(self, guest: _Guest) -> None:
+    def _parse_pending(self, guest: _PendingConnection) -> None:
         """Hand on or send away whoever has said enough for that."""
         try:
             size = self._opening(guest.data)
-        except Refused as refusal:
+        except HandshakeRejected as refusal:
             self._report(guest.address[0], f"{refusal}; disconnected")
-            self._dismiss(guest, refusal.answer)
+            self._close(guest, refusal.answer)
             return
         if size is not None:
-            self._hand_on(guest, size)
+            self._dispatch(guest, size)
 
-    def _hand_on(self, guest: _Guest, size: int) -> None:
+    def _dispatch(self, guest: _PendingConnection, size: int) -> None:
         self._forget(guest)
         guest.sock.setblocking(True)
         opening, rest = bytes(guest.data[:size]), bytes(guest.data[size:])
@@ -249,24 +249,24 @@ class Door:
             self._report("", f"a connection is closed: {problem}")
             guest.sock.close()
 
-    def _forget(self, guest: _Guest) -> None:
+    def _forget(self, guest: _PendingConnection) -> None:
         del self._guests[guest.sock.fileno()]
         self._selector.unregister(guest.sock)
 
-    def _dismiss(self, guest: _Guest, answer: bytes = b"") -> None:
+    def _close(self, guest: _PendingConnection, answer: bytes = b"") -> None:
         self._forget(guest)
         with guest.sock, contextlib.suppress(OSError):  # it may not want to know
             guest.sock.send(answer)
 
     # --- now and then ---
 
-    def _look_round(self) -> None:
+    def _close_expired(self) -> None:
         now = time.monotonic()
         for guest in [guest for guest in self._guests.values() if guest.until < now]:
             if not guest.idle:
                 said = f"{len(guest.data)} bytes and no more" if guest.data else "nothing"
                 self._report(guest.address[0], f"said {said} for {OPENING_SECONDS:g} s and was disconnected")
-            self._dismiss(guest)
+            self._close(guest)
         if self._paused_until and now > self._paused_until:
             if self._has_room():
                 self._paused_until = 0.0

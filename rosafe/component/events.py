@@ -14,14 +14,14 @@ _NUMBER = re.compile(r"\d+(\.\d+)?")
 
 
 @dataclass
-class _Held:
+class _SuppressedEvent:
     """What came of one kind since its last line."""
 
     count: int = 0
     last: str = ""
 
 
-class EventLog:
+class ThrottledLog:
     """Writes lines about events, of each kind at once where it is the first in a second.
 
     Those that follow within the second are counted, and the last of them is written with their number when the second
@@ -38,7 +38,7 @@ class EventLog:
     def __init__(self, write: Callable[[str], None], period: float = PERIOD) -> None:
         self._write = write
         self._period = period
-        self._held: dict[str, _Held] = {}
+        self._held: dict[str, _SuppressedEvent] = {}
         self._lock = threading.Lock()
 
     def __call__(self, line: str, kind: str = "") -> None:
@@ -56,7 +56,7 @@ class EventLog:
         self._write(line)
 
     def _hold(self, kind: str) -> None:
-        self._held[kind] = _Held()
+        self._held[kind] = _SuppressedEvent()
         timer = threading.Timer(self._period, self._release, (kind,))
         timer.daemon = True
         try:

@@ -22,7 +22,7 @@ SET_SECONDS = 0.05  # a stamp that is so much too early, or some seconds of them
 LATE_BINS = 20
 
 
-class Line(NamedTuple):
+class LinearClock(NamedTuple):
     """Frame `frame` was captured at `time` (s), others at `rate` (Hz) before and after."""
 
     frame: float
@@ -45,8 +45,8 @@ class FrameTime:
         self._nominal = rate
         self._points: deque[tuple[int, float]] = deque()  # of each bin the earliest, as the nominal rate has it
         self._first = 0  # frame at the beginning
-        self._told: Line | None = None  # the last time
-        self._fitted: Line | None = None  # to the points as they are
+        self._last_output: LinearClock | None = None  # the last time
+        self._fitted: LinearClock | None = None  # to the points as they are
 
     def add(self, frame: int, time: float) -> None:
         """Frame `frame` of the stream, later than those before, was captured at `time` (s) or a little earlier."""
@@ -84,7 +84,7 @@ class FrameTime:
             return True
         return len(self._points) > LATE_BINS and all(stamp > line.at(n) + SET_SECONDS for n, stamp in late)
 
-    def line(self, frame: int) -> Line | None:
+    def line(self, frame: int) -> LinearClock | None:
         """The line for frames about `frame`, with its time; None where no stamp has come yet.
 
         From one answer to the next it moves little, and so times grow with frames.
@@ -93,30 +93,30 @@ class FrameTime:
             return None
         fit = self._fit()
         time = fit.at(frame)
-        if self._told is not None and frame > self._told.frame and not self._settling(frame):
-            goes_on = self._told.at(frame)
-            most = min(STEP_SECONDS, SLEW * (frame - self._told.frame) / self._nominal)
+        if self._last_output is not None and frame > self._last_output.frame and not self._settling(frame):
+            goes_on = self._last_output.at(frame)
+            most = min(STEP_SECONDS, SLEW * (frame - self._last_output.frame) / self._nominal)
             time = min(max(time, goes_on - most), goes_on + most)
-        self._told = Line(frame, time, fit.rate)
-        return self._told
+        self._last_output = LinearClock(frame, time, fit.rate)
+        return self._last_output
 
     def _settling(self, frame: int) -> bool:
         return frame - self._first < SETTLING_SECONDS * self._nominal
 
-    def _fit(self) -> Line:
+    def _fit(self) -> LinearClock:
         if self._fitted is None:
-            self._fitted = self._fit_anew()
+            self._fitted = self._refit()
         return self._fitted
 
-    def _fit_anew(self) -> Line:
+    def _refit(self) -> LinearClock:
         newest = self._points[-1][0]
         if newest - self._points[0][0] >= LEARNING_SECONDS * self._nominal:
             (first, begin), (last, end) = self._edge()
             rate = (last - first) / max(end - begin, 1e-9)
             if abs(rate / self._nominal - 1) < MOST_SKEW:
-                return Line(first, begin, rate)
+                return LinearClock(first, begin, rate)
         earliest = min(self._residual(frame, time) for frame, time in self._points)
-        return Line(self._first, earliest, self._nominal)
+        return LinearClock(self._first, earliest, self._nominal)
 
     def _edge(self) -> tuple[tuple[int, float], tuple[int, float]]:
         """The two neighbours on the lower convex hull of the points that have the mean of all between them."""

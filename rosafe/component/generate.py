@@ -109,12 +109,14 @@ def sources() -> Sources | None:
 
 def _plugins() -> dict[str, str]:
     """The definitions of what plugins bring."""
-    if not plugins.expected():
+    if not plugins.expected_modules():
         return {}
     from rosafe.interface import ROSAFE, files, rosafe
     from rosafe.representations import registry
 
-    own = files.interface_files(rosafe.derive({k: stage.REPRESENTATION for k, stage in registry.own().items()}))
+    own = files.interface_files(
+        rosafe.derive({k: stage.REPRESENTATION for k, stage in registry.builtin_stages().items()})
+    )
     return {path: text for path, text in files.interface_files(ROSAFE).items() if path not in own}
 
 
@@ -307,16 +309,16 @@ def environment() -> dict[str, str]:
     if paths.PYPI_DIR.is_dir():
         python.append(paths.PYPI_DIR)
     return {
-        "PATH": _ahead(":", "PATH", [programs]),
-        "PYTHONPATH": _ahead(":", "PYTHONPATH", python),
-        "ROS_PACKAGE_PATH": _ahead(":", "ROS_PACKAGE_PATH", share),
-        "TCLLIBPATH": _ahead(" ", "TCLLIBPATH", [tcl]),  # a Tcl list
-        "OCTAVE_PATH": _ahead(":", "OCTAVE_PATH", [matlab]),
-        "MATLABPATH": _ahead(":", "MATLABPATH", [matlab]),
+        "PATH": _prepend_path(":", "PATH", [programs]),
+        "PYTHONPATH": _prepend_path(":", "PYTHONPATH", python),
+        "ROS_PACKAGE_PATH": _prepend_path(":", "ROS_PACKAGE_PATH", share),
+        "TCLLIBPATH": _prepend_path(" ", "TCLLIBPATH", [tcl]),  # a Tcl list
+        "OCTAVE_PATH": _prepend_path(":", "OCTAVE_PATH", [matlab]),
+        "MATLABPATH": _prepend_path(":", "MATLABPATH", [matlab]),
     }
 
 
-def _ahead(separator: str, variable: str, directories: list[Path]) -> str:
+def _prepend_path(separator: str, variable: str, directories: list[Path]) -> str:
     """The list in `variable` with `directories` at its head, each entry once."""
     first = [f"{{{d}}}" if separator == " " and " " in str(d) else str(d) for d in directories]
     present = f"{separator}{os.environ.get(variable, '')}{separator}"

@@ -38,16 +38,16 @@ from rospy.impl.registration import get_service_manager
 from rospy.msg import deserialize_messages
 
 from rosafe.component import door, master
-from rosafe.component.door import Door, Refused
-from rosafe.component.events import EventLog
+from rosafe.component.door import HandshakeRejected, HandshakeServer
+from rosafe.component.events import ThrottledLog
 from rosafe.component.publisher import send_pieces
-from rosafe.component.wire import Gather
+from rosafe.component.wire import BufferList
 from rosafe.interface import MAX_SEQUENCE, MAX_STRING
 
 HEADER_BYTES = 65536  # of a TCPROS header; it holds the definition of a message
 HTTP_HEADER_BYTES = 16384
 BODY_BYTES = 2**18  # of an XML-RPC request; the longest is a list of publishers
-SLIP_BYTES = 2**20  # of a service request, or of sound beyond its bound: a slip gets its error by name
+ERROR_REPLY_MARGIN = 2**20  # of a service request, or of sound beyond its bound: a slip gets its error by name
 DATA_BYTES = 2**30  # of a message that no rule bounds more closely, such as what is plotted or recorded
 LONG_BYTES, LONG_REQUESTS = 65536, 16  # of requests longer than this so many are read at a time
 REQUEST_SECONDS = 10.0  # from the first byte of a service request to the last
@@ -58,7 +58,7 @@ LOG_SECONDS = 60.0  # in which the log has one line about one fault of one peer
 
 _LENGTH = struct.Struct("<I")
 _LONG = threading.BoundedSemaphore(LONG_REQUESTS)
-_EVENTS = EventLog(rospy.logwarn, LOG_SECONDS)
+_EVENTS = ThrottledLog(rospy.logwarn, LOG_SECONDS)
 
 
 def install() -> None:
@@ -88,7 +88,7 @@ class TcprosServer(tcpros_base.TCPServer):
 
     def run(self) -> None:
         """Serve until the socket is closed."""
-        Door(self.server_sock, _header_size, _admit, functools.partial(_report, "TCPROS")).run()
+        HandshakeServer(self.server_sock, _header_size, _parse_header, functools.partial(_report, "TCPROS")).run()
 
 
 def _header_size(data: bytes | bytearray) -> int | None:
@@ -97,18 +97,18 @@ def _header_size(data: bytes | bytearray) -> int | None:
         return None
     (size,) = _LENGTH.unpack_from(data)
     if size > HEADER_BYTES:
-        raise Refused(f"a header of {size} bytes, which is not ROS")
+        raise HandshakeRejected(f"a header of {size} bytes, which is not ROS")
     whole = _LENGTH.size + size
     return whole if len(data) >= whole else None
 
 
-def _admit(sock: socket.socket, address: Any, opening: bytes, rest: bytes) -> None:
+def _parse_header(sock: socket.socket, address: Any, opening: bytes, rest: bytes) -> None:
     """Give a connection to the topic or the service that its header names."""
     try:
         _keep_alive(sock)
         sock.settimeout(ANSWER_SECONDS)
         header = decode_ros_handshake_header(opening)
-        problem = _give_to_owner(sock, address, header, rest)
+        problem = _route_connection(sock, address, header, rest)
         if problem:
             write_ros_handshake_header(sock, {"error": problem})
     except OSError:
@@ -122,7 +122,7 @@ def _admit(sock: socket.socket, address: Any, opening: bytes, rest: bytes) -> No
             _report("TCPROS", address[0], problem, "header")
 
 
-def _give_to_owner(sock: socket.socket, address: Any, header: Mapping[str, str], rest: bytes) -> str | None:
+def _route_connection(sock: socket.socket, address: Any, header: Mapping[str, str], rest: bytes) -> str | None:
     """What is wrong with the header; nothing where the connection is taken (or was served and closed)."""
     if rospy.core.is_shutdown_requested():
         return "node shutting down"
@@ -164,7 +164,7 @@ def _serve(sock: socket.socket, address: Any, header: Mapping[str, str], rest: b
         if header.get("probe") == "1":
             return None
         persistent = header.get("persistent", "").lower() in ("1", "true")
-        reader = _Requests(sock, rest, max(SLIP_BYTES, largest(service.request_class)))
+        reader = _Requests(sock, rest, max(ERROR_REPLY_MARGIN, largest(service.request_class)))
         try:
             while True:
                 data = reader.next(persistent)
@@ -173,7 +173,7 @@ def _serve(sock: socket.socket, address: Any, header: Mapping[str, str], rest: b
                 _answer(sock, service, data, header)
                 if not persistent:
                     return None
-        except Refused as refusal:
+        except HandshakeRejected as refusal:
             _report(service.resolved_name, address[0], f"{refusal}; disconnected")
         return None
 
@@ -197,11 +197,11 @@ class _Requests:
             return None
         (size,) = _LENGTH.unpack(prefix)
         if size > self._limit:
-            raise Refused(f"a request of {size} bytes, at most {self._limit} make sense")
+            raise HandshakeRejected(f"a request of {size} bytes, at most {self._limit} make sense")
         if size <= LONG_BYTES:
             return self._take(size, until)
         if not _LONG.acquire(timeout=REQUEST_SECONDS):
-            raise Refused("too many long requests at a time")
+            raise HandshakeRejected("too many long requests at a time")
         try:
             return self._take(size, until)
         finally:
@@ -216,7 +216,7 @@ class _Requests:
                 self._sock.settimeout(max(left, 1e-3))
                 part = self._sock.recv(size - len(data))
             except TimeoutError:
-                raise Refused(f"no whole request within {REQUEST_SECONDS:g} s") from None
+                raise HandshakeRejected(f"no whole request within {REQUEST_SECONDS:g} s") from None
             if not part:
                 return None
             data += part
@@ -225,7 +225,7 @@ class _Requests:
 
 def _answer(sock: socket.socket, service: Any, data: bytes, header: Mapping[str, str]) -> None:
     """Serve one request, as rospy would, but without a copy of what the response holds."""
-    written = Gather()
+    written = BufferList()
     try:
         try:
             request = service.request_class().deserialize(data)
@@ -241,7 +241,7 @@ def _answer(sock: socket.socket, service: Any, data: bytes, header: Mapping[str,
         else:
             text = f"error processing request: {problem}"
             service.error_handler(problem, *sys.exc_info())
-        prefix, written = b"\0", Gather()
+        prefix, written = b"\0", BufferList()
         written.write(text.encode("utf-8", "replace"))
     sock.settimeout(ANSWER_SECONDS)
     send_pieces(sock, [prefix + _LENGTH.pack(written.size), *written.pieces])
@@ -257,9 +257,9 @@ def read_header(sock: socket.socket, buffer: io.BytesIO, size: int) -> dict[str,
         while (end := _header_size(data)) is None:
             part = sock.recv(size)
             if not part:
-                raise Refused("the connection ended before there was a header")
+                raise HandshakeRejected("the connection ended before there was a header")
             data += part
-    except Refused as refusal:
+    except HandshakeRejected as refusal:
         _report("TCPROS", sock.getpeername()[0], str(refusal))
         raise
     buffer.seek(0)  # after a connection that was lost it holds the rest of a message
@@ -298,7 +298,7 @@ _REQUESTS = re.compile(r"\w+/\w+Action(Goal|Result|Feedback)|actionlib_msgs/\w+|
 def bound(message_class: Any) -> int:
     """The bytes of the longest message of a topic that is taken."""
     if hasattr(message_class, "longest_sequence"):
-        return largest(message_class) + SLIP_BYTES
+        return largest(message_class) + ERROR_REPLY_MARGIN
     return largest(message_class) if _REQUESTS.fullmatch(message_class._type) else DATA_BYTES
 
 
@@ -336,7 +336,7 @@ class XmlRpcServer(rosgraph.xmlrpc.ThreadingXMLRPCServer):
 
     def serve_forever(self, poll_interval: float = 0.5) -> None:
         """Serve until the socket is closed."""
-        self._door = Door(self.socket, _request_size, self._enter, functools.partial(_report, "XML-RPC"))
+        self._door = HandshakeServer(self.socket, _request_size, self._enter, functools.partial(_report, "XML-RPC"))
         self._door.run()
 
     def register_multicall_functions(self) -> None:
@@ -357,7 +357,7 @@ class XmlRpcServer(rosgraph.xmlrpc.ThreadingXMLRPCServer):
             if handler.close_connection:
                 self.shutdown_request(sock)
             else:
-                self._door.keep(sock, address, rest, KEEP_SECONDS)
+                self._door.adopt_idle(sock, address, rest, KEEP_SECONDS)
 
 
 class _Request(rosgraph.xmlrpc.SilenceableXMLRPCRequestHandler):
@@ -395,11 +395,13 @@ def _request_size(data: bytes | bytearray) -> int | None:
     end = _BLANK_LINE.search(data, 0, HTTP_HEADER_BYTES)
     if end is None:
         if len(data) > HTTP_HEADER_BYTES:
-            raise Refused("an HTTP request whose headers have no end", _http_error("431 Header Fields Too Large"))
+            raise HandshakeRejected(
+                "an HTTP request whose headers have no end", _http_error("431 Header Fields Too Large")
+            )
         return None
     lengths = [int(text[:20]) for text in _CONTENT_LENGTH.findall(data, 0, end.end())]
     if lengths and max(lengths) > BODY_BYTES:
-        raise Refused(f"an HTTP request of {max(lengths)} bytes", _http_error("413 Content Too Large"))
+        raise HandshakeRejected(f"an HTTP request of {max(lengths)} bytes", _http_error("413 Content Too Large"))
     size = end.end() + (lengths[0] if lengths else 0)
     return size if len(data) >= size else None
 

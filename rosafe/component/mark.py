@@ -13,19 +13,19 @@ from typing import Any
 HEADER = {"rosafe_complete": "1"}  # fields of the connection's header
 
 
-def is_marked(message: Any) -> bool:
+def has_explicit_defaults(message: Any) -> bool:
     """Whether a request or message came on a marked connection."""
     header = getattr(message, "_connection_header", None) or {}
     return all(header.get(name) == value for name, value in HEADER.items())
 
 
-def granted(message: Any, warning: str) -> str:
+def accepts_warnings(message: Any, warning: str) -> str:
     """The `genom_exdetail` of the answer to the request `message` that is granted with a warning, or without."""
-    return json.dumps({"warning": warning}, ensure_ascii=False) if warning and is_marked(message) else ""
+    return json.dumps({"warning": warning}, ensure_ascii=False) if warning and has_explicit_defaults(message) else ""
 
 
 def warning_in(exdetail: str) -> str:
-    """What `granted` has put into an answer; empty where that is nothing."""
+    """What `accepts_warnings` has put into an answer; empty where that is nothing."""
     try:
         told = json.loads(exdetail) if exdetail else {}
     except ValueError:

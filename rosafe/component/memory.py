@@ -10,7 +10,7 @@ LARGE = 8 * 2**20  # bytes; what is larger goes back to the system when it is fr
 KEPT = 64 * 2**20  # bytes of free memory at a pool's end that are kept for the next block
 
 
-def bound() -> None:
+def limit_arenas() -> None:
     """Settle this before there are threads. A C library without such settings is left as it is."""
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:
@@ -18,7 +18,7 @@ def bound() -> None:
             mallopt(setting, value)
 
 
-def give_back() -> None:
+def trim() -> None:
     """Return to the system what is free, holes included."""
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
     if trim is not None:

@@ -21,7 +21,7 @@ import rospy
 from rospy import topics
 from rospy.impl.registration import Registration, get_topic_manager
 
-from rosafe.component.wire import Gather
+from rosafe.component.wire import BufferList
 
 # What may wait for one subscriber besides what is on its way. Windows overlap, so that a message of a long port is made
 # up for by the next one, and the newest is enough; messages of short ports are small, and several can wait.
@@ -97,18 +97,18 @@ class _Topic(topics._PublisherImpl):
             if getattr(message, "_has_header", False):
                 self.seq += 1
                 message.header.seq = self.seq
-            written = Gather()
+            written = BufferList()
             message.serialize(written)
             self._offer(written, senders)
 
-    def send(self, written: Gather) -> bool:
+    def send(self, written: BufferList) -> bool:
         """Send a message to all subscribers, but do not keep it for later ones; return whether there are any."""
         senders = self.connections
         if senders:
             self._offer(written, senders)
         return bool(senders)
 
-    def _offer(self, written: Gather, senders: list[Any]) -> None:
+    def _offer(self, written: BufferList, senders: list[Any]) -> None:
         self.message_data_sent += _LENGTH.size + written.size  # for getBusStats; once, as rospy counts it
         for sender in senders:
             sender.offer(written)
@@ -134,7 +134,7 @@ class _Sender:
     def __init__(self, connection: Any) -> None:
         self._connection = connection
         self._turn = threading.Condition()
-        self._waiting: deque[Gather] = deque(maxlen=MAX_WAITING)
+        self._waiting: deque[BufferList] = deque(maxlen=MAX_WAITING)
         self._rest = b""  # of a message that was sent in part
         self._sending = False
         threading.Thread(target=self._run, name=f"to {connection.endpoint_id}", daemon=True).start()
@@ -162,7 +162,7 @@ class _Sender:
         with self._turn:
             self._turn.notify()
 
-    def offer(self, written: Gather) -> None:
+    def offer(self, written: BufferList) -> None:
         """Send a message when there is time, unless too many newer ones come before.
 
         A short one is sent at once if nothing is ahead of it: to wake the thread takes ten times as long.
@@ -176,7 +176,7 @@ class _Sender:
                 self._waiting.popleft()
             self._turn.notify()
 
-    def _send_at_once(self, written: Gather) -> bool:
+    def _send_at_once(self, written: BufferList) -> bool:
         """Return whether the message was sent; False if the subscriber reads too slowly, or has left."""
         sock, data = self._connection.socket, b"".join([_LENGTH.pack(written.size), *written.pieces])
         try:
@@ -208,7 +208,7 @@ class _Sender:
             self._waiting.clear()
             self._connection.close()
 
-    def _send(self, rest: bytes, written: Gather | None) -> None:
+    def _send(self, rest: bytes, written: BufferList | None) -> None:
         sock = self._connection.socket
         if sock is None:  # closed meanwhile
             return
@@ -218,7 +218,7 @@ class _Sender:
             send_pieces(sock, [_LENGTH.pack(written.size), *written.pieces])
             self._count(written)
 
-    def _count(self, written: Gather) -> None:
+    def _count(self, written: BufferList) -> None:
         self._connection.stat_bytes += _LENGTH.size + written.size
         self._connection.stat_num_msg += 1
 

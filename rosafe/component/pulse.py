@@ -23,7 +23,7 @@ CALL_SECONDS = 3.0  # for the answer on one port, but no more than a third of th
 FAILURES = 2  # in a row that are more than a moment's trouble
 
 
-class Pulse:
+class SelfCheck:
     """Calls this node now and then, on a thread of its own, once `start` is called.
 
     Parameters
@@ -62,7 +62,7 @@ class Pulse:
 
     def _try(self) -> None:
         begin = time.monotonic()
-        problem = call_oneself(min(CALL_SECONDS, self._period / 3))
+        problem = check_own_interfaces(min(CALL_SECONDS, self._period / 3))
         if self._finished.is_set():
             return
         if not problem:
@@ -75,7 +75,7 @@ class Pulse:
             rospy.logerr(f"this node cannot be called: {problem}")
 
 
-def call_oneself(seconds: float) -> str:
+def check_own_interfaces(seconds: float) -> str:
     """Call this node on each of its two ports; what is wrong, such as silence of `seconds`, or nothing."""
     everywhere = {"0.0.0.0": "127.0.0.1", "::": "::1"}
     host = rosgraph.network.get_bind_address()

@@ -70,9 +70,9 @@ class Registrar(RegistrationListener):
         self._pid: int | None = None  # of the master; None before it was asked
         self._turn = threading.Condition()
         self._offered: dict[tuple[str, str], _Entry] = {}
-        self._told: dict[tuple[str, str], _Entry] = {}  # what the master may know; of this thread alone
+        self._last_reported: dict[tuple[str, str], _Entry] = {}  # what the master may know; of this thread alone
         self._settled = 0  # the master knows as much as after so many changes
-        self._away = False  # it did not answer the last time
+        self._master_lost = False  # it did not answer the last time
         self._again = 1  # rounds in which all is told: a call that came to no end may have an effect later
         self._ended = False
         self._thread = threading.Thread(target=self._run, name="registrar", daemon=True)
@@ -104,7 +104,7 @@ class Registrar(RegistrationListener):
             (Registration.SRV, services.get_services()),
         ):
             for name, data in there:
-                self._offered[kind, name] = self._told[kind, name] = _Entry(kind, name, data)
+                self._offered[kind, name] = self._last_reported[kind, name] = _Entry(kind, name, data)
         self._thread.start()
 
     def settle(self, seconds: float = SETTLE_SECONDS) -> bool:
@@ -114,7 +114,7 @@ class Registrar(RegistrationListener):
         """
         with self._turn:
             wanted = self.changes
-            self._turn.wait_for(lambda: self._settled >= wanted or self._away or self._ended, seconds)
+            self._turn.wait_for(lambda: self._settled >= wanted or self._master_lost or self._ended, seconds)
             return self._settled >= wanted
 
     def end(self, reason: str = "") -> None:
@@ -122,11 +122,11 @@ class Registrar(RegistrationListener):
         with self._turn:
             self._ended = True
             self._turn.notify_all()
-        if self._away or not self._succession.turn.acquire(timeout=SETTLE_SECONDS):
+        if self._master_lost or not self._succession.turn.acquire(timeout=SETTLE_SECONDS):
             return
         self._succession.turn.release()  # the last call has returned
         farewell = xmlrpc.client.MultiCall(master.proxy(self.manager.master_uri))
-        for key, entry in dict(self._told).items():
+        for key, entry in dict(self._last_reported).items():
             if self._offered.get(key) is not entry:
                 getattr(farewell, f"unregister{_NOUNS[entry.kind]}")(self._name, entry.name, self._provider(entry))
         with contextlib.suppress(*master.FAILURES):
@@ -147,7 +147,7 @@ class Registrar(RegistrationListener):
         while not (self._ended or self._succession.over):
             with self._turn:
                 self._turn.wait_for(
-                    lambda: self._ended or (self._settled != self.changes and not self._away), CHECK_SECONDS
+                    lambda: self._ended or (self._settled != self.changes and not self._master_lost), CHECK_SECONDS
                 )
                 changes, offered = self.changes, dict(self._offered)
             try:
@@ -161,13 +161,13 @@ class Registrar(RegistrationListener):
         """Make the master know exactly `offered` of this node."""
         renewed = not self._is_known()
         if renewed:
-            self._told.clear()
-        for entry in [e for key, e in self._told.items() if offered.get(key) is not e]:
+            self._last_reported.clear()
+        for entry in [e for key, e in self._last_reported.items() if offered.get(key) is not e]:
             self._call(f"unregister{_NOUNS[entry.kind]}", entry.name, self._provider(entry))
-            del self._told[entry.kind, entry.name]
+            del self._last_reported[entry.kind, entry.name]
         for key, entry in offered.items():
-            if key not in self._told or self._again:
-                self._told[key] = entry
+            if key not in self._last_reported or self._again:
+                self._last_reported[key] = entry
                 publishers = self._call(f"register{_NOUNS[entry.kind]}", entry.name, entry.data, self.manager.uri)
                 if entry.kind == Registration.SUB:
                     self.manager.publisher_update(entry.name, publishers)
@@ -206,7 +206,7 @@ class Registrar(RegistrationListener):
 
     def _lost(self, problem: Exception) -> None:
         with self._turn:
-            first, self._away, self._again = not self._away, True, 2
+            first, self._master_lost, self._again = not self._master_lost, True, 2
             self._turn.notify_all()
         if first and not (self._ended or self._succession.over):
             rospy.logwarn(
@@ -216,7 +216,7 @@ class Registrar(RegistrationListener):
 
     def _found(self, changes: int) -> None:
         with self._turn:
-            back, self._away, self._again = self._away, False, max(0, self._again - 1)
+            back, self._master_lost, self._again = self._master_lost, False, max(0, self._again - 1)
             self._settled = changes
             self._turn.notify_all()
         if back:

@@ -81,7 +81,7 @@ def run_server(
     arguments = sys.argv[1:] if argv is None else argv
     options = _parse(component, [a for a in arguments if ":=" not in a], more_options)
     remappings = [a for a in arguments if ":=" in a]
-    told = Background() if options.background else None
+    told = DaemonFork() if options.background else None
     if told is not None and told.in_parent:
         return told.wait()
     received: list[int] = []
@@ -174,7 +174,7 @@ def _start(
     for name, variable in _ENVIRONMENT_REMAPPINGS.items():
         if mappings.get(name):
             os.environ[variable] = mappings[name]
-    memory.bound()
+    memory.limit_arenas()
     master.set_local_defaults()
     master.check_address(os.environ["ROS_MASTER_URI"])  # a wrong one does not get better
     doubt = master.unreachable()
@@ -346,7 +346,7 @@ def watchdog(seconds: float, code: int, message: str = "") -> threading.Timer:
 # --- background -------------------------------------------------------------------------------------------------
 
 
-class Background:
+class DaemonFork:
     """The process cut in two: the parent waits for the shell until the child, which becomes the node, is up."""
 
     def __init__(self) -> None:

@@ -37,13 +37,13 @@ ROW_BYTES = 4096  # rows of a window in pieces shorter than this are copied toge
 
 
 class Writer(Protocol):
-    """Where messages are written to: a BytesIO, or `Gather`."""
+    """Where messages are written to: a BytesIO, or `BufferList`."""
 
     def write(self, data: Any, /) -> Any:
         """Append the bytes of a buffer."""
 
 
-class Gather:
+class BufferList:
     """A written message in pieces that lie where they lay, for one `sendmsg`: what was written must not change."""
 
     def __init__(self) -> None:
@@ -203,7 +203,7 @@ def _read_ragged(reader: _Reader, levels: int) -> np.ndarray | list[Any]:
     return [_read_ragged(reader, levels - 1) for _ in range(reader.count())]
 
 
-class Struct(dict):
+class AttrDict(dict):
     """A struct within a message: its members by name, and as attributes."""
 
     def __getattr__(self, name: str) -> Any:
@@ -214,7 +214,7 @@ class Struct(dict):
 
 
 def decode(reader: _Reader, component: interface.Component, idl: str) -> Any:
-    """The next value of IDL type `idl`: structs as `Struct`, signals and numeric sequences as read-only arrays."""
+    """The next value of IDL type `idl`: structs as `AttrDict`, signals and numeric sequences as read-only arrays."""
     if idl in _SCALARS:
         form = "<" + _SCALARS[idl]
         return struct.unpack(form, reader.take(struct.calcsize(form)))[0]
@@ -227,7 +227,7 @@ def decode(reader: _Reader, component: interface.Component, idl: str) -> Any:
         if element in _SAMPLES:
             return reader.samples(_SAMPLES[element])
         return [decode(reader, component, element) for _ in range(reader.count())]
-    return Struct((name, decode(reader, component, kind)) for name, kind in component.members(idl))
+    return AttrDict((name, decode(reader, component, kind)) for name, kind in component.members(idl))
 
 
 # --- message classes --------------------------------------------------------------------------------------------
@@ -286,7 +286,7 @@ def array_msg(generated: Any) -> Any:
 
 
 @functools.cache
-def lenient_class(package: str, idl: str, longest: int = 0) -> Any:
+def tolerant_message_class(package: str, idl: str, longest: int = 0) -> Any:
     """As `message_class`, but what cannot be read becomes a message whose `problem` says why (else it is empty).
 
     Where deserialisation raises, rospy breaks the connection, and cannot mend it: one bad message would end a topic.

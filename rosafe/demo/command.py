@@ -17,7 +17,7 @@ from rosafe.terminal import printable
 DEFAULT_DEVICE = "scene:"
 DEFAULT_SECONDS = 10.0
 SHORTEST, LONGEST = 2.0, 600.0
-PICTURE = "rosafe-demo.png"
+PLOT_FILE = "rosafe-demo.png"
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
@@ -108,7 +108,7 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
         type=Path,
         default=Path("rosafe-demo"),
         metavar="DIR",
-        help=f"folder for the picture, {PICTURE} (default: ./rosafe-demo)",
+        help=f"folder for the picture, {PLOT_FILE} (default: ./rosafe-demo)",
     )
     return parser.parse_args(arguments)
 
@@ -167,7 +167,7 @@ def _run(options: argparse.Namespace, signals: _Signals, scratch: str) -> int:
             raise course.DemoError(f"cannot write to {options.out}: choose another folder with --out")
         cache = user_cache() / "matplotlib"
         os.environ["MPLCONFIGDIR"] = str(cache) if writable(cache) else scratch
-        course.run(options.sound, options.seconds, options.out / PICTURE, scratch, signals.check, signals.defer)
+        course.run(options.sound, options.seconds, options.out / PLOT_FILE, scratch, signals.check, signals.defer)
     except (course.DemoError, AudioFileError, ComponentError, GenerationError, OutputError) as problem:
         print(f"demo: {printable(' '.join(str(problem).split()))}", file=sys.stderr)
         return 1

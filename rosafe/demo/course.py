@@ -11,7 +11,7 @@ import numpy as np
 from rosafe.demo import sound as sounds
 from rosafe.demo.progress import Progress
 from rosafe.demo.recorder import PortRecorder
-from rosafe.demo.session import NAMES, POLL_SECONDS, DemoError, GuideSession, acquire, requests
+from rosafe.demo.session import NAMES, POLL_SECONDS, DemoError, DemoSession, acquire, requests
 from rosafe.demo.sound import Sound
 from rosafe.terminal import printable
 from rosafe.view import estimates, report
@@ -63,7 +63,7 @@ def run(
         print(
             f"its last {left_out:.2f} s fill no block of {sound.frames_per_block} frames, and are left out", flush=True
         )
-    session = GuideSession(scratch, check)
+    session = DemoSession(scratch, check)
     try:
         print(f"master of its own at {session.uri}; starting bass-ros and rosAFE-ros", flush=True)
         session.start_nodes()
@@ -88,7 +88,7 @@ def _say_command(command: str) -> None:
     print(f"$ {printable(command)}", flush=True)
 
 
-def _build(session: GuideSession, recorder: PortRecorder, sound: Sound) -> tuple[int, int]:
+def _build(session: DemoSession, recorder: PortRecorder, sound: Sound) -> tuple[int, int]:
     """Make the guide's requests; returns the position (`PortRecorder.position`) after which to follow."""
     steps = requests(sound)
     for service, arguments in steps[:-PARALLEL]:
@@ -103,9 +103,7 @@ def _build(session: GuideSession, recorder: PortRecorder, sound: Sound) -> tuple
     return position
 
 
-def _follow(
-    session: GuideSession, recorder: PortRecorder, sound: Sound, seconds: float, start: tuple[int, int]
-) -> None:
+def _follow(session: DemoSession, recorder: PortRecorder, sound: Sound, seconds: float, start: tuple[int, int]) -> None:
     """Follow the ports for so long, or until the sound ends."""
     print(f"following {len(recorder.ports)} ports for {seconds:.1f} s", flush=True)
     progress = Progress(recorder, seconds)

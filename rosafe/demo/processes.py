@@ -49,7 +49,7 @@ class Child:
         return self.process.poll() is not None
 
 
-class Children:
+class ProcessGroup:
     """All children of this process, ended together. For the main thread only: the kernel watches that.
 
     Where this process is killed, they are, too; `orphaned` is TERM for those that have children of their own to end.
@@ -79,7 +79,7 @@ class Children:
                 child.process.wait()
         self._all.clear()
 
-    def __enter__(self) -> Children:
+    def __enter__(self) -> ProcessGroup:
         return self
 
     def __exit__(

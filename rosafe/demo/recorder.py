@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from rosafe.interface import KINDS, ROSAFE, ros_type
-from rosafe.sound.windows import joined, new_frames
+from rosafe.sound.windows import new_frames, split_new_frames
 from rosafe.view.report import PortRow
 from rosafe.view.representations import Representations
 
@@ -67,7 +67,7 @@ class PortFollower:
                 self.beginnings += 1
             self._arrivals.append(now)
             self.frame_rate = message.sampleRate
-            lost, fresh = joined(self._fresh(message), message.framesOnPort)
+            lost, fresh = split_new_frames(self._fresh(message), message.framesOnPort)
             self.lost += lost
             self.frames += fresh
             self.index, self.message = message.lastFrameIndex, message

@@ -14,7 +14,7 @@ from rosafe import interface
 from rosafe.component import generate
 from rosafe.component.master import PrivateMaster
 from rosafe.component.paths import CODE_DIR
-from rosafe.demo.processes import Child, Children
+from rosafe.demo.processes import Child, ProcessGroup
 from rosafe.demo.sound import Sound
 
 START_SECONDS = 30.0
@@ -23,7 +23,7 @@ _RESET = "\x1b[0m"  # rospy's log lines are coloured
 POLL_SECONDS = 0.02
 NODES = {"bass": "bass-ros", "rosAFE": "rosAFE-ros"}
 # From kind of processor to the name that it gets: those of the guide.
-NAMES = {kind: representation.name for kind, representation in interface.FIXED.items()}
+NAMES = {kind: representation.name for kind, representation in interface.CORE_REPRESENTATIONS.items()}
 
 
 class DemoError(Exception):
@@ -105,7 +105,7 @@ def shown(command: list[str]) -> str:
     return " ".join([*command[:-1], f'"{argument}"'])
 
 
-class GuideSession:
+class DemoSession:
     """A private master with both nodes on it, in an environment of their own. Everything ends with `close`.
 
     Parameters
@@ -131,7 +131,7 @@ class GuideSession:
         generate.ensure_messages()
         self._master = PrivateMaster()
         self.uri = os.environ["ROS_MASTER_URI"] = self._master.uri
-        self._children = Children(os.environ)
+        self._children = ProcessGroup(os.environ)
         self.nodes: dict[str, Child] = {}
         self._joined = False
         self._ending = False  # that they end is no accident any more
@@ -220,7 +220,7 @@ class GuideSession:
             rospy.signal_shutdown("the demonstration is over")
         self._master.close()
 
-    def __enter__(self) -> GuideSession:
+    def __enter__(self) -> DemoSession:
         return self
 
     def __exit__(

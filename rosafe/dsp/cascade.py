@@ -9,10 +9,10 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from .guard import SPAN, flush
+from .guard import FLUSH_INTERVAL, flush_denormals
 
 
-class Cascade:
+class SosFilter:
     """Second-order sections with their state, from rest.
 
     Parameters
@@ -30,7 +30,7 @@ class Cascade:
         """Back to rest."""
         self.state = None
 
-    def started(self, rows: tuple[int, ...]) -> NDArray[Any]:
+    def ensure_state(self, rows: tuple[int, ...]) -> NDArray[Any]:
         """The state for a block of `rows`. Other rows than in the last block mean a start from rest."""
         shape = (len(self.sections), *rows, 2)
         if self.state is None or self.state.shape != shape:
@@ -40,7 +40,7 @@ class Cascade:
 
     def process(self, block: NDArray[Any]) -> NDArray[Any]:
         """Filter (*rows, N) along its last axis; `block` itself where there are no sections."""
-        state = self.started(block.shape[:-1])
+        state = self.ensure_state(block.shape[:-1])
         if len(self.sections) == 0:
             return block
         if block.size == 0:
@@ -50,13 +50,13 @@ class Cascade:
             result[..., span], state = scipy.signal.sosfilt(self.sections, block[..., span], zi=state)
             if whole:
                 state = np.ascontiguousarray(state)
-                flush(state)
+                flush_denormals(state)
         self.state = np.ascontiguousarray(state)
         self._position += block.shape[-1]
         return result
 
 
-class Parallel:
+class SosFilterBank:
     """Second-order sections with their states, from rest, which all get the same samples.
 
     Parameters
@@ -88,20 +88,20 @@ class Parallel:
                 result[..., number, span], state = scipy.signal.sosfilt([section], block[..., span], zi=state)
                 states[number] = state[0]
                 if whole:
-                    flush(states[number])
+                    flush_denormals(states[number])
         self._position += block.shape[-1]
         return result
 
 
 def _spans(position: int, count: int) -> Iterator[tuple[slice, bool]]:
-    """The next `count` samples, cut wherever `SPAN` of them are full, and whether that is so, behind `position` others.
+    """The next `count` samples, cut wherever `FLUSH_INTERVAL` of them are full, and whether that is so, behind `position` others.
 
     States are looked at there, and nowhere else: so it leaves no trace how sound was cut into blocks.
     """
     first = 0
     while first < count:
-        end = min(count, first + SPAN - (position + first) % SPAN)
-        yield slice(first, end), (position + end) % SPAN == 0
+        end = min(count, first + FLUSH_INTERVAL - (position + first) % FLUSH_INTERVAL)
+        yield slice(first, end), (position + end) % FLUSH_INTERVAL == 0
         first = end
 
 

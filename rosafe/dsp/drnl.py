@@ -12,8 +12,8 @@ import numpy as np
 import scipy
 
 from . import kernels
-from .cascade import Cascade
-from .guard import FloatArray, limited
+from .cascade import SosFilter
+from .guard import FloatArray, clamp
 
 COMPRESSION = 10**-0.60206
 HIGHEST_FITTED = 1000.0  # Hz; above, the nonlinear path has the gains of CASP_GAIN_FREQUENCY
@@ -56,7 +56,7 @@ class DrnlBank:
         self, block: FloatArray, with_envelope: bool, output: FloatArray | None = None
     ) -> tuple[FloatArray, FloatArray | None]:
         """Filter (2, N): output (2, C, N), into `output` where that is given; and the envelope if wanted, else None."""
-        block = limited(block)
+        block = clamp(block)
         if output is None:
             output = np.empty((2, len(self.channels), block.shape[-1]))
         with kernels.denormals_off():  # tails of the many filters go through them within a block
@@ -98,9 +98,9 @@ class _Channel:
         linear_sections = np.vstack(linear)
         linear_sections[0, :3] *= power_law(4.20405, -0.47909)
         resonance = np.vstack([resonator(centre, power_law(-0.03193, 0.70))] * 2)
-        self.linear = Cascade(linear_sections)
-        self.before = Cascade(resonance)
-        self.after = Cascade(np.vstack([resonance, lowpass(cutoff)]))
+        self.linear = SosFilter(linear_sections)
+        self.before = SosFilter(resonance)
+        self.after = SosFilter(np.vstack([resonance, lowpass(cutoff)]))
         fitted = frequency if frequency <= HIGHEST_FITTED else CASP_GAIN_FREQUENCY
         self.slope = power_law(1.40298, 0.81916, fitted)
         self.compressive_gain = power_law(1.61912, -0.81867, fitted)

@@ -13,9 +13,9 @@ from numpy.lib.stride_tricks import sliding_window_view
 from rosafe.vocabulary.parameter import Parameter
 
 from . import kernels
-from .guard import SQUARE_TINY, FloatArray, limited
+from .guard import SQUARE_TINY, FloatArray, clamp
 from .rounding import sample_count
-from .signal import Signal
+from .signal import SignalFormat
 from .stage import Output, Stage
 from .windows import NAMES, window
 
@@ -34,51 +34,51 @@ def frame_parameters(
 
 
 @dataclass(frozen=True)
-class Framing:
+class FrameGrid:
     """A window (w,) and a hop in samples: frame k covers the samples from k * hop to k * hop + w."""
 
     window: FloatArray
     hop: int
 
     @classmethod
-    def design(cls, sample_rate: float, prefix: str, values: Mapping[str, Any]) -> Framing:
+    def design(cls, sample_rate: float, prefix: str, values: Mapping[str, Any]) -> FrameGrid:
         """From the parameters of `frame_parameters`; the window's length is even. ValueError if one is too short."""
         half = sample_count(f"{prefix}_wSizeSec", values[f"{prefix}_wSizeSec"] * sample_rate / 2)
         hop = sample_count(f"{prefix}_hSizeSec", values[f"{prefix}_hSizeSec"] * sample_rate)
         return cls(window(values[f"{prefix}_wname"], 2 * half), hop)
 
-    def complete(self, samples: int) -> int:
+    def complete_frames(self, samples: int) -> int:
         """How many whole frames there are in so many samples."""
         return max(0, (samples - len(self.window)) // self.hop + 1)
 
     def frames(self, samples: FloatArray) -> FloatArray:
         """A view (..., F, w) of the whole frames in `samples` (..., n)."""
-        count = self.complete(samples.shape[-1])
+        count = self.complete_frames(samples.shape[-1])
         if count == 0:
             return np.empty((*samples.shape[:-1], 0, len(self.window)))
         return sliding_window_view(samples, len(self.window), axis=-1)[..., :: self.hop, :]
 
-    def weights(self, squared: bool) -> kernels.Pinned:
+    def weights(self, squared: bool) -> kernels.PinnedArray:
         """What to multiply samples, or their squares, with for the mean of a windowed frame."""
         return self._square_weights if squared else self._plain_weights
 
     @cached_property
-    def _plain_weights(self) -> kernels.Pinned:
-        return kernels.Pinned.of(self.window / len(self.window))
+    def _plain_weights(self) -> kernels.PinnedArray:
+        return kernels.PinnedArray.of(self.window / len(self.window))
 
     @cached_property
-    def _square_weights(self) -> kernels.Pinned:
-        return kernels.Pinned.of(np.square(self.window) / len(self.window))
+    def _square_weights(self) -> kernels.PinnedArray:
+        return kernels.PinnedArray.of(np.square(self.window) / len(self.window))
 
     @cached_property
-    def pinned(self) -> kernels.Pinned:
+    def pinned(self) -> kernels.PinnedArray:
         """The window, for a kernel."""
-        return kernels.Pinned.of(np.ascontiguousarray(self.window, np.float64))
+        return kernels.PinnedArray.of(np.ascontiguousarray(self.window, np.float64))
 
     def means(self, samples: FloatArray, squared: bool) -> FloatArray:
         """mean(window x), or mean((window x)**2), of each whole frame: (..., n) to (..., F)."""
-        if squared and self.complete(samples.shape[-1]) > 0:  # else a long window that is not full yet
-            samples = np.square(limited(samples, SQUARE_TINY))
+        if squared and self.complete_frames(samples.shape[-1]) > 0:  # else a long window that is not full yet
+            samples = np.square(clamp(samples, SQUARE_TINY))
         # Not a matrix product: OpenBLAS starts threads of its own for it, and two stages at work at the same time
         # then get in each other's way: several times slower than one alone.
         means: FloatArray = np.einsum("...fi,i->...f", self.frames(samples), self.weights(squared).array)
@@ -98,7 +98,7 @@ class FrameBuffer:
     """
 
     def __init__(self) -> None:
-        self._store = kernels.Pinned.of(np.empty((0, 0)))
+        self._store = kernels.PinnedArray.of(np.empty((0, 0)))
         self._rows: tuple[int, ...] = (0,)
         self._start = self._stop = 0
         self.skip = self.position = 0
@@ -115,7 +115,7 @@ class FrameBuffer:
             self._make_store(0)
             self._start = self._stop = self.skip = self.position = 0
 
-    def advance(self, arriving: int, count: int) -> tuple[kernels.Span, kernels.Span]:
+    def advance(self, arriving: int, count: int) -> tuple[kernels.SampleRange, kernels.SampleRange]:
         """After a block of so many samples, the next frame is to start `count` samples later than it would have.
 
         Returns the samples held till now, and room for those at the end of the block that will be held; the caller must
@@ -130,16 +130,18 @@ class FrameBuffer:
             self._make_room(total)
             start, stop = self._start, self._stop
             self._start, self._stop = start + first, stop + arriving
-            return kernels.Span(self._store, start, stop), kernels.Span(self._store, stop, stop + arriving)
-        history = kernels.Span(self._store, self._start, self._stop)
+            return kernels.SampleRange(self._store, start, stop), kernels.SampleRange(
+                self._store, stop, stop + arriving
+            )
+        history = kernels.SampleRange(self._store, self._start, self._stop)
         kept = max(0, kept)
         if kept > self._store.array.shape[-1]:
             self._make_store(kept)
         self._start, self._stop = 0, kept
-        return history, kernels.Span(self._store, 0, kept)
+        return history, kernels.SampleRange(self._store, 0, kept)
 
     def _make_store(self, samples: int) -> None:
-        self._store = kernels.Pinned.of(np.empty((*self._rows, samples)))
+        self._store = kernels.PinnedArray.of(np.empty((*self._rows, samples)))
 
     def append(self, block: FloatArray) -> FloatArray:
         """Take in (*rows, N); a view of all samples from the next frame's start on, valid until the next call."""
@@ -178,7 +180,7 @@ class FramedStage(Stage):
 
     prefix: ClassVar[str]  # of the three parameters of `frame_parameters`
 
-    def __init__(self, input_format: Signal | float, **parameters: Any) -> None:
+    def __init__(self, input_format: SignalFormat | float, **parameters: Any) -> None:
         self._buffer = FrameBuffer()
         super().__init__(input_format, **parameters)
 
@@ -192,7 +194,7 @@ class FramedStage(Stage):
         return self._framing.window
 
     def process(self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None) -> Output:
-        frames = self._framing.frames(self._buffer.append(limited(self._checked(block))))
+        frames = self._framing.frames(self._buffer.append(clamp(self._as_valid_block(block))))
         output = np.ascontiguousarray(self.frame(frames))
         if np.may_share_memory(output, frames):  # those move when the next block comes
             output = output.copy()
@@ -200,10 +202,10 @@ class FramedStage(Stage):
         return output
 
     def output_count(self, count: int) -> int:
-        return self._framing.complete(count)
+        return self._framing.complete_frames(count)
 
     @cached_property
-    def output_format(self) -> Signal:
+    def output_format(self) -> SignalFormat:
         return replace(
             self.input_format,
             rate=self.input_format.rate / self._framing.hop,
@@ -222,8 +224,8 @@ class FramedStage(Stage):
         return means
 
     def _frames(
-        self, block: FloatArray, weights: kernels.Pinned, rows: tuple[int, ...] | None = None
-    ) -> kernels.Frames:
+        self, block: FloatArray, weights: kernels.PinnedArray, rows: tuple[int, ...] | None = None
+    ) -> kernels.FrameReader:
         """The frames that `block` completes, for a kernel; the buffer has moved on then.
 
         `rows` are those of what is held, where that is not what comes.
@@ -232,9 +234,9 @@ class FramedStage(Stage):
         arriving, hop = shape[-1], framing.hop
         buffer.begin(shape[:-1] if rows is None else rows)
         skip, position = buffer.skip, buffer.position
-        count = framing.complete(buffer.held + arriving - skip)
+        count = framing.complete_frames(buffer.held + arriving - skip)
         history, room = buffer.advance(arriving, count * hop)
-        return kernels.Frames(history, block, room, skip, weights, hop, count, position)
+        return kernels.FrameReader(history, block, room, skip, weights, hop, count, position)
 
     def build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
-        self._framing = Framing.design(self.input_format.rate, self.prefix, values)
+        self._framing = FrameGrid.design(self.input_format.rate, self.prefix, values)

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from . import kernels, memory
 from .erb import bandwidth
-from .guard import SPAN, FloatArray, flush, limited
+from .guard import FLUSH_INTERVAL, FloatArray, clamp, flush_denormals
 
-POLES_TOGETHER = 4
+POLES_PER_SECTION = 4
 TURN_SPAN = 64  # samples; SPAN of kernels/gammatone.c, which takes no other `position` than below it
 
 
@@ -75,8 +75,8 @@ def _sections(poles: NDArray[np.complex128], gains: FloatArray, order: int) -> N
     sections = np.zeros((len(poles), order, 6), np.complex128)
     sections[..., 0] = sections[..., 3] = 1
     sections[..., 4] = -poles[:, np.newaxis]
-    for first in range(0, order, POLES_TOGETHER):
-        sections[:, first, 0] = gains ** min(POLES_TOGETHER, order - first)
+    for first in range(0, order, POLES_PER_SECTION):
+        sections[:, first, 0] = gains ** min(POLES_PER_SECTION, order - first)
     sections[:, 0, 0] *= 2  # y = 2 Re(H x): a real signal has half of its amplitude at each of ±f
     return sections
 
@@ -94,13 +94,13 @@ def filter_by_scipy(
     `state` (2, C, order) runs on from block to block: what each pole put out last, turned to frequency 0 by the pole's
     angle for each of the `position` samples that have come since phases began anew, as they do every `TURN_SPAN`.
     """
-    block = limited(block)
+    block = clamp(block)
     poles = -sections[..., 4]
     lengths = np.abs(poles)
     turns = np.divide(poles, lengths, out=np.ones_like(poles), where=lengths > 0)
     state *= lengths * turns**position  # as that of direct form II transposed, p y[n]
-    for first in range(0, block.shape[-1], SPAN):
-        span = slice(first, first + SPAN)
+    for first in range(0, block.shape[-1], FLUSH_INTERVAL):
+        span = slice(first, first + FLUSH_INTERVAL)
         for channel, cascade in enumerate(sections):
             before = np.zeros((len(cascade), 2, 2), np.complex128)
             before[..., 0] = state[:, channel].T
@@ -109,6 +109,6 @@ def filter_by_scipy(
             output[:, channel, span] = analytic.real
             if envelope is not None:
                 np.abs(analytic, out=envelope[:, channel, span])
-        flush(state)
+        flush_denormals(state)
     back = lengths * turns ** ((position + block.shape[-1]) % TURN_SPAN)
     np.divide(state, back, out=state, where=lengths > 0)

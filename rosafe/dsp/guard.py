@@ -18,10 +18,12 @@ LIMIT = 1e70
 TINY = 1e-200
 SQUARE_TINY = 1e-145  # the same where samples are squared and weighted
 
-SPAN = 4096  # samples that a filter goes on by before its state is looked at: it may become tiny in a long block
+FLUSH_INTERVAL = (
+    4096  # samples that a filter goes on by before its state is looked at: it may become tiny in a long block
+)
 
 
-def limited(block: FloatArray, tiny: float = TINY) -> FloatArray:
+def clamp(block: FloatArray, tiny: float = TINY) -> FloatArray:
     """`block` with samples bounded to ±LIMIT, and 0 for those below `tiny`; `block` itself where none is like that."""
     size = np.abs(block)
     below = size < tiny
@@ -32,7 +34,7 @@ def limited(block: FloatArray, tiny: float = TINY) -> FloatArray:
     return result
 
 
-def flush(state: NDArray[Any]) -> None:
+def flush_denormals(state: NDArray[Any]) -> None:
     """Set to 0, in place, what is smaller than TINY in a contiguous real or complex `state`."""
     parts = state.view(np.float64)
     parts[np.abs(parts) < TINY] = 0.0

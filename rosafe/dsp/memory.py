@@ -16,7 +16,7 @@ import numpy as np
 from .guard import FloatArray
 
 SMALLEST, LARGEST = 2**24, 2**28  # bytes of the blocks that are kept
-KEPT = 2  # idle ones of a size
+MAX_IDLE_PER_SIZE = 2  # idle ones of a size
 SIZES = 2  # of which idle ones are kept
 
 _idle: dict[int, deque[FloatArray]] = {}
@@ -31,10 +31,10 @@ def empty(shape: tuple[int, ...]) -> FloatArray:
         memory = _idle[count].pop()
     except (KeyError, IndexError):
         memory = np.empty(count)
-    return np.asarray(_Loan(memory, shape))
+    return np.asarray(_PooledArray(memory, shape))
 
 
-class _Loan:
+class _PooledArray:
     """The memory of one array and its views: numpy lets go of this with the last one of them."""
 
     _memory: FloatArray | None = None
@@ -47,6 +47,6 @@ class _Loan:
         if self._memory is None:  # there was no memory for the rest of this
             return
         with contextlib.suppress(MemoryError):  # then it is freed
-            _idle.setdefault(len(self._memory), deque(maxlen=KEPT)).append(self._memory)
+            _idle.setdefault(len(self._memory), deque(maxlen=MAX_IDLE_PER_SIZE)).append(self._memory)
             for size in list(_idle)[:-SIZES]:
                 _idle.pop(size, None)

@@ -23,7 +23,7 @@ from rosafe.vocabulary.parameter import REQUIRED, Parameter
 from rosafe.vocabulary.representation import Part
 
 from .guard import FloatArray
-from .signal import Signal
+from .signal import SignalFormat
 from .stage import FLOAT64, Output, Stage
 
 log = logging.getLogger("rosafe.plugin")
@@ -312,10 +312,10 @@ class CheckedStage(Stage):
 
     # --- what it declares ---
 
-    def become(self, given: Signal, changes: Collection[Mapping[str, Any]]) -> None:
+    def reconfigure(self, given: SignalFormat, changes: Collection[Mapping[str, Any]]) -> None:
         changed = given != self.input_format or any(changes)
         with self._locating("build", refuses=True):
-            super().become(given, changes)
+            super().reconfigure(given, changes)
         if changed:
             self.__count = _Count(since_start=False)
             self.__rows = {}
@@ -325,7 +325,7 @@ class CheckedStage(Stage):
         """Check all that can be asked without a block."""
         if not {"input_format", "values", "provide", "provided"} <= vars(self).keys():
             raise self._violation("__init__: expected a call of super().__init__(input_format, **parameters)")
-        if not isinstance(self.output_format, Signal):
+        if not isinstance(self.output_format, SignalFormat):
             raise self._violation(f"output_format: expected a Signal, got {type(self.output_format).__name__}")
         for name in ("parameters", "derived", "required_extra", "look_ahead"):
             getattr(self, name)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 
 @dataclass(frozen=True)
-class Signal:
+class SignalFormat:
     """The format of a stage's input or output. Equal formats mean that what comes goes on as before.
 
     Attributes
@@ -37,6 +37,6 @@ class Signal:
     lags: int = 0
 
     @classmethod
-    def sound(cls, sample_rate: float) -> Signal:
+    def sound(cls, sample_rate: float) -> SignalFormat:
         """That of samples of sound."""
         return cls(sample_rate, sample_rate)

@@ -16,7 +16,7 @@ from rosafe.vocabulary.representation import Representation
 from . import kernels, memory
 from .guard import FloatArray
 from .old_names import OldNames
-from .signal import Signal
+from .signal import SignalFormat
 
 SAMPLE_RATE = Parameter(
     "sample_rate", "double", REQUIRED, "Samples per second (Hz)", 0.0, 1e9, open_minimum=True, unit="Hz"
@@ -30,9 +30,9 @@ class Stage(OldNames):
 
     A representation is a subclass with its declaration. It implements `build`, `process`, `reset`, and what differs
     from the defaults here of `output_rows`, `output_format`, `output_count`, `look_ahead`, `required_extra`,
-    `input_format_changed`, `state_size`, `blocks_matter`.
+    `input_format_changed`, `state_size`, `block_size_dependent`.
 
-    The rule for every stage: `build`, and so `configure` and `receive`, puts new objects in the place of what it
+    The rule for every stage: `build`, and so `configure` and `set_input_format`, puts new objects in the place of what it
     changes (filters, framings, tables) and never alters those that are there. A shallow copy of a stage is therefore a
     second one that may be configured while the first one works; the tree tries changes on such copies, and may throw
     them away or put them to work with the state as it is then.
@@ -65,28 +65,30 @@ class Stage(OldNames):
     DECLARED_WITHIN: ClassVar[Representation | None] = None  # of a variant: with the names that the stage itself uses
     INPUT: ClassVar[tuple[str, ...]] = ("ear", "channel", "time")  # axes of the blocks that come
     EXTRAS: ClassVar[tuple[str, ...]] = ()  # by-products that children may need, such as the envelope
-    OVERWRITES: ClassVar[bool] = False  # `out` may be the input block
+    SUPPORTS_IN_PLACE: ClassVar[bool] = False  # `out` may be the input block
     TAKES_OUT: ClassVar[bool]  # whether `process` has the argument `out`; determined when the class is created
-    APART: ClassVar[bool] = False  # what it makes of a channel depends on no other one, not even in the last bit
+    CHANNEL_INDEPENDENT: ClassVar[bool] = (
+        False  # what it makes of a channel depends on no other one, not even in the last bit
+    )
 
     def __init_subclass__(cls, **arguments: Any) -> None:
         super().__init_subclass__(**arguments)
         cls.TAKES_OUT = callable(cls.process) and "out" in inspect.signature(cls.process).parameters
 
-    def __init__(self, input_format: Signal | float, **parameters: Any) -> None:
-        if not isinstance(input_format, Signal):
-            input_format = Signal.sound(SAMPLE_RATE.check(input_format))
+    def __init__(self, input_format: SignalFormat | float, **parameters: Any) -> None:
+        if not isinstance(input_format, SignalFormat):
+            input_format = SignalFormat.sound(SAMPLE_RATE.check(input_format))
         self.input_format = input_format
         self.provide: frozenset[str] = frozenset()
         self.provided: dict[str, FloatArray] = {}
         declared = (self.DECLARED_WITHIN or self.REPRESENTATION).parameters
         self.values = {parameter.name: parameter.check(parameter.default) for parameter in declared}
-        self.values = self._with(parameters)
+        self.values = self._checked_values(parameters)
         self.build(self.values, frozenset(self.values))
-        self._follow()
+        self._update_output_format()
 
     @classmethod
-    def in_force(cls, values: Mapping[str, Any]) -> dict[str, Any]:
+    def effective_values(cls, values: Mapping[str, Any]) -> dict[str, Any]:
         """What `parameters` tells of a stage with these (checked) values, as far as no sample rate is needed for that.
 
         ValueError for values that go together at no sample rate.
@@ -94,7 +96,9 @@ class Stage(OldNames):
         return dict(values)
 
     @classmethod
-    def at_rate(cls, values: Mapping[str, Any], given: Collection[str], sample_rate: float) -> dict[str, Any]:
+    def resolve_rate_defaults(
+        cls, values: Mapping[str, Any], given: Collection[str], sample_rate: float
+    ) -> dict[str, Any]:
         """`values`, where the defaults of those not `given` that follow the sample rate (Hz) are what it makes of them.
 
         These parameters are declared with `follows_rate`.
@@ -102,8 +106,8 @@ class Stage(OldNames):
         return dict(values)
 
     @classmethod
-    def asked(cls, values: Mapping[str, Any]) -> dict[str, Any]:
-        """`values` as a request may hold them, without what only `in_force` tells: so one can be made like another."""
+    def request_values(cls, values: Mapping[str, Any]) -> dict[str, Any]:
+        """`values` as a request may hold them, without what only `effective_values` tells: so one can be made like another."""
         return dict(values)
 
     # --- what it is -------------------------------------------------------------------------------------------
@@ -124,7 +128,7 @@ class Stage(OldNames):
         return {}
 
     @cached_property
-    def output_format(self) -> Signal:
+    def output_format(self) -> SignalFormat:
         """The format of what `process` returns; follows from `input_format` and `values`, and is updated after them."""
         return self.input_format
 
@@ -134,7 +138,7 @@ class Stage(OldNames):
         return ""
 
     @property
-    def blocks_matter(self) -> bool:
+    def block_size_dependent(self) -> bool:
         """Whether the output depends on how sound is cut, beyond rounding. Plugins are not asked: theirs may."""
         return False
 
@@ -170,14 +174,14 @@ class Stage(OldNames):
         A parameter that is set counts as changed even where it had the value already, as in the original.
         Which states start anew is said by each stage.
         """
-        self.become(self.input_format, [changes])
+        self.reconfigure(self.input_format, [changes])
 
-    def receive(self, given: Signal) -> None:
+    def set_input_format(self, given: SignalFormat) -> None:
         """From now on blocks have the format `given`: the parent has changed. A ValueError changes nothing."""
-        self.become(given, ())
+        self.reconfigure(given, ())
 
-    def become(self, given: Signal, changes: Collection[Mapping[str, Any]]) -> None:
-        """`receive` and one `configure` after the other, at once: only what comes of it all must be possible."""
+    def reconfigure(self, given: SignalFormat, changes: Collection[Mapping[str, Any]]) -> None:
+        """`set_input_format` and one `configure` after the other, at once: only what comes of it all must be possible."""
         if given == self.input_format and not any(changes):
             self.input_format = given
             return
@@ -185,23 +189,23 @@ class Stage(OldNames):
         tried.input_format = given
         changed: set[str] = set()
         for change in changes:
-            tried.values = tried._with(change)
+            tried.values = tried._checked_values(change)
             changed.update(self._parameter(name).name for name in change)
         if given != self.input_format:
             tried.input_format_changed(self.input_format)
         if changed:
             tried.build(tried.values, frozenset(changed))
-        tried._follow()
+        tried._update_output_format()
         self.__dict__.update(tried.__dict__)
 
-    def input_format_changed(self, before: Signal) -> None:
+    def input_format_changed(self, before: SignalFormat) -> None:
         """Design again for `input_format`, which was `before`; the rule of `build` holds.
 
         Override it if something that `build` computes depends on the format. A change of the number of rows is noticed
         by `process` alone.
         """
 
-    def _follow(self) -> None:
+    def _update_output_format(self) -> None:
         """Compute `output_format` again. An equal one remains the same object, which is quick to compare."""
         before = self.__dict__.pop("output_format", None)
         if self.output_format == before:
@@ -213,13 +217,13 @@ class Stage(OldNames):
         New objects replace the old ones: see the rule above.
         """
 
-    def _with(self, changes: Mapping[str, Any]) -> dict[str, Any]:
+    def _checked_values(self, changes: Mapping[str, Any]) -> dict[str, Any]:
         """All values after `changes`, each checked."""
         checked = {}
         for name, value in changes.items():
             parameter = self._parameter(name)
             checked[parameter.name] = parameter.check(value)
-        return self._merge(checked)
+        return self._resolve_values(checked)
 
     def _parameter(self, name: str) -> Parameter:
         try:
@@ -227,7 +231,7 @@ class Stage(OldNames):
         except KeyError:
             raise ValueError(f"{name}: {type(self).__name__} has no such parameter") from None
 
-    def _merge(self, checked: dict[str, Any]) -> dict[str, Any]:
+    def _resolve_values(self, checked: dict[str, Any]) -> dict[str, Any]:
         return {**self.values, **checked}
 
     # --- blocks -----------------------------------------------------------------------------------------------
@@ -243,7 +247,7 @@ class Stage(OldNames):
             The parent's by-product of the same block that `required_extra` names.
         out : ndarray, (..., M), optional
             Where the caller wants the output: evenly strided rows, each contiguous. It may be ignored. It can be
-            `block` if the stage `OVERWRITES`: then the output stays in the cache. A stage whose `process` does not
+            `block` if the stage `SUPPORTS_IN_PLACE`: then the output stays in the cache. A stage whose `process` does not
             have this argument is called without it.
 
         Returns
@@ -261,13 +265,13 @@ class Stage(OldNames):
     def reset(self) -> None:
         """Back to the state before the first block; parameters stay."""
 
-    def _room(self, shape: tuple[int, ...], out: FloatArray | None = None) -> FloatArray:
+    def _output_array(self, shape: tuple[int, ...], out: FloatArray | None = None) -> FloatArray:
         """`out` if it is suitable for an output of this shape, otherwise a new array."""
-        if out is None or out.shape != shape or out.dtype != FLOAT64 or not kernels.rows_apart(out):
+        if out is None or out.shape != shape or out.dtype != FLOAT64 or not kernels.rows_evenly_strided(out):
             return memory.empty(shape)
         return out
 
-    def _checked(self, block: Any) -> FloatArray:
+    def _as_valid_block(self, block: Any) -> FloatArray:
         """`block` as contiguous float64 of the right shape, or ValueError."""
         ears, dimensions = self.INPUT[0] == "ear", len(self.INPUT)
         quick = type(block) is np.ndarray and block.dtype is FLOAT64 and block.flags.c_contiguous

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 
 from rosafe.vocabulary.representation import Representation
 
-from .signal import Signal
+from .signal import SignalFormat
 from .stage import Stage
 
 
@@ -87,7 +87,7 @@ class _Variant(Stage):
 
     NAMES: ClassVar[Mapping[str, str]]  # of parameters and derived values, by those within the stage
 
-    def __init__(self, input_format: Signal | float, **parameters: Any) -> None:
+    def __init__(self, input_format: SignalFormat | float, **parameters: Any) -> None:
         inward = self._inward(parameters)
         with self._translating():
             super().__init__(input_format, **inward)
@@ -119,10 +119,10 @@ class _Variant(Stage):
             text = re.sub("|".join(rf"\b{name}\b" for name in cls.NAMES), lambda m: cls.NAMES[m[0]], str(problem))
             raise ValueError(text).with_traceback(problem.__traceback__) from None
 
-    def become(self, given: Signal, changes: Collection[Mapping[str, Any]]) -> None:
+    def reconfigure(self, given: SignalFormat, changes: Collection[Mapping[str, Any]]) -> None:
         inward = [self._inward(change) for change in changes]
         with self._translating():
-            super().become(given, inward)
+            super().reconfigure(given, inward)
 
     @property
     def parameters(self) -> dict[str, Any]:
@@ -133,23 +133,25 @@ class _Variant(Stage):
         return self._outward(super().derived)
 
     @classmethod
-    def in_force(cls, values: Mapping[str, Any]) -> dict[str, Any]:
+    def effective_values(cls, values: Mapping[str, Any]) -> dict[str, Any]:
         if cls._is_inner(values):
-            return super().in_force(values)
+            return super().effective_values(values)
         with cls._translating():
-            return cls._outward(super().in_force(cls._inward(values)))
+            return cls._outward(super().effective_values(cls._inward(values)))
 
     @classmethod
-    def at_rate(cls, values: Mapping[str, Any], given: Collection[str], sample_rate: float) -> dict[str, Any]:
+    def resolve_rate_defaults(
+        cls, values: Mapping[str, Any], given: Collection[str], sample_rate: float
+    ) -> dict[str, Any]:
         if cls._is_inner(values):
-            return super().at_rate(values, given, sample_rate)
+            return super().resolve_rate_defaults(values, given, sample_rate)
         with cls._translating():
             names = cls._inward(dict.fromkeys(given))
-            return cls._outward(super().at_rate(cls._inward(values), names, sample_rate))
+            return cls._outward(super().resolve_rate_defaults(cls._inward(values), names, sample_rate))
 
     @classmethod
-    def asked(cls, values: Mapping[str, Any]) -> dict[str, Any]:
+    def request_values(cls, values: Mapping[str, Any]) -> dict[str, Any]:
         own = {name: value for name, value in values.items() if name in cls.NAMES.values()}
         others = {name: value for name, value in values.items() if name not in own}
         with cls._translating():
-            return {**others, **cls._outward(super().asked(cls._inward(own)))}
+            return {**others, **cls._outward(super().request_values(cls._inward(own)))}

@@ -23,7 +23,7 @@ DELIMITERS = ' \t\n"{}[]$;()'
 _STDIN = 0
 
 
-class Abandoned(Exception):
+class LineCancelled(Exception):
     """The line that was being typed is not wanted any more (Ctrl-C)."""
 
 
@@ -71,7 +71,7 @@ class LineReader:
                 readline.insert_text(outer[1])
                 readline.redisplay()
         if abandoned:
-            raise Abandoned
+            raise LineCancelled
         return line
 
     def _install(self) -> None:
@@ -95,7 +95,7 @@ class LineReader:
         self._ended = True
         _rl.rl_callback_handler_remove()  # at once, or it shows the prompt for a next line
 
-    def abandon(self) -> bool:
+    def cancel_line(self) -> bool:
         """Give up the line that is being typed; False where there is none."""
         self._abandoned = self._active
         return self._active

@@ -95,7 +95,7 @@ class Shell:
                 else:
                     self.tcl.tk.call("source", "-encoding", encoding, script)
             except TclError as error:
-                self._tell_where(error)
+                self._print_error_info(error)
                 code = 1
         with contextlib.suppress(TclError):  # whatever a script's own `exit` does, this is the end
             self.tcl.tk.call("exit", str(code))
@@ -152,9 +152,9 @@ class Shell:
         try:
             self.tcl.tk.evalfile(path)
         except TclError as error:
-            self._tell_where(error)
+            self._print_error_info(error)
 
-    def _tell_where(self, error: TclError) -> None:
+    def _print_error_info(self, error: TclError) -> None:
         """errorInfo, unless it is that of another error: a file that cannot be read has none."""
         info = self.tcl.variable("errorInfo") or ""
         self.tcl.say(info if info.startswith(str(error)) else str(error), "stderr")
@@ -195,7 +195,7 @@ class Shell:
         return ""
 
     def _next_line(self) -> str | None:
-        from rosafe.eltclsh.line import Abandoned
+        from rosafe.eltclsh.line import LineCancelled
 
         reader, _ = self._editing()
         while True:
@@ -203,7 +203,7 @@ class Shell:
                 self.tcl.tk.eval("chan flush stdout; chan flush stderr")
             try:
                 return reader.read(self._prompt())
-            except Abandoned:
+            except LineCancelled:
                 self._pending = ""
 
     def _prompt(self) -> str:
@@ -272,13 +272,13 @@ class Shell:
             if self.tcl.tk.eval("chan flush stdout; chan gets stdin ::el::input") == "-1":
                 raise TclError("no input")
             return str(self.tcl.tk.eval("set ::el::input"))
-        from rosafe.eltclsh.line import Abandoned
+        from rosafe.eltclsh.line import LineCancelled
 
         reader, history = self._editing()
         kept = history.entries
         try:
             line = reader.read(prompt)
-        except Abandoned:
+        except LineCancelled:
             raise TclError("interrupted") from None
         finally:
             history.replace(kept)
@@ -303,7 +303,7 @@ class Shell:
 
     def _abandon(self) -> str:
         """Give up the line that is being typed, or else the command that runs."""
-        if self._reader is None or not self._reader.abandon():
+        if self._reader is None or not self._reader.cancel_line():
             self.signals.abandon()
         return ""
 

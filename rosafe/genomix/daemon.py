@@ -31,7 +31,7 @@ def main(argv: list[str] | None = None) -> int:
     """Run genomixd until a signal ends it; the exit code."""
     options = _parse(startup.without_names(sys.argv[1:] if argv is None else argv))
     _log_to_stderr(2 if options.debug else min(options.verbose, 2))
-    told = startup.Background() if options.background else None
+    told = startup.DaemonFork() if options.background else None
     if told is not None and told.in_parent:
         return told.wait()
     master.set_local_defaults()
@@ -114,7 +114,7 @@ def _log_to_stderr(verbosity: int) -> None:
     log.propagate = False  # rospy sets up the root for itself
 
 
-async def _serve(options: argparse.Namespace, told: startup.Background | None) -> int:
+async def _serve(options: argparse.Namespace, told: startup.DaemonFork | None) -> int:
     loop = asyncio.get_running_loop()
     end = asyncio.Event()
     for number in startup.ending_signals():

@@ -20,7 +20,7 @@ from xml.parsers.expat import ExpatError
 import aiohttp
 
 from rosafe.component import startup
-from rosafe.genomix.tasks import shared
+from rosafe.genomix.tasks import run_shared
 from rosafe.interface import ComponentError
 
 RPC_SECONDS = 3.0  # for one call of the master or of a node
@@ -34,7 +34,7 @@ MAX_KNOWN = 1000  # components whose addresses are remembered
 _FAILURES = (OSError, aiohttp.ClientError, ValueError)  # TimeoutError is an OSError
 
 
-class Unknown(Exception):
+class NotRegisteredError(Exception):
     """The master, or a node, answered that there is no such thing."""
 
 
@@ -70,7 +70,7 @@ class Graph:
         self._calls = asyncio.Semaphore(MAX_CALLS)
         self._look: asyncio.Task[set[str]] | None = None  # the next look at the services, which has not begun yet
         self._looking = asyncio.Lock()
-        self._looked_at = 0.0
+        self._topics_cached_at = 0.0
         self._addresses: dict[str, tuple[str, int]] = {}  # where instances were reached the last time
         self._uris: dict[str, str] = {}  # and their nodes
 
@@ -111,7 +111,7 @@ class Graph:
         except (ExpatError, xmlrpc.client.Error, ValueError, TypeError, IndexError):
             raise OSError(errno.EPROTO, os.strerror(errno.EPROTO)) from None
         if code != 1:
-            raise Unknown(message)
+            raise NotRegisteredError(message)
         return value
 
     async def service_address(self, name: str) -> tuple[str, int]:
@@ -121,14 +121,14 @@ class Graph:
     async def serves(self, name: str) -> bool:
         """Whether somebody serves `name`. One look at the master answers all who ask before it begins."""
         if self._look is None:
-            self._look = shared(self._look_at_services())
+            self._look = run_shared(self._look_at_services())
         return name in await asyncio.shield(self._look)
 
     async def _look_at_services(self) -> set[str]:
         clock = asyncio.get_running_loop().time
         async with self._looking:
-            await asyncio.sleep(self._looked_at + LOOK_SECONDS - clock())
-            self._look, self._looked_at = None, clock()
+            await asyncio.sleep(self._topics_cached_at + LOOK_SECONDS - clock())
+            self._look, self._topics_cached_at = None, clock()
             return {name for name, _ in (await self.master("getSystemState"))[2]}
 
     async def topics(self) -> dict[str, str]:
@@ -155,7 +155,7 @@ class Graph:
     async def _topic_at(self, uri: str, topic: str) -> tuple[str, int]:
         protocol = await self.node(uri, "requestTopic", topic, [["TCPROS"]])
         if len(protocol) != 3 or protocol[0] != "TCPROS":
-            raise Unknown(f"nobody gives out {topic}")
+            raise NotRegisteredError(f"nobody gives out {topic}")
         return str(protocol[1]), int(protocol[2])
 
     async def node_uri(self, instance: str) -> str:
@@ -168,7 +168,7 @@ class Graph:
         """Where the services of `instance` were reached the last time."""
         return self._addresses.get(instance)
 
-    def reached(self, instance: str, address: tuple[str, int]) -> None:
+    def note_reachable(self, instance: str, address: tuple[str, int]) -> None:
         """The services of `instance` are there: all of a node are at one address."""
         _remember(self._addresses, instance, address)
 
@@ -230,7 +230,7 @@ def _address(uri: str) -> tuple[str, int]:
     except ValueError:
         host = port = None
     if host is None or port is None:
-        raise Unknown(f"{uri!r} is no address of a service")
+        raise NotRegisteredError(f"{uri!r} is no address of a service")
     return host, port
 
 

@@ -8,7 +8,7 @@ import os
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
-from rosafe.genomix.graph import Graph, Unknown
+from rosafe.genomix.graph import Graph, NotRegisteredError
 from rosafe.http_server.access import host_name
 from rosafe.interface import ComponentError
 
@@ -44,7 +44,7 @@ class Names:
             self._next_read = now + READ_SECONDS
             try:
                 value = await self._graph.master("getParam", self._parameter)
-            except Unknown:
+            except NotRegisteredError:
                 value = []
             except ComponentError:
                 return self._from_parameter

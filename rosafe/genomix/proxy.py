@@ -12,11 +12,18 @@ import rosgraph.names
 from rosafe.component import mark
 from rosafe.genomix import installed_components, packed, setups, syntax
 from rosafe.genomix.actions import ActionClient, Goal
-from rosafe.genomix.graph import Graph, Unknown, middleware_error
+from rosafe.genomix.graph import Graph, NotRegisteredError, middleware_error
 from rosafe.genomix.installed_components import cannot_load
 from rosafe.genomix.syntax import Syntax
-from rosafe.genomix.tasks import shared
-from rosafe.genomix.tcpros import Connection, Refused, ServiceClient, TopicReader, component_exception, reach
+from rosafe.genomix.tasks import run_shared
+from rosafe.genomix.tcpros import (
+    Connection,
+    ConnectionRejected,
+    ServiceClient,
+    TopicReader,
+    component_exception,
+    connect_service,
+)
 from rosafe.genomix.values import complete, partial
 from rosafe.interface import (
     COMPONENTS,
@@ -39,13 +46,13 @@ from rosafe.interface import (
 from rosafe.tree import building
 from rosafe.vocabulary import plugins
 from rosafe.vocabulary.signals import LEVELS
-from rosafe.vocabulary.words import meant
+from rosafe.vocabulary.words import did_you_mean
 
 CALL_SECONDS = 60.0  # for the answer to one request
 APPEAR_SECONDS = 2.0  # that `load` waits for a component that is just starting
 POLL_SECONDS = 0.1
 REGISTER_SECONDS = 20.0  # for becoming a client of an action, the first time for becoming a node too
-LATE_SECONDS = 0.5  # results that a component sent before it ended arrive within
+RESULT_GRACE_SECONDS = 0.5  # results that a component sent before it ended arrive within
 MAX_PENDING = 1000  # requests to one component that are not answered yet
 WHOLE_TREES = (REQUEST, FIND)  # which take parameters of any kind, and only those that are given
 _COMPOSITES = {
@@ -98,7 +105,7 @@ def _size(value: Any) -> int:
     return int(getattr(value, "nbytes", 32))
 
 
-class Proxy:
+class ComponentClient:
     """The component `instance` of the interface `component`. Several sessions may share one."""
 
     def __init__(self, graph: Graph, component: Component, instance: str) -> None:
@@ -114,13 +121,13 @@ class Proxy:
         self.used_at = self.answered_at = asyncio.get_running_loop().time()
 
     @classmethod
-    async def load(cls, graph: Graph, instance: str) -> Proxy:
+    async def load(cls, graph: Graph, instance: str) -> ComponentClient:
         """The proxy of a component that runs, or that appears within a moment, or ComponentError."""
         package = await _package(graph, instance)
         component = await asyncio.to_thread(installed_components.known, package)
         if package not in COMPONENTS:
             component = installed_components.with_ports(component, instance, await graph.published_by(instance))
-        with contextlib.suppress(Unknown, ComponentError):  # later, perhaps
+        with contextlib.suppress(NotRegisteredError, ComponentError):  # later, perhaps
             await graph.node_uri(instance)  # for its ports, should the master be away then
         return cls(graph, component, instance)
 
@@ -133,7 +140,7 @@ class Proxy:
         """Return if the component runs still and may be called `name`, else raise ComponentError."""
         if name not in (self.component.name, self.instance):
             raise cannot_load(f"/{self.instance} is a {self.component.name}, and no {name}")
-        with self._one_more():
+        with self._count_pending():
             await self._client("connect_port").check()
 
     async def is_reachable(self) -> bool:
@@ -150,7 +157,7 @@ class Proxy:
             self._link.cancel()
         for service in self._services.values():
             service.close()
-        for client in self._made_actions():
+        for client in self._action_clients():
             await client.close()
         for task in self._actions.values():
             task.cancel()  # those that are still being made
@@ -159,14 +166,14 @@ class Proxy:
 
     def service(self, name: str) -> Service:
         """The service or composite called `name` (aliases count), or ``::genom::no_such_service``."""
-        for composite in self.component.composites:
+        for composite in self.component.client_side_services:
             if composite.name == name:
                 return composite
         try:
             return self.component.service(name)
         except KeyError:
-            known = [s.name for s in (*self.component.services, *self.component.composites)]
-            hint = meant(name, [*known, *(port.name for port in self.component.ports)])  # a URL may mean either
+            known = [s.name for s in (*self.component.services, *self.component.client_side_services)]
+            hint = did_you_mean(name, [*known, *(port.name for port in self.component.ports)])  # a URL may mean either
             what = f"{self.component.name} has no service {name[:80]!r}; it has {', '.join(known)}"
             if self.component is ROSAFE:
                 what += f"; those of plugins depend on {plugins.FOLDERS}, also of genomixd: {plugins.where()}"
@@ -181,8 +188,8 @@ class Proxy:
         """What a function returns; an activity returns as soon as it runs, with its outputs if it has ended by then."""
         if service.activity and self.component.name not in COMPONENTS:  # ours have a plain service for each activity
             return await self._call_action(service, values)
-        with self._one_more():
-            if service in self.component.composites:
+        with self._count_pending():
+            if service in self.component.client_side_services:
                 own = service == LOAD_SETUP  # which gives way
                 async with contextlib.nullcontext() if own else self.turns.turn():
                     answer = await _COMPOSITES[service.name](self, values)
@@ -211,7 +218,7 @@ class Proxy:
 
     async def start(self, service: Service, values: Mapping[str, Any]) -> Goal:
         """Send an activity; its goal tells when it runs and when it has ended."""
-        with self._one_more():
+        with self._count_pending():
             if service.name in {KINDS[kind].request for kind in PLUGINS}:
                 await self._client(service.name).check()  # the node may be without the plugin, or have another version
             await self._watch()
@@ -222,7 +229,7 @@ class Proxy:
         """The values that a service returns."""
         return (await self.call(self.service(service), values)).values
 
-    async def hears(self, port: str) -> str:
+    async def port_connected(self, port: str) -> str:
         """The topic that an input port is connected to, as the master knows: it subscribes to something of that type.
 
         Empty where it is not connected.
@@ -238,16 +245,16 @@ class Proxy:
         return topic in await self._graph.topics()
 
     @contextlib.asynccontextmanager
-    async def other(self, instance: str) -> AsyncIterator[Proxy]:
+    async def other(self, instance: str) -> AsyncIterator[ComponentClient]:
         """Another component of the graph, for a moment; ComponentError where there is none of that name."""
-        proxy = await Proxy.load(self._graph, instance)
+        proxy = await ComponentClient.load(self._graph, instance)
         try:
             yield proxy
         finally:
             await proxy.close()
 
     @contextlib.contextmanager
-    def _one_more(self) -> Iterator[None]:
+    def _count_pending(self) -> Iterator[None]:
         if self.pending >= MAX_PENDING:
             raise ComponentError("::genomix::e_tooMany", what=f"{self.instance}: {MAX_PENDING} requests are waiting")
         self.pending += 1
@@ -265,7 +272,7 @@ class Proxy:
         task = self._actions.get(action)
         if task is None or (task.done() and (task.cancelled() or task.exception() is not None)):
             made = ActionClient.create(self._graph, self.component.name, self.instance, action)
-            task = self._actions[action] = shared(made)
+            task = self._actions[action] = run_shared(made)
         return task
 
     async def _action(self, action: str) -> ActionClient:
@@ -285,12 +292,12 @@ class Proxy:
             await connection.closed()
         finally:
             connection.close()
-        concerned = [goal for client in self._made_actions() for goal in client.goals() if goal.seen.is_set()]
-        await asyncio.sleep(LATE_SECONDS)
+        concerned = [goal for client in self._action_clients() for goal in client.goals() if goal.seen.is_set()]
+        await asyncio.sleep(RESULT_GRACE_SECONDS)
         for goal in concerned:
             goal.end(middleware_error(f"{self.instance} ended before its activity did"))
 
-    def _made_actions(self) -> list[ActionClient]:
+    def _action_clients(self) -> list[ActionClient]:
         tasks = self._actions.values()
         return [task.result() for task in tasks if task.done() and not task.cancelled() and task.exception() is None]
 
@@ -308,7 +315,7 @@ class Proxy:
 
         Raises ComponentError: ``::genom::no_such_outport`` where there is no such port or element.
         """
-        with self._one_more():
+        with self._count_pending():
             if not port.output:
                 raise _no_port(f"{port.name} is an input port; connect_port connects it")
             message = await self._read(port, element)
@@ -344,10 +351,10 @@ class Proxy:
             if not port.multiple:
                 return await reader.read(topic)  # an element is of no use, and scripts give one
             if rosgraph.names.is_legal_name(f"{topic}/{element}"):
-                with contextlib.suppress(Unknown):
+                with contextlib.suppress(NotRegisteredError):
                     return await reader.read(f"{topic}/{element}")
             return await reader.read(await self._other_element(topic, port, element))
-        except Unknown as problem:
+        except NotRegisteredError as problem:
             raise _no_port(f"{self.instance} does not give out {topic}: {problem}") from None
 
     # --- description ---
@@ -362,7 +369,7 @@ class Proxy:
             "doc": component.doc,
             "services": {
                 **{s.name: _describe_service(s, composite=False) for s in component.services},
-                **{s.name: _describe_service(s, composite=s in WHOLE_TREES) for s in component.composites},
+                **{s.name: _describe_service(s, composite=s in WHOLE_TREES) for s in component.client_side_services},
             },
             "ports": {
                 p.name: {
@@ -413,15 +420,15 @@ async def _package(graph: Graph, instance: str) -> str:
         try:
             # Where it was the last time, or where somebody says that it is.
             if graph.known_address(instance) is not None or await graph.serves(name):
-                connection = await reach(graph, instance, probe)
+                connection = await connect_service(graph, instance, probe)
                 connection.close()
                 return connection.header.get("type", "").split("/")[0]
             problem = _not_running(instance, name)
-        except Unknown:
+        except NotRegisteredError:
             problem = _not_running(instance, name)
         except ComponentError as no_master:
             problem = no_master
-        except (Refused, OSError) as failure:
+        except (ConnectionRejected, OSError) as failure:
             why = str(failure) or "no answer"
             problem = middleware_error(f"{instance} is not running, though the master lists it ({why})")
             pause *= 2  # a look is for all, a connection for one only

@@ -50,7 +50,7 @@ class Request:
         if self._goal is not None:
             self._goal.cancel()
 
-    def may_begin(self) -> None:
+    def raise_if_aborted(self) -> None:
         """Raise ``::genom::interrupted`` where the request was aborted before it was sent."""
         if self._aborted:
             raise ComponentError("::genom::interrupted", by="client")
@@ -70,7 +70,7 @@ class Request:
         self.acknowledged.set()
         self.finished.set()
 
-    def let_go(self) -> None:
+    def drop_output(self) -> None:
         """Forget an output that takes memory. An event that waits for its listener tells how large it was, then."""
         if self.output_size > KEPT_BYTES:
             self.value, self._told = NOTHING, False
@@ -78,7 +78,7 @@ class Request:
     def pieces(self, form: Syntax) -> Iterator[str]:
         """The status as text: id, status, warning if there is one, and output or exception once there is one."""
         yield form.open("struct")
-        told = self._told_now()
+        told = self._publish_status()
         yield "".join(form.key(index, name) + plain(form, value) for index, (name, value) in enumerate(told.items()))
         if self._has_output:
             yield form.key(len(told), "output")
@@ -88,14 +88,14 @@ class Request:
     def packed(self) -> Iterator[bytes]:
         """The status as `pieces` tells it, packed."""
         yield packed.STRUCTURE
-        for name, value in self._told_now().items():
+        for name, value in self._publish_status().items():
             yield packed.member(name) + packed.plain(value)
         if self._has_output:
             yield packed.member("output")
             yield from self.value.packed()
         yield packed.END
 
-    def _told_now(self) -> dict[str, Any]:
+    def _publish_status(self) -> dict[str, Any]:
         """The status but for its output."""
         told: dict[str, Any] = {"id": self.id, "status": self.status}
         if self.warning:

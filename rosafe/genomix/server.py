@@ -17,12 +17,12 @@ from aiohttp import web
 from rosafe.genomix import packed
 from rosafe.genomix.graph import middleware_error
 from rosafe.genomix.names import Names
-from rosafe.genomix.proxy import Proxy, Value
+from rosafe.genomix.proxy import ComponentClient, Value
 from rosafe.genomix.requests import Request
 from rosafe.genomix.sessions import Session, Sessions
 from rosafe.genomix.syntax import JSON, SYNTAXES, TCL, Syntax, plain
-from rosafe.genomix.tasks import first
-from rosafe.genomix.values import parse_input, refused
+from rosafe.genomix.tasks import wait_any
+from rosafe.genomix.values import bad_value, parse_input
 from rosafe.http_server.access import check_host, check_no_browser
 from rosafe.http_server.connections import Connections, Limits
 from rosafe.http_server.listener import HttpListener, connection_of
@@ -182,7 +182,7 @@ class Server:
     def _session(self, request: web.Request) -> Session:
         name = request.query.get("s", "")
         if name and not _SESSION_NAME.fullmatch(name):
-            raise refused("s: a session's name has up to 100 letters, digits and . : @ _ -")
+            raise bad_value("s: a session's name has up to 100 letters, digits and . : @ _ -")
         return self._sessions.get(name, connection_of(request).account.address)
 
     # --- sessions ---
@@ -192,7 +192,7 @@ class Server:
 
     async def _session_start(self, request: web.Request) -> web.Response:
         if not request.query.get("s"):
-            raise refused("s: the session needs a name")
+            raise bad_value("s: the session needs a name")
         return _text(self._session(request).name)
 
     async def _session_stop(self, request: web.Request) -> web.Response:
@@ -230,7 +230,7 @@ class Server:
     async def _load(self, request: web.Request) -> web.StreamResponse:
         name = request.query.get("as", "")
         if name and not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII):
-            raise refused("as: letters, digits and _ only, a letter first")
+            raise bad_value("as: letters, digits and _ only, a letter first")
         component, instance = request.match_info["component"], request.query.get("i", "")
         return _small(request, await self._in_time(self._session(request).load(component, instance, name)))
 
@@ -252,11 +252,11 @@ class Server:
 
     # --- requests ---
 
-    async def _component(self, request: web.Request) -> Proxy:
+    async def _component(self, request: web.Request) -> ComponentClient:
         name = request.match_info["name"]
         return await self._session(request).component(name, request.query.get("i", ""))
 
-    async def _target(self, request: web.Request) -> tuple[Session, Proxy, str, Any, str]:
+    async def _target(self, request: web.Request) -> tuple[Session, ComponentClient, str, Any, str]:
         session, path = self._session(request), request.match_info
         given = parse_input(request.query.get("input", request.query.get("argv", "")))
         proxy = await self._component(request)
@@ -317,7 +317,7 @@ class Server:
         known, seconds = self._known(request), _milliseconds(request) / 1000
         connection = connection_of(request)
         with self._connections.long_poll(connection):
-            await first(known.finished, connection.gone, timeout=seconds)
+            await wait_any(known.finished, connection.gone, timeout=seconds)
         return _status(request, known)
 
     async def _request_abort(self, request: web.Request) -> web.StreamResponse:
@@ -358,7 +358,7 @@ def _check_url(request: web.Request) -> None:
     try:
         unquote_to_bytes(request.raw_path.encode("utf-8", "surrogateescape")).decode()
     except UnicodeDecodeError:
-        raise refused("the URL is not UTF-8") from None
+        raise bad_value("the URL is not UTF-8") from None
 
 
 def _is_packed(request: web.Request) -> bool:
@@ -368,7 +368,7 @@ def _is_packed(request: web.Request) -> bool:
 def _syntax(request: web.Request) -> Syntax:
     name = request.query.get("syntax", "json")
     if name not in SYNTAXES:
-        raise refused(f"syntax: {name[:20]!r} is not one of {', '.join((*SYNTAXES, _PACKED))}")
+        raise bad_value(f"syntax: {name[:20]!r} is not one of {', '.join((*SYNTAXES, _PACKED))}")
     return SYNTAXES[name]
 
 
@@ -384,7 +384,7 @@ def _flag(request: web.Request, name: str) -> bool:
 def _milliseconds(request: web.Request) -> int:
     text = request.query.get("ms", str(MAX_WAIT_MS))
     if not re.fullmatch(r"[0-9]{1,9}", text):
-        raise refused(f"ms: {text[:20]!r} is not a number of milliseconds")
+        raise bad_value(f"ms: {text[:20]!r} is not a number of milliseconds")
     return min(int(text), MAX_WAIT_MS)
 
 

@@ -13,9 +13,9 @@ from typing import Any, TypeVar
 
 from rosafe.genomix.errors import too_many
 from rosafe.genomix.graph import Graph
-from rosafe.genomix.proxy import NOTHING, Proxy, Value, names
+from rosafe.genomix.proxy import NOTHING, ComponentClient, Value, names
 from rosafe.genomix.requests import Request
-from rosafe.genomix.tasks import first
+from rosafe.genomix.tasks import wait_any
 from rosafe.interface import ComponentError, Service
 
 MAX_SESSIONS = 1000
@@ -50,12 +50,12 @@ class Session:
         self.name = name
         self.owner = owner
         self.kept = 0
-        self.components: dict[str, Proxy] = {}
+        self.components: dict[str, ComponentClient] = {}
         self.requests: dict[str, Request] = {}
         self.listeners: list[asyncio.Queue[tuple[str, Any]]] = []
         self.busy = 0  # HTTP requests under way
         self.used_at = 0.0
-        self._loose = 0  # requests under way of which nobody wants to know any more
+        self._detached_running = 0  # requests under way of which nobody wants to know any more
         self._listened = False
         self._sessions = sessions
         self._turn = asyncio.Lock()
@@ -73,12 +73,12 @@ class Session:
         return not (self.busy or self.listeners)
 
     @property
-    def settled(self) -> bool:
+    def all_finished(self) -> bool:
         """Whether all its requests have ended."""
         return all(request.finished.is_set() for request in self.requests.values())
 
     @property
-    def over(self) -> bool:
+    def expired(self) -> bool:
         """Whether its client is gone, as far as one can tell.
 
         One that asks for the status now and then, and never listens, may be quiet as long as an activity runs.
@@ -86,7 +86,7 @@ class Session:
         linger = LINGER_SECONDS if self._listened else IDLE_SECONDS
         if not self.idle or asyncio.get_running_loop().time() <= self.used_at + linger:
             return False
-        return self._listened or self.settled
+        return self._listened or self.all_finished
 
     def listen(self) -> asyncio.Queue[tuple[str, Any]]:
         """A queue of all events from now on: (name, request or text)."""
@@ -141,7 +141,7 @@ class Session:
         self.tell("unload", {"component": name})
         await self._sessions.release()
 
-    async def component(self, name: str, instance: str) -> Proxy:
+    async def component(self, name: str, instance: str) -> ComponentClient:
         """The component loaded under `name`; `instance`, or the one of that name, is loaded if need be."""
         if name not in self.components:
             await self.load(instance or name, instance, name)
@@ -150,7 +150,7 @@ class Session:
 
     # --- requests ---
 
-    async def call(self, proxy: Proxy, name: str, given: Any, element: str) -> Value:
+    async def call(self, proxy: ComponentClient, name: str, given: Any, element: str) -> Value:
         """Make a request, or read a port, and wait for what it returns."""
         port = proxy.port(name)
         if port is not None:
@@ -160,7 +160,14 @@ class Session:
         return await self._in_turn(lambda _: proxy.call(service, values))
 
     def send(
-        self, component: str, proxy: Proxy, name: str, given: Any, element: str, keep: bool = True, size: int = 0
+        self,
+        component: str,
+        proxy: ComponentClient,
+        name: str,
+        given: Any,
+        element: str,
+        keep: bool = True,
+        size: int = 0,
     ) -> Request:
         """Make a request that the client follows by its id, unless it does not want to `keep` it.
 
@@ -194,11 +201,11 @@ class Session:
         self._finish(request, value, error)
 
     async def _serve(
-        self, request: Request, proxy: Proxy, service: Service, values: Mapping[str, Any], turn: _Turn
+        self, request: Request, proxy: ComponentClient, service: Service, values: Mapping[str, Any], turn: _SendOrder
     ) -> Value:
         if not service.activity:
             return await proxy.call(service, values)
-        request.may_begin()
+        request.raise_if_aborted()
         goal = await proxy.start(service, values)
         request.begun(goal)
         try:
@@ -208,18 +215,18 @@ class Session:
             turn.over()
             if not goal.ended.is_set() and request.id in self.requests:
                 self.tell("request", request)
-            await first(goal.ended, request.forgotten)
+            await wait_any(goal.ended, request.forgotten)
         finally:
             goal.forget()
         if goal.error is not None:
             raise goal.error
         return proxy.result(service, goal)
 
-    async def _in_turn(self, work: Callable[[_Turn], Awaitable[T]]) -> T:
-        turn = _Turn()
+    async def _in_turn(self, work: Callable[[_SendOrder], Awaitable[T]]) -> T:
+        turn = _SendOrder()
         if self.name:
             await self._turn.acquire()
-            turn = _Turn(self._turn)
+            turn = _SendOrder(self._turn)
         try:
             return await work(turn)
         finally:
@@ -239,25 +246,25 @@ class Session:
     # --- what requests occupy ---
 
     def _add(self, request: Request, keep: bool = True) -> None:
-        while len(self.requests) + self._loose >= MAX_REQUESTS:
+        while len(self.requests) + self._detached_running >= MAX_REQUESTS:
             if not self.drop_oldest():
                 raise too_many(f"a session has at most {MAX_REQUESTS} requests under way")
         self._sessions.make_room(request)
-        self._occupy(request.size)
+        self._count_bytes(request.size)
         if keep:
             self.requests[request.id] = request
         else:
-            self._loose += 1
+            self._detached_running += 1
             request.forgotten.set()
 
     def _finish(self, request: Request, value: Value, error: ComponentError | None) -> None:
         request.finish(value, error)
         if request.id not in self.requests:
-            self._loose -= 1
-            self._occupy(-request.size)
+            self._detached_running -= 1
+            self._count_bytes(-request.size)
             return
         request.size += value.size
-        self._occupy(value.size)
+        self._count_bytes(value.size)
         self.tell("request", request)
         self._sessions.make_room(request)
 
@@ -265,10 +272,10 @@ class Session:
         del self.requests[request.id]
         request.forgotten.set()
         if request.finished.is_set():
-            self._occupy(-request.size)
-            request.let_go()
+            self._count_bytes(-request.size)
+            request.drop_output()
         else:
-            self._loose += 1
+            self._detached_running += 1
 
     def drop_oldest(self, but: Request | None = None) -> bool:
         """Forget the oldest request that has ended, if there is one `but` the given one."""
@@ -277,12 +284,12 @@ class Session:
             self._forget(oldest)
         return oldest is not None
 
-    def _occupy(self, size: int) -> None:
+    def _count_bytes(self, size: int) -> None:
         self.kept += size
         self._sessions.kept += size
 
 
-class _Turn:
+class _SendOrder:
     """A session's right to send, given back once; after a while by itself."""
 
     def __init__(self, lock: asyncio.Lock | None = None) -> None:
@@ -305,9 +312,9 @@ class Sessions:
         self.numbers = itertools.count(1)
         self.kept = 0
         self._sessions: dict[str, Session] = {}
-        self._proxies: dict[str, Proxy] = {}
+        self._proxies: dict[str, ComponentClient] = {}
         self._tasks: set[asyncio.Task[Any]] = set()
-        self.keep(asyncio.create_task(self._sweep()))
+        self.keep(asyncio.create_task(self._expire_loop()))
         self.keep(asyncio.create_task(self._check_components()))
 
     def keep(self, task: asyncio.Task[Any]) -> None:
@@ -337,7 +344,7 @@ class Sessions:
         idle.sort(key=lambda session: session.used_at)
         if not idle:
             raise too_many(f"{counts[crowd]} sessions are open")
-        given_up = next((session for session in idle if session.settled), idle[0])
+        given_up = next((session for session in idle if session.all_finished), idle[0])
         del self._sessions[given_up.name]
         self.keep(asyncio.create_task(given_up.close()))
 
@@ -365,12 +372,12 @@ class Sessions:
 
     # --- components ---
 
-    async def proxy(self, component: str, instance: str) -> Proxy:
+    async def proxy(self, component: str, instance: str) -> ComponentClient:
         """The proxy of a component that runs; the one that is in use, if there is one for the instance."""
         name, instance = names(component, instance)
         proxy = self._proxies.get(instance)
         if proxy is None:
-            found = await Proxy.load(self.graph, instance)
+            found = await ComponentClient.load(self.graph, instance)
             proxy = self._proxies.setdefault(instance, found)
         await proxy.check(name)
         proxy.prepare()
@@ -411,10 +418,10 @@ class Sessions:
         await asyncio.gather(*self._tasks, return_exceptions=True)
         await asyncio.gather(*(proxy.close() for proxy in self._proxies.values()))
 
-    async def _sweep(self) -> None:
+    async def _expire_loop(self) -> None:
         while True:
             await asyncio.sleep(SWEEP_SECONDS)
             for name, session in list(self._sessions.items()):
-                if session.over:
+                if session.expired:
                     await self.stop(name)
             await self.release()

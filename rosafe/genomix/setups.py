@@ -9,11 +9,19 @@ from contextlib import AbstractAsyncContextManager
 from typing import Any, Protocol
 
 from rosafe.interface import BASS, KINDS, REQUEST, ROSAFE, ComponentError
-from rosafe.setups import Setup, SetupError, Sound, plan, read, rehearse, wanted, write
+from rosafe.setups import Setup, SetupError, Sound, dry_run, plan, read, wanted, write
 from rosafe.setups.plan import refused
 from rosafe.tree import requests as request
-from rosafe.tree.building import TRIES, Services, look, remove, take_step, uncancelled, wait_for_input
-from rosafe.tree.requests import Found
+from rosafe.tree.building import (
+    MAX_ATTEMPTS,
+    Services,
+    execute_step,
+    list_processors,
+    remove,
+    shield_until_done,
+    wait_for_input,
+)
+from rosafe.tree.requests import ExistingProcessor
 from rosafe.vocabulary.plugins import FOLDERS
 
 AUDIO = "Audio"
@@ -37,13 +45,13 @@ async def save(component: Component, values: Mapping[str, Any]) -> dict[str, Any
 
 async def capture(component: Component) -> Setup:
     """The setup that would make the tree, the connection and the acquisition that are there."""
-    topic = await component.hears(AUDIO)
+    topic = await component.port_connected(AUDIO)
     there = (await component.outputs("getProcessors", {}))["processors"]
     for processor in there:
         if processor["kind"] not in KINDS:
             unknown = f"{processor['name']!r} is of kind {processor['kind']}, which is not known here"
             raise refused(f"{unknown}: set {FOLDERS} as for the node")
-    processors = [wanted(found) for found in await look(component)]
+    processors = [wanted(found) for found in await list_processors(component)]
     sound = None
     if topic:
         async with _bass(component, topic) as bass:
@@ -77,19 +85,19 @@ async def apply(component: Component, setup: Setup, wait: float = 0.0) -> dict[s
     undoing: list[Undo] = []
     made: list[str] = []
     try:
-        found = await look(component)
+        found = await list_processors(component)
         request_plan = plan(setup, found)
-        now, topic = await component.hears(AUDIO), await _topic(component, setup)
+        now, topic = await component.port_connected(AUDIO), await _topic(component, setup)
         await _wait_for_topic(component, topic, wait)
         if found and now and topic != now:
             what = f"the tree hears {now}, in the setup {topic}: call Stop first"
             raise ROSAFE.error("e_existsAlready", what=what)
         sound = await _sound(component, setup, topic, found, undoing)
         if topic and topic != now and (setup.connections or request_plan.steps):
-            await uncancelled(_connect(component, topic, now, undoing))
+            await shield_until_done(_connect(component, topic, now, undoing))
         names = await _make(component, setup, made, patient=sound == "started")
     except BaseException:
-        await uncancelled(_undo(component, made, undoing))
+        await shield_until_done(_undo(component, made, undoing))
         raise
     reused = [name for name in names if name not in made]
     return {"created": [name for name in names if name in made], "reused": reused, "sound": sound}
@@ -107,7 +115,7 @@ async def _undo(component: Component, made: list[str], undoing: list[Undo]) -> N
 
 async def _topic(component: Component, setup: Setup) -> str:
     """What the Audio port is to hear; nothing where that is left open and nobody publishes the usual."""
-    topic = setup.connections.get(AUDIO, "") or await component.hears(AUDIO)
+    topic = setup.connections.get(AUDIO, "") or await component.port_connected(AUDIO)
     usual = f"/{REQUEST.parameter('connect').default}"
     return topic or (usual if setup.sound is not None or await component.published(usual) else "")
 
@@ -133,24 +141,26 @@ async def _bass(component: Component, topic: str) -> AsyncIterator[Services | No
         yield bass if bass is not None and getattr(bass, "component", BASS) is BASS else None
 
 
-async def _sound(component: Component, setup: Setup, topic: str, found: list[Found], undoing: list[Undo]) -> str:
+async def _sound(
+    component: Component, setup: Setup, topic: str, found: list[ExistingProcessor], undoing: list[Undo]
+) -> str:
     """Have the setup's sound acquired: "started" or "reused"; "" where it has none. All that can be checked is."""
     rate = next((p.rate for p in found if not p.parent), 0.0)
     if setup.sound is None:
         if rate:
-            await asyncio.to_thread(rehearse, setup, rate)
+            await asyncio.to_thread(dry_run, setup, rate)
         return ""
     values = setup.sound.values
     rate = rate or values["sampleRate"]
     if rate:
-        await asyncio.to_thread(rehearse, setup, rate)
+        await asyncio.to_thread(dry_run, setup, rate)
     async with _bass(component, topic) as bass:
         if bass is None:
             what = f"the setup has a sound, but no bass publishes {topic}: start it with: bass-ros"
             raise ComponentError("::genom::mwerr", what=what)
         now = await bass.outputs("getAcquisition", {})
         if not now["running"]:
-            await uncancelled(_acquire(component, bass, values, topic, undoing))
+            await shield_until_done(_acquire(component, bass, values, topic, undoing))
             return "started"
         for name, value in values.items():
             if now[name] != value:
@@ -188,11 +198,11 @@ async def _make(component: Component, setup: Setup, made: list[str], patient: bo
     problem = ComponentError("::genom::mwerr", what="others change the tree all the time")
     deadline = asyncio.get_running_loop().time() + (SOUND_SECONDS if patient else 0.0)
     tries = 0
-    while tries < TRIES:
-        now = plan(setup, await look(component))
+    while tries < MAX_ATTEMPTS:
+        now = plan(setup, await list_processors(component))
         try:
             for step in now.steps:
-                await uncancelled(take_step(component, step, made))
+                await shield_until_done(execute_step(component, step, made))
                 if await component.turns.give_way():
                     break  # the others may have changed the tree
         except ComponentError as error:

@@ -9,14 +9,14 @@ from typing import Any, TypeVar
 T = TypeVar("T")
 
 
-def shared(work: Coroutine[Any, Any, T]) -> asyncio.Task[T]:
+def run_shared(work: Coroutine[Any, Any, T]) -> asyncio.Task[T]:
     """A task for those who wait for it, shielded from one another; where nobody does, its error is of no interest."""
     task = asyncio.create_task(work)
     task.add_done_callback(lambda done: done.cancelled() or done.exception())
     return task
 
 
-async def first(*events: asyncio.Event, timeout: float | None = None) -> None:
+async def wait_any(*events: asyncio.Event, timeout: float | None = None) -> None:
     """Wait until one of the events is set, or for `timeout` seconds."""
     waits = [asyncio.create_task(event.wait()) for event in events]
     try:

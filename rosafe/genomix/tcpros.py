@@ -21,9 +21,9 @@ import rosgraph.network
 
 from rosafe.component import mark
 from rosafe.genomix import installed_components
-from rosafe.genomix.graph import Graph, Unknown, middleware_error
-from rosafe.genomix.tasks import shared
-from rosafe.genomix.values import refused
+from rosafe.genomix.graph import Graph, NotRegisteredError, middleware_error
+from rosafe.genomix.tasks import run_shared
+from rosafe.genomix.values import bad_value
 from rosafe.interface import KINDS, PLUGINS, ComponentError
 from rosafe.vocabulary import plugins
 
@@ -40,7 +40,7 @@ _LENGTH = struct.Struct("<I")
 _GARBAGE = (asyncio.IncompleteReadError, rosgraph.network.ROSHandshakeException, ValueError, struct.error)
 
 
-class Refused(Exception):
+class ConnectionRejected(Exception):
     """The other side answered the connection with an error; the text is its own."""
 
 
@@ -64,7 +64,7 @@ class Connection:
                 answer = await _read_frame(reader, MAX_TEXT)
                 fields = rosgraph.network.decode_ros_handshake_header(_LENGTH.pack(len(answer)) + answer)
                 if "error" in fields:
-                    raise Refused(fields["error"])
+                    raise ConnectionRejected(fields["error"])
             except BaseException:
                 writer.close()
                 raise
@@ -73,7 +73,7 @@ class Connection:
         try:
             return await asyncio.wait_for(attempt(), CONNECT_SECONDS)
         except _GARBAGE as problem:
-            raise Refused(f"no ROS node: {problem}") from None
+            raise ConnectionRejected(f"no ROS node: {problem}") from None
 
     @property
     def open_still(self) -> bool:
@@ -97,7 +97,7 @@ class Connection:
         good = await self._reader.readexactly(1) == b"\1"
         answer = await _read_frame(self._reader, limit if good else MAX_TEXT)
         if not good:
-            raise Refused(answer.decode("utf-8", "replace"))
+            raise ConnectionRejected(answer.decode("utf-8", "replace"))
         return answer
 
     async def message(self) -> bytearray | None:
@@ -126,7 +126,7 @@ async def _read_frame(reader: asyncio.StreamReader, limit: int) -> bytearray:
 async def _read_body(reader: asyncio.StreamReader, prefix: bytes, limit: int) -> bytearray:
     (length,) = _LENGTH.unpack(prefix)
     if length > limit:
-        raise Refused(f"a message of {length} bytes is more than genomixd takes")
+        raise ConnectionRejected(f"a message of {length} bytes is more than genomixd takes")
     frame = bytearray()  # it grows as bytes come: what is only claimed takes no memory
     while len(frame) < length:
         part = await reader.read(length - len(frame))
@@ -143,7 +143,7 @@ async def decode(message: Any, data: bytearray) -> Any:
     return await asyncio.to_thread(message.deserialize, data)
 
 
-async def reach(graph: Graph, instance: str, header: Mapping[str, str]) -> Connection:
+async def connect_service(graph: Graph, instance: str, header: Mapping[str, str]) -> Connection:
     """A connection to the service of `instance` that `header` names: where it was the last time, or the master says.
 
     Raises Unknown, Refused or OSError, and ComponentError where the master has to be asked and is not there.
@@ -153,13 +153,13 @@ async def reach(graph: Graph, instance: str, header: Mapping[str, str]) -> Conne
     if known is not None:
         try:
             return await Connection.open(known, header)
-        except (Refused, OSError) as problem:
+        except (ConnectionRejected, OSError) as problem:
             failure = problem
     address = await graph.service_address(header["service"])
     if failure is not None and address == known:
         raise failure
     connection = await Connection.open(address, header)
-    graph.reached(instance, address)
+    graph.note_reachable(instance, address)
     return connection
 
 
@@ -194,7 +194,7 @@ class ServiceClient:
     async def check(self) -> None:
         """Return if the component can be reached, else raise ComponentError."""
         async with self._slots:
-            self._keep(await self.connect())
+            self._return_to_pool(await self.connect())
 
     async def connect(self) -> Connection:
         """A connection to the service; ComponentError where the component cannot be reached."""
@@ -204,12 +204,12 @@ class ServiceClient:
                 return connection
             connection.close()
         try:
-            return await reach(self._graph, self._instance, self._header)
-        except Unknown:
+            return await connect_service(self._graph, self._instance, self._header)
+        except NotRegisteredError:
             if self._plugin and await self._graph.serves(f"/{self._instance}/connect_port"):
                 raise self._without_plugin() from None
             raise middleware_error(f"{self._instance} is not running: nobody serves {self.name}") from None
-        except Refused as problem:
+        except ConnectionRejected as problem:
             if self._plugin and "is not a provider of" in str(problem):
                 raise self._without_plugin() from None
             if "md5sums do not match" in str(problem):
@@ -232,7 +232,7 @@ class ServiceClient:
             f"{self._instance} was started without the plugin {self._plugin}; set {plugins.FOLDERS} and restart it"
         )
 
-    def _keep(self, connection: Connection) -> None:
+    def _return_to_pool(self, connection: Connection) -> None:
         """Take back a connection that is fit for another call."""
         if connection.open_still:
             self._idle.append(connection)
@@ -248,7 +248,7 @@ class ServiceClient:
         try:
             installed_components.fill(self._request_class(), values).serialize(buffer)
         except UnicodeEncodeError:  # bytes of a command line that are no UTF-8
-            raise refused(f"{self.name}: half a surrogate pair is no character") from None
+            raise bad_value(f"{self.name}: half a surrogate pair is no character") from None
         try:
             answer = await asyncio.wait_for(self._ask(buffer.getvalue()), timeout)
         except TimeoutError:
@@ -263,7 +263,7 @@ class ServiceClient:
             connection = await self.connect()
             try:
                 answer = await connection.request(request, self._limit)
-            except Refused as problem:
+            except ConnectionRejected as problem:
                 connection.close()
                 raise middleware_error(f"{self.name}: {problem}") from None
             except (asyncio.IncompleteReadError, OSError):
@@ -272,7 +272,7 @@ class ServiceClient:
             except BaseException:
                 connection.close()
                 raise
-            self._keep(connection)
+            self._return_to_pool(connection)
             return answer
 
     def close(self) -> None:
@@ -300,7 +300,7 @@ class TopicReader:
         Those who ask while connections are few get the same message, one that is fetched after they asked.
         """
         if topic not in self._reads:
-            self._reads[topic] = shared(self._read(topic))
+            self._reads[topic] = run_shared(self._read(topic))
         return await asyncio.shield(self._reads[topic])
 
     async def _read(self, topic: str) -> Any:
@@ -310,7 +310,7 @@ class TopicReader:
             address = await self._graph.topic_address(topic, self._instance)
             try:
                 return await self._fetch(address, topic)
-            except (Refused, genpy.DeserializationError) as problem:
+            except (ConnectionRejected, genpy.DeserializationError) as problem:
                 raise middleware_error(f"{topic}: {problem}") from None
             except (TimeoutError, OSError, asyncio.IncompleteReadError) as problem:
                 why = type(problem).__name__

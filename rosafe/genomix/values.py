@@ -15,7 +15,7 @@ from rosafe.interface import KINDS, REQUEST, REQUIRED, ComponentError, Parameter
 from rosafe.tree.requests import kind_of
 from rosafe.vocabulary.idl import element
 from rosafe.vocabulary.parameter import StructParameter
-from rosafe.vocabulary.words import meant
+from rosafe.vocabulary.words import did_you_mean
 
 _WORDS = {
     **dict.fromkeys(("1", "true", "yes", "on", "t"), True),
@@ -28,7 +28,7 @@ _STRUCTURES = {name for kind in KINDS.values() for name in (kind.kind, kind.word
 _NO_PARAMETERS = {"name", *(derived.name for kind in KINDS.values() for derived in kind.derived)}
 
 
-def refused(what: str) -> ComponentError:
+def bad_value(what: str) -> ComponentError:
     """The error of an argument that is not sent at all."""
     return ComponentError("::genom::serialization", what=what)
 
@@ -41,9 +41,9 @@ def parse_input(text: str) -> Any:
         value = json.loads(text)
         json.dumps(value, ensure_ascii=False).encode()
     except UnicodeEncodeError:
-        raise refused("input: half a surrogate pair is no character") from None
+        raise bad_value("input: half a surrogate pair is no character") from None
     except (ValueError, RecursionError) as problem:
-        raise refused(f"input is not JSON: {problem}") from None
+        raise bad_value(f"input is not JSON: {problem}") from None
     return value
 
 
@@ -86,34 +86,36 @@ def partial(given: Any) -> dict[str, Any]:
     ComponentError
         As `complete`.
     """
-    pairs = _after_representation(given) if isinstance(given, (list, tuple)) else _named(REQUEST, given)
-    unfolded = [pair for name, value in pairs for pair in _unfolded(name, value)]
+    pairs = _positional_after_kind(given) if isinstance(given, (list, tuple)) else _named(REQUEST, given)
+    unfolded = [pair for name, value in pairs for pair in _expand_structures(name, value)]
     values = _converted(REQUEST, [(name, value) for name, value in unfolded if value is not None])
     _require(REQUEST, values)
     try:
         kind_of(values["representation"])
     except ValueError as problem:
-        raise refused(f"{REQUEST.name}: {problem}") from None
+        raise bad_value(f"{REQUEST.name}: {problem}") from None
     return values
 
 
-def _after_representation(given: Sequence[Any]) -> list[tuple[str, Any]]:
+def _positional_after_kind(given: Sequence[Any]) -> list[tuple[str, Any]]:
     words = list(given)
     parameters = words.pop() if words and isinstance(words[-1], Mapping) else {}
     if len(words) == 2 and words[1] in (None, "", []):  # an empty matrix of MATLAB
         words.pop()
     if len(words) > 1:
         given_instead = str(words[1])[:80]
-        raise refused(f"{REQUEST.name}: after representation come the parameters in one object, not {given_instead!r}")
+        raise bad_value(
+            f"{REQUEST.name}: after representation come the parameters in one object, not {given_instead!r}"
+        )
     return [*(("representation", word) for word in words), *parameters.items()]
 
 
-def _unfolded(name: str, value: Any) -> list[tuple[str, Any]]:
+def _expand_structures(name: str, value: Any) -> list[tuple[str, Any]]:
     if name not in _STRUCTURES:
         return [(name, value)]
     structures = value if isinstance(value, list) else [value]
     if len(structures) > 1 or not all(isinstance(structure, Mapping) for structure in structures):
-        raise refused(f"{name}: wanted is an object with parameters, as an element of getParameters")
+        raise bad_value(f"{name}: wanted is an object with parameters, as an element of getParameters")
     return [pair for structure in structures for pair in structure.items() if pair[0] not in _NO_PARAMETERS]
 
 
@@ -122,7 +124,7 @@ def _converted(service: Service, pairs: list[tuple[str, Any]]) -> dict[str, Any]
     for name, value in pairs:
         parameter = _parameter(service, name)
         if parameter.name in values:
-            raise refused(f"{service.name}: {parameter.name} is given twice")
+            raise bad_value(f"{service.name}: {parameter.name} is given twice")
         values[parameter.name] = _convert(service, parameter, value)
     return values
 
@@ -130,7 +132,7 @@ def _converted(service: Service, pairs: list[tuple[str, Any]]) -> dict[str, Any]
 def _require(service: Service, values: Mapping[str, Any]) -> None:
     missing = next((p for p in service.parameters if p.default is REQUIRED and p.name not in values), None)
     if missing is not None:
-        raise refused(f"{service.name}: {missing.name} is missing; {missing.range_text or expected(service)}")
+        raise bad_value(f"{service.name}: {missing.name} is missing; {missing.range_text or expected(service)}")
 
 
 def expected(service: Service) -> str:
@@ -147,9 +149,9 @@ def _named(service: Service, given: Any) -> list[tuple[str, Any]]:
         return list(given.items())
     if isinstance(given, (list, tuple)):
         if len(given) > len(service.parameters):
-            raise refused(f"{len(given)} arguments are too many; {expected(service)}")
+            raise bad_value(f"{len(given)} arguments are too many; {expected(service)}")
         return [(p.name, value) for p, value in zip(service.parameters, given, strict=False)]
-    raise refused(f"input is neither an object nor an array; {expected(service)}")
+    raise bad_value(f"input is neither an object nor an array; {expected(service)}")
 
 
 def _parameter(service: Service, name: str) -> Parameter:
@@ -157,7 +159,7 @@ def _parameter(service: Service, name: str) -> Parameter:
         return service.parameter(name)
     except KeyError:
         known = [p.name for p in service.parameters]
-        raise refused(f"unknown parameter {name[:80]!r}; {expected(service)}{meant(name, known)}") from None
+        raise bad_value(f"unknown parameter {name[:80]!r}; {expected(service)}{did_you_mean(name, known)}") from None
 
 
 def _convert(service: Service, parameter: Parameter, value: Any) -> Any:
@@ -168,7 +170,7 @@ def _convert(service: Service, parameter: Parameter, value: Any) -> Any:
         return checks.check(_typed_value(parameter, value))
     except ValueError as problem:
         allowed = f"; {parameter.range_text}" if parameter.range_text else ""
-        raise refused(f"{service.name}: {problem} ({parameter.name} is a {parameter.idl}{allowed})") from None
+        raise bad_value(f"{service.name}: {problem} ({parameter.name} is a {parameter.idl}{allowed})") from None
 
 
 def _typed_value(parameter: Parameter, value: Any) -> Any:

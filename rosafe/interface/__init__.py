@@ -12,15 +12,15 @@ from collections.abc import Iterator
 from rosafe.representations import KINDS, PLUGINS, PROBLEMS
 from rosafe.vocabulary.errors import ComponentError
 from rosafe.vocabulary.idl import ros_type
-from rosafe.vocabulary.parameter import MAX_SEQUENCE, MAX_STRING, REQUIRED, Parameter, text_of
+from rosafe.vocabulary.parameter import MAX_SEQUENCE, MAX_STRING, REQUIRED, Parameter, format_value
 from rosafe.vocabulary.representation import Representation
 
 from .bass import BASS
 from .genom import COMMON_SERVICES, GENOM_EXCEPTIONS, GENOM_STATE_PORT, MAX_ACTIVITIES
 from .rosafe import (
     BLOCK_AND_BUFFERS,
+    CORE_REPRESENTATIONS,
     FIND,
-    FIXED,
     LAYOUTS,
     LOAD_SETUP,
     MAX_BLOCK,
@@ -47,8 +47,8 @@ __all__ = [
     "BLOCK_AND_BUFFERS",
     "COMMON_SERVICES",
     "COMPONENTS",
+    "CORE_REPRESENTATIONS",
     "FIND",
-    "FIXED",
     "GENOM_EXCEPTIONS",
     "GENOM_STATE_PORT",
     "KINDS",
@@ -73,6 +73,6 @@ __all__ = [
     "Representation",
     "Service",
     "all_services",
+    "format_value",
     "ros_type",
-    "text_of",
 ]

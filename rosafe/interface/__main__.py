@@ -6,7 +6,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from rosafe.representations.registry import own
+from rosafe.representations.registry import builtin_stages
 
 from . import BASS, files, reference
 from .rosafe import derive
@@ -23,7 +23,7 @@ def main(argv: list[str] | None = None) -> int:
     )
     parser.add_argument("--check", action="store_true", help="write nothing, only name what is stale")
     options = parser.parse_args(argv)
-    kinds = {kind: stage.REPRESENTATION for kind, stage in own().items()}  # no plugins of whoever runs this
+    kinds = {kind: stage.REPRESENTATION for kind, stage in builtin_stages().items()}  # no plugins of whoever runs this
     components = (derive(kinds), BASS)
     wanted = files.all_files(ROOT, components)
     wanted[ROOT / "docs" / "parameters.md"] = reference.markdown(components, kinds)

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from rosafe.interface import FIXED, KINDS, Parameter
-from rosafe.vocabulary.parameter import shown
-from rosafe.vocabulary.words import meant
+from rosafe.interface import CORE_REPRESENTATIONS, KINDS, Parameter
+from rosafe.vocabulary.parameter import short_repr
+from rosafe.vocabulary.words import did_you_mean
 
 _BY_NAME = {name: p for kind in KINDS.values() for p in kind.parameters for name in (p.name, *p.aliases)}
 _BY_FORMER_NAME = {name: p for kind in KINDS.values() for p in kind.parameters for name in p.former}
@@ -42,23 +42,23 @@ def check_change(name: Any, value: Any) -> tuple[str, Any]:
 def _parameter(name: Any) -> Parameter:
     if not isinstance(name, str) or name not in _BY_NAME:
         known = list(dict.fromkeys(p.name for kind in KINDS.values() for p in kind.parameters))
-        raise ValueError(f"unknown parameter {shown(name)}; {_suggestion(name, known)}")
+        raise ValueError(f"unknown parameter {short_repr(name)}; {_suggestion(name, known)}")
     return _BY_NAME[name]
 
 
 def _suggestion(name: Any, known: Sequence[str]) -> str:
     """What may have been meant, or all that there is."""
-    hint = meant(name, known) if isinstance(name, str) else ""
+    hint = did_you_mean(name, known) if isinstance(name, str) else ""
     return hint.removeprefix("; ") or f"there are: {', '.join(known)}"
 
 
 def check_outputs(outputs: Any) -> list[str]:
     """The outputs to keep, each once, parents first (None: those of the original), or ValueError."""
     try:
-        wanted = [outputs] if isinstance(outputs, str) else list(FIXED if outputs is None else outputs)
+        wanted = [outputs] if isinstance(outputs, str) else list(CORE_REPRESENTATIONS if outputs is None else outputs)
     except TypeError:
         raise ValueError(f"outputs: {outputs!r} is not a sequence of names") from None
     for name in wanted:
         if not isinstance(name, str) or name not in KINDS:
-            raise ValueError(f"unknown output {shown(name)}; {_suggestion(name, list(KINDS))}")
+            raise ValueError(f"unknown output {short_repr(name)}; {_suggestion(name, list(KINDS))}")
     return [kind for kind in KINDS if kind in wanted]

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 from rosafe.representations import KINDS
-from rosafe.representations.registry import ORIGINAL
+from rosafe.representations.registry import CORE_KINDS
 from rosafe.vocabulary.idl import TIME
 from rosafe.vocabulary.parameter import REQUIRED, Parameter
 from rosafe.vocabulary.representation import Representation
@@ -24,7 +24,9 @@ MAX_PARAMETERS = 2**18  # characters of the parameters of a request for a whole 
 Kinds = Mapping[str, Representation]  # parents first
 
 LAYOUTS = {kind: layout(representation) for kind, representation in KINDS.items()}
-FIXED = {kind: KINDS[kind] for kind in ORIGINAL if kind in KINDS}  # what getParameters and getSignals report
+CORE_REPRESENTATIONS = {
+    kind: KINDS[kind] for kind in CORE_KINDS if kind in KINDS
+}  # what getParameters and getSignals report
 
 # --- types ------------------------------------------------------------------------------------------------------
 
@@ -40,14 +42,16 @@ def _structs(kinds: Kinds) -> dict[str, Struct]:
     structs = dict(SIGNALS)
     for kind in kinds:
         structs[LAYOUTS[kind].idl] = LAYOUTS[kind].members
-    for kind, representation in FIXED.items():
+    for kind, representation in CORE_REPRESENTATIONS.items():
         structs[parameter_struct(kind)] = (
             ("name", "string"),
             *((p.name, p.idl) for p in representation.parameters),
             *((d.name, d.idl) for d in representation.derived),
         )
-    structs["::rosAFE::parameters"] = tuple((kind, f"sequence<{parameter_struct(kind)}>") for kind in FIXED)
-    structs["::rosAFE::dataObjSt"] = tuple((kind, f"sequence<{LAYOUTS[kind].idl}>") for kind in FIXED)
+    structs["::rosAFE::parameters"] = tuple(
+        (kind, f"sequence<{parameter_struct(kind)}>") for kind in CORE_REPRESENTATIONS
+    )
+    structs["::rosAFE::dataObjSt"] = tuple((kind, f"sequence<{LAYOUTS[kind].idl}>") for kind in CORE_REPRESENTATIONS)
     structs["::rosAFE::frameTime"] = (("stamp", TIME), ("frameIndex", "unsigned long long"), ("sampleRate", "double"))
     structs["::rosAFE::parameterValue"] = (("name", "string"), ("value", "string"))
     structs["::rosAFE::processor"] = (
@@ -102,7 +106,7 @@ _PROCESSOR_THROWS = (
 )
 
 
-def _adding(representation: Representation, kinds: Kinds) -> Service:
+def _creation_service(representation: Representation, kinds: Kinds) -> Service:
     """The request that adds a processor."""
     name = Parameter("name", "string", representation.name, representation.name_doc)
     parent = representation.parent
@@ -178,7 +182,7 @@ def _whole_trees(kinds: Kinds) -> tuple[Service, ...]:
     return build, find, save, load
 
 
-def _plain(composites: tuple[Service, ...]) -> tuple[Service, ...]:
+def _ros_service(composites: tuple[Service, ...]) -> tuple[Service, ...]:
     """The request for a whole tree, as a service of ROS."""
     build = composites[0]
     parameters = (
@@ -262,7 +266,7 @@ _FUNCTIONS = (
 
 def derive(kinds: Kinds) -> Component:
     """The component whose processors are of these kinds."""
-    adding = tuple(_adding(kind, kinds) for kind in kinds.values())
+    adding = tuple(_creation_service(kind, kinds) for kind in kinds.values())
     composites = _whole_trees(kinds)
     stop = Service(
         "Stop",
@@ -300,10 +304,10 @@ def derive(kinds: Kinds) -> Component:
             "e_badNewValue": "a value of the wrong type or out of its range",
         },
         structs={**_structs(kinds), **BINAUDIO, **GENOM_STATE},
-        composites=composites,
-        plain=_plain(composites),
+        client_side_services=composites,
+        ros_services=_ros_service(composites),
     )
 
 
 ROSAFE = derive(KINDS)
-REQUEST, FIND, SAVE_SETUP, LOAD_SETUP = ROSAFE.composites
+REQUEST, FIND, SAVE_SETUP, LOAD_SETUP = ROSAFE.client_side_services

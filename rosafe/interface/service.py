@@ -67,7 +67,7 @@ class Service:
 
     def check(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """All values as their parameters' Python types, or ValueError naming the first that is refused."""
-        return {p.name: p.check(p.known_word(values[p.name])) for p in self.parameters if p.name in values}
+        return {p.name: p.check(p.resolve_choice(values[p.name])) for p in self.parameters if p.name in values}
 
 
 @dataclass(frozen=True)
@@ -94,15 +94,15 @@ class Component:
     exceptions: Mapping[str, str]  # short name -> meaning
     structs: Mapping[str, Struct]  # by IDL name
     # What genomixd makes of several services, for its clients to call like one.
-    composites: tuple[Service, ...] = ()
+    client_side_services: tuple[Service, ...] = ()
     # Composites that the component carries out itself, under the same names, for ROS' own tools: these fill in every
     # field of a request, hence one text stands for all parameters. genomixd's clients do not see these.
-    plain: tuple[Service, ...] = ()
+    ros_services: tuple[Service, ...] = ()
 
     @property
     def on_graph(self) -> tuple[Service, ...]:
         """All that are services of ROS."""
-        return (*self.services, *self.plain)
+        return (*self.services, *self.ros_services)
 
     def members(self, idl: str) -> Struct:
         """The members of a struct, or of ROS' own time, of which no file is made."""

@@ -24,7 +24,7 @@ HEADERS = {
 }
 
 
-class Door:
+class TokenAuth:
     """Who may use the live page: requests under a name of this machine, not of other pages; the socket needs the token.
 
     The files of the page contain no secret. Cookies are not used: browsers send them to every port of a host.

@@ -14,16 +14,16 @@ from typing import Any, NamedTuple
 
 from aiohttp import WSCloseCode, WSMsgType, web
 
-from rosafe.genomix.tasks import shared
+from rosafe.genomix.tasks import run_shared
 from rosafe.http_server.listener import connection_of
 from rosafe.interface import MAX_SETUP, ComponentError
 from rosafe.live.hub import FLOAT, Hub, Key, View
-from rosafe.live.robot import told
+from rosafe.live.robot import format_error
 
 PERIOD = 0.04  # s between two pictures, at least: 25 a second
 BYTES_PER_SECOND = 200_000
 MAX_PICTURE = 40_000  # bytes of one message
-FULL = 0.8  # of the bytes per second are for columns that go on; beyond, columns are left out
+BUFFER_LIMIT = 0.8  # of the bytes per second are for columns that go on; beyond, columns are left out
 MAX_VIEWS = 16
 MAX_PENDING = 4  # requests
 MAX_MESSAGE = 4 * MAX_SETUP  # bytes of a request, such as to load a setup
@@ -46,7 +46,7 @@ log = logging.getLogger("rosout.rosafe_live")  # stderr and /rosout, as rospy.lo
 Ask = Callable[[Mapping[str, Any]], Awaitable[dict[str, Any]]]
 
 
-class _Looking(NamedTuple):
+class _SubscribedView(NamedTuple):
     """A view that the page looks at, and its next column there."""
 
     view: View
@@ -60,7 +60,7 @@ class _Socket(web.WebSocketResponse):
         return await super().close(code=code, message=message or REASONS.get(code, b""))
 
 
-class Client:
+class BrowserConnection:
     """One WebSocket.
 
     Parameters
@@ -73,13 +73,13 @@ class Client:
     """
 
     def __init__(self, hub: Hub, asks: Mapping[str, Ask], changed: Callable[[], None]) -> None:
-        self._hub, self._asks, self._changed = hub, asks, changed
+        self._hub, self._pending_requests, self._changed = hub, asks, changed
         self._socket = _Socket(max_msg_size=MAX_MESSAGE, compress=False, heartbeat=HEARTBEAT_SECONDS, timeout=2.0)
         self._wake = asyncio.Event()
         self._newest: dict[str, str] = {}  # messages of which only the last one counts
         self._answers: deque[str] = deque()  # to requests, of which there are few
         self._pending: set[asyncio.Task[None]] = set()
-        self._looking: dict[Key, _Looking] = {}
+        self._looking: dict[Key, _SubscribedView] = {}
         self._problems: dict[Key, str] = {}
         self._cursors: dict[Key, int] = {}
         self._wanted: list[Key] = []
@@ -107,7 +107,7 @@ class Client:
         finally:
             sender.cancel()
             # After what it has asked for last, which goes on: what that looks at has to be let go, too.
-            gone = shared(self._look_at([], anew=False))
+            gone = run_shared(self._subscribe([], anew=False))
             await asyncio.gather(sender, *filter(None, [self._failure]), return_exceptions=True)
             await gone
         return self._socket
@@ -170,15 +170,15 @@ class Client:
     async def _do(self, number: int, what: str, arguments: Mapping[str, Any]) -> None:
         try:
             if what == "look":
-                await self._look_at(_keys(arguments), anew=bool(arguments.get("anew")))
+                await self._subscribe(_keys(arguments), anew=bool(arguments.get("anew")))
                 self._answer(number, {"ok": {}})
                 return
-            ask = self._asks.get(what)
+            ask = self._pending_requests.get(what)
             if ask is None:
                 raise ValueError(f"there is no request {what[:40]!r}")
             self._answer(number, {"ok": await ask(arguments)})
         except ComponentError as problem:
-            self._answer(number, {"error": told(problem)})
+            self._answer(number, {"error": format_error(problem)})
         except (ValueError, TypeError) as problem:
             self._answer(number, {"error": str(problem)[:500]})
         if what != "look":
@@ -192,13 +192,13 @@ class Client:
 
     # --- what it looks at ---
 
-    async def _look_at(self, keys: list[Key], anew: bool) -> None:
+    async def _subscribe(self, keys: list[Key], anew: bool) -> None:
         """Look at these and nothing else; `anew` sends the last seconds again."""
         async with self._turn:
             self._wanted = keys
             for key in [key for key in self._looking if key not in keys]:
                 view = self._looking.pop(key).view
-                await asyncio.to_thread(self._hub.leave, key, view)
+                await asyncio.to_thread(self._hub.unsubscribe, key, view)
             for key in keys:
                 if key not in self._looking:
                     await self._begin(key)
@@ -210,15 +210,15 @@ class Client:
 
     async def _begin(self, key: Key) -> None:
         try:
-            self._looking[key] = _Looking(*await asyncio.to_thread(self._hub.look, key))
+            self._looking[key] = _SubscribedView(*await asyncio.to_thread(self._hub.subscribe, key))
             self._cursors[key] = 0
             self._problems.pop(key, None)
         except ComponentError as problem:
-            self._problems[key] = told(problem)
+            self._problems[key] = format_error(problem)
         except ValueError as problem:
             self._problems[key] = str(problem)
 
-    async def look_again(self, changed: set[Key]) -> None:
+    async def on_tree_changed(self, changed: set[Key]) -> None:
         """The tree has changed: these views are gone, and what was not there may be there now."""
         async with self._failing("an update of the tree"), self._turn:
             for key in self._wanted:
@@ -292,7 +292,7 @@ class Client:
         """A message of new columns of all that it looks at; empty where there are none."""
         views = [looking.view for looking in self._looking.values()]
         wanted = sum(view.size * view.rate * (4 if view.form == FLOAT else 1) for view in views)
-        stride = max(1, -int(-wanted // (FULL * BYTES_PER_SECOND)))
+        stride = max(1, -int(-wanted // (BUFFER_LIMIT * BYTES_PER_SECOND)))
         pieces: list[bytes] = []
         room = MAX_PICTURE
         for key, looking in sorted(self._looking.items(), key=self._progress):
@@ -310,7 +310,7 @@ class Client:
                 break
         return HEAD.pack(FORMAT, len(pieces), 0) + b"".join(pieces) if pieces else b""
 
-    def _progress(self, item: tuple[Key, _Looking]) -> float:
+    def _progress(self, item: tuple[Key, _SubscribedView]) -> float:
         """Who is furthest behind comes first."""
         key, looking = item
         return (self._cursors.get(key, 0) - looking.view.next) / looking.view.rate

@@ -18,10 +18,10 @@ from pathlib import Path
 from rosafe.component import startup
 from rosafe.genomix.graph import Graph
 from rosafe.http_server.access import own_names
-from rosafe.live.access import Door
+from rosafe.live.access import TokenAuth
 from rosafe.live.health import Health
 from rosafe.live.hub import Hub
-from rosafe.live.robot import Robot
+from rosafe.live.robot import ComponentFacade
 from rosafe.live.server import Server
 
 THREADS = 8  # that wait for rospy
@@ -41,7 +41,7 @@ class Options:
     images: bool = False
 
 
-class Taken(Exception):
+class AddressInUse(Exception):
     """The server cannot listen; the text is one line that says why and what to do."""
 
 
@@ -54,7 +54,7 @@ async def serve(options: Options) -> None:
     signal.signal(signal.SIGPIPE, signal.SIG_IGN)
     loop.set_default_executor(ThreadPoolExecutor(THREADS, "rospy"))
     graph = Graph(os.environ["ROS_MASTER_URI"], "rosafe_live", server=True)
-    robot = Robot(graph, options.instance, options.bass)
+    robot = ComponentFacade(graph, options.instance, options.bass)
     server: Server | None = None
     opened: Path | None = None
     publishing: asyncio.Task[None] | None = None
@@ -65,13 +65,13 @@ async def serve(options: Options) -> None:
                 loop.call_soon_threadsafe(news)
 
         hub = Hub(robot.audio_topic, tell_news)
-        door = Door(own_names() | {options.host})
+        door = TokenAuth(own_names() | {options.host})
         asks = {
             "devices": robot.devices,
             "acquire": robot.acquire,
-            "silence": robot.silence,
+            "silence": robot.stop_capture,
             "build": robot.build,
-            "usual": robot.build_usual,
+            "usual": robot.build_default_tree,
             "modify": robot.modify,
             "remove": robot.remove,
             "save": robot.save_setup,
@@ -82,7 +82,7 @@ async def serve(options: Options) -> None:
         try:
             port = await server.start(options.host, options.port)
         except (OSError, UnicodeError) as problem:
-            raise Taken(_why(problem, options)) from None
+            raise AddressInUse(_why(problem, options)) from None
         await graph.become_node()  # not before: another page of this name ends then
         shown = EVERYWHERE.get(options.host, f"[{options.host}]" if ":" in options.host else options.host)
         url = f"http://{shown}:{port}/?token={door.token}"

@@ -8,7 +8,7 @@ import time
 from collections import deque
 from typing import Any
 
-FRESH_SECONDS = 3.5  # since a node told of itself last; it does so every second
+STALE_AFTER_SECONDS = 3.5  # since a node told of itself last; it does so every second
 MAX_LOSSES = 50
 MAX_DIGITS = 15  # of a counter: the page has no longer whole numbers
 MAX_LOADS = 10_000  # processors
@@ -95,7 +95,7 @@ class Health:
         """What the page shows."""
         now = time.monotonic()
         with self._lock:
-            fresh = {name for name, at in self._told.items() if now - at < FRESH_SECONDS}
+            fresh = {name for name, at in self._told.items() if now - at < STALE_AFTER_SECONDS}
             capture = self._values.get(f"{self._bass}: capture", {})
             audio = self._values.get(f"{self._rosafe}: audio", {})
             tree = self._values.get(f"{self._rosafe}: processors", {})

@@ -12,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from rosafe.bass.recording.levels import Levels
+from rosafe.bass.recording.levels import LevelMeter
 from rosafe.genomix.errors import too_many
 from rosafe.interface import KINDS
-from rosafe.live.pictures import COLUMNS, Picture, Processor, Tree, quantised
+from rosafe.live.pictures import COLUMNS, PlotLayout, Processor, Tree, quantize
 from rosafe.live.ports import Audio, Port
 from rosafe.view.estimates import AZIMUTHS, lag_of_azimuth
 
@@ -102,7 +102,7 @@ class View:
                 columns = self._ring[:, self._places(first, first + count * stride, stride)]
                 low = high = 0.0
                 if self.form == QUANTISED:
-                    low, high, data = quantised(columns)
+                    low, high, data = quantize(columns)
                 else:
                     data = np.ascontiguousarray(columns.T, "<f4").tobytes()
                 if first + count * stride > MAX_COLUMN:
@@ -112,12 +112,12 @@ class View:
             return first + count * stride, self._told[1]
 
 
-class _Watched:
+class _SharedSubscription:
     """A port and the pictures that are made of it."""
 
     def __init__(self, port: Port) -> None:
         self.port = port
-        self.takers: dict[Key, Callable[[Port, Any], None]] = {}
+        self.callbacks: dict[Key, Callable[[Port, Any], None]] = {}
 
 
 class Hub:
@@ -140,7 +140,7 @@ class Hub:
         self._news = news
         self._views: dict[Key, View] = {}
         self._told: dict[Key, dict[str, Any]] = {}
-        self._watched: dict[str, _Watched] = {}
+        self._watched: dict[str, _SharedSubscription] = {}
         self._needs: dict[Key, list[str]] = {}  # topics
         self._lock = threading.RLock()
         self._closed = False
@@ -155,7 +155,7 @@ class Hub:
 
     # --- who looks at what ---
 
-    def look(self, key: Key) -> tuple[View, dict[str, Any]]:
+    def subscribe(self, key: Key) -> tuple[View, dict[str, Any]]:
         """The view for `key` and its description, one user more; ValueError where there is no such thing."""
         with self._lock:
             if key not in self._views:
@@ -167,7 +167,7 @@ class Hub:
             self._views[key].users += 1
             return self._views[key], self._told[key]
 
-    def leave(self, key: Key, left: View) -> None:
+    def unsubscribe(self, key: Key, left: View) -> None:
         """One user of a view less; a port that nobody looks at any more is not subscribed."""
         with self._lock:
             view = self._views.get(key)
@@ -189,8 +189,8 @@ class Hub:
             self.audio = None
         for topic in self._needs.pop(key, ()):
             watched = self._watched[topic]
-            watched.takers.pop(key, None)
-            if not watched.takers:
+            watched.callbacks.pop(key, None)
+            if not watched.callbacks:
                 watched.port.close()
                 del self._watched[topic]
                 self.latencies.pop(topic, None)
@@ -211,10 +211,10 @@ class Hub:
         if key.what == "direction":
             self._begin_direction(key, processor)
         else:
-            picture = Picture(self.tree, processor, key.part, key.row)
+            picture = PlotLayout(self.tree, processor, key.part, key.row)
             view = View(picture.size, picture.rate, QUANTISED if picture.mode == "heat" else FLOAT)
             self._views[key], self._told[key] = view, picture.describe()
-            self._watch(key, processor, _Drawer(picture, view, self._news))
+            self._watch(key, processor, _PlotWriter(picture, view, self._news))
 
     def _begin_direction(self, key: Key, processor: Processor) -> None:
         if processor.kind != "crossCorrelation":
@@ -222,7 +222,9 @@ class Hub:
         itd, ic = (self.tree.child(processor.name, kind) for kind in ("itd", "ic"))
         source = itd or processor
         view = View(1, source.rate, FLOAT)
-        track = _Track(view, self._lags(processor), weighted=itd is not None and ic is not None, news=self._news)
+        track = _DirectionTracker(
+            view, self._lags(processor), weighted=itd is not None and ic is not None, news=self._news
+        )
         frequencies = self.tree.coordinates(processor, "channel", processor.shape[0]) or []
         azimuths = AZIMUTHS[::15]
         self._views[key] = view
@@ -246,9 +248,9 @@ class Hub:
     def _watch(self, key: Key, processor: Processor, take: Callable[[Port, Any], None]) -> None:
         topic = processor.topic
         if topic not in self._watched:
-            port = Port(processor, processor.rows(), self.tree.sample_rate, self._dispatch)
-            self._watched[topic] = _Watched(port)
-        self._watched[topic].takers[key] = take
+            port = Port(processor, processor.output_shape(), self.tree.sample_rate, self._dispatch)
+            self._watched[topic] = _SharedSubscription(port)
+        self._watched[topic].callbacks[key] = take
         self._needs.setdefault(key, []).append(topic)
 
     def _dispatch(self, port: Port, message: Any) -> None:
@@ -256,7 +258,7 @@ class Hub:
             watched, audio = self._watched.get(port.topic), self.audio
             if watched is None or watched.port is not port:
                 return
-            takers = list(watched.takers.values())
+            takers = list(watched.callbacks.values())
         captured = audio.captured_at(port.index) if audio is not None else None
         if captured is not None:
             self.latencies[port.topic] = time.time() - captured
@@ -265,19 +267,19 @@ class Hub:
 
     # --- changes of the tree ---
 
-    def replant(self, tree: Tree) -> set[Key]:
+    def on_tree_changed(self, tree: Tree) -> set[Key]:
         """Go over to what the tree has become; the keys whose views are others now, or gone."""
         with self._lock:
             before, self.tree = self.tree, tree
             changed = set()
             for key in list(self._views):
-                if key.what != "levels" and self._concerned(key, before) != self._concerned(key, tree):
+                if key.what != "levels" and self._affected_views(key, before) != self._affected_views(key, tree):
                     changed.add(key)
                     del self._views[key], self._told[key]
                     self._let_go(key)
             return changed
 
-    def _concerned(self, key: Key, tree: Tree) -> list[Any]:
+    def _affected_views(self, key: Key, tree: Tree) -> list[Any]:
         """All that a view of `key` depends on."""
         one = tree.processors.get(key.name)
         told: list[Any] = [tree.sample_rate]
@@ -301,10 +303,10 @@ class Hub:
         return sum(watched.port.lost for watched in list(self._watched.values()))
 
 
-class _Drawer:
+class _PlotWriter:
     """Makes a picture's columns of a port's messages."""
 
-    def __init__(self, picture: Picture, view: View, news: Callable[[], None]) -> None:
+    def __init__(self, picture: PlotLayout, view: View, news: Callable[[], None]) -> None:
         self._picture, self._view, self._news = picture, view, news
 
     def __call__(self, port: Port, message: Any) -> None:
@@ -333,7 +335,7 @@ class _Meter:
         self._view, self._news = view, news
 
     def __call__(self, samples: np.ndarray, lost: int, end: float) -> None:
-        levels = Levels()
+        levels = LevelMeter()
         levels.add(samples)
         column = [
             number for ear in range(2) for number in (levels.peak(ear), levels.rms(ear), float(levels.clipped[ear]))
@@ -343,7 +345,7 @@ class _Meter:
         self._news()
 
 
-class _Track:
+class _DirectionTracker:
     """The lag of the source in each frame: the mean of the channels' ITDs, weighted by their coherence.
 
     Without ITDs, the place of the cross-correlation's peak.

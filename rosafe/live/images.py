@@ -53,7 +53,7 @@ class Images:
     async def close(self) -> None:
         """The server ends."""
 
-    async def look_again(self, changed: set[Key]) -> None:
+    async def on_tree_changed(self, changed: set[Key]) -> None:
         """The tree has changed."""
         await asyncio.to_thread(self._look)
 
@@ -67,12 +67,12 @@ class Images:
                 del self._views[kind]
             wanted = publisher.get_num_connections() > 0
             if not wanted and kind in self._views:
-                self._hub.leave(*self._views.pop(kind)[:2])
+                self._hub.unsubscribe(*self._views.pop(kind)[:2])
             elif wanted and kind not in self._views:
                 first = next((p.name for p in self._hub.tree.processors.values() if p.kind == kind), None)
                 if first is not None:
                     key = Key("picture", first)
-                    self._views[kind] = (key, *self._hub.look(key))
+                    self._views[kind] = (key, *self._hub.subscribe(key))
 
     # --- images ---
 

@@ -58,7 +58,7 @@ class Processor:
         known = dict(zip([axis for axis in largest.axes if axis != "time"], self.shape, strict=False))
         return {axis: known.get(axis, 1) for axis in parts[part].axes if axis not in ("ear", "time")}
 
-    def rows(self) -> dict[str, tuple[int, ...]]:
+    def output_shape(self) -> dict[str, tuple[int, ...]]:
         """Return the shape of one frame of each field of its messages: of two axes, the second one is outermost."""
         places = [place for place in LAYOUTS[self.kind].places if place.present]
         sizes = [tuple(self.sizes(place.part).values()) for place in places]
@@ -104,7 +104,7 @@ def _list(kind: Representation, name: str, text: str) -> list[Any]:
         return []
 
 
-class Picture:
+class PlotLayout:
     """One picture of a processor's output, and the way from the port's arrays to its columns.
 
     Parameters
@@ -231,7 +231,7 @@ def _middle(labels: Sequence[Any]) -> Any:
 # --- columns to bytes ---
 
 
-def quantised(columns: np.ndarray) -> tuple[float, float, bytes]:
+def quantize(columns: np.ndarray) -> tuple[float, float, bytes]:
     """The least and the greatest value, and a byte for each number, column by column: 0 to 254 between these two.
 
     255 is none (NaN).

@@ -11,10 +11,10 @@ import numpy as np
 import rospy
 
 from rosafe.component import wire
-from rosafe.component.events import EventLog
+from rosafe.component.events import ThrottledLog
 from rosafe.interface import LAYOUTS
 from rosafe.live.pictures import Processor
-from rosafe.sound.windows import MAX_INDEX, MAX_WINDOW, joined, malformed, new_frames
+from rosafe.sound.windows import MAX_INDEX, MAX_WINDOW, new_frames, split_new_frames, window_error
 from rosafe.terminal import printable
 
 BUFFER = 2**17  # bytes that are read at a time: more of them cost more to make than turns do
@@ -22,7 +22,7 @@ AUDIO_RATE_SLACK = 0.5  # frames
 FORGET_SECONDS = 3.0  # after the last malformed message a topic is well again
 CHANGE_SECONDS = 3.0  # in which messages of a changed tree may come before the tree itself
 
-_report = EventLog(rospy.logwarn)
+_report = ThrottledLog(rospy.logwarn)
 
 
 class _Subscription:
@@ -123,7 +123,7 @@ class Port(_Subscription):
         self._take, self._rows = take, rows
         self._probe = next(iter(rows))  # the field that tells how far the window has moved on
         self._before: np.ndarray | None = None
-        message_class = wire.lenient_class("rosAFE", LAYOUTS[processor.kind].idl)
+        message_class = wire.tolerant_message_class("rosAFE", LAYOUTS[processor.kind].idl)
         super().__init__(processor.topic, message_class, CHANGE_SECONDS)
 
     def _accept(self, message: Any) -> str:
@@ -161,7 +161,7 @@ class Port(_Subscription):
             expected = (index - self.index) * self.rate / self.sample_rate
             audio = abs(self.rate - self.sample_rate) < AUDIO_RATE_SLACK
             new = round(expected) if audio else new_frames(expected, probe, self._before)
-            lost, self.fresh = joined(new, frames)
+            lost, self.fresh = split_new_frames(new, frames)
             self.newest += new
             if abs(self.newest - whole) > max(3.0, 0.05 * self.rate):  # of another stream: begin anew
                 self.newest = int(whole)
@@ -187,7 +187,7 @@ class Audio(_Subscription):
         self._take = take
         self._index = 0
         self._mark = (0, 0.0)  # a frame, and when it was captured (s, clock)
-        super().__init__(topic, wire.lenient_class("bass", "::binaudio::portStruct", MAX_WINDOW), 0.0)
+        super().__init__(topic, wire.tolerant_message_class("bass", "::binaudio::portStruct", MAX_WINDOW), 0.0)
 
     def captured_at(self, index: int) -> float | None:
         """When the audio frame `index` was captured (s, of the clock); None where nobody knows."""
@@ -195,14 +195,14 @@ class Audio(_Subscription):
         return at + (index - frame) / self.sample_rate if at and self.sample_rate else None
 
     def _accept(self, message: Any) -> str:
-        if problem := malformed(message):
+        if problem := window_error(message):
             return problem
         index, rate = int(message.lastFrameIndex), int(message.sampleRate)
         if index == self._index:
             return ""
         window = len(message.left)
         fresh = index - self._index if 0 < self._index < index else int(message.nFramesPerChunk)
-        lost, count = joined(fresh, min(window, index))
+        lost, count = split_new_frames(fresh, min(window, index))
         self._index, self.sample_rate = index, rate
         stamp = message.stamp.sec + 1e-9 * message.stamp.nsec
         self._mark = index, stamp

@@ -9,17 +9,17 @@ from typing import Any
 
 from rosafe.bass.sources import device_lines
 from rosafe.genomix.graph import Graph
-from rosafe.genomix.proxy import Proxy, describe_parameter
+from rosafe.genomix.proxy import ComponentClient, describe_parameter
 from rosafe.interface import BASS, KINDS, LOAD_SETUP, REQUEST, ROSAFE, SAVE_SETUP, ComponentError, Service
 from rosafe.live.pictures import Processor, Tree
 from rosafe.tree import requests
 
 LOOK_SECONDS = 3.0  # for the answer of a component that is well
 # What the page needs to show something of each sort, where there is nothing yet.
-USUAL = ("ratemap", "ild", "itd", "ic")
+DEFAULT_REPRESENTATIONS = ("ratemap", "ild", "itd", "ic")
 
 
-class Robot:
+class ComponentFacade:
     """A rosAFE and a bass on the graph.
 
     Parameters
@@ -31,8 +31,8 @@ class Robot:
 
     def __init__(self, graph: Graph, instance: str, bass: str) -> None:
         self._graph = graph
-        self._rosafe = Proxy(graph, ROSAFE, instance)
-        self._bass = Proxy(graph, BASS, bass)
+        self._rosafe = ComponentClient(graph, ROSAFE, instance)
+        self._bass = ComponentClient(graph, BASS, bass)
         self.audio_topic = f"/{bass}/Audio"
 
     async def close(self) -> None:
@@ -75,7 +75,7 @@ class Robot:
         await self._bass.call(service, self._bass.arguments(service, {**given}))
         return {}
 
-    async def silence(self, _: Mapping[str, Any]) -> dict[str, Any]:
+    async def stop_capture(self, _: Mapping[str, Any]) -> dict[str, Any]:
         """Stop the sound."""
         await self._bass.outputs("Stop", {})
         return {}
@@ -88,10 +88,10 @@ class Robot:
             values["representation"] = kind.word
         return await self._ask(REQUEST, values)
 
-    async def build_usual(self, _: Mapping[str, Any]) -> dict[str, Any]:
+    async def build_default_tree(self, _: Mapping[str, Any]) -> dict[str, Any]:
         """Build all that the page shows where it is opened for the first time."""
         created: list[str] = []
-        for kind in USUAL:
+        for kind in DEFAULT_REPRESENTATIONS:
             created += (await self.build({"representation": kind}))["created"]
         return {"created": created}
 
@@ -122,7 +122,7 @@ def catalogue() -> dict[str, Any]:
         "kinds": {
             kind.kind: {
                 "doc": kind.doc,
-                "chain": [above.kind for above in requests.chain(kind)],
+                "chain": [above.kind for above in requests.ancestor_kinds(kind)],
                 "parts": [{"name": part.name, "axes": list(part.axes), "unit": part.unit} for part in kind.parts],
                 "parameters": {p.name: describe_parameter(p) for p in kind.parameters},
                 "derived": [derived.name for derived in kind.derived],
@@ -134,7 +134,7 @@ def catalogue() -> dict[str, Any]:
     }
 
 
-def told(problem: ComponentError) -> str:
+def format_error(problem: ComponentError) -> str:
     """A refusal in one line: its name, and what it is about."""
     name = problem.ex.rpartition("::")[2]
     known = {**BASS.exceptions, **ROSAFE.exceptions}

@@ -11,17 +11,17 @@ from typing import Any, Protocol
 
 from aiohttp import web
 
-from rosafe.genomix.tasks import shared
+from rosafe.genomix.tasks import run_shared
 from rosafe.http_server.connections import Connections, Limits
 from rosafe.http_server.listener import HttpListener, connection_of
 from rosafe.http_server.refusal import HttpRefusal
 from rosafe.interface import ComponentError
-from rosafe.live.access import HEADERS, Door
-from rosafe.live.client import Ask, Client
+from rosafe.live.access import HEADERS, TokenAuth
+from rosafe.live.client import Ask, BrowserConnection
 from rosafe.live.health import Health
 from rosafe.live.hub import Hub, Key
 from rosafe.live.pictures import Tree
-from rosafe.live.robot import Robot, catalogue, told
+from rosafe.live.robot import ComponentFacade, catalogue, format_error
 from rosafe.version import VERSION
 
 PAGE = Path(__file__).with_name("page")
@@ -37,14 +37,14 @@ LIMITS = Limits(
     idle_seconds=75.0,
 )
 LAST_WORDS_SECONDS = 1.0  # that requests in progress have at the end
-HARMLESS = {"save"}  # what a page that only watches may ask for
+READ_ONLY_ACTIONS = {"save"}  # what a page that only watches may ask for
 _TYPES = {".html": "text/html", ".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml"}
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 log = logging.getLogger("rosout.rosafe_live")  # stderr and /rosout, as rospy.logerr
 
 
-class Looker(Protocol):
+class ViewSubscriber(Protocol):
     """Somebody who looks at pictures: a page, or those who publish images."""
 
     def wake(self) -> None:
@@ -53,7 +53,7 @@ class Looker(Protocol):
     def tell(self, about: str, message: Mapping[str, Any]) -> None:
         """There is news."""
 
-    async def look_again(self, changed: set[Key]) -> None:
+    async def on_tree_changed(self, changed: set[Key]) -> None:
         """The tree has changed, and with it these views."""
 
     async def close(self) -> None:
@@ -76,12 +76,12 @@ class Server:
     """
 
     def __init__(
-        self, robot: Robot, hub: Hub, health: Health, door: Door, asks: Mapping[str, Ask], watch: bool
+        self, robot: ComponentFacade, hub: Hub, health: Health, door: TokenAuth, asks: Mapping[str, Ask], watch: bool
     ) -> None:
         self._robot, self._hub, self._health, self._door, self._watch = robot, hub, health, door, watch
         self._asks = {name: _watched(ask, name, watch) for name, ask in asks.items()}
         self._hello = {"version": VERSION, "watch": watch, **catalogue()}
-        self._clients: set[Looker] = set()
+        self._clients: set[ViewSubscriber] = set()
         self._tree_told: Any = None
         self._problem = ""
         self._fault = ""  # the last one in the log
@@ -117,14 +117,14 @@ class Server:
         for client in self._clients:
             client.wake()
 
-    def join(self, looker: Looker) -> None:
+    def join(self, looker: ViewSubscriber) -> None:
         """From now on somebody looks."""
         if looker not in self._clients:
             self._clients.add(looker)
             self._tree_told = None
             self._again.set()
 
-    def leave(self, looker: Looker) -> None:
+    def leave(self, looker: ViewSubscriber) -> None:
         """Somebody looks no longer."""
         self._clients.discard(looker)
 
@@ -163,7 +163,7 @@ class Server:
         connection_of(request).mark_authenticated()
         if len(self._clients) >= MAX_CLIENTS:
             raise HttpRefusal(503, f"{MAX_CLIENTS} pages are open, which is as many as there may be")
-        client = Client(self._hub, self._asks, self._again.set)
+        client = BrowserConnection(self._hub, self._asks, self._again.set)
         client.tell("hello", self._hello)
         self.join(client)
         try:
@@ -201,10 +201,10 @@ class Server:
 
     async def _look_once(self) -> None:
         try:
-            await self._replant(await self._robot.tree())
+            await self._update_tree(await self._robot.tree())
             self._problem = ""
         except ComponentError as problem:  # what was shown stays: it may only be slow
-            self._problem = told(problem)
+            self._problem = format_error(problem)
         status = {
             "problem": self._problem,
             "malformed": self._hub.problems,
@@ -215,8 +215,8 @@ class Server:
         for client in self._clients:
             client.tell("status", status)
 
-    async def _replant(self, tree: Tree) -> None:
-        changed = await asyncio.to_thread(self._hub.replant, tree)
+    async def _update_tree(self, tree: Tree) -> None:
+        changed = await asyncio.to_thread(self._hub.on_tree_changed, tree)
         shown = [
             {"name": p.name, "kind": p.kind, "parent": p.parent, "topic": p.topic, "rate": p.rate, "values": p.values}
             for p in tree.processors.values()
@@ -225,7 +225,7 @@ class Server:
             self._tree_told = shown
             for client in list(self._clients):
                 client.tell("tree", {"processors": shown})
-                await shared(client.look_again(changed))
+                await run_shared(client.on_tree_changed(changed))
 
     def _sound(self) -> dict[str, Any]:
         audio = self._hub.audio
@@ -243,7 +243,7 @@ class Server:
 
 
 def _watched(ask: Ask, name: str, watch: bool) -> Ask:
-    if not watch or name in HARMLESS:
+    if not watch or name in READ_ONLY_ACTIONS:
         return ask
 
     async def refuse(_: Mapping[str, Any]) -> dict[str, Any]:

@@ -14,7 +14,7 @@ from rosafe.terminal import printable
 from rosafe.tree.requests import searched
 
 
-class Keeper:
+class TreeStateFile:
     """Writes what `describe` tells into a file, whenever `save` is called and it has changed.
 
     The file is a setup (docs/setups.md): whole at any moment, whatever kills the process or the machine.
@@ -42,10 +42,10 @@ class Keeper:
         self._describe = describe
         self._report = report
         self._written = ""
-        self._over = False
+        self._closed = False
         self._lock = threading.Lock()
 
-    def kept(self) -> Setup:
+    def saved(self) -> Setup:
         """What the file holds; an empty setup where there is none yet. ComponentError where it cannot be used."""
         try:
             self._written = read_regular(self.path, 4 * MAX_SETUP + 1).decode()
@@ -66,7 +66,7 @@ class Keeper:
     def save(self) -> None:
         """Have all changes up to now in the file once this returns; where that fails, life goes on."""
         with self._lock:  # who has waited here finds, as a rule, that the one before has written his change, too
-            text = "" if self._over else write(self._describe(), full=True)
+            text = "" if self._closed else write(self._describe(), full=True)
             if text in ("", self._written):
                 return
             try:
@@ -81,4 +81,4 @@ class Keeper:
     def close(self) -> None:
         """Write nothing any more: the processors end now, and are to come back."""
         with self._lock:
-            self._over = True
+            self._closed = True

@@ -19,29 +19,29 @@ from rosafe.component import wire
 from rosafe.component.activities import Activity, Handler
 from rosafe.component.audio import AudioRing
 from rosafe.component.component import ComponentNode
-from rosafe.component.events import EventLog
+from rosafe.component.events import ThrottledLog
 from rosafe.component.startup import run_server
 from rosafe.dsp import kernels
 from rosafe.interface import BLOCK_AND_BUFFERS, KINDS, LAYOUTS, ROSAFE, ComponentError, Representation
 from rosafe.node import reports
-from rosafe.node.keeper import Keeper
+from rosafe.node.keeper import TreeStateFile
 from rosafe.node.ports import OutputPort, element
 from rosafe.node.processor_health import ProcessorHealth
 from rosafe.node.trace_port import TracePort
-from rosafe.node.whole_trees import WholeTrees
-from rosafe.node.words import UnknownWords
+from rosafe.node.whole_trees import TreeRequestService
+from rosafe.node.words import ChoiceFallbacks
 from rosafe.representations import PLUGINS, PROBLEMS, STAGES, WARNINGS
-from rosafe.setups import Setup, rehearse, wanted
+from rosafe.setups import Setup, dry_run, wanted
 from rosafe.sound.windows import MAX_WINDOW
 from rosafe.tree.block import Block
 from rosafe.tree.processor import Processor
-from rosafe.tree.requests import Found
+from rosafe.tree.requests import ExistingProcessor
 from rosafe.tree.tree import Failure, Tree
 from rosafe.tree.workers import workers_to_use
-from rosafe.vocabulary.parameter import MAX_STRING, shown
+from rosafe.vocabulary.parameter import MAX_STRING, short_repr
 
 FIRST_AUDIO_SECONDS = 1.0  # how long InputProc waits for a first message
-LOOK_SECONDS = 0.1  # between two looks whether there is sound for a tree that is to come back
+POLL_SECONDS = 0.1  # between two looks whether there is sound for a tree that is to come back
 OPTIONS = {
     "--strict": {
         "action": "store_true",
@@ -71,20 +71,20 @@ class RosafeNode:
         self._node = ComponentNode(ROSAFE, lambda problem: ROSAFE.error("e_badNewValue", what=str(problem)))
         self.finished = self._node.finished
         self._tree = Tree(self, _workers())
-        self._words = UnknownWords(strict)
-        self._ring = AudioRing(EventLog(self._warn))
+        self._words = ChoiceFallbacks(strict)
+        self._ring = AudioRing(ThrottledLog(self._warn))
         self._audio: rospy.Subscriber | None = None
         self._audio_topic = ""
         self._ports: dict[Processor, OutputPort] = {}
-        self._ends: dict[Processor, Activity] = {}
+        self._activity_by_processor: dict[Processor, Activity] = {}
         self._health = ProcessorHealth(self._tree, self._words)
         self._starting = threading.Lock()  # an InputProc that a newer one has interrupted must not replace that one's
-        self._of_the_input: dict[str, Any] = {}  # what the InputProc that runs was asked for
+        self._input_services: dict[str, Any] = {}  # what the InputProc that runs was asked for
         self._keeper = _keeper(keep, self._setup)
-        kept = Setup() if self._keeper is None else self._keeper.kept()
+        kept = Setup() if self._keeper is None else self._keeper.saved()
         if self._keeper is not None and self._keeper.absent:
             rospy.logwarn(self._keeper.absent)
-        self._coming_back = Setup(None, kept.connections, kept.processors)  # what is not there yet
+        self._restoring_thread = Setup(None, kept.connections, kept.processors)  # what is not there yet
         self._sound = kept.sound  # which is not ours to make; but a file that has one keeps it
         self._restoring = ""  # why it is not there yet
         self._data_object = self._node.advertise("dataObj", wire.message_class("rosAFE", "::rosAFE::dataObjSt"))
@@ -105,7 +105,7 @@ class RosafeNode:
         self._node.function("modifyParameter", self._modify_parameter)
         self._node.function("removeProcessor", self._remove_processor)
         self._node.function("Stop", self._stop)
-        self._node.function("request", WholeTrees(self._node, lambda: self._audio_topic).build, waits=True)
+        self._node.function("request", TreeRequestService(self._node, lambda: self._audio_topic).build, waits=True)
         self._node.diagnostics.add("audio", self._audio_health)
         self._node.diagnostics.add("processors", self._health.report)
         self._node.diagnostics.add("plugins", _plugin_health)
@@ -139,7 +139,7 @@ class RosafeNode:
         self._audio_topic = topic
         self._audio = rospy.Subscriber(
             topic,
-            wire.lenient_class("rosAFE", "::binaudio::portStruct", MAX_WINDOW),
+            wire.tolerant_message_class("rosAFE", "::binaudio::portStruct", MAX_WINDOW),
             take,
             queue_size=None,  # all that has come is looked at: a window may be shorter than a hiccup
             buff_size=2**22,
@@ -157,44 +157,44 @@ class RosafeNode:
     def _setup(self) -> Setup:
         """The tree, or the one that is to come back, with the connection that there is now."""
         connections = {"Audio": self._audio_topic} if self._audio_topic else {}
-        if self._coming_back.processors:
-            return Setup(self._sound, connections, self._coming_back.processors)
+        if self._restoring_thread.processors:
+            return Setup(self._sound, connections, self._restoring_thread.processors)
         found = [processor.ask(self._found) for processor in self._tree.processors]
         return Setup(self._sound, connections, tuple(wanted(one) for one in found if one is not None))
 
-    def _found(self, processor: Processor) -> Found:
+    def _found(self, processor: Processor) -> ExistingProcessor:
         parent = processor.parent
-        of_the_input = self._of_the_input if parent is None else {}
+        of_the_input = self._input_services if parent is None else {}
         values = {**processor.parameters(), **of_the_input}
-        return Found(processor.name, processor.kind, parent.name if parent is not None else "", values)
+        return ExistingProcessor(processor.name, processor.kind, parent.name if parent is not None else "", values)
 
     def _begin_to_come_back(self) -> None:
-        topic = self._coming_back.connections.get("Audio", "")
+        topic = self._restoring_thread.connections.get("Audio", "")
         if topic:
             self._connect_audio(topic)  # whether or not somebody publishes it yet
-        if self._coming_back.processors:
+        if self._restoring_thread.processors:
             self._restoring = f"waiting for sound on {topic or 'the Audio port'}"
-            threading.Thread(target=self._come_back, name="come back", daemon=True).start()
+            threading.Thread(target=self._restore_tree, name="come back", daemon=True).start()
 
-    def _come_back(self) -> None:
+    def _restore_tree(self) -> None:
         """Build the tree that was there, as soon as there is sound of a rate at which that is possible."""
         tried: set[int] = set()
-        while self._coming_back.processors and not self.finished.wait(LOOK_SECONDS):
+        while self._restoring_thread.processors and not self.finished.wait(POLL_SECONDS):
             rate = self._ring.sample_rate
             asked = any(activity.service.name == "InputProc" for activity in self._node.activities.live())
             if rate == 0 or rate in tried or asked:
                 continue
             tried.add(rate)
             try:
-                rehearse(self._coming_back, rate)
-                self._rebuild(self._coming_back)
+                dry_run(self._restoring_thread, rate)
+                self._rebuild(self._restoring_thread)
             except ComponentError as problem:
                 self._restoring = str(problem)
-                if self._coming_back.processors:  # else somebody has begun another one
+                if self._restoring_thread.processors:  # else somebody has begun another one
                     rospy.logerr(f"the tree of {self._keeper and self._keeper.path} does not come back: {problem}")
             else:
-                rospy.loginfo(f"{len(self._coming_back.processors)} processors are back")
-                self._give_up_coming_back()
+                rospy.loginfo(f"{len(self._restoring_thread.processors)} processors are back")
+                self._abort_restore()
 
     def _rebuild(self, setup: Setup) -> None:
         again: Handler = functools.partial(self._input_proc, comes_back=True)
@@ -208,13 +208,13 @@ class RosafeNode:
                 if activity.error is not None:
                     raise activity.error
         except ComponentError:
-            if self._coming_back is setup:
+            if self._restoring_thread is setup:
                 self._tree.stop()
             raise
 
-    def _give_up_coming_back(self) -> None:
+    def _abort_restore(self) -> None:
         """From now on what is there counts."""
-        self._coming_back, self._restoring = Setup(), ""
+        self._restoring_thread, self._restoring = Setup(), ""
         self._keep()
 
     # --- processors ---
@@ -236,14 +236,14 @@ class RosafeNode:
                 buffers = values["bufferSize_s_port"], values["bufferSize_s_getSignal"]
                 parameters = {p.name: values[p.name] for p in KINDS["input"].parameters if p.name in values}
                 processor = self._tree.add_input(values["name"], reader, frames, *buffers, parameters)
-                self._of_the_input = {p.name: values[p.name] for p in BLOCK_AND_BUFFERS}
+                self._input_services = {p.name: values[p.name] for p in BLOCK_AND_BUFFERS}
                 if not comes_back:
-                    self._coming_back = Setup()  # somebody wants a tree of his own
+                    self._restoring_thread = Setup()  # somebody wants a tree of his own
         except BaseException:
             reader.stop()
             raise
         activity.interrupt_others()
-        self._live(activity, processor)
+        self._run_until_removed(activity, processor)
 
     def _serve_processor(self, kind: Representation) -> None:
         def check(values: dict[str, Any]) -> dict[str, Any]:
@@ -251,7 +251,7 @@ class RosafeNode:
             self._tree.check(kind.kind, values["name"], values["upperDepName"])
             name = values["name"]
             if len(name) > MAX_STRING or not re.fullmatch(r"\w+(/\w+)*", name, re.ASCII):
-                what = f"name: {shown(name)} names a topic too: letters, digits and _ only"
+                what = f"name: {short_repr(name)} names a topic too: letters, digits and _ only"
                 raise ROSAFE.error("e_badNewValue", what=what)
             return values
 
@@ -259,26 +259,28 @@ class RosafeNode:
 
     def _handler(self, kind: Representation) -> Handler:
         def handle(activity: Activity, values: dict[str, Any]) -> None:
-            asked = STAGES[kind.kind].asked({p.name: values[p.name] for p in kind.parameters if p.name in values})
+            asked = STAGES[kind.kind].request_values(
+                {p.name: values[p.name] for p in kind.parameters if p.name in values}
+            )
             doubts: dict[str, str] = {}
-            take = self._words.taking(doubts)
+            take = self._words.resolving(doubts)
             parameters = {p.name: take(p, asked[p.name]) for p in kind.parameters if p.name in asked}
             processor = self._tree.add(kind.kind, values["name"], values["upperDepName"], parameters)
             activity.warning = self._words.note(processor, doubts)
-            self._live(activity, processor)
+            self._run_until_removed(activity, processor)
 
         return handle
 
-    def _live(self, activity: Activity, processor: Processor) -> None:
+    def _run_until_removed(self, activity: Activity, processor: Processor) -> None:
         """From now on the activity is the processor: they end together."""
-        self._ends[processor] = activity
+        self._activity_by_processor[processor] = activity
         if processor not in self._tree.processors:  # it may have ended before its activity was known
             activity.interrupt("")
         self._node.settle()
         self._keep()  # before anybody is told that it runs
         activity.running()
         activity.stop_requested.wait()
-        self._ends.pop(processor, None)
+        self._activity_by_processor.pop(processor, None)
         self._tree.end(processor)
         self._words.forget(processor)
         self._keep()
@@ -292,7 +294,7 @@ class RosafeNode:
         message_class = wire.message_class("rosAFE", LAYOUTS[kind].idl)
         return self._node.advertise(KINDS[kind].port, message_class, element(kind, name))
 
-    def added(self, processor: Processor) -> None:
+    def on_added(self, processor: Processor) -> None:
         """Open the processor's port, full of zeros."""
         if processor.kind == "input":
             port = OutputPort(processor, self._input_port, lambda: None)
@@ -303,18 +305,18 @@ class RosafeNode:
         self._health.added(processor)
         port.open(self._tree.port_seconds)
 
-    def executed(self, processor: Processor, seconds: float) -> None:
+    def on_executed(self, processor: Processor, seconds: float) -> None:
         """Count the work, for genom_state and /diagnostics."""
         self._node.meters[ROSAFE.service(KINDS[processor.kind].request).task].cycle(seconds)
         self._health.executed(processor, seconds)
 
-    def released(self, processor: Processor, block: Block) -> None:
+    def on_released(self, processor: Processor, block: Block) -> None:
         """Publish the processor's window; with that of the input, the time of its newest frame."""
         self._ports[processor].append(block, self._tree.port_seconds)
         if processor.parent is None:
-            self._tell_time(block.next_index - 1)
+            self._publish_latency(block.next_index - 1)
 
-    def _tell_time(self, frame: int) -> None:
+    def _publish_latency(self, frame: int) -> None:
         line = self._ring.captured(frame)
         if line is not None:
             seconds, nanoseconds = divmod(round(line.time * 1e9), 1_000_000_000)
@@ -322,13 +324,13 @@ class RosafeNode:
                 stamp = {"sec": seconds, "nsec": nanoseconds}
                 self._frame_time.publish(self._time_class(stamp=stamp, frameIndex=frame, sampleRate=line.rate))
 
-    def ended(self, processor: Processor) -> None:
+    def on_removed(self, processor: Processor) -> None:
         """Close the port and end the activity."""
         self._health.ended(processor)
         port = self._ports.pop(processor, None)  # None where it could not be opened
         if port is not None:
             port.close()
-        activity = self._ends.get(processor)
+        activity = self._activity_by_processor.get(processor)
         if activity is not None:
             activity.interrupt("")
 
@@ -338,7 +340,7 @@ class RosafeNode:
         return reports.response("getSignals", signals=reports.signals(self._tree.processors))
 
     def _get_processors(self, values: dict[str, Any]) -> dict[str, Any]:
-        told = reports.descriptions(self._tree.processors, self._node.name, self._of_the_input)
+        told = reports.descriptions(self._tree.processors, self._node.name, self._input_services)
         return reports.response("getProcessors", processors=told)
 
     def _get_representation(self, values: dict[str, Any]) -> dict[str, Any]:
@@ -346,7 +348,7 @@ class RosafeNode:
 
     def _modify_parameter(self, values: dict[str, Any]) -> dict[str, Any]:
         doubts: dict[str, str] = {}
-        take = self._words.taking(doubts)
+        take = self._words.resolving(doubts)
         processor = self._tree.modify(values["nameProc"], values["nameParam"], values["newValue"], take)
         self._keep()
         return {"warning": self._words.note(processor, doubts)}
@@ -356,7 +358,7 @@ class RosafeNode:
         self._keep()
 
     def _stop(self, values: dict[str, Any]) -> None:
-        self._coming_back = Setup()
+        self._restoring_thread = Setup()
         self._tree.stop()
         self._keep()
 
@@ -374,11 +376,11 @@ class RosafeNode:
             )
         elif lag := self._ring.lag:
             status.summary(DiagnosticStatus.WARN, lag)
-        elif counters.lost or counters.dropped or counters.refused or counters.breaks:
+        elif counters.lost or counters.dropped or counters.refused or counters.discontinuities:
             status.summary(
                 DiagnosticStatus.WARN,
                 f"{counters.lost} frames lost in {counters.gaps} gaps, {counters.dropped} dropped, "
-                f"{counters.refused} messages refused, {counters.breaks} breaks",
+                f"{counters.refused} messages refused, {counters.discontinuities} breaks",
             )
         else:
             status.summary(DiagnosticStatus.OK, "no frames lost" if counters.messages else "no audio yet")
@@ -396,7 +398,7 @@ class RosafeNode:
         else:
             status.summary(DiagnosticStatus.OK, "the tree is kept")
         status.add("file", str(self._keeper.path))
-        status.add("to come back", " ".join(one.name for one in self._coming_back.processors) or "nothing")
+        status.add("to come back", " ".join(one.name for one in self._restoring_thread.processors) or "nothing")
         return status
 
 
@@ -414,13 +416,13 @@ def _plugin_health(status: Any) -> Any:
     return status
 
 
-def _keeper(path: str, describe: Callable[[], Setup]) -> Keeper | None:
+def _keeper(path: str, describe: Callable[[], Setup]) -> TreeStateFile | None:
     if not path:
         path = str(rospy.get_param("~keep", ""))
         if path and not path.endswith((".yaml", ".yml")):  # whoever reaches the master can set it, to any file
             name = rospy.resolve_name("~keep")
             raise ROSAFE.error("e_badNewValue", what=f"ROS parameter {name}: expected FILE.yaml, got {path!r:.300}")
-    return Keeper(Path(os.path.expanduser(path)).absolute(), describe, rospy.logerr) if path else None
+    return TreeStateFile(Path(os.path.expanduser(path)).absolute(), describe, rospy.logerr) if path else None
 
 
 def _workers() -> int:

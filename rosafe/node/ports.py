@@ -52,7 +52,7 @@ class OutputPort:
 
     def open(self, seconds: float) -> None:
         """Publish the first message: zeros."""
-        self._fit(self.processor.part_rows, frames_in(seconds, self.processor.rate))
+        self._fit(self.processor.output_shapes, frames_in(seconds, self.processor.rate))
         self._publish(self.processor.next_index, self.processor.rate)
 
     def _fit(self, part_rows: Sequence[tuple[int, ...]], frames: int) -> list[SlidingWindow]:

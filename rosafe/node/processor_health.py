@@ -10,10 +10,10 @@ from typing import Any
 import rospy
 from diagnostic_msgs.msg import DiagnosticStatus
 
-from rosafe.component.activities import TaskMeter
-from rosafe.component.events import EventLog
+from rosafe.component.activities import TaskStatistics
+from rosafe.component.events import ThrottledLog
 from rosafe.dsp.plugin_checks import plugin_of
-from rosafe.node.words import UnknownWords
+from rosafe.node.words import ChoiceFallbacks
 from rosafe.tree.processor import Processor
 from rosafe.tree.states import State
 from rosafe.tree.tree import Failure, Tree
@@ -34,7 +34,7 @@ class SlowCalls:
         self._lock = threading.Lock()
         self._computing: dict[Processor, tuple[int, float]] = {}  # block, and when it was first seen at that block
         self._found: dict[Processor, tuple[int, float, str]] = {}  # block, when it was seen last, the line
-        self._log = EventLog(rospy.logwarn, LOG_SECONDS)
+        self._log = ThrottledLog(rospy.logwarn, LOG_SECONDS)
 
     def look(self) -> None:
         """Look at all processors. Called about once a second."""
@@ -82,7 +82,7 @@ class SlowCalls:
 
 
 def _block_seconds(processor: Processor) -> float:
-    taken = processor.taken
+    taken = processor.current_block
     return taken.parts[0].shape[-1] / taken.signal.rate if taken is not None else 0.0
 
 
@@ -97,14 +97,14 @@ def _named(processor: Processor) -> str:
 class ProcessorHealth:
     """What `/diagnostics` says of the processors, with their loads."""
 
-    def __init__(self, tree: Tree, words: UnknownWords) -> None:
+    def __init__(self, tree: Tree, words: ChoiceFallbacks) -> None:
         self._tree, self._words = tree, words
         self._slow = SlowCalls(tree)
-        self._loads: dict[Processor, TaskMeter] = {}
+        self._loads: dict[Processor, TaskStatistics] = {}
 
     def added(self, processor: Processor) -> None:
         """The processor is about to start."""
-        self._loads[processor] = TaskMeter(processor.name)
+        self._loads[processor] = TaskStatistics(processor.name)
 
     def executed(self, processor: Processor, seconds: float) -> None:
         """A block was computed."""

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from rosafe.component import wire
-from rosafe.interface import FIXED, ros_type, text_of
+from rosafe.interface import CORE_REPRESENTATIONS, format_value, ros_type
 from rosafe.interface.rosafe import parameter_struct
 from rosafe.node.ports import element, signal_fields
 from rosafe.tree.processor import Processor
@@ -16,7 +16,7 @@ def parameters(processors: Iterable[Processor]) -> Any:
     """The `rosAFE_parameters` message: an array for each of the original's kinds, in the order of creation."""
     import rosAFE.msg as messages
 
-    arrays: dict[str, list[Any]] = {kind: [] for kind in FIXED}
+    arrays: dict[str, list[Any]] = {kind: [] for kind in CORE_REPRESENTATIONS}
     for processor in processors:
         if processor.kind in arrays:
             struct = getattr(messages, ros_type(parameter_struct(processor.kind)))
@@ -27,7 +27,7 @@ def parameters(processors: Iterable[Processor]) -> Any:
 
 def signals(processors: Iterable[Processor]) -> dict[str, list[Any]]:
     """The members of `rosAFE_dataObjSt`: what the original's kinds put out since getSignals was called last."""
-    arrays: dict[str, list[Any]] = {kind: [] for kind in FIXED}
+    arrays: dict[str, list[Any]] = {kind: [] for kind in CORE_REPRESENTATIONS}
     for processor in processors:
         if processor.kind in arrays:
             taken = processor.take("getSignals")
@@ -65,9 +65,9 @@ def _description(processor: Processor, node: str, of_the_input: Mapping[str, Any
         "port": kind.port,
         "topic": "/".join(filter(None, (node, kind.port, element(kind.kind, processor.name)))),
         "rate": processor.rate,
-        "shape": list(processor.part_rows[largest]),
+        "shape": list(processor.output_shapes[largest]),
         "axes": list(kind.parts[largest].axes[:-1]),
-        "parameters": [{"name": name, "value": text_of(value)} for name, value in values.items()],
+        "parameters": [{"name": name, "value": format_value(value)} for name, value in values.items()],
     }
 
 

@@ -15,7 +15,7 @@ from rosafe.tree import building
 from rosafe.tree.requests import kind_of
 
 
-class WholeTrees:
+class TreeRequestService:
     """Builds them on `node`; `heard()` is the topic that the Audio port is connected to, or nothing.
 
     It is what `rosafe.tree.building` asks for services.
@@ -44,11 +44,11 @@ class WholeTrees:
 
     async def outputs(self, service: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
         """What a service of the node returns; an activity, nothing, as soon as it runs. Raises ComponentError."""
-        answer = self._node.ask(service, values)  # whoever waits, waits for this: there is nothing beside it
+        answer = self._node.call_service(service, values)  # whoever waits, waits for this: there is nothing beside it
         whole = answer.get("response")
         return answer if whole is None else {name: getattr(whole, name) for name, _ in ROSAFE.service(service).outputs}
 
-    async def hears(self, port: str) -> str:
+    async def port_connected(self, port: str) -> str:
         """The topic that an input port is connected to, or nothing."""
         return self._heard()
 

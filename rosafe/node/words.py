@@ -12,10 +12,10 @@ from rosafe.component import master
 from rosafe.tree.processor import Processor
 from rosafe.vocabulary.parameter import Parameter
 
-STRICT = "~strict_words"  # the ROS parameter; read whenever there is such a word
+STRICT_CHOICES_PARAM = "~strict_words"  # the ROS parameter; read whenever there is such a word
 
 
-class UnknownWords:
+class ChoiceFallbacks:
     """What was taken for unknown words, for each processor that has got some.
 
     Parameters
@@ -29,12 +29,12 @@ class UnknownWords:
         self._told: dict[Processor, dict[str, str]] = {}  # by the name of the parameter
         self._lock = threading.Lock()
 
-    def taking(self, doubts: dict[str, str]) -> Callable[[Parameter, Any], Any]:
+    def resolving(self, doubts: dict[str, str]) -> Callable[[Parameter, Any], Any]:
         """What takes known words for unknown ones, unless those are to be refused, and enters that into `doubts`."""
 
         def take(parameter: Parameter, value: Any) -> Any:
-            doubts[parameter.name] = doubt = parameter.doubt(value)
-            return value if doubt and self._refused() else parameter.known_word(value)
+            doubts[parameter.name] = doubt = parameter.substitution_warning(value)
+            return value if doubt and self._refused() else parameter.resolve_choice(value)
 
         return take
 
@@ -42,7 +42,7 @@ class UnknownWords:
         if self._strict:
             return True
         try:
-            return bool(rospy.get_param_cached(STRICT, False) == 1)  # true, or 1
+            return bool(rospy.get_param_cached(STRICT_CHOICES_PARAM, False) == 1)  # true, or 1
         except master.FAILURES:  # nobody says so
             return False
 

@@ -14,7 +14,7 @@ import numpy as np
 from rosafe.dsp import kernels
 from rosafe.interface import KINDS, ComponentError
 from rosafe.offline.signals import frame_times
-from rosafe.representations import OWN, STAGES
+from rosafe.representations import BUILTIN, STAGES
 from rosafe.tree import sizes
 from rosafe.tree.block import Block
 from rosafe.tree.company import Observer
@@ -22,15 +22,15 @@ from rosafe.tree.processor import Processor
 from rosafe.tree.tree import Tree
 
 # A block that is put together has no more frames, and no processor puts out more for it
-MOST_FRAMES = 12000  # as InputProc's blocks by default
+MAX_FRAMES = 12000  # as InputProc's blocks by default
 MOST_BYTES = 2**22
 
 FILTERBANK = "gammatone"  # from which on there are channels
-TRUNK = ("input", "preProc")
+SHARED_KINDS = ("input", "preProc")
 
 
 class _GatedSource:
-    """Feeds blocks to the tree, one after the other, once `let_flow` says that the whole tree stands.
+    """Feeds blocks to the tree, one after the other, once `start` says that the whole tree stands.
 
     Those that have no more than `most` frames together are put together.
     """
@@ -47,7 +47,7 @@ class _GatedSource:
     def open(self, wake: Callable[[], None]) -> None:
         self._wake = wake
 
-    def let_flow(self, most: int) -> None:
+    def start(self, most: int) -> None:
         """Let the signal flow, in blocks of up to `most` frames where they are smaller."""
         self._most = most
         self._wake()
@@ -87,16 +87,16 @@ class _Listener:
         self._lock = threading.Lock()
         self.error: BaseException | None = None
 
-    def added(self, processor: Processor) -> None:
+    def on_added(self, processor: Processor) -> None:
         pass
 
-    def executed(self, processor: Processor, seconds: float) -> None:
+    def on_executed(self, processor: Processor, seconds: float) -> None:
         pass
 
-    def released(self, processor: Processor, block: Block) -> None:
+    def on_released(self, processor: Processor, block: Block) -> None:
         self._keep(processor.kind, self.branches[processor], block)
 
-    def ended(self, processor: Processor) -> None:
+    def on_removed(self, processor: Processor) -> None:
         if processor.error is not None:
             with self._lock:
                 self.error = self.error or processor.error
@@ -154,8 +154,12 @@ class Chain:
         self._remember(0)
 
     def _build(self, kinds: list[str], values: Mapping[str, Any], branches: int) -> None:
-        divided = branches > 1 and kernels.compiled() and all(STAGES[kind].APART for kind in kinds if kind not in TRUNK)
-        over = overwriting(kinds, self._outputs)
+        divided = (
+            branches > 1
+            and kernels.compiled()
+            and all(STAGES[kind].CHANNEL_INDEPENDENT for kind in kinds if kind not in SHARED_KINDS)
+        )
+        over = in_place_kinds(kinds, self._outputs)
         for kind in kinds:  # parents come first
             parent = KINDS[kind].parent
             mine = {p.name: values[p.name] for p in KINDS[kind].parameters if p.name in values}
@@ -172,9 +176,9 @@ class Chain:
                     made.append(self._tree.add(kind, above.name.replace(parent, kind), above.name, mine))
             for branch, processor in enumerate(made):
                 self._listener.branches[processor] = branch
-                processor.heard = kind in self._outputs
+                processor.has_consumers = kind in self._outputs
                 if kind in over:
-                    processor.place = _taken
+                    processor.output_buffer_for = _taken
 
     def schedule(self, block: int, name: str, value: Any) -> None:
         """Change a (checked) parameter before block `block`; the blocks of successive calls ascend. Or ValueError."""
@@ -185,7 +189,7 @@ class Chain:
     def _remember(self, block: int) -> None:
         self._derived[block] = {k: v for p, *_ in self._processors.values() for k, v in p.derived().items()}
 
-    def write_into(self, kind: str, branch: int, place: Callable[[int], np.ndarray | None]) -> None:
+    def set_output_allocator(self, kind: str, branch: int, place: Callable[[int], np.ndarray | None]) -> None:
         """Let the stage of a `kind` that nothing hangs on write where `place` says for so many frames, if it can.
 
         Stages that return frames, and those that do not take `out`, cannot, and are not asked.
@@ -194,7 +198,7 @@ class Chain:
         if (
             processor.stage.TAKES_OUT and not processor.signal.framed and not processor.children
         ):  # children take blocks in one piece
-            processor.place = lambda taken: place(taken.data.shape[-1])
+            processor.output_buffer_for = lambda taken: place(taken.data.shape[-1])
 
     def observe(self, observer: Observer) -> None:
         """Tell `observer` of every state that a processor enters."""
@@ -205,7 +209,7 @@ class Chain:
 
         Small blocks may go through `together`, where that cannot be seen in the numbers.
         """
-        self._source.let_flow(self._most_together() if together else 0)
+        self._source.start(self._most_together() if together else 0)
         for processor in self._all():
             processor.join()
         if self._listener.error is not None:
@@ -233,7 +237,7 @@ class Chain:
         """Shape of each part of an output, in each branch, for so many frames if no parameter changes on the way."""
         processors = self._processors[kind]
         count = self._count(processors[0], frames)
-        branches = zip(*(processor.part_rows for processor in processors), strict=True)
+        branches = zip(*(processor.output_shapes for processor in processors), strict=True)
         return {
             name: [(*rows, count) for rows in of_part]
             for name, of_part in zip(KINDS[kind].outputs, branches, strict=True)
@@ -253,7 +257,7 @@ class Chain:
     def largest_block(self, frames: int) -> tuple[str, int]:
         """Which processor puts out most for one block of so many frames, and how many bytes that can be."""
         seconds = frames / self.sample_rate
-        taken = {p: sizes.output_size(p.stage, p.given_rows, seconds) for p in self._all()}
+        taken = {p: sizes.output_size(p.stage, p.input_shape, seconds) for p in self._all()}
         largest = max(taken, key=lambda processor: taken[processor])
         return largest.kind, int(taken[largest])
 
@@ -265,11 +269,11 @@ class Chain:
         """
         processors = self._all()
         changed = len(self._derived) > 1
-        seen = not kernels.compiled() or any(p.kind not in OWN or p.stage.blocks_matter for p in processors)
+        seen = not kernels.compiled() or any(p.kind not in BUILTIN or p.stage.block_size_dependent for p in processors)
         if changed or seen:
             return 0
-        frame = max(sizes.output_size(p.stage, p.given_rows, 1 / self.sample_rate) for p in processors)
-        return min(MOST_FRAMES, int(MOST_BYTES / frame))
+        frame = max(sizes.output_size(p.stage, p.input_shape, 1 / self.sample_rate) for p in processors)
+        return min(MAX_FRAMES, int(MOST_BYTES / frame))
 
     def describe(self) -> dict[str, Any]:
         """Axes of what runs, `fb_cfHz` (Hz), `cc_lags` (s); rates of the outputs, `ild_frameRate` and its like (Hz).
@@ -302,7 +306,7 @@ def needed(outputs: Iterable[str]) -> list[str]:
     return [kind for kind in KINDS if kind in wanted]
 
 
-def overwriting(kinds: Collection[str], outputs: Collection[str]) -> list[str]:
+def in_place_kinds(kinds: Collection[str], outputs: Collection[str]) -> list[str]:
     """Of all `kinds` that run, those that may write over the blocks that they take, which nobody else wants.
 
     Kernels do; numpy does not, and plugins must not.
@@ -313,7 +317,7 @@ def overwriting(kinds: Collection[str], outputs: Collection[str]) -> list[str]:
     return [
         kind
         for kind, parent in zip(kinds, parents, strict=True)
-        if kind in OWN and STAGES[kind].OVERWRITES and parent not in outputs and parents.count(parent) == 1
+        if kind in BUILTIN and STAGES[kind].SUPPORTS_IN_PLACE and parent not in outputs and parents.count(parent) == 1
     ]
 
 

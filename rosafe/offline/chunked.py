@@ -18,7 +18,7 @@ _MAT_HEAD = b"MATLAB 7.3 MAT-file, written by rosafe"
 _FILL = math.nan  # of zarr's arrays: xarray takes each number that equals it for one that is missing, and shows NaN
 
 
-class _Waiting:
+class _ChunkBuffer:
     """Blocks of one array on their way to whole chunks."""
 
     def __init__(self, shape: tuple[int, ...]) -> None:
@@ -58,7 +58,7 @@ class ChunkedWriter(ABC):
     def __init__(self, path: Path, contents: Contents) -> None:
         self._path = path
         self._contents = contents
-        self._waiting = {name: _Waiting(shape) for name, shape in contents.shapes.items()}
+        self._waiting = {name: _ChunkBuffer(shape) for name, shape in contents.shapes.items()}
         self._open = ExitStack()
         try:
             self._begin()

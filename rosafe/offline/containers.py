@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from rosafe.offline.contents import is_scalar, new_array, restored, told
+from rosafe.offline.contents import is_scalar, new_array, parse_metadata, restored
 from rosafe.offline.isolated import MAX_TEXT, blocks
 from rosafe.offline.memory import refuse_over_available
 
@@ -148,13 +148,13 @@ class _Pipe:
 def read_h5(path: Path, arrays: bool = True) -> dict[str, Any]:
     """What is in an .h5; without its arrays, only what `told` gives. ValueError where it is damaged."""
     attributes, found = read_container("h5", path, "all" if arrays else "none")
-    return {**_numbers(found), **told(attributes)}
+    return {**_numbers(found), **parse_metadata(attributes)}
 
 
 def read_zarr(path: Path, arrays: bool = True) -> dict[str, Any]:
     """As `read_h5`, for a .zarr."""
     attributes, found = read_container("zarr", path, "all" if arrays else "none")
-    return {**_numbers(found), **told(attributes)}
+    return {**_numbers(found), **parse_metadata(attributes)}
 
 
 def _numbers(arrays: Arrays) -> dict[str, Any]:
@@ -165,7 +165,7 @@ def read_mat73(path: Path, arrays: bool = True) -> dict[str, Any]:
     """As `read_h5`, for a version 7.3 .mat."""
     _, found = read_container("mat", path, "all" if arrays else "texts")
     texts = {name: _text(name, *one) for name, one in found.items() if one[1].get("MATLAB_class") == "char"}
-    about = told({**texts, **{name: one[0] for name, one in found.items() if is_scalar(name)}})
+    about = parse_metadata({**texts, **{name: one[0] for name, one in found.items() if is_scalar(name)}})
     axes = about.get("axes", {})
     result: dict[str, Any] = {}
     for name in found.keys() - about.keys():

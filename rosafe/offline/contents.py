@@ -78,7 +78,7 @@ class Writer(Protocol):
         """Give back what is open; the file need not be complete."""
 
 
-def told(flat: Mapping[str, Any]) -> dict[str, Any]:
+def parse_metadata(flat: Mapping[str, Any]) -> dict[str, Any]:
     """`Contents.about`, with axes and units, from what `flat` has made of it, numpy's types included.
 
     ValueError for values of other types than `flat` writes.

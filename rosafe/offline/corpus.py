@@ -21,7 +21,7 @@ FAILED = "failed.csv"
 _HEAD = ["input", "why"]
 
 
-class Item(NamedTuple):
+class FileJob(NamedTuple):
     """A sound, and its place below the folder of results, before its name gets the end of a format."""
 
     source: Path
@@ -68,7 +68,7 @@ def compute(source: Path, target: Path, settings: Settings, progress: Callable[[
 # --- what there is ----------------------------------------------------------------------------------------------
 
 
-def find(inputs: Sequence[Path], besides: Path | None = None) -> tuple[list[Item], list[tuple[Path, str]]]:
+def find(inputs: Sequence[Path], besides: Path | None = None) -> tuple[list[FileJob], list[tuple[Path, str]]]:
     """The sounds that are meant by files and folders, and what is wrong with some of these.
 
     Folders are searched all the way down, symbolic links followed, each real folder once; names that begin with a dot
@@ -82,16 +82,16 @@ def find(inputs: Sequence[Path], besides: Path | None = None) -> tuple[list[Item
     besides : Path, optional
         A folder that is not searched, where it lies below one that is: that of the results.
     """
-    items: list[Item] = []
+    items: list[FileJob] = []
     problems: list[tuple[Path, str]] = []
     for path in inputs:
         if not os.path.isdir(path):
-            items.append(Item(path, PurePath(path.name or "_")))
+            items.append(FileJob(path, PurePath(path.name or "_")))
             continue
         root = PurePath() if len(inputs) == 1 else PurePath(Path(os.path.abspath(path)).name)
         before = len(items) + len(problems)
         for found in _sounds(path, besides, problems):
-            items.append(Item(found, root / found.relative_to(path)))
+            items.append(FileJob(found, root / found.relative_to(path)))
         if len(items) + len(problems) == before:
             problems.append((path, f"{path}: there is no sound file in this folder"))
     return items, problems
@@ -149,7 +149,7 @@ def make_folder(folder: Path) -> None:
 # --- where it goes ----------------------------------------------------------------------------------------------
 
 
-def named(items: Sequence[Item], folder: Path, extension: str) -> list[Path]:
+def output_paths(items: Sequence[FileJob], folder: Path, extension: str) -> list[Path]:
     """The result of each: its name without its end, or with it where two of a folder would get one name.
 
     ValueError where two would go to one place all the same.

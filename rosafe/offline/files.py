@@ -33,7 +33,7 @@ _TOO_LARGE = (
 )
 
 
-class Done(NamedTuple):
+class FileResult(NamedTuple):
     """What came of a file."""
 
     seconds: float  # of sound
@@ -54,7 +54,7 @@ def process_file(
     channels: tuple[int, int] | None = None,
     topic: str | None = None,
     resume: bool = False,
-) -> Done:
+) -> FileResult:
     """Compute the auditory representations of a sound file, block by block, as they come into a file.
 
     The numbers are those of `rosafe.process` on the file's int32 samples, and of the node on the same samples, bit
@@ -108,8 +108,8 @@ def process_file(
         **({"topic": topic} if topic else {}),
     }
     if resume and os.path.lexists(target):
-        if _complete(form, Path(target), about, values, wanted) and not _newer(source, target):
-            return Done(0.0, 0, True)
+        if _complete(form, Path(target), about, values, wanted) and not _source_modified(source, target):
+            return FileResult(0.0, 0, True)
         replace = True
     with closing(open_sound(source, channels, topic)) as sound:
         if os.path.exists(target) and os.path.samefile(sound.path, target):
@@ -120,7 +120,7 @@ def process_file(
         with place as path:
             _stream(sound, path, form, about, values, wanted, progress)
             size = sum(part.stat().st_size for part in path.rglob("*")) if form.folder else path.stat().st_size
-        return Done(sound.frames / sound.sample_rate, size, False, sound.not_finite)
+        return FileResult(sound.frames / sound.sample_rate, size, False, sound.not_finite)
 
 
 def _complete(
@@ -139,7 +139,7 @@ def _complete(
     rate = there.get("sample_rate")
     if isinstance(rate, (int, float)):
         about = {**about, "parameters": _parameters(values, wanted, rate)}
-    other = [name for name in about if there.get(name) != _as_read(about[name])]
+    other = [name for name in about if there.get(name) != _as_loaded(about[name])]
     other += [name for name in ("channels", "topic") if name in there and name not in about]
     other += ["outputs"] if set(there["axes"]) != names else []
     if other:
@@ -147,7 +147,7 @@ def _complete(
     return True
 
 
-def _newer(source: str | Path, target: str | Path) -> bool:
+def _source_modified(source: str | Path, target: str | Path) -> bool:
     """Whether the input has been written since; one that has gone, or is from the future, has not."""
     return os.path.exists(source) and os.stat(target).st_mtime_ns < os.stat(source).st_mtime_ns <= time.time_ns()
 
@@ -157,14 +157,14 @@ def _parameters(values: Mapping[str, Any], wanted: Sequence[str], sample_rate: f
     told = {p.name: p.default for kind in KINDS.values() for p in kind.parameters if not p.follows_rate} | dict(values)
     for kind in needed(wanted):
         mine = {p.name: values.get(p.name, p.default) for p in KINDS[kind].parameters}
-        told |= STAGES[kind].at_rate(mine, values.keys(), sample_rate)
+        told |= STAGES[kind].resolve_rate_defaults(mine, values.keys(), sample_rate)
     return told
 
 
-def _as_read(value: Any) -> Any:
+def _as_loaded(value: Any) -> Any:
     """As it comes back from a file: tuples are lists."""
     if isinstance(value, Mapping):
-        return {name: _as_read(one) for name, one in value.items()}
+        return {name: _as_loaded(one) for name, one in value.items()}
     return list(value) if isinstance(value, tuple) else value
 
 
@@ -190,7 +190,7 @@ def _stream(
     block_frames = about["block_frames"]
     with Chain(_blocks(sound, block_frames), sound.sample_rate, values, wanted, keep) as chain:
         kind, taken = chain.largest_block(min(block_frames, sound.frames))
-        sizes.refuse_over(sizes.MAX_BYTES, taken, f"{kind}: {_TOO_LARGE}", 1e9)  # several are under way at a time
+        sizes.check_memory(sizes.MAX_BYTES, taken, f"{kind}: {_TOO_LARGE}", 1e9)  # several are under way at a time
         rate = {"sample_rate": sound.sample_rate, "parameters": _parameters(values, wanted, sound.sample_rate)}
         contents = _contents(chain, {**rate, **about}, wanted, sound.frames)
         made = form.writer(contents)

@@ -21,7 +21,7 @@ from rosafe.offline.contents import Contents, Writer, checked, is_number, is_tex
 from rosafe.offline.mat5 import read_mat5
 from rosafe.offline.readers import read_csv, read_npz
 from rosafe.offline.whole import CsvWriter, Mat5Writer, NpzWriter
-from rosafe.vocabulary.parameter import shown
+from rosafe.vocabulary.parameter import short_repr
 
 MAT5_MOST = 2**30  # bytes of a variable; MATLAB's version 5 ends at 2**31, and scipy needs an array twice
 _MAX_EMPTY = 2**20  # along each axis of an array without numbers
@@ -150,7 +150,7 @@ def _check_arrays(result: Mapping[str, Any]) -> None:
     """ValueError where outputs, or what lies along their axes, are missing or of another type."""
     missing = result["axes"].keys() - result.keys()
     if missing:
-        raise ValueError(f"{', '.join(map(shown, sorted(missing)))} is not in it")
+        raise ValueError(f"{', '.join(map(short_repr, sorted(missing)))} is not in it")
     for name, axes in result["axes"].items():
         _check_array(name, result[name], len(axes))
     for kind in KINDS.values():
@@ -183,9 +183,9 @@ def _check_kind(kind: Representation, result: Mapping[str, Any]) -> None:
 
 def _check_array(name: str, value: Any, dimensions: int) -> None:
     if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiu" or value.dtype.itemsize < 4:
-        raise ValueError(f"{shown(name)}: expected an array of numbers of 32 or 64 bits")
+        raise ValueError(f"{short_repr(name)}: expected an array of numbers of 32 or 64 bits")
     if value.ndim != dimensions or (not value.size and max(value.shape) > _MAX_EMPTY):
-        raise ValueError(f"{shown(name)}: expected {dimensions} axes, got the shape {value.shape}")
+        raise ValueError(f"{short_repr(name)}: expected {dimensions} axes, got the shape {value.shape}")
 
 
 def read(form: Format, path: Path, arrays: bool = True) -> dict[str, Any]:

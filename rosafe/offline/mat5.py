@@ -17,7 +17,7 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 
 from rosafe.input import open_regular
-from rosafe.offline.contents import ABOUT, MAX_TEXT, is_scalar, new_array, restored, told
+from rosafe.offline.contents import ABOUT, MAX_TEXT, is_scalar, new_array, parse_metadata, restored
 from rosafe.offline.memory import check_arrays
 
 _HEAD = 128  # bytes
@@ -81,7 +81,7 @@ def read_mat5(path: Path, arrays: bool = True) -> dict[str, Any]:
     with open_regular(path) as file:
         size = os.fstat(file.fileno()).st_size
         found = dict(_variables(file, size, arrays))
-    about = told({name: value for name, value in found.items() if isinstance(value, str) or is_scalar(name)})
+    about = parse_metadata({name: value for name, value in found.items() if isinstance(value, str) or is_scalar(name)})
     axes = about.get("axes", {})
     others = found.keys() - about.keys()
     return {**{name: restored(found[name], axes.get(name)) for name in others}, **about}

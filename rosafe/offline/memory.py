@@ -23,7 +23,7 @@ def available() -> int:
 def refuse_over_available(taken: float, what: str, advice: str = "") -> None:
     """ValueError, with `advice`, where so many bytes are more than there are: the system would end the process."""
     text = f"{what} would take {{taken:.1f}} GB of memory, this machine has {{limit:.1f}} GB left{advice}"
-    sizes.refuse_over(available(), taken, text, 1e9)
+    sizes.check_memory(available(), taken, text, 1e9)
 
 
 def check_arrays(before: int, size: int, taken: float) -> None:

@@ -97,7 +97,7 @@ def process(
     if by_place:
         options = _named(by_place, options)
     try:
-        work = _Work(signal, sample_rate, *options)
+        work = _ProcessCall(signal, sample_rate, *options)
     except ValueError as problem:
         raise problem.with_traceback(None) from None  # where inside it was found helps nobody
     return work.run()
@@ -117,7 +117,7 @@ def _named(by_place: tuple[Any, ...], options: tuple[Any, Any, Any, Any]) -> tup
     return (*by_place, *options[len(by_place) :])
 
 
-class _Work:
+class _ProcessCall:
     """One call of `process`, all of it checked; nothing has been computed."""
 
     def __init__(self, signal: Any, sample_rate: Any, parameters: Any, sizes_: Any, changes: Any, outputs: Any) -> None:
@@ -128,12 +128,12 @@ class _Work:
         values = {"in_doNormalize": view.dtype.kind == "i", **check_parameters(parameters)}
         changes = _checked_modifications(changes)
         self.wanted = outputs_of(self.ears, outputs)
-        self.gathered: dict[str, dict[str, list[_Gathered]]] = {}  # by kind and name, of each branch
+        self.gathered: dict[str, dict[str, list[_OutputCollector]]] = {}  # by kind and name, of each branch
         # of each output, how many frames of each format have come, one after the other
         self.counts: dict[str, list[list[Any]]] = {kind: [[None, 0]] for kind in self.wanted}
         both = np.broadcast_to(view, (2, frames))
         blocks = (as_samples(both[:, first:end]) for first, end in _edges(lengths, frames))
-        branches = 1 if changes or frames <= chain.MOST_FRAMES else workers_to_use()
+        branches = 1 if changes or frames <= chain.MAX_FRAMES else workers_to_use()
         self.chain = Chain(blocks, self.rate, values, self.wanted, self.keep, branches)
         try:
             self._prepare(frames, lengths, changes)
@@ -161,9 +161,9 @@ class _Work:
                 axes = parts[name].axes
                 kept = [(self.ears, *shape[1:]) if axes[0] == "ear" else shape for shape in of_branches]
                 middle = axes.index(centred) if centred in axes else -1
-                self.gathered[kind][name] = [_Gathered(place, middle) for place in _places(kept, axes)]
+                self.gathered[kind][name] = [_OutputCollector(place, middle) for place in _places(kept, axes)]
             for branch, one in enumerate(next(iter(self.gathered[kind].values()))):
-                self.chain.write_into(kind, branch, one.place)
+                self.chain.set_output_allocator(kind, branch, one.place)
 
     def keep(self, kind: str, branch: int, block: Block) -> None:
         """Take what has been released."""
@@ -267,7 +267,7 @@ def _places(shapes: list[tuple[int, ...]], axes: tuple[str, ...]) -> list[np.nda
     return np.split(whole, ends[:-1], axis=along)
 
 
-def _joined(branches: list[_Gathered]) -> np.ndarray:
+def _joined(branches: list[_OutputCollector]) -> np.ndarray:
     joined = [branch.joined() for branch in branches]
     if len(joined) == 1:
         return joined[0]
@@ -276,7 +276,7 @@ def _joined(branches: list[_Gathered]) -> np.ndarray:
     return whole
 
 
-class _Gathered:
+class _OutputCollector:
     """All that is released of one output. Each block goes to its place in the result at once, small ones together.
 
     Parameters
@@ -298,19 +298,19 @@ class _Gathered:
         self._waiting: list[np.ndarray] = []
         self._frames = 0  # that wait
         self._fits = True
-        self._lent: np.ndarray | None = None
+        self._output_slice: np.ndarray | None = None
 
     def place(self, frames: int) -> np.ndarray | None:
         """Where the next block may be written, of so many frames if it has any."""
         end = self._filled + frames
         free = self._fits and not self._waiting and end <= self._whole.shape[-1]
-        self._lent = self._whole[..., self._filled : end] if free else None
-        return self._lent
+        self._output_slice = self._whole[..., self._filled : end] if free else None
+        return self._output_slice
 
     def add(self, block: np.ndarray) -> None:
         """The next block, (..., frames)."""
-        if block is self._lent:
-            self._filled, self._begun, self._lent = self._filled + block.shape[-1], True, None
+        if block is self._output_slice:
+            self._filled, self._begun, self._output_slice = self._filled + block.shape[-1], True, None
             return
         shape = block.shape
         if shape[:-1] != self._rows:
@@ -323,14 +323,14 @@ class _Gathered:
     def _write(self) -> None:
         end = self._filled + self._frames
         if end <= self._whole.shape[-1]:
-            kernels.join(self._waiting, self._whole[..., self._filled : end])
+            kernels.concatenate(self._waiting, self._whole[..., self._filled : end])
             self._waiting, self._filled, self._frames, self._begun = [], end, 0, True
 
     def joined(self) -> np.ndarray:
         """The whole. It is not held any longer: whoever still knows of this one must not keep that from being freed."""
         if self._waiting and self._fits:
             self._write()
-        whole, waiting, self._whole, self._waiting, self._lent = self._whole, self._waiting, _NOTHING, [], None
+        whole, waiting, self._whole, self._waiting, self._output_slice = self._whole, self._waiting, _NOTHING, [], None
         if not waiting and self._filled == whole.shape[-1]:
             return whole
         first = [whole[..., : self._filled]] if self._begun else []

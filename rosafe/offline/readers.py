@@ -14,7 +14,7 @@ from typing import IO, Any, BinaryIO
 import numpy as np
 
 from rosafe.input import open_regular
-from rosafe.offline.contents import ABOUT, MAX_TEXT, checked, from_json, is_number, new_array, told
+from rosafe.offline.contents import ABOUT, MAX_TEXT, checked, from_json, is_number, new_array, parse_metadata
 from rosafe.offline.memory import check_arrays
 from rosafe.offline.whole import CSV_HEAD
 
@@ -49,7 +49,7 @@ def read_npz(path: Path, arrays: bool = True) -> dict[str, Any]:
                 found = {name: _member(file, one) for name, one in _members(file, size, arrays)}
         except _DAMAGED as problem:
             raise ValueError(str(problem)[:300]) from None
-    return {**found, **told({name: value for name, value in found.items() if value.ndim == 0})}
+    return {**found, **parse_metadata({name: value for name, value in found.items() if value.ndim == 0})}
 
 
 def _members(file: zipfile.ZipFile, size: int, arrays: bool) -> Iterator[tuple[str, zipfile.ZipInfo]]:

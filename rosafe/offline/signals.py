@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from rosafe.dsp.signal import Signal
-from rosafe.interface import FIXED, KINDS
+from rosafe.dsp.signal import SignalFormat
+from rosafe.interface import CORE_REPRESENTATIONS, KINDS
 from rosafe.interface.arguments import check_outputs
 
 _CHECKED_TOGETHER = 2**18  # frames; no large array is made for the check
@@ -47,7 +47,7 @@ def ears_view(signal: Any, upright: bool = False) -> np.ndarray:
     whole = array.dtype.kind == "i" and array.dtype.itemsize in (2, 4)
     if not whole and array.dtype.kind != "f":
         raise ValueError(f"signal is of type {array.dtype}, wanted is a float type, int32 or int16")
-    return array.T if is_upright(array, upright) else array
+    return array.T if is_frames_first(array, upright) else array
 
 
 def as_samples(ears: np.ndarray) -> np.ndarray:
@@ -67,7 +67,7 @@ def check_finite(ears: np.ndarray) -> None:
                 raise ValueError("signal holds NaN or infinite samples")
 
 
-def is_upright(signal: np.ndarray, upright: bool = False) -> bool:
+def is_frames_first(signal: np.ndarray, upright: bool = False) -> bool:
     """Whether a signal of two axes is (N, 2), as `ears_view` takes it."""
     return signal.shape[1] == 2 and (signal.shape[0] > 2 or signal.shape[0] == 0 or (upright and len(signal) == 2))
 
@@ -75,7 +75,7 @@ def is_upright(signal: np.ndarray, upright: bool = False) -> bool:
 def outputs_of(ears: int, outputs: Any) -> list[str]:
     """The outputs to keep of a signal of so many ears, as `check_outputs`; ValueError where one ear is not enough."""
     if outputs is None and ears == 1:
-        return [kind for kind in FIXED if not KINDS[kind].binaural]
+        return [kind for kind in CORE_REPRESENTATIONS if not KINDS[kind].binaural]
     wanted = check_outputs(outputs)
     both = [kind for kind in wanted if KINDS[kind].binaural]
     if ears == 1 and both:
@@ -88,7 +88,7 @@ def of_ears(ears: int, axes: tuple[str, ...], data: np.ndarray) -> np.ndarray:
     return data[:1] if ears == 1 and axes[0] == "ear" else data
 
 
-def frame_times(signal: Signal, first: int, count: int) -> np.ndarray:
+def frame_times(signal: SignalFormat, first: int, count: int) -> np.ndarray:
     """Seconds from the first sample to the middle of each frame, of so many that begin `first` samples later.
 
     (first + k hop + window / 2) / fs for frame k, n / fs for sample n.

@@ -14,7 +14,7 @@ from rosafe.sound.audiofile import AudioFile, AudioFileError
 from rosafe.sound.bagsound import BagSoundError, Piece, Recording
 
 BAG = ".bag"
-USUAL_TOPIC = "/bass/Audio"
+DEFAULT_TOPIC = "/bass/Audio"
 # What is a sound in a folder: what libsndfile reads, but for formats that need to be told what is in them, and bags.
 SOUNDS = frozenset(
     f".{one}"
@@ -85,7 +85,7 @@ class BagSound:
             raise AudioFileError(f"{path} has 2 channels: there is no channel {max(ears)}")
         self._ears = [ear - 1 for ear in ears]
         try:
-            self._recording = Recording(path, topic, threading.Event(), USUAL_TOPIC, "pick one with --topic")
+            self._recording = Recording(path, topic, threading.Event(), DEFAULT_TOPIC, "pick one with --topic")
         except BagSoundError as problem:
             raise AudioFileError(str(problem)) from None
         self.sample_rate = self.frames = 0

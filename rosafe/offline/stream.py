@@ -8,13 +8,21 @@ from typing import Any
 
 import numpy as np
 
-from rosafe.dsp.signal import Signal
+from rosafe.dsp.signal import SignalFormat
 from rosafe.dsp.stage import SAMPLE_RATE, Stage, parts_of
 from rosafe.interface import KINDS
 from rosafe.interface.arguments import check_change, check_outputs, check_parameters
-from rosafe.offline.chain import needed, overwriting
+from rosafe.offline.chain import in_place_kinds, needed
 from rosafe.offline.memory import refuse_over_available
-from rosafe.offline.signals import as_samples, check_finite, ears_view, frame_times, is_upright, of_ears, outputs_of
+from rosafe.offline.signals import (
+    as_samples,
+    check_finite,
+    ears_view,
+    frame_times,
+    is_frames_first,
+    of_ears,
+    outputs_of,
+)
 from rosafe.representations import STAGES
 from rosafe.tree import sizes
 
@@ -70,21 +78,21 @@ class Stream:
             self._begin()
             self._stages: dict[str, Stage] = {}
             for kind in needed(self._outputs):
-                self._stages[kind] = STAGES[kind](self._comes_to(kind, self._stages), **self._mine(kind))
-            self._put_to_work(self._stages)
+                self._stages[kind] = STAGES[kind](self._comes_to(kind, self._stages), **self._public_name(kind))
+            self._install_stages(self._stages)
         except ValueError as problem:
             raise problem.with_traceback(None) from None
 
     def _begin(self) -> None:
         self._ears = 0  # not known yet
-        self._whole = self._upright = False
+        self._whole = self._frames_first = False
         self._next = dict.fromkeys(self._outputs, 0)  # where each output's next frame begins, in samples
 
-    def _comes_to(self, kind: str, stages: Mapping[str, Stage]) -> Signal | float:
+    def _comes_to(self, kind: str, stages: Mapping[str, Stage]) -> SignalFormat | float:
         parent = stages.get(KINDS[kind].parent)
         return self._rate if parent is None else parent.output_format
 
-    def _put_to_work(self, stages: dict[str, Stage]) -> None:
+    def _install_stages(self, stages: dict[str, Stage]) -> None:
         """Let these stages stand in the place of those that there are; ValueError where they would fill the memory."""
         rows: dict[str, tuple[int, ...]] = {"": (2,)}
         for kind, stage in stages.items():
@@ -107,7 +115,7 @@ class Stream:
     def _lay_out(self) -> None:
         """What `process` goes through for each block: names and axes only of what is returned."""
         axes = {kind: [(name, part.axes) for name, part in KINDS[kind].outputs.items()] for kind in self._stages}
-        over = overwriting(self._stages, self._next)
+        over = in_place_kinds(self._stages, self._next)
         self._plan = [
             (kind, KINDS[kind].parent, stage, kind in over, axes[kind] if kind in self._next else [])
             for kind, stage in self._stages.items()
@@ -166,7 +174,7 @@ class Stream:
         shape = np.shape(block)
         if self._ears == 2 and shape == (1, 2):  # one frame
             block = np.transpose(block)
-        view = ears_view(block, self._upright)
+        view = ears_view(block, self._frames_first)
         (ears, frames), whole = view.shape, view.dtype.kind == "i"
         stages, kept = self._stages, list(self._next)
         if not self._ears:
@@ -185,7 +193,7 @@ class Stream:
         # Nothing is refused from here on.
         self._largest = max(self._largest, frames)
         if len(shape) == 2 and shape != (2, 2):
-            self._upright = is_upright(np.asarray(block)) or shape == (1, 2)
+            self._frames_first = is_frames_first(np.asarray(block)) or shape == (1, 2)
         if not self._ears:
             self._ears, self._whole = ears, whole
             self._next = dict.fromkeys(kept, 0)
@@ -205,13 +213,13 @@ class Stream:
         stages = {kind: copy.copy(stage) for kind, stage in self._stages.items()}
         for kind in needed(self._outputs):
             if kind not in stages:  # it was left out for one ear
-                stages[kind] = STAGES[kind](self._comes_to(kind, stages), **self._mine(kind))
+                stages[kind] = STAGES[kind](self._comes_to(kind, stages), **self._public_name(kind))
         for stage in stages.values():
             stage.reset()
         self._begin()
-        self._put_to_work({kind: stages[kind] for kind in needed(self._outputs)})
+        self._install_stages({kind: stages[kind] for kind in needed(self._outputs)})
 
-    def _mine(self, kind: str) -> dict[str, Any]:
+    def _public_name(self, kind: str) -> dict[str, Any]:
         return {p.name: self._parameters[p.name] for p in KINDS[kind].parameters if p.name in self._parameters}
 
     # --- parameters ---
@@ -238,11 +246,11 @@ class Stream:
             tried = {kind: copy.copy(stage) for kind, stage in self._stages.items()}
             for kind, stage in tried.items():
                 comes = self._comes_to(kind, tried)
-                if isinstance(comes, Signal):
-                    stage.receive(comes)
+                if isinstance(comes, SignalFormat):
+                    stage.set_input_format(comes)
                 if any(name == p.name for p in KINDS[kind].parameters):
                     stage.configure(**{name: value})
-            self._put_to_work(tried)
+            self._install_stages(tried)
         except ValueError as problem:
             raise problem.with_traceback(None) from None
         self._parameters[name] = value

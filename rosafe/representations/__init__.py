@@ -7,8 +7,8 @@ left out and named in `PROBLEMS`; `WARNINGS` are remarks about the others, and `
 
 from __future__ import annotations
 
-from .registry import OWN, PLUGINS, PROBLEMS, STAGES, WARNINGS
+from .registry import BUILTIN, PLUGINS, PROBLEMS, STAGES, WARNINGS
 
 KINDS = {kind: stage.REPRESENTATION for kind, stage in STAGES.items()}
 
-__all__ = ["KINDS", "OWN", "PLUGINS", "PROBLEMS", "STAGES", "WARNINGS"]
+__all__ = ["BUILTIN", "KINDS", "PLUGINS", "PROBLEMS", "STAGES", "WARNINGS"]

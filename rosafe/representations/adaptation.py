@@ -24,7 +24,7 @@ import numpy as np
 
 from rosafe.dsp import kernels
 from rosafe.dsp.guard import LIMIT, FloatArray
-from rosafe.dsp.signal import Signal
+from rosafe.dsp.signal import SignalFormat
 from rosafe.dsp.stage import Stage
 from rosafe.vocabulary.parameter import Parameter
 from rosafe.vocabulary.representation import Representation
@@ -32,7 +32,7 @@ from rosafe.vocabulary.representation import Representation
 FULL_SCALE_DB = 100.0  # SPL of sound whose rms is 1, and model units that it settles at
 GREATEST_THRESHOLD_DB = 99.0  # from 100 on, there is nothing between threshold and full scale
 DRNL_FACTOR = 1e5  # of the squares: (10**(50 / 20))**2
-LEAST_LIMIT = 1e-30  # stands for no room above 1 at all
+MIN_LIMIT = 1e-30  # stands for no room above 1 at all
 LEAST, MOST = 1e-100, 1e100  # bounds of the quotients, far beyond sound: no state becomes 0 or infinite
 
 TAU = (0.005, 0.05, 0.129, 0.253, 0.5)
@@ -109,7 +109,7 @@ class Adaptation(Stage):
     _state: FloatArray | None  # (n, 2, C); None is rest
 
     def process(self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None) -> FloatArray:
-        samples = self._checked(block)
+        samples = self._as_valid_block(block)
         loops, channels = self._loops, samples.shape[1]
         if len(loops.thresholds) not in (1, channels):
             raise ValueError(f"block: {channels} channels, but thresholds of {len(loops.thresholds)}")
@@ -123,7 +123,7 @@ class Adaptation(Stage):
                 loops.thresholds,
                 loops.offsets,
                 loops.gains,
-                loops.retentions,
+                loops.decay_factors,
                 loops.limits,
                 self._state,
             )
@@ -132,14 +132,14 @@ class Adaptation(Stage):
     def reset(self) -> None:
         self._state = None
 
-    def input_format_changed(self, before: Signal) -> None:
+    def input_format_changed(self, before: SignalFormat) -> None:
         self.build(self.values, frozenset())
 
-    def _merge(self, checked: dict[str, Any]) -> dict[str, Any]:
-        return self.in_force(super()._merge(checked))
+    def _resolve_values(self, checked: dict[str, Any]) -> dict[str, Any]:
+        return self.effective_values(super()._resolve_values(checked))
 
     @classmethod
-    def in_force(cls, values: Mapping[str, Any]) -> dict[str, Any]:
+    def effective_values(cls, values: Mapping[str, Any]) -> dict[str, Any]:
         parameter = (cls.DECLARED_WITHIN or cls.REPRESENTATION).parameter
         published = SETS.get(values["adpt_model"], {})
         return {**values, **{name: parameter(name).check(value) for name, value in published.items()}}
@@ -181,7 +181,7 @@ class Loops(NamedTuple):
     thresholds: FloatArray
     offsets: FloatArray
     gains: FloatArray
-    retentions: FloatArray
+    decay_factors: FloatArray
     limits: FloatArray
     rest: FloatArray
 
@@ -194,7 +194,7 @@ class Loops(NamedTuple):
         logs = log_threshold * 0.5 ** np.arange(1, len(tau) + 1)[:, np.newaxis]
         limits = np.zeros(len(tau))
         if overshoot > 1:  # m tanh(u / m) does not depend on the sign of m
-            limits = np.maximum(np.abs(-np.expm1(2 * logs[:, 0]) * overshoot - 1), LEAST_LIMIT)
+            limits = np.maximum(np.abs(-np.expm1(2 * logs[:, 0]) * overshoot - 1), MIN_LIMIT)
         with np.errstate(divide="ignore", over="ignore"):  # a time constant may be nothing at all
             retentions = np.exp(-1 / (np.array(tau) * sample_rate))
         return cls(
@@ -225,7 +225,9 @@ def adapt(samples: FloatArray, loops: Loops, state: FloatArray) -> FloatArray:
     x = np.moveaxis(np.maximum(x, loops.thresholds[:, np.newaxis]), -1, 0)
     output = np.empty(x.shape)
     number, count = len(x), len(state)
-    a, b, m = (values[:, np.newaxis, np.newaxis] for values in (loops.retentions, 1 - loops.retentions, loops.limits))
+    a, b, m = (
+        values[:, np.newaxis, np.newaxis] for values in (loops.decay_factors, 1 - loops.decay_factors, loops.limits)
+    )
     passed = np.empty((count + 1, *x.shape[1:]))  # what comes to each loop, and what leaves the last
     for step in range(number + count - 1 if number else 0):
         first, end = max(0, step - number + 1), min(count, step + 1)  # the loops that have something to do

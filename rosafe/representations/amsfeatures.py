@@ -22,11 +22,11 @@ import numpy as np
 import scipy
 
 from rosafe.dsp import kernels
-from rosafe.dsp.cascade import Parallel
-from rosafe.dsp.framing import MAX_FRAME_SECONDS, FrameBuffer, FramedStage, Framing
-from rosafe.dsp.guard import SPAN, FloatArray, limited
+from rosafe.dsp.cascade import SosFilterBank
+from rosafe.dsp.framing import MAX_FRAME_SECONDS, FrameBuffer, FramedStage, FrameGrid
+from rosafe.dsp.guard import FLUSH_INTERVAL, FloatArray, clamp
 from rosafe.dsp.rounding import sample_count
-from rosafe.dsp.signal import Signal
+from rosafe.dsp.signal import SignalFormat
 from rosafe.dsp.windows import ALL_NAMES, window
 from rosafe.vocabulary.parameter import Parameter
 from rosafe.vocabulary.representation import Representation
@@ -136,15 +136,15 @@ class AmsFeatures(FramedStage):
     prefix = "ams"
 
     _decimation: Decimation
-    _filters: Parallel
+    _filters: SosFilterBank
 
     @classmethod
-    def in_force(cls, values: Mapping[str, Any]) -> dict[str, Any]:
+    def effective_values(cls, values: Mapping[str, Any]) -> dict[str, Any]:
         return {**values, "ams_cfHz": center_frequencies(values).tolist()}
 
     @property
     def parameters(self) -> dict[str, Any]:
-        return self.in_force(self.values)
+        return self.effective_values(self.values)
 
     def output_rows(self, rows: tuple[int, ...]) -> tuple[int, ...]:
         return (*rows, len(self._frequencies))
@@ -154,20 +154,22 @@ class AmsFeatures(FramedStage):
         return 2 * math.prod(rows) * filters * len(self.window)  # in a store of up to twice as many
 
     def output_count(self, count: int) -> int:
-        return self._framing.complete(-(-count // self._decimation.ratio))
+        return self._framing.complete_frames(-(-count // self._decimation.ratio))
 
     def process(self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None) -> FloatArray:
-        samples = self._decimation.process(self._checked(block))
+        samples = self._decimation.process(self._as_valid_block(block))
         if self._triangles is not None:
-            return self._by_spectra(limited(samples), self._triangles)
+            return self._by_spectra(clamp(samples), self._triangles)
         rows = (*samples.shape[:-1], len(self._frequencies))
         if kernels.compiled():
             frames = self._frames(samples, self._framing.weights(squared=False), rows)
             state = self._filters.started(samples.shape[:-1])
             return kernels.modulation(frames, self._filters.sections, state)
         parts = [np.empty((*rows, 0))]
-        for first in range(0, samples.shape[-1], SPAN):  # what comes out takes much more memory than what goes in
-            filtered = self._filters.process(limited(samples[..., first : first + SPAN]))
+        for first in range(
+            0, samples.shape[-1], FLUSH_INTERVAL
+        ):  # what comes out takes much more memory than what goes in
+            filtered = self._filters.process(clamp(samples[..., first : first + FLUSH_INTERVAL]))
             parts.append(self._means(np.abs(filtered), squared=False))
         return np.concatenate(parts, axis=-1)
 
@@ -191,10 +193,10 @@ class AmsFeatures(FramedStage):
     def reset(self) -> None:
         super().reset()
         self._decimation = Decimation(self._decimation.ratio)
-        self._filters = Parallel(self._filters.sections)
+        self._filters = SosFilterBank(self._filters.sections)
 
     @cached_property
-    def output_format(self) -> Signal:
+    def output_format(self) -> SignalFormat:
         ratio = self._decimation.ratio
         return replace(
             self.input_format,
@@ -204,7 +206,7 @@ class AmsFeatures(FramedStage):
             window=len(self._framing.window) * ratio * self.input_format.hop,
         )
 
-    def input_format_changed(self, before: Signal) -> None:
+    def input_format_changed(self, before: SignalFormat) -> None:
         self.build(self.values, frozenset(self.values))
 
     def build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
@@ -227,16 +229,16 @@ class AmsFeatures(FramedStage):
         self._framing, self._frequencies, self._triangles = framing, frequencies, triangles
         if not changed <= FRAMES:
             self._decimation = Decimation(values["ams_dsRatio"])
-            self._filters = Parallel(np.empty((0, 6)) if sections is None else sections)
+            self._filters = SosFilterBank(np.empty((0, 6)) if sections is None else sections)
             self._buffer = FrameBuffer()
 
 
-def design_framing(values: Mapping[str, Any], rate: float) -> Framing:
+def design_framing(values: Mapping[str, Any], rate: float) -> FrameGrid:
     """The frames at the sample rate (Hz) after the decimation; ValueError if a window is too short."""
     seconds = values["ams_wSizeSec"]
     size = 2 * sample_count("ams_wSizeSec", seconds * rate / 2)
     hop = sample_count("ams_hSizeSec", max(1.0, size / (seconds / values["ams_hSizeSec"])))
-    return Framing(np.abs(window(values["ams_wname"], size)), hop)  # rounding makes some ends less than 0
+    return FrameGrid(np.abs(window(values["ams_wname"], size)), hop)  # rounding makes some ends less than 0
 
 
 def center_frequencies(values: Mapping[str, Any]) -> FloatArray:

@@ -20,8 +20,8 @@ import scipy
 
 from rosafe.dsp import kernels
 from rosafe.dsp.framing import FrameBuffer, FramedStage, frame_parameters
-from rosafe.dsp.guard import FloatArray, limited
-from rosafe.dsp.signal import Signal
+from rosafe.dsp.guard import FloatArray, clamp
+from rosafe.dsp.signal import SignalFormat
 from rosafe.dsp.windows import ALL_NAMES
 from rosafe.vocabulary.parameter import Parameter
 from rosafe.vocabulary.representation import Derived, Representation
@@ -86,7 +86,7 @@ class Autocorrelation(FramedStage):
         port_doc="Autocorrelations, [lag][channel][frame]",
     )
     prefix = "ac"
-    APART = True
+    CHANNEL_INDEPENDENT = True
 
     @property
     def derived(self) -> dict[str, Any]:
@@ -96,12 +96,12 @@ class Autocorrelation(FramedStage):
         return (*rows, self._lags)
 
     def process(self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None) -> FloatArray:
-        samples, values = self._checked(block), self.values
+        samples, values = self._as_valid_block(block), self.values
         clipping, alpha, exponent = values["ac_clipMethod"], values["ac_clipAlpha"], values["ac_K"]
         if kernels.compiled() and len(self.window) <= kernels.MOST_SIZE:
             frames = self._frames(samples, self._framing.pinned)
             return kernels.autocorrelations(frames, clipping, alpha, exponent, self._corrections)
-        whole = self._framing.frames(self._buffer.append(limited(samples)))  # (2, C, F, w)
+        whole = self._framing.frames(self._buffer.append(clamp(samples)))  # (2, C, F, w)
         result = autocorrelate(whole, self.window, clipping, alpha, exponent, self._corrections)
         self._buffer.drop(result.shape[-1] * self._framing.hop)
         return result
@@ -111,10 +111,10 @@ class Autocorrelation(FramedStage):
         return len(self._corrections)
 
     @cached_property
-    def output_format(self) -> Signal:
+    def output_format(self) -> SignalFormat:
         return replace(super().output_format, lags=self._lags - 1)
 
-    def input_format_changed(self, before: Signal) -> None:
+    def input_format_changed(self, before: SignalFormat) -> None:
         self._buffer = FrameBuffer()
 
     def build(self, values: dict[str, Any], changed: frozenset[str]) -> None:

@@ -17,9 +17,9 @@ import scipy
 
 from rosafe.dsp import kernels, memory
 from rosafe.dsp.framing import FramedStage, frame_parameters
-from rosafe.dsp.guard import SQUARE_TINY, FloatArray, limited
+from rosafe.dsp.guard import SQUARE_TINY, FloatArray, clamp
 from rosafe.dsp.rounding import MAX_SAMPLES
-from rosafe.dsp.signal import Signal
+from rosafe.dsp.signal import SignalFormat
 from rosafe.vocabulary.parameter import Parameter
 from rosafe.vocabulary.representation import Derived, Representation
 
@@ -64,25 +64,25 @@ class CrossCorrelation(FramedStage):
         word="crosscorrelation",
     )
     prefix = "cc"
-    APART = True
+    CHANNEL_INDEPENDENT = True
 
     @property
     def derived(self) -> dict[str, Any]:
         return {"cc_lags": (np.arange(-self._max_lag, self._max_lag + 1) / self.sample_rate).tolist()}
 
     @cached_property
-    def output_format(self) -> Signal:
+    def output_format(self) -> SignalFormat:
         return replace(super().output_format, lags=self._max_lag)
 
     def output_rows(self, rows: tuple[int, ...]) -> tuple[int, ...]:
         return (rows[1], 2 * self._max_lag + 1)
 
     def process(self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None) -> FloatArray:
-        samples = self._checked(block)
+        samples = self._as_valid_block(block)
         reach = min(self._max_lag, len(self._framing.window) - 1)  # beyond, frames do not overlap
-        if kernels.compiled() and 2 * reach + 1 <= kernels.MOST_LAGS:
+        if kernels.compiled() and 2 * reach + 1 <= kernels.MAX_LAGS:
             return self._by_kernel(samples, reach)
-        frames = self._framing.frames(self._buffer.append(limited(samples, SQUARE_TINY)))  # (2, C, F, w)
+        frames = self._framing.frames(self._buffer.append(clamp(samples, SQUARE_TINY)))  # (2, C, F, w)
         result = np.zeros((samples.shape[1], 2 * self._max_lag + 1, frames.shape[2]))
         correlate_by_fft(frames, self._framing.window, reach, result)
         self._buffer.drop(frames.shape[2] * self._framing.hop)

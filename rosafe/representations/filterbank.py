@@ -14,13 +14,13 @@ from rosafe.dsp.drnl import DrnlBank
 from rosafe.dsp.erb import erb_rate, erb_rate_to_frequency
 from rosafe.dsp.gammatone import GammatoneBank
 from rosafe.dsp.guard import FloatArray
-from rosafe.dsp.signal import Signal
+from rosafe.dsp.signal import SignalFormat
 from rosafe.dsp.stage import Stage
 from rosafe.vocabulary.parameter import MAX_SEQUENCE, Parameter
 from rosafe.vocabulary.representation import Representation
 
 MAX_CHANNELS = MAX_SEQUENCE
-HIGHEST = 0.475  # of the sample rate, for channels: speech at 16 kHz has them up to 7600 Hz
+MAX_RELATIVE_FREQUENCY = 0.475  # of the sample rate, for channels: speech at 16 kHz has them up to 7600 Hz
 
 
 class Filterbank(Stage):
@@ -117,12 +117,12 @@ class Filterbank(Stage):
     )
     INPUT = ("ear", "time")
     EXTRAS = ("envelope",)
-    APART = True
+    CHANNEL_INDEPENDENT = True
 
     _given: frozenset[str] = frozenset()  # of what follows the rate
 
     @classmethod
-    def in_force(cls, values: Mapping[str, Any]) -> dict[str, Any]:
+    def effective_values(cls, values: Mapping[str, Any]) -> dict[str, Any]:
         frequencies = center_frequencies(values).tolist()
         told = {**values, "fb_nChannels": len(frequencies), "fb_cfHz": frequencies}
         if values["fb_cfHz"]:
@@ -132,27 +132,29 @@ class Filterbank(Stage):
         return told
 
     @classmethod
-    def at_rate(cls, values: Mapping[str, Any], given: Collection[str], sample_rate: float) -> dict[str, Any]:
+    def resolve_rate_defaults(
+        cls, values: Mapping[str, Any], given: Collection[str], sample_rate: float
+    ) -> dict[str, Any]:
         free = "fb_highFreqHz" not in given and not values["fb_cfHz"]
         if free and center_frequencies(values).max() >= sample_rate / 2:
-            return {**values, "fb_highFreqHz": HIGHEST * sample_rate}
+            return {**values, "fb_highFreqHz": MAX_RELATIVE_FREQUENCY * sample_rate}
         return dict(values)
 
     @classmethod
-    def asked(cls, values: Mapping[str, Any]) -> dict[str, Any]:
+    def request_values(cls, values: Mapping[str, Any]) -> dict[str, Any]:
         listed = bool(values.get("fb_cfHz")) and values.get("fb_nERBs") == 0
         return {name: value for name, value in values.items() if not (listed and name == "fb_nERBs")}
 
     @property
     def parameters(self) -> dict[str, Any]:
-        return self.in_force(self.at_rate(self.values, self._given, self.sample_rate))
+        return self.effective_values(self.resolve_rate_defaults(self.values, self._given, self.sample_rate))
 
     def output_rows(self, rows: tuple[int, ...]) -> tuple[int, ...]:
         return (*rows, len(self._frequencies))
 
     def process(self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None) -> FloatArray:
-        samples = self._checked(block)
-        place = self._room((2, len(self._frequencies), samples.shape[-1]), out)
+        samples = self._as_valid_block(block)
+        place = self._output_array((2, len(self._frequencies), samples.shape[-1]), out)
         output, envelope = self._bank.process(samples, "envelope" in self.provide, place)
         self.provided = {} if envelope is None else {"envelope": envelope}
         return output
@@ -162,12 +164,12 @@ class Filterbank(Stage):
         self.provided = {}
 
     @cached_property
-    def output_format(self) -> Signal:
+    def output_format(self) -> SignalFormat:
         channels = tuple(self._frequencies.tolist())
         return replace(self.input_format, center_frequencies=channels, filterbank=self.values["fb_type"])
 
-    def _merge(self, checked: dict[str, Any]) -> dict[str, Any]:
-        values = super()._merge(checked)
+    def _resolve_values(self, checked: dict[str, Any]) -> dict[str, Any]:
+        values = super()._resolve_values(checked)
         self._given = self._given | ({"fb_highFreqHz"} & checked.keys())
         decides = checked.get("fb_nChannels") or {"fb_lowFreqHz", "fb_highFreqHz", "fb_nERBs"} & checked.keys()
         if decides and not checked.get("fb_cfHz"):
@@ -177,12 +179,12 @@ class Filterbank(Stage):
         return values
 
     def build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
-        values = self.at_rate(values, self._given, self.sample_rate)
+        values = self.resolve_rate_defaults(values, self._given, self.sample_rate)
         frequencies = center_frequencies(values)
         if frequencies.max() >= self.sample_rate / 2:
             raise ValueError(
                 f"{_chosen_by(values)}: a channel at {frequencies.max():.12g} Hz is not below half the sample rate; "
-                f"{HIGHEST * self.sample_rate:.12g} Hz would do"
+                f"{MAX_RELATIVE_FREQUENCY * self.sample_rate:.12g} Hz would do"
             )
         bank: GammatoneBank | DrnlBank
         if values["fb_type"] == "drnl":

@@ -22,22 +22,22 @@ from rosafe.dsp import kernels
 from rosafe.dsp.framing import FrameBuffer
 from rosafe.dsp.guard import FloatArray
 from rosafe.dsp.rounding import round_half_away
-from rosafe.dsp.signal import Signal
+from rosafe.dsp.signal import SignalFormat
 from rosafe.dsp.stage import Stage
 from rosafe.vocabulary.parameter import Parameter
 from rosafe.vocabulary.representation import Derived, Representation
 
-MEMORY = 5.0  # s, that levels and features are normalised by
-REACH = 19  # frames before and after one that its features take in
+NORMALISATION_SECONDS = 5.0  # s, that levels and features are normalised by
+CONTEXT_FRAMES = 19  # frames before and after one that its features take in
 WAVES = 3.5  # half periods in the length of a filter
 LENGTH = 40  # of the longest filter, in frames
 TIME_STEP, CHANNEL_STEP = 0.2, 0.3  # how far apart the frequencies of the filters are
 HIGHEST = math.pi / 2  # of these, per frame or channel
 EPSILON = 2.2204e-16  # the original's literal
-STEADY = 1e-9  # of 1 + |mean|: features that deviate by less are 0
+MIN_RELATIVE_DEVIATION = 1e-9  # of 1 + |mean|: features that deviate by less are 0
 
 
-class Memory:
+class GaborState:
     """What frames still to come depend on.
 
     Attributes
@@ -58,7 +58,7 @@ class Memory:
     def begin(self, channels: int, features: int) -> None:
         """Nothing has come yet."""
         self.levels, self.maxima = FrameBuffer(), FrameBuffer()
-        self.deviations = Deviations(1, np.empty((0, 2 * features)))
+        self.deviations = RunningZScore(1, np.empty((0, 2 * features)))
         self.channels = channels
 
 
@@ -98,28 +98,28 @@ class Gabor(Stage):
         port_doc="Gabor features",
     )
 
-    def __init__(self, input_format: Signal | float, **parameters: Any) -> None:
-        self._memory = Memory()
+    def __init__(self, input_format: SignalFormat | float, **parameters: Any) -> None:
+        self._memory = GaborState()
         super().__init__(input_format, **parameters)
 
     @property
     def derived(self) -> dict[str, Any]:
-        return {"gb_nFeatures": counted(len(self.input_format.center_frequencies)).features}
+        return {"gb_nFeatures": count_features(len(self.input_format.center_frequencies)).features}
 
     @property
     def look_ahead(self) -> int:
-        return REACH
+        return CONTEXT_FRAMES
 
     def output_rows(self, rows: tuple[int, ...]) -> tuple[int, ...]:
-        return (rows[0], counted(rows[1]).features)
+        return (rows[0], count_features(rows[1]).features)
 
     def state_size(self, rows: tuple[int, ...]) -> int:
-        features, weights = counted(rows[1])
+        features, weights = count_features(rows[1])
         # of the last 5 s the features, their sums and their squares' sums; levels, in a store of up to twice as many
-        return 3 * self._remembered * 2 * features + weights + 4 * 2 * REACH * math.prod(rows)
+        return 3 * self._remembered * 2 * features + weights + 4 * 2 * CONTEXT_FRAMES * math.prod(rows)
 
     def process(self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None) -> FloatArray:
-        rates = np.maximum(self._checked(block), 0.0)
+        rates = np.maximum(self._as_valid_block(block), 0.0)
         memory, made = self._memory, patterns(rates.shape[1])
         if rates.shape[1] != memory.channels:
             memory.begin(rates.shape[1], len(made.places))
@@ -127,10 +127,10 @@ class Gabor(Stage):
             return np.empty((2, len(made.places), 0))
         levels = self._levels(rates)
         if memory.levels.held == 0:
-            levels = np.concatenate((np.repeat(levels[..., :1], REACH, axis=-1), levels), axis=-1)
+            levels = np.concatenate((np.repeat(levels[..., :1], CONTEXT_FRAMES, axis=-1), levels), axis=-1)
         levels = memory.levels.append(levels)
-        count = max(0, levels.shape[-1] - 2 * REACH)
-        features = respond(levels, count, made)
+        count = max(0, levels.shape[-1] - 2 * CONTEXT_FRAMES)
+        features = filter_responses(levels, count, made)
         memory.levels.drop(count)
         if memory.deviations.length != self._remembered:
             memory.deviations = memory.deviations.resized(self._remembered)
@@ -149,16 +149,16 @@ class Gabor(Stage):
         return np.multiply(levels, 10.0, out=levels)
 
     def reset(self) -> None:
-        self._memory = Memory()
+        self._memory = GaborState()
 
-    def input_format_changed(self, before: Signal) -> None:
+    def input_format_changed(self, before: SignalFormat) -> None:
         if self.input_format.center_frequencies != before.center_frequencies:
-            self._memory = Memory()
+            self._memory = GaborState()
         self.build(self.values, frozenset())
 
     def build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
         self._floor = 10 ** (-values["gb_maxDynamicRangeDB"] / 10)
-        self._remembered = max(1, round_half_away(MEMORY * self.input_format.rate))
+        self._remembered = max(1, round_half_away(NORMALISATION_SECONDS * self.input_format.rate))
 
 
 # --- filters ----------------------------------------------------------------------------------------------------
@@ -187,7 +187,7 @@ class Count(NamedTuple):
 
 
 @functools.lru_cache(maxsize=16)
-def counted(channels: int) -> Count:
+def count_features(channels: int) -> Count:
     """Those of so many channels, told without making them."""
     features = weights = 0
     for (length, _), (extent, _) in extents(channels):
@@ -272,21 +272,21 @@ def _filter(time: tuple[float, float], channel: tuple[float, float]) -> NDArray[
 # --- features of frames -----------------------------------------------------------------------------------------
 
 
-def respond(levels: FloatArray, count: int, made: Patterns) -> FloatArray:
+def filter_responses(levels: FloatArray, count: int, made: Patterns) -> FloatArray:
     """The features (2, G, count) of levels (2, C, count + 38)."""
     if count == 0:
         return np.empty((2, len(made.places), 0))
     if not kernels.compiled():
         return respond_by_scipy(levels, count, made)
-    return kernels.patterns(levels, count, REACH, made.places, made.weights)
+    return kernels.gabor_responses(levels, count, CONTEXT_FRAMES, made.places, made.weights)
 
 
 def respond_by_scipy(levels: FloatArray, count: int, made: Patterns) -> FloatArray:
-    """As `respond`."""
+    """As `filter_responses`."""
     matrix = _matrix(levels.shape[1])
     result = np.empty((2, len(made.places), count))
     for ear in range(2):  # not a dense product: OpenBLAS would start threads for it, see `Framing.means`
-        frames = sliding_window_view(levels[ear], 2 * REACH + 1, axis=-1)[:, :count]  # (C, F, 39)
+        frames = sliding_window_view(levels[ear], 2 * CONTEXT_FRAMES + 1, axis=-1)[:, :count]  # (C, F, 39)
         result[ear] = matrix @ frames.swapaxes(1, 2).reshape(-1, count)
     return result
 
@@ -296,15 +296,19 @@ def _matrix(channels: int) -> Any:
     """The weights as a sparse matrix (G, C * 39)."""
     made = patterns(channels)
     columns = [
-        ((first + np.arange(number))[:, np.newaxis] * (2 * REACH + 1) + REACH + np.arange(-reach, reach + 1)).ravel()
+        (
+            (first + np.arange(number))[:, np.newaxis] * (2 * CONTEXT_FRAMES + 1)
+            + CONTEXT_FRAMES
+            + np.arange(-reach, reach + 1)
+        ).ravel()
         for first, number, reach, _ in made.places.tolist()
     ]
     begins = np.append(made.places[:, 3], len(made.weights))
-    shape = (len(made.places), channels * (2 * REACH + 1))
+    shape = (len(made.places), channels * (2 * CONTEXT_FRAMES + 1))
     return scipy.sparse.csr_matrix((made.weights, np.concatenate([np.empty(0, int), *columns]), begins), shape)
 
 
-class Deviations:
+class RunningZScore:
     """How many standard deviations each value of some rows is above the mean of the last ones, itself included.
 
     The values are in stretches as long as the window. A window is the end of one stretch and the beginning of the next:
@@ -335,10 +339,10 @@ class Deviations:
         self._values[length - self._before :] = values[len(values) - self._before :]
         self._begin()
 
-    def resized(self, length: int) -> Deviations:
+    def resized(self, length: int) -> RunningZScore:
         """The same with another window."""
         rest = self._values[max(self._here, self.length - self._before) :]
-        return Deviations(length, np.concatenate((rest, self._values[: self._here])))
+        return RunningZScore(length, np.concatenate((rest, self._values[: self._here])))
 
     def process(self, values: FloatArray) -> FloatArray:
         """The deviations (n, R) of the next values (n, R); 0 where the standard deviation is next to nothing."""
@@ -357,7 +361,7 @@ class Deviations:
                 mean = mean + difference * (older / count)
                 squares = squares + end_squares + np.square(difference) * (self._here * older / count)
             sigma = np.sqrt(squares / count)
-            np.divide(value - mean, sigma, out=deviation, where=sigma > STEADY * (1 + np.abs(mean)))
+            np.divide(value - mean, sigma, out=deviation, where=sigma > MIN_RELATIVE_DEVIATION * (1 + np.abs(mean)))
         return result
 
     def _begin(self) -> None:

@@ -19,8 +19,8 @@ import numpy as np
 import scipy
 
 from rosafe.dsp import kernels
-from rosafe.dsp.cascade import Cascade
-from rosafe.dsp.guard import SQUARE_TINY, TINY, FloatArray, limited
+from rosafe.dsp.cascade import SosFilter
+from rosafe.dsp.guard import SQUARE_TINY, TINY, FloatArray, clamp
 from rosafe.dsp.stage import Stage
 from rosafe.vocabulary.parameter import Parameter
 from rosafe.vocabulary.representation import Representation
@@ -46,7 +46,7 @@ RECTIFIERS: dict[str, Callable[[FloatArray], FloatArray]] = {
     "none": np.copy,
     "halfwave": lambda samples: np.maximum(samples, 0.0),
     "fullwave": np.abs,
-    "square": lambda samples: np.square(limited(samples, SQUARE_TINY)),
+    "square": lambda samples: np.square(clamp(samples, SQUARE_TINY)),
 }
 ENVELOPE_METHODS = ("hilbert", "joergensen", "bernstein")
 METHODS = ("none", "halfwave", "fullwave", "square", "hilbert", "joergensen", "dau", "breebart", "bernstein")
@@ -83,15 +83,15 @@ class InnerHairCell(Stage):
         word="innerhaircell",
     )
 
-    OVERWRITES = True
-    APART = True
+    SUPPORTS_IN_PLACE = True
+    CHANNEL_INDEPENDENT = True
 
     @property
     def required_extra(self) -> str:
         return "envelope" if self.values["ihc_method"] in ENVELOPE_METHODS else ""
 
     def process(self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None) -> FloatArray:
-        samples, envelope = self._checked(block), extra
+        samples, envelope = self._as_valid_block(block), extra
         method = self.values["ihc_method"]
         rectification = RECTIFICATION.get(method, "none")
         if not self.required_extra:
@@ -99,17 +99,17 @@ class InnerHairCell(Stage):
         elif envelope is None or np.shape(envelope) != samples.shape:
             raise ValueError(f"envelope: {method} needs one of the shape of the block")
         elif rectification == "compressed":
-            envelope = self._checked(envelope)
+            envelope = self._as_valid_block(envelope)
         else:
-            samples, envelope = self._checked(envelope), None
+            samples, envelope = self._as_valid_block(envelope), None
         if kernels.compiled():
-            state = self._lowpass.started(samples.shape[:-1])
-            output = self._room(samples.shape, out)
+            state = self._lowpass.ensure_state(samples.shape[:-1])
+            output = self._output_array(samples.shape, out)
             kernels.rectify_and_filter(rectification, samples, envelope, self._lowpass.sections, state, output)
             return output
         if envelope is not None:
-            return self._lowpass.process(compressed(limited(samples), limited(envelope)))
-        return self._lowpass.process(RECTIFIERS[rectification](limited(samples)))
+            return self._lowpass.process(compressed(clamp(samples), clamp(envelope)))
+        return self._lowpass.process(RECTIFIERS[rectification](clamp(samples)))
 
     def reset(self) -> None:
         self._lowpass.reset()
@@ -122,7 +122,7 @@ class InnerHairCell(Stage):
             if cutoff >= self.sample_rate / 2:
                 raise ValueError(f"ihc_method: {method} needs a sample rate above {2 * cutoff:.12g} Hz")
             sections = np.tile(scipy.signal.butter(order, cutoff, fs=self.sample_rate, output="sos"), (times, 1))
-        self._lowpass = Cascade(sections)
+        self._lowpass = SosFilter(sections)
 
 
 def compressed(samples: FloatArray, envelope: FloatArray) -> FloatArray:
@@ -130,4 +130,4 @@ def compressed(samples: FloatArray, envelope: FloatArray) -> FloatArray:
     result = np.power(envelope, COMPRESSION, out=np.zeros_like(envelope), where=envelope >= TINY)
     result *= samples
     # the bound tells only where an envelope is smaller by far than the signal it is said to belong to
-    return np.square(limited(np.maximum(result, 0.0, out=result), SQUARE_TINY))
+    return np.square(clamp(np.maximum(result, 0.0, out=result), SQUARE_TINY))

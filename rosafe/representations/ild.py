@@ -32,15 +32,15 @@ class Ild(FramedStage):
         port_doc="Interaural level differences (dB), in `left`",
     )
     prefix = "ild"
-    APART = True
+    CHANNEL_INDEPENDENT = True
 
     def output_rows(self, rows: tuple[int, ...]) -> tuple[int, ...]:
         return rows[1:]
 
     def process(self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None) -> FloatArray:
-        samples = self._checked(block)
+        samples = self._as_valid_block(block)
         if kernels.compiled():
             frames = self._frames(samples, self._framing.weights(squared=True))
-            return kernels.levels(frames, EPSILON)
+            return kernels.level_differences(frames, EPSILON)
         energies = self._means(samples, squared=True) + EPSILON
         return 10 * np.log10(energies[1] / energies[0])

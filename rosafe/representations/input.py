@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from rosafe.dsp.guard import FloatArray, limited
+from rosafe.dsp.guard import FloatArray, clamp
 from rosafe.dsp.stage import Stage
 from rosafe.vocabulary.parameter import Parameter
 from rosafe.vocabulary.representation import Representation
@@ -37,11 +37,11 @@ class Input(Stage):
 
     def process(self, block: Any, extra: FloatArray | None = None, out: FloatArray | None = None) -> FloatArray:
         """(2, N) of int32 or float to (2, N); ValueError for NaN and infinities."""
-        samples = self._checked(block)
+        samples = self._as_valid_block(block)
         if np.asarray(block).dtype.kind == "f":  # of whole numbers, all are finite and within the limit
             if not np.isfinite(samples).all():
                 raise ValueError("block: there are samples that are not finite")
-            samples = limited(samples)
+            samples = clamp(samples)
         return samples / self._divisor
 
     def build(self, values: dict[str, Any], changed: frozenset[str]) -> None:

@@ -16,12 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rosafe.dsp.guard import FloatArray
-from rosafe.dsp.signal import Signal
+from rosafe.dsp.signal import SignalFormat
 from rosafe.dsp.stage import Stage
 from rosafe.vocabulary.representation import Representation
 
 
-class Peaks(NamedTuple):
+class ParabolicPeaks(NamedTuple):
     """Of the correlations of each channel and frame; all arrays are (C, F)."""
 
     place: NDArray[np.intp]  # of the largest value, the first of equals
@@ -31,7 +31,7 @@ class Peaks(NamedTuple):
     flat: NDArray[np.bool_]  # where all lags are equal
 
     @classmethod
-    def find(cls, correlations: FloatArray) -> Peaks:
+    def find(cls, correlations: FloatArray) -> ParabolicPeaks:
         """Those of (C, L, F). At the ends of the lags there is no parabola: offset and slope are 0."""
         channels, lags, frames = correlations.shape
         peak = correlations.argmax(axis=1)
@@ -53,7 +53,7 @@ class Peaks(NamedTuple):
         return cls(peak, value, offset, slope, flat)
 
 
-class _OfPeaks(Stage):
+class _PeakStage(Stage):
     """A stage that takes one number from the peak of each channel and frame, (C, L, F) to (C, F); it has no state."""
 
     INPUT = ("channel", "lag", "time")
@@ -62,11 +62,11 @@ class _OfPeaks(Stage):
         return rows[:1]
 
     @cached_property
-    def output_format(self) -> Signal:
+    def output_format(self) -> SignalFormat:
         return replace(self.input_format, lags=0)
 
 
-class Itd(_OfPeaks):
+class Itd(_PeakStage):
     """Interaural time difference in s; positive where the left ear hears later, that is, for sources on the right.
 
     (i - M + d) / fs, with i the place of the first largest of the correlations c[0] to c[2M], and d = (c[i-1] -
@@ -84,15 +84,15 @@ class Itd(_OfPeaks):
     )
 
     def process(self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None) -> FloatArray:
-        correlations = self._checked(block)
-        peaks = Peaks.find(correlations)
+        correlations = self._as_valid_block(block)
+        peaks = ParabolicPeaks.find(correlations)
         lags = peaks.place - correlations.shape[1] // 2 + peaks.offset
         lags[peaks.flat] = 0.0
         lags /= self.sample_rate
         return lags
 
 
-class Ic(_OfPeaks):
+class Ic(_PeakStage):
     """Interaural coherence: the height of the correlation's peak.
 
     c[i] - (c[i-1] - c[i+1]) d / 4, with i and d as for `Itd`; at the ends of the lags c[i]. The top of a parabola may
@@ -108,6 +108,6 @@ class Ic(_OfPeaks):
     )
 
     def process(self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None) -> FloatArray:
-        peaks = Peaks.find(self._checked(block))
+        peaks = ParabolicPeaks.find(self._as_valid_block(block))
         coherence: FloatArray = peaks.value - 0.25 * peaks.slope * peaks.offset
         return coherence

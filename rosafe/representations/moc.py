@@ -75,7 +75,7 @@ class Moc(Stage):
     )
 
     def process(self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None) -> FloatArray:
-        rates = self._checked(block)
+        rates = self._as_valid_block(block)
         levels = 20 * np.log10(np.maximum(rates, SILENCE))
         np.minimum(np.maximum(levels, self._least, out=levels), FALL, out=levels)
         attenuation = np.full(levels.shape, FACTORS[0])

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from rosafe.dsp.guard import FloatArray
 from rosafe.dsp.rounding import round_half_away
-from rosafe.dsp.signal import Signal
+from rosafe.dsp.signal import SignalFormat
 from rosafe.dsp.stage import Stage
 from rosafe.vocabulary.parameter import Parameter
 from rosafe.vocabulary.representation import Representation
@@ -87,9 +87,9 @@ class Pitch(Stage):
     _channels: int  # of the last block; 0 before the first
     _confidences: FloatArray  # (2, n), of the last 5 s of frames that have come
     _frames: FloatArray  # (2, 3, n): q, rawPitch and confidence of the last frames that have been put out, then of
-    _held: int  # so many that have not
+    _pending_frames: int  # so many that have not
 
-    def __init__(self, input_format: Signal | float, **parameters: Any) -> None:
+    def __init__(self, input_format: SignalFormat | float, **parameters: Any) -> None:
         self.reset()
         super().__init__(input_format, **parameters)
 
@@ -101,7 +101,7 @@ class Pitch(Stage):
         return (rows[0], 3)
 
     def process(self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None) -> FloatArray:
-        correlations = self._checked(block)
+        correlations = self._as_valid_block(block)
         channels, lags = correlations.shape[1:3]
         if lags != self.input_format.lags + 1:
             raise ValueError(f"block: {lags} lags, and not {self.input_format.lags + 1}")
@@ -113,12 +113,12 @@ class Pitch(Stage):
         raw = np.divide(self.sample_rate, lag + self._range.start, out=np.zeros(lag.shape), where=confidence > 0)
         self._confidences, greatest = running_maximum(self._confidences, confidence, self._reach)
         chosen = np.where(confidence < self.values["pi_confThres"] * greatest, 0.0, raw)
-        return self._released(np.stack((chosen, raw, confidence), axis=1))
+        return self._emit(np.stack((chosen, raw, confidence), axis=1))
 
-    def _released(self, arriving: FloatArray) -> FloatArray:
+    def _emit(self, arriving: FloatArray) -> FloatArray:
         """What can be put out when frames (2, 3, F) of q, rawPitch and confidence have come."""
         frames = np.concatenate((self._frames, arriving), axis=-1)
-        held = self._held + arriving.shape[-1]
+        held = self._pending_frames + arriving.shape[-1]
         count, order = max(0, held - self.look_ahead), self.values["pi_medianOrder"]
         first = frames.shape[-1] - held
         output = frames[..., first : first + count].copy()
@@ -127,21 +127,21 @@ class Pitch(Stage):
             windows = np.sort(sliding_window_view(frames[:, 0, begin : begin + count + order - 1], order, axis=-1))
             median = (windows[..., (order - 1) // 2] + windows[..., order // 2]) / 2
             output[:, 0] = np.where(median > 0, median, np.nan)
-        self._held = held - count
-        self._frames = frames[..., frames.shape[-1] - self._held - MOST_ORDER // 2 :].copy()
+        self._pending_frames = held - count
+        self._frames = frames[..., frames.shape[-1] - self._pending_frames - MOST_ORDER // 2 :].copy()
         return output
 
     def reset(self) -> None:
         self._channels = 0
         self._confidences = np.empty((2, 0))
         self._frames = np.zeros((2, 3, MOST_ORDER // 2))  # as many as the longest median wants
-        self._held = 0
+        self._pending_frames = 0
 
     @cached_property
-    def output_format(self) -> Signal:
+    def output_format(self) -> SignalFormat:
         return replace(self.input_format, lags=0)
 
-    def input_format_changed(self, before: Signal) -> None:
+    def input_format_changed(self, before: SignalFormat) -> None:
         self.build(self.values, frozenset())
         channels = (self.input_format.center_frequencies, self.input_format.filterbank)
         if channels != (before.center_frequencies, before.filterbank):

@@ -20,20 +20,20 @@ import scipy
 
 from rosafe.dsp import kernels
 from rosafe.dsp.framing import FrameBuffer, FramedStage, frame_parameters
-from rosafe.dsp.guard import SQUARE_TINY, TINY, FloatArray, limited
+from rosafe.dsp.guard import SQUARE_TINY, TINY, FloatArray, clamp
 from rosafe.dsp.kernels import precedence as by_kernel
-from rosafe.dsp.kernels.precedence import TAPS, TOGETHER, Taps, Windowed
+from rosafe.dsp.kernels.precedence import BATCH, TAPS, Taps, Windowed
 from rosafe.dsp.rounding import MAX_SAMPLES, round_half_away
-from rosafe.dsp.signal import Signal
+from rosafe.dsp.signal import SignalFormat
 from rosafe.vocabulary.parameter import Parameter
 from rosafe.vocabulary.representation import Derived, Part, Representation
 
 EPSILON = 2.2204e-16  # the original's literal
 SECONDS = 0.01  # that autocorrelations reach
 LOWEST = 100.0  # Hz: channels below weigh as one here
-LOUD = 10 ** (-12 / 20)  # of the highest peak of all channels: those that reach it are active
-FEW = 5  # active channels; where there are no more, each channel is normalised
-FAINT = 1e-3  # of the strongest channel; weaker ones are left out then
+ACTIVE_PEAK_RATIO = 10 ** (-12 / 20)  # of the highest peak of all channels: those that reach it are active
+MAX_FEW_ACTIVE = 5  # active channels; where there are no more, each channel is normalised
+MIN_ENERGY_RATIO = 1e-3  # of the strongest channel; weaker ones are left out then
 NOISE = 1e-13  # of what a correlation can be at most: what rounding leaves of a 0
 GAINS = np.arange(101) / 100  # that an echo may have
 RATIOS = GAINS / (1 + GAINS**2)  # of an autocorrelation at the echo's delay and at lag 0
@@ -43,7 +43,7 @@ PAIRS = np.array([(SMALL, SMALL), (LARGE, LARGE), (SMALL, LARGE), (LARGE, SMALL)
 BATCH = 2**18  # samples per ear that are worked on at a time, to bound memory and stay in the cache
 
 
-class Running:
+class RunningSums:
     """What has been summed since the start.
 
     Attributes
@@ -65,7 +65,7 @@ class Running:
         """Nothing has come yet of the channels at these frequencies (Hz)."""
         channels = len(frequencies)
         self.gains, self.weights = 1 / np.maximum(frequencies, LOWEST), weights(frequencies)
-        self.power = np.zeros((math.ceil(2 * channels / TOGETHER), bins, TOGETHER))
+        self.power = np.zeros((math.ceil(2 * channels / BATCH), bins, BATCH))
         self.energies = np.zeros((2, channels))
         self.pairs = np.zeros((len(PAIRS), lags))
 
@@ -136,13 +136,13 @@ class Precedence(FramedStage):
 
     def state_size(self, rows: tuple[int, ...]) -> int:
         bins = self._points // 2 + 1
-        groups = -(-math.prod(rows) // TOGETHER) * TOGETHER
+        groups = -(-math.prod(rows) // BATCH) * BATCH
         return bins * (groups + 4)  # sums of spectra, and the tables of the transform
 
     def process(
         self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None
     ) -> tuple[FloatArray, ...]:
-        samples = self._checked(block)
+        samples = self._as_valid_block(block)
         channels = samples.shape[1]
         if self._running.energies.shape[1] != channels:
             frequencies = np.array(self.input_format.center_frequencies)
@@ -154,7 +154,7 @@ class Precedence(FramedStage):
             frames = self._frames(samples, self._framing.pinned)
             count = frames.number
         else:
-            views = self._framing.frames(self._buffer.append(limited(samples, SQUARE_TINY)))
+            views = self._framing.frames(self._buffer.append(clamp(samples, SQUARE_TINY)))
             count = views.shape[-2]
         itd, ild = np.empty((channels, count)), np.empty((channels, count))
         cc = np.empty((channels, 2 * self._max_lag + 1, count))
@@ -169,20 +169,20 @@ class Precedence(FramedStage):
                 windowed(views[..., part, :], self._framing.window, taken)
             self._localise(taken, itd[:, part], ild[:, part], cc[..., part])
         if compiled:
-            frames.keep()
+            frames.save_tail()
         else:
             self._buffer.drop(count * self._framing.hop)
         return itd, ild, cc
 
     def reset(self) -> None:
         super().reset()
-        self._running = Running()
+        self._running = RunningSums()
 
     @cached_property
-    def output_format(self) -> Signal:
+    def output_format(self) -> SignalFormat:
         return replace(super().output_format, lags=self._max_lag)
 
-    def input_format_changed(self, before: Signal) -> None:
+    def input_format_changed(self, before: SignalFormat) -> None:
         self.build(self.values, frozenset())
         self._buffer = FrameBuffer()
 
@@ -197,9 +197,9 @@ class Precedence(FramedStage):
         self._size = len(self._framing.window)
         self._max_lag, self._pair_reach = math.ceil(lag), math.ceil(rate / 1000)
         self._first_delay, self._last_delay = first_delay, round_half_away(SECONDS * rate)
-        self._fading = fading(np.arange(self._last_delay + 1), round_half_away(rate / 1000))
+        self._lag_weights = fading(np.arange(self._last_delay + 1), round_half_away(rate / 1000))
         self._points = 1 << (self._size + self._last_delay - 1).bit_length()
-        self._running = Running()
+        self._running = RunningSums()
 
     # --- some frames ----------------------------------------------------------------------------------------------
 
@@ -235,9 +235,13 @@ class Precedence(FramedStage):
         energies = np.cumsum(np.concatenate((running.energies[np.newaxis], frames.energies * running.gains)), axis=0)
         running.energies = energies[-1].copy()
         energies = energies[1:]
-        active = (frames.peaks > LOUD * frames.peaks.max(axis=-1, keepdims=True)).sum(axis=-1, keepdims=True)
-        strong = energies > np.maximum(FAINT * energies.max(axis=-1, keepdims=True), TINY)
-        factors = np.where(active > FEW, 1.0, np.divide(1.0, energies, out=np.zeros_like(energies), where=strong))
+        active = (frames.peaks > ACTIVE_PEAK_RATIO * frames.peaks.max(axis=-1, keepdims=True)).sum(
+            axis=-1, keepdims=True
+        )
+        strong = energies > np.maximum(MIN_ENERGY_RATIO * energies.max(axis=-1, keepdims=True), TINY)
+        factors = np.where(
+            active > MAX_FEW_ACTIVE, 1.0, np.divide(1.0, energies, out=np.zeros_like(energies), where=strong)
+        )
         add = by_kernel.add_spectra if kernels.compiled() and self._points <= kernels.MOST_POINTS else add_spectra
         spectra = add(frames.samples, self._points, running.gains, factors, running.power)
         lags: FloatArray = scipy.fft.irfft(spectra, self._points)
@@ -253,7 +257,7 @@ class Precedence(FramedStage):
         echo = np.take_along_axis(lags, delays[..., np.newaxis], axis=-1)[..., 0]
         ratios = np.divide(echo, largest, out=np.zeros_like(echo), where=largest > 0).clip(0.0, 0.5)
         gains = np.minimum(GAINS[np.searchsorted(RATIOS, ratios)], MOST_GAIN)[..., np.newaxis]
-        faded = self._fading[delays][..., np.newaxis]
+        faded = self._lag_weights[delays][..., np.newaxis]
         order = np.arange(TAPS)
         back = TAPS - order
         small, large = (-gains * faded) ** order, (-1.0) ** (order + 1) * gains**back * faded ** (back - 1)
@@ -262,7 +266,7 @@ class Precedence(FramedStage):
     def _correlate(
         self, left: FloatArray, left_taps: Taps, right: FloatArray, right_taps: Taps, reach: int
     ) -> tuple[FloatArray, FloatArray]:
-        few_lags = 2 * reach + 1 <= kernels.MOST_LAGS
+        few_lags = 2 * reach + 1 <= kernels.MAX_LAGS
         correlate = by_kernel.correlate_filtered if kernels.compiled() and few_lags else correlate_filtered
         lags, energies = correlate(left, left_taps, right, right_taps, reach)
         lags[np.abs(lags) < NOISE * np.sqrt(energies[0] * energies[1])[..., np.newaxis]] = 0.0
@@ -296,14 +300,14 @@ def windowed(frames: FloatArray, window: FloatArray, output: Windowed) -> None:
 def add_spectra(
     samples: FloatArray, points: int, gains: FloatArray, factors: FloatArray, power: FloatArray
 ) -> FloatArray:
-    """Add the power spectra of frames (F, 2, C, w), times `gains` (C,), to `power` as of `Running`, frame by frame.
+    """Add the power spectra of frames (F, 2, C, w), times `gains` (C,), to `power` as of `RunningSums`, frame by frame.
 
     Returns what `power` is with each frame, times `factors` (F, 2, C) and summed over channels: (F, 2, K). The spectra
     are of `points` points, K is half of these and one more.
     """
     sums = np.empty((len(samples), 2, power.shape[1]))
     row = np.arange(2 * len(gains)).reshape(2, -1)
-    group, lane = row // TOGETHER, row % TOGETHER
+    group, lane = row // BATCH, row % BATCH
     for frame, total, factor in zip(samples, sums, factors, strict=True):
         spectra = scipy.fft.rfft(frame, points)
         power[group, :, lane] += (np.square(spectra.real) + np.square(spectra.imag)) * gains[:, np.newaxis]

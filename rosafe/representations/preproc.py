@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import scipy
 
-from rosafe.dsp.cascade import Cascade, leaky_integrator
-from rosafe.dsp.guard import SQUARE_TINY, FloatArray, limited
+from rosafe.dsp.cascade import SosFilter, leaky_integrator
+from rosafe.dsp.guard import SQUARE_TINY, FloatArray, clamp
 from rosafe.dsp.middle_ear import MODELS, middle_ear_fir
 from rosafe.dsp.rounding import round_half_away
 from rosafe.dsp.stage import Stage
@@ -101,13 +101,13 @@ class PreProc(Stage):
     INPUT = ("ear", "time")
 
     @property
-    def blocks_matter(self) -> bool:
+    def block_size_dependent(self) -> bool:
         return bool(self.values["pp_bNormalizeRMS"])  # see `GainControl`
 
     def process(self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None) -> FloatArray:
         if not self._steps and self._gain == 1.0:
-            return self._checked(block).copy()
-        samples = limited(self._checked(block))
+            return self._as_valid_block(block).copy()
+        samples = clamp(self._as_valid_block(block))
         for step in self._steps:
             samples = step.process(samples)
         return samples * self._gain
@@ -117,12 +117,14 @@ class PreProc(Stage):
             step.reset()
 
     def build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
-        steps: list[Cascade | PreEmphasis | GainControl | Fir] = []
+        steps: list[SosFilter | PreEmphasis | GainControl | Fir] = []
         if values["pp_bRemoveDC"]:
             cutoff = values["pp_cutoffHzDC"]
             if cutoff >= self.sample_rate / 2:
                 raise ValueError(f"pp_cutoffHzDC: {cutoff:.12g} Hz is not below half the sample rate")
-            steps.append(Cascade(scipy.signal.butter(DC_ORDER, cutoff, "highpass", fs=self.sample_rate, output="sos")))
+            steps.append(
+                SosFilter(scipy.signal.butter(DC_ORDER, cutoff, "highpass", fs=self.sample_rate, output="sos"))
+            )
         if values["pp_bPreEmphasis"]:
             steps.append(PreEmphasis(abs(values["pp_coefPreEmphasis"])))
         if values["pp_bNormalizeRMS"]:
@@ -174,13 +176,13 @@ class GainControl:
 
     def reset(self) -> None:
         self.started = [False, False]
-        self.power = [Cascade(leaky_integrator(self.retention)) for _ in range(2)]
+        self.power = [SosFilter(leaky_integrator(self.retention)) for _ in range(2)]
 
     def process(self, block: FloatArray) -> FloatArray:
         """Normalise (2, N)."""
         gain = np.zeros(block.shape[-1])
         for ear, samples in enumerate(block):
-            squares = np.square(limited(samples, SQUARE_TINY))
+            squares = np.square(clamp(samples, SQUARE_TINY))
             if not self.started[ear]:
                 self._start(ear, squares)
             if self.started[ear]:

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from rosafe.dsp import kernels
-from rosafe.dsp.cascade import Cascade, leaky_integrator
+from rosafe.dsp.cascade import SosFilter, leaky_integrator
 from rosafe.dsp.framing import FramedStage, frame_parameters
-from rosafe.dsp.guard import FloatArray, limited
+from rosafe.dsp.guard import FloatArray, clamp
 from rosafe.vocabulary.parameter import Parameter
 from rosafe.vocabulary.representation import Representation
 
@@ -57,15 +57,15 @@ class Ratemap(FramedStage):
         port_doc="Ratemaps",
     )
     prefix = "rm"
-    APART = True
+    CHANNEL_INDEPENDENT = True
 
     def process(self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None) -> FloatArray:
-        samples = self._checked(block)
+        samples = self._as_valid_block(block)
         power = self.values["rm_scaling"] == "power"
         if not kernels.compiled():
-            return self._means(self._integrator.process(limited(samples)), power)
+            return self._means(self._integrator.process(clamp(samples)), power)
         frames = self._frames(samples, self._framing.weights(squared=power))
-        state = self._integrator.started(samples.shape[:-1])
+        state = self._integrator.ensure_state(samples.shape[:-1])
         return kernels.ratemap(frames, power, self._integrator.sections, state)
 
     def reset(self) -> None:
@@ -76,4 +76,4 @@ class Ratemap(FramedStage):
         super().build(values, changed)
         if changed & {"rm_decaySec", "rm_scaling"}:
             retention = float(np.exp(-1 / (self.sample_rate * values["rm_decaySec"])))
-            self._integrator = Cascade(leaky_integrator(retention))
+            self._integrator = SosFilter(leaky_integrator(retention))

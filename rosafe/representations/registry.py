@@ -16,7 +16,7 @@ from rosafe.vocabulary.checks import short
 from rosafe.vocabulary.representation import Representation
 
 # The original's processors, in its order: also that of getParameters and getSignals, which report no others.
-ORIGINAL = ("input", "preProc", "gammatone", "ihc", "ild", "ratemap", "crossCorrelation")
+CORE_KINDS = ("input", "preProc", "gammatone", "ihc", "ild", "ratemap", "crossCorrelation")
 
 
 def _stages_in(found: Any) -> list[type[Stage]]:
@@ -27,7 +27,7 @@ def _stages_in(found: Any) -> list[type[Stage]]:
     return [value for value in own.values() if "REPRESENTATION" in vars(value)]
 
 
-def own() -> dict[str, type[Stage]]:
+def builtin_stages() -> dict[str, type[Stage]]:
     """The representations of this folder by kind, without plugins; parents first."""
     found: dict[str, type[Stage]] = {}
     for info in pkgutil.iter_modules([str(Path(__file__).parent)]):
@@ -39,7 +39,7 @@ def own() -> dict[str, type[Stage]]:
 
 def _ordered(stages: Mapping[str, type[Stage]]) -> dict[str, type[Stage]]:
     """The original's first, then by name, parents before their children; without those whose parent is missing."""
-    waiting = sorted(stages, key=lambda kind: (ORIGINAL.index(kind) if kind in ORIGINAL else len(ORIGINAL), kind))
+    waiting = sorted(stages, key=lambda kind: (CORE_KINDS.index(kind) if kind in CORE_KINDS else len(CORE_KINDS), kind))
     ordered: dict[str, type[Stage]] = {}
     while ready := [kind for kind in waiting if stages[kind].REPRESENTATION.parent in ("", *ordered)]:
         ordered[ready[0]] = stages[ready[0]]
@@ -61,7 +61,7 @@ class _Search:
     """
 
     def __init__(self) -> None:
-        self.stages = own()
+        self.stages = builtin_stages()
         self.plugins: dict[str, str] = {}
         self.problems: list[str] = []
         self.warnings: list[str] = []
@@ -109,4 +109,4 @@ class _Search:
 
 _SEARCH = _Search()
 STAGES, PLUGINS, PROBLEMS, WARNINGS = _SEARCH.stages, _SEARCH.plugins, _SEARCH.problems, _SEARCH.warnings
-OWN = frozenset(own())  # kinds that are no plugins
+BUILTIN = frozenset(builtin_stages())  # kinds that are no plugins

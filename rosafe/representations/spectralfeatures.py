@@ -25,7 +25,7 @@ import numpy as np
 
 from rosafe.dsp import kernels
 from rosafe.dsp.guard import LIMIT, FloatArray
-from rosafe.dsp.signal import Signal
+from rosafe.dsp.signal import SignalFormat
 from rosafe.dsp.stage import Stage
 from rosafe.vocabulary.parameter import Parameter
 from rosafe.vocabulary.representation import Representation
@@ -232,23 +232,23 @@ class SpectralFeatures(Stage):
     _last: FloatArray | None = None  # the last spectra, (2, C, 1)
 
     @classmethod
-    def in_force(cls, values: Mapping[str, Any]) -> dict[str, Any]:
+    def effective_values(cls, values: Mapping[str, Any]) -> dict[str, Any]:
         words = values["sf_requests"]
         return {**values, "sf_requests": list(FEATURES) if "all" in words else words}
 
     @property
     def parameters(self) -> dict[str, Any]:
-        return self.in_force(self.values)
+        return self.effective_values(self.values)
 
     def output_rows(self, rows: tuple[int, ...]) -> tuple[int, ...]:
         return (rows[0], len(self._words))
 
     @cached_property
-    def output_format(self) -> Signal:
+    def output_format(self) -> SignalFormat:
         return replace(self.input_format, center_frequencies=())
 
     def process(self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None) -> FloatArray:
-        rates = self._checked(block)
+        rates = self._as_valid_block(block)
         channels, known = rates.shape[1], len(self._frequencies)
         if not channels == known > 0:
             raise ValueError(f"block: {channels} channels, and the center frequencies of {known} are known")
@@ -270,7 +270,7 @@ class SpectralFeatures(Stage):
     def reset(self) -> None:
         self._last = None
 
-    def input_format_changed(self, before: Signal) -> None:
+    def input_format_changed(self, before: SignalFormat) -> None:
         if self.input_format.center_frequencies != before.center_frequencies:
             self._last = None
             self._frequencies = np.array(self.input_format.center_frequencies)

@@ -17,7 +17,7 @@ from rosafe.dsp import kernels
 from rosafe.dsp.framing import FrameBuffer
 from rosafe.dsp.guard import FloatArray
 from rosafe.dsp.rounding import MAX_SAMPLES, round_half_away
-from rosafe.dsp.signal import Signal
+from rosafe.dsp.signal import SignalFormat
 from rosafe.dsp.stage import Stage
 from rosafe.vocabulary.parameter import Parameter
 from rosafe.vocabulary.representation import Representation
@@ -73,7 +73,7 @@ class _Map(Stage):
     _rows: tuple[int, ...] = ()  # of the blocks
     _past = 0  # frames in the buffer that have been put out
 
-    def __init__(self, input_format: Signal | float, **parameters: Any) -> None:
+    def __init__(self, input_format: SignalFormat | float, **parameters: Any) -> None:
         self._buffer = FrameBuffer()  # of strengths and levels, (2, 2, C)
         super().__init__(input_format, **parameters)
 
@@ -91,10 +91,10 @@ class _Map(Stage):
         return 4 * math.prod(rows) * frames  # strengths and levels, in a store of up to twice as many
 
     def process(self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None) -> FloatArray:
-        strengths = self._checked(block)
+        strengths = self._as_valid_block(block)
         if extra is None or np.shape(extra) != strengths.shape:
             raise ValueError("level: wanted is one of the shape of the block")
-        both = np.stack((strengths, self._checked(extra)))
+        both = np.stack((strengths, self._as_valid_block(extra)))
         if both.shape[:-1] != self._rows:
             self._rows, self._past = both.shape[:-1], 0
         held = self._buffer.append(both)
@@ -117,7 +117,7 @@ class _Map(Stage):
         self._buffer = FrameBuffer()
         self._past = 0
 
-    def input_format_changed(self, before: Signal) -> None:
+    def input_format_changed(self, before: SignalFormat) -> None:
         if self.input_format.center_frequencies != before.center_frequencies:
             self.reset()
         self.build(self.values, frozenset())

@@ -11,7 +11,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from rosafe.dsp.guard import FloatArray
-from rosafe.dsp.signal import Signal
+from rosafe.dsp.signal import SignalFormat
 from rosafe.dsp.stage import Stage
 from rosafe.vocabulary.parameter import Parameter
 from rosafe.vocabulary.representation import Representation
@@ -36,7 +36,7 @@ class _Strength(Stage):
     _last: FloatArray | None = None  # level of the last frame, (2, C, 1); None before the first one
 
     def process(self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None) -> FloatArray:
-        rates = self._checked(block)
+        rates = self._as_valid_block(block)
         levels: FloatArray = np.log10(np.maximum(rates, SILENCE))
         levels *= 10.0
         self.provided = {"level": levels} if "level" in self.provide else {}
@@ -57,7 +57,7 @@ class _Strength(Stage):
         self._last = None
         self.provided = {}
 
-    def input_format_changed(self, before: Signal) -> None:
+    def input_format_changed(self, before: SignalFormat) -> None:
         if self.input_format.center_frequencies != before.center_frequencies:
             self._last = None
 

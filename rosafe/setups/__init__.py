@@ -7,21 +7,21 @@ rosafe/genomix/setups.py does it on a running graph.
 from __future__ import annotations
 
 from .markup import SetupError
-from .plan import Plan, plan, rehearse
+from .plan import Plan, dry_run, plan
 from .reading import read, read_parameters
-from .setup import Setup, Sound, Wanted, wanted
+from .setup import Setup, SetupProcessor, Sound, wanted
 from .writing import write
 
 __all__ = [
     "Plan",
     "Setup",
     "SetupError",
+    "SetupProcessor",
     "Sound",
-    "Wanted",
+    "dry_run",
     "plan",
     "read",
     "read_parameters",
-    "rehearse",
     "wanted",
     "write",
 ]

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import yaml
 
-from rosafe.vocabulary.parameter import shown
+from rosafe.vocabulary.parameter import short_repr
 
 MAX_DEPTH = 6  # a setup has 4
 MAX_VALUES = 2**18  # scalars, lists and maps of a setup, ends of lists and maps included: less than a second of parsing
@@ -62,10 +62,10 @@ class Node(NamedTuple):
             name = key.word(f"{what}: a name")
             if name in members:
                 raise SetupError(
-                    key.line, f"{what}: {shown(name)} is there twice, first in line {members[name][1].line}"
+                    key.line, f"{what}: {short_repr(name)} is there twice, first in line {members[name][1].line}"
                 )
             if known and name not in known:
-                raise SetupError(key.line, f"{what}: unknown {shown(name)}; there are: {', '.join(known)}")
+                raise SetupError(key.line, f"{what}: unknown {short_repr(name)}; there are: {', '.join(known)}")
             members[name] = name, key, value
         return list(members.values())
 
@@ -91,7 +91,7 @@ def _check_directives(text: str) -> None:
     for number, found in enumerate(_DIRECTIVE.finditer(text)):
         if number or not _VERSION.fullmatch(found[0]):
             line = len(re.findall("\r\n|[\n\r\x85\u2028\u2029]", text[: found.start()])) + 1
-            raise SetupError(line, f"expected no directive but one %YAML 1.1 or 1.2, got {shown(found[0][:80])}")
+            raise SetupError(line, f"expected no directive but one %YAML 1.1 or 1.2, got {short_repr(found[0][:80])}")
 
 
 def _counted(events: Iterator[yaml.Event], most: int) -> Iterator[yaml.Event]:
@@ -109,7 +109,7 @@ def _build(events: Iterator[yaml.Event], event: yaml.Event, depth: int) -> Node:
     if isinstance(event, yaml.AliasEvent) or event.anchor is not None:
         raise SetupError(line, "anchors and aliases (& and *) are not taken")
     if event.tag is not None:
-        raise SetupError(line, f"tags ({shown(event.tag)}) are not taken")
+        raise SetupError(line, f"tags ({short_repr(event.tag)}) are not taken")
     if depth == MAX_DEPTH:
         raise SetupError(line, "nested too deeply")
     if isinstance(event, yaml.SequenceStartEvent):

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from rosafe.dsp.signal import Signal
-from rosafe.interface import BLOCK_AND_BUFFERS, ROSAFE, ComponentError, text_of
+from rosafe.dsp.signal import SignalFormat
+from rosafe.interface import BLOCK_AND_BUFFERS, ROSAFE, ComponentError, format_value
 from rosafe.representations import STAGES
-from rosafe.tree.requests import Found, Step, making
+from rosafe.tree.requests import ExistingProcessor, ServiceCall, creation_call
 
-from .setup import Setup, Wanted
+from .setup import Setup, SetupProcessor
 
 
 class Plan(NamedTuple):
@@ -18,10 +18,10 @@ class Plan(NamedTuple):
 
     names: list[str]
     reused: list[str]
-    steps: list[Step]
+    steps: list[ServiceCall]
 
 
-def plan(setup: Setup, found: Sequence[Found]) -> Plan:
+def plan(setup: Setup, found: Sequence[ExistingProcessor]) -> Plan:
     """What to do for `setup` in a tree that consists of `found`.
 
     A processor of the same name that is the same, to the last digit, is used. There is but one input, and it is used
@@ -43,7 +43,7 @@ def plan(setup: Setup, found: Sequence[Found]) -> Plan:
             same = next((p for p in found if not p.parent and p.kind == wanted.kind), same)
         if same is None:
             names[wanted.name] = wanted.name
-            steps += making(wanted.level, wanted.name, parent, wanted.input_values)
+            steps += creation_call(wanted.level, wanted.name, parent, wanted.input_values)
         else:
             _compare(wanted, parent, same, sample_rate)
             names[wanted.name] = same.name
@@ -51,7 +51,7 @@ def plan(setup: Setup, found: Sequence[Found]) -> Plan:
     return Plan(list(names.values()), reused, steps)
 
 
-def _compare(wanted: Wanted, parent: str, there: Found, sample_rate: float) -> None:
+def _compare(wanted: SetupProcessor, parent: str, there: ExistingProcessor, sample_rate: float) -> None:
     """Return where `there` is what is wanted, else raise e_existsAlready with the difference."""
     if there.kind != wanted.kind:
         _refuse(there, f"is of kind {there.kind}, in the setup of kind {wanted.kind}")
@@ -62,25 +62,25 @@ def _compare(wanted: Wanted, parent: str, there: Found, sample_rate: float) -> N
             value = wanted.input_values[p.name]
             if there.values.get(p.name, value) != value:
                 _differs(there, p.name, value)
-    if not wanted.level.fits(there, sample_rate):
+    if not wanted.level.matches(there, sample_rate):
         told: Mapping[str, Any] = wanted.level.in_force
         first = [*wanted.given, *told]  # what the setup says itself tells most
         name = next(name for name in first if name in told and there.values[name] != told[name])
         _differs(there, name, told[name])
 
 
-def _differs(there: Found, name: str, value: Any) -> None:
-    _refuse(there, f"has {name} {text_of(there.values.get(name))[:80]}, in the setup {text_of(value)[:80]}")
+def _differs(there: ExistingProcessor, name: str, value: Any) -> None:
+    _refuse(there, f"has {name} {format_value(there.values.get(name))[:80]}, in the setup {format_value(value)[:80]}")
 
 
-def _refuse(there: Found, how: str) -> None:
+def _refuse(there: ExistingProcessor, how: str) -> None:
     what = f"{there.name!r} is there already and {how}: remove it first (the input: Stop), or load another setup"
     raise ROSAFE.error("e_existsAlready", what=what)
 
 
-def rehearse(setup: Setup, sample_rate: float) -> None:
+def dry_run(setup: Setup, sample_rate: float) -> None:
     """Whether all processors of `setup` can be made for sound of `sample_rate` (Hz): ComponentError where not."""
-    formats: dict[str, Signal | float] = {"": float(sample_rate)}
+    formats: dict[str, SignalFormat | float] = {"": float(sample_rate)}
     providers: dict[str, Sequence[str]] = {"": ()}
     for wanted in setup.processors:
         try:

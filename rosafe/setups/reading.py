@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 
 from rosafe.interface import KINDS, MAX_SETUP, REQUEST, Parameter, Representation
 from rosafe.tree.requests import kind_of
-from rosafe.vocabulary.parameter import MAX_STRING, shown
-from rosafe.vocabulary.words import meant
+from rosafe.vocabulary.parameter import MAX_STRING, short_repr
+from rosafe.vocabulary.words import did_you_mean
 
 from .markup import Node, SetupError, parse
-from .setup import ACQUIRE, INPUT_PORTS, Setup, Sound, Wanted, parameters_of
+from .setup import ACQUIRE, INPUT_PORTS, Setup, SetupProcessor, Sound, parameters_of
 
 MAX_PROCESSORS = 10_000  # more than a node takes
 MAX_PARAMETER_VALUES = 2**15  # of a request, all of whose parameters are read while sound is processed
@@ -27,7 +27,7 @@ class _Entry(NamedTuple):
 
     line: int
     parent_line: int
-    wanted: Wanted
+    wanted: SetupProcessor
 
 
 def read(text: str, absent: list[str] | None = None) -> Setup:
@@ -74,7 +74,7 @@ def _connections(node: Node) -> Iterator[tuple[str, str]]:
     for port, _, value in node.members("connections", INPUT_PORTS):
         topic = value.word(f"connections: {port}")
         if len(topic) > MAX_STRING or not _TOPIC.fullmatch(topic):
-            raise SetupError(value.line, f"connections: {shown(topic)} is no name of a topic, such as bass/Audio")
+            raise SetupError(value.line, f"connections: {short_repr(topic)} is no name of a topic, such as bass/Audio")
         yield port, f"/{topic.removeprefix('/')}"
 
 
@@ -90,8 +90,8 @@ def _values(node: Node, parameters: tuple[Parameter, ...], what: str, but: tuple
         parameter = next((p for p in parameters if name in (p.name, *p.aliases)), None)
         if parameter is None:
             known = ", ".join((*but, *(p.name for p in parameters)))
-            near = meant(name, [p.name for p in parameters])
-            raise SetupError(key.line, f"{what}: unknown {shown(name)}; there are: {known}{near}")
+            near = did_you_mean(name, [p.name for p in parameters])
+            raise SetupError(key.line, f"{what}: unknown {short_repr(name)}; there are: {known}{near}")
         if parameter.name in values:
             raise SetupError(key.line, f"{what}: {parameter.name} is given twice")
         try:
@@ -144,21 +144,21 @@ def _of_unknown_kinds(members: Sequence[tuple[str, Node, Node]]) -> dict[str, st
     without: dict[str, str] = {}
     parents: dict[str, str] = {}
     for name, _, node in members:
-        values = {member: value for member, _, value in node.members(shown(name))}
+        values = {member: value for member, _, value in node.members(short_repr(name))}
         parents[name] = values["parent"].word(name) if "parent" in values else ""
         if "kind" in values:
             word = values["kind"].word(name)
             try:
                 kind_of(word)
             except ValueError:
-                without[name] = f"{name} (there is no plugin {shown(word)})"
+                without[name] = f"{name} (there is no plugin {short_repr(word)})"
     while below := {name for name, parent in parents.items() if parent in without and name not in without}:
         without |= {name: f"{name} (it is below {parents[name]})" for name in below}
     return without
 
 
 def _processor(name: str, key: Node, node: Node) -> _Entry:
-    what = shown(name)
+    what = short_repr(name)
     members = {member: value for member, _, value in node.members(what)}
     if "kind" not in members:
         raise SetupError(key.line, f"{what}: kind is missing; there are: {', '.join(KINDS)}")
@@ -172,7 +172,7 @@ def _processor(name: str, key: Node, node: Node) -> _Entry:
     parameters = parameters_of(kind)
     values = _values(node, parameters, what, but=("kind", "parent"))
     given = {p.name: values[p.name] for p in parameters if p.name in values and values[p.name] != p.check(p.default)}
-    wanted = Wanted(name, kind.kind, parent, given)
+    wanted = SetupProcessor(name, kind.kind, parent, given)
     try:
         _ = wanted.level
     except ValueError as problem:
@@ -186,24 +186,24 @@ def _kind(node: Node, what: str) -> Representation:
         return kind_of(word)
     except ValueError:
         raise SetupError(
-            node.line, f"{what}: {shown(word)} is no kind of processor; there are: {', '.join(KINDS)}"
+            node.line, f"{what}: {short_repr(word)} is no kind of processor; there are: {', '.join(KINDS)}"
         ) from None
 
 
 def _check_name(name: str, line: int, kind: Representation) -> None:
     if not 0 < len(name) <= MAX_STRING or "\0" in name:
-        raise SetupError(line, f"{shown(name)} is no name of a processor")
+        raise SetupError(line, f"{short_repr(name)} is no name of a processor")
     if kind.parent and not _NAME.fullmatch(name):
-        raise SetupError(line, f"{shown(name)} names a topic too: letters, digits and _ only")
+        raise SetupError(line, f"{short_repr(name)} names a topic too: letters, digits and _ only")
 
 
-def _ordered(entries: Mapping[str, _Entry]) -> tuple[Wanted, ...]:
+def _ordered(entries: Mapping[str, _Entry]) -> tuple[SetupProcessor, ...]:
     """The processors, each after its parent and else in the order of the setup; SetupError where they are no tree."""
     inputs = [entry for entry in entries.values() if not entry.wanted.parent]
     if len(inputs) > 1:
-        names = " and ".join(shown(entry.wanted.name) for entry in inputs[:2])
+        names = " and ".join(short_repr(entry.wanted.name) for entry in inputs[:2])
         raise SetupError(inputs[1].line, f"{names} are two inputs; there can be but one")
-    ordered: dict[str, Wanted] = {}
+    ordered: dict[str, SetupProcessor] = {}
     for entry in entries.values():
         _check_parent(entry, entries)
     for entry in entries.values():
@@ -220,7 +220,7 @@ def _check_parent(entry: _Entry, entries: Mapping[str, _Entry]) -> None:
     wanted = entry.wanted
     if not wanted.parent:
         return
-    what, kind = f"{shown(wanted.name)}: its parent {shown(wanted.parent)}", wanted.representation.parent
+    what, kind = f"{short_repr(wanted.name)}: its parent {short_repr(wanted.parent)}", wanted.representation.parent
     if wanted.parent not in entries:
         raise SetupError(entry.parent_line, f"{what} is not in the setup; wanted is one of kind {kind}")
     found = entries[wanted.parent].wanted.kind

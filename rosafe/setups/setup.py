@@ -10,11 +10,11 @@ from typing import Any
 
 from rosafe.interface import BASS, BLOCK_AND_BUFFERS, KINDS, ROSAFE, Parameter, Representation
 from rosafe.representations import STAGES
-from rosafe.tree.requests import Found, Level
+from rosafe.tree.requests import ExistingProcessor, ProcessorSpec
 from rosafe.vocabulary import plugins
 
 ACQUIRE = BASS.service("Acquire").parameters
-MAX_TRIED = 1000  # ways to say what a processor was made with
+MAX_NAME_ATTEMPTS = 1000  # ways to say what a processor was made with
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class Sound:
 
 
 @dataclass(frozen=True)
-class Wanted:
+class SetupProcessor:
     """One processor of a setup.
 
     Attributes
@@ -68,7 +68,7 @@ class Wanted:
         return {**_defaults(self.representation.parameters), **self._own}
 
     @property
-    def everything(self) -> dict[str, Any]:
+    def all_values(self) -> dict[str, Any]:
         """All that can be given."""
         return {p.name: self.given.get(p.name, p.check(p.default)) for p in self.parameters}
 
@@ -82,9 +82,11 @@ class Wanted:
         return {p.name: self.given[p.name] for p in self.representation.parameters if p.name in self.given}
 
     @cached_property
-    def level(self) -> Level:
+    def level(self) -> ProcessorSpec:
         """As requests for whole trees see it; ValueError for values that go together at no sample rate."""
-        return Level(self.representation, self.values, STAGES[self.kind].in_force(self.values), self._own)
+        return ProcessorSpec(
+            self.representation, self.values, STAGES[self.kind].effective_values(self.values), self._own
+        )
 
 
 @dataclass(frozen=True)
@@ -93,7 +95,7 @@ class Setup:
 
     sound: Sound | None = None
     connections: Mapping[str, str] = field(default_factory=dict)  # input port -> topic
-    processors: tuple[Wanted, ...] = ()
+    processors: tuple[SetupProcessor, ...] = ()
 
 
 INPUT_PORTS = tuple(port.name for port in ROSAFE.ports if not port.output)
@@ -108,7 +110,7 @@ def _defaults(parameters: tuple[Parameter, ...]) -> dict[str, Any]:
     return {p.name: p.check(p.default) for p in parameters}
 
 
-def wanted(found: Found) -> Wanted:
+def wanted(found: ExistingProcessor) -> SetupProcessor:
     """The processor that `found` tells of, with as few parameters as tell all of it.
 
     What follows from others, such as the channels of a filterbank from their number, is left out.
@@ -126,7 +128,7 @@ def wanted(found: Found) -> Wanted:
     if not kind.parent:
         of_the_input = {p.name: found.values.get(p.name, p.default) for p in BLOCK_AND_BUFFERS}
         given = {p.name: of_the_input[p.name] for p in BLOCK_AND_BUFFERS if of_the_input[p.name] != p.default} | given
-    return Wanted(found.name, found.kind, found.parent, given)
+    return SetupProcessor(found.name, found.kind, found.parent, given)
 
 
 def _given(kind: str, told: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[str, Any]:
@@ -134,7 +136,7 @@ def _given(kind: str, told: Mapping[str, Any], defaults: Mapping[str, Any]) -> d
 
     def tells(names: frozenset[str]) -> bool:
         try:
-            return STAGES[kind].in_force({**defaults, **{n: v for n, v in told.items() if n in names}}) == told
+            return STAGES[kind].effective_values({**defaults, **{n: v for n, v in told.items() if n in names}}) == told
         except ValueError:
             return False
 
@@ -144,7 +146,7 @@ def _given(kind: str, told: Mapping[str, Any], defaults: Mapping[str, Any]) -> d
         for count in range(len(everything) + 1)
         for left_out in itertools.combinations(differing, count)
     )
-    names = next(filter(tells, itertools.islice(ways, MAX_TRIED)), everything)
+    names = next(filter(tells, itertools.islice(ways, MAX_NAME_ATTEMPTS)), everything)
     for name in differing:
         if name in names and tells(names - {name}):
             names -= {name}

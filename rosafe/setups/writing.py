@@ -6,7 +6,7 @@ from typing import Any
 
 import yaml
 
-from .setup import Setup, Wanted
+from .setup import Setup, SetupProcessor
 
 _HEAD = "# A setup of rosAFE: `rosafe setup load FILE` builds it. What is not given has its default.\n"
 _HEAD_FULL = "# A setup of rosAFE: `rosafe setup load FILE` builds it.\n"
@@ -46,8 +46,8 @@ def write(setup: Setup, full: bool = False) -> str:
     )
 
 
-def _processor(wanted: Wanted, full: bool) -> dict[str, Any]:
-    values = wanted.everything if full else wanted.given
+def _processor(wanted: SetupProcessor, full: bool) -> dict[str, Any]:
+    values = wanted.all_values if full else wanted.given
     parent = {"parent": wanted.parent} if wanted.parent else {}
     return {
         "kind": wanted.kind,

@@ -70,7 +70,9 @@ class AudioFile:
             # Given the name, libsndfile would open resource forks too, and take any file as .gsm or .vox.
             self._file = soundfile.SoundFile(descriptor)
         except soundfile.LibsndfileError as problem:
-            raise AudioFileError(f"{self.path} is not a sound file: {problem.error_string}{self._cure()}") from None
+            raise AudioFileError(
+                f"{self.path} is not a sound file: {problem.error_string}{self._replace_non_finite()}"
+            ) from None
         self.not_finite = 0
         self.sample_rate = int(self._file.samplerate)
         self.channels = int(self._file.channels)
@@ -83,7 +85,7 @@ class AudioFile:
             self.close()
             raise
 
-    def _cure(self) -> str:
+    def _replace_non_finite(self) -> str:
         """What to do where this libsndfile is too old for the file."""
         if self.path.suffix.lower() != ".mp3" or "MP3" in soundfile.available_formats():
             return ""

@@ -91,7 +91,7 @@ class BagFile:
         if os.pread(self._descriptor, len(_MAGIC), 0) != _MAGIC:
             raise BagError("is not a bag of format 2.0")  # without a byte of it: who asks may not be allowed to read it
         try:
-            records = _Stretch(self._descriptor, len(_MAGIC), self._size)
+            records = _FileSlice(self._descriptor, len(_MAGIC), self._size)
             header = _read_header(records, _BAG)
             self._index = _number(header, "index_pos", 8)
             self._count = _number(header, "conn_count", 4)
@@ -107,7 +107,7 @@ class BagFile:
     def _read_connections(self) -> dict[int, Connection]:
         if self._count > MAX_CONNECTIONS:
             raise BagError(f"is not a whole bag: {self._count} connections, at most {MAX_CONNECTIONS} go")
-        records = _Stretch(self._descriptor, self._index, self._size)
+        records = _FileSlice(self._descriptor, self._index, self._size)
         found = {}
         try:
             for _ in range(self._count):
@@ -124,7 +124,7 @@ class BagFile:
 
         Raises BagError where the bag is damaged.
         """
-        records = _Stretch(self._descriptor, self._first, self._index)
+        records = _FileSlice(self._descriptor, self._first, self._index)
         try:
             while records.left:
                 self._check_stop()
@@ -139,13 +139,13 @@ class BagFile:
         except _StopReading:
             return
 
-    def _chunk(self, header: dict[str, bytes], packed: _Stretch) -> _Bytes:
+    def _chunk(self, header: dict[str, bytes], packed: _FileSlice) -> _Bytes:
         compression = header.get("compression", b"").decode("ascii", "replace")
         if compression == "none":
             return packed
         if compression not in _UNPACK:
             raise BagError(f"is damaged: compression {compression[:20]!r}")
-        return _Unpacked(_UNPACK[compression](_pieces(packed)), _number(header, "size", 4), self._check_stop)
+        return _DecompressedChunk(_UNPACK[compression](_pieces(packed)), _number(header, "size", 4), self._check_stop)
 
     def _messages_in(self, chunk: _Bytes, connections: Container[int]) -> Iterator[tuple[int, bytes]]:
         while chunk.left:
@@ -181,7 +181,7 @@ class _Bytes(Protocol):
         """Leave out the next `count` bytes; BagError where there are fewer."""
 
 
-class _Stretch:
+class _FileSlice:
     """The bytes of a file from `at` to `end`."""
 
     def __init__(self, descriptor: int, at: int, end: int) -> None:
@@ -205,12 +205,12 @@ class _Stretch:
         self.at += count
         self.left -= count
 
-    def part(self, length: int) -> _Stretch:
+    def part(self, length: int) -> _FileSlice:
         """The next `length` bytes as a stretch of their own."""
-        return _Stretch(self._descriptor, self.at, self.at + min(length, self.left))
+        return _FileSlice(self._descriptor, self.at, self.at + min(length, self.left))
 
 
-class _Unpacked:
+class _DecompressedChunk:
     """The `size` bytes of a compressed chunk, unpacked as they are needed."""
 
     def __init__(self, unpacked: Iterator[bytes], size: int, check_stop: Callable[[], None]) -> None:
@@ -250,7 +250,7 @@ class _Unpacked:
             raise BagError("is damaged: a compressed chunk ends too early") from None
 
 
-def _pieces(packed: _Stretch) -> Iterator[bytes]:
+def _pieces(packed: _FileSlice) -> Iterator[bytes]:
     while packed.left:
         yield packed.read(min(_PIECE, packed.left))
 

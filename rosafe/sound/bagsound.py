@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rosafe.sound.bagfile import BagError, BagFile, NotClosedError
-from rosafe.sound.windows import MAX_WINDOW, WindowStream, malformed
+from rosafe.sound.windows import MAX_WINDOW, WindowStream, window_error
 
 TYPE = "binaudio_portStruct"  # of the port Audio, in the package bass or another
 MD5SUM = "a3b73b6f3547870cf712571c1a85ea1d"
@@ -140,10 +140,10 @@ class Recording:
         """Number of the stream, its sample rate, and a piece of it."""
         count, stream = 0, WindowStream(with_first=True)
         for message in self._messages():
-            problem = malformed(message)
+            problem = window_error(message)
             if problem:
                 raise BagSoundError(f"{self._path}: a malformed message on {self.topic}: {problem}")
-            if stream.joint(message):
+            if stream.join_state(message):
                 count, stream = count + 1, WindowStream(with_first=True)
             yield count, message.sampleRate, stream.fresh(message)
 

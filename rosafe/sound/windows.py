@@ -12,7 +12,7 @@ MAX_INDEX = 2**63
 MAX_JUMP_SECONDS = 3600.0  # an index that jumps further is no loss but another stream
 
 
-def malformed(message: Any) -> str:
+def window_error(message: Any) -> str:
     """What is wrong with a message; empty where it can be used."""
     left, right, rate, index = len(message.left), len(message.right), message.sampleRate, message.lastFrameIndex
     if left != right:
@@ -28,7 +28,7 @@ def malformed(message: Any) -> str:
     return ""
 
 
-def joined(new: int, window: int) -> tuple[int, int]:
+def split_new_frames(new: int, window: int) -> tuple[int, int]:
     """Of `new` frames since the last message, how many are lost, and how many a window of so many frames shows."""
     shown = min(new, window)
     return new - shown, shown
@@ -68,7 +68,7 @@ class WindowStream:
         self.newest = 0  # number of the newest frame
         self._with_first = with_first
 
-    def joint(self, message: Any) -> str:
+    def join_state(self, message: Any) -> str:
         """Why `message` cannot be of this stream; empty where it can."""
         rate, index = message.sampleRate, message.lastFrameIndex
         if self.sample_rate in (0, rate):
@@ -85,6 +85,6 @@ class WindowStream:
         if self.sample_rate == 0:
             self.sample_rate = int(message.sampleRate)
             self.newest = max(0, index - window) if self._with_first else index
-        lost, count = joined(index - self.newest, window)
+        lost, count = split_new_frames(index - self.newest, window)
         self.newest = index
         return lost, np.stack((message.left[window - count :], message.right[window - count :]))

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple, Protocol
 from numpy.typing import NDArray
 
 from rosafe.dsp.guard import FloatArray
-from rosafe.dsp.signal import Signal
+from rosafe.dsp.signal import SignalFormat
 
 
 class Block(NamedTuple):
@@ -31,7 +31,7 @@ class Block(NamedTuple):
     number: int
     parts: tuple[FloatArray, ...]
     next_index: int
-    signal: Signal
+    signal: SignalFormat
     extras: Mapping[str, FloatArray] = {}
 
     @property

@@ -10,11 +10,11 @@ from contextlib import asynccontextmanager
 from typing import Any, Protocol, TypeVar
 
 from rosafe.interface import BLOCK_AND_BUFFERS, KINDS, REQUEST, ROSAFE, ComponentError
-from rosafe.representations import OWN
+from rosafe.representations import BUILTIN
 from rosafe.tree import requests as request
-from rosafe.tree.requests import Found, Plan, Step, Wish
+from rosafe.tree.requests import ExistingProcessor, Plan, ServiceCall, TreeRequest
 
-TRIES = 20  # plans that others' changes of the tree may spoil before the error is told
+MAX_ATTEMPTS = 20  # plans that others' changes of the tree may spoil before the error is told
 INPUT_SECONDS = 1.5  # longer than an InputProc waits for sound
 POLL_SECONDS = 0.02
 LOOK_SECONDS = 0.1  # between two looks at the tree while many processors are removed
@@ -76,7 +76,7 @@ class Turns:
         if not self._waiting:
             return False
         self._lock.release()
-        await uncancelled(self._lock.acquire())
+        await shield_until_done(self._lock.acquire())
         return True
 
 
@@ -89,7 +89,7 @@ class Services(Protocol):
     async def outputs(self, service: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
         """What a service returns; an activity, nothing, as soon as it runs. Raises ComponentError."""
 
-    async def hears(self, port: str) -> str:
+    async def port_connected(self, port: str) -> str:
         """The topic that an input port is connected to, or nothing."""
 
     async def published(self, topic: str) -> bool:
@@ -112,18 +112,18 @@ async def build(component: Services, values: Mapping[str, Any]) -> dict[str, Any
     made: list[str] = []
     try:
         dependencies = await _carry_out(component, wish, made)
-        if set(wish.kinds) - OWN and made:
+        if set(wish.kinds) - BUILTIN and made:
             await _watch_begin(component, made)
     except BaseException:
-        await uncancelled(remove(component, made))
+        await shield_until_done(remove(component, made))
         raise
     component.turns.keep(dependencies)
-    return request.answer(wish, dependencies, made, component.instance)
+    return request.build_response(wish, dependencies, made, component.instance)
 
 
 async def _watch_begin(component: Services, made: list[str]) -> None:
     """Raise ComponentError if a processor that was made fails with one of its first blocks, as plugins may."""
-    found = await look(component)
+    found = await list_processors(component)
     root = next((p for p in found if not p.parent), None)
     block = root.values["nFramesPerBlock"] / root.rate if root is not None and root.rate else 0.0
     deadline = asyncio.get_running_loop().time() + min(BEGIN_SECONDS, BEGIN_BLOCKS * block)
@@ -138,23 +138,23 @@ async def _watch_begin(component: Services, made: list[str]) -> None:
 async def find(component: Services, values: Mapping[str, Any]) -> dict[str, Any]:
     """What `build` would answer if all that it needs is there; ``::rosAFE::e_noSuchProcessor`` where it is not."""
     wish = await _understood(values)
-    plan = request.plan(wish, await look(component))
+    plan = request.plan(wish, await list_processors(component))
     if plan.steps:
         missing = ", ".join(step.service for step in plan.steps if step.makes)
         raise ROSAFE.error("e_noSuchProcessor", what=f"there is none with these parameters; missing: {missing}")
-    return request.answer(wish, plan.dependencies, (), component.instance)
+    return request.build_response(wish, plan.dependencies, (), component.instance)
 
 
-async def _understood(values: Mapping[str, Any]) -> Wish:
+async def _understood(values: Mapping[str, Any]) -> TreeRequest:
     given = dict(values)
     kind = request.kind_of(given.pop("representation"))
-    return await asyncio.to_thread(request.understand, kind, given)  # numpy's and scipy's work, and their import
+    return await asyncio.to_thread(request.parse_request, kind, given)  # numpy's and scipy's work, and their import
 
 
-async def _carry_out(component: Services, wish: Wish, made: list[str]) -> list[str]:
+async def _carry_out(component: Services, wish: TreeRequest, made: list[str]) -> list[str]:
     problem = ComponentError("::genom::mwerr", what="others change the tree all the time")
-    for _ in range(TRIES):
-        plan = request.plan(wish, await look(component), component.turns.reserved)
+    for _ in range(MAX_ATTEMPTS):
+        plan = request.plan(wish, await list_processors(component), component.turns.reserved)
         try:
             await _take_steps(component, wish, plan, made)
         except ComponentError as error:
@@ -164,7 +164,7 @@ async def _carry_out(component: Services, wish: Wish, made: list[str]) -> list[s
             if error.ex == request.INTERRUPTED:
                 await wait_for_input(component)
         else:
-            if not plan.steps or request.stands(plan.dependencies, await look(component)):
+            if not plan.steps or request.chain_exists(plan.dependencies, await list_processors(component)):
                 return plan.dependencies
     raise problem
 
@@ -173,26 +173,26 @@ async def wait_for_input(component: Services) -> None:
     """Let another's InputProc, which has taken the place of ours, come to its end: it may be waiting for sound."""
     deadline = asyncio.get_running_loop().time() + INPUT_SECONDS
     while asyncio.get_running_loop().time() < deadline:
-        if await look(component):
+        if await list_processors(component):
             return
         await asyncio.sleep(POLL_SECONDS)
 
 
-async def _take_steps(component: Services, wish: Wish, plan: Plan, made: list[str]) -> None:
+async def _take_steps(component: Services, wish: TreeRequest, plan: Plan, made: list[str]) -> None:
     if plan.steps and plan.steps[0].makes == plan.dependencies[0]:
         await _connect(component, wish)
     for step in plan.steps:
-        await uncancelled(take_step(component, step, made))
+        await shield_until_done(execute_step(component, step, made))
 
 
-async def take_step(component: Services, step: Step, made: list[str]) -> None:
+async def execute_step(component: Services, step: ServiceCall, made: list[str]) -> None:
     """Make one request, and note what it has made."""
     await component.outputs(step.service, step.values)
     if step.makes:
         made.append(step.makes)
 
 
-async def uncancelled(work: Awaitable[T]) -> T:
+async def shield_until_done(work: Awaitable[T]) -> T:
     """Do `work` to its end, also where the task is cancelled meanwhile: what a request made must be known."""
     task = asyncio.ensure_future(work)
     try:
@@ -202,17 +202,17 @@ async def uncancelled(work: Awaitable[T]) -> T:
         raise
 
 
-async def _connect(component: Services, wish: Wish) -> None:
+async def _connect(component: Services, wish: TreeRequest) -> None:
     """Connect the Audio port to the topic that the client named, or to bass where it is not connected yet."""
     topic = wish.connect
-    if not topic and not await component.hears("Audio"):
+    if not topic and not await component.port_connected("Audio"):
         default = REQUEST.parameter("connect").default
         topic = default if await component.published(f"/{default}") else ""
     if topic:
         await component.outputs("connect_port", {"local": "Audio", "remote": topic})
 
 
-async def look(component: Services) -> list[Found]:
+async def list_processors(component: Services) -> list[ExistingProcessor]:
     """All processors of the kinds that are known here."""
     found = []
     for processor in (await component.outputs("getProcessors", {}))["processors"]:
@@ -222,19 +222,19 @@ async def look(component: Services) -> list[Found]:
             declared = kind.parameters if kind.parent else (*kind.parameters, *BLOCK_AND_BUFFERS)
             values = {p.name: p.parse(texts[p.name]) for p in declared if p.name in texts}
             rate = float(processor.get("rate", 0.0))
-            found.append(Found(processor["name"], kind.kind, processor["upperDepName"], values, rate))
+            found.append(ExistingProcessor(processor["name"], kind.kind, processor["upperDepName"], values, rate))
     return found
 
 
 async def remove(component: Services, made: list[str]) -> None:
     """Remove what was made, leaves first, but nothing that others have come to use. Errors are told by what failed."""
     clock, looked = asyncio.get_running_loop().time, -math.inf
-    found: dict[str, Found] = {}
+    found: dict[str, ExistingProcessor] = {}
     children: Counter[str] = Counter()
     try:
         for name in reversed(made):
             if await component.turns.give_way() or clock() - looked > LOOK_SECONDS:
-                found, looked = {p.name: p for p in await look(component)}, clock()
+                found, looked = {p.name: p for p in await list_processors(component)}, clock()
                 children = Counter(p.parent for p in found.values())
             if name not in found or children[name] or name in component.turns.kept:
                 continue

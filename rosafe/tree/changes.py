@@ -9,12 +9,12 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from rosafe.dsp.plugin_checks import PluginError
-from rosafe.dsp.signal import Signal
+from rosafe.dsp.signal import SignalFormat
 from rosafe.dsp.stage import Stage
 from rosafe.tree.block import Block
 
 
-class Change(NamedTuple):
+class ParameterUpdate(NamedTuple):
     """A change that waits for the processor's next block, or for a later one."""
 
     block: int  # of the input; it is made before this one, or the next one if that is a later one
@@ -23,7 +23,7 @@ class Change(NamedTuple):
     needs: str  # of the parent's by-products, from then on
 
 
-class Changes:
+class ParameterUpdates:
     """The stage of a processor as it is at work, and as it will be.
 
     A change is made before the first block that the stage can then work on: a method that needs the parent's envelope
@@ -36,43 +36,43 @@ class Changes:
     """
 
     def __init__(self, stage: Stage) -> None:
-        self.planned = stage
-        self._working = stage
-        self._waiting: list[Change] = []
+        self.final_stage = stage
+        self._active = stage
+        self._queue: list[ParameterUpdate] = []
         self._lock = threading.Lock()  # guards _waiting, and the exchange of _working
 
-    def plan(self, name: str, value: Any) -> Stage:
+    def preview(self, name: str, value: Any) -> Stage:
         """The stage after one more change, which is not made yet; ValueError where it refuses that."""
-        stage = copy.copy(self.planned)
+        stage = copy.copy(self.final_stage)
         stage.configure(**{name: value})
         return stage
 
-    def follow(self, given: Signal) -> Stage:
-        """The stage under a parent that puts out another format, or ValueError; `planned` where it is the same."""
-        if given == self.planned.input_format:
-            return self.planned
-        stage = copy.copy(self.planned)
-        stage.receive(given)
+    def preview_input(self, given: SignalFormat) -> Stage:
+        """The stage under a parent that puts out another format, or ValueError; `final_stage` where it is the same."""
+        if given == self.final_stage.input_format:
+            return self.final_stage
+        stage = copy.copy(self.final_stage)
+        stage.set_input_format(given)
         return stage
 
-    def accept(self, planned: Stage, name: str, value: Any, block: int = 0) -> None:
-        """Make the change that was `planned` before block `block` of the input; blocks of successive calls ascend."""
+    def enqueue(self, planned: Stage, name: str, value: Any, block: int = 0) -> None:
+        """Make the change that was `final_stage` before block `block` of the input; blocks of successive calls ascend."""
         with self._lock:
-            self.planned = planned
-            self._waiting.append(Change(block, name, value, planned.required_extra))
+            self.final_stage = planned
+            self._queue.append(ParameterUpdate(block, name, value, planned.required_extra))
 
     def needs(self, number: int) -> str:
         """Which of the parent's by-products block `number` should carry."""
-        if not self._waiting:
-            return self._working.required_extra
+        if not self._queue:
+            return self._active.required_extra
         with self._lock:
             due = self._due(number)
-            return due[-1].needs if due else self._working.required_extra
+            return due[-1].needs if due else self._active.required_extra
 
-    def stage_for(self, block: Block) -> Stage | None:
+    def stage_for_block(self, block: Block) -> Stage | None:
         """The stage to work on `block`, after all changes that are due and go with it; None where none can."""
-        stage = self._working
-        if not self._waiting and block.signal is stage.input_format:
+        stage = self._active
+        if not self._queue and block.signal is stage.input_format:
             needs = stage.required_extra
             return stage if not needs or needs in block.extras else None
         with self._lock:
@@ -80,26 +80,26 @@ class Changes:
             for count in range(len(due), -1, -1):
                 changed = _changed(stage, block.signal, due[:count])
                 if changed is not None and (not changed.required_extra or changed.required_extra in block.extras):
-                    self._working = changed
-                    del self._waiting[:count]
+                    self._active = changed
+                    del self._queue[:count]
                     return changed
         return None
 
-    def _due(self, number: int) -> list[Change]:
-        return list(itertools.takewhile(lambda change: change.block <= number, self._waiting))
+    def _due(self, number: int) -> list[ParameterUpdate]:
+        return list(itertools.takewhile(lambda change: change.block <= number, self._queue))
 
 
-def _changed(stage: Stage, given: Signal, changes: Sequence[Change]) -> Stage | None:
+def _changed(stage: Stage, given: SignalFormat, changes: Sequence[ParameterUpdate]) -> Stage | None:
     """`stage` after `changes`, with blocks of the format `given`, or None where that cannot be.
 
     It shares the state of `stage`, which does not notice.
     """
     if given == stage.input_format and not changes:
-        stage.receive(given)
+        stage.set_input_format(given)
         return stage
     changed = copy.copy(stage)
     try:
-        changed.become(given, [{change.name: change.value} for change in changes])
+        changed.reconfigure(given, [{change.name: change.value} for change in changes])
     except PluginError:
         raise
     except ValueError:

@@ -15,19 +15,19 @@ if TYPE_CHECKING:
     from rosafe.tree.processor import Processor
 
 
-class Listener(Protocol):
+class TreeListener(Protocol):
     """Who hears of what the processors do. Called by workers, of which others go on; must not wait for the tree."""
 
-    def added(self, processor: Processor) -> None:
+    def on_added(self, processor: Processor) -> None:
         """A processor is about to start; nothing was released yet. Where this raises, it is taken out again."""
 
-    def executed(self, processor: Processor, seconds: float) -> None:
-        """One block was computed in so many seconds; the last one perhaps after `ended`."""
+    def on_executed(self, processor: Processor, seconds: float) -> None:
+        """One block was computed in so many seconds; the last one perhaps after `on_removed`."""
 
-    def released(self, processor: Processor, block: Block) -> None:
-        """One that is `heard` released a block. Never called after `ended`, and by one worker at a time for each."""
+    def on_released(self, processor: Processor, block: Block) -> None:
+        """One that is `heard` released a block. Never called after `on_removed`, and by one worker at a time for each."""
 
-    def ended(self, processor: Processor) -> None:
+    def on_removed(self, processor: Processor) -> None:
         """The processor is gone; `processor.error` tells why where it was not asked to."""
 
 
@@ -36,14 +36,14 @@ Observer = Callable[["Processor", State, "int | None"], None]
 
 
 @dataclass(frozen=True)
-class Company:
+class TreeContext:
     """What all processors of one tree have in common.
 
-    `failed` is called, by the worker, where a processor's `error` is set.
+    `on_failure` is called, by the worker, where a processor's `error` is set.
     """
 
     workers: Workers
-    listener: Listener
-    failed: Callable[[Processor], None]
-    over: threading.Condition  # on the tree's lock: somebody may have come to its end
+    listener: TreeListener
+    on_failure: Callable[[Processor], None]
+    finished_condition: threading.Condition  # on the tree's lock: somebody may have come to its end
     observers: list[Observer] = field(default_factory=list)

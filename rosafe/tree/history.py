@@ -8,17 +8,17 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rosafe.dsp.signal import Signal
+from rosafe.dsp.signal import SignalFormat
 from rosafe.tree.block import Block
-from rosafe.tree.window import Newest, WindowView, frames_in
+from rosafe.tree.window import RecentFrames, WindowView, frames_in
 
 
-class Taken(NamedTuple):
+class HistorySlice(NamedTuple):
     """What a reader got."""
 
     parts: tuple[WindowView, ...]
     next_index: int  # of the audio frame after the newest one that this knows of
-    signal: Signal
+    signal: SignalFormat
 
 
 class History:
@@ -34,16 +34,16 @@ class History:
         Its length, which may be changed.
     """
 
-    def __init__(self, part_rows: Sequence[tuple[int, ...]], signal: Signal, seconds: float) -> None:
+    def __init__(self, part_rows: Sequence[tuple[int, ...]], signal: SignalFormat, seconds: float) -> None:
         self.seconds = seconds
         self.next_index = 0
         self._lock = threading.Lock()
         self._begin(tuple(part_rows), signal)
 
-    def _begin(self, part_rows: tuple[tuple[int, ...], ...], signal: Signal) -> None:
+    def _begin(self, part_rows: tuple[tuple[int, ...], ...], signal: SignalFormat) -> None:
         """Forget what there was: frames of different shapes or rates do not go together."""
         self._signal = signal
-        self._parts = [Newest(np.empty((*rows, 0)), 0) for rows in part_rows]
+        self._parts = [RecentFrames(np.empty((*rows, 0)), 0) for rows in part_rows]
         self._came = 0  # frames in all
         self._read: dict[str, int] = {}  # how many of them had come when a reader was there
 
@@ -67,9 +67,9 @@ class History:
                 newest.append(part)
             self._came += block.data.shape[-1]
 
-    def take(self, reader: str) -> Taken:
+    def read_new(self, reader: str) -> HistorySlice:
         """What has come since `reader` was here last, or since the start, as far as it is remembered."""
         with self._lock:
             fresh = self._came - self._read.get(reader, 0)
             self._read[reader] = self._came
-            return Taken(tuple(part.view(fresh) for part in self._parts), self.next_index, self._signal)
+            return HistorySlice(tuple(part.view(fresh) for part in self._parts), self.next_index, self._signal)

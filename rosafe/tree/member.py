@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from typing import Any
 
-from rosafe.dsp.signal import Signal
+from rosafe.dsp.signal import SignalFormat
 from rosafe.dsp.stage import Stage
-from rosafe.tree.changes import Changes
-from rosafe.tree.history import History, Taken
+from rosafe.tree.changes import ParameterUpdates
+from rosafe.tree.history import History, HistorySlice
 from rosafe.tree.states import StateMachine
 from rosafe.vocabulary.representation import Representation
 
@@ -46,8 +46,8 @@ class Member(StateMachine):
         self.kind = stage.REPRESENTATION.kind
         self.error: BaseException | None = None
         self.blocks = 0
-        self.changes = Changes(stage)
-        self.history = History(self.part_rows, stage.output_format, history_seconds)
+        self.changes = ParameterUpdates(stage)
+        self.history = History(self.output_shapes, stage.output_format, history_seconds)
 
     def __repr__(self) -> str:
         return f"<{self.kind} {self.name!r} {self.state.value}>"
@@ -55,7 +55,7 @@ class Member(StateMachine):
     @property
     def stage(self) -> Stage:
         """As it will be after all changes, to be asked and not to be run."""
-        return self.changes.planned
+        return self.changes.final_stage
 
     @property
     def representation(self) -> Representation:
@@ -63,19 +63,19 @@ class Member(StateMachine):
         return self.stage.REPRESENTATION
 
     @property
-    def given_rows(self) -> tuple[int, ...]:
+    def input_shape(self) -> tuple[int, ...]:
         """Leading shape of what it takes."""
-        return EARS if self.parent is None else self.parent.rows
+        return EARS if self.parent is None else self.parent.output_shape
 
     @property
-    def part_rows(self) -> tuple[tuple[int, ...], ...]:
+    def output_shapes(self) -> tuple[tuple[int, ...], ...]:
         """Leading shape of each part of its output, such as (2, channels)."""
-        return self.stage.part_rows(self.given_rows)
+        return self.stage.part_rows(self.input_shape)
 
     @property
-    def rows(self) -> tuple[int, ...]:
+    def output_shape(self) -> tuple[int, ...]:
         """That of the first part, which its children take."""
-        return self.stage.output_rows(self.given_rows)
+        return self.stage.output_rows(self.input_shape)
 
     @property
     def axes(self) -> tuple[tuple[str, ...], ...]:
@@ -83,7 +83,7 @@ class Member(StateMachine):
         return tuple(part.axes for part in self.representation.parts)
 
     @property
-    def signal(self) -> Signal:
+    def signal(self) -> SignalFormat:
         """The format of its output."""
         return self.stage.output_format
 
@@ -110,6 +110,6 @@ class Member(StateMachine):
         stage = self.stage
         return {**stage.parameters, **stage.derived}
 
-    def take(self, reader: str) -> Taken:
+    def take(self, reader: str) -> HistorySlice:
         """What it released since `reader` asked last, at most the history."""
-        return self.history.take(reader)
+        return self.history.read_new(reader)

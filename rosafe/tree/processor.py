@@ -12,20 +12,20 @@ from rosafe.dsp.guard import FloatArray
 from rosafe.dsp.plugin_checks import PluginError
 from rosafe.dsp.stage import Stage
 from rosafe.tree.block import Block, Source
-from rosafe.tree.company import Company
+from rosafe.tree.company import TreeContext
 from rosafe.tree.member import Member
 from rosafe.tree.states import State
-from rosafe.tree.workers import SHORT
+from rosafe.tree.workers import WAKE_THRESHOLD_SECONDS
 
 T = TypeVar("T")
 NOTHING: frozenset[str] = frozenset()
-RISE = 2.0  # what a processor usually takes is the least of late; that is forgotten at this pace per block
+ESTIMATE_GROWTH = 2.0  # what a processor usually takes is the least of late; that is forgotten at this pace per block
 
 
 class Processor(Member):
     """A node of the tree. Made and wired by `Tree`; the public members are safe from any thread.
 
-    Locks are taken in this order: the tree's requests, `_telling`, the tree's lock or those of changes and history.
+    Locks are taken in this order: the tree's requests, `_publish_lock`, the tree's lock or those of changes and history.
 
     Parameters
     ----------
@@ -51,31 +51,31 @@ class Processor(Member):
         stage: Stage,
         parent: Processor | None,
         history_seconds: float,
-        company: Company,
+        company: TreeContext,
         source: Source | None = None,
     ) -> None:
         super().__init__(name, stage, parent, history_seconds)
         # No more than 30 attributes in all, with those of `Member` and `StateMachine`: beyond, each takes longer.
         self.observers = company.observers
-        self.held_up_since = 0.0
-        self.usual = math.inf
-        self.place: Callable[[Block], FloatArray | None] | None = None
-        self._company = company
+        self.blocked_since = 0.0
+        self.estimated_seconds = math.inf
+        self.output_buffer_for: Callable[[Block], FloatArray | None] | None = None
+        self._context = company
         self._lock = company.workers.lock
         self._source = source
         self._started = False
-        self._usual_telling = 0.0  # seconds that the listener took for the last block
-        self._telling = threading.Lock()  # `released` and `ended` exclude each other
+        self._publish_seconds = 0.0  # seconds that the listener took for the last block
+        self._publish_lock = threading.Lock()  # `on_released` and `ended` exclude each other
 
     # --- life ---
 
     def start(self) -> None:
         """Begin to work, with the block that the parent released last."""
         with self._lock:
-            self._company.workers.enter()  # nothing is attached where the system has no thread left
+            self._context.workers.add_client()  # nothing is attached where the system has no thread left
             self._started = True
             self.attach()
-            self._company.workers.wake()
+            self._context.workers.wake()
         if self._source is not None:
             self._source.open(self._wake)
             self._wake()
@@ -83,25 +83,25 @@ class Processor(Member):
     def _wake(self) -> None:
         """The source may have something."""
         with self._lock:
-            self.call()
-            self._company.workers.wake()
+            self.notify_input()
+            self._context.workers.wake()
 
     def end(self) -> None:
         """Take it out of the tree, at once; whoever works on it still will not be heard."""
         with self._lock:
             self.remove()
             if self._started:
-                self._company.workers.leave()
-            self._company.workers.wake()
+                self._context.workers.remove_client()
+            self._context.workers.wake()
         if self._source is not None:
             self._source.stop()
-        with self._telling:
-            self._company.listener.ended(self)
+        with self._publish_lock:
+            self._context.listener.on_removed(self)
 
     def join(self, timeout: float | None = None) -> bool:
         """Wait until nobody works on it and nobody will; whether that is so."""
         with self._lock:
-            return bool(self._company.over.wait_for(lambda: self.over, timeout))
+            return bool(self._context.finished_condition.wait_for(lambda: self.finished, timeout))
 
     def ask(self, question: Callable[[Processor], T]) -> T | None:
         """`question(self)`, or None if its plugin raises instead of answering: the processor has failed then."""
@@ -109,49 +109,49 @@ class Processor(Member):
             return question(self)
         except PluginError as problem:
             self.error = problem
-            self._company.failed(self)
+            self._context.on_failure(self)
             return None
 
-    def rouse(self) -> None:
-        self._company.workers.push(self)
+    def on_ready(self) -> None:
+        self._context.workers.push(self)
 
-    def settle(self) -> None:
-        self._company.over.notify_all()
+    def on_finished(self) -> None:
+        self._context.finished_condition.notify_all()
 
     # --- what workers do ---
 
     def work(self) -> None:
         """Take the next step: tell of the last block, or compute the next one."""
         try:
-            if self.untold is not None:
-                self._tell(self.untold, monotonic())
+            if self.unpublished_block is not None:
+                self._publish(self.unpublished_block, monotonic())
                 return
             if self._source is not None:
                 self._read(self._source)
-            if self.taken is not None:
-                self._compute(self.taken)
+            if self.current_block is not None:
+                self._compute(self.current_block)
         except BaseException as problem:  # whatever it was: the tree must hear of it, and nobody may wait for this one
             self.error = problem
             with self._lock:
-                self.finish()
-            self.held_up_since = monotonic()  # by requests
-            self._company.failed(self)
-            self.held_up_since = 0.0
+                self.end_of_stream()
+            self.blocked_since = monotonic()  # by requests
+            self._context.on_failure(self)
+            self.blocked_since = 0.0
 
     def _read(self, source: Source) -> None:
         """Take the next block of the source, if there is one, or come to the end with it."""
-        self.held_up_since = monotonic()
+        self.blocked_since = monotonic()
         while True:
             ended = source.ended  # looked at first: what has come before the end is read
             got = source.read()
             if got is not None or ended == source.ended:
                 break
-        self.held_up_since = 0.0
+        self.blocked_since = 0.0
         with self._lock:
             if got is not None:
-                self.read(Block(self.blocks, (got[0],), got[1], self.stage.input_format))
+                self.accept_input_block(Block(self.blocks, (got[0],), got[1], self.stage.input_format))
             elif ended:
-                self.finish()
+                self.end_of_stream()
 
     def _compute(self, taken: Block) -> None:
         begun = monotonic()
@@ -159,25 +159,27 @@ class Processor(Member):
         ended = monotonic()
         seconds = ended - begun
         self.blocks += 1
-        limit = RISE * self.usual
-        self.usual = seconds if seconds < limit else limit
+        limit = ESTIMATE_GROWTH * self.estimated_seconds
+        self.estimated_seconds = seconds if seconds < limit else limit
         with self._lock:
-            self.done(private)
-        self._company.listener.executed(self, seconds)
-        if self.untold is not None and self._usual_telling < SHORT:  # else once nothing deeper in the tree is ready
-            self._tell(self.untold, ended)
+            self.finish_block(private)
+        self._context.listener.on_executed(self, seconds)
+        if (
+            self.unpublished_block is not None and self._publish_seconds < WAKE_THRESHOLD_SECONDS
+        ):  # else once nothing deeper in the tree is ready
+            self._publish(self.unpublished_block, ended)
 
     def _process(self, taken: Block) -> Block | None:
         """What comes out for a block; None where that cannot be used."""
-        stage = self.changes.stage_for(taken)
+        stage = self.changes.stage_for_block(taken)
         if stage is None:
             return None
         if stage.EXTRAS:
-            stage.provide = self._wanted(stage, taken.number)
+            stage.provide = self._requested_extras(stage, taken.number)
         data, extras = taken.parts[0], taken.extras
         required = extras and stage.required_extra
-        if self.place is not None:
-            output = stage.process(data, extras[required] if required else None, self.place(taken))
+        if self.output_buffer_for is not None:
+            output = stage.process(data, extras[required] if required else None, self.output_buffer_for(taken))
         else:
             output = stage.process(data, extras[required]) if required else stage.process(data)
         parts = output if isinstance(output, tuple) else (output,)
@@ -186,23 +188,23 @@ class Processor(Member):
             next_index = max(0, next_index - look_ahead * stage.input_format.hop)
         return Block(taken.number, parts, next_index, stage.output_format, stage.provided)
 
-    def _wanted(self, stage: Stage, number: int) -> frozenset[str]:
+    def _requested_extras(self, stage: Stage, number: int) -> frozenset[str]:
         """The by-products that children need of block `number`."""
         wanted = [needs for child in tuple(self.children) if (needs := child.changes.needs(number))]
         return frozenset(stage.EXTRAS).intersection(wanted) if wanted else NOTHING
 
-    def _tell(self, block: Block, begun: float) -> None:
+    def _publish(self, block: Block, begun: float) -> None:
         """Tell the world of the block that was released last."""
-        self.untold = None
-        if not self.heard:
+        self.unpublished_block = None
+        if not self.has_consumers:
             return
-        self.held_up_since = begun
-        with self._telling:
+        self.blocked_since = begun
+        with self._publish_lock:
             if self.state is not State.REMOVED:
                 self.history.append(block)
-                self._company.listener.released(self, block)
-        self.held_up_since = 0.0
-        self._usual_telling = monotonic() - begun
+                self._context.listener.on_released(self, block)
+        self.blocked_since = 0.0
+        self._publish_seconds = monotonic() - begun
 
 
 def subtree(processor: Processor) -> Iterator[Processor]:

@@ -13,11 +13,11 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-from rosafe.interface import BASS, KINDS, REQUEST, ROSAFE, ComponentError, Representation, text_of
+from rosafe.interface import BASS, KINDS, REQUEST, ROSAFE, ComponentError, Representation, format_value
 from rosafe.interface.arguments import check_parameter
 from rosafe.representations import PROBLEMS, STAGES
 from rosafe.vocabulary import plugins
-from rosafe.vocabulary.words import meant
+from rosafe.vocabulary.words import did_you_mean
 
 HIGHEST_RATE = float(BASS.service("Acquire").parameter("sampleRate").maximum or 0)  # Hz; what is wrong there is at any
 INTERRUPTED = "::genom::interrupted"
@@ -26,7 +26,7 @@ _RACES = {f"::rosAFE::{short}" for short in ("e_existsAlready", "e_noUpperDepend
 OF_THE_INPUT = ("connect", *(p.name for p in ROSAFE.service("InputProc").parameters[1:]))
 
 
-class Found(NamedTuple):
+class ExistingProcessor(NamedTuple):
     """A processor of the tree. `values` are those of getParameters; `parent` is empty for the input."""
 
     name: str
@@ -36,7 +36,7 @@ class Found(NamedTuple):
     rate: float = 0.0  # frames of output per second
 
 
-class Step(NamedTuple):
+class ServiceCall(NamedTuple):
     """One request to make, with all its values; `makes` is the name of the processor that it adds, if it does."""
 
     service: str
@@ -48,11 +48,11 @@ class Plan(NamedTuple):
     """The names from the input down to the wanted processor, and what to do for those that are not there."""
 
     dependencies: list[str]
-    steps: list[Step]
+    steps: list[ServiceCall]
 
 
 @dataclass(frozen=True)
-class Level:
+class ProcessorSpec:
     """One processor on the way from the input to the wanted one.
 
     `values` are all its parameters, as asked for; `in_force` what getParameters tells of a processor that was made
@@ -64,7 +64,7 @@ class Level:
     in_force: Mapping[str, Any]
     given: Mapping[str, Any]
 
-    def fits(self, found: Found, sample_rate: float) -> bool:
+    def matches(self, found: ExistingProcessor, sample_rate: float) -> bool:
         """Whether `found`, at a sample rate (Hz), is what is wanted: each parameter the same, to the last digit.
 
         A structure of getParameters fits the processor that it describes, though one that was made with all that
@@ -74,15 +74,15 @@ class Level:
         in_force = self.in_force
         if sample_rate and any(p.follows_rate for p in self.kind.parameters):
             stage = STAGES[self.kind.kind]
-            in_force = stage.in_force(stage.at_rate(self.values, self.given, sample_rate))
+            in_force = stage.effective_values(stage.resolve_rate_defaults(self.values, self.given, sample_rate))
         return told in (in_force, {**in_force, **self.given})
 
 
 @dataclass(frozen=True)
-class Wish:
+class TreeRequest:
     """A checked request for a whole tree: `levels` from the input to the wanted processor, `given` by the client."""
 
-    levels: tuple[Level, ...]
+    levels: tuple[ProcessorSpec, ...]
     input_values: Mapping[str, Any]  # of InputProc, less its name
     given: Mapping[str, Any]
 
@@ -109,7 +109,7 @@ def kind_of(representation: str) -> Representation:
         if representation.lower() in map(str.lower, (kind.word, *kind.word_aliases, kind.kind)):
             return kind
     parameter = REQUEST.parameter("representation")
-    hint = meant(representation, parameter.choices)
+    hint = did_you_mean(representation, parameter.choices)
     raise ValueError(
         f"representation: {representation[:80]!r} is not {parameter.range_text}; plugins are loaded when a program "
         f"starts: {searched()}{hint}"
@@ -121,12 +121,12 @@ def searched() -> str:
     return "; left out: ".join((plugins.where(), *PROBLEMS))
 
 
-def chain(kind: Representation) -> list[Representation]:
+def ancestor_kinds(kind: Representation) -> list[Representation]:
     """The kinds of processors from the input down to `kind`."""
-    return [*(chain(KINDS[kind.parent]) if kind.parent else ()), kind]
+    return [*(ancestor_kinds(KINDS[kind.parent]) if kind.parent else ()), kind]
 
 
-def understand(kind: Representation, given: Mapping[str, Any]) -> Wish:
+def parse_request(kind: Representation, given: Mapping[str, Any]) -> TreeRequest:
     """The checked request for a processor of `kind`.
 
     Parameters
@@ -141,31 +141,31 @@ def understand(kind: Representation, given: Mapping[str, Any]) -> Wish:
     ComponentError
         ``::rosAFE::e_badNewValue``, as the component itself would, for what no sample rate makes possible.
     """
-    for above in chain(kind):
-        given = STAGES[above.kind].asked(given)
+    for above in ancestor_kinds(kind):
+        given = STAGES[above.kind].request_values(given)
     try:
         for name in OF_THE_INPUT:
             if name in given:
                 REQUEST.parameter(name).check(given[name])
         # What belongs to none of them has no effect, and is checked all the same.
         checked = dict(check_parameter(name, value) for name, value in given.items() if name not in OF_THE_INPUT)
-        levels = tuple(_level(above, checked) for above in chain(kind))
+        levels = tuple(_level(above, checked) for above in ancestor_kinds(kind))
     except ValueError as problem:
         raise ROSAFE.error("e_badNewValue", what=str(problem)) from None
     input_values = {p.name: given.get(p.name, p.default) for p in ROSAFE.service("InputProc").parameters[1:]}
-    return Wish(levels, input_values, dict(given))
+    return TreeRequest(levels, input_values, dict(given))
 
 
-def _level(kind: Representation, checked: Mapping[str, Any]) -> Level:
+def _level(kind: Representation, checked: Mapping[str, Any]) -> ProcessorSpec:
     given = {p.name: checked[p.name] for p in kind.parameters if p.name in checked}
     values = {p.name: p.check(p.default) for p in kind.parameters} | given
-    return Level(kind, values, STAGES[kind.kind].in_force(values), given)
+    return ProcessorSpec(kind, values, STAGES[kind.kind].effective_values(values), given)
 
 
 # --- what to do -------------------------------------------------------------------------------------------------
 
 
-def plan(wish: Wish, found: Sequence[Found], reserved: Collection[str] = ()) -> Plan:
+def plan(wish: TreeRequest, found: Sequence[ExistingProcessor], reserved: Collection[str] = ()) -> Plan:
     """What to do for `wish` in a tree that consists of `found`; new processors get none of the names `reserved`.
 
     What is there and fits is used, as far down as possible; the rest is made below it, under new names.
@@ -184,27 +184,27 @@ def plan(wish: Wish, found: Sequence[Found], reserved: Collection[str] = ()) -> 
     for level in wish.levels[len(reused) :]:
         name = free_name(level.kind, names)
         names.add(name)
-        steps += making(level, name, dependencies[-1] if dependencies else "", wish.input_values)
+        steps += creation_call(level, name, dependencies[-1] if dependencies else "", wish.input_values)
         dependencies.append(name)
     return Plan(dependencies, steps)
 
 
-def _check_input(root: Found, level: Level) -> None:
+def _check_input(root: ExistingProcessor, level: ProcessorSpec) -> None:
     for name, value in level.given.items():
         if root.values[name] != value:
-            there = f"the input {root.name!r} has {name} {text_of(root.values[name])}"
+            there = f"the input {root.name!r} has {name} {format_value(root.values[name])}"
             what = f"{there}, which modifyParameter changes for all"
             raise ROSAFE.error("e_existsAlready", what=what)
 
 
-def _deepest(levels: Sequence[Level], found: Iterable[Found], sample_rate: float) -> list[str]:
+def _deepest(levels: Sequence[ProcessorSpec], found: Iterable[ExistingProcessor], sample_rate: float) -> list[str]:
     """The names, from the input on, of the longest line of processors that fit."""
     lines: dict[str, list[str]] = {"": []}  # that fit so far, by the name of their last processor
     for level in levels:
         longer = {
             p.name: [*lines[p.parent], p.name]
             for p in found
-            if p.kind == level.kind.kind and p.parent in lines and (not p.parent or level.fits(p, sample_rate))
+            if p.kind == level.kind.kind and p.parent in lines and (not p.parent or level.matches(p, sample_rate))
         }
         if not longer:
             break
@@ -221,19 +221,19 @@ def free_name(kind: Representation, names: Collection[str]) -> str:
     return f"{kind.word}_{number}"
 
 
-def making(level: Level, name: str, parent: str, input_values: Mapping[str, Any]) -> list[Step]:
+def creation_call(level: ProcessorSpec, name: str, parent: str, input_values: Mapping[str, Any]) -> list[ServiceCall]:
     """The requests for one processor. What that of an input cannot carry is set before anything hangs on it.
 
     `input_values` are those of InputProc less its name, of which only an input takes notice.
     """
     if level.kind.parent:
         free = {p.name: math.nan for p in level.kind.parameters if p.follows_rate and p.name not in level.given}
-        return [Step(level.kind.request, {"name": name, "upperDepName": parent, **level.values, **free}, name)]
+        return [ServiceCall(level.kind.request, {"name": name, "upperDepName": parent, **level.values, **free}, name)]
     changed = {p.name: level.values[p.name] for p in level.kind.parameters if level.values[p.name] != p.default}
     return [
-        Step(level.kind.request, {"name": name, **input_values}, name),
+        ServiceCall(level.kind.request, {"name": name, **input_values}, name),
         *(
-            Step("modifyParameter", {"nameProc": name, "nameParam": parameter, "newValue": text_of(value)})
+            ServiceCall("modifyParameter", {"nameProc": name, "nameParam": parameter, "newValue": format_value(value)})
             for parameter, value in changed.items()
         ),
     ]
@@ -242,7 +242,9 @@ def making(level: Level, name: str, parent: str, input_values: Mapping[str, Any]
 # --- what has been done -----------------------------------------------------------------------------------------
 
 
-def answer(wish: Wish, dependencies: Sequence[str], created: Collection[str], instance: str) -> dict[str, Any]:
+def build_response(
+    wish: TreeRequest, dependencies: Sequence[str], created: Collection[str], instance: str
+) -> dict[str, Any]:
     """The outputs of `interface.REQUEST`, once the processors `dependencies` are there."""
     return {
         "name": dependencies[-1],
@@ -266,7 +268,7 @@ def topic(instance: str, kind: Representation, name: str) -> str:
     return f"/{instance}/{kind.port}" + (f"/{name}" if ROSAFE.port(kind.port).multiple else "")
 
 
-def stands(dependencies: Sequence[str], found: Iterable[Found]) -> bool:
+def chain_exists(dependencies: Sequence[str], found: Iterable[ExistingProcessor]) -> bool:
     """Whether processors of these names hang on each other, the first one being the input."""
     parents = {p.name: p.parent for p in found}
     return all(parents.get(name) == parent for parent, name in itertools.pairwise(["", *dependencies]))

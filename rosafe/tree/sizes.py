@@ -12,7 +12,7 @@ from rosafe.dsp.stage import Stage
 MAX_BYTES = (
     2**30
 )  # of one output port, of one processor's history, of the samples that it keeps for a frame, of a block
-SHARE = 0.5  # of the machine's memory, for output ports, histories and states of all processors together
+MAX_MEMORY_FRACTION = 0.5  # of the machine's memory, for output ports, histories and states of all processors together
 
 Rows = tuple[int, ...]
 
@@ -37,7 +37,7 @@ def output_size(stage: Stage, rows: Rows, seconds: float) -> float:
     return sum(size(part, seconds * stage.output_format.rate) for part in stage.part_rows(rows))
 
 
-def refuse_over(limit: float, taken: float, text: str, unit: float = 2**20) -> None:
+def check_memory(limit: float, taken: float, text: str, unit: float = 2**20) -> None:
     """ValueError where `taken` passes `limit`; `text` says so, with {taken} and {limit} in its place, in units."""
     if taken > limit:
         raise ValueError(text.format(taken=taken / unit, limit=limit / unit))
@@ -53,13 +53,13 @@ def check_stage(stage: Stage, rows: Rows, seconds: float) -> None:
     _check_span(name, rows, frames / given.rate, given.rate)
     shape = "x".join(map(str, rows))
     text = f"{stage.REPRESENTATION.kind}: what it keeps of {shape} values takes {{taken:.0f}} MiB"
-    refuse_over(MAX_BYTES, state_size(stage, rows), f"{text}, more than {{limit:.0f}} MiB")
+    check_memory(MAX_BYTES, state_size(stage, rows), f"{text}, more than {{limit:.0f}} MiB")
 
 
 def _check_span(what: str, rows: Rows, seconds: float, rate: float) -> None:
     span = f"{seconds:g} s of {'x'.join(map(str, rows))} values at {rate:g} Hz"
     text = f"{what}: {span} take {{taken:.0f}} MiB, more than {{limit:.0f}} MiB"
-    refuse_over(MAX_BYTES, size(rows, seconds * rate), text)
+    check_memory(MAX_BYTES, size(rows, seconds * rate), text)
 
 
 def check_all(stages: Iterable[tuple[Stage, Rows]], seconds: float) -> None:
@@ -67,4 +67,8 @@ def check_all(stages: Iterable[tuple[Stage, Rows]], seconds: float) -> None:
     sizes = [output_size(stage, rows, seconds) + state_size(stage, rows) for stage, rows in stages]
     text = f"{seconds:g} s of output of {len(sizes)} processors, and their states,"
     text = f"{text} take {{taken:.0f}} MiB, more than {{limit:.0f}} MiB"
-    refuse_over(SHARE * machine_memory(), sum(sizes), f"{text}, which is {SHARE:.0%} of this machine's memory")
+    check_memory(
+        MAX_MEMORY_FRACTION * machine_memory(),
+        sum(sizes),
+        f"{text}, which is {MAX_MEMORY_FRACTION:.0%} of this machine's memory",
+    )

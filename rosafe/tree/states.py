@@ -12,7 +12,7 @@ import enum
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from rosafe.dsp.signal import Signal
+from rosafe.dsp.signal import SignalFormat
 from rosafe.tree.block import Block
 
 
@@ -29,9 +29,9 @@ class State(enum.Enum):
 
 # Enumerations are slow to look up.
 WAIT_EXEC, EXEC, WAIT_RELEASE, RELEASE = State.WAIT_EXEC, State.EXEC, State.WAIT_RELEASE, State.RELEASE
-DONE, REMOVED = ENDS = (State.DONE, State.REMOVED)
+DONE, REMOVED = FINAL_STATES = (State.DONE, State.REMOVED)
 
-NOTHING = Block(0, (), 0, Signal.sound(1.0))  # to be told of a block that nobody hears of
+NO_BLOCK = Block(0, (), 0, SignalFormat.sound(1.0))  # to be told of a block that nobody hears of
 
 
 class StateMachine:
@@ -42,7 +42,7 @@ class StateMachine:
     depth : int
         How many there are above it.
     at_work : bool
-        A worker is at it, from `begin` to `rest`.
+        A worker is at it, from `begin_work` to `end_work`.
     called : bool
         Of the input: there may be sound to read.
     taken : Block or None
@@ -51,9 +51,9 @@ class StateMachine:
         Somebody may want the last block later: the world is told of it, and a new child begins with it. Else its memory
         is free, and still in the cache, as soon as the children have done with it.
     shared : Block or None
-        Released last; a new child begins with it. None where it is not `heard`.
+        Released last; a new child begins with it. None where it is not `has_consumers`.
     untold : Block or None
-        Released last, until the world has been told of it; `NOTHING` where it is not `heard`.
+        Released last, until the world has been told of it; `NO_BLOCK` where it is not `has_consumers`.
     observers : sequence of callable
         Get the processor, the state that it enters, and the number of the block at hand, or None. No waiting.
     """
@@ -66,23 +66,23 @@ class StateMachine:
         self.children: list[StateMachine] = []
         self.depth: int = 0 if parent is None else parent.depth + 1
         self.state = WAIT_EXEC
-        self.at_work = self.called = False
-        self.taken: Block | None = None
-        self.heard = True
-        self.shared: Block | None = None
-        self.untold: Block | None = None
-        self._private: Block | None = None  # computed, and to be released as soon as no child holds the last one
-        self._token: Block | None = None  # the parent's, not taken yet
-        self._reading: StateMachine | None = None  # whose block it holds: the input may be replaced meanwhile
-        self._holders: set[StateMachine] = set()  # children that have not given the last block back
+        self.busy = self.input_pending = False
+        self.current_block: Block | None = None
+        self.has_consumers = True
+        self.last_block: Block | None = None
+        self.unpublished_block: Block | None = None
+        self._pending_block: Block | None = None  # computed, and to be released as soon as no child holds the last one
+        self._next_block: Block | None = None  # the parent's, not taken yet
+        self._block_owner: StateMachine | None = None  # whose block it holds: the input may be replaced meanwhile
+        self._readers: set[StateMachine] = set()  # children that have not given the last block back
 
     # --- what a processor adds ---
 
-    def rouse(self) -> None:
+    def on_ready(self) -> None:
         """It has become ready."""
 
-    def settle(self) -> None:
-        """It is `over`."""
+    def on_finished(self) -> None:
+        """It is `finished`."""
 
     # --- coming and going ---
 
@@ -91,152 +91,152 @@ class StateMachine:
         if self.parent is None:
             return
         self.parent.children.append(self)
-        if self.parent.shared is not None:
-            self.parent._hand(self, self.parent.shared)
+        if self.parent.last_block is not None:
+            self.parent._offer(self, self.parent.last_block)
         self._end_if_exhausted()
 
-    def call(self) -> None:
+    def notify_input(self) -> None:
         """There may be sound to read."""
-        self.called = True
+        self.input_pending = True
         if self.ready:
-            self.rouse()
+            self.on_ready()
 
     def move(self, parent: StateMachine) -> None:
         """Become a child of another parent, which has released nothing yet; a block that was not taken is dropped."""
-        self._leave()
-        self.parent, self._token = parent, None
+        self._detach()
+        self.parent, self._next_block = parent, None
         parent.children.append(self)
 
     def remove(self) -> None:
         """Gone at once: its parent waits for it no longer, and it will release nothing more."""
-        self._enter(REMOVED)
-        self.shared = self._private = self._token = None
-        self._leave()
-        if not self.at_work:
-            self.settle()
+        self._set_state(REMOVED)
+        self.last_block = self._pending_block = self._next_block = None
+        self._detach()
+        if not self.busy:
+            self.on_finished()
 
-    def finish(self) -> None:
+    def end_of_stream(self) -> None:
         """Nothing more will come of it; children may still take the block released last."""
-        self.give_back()
-        self._enter(DONE)
-        if self.parent is not None and self._token is not None:  # it has failed
-            self._token = None
-            self.parent._freed_by(self)
+        self.release_input()
+        self._set_state(DONE)
+        if self.parent is not None and self._next_block is not None:  # it has failed
+            self._next_block = None
+            self.parent._reader_done(self)
         for child in self.children:
             child._end_if_exhausted()
-        if not self.at_work:
-            self.settle()
+        if not self.busy:
+            self.on_finished()
 
-    def _leave(self) -> None:
+    def _detach(self) -> None:
         if self.parent is not None and self in self.parent.children:
             self.parent.children.remove(self)
-            self.parent._freed_by(self)
+            self.parent._reader_done(self)
 
     def _end_if_exhausted(self) -> None:
-        if self.parent is None or self.parent.state is not DONE or self._token is not None:
+        if self.parent is None or self.parent.state is not DONE or self._next_block is not None:
             return
-        if not self.at_work and self.state is WAIT_EXEC:
-            self.finish()
+        if not self.busy and self.state is WAIT_EXEC:
+            self.end_of_stream()
 
     @property
-    def gone(self) -> bool:
+    def removed(self) -> bool:
         """Whether it was removed."""
         return self.state is REMOVED
 
     @property
-    def over(self) -> bool:
+    def finished(self) -> bool:
         """Whether nobody works on it and nobody ever will."""
-        return self.state in ENDS and not self.at_work
+        return self.state in FINAL_STATES and not self.busy
 
     # --- the four states ---
 
     @property
     def ready(self) -> bool:
         """Whether there is something to do: a block to take, or one to tell of."""
-        if self.at_work:
+        if self.busy:
             return False
         state = self.state
-        return self._token is not None or self.called if state is WAIT_EXEC else state is RELEASE
+        return self._next_block is not None or self.input_pending if state is WAIT_EXEC else state is RELEASE
 
-    def begin(self) -> bool:
+    def begin_work(self) -> bool:
         """Somebody works on it from now on, and takes the block that waits for it, if there is one.
 
         False where there is nothing to do.
         """
-        if self.at_work:
+        if self.busy:
             return False
         state = self.state
         if state is WAIT_EXEC:
-            taken = self._token
+            taken = self._next_block
             if taken is None:
-                if not self.called:
+                if not self.input_pending:
                     return False
-                self.called = False
+                self.input_pending = False
             else:
-                self._token = None
-                self._reading = self.parent
+                self._next_block = None
+                self._block_owner = self.parent
                 self.state = EXEC
                 if self.observers:
                     self._tell_observers(taken.number)
-            self.taken = taken
+            self.current_block = taken
         elif state is not RELEASE:
             return False
-        self.at_work = True
+        self.busy = True
         return True
 
-    def read(self, block: Block) -> None:
+    def accept_input_block(self, block: Block) -> None:
         """The input has read a block."""
-        self.called = True  # perhaps there is more
-        self.taken = block
-        self._enter(EXEC, block.number)
+        self.input_pending = True  # perhaps there is more
+        self.current_block = block
+        self._set_state(EXEC, block.number)
 
-    def done(self, private: Block | None) -> None:
+    def finish_block(self, private: Block | None) -> None:
         """It has computed `private`, or nothing: that is released at once or as soon as no child holds the last one."""
         if self.skipped:
             del self.skipped
-        self.give_back()
+        self.release_input()
         if private is not None and self.state is not REMOVED:
             self.state = WAIT_RELEASE
             if self.observers:
                 self._tell_observers(private.number)
-            if self._holders:
-                self._private = private
+            if self._readers:
+                self._pending_block = private
             else:
                 self._release(private)
 
     def skip(self) -> None:
         """Release the parent's block during a long computation: siblings continue, this one misses blocks meanwhile."""
         self.skipped = True
-        self.give_back()
+        self.release_input()
 
-    def give_back(self) -> None:
+    def release_input(self) -> None:
         """Return the parent's block, which may release its next one then."""
-        reading = self._reading
+        reading = self._block_owner
         if reading is not None:
-            self._reading = None
-            reading._freed_by(self)
+            self._block_owner = None
+            reading._reader_done(self)
 
-    def rest(self) -> None:
+    def end_work(self) -> None:
         """Nobody works on it any more."""
-        self.at_work, self.taken = False, None
+        self.busy, self.current_block = False, None
         state = self.state
-        if state is EXEC or (state is RELEASE and self.untold is None):
+        if state is EXEC or (state is RELEASE and self.unpublished_block is None):
             self.state = WAIT_EXEC
             if self.observers:
                 self._tell_observers(None)
-            if self._token is not None or self.called:
-                self.rouse()
+            if self._next_block is not None or self.input_pending:
+                self.on_ready()
             elif self.parent is not None and self.parent.state is DONE:
                 self._end_if_exhausted()
-        elif state in ENDS:
-            self.settle()
+        elif state in FINAL_STATES:
+            self.on_finished()
         elif self.ready:
-            self.rouse()
+            self.on_ready()
 
-    def _freed_by(self, child: StateMachine) -> None:
-        self._holders.discard(child)
-        if not self._holders and self.state is WAIT_RELEASE:
-            block, self._private = self._private, None
+    def _reader_done(self, child: StateMachine) -> None:
+        self._readers.discard(child)
+        if not self._readers and self.state is WAIT_RELEASE:
+            block, self._pending_block = self._pending_block, None
             assert block is not None
             self._release(block)
 
@@ -245,20 +245,20 @@ class StateMachine:
         self.state = RELEASE
         if self.observers:
             self._tell_observers(block.number)
-        self.shared, self.untold = (block, block) if self.heard else (None, NOTHING)
+        self.last_block, self.unpublished_block = (block, block) if self.has_consumers else (None, NO_BLOCK)
         for child in self.children:
             if child.state is not DONE and not child.skipped:
-                self._hand(child, block)
-        if not self.at_work:
-            self.rouse()
+                self._offer(child, block)
+        if not self.busy:
+            self.on_ready()
 
-    def _hand(self, child: StateMachine, block: Block) -> None:
-        self._holders.add(child)
-        child._token = block
-        if child.state is WAIT_EXEC and not child.at_work:
-            child.rouse()
+    def _offer(self, child: StateMachine, block: Block) -> None:
+        self._readers.add(child)
+        child._next_block = block
+        if child.state is WAIT_EXEC and not child.busy:
+            child.on_ready()
 
-    def _enter(self, state: State, number: int | None = None) -> None:
+    def _set_state(self, state: State, number: int | None = None) -> None:
         if self.state is not REMOVED:
             self.state = state
             self._tell_observers(number)

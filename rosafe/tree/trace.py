@@ -10,7 +10,7 @@ from statistics import median
 from typing import Any, NamedTuple
 
 from rosafe.tree.processor import Processor
-from rosafe.tree.states import ENDS, State
+from rosafe.tree.states import FINAL_STATES, State
 from rosafe.tree.workers import WORKER
 
 MAX_EVENTS = 500_000  # that wait to be taken; the oldest are forgotten
@@ -29,7 +29,7 @@ class Event(NamedTuple):
     worker: str = ""  # who brought it there, where that was one
 
 
-class Span(NamedTuple):
+class StateInterval(NamedTuple):
     """A processor is in a state. Times in microseconds."""
 
     name: str
@@ -72,26 +72,26 @@ class Trace:
         self.processors = _parents_first({event.name: event for event in events})
         self.spans = list(self._spans(events))
         self.workers = sorted({span.worker for span in self.spans if span.worker}, key=lambda name: (len(name), name))
-        self._of: dict[tuple[str, str], list[Span]] = {}
+        self._of: dict[tuple[str, str], list[StateInterval]] = {}
         for span in self.spans:
             self._of.setdefault((span.name, span.state), []).append(span)
 
-    def _spans(self, events: Sequence[Event]) -> Iterator[Span]:
+    def _spans(self, events: Sequence[Event]) -> Iterator[StateInterval]:
         entered: dict[str, Event] = {}
         for event in events:
             before = entered.pop(event.name, None)
             if before is not None:
                 yield _span(before, event.time)
-            if State(event.state) not in ENDS:
+            if State(event.state) not in FINAL_STATES:
                 entered[event.name] = event
         for event in entered.values():
             yield _span(event, self.end)
 
-    def of(self, name: str, state: State) -> list[Span]:
+    def of(self, name: str, state: State) -> list[StateInterval]:
         """When a processor was in a state, in the order of time."""
         return self._of.get((name, state.value), [])
 
-    def together(self, one: str, other: str) -> list[tuple[Span, Span]]:
+    def overlap(self, one: str, other: str) -> list[tuple[StateInterval, StateInterval]]:
         """The pairs of spans in which both processors compute at the same time."""
         ones, others = deque(self.of(one, State.EXEC)), deque(self.of(other, State.EXEC))
         pairs = []
@@ -101,7 +101,7 @@ class Trace:
             (ones if ones[0].end <= others[0].end else others).popleft()
         return pairs
 
-    def kin(self) -> Iterator[tuple[str, str, str]]:
+    def related_pairs(self) -> Iterator[tuple[str, str, str]]:
         """All pairs that may work at the same time, and what they are to each other."""
         for name, event in self.processors.items():
             if event.parent in self.processors:
@@ -110,7 +110,7 @@ class Trace:
                 if name < other and event.parent and sibling.parent == event.parent:
                     yield name, other, "siblings"
 
-    def at_once(self) -> dict[int, int]:
+    def concurrency(self) -> dict[int, int]:
         """For how many microseconds so many processors computed at the same time."""
         work = [span for span in self.spans if span.state == State.EXEC.value]
         steps = [(span.begin, 1) for span in work] + [(span.end, -1) for span in work]
@@ -143,7 +143,7 @@ class Trace:
                 shown.append(self._shown(span, span.name, WORKERS, workers[span.worker]))
         return {"traceEvents": shown, "displayTimeUnit": "ms"}
 
-    def _shown(self, span: Span, what: str, process: int, row: int) -> dict[str, Any]:
+    def _shown(self, span: StateInterval, what: str, process: int, row: int) -> dict[str, Any]:
         block = {} if span.block is None else {"block": span.block}
         return {
             "name": " ".join([what, *map(str, block.values())]),
@@ -168,7 +168,7 @@ class Trace:
                 f"{name:{width}} {len(work):6d} {median(work or [0.0]):7.2f} {max(work, default=0.0):8.2f}"
                 + "".join(f"{share:12.1%}" for share in shares)
             )
-        spent = self.at_once()
+        spent = self.concurrency()
         busy = self.end - self.begin - spent.get(0, 0)
         computed = sum(count * time for count, time in spent.items())
         several = sum(time for count, time in spent.items() if count > 1)
@@ -181,8 +181,8 @@ class Trace:
             share = sum(span.end - span.begin for span in did) / self._length
             lines.append(f"{worker:{width}} {len(did):6d} blocks, computes in {share:.1%} of the time")
         lines.append("at the same time:")
-        for one, other, what in self.kin():
-            both = sum(_common(a, b) for a, b in self.together(one, other))
+        for one, other, what in self.related_pairs():
+            both = sum(_common(a, b) for a, b in self.overlap(one, other))
             lines.append(f"{one:>{width}} and {other:{width}} {both / 1000:9.1f} ms  ({what})")
         return lines
 
@@ -201,12 +201,12 @@ def _parents_first(processors: dict[str, Event]) -> dict[str, Event]:
     return {name: processors[name] for name in sorted(processors, key=depth)}
 
 
-def _common(a: Span, b: Span) -> int:
+def _common(a: StateInterval, b: StateInterval) -> int:
     return min(a.end, b.end) - max(a.begin, b.begin)
 
 
-def _span(event: Event, end: int) -> Span:
-    return Span(event.name, event.state, event.block, event.time, end, event.worker)
+def _span(event: Event, end: int) -> StateInterval:
+    return StateInterval(event.name, event.state, event.block, event.time, end, event.worker)
 
 
 def _metadata(what: str, process: int, row: int, **arguments: Any) -> dict[str, Any]:

@@ -13,14 +13,14 @@ from rosafe.interface import KINDS, ROSAFE, ComponentError
 from rosafe.representations import STAGES
 from rosafe.tree import sizes
 from rosafe.tree.block import Source
-from rosafe.tree.company import Company, Listener, Observer
+from rosafe.tree.company import Observer, TreeContext, TreeListener
 from rosafe.tree.member import EARS
 from rosafe.tree.processor import Processor, subtree
 from rosafe.tree.sizes import Rows
 from rosafe.tree.states import State
 from rosafe.tree.workers import Workers, workers_to_use
-from rosafe.vocabulary.parameter import Parameter, shown
-from rosafe.vocabulary.words import listed, meant
+from rosafe.vocabulary.parameter import Parameter, short_repr
+from rosafe.vocabulary.words import did_you_mean, join_names
 
 INPUT = next(kind for kind, representation in KINDS.items() if not representation.parent)
 
@@ -79,13 +79,13 @@ class Tree:
         For another number of workers than 1 to 1024.
     """
 
-    def __init__(self, listener: Listener, workers: int | None = None) -> None:
+    def __init__(self, listener: TreeListener, workers: int | None = None) -> None:
         self._processors: dict[str, Processor] = {}  # in the order of creation, as getParameters reports them
         self._lock = threading.RLock()  # guards all tokens
         self._requests = threading.RLock()  # one request at a time; taken before _lock
         self._failures: dict[str, Failure] = {}  # by the processor's name
         self._workers = Workers(self._lock, workers_to_use(workers))
-        self._company = Company(self._workers, listener, self.end, threading.Condition(self._lock))
+        self._company = TreeContext(self._workers, listener, self.end, threading.Condition(self._lock))
         self.sample_rate = 0.0
         self.port_seconds = 1.0
         self.history_seconds = 1.0
@@ -126,7 +126,7 @@ class Tree:
     def _no_processor(self, name: str) -> str:
         failure = self._failures.get(name)
         reason = f": {failure}" if failure is not None else ""
-        return f"there is no processor {shown(name)}{reason}; there are: {listed(self._processors)}"
+        return f"there is no processor {short_repr(name)}{reason}; there are: {join_names(self._processors)}"
 
     def dependencies(self, name: str) -> list[str]:
         """The names from the input down to `name`."""
@@ -158,7 +158,7 @@ class Tree:
         with self._requests:
             holder = self._processors.get(name)
             if holder is not None and holder.parent is not None:
-                raise ROSAFE.error("e_existsAlready", f"{shown(name)} exists already, of kind {holder.kind}")
+                raise ROSAFE.error("e_existsAlready", f"{short_repr(name)} exists already, of kind {holder.kind}")
             root = self.input
             if root is not None and root.children and sample_rate != self.sample_rate:
                 raise ROSAFE.error(
@@ -185,7 +185,7 @@ class Tree:
             old = self.input
             try:
                 self.check_input(name, source.sample_rate)
-                with _refusing():
+                with _as_value_error():
                     stage = STAGES[INPUT](source.sample_rate, **(parameters or {}))
                     new = Processor(name, stage, None, history_seconds, self._company, source)
                     heir = old if old is not None and old.state is not State.DONE else new
@@ -220,29 +220,31 @@ class Tree:
             wanted = KINDS[kind].parent
             parent = self._processors.get(parent_name)
             if parent is None:
-                raise ROSAFE.error("e_noUpperDependencie", f"{self._no_processor(parent_name)}{self._of_kind(wanted)}")
+                raise ROSAFE.error(
+                    "e_noUpperDependencie", f"{self._no_processor(parent_name)}{self._descendants_of_kind(wanted)}"
+                )
             if name in self._processors:
                 there = self._processors[name].kind
-                raise ROSAFE.error("e_existsAlready", f"{shown(name)} exists already, of kind {there}")
+                raise ROSAFE.error("e_existsAlready", f"{short_repr(name)} exists already, of kind {there}")
             if parent.kind != wanted:
                 raise ROSAFE.error(
                     "e_noUpperDependencie",
-                    f"{shown(parent_name)} is of kind {parent.kind}, wanted is {wanted}{self._of_kind(wanted)}",
+                    f"{short_repr(parent_name)} is of kind {parent.kind}, wanted is {wanted}{self._descendants_of_kind(wanted)}",
                 )
             return parent
 
-    def _of_kind(self, kind: str) -> str:
+    def _descendants_of_kind(self, kind: str) -> str:
         names = [processor.name for processor in self._processors.values() if processor.kind == kind]
-        return f"; of kind {kind}: {listed(names)}"
+        return f"; of kind {kind}: {join_names(names)}"
 
     def add(self, kind: str, name: str, parent_name: str, parameters: Mapping[str, Any] | None = None) -> Processor:
         """Add a processor of `kind` under `parent_name`; it runs when this returns."""
         with self._requests:
             parent = self.check(kind, name, parent_name)
-            with _refusing():
+            with _as_value_error():
                 stage = STAGES[kind](parent.signal, **(parameters or {}))
                 processor = Processor(name, stage, parent, self.history_seconds, self._company)
-                self._check(_planned(processor, stage, parent.rows, parent.stage), self._longest)
+                self._check(_planned(processor, stage, parent.output_shape, parent.stage), self._longest)
             self._begin(processor)
             return processor
 
@@ -250,7 +252,7 @@ class Tree:
         self._processors[processor.name] = processor
         self._failures.pop(processor.name, None)
         try:
-            self._company.listener.added(processor)
+            self._company.listener.on_added(processor)
             processor.start()
         except BaseException:
             self._remove(processor)
@@ -262,7 +264,7 @@ class Tree:
         return max(self.port_seconds, self.history_seconds)
 
     def _check(self, planned: Iterable[Planned], seconds: float, instead_of: Processor | None = None) -> None:
-        """ValueError where what is `planned` would fill the memory.
+        """ValueError where what is `final_stage` would fill the memory.
 
         That is with `seconds` of output or with the samples of one frame, or with the output of the whole tree as it
         would be then: without `instead_of` and all below it.
@@ -281,7 +283,7 @@ class Tree:
         name: str,
         parameter_name: str,
         text: str,
-        taken: Callable[[Parameter, Any], Any] = Parameter.known_word,
+        taken: Callable[[Parameter, Any], Any] = Parameter.resolve_choice,
     ) -> Processor:
         """modifyParameter: change one parameter, given as text, from the processor's next block on.
 
@@ -295,10 +297,10 @@ class Tree:
                 known = [p.name for p in processor.representation.parameters]
                 raise ROSAFE.error(
                     "e_noSuchParameter",
-                    f"processors of kind {processor.kind} have no {shown(parameter_name)}, but: {listed(known)}"
-                    f"{meant(parameter_name, known)}",
+                    f"processors of kind {processor.kind} have no {short_repr(parameter_name)}, but: {join_names(known)}"
+                    f"{did_you_mean(parameter_name, known)}",
                 ) from None
-            with _refusing():
+            with _as_value_error():
                 self._change(processor, parameter.name, taken(parameter, parameter.parse(text, parameter_name)))
             return processor
 
@@ -307,20 +309,20 @@ class Tree:
 
         Several changes come in the order of their blocks: each is checked after all that were made before it.
         """
-        with self._requests, _refusing():
+        with self._requests, _as_value_error():
             for processor in self._processors.values():
                 if any(parameter_name == p.name for p in processor.representation.parameters):
                     self._change(processor, parameter_name, value, block)
 
     def _change(self, processor: Processor, name: str, value: Any, block: int = 0) -> None:
         """Change a parameter if all processors below can go on then; else ValueError, and nothing has changed."""
-        changed = processor.changes.plan(name, value)
+        changed = processor.changes.preview(name, value)
         above = None if processor.parent is None else processor.parent.stage
-        planned = list(_planned(processor, changed, processor.given_rows, above))
+        planned = list(_planned(processor, changed, processor.input_shape, above))
         self._check(planned, self._longest, processor)
         for one, stage, _ in planned:
-            one.changes.planned = stage
-        processor.changes.accept(changed, name, value, block)
+            one.changes.final_stage = stage
+        processor.changes.enqueue(changed, name, value, block)
 
     # --- removing ---
 
@@ -370,7 +372,7 @@ class Tree:
 
 
 @contextmanager
-def _refusing() -> Iterator[None]:
+def _as_value_error() -> Iterator[None]:
     """Make e_badNewValue of any ValueError."""
     try:
         yield
@@ -388,14 +390,16 @@ def _planned(processor: Processor, stage: Stage, rows: Rows, above: Stage | None
     yield Planned(processor, stage, rows)
     for child in list(processor.children):
         below = child.ask(
-            lambda one: list(_planned(one, one.changes.follow(stage.output_format), stage.output_rows(rows), stage))
+            lambda one: list(
+                _planned(one, one.changes.preview_input(stage.output_format), stage.output_rows(rows), stage)
+            )
         )
         yield from below or ()
 
 
 def _sized(processor: Processor) -> tuple[Stage, Rows]:
     """The stage of a processor and the rows of its input, once the stage has answered what its sizes are."""
-    stage, rows = processor.stage, processor.given_rows
+    stage, rows = processor.stage, processor.input_shape
     sizes.output_size(stage, rows, 0.0)
     sizes.state_size(stage, rows)
     return stage, rows

@@ -71,7 +71,7 @@ class WindowView:
         return joined
 
 
-class Newest:
+class RecentFrames:
     """The newest frames of a signal.
 
     Parameters
@@ -128,7 +128,7 @@ class SlidingWindow:
         self.rows = rows
         self.frames = frames
         # rows of one row, which is nowhere before somebody writes to it
-        self._newest = Newest(np.broadcast_to(np.zeros(frames), (*rows, frames)), frames)
+        self._newest = RecentFrames(np.broadcast_to(np.zeros(frames), (*rows, frames)), frames)
 
     def append(self, block: FloatArray) -> None:
         """Shift left and put `block`, of shape (*rows, n), at the end. The block must not be written again."""

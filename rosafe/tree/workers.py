@@ -6,7 +6,7 @@ wakes another worker only where something is left over and one is idle, and both
 thread is ever switched so; on several, siblings and successive blocks are worked on at the same time.
 
 Only those who compute count. A worker that somebody else holds up (a listener that does not return, a source that does
-not answer), or whose processor was removed, loses its seat to another one after `PATIENCE` seconds.
+not answer), or whose processor was removed, loses its seat to another one after `BLOCKED_TIMEOUT_SECONDS` seconds.
 """
 
 from __future__ import annotations
@@ -21,9 +21,11 @@ from collections.abc import Callable
 from typing import Protocol
 
 VARIABLE = "ROSAFE_WORKERS"
-MOST = 1024
-PATIENCE = 0.05  # seconds
-SHORT = 2.5e-4  # seconds: a call takes some ten microseconds of two workers, which then want the interpreter in turn
+MAX_WORKERS = 1024
+BLOCKED_TIMEOUT_SECONDS = 0.05  # seconds
+WAKE_THRESHOLD_SECONDS = (
+    2.5e-4  # seconds: a call takes some ten microseconds of two workers, which then want the interpreter in turn
+)
 WORKER = "rosafe worker"  # what the names of their threads begin with
 
 
@@ -33,8 +35,8 @@ def workers_to_use(wanted: int | str | None = None) -> int:
     name, given = ("workers", str(wanted)) if wanted is not None else (VARIABLE, text)
     if not given:
         return len(os.sched_getaffinity(0))
-    if not (given.isascii() and given.isdigit()) or not 1 <= int(given[:20]) <= MOST:
-        raise ValueError(f"{name}: {given[:80]!r} is not a whole number from 1 to {MOST}")
+    if not (given.isascii() and given.isdigit()) or not 1 <= int(given[:20]) <= MAX_WORKERS:
+        raise ValueError(f"{name}: {given[:80]!r} is not a whole number from 1 to {MAX_WORKERS}")
     return int(given)
 
 
@@ -45,20 +47,20 @@ class Task(Protocol):
     """
 
     depth: int
-    usual: float  # seconds that it takes, or more than that
-    held_up_since: float  # time.monotonic() at which somebody else began to hold it up; 0 where nobody does
+    estimated_seconds: float  # seconds that it takes, or more than that
+    blocked_since: float  # time.monotonic() at which somebody else began to hold it up; 0 where nobody does
 
     @property
-    def gone(self) -> bool:
+    def removed(self) -> bool:
         """Whether nobody wants the result of what is being done any more."""
 
-    def begin(self) -> bool:
+    def begin_work(self) -> bool:
         """Somebody works on it from now on; False where there is nothing to do."""
 
     def work(self) -> None:
         """Do it. Raises nothing."""
 
-    def rest(self) -> None:
+    def end_work(self) -> None:
         """Nobody works on it any more; it may be ready again."""
 
 
@@ -67,7 +69,7 @@ class _Worker:
 
     def __init__(self) -> None:
         self.task: Task | None = None
-        self.seated = False  # counts as one of those who compute
+        self.has_slot = False  # counts as one of those who compute
 
 
 class Workers:
@@ -84,36 +86,36 @@ class Workers:
     def __init__(self, lock: threading.RLock, count: int) -> None:
         self.lock = lock
         self.count = count
-        self._members = 0
+        self._clients = 0
         self._ready: list[tuple[int, int, Task]] = []  # a heap: the deepest first, of these the one that came last
-        self._falling = itertools.count(0, -1)
-        self._free = count  # seats that nobody has
+        self._sequence = itertools.count(0, -1)
+        self._free_slots = count  # seats that nobody has
         self._idle = 0  # threads that wait for a task, or are about to begin, and
-        self._called = 0  # those of them that are called already
+        self._woken = 0  # those of them that are called already
         self._last: dict[int, _Worker] = {}  # who did a task the last time, by its id
-        self._turn = threading.Condition(lock)
+        self._task_available = threading.Condition(lock)
         self._watch = threading.Condition(lock)
         self._workers: list[_Worker] = []
         self._threads: dict[str, threading.Thread] = {}
 
-    def enter(self) -> None:
+    def add_client(self) -> None:
         """One member more. RuntimeError where the system has no thread left for the first one."""
-        self._members += 1
+        self._clients += 1
         try:
             if not self._threads:
-                self._start("rosafe watch", self._keep_watch)
+                self._start("rosafe watch", self._monitor_blocked)
             if not self._workers:
                 self._start_worker()
         except RuntimeError:
-            self.leave()
+            self.remove_client()
             raise
 
-    def leave(self) -> None:
+    def remove_client(self) -> None:
         """One member less."""
-        self._members -= 1
-        if self._members == 0:
+        self._clients -= 1
+        if self._clients == 0:
             self._ready, self._last = [], {}
-            self._turn.notify_all()
+            self._task_available.notify_all()
             self._watch.notify_all()
 
     def join(self) -> None:
@@ -127,30 +129,30 @@ class Workers:
 
     def push(self, task: Task) -> None:
         """`task` is ready. Who is no worker calls `wake` after that."""
-        heapq.heappush(self._ready, (-task.depth, next(self._falling), task))
+        heapq.heappush(self._ready, (-task.depth, next(self._sequence), task))
 
     def wake(self) -> None:
         """Call an idle worker, or start one, for each task that waits, as far as there are seats."""
-        for _ in range(min(len(self._ready), self._free) - self._called):
-            if self._idle > self._called:
-                self._called += 1
-                self._turn.notify()
+        for _ in range(min(len(self._ready), self._free_slots) - self._woken):
+            if self._idle > self._woken:
+                self._woken += 1
+                self._task_available.notify()
                 continue
             try:
                 self._start_worker()
             except RuntimeError:  # the system has none left: those that there are must do
                 return
 
-    def _worth_a_call(self, own: Task) -> bool:
+    def _should_wake_another(self, own: Task) -> bool:
         """Whether what waits would wait too long for a worker that takes up `own` now, or keep it busy for too long."""
-        seconds = own.usual
+        seconds = own.estimated_seconds
         for _, _, task in self._ready:
-            if seconds > SHORT:
+            if seconds > WAKE_THRESHOLD_SECONDS:
                 break
-            seconds += task.usual
-        return seconds > SHORT
+            seconds += task.estimated_seconds
+        return seconds > WAKE_THRESHOLD_SECONDS
 
-    def _take(self, me: _Worker) -> Task:
+    def _pop_task(self, me: _Worker) -> Task:
         """The deepest one; of several that of `me`."""
         ready, last = self._ready, self._last
         depth, _, task = ready[0]
@@ -173,7 +175,7 @@ class Workers:
         self._start(name, functools.partial(self._run, name, worker))
         self._workers.append(worker)
         self._idle += 1
-        self._called += 1
+        self._woken += 1
 
     def _start(self, name: str, run: Callable[[], None]) -> None:
         thread = threading.Thread(target=run, name=name, daemon=True)
@@ -184,59 +186,59 @@ class Workers:
         acquire, release = self.lock.acquire, self.lock.release
         with self.lock:
             self._idle -= 1
-            self._called -= 1
-            while (task := self._next(me)) is not None:
+            self._woken -= 1
+            while (task := self._wait_for_task(me)) is not None:
                 release()
                 try:
                     task.work()
                 finally:
                     acquire()
-                    task.rest()
+                    task.end_work()
             self._workers.remove(me)
             del self._threads[name]
 
-    def _next(self, me: _Worker) -> Task | None:
+    def _wait_for_task(self, me: _Worker) -> Task | None:
         """A task that has begun, and a seat for it, as soon as there are both; None where the thread is to end."""
-        while self._members:
-            if me.seated or self._free:
+        while self._clients:
+            if me.has_slot or self._free_slots:
                 while self._ready:
-                    task = self._take(me) if self.count > 1 else heapq.heappop(self._ready)[2]
-                    if not task.begin():
+                    task = self._pop_task(me) if self.count > 1 else heapq.heappop(self._ready)[2]
+                    if not task.begin_work():
                         continue
                     me.task = task
-                    if not me.seated:
-                        me.seated = True
-                        self._free -= 1
-                    if self._ready and self._free and self._worth_a_call(task):
+                    if not me.has_slot:
+                        me.has_slot = True
+                        self._free_slots -= 1
+                    if self._ready and self._free_slots and self._should_wake_another(task):
                         self.wake()
                     return task
-            self._stand(me)
+            self._release_slot(me)
             if self._idle >= self.count:  # others have come in the place of those that were held up
                 break
             self._idle += 1
-            self._turn.wait()
+            self._task_available.wait()
             self._idle -= 1
-            self._called = max(0, self._called - 1)
-        self._stand(me)
+            self._woken = max(0, self._woken - 1)
+        self._release_slot(me)
         return None
 
-    def _stand(self, me: _Worker) -> None:
+    def _release_slot(self, me: _Worker) -> None:
         """Give the seat back, if there still is one."""
-        self._free += me.seated
-        me.task, me.seated = None, False
+        self._free_slots += me.has_slot
+        me.task, me.has_slot = None, False
 
-    def _keep_watch(self) -> None:
+    def _monitor_blocked(self) -> None:
         """Give the seats of those that are held up to others."""
         with self.lock:
-            while self._members:
-                self._watch.wait(PATIENCE)
+            while self._clients:
+                self._watch.wait(BLOCKED_TIMEOUT_SECONDS)
                 for worker in self._workers:
-                    if worker.seated and worker.task is not None and _held_up(worker.task):
-                        worker.seated = False
-                        self._free += 1
+                    if worker.has_slot and worker.task is not None and _is_blocked(worker.task):
+                        worker.has_slot = False
+                        self._free_slots += 1
                 self.wake()
             del self._threads["rosafe watch"]
 
 
-def _held_up(task: Task) -> bool:
-    return task.gone or 0 < task.held_up_since < time.monotonic() - PATIENCE
+def _is_blocked(task: Task) -> bool:
+    return task.removed or 0 < task.blocked_since < time.monotonic() - BLOCKED_TIMEOUT_SECONDS

@@ -24,13 +24,13 @@ class ComponentError(Exception):
     def __init__(self, ex: str, why: str = "", **detail: Any) -> None:
         super().__init__(why or detail.get("what") or ex)
         self.ex = ex
-        self.why = why
+        self.reason = why
         self.detail = detail
 
     @property
     def what(self) -> str:
         """The reason, for people; empty where none is known."""
-        return str(self.detail.get("what", "")) or self.why
+        return str(self.detail.get("what", "")) or self.reason
 
     @property
     def body(self) -> dict[str, Any]:
@@ -38,8 +38,8 @@ class ComponentError(Exception):
         body: dict[str, Any] = {"ex": self.ex}
         if self.detail:
             body["detail"] = self.detail
-        if self.why and "what" not in self.detail:
-            body["what"] = self.why[:MAX_WHAT]
+        if self.reason and "what" not in self.detail:
+            body["what"] = self.reason[:MAX_WHAT]
         return body
 
     @property

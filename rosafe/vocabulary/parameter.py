@@ -10,21 +10,21 @@ from typing import Any
 
 from .checks import as_tuple, bad_name, bad_text, is_number, short, twice
 from .idl import SCALARS, element, ros_type
-from .words import meant, nearest
+from .words import closest_matches, did_you_mean
 
 REQUIRED = object()  # a parameter without a default, such as connect_port's `local`
 MAX_STRING = 4096  # characters in any string that a request carries
 MAX_SEQUENCE = 1024  # elements in any list that a request carries, and channels of a filterbank
 
 
-def _plain(value: Any) -> Any:
+def _to_python(value: Any) -> Any:
     """A number of numpy's, or an array without dimensions, as Python's own type; NaN if it is masked."""
     if not hasattr(value, "item") or getattr(value, "ndim", 1) != 0:
         return value
     return math.nan if getattr(value, "mask", False) else value.item()
 
 
-def shown(value: Any) -> str:
+def short_repr(value: Any) -> str:
     """`value` for a message of one line, not too long."""
     text = repr(value)
     return text if len(text) <= 80 else text[:77] + "..."
@@ -37,7 +37,7 @@ class Parameter:
     `minimum` and `maximum` are inclusive unless `open_minimum` says otherwise; they bind the elements of a sequence,
     `least` and `most` its length, `longest` the characters of a text. `choices` are the known words of an enumerated
     string, or of a list of words.
-    Requests from the ROS graph may hold any word: `known_word` says what is taken for it, the original's `fallback`;
+    Requests from the ROS graph may hold any word: `resolve_choice` says what is taken for it, the original's `fallback`;
     where there is none, unknown words are refused there as everywhere else.
     """
 
@@ -160,7 +160,7 @@ class Parameter:
         return self._check_scalar(self.idl, value)
 
     def _refuse(self, value: Any, wanted: str) -> ValueError:
-        return ValueError(f"{self.name}: {shown(value)} is not {wanted}")
+        return ValueError(f"{self.name}: {short_repr(value)} is not {wanted}")
 
     def _check_sequence(self, of: str, value: Any) -> list[Any]:
         if of == "string" and isinstance(value, str):  # a single word is a list of one
@@ -168,9 +168,11 @@ class Parameter:
         if isinstance(value, (str, bytes, Mapping)):
             raise self._refuse(value, f"a list of {of}")
         try:
-            items = [_plain(item) for item in itertools.islice(value, MAX_SEQUENCE + 1)] if value is not None else []
+            items = (
+                [_to_python(item) for item in itertools.islice(value, MAX_SEQUENCE + 1)] if value is not None else []
+            )
         except TypeError:  # a single number is a list of one: MATLAB users write 0 for "no list"
-            items = [_plain(value)]
+            items = [_to_python(value)]
         if len(items) > self.most:
             raise ValueError(f"{self.name}: too many values, at most {self.most}")
         if not self.least and len(items) == 1 and isinstance(items[0], (int, float)) and items[0] == 0:
@@ -184,7 +186,7 @@ class Parameter:
     def _check_scalar(self, idl: str, value: Any) -> Any:
         if idl == "string":
             return self._check_word(value)
-        value = _plain(value)
+        value = _to_python(value)
         if idl == "boolean":
             if isinstance(value, (bool, int, float)) and value in (0, 1):
                 return bool(value)
@@ -214,7 +216,7 @@ class Parameter:
             raise self._refuse(value, f"a text of at most {self.longest} characters")
         value = self.spellings.get(value, value)
         if self.choices and value not in self.choices:
-            raise self._refuse(value, self.range_text + meant(value, self.choices))
+            raise self._refuse(value, self.range_text + did_you_mean(value, self.choices))
         return value
 
     def _check_range(self, number: float) -> None:
@@ -223,7 +225,7 @@ class Parameter:
         if below or (high is not None and number > high):
             raise ValueError(f"{self.name}: {number:.12g} is out of range, allowed is {self.range_text}")
 
-    def known_word(self, value: Any) -> Any:
+    def resolve_choice(self, value: Any) -> Any:
         """What is taken for `value` where any word goes: itself where it is known, else the `fallback`.
 
         Anything but an unknown word, and any word where there is no fallback, is left to `check`.
@@ -233,13 +235,13 @@ class Parameter:
             self.fallback if self.fallback and word and self.spellings.get(value, value) not in self.choices else value
         )
 
-    def doubt(self, value: Any) -> str:
-        """What is to be told where `known_word` takes another word for `value`; empty where it takes that."""
-        taken = self.known_word(value)
+    def substitution_warning(self, value: Any) -> str:
+        """What is to be told where `resolve_choice` takes another word for `value`; empty where it takes that."""
+        taken = self.resolve_choice(value)
         if taken is value:
             return ""
-        near = nearest(value, self.choices)
-        return f"{self.name}: {shown(value)} is no known word, {taken} is taken; the nearest known one is {near}"
+        near = closest_matches(value, self.choices)
+        return f"{self.name}: {short_repr(value)} is no known word, {taken} is taken; the nearest known one is {near}"
 
     # --- texts ------------------------------------------------------------------------------------------------
 
@@ -298,14 +300,14 @@ class StructParameter(Parameter):
     def _check_scalar(self, idl: str, value: Any) -> Any:
         names = [member.name for member in self.members]
         if not isinstance(value, Mapping) or sorted(map(str, value)) != sorted(names):
-            raise ValueError(f"{self.name}: expected an object with {', '.join(names)}, got {shown(value)}")
+            raise ValueError(f"{self.name}: expected an object with {', '.join(names)}, got {short_repr(value)}")
         return {member.name: member.check(value[member.name]) for member in self.members}
 
 
-def text_of(value: Any) -> str:
+def format_value(value: Any) -> str:
     """The text that `Parameter.parse` reads as `value`, to the last digit: 1, 0.02, [100.0, 200.0], hann."""
     if isinstance(value, bool):
         return str(int(value))
     if isinstance(value, (list, tuple)):
-        return f"[{', '.join(map(text_of, value))}]"
+        return f"[{', '.join(map(format_value, value))}]"
     return str(value)

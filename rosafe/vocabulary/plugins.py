@@ -36,7 +36,7 @@ def entry_points() -> importlib.metadata.EntryPoints:
     return importlib.metadata.EntryPoints() if _disabled else importlib.metadata.entry_points(group=ENTRY_POINTS)
 
 
-def expected() -> bool:
+def expected_modules() -> bool:
     """Whether there may be plugins to import."""
     return bool(folders() or entry_points())
 

@@ -12,7 +12,7 @@ import os
 import resource
 import sys
 
-from rosafe.bass.sources.libasound import complaints, load_alsaaudio
+from rosafe.bass.sources.libasound import captured_alsa_errors, load_alsaaudio
 from rosafe.bass.sources.pcmname import checked_name
 from rosafe.component.paths import prefer_pypi_packages
 from rosafe.interface import ComponentError
@@ -35,12 +35,12 @@ def main() -> None:
     for line in sys.stdin:
         name, checked = json.loads(line)
         before, outcome = children(), "opened"
-        with complaints():
+        with captured_alsa_errors():
             try:
                 wanted = checked_name(name) if checked else name
                 alsa.PCM(type=alsa.PCM_CAPTURE, mode=alsa.PCM_NONBLOCK, device=wanted).close()
             except ComponentError as problem:
-                outcome = f"refused: {problem.why}"
+                outcome = f"refused: {problem.reason}"
             except (alsa.ALSAAudioError, ValueError) as problem:
                 outcome = f"failed: {problem}"
         try:

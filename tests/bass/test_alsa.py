@@ -363,7 +363,7 @@ def test_inexact_device_is_refused_with_its_offer(pcm: type[FakePcm], changes: d
     with pytest.raises(ComponentError) as caught:
         open_fake()
     assert caught.value.ex == "::bass::e_hwparams"
-    assert why in caught.value.why and "\n" not in caught.value.why
+    assert why in caught.value.reason and "\n" not in caught.value.reason
     assert pcm.opened[0].closed
 
 
@@ -521,5 +521,5 @@ def test_real_refusals_are_one_line(
     with pytest.raises(ComponentError) as caught:
         open_source(device, 44100, 2205, threading.Event())
     assert caught.value.ex == f"::bass::{exception}"
-    assert why in caught.value.why and "\n" not in caught.value.why
+    assert why in caught.value.reason and "\n" not in caught.value.reason
     assert capfd.readouterr().err == ""  # nothing of libasound's own

@@ -143,7 +143,7 @@ def test_topics(tmp_path: Path) -> None:
     ):
         with pytest.raises(ComponentError) as caught:
             open_bag(tmp_path / "a.bag", option)
-        assert caught.value.ex == "::bass::e_device" and why in caught.value.why
+        assert caught.value.ex == "::bass::e_device" and why in caught.value.reason
 
 
 @pytest.fixture(scope="module")
@@ -201,7 +201,7 @@ def test_refused(bad_bags: Path, monkeypatch: pytest.MonkeyPatch, text: str, exc
     with pytest.raises(ComponentError) as caught:
         open_source(f"bag:{text}", rate, CHUNK, threading.Event())
     assert caught.value.ex == f"::bass::{exception}"
-    assert why in caught.value.why and "\n" not in caught.value.why
+    assert why in caught.value.reason and "\n" not in caught.value.reason
 
 
 def test_damage_in_the_middle_ends_it_by_name(bad_bags: Path) -> None:

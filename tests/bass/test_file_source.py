@@ -189,7 +189,7 @@ def test_refused(bad_files: Path, monkeypatch: pytest.MonkeyPatch, text: str, ex
     with pytest.raises(ComponentError) as caught:
         open_source(f"file:{text}", 44100, 100, threading.Event())
     assert caught.value.ex == f"::bass::{exception}"
-    assert why in caught.value.why and "\n" not in caught.value.why
+    assert why in caught.value.reason and "\n" not in caught.value.reason
 
 
 def test_file_that_shrinks_while_it_plays(tmp_path: Path) -> None:
@@ -247,4 +247,4 @@ def test_channels_that_are_not_there(tmp_path: Path, text: str, exception: str, 
     with pytest.raises(ComponentError) as caught:
         open_source(f"file:{tmp_path}/{text}", 0, 100, threading.Event())
     assert caught.value.ex == f"::bass::{exception}"
-    assert why in caught.value.why
+    assert why in caught.value.reason

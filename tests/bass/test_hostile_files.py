@@ -238,7 +238,7 @@ def test_damaged_anyhow(
         finally:
             source.close()
     except ComponentError as problem:
-        assert problem.ex == "::bass::e_device" and problem.why.isprintable()
+        assert problem.ex == "::bass::e_device" and problem.reason.isprintable()
 
 
 # --- sound files ------------------------------------------------------------------------------------------------

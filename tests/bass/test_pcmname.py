@@ -201,8 +201,8 @@ def test_names_that_are_refused(folder: Path, name: str) -> None:
     with pytest.raises(ComponentError) as caught:
         opening(name, 44100, 2205, threading.Event())
     assert caught.value.ex == "::bass::e_device"
-    assert re.search("no name of a PCM|reaches|in no device's name", caught.value.why)
-    assert len(caught.value.why) < 500 and caught.value.why.isprintable()
+    assert re.search("no name of a PCM|reaches|in no device's name", caught.value.reason)
+    assert len(caught.value.reason) < 500 and caught.value.reason.isprintable()
     assert sorted(os.listdir(folder)) == ["asound.conf", "precious", "samples.raw"]
 
 

@@ -15,7 +15,7 @@ import pytest
 import soundfile
 
 from rosafe.bass.recording import outputs
-from rosafe.bass.recording.levels import Levels
+from rosafe.bass.recording.levels import LevelMeter
 from rosafe.bass.recording.outputs import BagFile, WavFile
 from rosafe.bass.recording.recorder import SoundRecorder
 from rosafe.bass.sources import base, open_source
@@ -38,7 +38,7 @@ def test_levels_of_known_signals() -> None:
     time = np.arange(RATE) / RATE
     sine = (2.0**30 * np.sin(2 * np.pi * 100 * time)).astype(np.int32)
     square = np.where(np.arange(RATE) % 2, -(2**31), 2**31 - 1).astype(np.int32)
-    levels = Levels()
+    levels = LevelMeter()
     for part in np.array_split(np.stack((sine, square)), 7, axis=1):
         levels.add(part)
     assert levels.peak(0) == pytest.approx(20 * math.log10(0.5 * np.sin(0.4 * np.pi)), abs=1e-4)
@@ -48,7 +48,7 @@ def test_levels_of_known_signals() -> None:
 
 
 def test_levels_of_silence_and_nothing() -> None:
-    levels = Levels()
+    levels = LevelMeter()
     assert levels.peak(0) == levels.rms(1) == -math.inf
     levels.add(np.zeros((2, 0), np.int32))
     levels.add(np.zeros((2, 5), np.int32))
@@ -59,7 +59,7 @@ def test_levels_of_silence_and_nothing() -> None:
     ("sample", "clipped"), [(32767 << 16, 1), (-(2**31), 1), (-(32767 << 16), 1), (32766 << 16, 0)]
 )
 def test_the_end_of_16_bits_is_clipped_too(sample: int, clipped: int) -> None:
-    levels = Levels()
+    levels = LevelMeter()
     levels.add(np.array([[0, sample], [0, 0]], np.int32))
     assert levels.clipped == [clipped, 0]
 

@@ -14,7 +14,7 @@ import rosgraph
 import soundfile
 
 from rosafe.component import wire
-from rosafe.interface import FIXED
+from rosafe.interface import CORE_REPRESENTATIONS
 from tests.bass import bags
 from tests.harness import Graph, Process, wait_for
 from tests.ros.session import RATE, Session, assert_holds, expected, noise, own_node, windowed
@@ -22,7 +22,7 @@ from tests.ros.session import RATE, Session, assert_holds, expected, noise, own_
 CHUNK, CHUNKS, BLOCK, FRAMES = RATE // 20, 20, RATE // 4, 3 * RATE // 4
 SECONDS = FRAMES / RATE
 VALUES = {"fb_nERBs": 3.0, "pp_bRemoveDC": True}
-REQUESTS = [kind.request for kind in FIXED.values() if kind.parent]
+REQUESTS = [kind.request for kind in CORE_REPRESENTATIONS.values() if kind.parent]
 
 
 class Recorded(NamedTuple):
@@ -41,7 +41,7 @@ def prepare(node: Session, topic: str, *requests: str) -> None:
 
 def assert_same(node: Session, recorded: Recorded) -> None:
     """All ports hold, bit for bit, what comes of the whole signal, and under the same frame numbers."""
-    for kind in FIXED:
+    for kind in CORE_REPRESENTATIONS:
         rate = float(recorded.result.get(f"{kind}_frameRate", RATE))
         message = node.read(kind, index=FRAMES + 1)
         assert_holds(message, kind, windowed(recorded.result[kind], SECONDS, rate))

@@ -128,4 +128,4 @@ def test_refused(device: str, rate: int, exception: str, why: str) -> None:
     with pytest.raises(ComponentError) as caught:
         open_source(device, rate, 100, threading.Event())
     assert caught.value.ex == f"::bass::{exception}"
-    assert why in caught.value.why
+    assert why in caught.value.reason

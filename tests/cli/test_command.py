@@ -94,10 +94,10 @@ def test_in_an_install_space(tmp_path: Path, place: str) -> None:
 def test_a_module_is_all_that_a_command_takes(tmp_path: Path) -> None:
     (tmp_path / "say_hello.py").write_text(
         '"""Say hello to somebody."""\n'
-        "from rosafe.commands import Failure\n"
+        "from rosafe.commands import CommandError\n"
         "def configure(parser):\n    parser.add_argument('name')\n"
         "def run(options):\n"
-        "    if options.name == 'nobody':\n        raise Failure('there is nobody')\n"
+        "    if options.name == 'nobody':\n        raise CommandError('there is nobody')\n"
         "    print('hello', options.name)\n    return 3\n"
     )
     (tmp_path / "_part.py").write_text("raise RuntimeError('not a command')\n")

@@ -19,7 +19,7 @@ import zarr
 import rosafe
 from rosafe.interface import KINDS
 from rosafe.offline import files, formats, whole
-from rosafe.offline.files import Done, process_file
+from rosafe.offline.files import FileResult, process_file
 from rosafe.output import OutputError
 from rosafe.version import VERSION
 from tests.bass import bags
@@ -214,7 +214,7 @@ def test_resume(tmp_path: Path, sound: Path, extension: str) -> None:
     """What is complete stays; half a file is made anew; what was made otherwise, or is something else, is refused."""
     target = tmp_path / f"a{extension}"
 
-    def go(parameters: dict[str, Any], **options: Any) -> Done:
+    def go(parameters: dict[str, Any], **options: Any) -> FileResult:
         return process_file(sound, target, parameters, outputs=["ild"], resume=True, **options)
 
     assert not go(SMALL_PARAMETERS).skipped

@@ -124,13 +124,13 @@ def test_ctrl_c_at_the_terminal(long_file: Path) -> None:
 def test_a_child_that_ends_first_of_the_same_signal_has_not_failed() -> None:
     program = """
 import os, signal
-from rosafe.commands._workers import Interrupted, Interrupts, run_together
+from rosafe.commands._workers import Interrupted, Interrupts, run_parallel
 
 def work(progress):
     os.kill(os.getppid(), signal.SIGINT)
     raise Interrupted(signal.SIGINT)
 
-run_together([work], 1, (), lambda index, told: print(told), Interrupts())
+run_parallel([work], 1, (), lambda index, told: print(told), Interrupts())
 """
     done = subprocess.run(
         ["/usr/bin/python3", "-c", program], env=environment(), cwd=ROOT, capture_output=True, text=True, timeout=120

@@ -17,7 +17,7 @@ import soundfile
 
 from rosafe import output
 from rosafe.bass.sources.scene import Scene
-from rosafe.output import OutputError, Part, new_file
+from rosafe.output import AtomicOutput, OutputError, new_file
 from tests.bass import bags
 from tests.cli.command import refused, rosafe, start
 from tests.harness import Process, wait_for
@@ -186,7 +186,7 @@ def test_places_that_are_taken(tmp_path: Path) -> None:
         ("a\0b", True, "null"),
     ):
         with pytest.raises(OutputError, match=why):
-            Part(tmp_path / name, replace)
+            AtomicOutput(tmp_path / name, replace)
     assert sorted(os.listdir(tmp_path)) == ["fifo", "folder", "link", "there"]
 
 
@@ -209,7 +209,7 @@ def test_links_lead_to_the_file(tmp_path: Path) -> None:
     (tmp_path / "link").symlink_to(tmp_path / "deep" / "a")
     with new_file(tmp_path / "link", replace=False) as descriptor:
         with pytest.raises(OutputError, match="is writing it"):
-            Part(tmp_path / "deep" / "a", replace=False)
+            AtomicOutput(tmp_path / "deep" / "a", replace=False)
         os.write(descriptor, b"whole")
     assert (tmp_path / "link").is_symlink() and content(tmp_path / "deep") == {"a": "whole"}
 
@@ -248,4 +248,4 @@ def test_file_systems_that_cannot_rename_to_nothing_only(
 def test_a_holder_of_whom_nothing_is_known(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(output.glob, "iglob", lambda pattern: iter(()))  # as where it is another user's
     with new_file(tmp_path / "a", replace=False), pytest.raises(OutputError, match="another process is writing it"):
-        Part(tmp_path / "a", replace=False)
+        AtomicOutput(tmp_path / "a", replace=False)

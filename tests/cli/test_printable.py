@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from rosafe.commands.__main__ import main
-from rosafe.node.keeper import Keeper
+from rosafe.node.keeper import TreeStateFile
 from rosafe.setups import Setup
 from rosafe.setups.setup import Sound
 from rosafe.terminal import printable
@@ -144,7 +144,7 @@ def test_what_a_node_logs(graph: Graph) -> None:
 
 def test_what_the_keeper_of_a_tree_reports(tmp_path: Path) -> None:
     reports: list[str] = []
-    keeper = Keeper(tmp_path / EVIL / "tree.yaml", lambda: Setup(Sound({"device": "scene:"})), reports.append)
+    keeper = TreeStateFile(tmp_path / EVIL / "tree.yaml", lambda: Setup(Sound({"device": "scene:"})), reports.append)
     keeper.save()
     assert SHOWN in keeper.problem and keeper.problem.isprintable()
     assert reports == [f"the tree is not kept: {keeper.problem}"]

@@ -12,13 +12,13 @@ import pytest
 import soundfile
 
 from rosafe import load, process
-from rosafe.interface import FIXED, KINDS
+from rosafe.interface import CORE_REPRESENTATIONS, KINDS
 from tests.cli.command import SMALL, SMALL_PARAMETERS, as_int32, noise, rosafe, write
 from tests.harness import shared
 
 BESIDES = {"sample_rate", "block_frames", "parameters", "source", "rosafe_version", "axes", "units"}
 FRAMES = ["ild", "ratemap", "crossCorrelation"]
-SEVEN = ("--outputs", ",".join(FIXED))
+SEVEN = ("--outputs", ",".join(CORE_REPRESENTATIONS))
 
 
 def assert_equal(path: Path, expected: dict[str, Any]) -> None:
@@ -96,7 +96,7 @@ def test_everything_at_any_rate_with_defaults(tmp_path: Path) -> None:
     assert done.returncode == 0, done
     for rate, samples in signals.items():
         expected = process(samples, rate)
-        assert set(FIXED) < set(expected)
+        assert set(CORE_REPRESENTATIONS) < set(expected)
         assert_equal(tmp_path / f"{rate}.npz", expected)
         with np.load(tmp_path / f"{rate}.npz") as loaded:
             assert loaded["sample_rate"] == rate

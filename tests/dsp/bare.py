@@ -14,11 +14,11 @@ from rosafe.dsp.stage import Output, Stage
 from rosafe.representations import STAGES
 from rosafe.representations.filterbank import Filterbank
 from rosafe.representations.haircell import InnerHairCell
-from rosafe.representations.registry import ORIGINAL
+from rosafe.representations.registry import CORE_KINDS
 
 FloatArray = NDArray[np.float64]
 
-KIND_OF = {p.name: kind.kind for kind in interface.FIXED.values() for p in kind.parameters}
+KIND_OF = {p.name: kind.kind for kind in interface.CORE_REPRESENTATIONS.values() for p in kind.parameters}
 
 
 def cut(signal: NDArray[Any], sizes: int | Iterable[int]) -> list[NDArray[Any]]:
@@ -48,10 +48,10 @@ class Chain:
     """All seven stages, `ihc` feeding the last three."""
 
     def __init__(self, sample_rate: float, parameters: Mapping[str, Any]) -> None:
-        own: dict[str, dict[str, Any]] = {kind: {} for kind in ORIGINAL}
+        own: dict[str, dict[str, Any]] = {kind: {} for kind in CORE_KINDS}
         for name, value in parameters.items():
             own[KIND_OF[name]][name] = value
-        self.stages = {kind: STAGES[kind](sample_rate, **own[kind]) for kind in ORIGINAL}
+        self.stages = {kind: STAGES[kind](sample_rate, **own[kind]) for kind in CORE_KINDS}
 
     def process(self, block: NDArray[Any]) -> dict[str, FloatArray]:
         """The output of every stage for one block."""

@@ -53,12 +53,12 @@ MACHINES = {
 }
 
 
-_pinned: dict[int, kernels.Pinned] = {}  # by address
+_pinned: dict[int, kernels.PinnedArray] = {}  # by address
 
 
-def pin(array: NDArray[Any]) -> kernels.Pinned:
+def pin(array: NDArray[Any]) -> kernels.PinnedArray:
     """As `kernels.Pinned.of`; the array goes with each call that names it, whichever kernels were in use meanwhile."""
-    pinned = kernels.Pinned(array, array.ctypes.data)
+    pinned = kernels.PinnedArray(array, array.ctypes.data)
     _pinned[pinned.address] = pinned
     if len(_pinned) > MOST_PINNED:
         del _pinned[next(iter(_pinned))]  # the oldest

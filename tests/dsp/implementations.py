@@ -40,7 +40,7 @@ def _by_clang() -> ctypes.CDLL:
         pytest.skip("no clang here: scripts/install --tests brings it")
     level = levels()[-1]
     with tempfile.TemporaryDirectory() as folder:
-        names = {level: build.LEVELS[platform.machine()][level]}
+        names = {level: build.ISA_LEVELS[platform.machine()][level]}
         return library.load(build.compile_sources("clang", names, Path(folder))[level])
 
 
@@ -49,7 +49,7 @@ def using(choice: Choice) -> Iterator[None]:
     """Within this, the stages run on these kernels, or on the twins."""
     loaded: tuple[Any, library.Status] = (None, library.Status(False, "the twins, for a test"))
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(kernels.Pinned, "of", foreign.pin)
+        patch.setattr(kernels.PinnedArray, "of", foreign.pin)
         if choice in foreign.MACHINES:
             elsewhere = foreign.running(str(choice))
             loaded = (elsewhere, library.Status(True, f"{choice}, for a test"))

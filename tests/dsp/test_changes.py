@@ -20,7 +20,7 @@ from rosafe.representations.ild import Ild
 from rosafe.representations.input import Input
 from rosafe.representations.preproc import PreProc
 from rosafe.representations.ratemap import Ratemap
-from rosafe.representations.registry import ORIGINAL
+from rosafe.representations.registry import CORE_KINDS
 
 from .bare import run
 from .stages import MODES, NAMES, RATE, make, noise, rows
@@ -118,14 +118,14 @@ def test_what_is_refused_changes_nothing(kind: str, changes: dict[str, Any]) -> 
     assert stage.output_format.rate == twin.output_format.rate
 
 
-@pytest.mark.parametrize("kind", ORIGINAL)
+@pytest.mark.parametrize("kind", CORE_KINDS)
 @pytest.mark.parametrize("rate", [0, -1, NAN, INF, "44100", None])
 def test_bad_sample_rates(kind: str, rate: Any) -> None:
     with pytest.raises(ValueError, match=r"^sample_rate: "):
         STAGES[kind](rate)
 
 
-@pytest.mark.parametrize("kind", ORIGINAL)
+@pytest.mark.parametrize("kind", CORE_KINDS)
 def test_unknown_names(kind: str) -> None:
     with pytest.raises(ValueError, match=r"^fb_bAlign: .*no such parameter"):
         STAGES[kind](RATE, fb_bAlign=True)

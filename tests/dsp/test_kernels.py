@@ -14,12 +14,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rosafe.dsp import kernels
-from rosafe.dsp.framing import FrameBuffer, Framing
+from rosafe.dsp.framing import FrameBuffer, FrameGrid
 from rosafe.dsp.gammatone import TURN_SPAN, GammatoneBank
 from rosafe.dsp.guard import LIMIT
 from rosafe.dsp.kernels import build
 from rosafe.dsp.kernels import precedence as by_kernel
-from rosafe.dsp.signal import Signal
+from rosafe.dsp.signal import SignalFormat
 from rosafe.dsp.stage import Stage
 from rosafe.dsp.windows import NAMES
 from rosafe.representations import STAGES, precedence
@@ -28,7 +28,7 @@ from rosafe.representations.crosscorrelation import CrossCorrelation
 from rosafe.representations.haircell import METHODS, InnerHairCell
 from rosafe.representations.ild import Ild
 from rosafe.representations.ratemap import Ratemap
-from rosafe.representations.registry import ORIGINAL
+from rosafe.representations.registry import CORE_KINDS
 from tests.harness import ROOT
 
 from .bare import FloatArray, cut, single
@@ -82,7 +82,7 @@ def check(
     kind: str,
     parameters: dict[str, Any],
     blocks: list[FloatArray],
-    given: Signal | float = RATE,
+    given: SignalFormat | float = RATE,
     least: float = 1e-140,
 ) -> None:
     """The kernels give what the twins give; so does a stage that goes back and forth between the two."""
@@ -211,7 +211,9 @@ def test_adaptation(
     channels: int,
     sizes: list[int],
 ) -> None:
-    given_signal = Signal(RATE, RATE, False, 1, 1, tuple(np.geomspace(50.0, 7000.0, channels).tolist()), filterbank)
+    given_signal = SignalFormat(
+        RATE, RATE, False, 1, 1, tuple(np.geomspace(50.0, 7000.0, channels).tolist()), filterbank
+    )
     parameters = {"adpt_tau": tau, "adpt_lim": lim, "adpt_mindB": threshold, "adpt_model": model}
     blocks = cut(signal(channels, sum(sizes) + 50), [*sizes, 50])
     check(level, "adaptation", parameters, blocks, given_signal, least=100.0)  # silence is 0 less its rounding
@@ -287,7 +289,7 @@ def test_windowed_frames(
 ) -> None:
     """Of some frames after the other, those that lie in the history, in the block and in both."""
     window = np.random.default_rng(0).standard_normal(round(parameters["prec_wSizeSec"] * RATE))
-    framing = Framing(window, round(parameters["prec_hSizeSec"] * RATE))
+    framing = FrameGrid(window, round(parameters["prec_hSizeSec"] * RATE))
     with using(TWINS):  # which notes where arrays are
         buffer, rest = FrameBuffer(), FrameBuffer()
         for block in cut(signal(channels, sum(sizes) + 900), [*sizes, 300]):
@@ -297,8 +299,8 @@ def test_windowed_frames(
             buffer.begin(block.shape[:-1])
             skip, position = buffer.skip, buffer.position
             history, room = buffer.advance(block.shape[-1], count * framing.hop)
-            frames = kernels.Frames(
-                *(history, np.ascontiguousarray(block), room, skip, kernels.Pinned.of(window)),
+            frames = kernels.FrameReader(
+                *(history, np.ascontiguousarray(block), room, skip, kernels.PinnedArray.of(window)),
                 *(framing.hop, count, position),
             )
             batch = max(1, count // parts)
@@ -310,7 +312,7 @@ def test_windowed_frames(
                 precedence.windowed(wanted[:, :, first : first + number], window, expected)
                 for mine, theirs in zip(got, expected, strict=True):
                     agree([mine], [theirs])
-            frames.keep()
+            frames.save_tail()
 
 
 @each_level
@@ -322,7 +324,7 @@ def test_summed_spectra(level: Choice, channels: int, frames: int, half: int, po
     rng = np.random.default_rng(half)
     gains, sums = rng.random(channels), {}
     for choice in (TWINS, level):
-        running = precedence.Running()
+        running = precedence.RunningSums()
         running.begin(np.full(channels, 500.0), points // 2 + 1, 1)
         rng, made = np.random.default_rng(half), []
         with using(choice):
@@ -332,7 +334,7 @@ def test_summed_spectra(level: Choice, channels: int, frames: int, half: int, po
                 factors = np.where(rng.random((frames, 2, channels)) < 0.3, 0, rng.random((frames, 2, channels)))
                 made.append(add(samples, points, gains, factors, running.power).T)
         rows = np.arange(2 * channels)
-        made.append(running.power[rows // by_kernel.TOGETHER, :, rows % by_kernel.TOGETHER].T)
+        made.append(running.power[rows // by_kernel.BATCH, :, rows % by_kernel.BATCH].T)
         sums[choice] = made
     for got, expected in zip(sums[level], sums[TWINS], strict=True):
         agree([got], [expected])
@@ -400,7 +402,7 @@ def test_gabor(level: Choice, channels: int, sizes: list[int]) -> None:
     """The patterns; what is made of these is the same code. Values of a few standard deviations: see the levels."""
     rng = np.random.default_rng(channels)
     rates = 10.0 ** rng.uniform(-3, 0, (2, channels, sum(sizes) + 60))
-    check(level, "gabor", {}, cut(rates, [*sizes, 23]), Signal(44100.0, 100.0, True, 441, 882))
+    check(level, "gabor", {}, cut(rates, [*sizes, 23]), SignalFormat(44100.0, 100.0, True, 441, 882))
 
 
 @each_level
@@ -441,7 +443,7 @@ def test_denormal_numbers_stay_a_matter_of_the_kernels(level: Choice) -> None:
     """They are switched off inside; outside, arithmetic is as before."""
     smallest = np.array([5e-324])
     with using(level):
-        for kind in ORIGINAL:
+        for kind in CORE_KINDS:
             STAGES[kind](RATE).process(
                 np.ones((2, 100)) if kind in ("input", "preProc", "gammatone") else np.ones((2, 3, 100))
             )
@@ -494,10 +496,10 @@ def test_constants_are_those_of_the_sources() -> None:
     assert f"MOST_POLES = {kernels.MOST_POLES} " in sources["gammatone.c"]
     assert f"{{ SPAN = {TURN_SPAN} " in sources["gammatone.c"]
     assert f"MOST_SECTIONS = {kernels.MOST_SECTIONS} " in sources["biquads.c"]
-    assert f"MOST_LAGS = {kernels.MOST_LAGS}," in sources["products.h"]
+    assert f"MOST_LAGS = {kernels.MAX_LAGS}," in sources["products.h"]
     assert f"MOST_POINTS = {kernels.MOST_POINTS // 2} " in sources["fourier.h"]
     assert f"TAPS = {by_kernel.TAPS} " in sources["precedence.c"]
-    assert f"TOGETHER = {by_kernel.TOGETHER} " in sources["precedence.c"]
+    assert f"TOGETHER = {by_kernel.BATCH} " in sources["precedence.c"]
     assert f"MOST_LOOPS = {kernels.MOST_LOOPS} " in sources["adaptation.c"]
     assert f"MOST_SIZE = {kernels.MOST_SIZE} " in sources["autocorrelation.c"]
     assert kernels.CLIPPINGS == ("clp", "clc", "sgn")

@@ -9,7 +9,7 @@ import pytest
 import scipy
 
 from rosafe.dsp import kernels
-from rosafe.dsp.cascade import Cascade, leaky_integrator
+from rosafe.dsp.cascade import SosFilter, leaky_integrator
 from rosafe.dsp.guard import LIMIT
 from rosafe.representations import STAGES
 from rosafe.representations.filterbank import Filterbank
@@ -145,7 +145,7 @@ def test_silence_becomes_exactly_silent(kind: str, parameters: dict[str, Any], b
 @pytest.mark.parametrize("retention", [0.5, 0.99, 0.9999])
 def test_states_are_never_denormal_for_long(retention: float) -> None:
     """They are looked at every 4096 samples, however these come."""
-    cascade = Cascade(leaky_integrator(retention))
+    cascade = SosFilter(leaky_integrator(retention))
     cascade.process(np.ones((2, 96)))
     for _ in range(30):
         for samples in (1000, 2999, 1, 0, 0):
@@ -158,7 +158,7 @@ def test_states_are_never_denormal_for_long(retention: float) -> None:
 
 def test_complex_states_are_flushed_too() -> None:
     sections = np.tile(np.array([0.1, 0, 0, 1, -0.9 * np.exp(0.3j), 0]), (4, 1))
-    cascade = Cascade(sections)
+    cascade = SosFilter(sections)
     cascade.process(np.ones((2, 5)))
     for _ in range(10):
         cascade.process(np.zeros((2, 1000)))

@@ -44,7 +44,10 @@ def test_little_is_kept() -> None:
     assert {size: len(kept) for size, kept in memory._idle.items()} == {6 * (LONG + 2): 1, 6 * (LONG + 3): 1}
     blocks = [memory.empty((*ROWS, LONG)) for _ in range(4)]
     blocks.clear()
-    assert {size: len(kept) for size, kept in memory._idle.items()} == {6 * (LONG + 3): 1, 6 * LONG: memory.KEPT}
+    assert {size: len(kept) for size, kept in memory._idle.items()} == {
+        6 * (LONG + 3): 1,
+        6 * LONG: memory.MAX_IDLE_PER_SIZE,
+    }
     for shape in ((2, 100), (2**9, 2**17), (0,), ()):
         assert memory.empty(shape).shape == shape
     assert len(memory._idle) == memory.SIZES
@@ -73,5 +76,5 @@ def test_a_lack_of_memory_is_one_error(monkeypatch: pytest.MonkeyPatch, capfd: p
     monkeypatch.setattr(np, "empty", empty)
     with pytest.raises(MemoryError):
         memory.empty((*ROWS, LONG))
-    memory._Loan.__new__(memory._Loan)  # as if there were no memory for its attributes
+    memory._PooledArray.__new__(memory._PooledArray)  # as if there were no memory for its attributes
     assert capfd.readouterr().err == ""

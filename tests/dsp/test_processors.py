@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from rosafe.dsp.signal import Signal
+from rosafe.dsp.signal import SignalFormat
 from rosafe.dsp.stage import Output
 from rosafe.representations import STAGES
 
@@ -33,7 +33,9 @@ def representations(choice: Choice) -> dict[str, FloatArray]:
     bank, cell = STAGES["gammatone"](RATE, fb_nChannels=CHANNELS, fb_highFreqHz=7000.0), STAGES["ihc"](RATE)
     kinds = ("ild", "ratemap", "crossCorrelation", "adaptation", "autocorrelation", "amsFeatures", "precedence")
     stages = {kind: STAGES[kind](RATE) for kind in kinds}
-    frames = Signal(RATE, 100.0, True, round(RATE / 100), round(RATE / 50), tuple(np.geomspace(80, 7000, CHANNELS)))
+    frames = SignalFormat(
+        RATE, 100.0, True, round(RATE / 100), round(RATE / 50), tuple(np.geomspace(80, 7000, CHANNELS))
+    )
     with using(choice):
         for block in np.array_split(signal(1, 9000)[:, 0], 2, axis=-1):
             block = np.ascontiguousarray(block)

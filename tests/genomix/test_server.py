@@ -29,7 +29,9 @@ def start_tree(http: Http) -> None:
 def test_load_tells_the_interface(world: World) -> None:
     told = world.http.get("/load/rosAFE", s="load")
     assert (told["name"], told["component"], told["instance"]) == ("rosAFE", "rosAFE", "rosAFE")
-    assert list(told["services"]) == [s.name for s in (*interface.ROSAFE.services, *interface.ROSAFE.composites)]
+    assert list(told["services"]) == [
+        s.name for s in (*interface.ROSAFE.services, *interface.ROSAFE.client_side_services)
+    ]
     assert told["services"]["getSignals"]["aliases"] == ["getSignal"]
     parameter = told["services"]["PreProc"]["parameters"]["pp_refSPLdB"]
     assert parameter["default"] == 100.0
@@ -92,7 +94,7 @@ def test_aliases_of_services_and_ports(world: World) -> None:
     world.http.call("rosAFE/IhcProc")
     world.http.call("rosAFE/Ratemap", {"name": "r"})
     assert world.http.call("rosAFE/ratemapProcPort/r")["ratemapPort"]["numberOfChannels"] == 4
-    assert set(world.http.call("rosAFE/getSignal")["signals"]) == set(interface.FIXED)
+    assert set(world.http.call("rosAFE/getSignal")["signals"]) == set(interface.CORE_REPRESENTATIONS)
 
 
 def test_signals_are_those_of_the_ports(world: World) -> None:
@@ -342,7 +344,7 @@ def test_ports_give_the_newest_sample(world: World) -> None:
 
 
 def test_a_port_without_a_sample_is_zeros(world: World) -> None:
-    assert world.http.call("rosAFE/dataObj")["dataObj"] == {kind: [] for kind in interface.FIXED}
+    assert world.http.call("rosAFE/dataObj")["dataObj"] == {kind: [] for kind in interface.CORE_REPRESENTATIONS}
 
 
 def test_what_is_not_there_makes_the_node_say_nothing(world: World) -> None:

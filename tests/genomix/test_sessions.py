@@ -13,14 +13,14 @@ import pytest
 
 from rosafe.genomix import sessions
 from rosafe.genomix.graph import Graph
-from rosafe.genomix.proxy import Proxy, Value
+from rosafe.genomix.proxy import ComponentClient, Value
 from rosafe.genomix.requests import REQUEST_BYTES, Request
 from rosafe.genomix.sessions import Session, Sessions
 from rosafe.genomix.syntax import JSON
 from rosafe.interface import BASS, ROSAFE, ComponentError, Service
 
 
-class Component(Proxy):
+class Component(ComponentClient):
     """A bass whose functions answer with as many bytes as they are told, once they may."""
 
     def __init__(self) -> None:

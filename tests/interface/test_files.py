@@ -17,7 +17,7 @@ def test_nothing_is_stale() -> None:
 
 def test_files_follow_the_table(tmp_path: Path) -> None:
     """A representation that is gone takes its files with it, and comes back with them; nothing else is touched."""
-    component = rosafe.derive({kind: stage.REPRESENTATION for kind, stage in registry.own().items()})
+    component = rosafe.derive({kind: stage.REPRESENTATION for kind, stage in registry.builtin_stages().items()})
     less = rosafe.derive({kind: r for kind, r in rosafe.KINDS.items() if kind not in ("ild", *children("ild"))})
     for folder in (tmp_path, tmp_path / "bass"):
         for kind in ("msg", "srv", "action"):

@@ -81,7 +81,7 @@ def test_ports_and_outputs_have_types(component: Component) -> None:
 
 
 # The requests of representations that the original did not have.
-LATER = {kind.request: kind for kind in interface.KINDS.values() if kind.kind not in interface.FIXED}
+LATER = {kind.request: kind for kind in interface.KINDS.values() if kind.kind not in interface.CORE_REPRESENTATIONS}
 
 # What the original's interface definition says, in its own order; REQUIRED where it has no default.
 DEFAULTS = {

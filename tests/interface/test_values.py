@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosafe.interface import BASS, MAX_SEQUENCE, REQUIRED, ROSAFE, Parameter, text_of
+from rosafe.interface import BASS, MAX_SEQUENCE, REQUIRED, ROSAFE, Parameter, format_value
 from rosafe.representations import STAGES
 
 BOOLEAN = Parameter("flag", "boolean", False, "")
@@ -219,21 +219,21 @@ def test_a_zero_is_no_list_only_where_there_may_be_none(least: int, given: Any, 
 
 
 def test_words_that_nobody_knows() -> None:
-    assert [WORD.known_word(word) for word in ("triang", "Hann", "", "hann ")] == ["triang", "hann", "hann", "hann"]
-    assert WORDS.known_word("x") == "x"  # nothing is taken for it
+    assert [WORD.resolve_choice(word) for word in ("triang", "Hann", "", "hann ")] == ["triang", "hann", "hann", "hann"]
+    assert WORDS.resolve_choice("x") == "x"  # nothing is taken for it
     for text in ("x" * 4097, "nul\0"):  # nor for what is no word at all
-        assert WORD.known_word(text) == text
+        assert WORD.resolve_choice(text) == text
     for kind, word in (("PreProc", "jespen"), ("GammatoneProc", "string"), ("IhcProc", "meddis")):
         enumerated = next(p for p in ROSAFE.service(kind).parameters if p.choices)
-        assert enumerated.check(enumerated.known_word(word)) == enumerated.default
+        assert enumerated.check(enumerated.resolve_choice(word)) == enumerated.default
 
 
 @given(st.one_of(st.booleans(), st.integers(0, 2**32 - 1), st.floats(allow_nan=False, allow_infinity=False)))
 def test_texts_read_back_as_the_value(value: Any) -> None:
     parameter = {bool: BOOLEAN, int: UNSIGNED, float: Parameter("any", "double", 1.0, "")}[type(value)]
-    assert parameter.read(text_of(value)) == value
+    assert parameter.read(format_value(value)) == value
     numbers = Parameter("list", "sequence<double>", (), "")
-    assert numbers.read(text_of([1.5, float(value)])) == [1.5, float(value)]
+    assert numbers.read(format_value([1.5, float(value)])) == [1.5, float(value)]
 
 
 def requests() -> list[Any]:

@@ -34,7 +34,7 @@ async def no_devices(self, arguments):
     raise RuntimeError("no devices today")
 broken = sys.argv.pop(1)
 hub.View.append, hub.View.piece = late, failing
-robot.Robot.devices = no_devices
+robot.ComponentFacade.devices = no_devices
 from rosafe.commands.__main__ import main
 sys.exit(main(sys.argv[1:]))
 """

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rosafe.interface import KINDS, text_of
-from rosafe.live.client import Client, _keys
+from rosafe.interface import KINDS, format_value
+from rosafe.live.client import BrowserConnection, _keys
 from rosafe.live.hub import FLOAT, PIECE, QUANTISED, Key, View
-from rosafe.live.pictures import Picture, Processor, Tree, quantised
+from rosafe.live.pictures import PlotLayout, Processor, Tree, quantize
 
 FREQUENCIES = [100.0, 200.0, 400.0]
 RNG = np.random.default_rng(3)
@@ -22,13 +22,13 @@ def processor(kind: str, rate: float, shape: tuple[int, ...], **values: str) -> 
 
 
 def tree(*processors: Processor) -> Tree:
-    filterbank = processor("gammatone", 44100, (2, 3), fb_cfHz=text_of(FREQUENCIES))
+    filterbank = processor("gammatone", 44100, (2, 3), fb_cfHz=format_value(FREQUENCIES))
     return Tree([filterbank, processor("ihc", 44100, (2, 3)), *processors])
 
 
 def test_a_cochleagram_is_in_decibels() -> None:
     one = processor("ratemap", 100, (2, 3), rm_scaling="power")
-    picture = Picture(tree(one), one, 0, -1)
+    picture = PlotLayout(tree(one), one, 0, -1)
     left, right = RNG.random((2, 3, 7))
     assert np.allclose(picture.columns([left, right]), 10 * np.log10(np.concatenate([left, right])), atol=1e-4)
     told = picture.describe()
@@ -40,12 +40,12 @@ def test_a_cochleagram_is_in_decibels() -> None:
 def test_a_magnitude_has_twice_the_decibels() -> None:
     one = processor("ratemap", 100, (2, 3), rm_scaling="magnitude")
     values = RNG.random((3, 4))
-    assert np.allclose(Picture(tree(one), one, 0, -1).columns([values] * 2)[:3], 20 * np.log10(values), atol=1e-4)
+    assert np.allclose(PlotLayout(tree(one), one, 0, -1).columns([values] * 2)[:3], 20 * np.log10(values), atol=1e-4)
 
 
 def test_a_signal_is_an_envelope() -> None:
     one = processor("input", 44100, (2,))
-    picture = Picture(Tree([one]), one, 0, -1)
+    picture = PlotLayout(Tree([one]), one, 0, -1)
     assert (picture.group, picture.rate) == (441, 100)
     sound = RNG.normal(size=(2, 4410))
     columns = picture.columns(list(sound))
@@ -55,9 +55,9 @@ def test_a_signal_is_an_envelope() -> None:
 
 
 def test_levels_of_a_filterbank_are_those_of_the_mean_power() -> None:
-    one = processor("gammatone", 44100, (2, 3), fb_cfHz=text_of(FREQUENCIES))
+    one = processor("gammatone", 44100, (2, 3), fb_cfHz=format_value(FREQUENCIES))
     signal = RNG.normal(size=(3, 882))
-    columns = Picture(Tree([one]), one, 0, -1).columns([signal, signal])
+    columns = PlotLayout(Tree([one]), one, 0, -1).columns([signal, signal])
     power = (signal.reshape(3, 2, 441) ** 2).mean(axis=2)
     assert np.allclose(columns[:3], 10 * np.log10(power), atol=1e-4)
 
@@ -65,8 +65,8 @@ def test_levels_of_a_filterbank_are_those_of_the_mean_power() -> None:
 @pytest.mark.parametrize("row", [-1, 0, 2])
 def test_correlations_of_one_channel_or_of_all(row: int) -> None:
     lags = [-1e-3, 0.0, 1e-3, 2e-3]
-    one = processor("crossCorrelation", 100, (3, 4), cc_lags=text_of(lags))
-    picture = Picture(tree(one), one, 0, row)
+    one = processor("crossCorrelation", 100, (3, 4), cc_lags=format_value(lags))
+    picture = PlotLayout(tree(one), one, 0, row)
     curves = RNG.random((4, 3, 5))  # as on the wire
     wanted = curves.mean(axis=1) if row < 0 else curves[:, row]
     assert np.allclose(picture.columns([curves]), wanted, atol=1e-6)
@@ -75,7 +75,7 @@ def test_correlations_of_one_channel_or_of_all(row: int) -> None:
 
 def test_pitch_is_a_line_that_may_have_gaps() -> None:
     one = processor("pitch", 100, (2, 3))
-    picture = Picture(Tree([one]), one, 0, 2)
+    picture = PlotLayout(Tree([one]), one, 0, 2)
     values = np.array([[1.0, np.nan], [3, 4], [5, 6]])
     assert picture.describe()["choices"] == ["pitch", "rawPitch", "confidence"]
     assert np.array_equal(picture.columns([values, values + 1]), [[5, 6], [6, 7]])
@@ -83,7 +83,7 @@ def test_pitch_is_a_line_that_may_have_gaps() -> None:
 
 def test_many_rows_are_drawn_together() -> None:
     one = processor("gabor", 100, (2, 300))
-    picture = Picture(Tree([one]), one, 0, -1)
+    picture = PlotLayout(Tree([one]), one, 0, -1)
     values = RNG.random((300, 2))
     assert picture.rows == 100
     assert np.allclose(picture.columns([values, values])[:100], values.reshape(100, 3, 2).mean(axis=1), atol=1e-6)
@@ -95,7 +95,7 @@ def test_each_kind_has_a_picture() -> None:
         largest = max(representation.parts, key=lambda part: len(part.axes))
         one = processor(kind, 100, tuple(sizes[axis] for axis in largest.axes if axis != "time"))
         for index, part in enumerate(representation.parts):
-            picture = Picture(Tree([one]), one, index, -1)
+            picture = PlotLayout(Tree([one]), one, index, -1)
             rows = [sizes[axis] for axis in part.axes if axis not in ("ear", "time")]
             array = np.ones((*rows[1:], *rows[:1], 4))  # the second axis outermost
             assert picture.columns([array] * picture.ears).shape == (picture.size, 4), (kind, part)
@@ -104,13 +104,13 @@ def test_each_kind_has_a_picture() -> None:
 def test_bytes_are_within_half_a_step() -> None:
     columns = RNG.normal(size=(6, 40)).astype(np.float32)
     columns[2, 5] = np.nan
-    low, high, data = quantised(columns)
+    low, high, data = quantize(columns)
     steps = np.frombuffer(data, np.uint8).reshape(40, 6).T
     assert steps[2, 5] == 255 and np.sum(steps == 255) == 1
     found = low + steps * (high - low) / 254
     assert np.nanmax(np.abs(np.where(steps == 255, np.nan, found) - columns)) <= 0.5001 * (high - low) / 254
-    assert set(quantised(np.full((2, 2), np.nan))[2]) == {255}
-    assert quantised(np.full((2, 2), 7.0))[:2] == (7.0, 7.0)
+    assert set(quantize(np.full((2, 2), np.nan))[2]) == {255}
+    assert quantize(np.full((2, 2), 7.0))[:2] == (7.0, 7.0)
 
 
 # --- the newest seconds ---
@@ -201,9 +201,9 @@ def test_a_slow_client_gets_the_newest_columns_and_keeps_nothing_waiting() -> No
     async def scenario() -> list[bytes]:
         deaf: Any = Deaf()
         hub: Any = OneView()
-        client = Client(hub, {}, lambda: None)
+        client = BrowserConnection(hub, {}, lambda: None)
         client._socket = deaf
-        await client._look_at([Key("picture", "one")], anew=False)
+        await client._subscribe([Key("picture", "one")], anew=False)
         sender = asyncio.create_task(client._send(deaf))
         for first in range(0, 1000, 10):
             view.append(first, np.zeros((1, 10), np.float32), first / 100)

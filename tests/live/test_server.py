@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from rosafe.http_server.refusal import HttpRefusal
-from rosafe.live.access import Door
+from rosafe.live.access import TokenAuth
 from tests.harness import ROOT, Graph, Process, wait_for
 from tests.live.world import Live, build, live, page
 
@@ -108,7 +108,7 @@ def test_pages_from_elsewhere_are_refused(world: World, headers: dict[str, str])
 
 
 def test_the_door_takes_no_odd_characters_for_the_token() -> None:
-    door = Door({"robot"})
+    door = TokenAuth({"robot"})
     door.check({"Host": "robot:8090"}, {"token": door.token})
     for query in ({"token": "\udcff\0ä"}, {"token": ""}, {}):
         with pytest.raises(HttpRefusal, match="token"):

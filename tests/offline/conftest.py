@@ -20,4 +20,4 @@ def no_thread_left() -> Iterator[None]:
 def blocks_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
     """None are put together, and the tree has no branches."""
     monkeypatch.setattr(chain, "MOST_BYTES", 0)
-    monkeypatch.setattr(chain, "MOST_FRAMES", 10**9)
+    monkeypatch.setattr(chain, "MAX_FRAMES", 10**9)

@@ -17,7 +17,7 @@ import rosafe
 from rosafe.dsp import kernels
 from rosafe.offline import chain
 from rosafe.offline.files import process_file
-from rosafe.representations import OWN, STAGES
+from rosafe.representations import BUILTIN, STAGES
 from rosafe.representations.filterbank import Filterbank
 from rosafe.representations.input import Input
 from rosafe.representations.ratemap import Ratemap
@@ -82,7 +82,7 @@ def assert_same(got: dict[str, Any], wanted: dict[str, Any]) -> None:
 @given(sizes=sizes, given_parameters=parameters)
 @settings(deadline=None, max_examples=40)
 def test_no_trace_in_any_representation(sizes: list[int], given_parameters: dict[str, Any]) -> None:
-    options: dict[str, Any] = {"parameters": {**FEW, **given_parameters}, "outputs": sorted(OWN)}
+    options: dict[str, Any] = {"parameters": {**FEW, **given_parameters}, "outputs": sorted(BUILTIN)}
     with at_most(0) as lengths:
         whole = rosafe.process(SOUND, RATE, block_frames=SAMPLES, **options)
         assert lengths == [SAMPLES]
@@ -113,7 +113,7 @@ def test_no_trace_in_blocks_of_one_frame_nor_in_long_tails() -> None:
     sound[:, :300], sound[:, 8000], sound[0, 8400:8410] = SOUND[:, :300], 1e-300, 1e80
     with at_most(0):
         for frames, block, kind in ((700, 1, "gammatone"), (9000, 100, "gammatone"), (9000, 77, "drnl")):
-            options: dict[str, Any] = {"parameters": {**FEW, "fb_type": kind}, "outputs": sorted(OWN)}
+            options: dict[str, Any] = {"parameters": {**FEW, "fb_type": kind}, "outputs": sorted(BUILTIN)}
             whole = rosafe.process(sound[:, :frames], RATE, block_frames=frames, **options)
             assert_same(rosafe.process(sound[:, :frames], RATE, block_frames=block, **options), whole)
 
@@ -189,7 +189,7 @@ def test_blocks_that_may_be_seen_stay_as_they_are(why: str, monkeypatch: pytest.
     elif why == "gain control":
         options["parameters"]["pp_bNormalizeRMS"] = True
     elif why == "a plugin":
-        monkeypatch.setattr(chain, "OWN", OWN - {"ratemap"})
+        monkeypatch.setattr(chain, "BUILTIN", BUILTIN - {"ratemap"})
     with at_most(2**22) as seen, using(TWINS if why == "twins" else [TWINS, *levels()][-1]):
         rosafe.process(SOUND, RATE, **options)
     assert seen == [1000, 1000, 1000, 500]
@@ -211,12 +211,12 @@ def workers(count: int) -> Iterator[list[int]]:
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("ROSAFE_WORKERS", str(count))
-        patch.setattr(chain, "MOST_FRAMES", 500)
+        patch.setattr(chain, "MAX_FRAMES", 500)
         patch.setattr(Filterbank, "process", watch)
         yield channels
 
 
-APART = [kind for kind, stage in STAGES.items() if stage.APART]
+APART = [kind for kind, stage in STAGES.items() if stage.CHANNEL_INDEPENDENT]
 
 
 @with_kernels
@@ -261,7 +261,7 @@ def test_branches_leave_no_trace(
 
 @with_kernels
 def test_what_takes_several_channels_has_one_branch() -> None:
-    for kind in sorted(OWN - set(APART) - {"input", "preProc"}):
+    for kind in sorted(BUILTIN - set(APART) - {"input", "preProc"}):
         with workers(2) as seen:
             rosafe.process(SOUND, RATE, parameters={**FEW, "fb_nChannels": 20}, outputs=["ratemap", kind])
         assert set(seen) == {20}, kind

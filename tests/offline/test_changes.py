@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 import rosafe
-from rosafe.interface import FIXED
+from rosafe.interface import CORE_REPRESENTATIONS
 from rosafe.representations import STAGES
 from tests.dsp.bare import Chain, cut
 
@@ -63,12 +63,12 @@ CHANGES: dict[str, Any] = {
     **{f"{prefix}_wSizeSec": 0.03 for prefix in ("ild", "rm", "cc")},
     **{f"{prefix}_hSizeSec": 0.007 for prefix in ("ild", "rm", "cc")},
 }
-KIND_OF = {parameter.name: kind.kind for kind in FIXED.values() for parameter in kind.parameters}
+KIND_OF = {parameter.name: kind.kind for kind in CORE_REPRESENTATIONS.values() for parameter in kind.parameters}
 
 
 def below(kind: str) -> set[str]:
     """A processor and all that depend on it."""
-    return {kind}.union(*(below(child.kind) for child in FIXED.values() if child.parent == kind))
+    return {kind}.union(*(below(child.kind) for child in CORE_REPRESENTATIONS.values() if child.parent == kind))
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +81,7 @@ def test_a_change_of(name: str, unchanged: dict[str, Any]) -> None:
     kind = KIND_OF[name]
     got = rosafe.process(SOUND, RATE, parameters=BASE, block_frames=BLOCK, modifications=[(AT, name, CHANGES[name])])
     outputs = Chain(RATE, BASE).run(cut(SOUND, BLOCK), [(AT, name, CHANGES[name])])
-    for other in FIXED:
+    for other in CORE_REPRESENTATIONS:
         whole = unchanged[other]
         if other not in below(kind):
             np.testing.assert_array_equal(got[other], whole, err_msg=f"{other} has noticed")
@@ -95,7 +95,7 @@ def test_a_change_of(name: str, unchanged: dict[str, Any]) -> None:
     if kind in ("input", "preProc", "gammatone"):  # what begins anew is as if it were new
         values = {key: value for key, value in {**BASE, name: CHANGES[name]}.items() if KIND_OF[key] == kind}
         stage = STAGES[kind](RATE, **values)
-        taken = got[FIXED[kind].parent] if kind != "input" else SOUND
+        taken = got[CORE_REPRESENTATIONS[kind].parent] if kind != "input" else SOUND
         anew = np.concatenate([stage.process(block) for block in cut(taken[..., AT * BLOCK :], BLOCK)], axis=-1)
         np.testing.assert_array_equal(inner(kind, got[kind], anew.shape)[..., AT * BLOCK :], anew)
 

@@ -10,7 +10,7 @@ import pytest
 
 import rosafe
 from rosafe.dsp.framing import FramedStage, frame_parameters
-from rosafe.dsp.guard import FloatArray, limited
+from rosafe.dsp.guard import FloatArray, clamp
 from rosafe.dsp.stage import Output
 from rosafe.representations import KINDS, STAGES
 from rosafe.vocabulary.parameter import Parameter
@@ -53,7 +53,7 @@ class Shells(FramedStage):
         return ()
 
     def process(self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None) -> Output:
-        frames = self._framing.frames(self._buffer.append(limited(self._checked(block)))).sum(axis=-1)
+        frames = self._framing.frames(self._buffer.append(clamp(self._as_valid_block(block)))).sum(axis=-1)
         self._buffer.drop(frames.shape[-1] * self._framing.hop)
         return frames.sum(axis=0), frames[:, np.newaxis] * self.shells[:, np.newaxis]
 

@@ -9,7 +9,7 @@ import pytest
 
 import rosafe
 from rosafe.dsp import kernels
-from rosafe.offline.process import _Gathered
+from rosafe.offline.process import _OutputCollector
 from rosafe.representations import STAGES
 from rosafe.representations.haircell import METHODS, InnerHairCell
 from tests.dsp.bare import Chain, cut
@@ -28,14 +28,14 @@ SOUND = 0.1 * np.random.default_rng(2).standard_normal((2, 3000))
 def copied(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     """Frames of the blocks that were copied into a result."""
     counts: list[int] = []
-    add = _Gathered.add
+    add = _OutputCollector.add
 
-    def count(self: _Gathered, block: np.ndarray) -> None:
-        if block is not self._lent:
+    def count(self: _OutputCollector, block: np.ndarray) -> None:
+        if block is not self._output_slice:
             counts.append(block.shape[-1])
         add(self, block)
 
-    monkeypatch.setattr(_Gathered, "add", count)
+    monkeypatch.setattr(_OutputCollector, "add", count)
     return counts
 
 
@@ -174,8 +174,8 @@ def test_joined_as_numpy_does(lengths: list[int]) -> None:
     end = 20 + sum(lengths)
     blocks = [rng.standard_normal((3, 7, length)) for length in lengths]
     blocks[-1] = np.asfortranarray(blocks[-1])
-    kernels.join(blocks, whole[..., 20:end])
+    kernels.concatenate(blocks, whole[..., 20:end])
     np.testing.assert_array_equal(whole[..., 20:end], np.concatenate(blocks, axis=-1))
     assert np.isnan(whole[..., :20]).all() and np.isnan(whole[..., end:]).all()
-    kernels.join([block.astype(np.float32) for block in blocks], whole[..., 20:end])
+    kernels.concatenate([block.astype(np.float32) for block in blocks], whole[..., 20:end])
     np.testing.assert_array_equal(whole[..., 20:end], np.concatenate(blocks, axis=-1).astype(np.float32))

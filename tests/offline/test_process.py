@@ -15,7 +15,7 @@ import pytest
 from numpy.typing import NDArray
 
 import rosafe
-from rosafe.interface import FIXED
+from rosafe.interface import CORE_REPRESENTATIONS
 from rosafe.offline import chain
 from rosafe.representations import STAGES
 from rosafe.representations.haircell import InnerHairCell
@@ -219,7 +219,7 @@ def test_one_ear(signal: Any) -> None:
     got = rosafe.process(signal, RATE, parameters=FEW, block_frames=1000, modifications=changes)
     both = rosafe.process(SOUND[[0, 0]], RATE, parameters=FEW, block_frames=1000, modifications=changes)
     per_ear = ("input", "preProc", "gammatone", "ihc", "ratemap")
-    assert {name for name in got if name in FIXED} == set(per_ear)
+    assert {name for name in got if name in CORE_REPRESENTATIONS} == set(per_ear)
     for name in per_ear:
         np.testing.assert_array_equal(got[name], both[name][:1])
     kinds = [kind for kind, stage in STAGES.items() if not stage.REPRESENTATION.binaural]
@@ -280,11 +280,11 @@ def test_times_after_a_change_of_the_hop() -> None:
 # --- parts of the outputs ---
 
 
-@pytest.mark.parametrize("kind", FIXED)
+@pytest.mark.parametrize("kind", CORE_REPRESENTATIONS)
 def test_what_nothing_depends_on_is_not_computed(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = rosafe.process(SOUND, RATE, parameters=FEW)
     needed = [kind]
-    while parent := FIXED[needed[-1]].parent:
+    while parent := CORE_REPRESENTATIONS[needed[-1]].parent:
         needed.append(parent)
 
     def refuse(*arguments: Any, **parameters: Any) -> None:
@@ -349,7 +349,7 @@ def test_changes_before_their_blocks() -> None:
     stages = Chain(RATE, {**FEW, "in_doNormalize": False})
     made = [(at, name.replace("BS", "B"), value) for at, name, value in changes if at < 6]
     outputs = stages.run(cut(SOUND, 500), sorted(made, key=lambda change: change[0]))
-    for kind in FIXED:
+    for kind in CORE_REPRESENTATIONS:
         wanted = np.concatenate([output[kind] for output in outputs], axis=-1)
         np.testing.assert_allclose(results[kind], wanted, rtol=0, atol=1e-12, err_msg=kind)
     assert results["ild_frameRate"] == 200.0

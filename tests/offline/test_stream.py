@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import rosafe
-from rosafe.interface import FIXED
+from rosafe.interface import CORE_REPRESENTATIONS
 from rosafe.offline import memory
 from rosafe.representations import STAGES
 from tests.representations.chain import Chain, cut
@@ -37,7 +37,7 @@ def assert_same(got: dict[str, Any], wanted: dict[str, Any]) -> None:
 @given(st.lists(st.integers(1, 900), min_size=1, max_size=5))
 def test_any_blocks_give_the_numbers_of_process(lengths: list[int]) -> None:
     got = joined(rosafe.Stream(RATE, FEW), cut(SOUND, lengths))
-    assert set(FIXED) < set(got)
+    assert set(CORE_REPRESENTATIONS) < set(got)
     assert_same(got, rosafe.process(SOUND, RATE, parameters=FEW, block_frames=lengths))
 
 
@@ -157,7 +157,7 @@ def test_it_starts_no_thread_and_costs_what_the_stages_cost() -> None:
     rate, frames = 44100, 441
     sound = 0.1 * np.random.default_rng(1).standard_normal((2, 60 * frames))
     before = threading.active_count()
-    stream, stages = rosafe.Stream(rate), Chain(float(rate), FIXED, {"in_doNormalize": False})
+    stream, stages = rosafe.Stream(rate), Chain(float(rate), CORE_REPRESENTATIONS, {"in_doNormalize": False})
     seconds: dict[Any, list[float]] = {stream: [], stages: []}
     for block in cut(sound, frames) * 3:
         for one, taken in seconds.items():

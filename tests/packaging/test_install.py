@@ -49,7 +49,7 @@ class Machine:
         done = run("/bin/bash", self.script, *arguments, env=env)
         return done.returncode, done.stdout, done.stderr
 
-    def called(self, name: str) -> list[str]:
+    def input_pending(self, name: str) -> list[str]:
         return [line for line in self.calls.read_text().splitlines() if line.split()[0] == name]
 
 
@@ -84,7 +84,7 @@ def test_nothing_to_do_asks_apt_nothing(machine: Machine) -> None:
     machine.command("id", "echo 1000")
     pypi(machine, "python", "pyalsaaudio-0.11.0")
     assert machine.install() == (0, "everything is installed\n", "")
-    assert machine.called("apt-get") == []
+    assert machine.input_pending("apt-get") == []
 
 
 def test_installs_only_what_is_missing(machine: Machine) -> None:
@@ -93,7 +93,7 @@ def test_installs_only_what_is_missing(machine: Machine) -> None:
     code, out, err = machine.install()
     assert (code, err) == (0, "")
     assert out.endswith("done\n")
-    update, install = machine.called("apt-get")
+    update, install = machine.input_pending("apt-get")
     assert update.endswith(" update")
     assert install.split()[-2:] == ["install", "tcl"]
     assert "--no-install-recommends" in install and " -y " in install
@@ -103,15 +103,15 @@ def test_removed_but_configured_counts_as_missing(machine: Machine) -> None:
     machine.command("dpkg-query", 'for name in "${@:3}"; do echo "$name config-files"; done')
     pypi(machine, "python", "pyalsaaudio-0.11.0")
     assert machine.install()[0] == 0
-    assert " python3-rospy " in machine.called("apt-get")[1]
+    assert " python3-rospy " in machine.input_pending("apt-get")[1]
 
 
 def test_tests_brings_more(machine: Machine) -> None:
     pypi(machine, "python", "pyalsaaudio-0.11.0")
     assert machine.install()[0] == 0
-    assert not any("python3-pytest" in call for call in machine.called("apt-get"))
+    assert not any("python3-pytest" in call for call in machine.input_pending("apt-get"))
     machine.install("--tests", PIP_NO_INDEX="1", PIP_FIND_LINKS="")
-    assert any("python3-pytest" in call for call in machine.called("apt-get"))
+    assert any("python3-pytest" in call for call in machine.input_pending("apt-get"))
 
 
 def test_no_network(machine: Machine) -> None:
@@ -148,7 +148,7 @@ def test_no_right(machine: Machine) -> None:
     code, out, err = machine.install()
     assert (code, out) == (1, "")
     assert "run this as root, or have sudo" in err and err.count("\n") == 1
-    assert machine.called("apt-get") == []
+    assert machine.input_pending("apt-get") == []
 
 
 def test_sudo_that_refuses(machine: Machine) -> None:
@@ -157,7 +157,7 @@ def test_sudo_that_refuses(machine: Machine) -> None:
     code, _, err = machine.install()
     assert code == 1
     assert "scripts/install: " in err.splitlines()[-1]
-    assert machine.called("apt-get") == []
+    assert machine.input_pending("apt-get") == []
 
 
 def test_through_sudo(machine: Machine) -> None:
@@ -165,8 +165,8 @@ def test_through_sudo(machine: Machine) -> None:
     machine.command("sudo", 'shift; "$@"')
     pypi(machine, "python", "pyalsaaudio-0.11.0")
     assert machine.install()[0] == 0
-    assert [call.split()[2] for call in machine.called("sudo")] == ["env", "apt-get", "env"]
-    assert len(machine.called("apt-get")) == 2
+    assert [call.split()[2] for call in machine.input_pending("sudo")] == ["env", "apt-get", "env"]
+    assert len(machine.input_pending("apt-get")) == 2
 
 
 def test_not_debian(machine: Machine) -> None:

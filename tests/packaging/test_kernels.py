@@ -251,7 +251,7 @@ def test_no_more_than_the_processor_can(monkeypatch: pytest.MonkeyPatch, level: 
         return Library()
 
     monkeypatch.setattr(library, "load", load)
-    monkeypatch.delenv(library.SWITCH, raising=False)
+    monkeypatch.delenv(library.KERNELS_VARIABLE, raising=False)
     loaded, status = library.loaded.__wrapped__()
     assert (loaded is not None) == status.compiled == (level > 0)
     assert ("x86-64-v4.so" in opened) == (level == 4)

@@ -92,7 +92,7 @@ def test_all_files_are_in_the_wheel_and_in_the_sdist(built: dict[str, Path]) -> 
     sums = {name for name in names if name.endswith(f"/{build.SUMS}")}
     assert names - libraries - sums == files_of_the_package() and len(sums) == bool(libraries)
     if shutil.which("gcc") and os.uname().machine == "x86_64":
-        assert {Path(name).stem for name in libraries} == set(build.LEVELS["x86_64"].values())
+        assert {Path(name).stem for name in libraries} == set(build.ISA_LEVELS["x86_64"].values())
         assert built["wheel"].name == f"rosafe-{VERSION}-py3-none-linux_x86_64.whl"
     assert (metadata["Name"], metadata["Version"]) == ("rosafe", VERSION)
     assert metadata["Requires-Python"] == ">=3.10" and metadata["Summary"] and metadata["Author-email"]

@@ -274,13 +274,13 @@ def loaded(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[str]]:
     code = """
 import json, numpy, rosafe, rosafe.interface
 from rosafe.component import generate
-from rosafe.representations import OWN, PROBLEMS, STAGES
+from rosafe.representations import BUILTIN, PROBLEMS, STAGES
 result = rosafe.process(numpy.zeros((2, 100)), 16000, outputs=["good"])
 assert result["good"].shape[-1] == 100
 generate.ensure_messages()
 import rosAFE.srv
 assert rosAFE.srv.GoodProc
-print(json.dumps({"problems": PROBLEMS, "kinds": sorted(set(STAGES) - OWN)}))
+print(json.dumps({"problems": PROBLEMS, "kinds": sorted(set(STAGES) - BUILTIN)}))
 """
     done = python(code, folder)
     assert done.returncode == 0, done.stderr
@@ -307,7 +307,7 @@ def test_it_is_named_with_the_reason(loaded: dict[str, list[str]], number: int) 
 
 def test_the_reserved_names_are_those_of_the_component() -> None:
     kinds = [name for kind in KINDS.values() for name in (kind.request, *kind.request_aliases)]
-    requests = {name for s in (*ROSAFE.on_graph, *ROSAFE.composites) for name in (s.name, *s.aliases)}
+    requests = {name for s in (*ROSAFE.on_graph, *ROSAFE.client_side_services) for name in (s.name, *s.aliases)}
     assert requests - set(kinds) == set(checks.REQUESTS)
     ports = {name for port in ROSAFE.ports for name in (port.name, *port.aliases)}
     assert ports - {name for kind in KINDS.values() for name in (kind.port, *kind.port_aliases)} < set(checks.PORTS)

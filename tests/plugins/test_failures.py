@@ -92,7 +92,7 @@ def test_values_that_cannot_be_reported_end_their_processor(use: Use, tree: tupl
     this.modify("gammatone", "fb_nChannels", "6")  # which concerns all below it
     assert mine in listener.ends
     assert "derived: ZeroDivisionError" in str(this.failures[0])
-    assert this.find("ratemap").rows == (2, 6)
+    assert this.find("ratemap").output_shape == (2, 6)
 
 
 def test_a_stage_that_does_not_return_stops_nobody_else(use: Use, tree: tuple[Tree, Recorder, Feed]) -> None:

@@ -16,8 +16,8 @@ from .test_declarations import GOOD
 
 SHOW = """
 import json, os, sys
-from rosafe.representations import OWN, PLUGINS, PROBLEMS, STAGES, WARNINGS
-print(json.dumps([sorted(set(STAGES) - OWN), PROBLEMS, WARNINGS, os.getcwd(), os.environ.get("PATH"), sys.path]))
+from rosafe.representations import BUILTIN, PLUGINS, PROBLEMS, STAGES, WARNINGS
+print(json.dumps([sorted(set(STAGES) - BUILTIN), PROBLEMS, WARNINGS, os.getcwd(), os.environ.get("PATH"), sys.path]))
 """
 
 

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rosafe.dsp.signal import Signal
+from rosafe.dsp.signal import SignalFormat
 from rosafe.dsp.stage import Output, Stage, parts_of
 from rosafe.representations import KINDS, STAGES
 from tests import harness
@@ -36,7 +36,9 @@ def needed(outputs: Iterable[str]) -> list[str]:
     return [kind for kind in STAGES if kind in wanted]
 
 
-def check_new_beginnings(fresh: Callable[[int], Stage], given: Signal, x: FloatArray, *others: FloatArray) -> None:
+def check_new_beginnings(
+    fresh: Callable[[int], Stage], given: SignalFormat, x: FloatArray, *others: FloatArray
+) -> None:
     """A stage of `given`, after a reset, and for other channels, is as a new one, which `fresh` makes for so many."""
     stage = fresh(x.shape[1])
     expected = single(stage.process(x))
@@ -44,7 +46,7 @@ def check_new_beginnings(fresh: Callable[[int], Stage], given: Signal, x: FloatA
     stage.reset()
     np.testing.assert_array_equal(stage.process(x), expected)
     names = tuple(float(number) for number in range(1, x.shape[1] + 1))
-    stage.receive(replace(given, center_frequencies=names))  # as many, but others
+    stage.set_input_format(replace(given, center_frequencies=names))  # as many, but others
     np.testing.assert_array_equal(stage.process(x), expected)
     for other in others:
         np.testing.assert_array_equal(stage.process(other), fresh(other.shape[1]).process(other))
@@ -79,7 +81,11 @@ class Chain:
     """
 
     def __init__(
-        self, given: Signal | float, outputs: Iterable[str], parameters: Mapping[str, Any] | None = None, root: str = ""
+        self,
+        given: SignalFormat | float,
+        outputs: Iterable[str],
+        parameters: Mapping[str, Any] | None = None,
+        root: str = "",
     ) -> None:
         self.outputs = list(outputs)
         kinds = needed(self.outputs)
@@ -94,7 +100,7 @@ class Chain:
         for kind in kinds:
             self.stages[kind] = STAGES[kind](self._comes_to(kind, self.stages), **own[kind])
 
-    def _comes_to(self, kind: str, stages: Mapping[str, Stage]) -> Signal | float:
+    def _comes_to(self, kind: str, stages: Mapping[str, Stage]) -> SignalFormat | float:
         parent = stages.get(KINDS[kind].parent)
         return self.given if parent is None else parent.output_format
 
@@ -108,8 +114,8 @@ class Chain:
             tried[kind].configure(**{name: value})
         for kind, stage in tried.items():
             comes = self._comes_to(kind, tried)
-            if isinstance(comes, Signal):
-                stage.receive(comes)
+            if isinstance(comes, SignalFormat):
+                stage.set_input_format(comes)
         self.stages = tried
 
     def process(self, block: NDArray[Any], extra: NDArray[Any] | None = None) -> dict[str, Output]:

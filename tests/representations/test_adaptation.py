@@ -12,14 +12,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rosafe.dsp.signal import Signal
+from rosafe.dsp.signal import SignalFormat
 from rosafe.representations.adaptation import EVEN_TAU, TAU, Adaptation, hearing_threshold
 
 from .chain import Chain, FloatArray, cut, reference
 
 RATE = 8000.0
 FREQUENCIES = (100.0, 1000.0, 4000.0)
-SOUND = Signal(RATE, RATE, center_frequencies=FREQUENCIES, filterbank="gammatone")
+SOUND = SignalFormat(RATE, RATE, center_frequencies=FREQUENCIES, filterbank="gammatone")
 DRNL = replace(SOUND, filterbank="drnl")
 
 
@@ -137,7 +137,7 @@ def test_negative_input_counts_as_the_threshold() -> None:
 
 # --- streams ----------------------------------------------------------------------------------------------------
 
-MODES: list[tuple[Signal, dict[str, Any]]] = [
+MODES: list[tuple[SignalFormat, dict[str, Any]]] = [
     (SOUND, {}),
     (SOUND, {"adpt_lim": 0.0, "adpt_tau": [0.01, 0.1, 1.0]}),
     (SOUND, {"adpt_model": "adt_vandorpschuitman"}),
@@ -150,7 +150,7 @@ sizes = st.lists(st.one_of(st.sampled_from([0, 1, 2, 31, 32, 33]), st.integers(0
 @each_mode
 @given(sizes=sizes)
 @settings(max_examples=10, deadline=None, database=None)
-def test_cuts_and_prefixes(signal: Signal, parameters: dict[str, Any], sizes: list[int]) -> None:
+def test_cuts_and_prefixes(signal: SignalFormat, parameters: dict[str, Any], sizes: list[int]) -> None:
     x = sound(400)
     whole = Adaptation(signal, **parameters).process(x)
     stage = Adaptation(signal, **parameters)
@@ -161,17 +161,17 @@ def test_cuts_and_prefixes(signal: Signal, parameters: dict[str, Any], sizes: li
 
 
 @each_mode
-def test_reset_and_other_channels_are_a_new_beginning(signal: Signal, parameters: dict[str, Any]) -> None:
+def test_reset_and_other_channels_are_a_new_beginning(signal: SignalFormat, parameters: dict[str, Any]) -> None:
     stage = Adaptation(signal, **parameters)
     expected = stage.process(sound(100))
     stage.reset()
     np.testing.assert_array_equal(stage.process(sound(100)), expected)
 
     other = replace(signal, center_frequencies=(3000.0, 300.0), filterbank="gammatone")
-    stage.receive(other)
+    stage.set_input_format(other)
     x = sound(100, 1, channels=2)
     np.testing.assert_array_equal(stage.process(x), Adaptation(other, **parameters).process(x))
-    stage.receive(replace(other, filterbank="drnl"))  # the same channels, by other filters
+    stage.set_input_format(replace(other, filterbank="drnl"))  # the same channels, by other filters
     expected = Adaptation(replace(other, filterbank="drnl"), **parameters).process(x)
     np.testing.assert_array_equal(stage.process(x), expected)
     if "adpt_model" in parameters:
@@ -183,13 +183,13 @@ def test_reset_and_other_channels_are_a_new_beginning(signal: Signal, parameters
 
 
 @each_mode
-def test_copies_may_be_changed_and_thrown_away(signal: Signal, parameters: dict[str, Any]) -> None:
+def test_copies_may_be_changed_and_thrown_away(signal: SignalFormat, parameters: dict[str, Any]) -> None:
     expected = Adaptation(signal, **parameters).process(sound(300))
     stage, made = Adaptation(signal, **parameters), []
     for block in cut(sound(300), 100):
         planned = copy.copy(stage)
         planned.configure(adpt_tau=[1.0], adpt_mindB=3)
-        planned.receive(replace(signal, filterbank="", center_frequencies=(5.0,)))
+        planned.set_input_format(replace(signal, filterbank="", center_frequencies=(5.0,)))
         made.append(stage.process(block))
     np.testing.assert_allclose(np.concatenate(made, axis=-1), expected, rtol=1e-13, atol=1e-12 * np.abs(expected).max())
 

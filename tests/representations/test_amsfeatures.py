@@ -13,14 +13,14 @@ import scipy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rosafe.dsp.signal import Signal
+from rosafe.dsp.signal import SignalFormat
 from rosafe.dsp.windows import ALL_NAMES, window
 from rosafe.representations.amsfeatures import AmsFeatures, design_sections
 
 from .chain import Chain, FloatArray, check_fresh_output, check_new_beginnings, cut, reference
 
 RATE = 16000.0
-SOUND = Signal(RATE, RATE, center_frequencies=(100.0, 1000.0, 3000.0), filterbank="gammatone")
+SOUND = SignalFormat(RATE, RATE, center_frequencies=(100.0, 1000.0, 3000.0), filterbank="gammatone")
 GOLDEN = (1 + math.sqrt(5)) / 2
 
 
@@ -87,7 +87,7 @@ def test_centres(values: dict[str, Any], centres: list[float]) -> None:
     stage = AmsFeatures(RATE, **values)
     np.testing.assert_allclose(stage.parameters["ams_cfHz"], centres, rtol=1e-14)
     assert stage.output_rows((2, 31)) == (2, 31, len(centres))
-    assert AmsFeatures.in_force({**AmsFeatures(RATE).parameters, "ams_cfHz": [], **values}) == stage.parameters
+    assert AmsFeatures.effective_values({**AmsFeatures(RATE).parameters, "ams_cfHz": [], **values}) == stage.parameters
 
 
 @pytest.mark.parametrize("name", ALL_NAMES)
@@ -266,7 +266,11 @@ def test_the_defaults() -> None:
     }
     assert AmsFeatures(44100, ams_nFilter=3).parameters["ams_nFilters"] == 3
     declared = AmsFeatures.REPRESENTATION
-    assert (declared.request, declared.port, declared.word) == ("ModulationProc", "amsFeaturesPort", "amsFeatures")
+    assert (declared.request, declared.port, declared.word) == (
+        "ModulationProc",
+        "amsFeaturesPort",
+        "amsFeatures",
+    )
     idl = {p.name: p.idl for p in declared.parameters}
     assert idl["ams_nFilters"] == idl["ams_dsRatio"] == "unsigned long" and idl["ams_cfHz"] == "sequence<double>"
 
@@ -353,7 +357,7 @@ def test_copies_may_be_changed_and_thrown_away() -> None:
             planned = copy.copy(stage)
             planned.configure(ams_wSizeSec=0.01, ams_hSizeSec=0.001)
             planned.configure(ams_nFilters=2, ams_dsRatio=2)
-            planned.receive(replace(SOUND, center_frequencies=(5.0,)))
+            planned.set_input_format(replace(SOUND, center_frequencies=(5.0,)))
             made.append(stage.process(block))
         np.testing.assert_allclose(np.concatenate(made, axis=-1), expected, rtol=0, atol=1e-12)
 
@@ -394,7 +398,7 @@ def test_refusals(name: str, changes: dict[str, Any]) -> None:
     assert stage.parameters == twin.parameters
     np.testing.assert_array_equal(stage.process(sound(900)), twin.process(sound(900)))
     parameter = AmsFeatures.REPRESENTATION.parameter(name)
-    assert parameter.known_word("nonsense") == "nonsense"  # there are no old scripts: nothing is taken for it
+    assert parameter.resolve_choice("nonsense") == "nonsense"  # there are no old scripts: nothing is taken for it
 
 
 def test_the_highest_filter_depends_on_the_rate() -> None:
@@ -405,7 +409,7 @@ def test_the_highest_filter_depends_on_the_rate() -> None:
     AmsFeatures(RATE, ams_highFreqHz=2000.0, ams_fbType="lin")
     stage = AmsFeatures(SOUND)
     with pytest.raises(ValueError, match=r"^ams_highFreqHz: "):
-        stage.receive(replace(SOUND, sample_rate=8000.0, rate=8000.0))
+        stage.set_input_format(replace(SOUND, sample_rate=8000.0, rate=8000.0))
     assert stage.input_format is SOUND
 
 

@@ -12,14 +12,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rosafe.dsp.signal import Signal
+from rosafe.dsp.signal import SignalFormat
 from rosafe.dsp.windows import ALL_NAMES, window
 from rosafe.representations.autocorrelation import Autocorrelation
 
 from .chain import Chain, FloatArray, check_fresh_output, check_new_beginnings, cut, reference
 
 RATE = 8000.0
-SOUND = Signal(RATE, RATE, center_frequencies=(100.0, 1000.0, 3000.0), filterbank="gammatone")
+SOUND = SignalFormat(RATE, RATE, center_frequencies=(100.0, 1000.0, 3000.0), filterbank="gammatone")
 
 
 def framed(size: int, hop: int, **more: Any) -> dict[str, Any]:
@@ -282,7 +282,7 @@ def test_copies_may_be_changed_and_thrown_away() -> None:
     for block in cut(sound(700), 100):
         planned = copy.copy(stage)
         planned.configure(ac_wSizeSec=0.01, ac_hSizeSec=0.001, ac_K=1, ac_clipMethod="sgn", ac_clipAlpha=0)
-        planned.receive(replace(SOUND, center_frequencies=(5.0,)))
+        planned.set_input_format(replace(SOUND, center_frequencies=(5.0,)))
         made.append(stage.process(block))
     np.testing.assert_allclose(np.concatenate(made, axis=-1), expected, rtol=0, atol=1e-12)
 
@@ -316,7 +316,7 @@ def test_refusals(changes: dict[str, Any]) -> None:
     assert stage.parameters == twin.parameters
     np.testing.assert_array_equal(stage.process(sound(200)), twin.process(sound(200)))
     parameter = Autocorrelation.REPRESENTATION.parameter(name)
-    assert parameter.known_word("nonsense") == "nonsense"  # there are no old scripts: nothing is taken for it
+    assert parameter.resolve_choice("nonsense") == "nonsense"  # there are no old scripts: nothing is taken for it
 
 
 def test_other_blocks_are_refused() -> None:

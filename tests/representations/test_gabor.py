@@ -11,18 +11,18 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rosafe.dsp.signal import Signal
-from rosafe.representations.gabor import Deviations, Gabor, filters, patterns
+from rosafe.dsp.signal import SignalFormat
+from rosafe.representations.gabor import Gabor, RunningZScore, filters, patterns
 
 from .chain import Chain, FloatArray, check_fresh_output, check_new_beginnings, cut, reference
 
 REACH = 19
 
 
-def given_signal(channels: int, rate: float = 3.0) -> Signal:
+def given_signal(channels: int, rate: float = 3.0) -> SignalFormat:
     """Of ratemaps: at 3 frames a second, 5 s are 15 frames."""
     frequencies = tuple(np.geomspace(100.0, 5000.0, channels))
-    return Signal(12000.0, rate, True, round(12000 / rate), 8000, frequencies, "gammatone")
+    return SignalFormat(12000.0, rate, True, round(12000 / rate), 8000, frequencies, "gammatone")
 
 
 def rates(frames: int, channels: int = 5, seed: int = 0) -> FloatArray:
@@ -190,7 +190,7 @@ def test_deviations_are_those_of_the_window(length: int) -> None:
     values[400:700] *= 1e6  # what leaves the window leaves no trace
     values[900:, 2] = 7.0
     values[900:, 3] = 7.0 + 1e-12 * rng.standard_normal(400)
-    made = Deviations(length, np.empty((0, 9)))
+    made = RunningZScore(length, np.empty((0, 9)))
     got = np.concatenate([made.process(block.T) for block in cut(values.T, [17, 0, 1, 101])])
     for k in range(1300):
         past = values[max(0, k - length + 1) : k + 1]
@@ -206,7 +206,7 @@ def test_deviations_are_those_of_the_window(length: int) -> None:
 @pytest.mark.parametrize("come", [0, 3, 20, 47, 60])
 def test_another_window_goes_on_with_what_is_remembered(come: int, after: int) -> None:
     values = np.random.default_rng(come).standard_normal((200, 4))
-    before = Deviations(20, np.empty((0, 4)))
+    before = RunningZScore(20, np.empty((0, 4)))
     before.process(values[:come])
     made = before.resized(after)
     got, wide = made.process(values[come:]), before.process(values[come:])
@@ -215,7 +215,7 @@ def test_another_window_goes_on_with_what_is_remembered(come: int, after: int) -
         past = values[max(first, k - after + 1) : k + 1]
         expected = (values[k] - past.mean(axis=0)) / np.where(past.std(axis=0) > 0, past.std(axis=0), 1)
         np.testing.assert_allclose(got[k - come], expected, rtol=0, atol=1e-11)
-    expected = Deviations(20, np.empty((0, 4))).process(values)[come:]
+    expected = RunningZScore(20, np.empty((0, 4))).process(values)[come:]
     np.testing.assert_array_equal(wide, expected)  # the one before does not notice
 
 
@@ -255,7 +255,7 @@ def test_frames_are_held_back() -> None:
 def test_reset_and_other_channels_are_a_new_beginning() -> None:
     check_new_beginnings(lambda n: Gabor(given_signal(n)), given_signal(5), rates(60), rates(60, 6), rates(60, 2))
     stage = Gabor(given_signal(5))
-    stage.receive(given_signal(7))
+    stage.set_input_format(given_signal(7))
     assert stage.derived["gb_nFeatures"] == len(spelt_out_weights(7))
 
 
@@ -315,7 +315,7 @@ def test_another_step_of_the_parent_goes_on_with_what_is_remembered() -> None:
     x = rates(120)
     stage = Gabor(given_signal(5, 3.0))
     first = stage.process(x[..., :50])
-    stage.receive(given_signal(5, 1.0))
+    stage.set_input_format(given_signal(5, 1.0))
     second = stage.process(x[..., 50:])
     assert (stage.look_ahead, stage.output_format.rate) == (19, 1.0)
     np.testing.assert_array_equal(first, Gabor(given_signal(5, 3.0)).process(x)[..., :31])
@@ -343,8 +343,8 @@ def test_copies_may_be_changed_and_thrown_away() -> None:
     for block in cut(rates(100), 13):
         planned = copy.copy(stage)
         planned.configure(gb_maxDynamicRangeDB=10.0)
-        planned.receive(given_signal(5, 1.0))
-        planned.receive(given_signal(3, 2.0))
+        planned.set_input_format(given_signal(5, 1.0))
+        planned.set_input_format(given_signal(3, 2.0))
         made.append(stage.process(block))
     np.testing.assert_allclose(np.concatenate(made, axis=-1), expected, rtol=0, atol=1e-9)
 

@@ -8,7 +8,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from rosafe.dsp.signal import Signal
+from rosafe.dsp.signal import SignalFormat
 from rosafe.representations import KINDS
 from rosafe.representations.interaural import Ic, Itd
 
@@ -16,7 +16,7 @@ from .chain import Chain, FloatArray, process, reference
 
 RATE = 16000.0
 CHANNELS = [300.0, 500.0, 800.0]
-GIVEN = Signal(RATE, 100.0, True, 160, 320, (500.0,), "gammatone", lags=4)
+GIVEN = SignalFormat(RATE, 100.0, True, 160, 320, (500.0,), "gammatone", lags=4)
 
 
 def of(correlations: list[float] | FloatArray) -> tuple[float, float]:

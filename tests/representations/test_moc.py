@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rosafe.dsp.signal import Signal
+from rosafe.dsp.signal import SignalFormat
 from rosafe.representations import KINDS
 from rosafe.representations.moc import Moc
 
 from .chain import FloatArray, reference
 
-GIVEN = Signal(16000.0, 100.0, True, 160, 320, (500.0,), "drnl")
+GIVEN = SignalFormat(16000.0, 100.0, True, 160, 320, (500.0,), "drnl")
 DEFAULTS = {"moc_extIpsi": 1.0, "moc_extContra": 1.0, "moc_thresholdRatedB": -180.0, "moc_maxAttenuationdB": 40.0}
 FACTORS = [Fraction(x) for x in ("-0.00012411", "-0.051322", "-6.3528", "-206.11")]
 

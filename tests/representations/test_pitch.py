@@ -14,7 +14,7 @@ import scipy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rosafe.dsp.signal import Signal
+from rosafe.dsp.signal import SignalFormat
 from rosafe.representations import pitch
 from rosafe.representations.pitch import Pitch
 
@@ -22,7 +22,7 @@ from .chain import Chain, FloatArray, cut, process, reference
 
 FS = 1000.0
 # 10 frames a second, so that 5 s are 50 of them; lags from 0 to 30 ms
-GIVEN = Signal(FS, 10.0, True, 100, 31, (200.0, 300.0), "gammatone", lags=30)
+GIVEN = SignalFormat(FS, 10.0, True, 100, 31, (200.0, 300.0), "gammatone", lags=30)
 WIDE: dict[str, Any] = {"pi_rangeHz": [40.0, 400.0]}  # lags 3 to 25
 
 
@@ -121,7 +121,7 @@ def test_peaks(curve: list[float], lag: int, height: float) -> None:
 @pytest.mark.parametrize("rate", [8000.0, 16000.0, 44100.0, 48000.0, 11025.0])
 def test_the_range(rate: float, limits: list[float]) -> None:
     """In any order; both ends belong to it, as the quotients say."""
-    format_ = Signal(rate, 100.0, True, round(rate / 100), 2, (), "", lags=round(rate / 50))
+    format_ = SignalFormat(rate, 100.0, True, round(rate / 100), 2, (), "", lags=round(rate / 50))
     lags = [lag for lag in range(format_.lags + 1) if 1 / limits[1] <= lag / rate <= 1 / limits[0]]
     if len(lags) < 3:
         with pytest.raises(ValueError, match=r"^pi_rangeHz: .* lags"):
@@ -196,9 +196,9 @@ def test_reset_and_other_channels_are_a_new_beginning() -> None:
         expected = stage.process(correlations(40))
         stage.reset()
         np.testing.assert_array_equal(stage.process(correlations(40)), expected)
-        stage.receive(replace(GIVEN, center_frequencies=(1.0, 2.0)))
+        stage.set_input_format(replace(GIVEN, center_frequencies=(1.0, 2.0)))
         np.testing.assert_array_equal(stage.process(correlations(40)), expected)
-        stage.receive(replace(GIVEN, center_frequencies=(1.0, 2.0), filterbank="drnl"))
+        stage.set_input_format(replace(GIVEN, center_frequencies=(1.0, 2.0), filterbank="drnl"))
         np.testing.assert_array_equal(stage.process(correlations(40)), expected)
         fresh = Pitch(GIVEN, **WIDE, pi_medianOrder=order).process(correlations(40, channels=3))
         np.testing.assert_array_equal(stage.process(correlations(40, channels=3)), fresh)  # nobody has told
@@ -226,7 +226,7 @@ def test_what_comes_out() -> None:
 
 
 def test_the_defaults_and_the_documentations_names() -> None:
-    stage = Pitch(Signal(16000.0, 100.0, True, 160, 320, (), "", lags=318))
+    stage = Pitch(SignalFormat(16000.0, 100.0, True, 160, 320, (), "", lags=318))
     assert stage.parameters == {"pi_rangeHz": [80.0, 400.0], "pi_confThres": 0.7, "pi_medianOrder": 3}
     stage.configure(p_pitchRangeHz=[100, 300], p_confThresPerc=0, p_orderMedFilt=5)
     assert stage.parameters == {"pi_rangeHz": [100.0, 300.0], "pi_confThres": 0.0, "pi_medianOrder": 5}
@@ -273,21 +273,21 @@ def test_another_step_of_the_parent() -> None:
     """5 s are as many frames as they are now; the frames that are remembered stay."""
     stage = Pitch(GIVEN, **WIDE, pi_medianOrder=1)
     assert not np.isnan(stage.process(peaks_at([9] * 20, [0.9] * 19 + [1.0]))[0, 0]).any()
-    stage.receive(replace(GIVEN, rate=4.0, hop=250))  # 20 frames
+    stage.set_input_format(replace(GIVEN, rate=4.0, hop=250))  # 20 frames
     assert stage.output_format.rate == 4.0
     assert np.isnan(stage.process(peaks_at([9] * 19, [0.65] * 19))[0, 0]).all()
-    stage.receive(replace(GIVEN, rate=1.0, hop=1000))  # 5 frames
+    stage.set_input_format(replace(GIVEN, rate=1.0, hop=1000))  # 5 frames
     assert not np.isnan(stage.process(peaks_at([9], [0.5]))[0, 0]).any()
 
 
 def test_another_window_of_the_parent() -> None:
     stage = Pitch(GIVEN, pi_rangeHz=[20.0, 400.0])
     stage.process(correlations(10))
-    stage.receive(replace(GIVEN, lags=12))
+    stage.set_input_format(replace(GIVEN, lags=12))
     assert stage._range == slice(3, 13)
     assert stage.process(correlations(10, lags=13)).shape == (2, 3, 10)  # with the one that was held back
     with pytest.raises(ValueError, match=r"^pi_rangeHz: .* 2 lags"):
-        stage.receive(replace(GIVEN, lags=4))
+        stage.set_input_format(replace(GIVEN, lags=4))
     assert stage.input_format.lags == 12
     assert stage.process(correlations(10, lags=13)).shape == (2, 3, 10)
     with pytest.raises(ValueError, match=r"^block: 31 lags"):
@@ -315,7 +315,7 @@ def test_copies_may_be_changed_and_thrown_away() -> None:
     for block in cut(correlations(60), 7):
         planned = copy.copy(stage)
         planned.configure(pi_medianOrder=9, pi_rangeHz=[50.0, 60.0], pi_confThres=0)
-        planned.receive(replace(GIVEN, center_frequencies=(5.0,), rate=1.0))
+        planned.set_input_format(replace(GIVEN, center_frequencies=(5.0,), rate=1.0))
         made.append(stage.process(block))
     np.testing.assert_array_equal(np.concatenate(made, axis=-1), expected)
 

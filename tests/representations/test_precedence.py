@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rosafe.dsp.signal import Signal
+from rosafe.dsp.signal import SignalFormat
 from rosafe.representations.precedence import PAIRS, Precedence, fading, weights
 
 from .chain import Chain, FloatArray, cut, process, reference
@@ -21,8 +21,10 @@ RATE = 2000.0  # 1 ms are 2 samples, 10 ms 20
 PARTS = ("itd", "ild", "cc")
 
 
-def given_signal(channels: int, rate: float = RATE) -> Signal:
-    return Signal(rate, rate, center_frequencies=tuple(np.geomspace(60.0, 900.0, channels)), filterbank="gammatone")
+def given_signal(channels: int, rate: float = RATE) -> SignalFormat:
+    return SignalFormat(
+        rate, rate, center_frequencies=tuple(np.geomspace(60.0, 900.0, channels)), filterbank="gammatone"
+    )
 
 
 def framed(size: int, hop: int, rate: float = RATE, **more: Any) -> dict[str, Any]:
@@ -52,7 +54,7 @@ def xc(a: FloatArray, b: FloatArray, reach: int) -> FloatArray:
     return np.array(made)
 
 
-def spelt_out(x: FloatArray, signal: Signal, size: int, hop: int, delay: float) -> tuple[Any, ...]:
+def spelt_out(x: FloatArray, signal: SignalFormat, size: int, hop: int, delay: float) -> tuple[Any, ...]:
     """itd, ild, cc of (2, C, N) as the specification's steps say, and which pair, delays and gains there were."""
     rate, frequencies = signal.sample_rate, signal.center_frequencies
     most, last, reach = math.ceil(delay * rate), math.floor(0.01 * rate + 0.5), math.ceil(rate / 1000)
@@ -352,7 +354,7 @@ def test_reset_and_other_channels_are_a_new_beginning(parameters: dict[str, Any]
     stage.reset()
     assert same(stage.process(sound(433)), expected)
     others = replace(given_signal(3), center_frequencies=(500.0, 600.0, 700.0))  # as many, but others
-    stage.receive(others)
+    stage.set_input_format(others)
     assert same(stage.process(sound(433)), Precedence(others, **parameters).process(sound(433)))
     assert stage.output_format.center_frequencies == (500.0, 600.0, 700.0)
     for channels in (5, 2):
@@ -437,7 +439,7 @@ def test_copies_may_be_changed_and_thrown_away() -> None:
     for block in cut(sound(700), 100):
         planned = copy.copy(stage)
         planned.configure(**framed(70, 11, prec_maxDelaySec=0.004))
-        planned.receive(replace(given_signal(3), center_frequencies=(5.0,)))
+        planned.set_input_format(replace(given_signal(3), center_frequencies=(5.0,)))
         made.append(stage.process(block))
     for got, wanted in zip(joined(made), expected, strict=True):
         np.testing.assert_allclose(got, wanted, rtol=0, atol=1e-11)

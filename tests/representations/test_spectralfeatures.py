@@ -12,7 +12,7 @@ import scipy.stats
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rosafe.dsp.signal import Signal
+from rosafe.dsp.signal import SignalFormat
 from rosafe.representations import KINDS
 from rosafe.representations.spectralfeatures import FEATURES, SpectralFeatures
 from tests.dsp.implementations import TWINS, Choice, using
@@ -26,8 +26,8 @@ WORDS = [
 FREQUENCIES = (300.0, 3000.0, 1000.0, 2000.0)  # the highest is not the last
 
 
-def signal(frequencies: tuple[float, ...] = FREQUENCIES) -> Signal:
-    return Signal(16000.0, 100.0, True, 160, 320, frequencies, "gammatone")
+def signal(frequencies: tuple[float, ...] = FREQUENCIES) -> SignalFormat:
+    return SignalFormat(16000.0, 100.0, True, 160, 320, frequencies, "gammatone")
 
 
 def features(

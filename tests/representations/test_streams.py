@@ -11,12 +11,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rosafe.dsp.signal import Signal
+from rosafe.dsp.signal import SignalFormat
 from rosafe.representations import KINDS, STAGES
 
 from .chain import Chain, FloatArray
 
-RATEMAP = Signal(16000.0, 100.0, True, 160, 320, (200.0, 500.0, 1200.0, 3000.0, 2500.0), "gammatone")
+RATEMAP = SignalFormat(16000.0, 100.0, True, 160, 320, (200.0, 500.0, 1200.0, 3000.0, 2500.0), "gammatone")
 CORRELATIONS = replace(RATEMAP, lags=3)
 MAP = {"trm_fuseWithinSec": 0.03, "trm_minSpread": 2, "trm_minStrengthdB": 1.0}
 # (kind, the kind that the blocks are given to, parameters)
@@ -131,7 +131,7 @@ def test_other_channels_are_a_new_beginning(kind: str, root: str, parameters: di
         others = tuple(np.linspace(300.0, 3300.0, channels).tolist())
         given_signal = one.stages[root].input_format
         for stage in one.stages.values():
-            stage.receive(replace(stage.input_format, center_frequencies=others))
+            stage.set_input_format(replace(stage.input_format, center_frequencies=others))
         fresh = Chain(replace(given_signal, center_frequencies=others), [kind], parameters, root)
         later = frames(root, 40, 3, channels)
         np.testing.assert_array_equal(one.run(later, 13)[kind], fresh.run(later, 13)[kind])
@@ -160,7 +160,7 @@ def test_copies_may_be_changed_and_thrown_away(kind: str, root: str, parameters:
                 planned.configure(trm_minSpread=9, trm_fuseWithinSec=0.2)
             if "sf_requests" in planned.parameters:
                 planned.configure(sf_requests="hfc")
-            planned.receive(replace(stage.input_format, center_frequencies=(1.0,), rate=7.0))
+            planned.set_input_format(replace(stage.input_format, center_frequencies=(1.0,), rate=7.0))
         made.append(one.process(block)[kind])
     np.testing.assert_array_equal(np.concatenate(made, axis=-1), expected)
 

@@ -12,14 +12,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rosafe.dsp.signal import Signal
+from rosafe.dsp.signal import SignalFormat
 from rosafe.representations import KINDS
 from rosafe.representations.transientmaps import KEPT, OffsetMap, OnsetMap
 from tests.dsp.implementations import TWINS, Choice, using
 
 from .chain import Chain, FloatArray, reference
 
-GIVEN = Signal(16000.0, 100.0, True, 160, 320, (200.0, 500.0, 1200.0, 3000.0), "gammatone")
+GIVEN = SignalFormat(16000.0, 100.0, True, 160, 320, (200.0, 500.0, 1200.0, 3000.0), "gammatone")
 DEFAULTS = {"trm_minStrengthdB": 3.0, "trm_minSpread": 5, "trm_fuseWithinSec": 0.03, "trm_minValuedB": -2000.0}
 
 
@@ -103,7 +103,7 @@ def run(
     values: dict[str, Any],
     sizes: Sequence[int],
     changes: Sequence[tuple[int, str, Any]] = (),
-    given_signal: Signal = GIVEN,
+    given_signal: SignalFormat = GIVEN,
 ) -> FloatArray:
     """What the stage makes of it."""
     stage, made, at = OnsetMap(given_signal, **values), [], 0
@@ -287,7 +287,7 @@ def test_other_steps_of_the_parent() -> None:
     stage = OnsetMap(GIVEN, **values)
     first = stage.process(strengths[..., :30], levels[..., :30])
     assert first.shape[-1] == 19
-    stage.receive(replace(GIVEN, rate=60.0, hop=267))  # q 3, H 7
+    stage.set_input_format(replace(GIVEN, rate=60.0, hop=267))  # q 3, H 7
     assert stage.look_ahead == 7
     assert stage.output_format.rate == 60.0
     rest = stage.process(strengths[..., 30:], levels[..., 30:])
@@ -385,7 +385,7 @@ def test_more_frames_than_can_be_meant() -> None:
         OnsetMap(replace(GIVEN, rate=1e9), trm_fuseWithinSec=10.0)
     stage = OnsetMap(GIVEN, trm_fuseWithinSec=10.0)
     with pytest.raises(ValueError, match=r"^trm_fuseWithinSec: too long"):
-        stage.receive(replace(GIVEN, rate=1e9))
+        stage.set_input_format(replace(GIVEN, rate=1e9))
     assert stage.output_format.rate == 100.0
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rosafe.dsp.signal import Signal
+from rosafe.dsp.signal import SignalFormat
 from rosafe.dsp.stage import Stage
 from rosafe.representations import KINDS
 from rosafe.representations.transients import OffsetStrength, OnsetStrength
@@ -16,7 +16,7 @@ from rosafe.representations.transients import OffsetStrength, OnsetStrength
 from .chain import Chain, FloatArray, reference
 
 RATE = 16000.0
-GIVEN = Signal(RATE, 100.0, True, 160, 320, (500.0, 900.0), "gammatone")
+GIVEN = SignalFormat(RATE, 100.0, True, 160, 320, (500.0, 900.0), "gammatone")
 KINDS_AND_LIMITS: list[tuple[type[Stage], str, int]] = [
     (OnsetStrength, "ons_maxOnsetdB", 1),
     (OffsetStrength, "ofs_maxOffsetdB", -1),
@@ -89,7 +89,7 @@ def test_the_level_for_the_maps(kind: type[Stage], limit: str, sign: int) -> Non
 def test_the_decay_after_sound(kind: type[Stage], limit: str, sign: int, scaling: str, per_frame: float) -> None:
     """What the integrator loses from frame to frame, until -2000 dB; then nothing is left."""
     name = kind.REPRESENTATION.kind
-    ihc = Signal(RATE, RATE, center_frequencies=(500.0, 900.0), filterbank="gammatone")
+    ihc = SignalFormat(RATE, RATE, center_frequencies=(500.0, 900.0), filterbank="gammatone")
     chain = Chain(ihc, [name], {"rm_scaling": scaling, limit: 30.0}, root="ratemap")
     sound = np.random.default_rng(1).uniform(0, 1, (2, 2, 800))
     made = chain.run(np.concatenate([sound, np.zeros((2, 2, 80000))], axis=-1), 8000)[name]
@@ -115,7 +115,7 @@ def test_a_new_limit_keeps_the_last_level(kind: type[Stage], limit: str, sign: i
 def test_other_steps_of_the_ratemap_keep_the_last_level(kind: type[Stage], limit: str, sign: int) -> None:
     stage = kind(GIVEN)
     stage.process(rates([0]))
-    stage.receive(Signal(RATE, 50.0, True, 320, 640, (500.0, 900.0), "gammatone"))
+    stage.set_input_format(SignalFormat(RATE, 50.0, True, 320, 640, (500.0, 900.0), "gammatone"))
     assert stage.output_format.rate == 50.0
     np.testing.assert_allclose(stage.process(rates([sign * 9])), 9.0, rtol=1e-13)
 

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
 
-from rosafe.dsp.signal import Signal
+from rosafe.dsp.signal import SignalFormat
 from rosafe.dsp.stage import Stage
-from rosafe.interface import KINDS, ROSAFE, ComponentError, text_of
+from rosafe.interface import KINDS, ROSAFE, ComponentError, format_value
 from rosafe.representations import STAGES
 from rosafe.tree.building import Turns
 
@@ -63,7 +63,7 @@ class Model:
         await asyncio.sleep(0)
         return result
 
-    async def hears(self, port: str) -> str:
+    async def port_connected(self, port: str) -> str:
         assert port == "Audio"
         return self.connected and f"/{self.connected.removeprefix('/')}"
 
@@ -90,7 +90,7 @@ class Model:
             raise ROSAFE.error("e_existsAlready")
         try:
             checked = {p.name: p.check(given[p.name]) for p in kind.parameters if p.name in given}
-            comes: Signal | float = self.processors[parent].stage.output_format if parent else self.sample_rate
+            comes: SignalFormat | float = self.processors[parent].stage.output_format if parent else self.sample_rate
             self.processors[name] = Processor(kind.kind, parent, STAGES[kind.kind](comes, **checked))
         except ValueError as problem:
             raise ROSAFE.error("e_badNewValue", what=str(problem)) from None
@@ -112,7 +112,7 @@ class Model:
                     "rate": processor.stage.output_format.rate,
                     "upperDepName": processor.parent,
                     "parameters": [
-                        {"name": parameter, "value": text_of(value)}
+                        {"name": parameter, "value": format_value(value)}
                         for parameter, value in {**processor.stage.parameters, **processor.stage.derived}.items()
                     ],
                 }

@@ -67,7 +67,9 @@ def check(model: Model, before: Mapping[str, Any], wanted: tuple[str, Mapping[st
     representation, parameters = wanted
     names, state = told["dependencies"], model.state()
     assert names == list(model.line(told["name"]))[::-1]
-    assert [state[name][0] for name in names] == [k.kind for k in request.chain(request.kind_of(representation))]
+    assert [state[name][0] for name in names] == [
+        k.kind for k in request.ancestor_kinds(request.kind_of(representation))
+    ]
     for name in names:
         kind, _, values = state[name]
         assert values == in_force(kind, parameters), name
@@ -120,7 +122,7 @@ def test_clients_that_do_not_know_of_each_other(wanted: list[tuple[str, dict[str
     answers = asyncio.run(all_at_once())
     for (representation, parameters), told in zip(wanted, answers, strict=True):
         assert [model.processors[name].kind for name in told["dependencies"]] == [
-            k.kind for k in request.chain(request.kind_of(representation))
+            k.kind for k in request.ancestor_kinds(request.kind_of(representation))
         ]
         for name in told["dependencies"]:
             processor = model.processors[name]
@@ -380,7 +382,7 @@ def test_a_long_window_costs_nothing() -> None:
     """It is the node's to make, or to refuse."""
     tracemalloc.start()
     try:
-        request.understand(KINDS["ild"], {"ild_wSizeSec": 60.0})
+        request.parse_request(KINDS["ild"], {"ild_wSizeSec": 60.0})
         assert tracemalloc.get_traced_memory()[1] < 10e6
     finally:
         tracemalloc.stop()
@@ -464,7 +466,7 @@ _JSON = st.recursive(
 def test_whatever_comes_is_understood_or_refused(form: Any) -> None:
     try:
         values = partial(form)
-        wish = request.understand(request.kind_of(values.pop("representation")), values)
+        wish = request.parse_request(request.kind_of(values.pop("representation")), values)
     except ComponentError as refused:
         assert refused.ex in ("::genom::serialization", "::rosAFE::e_badNewValue")
         assert refused.detail["what"]

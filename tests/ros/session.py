@@ -19,7 +19,7 @@ from actionlib import CommState
 
 from rosafe import process
 from rosafe.component import wire
-from rosafe.interface import FIXED, ROSAFE
+from rosafe.interface import CORE_REPRESENTATIONS, ROSAFE
 from tests.harness import PATIENCE, PYTHON, Graph, Process, wait_for
 
 RATE = 20000  # Hz; cheap, and all default channels lie below half of it
@@ -151,21 +151,25 @@ class Session:
     def processors(self) -> dict[str, list[str]]:
         """The names of all processors by kind, as getParameters tells them."""
         parameters = self.ok("getParameters").parameters
-        return {kind: [p.name for p in getattr(parameters, kind)] for kind in FIXED if getattr(parameters, kind)}
+        return {
+            kind: [p.name for p in getattr(parameters, kind)]
+            for kind in CORE_REPRESENTATIONS
+            if getattr(parameters, kind)
+        }
 
     # --- ports ---
 
     def topic(self, kind: str, name: str = "") -> str:
         """The topic of a processor; `name` by default as the request's."""
-        port = ROSAFE.port(FIXED[kind].port)
-        element = name or ROSAFE.service(FIXED[kind].request).parameter("name").default
+        port = ROSAFE.port(CORE_REPRESENTATIONS[kind].port)
+        element = name or ROSAFE.service(CORE_REPRESENTATIONS[kind].request).parameter("name").default
         return f"/{self.name}/{port.name}" + (f"/{element}" if port.multiple else "")
 
     def read(self, kind: str, index: int | None = None, name: str = "", timeout: float = PATIENCE) -> Any:
         """The newest message of a port, with arrays; the one with lastFrameIndex `index` where that is given."""
         return self.graph.message(
             self.topic(kind, name),
-            wire.message_class("rosAFE", ROSAFE.port(FIXED[kind].port).idl),
+            wire.message_class("rosAFE", ROSAFE.port(CORE_REPRESENTATIONS[kind].port).idl),
             accept=lambda message: index is None or message.lastFrameIndex == index,
             timeout=timeout,
         )
@@ -173,7 +177,7 @@ class Session:
     @contextmanager
     def follow(self, kind: str, name: str = "") -> Iterator[list[Any]]:
         """All messages of a port, from the latched one on."""
-        message_class = wire.message_class("rosAFE", ROSAFE.port(FIXED[kind].port).idl)
+        message_class = wire.message_class("rosAFE", ROSAFE.port(CORE_REPRESENTATIONS[kind].port).idl)
         with self.graph.collect(self.topic(kind, name), message_class) as messages:
             wait_for(lambda: messages, what=f"a message on {self.topic(kind, name)}")
             yield messages

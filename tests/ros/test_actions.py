@@ -14,11 +14,11 @@ import rospy
 from actionlib import CommState
 from actionlib_msgs.msg import GoalStatus
 
-from rosafe.interface import FIXED, ROSAFE
+from rosafe.interface import CORE_REPRESENTATIONS, ROSAFE
 from tests.harness import Graph, wait_for
 from tests.ros.session import Goal, Session, noise, own_node, told
 
-REQUESTS = [kind.request for kind in FIXED.values()]
+REQUESTS = [kind.request for kind in CORE_REPRESENTATIONS.values()]
 
 
 def build(afe: Session, *requests: str) -> dict[str, Goal]:
@@ -51,7 +51,7 @@ def test_a_whole_tree_of_goals(afe: Session) -> None:
     """Accepted means running, so that each can follow at once; the results come when the activities end."""
     goals = build(afe, *REQUESTS[1:])
     assert afe.processors() == {
-        kind: [ROSAFE.service(k.request).parameter("name").default] for kind, k in FIXED.items()
+        kind: [ROSAFE.service(k.request).parameter("name").default] for kind, k in CORE_REPRESENTATIONS.items()
     }
     ids = afe.wait_activities(REQUESTS)
     assert list(ids.values()) == REQUESTS and sorted(ids) == list(ids), "ids grow in the order of the requests"

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from rosafe.component import activities as module
-from rosafe.component.activities import Activities, Activity, TaskMeter
+from rosafe.component.activities import Activities, Activity, TaskStatistics
 from rosafe.interface import BASS, MAX_ACTIVITIES, ROSAFE, ComponentError
 from tests.harness import PATIENCE
 
@@ -197,7 +197,7 @@ def test_the_table_names_activities_that_exist() -> None:
 def test_a_task_measures_its_cycles(monkeypatch: pytest.MonkeyPatch) -> None:
     now = 100.0
     monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: now))
-    meter = TaskMeter("input")
+    meter = TaskStatistics("input")
     assert meter.snapshot() == {
         "cycles": 0,
         "timings": {"last": 0.0, "max": 0.0, "avg": 0.0},

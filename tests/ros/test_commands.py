@@ -8,14 +8,14 @@ from collections.abc import Iterator
 
 import pytest
 
-from rosafe.interface import FIXED, ROSAFE, ros_type
+from rosafe.interface import CORE_REPRESENTATIONS, ROSAFE, ros_type
 from tests.harness import Graph, run_together, wait_for
 
 PORTS = {
     f"/rosAFE/{port.name}" + ("/" + ROSAFE.service(kind.request).parameter("name").default if port.multiple else ""): (
         "rosAFE/" + ros_type(port.idl)
     )
-    for kind in FIXED.values()
+    for kind in CORE_REPRESENTATIONS.values()
     for port in [ROSAFE.port(kind.port)]
 }
 

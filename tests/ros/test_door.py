@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from rosafe.component import door
-from rosafe.component.door import Door, Refused
+from rosafe.component.door import HandshakeRejected, HandshakeServer
 from tests.harness import wait_for
 
 
@@ -22,18 +22,18 @@ class House:
         self.reports: list[tuple[str, str]] = []
         self.listener = socket.create_server(("127.0.0.1", 0))
         self.opening: Callable[[bytearray], int | None] = self._line
-        self.door = Door(self.listener, lambda data: self.opening(data), self._echo, self._report)
+        self.door = HandshakeServer(self.listener, lambda data: self.opening(data), self._echo, self._report)
         self.thread = threading.Thread(target=self.door.run)
 
     def _line(self, data: bytearray) -> int | None:
         if len(data) > 1000:
-            raise Refused("too long", b"no\n")
+            raise HandshakeRejected("too long", b"no\n")
         end = data.find(b"\n")
         return end + 1 if end >= 0 else None
 
     def _echo(self, sock: socket.socket, address: Any, opening: bytes, rest: bytes) -> None:
         sock.sendall(opening)
-        self.door.keep(sock, address, rest, 60)
+        self.door.adopt_idle(sock, address, rest, 60)
 
     def _report(self, peer: str, what: str) -> None:
         self.reports.append((peer, what))
@@ -87,7 +87,7 @@ def test_who_is_silent_goes_after_a_while_but_not_who_was_heard(monkeypatch: pyt
 
 
 def test_the_one_that_came_first_goes_where_there_are_too_many(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(door, "GUESTS", 10)
+    monkeypatch.setattr(door, "MAX_PENDING", 10)
     with house() as it:
         crowd = [it.visit() for _ in range(15)]
         for sock in crowd[:5]:

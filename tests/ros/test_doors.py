@@ -83,7 +83,7 @@ def test_many_that_are_silent_or_slow_hold_nobody_up(target: Target) -> None:
                     with contextlib.suppress(ConnectionError):
                         sock.sendall(byte)
                 target.assert_well()
-        assert target.descriptors < 2 * door.GUESTS + 200, "no more wait than that"
+        assert target.descriptors < 2 * door.MAX_PENDING + 200, "no more wait than that"
 
 
 def test_one_who_says_its_piece_byte_by_byte_is_understood(target: Target) -> None:

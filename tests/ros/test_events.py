@@ -6,7 +6,7 @@ import itertools
 import re
 import time
 
-from rosafe.component.events import KINDS, EventLog
+from rosafe.component.events import KINDS, ThrottledLog
 from tests.harness import run_together, wait_for
 
 
@@ -18,7 +18,7 @@ def told(lines: list[str]) -> int:
 
 def test_kinds_do_not_hide_each_other() -> None:
     lines: list[str] = []
-    log = EventLog(lines.append, period=60.0)
+    log = ThrottledLog(lines.append, period=60.0)
     for number in range(3):
         log(f"lost {number} frames ({number / 7:.3f} s)")
         log(f"a new stream at {number} Hz")
@@ -27,7 +27,7 @@ def test_kinds_do_not_hide_each_other() -> None:
 
 def test_a_storm_is_one_line_a_period_with_the_last_of_it() -> None:
     lines: list[str] = []
-    log = EventLog(lines.append, period=0.2)
+    log = ThrottledLog(lines.append, period=0.2)
     for number in range(1000):
         log(f"lost frame {number}")
     wait_for(lambda: told(lines) == 1000)
@@ -41,7 +41,7 @@ def test_a_storm_is_one_line_a_period_with_the_last_of_it() -> None:
 def test_a_storm_that_goes_on_is_never_two_lines_at_a_time() -> None:
     """The line that counts is not followed by the next event's own."""
     times: list[float] = []
-    log = EventLog(lambda line: times.append(time.monotonic()), period=0.5)
+    log = ThrottledLog(lambda line: times.append(time.monotonic()), period=0.5)
 
     def five_lines() -> bool:
         log("lost 1 frame")
@@ -55,7 +55,7 @@ def test_a_storm_that_goes_on_is_never_two_lines_at_a_time() -> None:
 def test_a_kind_may_be_named_and_there_are_not_too_many_at_once() -> None:
     """What others may choose the text of does not fill the log."""
     lines: list[str] = []
-    log = EventLog(lines.append, period=60.0)
+    log = ThrottledLog(lines.append, period=60.0)
     for text in ("a", "b"):
         log(f"peer says {text}", kind="peer")
     assert lines == ["peer says a"]
@@ -66,11 +66,11 @@ def test_a_kind_may_be_named_and_there_are_not_too_many_at_once() -> None:
 
 def test_events_from_many_threads_are_all_counted() -> None:
     lines: list[str] = []
-    log = EventLog(lines.append, period=0.05)
+    log = ThrottledLog(lines.append, period=0.05)
     run_together(8, lambda thread: storm(log))
     wait_for(lambda: told(lines) == 4000, what=lambda: str(told(lines)))
 
 
-def storm(log: EventLog) -> None:
+def storm(log: ThrottledLog) -> None:
     for number in range(500):
         log(f"event {number}")

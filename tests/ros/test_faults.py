@@ -15,7 +15,7 @@ import rosgraph
 import rosservice
 from actionlib_msgs.msg import GoalStatus
 
-from rosafe.interface import FIXED, MAX_ACTIVITIES
+from rosafe.interface import CORE_REPRESENTATIONS, MAX_ACTIVITIES
 from tests.harness import Graph, Process, proc, run_together, wait_for
 from tests.ros.session import Session, noise, own_node, reader, told
 
@@ -152,7 +152,7 @@ def test_anything_at_all_from_eight_clients(afe: Session) -> None:
 
     run_together(8, work)
     there = afe.processors()
-    afe.wait_activities([FIXED[kind].request for kind, members in there.items() for _ in members])
+    afe.wait_activities([CORE_REPRESENTATIONS[kind].request for kind, members in there.items() for _ in members])
     topics = {afe.topic(kind, name) for kind, members in there.items() for name in members if kind != "input"}
     assert {t for t in afe.graph.topics() if "Port/" in t and t.startswith("/rosAFE/")} == topics
     for members in there.values():

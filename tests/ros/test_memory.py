@@ -8,7 +8,7 @@ from tests.harness import PYTHON, ROOT, Graph, proc
 SPREAD = """
 import random, threading
 from rosafe.component import memory
-memory.bound()
+memory.limit_arenas()
 def resident():
     return int(next(line for line in open("/proc/self/status") if line.startswith("VmRSS")).split()[1]) // 1024
 kept, before = [], resident()
@@ -19,7 +19,7 @@ def work(seed):
 threads = [threading.Thread(target=work, args=(seed,)) for seed in range(12)]
 [thread.start() for thread in threads]
 [thread.join() for thread in threads]
-memory.give_back()
+memory.trim()
 print(resident() - before)
 """
 

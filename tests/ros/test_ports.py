@@ -12,7 +12,7 @@ import rosAFE.srv
 import rospy
 
 from rosafe.component import wire
-from rosafe.interface import FIXED, ROSAFE, ros_type
+from rosafe.interface import CORE_REPRESENTATIONS, ROSAFE, ros_type
 from rosafe.ros import array_srv
 from tests.harness import wait_for
 from tests.ros.session import RATE, Session, assert_holds, ears, expected, noise, windowed
@@ -33,7 +33,7 @@ def test_every_port_holds_what_process_computes(afe: Session, seconds: float) ->
     signal = noise(4 * BLOCK)
     parameters = {"fb_nChannels": 3}
     with_nothing = expected(signal[:, :0], BLOCK, parameters)
-    for kind in FIXED:
+    for kind in CORE_REPRESENTATIONS:
         message = afe.read(kind)
         empty = with_nothing[kind]
         assert message.lastFrameIndex == 0
@@ -44,7 +44,7 @@ def test_every_port_holds_what_process_computes(afe: Session, seconds: float) ->
         end = blocks * BLOCK
         afe.microphone.play(signal[:, end - BLOCK : end])
         truth = expected(signal[:, :end], BLOCK, parameters)
-        for kind in FIXED:
+        for kind in CORE_REPRESENTATIONS:
             message = afe.read(kind, end + 1)
             assert_holds(message, kind, windowed(truth[kind], seconds, rate_of(kind, truth)))
             if kind in ("gammatone", "ihc", *FRAMED):
@@ -62,7 +62,7 @@ def test_the_default_tree_at_44100(afe: Session) -> None:
     signal = noise(12000 * blocks)
     microphone.play(signal)
     truth = expected(signal, 12000, rate=rate)
-    for kind in FIXED:
+    for kind in CORE_REPRESENTATIONS:
         message = afe.read(kind, 12000 * blocks + 1)
         frame_rate = truth[f"{kind}_frameRate"] if kind in FRAMED else rate
         assert message.framesOnPort == frame_rate
@@ -94,7 +94,7 @@ def test_a_late_subscriber_gets_the_newest(afe: Session) -> None:
 
 @pytest.mark.parametrize("kind", ["preProc", "ihc", "ild", "crossCorrelation"])
 def test_bytes_on_the_wire_are_those_of_the_generated_class(afe: Session, kind: str) -> None:
-    requests = CHAIN[: CHAIN.index(FIXED[kind].request) + 1]
+    requests = CHAIN[: CHAIN.index(CORE_REPRESENTATIONS[kind].request) + 1]
     microphone = afe.build(*requests, block=BLOCK, fb_nChannels=3, bufferSize_s_port=0.1)
     microphone.play(noise(BLOCK))
     raw = afe.graph.message(
@@ -102,7 +102,7 @@ def test_bytes_on_the_wire_are_those_of_the_generated_class(afe: Session, kind: 
         rospy.AnyMsg,
         accept=lambda m: int.from_bytes(m._buff[4:12], "little") == BLOCK + 1,
     )._buff
-    plain = getattr(rosAFE.msg, ros_type(ROSAFE.port(FIXED[kind].port).idl))().deserialize(raw)
+    plain = getattr(rosAFE.msg, ros_type(ROSAFE.port(CORE_REPRESENTATIONS[kind].port).idl))().deserialize(raw)
     again = io.BytesIO()
     plain.serialize(again)
     assert again.getvalue() == raw
@@ -214,18 +214,18 @@ def test_signals_are_what_is_new(afe: Session) -> None:
     microphone = afe.build(*CHAIN, block=BLOCK, bufferSize_s_getSignal=0.5, **parameters)
     signal = noise(5 * BLOCK)
     first = afe.ok("getSignals").signals
-    for kind in FIXED:
+    for kind in CORE_REPRESENTATIONS:
         (message,) = getattr(first, kind)
         assert (message.lastFrameIndex, message.framesOnPort) == (0, 0), "before any data"
-    seen = dict.fromkeys(FIXED, 0)
+    seen = dict.fromkeys(CORE_REPRESENTATIONS, 0)
     for blocks in (1, 3, 5):
         end = blocks * BLOCK
         microphone.play(signal[:, (microphone.index) : end])
-        for kind in FIXED:
+        for kind in CORE_REPRESENTATIONS:
             afe.read(kind, end + 1)
         signals = afe.ok("getSignals").signals
         truth = expected(signal[:, :end], BLOCK, parameters)
-        for kind in FIXED:
+        for kind in CORE_REPRESENTATIONS:
             (message,) = getattr(signals, kind)
             left, right = arrays(signals, kind)
             new = truth[kind][..., seen[kind] :]
@@ -241,7 +241,7 @@ def test_signals_are_what_is_new(afe: Session) -> None:
                 np.testing.assert_array_equal(left, new[0])
                 np.testing.assert_array_equal(right, new[1])
     again = afe.ok("getSignals").signals
-    for kind in FIXED:
+    for kind in CORE_REPRESENTATIONS:
         (message,) = getattr(again, kind)
         assert (message.lastFrameIndex, message.framesOnPort) == (5 * BLOCK + 1, 0), "nothing is new"
         assert arrays(again, kind)[0].size == 0
@@ -254,22 +254,22 @@ def test_many_calls_at_any_moment_get_every_frame_once(afe: Session) -> None:
     microphone = afe.build(*CHAIN, block=BLOCK, bufferSize_s_getSignal=2.0, **parameters)
     blocks = 14
     signal = noise(blocks * BLOCK)
-    got: dict[str, list[tuple[int, np.ndarray]]] = {kind: [] for kind in FIXED}
+    got: dict[str, list[tuple[int, np.ndarray]]] = {kind: [] for kind in CORE_REPRESENTATIONS}
 
     def call() -> None:
         signals = afe.ok("getSignals").signals
-        for kind in FIXED:
+        for kind in CORE_REPRESENTATIONS:
             (message,) = getattr(signals, kind)
             got[kind].append((message.lastFrameIndex, arrays(signals, kind)[0]))
 
     while microphone.index < signal.shape[1]:
         microphone.play(signal[:, microphone.index : microphone.index + 2 * BLOCK - 700])
         call()
-    for kind in FIXED:
+    for kind in CORE_REPRESENTATIONS:
         afe.read(kind, blocks * BLOCK + 1)
     call()
     truth = expected(signal, BLOCK, parameters)
-    for kind in FIXED:
+    for kind in CORE_REPRESENTATIONS:
         left, _ = ears(kind, truth[kind])
         np.testing.assert_array_equal(np.concatenate([piece for _, piece in got[kind]], axis=-1), left)
         seen = 0

@@ -26,8 +26,8 @@ from rospy.impl.tcpros_pubsub import TCPROSPub
 
 from rosafe.component import publisher
 from rosafe.component.publisher import MAX_WAITING, MAX_WAITING_BYTES, Publisher, send_pieces
-from rosafe.component.wire import Gather
-from rosafe.interface import FIXED
+from rosafe.component.wire import BufferList
+from rosafe.interface import CORE_REPRESENTATIONS
 from rosafe.ros import array_msg
 from tests.harness import PATIENCE, PYTHON, ROOT, Graph, Process, proc, wait_for
 from tests.ros.session import Session, noise, own_node
@@ -79,7 +79,7 @@ def test_what_the_system_left_over_is_sent_after_it(monkeypatch: pytest.MonkeyPa
 
 
 def test_gathered_pieces_are_counted_and_empty_ones_left_out() -> None:
-    out = Gather()
+    out = BufferList()
     for piece in (b"abc", b"", np.zeros(0), np.zeros(2), memoryview(b"1234")):
         out.write(piece)
     assert (len(out.pieces), out.size) == (3, 3 + 16 + 4)
@@ -328,6 +328,6 @@ def test_all_ports_for_a_while(tmp_path: Path) -> None:
     with Process(command, {**env, "HOME": str(tmp_path)}) as done:
         assert done.wait(200) == 0, done
         rows = re.findall(r"^\| (/rosAFE/\S+) \| (\d+) \| (\d+) \| (\d+) \|$", done.out, re.MULTILINE)
-    assert len(rows) == 2 * len(FIXED)
+    assert len(rows) == 2 * len(CORE_REPRESENTATIONS)
     for topic, came, expected, lost in rows:
         assert 2 < int(came) <= int(expected) and int(lost) == 0, topic

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from rosafe.interface import FIXED, KINDS, ROSAFE, Parameter, Representation, Service
+from rosafe.interface import CORE_REPRESENTATIONS, KINDS, ROSAFE, Parameter, Representation, Service
 from tests.ros.session import Session, told
 from tests.ros.test_requests import NAMES, snapshot
 
@@ -77,12 +77,12 @@ def test_values_outside_are_refused_by_service_and_action(afe: Session, service:
     assert snapshot(afe) == before
 
 
-@pytest.mark.parametrize("kind", FIXED)
+@pytest.mark.parametrize("kind", CORE_REPRESENTATIONS)
 def test_values_outside_are_refused_by_modify_parameter(afe: Session, kind: str) -> None:
     """There, zero is zero."""
-    afe.build(*(k.request for k in FIXED.values() if k.parent), fb_nChannels=2)
+    afe.build(*(k.request for k in CORE_REPRESENTATIONS.values() if k.parent), fb_nChannels=2)
     before = snapshot(afe)
-    for parameter in numeric(FIXED[kind].parameters):
+    for parameter in numeric(CORE_REPRESENTATIONS[kind].parameters):
         for value in outside(parameter):
             if value == 0 and parameter.idl != element(parameter):
                 continue  # a list of one zero is none
@@ -93,11 +93,11 @@ def test_values_outside_are_refused_by_modify_parameter(afe: Session, kind: str)
     assert snapshot(afe) == before
 
 
-@pytest.mark.parametrize("kind", [kind for kind in FIXED if FIXED[kind].parent])
+@pytest.mark.parametrize("kind", [kind for kind in CORE_REPRESENTATIONS if CORE_REPRESENTATIONS[kind].parent])
 def test_unknown_words_become_the_default_by_service_and_by_modify_parameter(afe: Session, kind: str) -> None:
     afe.build(*PARENTS, fb_nChannels=2)
     numbers = itertools.count(1)
-    for parameter in FIXED[kind].parameters:
+    for parameter in CORE_REPRESENTATIONS[kind].parameters:
         if not parameter.choices:
             continue
         for word, meant in [
@@ -105,7 +105,7 @@ def test_unknown_words_become_the_default_by_service_and_by_modify_parameter(afe
             *((word, parameter.fallback) for word in ("jespen", parameter.choices[0].upper(), "0", "ä b", "x" * 4000)),
         ]:
             name = f"word{next(numbers)}"
-            afe.ok(FIXED[kind].request, name=name, **{parameter.name: word})
+            afe.ok(CORE_REPRESENTATIONS[kind].request, name=name, **{parameter.name: word})
             (given,) = [p for p in getattr(afe.ok("getParameters").parameters, kind) if p.name == name]
             assert getattr(given, parameter.name) == meant
             afe.ok("modifyParameter", nameProc=name, nameParam=parameter.name, newValue=parameter.choices[-1])

@@ -12,13 +12,13 @@ import pytest
 import rospy
 
 from rosafe import process
-from rosafe.interface import FIXED, ROSAFE
+from rosafe.interface import CORE_REPRESENTATIONS, ROSAFE
 from tests import harness
 from tests.harness import wait_for
 from tests.ros.session import RATE, Session, noise, own_node
 
 CHAIN = ("PreProc", "GammatoneProc", "IhcProc", "IldProc", "RatemapProc", "CrossCorrelationProc")
-NAMES = {kind: [ROSAFE.service(k.request).parameter("name").default] for kind, k in FIXED.items()}
+NAMES = {kind: [ROSAFE.service(k.request).parameter("name").default] for kind, k in CORE_REPRESENTATIONS.items()}
 
 
 def snapshot(afe: Session) -> tuple[Any, set[str]]:
@@ -173,7 +173,7 @@ def test_zeros_are_defaults(afe: Session) -> None:
         afe.ok(request)
     assert afe.processors() == NAMES
     parameters = afe.ok("getParameters").parameters
-    for kind, table in FIXED.items():
+    for kind, table in CORE_REPRESENTATIONS.items():
         (told,) = getattr(parameters, kind)
         for parameter in table.parameters:
             if parameter.name not in ("fb_cfHz", "fb_nChannels"):
@@ -238,7 +238,7 @@ def test_parameters_come_back_exactly(afe: Session) -> None:
             parent = f"my_{request}"
     parameters = afe.ok("getParameters").parameters
     assert [p.name for p in parameters.preProc] == ["preProc", "my_PreProc"], "in the order of creation"
-    for kind, table in FIXED.items():
+    for kind, table in CORE_REPRESENTATIONS.items():
         if table.parent:
             told = getattr(parameters, kind)[-1]
             assert told.name == f"my_{table.request}"
@@ -293,7 +293,7 @@ def test_modify_parameter(afe: Session, name: str, parameter: str, text: str, va
     afe.build(*CHAIN, fb_nChannels=2)
     afe.ok("modifyParameter", nameProc=name, nameParam=parameter, newValue=text)
     parameters = afe.ok("getParameters").parameters
-    told = {p.name: p for kind in FIXED for p in getattr(parameters, kind)}[name]
+    told = {p.name: p for kind in CORE_REPRESENTATIONS for p in getattr(parameters, kind)}[name]
     real = {"pp_refSPLdBS": "pp_refSPLdB", "set_rm_scailing": "rm_scaling"}.get(parameter, parameter)
     assert getattr(told, real) == value
     if parameter == "cc_maxDelaySec":

@@ -18,7 +18,7 @@ from actionlib_msgs.msg import GoalStatusArray
 import bass.msg
 from rosafe.component import action_server, generate
 from rosafe.component.action_server import DEFAULT_FREQUENCY, StatusPublisher
-from rosafe.component.wire import Gather
+from rosafe.component.wire import BufferList
 from tests.harness import PATIENCE, PYTHON, Graph, wait_for
 
 GENERATOR = Path("/usr/lib/gencpp/gen_cpp.py")
@@ -98,11 +98,11 @@ class Counted:
     frequency = 1000.0
 
     def __init__(self) -> None:
-        self.asked = 0
+        self.request_values = 0
         self.in_use = False
 
-    def publish_again(self, idle: Gather) -> bool:
-        self.asked += 1
+    def publish_again(self, idle: BufferList) -> bool:
+        self.request_values += 1
         return self.in_use
 
 
@@ -116,13 +116,13 @@ def test_what_nobody_uses_costs_nothing(monkeypatch: pytest.MonkeyPatch) -> None
     thread = threading.Thread(target=statuses.run)
     thread.start()
     for _ in range(2):
-        server.in_use, asked = True, server.asked
+        server.in_use, asked = True, server.request_values
         statuses._in_use.set()
-        wait_for(lambda: server.asked >= asked + 5)  # noqa: B023
+        wait_for(lambda: server.request_values >= asked + 5)  # noqa: B023
         server.in_use = False
         wait_for(lambda: not statuses._in_use.is_set())
-        asked = server.asked
-        assert not finished.wait(0.05) and server.asked <= asked + 1
+        asked = server.request_values
+        assert not finished.wait(0.05) and server.request_values <= asked + 1
     finished.set()
     statuses._in_use.set()
     thread.join()

@@ -17,7 +17,7 @@ import rospy
 import soundfile
 from std_msgs.msg import String
 
-from rosafe.interface import FIXED
+from rosafe.interface import CORE_REPRESENTATIONS
 from rosafe.node.trace_port import TracePort, read
 from rosafe.tree.company import Observer
 from rosafe.tree.states import State
@@ -72,7 +72,8 @@ def test_a_real_run_shows_parents_children_and_siblings_at_work_at_once(afe: Ses
     assert 1 <= len(workers) <= len(os.sched_getaffinity(0)) + 1
     assert sum(len(row) for row in workers.values()) >= BLOCKS * len(rows), "each block is some worker's"
     assert list(rows) == [
-        f"{name} ({kind})" for kind, name in zip(FIXED, [*list(FIXED)[:-1], "crosscorrelation"], strict=True)
+        f"{name} ({kind})"
+        for kind, name in zip(CORE_REPRESENTATIONS, [*list(CORE_REPRESENTATIONS)[:-1], "crosscorrelation"], strict=True)
     ]
     for row in rows.values():
         assert [block for state, block, _, _ in row if state == "exec"] == list(range(BLOCKS))
@@ -117,7 +118,7 @@ def test_a_sound_file_without_ros(tmp_path: Path) -> None:
     done = rosafe("trace", sound, "-o", path, "--block", "882", "--seconds", "0.5", **nowhere)
     assert done.returncode == 0, done
     rows = spans(path)
-    assert len(rows) == len(FIXED)
+    assert len(rows) == len(CORE_REPRESENTATIONS)
     for row in rows.values():
         assert [block for state, block, _, _ in row if state == "exec"] == list(range(25))
     soundfile.write(sound, np.zeros((100, 1)), 44100)

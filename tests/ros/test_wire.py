@@ -134,7 +134,7 @@ def test_rows_as_they_lie_and_rows_copied_together(idl: str, blocks: list[int], 
         ours.left, ours.right = view.select(0), view.select(1)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(wire, "ROW_BYTES", row_bytes)
-        gathered = wire.Gather()
+        gathered = wire.BufferList()
         ours.serialize(gathered)
         assert serialized(ours) == serialized(plain)
     assert b"".join(gathered.pieces) == serialized(plain)
@@ -252,7 +252,7 @@ def test_truncated_messages_are_refused_wherever_they_end(idl: str) -> None:
 @settings(deadline=None, max_examples=200)
 @given(idl=st.sampled_from([*sorted(LEVELS), AUDIO]), data=st.binary(max_size=120))
 def test_garbage_is_refused_or_read_and_nothing_else(idl: str, data: bytes) -> None:
-    lenient = wire.lenient_class("rosAFE", idl, 100)().deserialize(data)
+    lenient = wire.tolerant_message_class("rosAFE", idl, 100)().deserialize(data)
     try:
         wire.message_class("rosAFE", idl)().deserialize(data)
     except genpy.DeserializationError as problem:

@@ -12,9 +12,9 @@ from hypothesis import strategies as st
 
 from rosafe.interface import KINDS, MAX_SETUP, Parameter
 from rosafe.representations import STAGES
-from rosafe.setups import Setup, SetupError, Sound, Wanted, read, wanted, write
+from rosafe.setups import Setup, SetupError, SetupProcessor, Sound, read, wanted, write
 from rosafe.setups.setup import parameters_of
-from rosafe.tree.requests import Found
+from rosafe.tree.requests import ExistingProcessor
 
 TREE = """\
 sound:
@@ -75,7 +75,7 @@ def _values(parameter: Parameter) -> st.SearchStrategy[Any]:
 _SIMPLE = [
     kind
     for kind in KINDS.values()
-    if STAGES[kind.kind].in_force.__func__ is STAGES["ihc"].in_force.__func__  # type: ignore[attr-defined]
+    if STAGES[kind.kind].effective_values.__func__ is STAGES["ihc"].effective_values.__func__  # type: ignore[attr-defined]
 ]
 
 
@@ -88,9 +88,9 @@ def test_every_parameter_to_the_last_digit(data: st.DataObject) -> None:
     while line[0].parent:
         line.insert(0, KINDS[line[0].parent])
     parents = ["", *(k.name for k in line[:-1])]
-    processors = [Wanted(k.name, k.kind, parent) for k, parent in zip(line, parents, strict=True)]
+    processors = [SetupProcessor(k.name, k.kind, parent) for k, parent in zip(line, parents, strict=True)]
     differing = {p.name: given[p.name] for p in parameters_of(kind) if given.get(p.name, p.default) != p.default}
-    processors[-1] = Wanted(kind.name, kind.kind, parents[-1], differing)
+    processors[-1] = SetupProcessor(kind.name, kind.kind, parents[-1], differing)
     setup = Setup(processors=tuple(processors))
     assert read(write(setup)) == setup
     assert read(write(setup, full=True)) == setup
@@ -109,7 +109,7 @@ def test_every_parameter_to_the_last_digit(data: st.DataObject) -> None:
 def test_a_filterbank_is_told_as_it_was_asked_for(values: dict[str, Any]) -> None:
     kind = KINDS["gammatone"]
     stage = STAGES["gammatone"](44100.0, **values)
-    found = wanted(Found("bank", "gammatone", "preProc", stage.parameters))
+    found = wanted(ExistingProcessor("bank", "gammatone", "preProc", stage.parameters))
     assert found.given == {name: value for name, value in values.items() if value != kind.parameter(name).default}
     assert STAGES["gammatone"](44100.0, **found.values).parameters == stage.parameters
 

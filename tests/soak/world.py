@@ -18,7 +18,7 @@ import rospy
 import soundfile
 
 from rosafe.component import registration, wire
-from rosafe.interface import BASS, FIXED, ROSAFE
+from rosafe.interface import BASS, CORE_REPRESENTATIONS, ROSAFE
 from rosafe.interface.arguments import check_parameters
 from rosafe.offline.chain import Chain
 from rosafe.tree.window import SlidingWindow, frames_in
@@ -27,7 +27,7 @@ from tests.genomix.world import Http, genomixd
 from tests.harness import free_port, proc, run_together, wait_for
 from tests.ros.session import Session, assert_holds
 
-NAMES = {kind: ROSAFE.service(entry.request).parameter("name").default for kind, entry in FIXED.items()}
+NAMES = {kind: ROSAFE.service(entry.request).parameter("name").default for kind, entry in CORE_REPRESENTATIONS.items()}
 TREE = {kind: [name] for kind, name in NAMES.items()}
 CHUNKS = 20  # on bass' port, as by default
 DRIFT = 0.15  # seconds that bass' frames may be off the clock: a chunk more or less, and a busy machine
@@ -158,7 +158,7 @@ class World:
         assert self.graph.call("/bass/Stop").genom_success
         self.afe.ok("Stop")
         self.afe.ok("InputProc", nFramesPerBlock=self.size.block)
-        for kind in list(FIXED.values())[1:]:
+        for kind in list(CORE_REPRESENTATIONS.values())[1:]:
             few = {"fb_nChannels": self.size.channels} if kind.kind == "gammatone" else {}
             self.afe.ok(kind.request, **few)
         before = self.counters()
@@ -188,9 +188,11 @@ class World:
 
         parameters = check_parameters({"fb_nChannels": self.size.channels} if self.size.channels else {})
         blocks = (self.frames(first, self.size.block) for first in range(1, end, self.size.block))
-        with Chain(blocks, self.size.rate, {"in_doNormalize": True, **parameters}, list(FIXED), keep) as chain:
+        with Chain(
+            blocks, self.size.rate, {"in_doNormalize": True, **parameters}, list(CORE_REPRESENTATIONS), keep
+        ) as chain:
             chain.run()
-        for kind in FIXED:
+        for kind in CORE_REPRESENTATIONS:
             assert_holds(self.afe.read(kind, end + 1), kind, truth[kind].view().array())
 
     def counters(self) -> dict[str, Any]:

@@ -116,7 +116,7 @@ def test_what_the_page_says_listens(setting: str, tmp_path: Path) -> None:
 def test_the_bounds_of_the_page() -> None:
     wanted = [
         door.OPENING_SECONDS,
-        door.GUESTS,
+        door.MAX_PENDING,
         inbound.HEADER_BYTES,
         inbound.BODY_BYTES,
         (door.DESCRIPTORS, door.RESERVE),

@@ -68,22 +68,22 @@ class Recorder:
         self.late: list[Processor] = []  # released something after their end
         self._turn = threading.Condition()
 
-    def added(self, processor: Processor) -> None:
+    def on_added(self, processor: Processor) -> None:
         with self._turn:
             self.processors.append(processor)
             self.blocks[processor] = []
 
-    def executed(self, processor: Processor, seconds: float) -> None:
+    def on_executed(self, processor: Processor, seconds: float) -> None:
         pass
 
-    def released(self, processor: Processor, block: Block) -> None:
+    def on_released(self, processor: Processor, block: Block) -> None:
         with self._turn:
             if processor in self.ends:
                 self.late.append(processor)
             self.blocks[processor].append(block)
             self._turn.notify_all()
 
-    def ended(self, processor: Processor) -> None:
+    def on_removed(self, processor: Processor) -> None:
         with self._turn:
             self.ends.append(processor)
             self._turn.notify_all()
@@ -118,7 +118,7 @@ class Plain(Stage):
         self.work(block)
         return block
 
-    def _with(self, changes: Mapping[str, Any]) -> dict[str, Any]:
+    def _checked_values(self, changes: Mapping[str, Any]) -> dict[str, Any]:
         return {**self.values, **changes}
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rosafe.interface import FIXED, ComponentError
+from rosafe.interface import CORE_REPRESENTATIONS, ComponentError
 from rosafe.tree import sizes
 from rosafe.tree.states import State
 from rosafe.tree.tree import Tree
@@ -56,7 +56,9 @@ CHANGES: dict[str, tuple[str, Any]] = {
     "cc_hSizeSec": ("0.02", 0.02),
     "cc_maxDelaySec": ("0.002", 0.002),
 }
-OWNER = {p.name: kind.kind for kind in FIXED.values() for p in kind.parameters}  # later kinds: tests/representations
+OWNER = {
+    p.name: kind.kind for kind in CORE_REPRESENTATIONS.values() for p in kind.parameters
+}  # later kinds: tests/representations
 
 
 def test_every_parameter_has_a_change_here() -> None:
@@ -206,7 +208,7 @@ def test_a_refused_change_does_not_touch_the_numbers(
             tree.modify(OWNER[name], name, text)
     settle(tree, feed, listener, *NOISE[2:4])
     outputs = chain().run(list(NOISE[:4]))
-    for kind in FIXED:
+    for kind in CORE_REPRESENTATIONS:
         assert_as(listener, tree, kind, outputs)
 
 
@@ -275,7 +277,7 @@ def test_another_number_of_channels_reaches_the_leaves(tree: Tree, feed: Feed, l
     grow(tree, feed)
     settle(tree, feed, listener, *NOISE[:2])
     tree.modify("gammatone", "fb_nChannels", "9")
-    assert {p.kind: p.rows for p in tree.processors if p.kind in LEAVES} == {
+    assert {p.kind: p.output_shape for p in tree.processors if p.kind in LEAVES} == {
         "ild": (9,),
         "ratemap": (2, 9),
         "crossCorrelation": (9, 37),

@@ -125,7 +125,7 @@ def test_a_block_that_nobody_hears_of_is_gone_once_the_children_have_done_with_i
     parent = tree.add("preProc", "parent", "input")
     children = [tree.add("gammatone", name, "parent") for name in ("one", "other")]
     for count, heard in ((2, False), (4, True)):
-        parent.heard = heard
+        parent.has_consumers = heard
         feed.put(count=2)
         for child in children:
             listener.wait_blocks(child, count)
@@ -162,7 +162,7 @@ def test_the_four_states(tree: Tree, listener: Recorder, feed: Feed, monkeypatch
     wait_for(lambda: parent.state is State.WAIT_RELEASE)  # its child still has the last block
     assert child.state is State.EXEC
     states: set[State] = set()
-    monkeypatch.setattr(Recorder, "released", lambda self, processor, block: states.add(processor.state))
+    monkeypatch.setattr(Recorder, "on_released", lambda self, processor, block: states.add(processor.state))
     go_on.set()
     wait_for(lambda: [p.state for p in (root, parent, child)] == [State.WAIT_EXEC] * 3)
     assert states == {State.RELEASE}

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from rosafe.dsp.guard import FloatArray
-from rosafe.dsp.signal import Signal
+from rosafe.dsp.signal import SignalFormat
 from rosafe.dsp.stage import Output, Stage
 from rosafe.interface import ComponentError
 from rosafe.representations import KINDS, STAGES
 from rosafe.tree.block import Block
-from rosafe.tree.changes import Changes
+from rosafe.tree.changes import ParameterUpdates
 from rosafe.tree.states import State
 from rosafe.tree.tree import Tree
 from rosafe.vocabulary.parameter import Parameter
@@ -54,7 +54,7 @@ class Coarser(Stage):
         return frames
 
     @cached_property
-    def output_format(self) -> Signal:
+    def output_format(self) -> SignalFormat:
         step = self.values["pp_step"]
         return replace(
             self.input_format,
@@ -80,7 +80,7 @@ class Picky(Stage):
     )
     INPUT = ("ear", "time")
 
-    def __init__(self, given: Signal | float, **parameters: Any) -> None:
+    def __init__(self, given: SignalFormat | float, **parameters: Any) -> None:
         self.held = np.zeros((2, 0))
         super().__init__(given, **parameters)
 
@@ -105,7 +105,7 @@ class Picky(Stage):
     def build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
         self._check(values)
 
-    def input_format_changed(self, before: Signal) -> None:
+    def input_format_changed(self, before: SignalFormat) -> None:
         self._check(self.values)
 
     def _check(self, values: dict[str, Any]) -> None:
@@ -151,7 +151,7 @@ def test_what_a_processor_tells_of_itself(tree: Tree, feed: Feed) -> None:
     coarser, picky, below = (tree.find(name) for name in ("coarser", "picky", "below"))
     assert (coarser.kind, picky.representation) == ("preProc", Picky.REPRESENTATION)
     assert (coarser.signal.hop, coarser.rate, picky.rate) == (2, RATE / 2, RATE / 2)
-    assert (picky.rows, picky.part_rows, below.rows) == ((2,), ((2,), ()), (2,))
+    assert (picky.output_shape, picky.output_shapes, below.output_shape) == ((2,), ((2,), ()), (2,))
     assert picky.axes == (("ear", "time"), ("time",))
     assert coarser.parameters() == {"pp_step": 2, "pp_lags": 10}
     assert coarser.derived() == {}
@@ -255,36 +255,36 @@ def test_a_change_waits_for_the_format_that_it_goes_with(
 
 def test_changes_in_an_order_that_only_goes_with_a_format_in_between() -> None:
     """The new format needs a change, and another change needs the new format."""
-    few, many = (replace(Signal.sound(RATE), lags=lags) for lags in (5, 20))
-    changes = Changes(Picky(many, fb_least=20))
+    few, many = (replace(SignalFormat.sound(RATE), lags=lags) for lags in (5, 20))
+    changes = ParameterUpdates(Picky(many, fb_least=20))
     for name, value in (("fb_least", 3), ("fb_held", 1)):
-        changes.accept(changes.plan(name, value), name, value)
-    changes.planned = changes.follow(few)
-    changes.accept(changes.plan("fb_least", 5), "fb_least", 5)
+        changes.enqueue(changes.preview(name, value), name, value)
+    changes.final_stage = changes.preview_input(few)
+    changes.enqueue(changes.preview("fb_least", 5), "fb_least", 5)
     with pytest.raises(ValueError, match="fb_least"):
-        changes.plan("fb_least", 6)
-    stage = changes.stage_for(Block(0, (np.zeros((2, 4)),), 4, few))
+        changes.preview("fb_least", 6)
+    stage = changes.stage_for_block(Block(0, (np.zeros((2, 4)),), 4, few))
     assert stage is not None
     assert stage.parameters == {"fb_least": 5, "fb_held": 1, "fb_squares": False}
-    assert changes.stage_for(Block(1, (np.zeros((2, 4)),), 8, few)) is stage
+    assert changes.stage_for_block(Block(1, (np.zeros((2, 4)),), 8, few)) is stage
 
 
 def test_a_format_that_nobody_can_use_yet_is_skipped() -> None:
     """A stage that was made for the coming format, before a block of the last one."""
-    few, many = (replace(Signal.sound(RATE), lags=lags) for lags in (5, 20))
-    changes = Changes(Picky(many, fb_least=20))
-    planned = changes.planned
-    assert changes.stage_for(Block(0, (np.zeros((2, 4)),), 4, few)) is None
-    assert changes.planned is planned
-    assert changes.stage_for(Block(1, (np.zeros((2, 4)),), 8, many)) is planned
+    few, many = (replace(SignalFormat.sound(RATE), lags=lags) for lags in (5, 20))
+    changes = ParameterUpdates(Picky(many, fb_least=20))
+    planned = changes.final_stage
+    assert changes.stage_for_block(Block(0, (np.zeros((2, 4)),), 4, few)) is None
+    assert changes.final_stage is planned
+    assert changes.stage_for_block(Block(1, (np.zeros((2, 4)),), 8, many)) is planned
 
 
 def test_what_is_planned_is_not_changed_by_a_block_of_the_last_format() -> None:
-    few, many = (replace(Signal.sound(RATE), lags=lags) for lags in (5, 20))
-    changes = Changes(Picky(many, fb_least=1))
-    stage = changes.stage_for(Block(0, (np.zeros((2, 4)),), 4, few))
+    few, many = (replace(SignalFormat.sound(RATE), lags=lags) for lags in (5, 20))
+    changes = ParameterUpdates(Picky(many, fb_least=1))
+    stage = changes.stage_for_block(Block(0, (np.zeros((2, 4)),), 4, few))
     assert stage is not None
-    assert (stage.output_format.lags, changes.planned.output_format.lags) == (5, 20)
+    assert (stage.output_format.lags, changes.final_stage.output_format.lags) == (5, 20)
 
 
 def test_by_products_go_to_those_that_need_them(tree: Tree, feed: Feed, listener: Recorder) -> None:

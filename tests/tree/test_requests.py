@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rosafe.interface import FIXED, ComponentError
+from rosafe.interface import CORE_REPRESENTATIONS, ComponentError
 from rosafe.representations import STAGES
 from rosafe.tree import sizes
 from rosafe.tree.block import Block
@@ -39,11 +39,11 @@ def refused(tree: Tree, ex: str, what: str, request: Any, *arguments: Any) -> No
 
 def test_the_tree_of_the_guide(tree: Tree, feed: Feed, listener: Recorder) -> None:
     grow(tree, feed)
-    assert [p.name for p in tree.processors] == [p.kind for p in tree.processors] == list(FIXED)
+    assert [p.name for p in tree.processors] == [p.kind for p in tree.processors] == list(CORE_REPRESENTATIONS)
     assert tree.dependencies("ratemap") == ["input", "preProc", "gammatone", "ihc", "ratemap"]
     assert tree.dependencies("input") == ["input"]
     assert tree.input is tree.find("input")
-    rows = {p.kind: p.rows for p in tree.processors}
+    rows = {p.kind: p.output_shape for p in tree.processors}
     assert rows["input"] == rows["preProc"] == (2,)
     assert rows["gammatone"] == rows["ihc"] == rows["ratemap"] == (2, 5)
     assert (rows["ild"], rows["crossCorrelation"]) == ((5,), (5, 37))
@@ -51,7 +51,7 @@ def test_the_tree_of_the_guide(tree: Tree, feed: Feed, listener: Recorder) -> No
     feed.put(count=4)
     for processor in tree.processors:
         listener.wait_blocks(processor, 4)
-        assert listener.data(processor).shape == (*processor.rows, 640 if processor.rate == RATE else 3)
+        assert listener.data(processor).shape == (*processor.output_shape, 640 if processor.rate == RATE else 3)
         assert processor.next_index == 640
 
 
@@ -355,7 +355,7 @@ def test_bad_samples_end_the_input_with_a_reason(tree: Tree, feed: Feed, listene
     assert "not finite" in str(root.error)
 
 
-@pytest.mark.parametrize("when", ["added", "released"])
+@pytest.mark.parametrize("when", ["on_added", "on_released"])
 def test_a_listener_that_fails(
     tree: Tree, feed: Feed, listener: Recorder, when: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -369,7 +369,7 @@ def test_a_listener_that_fails(
 
     monkeypatch.setattr(Recorder, when, fail)
     root = tree.add_input("input", feed, 160, 1.0, 1.0)
-    if when == "added":
+    if when == "on_added":
         with pytest.raises(OSError, match="no space"):
             tree.add("preProc", "unlucky", "input")
     else:

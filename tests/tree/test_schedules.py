@@ -61,17 +61,17 @@ class Log:
         self.numbers: dict[Processor, list[int]] = {}
         self.ends: list[Processor] = []
 
-    def added(self, processor: Processor) -> None:
+    def on_added(self, processor: Processor) -> None:
         self.numbers[processor] = []
 
-    def executed(self, processor: Processor, seconds: float) -> None:
+    def on_executed(self, processor: Processor, seconds: float) -> None:
         pass
 
-    def released(self, processor: Processor, block: Block) -> None:
+    def on_released(self, processor: Processor, block: Block) -> None:
         assert processor not in self.ends
         self.numbers[processor].append(int(block.data[0, 0]))
 
-    def ended(self, processor: Processor) -> None:
+    def on_removed(self, processor: Processor) -> None:
         self.ends.append(processor)
 
     def assert_run(self, processor: Processor, first: int | None, last: int | None) -> None:
@@ -160,7 +160,7 @@ def pass_on(scheduler: Scheduler, count: int) -> Check:
     root = tree.add_input("input", source, 1, 0.0, 0.0)
     middle = tree.add("preProc", "middle", "input")
     below = tree.add("gammatone", "below", "middle")
-    root.heard = middle.heard = False
+    root.has_consumers = middle.has_consumers = False
     source.numbers.extend(range(3))
     source.wake()
     source.ended = True
@@ -297,7 +297,7 @@ class Failing(Plain):
 @pytest.fixture(autouse=True)
 def plain(monkeypatch: pytest.MonkeyPatch) -> None:
     use_plain_stages(monkeypatch, preProc=Failing)
-    monkeypatch.setattr(workers, "SHORT", 0.0)
+    monkeypatch.setattr(workers, "WAKE_THRESHOLD_SECONDS", 0.0)
 
 
 def go(patch: pytest.MonkeyPatch, scenario: Scenario, count: int, delays: int, walks: int) -> int:
@@ -317,13 +317,13 @@ def test_any_order_of_events(
     scenario: Scenario, delays: int, count: int, telling: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Other workers are called whenever there is something to do; the world is told at once, or later."""
-    monkeypatch.setattr(processor, "SHORT", telling)
+    monkeypatch.setattr(processor, "WAKE_THRESHOLD_SECONDS", telling)
     assert go(monkeypatch, scenario, count, delays, WALKS) > WALKS + 15
 
 
 @pytest.mark.parametrize("scenario", [grow, hear, shrink, replace_input])
 def test_any_order_of_events_where_calls_are_rare(scenario: Scenario, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(workers, "SHORT", math.inf)
+    monkeypatch.setattr(workers, "WAKE_THRESHOLD_SECONDS", math.inf)
     assert go(monkeypatch, scenario, 2, 1, WALKS) > WALKS + 15
 
 
@@ -332,13 +332,13 @@ def test_any_order_of_events_where_calls_are_rare(scenario: Scenario, monkeypatc
 
 def test_the_exploration_finds_a_parent_that_does_not_wait(monkeypatch: pytest.MonkeyPatch) -> None:
     """It releases while a child holds the last block, or has not taken it."""
-    done = StateMachine.done
+    done = StateMachine.finish_block
 
     def release_anyway(self: StateMachine, private: Block | None) -> None:
-        self._holders.clear()
+        self._readers.clear()
         done(self, private)
 
-    monkeypatch.setattr(StateMachine, "done", release_anyway)
+    monkeypatch.setattr(StateMachine, "finish_block", release_anyway)
     with pytest.raises(AssertionError, match="released"):
         go(monkeypatch, grow, 2, 1, WALKS)
 
@@ -349,16 +349,16 @@ def test_the_exploration_finds_a_look_at_tokens_that_is_out_of_date(monkeypatch:
     def take_later(self: Processor) -> bool:
         if not self.ready:
             return False
-        self.at_work = True
-        self.taken = self._token
+        self.busy = True
+        self.current_block = self._next_block
         self._lock.release()
         self._lock.acquire()
-        self.called, self._token, self._reading = False, None, self.parent
-        if self.taken is not None:
-            self._enter(State.EXEC, self.taken.number)
+        self.input_pending, self._next_block, self._block_owner = False, None, self.parent
+        if self.current_block is not None:
+            self._set_state(State.EXEC, self.current_block.number)
         return True
 
-    monkeypatch.setattr(Processor, "begin", take_later)
+    monkeypatch.setattr(Processor, "begin_work", take_later)
     with pytest.raises(AssertionError, match=r"released|deadlock"):
         go(monkeypatch, replace_input, 2, 2, WALKS)
 
@@ -368,42 +368,42 @@ def test_the_exploration_finds_a_token_for_the_wrong_zone(monkeypatch: pytest.Mo
 
     def give_back_to_the_present_parent(self: StateMachine) -> None:
         if self.parent is not None:
-            self.parent._freed_by(self)
+            self.parent._reader_done(self)
 
-    monkeypatch.setattr(StateMachine, "give_back", give_back_to_the_present_parent)
+    monkeypatch.setattr(StateMachine, "release_input", give_back_to_the_present_parent)
     with pytest.raises(AssertionError, match="released"):
         go(monkeypatch, replace_input, 2, 0, WALKS)
 
 
 def test_the_exploration_finds_a_deadlock(monkeypatch: pytest.MonkeyPatch) -> None:
     """A child that does not say that it is done."""
-    monkeypatch.setattr(StateMachine, "_freed_by", lambda self, child: self._holders.discard(child))
+    monkeypatch.setattr(StateMachine, "_reader_done", lambda self, child: self._readers.discard(child))
     with pytest.raises(AssertionError, match="deadlock"):
         go(monkeypatch, grow, 2, 0, WALKS)
 
 
 def test_the_exploration_finds_a_task_that_two_work_on(monkeypatch: pytest.MonkeyPatch) -> None:
     """An input that was called twice, and is taken up twice."""
-    begin = StateMachine.begin
+    begin = StateMachine.begin_work
 
     def begin_though_at_work(self: StateMachine) -> bool:
-        self.at_work = False
+        self.busy = False
         return begin(self)
 
-    monkeypatch.setattr(StateMachine, "begin", begin_though_at_work)
+    monkeypatch.setattr(StateMachine, "begin_work", begin_though_at_work)
     with pytest.raises(AssertionError):
         go(monkeypatch, hear, 2, 1, WALKS)
 
 
 def test_the_exploration_finds_a_call_that_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
     """An input that forgets, after it has looked for sound in vain, that it was called meanwhile."""
-    rest = Processor.rest
+    rest = Processor.end_work
 
     def forget(self: Processor) -> None:
-        self.called = self.called and self.state is not State.WAIT_EXEC
+        self.input_pending = self.input_pending and self.state is not State.WAIT_EXEC
         rest(self)
 
-    monkeypatch.setattr(Processor, "rest", forget)
+    monkeypatch.setattr(Processor, "end_work", forget)
     with pytest.raises(AssertionError, match="deadlock"):
         go(monkeypatch, hear, 2, 1, WALKS)
 

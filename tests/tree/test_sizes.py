@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import rosafe
-from rosafe.dsp.signal import Signal
+from rosafe.dsp.signal import SignalFormat
 from rosafe.interface import ComponentError
 from rosafe.representations import STAGES
 from rosafe.tree import sizes
@@ -20,8 +20,8 @@ from .support import Feed
 RATE = 16000.0
 CHANNELS = 20
 FREQUENCIES = tuple(np.geomspace(80.0, 7000.0, CHANNELS))
-FRAMES = Signal(RATE, 100.0, True, 160, 320, FREQUENCIES)
-SOUND = Signal(RATE, RATE, False, 1, 1, FREQUENCIES)
+FRAMES = SignalFormat(RATE, 100.0, True, 160, 320, FREQUENCIES)
+SOUND = SignalFormat(RATE, RATE, False, 1, 1, FREQUENCIES)
 
 
 @pytest.mark.parametrize(
@@ -36,7 +36,7 @@ SOUND = Signal(RATE, RATE, False, 1, 1, FREQUENCIES)
     ids=lambda value: value if isinstance(value, str) else "",
 )
 def test_what_a_stage_keeps_is_what_it_says(
-    kind: str, given: Signal, parameters: dict[str, Any], blocks: list[int]
+    kind: str, given: SignalFormat, parameters: dict[str, Any], blocks: list[int]
 ) -> None:
     rng = np.random.default_rng(0)
     STAGES[kind](given, **parameters).process(*arguments(kind, rng, 50))  # tables that all of its kind share
@@ -99,7 +99,7 @@ def test_states_have_their_share_of_the_memory(monkeypatch: pytest.MonkeyPatch) 
     """Each of them would do, and all together not."""
     stages = [(STAGES["gabor"](FRAMES), (2, CHANNELS)) for _ in range(4)]
     one = sizes.state_size(*stages[0]) + sizes.output_size(*stages[0], 1.0)
-    monkeypatch.setattr(sizes, "machine_memory", lambda: int(one * 3.5 / sizes.SHARE))
+    monkeypatch.setattr(sizes, "machine_memory", lambda: int(one * 3.5 / sizes.MAX_MEMORY_FRACTION))
     sizes.check_all(stages[:3], 1.0)
     with pytest.raises(ValueError, match=r"4 processors, and their states, take .* of this machine's memory"):
         sizes.check_all(stages, 1.0)

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rosafe.dsp.signal import Signal
+from rosafe.dsp.signal import SignalFormat
 from rosafe.tree.block import Block
-from rosafe.tree.states import ENDS, State, StateMachine
+from rosafe.tree.states import FINAL_STATES, State, StateMachine
 
-SIGNAL = Signal.sound(1.0)
+SIGNAL = SignalFormat.sound(1.0)
 Saved = tuple[list[dict[str, Any]], dict[str, tuple[int, ...]]]
 STEPS = {"": (), "compute": ("compute", "skip"), "tell": ("tell", "rest"), "rest": ("rest",)}  # of a worker
 
@@ -43,28 +43,34 @@ class Machine(StateMachine):
         return self.name
 
     def save(self) -> dict[str, Any]:
-        return {**self.__dict__, "children": tuple(self.children), "_holders": frozenset(self._holders)}
+        return {**self.__dict__, "children": tuple(self.children), "_readers": frozenset(self._readers)}
 
     def load(self, saved: dict[str, Any]) -> None:
         self.__dict__.update(saved)
-        self.children, self._holders = list(saved["children"]), set(saved["_holders"])
+        self.children, self._readers = list(saved["children"]), set(saved["_readers"])
 
-    def rouse(self) -> None:
+    def on_ready(self) -> None:
         assert self.ready
         self.roused = True
 
-    def settle(self) -> None:
-        assert self.over
+    def on_finished(self) -> None:
+        assert self.finished
         self.settled = True
 
     def fingerprint(self) -> tuple[Any, ...]:
         """All that `save` keeps and that changes; of a block only its number."""
-        taken, shared, untold, private, token = self.taken, self.shared, self.untold, self._private, self._token
+        taken, shared, untold, private, token = (
+            self.current_block,
+            self.last_block,
+            self.unpublished_block,
+            self._pending_block,
+            self._next_block,
+        )
         return (
-            *(self.state, self.at_work, self.called, self.attached, self.roused, self.settled, self.then),
+            *(self.state, self.busy, self.input_pending, self.attached, self.roused, self.settled, self.then),
             *(taken and taken.number, shared and shared.number, untold and untold.number),
             *(private and private.number, token and token.number),
-            *(self.parent, self._reading, frozenset(self.children), frozenset(self._holders)),
+            *(self.parent, self._block_owner, frozenset(self.children), frozenset(self._readers)),
             *(self.seen, self.released, self.told),
         )
 
@@ -97,8 +103,8 @@ class World:
 
     def attach(self, machine: Machine) -> None:
         machine.attached = True
-        if machine.parent is not None and machine.parent.shared is not None:
-            machine.begins = machine.parent.shared.number
+        if machine.parent is not None and machine.parent.last_block is not None:
+            machine.begins = machine.parent.last_block.number
         machine.attach()
 
     def steps(self) -> list[tuple[str, str]]:
@@ -110,13 +116,13 @@ class World:
         if not one.attached:
             if above is None:
                 return ["replace"] if self.machines["root"].state is not State.DONE else []
-            return ["come"] if above.attached and not above.gone else []  # type: ignore[attr-defined]
+            return ["come"] if above.attached and not above.removed else []  # type: ignore[attr-defined]
         steps = [*STEPS[one.then]]
         if self.fails and one.then in ("compute", "tell"):
             steps.append("fail")
-        if above is not None and not one.gone:
+        if above is not None and not one.removed:
             steps.append("go")
-        if above is None and not self.called_once and not one.called and one.state not in ENDS:
+        if above is None and not self.called_once and not one.input_pending and one.state not in FINAL_STATES:
             steps.append("call")
         if one.roused and one.ready:
             steps.append("begin")
@@ -162,56 +168,56 @@ class World:
         self.attach(new)
 
     def call(self, one: Machine) -> None:
-        one.call()
+        one.notify_input()
 
     # what a worker does, each step with the lock held
 
     def begin(self, one: Machine) -> None:
         one.roused = False
         telling = one.state is State.RELEASE
-        assert one.begin()
+        assert one.begin_work()
         if telling:
             one.then = "tell"
             return
         if one.parent is None and self.coming[one.name]:
             first, *rest = self.coming[one.name]
             self.coming[one.name] = tuple(rest)
-            one.read(block(first))
+            one.accept_input_block(block(first))
         elif one.parent is None:
-            one.finish()
+            one.end_of_stream()
             one.then = "rest"
             return
-        assert one.taken is not None
-        assert one.seen or one.begins in (one.taken.number, None)
-        one.seen += (one.taken.number,)
+        assert one.current_block is not None
+        assert one.seen or one.begins in (one.current_block.number, None)
+        one.seen += (one.current_block.number,)
         one.then = "compute"
 
     def compute(self, one: Machine) -> None:
-        assert one.taken is not None
-        one.done(block(one.taken.number))
-        one.then = "rest" if one.untold is None else "tell"
+        assert one.current_block is not None
+        one.finish_block(block(one.current_block.number))
+        one.then = "rest" if one.unpublished_block is None else "tell"
 
     def skip(self, one: Machine) -> None:
         """A block that it cannot use."""
-        one.done(None)
+        one.finish_block(None)
         one.then = "rest"
 
     def fail(self, one: Machine) -> None:
         """Also one that has computed, and cannot tell of it."""
-        one.finish()
+        one.end_of_stream()
         one.then = "rest"
 
     def tell(self, one: Machine) -> None:
-        if one.untold is not None:
-            if not one.gone:
-                one.told += (one.untold.number,)
-            one.untold = None
+        if one.unpublished_block is not None:
+            if not one.removed:
+                one.told += (one.unpublished_block.number,)
+            one.unpublished_block = None
         one.then = "rest"
 
     def rest(self, one: Machine) -> None:
         """Also before it has told: somebody else may do that."""
         one.then = ""
-        one.rest()
+        one.end_work()
 
     # what holds
 
@@ -225,12 +231,12 @@ class World:
             assert one.told == one.released[: len(one.told)], f"{one.name} told {one.told} of {one.released}"
             if one.ready:
                 assert one.roused, f"{one.name} is ready, and nobody knows"
-            reading = one._reading
-            if reading is not None and not reading.gone and not one.gone:
-                assert one.taken is reading.shared, "a block changed under its reader"
-            assert one.settled == (one.attached and one.over), f"{one.name} is over, and nobody knows"
+            reading = one._block_owner
+            if reading is not None and not reading.removed and not one.removed:
+                assert one.current_block is reading.last_block, "a block changed under its reader"
+            assert one.settled == (one.attached and one.finished), f"{one.name} is over, and nobody knows"
             assert (one.parent is None) or (one in one.parent.children) == (
-                one.attached and not one.gone and not one.parent.gone
+                one.attached and not one.removed and not one.parent.removed
             )
 
     def released(self, child: Machine, numbers: range) -> list[int]:
@@ -242,12 +248,12 @@ class World:
 
     def check_end(self) -> None:
         """Where nothing can happen any more but that somebody comes or goes."""
-        replaced = self.machines["root"].gone
+        replaced = self.machines["root"].removed
         for one in self.machines.values():
-            if one.attached and not one.gone:
-                assert one.over and one.state is State.DONE, f"{one.name} waits for ever"
-                assert not one._holders
-                assert one.untold is None or self.fails
+            if one.attached and not one.removed:
+                assert one.finished and one.state is State.DONE, f"{one.name} waits for ever"
+                assert not one._readers
+                assert one.unpublished_block is None or self.fails
                 if one.parent is not None and one.begins is not None and not replaced:
                     all_seen = one.seen[-1:] == one.parent.released[-1:]  # type: ignore[attr-defined]
                     assert all_seen or self.fails
@@ -311,14 +317,14 @@ def test_each_may_fail() -> None:
 
 
 def test_a_call_that_is_forgotten_while_it_tells_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    begin = StateMachine.begin
+    begin = StateMachine.begin_work
 
     def forget(self: StateMachine) -> bool:
         begun = begin(self)
-        self.called = False
+        self.input_pending = False
         return begun
 
-    monkeypatch.setattr(StateMachine, "begin", forget)
+    monkeypatch.setattr(StateMachine, "begin_work", forget)
     with pytest.raises(AssertionError, match="waits for ever"):
         explore(World(CHILD, 3, called_once=True))
 
@@ -326,14 +332,14 @@ def test_a_call_that_is_forgotten_while_it_tells_is_found(monkeypatch: pytest.Mo
 @pytest.mark.parametrize(
     ("name", "mutant", "fault"),
     [
-        ("_freed_by", lambda self, child: self._holders.discard(child), "waits for ever"),
+        ("_reader_done", lambda self, child: self._readers.discard(child), "waits for ever"),
         (
-            "give_back",
-            lambda self: self.parent and self.parent._freed_by(self),
+            "release_input",
+            lambda self: self.parent and self.parent._reader_done(self),
             "changed under its reader|waits for ever|saw",
         ),
         ("_end_if_exhausted", lambda self: None, "waits for ever"),
-        ("_leave", lambda self: self.parent and self.parent.children.remove(self), "waits for ever|changed|assert"),
+        ("_detach", lambda self: self.parent and self.parent.children.remove(self), "waits for ever|changed|assert"),
     ],
 )
 def test_faults_are_found(name: str, mutant: Any, fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -351,24 +357,24 @@ def machine(name: str, parent: Machine | None = None, *released: int) -> Machine
     one = Machine(name, parent)
     one.attach()
     for number in released:
-        one.done(block(number))
-        one.untold = None
-        one.rest()
+        one.finish_block(block(number))
+        one.unpublished_block = None
+        one.end_work()
     return one
 
 
 def test_a_block_is_not_released_while_a_child_holds_the_last_one() -> None:
     parent = machine("parent")
     child = machine("child", parent)
-    parent.done(block(0))
-    child.begin()
-    assert child.taken is parent.shared
-    parent.rest()
-    parent.done(block(1))
+    parent.finish_block(block(0))
+    child.begin_work()
+    assert child.current_block is parent.last_block
+    parent.end_work()
+    parent.finish_block(block(1))
     assert parent.state is State.WAIT_RELEASE
-    assert [one.number for one in (parent.shared, parent._private) if one is not None] == [0, 1]
-    child.give_back()
-    assert [one.number for one in (parent.shared, parent._private) if one is not None] == [1]
+    assert [one.number for one in (parent.last_block, parent._pending_block) if one is not None] == [0, 1]
+    child.release_input()
+    assert [one.number for one in (parent.last_block, parent._pending_block) if one is not None] == [1]
 
 
 def test_a_token_is_taken_once() -> None:
@@ -377,34 +383,34 @@ def test_a_token_is_taken_once() -> None:
     taken = []
     for _ in range(2):
         ready = late.ready
-        assert late.begin() == ready
-        taken.append((ready, late.taken))
-        late.give_back()
-        late.rest()
-    assert taken == [(True, parent.shared), (False, None)]
+        assert late.begin_work() == ready
+        taken.append((ready, late.current_block))
+        late.release_input()
+        late.end_work()
+    assert taken == [(True, parent.last_block), (False, None)]
 
 
 def test_siblings_read_the_same_memory() -> None:
     parent = machine("parent")
     siblings = [machine(name, parent) for name in "abc"]
-    parent.done(block(0))
+    parent.finish_block(block(0))
     for child in siblings:
-        child.begin()
-    assert all(child.taken is parent.shared for child in siblings)
+        child.begin_work()
+    assert all(child.current_block is parent.last_block for child in siblings)
     for child in siblings:
-        assert parent._holders
-        child.give_back()
-    assert not parent._holders
+        assert parent._readers
+        child.release_input()
+    assert not parent._readers
 
 
 def test_one_that_was_removed_releases_nothing_and_holds_up_nobody() -> None:
     parent = machine("parent")
     child = machine("child", parent)
-    parent.done(block(0))
-    child.begin()
+    parent.finish_block(block(0))
+    child.begin_work()
     child.remove()
-    assert not parent._holders
-    child.give_back()
-    child.done(block(0))
-    child.rest()
-    assert child.over and child.shared is None and not child.ready
+    assert not parent._readers
+    child.release_input()
+    child.finish_block(block(0))
+    child.end_work()
+    assert child.finished and child.last_block is None and not child.ready

@@ -63,7 +63,7 @@ def test_overlap_of_parent_and_child_and_of_siblings(
     trace = Trace(tracer.take())
 
     assert list(trace.processors) == ["input", "parent", "a", "b"], "parents first"
-    assert set(trace.kin()) == {
+    assert set(trace.related_pairs()) == {
         ("input", "parent", "parent and child"),
         ("parent", "a", "parent and child"),
         ("parent", "b", "parent and child"),
@@ -75,9 +75,9 @@ def test_overlap_of_parent_and_child_and_of_siblings(
     assert trace.workers == ["worker 1", "worker 2", "worker 3"]
     assert all(span.worker in trace.workers for span in trace.spans if span.state == State.EXEC.value)
     for name in ("a", "b"):
-        together = {(one.block, other.block) for one, other in trace.together("parent", name)}
+        together = {(one.block, other.block) for one, other in trace.overlap("parent", name)}
         assert {(n + 1, n) for n in range(last)} <= together, "the parent at block n + 1, the child at block n"
-    assert {(n, n) for n in range(last + 1)} <= {(a.block, b.block) for a, b in trace.together("a", "b")}
+    assert {(n, n) for n in range(last + 1)} <= {(a.block, b.block) for a, b in trace.overlap("a", "b")}
 
 
 def test_nothing_is_noted_after_the_end(tree: Tree, listener: Recorder, feed: Feed) -> None:
@@ -127,8 +127,8 @@ def test_spans_overlap_and_shares() -> None:
     trace = Trace(EVENTS)
     assert (trace.begin, trace.end) == (0, 1000)
     assert [(s.begin, s.end, s.block) for s in trace.of("root", State.EXEC)] == [(0, 400, 7), (600, 1000, 8)]
-    assert [(a.block, b.block) for a, b in trace.together("root", "child")] == [(8, 7)]
-    assert trace.at_once() == {0: 100, 1: 600, 2: 300}
+    assert [(a.block, b.block) for a, b in trace.overlap("root", "child")] == [(8, 7)]
+    assert trace.concurrency() == {0: 100, 1: 600, 2: 300}
     summary = "\n".join(trace.summary())
     assert "somebody computes in 90.0% of the time; of that, two or more at once in 33%, 1.33 on average" in summary
     assert "root and child           0.3 ms  (parent and child)" in summary

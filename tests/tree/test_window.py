@@ -8,7 +8,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from rosafe.dsp.signal import Signal
+from rosafe.dsp.signal import SignalFormat
 from rosafe.tree.block import Block
 from rosafe.tree.history import History
 from rosafe.tree.window import MAX_PIECES, SlidingWindow, WindowView, frames_in
@@ -50,7 +50,7 @@ def test_a_history_is_what_came_since_it_was_taken(
     rows: tuple[int, ...], capacity: int, steps: list[int | str]
 ) -> None:
     """Each reader (a word) has a memory of its own, and the second part goes with the first."""
-    signal = Signal.sound(100.0)
+    signal = SignalFormat.sound(100.0)
     history = History([rows, (7,)], signal, capacity / 100)
     sizes = [step for step in steps if isinstance(step, int)]
     blocks = zip(numbered(rows, sizes), numbered((7,), sizes), strict=True)
@@ -61,7 +61,7 @@ def test_a_history_is_what_came_since_it_was_taken(
         if isinstance(step, str):
             end = came[0].shape[-1]
             first = max(read.get(step, 0), end - capacity)
-            taken.append((history.take(step), [part[..., first:] for part in came], end))
+            taken.append((history.read_new(step), [part[..., first:] for part in came], end))
             read[step] = end
         else:
             parts = next(blocks)
@@ -77,23 +77,28 @@ def test_a_history_is_what_came_since_it_was_taken(
 
 
 def test_a_history_grows_and_shrinks_with_its_seconds() -> None:
-    signal = Signal.sound(10.0)
+    signal = SignalFormat.sound(10.0)
     history = History([(2,)], signal, 0.5)
     whole = np.arange(40.0).reshape(2, 20)
     for first, seconds in ((0, 1.0), (10, 2.0), (15, 0.3)):
         history.append(Block(0, (whole[:, first : first + 5],), first + 5, signal))
         history.seconds = seconds
     history.append(Block(0, (whole[:, 18:19],), 19, signal))
-    (view,) = history.take("x").parts
+    (view,) = history.read_new("x").parts
     np.testing.assert_array_equal(view.array(), whole[:, [18, 19, 18]])
 
 
 def test_a_history_begins_anew_with_other_rows_or_another_rate() -> None:
-    signal = Signal.sound(10.0)
+    signal = SignalFormat.sound(10.0)
     history = History([(2,)], signal, 1.0)
-    for rows, of in (((2,), signal), ((3,), signal), ((3,), Signal.sound(20.0)), ((3,), Signal(10.0, 20.0, lags=5))):
+    for rows, of in (
+        ((2,), signal),
+        ((3,), signal),
+        ((3,), SignalFormat.sound(20.0)),
+        ((3,), SignalFormat(10.0, 20.0, lags=5)),
+    ):
         history.append(Block(0, (np.ones((*rows, 2)),), 0, of))
-    (view,), _, last = history.take("x")
+    (view,), _, last = history.read_new("x")
     assert (view.shape, last.lags) == ((3, 4), 5)
 
 
@@ -116,12 +121,12 @@ def test_views_of_a_part_and_of_exchanged_rows(frames: int, sizes: list[int]) ->
 
 def test_blocks_are_referred_to_and_not_copied() -> None:
     block = np.ones((2, 10))
-    signal = Signal.sound(100.0)
+    signal = SignalFormat.sound(100.0)
     window, history = SlidingWindow((2,), 25), History([(2,)], signal, 0.25)
     window.append(block)
     history.append(Block(0, (block,), 10, signal))
     assert window.view().pieces[-1] is block
-    assert history.take("x").parts[0].pieces[-1] is block
+    assert history.read_new("x").parts[0].pieces[-1] is block
 
 
 def test_an_empty_window_costs_no_memory() -> None:

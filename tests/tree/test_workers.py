@@ -14,10 +14,10 @@ import pytest
 
 from rosafe.tree import workers as pool
 from rosafe.tree.block import Block
-from rosafe.tree.processor import RISE, Processor
+from rosafe.tree.processor import ESTIMATE_GROWTH, Processor
 from rosafe.tree.states import State
 from rosafe.tree.tree import Tree
-from rosafe.tree.workers import MOST, VARIABLE, workers_to_use
+from rosafe.tree.workers import MAX_WORKERS, VARIABLE, workers_to_use
 from tests.harness import PATIENCE, wait_for
 
 from .support import Feed, Plain, Recorder, tree_threads, use_plain_stages
@@ -44,16 +44,18 @@ def test_how_many_there_are(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv(VARIABLE, raising=False)
     assert workers_to_use() == len(os.sched_getaffinity(0))
     assert workers_to_use(3) == 3
-    for text, count in (("5", 5), (" 2 ", 2), ("", workers_to_use()), (str(MOST), MOST)):
+    for text, count in (("5", 5), (" 2 ", 2), ("", workers_to_use()), (str(MAX_WORKERS), MAX_WORKERS)):
         monkeypatch.setenv(VARIABLE, text)
         assert workers_to_use() == count
         assert workers_to_use(4) == 4, "what a program says counts more than the environment"
 
 
-@pytest.mark.parametrize("text", ["0", "-1", "1.5", "two", str(MOST + 1), "9" * 5000, "\N{ARABIC-INDIC DIGIT FIVE}"])
+@pytest.mark.parametrize(
+    "text", ["0", "-1", "1.5", "two", str(MAX_WORKERS + 1), "9" * 5000, "\N{ARABIC-INDIC DIGIT FIVE}"]
+)
 def test_numbers_that_are_none(text: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(VARIABLE, text)
-    with pytest.raises(ValueError, match=f"^{VARIABLE}: .* is not a whole number from 1 to {MOST}$"):
+    with pytest.raises(ValueError, match=f"^{VARIABLE}: .* is not a whole number from 1 to {MAX_WORKERS}$"):
         Tree(Recorder())
     with pytest.raises(ValueError, match=r"^workers: "):
         Tree(Recorder(), 0)
@@ -134,19 +136,19 @@ class Short:
     """A task that takes so many seconds, as it says; it never does."""
 
     depth = 0
-    held_up_since = 0.0
-    gone = False
+    blocked_since = 0.0
+    removed = False
 
     def __init__(self, usual: float) -> None:
-        self.usual = usual
+        self.estimated_seconds = usual
 
-    def begin(self) -> bool:
+    def begin_work(self) -> bool:
         return True
 
     def work(self) -> None:
         pass
 
-    def rest(self) -> None:
+    def end_work(self) -> None:
         pass
 
 
@@ -168,7 +170,7 @@ def test_short_work_is_not_worth_a_call(seconds: list[float], worth: bool) -> No
     workers = pool.Workers(threading.RLock(), 2)
     for task in waiting:
         workers.push(task)
-    assert workers._worth_a_call(own) == worth
+    assert workers._should_wake_another(own) == worth
 
 
 def test_a_worker_goes_on_with_what_it_did_the_last_time() -> None:
@@ -181,7 +183,7 @@ def test_a_worker_goes_on_with_what_it_did_the_last_time() -> None:
     def taken(worker: Any, *tasks: Short) -> list[Short]:
         for task in tasks:
             workers.push(task)
-        return [workers._take(worker) for _ in tasks]  # type: ignore[misc]
+        return [workers._pop_task(worker) for _ in tasks]  # type: ignore[misc]
 
     assert taken(one, first) == [first]
     assert taken(other, second) == [second]
@@ -196,12 +198,12 @@ def test_a_worker_goes_on_with_what_it_did_the_last_time() -> None:
 def test_what_a_processor_usually_takes(tree: Tree, feed: Feed, listener: Recorder) -> None:
     """Unknown at first, so that nobody waits for it in vain; then the least of late."""
     one = tree.add_input("input", feed, 1, 1.0, 1.0)
-    assert one.usual == math.inf
+    assert one.estimated_seconds == math.inf
     for number in range(1, 4):
-        before = one.usual
+        before = one.estimated_seconds
         feed.put(count=1)
         listener.wait_blocks(one, number)
-        assert 0 < one.usual <= RISE * before
+        assert 0 < one.estimated_seconds <= ESTIMATE_GROWTH * before
 
 
 # --- who is held up ---
@@ -216,11 +218,11 @@ class Stubborn(Recorder):
         self.held: set[str] = set()
         self.go = threading.Event()
 
-    def released(self, processor: Processor, block: Block) -> None:
+    def on_released(self, processor: Processor, block: Block) -> None:
         if processor.name in self.holds and not self.go.is_set():
             self.held.add(processor.name)
             assert self.go.wait(PATIENCE)
-        super().released(processor, block)
+        super().on_released(processor, block)
 
 
 @pytest.fixture
@@ -329,15 +331,15 @@ def test_a_listener_that_is_slow_is_told_last(
     def released(self: Stubborn, processor: Processor, block: Block) -> None:
         told.append(processor.name)
         if processor.name == "slow":
-            processor._usual_telling = 1.0
-        Recorder.released(self, processor, block)
+            processor._publish_seconds = 1.0
+        Recorder.on_released(self, processor, block)
 
     use_plain_stages(monkeypatch)
-    monkeypatch.setattr(Stubborn, "released", released)
+    monkeypatch.setattr(Stubborn, "on_released", released)
     tree.add_input("input", feed, 1, 1.0, 1.0)
     slow = tree.add("preProc", "slow", "input")
     below = tree.add("gammatone", "below", "slow")
-    slow._usual_telling = 1.0
+    slow._publish_seconds = 1.0
     feed.put(count=1)
     listener.wait_blocks(slow, 1)
     listener.wait_blocks(below, 1)
@@ -386,7 +388,7 @@ def test_a_listener_asks_the_tree(tree: Tree, feed: Feed, listener: Stubborn, mo
     def executed(self: Stubborn, processor: Processor, seconds: float) -> None:
         answers.append(tree.dependencies(processor.name))
 
-    monkeypatch.setattr(Stubborn, "executed", executed)
+    monkeypatch.setattr(Stubborn, "on_executed", executed)
     tree.add_input("input", feed, 1, 1.0, 1.0)
     child = tree.add("preProc", "child", "input")
     feed.put(count=1)

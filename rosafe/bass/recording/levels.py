@@ -24,7 +24,7 @@ def reference(spl: float, rms: float) -> float:
     return 200.0 - spl + rms
 
 
-class Levels:
+class LevelMeter:
     """Levels of the samples that were added. An RMS of 0 dBFS is a full square wave; a full sine has -3 dBFS."""
 
     def __init__(self) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from rosafe.bass.recording.levels import Levels
+from rosafe.bass.recording.levels import LevelMeter
 from rosafe.bass.recording.outputs import Output
 from rosafe.bass.sources import SoundSource
 from rosafe.bass.sources.base import loss_text, wall_time_ns
@@ -49,7 +49,7 @@ class SoundRecorder:
     ) -> None:
         self.frames = 0
         self.lost = 0
-        self.levels = Levels()
+        self.levels = LevelMeter()
         self._source = source
         self._output = output
         self._limit = frames

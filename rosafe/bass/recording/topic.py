@@ -14,10 +14,10 @@ import rospy
 from rosafe.bass.sources.base import Chunk, device_error, hwparams_error
 from rosafe.component import wire
 from rosafe.interface import BASS, ComponentError
-from rosafe.sound.windows import MAX_WINDOW, WindowStream, malformed
+from rosafe.sound.windows import MAX_WINDOW, WindowStream, window_error
 
 FIRST_SECONDS = 3.0  # for a first message
-NOBODY_SECONDS = 1.0  # for one where nobody publishes the topic
+NO_PUBLISHER_TIMEOUT = 1.0  # for one where nobody publishes the topic
 STALL_SECONDS = 5.0  # without anything new, the stream counts as ended; besides a chunk's own length
 POLL_SECONDS = 0.1
 MAX_WAITING = 2**24  # frames that came and were not read yet, 128 MB; more are lost
@@ -63,7 +63,7 @@ class TopicSource:
         self._begun = False
         self._first: Any = None
         self._arrived = threading.Event()
-        message_class = wire.lenient_class("bass", BASS.port("Audio").idl, MAX_WINDOW)
+        message_class = wire.tolerant_message_class("bass", BASS.port("Audio").idl, MAX_WINDOW)
         kinds = dict(rospy.get_published_topics())
         kind = kinds.get(topic)
         if kind is not None and kind.rpartition("/")[2] != message_class.__name__:
@@ -84,7 +84,7 @@ class TopicSource:
         self._patience = STALL_SECONDS + self.frames_per_chunk / self.sample_rate
 
     def _await_first(self, published: bool) -> Any:
-        end = time.monotonic() + (FIRST_SECONDS if published else NOBODY_SECONDS)
+        end = time.monotonic() + (FIRST_SECONDS if published else NO_PUBLISHER_TIMEOUT)
         while not self._arrived.wait(POLL_SECONDS) and not self._stopping.is_set():
             if time.monotonic() > end:
                 what = (
@@ -98,13 +98,13 @@ class TopicSource:
         return self._first
 
     def _hear(self, message: Any) -> None:
-        if self._ended or message.problem or malformed(message):
+        if self._ended or message.problem or window_error(message):
             return  # the next window shows what it would have shown
         if self._first is None:
             self._first = message
             self._stream.fresh(message)
             self._arrived.set()
-        elif why := self._stream.joint(message):
+        elif why := self._stream.join_state(message):
             self._ended = True
             self._news.put(f"{self.name}: a new stream begins ({why})")
         else:

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 from rosafe.bass.sources.base import Chunk, SoundSource, device_error
 from rosafe.interface import ComponentError
-from rosafe.vocabulary.words import meant
+from rosafe.vocabulary.words import did_you_mean
 
 __all__ = ["Chunk", "SoundSource", "device_lines", "open_source"]
 
@@ -76,7 +76,7 @@ def open_source(device: str, sample_rate: int, frames_per_chunk: int, stopping: 
         return AlsaSource(device, sample_rate or DEFAULT_RATE, frames_per_chunk, stopping)
     except ComponentError as problem:
         first = device.strip("'\" ").partition(":")[0]
-        hint = meant(first, [name.partition(":")[0] for name, _ in BUILT_IN])
+        hint = did_you_mean(first, [name.partition(":")[0] for name, _ in BUILT_IN])
         if problem.ex != device_error("").ex or isinstance(problem, DeviceBusyError) or not hint:
             raise
         raise device_error(f"{problem.what}{hint.removesuffix('?')}:?") from None

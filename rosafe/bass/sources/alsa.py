@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from rosafe.bass.sources.base import Chunk, Chunker, device_error, hwparams_error, parse_options
-from rosafe.bass.sources.libasound import complaints, load_alsaaudio
+from rosafe.bass.sources.libasound import captured_alsa_errors, load_alsaaudio
 from rosafe.bass.sources.pcmname import checked_name
 from rosafe.interface import ComponentError
 
@@ -61,7 +61,7 @@ class AlsaSource:
         self.overruns = 0
         self.lost_frames = 0
         pcm_name, _, options = device.partition("?")
-        with complaints():
+        with captured_alsa_errors():
             self._pcm_name = checked_name(pcm_name)
         self._channels: tuple[int, int] | None = parse_options(device, options, {"channels": _channel_pair}).get(
             "channels"
@@ -73,15 +73,15 @@ class AlsaSource:
         self._width = 2
         self._open()
         self._chunks = Chunker(frames_per_chunk)
-        self._heard: float | None = None  # when the newest frame that was read left the converter
+        self._last_audio_time: float | None = None  # when the newest frame that was read left the converter
         self._since: float | None = None  # when the device was started, or gave sound
         self._broken = False  # whether it was started anew since its newest frame
         self._asked = math.inf  # when the device was last read from
         self._settled = math.inf  # after a standstill, when to compare the frames that came with the clock
-        self._reckoned = 0.0  # meanwhile, when the newest one left the converter if none was dropped
+        self._expected_time = 0.0  # meanwhile, when the newest one left the converter if none was dropped
         self._time = 0.0
         self._failures = 0  # attempts to reopen the device since it last gave sound
-        self._barren = 0  # overruns since then
+        self._overruns_without_audio = 0  # overruns since then
 
     # --- opening ---
 
@@ -98,7 +98,7 @@ class AlsaSource:
 
     def _open_with(self, channels: int, exact_channels: bool = True) -> Any:
         """The PCM, open and exact; None where only the number of channels is wrong and another one may be tried."""
-        with complaints() as heard:
+        with captured_alsa_errors() as heard:
             try:
                 pcm = self._alsa.PCM(
                     type=self._alsa.PCM_CAPTURE,
@@ -159,12 +159,12 @@ class AlsaSource:
 
     def read(self) -> Chunk | None:
         """The next chunk; None when told to stop, ``::bass::e_device`` when the device is gone."""
-        with complaints():
+        with captured_alsa_errors():
             while (chunk := self._chunks.take()) is None:
                 if self._stopping.is_set():
                     return None
                 self._read_some()
-        self._time = max(self._time, (self._heard or 0.0) - self._chunks.pending / self.sample_rate)
+        self._time = max(self._time, (self._last_audio_time or 0.0) - self._chunks.pending / self.sample_rate)
         return Chunk(*chunk, self._time)
 
     def _read_some(self) -> None:
@@ -172,9 +172,9 @@ class AlsaSource:
         before = time.monotonic()
         if self._since is None:
             self._since = before  # the first read starts the device
-        if self._heard is not None and before - self._asked > STANDSTILL_SECONDS:
+        if self._last_audio_time is not None and before - self._asked > STANDSTILL_SECONDS:
             if self._settled == math.inf:  # else the reckoning of an earlier one goes on
-                self._reckoned = self._heard
+                self._expected_time = self._last_audio_time
             self._settled = before + SETTLE_SECONDS
         self._asked = before
         try:
@@ -186,19 +186,19 @@ class AlsaSource:
                 newest = self._since - behind / self.sample_rate
                 if self._broken:
                     self._lose(newest - count / self.sample_rate)
-                self._heard = newest
-                self._reckoned += count / self.sample_rate
+                self._last_audio_time = newest
+                self._expected_time += count / self.sample_rate
                 if newest > self._settled:
                     self._compare(newest)
                 left, right = self._channels or (1, 2)
                 frames = np.frombuffer(data, "<i4").reshape(-1, self._width).T
                 self._chunks.add(frames[[left - 1, right - 1]])
-                self._failures = self._barren = 0
+                self._failures = self._overruns_without_audio = 0
             elif count == 0:
                 self._wait_for_sound(before)
             elif count == -errno.EPIPE:  # pyalsaaudio has prepared the device; the next read starts it again
-                self._barren += 1
-                if self._barren > RETRIES:
+                self._overruns_without_audio += 1
+                if self._overruns_without_audio > RETRIES:
                     raise self._alsa.ALSAAudioError("overrun after overrun and no sound")
                 self._break()
             else:
@@ -227,14 +227,14 @@ class AlsaSource:
     def _lose(self, begin: float) -> None:
         """Account for the frames between the newest one read and `begin`, from which on there is sound again."""
         self._broken = False
-        self._reckoned = begin
-        if self._heard is not None:  # else the stream only begins
-            self._count(max(1, round((begin - self._heard) * self.sample_rate)))
+        self._expected_time = begin
+        if self._last_audio_time is not None:  # else the stream only begins
+            self._count(max(1, round((begin - self._last_audio_time) * self.sample_rate)))
 
     def _compare(self, newest: float) -> None:
         """Account for what was dropped in a standstill without a word; the newest frame is of the time `newest`."""
         self._settled = math.inf
-        missing = newest - self._reckoned
+        missing = newest - self._expected_time
         if missing > SLACK_SECONDS:
             self.overruns += 1
             self._count(round(missing * self.sample_rate))

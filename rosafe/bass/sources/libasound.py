@@ -36,7 +36,7 @@ def load_alsaaudio() -> Any:
 
 
 @contextlib.contextmanager
-def complaints() -> Iterator[list[str]]:
+def captured_alsa_errors() -> Iterator[list[str]]:
     """Collect what libasound would print on stderr for this thread, one line each."""
     heard: list[str] = []
     try:

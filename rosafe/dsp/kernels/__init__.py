@@ -27,7 +27,7 @@ FloatArray = NDArray[np.float64]
 
 MOST_POLES = 128  # of a gammatone filter
 MOST_SECTIONS = 8  # of a low-pass
-MOST_LAGS = 1024  # of a correlation; FFT is faster beyond
+MAX_LAGS = 1024  # of a correlation; FFT is faster beyond
 MOST_LOOPS = 32  # of adaptation
 MOST_SIZE = 4096  # samples of a frame whose autocorrelation is made
 MOST_POINTS = 8192  # real ones of a Fourier transform
@@ -58,7 +58,7 @@ def gammatone(
     output: FloatArray,
     envelope: FloatArray | None,
 ) -> None:
-    """Gammatone filters: as `rosafe.dsp.gammatone.filter_by_scipy`. Rows of `output` may lie apart (`rows_apart`)."""
+    """Gammatone filters: as `rosafe.dsp.gammatone.filter_by_scipy`. Rows of `output` may lie apart (`rows_evenly_strided`)."""
     channels, order = sections.shape[:2]
     _function("rosafe_gammatone")(
         _address(block),
@@ -83,7 +83,7 @@ def rectify_and_filter(
 ) -> None:
     """Rectify (*rows, N), then filter it by second-order sections (S, 6); `state` (S, *rows, 2) as in scipy.
 
-    The envelope of the same shape is for `compressed`. Rows of `output` may lie apart (`rows_apart`); or it is
+    The envelope of the same shape is for `compressed`. Rows of `output` may lie apart (`rows_evenly_strided`); or it is
     `block`. The twin is `RECTIFIERS` of rosafe/representations/haircell.py, or `compressed` there, and
     `rosafe.dsp.cascade.Cascade`.
     """
@@ -133,22 +133,22 @@ def adaptation(
     return output
 
 
-class Pinned(NamedTuple):
+class PinnedArray(NamedTuple):
     """An array that stays, and where: to look that up takes longer than much of what is done with it."""
 
     array: FloatArray
     address: int
 
     @classmethod
-    def of(cls, array: FloatArray) -> Pinned:
+    def of(cls, array: FloatArray) -> PinnedArray:
         """`array`, which nobody resizes."""
         return cls(array, _address(array))
 
 
-class Span(NamedTuple):
+class SampleRange(NamedTuple):
     """Samples `start` to `stop` of each row of a store (*rows, T)."""
 
-    store: Pinned
+    store: PinnedArray
     start: int
     stop: int
 
@@ -163,22 +163,22 @@ class Span(NamedTuple):
         return self.store.array[..., self.start : self.stop]
 
 
-class Frames(NamedTuple):
+class FrameReader(NamedTuple):
     """Frames over samples that lie in a history and a block behind it, without the two being joined.
 
     Samples are counted from the first one of the history on.
     """
 
-    history: Span
+    history: SampleRange
     block: FloatArray  # (*rows, N)
-    tail: Span  # to be filled with the last samples; may lie where the history does
+    tail: SampleRange  # to be filled with the last samples; may lie where the history does
     skip: int  # where the first frame starts
-    weights: Pinned  # (w,), of the samples of a frame
+    weights: PinnedArray  # (w,), of the samples of a frame
     hop: int  # from a frame's start to that of the next one
     number: int  # of whole ones
     position: int  # of the first sample, counted from where the signal began
 
-    def part(self, first: int, number: int) -> Frames:
+    def part(self, first: int, number: int) -> FrameReader:
         """Some of them, for a kernel that leaves the tail alone."""
         return self._replace(skip=self.skip + first * self.hop, number=number)
 
@@ -206,13 +206,13 @@ class Frames(NamedTuple):
             position,
         )
 
-    def keep(self) -> None:
+    def save_tail(self) -> None:
         """Fill the tail, after such kernels."""
         length = self.tail.length
         self.tail.samples[...] = self.block[..., self.block.shape[-1] - length :]
 
 
-def levels(frames: Frames, epsilon: float) -> FloatArray:
+def level_differences(frames: FrameReader, epsilon: float) -> FloatArray:
     """10 log10((R + epsilon) / (L + epsilon)) of the two ears' energies of each frame, (2, C, N) to (C, F).
 
     Energies are weighted sums of squares. The twin is `rosafe.dsp.framing.Framing.means` with
@@ -224,7 +224,7 @@ def levels(frames: Frames, epsilon: float) -> FloatArray:
     return result
 
 
-def ratemap(frames: Frames, squared: bool, section: FloatArray, state: FloatArray) -> FloatArray:
+def ratemap(frames: FrameReader, squared: bool, section: FloatArray, state: FloatArray) -> FloatArray:
     """Weighted sums of what a leaky integrator makes of each frame's samples, or of the squares of that, (*rows, F).
 
     The integrator is `section` (1, 6), as of `rosafe.dsp.cascade.leaky_integrator`, with its `state` (1, *rows, 2). The
@@ -236,7 +236,7 @@ def ratemap(frames: Frames, squared: bool, section: FloatArray, state: FloatArra
     return rates
 
 
-def modulation(frames: Frames, sections: FloatArray, state: FloatArray) -> FloatArray:
+def modulation(frames: FrameReader, sections: FloatArray, state: FloatArray) -> FloatArray:
     """Weighted sums of the magnitudes of what parallel sections (M, 6) make of each frame's samples, (*rows, M, F).
 
     Of samples (*rows, N), with the sections' state (M, *rows, 2). The history of `frames` is (*rows, M), and what has
@@ -248,10 +248,10 @@ def modulation(frames: Frames, sections: FloatArray, state: FloatArray) -> Float
     return means
 
 
-def correlations(frames: Frames, reach: int, epsilon: float, output: FloatArray) -> None:
+def correlations(frames: FrameReader, reach: int, epsilon: float, output: FloatArray) -> None:
     """Correlate the frames (2, C) of the two ears over the lags up to `reach`, into the middle of `output` (C, L, F).
 
-    2 reach + 1 is at most `MOST_LAGS`. The twin is `rosafe.representations.crosscorrelation.correlate_by_fft`.
+    2 reach + 1 is at most `MAX_LAGS`. The twin is `rosafe.representations.crosscorrelation.correlate_by_fft`.
     """
     _, lags, number = output.shape
     outside = lags // 2 - reach
@@ -312,7 +312,7 @@ def transient_map(
 
 
 def autocorrelations(
-    frames: Frames, clipping: str, alpha: float, exponent: float, corrections: FloatArray
+    frames: FrameReader, clipping: str, alpha: float, exponent: float, corrections: FloatArray
 ) -> FloatArray:
     """Normalised autocorrelations of centre-clipped frames at the lags of `corrections` (L,), (*rows, L, F).
 
@@ -372,7 +372,9 @@ class Transform(NamedTuple):
         return cls(points, np.concatenate(twiddles), places, np.exp(1j * np.pi / points * k))
 
 
-def patterns(levels: FloatArray, count: int, reach: int, places: NDArray[np.int64], weights: FloatArray) -> FloatArray:
+def gabor_responses(
+    levels: FloatArray, count: int, reach: int, places: NDArray[np.int64], weights: FloatArray
+) -> FloatArray:
     """As `rosafe.representations.gabor.respond_by_scipy`."""
     frames = -(-count // MOST_LANES) * MOST_LANES
     padded = np.zeros((*levels.shape[:-1], frames + 2 * reach))
@@ -390,12 +392,12 @@ def patterns(levels: FloatArray, count: int, reach: int, places: NDArray[np.int6
     return sums[..., :count]
 
 
-def join(blocks: Sequence[FloatArray], whole: FloatArray) -> None:
+def concatenate(blocks: Sequence[FloatArray], whole: FloatArray) -> None:
     """Blocks (*rows, N) one after the other into `whole`: as `numpy.concatenate`, which is the twin.
 
     That takes many times as long where N is small. It serves other types than float64, too, and without kernels.
     """
-    fits = whole.ndim > 1 and rows_apart(whole) and all(block.dtype == whole.dtype for block in blocks)
+    fits = whole.ndim > 1 and rows_evenly_strided(whole) and all(block.dtype == whole.dtype for block in blocks)
     if not fits or not compiled():
         np.concatenate(blocks, axis=-1, out=whole)
         return
@@ -438,7 +440,7 @@ def _address(array: NDArray[Any]) -> int:
         return address
 
 
-def rows_apart(array: FloatArray) -> bool:
+def rows_evenly_strided(array: FloatArray) -> bool:
     """Whether the rows of (*rows, N) lie evenly apart, each in one piece, as the outputs of some kernels may."""
     strides, sizes = array.strides, array.shape
     even = all(strides[axis] == sizes[axis + 1] * strides[axis + 1] for axis in range(array.ndim - 2))

@@ -68,7 +68,7 @@ INLINE void run(const int limited, const int64_t count, const loop *loops, const
 
 /* block and output (rows, n); samples are squared and times `factor` first, where that is not 0. constants (channels, 3):
  * threshold, offset and gain of the output, where `channels` is 1 or such that row i is one of channel i % channels;
- * loops (count, 3): a, b and m, without limits where `limited` is 0; state (count, rows). */
+ * loops (count, 3): a, b and m, without limits where `clamp` is 0; state (count, rows). */
 void rosafe_adaptation(const double *block, int64_t rows, int64_t n, double factor, const double *constants, int64_t channels,
                        const double *of_loops, int64_t count, int64_t limited, double *state, double *output) {
     uint32_t mode = enter();

@@ -26,11 +26,11 @@ ROOT = HERE.parents[2]
 COMPILER = "ROSAFE_COMPILER"  # environment variable: the compiler to take; else the first of COMPILERS that is there
 COMPILERS = ("gcc", "clang")
 # levels of processors, and their names for the compiler
-LEVELS = {"x86_64": {2: "x86-64-v2", 3: "x86-64-v3", 4: "x86-64-v4"}, "aarch64": {8: "armv8-a"}}
+ISA_LEVELS = {"x86_64": {2: "x86-64-v2", 3: "x86-64-v3", 4: "x86-64-v4"}, "aarch64": {8: "armv8-a"}}
 # -O3 is slower: it unrolls what is unrolled already. Without -ffp-contract=off products and sums are fused at will;
 # without -fno-math-errno square roots are taken one by one.
 FLAGS = ("-std=gnu11", "-O2", "-ffp-contract=off", "-fno-math-errno", "-fPIC", "-shared", "-Wall", "-Wextra")
-PATIENCE = 120  # seconds for the compiler, which takes about three
+COMPILE_TIMEOUT_SECONDS = 120  # seconds for the compiler, which takes about three
 SUMS = "libraries.sha256"  # in each folder, for sha256sum
 KEPT = 3  # folders that stay: programs of other versions may want theirs again
 
@@ -41,7 +41,7 @@ class BuildError(Exception):
 
 def digest() -> str:
     """A name for what the sources and flags give."""
-    sha = hashlib.sha256(f"{LEVELS} {FLAGS} {os.environ.get(COMPILER, '')}\0".encode())
+    sha = hashlib.sha256(f"{ISA_LEVELS} {FLAGS} {os.environ.get(COMPILER, '')}\0".encode())
     for source in sorted(HERE.glob("*.[ch]")):
         sha.update(f"{source.name}\0".encode())
         sha.update(source.read_bytes())
@@ -67,14 +67,14 @@ def libraries(below: Path | None = None) -> dict[int, Path]:
         If there are none, and no compiler, no permission to write, or the wrong processor; or if other users could
         have put them there.
     """
-    levels = LEVELS.get(platform.machine())
+    levels = ISA_LEVELS.get(platform.machine())
     if levels is None:
-        raise BuildError(f"the kernels are for {' and '.join(LEVELS)}, and this machine is {platform.machine()}")
+        raise BuildError(f"the kernels are for {' and '.join(ISA_LEVELS)}, and this machine is {platform.machine()}")
     base = place() if below is None else below
     folder = base / f"kernels-{digest()}"
     try:
         _refuse_foreign(base, folder)
-        if _lacking(folder, levels):
+        if _missing_libraries(folder, levels):
             _build(folder, levels)
         _refuse_foreign(*_paths(folder, levels).values())
     except OSError as problem:
@@ -101,7 +101,7 @@ def _refuse_foreign(*paths: Path) -> None:
             )
 
 
-def _lacking(folder: Path, levels: dict[int, str]) -> list[str]:
+def _missing_libraries(folder: Path, levels: dict[int, str]) -> list[str]:
     """The names of the libraries that are not in `folder`, or not as they were built."""
     try:
         sums = {line[66:]: line[:64] for line in (folder / SUMS).read_text("ascii").splitlines()}
@@ -132,7 +132,7 @@ def _build(folder: Path, levels: dict[int, str]) -> None:
         fcntl.flock(lock, fcntl.LOCK_EX)  # given back by the kernel even if this process is killed
         for orphan in base.glob("kernels-*.new-*"):  # nobody else builds now: left by one that was killed
             shutil.rmtree(orphan)
-        if _lacking(folder, levels):
+        if _missing_libraries(folder, levels):
             workshop = Path(tempfile.mkdtemp(prefix=f"{folder.name}.new-", dir=base))
             try:
                 built = compile_sources(compiler, levels, workshop).values()
@@ -161,7 +161,7 @@ def _sync(path: Path) -> None:
 def compile_sources(
     compiler: str, levels: dict[int, str], folder: Path, sources: Path = HERE, options: tuple[str, ...] = ()
 ) -> dict[int, Path]:
-    """A library in `folder` for each of the `levels`, all at once, each by a compiler of its own.
+    """A library in `folder` for each of the `level_differences`, all at once, each by a compiler of its own.
 
     Raises
     ------
@@ -177,13 +177,13 @@ def compile_sources(
             command = [compiler, *FLAGS, *options, f"-march={levels[level]}", "-o", str(path), *files, "-lm"]
             running.append(subprocess.Popen(command, stdin=subprocess.DEVNULL, stderr=subprocess.PIPE, env=environment))
         for process in running:
-            _, said = process.communicate(timeout=PATIENCE)
+            _, said = process.communicate(timeout=COMPILE_TIMEOUT_SECONDS)
             if process.returncode != 0:
                 lines = said.decode(errors="replace").strip().splitlines()
                 errors = [line for line in lines if "error" in line] or lines or [f"status {process.returncode}"]
                 raise BuildError(f"{name} cannot build the kernels: {errors[0]}")
     except subprocess.TimeoutExpired as problem:
-        raise BuildError(f"{name} took more than {PATIENCE} seconds for the kernels") from problem
+        raise BuildError(f"{name} took more than {COMPILE_TIMEOUT_SECONDS} seconds for the kernels") from problem
     finally:
         for process in running:
             process.kill()  # one that is done already takes no notice

@@ -10,7 +10,7 @@ typedef struct {
     int64_t first, channels, reach, weights;
 } pattern;
 
-/* Of `count` registers of frames from `levels` on, of the left ear and, `ear` further, of the right one. */
+/* Of `count` registers of frames from `level_differences` on, of the left ear and, `ear` further, of the right one. */
 INLINE void add_products(const int count, const double *levels, int64_t ear, int64_t stride, const pattern *of,
                          const double *weights, double *left, double *right) {
     vec sum[2][TOGETHER] = {};

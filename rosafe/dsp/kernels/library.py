@@ -10,7 +10,9 @@ from typing import NamedTuple
 
 from . import build
 
-SWITCH = "ROSAFE_KERNELS"  # environment variable: 0 for numpy and scipy, 2, 3... for at most that level of processor
+KERNELS_VARIABLE = (
+    "ROSAFE_KERNELS"  # environment variable: 0 for numpy and scipy, 2, 3... for at most that level of processor
+)
 
 INSTRUCTIONS = {2: "SSE4.2", 3: "AVX2 and FMA", 4: "AVX-512", 8: "NEON"}  # that the levels are for
 
@@ -58,9 +60,9 @@ def loaded() -> tuple[ctypes.CDLL | None, Status]:
 
     Takes a fraction of a millisecond, and a second where the library must be built first.
     """
-    switch = os.environ.get(SWITCH, "").strip()
+    switch = os.environ.get(KERNELS_VARIABLE, "").strip()
     if switch == "0":
-        return None, Status(False, f"numpy and scipy, as {SWITCH}=0 says")
+        return None, Status(False, f"numpy and scipy, as {KERNELS_VARIABLE}=0 says")
     try:
         paths = build.libraries()
         least = min(paths)
@@ -70,9 +72,9 @@ def loaded() -> tuple[ctypes.CDLL | None, Status]:
         reason = f"the processor has {INSTRUCTIONS[level]}"
         if switch not in ("", *map(str, paths)):
             choices = ", ".join(map(str, (0, *list(paths)[:-1])))
-            reason += f" ({SWITCH} is {switch[:20]!r}, which means nothing: {choices} or {max(paths)} would)"
+            reason += f" ({KERNELS_VARIABLE} is {switch[:20]!r}, which means nothing: {choices} or {max(paths)} would)"
         elif switch and int(switch) < level:
-            level, reason = int(switch), f"{reason}, but {SWITCH} is {switch}"
+            level, reason = int(switch), f"{reason}, but {KERNELS_VARIABLE} is {switch}"
         path = paths[level]
         library = load(path)
         compiler = library.rosafe_compiler().decode().strip()

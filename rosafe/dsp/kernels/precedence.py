@@ -7,10 +7,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from . import MOST_LANES, REAL_SIZE, FloatArray, Frames, Transform, _address, _function
+from . import MOST_LANES, REAL_SIZE, FloatArray, FrameReader, Transform, _address, _function
 
 TAPS = 6  # of a filter that takes an echo out
-TOGETHER = 8  # rows that lie in memory sample by sample
+BATCH = 8  # rows that lie in memory sample by sample
 
 
 class Windowed(NamedTuple):
@@ -43,7 +43,7 @@ class Taps(NamedTuple):
         return Taps(self.shifts[place], self.values[place])
 
 
-def windowed(frames: Frames, output: Windowed) -> None:
+def windowed(frames: FrameReader, output: Windowed) -> None:
     """The frames of (2, C, N), windowed by their weights, to `output`; the tail is left alone.
 
     The twin is `rosafe.representations.precedence.windowed`.

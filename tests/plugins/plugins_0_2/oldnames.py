@@ -26,9 +26,9 @@ class Every(Stage):
     PROVIDES = ("square",)
 
     def process(self, block, extra=None):
-        room = self._room(block[..., ::1].shape)
+        room = self._output_array(block[..., ::1].shape)
         room[...] = block
-        samples = np.concatenate((self._rest, self._checked(room)), axis=-1) if self._rest is not None else room
+        samples = np.concatenate((self._rest, self._as_valid_block(room)), axis=-1) if self._rest is not None else room
         step = self._values["ev_step"]
         count = samples.shape[-1] // step
         self._rest = samples[..., count * step :].copy()

@@ -1,0 +1,197 @@
+"""Limits of size and complexity, names that occur once, plain English, and references to files that exist."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import re
+from collections import Counter, defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from tests.harness import ROOT
+from tests.packaging.prose import SUFFIXES, markers, sentences
+from tests.packaging.test_lint import tracked
+
+PACKAGE = ROOT / "rosafe"
+MODULES = {path: ast.parse(path.read_text("utf-8")) for path in sorted(PACKAGE.rglob("*.py"))}
+Function = ast.FunctionDef | ast.AsyncFunctionDef
+
+# --- size and complexity ----------------------------------------------------------------------------------------
+
+MAX_CLASS_LINES = 250
+MAX_ATTRIBUTES = 15  # names assigned on `self`
+MAX_COMPLEXITY = 14
+MAX_EXCEPTIONS = 8
+COMPLEX: dict[str, str] = {}  # function: reason; at most MAX_EXCEPTIONS
+_BRANCHES = (ast.If, ast.For, ast.AsyncFor, ast.While, ast.IfExp, ast.ExceptHandler, ast.comprehension)
+
+
+def classes() -> Iterator[tuple[Path, ast.ClassDef]]:
+    for path, module in MODULES.items():
+        for node in ast.walk(module):
+            if isinstance(node, ast.ClassDef):
+                yield path, node
+
+
+def complexity(function: Function) -> int:
+    """One more than the branches of a function; those of functions within it are their own."""
+    total, waiting = 1, list(ast.iter_child_nodes(function))
+    while waiting:
+        node = waiting.pop()
+        total += isinstance(node, _BRANCHES) + (len(node.values) - 1 if isinstance(node, ast.BoolOp) else 0)
+        if not isinstance(node, (ast.FunctionDef, ast.AsyncFunctionDef, ast.ClassDef)):
+            waiting += ast.iter_child_nodes(node)
+    return total
+
+
+def assigned_on_self(node: ast.ClassDef) -> set[str]:
+    return {
+        target.attr
+        for target in ast.walk(node)
+        if isinstance(target, ast.Attribute)
+        and isinstance(target.ctx, ast.Store)
+        and isinstance(target.value, ast.Name)
+        and target.value.id == "self"
+    }
+
+
+def test_the_size_of_classes_is_limited() -> None:
+    too_large = {}
+    for path, node in classes():
+        lines, attributes = (node.end_lineno or 0) - node.lineno + 1, len(assigned_on_self(node))
+        if lines > MAX_CLASS_LINES or attributes > MAX_ATTRIBUTES:
+            too_large[f"{path.relative_to(ROOT)}:{node.name}"] = f"{lines} lines, {attributes} attributes"
+    assert not too_large
+
+
+def test_the_complexity_of_functions_is_limited() -> None:
+    found = {}
+    for path, module in MODULES.items():
+        for node in ast.walk(module):
+            if isinstance(node, Function) and complexity(node) > MAX_COMPLEXITY:
+                found[f"{path.relative_to(ROOT)}:{node.name}"] = complexity(node)
+    assert found.keys() == COMPLEX.keys(), found
+    assert len(COMPLEX) <= MAX_EXCEPTIONS
+
+
+def test_complexity_counts_each_branch_once() -> None:
+    source = "def f(x):\n if x and x > 1 or x < 0:\n  return [y for y in x]\n def g():\n  while x: pass\n return 1 if x else 2"
+    function = ast.parse(source).body[0]
+    assert isinstance(function, Function)
+    assert complexity(function) == 1 + 1 + 2 + 1 + 1  # if, two further operands, comprehension, conditional expression
+
+
+def test_each_class_has_a_name_of_its_own() -> None:
+    names = Counter(node.name for _, node in classes())
+    assert not [name for name, count in names.items() if count > 1]
+
+
+# --- plain English ----------------------------------------------------------------------------------------------
+
+# Marked sentences for each folder, in per cent. A figure may only fall: lower it when the text has become better.
+MAX_MARKED_PERCENT: dict[str, float] = {}
+SLACK_PERCENT = 1.0  # how far the text may be better than its figure
+
+
+def folder_of(path: Path) -> str:
+    parts = path.relative_to(ROOT).parts
+    return "/".join(parts[:2]) if parts[0] == "rosafe" and len(parts) > 2 else parts[0] if len(parts) > 1 else "top"
+
+
+@pytest.fixture(scope="module")
+def marked_percent() -> dict[str, float]:
+    """The share of sentences with a marker in each folder."""
+    counts: dict[str, list[int]] = defaultdict(lambda: [0, 0])
+    for path in tracked():
+        if path.suffix in SUFFIXES and path.name not in ("prose.py", "parameters.md"):
+            for sentence in sentences(path):
+                count = counts[folder_of(path)]
+                count[0] += 1
+                count[1] += bool(markers(sentence))
+    return {folder: 100 * marked / total for folder, (total, marked) in sorted(counts.items()) if total}
+
+
+def test_the_share_of_sentences_with_a_marker_only_falls(marked_percent: dict[str, float]) -> None:
+    assert marked_percent.keys() == MAX_MARKED_PERCENT.keys()
+    worse = {f: round(p, 1) for f, p in marked_percent.items() if p > MAX_MARKED_PERCENT[f]}
+    assert not worse, "list them with: python3 -m tests.packaging.prose FOLDER"
+    better = {f: round(p, 1) for f, p in marked_percent.items() if p < MAX_MARKED_PERCENT[f] - SLACK_PERCENT}
+    assert not better, "lower the figures of these folders in MAX_MARKED_PERCENT"
+
+
+@pytest.mark.parametrize(
+    ("sentence", "marker"),
+    [
+        ("Return what the client has sent.", "'what' as a noun"),
+        ("Close it if nobody reads it.", "a person instead of a role"),
+        ("The node tells its state.", "tell"),
+        ("Raise ValueError where there is no block.", "'where' as 'if'"),
+        ("An .npy is no archive of arrays.", "is no"),
+    ],
+)
+def test_a_marker_is_found(sentence: str, marker: str) -> None:
+    assert marker in markers(sentence)
+
+
+def test_plain_english_has_no_marker() -> None:
+    assert not markers("Return the block at the output port, or None if no client has subscribed to it.")
+
+
+# --- references -------------------------------------------------------------------------------------------------
+
+_NAME = r"(?<![\w./:<>{}*-])[\w+-]+(?:/[\w+-]+)*\."
+_PATH = re.compile(rf"{_NAME}(?:py|md|c|h|js|css|html|sh|tcl|m|rst|ipynb)\b(?![\w/*]|\.\w)")
+_MODULE = re.compile(r"(?<![\w./:-])rosafe(?:\.[a-z]\w+)+(?:\.[A-Z_]\w+)*(?![\w/-])")
+_UNITS = {"rosafe.launch", "rosafe.target", "rosafe.service"}  # files of roslaunch and systemd
+
+
+def referring(*suffixes: str) -> list[Path]:
+    """Files that may name other files. A changelog names those of its time."""
+    return [path for path in tracked() if path.suffix in suffixes and path.name != "CHANGELOG.md"]
+
+
+def prose_of(path: Path) -> str:
+    return path.read_text("utf-8") if path.suffix != ".py" else "\n".join(sentences(path))
+
+
+def exists(name: str, near: Path) -> bool:
+    """Whether a path exists below the root, the package, the tests, or the folder of the file that names it."""
+    return any((folder / name).exists() for folder in (ROOT, PACKAGE, ROOT / "tests", *near.parents))
+
+
+def test_each_path_that_is_named_exists() -> None:
+    """Paths with a folder; a name alone may be one that a user chooses."""
+    missing = {
+        f"{path.relative_to(ROOT)}: {name}"
+        for path in referring(*SUFFIXES, ".rst", ".toml", ".txt")
+        for name in _PATH.findall(prose_of(path))
+        if "/" in name and not exists(name, path)
+    }
+    assert not missing
+
+
+def resolves(name: str) -> bool:
+    """Whether a dotted name is a module, or a name in one."""
+    parts = name.split(".")
+    for end in range(len(parts), 0, -1):
+        try:
+            value: object = importlib.import_module(".".join(parts[:end]))
+        except ModuleNotFoundError:
+            continue
+        for attribute in parts[end:]:
+            if not hasattr(value, attribute):
+                return False
+            value = getattr(value, attribute)
+        return True
+    return False
+
+
+def test_each_module_that_is_named_exists() -> None:
+    named: dict[str, str] = {}
+    for path in referring(".py", ".md", ".rst", ".c", ".h", ".sh", ".toml"):
+        for name in set(_MODULE.findall(prose_of(path))) - _UNITS:
+            named.setdefault(name, str(path.relative_to(ROOT)))
+    assert {name: path for name, path in named.items() if not resolves(name)} == {}
