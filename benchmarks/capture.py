@@ -23,7 +23,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT)]
 
 from rosafe.component import generate  # noqa: E402
-from rosafe.component.master import PrivateMaster  # noqa: E402
+from rosafe.transport.master import PrivateMaster  # noqa: E402
 
 RATE, CHUNK = 44100, 2205
 WINDOWS = (0.2, 1.0, 10.0, 60.0)  # s
@@ -84,7 +84,7 @@ def main() -> None:
         import rosservice
         import soundfile
 
-        from rosafe.component import wire
+        from rosafe.component import serialization
 
         noise = np.random.default_rng(0).integers(-(2**15), 2**15, (10 * RATE, 2)).astype(np.int16)
         soundfile.write(f"{folder}/noise.wav", noise, RATE)
@@ -104,7 +104,7 @@ def main() -> None:
                     if not answer.genom_success:
                         sys.exit(f"{service}: {answer.genom_exdetail}")
 
-                audio = wire.message_class("bass", "::binaudio::portStruct")
+                audio = serialization.message_class("bass", "::binaudio::portStruct")
                 rospy.Subscriber("/bass/Audio", audio, hear, queue_size=1, buff_size=2**26, tcp_nodelay=True)
                 device = f"file:{folder}/noise.wav?loop=1"
                 rows = [measure(call, device, window, options.seconds, bass.pid, heard) for window in WINDOWS]

@@ -129,9 +129,9 @@ def by_hand(block: int) -> Cost:
     return _by_hand(ours(), block, SECONDS)
 
 
-def through_tree(block: int, outputs: tuple[str, ...] = LEAVES, together: int = chain.MOST_BYTES) -> Cost:
+def through_tree(block: int, outputs: tuple[str, ...] = LEAVES, together: int = chain.MAX_BYTES) -> Cost:
     """What `rosafe.process` takes, with small blocks put `together` to so many bytes."""
-    chain.MOST_BYTES = together
+    chain.MAX_BYTES = together
     signal = sound(SECONDS * RATE)
     wall, spent = time.perf_counter(), time.process_time()
     rosafe.process(signal, RATE, block_frames=block, outputs=outputs)
@@ -256,7 +256,7 @@ def _say_tree(page: report.Report, rounds: int) -> None:
     page.say(f"{SECONDS} s of sound to {', '.join(LEAVES)}; on one core processor time, on two the clock on the wall.")
     page.say("The limit is what two runs on one core each do at the same time. All took turns in the same minutes.")
     page.say(
-        f"Small blocks go through together, up to {chain.MOST_BYTES >> 20} MiB of a processor's output, as the numbers"
+        f"Small blocks go through together, up to {chain.MAX_BYTES >> 20} MiB of a processor's output, as the numbers"
     )
     page.say("are the same to the last bit. Block by block is what the tree of the node does, which cannot wait.")
     page.say()

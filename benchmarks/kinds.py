@@ -17,7 +17,7 @@ BLOCKS = (12000, 882)
 # Bounds in ms for a second of sound; everything else together has one of its own.
 BOUNDS = {"adaptation": 60.0, "autocorrelation": 120.0, "amsFeatures": 25.0, "precedence": 100.0}
 REST, REST_BOUND = "everything else", 30.0
-MOST_APART = 1e-6  # of the largest number; maps and pitch decide, and may decide otherwise now and then
+MAX_APART = 1e-6  # of the largest number; maps and pitch decide, and may decide otherwise now and then
 DECIDING = ("pitch", "onsetMap", "offsetMap", "precedence", "itd")
 FEW = 0.02  # of the decisions
 
@@ -93,7 +93,7 @@ def _apart(kind: str, got: np.ndarray, wanted: np.ndarray) -> float:
 
 def agrees(kind: str, found: dict[str, float]) -> bool:
     """Whether both sides have made the same."""
-    return found["apart"] <= (FEW if kind in DECIDING else MOST_APART)
+    return found["apart"] <= (FEW if kind in DECIDING else MAX_APART)
 
 
 def measure(rounds: int) -> dict[str, dict[str, float]]:

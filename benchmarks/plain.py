@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from scipy import fft, ndimage, signal, sparse
 
 from rosafe.dsp import kernels
-from rosafe.dsp.signal import SignalFormat
+from rosafe.dsp.signal_format import SignalFormat
 from rosafe.dsp.windows import window
 from rosafe.representations import STAGES
 from rosafe.representations.gabor import CONTEXT_FRAMES, patterns

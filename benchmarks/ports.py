@@ -24,6 +24,7 @@ from report import Report, arguments
 
 from rosafe.component import generate
 from rosafe.interface import CORE_REPRESENTATIONS
+from rosafe.transport.buffer_list import BufferList
 
 SETTLED = 5.0  # seconds until memory counts: windows and buffers are full by then
 GROWTH = 64.0  # MB; a leak of one window in the time would be as much as that
@@ -37,9 +38,9 @@ def times(count: int = 20) -> dict[str, float]:
     generate.ensure_messages()
     from rosAFE.msg import rosAFE_TimeFrequencySignalPortStruct
 
-    from rosafe.component.publisher import send_pieces
     from rosafe.ros import array_msg
-    from rosafe.tree.window import SlidingWindow
+    from rosafe.transport.publisher import send_pieces
+    from rosafe.tree.sliding_window import SlidingWindow
 
     window = SlidingWindow((2, 31), graph.RATE)
     for seed in range(6):
@@ -52,7 +53,7 @@ def times(count: int = 20) -> dict[str, float]:
         message.serialize(io.BytesIO())
 
     def for_the_socket() -> None:
-        message.serialize(Gather())
+        message.serialize(BufferList())
 
     out = io.BytesIO()
     message.serialize(out)
@@ -62,7 +63,7 @@ def times(count: int = 20) -> dict[str, float]:
     drain.start()
 
     def through_a_socket() -> None:
-        out = Gather()
+        out = BufferList()
         message.serialize(out)
         send_pieces(ours, out.pieces)
 

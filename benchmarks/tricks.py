@@ -32,8 +32,8 @@ import report  # noqa: E402
 
 import rosafe  # noqa: E402
 from rosafe.dsp import kernels  # noqa: E402
-from rosafe.dsp.kernels import build, library  # noqa: E402
-from rosafe.dsp.signal import SignalFormat  # noqa: E402
+from rosafe.dsp.kernels import build, loader  # noqa: E402
+from rosafe.dsp.signal_format import SignalFormat  # noqa: E402
 from rosafe.representations import STAGES  # noqa: E402
 
 RATE = 44100.0
@@ -54,8 +54,8 @@ class Trick(NamedTuple):
 
 SPLIT_ONCE = """
     const int64_t third = (n + WAYS - 1) / WAYS, third_lags = (lags + WAYS - 1) / WAYS;
-    vec l_thirds[POINTS][(SPAN + MOST_LAGS) / WAYS + APART], r_thirds[POINTS][SPAN / WAYS + APART];
-    vec once[POINTS][MOST_LAGS / WAYS + APART];
+    vec l_thirds[POINTS][(SPAN + MAX_LAGS) / WAYS + APART], r_thirds[POINTS][SPAN / WAYS + APART];
+    vec once[POINTS][MAX_LAGS / WAYS + APART];
     put_zeros(l, n + lags - 1, WAYS * (third + third_lags));
     put_zeros(r, n, WAYS * third);
     for (int64_t t = 0; t < third + third_lags - 1; t++)
@@ -73,17 +73,17 @@ SPLIT_ONCE = """
 TRICKS = (
     Trick(
         "25 products for 81 of every ninth sample (Toom's way, twice)",
-        "products.c",
+        "correlation_blocks.c",
         (("    put_zeros(l, n + lags", "    direct(l, r, n, lags, c);\n    return;\n    put_zeros(l, n + lags"),),
     ),
     Trick(
         "the same, instead of five products for nine of every third sample",
-        "products.c",
+        "correlation_blocks.c",
         (("    put_zeros(l, n + lags", SPLIT_ONCE + "    put_zeros(l, n + lags"),),
     ),
     Trick(
         "the barrier that keeps sums of lags in registers",
-        "products.c",
+        "correlation_blocks.c",
         (('if (LANES < 8) __asm__ volatile("");', ""),),
     ),
     Trick(
@@ -114,7 +114,7 @@ TRICKS = (
     ),
     Trick(
         "who comes out of a kernel waits awake for the interpreter",
-        "gate.c",
+        "gil_handoff.c",
         (("if (replaced(0, mine)) return;", "return;"),),
         cores=2,
     ),
@@ -215,14 +215,14 @@ class Workshop(NamedTuple):
                 shutil.copy(path, folder)
         levels = {self.level: build.ISA_LEVELS[platform.machine()][self.level]}
         options = (*self.options, *unchanged)
-        return library.load(build.compile_sources(self.compiler, levels, folder, folder, options)[self.level])
+        return loader.load(build.compile_sources(self.compiler, levels, folder, folder, options)[self.level])
 
 
 @contextmanager
 def using(loaded: Any) -> Iterator[None]:
     """Within this, the stages call this library."""
     before = kernels.loaded
-    kernels.loaded = lambda: (loaded, library.Status(True, "a variant"))
+    kernels.loaded = lambda: (loaded, loader.Status(True, "a variant"))
     try:
         yield
     finally:
@@ -318,7 +318,7 @@ def main() -> int:
     page.say()
     page.say("How much more time the default chain takes without it, or a stage that is not in the chain.")
     page.say()
-    best = library.load(min(build.libraries().items())[1]).rosafe_processor_level()
+    best = loader.load(min(build.libraries().items())[1]).rosafe_processor_level()
     levels = [level for level in build.libraries() if best >= level >= min(best, 3)]  # SSE is nobody's any more
     names = [build.ISA_LEVELS[platform.machine()][level] for level in levels]
     shares: dict[Trick, list[str]] = {trick: [] for trick in tricks}

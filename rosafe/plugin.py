@@ -14,11 +14,11 @@ API_VERSION : int
     The version of this interface. A plugin that depends on it can compare it with the version it was written for.
 """
 
+from rosafe.declarations.parameter import Parameter
+from rosafe.declarations.representation import Derived, Part, Representation
 from rosafe.dsp.framing import FramedStage, frame_parameters
 from rosafe.dsp.stage import Stage
 from rosafe.dsp.variants import variant
-from rosafe.vocabulary.parameter import Parameter
-from rosafe.vocabulary.representation import Derived, Part, Representation
 
 API_VERSION = 1
 

@@ -11,17 +11,17 @@ KEPT = 600  # lines of a FrameClock: two minutes and more with the default block
 
 
 def array_msg(generated: Any) -> Any:
-    """As `rosafe.component.wire.array_msg`: the message class to use in place of a generated one."""
-    from rosafe.component import wire  # which needs ROS, and generated messages
+    """As `rosafe.component.serialization.array_msg`: the message class to use in place of a generated one."""
+    from rosafe.component import serialization  # which needs ROS, and generated messages
 
-    return wire.array_msg(generated)
+    return serialization.array_msg(generated)
 
 
 def array_srv(generated: Any) -> Any:
-    """As `rosafe.component.wire.array_srv`: the service class to use in place of a generated one."""
-    from rosafe.component import wire
+    """As `rosafe.component.serialization.array_srv`: the service class to use in place of a generated one."""
+    from rosafe.component import serialization
 
-    return wire.array_srv(generated)
+    return serialization.array_srv(generated)
 
 
 class Moment(NamedTuple):

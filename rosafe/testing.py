@@ -11,20 +11,20 @@ from typing import Any
 
 import numpy as np
 
-from rosafe.dsp.guard import FloatArray
+from rosafe.declarations.idl import element
+from rosafe.declarations.parameter import Parameter
+from rosafe.declarations.signals import layout
+from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.dsp.plugin_checks import PluginError, checked
 from rosafe.dsp.stage import Stage, parts_of
 from rosafe.interface import format_value
 from rosafe.representations import BUILTIN, STAGES
 from rosafe.tree import sizes
-from rosafe.vocabulary.idl import element
-from rosafe.vocabulary.parameter import Parameter
-from rosafe.vocabulary.signals import layout
 
 _CUTS = ([1], [7, 0, 160], [0, 0, 441], [3, 1000, 50])
 _LOUD = 2.0**31  # the samples of int32 sound that is not normalised
 _LONG_SECONDS = 8.0
-_MOST_BYTES = 2**25  # of the output of a parent at a limit of its parameters, for a short sound
+_MAX_BYTES = 2**25  # of the output of a parent at a limit of its parameters, for a short sound
 _COST_RATE, _COST_SECONDS = 44100.0, 0.5
 
 
@@ -295,7 +295,7 @@ def _fits(stages: Sequence[Stage]) -> bool:
     """Whether a short sound does not take too much memory at any stage."""
     rows: tuple[int, ...] = (2,)
     for stage in stages:
-        if sizes.output_size(stage, rows, 0.25) > _MOST_BYTES or sizes.state_size(stage, rows) > _MOST_BYTES:
+        if sizes.output_size(stage, rows, 0.25) > _MAX_BYTES or sizes.state_size(stage, rows) > _MAX_BYTES:
             return False
         if stage.output_format.window > stage.sample_rate:  # a second, of which there is less
             return False

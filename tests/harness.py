@@ -33,7 +33,7 @@ import pytest
 
 from rosafe import interface
 from rosafe.component import generate
-from rosafe.component.master import PrivateMaster
+from rosafe.transport.master import PrivateMaster
 
 ROOT = Path(__file__).resolve().parents[1]
 SCRIPTS = ROOT / "scripts"
@@ -377,7 +377,7 @@ class MasterProcess:
 
     def start(self, env: dict[str, str]) -> None:
         """Start it and wait until it answers."""
-        from rosafe.component.master import MasterError, check_master
+        from rosafe.transport.master import MasterError, check_master
 
         def answers() -> bool:
             assert self.process is not None

@@ -18,7 +18,7 @@ from rosafe.commands import CommandError
 from rosafe.commands.setup import read_file
 from rosafe.input import open_descriptor, open_regular, read_regular
 from rosafe.interface import ComponentError
-from rosafe.node.keeper import TreeStateFile
+from rosafe.node.tree_state_file import TreeStateFile
 from rosafe.offline.corpus import write_failed
 from rosafe.offline.files import process_file
 from rosafe.offline.formats import FORMATS

@@ -13,13 +13,14 @@ from rosafe.bass.capture import Capture, Snapshot, check_window
 from rosafe.bass.socket_server import DEFAULT_HOST, DEFAULT_PORT, DedicatedSocket
 from rosafe.bass.sources import SoundSource, device_lines, open_source
 from rosafe.bass.sources.alsa import AlsaSource, DeviceBusyError
-from rosafe.component import master, wire
+from rosafe.component import serialization
 from rosafe.component.activities import Activity
 from rosafe.component.component import ComponentNode
-from rosafe.component.events import ThrottledLog
 from rosafe.component.startup import run_server
 from rosafe.interface import BASS, ComponentError
 from rosafe.terminal import printable
+from rosafe.transport import master
+from rosafe.transport.log_throttle import ThrottledLog
 
 
 class BassNode:
@@ -32,7 +33,7 @@ class BassNode:
     def __init__(self, instance: str) -> None:
         self._node = ComponentNode(BASS, lambda problem: BASS.error("e_hwparams", str(problem)))
         self.finished = self._node.finished
-        self._message_class = wire.message_class("bass", BASS.port("Audio").idl)
+        self._message_class = serialization.message_class("bass", BASS.port("Audio").idl)
         self._audio = self._node.advertise("Audio", self._message_class)
         self._snapshot: Snapshot | None = None
         self._source: SoundSource | None = None  # of the acquisition under way

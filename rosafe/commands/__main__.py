@@ -14,10 +14,10 @@ from pathlib import Path
 from rosafe import commands, missing, streams
 from rosafe.commands import CommandError
 from rosafe.component.startup import Parser, without_names
+from rosafe.declarations import plugins
 from rosafe.output import OutputError
 from rosafe.terminal import printable
 from rosafe.version import VERSION
-from rosafe.vocabulary import plugins
 
 _WITHOUT_PLUGINS = ("check", "doctor", "record", "trace")  # they compute nothing, or import plugins in another process
 _EPILOG = """example:

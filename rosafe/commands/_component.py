@@ -13,15 +13,16 @@ from rosafe.commands import CommandError
 from rosafe.interface import ROSAFE, ComponentError
 
 if TYPE_CHECKING:
-    from rosafe.genomix.graph import Graph
-    from rosafe.genomix.proxy import ComponentClient
+    from rosafe.client.component_client import ComponentClient
+    from rosafe.client.graph import Graph
 
 PAUSE = 0.2  # seconds between two looks, where a component is waited for
 
 
 def prepare(wait: float = 0.0) -> None:
     """Have messages and a ROS master, which may take `wait` seconds to come; else Failure."""
-    from rosafe.component import generate, master
+    from rosafe.component import generate
+    from rosafe.transport import master
 
     master.set_local_defaults()
     deadline = time.monotonic() + wait
@@ -41,7 +42,7 @@ def prepare(wait: float = 0.0) -> None:
 @asynccontextmanager
 async def component(instance: str, wait: float = 0.0) -> AsyncIterator[ComponentClient]:
     """The rosAFE of that name, which may take `wait` seconds to come; Failure where there is none."""
-    from rosafe.genomix.graph import Graph
+    from rosafe.client.graph import Graph
 
     graph = Graph(os.environ["ROS_MASTER_URI"])
     try:
@@ -60,7 +61,7 @@ async def component(instance: str, wait: float = 0.0) -> AsyncIterator[Component
 
 
 async def _found(graph: Graph, instance: str, wait: float) -> ComponentClient:
-    from rosafe.genomix.proxy import ComponentClient, names
+    from rosafe.client.component_client import ComponentClient, names
 
     deadline = time.monotonic() + wait
     while True:

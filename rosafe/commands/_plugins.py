@@ -16,7 +16,7 @@ import tempfile
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-from rosafe.vocabulary import plugins
+from rosafe.declarations import plugins
 
 LIMIT_SECONDS = 10.0  # for importing all plugins
 TRIAL_SECONDS = 300.0  # for trying the representations of one file

@@ -11,8 +11,8 @@ import os
 import textwrap
 
 from rosafe.commands import CommandError, _plugins
+from rosafe.declarations import plugins
 from rosafe.terminal import printable
-from rosafe.vocabulary import plugins
 
 
 def configure(parser: argparse.ArgumentParser) -> None:

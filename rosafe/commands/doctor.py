@@ -20,10 +20,11 @@ from typing import NamedTuple
 
 from rosafe import missing
 from rosafe.commands import _plugins as _child
-from rosafe.component import generate, master, paths
+from rosafe.component import generate
+from rosafe.declarations import plugins
+from rosafe.declarations.errors import ComponentError
 from rosafe.terminal import printable
-from rosafe.vocabulary import plugins
-from rosafe.vocabulary.errors import ComponentError
+from rosafe.transport import master, paths
 
 OK, NOTE, MISSING = "ok", "note", "MISSING"
 

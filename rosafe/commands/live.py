@@ -43,15 +43,16 @@ def _port(text: str) -> int:
 
 def run(options: argparse.Namespace) -> int:
     """Serve until Ctrl-C."""
-    from rosafe.component import generate, master, startup
+    from rosafe.component import generate, startup
     from rosafe.interface import ComponentError
+    from rosafe.transport import master
 
     master.set_local_defaults()
     try:
         generate.ensure_messages()
         master.check_master(os.environ["ROS_MASTER_URI"])
         startup.ensure_log_directory()
-        from rosafe.genomix.proxy import names
+        from rosafe.client.component_client import names
         from rosafe.live import daemon
 
         instance, bass = (names(name, name)[1] for name in (options.instance, options.bass))

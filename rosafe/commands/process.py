@@ -289,7 +289,7 @@ def _for_dask(plan: _Plan, options: argparse.Namespace) -> _Plan:
 
 def _runner(options: argparse.Namespace, count: int) -> Any:
     if options.dask:
-        from rosafe.commands._cluster import run_on
+        from rosafe.commands._dask import run_on
 
         return partial(run_on, options.dask)
     if count > 1:  # the cores have a process each, and its tree needs no more of them

@@ -199,19 +199,19 @@ def _open_source(options: argparse.Namespace, stopping: threading.Event) -> Soun
     try:
         if options.device is not None:
             from rosafe.bass.sources import open_source
-            from rosafe.component.paths import prefer_pypi_packages
+            from rosafe.transport.paths import prefer_pypi_packages
 
             prefer_pypi_packages()
             return open_source(options.device, options.rate, options.chunk, stopping)
         if options.socket:
-            from rosafe.bass.recording.remote import SocketSource
+            from rosafe.bass.recording.socket_source import SocketSource
 
             host, port = options.socket
             return SocketSource(host, port, options.rate, stopping)
-        from rosafe.bass.recording.topic import TopicSource
+        from rosafe.bass.recording.topic_source import TopicSource
         from rosafe.component.generate import GenerationError
-        from rosafe.component.master import MasterError
         from rosafe.component.startup import become_node
+        from rosafe.transport.master import MasterError
 
         try:
             become_node("rosafe_record")

@@ -17,12 +17,12 @@ from typing import Any
 
 from rosafe.commands import CommandError
 from rosafe.commands._component import component, format_error, prepare
+from rosafe.declarations.parameter import short_repr
+from rosafe.declarations.text import did_you_mean
 from rosafe.interface import REQUEST, ROSAFE, ComponentError, Representation
 from rosafe.interface.arguments import check_parameter
 from rosafe.terminal import printable
-from rosafe.tree import requests as request
-from rosafe.vocabulary.parameter import short_repr
-from rosafe.vocabulary.words import did_you_mean
+from rosafe.tree import tree_planner as request
 
 _SETTINGS = [p for p in REQUEST.parameters if p.name not in ("representation", "connect")]  # those have other places
 

@@ -110,21 +110,21 @@ def without_saved_tree(setup: Setup, keep: str) -> Setup:
 
 async def load(setup: Setup, instance: str, wait: float = 0.0) -> dict[str, Any]:
     """Build it on a running rosAFE; the outputs of `interface.LOAD_SETUP`, or Failure."""
-    from rosafe.genomix import setups
+    from rosafe.client import setup_transaction
 
     async with component(instance, wait) as proxy:
         try:
-            return await setups.apply(proxy, setup, wait)
+            return await setup_transaction.apply(proxy, setup, wait)
         except ComponentError as problem:
             raise CommandError(format_error(problem)) from None
 
 
 async def _saved(options: argparse.Namespace) -> str:
-    from rosafe.genomix import setups
+    from rosafe.client import setup_transaction
 
     async with component(options.instance, options.wait) as proxy:
         try:
-            return write(await setups.capture(proxy), options.full)
+            return write(await setup_transaction.capture(proxy), options.full)
         except ComponentError as problem:
             raise CommandError(format_error(problem)) from None
 

@@ -124,9 +124,9 @@ def _listen(node: str, seconds: float) -> list[Event]:
     import rospy
     from std_msgs.msg import String
 
-    from rosafe.component.master import MasterError
     from rosafe.component.startup import become_node
     from rosafe.node.trace_port import read
+    from rosafe.transport.master import MasterError
 
     messages: queue.SimpleQueue[Any] = queue.SimpleQueue()
     try:

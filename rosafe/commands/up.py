@@ -19,9 +19,9 @@ from rosafe.interface import ComponentError
 from rosafe.setups import Setup
 
 if TYPE_CHECKING:
-    from rosafe.commands._stack import Launcher, ManagedProcess
-    from rosafe.genomix.graph import Graph
-    from rosafe.genomix.proxy import ComponentClient
+    from rosafe.client.component_client import ComponentClient
+    from rosafe.client.graph import Graph
+    from rosafe.commands._launcher import Launcher, ManagedProcess
 
 PERIOD = 1.0  # seconds between two looks at all
 
@@ -57,9 +57,10 @@ def _port(text: str) -> int:
 
 def run(options: argparse.Namespace) -> int:
     """Start everything, show how it is, and end what was started."""
-    from rosafe.commands._stack import Launcher, environment
+    from rosafe.commands._launcher import Launcher, environment
     from rosafe.commands.setup import read_file, without_saved_tree
-    from rosafe.component import generate, master
+    from rosafe.component import generate
+    from rosafe.transport import master
 
     # What is wrong with it is told before anything starts.
     setup = without_saved_tree(read_file(options.file), options.keep) if options.file else None
@@ -133,9 +134,9 @@ class _Session:
                 await asyncio.sleep(PERIOD)
 
     async def _load(self, afe: ComponentClient | None) -> None:
+        from rosafe.client import setup_transaction
         from rosafe.commands._component import format_error
-        from rosafe.commands._stack import ManagedProcess
-        from rosafe.genomix import setups
+        from rosafe.commands._launcher import ManagedProcess
 
         if self._setup is None:
             return
@@ -144,7 +145,7 @@ class _Session:
             part.state, part.detail = "refused", "rosAFE does not run"
             return
         try:
-            answer = await setups.apply(afe, self._setup, wait=10.0)
+            answer = await setup_transaction.apply(afe, self._setup, wait=10.0)
             part.state = "loaded"
             part.detail = f"{self._options.file}: {len(answer['created'])} created, {len(answer['reused'])} reused"
         except ComponentError as problem:
@@ -179,7 +180,7 @@ async def _tree(afe: ComponentClient) -> str:
 
 @asynccontextmanager
 async def _graph() -> AsyncIterator[Graph]:
-    from rosafe.genomix.graph import Graph
+    from rosafe.client.graph import Graph
 
     graph = Graph(os.environ["ROS_MASTER_URI"])
     try:

@@ -11,8 +11,8 @@ import actionlib
 import rospy
 from actionlib_msgs.msg import GoalStatusArray
 
-from rosafe.component.publisher import Publisher
-from rosafe.component.wire import BufferList
+from rosafe.transport.buffer_list import BufferList
+from rosafe.transport.publisher import Publisher
 
 DEFAULT_FREQUENCY = 5.0  # Hz, as of every action server
 MAX_FREQUENCY = 100.0  # Hz

@@ -9,8 +9,8 @@ import time
 from collections.abc import Callable, Iterable
 from typing import Any
 
+from rosafe.declarations.text import join_names
 from rosafe.interface import MAX_ACTIVITIES, ComponentError, Service
-from rosafe.vocabulary.words import join_names
 
 Handler = Callable[["Activity", dict[str, Any]], None]
 

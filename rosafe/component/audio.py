@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 
-from rosafe.component.frametime import FrameTime, LinearClock
+from rosafe.component.frame_clock import FrameTime, LinearClock
 from rosafe.component.lag import LagMonitor
 from rosafe.sound.windows import split_new_frames, window_error
 

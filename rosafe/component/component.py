@@ -25,14 +25,15 @@ import rospy
 from actionlib_msgs.msg import GoalStatus
 
 from rosafe import interface
-from rosafe.component import mark, master, memory, registration
+from rosafe.component import explicit_defaults, malloc_tuning
 from rosafe.component.action_server import StatusPublisher
 from rosafe.component.activities import Activities, Activity, Handler, TaskStatistics, too_many
-from rosafe.component.publisher import Publisher
-from rosafe.component.pulse import SelfCheck
+from rosafe.declarations.parameter import short_repr
 from rosafe.interface import ComponentError
+from rosafe.transport import master, registration
+from rosafe.transport.publisher import Publisher
+from rosafe.transport.self_check import SelfCheck
 from rosafe.version import VERSION
-from rosafe.vocabulary.parameter import short_repr
 
 STATE_PERIOD = 0.9  # seconds between two genom_state messages at the most; the contract is 1
 BURST_SECONDS = 0.005  # what changes within this makes one message, not one each
@@ -211,16 +212,16 @@ class ComponentNode:
     def _serve_activity(self, service: interface.Service, request: Any) -> Any:
         response = getattr(self._srv, f"{service.name}Response")
         try:
-            activity = self._run(service, request, mark.has_explicit_defaults(request))
+            activity = self._run(service, request, explicit_defaults.has_explicit_defaults(request))
         except ComponentError as problem:
             return response(False, self._logged_errors(service, problem))
-        return response(True, mark.accepts_warnings(request, activity.warning))
+        return response(True, explicit_defaults.accepts_warnings(request, activity.warning))
 
     def _serve_function(self, service: interface.Service, request: Any) -> Any:
         response = getattr(self._srv, f"{service.name}Response")
         changes = self._registrar.changes
         try:
-            outputs = self._answer(service, request, mark.has_explicit_defaults(request))
+            outputs = self._answer(service, request, explicit_defaults.has_explicit_defaults(request))
         except ComponentError as problem:
             return response(genom_success=False, genom_exdetail=self._logged_errors(service, problem))
         except Exception as problem:  # a fault of ours must reach the caller and the log, and not end the node
@@ -233,7 +234,7 @@ class ComponentNode:
         whole = outputs.pop("response", None)  # a handler may bring a response of its own, with arrays in it
         if whole is not None:
             return whole
-        told = mark.accepts_warnings(request, outputs.pop("warning", ""))
+        told = explicit_defaults.accepts_warnings(request, outputs.pop("warning", ""))
         return response(genom_success=True, genom_exdetail=told, **outputs)
 
     def _logged_errors(self, service: interface.Service, problem: ComponentError) -> str:
@@ -274,7 +275,9 @@ class ComponentNode:
                 set_accepted(activity)
 
             try:
-                activity = self._begin(service, goal.get_goal(), mark.has_explicit_defaults(goal.goal), end)
+                activity = self._begin(
+                    service, goal.get_goal(), explicit_defaults.has_explicit_defaults(goal.goal), end
+                )
             except ComponentError as problem:
                 goal.set_accepted()
                 answer(goal, problem)
@@ -351,7 +354,7 @@ class ComponentNode:
             self._health_changed.clear()
             self.diagnostics.force_update()  # `update` would ask the master for the period, and fail without one
             if next(rounds) % TRIM_ROUNDS == 0:
-                memory.trim()
+                malloc_tuning.trim()
 
     def _state_message(self) -> Any:
         msg = self._msg

@@ -33,10 +33,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 from rosafe import missing
-from rosafe.component import master, paths
+from rosafe.declarations import plugins
 from rosafe.output import sync_tree
 from rosafe.terminal import printable
-from rosafe.vocabulary import plugins
+from rosafe.transport import master, paths
 
 # Debian ships the messages of these without package.xml, without which rosmsg finds no message that uses them.
 DEBIAN_PACKAGES = ("std_msgs", "actionlib_msgs", "diagnostic_msgs", "rosgraph_msgs")

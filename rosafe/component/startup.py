@@ -17,10 +17,11 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, NoReturn, Protocol
 
-from rosafe.component import generate, master, memory, paths, systemd
+from rosafe.component import generate, malloc_tuning
+from rosafe.declarations.errors import ComponentError
 from rosafe.terminal import printable
+from rosafe.transport import master, paths, systemd
 from rosafe.version import VERSION
-from rosafe.vocabulary.errors import ComponentError
 
 if TYPE_CHECKING:
     from rosafe.interface import Component  # which needs numpy, and `rosafe doctor` must not
@@ -174,7 +175,7 @@ def _start(
     for name, variable in _ENVIRONMENT_REMAPPINGS.items():
         if mappings.get(name):
             os.environ[variable] = mappings[name]
-    memory.limit_arenas()
+    malloc_tuning.limit_arenas()
     master.set_local_defaults()
     master.check_address(os.environ["ROS_MASTER_URI"])  # a wrong one does not get better
     doubt = master.unreachable()
@@ -194,7 +195,7 @@ def _start(
     sys.setswitchinterval(SWITCH_SECONDS)
     import rospy
 
-    from rosafe.component import registration
+    from rosafe.transport import registration
 
     try:
         registrar = registration.init_node(instance, [f"{component.name}-ros", *remappings])
@@ -266,7 +267,7 @@ def become_node(name: str) -> None:
     """
     import rospy
 
-    from rosafe.component import registration
+    from rosafe.transport import registration
 
     master.set_local_defaults()
     master.check_master(os.environ["ROS_MASTER_URI"])

@@ -156,19 +156,19 @@ def _without_empty_folders(path: Path, signals: _Signals) -> Iterator[None]:
 def _run(options: argparse.Namespace, signals: _Signals, scratch: str) -> int:
     """The demonstration, with its failures as one line; `scratch` is a folder for log files and caches."""
     from rosafe.component.generate import GenerationError
-    from rosafe.component.paths import user_cache, writable
-    from rosafe.demo import course
+    from rosafe.demo import scenario
     from rosafe.interface import ComponentError
     from rosafe.output import OutputError
     from rosafe.sound.audiofile import AudioFileError
+    from rosafe.transport.paths import user_cache, writable
 
     try:
         if not writable(options.out):
-            raise course.DemoError(f"cannot write to {options.out}: choose another folder with --out")
+            raise scenario.DemoError(f"cannot write to {options.out}: choose another folder with --out")
         cache = user_cache() / "matplotlib"
         os.environ["MPLCONFIGDIR"] = str(cache) if writable(cache) else scratch
-        course.run(options.sound, options.seconds, options.out / PLOT_FILE, scratch, signals.check, signals.defer)
-    except (course.DemoError, AudioFileError, ComponentError, GenerationError, OutputError) as problem:
+        scenario.run(options.sound, options.seconds, options.out / PLOT_FILE, scratch, signals.check, signals.defer)
+    except (scenario.DemoError, AudioFileError, ComponentError, GenerationError, OutputError) as problem:
         print(f"demo: {printable(' '.join(str(problem).split()))}", file=sys.stderr)
         return 1
     return 0

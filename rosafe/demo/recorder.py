@@ -135,7 +135,7 @@ class PortRecorder:
         import rospy
         from diagnostic_msgs.msg import DiagnosticArray
 
-        from rosafe.component import wire
+        from rosafe.component import serialization
 
         self.center_frequencies = np.zeros(0)
         self.lags = np.zeros(0)
@@ -148,7 +148,7 @@ class PortRecorder:
             topic = f"/rosAFE/{port.name}" + (f"/{name}" if port.multiple else "")
             follower = PortFollower(kind, topic, sample_rate, frames_per_block)
             self.ports[kind] = follower
-            message_class = wire.message_class("rosAFE", port.idl)
+            message_class = serialization.message_class("rosAFE", port.idl)
             rospy.Subscriber(topic, message_class, follower.take, buff_size=2**22, tcp_nodelay=True)
 
     def _take_health(self, message: Any) -> None:

@@ -12,10 +12,10 @@ from typing import Any
 
 from rosafe import interface
 from rosafe.component import generate
-from rosafe.component.master import PrivateMaster
-from rosafe.component.paths import CODE_DIR
 from rosafe.demo.processes import Child, ProcessGroup
 from rosafe.demo.sound import Sound
+from rosafe.transport.master import PrivateMaster
+from rosafe.transport.paths import CODE_DIR
 
 START_SECONDS = 30.0
 REQUEST_SECONDS = 30.0

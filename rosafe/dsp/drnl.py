@@ -12,8 +12,8 @@ import numpy as np
 import scipy
 
 from . import kernels
-from .cascade import SosFilter
-from .guard import FloatArray, clamp
+from .numeric_limits import FloatArray, clamp
+from .sos_filter import SosFilter
 
 COMPRESSION = 10**-0.60206
 HIGHEST_FITTED = 1000.0  # Hz; above, the nonlinear path has the gains of CASP_GAIN_FREQUENCY

@@ -10,12 +10,12 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from rosafe.vocabulary.parameter import Parameter
+from rosafe.declarations.parameter import Parameter
 
 from . import kernels
-from .guard import SQUARE_TINY, FloatArray, clamp
+from .numeric_limits import SQUARE_TINY, FloatArray, clamp
 from .rounding import sample_count
-from .signal import SignalFormat
+from .signal_format import SignalFormat
 from .stage import Output, Stage
 from .windows import NAMES, window
 

@@ -11,9 +11,9 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from . import kernels, memory
+from . import buffer_pool, kernels
 from .erb import bandwidth
-from .guard import FLUSH_INTERVAL, FloatArray, clamp, flush_denormals
+from .numeric_limits import FLUSH_INTERVAL, FloatArray, clamp, flush_denormals
 
 POLES_PER_SECTION = 4
 TURN_SPAN = 64  # samples; SPAN of kernels/gammatone.c, which takes no other `position` than below it
@@ -59,8 +59,8 @@ class GammatoneBank:
         It goes into `output` where that is given; its rows may lie apart (`kernels.rows_apart`).
         """
         if output is None:
-            output = memory.empty((2, len(self._sections), block.shape[-1]))
-        envelope = memory.empty(output.shape) if with_envelope else None
+            output = buffer_pool.empty((2, len(self._sections), block.shape[-1]))
+        envelope = buffer_pool.empty(output.shape) if with_envelope else None
         run = kernels.gammatone if kernels.compiled() else filter_by_scipy
         run(block, self._sections, self._state, self._position, output, envelope)
         self._position = (self._position + block.shape[-1]) % TURN_SPAN

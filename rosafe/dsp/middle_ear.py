@@ -11,7 +11,7 @@ from __future__ import annotations
 import numpy as np
 import scipy
 
-from .guard import FloatArray
+from .numeric_limits import FloatArray
 
 ORDER = 512
 MODELS = ("jepsen", "lopezpoveda")

@@ -18,12 +18,12 @@ from typing import Any, ClassVar, NoReturn
 
 import numpy as np
 
-from rosafe.vocabulary.checks import MAX_TEXT
-from rosafe.vocabulary.parameter import REQUIRED, Parameter
-from rosafe.vocabulary.representation import Part
+from rosafe.declarations.checks import MAX_TEXT
+from rosafe.declarations.parameter import REQUIRED, Parameter
+from rosafe.declarations.representation import Part
 
-from .guard import FloatArray
-from .signal import SignalFormat
+from .numeric_limits import FloatArray
+from .signal_format import SignalFormat
 from .stage import FLOAT64, Output, Stage
 
 log = logging.getLogger("rosafe.plugin")

@@ -10,13 +10,13 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from rosafe.vocabulary.parameter import REQUIRED, Parameter
-from rosafe.vocabulary.representation import Representation
+from rosafe.declarations.parameter import REQUIRED, Parameter
+from rosafe.declarations.representation import Representation
 
-from . import kernels, memory
-from .guard import FloatArray
+from . import buffer_pool, kernels
+from .numeric_limits import FloatArray
 from .old_names import OldNames
-from .signal import SignalFormat
+from .signal_format import SignalFormat
 
 SAMPLE_RATE = Parameter(
     "sample_rate", "double", REQUIRED, "Samples per second (Hz)", 0.0, 1e9, open_minimum=True, unit="Hz"
@@ -32,7 +32,7 @@ class Stage(OldNames):
     from the defaults here of `output_rows`, `output_format`, `output_count`, `look_ahead`, `required_extra`,
     `input_format_changed`, `state_size`, `block_size_dependent`.
 
-    The rule for every stage: `build`, and so `configure` and `set_input_format`, puts new objects in the place of what it
+    The rule for every stage: `build`, and so `configure` and `set_input_format`, puts new objects in place of what it
     changes (filters, framings, tables) and never alters those that are there. A shallow copy of a stage is therefore a
     second one that may be configured while the first one works; the tree tries changes on such copies, and may throw
     them away or put them to work with the state as it is then.
@@ -107,7 +107,7 @@ class Stage(OldNames):
 
     @classmethod
     def request_values(cls, values: Mapping[str, Any]) -> dict[str, Any]:
-        """`values` as a request may hold them, without what only `effective_values` tells: so one can be made like another."""
+        """Return `values` as a request may hold them, to create an equal stage."""
         return dict(values)
 
     # --- what it is -------------------------------------------------------------------------------------------
@@ -181,7 +181,7 @@ class Stage(OldNames):
         self.reconfigure(given, ())
 
     def reconfigure(self, given: SignalFormat, changes: Collection[Mapping[str, Any]]) -> None:
-        """`set_input_format` and one `configure` after the other, at once: only what comes of it all must be possible."""
+        """Apply `set_input_format` and several `configure` at once: only the final state has to be valid."""
         if given == self.input_format and not any(changes):
             self.input_format = given
             return
@@ -247,8 +247,8 @@ class Stage(OldNames):
             The parent's by-product of the same block that `required_extra` names.
         out : ndarray, (..., M), optional
             Where the caller wants the output: evenly strided rows, each contiguous. It may be ignored. It can be
-            `block` if the stage `SUPPORTS_IN_PLACE`: then the output stays in the cache. A stage whose `process` does not
-            have this argument is called without it.
+            `block` if the stage `SUPPORTS_IN_PLACE`: the output then stays in the cache. A stage whose `process` does
+            not             have this argument is called without it.
 
         Returns
         -------
@@ -268,7 +268,7 @@ class Stage(OldNames):
     def _output_array(self, shape: tuple[int, ...], out: FloatArray | None = None) -> FloatArray:
         """`out` if it is suitable for an output of this shape, otherwise a new array."""
         if out is None or out.shape != shape or out.dtype != FLOAT64 or not kernels.rows_evenly_strided(out):
-            return memory.empty(shape)
+            return buffer_pool.empty(shape)
         return out
 
     def _as_valid_block(self, block: Any) -> FloatArray:

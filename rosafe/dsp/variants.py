@@ -9,9 +9,9 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any, ClassVar
 
-from rosafe.vocabulary.representation import Representation
+from rosafe.declarations.representation import Representation
 
-from .signal import SignalFormat
+from .signal_format import SignalFormat
 from .stage import Stage
 
 

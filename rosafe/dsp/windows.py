@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 import scipy
 
-from .guard import FloatArray
+from .numeric_limits import FloatArray
 
 NAMES = ("hamming", "hanning", "hann", "blackman", "triang", "sqrt_win")  # which the original's processors know
 ALL_NAMES = (*NAMES, "rectwin")

@@ -13,13 +13,14 @@ import sys
 import threading
 from concurrent.futures import ThreadPoolExecutor
 
-from rosafe.component import generate, master, startup, systemd
-from rosafe.genomix.graph import JOIN_SECONDS, Graph
+from rosafe.client.graph import JOIN_SECONDS, Graph
+from rosafe.component import generate, startup
 from rosafe.genomix.names import Names, parameter_name
-from rosafe.genomix.server import Server
+from rosafe.genomix.routes import Server
 from rosafe.genomix.sessions import Sessions
 from rosafe.http_server.access import host_name, own_names
 from rosafe.terminal import printable
+from rosafe.transport import master, systemd
 from rosafe.version import VERSION
 
 DEFAULT_PORT = 8080

@@ -8,7 +8,7 @@ import os
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
-from rosafe.genomix.graph import Graph, NotRegisteredError
+from rosafe.client.graph import Graph, NotRegisteredError
 from rosafe.http_server.access import host_name
 from rosafe.interface import ComponentError
 

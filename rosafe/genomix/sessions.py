@@ -11,11 +11,11 @@ from collections import Counter
 from collections.abc import Awaitable, Callable, Mapping
 from typing import Any, TypeVar
 
-from rosafe.genomix.errors import too_many
-from rosafe.genomix.graph import Graph
-from rosafe.genomix.proxy import NOTHING, ComponentClient, Value, names
-from rosafe.genomix.requests import Request
-from rosafe.genomix.tasks import wait_any
+from rosafe.client.asyncio_tools import wait_any
+from rosafe.client.component_client import NOTHING, ComponentClient, Value, names
+from rosafe.client.errors import too_many
+from rosafe.client.graph import Graph
+from rosafe.genomix.activity_request import Request
 from rosafe.interface import ComponentError, Service
 
 MAX_SESSIONS = 1000

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from rosafe.declarations.errors import ComponentError
+from rosafe.declarations.idl import ros_type
+from rosafe.declarations.parameter import MAX_SEQUENCE, MAX_STRING, REQUIRED, Parameter, format_value
+from rosafe.declarations.representation import Representation
 from rosafe.representations import KINDS, PLUGINS, PROBLEMS
-from rosafe.vocabulary.errors import ComponentError
-from rosafe.vocabulary.idl import ros_type
-from rosafe.vocabulary.parameter import MAX_SEQUENCE, MAX_STRING, REQUIRED, Parameter, format_value
-from rosafe.vocabulary.representation import Representation
 
 from .bass import BASS
 from .genom import COMMON_SERVICES, GENOM_EXCEPTIONS, GENOM_STATE_PORT, MAX_ACTIVITIES

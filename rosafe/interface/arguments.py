@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from rosafe.declarations.parameter import short_repr
+from rosafe.declarations.text import did_you_mean
 from rosafe.interface import CORE_REPRESENTATIONS, KINDS, Parameter
-from rosafe.vocabulary.parameter import short_repr
-from rosafe.vocabulary.words import did_you_mean
 
 _BY_NAME = {name: p for kind in KINDS.values() for p in kind.parameters for name in (p.name, *p.aliases)}
 _BY_FORMER_NAME = {name: p for kind in KINDS.values() for p in kind.parameters for name in p.former}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rosafe.vocabulary.parameter import Parameter
+from rosafe.declarations.parameter import Parameter
 
 from .genom import COMMON_SERVICES, GENOM_STATE, GENOM_STATE_PORT
 from .service import Component, Port, Service, Struct

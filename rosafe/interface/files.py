@@ -9,7 +9,7 @@ import re
 from collections.abc import Iterator
 from pathlib import Path
 
-from rosafe.vocabulary.idl import ros_type
+from rosafe.declarations.idl import ros_type
 
 from .service import Component, Service, Struct
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rosafe.vocabulary.parameter import REQUIRED, Parameter
+from rosafe.declarations.parameter import REQUIRED, Parameter
 
 from .service import Port, Service, Struct
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
-from rosafe.vocabulary.idl import ros_type
-from rosafe.vocabulary.parameter import REQUIRED, Parameter
-from rosafe.vocabulary.representation import Representation
+from rosafe.declarations.idl import ros_type
+from rosafe.declarations.parameter import REQUIRED, Parameter
+from rosafe.declarations.representation import Representation
 
 from .service import Component, Port, Service
 

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 
+from rosafe.declarations.idl import TIME
+from rosafe.declarations.parameter import REQUIRED, Parameter
+from rosafe.declarations.representation import Representation
+from rosafe.declarations.signals import SIGNALS, layout
 from rosafe.representations import KINDS
 from rosafe.representations.registry import CORE_KINDS
-from rosafe.vocabulary.idl import TIME
-from rosafe.vocabulary.parameter import REQUIRED, Parameter
-from rosafe.vocabulary.representation import Representation
-from rosafe.vocabulary.signals import SIGNALS, layout
 
 from .bass import BINAUDIO
 from .genom import COMMON_SERVICES, GENOM_STATE, GENOM_STATE_PORT

@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from rosafe.vocabulary.errors import ComponentError
-from rosafe.vocabulary.idl import TIME, TIME_MEMBERS
-from rosafe.vocabulary.parameter import REQUIRED, Parameter
-from rosafe.vocabulary.signals import Struct
+from rosafe.declarations.errors import ComponentError
+from rosafe.declarations.idl import TIME, TIME_MEMBERS
+from rosafe.declarations.parameter import REQUIRED, Parameter
+from rosafe.declarations.signals import Struct
 
 
 def _unset(parameter: Parameter, value: Any) -> bool:

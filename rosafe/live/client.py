@@ -14,11 +14,11 @@ from typing import Any, NamedTuple
 
 from aiohttp import WSCloseCode, WSMsgType, web
 
-from rosafe.genomix.tasks import run_shared
+from rosafe.client.asyncio_tools import run_shared
 from rosafe.http_server.listener import connection_of
 from rosafe.interface import MAX_SETUP, ComponentError
-from rosafe.live.hub import FLOAT, Hub, Key, View
-from rosafe.live.robot import format_error
+from rosafe.live.components import format_error
+from rosafe.live.views import FLOAT, Hub, Key, View
 
 PERIOD = 0.04  # s between two pictures, at least: 25 a second
 BYTES_PER_SECOND = 200_000

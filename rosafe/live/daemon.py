@@ -15,14 +15,14 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
+from rosafe.client.graph import Graph
 from rosafe.component import startup
-from rosafe.genomix.graph import Graph
 from rosafe.http_server.access import own_names
 from rosafe.live.access import TokenAuth
+from rosafe.live.components import ComponentFacade
 from rosafe.live.health import Health
-from rosafe.live.hub import Hub
-from rosafe.live.robot import ComponentFacade
 from rosafe.live.server import Server
+from rosafe.live.views import Hub
 
 THREADS = 8  # that wait for rospy
 EVERYWHERE = {"0.0.0.0": "127.0.0.1", "::": "[::1]", "": "127.0.0.1"}  # and where this machine finds itself then
@@ -46,7 +46,7 @@ class AddressInUse(Exception):
 
 
 async def serve(options: Options) -> None:
-    """Serve until a signal comes; Taken, or ComponentError where there is no master."""
+    """Serve until a signal arrives; raise AddressInUse, or ComponentError where there is no master."""
     loop = asyncio.get_running_loop()
     end = asyncio.Event()
     for number in startup.ending_signals():
@@ -108,9 +108,9 @@ async def serve(options: Options) -> None:
 
 
 async def _publish_images(hub: Hub, server: Server) -> None:
-    from rosafe.live import images  # matplotlib's colours take a moment
+    from rosafe.live import image_topics  # matplotlib's colours take a moment
 
-    lookers = await asyncio.to_thread(images.Images, hub)
+    lookers = await asyncio.to_thread(image_topics.Images, hub)
     while True:
         if lookers.wanted:
             server.join(lookers)
@@ -118,7 +118,7 @@ async def _publish_images(hub: Hub, server: Server) -> None:
         else:
             await lookers.publish()  # lets go
             server.leave(lookers)
-        await asyncio.sleep(images.PERIOD)
+        await asyncio.sleep(image_topics.PERIOD)
 
 
 def _why(problem: OSError | UnicodeError, options: Options) -> str:

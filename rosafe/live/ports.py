@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import rospy
 
-from rosafe.component import wire
-from rosafe.component.events import ThrottledLog
+from rosafe.component import serialization
 from rosafe.interface import LAYOUTS
-from rosafe.live.pictures import Processor
+from rosafe.live.plot_data import Processor
 from rosafe.sound.windows import MAX_INDEX, MAX_WINDOW, new_frames, split_new_frames, window_error
 from rosafe.terminal import printable
+from rosafe.transport.log_throttle import ThrottledLog
 
 BUFFER = 2**17  # bytes that are read at a time: more of them cost more to make than turns do
 AUDIO_RATE_SLACK = 0.5  # frames
@@ -123,7 +123,7 @@ class Port(_Subscription):
         self._take, self._rows = take, rows
         self._probe = next(iter(rows))  # the field that tells how far the window has moved on
         self._before: np.ndarray | None = None
-        message_class = wire.tolerant_message_class("rosAFE", LAYOUTS[processor.kind].idl)
+        message_class = serialization.tolerant_message_class("rosAFE", LAYOUTS[processor.kind].idl)
         super().__init__(processor.topic, message_class, CHANGE_SECONDS)
 
     def _accept(self, message: Any) -> str:
@@ -187,7 +187,7 @@ class Audio(_Subscription):
         self._take = take
         self._index = 0
         self._mark = (0, 0.0)  # a frame, and when it was captured (s, clock)
-        super().__init__(topic, wire.tolerant_message_class("bass", "::binaudio::portStruct", MAX_WINDOW), 0.0)
+        super().__init__(topic, serialization.tolerant_message_class("bass", "::binaudio::portStruct", MAX_WINDOW), 0.0)
 
     def captured_at(self, index: int) -> float | None:
         """When the audio frame `index` was captured (s, of the clock); None where nobody knows."""

@@ -11,17 +11,17 @@ from typing import Any, Protocol
 
 from aiohttp import web
 
-from rosafe.genomix.tasks import run_shared
+from rosafe.client.asyncio_tools import run_shared
 from rosafe.http_server.connections import Connections, Limits
 from rosafe.http_server.listener import HttpListener, connection_of
 from rosafe.http_server.refusal import HttpRefusal
 from rosafe.interface import ComponentError
 from rosafe.live.access import HEADERS, TokenAuth
 from rosafe.live.client import Ask, BrowserConnection
+from rosafe.live.components import ComponentFacade, catalogue, format_error
 from rosafe.live.health import Health
-from rosafe.live.hub import Hub, Key
-from rosafe.live.pictures import Tree
-from rosafe.live.robot import ComponentFacade, catalogue, format_error
+from rosafe.live.plot_data import Tree
+from rosafe.live.views import Hub, Key
 from rosafe.version import VERSION
 
 PAGE = Path(__file__).with_name("page")

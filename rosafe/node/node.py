@@ -15,30 +15,30 @@ import rospy
 from diagnostic_msgs.msg import DiagnosticStatus
 
 from rosafe import interface
-from rosafe.component import wire
+from rosafe.component import serialization
 from rosafe.component.activities import Activity, Handler
 from rosafe.component.audio import AudioRing
 from rosafe.component.component import ComponentNode
-from rosafe.component.events import ThrottledLog
 from rosafe.component.startup import run_server
+from rosafe.declarations.parameter import MAX_STRING, short_repr
 from rosafe.dsp import kernels
 from rosafe.interface import BLOCK_AND_BUFFERS, KINDS, LAYOUTS, ROSAFE, ComponentError, Representation
-from rosafe.node import reports
-from rosafe.node.keeper import TreeStateFile
+from rosafe.node import responses
+from rosafe.node.choice_fallbacks import ChoiceFallbacks
 from rosafe.node.ports import OutputPort, element
 from rosafe.node.processor_health import ProcessorHealth
 from rosafe.node.trace_port import TracePort
-from rosafe.node.whole_trees import TreeRequestService
-from rosafe.node.words import ChoiceFallbacks
+from rosafe.node.tree_request_service import TreeRequestService
+from rosafe.node.tree_state_file import TreeStateFile
 from rosafe.representations import PLUGINS, PROBLEMS, STAGES, WARNINGS
 from rosafe.setups import Setup, dry_run, wanted
 from rosafe.sound.windows import MAX_WINDOW
+from rosafe.transport.log_throttle import ThrottledLog
 from rosafe.tree.block import Block
 from rosafe.tree.processor import Processor
-from rosafe.tree.requests import ExistingProcessor
 from rosafe.tree.tree import Failure, Tree
+from rosafe.tree.tree_planner import ExistingProcessor
 from rosafe.tree.workers import workers_to_use
-from rosafe.vocabulary.parameter import MAX_STRING, short_repr
 
 FIRST_AUDIO_SECONDS = 1.0  # how long InputProc waits for a first message
 POLL_SECONDS = 0.1  # between two looks whether there is sound for a tree that is to come back
@@ -87,9 +87,11 @@ class RosafeNode:
         self._restoring_thread = Setup(None, kept.connections, kept.processors)  # what is not there yet
         self._sound = kept.sound  # which is not ours to make; but a file that has one keeps it
         self._restoring = ""  # why it is not there yet
-        self._data_object = self._node.advertise("dataObj", wire.message_class("rosAFE", "::rosAFE::dataObjSt"))
+        self._data_object = self._node.advertise(
+            "dataObj", serialization.message_class("rosAFE", "::rosAFE::dataObjSt")
+        )
         self._input_port = self._advertise("input")
-        self._time_class = wire.message_class("rosAFE", "::rosAFE::frameTime")
+        self._time_class = serialization.message_class("rosAFE", "::rosAFE::frameTime")
         self._frame_time = self._node.advertise("frameTime", self._time_class)
 
         self._node.input_port("Audio", self._connect_audio)
@@ -98,7 +100,7 @@ class RosafeNode:
             if kind.parent:
                 self._serve_processor(kind)
         self._node.function("getSignals", self._get_signals)
-        self._node.function("getParameters", lambda _: {"parameters": reports.parameters(self._tree.processors)})
+        self._node.function("getParameters", lambda _: {"parameters": responses.parameters(self._tree.processors)})
         self._node.function("getProcessors", self._get_processors)
         self._node.function("getRepresentation", self._get_representation)
         self._node.function("getDependencies", lambda v: {"dependencies": self._tree.dependencies(v["nameProc"])})
@@ -139,7 +141,7 @@ class RosafeNode:
         self._audio_topic = topic
         self._audio = rospy.Subscriber(
             topic,
-            wire.tolerant_message_class("rosAFE", "::binaudio::portStruct", MAX_WINDOW),
+            serialization.tolerant_message_class("rosAFE", "::binaudio::portStruct", MAX_WINDOW),
             take,
             queue_size=None,  # all that has come is looked at: a window may be shorter than a hiccup
             buff_size=2**22,
@@ -291,7 +293,7 @@ class RosafeNode:
     # --- what the tree tells (on its threads) ---
 
     def _advertise(self, kind: str, name: str = "") -> rospy.Publisher:
-        message_class = wire.message_class("rosAFE", LAYOUTS[kind].idl)
+        message_class = serialization.message_class("rosAFE", LAYOUTS[kind].idl)
         return self._node.advertise(KINDS[kind].port, message_class, element(kind, name))
 
     def on_added(self, processor: Processor) -> None:
@@ -337,14 +339,14 @@ class RosafeNode:
     # --- functions ---
 
     def _get_signals(self, values: dict[str, Any]) -> dict[str, Any]:
-        return reports.response("getSignals", signals=reports.signals(self._tree.processors))
+        return responses.response("getSignals", signals=responses.signals(self._tree.processors))
 
     def _get_processors(self, values: dict[str, Any]) -> dict[str, Any]:
-        told = reports.descriptions(self._tree.processors, self._node.name, self._input_services)
-        return reports.response("getProcessors", processors=told)
+        told = responses.descriptions(self._tree.processors, self._node.name, self._input_services)
+        return responses.response("getProcessors", processors=told)
 
     def _get_representation(self, values: dict[str, Any]) -> dict[str, Any]:
-        return reports.response("getRepresentation", parts=reports.representation(self._tree.find(values["name"])))
+        return responses.response("getRepresentation", parts=responses.representation(self._tree.find(values["name"])))
 
     def _modify_parameter(self, values: dict[str, Any]) -> dict[str, Any]:
         doubts: dict[str, str] = {}

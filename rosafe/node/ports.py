@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import rospy
 
-from rosafe.component import wire
+from rosafe.component import serialization
 from rosafe.interface import KINDS, LAYOUTS, ROSAFE
 from rosafe.tree.block import Block
 from rosafe.tree.processor import Processor
-from rosafe.tree.window import SlidingWindow, WindowView, frames_in
+from rosafe.tree.sliding_window import SlidingWindow, WindowView, frames_in
 
 _NOTHING = np.zeros(0)  # what is always empty, such as ILD's `right`
 
@@ -47,7 +47,7 @@ class OutputPort:
         self.processor = processor
         self._publisher = publisher
         self._close = close
-        self._message = wire.message_class("rosAFE", LAYOUTS[processor.kind].idl)
+        self._message = serialization.message_class("rosAFE", LAYOUTS[processor.kind].idl)
         self._windows: list[SlidingWindow] = []
 
     def open(self, seconds: float) -> None:

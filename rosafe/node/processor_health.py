@@ -11,9 +11,9 @@ import rospy
 from diagnostic_msgs.msg import DiagnosticStatus
 
 from rosafe.component.activities import TaskStatistics
-from rosafe.component.events import ThrottledLog
 from rosafe.dsp.plugin_checks import plugin_of
-from rosafe.node.words import ChoiceFallbacks
+from rosafe.node.choice_fallbacks import ChoiceFallbacks
+from rosafe.transport.log_throttle import ThrottledLog
 from rosafe.tree.processor import Processor
 from rosafe.tree.states import State
 from rosafe.tree.tree import Failure, Tree

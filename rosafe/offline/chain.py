@@ -17,13 +17,13 @@ from rosafe.offline.signals import frame_times
 from rosafe.representations import BUILTIN, STAGES
 from rosafe.tree import sizes
 from rosafe.tree.block import Block
-from rosafe.tree.company import Observer
+from rosafe.tree.context import Observer
 from rosafe.tree.processor import Processor
 from rosafe.tree.tree import Tree
 
 # A block that is put together has no more frames, and no processor puts out more for it
 MAX_FRAMES = 12000  # as InputProc's blocks by default
-MOST_BYTES = 2**22
+MAX_BYTES = 2**22
 
 FILTERBANK = "gammatone"  # from which on there are channels
 SHARED_KINDS = ("input", "preProc")
@@ -273,7 +273,7 @@ class Chain:
         if changed or seen:
             return 0
         frame = max(sizes.output_size(p.stage, p.input_shape, 1 / self.sample_rate) for p in processors)
-        return min(MAX_FRAMES, int(MOST_BYTES / frame))
+        return min(MAX_FRAMES, int(MAX_BYTES / frame))
 
     def describe(self) -> dict[str, Any]:
         """Axes of what runs, `fb_cfHz` (Hz), `cc_lags` (s); rates of the outputs, `ild_frameRate` and its like (Hz).
@@ -323,9 +323,9 @@ def in_place_kinds(kinds: Collection[str], outputs: Collection[str]) -> list[str
 
 def _shares(frequencies: Sequence[float], count: int) -> list[list[float]]:
     """`frequencies` in up to `count` parts, of as many as a kernel takes together, but for the last one."""
-    groups = -(-len(frequencies) // kernels.MOST_LANES)
+    groups = -(-len(frequencies) // kernels.MAX_LANES)
     count = min(count, groups)
-    ends = [kernels.MOST_LANES * (groups * number // count) for number in range(count + 1)]
+    ends = [kernels.MAX_LANES * (groups * number // count) for number in range(count + 1)]
     return [list(frequencies[first:end]) for first, end in itertools.pairwise(ends)]
 
 

@@ -19,9 +19,9 @@ from typing import Any
 
 import numpy as np
 
-from rosafe.offline.contents import is_scalar, new_array, parse_metadata, restored
 from rosafe.offline.isolated import MAX_TEXT, blocks
 from rosafe.offline.memory import refuse_over_available
+from rosafe.offline.result_metadata import is_scalar, new_array, parse_metadata, restored
 
 STALL = 10  # seconds without a sign of the child process, after which the file counts as damaged
 START = 60  # seconds that the child process may take to start

@@ -15,9 +15,9 @@ import numpy as np
 from rosafe.interface import KINDS
 from rosafe.interface.arguments import check_outputs, check_parameters
 from rosafe.offline.chain import Chain, needed
-from rosafe.offline.contents import Contents
 from rosafe.offline.formats import Format, check_format, format_of, read
 from rosafe.offline.process import DEFAULT_BLOCK
+from rosafe.offline.result_metadata import Contents
 from rosafe.offline.sounds import Sound, open_sound
 from rosafe.output import OutputError, new_folder, new_path
 from rosafe.representations import STAGES

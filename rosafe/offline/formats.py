@@ -12,16 +12,16 @@ from typing import Any
 
 import numpy as np
 
+from rosafe.declarations.parameter import short_repr
 from rosafe.input import open_descriptor, open_regular
 from rosafe.interface import KINDS, Representation
 from rosafe.missing import require
-from rosafe.offline.chunked import H5Writer, Mat73Writer, ZarrWriter
 from rosafe.offline.containers import read_h5, read_mat73, read_zarr
-from rosafe.offline.contents import Contents, Writer, checked, is_number, is_texts, sample_times
+from rosafe.offline.in_memory_formats import CsvWriter, Mat5Writer, NpzWriter
 from rosafe.offline.mat5 import read_mat5
 from rosafe.offline.readers import read_csv, read_npz
-from rosafe.offline.whole import CsvWriter, Mat5Writer, NpzWriter
-from rosafe.vocabulary.parameter import short_repr
+from rosafe.offline.result_metadata import Contents, Writer, checked, is_number, is_texts, sample_times
+from rosafe.offline.streaming_formats import H5Writer, Mat73Writer, ZarrWriter
 
 MAT5_MOST = 2**30  # bytes of a variable; MATLAB's version 5 ends at 2**31, and scipy needs an array twice
 _MAX_EMPTY = 2**20  # along each axis of an array without numbers

@@ -17,8 +17,8 @@ from typing import Any, BinaryIO, NamedTuple
 import numpy as np
 
 from rosafe.input import open_regular
-from rosafe.offline.contents import ABOUT, MAX_TEXT, is_scalar, new_array, parse_metadata, restored
 from rosafe.offline.memory import check_arrays
+from rosafe.offline.result_metadata import ABOUT, MAX_TEXT, is_scalar, new_array, parse_metadata, restored
 
 _HEAD = 128  # bytes
 _MATRIX, _COMPRESSED = 14, 15

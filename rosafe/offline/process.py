@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from rosafe.declarations.checks import short
 from rosafe.dsp import kernels
 from rosafe.dsp.stage import SAMPLE_RATE
 from rosafe.interface import KINDS
@@ -21,7 +22,6 @@ from rosafe.offline.memory import refuse_over_available
 from rosafe.offline.signals import as_samples, check_finite, ears_view, frame_times, of_ears, outputs_of
 from rosafe.tree.block import Block
 from rosafe.tree.workers import workers_to_use
-from rosafe.vocabulary.checks import short
 
 _NOTHING = np.empty(0)
 DEFAULT_BLOCK = 12000  # frames, as InputProc's

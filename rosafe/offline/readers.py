@@ -14,9 +14,9 @@ from typing import IO, Any, BinaryIO
 import numpy as np
 
 from rosafe.input import open_regular
-from rosafe.offline.contents import ABOUT, MAX_TEXT, checked, from_json, is_number, new_array, parse_metadata
+from rosafe.offline.in_memory_formats import CSV_HEAD
 from rosafe.offline.memory import check_arrays
-from rosafe.offline.whole import CSV_HEAD
+from rosafe.offline.result_metadata import ABOUT, MAX_TEXT, checked, from_json, is_number, new_array, parse_metadata
 
 _MAX_MEMBERS = 4096  # of an .npz
 _MAX_HEADER = 4096  # bytes of the header of an array

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from rosafe.dsp.signal import SignalFormat
+from rosafe.dsp.signal_format import SignalFormat
 from rosafe.interface import CORE_REPRESENTATIONS, KINDS
 from rosafe.interface.arguments import check_outputs
 

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from rosafe.dsp.signal import SignalFormat
+from rosafe.dsp.signal_format import SignalFormat
 from rosafe.dsp.stage import SAMPLE_RATE, Stage, parts_of
 from rosafe.interface import KINDS
 from rosafe.interface.arguments import check_change, check_outputs, check_parameters

@@ -22,12 +22,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from rosafe.declarations.parameter import Parameter
+from rosafe.declarations.representation import Representation
 from rosafe.dsp import kernels
-from rosafe.dsp.guard import LIMIT, FloatArray
-from rosafe.dsp.signal import SignalFormat
+from rosafe.dsp.numeric_limits import LIMIT, FloatArray
+from rosafe.dsp.signal_format import SignalFormat
 from rosafe.dsp.stage import Stage
-from rosafe.vocabulary.parameter import Parameter
-from rosafe.vocabulary.representation import Representation
 
 FULL_SCALE_DB = 100.0  # SPL of sound whose rms is 1, and model units that it settles at
 GREATEST_THRESHOLD_DB = 99.0  # from 100 on, there is nothing between threshold and full scale
@@ -91,7 +91,7 @@ class Adaptation(Stage):
                 3600.0,
                 open_minimum=True,
                 least=1,
-                most=kernels.MOST_LOOPS,
+                most=kernels.MAX_LOOPS,
                 unit="s",
             ),
             Parameter(

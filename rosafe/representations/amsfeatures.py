@@ -21,17 +21,17 @@ from typing import Any
 import numpy as np
 import scipy
 
+from rosafe.declarations.parameter import Parameter
+from rosafe.declarations.representation import Representation
 from rosafe.dsp import kernels
-from rosafe.dsp.cascade import SosFilterBank
 from rosafe.dsp.framing import MAX_FRAME_SECONDS, FrameBuffer, FramedStage, FrameGrid
-from rosafe.dsp.guard import FLUSH_INTERVAL, FloatArray, clamp
+from rosafe.dsp.numeric_limits import FLUSH_INTERVAL, FloatArray, clamp
 from rosafe.dsp.rounding import sample_count
-from rosafe.dsp.signal import SignalFormat
+from rosafe.dsp.signal_format import SignalFormat
+from rosafe.dsp.sos_filter import SosFilterBank
 from rosafe.dsp.windows import ALL_NAMES, window
-from rosafe.vocabulary.parameter import Parameter
-from rosafe.vocabulary.representation import Representation
 
-MOST_FILTERS = 256
+MAX_FILTERS = 256
 BATCH = 2**18  # samples that are transformed at a time, to bound memory and stay in the cache
 UPPER = math.sqrt(1.25) + 0.5  # the edges of a band-pass of Q = 1 are at so many times its centre, and at 1 / UPPER
 FRAMES = frozenset({"ams_wname", "ams_wSizeSec", "ams_hSizeSec"})  # a change of these keeps what is buffered
@@ -92,7 +92,7 @@ class AmsFeatures(FramedStage):
                 15,
                 "Number of modulation filters; 0 (log only): one an octave",
                 0,
-                MOST_FILTERS,
+                MAX_FILTERS,
                 aliases=("ams_nFilter",),
             ),
             Parameter(

@@ -18,13 +18,13 @@ from typing import Any
 import numpy as np
 import scipy
 
+from rosafe.declarations.parameter import Parameter
+from rosafe.declarations.representation import Derived, Representation
 from rosafe.dsp import kernels
 from rosafe.dsp.framing import FrameBuffer, FramedStage, frame_parameters
-from rosafe.dsp.guard import FloatArray, clamp
-from rosafe.dsp.signal import SignalFormat
+from rosafe.dsp.numeric_limits import FloatArray, clamp
+from rosafe.dsp.signal_format import SignalFormat
 from rosafe.dsp.windows import ALL_NAMES
-from rosafe.vocabulary.parameter import Parameter
-from rosafe.vocabulary.representation import Derived, Representation
 
 BATCH = 2**18  # samples that are transformed at a time, to bound memory and stay in the cache
 SMALLEST = 1e-300  # stands for 0 in denominators
@@ -98,7 +98,7 @@ class Autocorrelation(FramedStage):
     def process(self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None) -> FloatArray:
         samples, values = self._as_valid_block(block), self.values
         clipping, alpha, exponent = values["ac_clipMethod"], values["ac_clipAlpha"], values["ac_K"]
-        if kernels.compiled() and len(self.window) <= kernels.MOST_SIZE:
+        if kernels.compiled() and len(self.window) <= kernels.MAX_SIZE:
             frames = self._frames(samples, self._framing.pinned)
             return kernels.autocorrelations(frames, clipping, alpha, exponent, self._corrections)
         whole = self._framing.frames(self._buffer.append(clamp(samples)))  # (2, C, F, w)

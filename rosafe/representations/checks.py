@@ -6,11 +6,11 @@ import inspect
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from rosafe.declarations.checks import bad_name, short
+from rosafe.declarations.representation import Representation
+from rosafe.declarations.signals import layout
 from rosafe.dsp.framing import FramedStage
 from rosafe.dsp.stage import Stage
-from rosafe.vocabulary.checks import bad_name, short
-from rosafe.vocabulary.representation import Representation
-from rosafe.vocabulary.signals import layout
 
 # What the component calls its own requests and topics, and the structures of its messages; see rosafe/interface
 REQUESTS = [

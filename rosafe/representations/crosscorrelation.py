@@ -15,13 +15,13 @@ from typing import Any
 import numpy as np
 import scipy
 
-from rosafe.dsp import kernels, memory
+from rosafe.declarations.parameter import Parameter
+from rosafe.declarations.representation import Derived, Representation
+from rosafe.dsp import buffer_pool, kernels
 from rosafe.dsp.framing import FramedStage, frame_parameters
-from rosafe.dsp.guard import SQUARE_TINY, FloatArray, clamp
+from rosafe.dsp.numeric_limits import SQUARE_TINY, FloatArray, clamp
 from rosafe.dsp.rounding import MAX_SAMPLES
-from rosafe.dsp.signal import SignalFormat
-from rosafe.vocabulary.parameter import Parameter
-from rosafe.vocabulary.representation import Derived, Representation
+from rosafe.dsp.signal_format import SignalFormat
 
 EPSILON = 2.2204e-16  # the original's literal
 BATCH = 2**18  # samples per ear that are transformed at a time, to bound memory and stay in the cache
@@ -91,7 +91,7 @@ class CrossCorrelation(FramedStage):
     def _by_kernel(self, samples: FloatArray, reach: int) -> FloatArray:
         frames = self._frames(samples, self._framing.pinned)
         shape = (samples.shape[1], 2 * self._max_lag + 1, frames.number)
-        result = memory.empty(shape) if reach == self._max_lag else np.zeros(shape)
+        result = buffer_pool.empty(shape) if reach == self._max_lag else np.zeros(shape)
         kernels.correlations(frames, reach, EPSILON, result)
         return result
 

@@ -10,14 +10,14 @@ from typing import Any
 
 import numpy as np
 
+from rosafe.declarations.parameter import MAX_SEQUENCE, Parameter
+from rosafe.declarations.representation import Representation
 from rosafe.dsp.drnl import DrnlBank
 from rosafe.dsp.erb import erb_rate, erb_rate_to_frequency
 from rosafe.dsp.gammatone import GammatoneBank
-from rosafe.dsp.guard import FloatArray
-from rosafe.dsp.signal import SignalFormat
+from rosafe.dsp.numeric_limits import FloatArray
+from rosafe.dsp.signal_format import SignalFormat
 from rosafe.dsp.stage import Stage
-from rosafe.vocabulary.parameter import MAX_SEQUENCE, Parameter
-from rosafe.vocabulary.representation import Representation
 
 MAX_CHANNELS = MAX_SEQUENCE
 MAX_RELATIVE_FREQUENCY = 0.475  # of the sample rate, for channels: speech at 16 kHz has them up to 7600 Hz

@@ -18,14 +18,14 @@ import scipy
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from rosafe.declarations.parameter import Parameter
+from rosafe.declarations.representation import Derived, Representation
 from rosafe.dsp import kernels
 from rosafe.dsp.framing import FrameBuffer
-from rosafe.dsp.guard import FloatArray
+from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.dsp.rounding import round_half_away
-from rosafe.dsp.signal import SignalFormat
+from rosafe.dsp.signal_format import SignalFormat
 from rosafe.dsp.stage import Stage
-from rosafe.vocabulary.parameter import Parameter
-from rosafe.vocabulary.representation import Derived, Representation
 
 NORMALISATION_SECONDS = 5.0  # s, that levels and features are normalised by
 CONTEXT_FRAMES = 19  # frames before and after one that its features take in

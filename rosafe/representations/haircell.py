@@ -18,12 +18,12 @@ from typing import Any
 import numpy as np
 import scipy
 
+from rosafe.declarations.parameter import Parameter
+from rosafe.declarations.representation import Representation
 from rosafe.dsp import kernels
-from rosafe.dsp.cascade import SosFilter
-from rosafe.dsp.guard import SQUARE_TINY, TINY, FloatArray, clamp
+from rosafe.dsp.numeric_limits import SQUARE_TINY, TINY, FloatArray, clamp
+from rosafe.dsp.sos_filter import SosFilter
 from rosafe.dsp.stage import Stage
-from rosafe.vocabulary.parameter import Parameter
-from rosafe.vocabulary.representation import Representation
 
 # Butterworth low-pass after the rectification: order, cutoff (Hz), how many in cascade
 LOWPASS = {

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from rosafe.declarations.representation import Representation
 from rosafe.dsp import kernels
 from rosafe.dsp.framing import FramedStage, frame_parameters
-from rosafe.dsp.guard import FloatArray
-from rosafe.vocabulary.representation import Representation
+from rosafe.dsp.numeric_limits import FloatArray
 
 EPSILON = 2.2204e-16  # the original's literal
 

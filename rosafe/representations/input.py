@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from rosafe.dsp.guard import FloatArray, clamp
+from rosafe.declarations.parameter import Parameter
+from rosafe.declarations.representation import Representation
+from rosafe.dsp.numeric_limits import FloatArray, clamp
 from rosafe.dsp.stage import Stage
-from rosafe.vocabulary.parameter import Parameter
-from rosafe.vocabulary.representation import Representation
 
 
 class Input(Stage):

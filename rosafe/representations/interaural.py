@@ -15,10 +15,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from rosafe.dsp.guard import FloatArray
-from rosafe.dsp.signal import SignalFormat
+from rosafe.declarations.representation import Representation
+from rosafe.dsp.numeric_limits import FloatArray
+from rosafe.dsp.signal_format import SignalFormat
 from rosafe.dsp.stage import Stage
-from rosafe.vocabulary.representation import Representation
 
 
 class ParabolicPeaks(NamedTuple):

@@ -16,8 +16,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from rosafe.declarations import plugins
 from rosafe.dsp import old_names
-from rosafe.vocabulary import plugins
 
 
 class Loaded(NamedTuple):

@@ -14,15 +14,15 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
-from rosafe.dsp.guard import FloatArray
+from rosafe.declarations.parameter import Parameter
+from rosafe.declarations.representation import Representation
+from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.dsp.rounding import round_half_away
-from rosafe.dsp.signal import SignalFormat
+from rosafe.dsp.signal_format import SignalFormat
 from rosafe.dsp.stage import Stage
-from rosafe.vocabulary.parameter import Parameter
-from rosafe.vocabulary.representation import Representation
 
 MEMORY_SECONDS = 5.0  # of confidences
-MOST_ORDER = 99  # of the median
+MAX_ORDER = 99  # of the median
 
 
 class Pitch(Stage):
@@ -76,7 +76,7 @@ class Pitch(Stage):
                 3,
                 "Frames of the median",
                 1,
-                MOST_ORDER,
+                MAX_ORDER,
                 aliases=("p_orderMedFilt",),
             ),
         ),
@@ -128,13 +128,13 @@ class Pitch(Stage):
             median = (windows[..., (order - 1) // 2] + windows[..., order // 2]) / 2
             output[:, 0] = np.where(median > 0, median, np.nan)
         self._pending_frames = held - count
-        self._frames = frames[..., frames.shape[-1] - self._pending_frames - MOST_ORDER // 2 :].copy()
+        self._frames = frames[..., frames.shape[-1] - self._pending_frames - MAX_ORDER // 2 :].copy()
         return output
 
     def reset(self) -> None:
         self._channels = 0
         self._confidences = np.empty((2, 0))
-        self._frames = np.zeros((2, 3, MOST_ORDER // 2))  # as many as the longest median wants
+        self._frames = np.zeros((2, 3, MAX_ORDER // 2))  # as many as the longest median wants
         self._pending_frames = 0
 
     @cached_property

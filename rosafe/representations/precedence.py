@@ -18,15 +18,15 @@ from typing import Any
 import numpy as np
 import scipy
 
+from rosafe.declarations.parameter import Parameter
+from rosafe.declarations.representation import Derived, Part, Representation
 from rosafe.dsp import kernels
 from rosafe.dsp.framing import FrameBuffer, FramedStage, frame_parameters
-from rosafe.dsp.guard import SQUARE_TINY, TINY, FloatArray, clamp
 from rosafe.dsp.kernels import precedence as by_kernel
-from rosafe.dsp.kernels.precedence import BATCH, TAPS, Taps, Windowed
+from rosafe.dsp.kernels.precedence import INTERLEAVED_ROWS, TAPS, Taps, Windowed
+from rosafe.dsp.numeric_limits import SQUARE_TINY, TINY, FloatArray, clamp
 from rosafe.dsp.rounding import MAX_SAMPLES, round_half_away
-from rosafe.dsp.signal import SignalFormat
-from rosafe.vocabulary.parameter import Parameter
-from rosafe.vocabulary.representation import Derived, Part, Representation
+from rosafe.dsp.signal_format import SignalFormat
 
 EPSILON = 2.2204e-16  # the original's literal
 SECONDS = 0.01  # that autocorrelations reach
@@ -37,7 +37,7 @@ MIN_ENERGY_RATIO = 1e-3  # of the strongest channel; weaker ones are left out th
 NOISE = 1e-13  # of what a correlation can be at most: what rounding leaves of a 0
 GAINS = np.arange(101) / 100  # that an echo may have
 RATIOS = GAINS / (1 + GAINS**2)  # of an autocorrelation at the echo's delay and at lag 0
-MOST_GAIN = 0.9  # of these
+MAX_GAIN = 0.9  # of these
 SMALL, LARGE = 0, 1  # the two ways to clean
 PAIRS = np.array([(SMALL, SMALL), (LARGE, LARGE), (SMALL, LARGE), (LARGE, SMALL)])  # for left and right
 BATCH = 2**18  # samples per ear that are worked on at a time, to bound memory and stay in the cache
@@ -65,7 +65,7 @@ class RunningSums:
         """Nothing has come yet of the channels at these frequencies (Hz)."""
         channels = len(frequencies)
         self.gains, self.weights = 1 / np.maximum(frequencies, LOWEST), weights(frequencies)
-        self.power = np.zeros((math.ceil(2 * channels / BATCH), bins, BATCH))
+        self.power = np.zeros((math.ceil(2 * channels / INTERLEAVED_ROWS), bins, INTERLEAVED_ROWS))
         self.energies = np.zeros((2, channels))
         self.pairs = np.zeros((len(PAIRS), lags))
 
@@ -136,7 +136,7 @@ class Precedence(FramedStage):
 
     def state_size(self, rows: tuple[int, ...]) -> int:
         bins = self._points // 2 + 1
-        groups = -(-math.prod(rows) // BATCH) * BATCH
+        groups = -(-math.prod(rows) // INTERLEAVED_ROWS) * INTERLEAVED_ROWS
         return bins * (groups + 4)  # sums of spectra, and the tables of the transform
 
     def process(
@@ -242,7 +242,7 @@ class Precedence(FramedStage):
         factors = np.where(
             active > MAX_FEW_ACTIVE, 1.0, np.divide(1.0, energies, out=np.zeros_like(energies), where=strong)
         )
-        add = by_kernel.add_spectra if kernels.compiled() and self._points <= kernels.MOST_POINTS else add_spectra
+        add = by_kernel.add_spectra if kernels.compiled() and self._points <= kernels.MAX_POINTS else add_spectra
         spectra = add(frames.samples, self._points, running.gains, factors, running.power)
         lags: FloatArray = scipy.fft.irfft(spectra, self._points)
         lags = lags[..., : self._last_delay + 1]
@@ -256,7 +256,7 @@ class Precedence(FramedStage):
         largest = lags.max(axis=-1)
         echo = np.take_along_axis(lags, delays[..., np.newaxis], axis=-1)[..., 0]
         ratios = np.divide(echo, largest, out=np.zeros_like(echo), where=largest > 0).clip(0.0, 0.5)
-        gains = np.minimum(GAINS[np.searchsorted(RATIOS, ratios)], MOST_GAIN)[..., np.newaxis]
+        gains = np.minimum(GAINS[np.searchsorted(RATIOS, ratios)], MAX_GAIN)[..., np.newaxis]
         faded = self._lag_weights[delays][..., np.newaxis]
         order = np.arange(TAPS)
         back = TAPS - order
@@ -307,7 +307,7 @@ def add_spectra(
     """
     sums = np.empty((len(samples), 2, power.shape[1]))
     row = np.arange(2 * len(gains)).reshape(2, -1)
-    group, lane = row // BATCH, row % BATCH
+    group, lane = row // INTERLEAVED_ROWS, row % INTERLEAVED_ROWS
     for frame, total, factor in zip(samples, sums, factors, strict=True):
         spectra = scipy.fft.rfft(frame, points)
         power[group, :, lane] += (np.square(spectra.real) + np.square(spectra.imag)) * gains[:, np.newaxis]

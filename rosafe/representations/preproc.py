@@ -12,13 +12,13 @@ from typing import Any
 import numpy as np
 import scipy
 
-from rosafe.dsp.cascade import SosFilter, leaky_integrator
-from rosafe.dsp.guard import SQUARE_TINY, FloatArray, clamp
+from rosafe.declarations.parameter import Parameter
+from rosafe.declarations.representation import Representation
 from rosafe.dsp.middle_ear import MODELS, middle_ear_fir
+from rosafe.dsp.numeric_limits import SQUARE_TINY, FloatArray, clamp
 from rosafe.dsp.rounding import round_half_away
+from rosafe.dsp.sos_filter import SosFilter, leaky_integrator
 from rosafe.dsp.stage import Stage
-from rosafe.vocabulary.parameter import Parameter
-from rosafe.vocabulary.representation import Representation
 
 DC_ORDER = 4
 LEVEL_OF_RMS_1 = 100.0  # dB SPL

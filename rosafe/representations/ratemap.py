@@ -9,12 +9,12 @@ from typing import Any
 
 import numpy as np
 
+from rosafe.declarations.parameter import Parameter
+from rosafe.declarations.representation import Representation
 from rosafe.dsp import kernels
-from rosafe.dsp.cascade import SosFilter, leaky_integrator
 from rosafe.dsp.framing import FramedStage, frame_parameters
-from rosafe.dsp.guard import FloatArray, clamp
-from rosafe.vocabulary.parameter import Parameter
-from rosafe.vocabulary.representation import Representation
+from rosafe.dsp.numeric_limits import FloatArray, clamp
+from rosafe.dsp.sos_filter import SosFilter, leaky_integrator
 
 
 class Ratemap(FramedStage):

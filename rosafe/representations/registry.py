@@ -9,11 +9,11 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from rosafe.declarations.checks import short
+from rosafe.declarations.representation import Representation
 from rosafe.dsp.plugin_checks import checked
 from rosafe.dsp.stage import Stage
 from rosafe.representations import checks, loading
-from rosafe.vocabulary.checks import short
-from rosafe.vocabulary.representation import Representation
 
 # The original's processors, in its order: also that of getParameters and getSignals, which report no others.
 CORE_KINDS = ("input", "preProc", "gammatone", "ihc", "ild", "ratemap", "crossCorrelation")

@@ -23,12 +23,12 @@ from typing import Any
 
 import numpy as np
 
+from rosafe.declarations.parameter import Parameter
+from rosafe.declarations.representation import Representation
 from rosafe.dsp import kernels
-from rosafe.dsp.guard import LIMIT, FloatArray
-from rosafe.dsp.signal import SignalFormat
+from rosafe.dsp.numeric_limits import LIMIT, FloatArray
+from rosafe.dsp.signal_format import SignalFormat
 from rosafe.dsp.stage import Stage
-from rosafe.vocabulary.parameter import Parameter
-from rosafe.vocabulary.representation import Representation
 
 E = 1e-15  # keeps quotients and logarithms finite
 LARGEST = LIMIT**2  # of the rates: the square of the largest sample

@@ -1,7 +1,7 @@
 """Setups: a tree of processors with its sound as a file that people read and write (docs/setups.md); no ROS.
 
 `read` and `write` go from text to `Setup` and back; `plan` tells what to do for one in a tree that is there already.
-rosafe/genomix/setups.py does it on a running graph.
+rosafe/client/setup_transaction.py does it on a running graph.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 
 import yaml
 
-from rosafe.vocabulary.parameter import short_repr
+from rosafe.declarations.parameter import short_repr
 
 MAX_DEPTH = 6  # a setup has 4
 MAX_VALUES = 2**18  # scalars, lists and maps of a setup, ends of lists and maps included: less than a second of parsing

@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
-from rosafe.dsp.signal import SignalFormat
+from rosafe.dsp.signal_format import SignalFormat
 from rosafe.interface import BLOCK_AND_BUFFERS, ROSAFE, ComponentError, format_value
 from rosafe.representations import STAGES
-from rosafe.tree.requests import ExistingProcessor, ServiceCall, creation_call
+from rosafe.tree.tree_planner import ExistingProcessor, ServiceCall, creation_call
 
 from .setup import Setup, SetupProcessor
 

@@ -6,10 +6,10 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
+from rosafe.declarations.parameter import MAX_STRING, short_repr
+from rosafe.declarations.text import did_you_mean
 from rosafe.interface import KINDS, MAX_SETUP, REQUEST, Parameter, Representation
-from rosafe.tree.requests import kind_of
-from rosafe.vocabulary.parameter import MAX_STRING, short_repr
-from rosafe.vocabulary.words import did_you_mean
+from rosafe.tree.tree_planner import kind_of
 
 from .markup import Node, SetupError, parse
 from .setup import ACQUIRE, INPUT_PORTS, Setup, SetupProcessor, Sound, parameters_of

@@ -8,10 +8,10 @@ from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
+from rosafe.declarations import plugins
 from rosafe.interface import BASS, BLOCK_AND_BUFFERS, KINDS, ROSAFE, Parameter, Representation
 from rosafe.representations import STAGES
-from rosafe.tree.requests import ExistingProcessor, ProcessorSpec
-from rosafe.vocabulary import plugins
+from rosafe.tree.tree_planner import ExistingProcessor, ProcessorSpec
 
 ACQUIRE = BASS.service("Acquire").parameters
 MAX_NAME_ATTEMPTS = 1000  # ways to say what a processor was made with

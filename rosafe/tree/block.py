@@ -7,8 +7,8 @@ from typing import Any, NamedTuple, Protocol
 
 from numpy.typing import NDArray
 
-from rosafe.dsp.guard import FloatArray
-from rosafe.dsp.signal import SignalFormat
+from rosafe.dsp.numeric_limits import FloatArray
+from rosafe.dsp.signal_format import SignalFormat
 
 
 class Block(NamedTuple):

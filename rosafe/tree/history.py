@@ -8,9 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rosafe.dsp.signal import SignalFormat
+from rosafe.dsp.signal_format import SignalFormat
 from rosafe.tree.block import Block
-from rosafe.tree.window import RecentFrames, WindowView, frames_in
+from rosafe.tree.sliding_window import RecentFrames, WindowView, frames_in
 
 
 class HistorySlice(NamedTuple):

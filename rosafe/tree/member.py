@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
-from rosafe.dsp.signal import SignalFormat
+from rosafe.declarations.representation import Representation
+from rosafe.dsp.signal_format import SignalFormat
 from rosafe.dsp.stage import Stage
-from rosafe.tree.changes import ParameterUpdates
 from rosafe.tree.history import History, HistorySlice
+from rosafe.tree.parameter_updates import ParameterUpdates
 from rosafe.tree.states import StateMachine
-from rosafe.vocabulary.representation import Representation
 
 EARS = (2,)  # leading shape of what the input takes
 

@@ -8,11 +8,11 @@ from collections.abc import Callable, Iterator
 from time import monotonic
 from typing import TypeVar
 
-from rosafe.dsp.guard import FloatArray
+from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.dsp.plugin_checks import PluginError
 from rosafe.dsp.stage import Stage
 from rosafe.tree.block import Block, Source
-from rosafe.tree.company import TreeContext
+from rosafe.tree.context import TreeContext
 from rosafe.tree.member import Member
 from rosafe.tree.states import State
 from rosafe.tree.workers import WAKE_THRESHOLD_SECONDS
@@ -25,7 +25,7 @@ ESTIMATE_GROWTH = 2.0  # what a processor usually takes is the least of late; th
 class Processor(Member):
     """A node of the tree. Made and wired by `Tree`; the public members are safe from any thread.
 
-    Locks are taken in this order: the tree's requests, `_publish_lock`, the tree's lock or those of changes and history.
+    Locks are acquired in this order: tree's requests, `_publish_lock`, then the tree's or those of updates and history.
 
     Parameters
     ----------

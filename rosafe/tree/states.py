@@ -12,7 +12,7 @@ import enum
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from rosafe.dsp.signal import SignalFormat
+from rosafe.dsp.signal_format import SignalFormat
 from rosafe.tree.block import Block
 
 

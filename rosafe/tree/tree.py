@@ -7,20 +7,20 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from typing import Any, NamedTuple
 
+from rosafe.declarations.parameter import Parameter, short_repr
+from rosafe.declarations.text import did_you_mean, join_names
 from rosafe.dsp.plugin_checks import PluginError
 from rosafe.dsp.stage import Stage
 from rosafe.interface import KINDS, ROSAFE, ComponentError
 from rosafe.representations import STAGES
 from rosafe.tree import sizes
 from rosafe.tree.block import Source
-from rosafe.tree.company import Observer, TreeContext, TreeListener
+from rosafe.tree.context import Observer, TreeContext, TreeListener
 from rosafe.tree.member import EARS
 from rosafe.tree.processor import Processor, subtree
 from rosafe.tree.sizes import Rows
 from rosafe.tree.states import State
 from rosafe.tree.workers import Workers, workers_to_use
-from rosafe.vocabulary.parameter import Parameter, short_repr
-from rosafe.vocabulary.words import did_you_mean, join_names
 
 INPUT = next(kind for kind, representation in KINDS.items() if not representation.parent)
 
@@ -229,7 +229,8 @@ class Tree:
             if parent.kind != wanted:
                 raise ROSAFE.error(
                     "e_noUpperDependencie",
-                    f"{short_repr(parent_name)} is of kind {parent.kind}, wanted is {wanted}{self._descendants_of_kind(wanted)}",
+                    f"{short_repr(parent_name)} is of kind {parent.kind}, wanted is {wanted}"
+                    f"{self._descendants_of_kind(wanted)}",
                 )
             return parent
 
@@ -297,7 +298,8 @@ class Tree:
                 known = [p.name for p in processor.representation.parameters]
                 raise ROSAFE.error(
                     "e_noSuchParameter",
-                    f"processors of kind {processor.kind} have no {short_repr(parameter_name)}, but: {join_names(known)}"
+                    f"processors of kind {processor.kind} have no {short_repr(parameter_name)}, but: "
+                    f"{join_names(known)}"
                     f"{did_you_mean(parameter_name, known)}",
                 ) from None
             with _as_value_error():

@@ -1,1 +1,1 @@
-"""The words that everything else is declared in: types, parameters, representations, named errors."""
+"""The former name of `rosafe.declarations`, for plugins that were written for 0.2. Removed in the next release."""

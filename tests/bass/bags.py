@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from rosafe.component import wire
+from rosafe.component import serialization
 
 
 def stream(frames: int, seed: int = 0) -> np.ndarray:
@@ -21,7 +21,7 @@ def message(samples: np.ndarray, index: int, window: int, rate: int = 1000, chun
     """The port when frame `index` is the newest of `samples`."""
     padded = np.concatenate((np.zeros((2, window), np.int32), samples[:, :index]), axis=1)[:, -window:]
     left, right = np.ascontiguousarray(padded)
-    return wire.message_class("bass", "::binaudio::portStruct")(
+    return serialization.message_class("bass", "::binaudio::portStruct")(
         sampleRate=rate,
         nChunksOnPort=window // chunk,
         nFramesPerChunk=chunk,
@@ -59,7 +59,7 @@ def number(value: int, size: int = 4) -> bytes:
 
 def forge(path: Path, chunks: bytes, hole: int = 0, connections: int = 1) -> Path:
     """A bag of these chunks and a hole, with one connection of a port Audio, 0, at its end."""
-    kind = wire.message_class("bass", "::binaudio::portStruct")
+    kind = serialization.message_class("bass", "::binaudio::portStruct")
 
     def head(index: int) -> bytes:
         header = record(

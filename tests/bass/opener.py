@@ -14,8 +14,8 @@ import sys
 
 from rosafe.bass.sources.libasound import captured_alsa_errors, load_alsaaudio
 from rosafe.bass.sources.pcmname import checked_name
-from rosafe.component.paths import prefer_pypi_packages
 from rosafe.interface import ComponentError
+from rosafe.transport.paths import prefer_pypi_packages
 
 WRITTEN = 0x2 | 0x8 | 0x40 | 0x80 | 0x100 | 0x200  # IN_MODIFY, CLOSE_WRITE, MOVED_FROM, MOVED_TO, CREATE, DELETE
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from rosafe.component import paths
+from rosafe.transport import paths
 from tests.harness import PATIENCE, Process, wait_for
 
 

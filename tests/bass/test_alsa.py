@@ -18,8 +18,8 @@ import pytest
 
 from rosafe.bass.sources import alsa, libasound, open_source
 from rosafe.bass.sources.alsa import AlsaSource, DeviceBusyError
-from rosafe.component import paths
 from rosafe.interface import ComponentError
+from rosafe.transport import paths
 
 CHUNK, RATE = 10, 1000
 XRUN = -errno.EPIPE

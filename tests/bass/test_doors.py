@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from rosafe.component import wire
+from rosafe.component import serialization
 from tests.cli.command import refused, rosafe
 from tests.genomix import world as worlds
 from tests.genomix.world import HttpError, World
@@ -100,7 +100,7 @@ def test_the_reason_is_told_and_the_acquisition_goes_on(graph: Graph, bass_node:
     answer = graph.call("/bass/Acquire", device=ATTACKS[0])
     told = json.loads(answer.genom_exdetail)
     assert told["ex"] == "::bass::e_device"
-    audio = wire.message_class("bass", "::binaudio::portStruct")
+    audio = serialization.message_class("bass", "::binaudio::portStruct")
     newest = graph.message("/bass/Audio", audio).lastFrameIndex
     graph.message("/bass/Audio", audio, accept=lambda message: message.lastFrameIndex > newest + 800)
     assert WHY in bass_node.err and bass_node.err.count("tee:null") == 1

@@ -16,7 +16,7 @@ import soundfile
 
 from rosafe.bass.sources import libasound
 from rosafe.bass.sources.scene import Scene
-from rosafe.component import wire
+from rosafe.component import serialization
 from rosafe.interface import ComponentError
 from tests.bass import bags
 from tests.harness import PATIENCE, Graph, Process, free_port, run_together, wait_for
@@ -25,7 +25,7 @@ RATE, CHUNK, CHUNKS = 8000, 400, 4
 
 
 def audio_class() -> Any:
-    return wire.message_class("bass", "::binaudio::portStruct")
+    return serialization.message_class("bass", "::binaudio::portStruct")
 
 
 def seconds(message: Any) -> float:

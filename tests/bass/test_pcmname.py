@@ -19,8 +19,8 @@ from hypothesis import strategies as st
 from rosafe.bass.sources import open_source
 from rosafe.bass.sources.alsa import AlsaSource
 from rosafe.bass.sources.pcmname import checked_name
-from rosafe.component import paths
 from rosafe.interface import ComponentError
+from rosafe.transport import paths
 from tests.harness import PYTHON, ROOT
 
 RUN = "tee:null,'|touch MARK',raw"

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import soundfile
 
-from rosafe.component import wire
+from rosafe.component import serialization
 from tests.bass.pulse import PulseServer
 from tests.harness import Graph, Process, wait_for
 
@@ -32,7 +32,7 @@ def played_as_captured(pulse: PulseServer, messages: list[Any], samples: np.ndar
 def test_captured_is_what_was_played_and_the_plug_may_be_pulled(graph: Graph, pulse: PulseServer) -> None:
     samples = np.random.default_rng(4).integers(-(2**30), 2**30, (2, 44100)).astype(np.int32)
     soundfile.write(pulse.folder / "noise.wav", samples.T, 44100, subtype="PCM_32")
-    audio = wire.message_class("bass", "::binaudio::portStruct")
+    audio = serialization.message_class("bass", "::binaudio::portStruct")
     with graph.node("bass-ros", **pulse.env) as bass, graph.collect("/bass/Audio", audio) as messages:
         assert graph.call("/bass/Acquire", device="pulse", sampleRate=44100, nChunksOnPort=60).genom_success
         wait_for(lambda: messages and messages[-1].lastFrameIndex > 0, what=lambda: str(bass))

@@ -13,7 +13,7 @@ import pytest
 import rosgraph
 import soundfile
 
-from rosafe.component import wire
+from rosafe.component import serialization
 from rosafe.interface import CORE_REPRESENTATIONS
 from tests.bass import bags
 from tests.harness import Graph, Process, wait_for
@@ -117,7 +117,7 @@ def test_played_from_the_middle_and_with_a_loss(graph: Graph, recorded: Recorded
 
 def test_source_of_bass(graph: Graph, bass: Process, recorded: Recorded) -> None:
     """`bag:` publishes the recorded frames under their numbers."""
-    audio = wire.message_class("bass", "::binaudio::portStruct")
+    audio = serialization.message_class("bass", "::binaudio::portStruct")
     with graph.collect("/bass/Audio", audio) as messages:
         wait_for(lambda: messages, what="what the port shows of the live run")
         acquire(graph, f"bag:{recorded.bag}")

@@ -8,8 +8,8 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from rosafe.bass.recording import topic
-from rosafe.bass.recording.topic import TopicSource
+from rosafe.bass.recording import topic_source
+from rosafe.bass.recording.topic_source import TopicSource
 from rosafe.interface import ComponentError
 from tests.bass import bags
 from tests.harness import Graph, wait_for
@@ -27,7 +27,7 @@ def microphone(graph: Graph) -> Iterator[Microphone]:
 
 @pytest.fixture
 def source(microphone: Microphone, monkeypatch: pytest.MonkeyPatch) -> Iterator[TopicSource]:
-    monkeypatch.setattr(topic, "STALL_SECONDS", 1.0)
+    monkeypatch.setattr(topic_source, "STALL_SECONDS", 1.0)
     source = TopicSource(microphone.topic, 0, threading.Event())
     yield source
     source.close()
@@ -64,7 +64,7 @@ def test_what_is_new_once_and_losses(source: TopicSource, microphone: Microphone
 def test_who_reads_too_slowly_loses_sound_and_not_the_memory(
     source: TopicSource, microphone: Microphone, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(topic, "MAX_WAITING", 2000)
+    monkeypatch.setattr(topic_source, "MAX_WAITING", 2000)
     signal = noise(10_000)
     microphone.play(signal[:, :8000])
     wait_for(lambda: source._missed == 6000)

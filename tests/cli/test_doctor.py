@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from rosafe.component import paths
+from rosafe.transport import paths
 from tests.cli.command import environment, rosafe, rosafe_alone
 from tests.harness import ROOT, Graph, free_port
 

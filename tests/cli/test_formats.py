@@ -18,7 +18,7 @@ import zarr
 
 import rosafe
 from rosafe.interface import KINDS
-from rosafe.offline import files, formats, whole
+from rosafe.offline import files, formats, in_memory_formats
 from rosafe.offline.files import FileResult, process_file
 from rosafe.output import OutputError
 from rosafe.version import VERSION
@@ -134,7 +134,7 @@ def test_large_arrays_wait_on_the_disk(
     tmp_path: Path, sound: Path, extension: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     process_file(sound, tmp_path / f"a{extension}", SMALL_PARAMETERS, 1000, ["ihc", "ild"])
-    monkeypatch.setattr(whole, "IN_MEMORY", 1000)
+    monkeypatch.setattr(in_memory_formats, "IN_MEMORY", 1000)
     process_file(sound, tmp_path / f"b{extension}", SMALL_PARAMETERS, 1000, ["ihc", "ild"])
     assert_same(rosafe.load(tmp_path / f"b{extension}"), rosafe.load(tmp_path / f"a{extension}"))
     assert len(list(tmp_path.iterdir())) == 3

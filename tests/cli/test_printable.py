@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from rosafe.commands.__main__ import main
-from rosafe.node.keeper import TreeStateFile
+from rosafe.node.tree_state_file import TreeStateFile
 from rosafe.setups import Setup
 from rosafe.setups.setup import Sound
 from rosafe.terminal import printable

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from rosafe.component.master import MasterError, check_master
+from rosafe.transport.master import MasterError, check_master
 from tests.harness import ROOT, SCRIPTS, Graph, MasterProcess, Process, free_port, wait_for
 from tests.terminal import Terminal
 

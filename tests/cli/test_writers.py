@@ -250,8 +250,8 @@ def test_files_that_may_not_grow(tmp_path: Path, extension: str) -> None:
 @pytest.mark.parametrize("name", ["H5Writer", "Mat73Writer"])
 def test_hdf5_after_a_failure_at_any_write(tmp_path: Path, name: str) -> None:
     """Each in a process of its own, which the library used to end."""
-    from rosafe.offline import chunked
-    from rosafe.offline.contents import Contents
+    from rosafe.offline import streaming_formats
+    from rosafe.offline.result_metadata import Contents
 
     def attempt(fail_at: float) -> int:
         count, pwrite = 0, os.pwrite
@@ -268,7 +268,7 @@ def test_hdf5_after_a_failure_at_any_write(tmp_path: Path, name: str) -> None:
             {"ild": (31, 2000)}, {"ild": ("channel", "time")}, {"ild": "dB"}, {}, {"parameters": {"x": "y" * 30000}}
         )
         (tmp_path / "a").write_bytes(b"")
-        writer = getattr(chunked, name)(tmp_path / "a", contents)
+        writer = getattr(streaming_formats, name)(tmp_path / "a", contents)
         try:
             for _ in range(4):
                 writer.append("ild", np.zeros((31, 500)))

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from rosafe.component.master import is_local
+from rosafe.transport.master import is_local
 from tests.demo.running import check_picture, check_walk, family, new_mark
 from tests.genomix import world as worlds
 from tests.harness import PYTHON, ROOT, SCRIPTS, Process, free_port, wait_for

@@ -10,7 +10,7 @@
 #include <string.h>
 #include <sys/mman.h>
 
-enum { MOST_ARRAYS = 32, MOST_ARGUMENTS = 40, MOST_REALS = 8, MOST_MEMBERS = 16, PAGE = 65536 };
+enum { MAX_ARRAYS = 32, MAX_ARGUMENTS = 40, MAX_REALS = 8, MAX_MEMBERS = 16, PAGE = 65536 };
 
 enum kind { INTEGER, REAL, ADDRESS /* number of the array, bytes from its beginning */, STRUCT /* number of members, which follow */ };
 
@@ -51,12 +51,12 @@ int main(int count, char **arguments) {
         return 1;
     }
     for (;;) {
-        char *arrays[MOST_ARRAYS], *begins[MOST_ARRAYS], name[64];
-        int64_t members[MOST_MEMBERS];
-        size_t bytes[MOST_ARRAYS], sizes[MOST_ARRAYS];
-        int64_t integers[MOST_ARGUMENTS] = {0}, used = 0, reals_used = 0, number = take_number();
-        double reals[MOST_REALS] = {0};
-        if (number > MOST_ARRAYS) abort();
+        char *arrays[MAX_ARRAYS], *begins[MAX_ARRAYS], name[64];
+        int64_t members[MAX_MEMBERS];
+        size_t bytes[MAX_ARRAYS], sizes[MAX_ARRAYS];
+        int64_t integers[MAX_ARGUMENTS] = {0}, used = 0, reals_used = 0, number = take_number();
+        double reals[MAX_REALS] = {0};
+        if (number > MAX_ARRAYS) abort();
         for (int64_t i = 0; i < number; i++) {
             bytes[i] = take_number();
             arrays[i] = room(bytes[i], &begins[i], &sizes[i]);
@@ -68,7 +68,7 @@ int main(int count, char **arguments) {
             if (kind == REAL)
                 memcpy(&reals[reals_used++], &value, sizeof value);
             else if (kind == STRUCT) {
-                if (value > MOST_MEMBERS) abort();
+                if (value > MAX_MEMBERS) abort();
                 for (int64_t i = 0; i < value; i++) {
                     int64_t of_member = take_number(), member = take_number(), bytes_from = take_number();
                     members[i] = whole(of_member, member, bytes_from, arrays);

@@ -18,10 +18,10 @@ import pytest
 from numpy.typing import NDArray
 
 from rosafe.dsp import kernels
-from rosafe.dsp.kernels import build, library
+from rosafe.dsp.kernels import build, loader
 
 INTEGER, REAL, ADDRESS, STRUCT = range(4)  # as in driver.c
-MOST_PINNED = 100  # arrays that the stages at work have
+MAX_PINNED = 100  # arrays that the stages at work have
 
 
 class Machine(NamedTuple):
@@ -60,7 +60,7 @@ def pin(array: NDArray[Any]) -> kernels.PinnedArray:
     """As `kernels.Pinned.of`; the array goes with each call that names it, whichever kernels were in use meanwhile."""
     pinned = kernels.PinnedArray(array, array.ctypes.data)
     _pinned[pinned.address] = pinned
-    if len(_pinned) > MOST_PINNED:
+    if len(_pinned) > MAX_PINNED:
         del _pinned[next(iter(_pinned))]  # the oldest
     return pinned
 
@@ -90,7 +90,7 @@ class Foreign:
         return functools.partial(self._call, name)
 
     def _call(self, name: str, *arguments: float | bytes | None) -> int:
-        kinds = library._ARGUMENTS.get(name, ())
+        kinds = loader._ARGUMENTS.get(name, ())
         named = set(_addresses(kinds, arguments))
         own = [np.byte_bounds(pinned.array) for pinned in _pinned.values()]
         own = [(low, high) for low, high in own if any(low <= address <= high for address in named)]
@@ -146,7 +146,7 @@ def _addresses(kinds: Sequence[Any], values: Sequence[Any]) -> Iterator[int]:
 def _members(packed: bytes) -> tuple[Sequence[Any], Sequence[int]]:
     """Kinds and values in a struct that a kernel is given."""
     kinds = {"P": ctypes.c_void_p, "q": ctypes.c_int64}
-    return [kinds[letter] for letter in library.FRAMES], struct.unpack(library.FRAMES, packed)
+    return [kinds[letter] for letter in loader.FRAMES], struct.unpack(loader.FRAMES, packed)
 
 
 def _argument(kind: Any, value: Any, spans: list[tuple[int, int]]) -> bytes:

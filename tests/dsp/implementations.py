@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from rosafe.dsp import kernels
-from rosafe.dsp.kernels import build, library, precedence
+from rosafe.dsp.kernels import build, loader, precedence
 
 from . import foreign
 
@@ -31,7 +31,7 @@ def levels() -> list[int]:
         paths = build.libraries()
     except build.BuildError:
         return []
-    return [level for level in paths if level <= library.load(paths[min(paths)]).rosafe_processor_level()]
+    return [level for level in paths if level <= loader.load(paths[min(paths)]).rosafe_processor_level()]
 
 
 @functools.cache
@@ -41,25 +41,25 @@ def _by_clang() -> ctypes.CDLL:
     level = levels()[-1]
     with tempfile.TemporaryDirectory() as folder:
         names = {level: build.ISA_LEVELS[platform.machine()][level]}
-        return library.load(build.compile_sources("clang", names, Path(folder))[level])
+        return loader.load(build.compile_sources("clang", names, Path(folder))[level])
 
 
 @contextmanager
 def using(choice: Choice) -> Iterator[None]:
     """Within this, the stages run on these kernels, or on the twins."""
-    loaded: tuple[Any, library.Status] = (None, library.Status(False, "the twins, for a test"))
+    loaded: tuple[Any, loader.Status] = (None, loader.Status(False, "the twins, for a test"))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(kernels.PinnedArray, "of", foreign.pin)
         if choice in foreign.MACHINES:
             elsewhere = foreign.running(str(choice))
-            loaded = (elsewhere, library.Status(True, f"{choice}, for a test"))
+            loaded = (elsewhere, loader.Status(True, f"{choice}, for a test"))
             for module in (kernels, precedence):
                 patch.setattr(module, "_address", elsewhere.address)
         elif choice == CLANG:
-            loaded = (_by_clang(), library.Status(True, "clang's, for a test"))
+            loaded = (_by_clang(), loader.Status(True, "clang's, for a test"))
         elif isinstance(choice, int) and choice != TWINS:
             if choice not in levels():
                 pytest.skip(f"no kernels of level {choice} here")
-            loaded = (library.load(build.libraries()[choice]), library.Status(True, f"level {choice}, for a test"))
+            loaded = (loader.load(build.libraries()[choice]), loader.Status(True, f"level {choice}, for a test"))
         patch.setattr(kernels, "loaded", lambda: loaded)
         yield

@@ -1,4 +1,4 @@
-"""Kernels are left one by one (gate.c): whoever stays away holds up nobody for good, and results are the same."""
+"""Threads leave kernels one by one (gil_handoff.c); one that stays away blocks no other, and results are the same."""
 
 from __future__ import annotations
 

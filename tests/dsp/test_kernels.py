@@ -16,10 +16,10 @@ from hypothesis import strategies as st
 from rosafe.dsp import kernels
 from rosafe.dsp.framing import FrameBuffer, FrameGrid
 from rosafe.dsp.gammatone import TURN_SPAN, GammatoneBank
-from rosafe.dsp.guard import LIMIT
 from rosafe.dsp.kernels import build
 from rosafe.dsp.kernels import precedence as by_kernel
-from rosafe.dsp.signal import SignalFormat
+from rosafe.dsp.numeric_limits import LIMIT
+from rosafe.dsp.signal_format import SignalFormat
 from rosafe.dsp.stage import Stage
 from rosafe.dsp.windows import NAMES
 from rosafe.representations import STAGES, precedence
@@ -334,7 +334,7 @@ def test_summed_spectra(level: Choice, channels: int, frames: int, half: int, po
                 factors = np.where(rng.random((frames, 2, channels)) < 0.3, 0, rng.random((frames, 2, channels)))
                 made.append(add(samples, points, gains, factors, running.power).T)
         rows = np.arange(2 * channels)
-        made.append(running.power[rows // by_kernel.BATCH, :, rows % by_kernel.BATCH].T)
+        made.append(running.power[rows // by_kernel.INTERLEAVED_ROWS, :, rows % by_kernel.INTERLEAVED_ROWS].T)
         sums[choice] = made
     for got, expected in zip(sums[level], sums[TWINS], strict=True):
         agree([got], [expected])
@@ -493,15 +493,15 @@ def _steps_meanwhile(level: Choice) -> int:
 
 def test_constants_are_those_of_the_sources() -> None:
     sources = {path.name: path.read_text() for path in (ROOT / "rosafe" / "dsp" / "kernels").glob("*.[ch]")}
-    assert f"MOST_POLES = {kernels.MOST_POLES} " in sources["gammatone.c"]
+    assert f"MAX_POLES = {kernels.MAX_POLES} " in sources["gammatone.c"]
     assert f"{{ SPAN = {TURN_SPAN} " in sources["gammatone.c"]
-    assert f"MOST_SECTIONS = {kernels.MOST_SECTIONS} " in sources["biquads.c"]
-    assert f"MOST_LAGS = {kernels.MAX_LAGS}," in sources["products.h"]
-    assert f"MOST_POINTS = {kernels.MOST_POINTS // 2} " in sources["fourier.h"]
+    assert f"MAX_SECTIONS = {kernels.MAX_SECTIONS} " in sources["biquads.c"]
+    assert f"MAX_LAGS = {kernels.MAX_LAGS}," in sources["correlation_blocks.h"]
+    assert f"MAX_POINTS = {kernels.MAX_POINTS // 2} " in sources["fourier.h"]
     assert f"TAPS = {by_kernel.TAPS} " in sources["precedence.c"]
-    assert f"TOGETHER = {by_kernel.BATCH} " in sources["precedence.c"]
-    assert f"MOST_LOOPS = {kernels.MOST_LOOPS} " in sources["adaptation.c"]
-    assert f"MOST_SIZE = {kernels.MOST_SIZE} " in sources["autocorrelation.c"]
+    assert f"INTERLEAVED_ROWS = {by_kernel.INTERLEAVED_ROWS} " in sources["precedence.c"]
+    assert f"MAX_LOOPS = {kernels.MAX_LOOPS} " in sources["adaptation.c"]
+    assert f"MAX_SIZE = {kernels.MAX_SIZE} " in sources["autocorrelation.c"]
     assert kernels.CLIPPINGS == ("clp", "clc", "sgn")
     assert "{ COMPRESS, CLIP_ONLY, SIGN }" in sources["autocorrelation.c"]
     assert [name.upper().replace("WAVE", "_WAVE") for name in kernels.RECTIFICATIONS] == [

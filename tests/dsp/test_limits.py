@@ -9,8 +9,8 @@ import pytest
 import scipy
 
 from rosafe.dsp import kernels
-from rosafe.dsp.cascade import SosFilter, leaky_integrator
-from rosafe.dsp.guard import LIMIT
+from rosafe.dsp.numeric_limits import LIMIT
+from rosafe.dsp.sos_filter import SosFilter, leaky_integrator
 from rosafe.representations import STAGES
 from rosafe.representations.filterbank import Filterbank
 from rosafe.representations.input import Input

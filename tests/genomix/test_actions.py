@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from rosafe.genomix import actions
-from rosafe.genomix.actions import ActionClient
-from rosafe.genomix.graph import Graph
+from rosafe.client import actions
+from rosafe.client.actions import ActionClient
+from rosafe.client.graph import Graph
 from rosafe.interface import ComponentError
 
 

@@ -18,7 +18,7 @@ from typing import cast
 
 import pytest
 
-from rosafe.genomix.server import LIMITS
+from rosafe.genomix.routes import LIMITS
 from rosafe.http_server.connections import ClientAccount, Connections, HttpConnection, _address
 from rosafe.http_server.refusal import HttpRefusal
 from tests import harness

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from rosafe import interface
-from rosafe.genomix import packed
+from rosafe.genomix import binary_format
 from tests.harness import ROOT
 
 LONG = int(os.environ.get("DECODE_FUZZ", "0"))  # so many more, in rounds of their own: DECODE_FUZZ=100000
@@ -23,13 +23,13 @@ SIZES = (1, 2, 255, 65_536, 1_000_000, 2**24, 2**30, 2**31 - 1, 2**31, 2**32 - 8
 
 def text(value: str) -> bytes:
     """A name of a level."""
-    return packed.text(value)
+    return binary_format.text(value)
 
 
 def signal(*levels: tuple[str, int], data: bytes = b"") -> bytes:
     """A signal that claims these levels."""
     sizes = b"".join(text(name) + struct.pack("<I", size) for name, size in levels)
-    return packed.SIGNAL + struct.pack("<I", len(levels)) + sizes + data
+    return binary_format.SIGNAL + struct.pack("<I", len(levels)) + sizes + data
 
 
 def documents() -> list[bytes]:
@@ -45,11 +45,13 @@ def documents() -> list[bytes]:
     }
     spectrum = "::rosAFE::TimeFrequencySignalPortStruct"
     return [
-        packed.plain({"a": [1, 2.5], "b": ["x", "ä€", ""], "c": [], "d": {"::e": True}, "e": {"f": {"g": None}}}),
-        packed.error({"ex": "::genom::mwerr", "detail": {"what": "no answer"}}),
-        b"".join(packed.pieces(interface.ROSAFE, "::rosAFE::signalNxND", lags)),
-        b"".join(packed.pieces(interface.ROSAFE, "::rosAFE::signalND", [np.ones(2), np.zeros(3)])),
-        b"".join(packed.pieces(interface.ROSAFE, spectrum, port)),
+        binary_format.plain(
+            {"a": [1, 2.5], "b": ["x", "ä€", ""], "c": [], "d": {"::e": True}, "e": {"f": {"g": None}}}
+        ),
+        binary_format.error({"ex": "::genom::mwerr", "detail": {"what": "no answer"}}),
+        b"".join(binary_format.pieces(interface.ROSAFE, "::rosAFE::signalNxND", lags)),
+        b"".join(binary_format.pieces(interface.ROSAFE, "::rosAFE::signalND", [np.ones(2), np.zeros(3)])),
+        b"".join(binary_format.pieces(interface.ROSAFE, spectrum, port)),
     ]
 
 
@@ -65,25 +67,29 @@ CRAFTED = [
     signal(),
     signal(("not a name", 1), data=bytes(8)),
     signal(("", 1), data=bytes(8)),
-    packed.SIGNAL + struct.pack("<I", 2**32 - 1),
-    packed.NUMBERS + struct.pack("<I", 2**32 - 1) + bytes(16),
-    packed.NUMBERS + struct.pack("<I", 2**29) + bytes(16),
-    packed.TEXT + struct.pack("<I", 2**32 - 1) + b"abc",
-    packed.TEXT + struct.pack("<I", 3) + b"\xff\xfe\xed",
-    packed.STRUCTURE + b"d" + bytes(8) + packed.END,
-    packed.STRUCTURE + packed.member("a"),
-    packed.STRUCTURE,
-    packed.SEQUENCE,
-    packed.SEQUENCE * 300_000,
-    packed.STRUCTURE + packed.member("a") * 1 + (packed.STRUCTURE + packed.member("a")) * 100_000,
-    packed.SEQUENCE + (packed.STRUCTURE + packed.END) * 200_000 + packed.END,
-    packed.STRUCTURE + b"".join(packed.member(f"a{i}") + packed.number(1) for i in range(30_000)) + packed.END,
-    packed.ERROR,
-    packed.ERROR + packed.number(1),
-    packed.ERROR + packed.plain({"what": "x"}),
-    packed.ERROR + packed.plain({"ex": 7}),
-    packed.ERROR * 3,
-    packed.plain({"a": 1}) + b"x",
+    binary_format.SIGNAL + struct.pack("<I", 2**32 - 1),
+    binary_format.NUMBERS + struct.pack("<I", 2**32 - 1) + bytes(16),
+    binary_format.NUMBERS + struct.pack("<I", 2**29) + bytes(16),
+    binary_format.TEXT + struct.pack("<I", 2**32 - 1) + b"abc",
+    binary_format.TEXT + struct.pack("<I", 3) + b"\xff\xfe\xed",
+    binary_format.STRUCTURE + b"d" + bytes(8) + binary_format.END,
+    binary_format.STRUCTURE + binary_format.member("a"),
+    binary_format.STRUCTURE,
+    binary_format.SEQUENCE,
+    binary_format.SEQUENCE * 300_000,
+    binary_format.STRUCTURE
+    + binary_format.member("a") * 1
+    + (binary_format.STRUCTURE + binary_format.member("a")) * 100_000,
+    binary_format.SEQUENCE + (binary_format.STRUCTURE + binary_format.END) * 200_000 + binary_format.END,
+    binary_format.STRUCTURE
+    + b"".join(binary_format.member(f"a{i}") + binary_format.number(1) for i in range(30_000))
+    + binary_format.END,
+    binary_format.ERROR,
+    binary_format.ERROR + binary_format.number(1),
+    binary_format.ERROR + binary_format.plain({"what": "x"}),
+    binary_format.ERROR + binary_format.plain({"ex": 7}),
+    binary_format.ERROR * 3,
+    binary_format.plain({"a": 1}) + b"x",
     b"x",
     b"\0" * 100,
     b"HTTP/1.1 200 OK\r\n\r\n",

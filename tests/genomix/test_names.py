@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from rosafe.client.graph import Graph as RosGraph
 from rosafe.genomix import names
-from rosafe.genomix.graph import Graph as RosGraph
 from tests import harness
 from tests.genomix.world import Http, port_of
 from tests.harness import Graph

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from rosafe import interface
-from rosafe.genomix import installed_components, tcpros
+from rosafe.client import installed_components, tcpros
 from rosafe.interface import ComponentError
 from tests import harness
 from tests.genomix import world as worlds

@@ -17,7 +17,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rosafe import interface
-from rosafe.genomix import packed
+from rosafe.genomix import binary_format
 from tests.genomix.world import World
 from tests.harness import PATIENCE, ROOT
 
@@ -51,7 +51,7 @@ class Reader:
 
     def until_end(self) -> bool:
         """Whether a sequence or structure goes on."""
-        if self._data[self._at : self._at + 1] == packed.END:
+        if self._data[self._at : self._at + 1] == binary_format.END:
             self._at += 1
             return False
         return True
@@ -59,27 +59,27 @@ class Reader:
     def value(self) -> Any:
         """Any value; a signal as (names, array)."""
         kind = self.take(1)
-        if kind == packed.NUMBER:
+        if kind == binary_format.NUMBER:
             return float(self.numbers(1)[0])
-        if kind == packed.TEXT:
+        if kind == binary_format.TEXT:
             return self.text()
-        if kind == packed.NUMBERS:
+        if kind == binary_format.NUMBERS:
             return self.numbers(self.count())
-        if kind == packed.SIGNAL:
+        if kind == binary_format.SIGNAL:
             levels = [(self.text(), self.count()) for _ in range(self.count())]
             shape = [size for _, size in levels]
             return [name for name, _ in levels], self.numbers(math.prod(shape)).reshape(shape)
-        if kind == packed.SEQUENCE:
+        if kind == binary_format.SEQUENCE:
             items = []
             while self.until_end():
                 items.append(self.value())
             return items
-        assert kind in (packed.STRUCTURE, packed.ERROR), kind
-        if kind == packed.ERROR:
+        assert kind in (binary_format.STRUCTURE, binary_format.ERROR), kind
+        if kind == binary_format.ERROR:
             return {"!": self.value()}
         members = {}
         while self.until_end():
-            assert self.take(1) == packed.TEXT
+            assert self.take(1) == binary_format.TEXT
             name = self.text()
             members[name] = self.value()
         return members
@@ -109,7 +109,7 @@ def same(found: Any, value: Any) -> bool:
 @settings(deadline=None, max_examples=50)
 @given(values)
 def test_plain_values_read_back(value: Any) -> None:
-    assert same(read(packed.plain(value)), value)
+    assert same(read(binary_format.plain(value)), value)
 
 
 @settings(deadline=None)
@@ -120,7 +120,7 @@ def test_signals_read_back(channels: list[list[float]], alike: bool) -> None:
         channels = [(channel + [0.0] * 4)[:3] for channel in channels]
     arrays = [np.array(channel) for channel in channels]
     port = {"sampleRate": 1, "lastFrameIndex": 2**53, "framesOnPort": 3, "numberOfChannels": 4, "left": arrays}
-    data = b"".join(packed.pieces(interface.ROSAFE, SPECTRUM, {**port, "right": []}))
+    data = b"".join(binary_format.pieces(interface.ROSAFE, SPECTRUM, {**port, "right": []}))
     found = read(data)
     assert list(found) == [name for name, _ in interface.ROSAFE.structs[SPECTRUM]]
     assert found["lastFrameIndex"] == 2**53
@@ -133,11 +133,11 @@ def test_signals_read_back(channels: list[list[float]], alike: bool) -> None:
 
 
 def test_special_numbers_and_texts() -> None:
-    assert math.isnan(read(packed.plain(None)))
-    assert math.isnan(read(packed.plain(math.nan)))
-    assert read(packed.plain([math.inf, 1])).tolist() == [math.inf, 1]
-    assert read(packed.plain("\ud800")) == "\\ud800"
-    assert read(packed.error({"ex": "::genom::syserr", "detail": {"code": 11}})) == {
+    assert math.isnan(read(binary_format.plain(None)))
+    assert math.isnan(read(binary_format.plain(math.nan)))
+    assert read(binary_format.plain([math.inf, 1])).tolist() == [math.inf, 1]
+    assert read(binary_format.plain("\ud800")) == "\\ud800"
+    assert read(binary_format.error({"ex": "::genom::syserr", "detail": {"code": 11}})) == {
         "!": {"ex": "::genom::syserr", "detail": {"code": 11}}
     }
 
@@ -147,13 +147,15 @@ def test_octave_reads_the_same(tmp_path: Path) -> None:
     if shutil.which("octave-cli") is None:
         pytest.skip("octave-cli is not installed; scripts/install --tests brings it")
     lags = [[np.arange(3.0) + 10 * channel + 100 * lag for channel in range(2)] for lag in range(4)]
-    correlation = b"".join(packed.pieces(interface.ROSAFE, "::rosAFE::signalNxND", lags))
+    correlation = b"".join(binary_format.pieces(interface.ROSAFE, "::rosAFE::signalNxND", lags))
     documents = {
-        "plain": packed.plain({"a": [1, 2.5, math.nan], "b": ["x", "äß€", ""], "c": [], "d": {"::e": True}, "e": []}),
+        "plain": binary_format.plain(
+            {"a": [1, 2.5, math.nan], "b": ["x", "äß€", ""], "c": [], "d": {"::e": True}, "e": []}
+        ),
         "lags": correlation,
-        "ragged": b"".join(packed.pieces(interface.ROSAFE, "::rosAFE::signalND", [np.ones(2), np.zeros(3)])),
-        "error": packed.error({"ex": "x"}),
-        "empty": b"".join(packed.pieces(interface.ROSAFE, "::rosAFE::signalNxND", [[np.empty(0), np.empty(0)]])),
+        "ragged": b"".join(binary_format.pieces(interface.ROSAFE, "::rosAFE::signalND", [np.ones(2), np.zeros(3)])),
+        "error": binary_format.error({"ex": "x"}),
+        "empty": b"".join(binary_format.pieces(interface.ROSAFE, "::rosAFE::signalNxND", [[np.empty(0), np.empty(0)]])),
     }
     for name, data in documents.items():
         (tmp_path / name).write_bytes(data)
@@ -243,5 +245,5 @@ def test_the_server_answers_packed(world: World) -> None:
 def test_numbers_beyond_all_floats() -> None:
     """A component's error may hold any number that JSON has."""
     huge = 10**4000
-    assert packed.plain(huge) == packed.plain(math.inf)
-    assert packed.plain([-huge, 1]) == packed.plain([-math.inf, 1])
+    assert binary_format.plain(huge) == binary_format.plain(math.inf)
+    assert binary_format.plain([-huge, 1]) == binary_format.plain([-math.inf, 1])

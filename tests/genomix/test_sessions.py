@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rosafe.client.component_client import ComponentClient, Value
+from rosafe.client.graph import Graph
 from rosafe.genomix import sessions
-from rosafe.genomix.graph import Graph
-from rosafe.genomix.proxy import ComponentClient, Value
-from rosafe.genomix.requests import REQUEST_BYTES, Request
+from rosafe.genomix.activity_request import REQUEST_BYTES, Request
 from rosafe.genomix.sessions import Session, Sessions
-from rosafe.genomix.syntax import JSON
+from rosafe.genomix.text_formats import JSON
 from rosafe.interface import BASS, ROSAFE, ComponentError, Service
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from rosafe.genomix import packed
+from rosafe.genomix import binary_format
 from tests import harness
 from tests.matlab import octave
 
@@ -132,13 +132,15 @@ def test_tcl_is_told_nonsense(body: bytes, told: str, tmp_path: Path) -> None:
 
 STRANGE = {
     "web page": b"<html>hello</html>",
-    "52 bytes": packed.SIGNAL
+    "52 bytes": binary_format.SIGNAL
     + struct.pack("<I", 3)
-    + b"".join(packed.text(name) + struct.pack("<I", size) for name, size in (("a", 2**32 - 1), ("b", 1), ("c", 0))),
-    "cut": packed.plain({"name": "rosAFE"})[:-3],
-    "number": packed.plain(7),
-    "other structure": packed.plain({"a": 1}),
-    "no structures": packed.plain({"name": "x", "instance": "x", "services": 1, "ports": 2}),
+    + b"".join(
+        binary_format.text(name) + struct.pack("<I", size) for name, size in (("a", 2**32 - 1), ("b", 1), ("c", 0))
+    ),
+    "cut": binary_format.plain({"name": "rosAFE"})[:-3],
+    "number": binary_format.plain(7),
+    "other structure": binary_format.plain({"a": 1}),
+    "no structures": binary_format.plain({"name": "x", "instance": "x", "services": 1, "ports": 2}),
 }
 
 

@@ -11,10 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rosafe import interface
-from rosafe.genomix import syntax
-from rosafe.genomix.values import complete, parse_input
+from rosafe.client.values import complete, parse_input, tcl_list
+from rosafe.declarations.idl import element
 from rosafe.interface import BASS, REQUIRED, ROSAFE, ComponentError, Service
-from rosafe.vocabulary.idl import element
 
 GAMMATONE = ROSAFE.service("GammatoneProc")
 INPUT = ROSAFE.service("InputProc")
@@ -184,7 +183,7 @@ def test_whatever_comes_is_of_the_right_types_or_refused(data: st.DataObject) ->
 @given(st.text(alphabet='ab {}"\\$[ ', max_size=12))
 def test_tcl_lists_are_split_as_tcl_does(text: str) -> None:
     """Or not at all: quotes, backslashes and unbalanced braces."""
-    words = syntax.tcl_list(text)
+    words = tcl_list(text)
     try:
         expected = list(tkinter.Tcl().splitlist(text))
     except tkinter.TclError:

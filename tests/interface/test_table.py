@@ -9,8 +9,8 @@ import pytest
 
 import rosafe
 from rosafe import interface
+from rosafe.declarations.idl import SCALARS
 from rosafe.interface import BASS, ROSAFE, Component, Service
-from rosafe.vocabulary.idl import SCALARS
 from tests import harness
 
 FOLDERS = {"rosAFE": harness.ROOT, "bass": harness.ROOT / "bass"}

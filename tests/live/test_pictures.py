@@ -9,8 +9,8 @@ import pytest
 
 from rosafe.interface import KINDS, format_value
 from rosafe.live.client import BrowserConnection, _keys
-from rosafe.live.hub import FLOAT, PIECE, QUANTISED, Key, View
-from rosafe.live.pictures import PlotLayout, Processor, Tree, quantize
+from rosafe.live.plot_data import PlotLayout, Processor, Tree, quantize
+from rosafe.live.views import FLOAT, PIECE, QUANTISED, Key, View
 
 FREQUENCIES = [100.0, 200.0, 400.0]
 RNG = np.random.default_rng(3)

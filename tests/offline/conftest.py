@@ -19,5 +19,5 @@ def no_thread_left() -> Iterator[None]:
 @pytest.fixture
 def blocks_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
     """None are put together, and the tree has no branches."""
-    monkeypatch.setattr(chain, "MOST_BYTES", 0)
+    monkeypatch.setattr(chain, "MAX_BYTES", 0)
     monkeypatch.setattr(chain, "MAX_FRAMES", 10**9)

@@ -67,7 +67,7 @@ def at_most(size: int) -> Iterator[list[int]]:
         return process(self, block, extra)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(chain, "MOST_BYTES", size)
+        patch.setattr(chain, "MAX_BYTES", size)
         patch.setattr(Input, "process", watch)
         yield lengths
 

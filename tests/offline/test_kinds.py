@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 import rosafe
+from rosafe.declarations.parameter import Parameter
+from rosafe.declarations.representation import Derived, Part, Representation
 from rosafe.dsp.framing import FramedStage, frame_parameters
-from rosafe.dsp.guard import FloatArray, clamp
+from rosafe.dsp.numeric_limits import FloatArray, clamp
 from rosafe.dsp.stage import Output
 from rosafe.representations import KINDS, STAGES
-from rosafe.vocabulary.parameter import Parameter
-from rosafe.vocabulary.representation import Derived, Part, Representation
 from tests.dsp.bare import cut
 
 RATE = 16000.0

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from rosafe.dsp.kernels import build, library
+from rosafe.dsp.kernels import build, loader
 from tests.harness import PYTHON, run_together, wait_for
 from tests.packaging.clone import environment, fresh_copy, run, without_rights
 
@@ -250,9 +250,9 @@ def test_no_more_than_the_processor_can(monkeypatch: pytest.MonkeyPatch, level: 
         opened.append(path.name)
         return Library()
 
-    monkeypatch.setattr(library, "load", load)
-    monkeypatch.delenv(library.KERNELS_VARIABLE, raising=False)
-    loaded, status = library.loaded.__wrapped__()
+    monkeypatch.setattr(loader, "load", load)
+    monkeypatch.delenv(loader.KERNELS_VARIABLE, raising=False)
+    loaded, status = loader.loaded.__wrapped__()
     assert (loaded is not None) == status.compiled == (level > 0)
     assert ("x86-64-v4.so" in opened) == (level == 4)
     assert ("x86-64-v3.so" in opened) == (level == 3)

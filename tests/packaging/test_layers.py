@@ -11,26 +11,32 @@ import pytest
 from tests.harness import ROOT
 
 PACKAGE = ROOT / "rosafe"
-_NUMERICS = {"vocabulary", "dsp", "representations"}
+_NUMERICS = {"declarations", "dsp", "representations"}
 STANDS_ON: dict[str, set[str]] = {
-    "vocabulary": set(),
+    "declarations": set(),
+    "vocabulary": {"declarations"},
     "sound": set(),
-    "dsp": {"vocabulary"},
-    "plugin": {"vocabulary", "dsp"},
-    "representations": {"vocabulary", "dsp"},
+    "dsp": {"declarations"},
+    "plugin": {"declarations", "dsp"},
+    "representations": {"declarations", "dsp"},
     "interface": _NUMERICS,
     "tree": {*_NUMERICS, "interface"},
     "setups": {*_NUMERICS, "interface", "tree"},
     "offline": {*_NUMERICS, "interface", "tree", "sound"},
-    "component": {"vocabulary", "representations", "interface", "tree", "sound"},
-    "node": {*_NUMERICS, "interface", "tree", "component", "sound", "setups"},
-    "bass": {"vocabulary", "interface", "component", "sound"},
+    "transport": {"declarations", "interface"},
+    "component": {"declarations", "representations", "interface", "tree", "sound", "transport"},
+    "node": {*_NUMERICS, "interface", "tree", "component", "transport", "sound", "setups"},
+    "bass": {"declarations", "interface", "component", "transport", "sound"},
     "http_server": set(),
-    "genomix": {"vocabulary", "interface", "tree", "component", "setups", "http_server"},
-    "eltclsh": {"vocabulary", "interface", "component", "genomix"},
+    "client": {"declarations", "interface", "tree", "component", "transport", "setups"},
+    "genomix": {"declarations", "interface", "tree", "component", "transport", "client", "http_server"},
+    "eltclsh": {"declarations", "interface", "component", "transport", "client", "genomix"},
     "view": {"interface", "sound"},
-    "live": {"vocabulary", "interface", "tree", "component", "bass", "http_server", "genomix", "view", "sound"},
-    "demo": {"interface", "tree", "component", "bass", "sound", "view", "offline", "vocabulary"},
+    "live": {
+        *("declarations", "interface", "tree", "component", "transport", "bass", "http_server", "client", "genomix"),
+        *("view", "sound"),
+    },
+    "demo": {*_NUMERICS, "interface", "tree", "component", "transport", "bass", "sound", "view", "offline"},
 }
 TOP = {"commands", "testing", "ros", "__init__"}  # may use everything
 EVERYWHERE = {"version", "output", "input", "missing", "terminal", "streams"}

@@ -78,7 +78,10 @@ def test_the_complexity_of_functions_is_limited() -> None:
 
 
 def test_complexity_counts_each_branch_once() -> None:
-    source = "def f(x):\n if x and x > 1 or x < 0:\n  return [y for y in x]\n def g():\n  while x: pass\n return 1 if x else 2"
+    source = (
+        "def f(x):\n if x and x > 1 or x < 0:\n  return [y for y in x]\n"
+        " def g():\n  while x: pass\n return 1 if x else 2"
+    )
     function = ast.parse(source).body[0]
     assert isinstance(function, Function)
     assert complexity(function) == 1 + 1 + 2 + 1 + 1  # if, two further operands, comprehension, conditional expression

@@ -8,8 +8,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
+from rosafe.declarations.representation import Representation
 from rosafe.dsp.stage import Stage
-from rosafe.vocabulary.representation import Representation
 
 HEAD = """\
 from collections import deque

@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import pytest
 
+from rosafe.declarations.signals import layout
 from rosafe.interface import KINDS, ROSAFE
 from rosafe.representations import checks
-from rosafe.vocabulary.signals import layout
 
 from .support import python
 

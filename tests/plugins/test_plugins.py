@@ -24,15 +24,15 @@ BROKEN = {
     "syntax.py": ("class :", "SyntaxError"),
     "leaves.py": ("import sys; sys.exit(3)", "SystemExit"),
     "declared_wrong.py": (
-        "from rosafe.vocabulary.representation import Representation\n"
+        "from rosafe.declarations.representation import Representation\n"
         "Representation(kind='x', doc='x', parent='ihc', axes=('channel',))\n",
         "time last",
     ),
 }
 TAKEN = """
 from rosafe.dsp.stage import Stage
-from rosafe.vocabulary.parameter import Parameter
-from rosafe.vocabulary.representation import Representation
+from rosafe.declarations.parameter import Parameter
+from rosafe.declarations.representation import Representation
 
 
 class Taken(Stage):

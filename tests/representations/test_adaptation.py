@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rosafe.dsp.signal import SignalFormat
+from rosafe.dsp.signal_format import SignalFormat
 from rosafe.representations.adaptation import EVEN_TAU, TAU, Adaptation, hearing_threshold
 
 from .chain import Chain, FloatArray, cut, reference

@@ -13,7 +13,7 @@ import scipy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rosafe.dsp.signal import SignalFormat
+from rosafe.dsp.signal_format import SignalFormat
 from rosafe.dsp.windows import ALL_NAMES, window
 from rosafe.representations.amsfeatures import AmsFeatures, design_sections
 

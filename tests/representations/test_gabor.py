@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rosafe.dsp.signal import SignalFormat
+from rosafe.dsp.signal_format import SignalFormat
 from rosafe.representations.gabor import Gabor, RunningZScore, filters, patterns
 
 from .chain import Chain, FloatArray, check_fresh_output, check_new_beginnings, cut, reference

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rosafe.dsp.signal import SignalFormat
+from rosafe.dsp.signal_format import SignalFormat
 from rosafe.representations import KINDS
-from rosafe.representations.moc import Moc
+from rosafe.representations.moc_reflex import Moc
 
 from .chain import FloatArray, reference
 

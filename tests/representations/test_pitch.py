@@ -14,7 +14,7 @@ import scipy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rosafe.dsp.signal import SignalFormat
+from rosafe.dsp.signal_format import SignalFormat
 from rosafe.representations import pitch
 from rosafe.representations.pitch import Pitch
 

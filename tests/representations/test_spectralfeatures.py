@@ -12,7 +12,7 @@ import scipy.stats
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rosafe.dsp.signal import SignalFormat
+from rosafe.dsp.signal_format import SignalFormat
 from rosafe.representations import KINDS
 from rosafe.representations.spectralfeatures import FEATURES, SpectralFeatures
 from tests.dsp.implementations import TWINS, Choice, using

@@ -12,9 +12,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rosafe.dsp.signal import SignalFormat
+from rosafe.dsp.signal_format import SignalFormat
 from rosafe.representations import KINDS
-from rosafe.representations.transientmaps import KEPT, OffsetMap, OnsetMap
+from rosafe.representations.onset_offset_maps import KEPT, OffsetMap, OnsetMap
 from tests.dsp.implementations import TWINS, Choice, using
 
 from .chain import Chain, FloatArray, reference

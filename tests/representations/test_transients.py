@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rosafe.dsp.signal import SignalFormat
+from rosafe.dsp.signal_format import SignalFormat
 from rosafe.dsp.stage import Stage
 from rosafe.representations import KINDS
-from rosafe.representations.transients import OffsetStrength, OnsetStrength
+from rosafe.representations.onset_offset_strength import OffsetStrength, OnsetStrength
 
 from .chain import Chain, FloatArray, reference
 

@@ -1,1 +1,1 @@
-"""Tests of the request for a whole tree, on a tree in this process: rosafe.tree.requests and rosafe.tree.building."""
+"""Tests of the request for a whole tree, without ROS: rosafe.tree.tree_planner and rosafe.tree.tree_builder."""

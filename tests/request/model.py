@@ -1,4 +1,4 @@
-"""A rosAFE in this process, as `rosafe.tree.building` sees one: services that answer as the node's, without sound."""
+"""A model of rosAFE for `rosafe.tree.tree_builder`: services that respond as the node's, without sound."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from types import SimpleNamespace
 from typing import Any
 
-from rosafe.dsp.signal import SignalFormat
+from rosafe.dsp.signal_format import SignalFormat
 from rosafe.dsp.stage import Stage
 from rosafe.interface import KINDS, ROSAFE, ComponentError, format_value
 from rosafe.representations import STAGES
-from rosafe.tree.building import Turns
+from rosafe.tree.tree_builder import Turns
 
 RATE = 44100.0
 KIND_OF_SERVICE = {kind.request: kind for kind in KINDS.values()}

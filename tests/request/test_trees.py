@@ -12,12 +12,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rosafe import interface
+from rosafe.client.values import partial
 from rosafe.dsp.stage import Stage
-from rosafe.genomix.values import partial
 from rosafe.interface import KINDS, ROSAFE, ComponentError
 from rosafe.representations import STAGES
-from rosafe.tree import building
-from rosafe.tree import requests as request
+from rosafe.tree import tree_builder
+from rosafe.tree import tree_planner as request
 from tests.request.model import RATE, Model
 
 REPRESENTATIONS = [kind.word for kind in KINDS.values()]
@@ -42,12 +42,12 @@ CHANGES = st.tuples(st.integers(0, 10**6), st.sampled_from(["remove", "stop", *V
 
 def build(model: Model, representation: str, **parameters: Any) -> dict[str, Any]:
     """The answer to one request."""
-    return asyncio.run(building.build(model, {"representation": representation, **parameters}))
+    return asyncio.run(tree_builder.build(model, {"representation": representation, **parameters}))
 
 
 def find(model: Model, representation: str, **parameters: Any) -> dict[str, Any]:
     """What there is of it."""
-    return asyncio.run(building.find(model, {"representation": representation, **parameters}))
+    return asyncio.run(tree_builder.find(model, {"representation": representation, **parameters}))
 
 
 def in_force(kind: str, parameters: Mapping[str, Any]) -> dict[str, Any]:
@@ -117,7 +117,7 @@ def test_clients_that_do_not_know_of_each_other(wanted: list[tuple[str, dict[str
     model = Model()
 
     async def all_at_once() -> list[dict[str, Any]]:
-        return await asyncio.gather(*(building.build(model, {"representation": r, **p}) for r, p in wanted))
+        return await asyncio.gather(*(tree_builder.build(model, {"representation": r, **p}) for r, p in wanted))
 
     answers = asyncio.run(all_at_once())
     for (representation, parameters), told in zip(wanted, answers, strict=True):
@@ -143,7 +143,7 @@ def test_nothing_is_left_of_what_fails(
     error = ComponentError("::genom::syserr", code=12)
 
     async def go() -> dict[str, Any]:
-        task = asyncio.create_task(building.build(model, {"representation": wanted[0], **wanted[1]}))
+        task = asyncio.create_task(tree_builder.build(model, {"representation": wanted[0], **wanted[1]}))
         if cancelled:
             model.cancel[number] = model.cancel[number + again] = task
         else:
@@ -257,7 +257,7 @@ def test_a_structure_of_getparameters_means_the_processor_that_it_describes(valu
     structures: tuple[dict[str, Any], ...] = ({"filterbank": told}, {"gammatone": [told]})
     for structure in structures:
         wanted = partial({"representation": "ratemap", **structure})
-        assert asyncio.run(building.build(model, wanted))["dependencies"][2] == "filterbank_1"
+        assert asyncio.run(tree_builder.build(model, wanted))["dependencies"][2] == "filterbank_1"
     if not values:
         assert build(model, "ratemap", fb_nChannels=31)["dependencies"][2] == "filterbank_2"
 
@@ -360,7 +360,7 @@ def test_what_others_have_come_to_use_stays() -> None:
     model = Model()
 
     async def go() -> None:
-        failing = asyncio.create_task(building.build(model, {"representation": "ild", "fb_highFreqHz": 30000.0}))
+        failing = asyncio.create_task(tree_builder.build(model, {"representation": "ild", "fb_highFreqHz": 30000.0}))
         while "time_0" not in model.processors:
             await asyncio.sleep(0)
         defaults = {p.name: p.default for p in ROSAFE.service("GammatoneProc").parameters}

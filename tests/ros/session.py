@@ -18,7 +18,7 @@ import rospy
 from actionlib import CommState
 
 from rosafe import process
-from rosafe.component import wire
+from rosafe.component import serialization
 from rosafe.interface import CORE_REPRESENTATIONS, ROSAFE
 from tests.harness import PATIENCE, PYTHON, Graph, Process, wait_for
 
@@ -41,7 +41,7 @@ class Microphone:
         self.topic = topic or f"/microphone{next(_topics)}/Audio"
         self.sample_rate, self.chunk, self.chunks = sample_rate, chunk, chunks
         self.index = 0  # of the newest frame
-        self._message = wire.message_class("bass", "::binaudio::portStruct")
+        self._message = serialization.message_class("bass", "::binaudio::portStruct")
         self.window = np.zeros((2, chunk * chunks), np.int32)
         self._publisher = rospy.Publisher(self.topic, self._message, latch=True, queue_size=0, tcp_nodelay=True)
         self.publish()
@@ -169,7 +169,7 @@ class Session:
         """The newest message of a port, with arrays; the one with lastFrameIndex `index` where that is given."""
         return self.graph.message(
             self.topic(kind, name),
-            wire.message_class("rosAFE", ROSAFE.port(CORE_REPRESENTATIONS[kind].port).idl),
+            serialization.message_class("rosAFE", ROSAFE.port(CORE_REPRESENTATIONS[kind].port).idl),
             accept=lambda message: index is None or message.lastFrameIndex == index,
             timeout=timeout,
         )
@@ -177,7 +177,7 @@ class Session:
     @contextmanager
     def follow(self, kind: str, name: str = "") -> Iterator[list[Any]]:
         """All messages of a port, from the latched one on."""
-        message_class = wire.message_class("rosAFE", ROSAFE.port(CORE_REPRESENTATIONS[kind].port).idl)
+        message_class = serialization.message_class("rosAFE", ROSAFE.port(CORE_REPRESENTATIONS[kind].port).idl)
         with self.graph.collect(self.topic(kind, name), message_class) as messages:
             wait_for(lambda: messages, what=f"a message on {self.topic(kind, name)}")
             yield messages

@@ -10,8 +10,8 @@ from typing import Any
 
 import pytest
 
-from rosafe.component import door
-from rosafe.component.door import HandshakeRejected, HandshakeServer
+from rosafe.transport import handshake_server
+from rosafe.transport.handshake_server import HandshakeRejected, HandshakeServer
 from tests.harness import wait_for
 
 
@@ -73,7 +73,7 @@ def test_who_says_nonsense_is_told_and_named() -> None:
 
 
 def test_who_is_silent_goes_after_a_while_but_not_who_was_heard(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(door, "OPENING_SECONDS", 0.5)
+    monkeypatch.setattr(handshake_server, "OPENING_SECONDS", 0.5)
     with house() as it, it.visit() as silent, it.visit(b"half") as half, it.visit(b"a line\n") as heard:
         assert silent.recv(100) == b"" == half.recv(100)
         assert sorted(what for _, what in it.reports) == [
@@ -87,7 +87,7 @@ def test_who_is_silent_goes_after_a_while_but_not_who_was_heard(monkeypatch: pyt
 
 
 def test_the_one_that_came_first_goes_where_there_are_too_many(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(door, "MAX_PENDING", 10)
+    monkeypatch.setattr(handshake_server, "MAX_PENDING", 10)
     with house() as it:
         crowd = [it.visit() for _ in range(15)]
         for sock in crowd[:5]:

@@ -21,8 +21,8 @@ from rosgraph.network import encode_ros_handshake_header, read_ros_handshake_hea
 from std_msgs.msg import Header, String
 
 import bass.msg
-from rosafe.component import door
 from rosafe.sound.windows import MAX_WINDOW
+from rosafe.transport import handshake_server
 from tests.harness import PATIENCE, PYTHON, Graph, proc, python_path, wait_for
 from tests.ros.attacker import HUGE, FakePublisher, Target, closed, length, pour, publisher_header
 from tests.ros.session import Session, noise, own_node
@@ -83,7 +83,7 @@ def test_many_that_are_silent_or_slow_hold_nobody_up(target: Target) -> None:
                     with contextlib.suppress(ConnectionError):
                         sock.sendall(byte)
                 target.assert_well()
-        assert target.descriptors < 2 * door.MAX_PENDING + 200, "no more wait than that"
+        assert target.descriptors < 2 * handshake_server.MAX_PENDING + 200, "no more wait than that"
 
 
 def test_one_who_says_its_piece_byte_by_byte_is_understood(target: Target) -> None:
@@ -203,7 +203,7 @@ def test_a_name_that_would_break_those_who_read_it_is_refused(target: Target) ->
 def test_the_soft_limit_is_raised(target: Target) -> None:
     limits = proc(target.process.pid, "limits").read_text()
     soft, hard = re.findall(r"^Max open files +(\d+) +(\d+)", limits, re.MULTILINE)[0]
-    assert int(soft) == min(door.DESCRIPTORS, int(hard)) or int(soft) > door.DESCRIPTORS
+    assert int(soft) == min(handshake_server.DESCRIPTORS, int(hard)) or int(soft) > handshake_server.DESCRIPTORS
 
 
 def test_when_descriptors_run_out_the_node_waits_and_goes_on(target: Target) -> None:

@@ -6,7 +6,7 @@ import itertools
 import re
 import time
 
-from rosafe.component.events import KINDS, ThrottledLog
+from rosafe.transport.log_throttle import KINDS, ThrottledLog
 from tests.harness import run_together, wait_for
 
 

@@ -15,8 +15,8 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from rosAFE.msg import rosAFE_frameTime, rosAFE_TimeFrequencySignalPortStruct
 
-from rosafe.component import wire
-from rosafe.component.frametime import FrameTime
+from rosafe.component import serialization
+from rosafe.component.frame_clock import FrameTime
 from rosafe.ros import FrameClock, array_msg
 from tests.harness import SCRIPTS, Graph, free_port, wait_for
 from tests.ros.session import Microphone, Session, noise
@@ -196,7 +196,7 @@ def test_the_array_class_has_the_bytes_of_the_generated_one(graph: Graph) -> Non
 
     both = []
     stamp = {"sec": 7, "nsec": 9}
-    quick = wire.message_class("rosAFE", "::rosAFE::frameTime")
+    quick = serialization.message_class("rosAFE", "::rosAFE::frameTime")
     for message in (
         rosAFE_frameTime(rospy.Time(7, 9), 11, 44100.5),
         quick(stamp=stamp, frameIndex=11, sampleRate=44100.5),

@@ -11,7 +11,7 @@ import rosAFE.msg
 import rosAFE.srv
 import rospy
 
-from rosafe.component import wire
+from rosafe.component import serialization
 from rosafe.interface import CORE_REPRESENTATIONS, ROSAFE, ros_type
 from rosafe.ros import array_srv
 from tests.harness import wait_for
@@ -189,7 +189,7 @@ def test_a_child_begins_with_the_block_that_was_released_last(afe: Session) -> N
 
 def test_the_data_object_is_advertised_and_silent(afe: Session) -> None:
     microphone = afe.build("PreProc", block=BLOCK)
-    with afe.graph.collect("/rosAFE/dataObj", wire.message_class("rosAFE", "::rosAFE::dataObjSt")) as messages:
+    with afe.graph.collect("/rosAFE/dataObj", serialization.message_class("rosAFE", "::rosAFE::dataObjSt")) as messages:
         microphone.play(noise(BLOCK))
         afe.read("preProc", BLOCK + 1)
         assert messages == []

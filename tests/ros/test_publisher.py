@@ -24,11 +24,11 @@ from rospy import topics
 from rospy.impl.tcpros_base import TCPROSTransport
 from rospy.impl.tcpros_pubsub import TCPROSPub
 
-from rosafe.component import publisher
-from rosafe.component.publisher import MAX_WAITING, MAX_WAITING_BYTES, Publisher, send_pieces
-from rosafe.component.wire import BufferList
 from rosafe.interface import CORE_REPRESENTATIONS
 from rosafe.ros import array_msg
+from rosafe.transport import publisher
+from rosafe.transport.buffer_list import BufferList
+from rosafe.transport.publisher import MAX_WAITING, MAX_WAITING_BYTES, Publisher, send_pieces
 from tests.harness import PATIENCE, PYTHON, ROOT, Graph, Process, proc, wait_for
 from tests.ros.session import Session, noise, own_node
 

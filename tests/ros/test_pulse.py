@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 
-from rosafe.component import systemd
+from rosafe.transport import systemd
 from tests.harness import Graph, MasterProcess, wait_for
 from tests.ros.attacker import Target
 

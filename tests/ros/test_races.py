@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 import rosgraph
 
-from rosafe.component import master
+from rosafe.transport import master
 from tests.harness import PYTHON, Graph, MasterProcess, python_path, run_together, wait_for
 from tests.ros.session import Session, told
 

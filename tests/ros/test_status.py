@@ -18,7 +18,7 @@ from actionlib_msgs.msg import GoalStatusArray
 import bass.msg
 from rosafe.component import action_server, generate
 from rosafe.component.action_server import DEFAULT_FREQUENCY, StatusPublisher
-from rosafe.component.wire import BufferList
+from rosafe.transport.buffer_list import BufferList
 from tests.harness import PATIENCE, PYTHON, Graph, wait_for
 
 GENERATOR = Path("/usr/lib/gencpp/gen_cpp.py")

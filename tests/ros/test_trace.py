@@ -19,7 +19,7 @@ from std_msgs.msg import String
 
 from rosafe.interface import CORE_REPRESENTATIONS
 from rosafe.node.trace_port import TracePort, read
-from rosafe.tree.company import Observer
+from rosafe.tree.context import Observer
 from rosafe.tree.states import State
 from tests.cli.command import refused, rosafe
 from tests.harness import PATIENCE, SCRIPTS, Graph, wait_for

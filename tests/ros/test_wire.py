@@ -18,10 +18,11 @@ from hypothesis import strategies as st
 
 import bass.msg
 from rosafe import interface
-from rosafe.component import wire
+from rosafe.component import serialization
 from rosafe.interface import ROSAFE
 from rosafe.ros import array_msg
-from rosafe.tree.window import SlidingWindow, WindowView
+from rosafe.transport.buffer_list import BufferList
+from rosafe.tree.sliding_window import SlidingWindow, WindowView
 
 TIME_DOMAIN = "::rosAFE::TimeDomainSignalPortStruct"
 TIME_FREQUENCY = "::rosAFE::TimeFrequencySignalPortStruct"
@@ -65,7 +66,7 @@ def ours_and_plain(idl: str, left: np.ndarray, right: np.ndarray | None = None) 
     signals = {"left": left} if idl == CROSS_CORRELATION else {"left": left, "right": left if right is None else right}
     lists = {name: _nested(array.tolist(), LEVELS[idl]) for name, array in signals.items()}
     return (
-        wire.message_class("rosAFE", idl)(**HEADS[idl], **signals),
+        serialization.message_class("rosAFE", idl)(**HEADS[idl], **signals),
         plain_class(idl)(**HEADS[idl], **lists),
     )
 
@@ -78,7 +79,7 @@ def test_bytes_are_those_of_the_generated_class(data: st.DataObject, idl: str) -
     ours, plain = ours_and_plain(idl, values, 2 * values)
     sent = serialized(plain)
     assert serialized(ours) == sent
-    back = wire.message_class("rosAFE", idl)().deserialize(sent)
+    back = serialization.message_class("rosAFE", idl)().deserialize(sent)
     np.testing.assert_array_equal(back.left, values)
     assert back.left.shape == shape
     assert {name: getattr(back, name) for name in HEADS[idl]} == HEADS[idl]
@@ -88,15 +89,15 @@ def test_bytes_are_those_of_the_generated_class(data: st.DataObject, idl: str) -
 
 @pytest.mark.parametrize("idl", sorted(LEVELS))
 def test_types_are_those_of_the_generated_class(idl: str) -> None:
-    ours, plain = wire.message_class("rosAFE", idl), plain_class(idl)
+    ours, plain = serialization.message_class("rosAFE", idl), plain_class(idl)
     assert (ours._md5sum, ours._type, ours._full_text) == (plain._md5sum, plain._type, plain._full_text)
     assert issubclass(ours, plain)
-    assert wire.message_class("rosAFE", idl) is ours
+    assert serialization.message_class("rosAFE", idl) is ours
 
 
 @pytest.mark.parametrize("idl", sorted(LEVELS))
 def test_a_message_made_without_arrays_can_be_sent(idl: str) -> None:
-    assert serialized(wire.message_class("rosAFE", idl)()) == serialized(plain_class(idl)())
+    assert serialized(serialization.message_class("rosAFE", idl)()) == serialized(plain_class(idl)())
 
 
 def test_the_pieces_of_a_window_are_sent_as_one() -> None:
@@ -133,8 +134,8 @@ def test_rows_as_they_lie_and_rows_copied_together(idl: str, blocks: list[int], 
         ours, plain = ours_and_plain(idl, *view.array())
         ours.left, ours.right = view.select(0), view.select(1)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(wire, "ROW_BYTES", row_bytes)
-        gathered = wire.BufferList()
+        patch.setattr(serialization, "ROW_BYTES", row_bytes)
+        gathered = BufferList()
         ours.serialize(gathered)
         assert serialized(ours) == serialized(plain)
     assert b"".join(gathered.pieces) == serialized(plain)
@@ -145,7 +146,7 @@ def test_array_msg_is_the_class_that_belongs_to_a_generated_one() -> None:
     for package, classes in (("rosAFE", rosAFE.msg), ("bass", bass.msg)):
         for idl in interface.COMPONENTS[package].structs:
             generated = getattr(classes, interface.ros_type(idl))
-            assert array_msg(generated) is wire.message_class(package, idl)
+            assert array_msg(generated) is serialization.message_class(package, idl)
             assert array_msg(array_msg(generated)) is array_msg(generated)
     for wrong in (None, int, "rosAFE/rosAFE_signalND", rosAFE.msg.InputProcGoal, genpy.Message):
         with pytest.raises(TypeError, match="no message class"):
@@ -172,17 +173,22 @@ def test_bags_keep_such_messages_and_give_them_back(tmp_path: Path) -> None:
 
 
 def test_an_absent_signal_has_no_channels() -> None:
-    message = wire.message_class("rosAFE", TIME_FREQUENCY)(**HEADS[TIME_FREQUENCY], left=np.ones((3, 2)), right=[])
+    message = serialization.message_class("rosAFE", TIME_FREQUENCY)(
+        **HEADS[TIME_FREQUENCY], left=np.ones((3, 2)), right=[]
+    )
     received = plain_class(TIME_FREQUENCY)().deserialize(serialized(message))
     assert received.right.dataN == [] and len(received.left.dataN) == 3
-    assert wire.message_class("rosAFE", TIME_FREQUENCY)().deserialize(serialized(message)).right.shape == (0, 0)
+    assert serialization.message_class("rosAFE", TIME_FREQUENCY)().deserialize(serialized(message)).right.shape == (
+        0,
+        0,
+    )
 
 
 def test_ragged_signals_are_lists_of_arrays() -> None:
     plain = plain_class(TIME_FREQUENCY)(
         left=_nested([[1.0, 2.0], [3.0]], 2), right=_nested([[], [1.0]], 2), **HEADS[TIME_FREQUENCY]
     )
-    received = wire.message_class("rosAFE", TIME_FREQUENCY)().deserialize(serialized(plain))
+    received = serialization.message_class("rosAFE", TIME_FREQUENCY)().deserialize(serialized(plain))
     assert [row.tolist() for row in received.left] == [[1.0, 2.0], [3.0]]
     assert [row.tolist() for row in received.right] == [[], [1.0]]
 
@@ -198,7 +204,7 @@ def test_audio_is_int32_and_its_stamp_a_struct() -> None:
         right=left[::-1].tolist(),
         stamp=bass.msg.binaudio_timestamp(sec=3, nsec=4),
     )
-    ours = wire.message_class("bass", AUDIO)(
+    ours = serialization.message_class("bass", AUDIO)(
         sampleRate=44100,
         nChunksOnPort=2,
         nFramesPerChunk=2,
@@ -208,7 +214,7 @@ def test_audio_is_int32_and_its_stamp_a_struct() -> None:
         stamp={"sec": 3, "nsec": 4},
     )
     assert serialized(ours) == serialized(plain)
-    received = wire.message_class("rosAFE", AUDIO)().deserialize(serialized(plain))
+    received = serialization.message_class("rosAFE", AUDIO)().deserialize(serialized(plain))
     assert received.left.dtype == np.int32 and received.left.tolist() == left.tolist()
     assert not received.left.flags.writeable
     assert (received.stamp.sec, received.stamp["nsec"]) == (3, 4)
@@ -225,10 +231,10 @@ def test_signals_of_all_processors_in_one_response() -> None:
     plain_arrays = {name: list(items) for name, items in arrays.items()}
     arrays["input"], plain_arrays["input"] = [time_domain], [plain_time]
     arrays["ihc"], plain_arrays["ihc"] = [frequency, frequency], [plain_frequency, plain_frequency]
-    ours = wire.response_class("rosAFE", "getSignals")(genom_success=True, genom_exdetail="", signals=arrays)
+    ours = serialization.response_class("rosAFE", "getSignals")(genom_success=True, genom_exdetail="", signals=arrays)
     plain = rosAFE.srv.getSignalsResponse(True, "", rosAFE.msg.rosAFE_dataObjSt(**plain_arrays))
     assert serialized(ours) == serialized(plain)
-    received = wire.response_class("rosAFE", "getSignals")().deserialize(serialized(plain))
+    received = serialization.response_class("rosAFE", "getSignals")().deserialize(serialized(plain))
     assert received.genom_success is True
     np.testing.assert_array_equal(received.signals.ihc[1].left, many)
     assert received.signals["input"][0]["lastFrameIndex"] == 2**40
@@ -246,15 +252,15 @@ def test_truncated_messages_are_refused_wherever_they_end(idl: str) -> None:
     whole = audio_bytes() if idl == AUDIO else serialized(ours_and_plain(idl, np.ones((2, 3, 4)[3 - LEVELS[idl] :]))[1])
     for length in range(len(whole)):
         with pytest.raises(genpy.DeserializationError):
-            wire.message_class("rosAFE", idl)().deserialize(whole[:length])
+            serialization.message_class("rosAFE", idl)().deserialize(whole[:length])
 
 
 @settings(deadline=None, max_examples=200)
 @given(idl=st.sampled_from([*sorted(LEVELS), AUDIO]), data=st.binary(max_size=120))
 def test_garbage_is_refused_or_read_and_nothing_else(idl: str, data: bytes) -> None:
-    lenient = wire.tolerant_message_class("rosAFE", idl, 100)().deserialize(data)
+    lenient = serialization.tolerant_message_class("rosAFE", idl, 100)().deserialize(data)
     try:
-        wire.message_class("rosAFE", idl)().deserialize(data)
+        serialization.message_class("rosAFE", idl)().deserialize(data)
     except genpy.DeserializationError as problem:
         assert lenient.problem == str(problem) != ""
     else:
@@ -268,14 +274,14 @@ def test_a_signal_beyond_what_numpy_can_lay_out_is_read_all_the_same() -> None:
     data = np.zeros(len(head) + 4 + 8 * count + 4, np.uint8)
     data[: len(head)] = np.frombuffer(head, np.uint8)
     data[len(head) : len(head) + 4] = np.frombuffer(count.to_bytes(4, "little"), np.uint8)
-    message = wire.message_class("rosAFE", TIME_DOMAIN)().deserialize(data)
+    message = serialization.message_class("rosAFE", TIME_DOMAIN)().deserialize(data)
     assert (message.left.shape, message.right.shape) == ((count,), (0,))
     assert message.left[0] == message.left[-1] == 0.0
 
 
 @pytest.mark.parametrize("idl", sorted(LEVELS))
 def test_counts_beyond_the_message_cost_nothing(idl: str) -> None:
-    message_class = wire.message_class("rosAFE", idl)
+    message_class = serialization.message_class("rosAFE", idl)
     head = serialized(plain_class(idl)())[: {TIME_DOMAIN: 20, TIME_FREQUENCY: 24, CROSS_CORRELATION: 32}[idl]]
     huge = (2**32 - 1).to_bytes(4, "little")
     for counts in range(1, 4):
@@ -305,7 +311,7 @@ def test_counts_beyond_the_message_cost_nothing(idl: str) -> None:
     ],
 )
 def test_what_does_not_fit_is_refused_and_named(field: str, value: Any) -> None:
-    message = wire.message_class("bass", AUDIO)(**{field: value})
+    message = serialization.message_class("bass", AUDIO)(**{field: value})
     with pytest.raises(genpy.SerializationError, match=field):
         serialized(message)
 
@@ -314,9 +320,9 @@ def test_signals_of_the_wrong_shape_are_refused() -> None:
     for idl, levels in LEVELS.items():
         for shape in {1: (2, 2), 2: (3,), 3: (2, 2)}[levels], (1, 1, 1, 1):
             with pytest.raises(genpy.SerializationError, match="left"):
-                serialized(wire.message_class("rosAFE", idl)(left=np.ones(shape)))
+                serialized(serialization.message_class("rosAFE", idl)(left=np.ones(shape)))
     with pytest.raises(genpy.SerializationError, match="left"):
-        serialized(wire.message_class("rosAFE", TIME_FREQUENCY)(left=[[1.0, 2.0], [3.0]]))
+        serialized(serialization.message_class("rosAFE", TIME_FREQUENCY)(left=[[1.0, 2.0], [3.0]]))
 
 
 # --- large messages ---------------------------------------------------------------------------------------------
@@ -327,13 +333,13 @@ def test_a_port_of_22_megabytes(record_property: Any) -> None:
     values = np.random.default_rng(1).normal(size=(2, 31, 44100))
     pieces = tuple(values[..., start : start + 12000] for start in range(0, 44100, 12000))
     view = WindowView(pieces)
-    message = wire.message_class("rosAFE", TIME_FREQUENCY)(
+    message = serialization.message_class("rosAFE", TIME_FREQUENCY)(
         **HEADS[TIME_FREQUENCY], left=view.select(0), right=view.select(1)
     )
     begun = time.perf_counter()
     data = serialized(message)
     written = time.perf_counter()
-    received = wire.message_class("rosAFE", TIME_FREQUENCY)().deserialize(data)
+    received = serialization.message_class("rosAFE", TIME_FREQUENCY)().deserialize(data)
     read = time.perf_counter()
     record_property("serialize_ms", 1000 * (written - begun))
     record_property("deserialize_ms", 1000 * (read - written))

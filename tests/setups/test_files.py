@@ -14,7 +14,7 @@ from rosafe.interface import KINDS, MAX_SETUP, Parameter
 from rosafe.representations import STAGES
 from rosafe.setups import Setup, SetupError, SetupProcessor, Sound, read, wanted, write
 from rosafe.setups.setup import parameters_of
-from rosafe.tree.requests import ExistingProcessor
+from rosafe.tree.tree_planner import ExistingProcessor
 
 TREE = """\
 sound:

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from rosafe.genomix import setups
+from rosafe.client import setup_transaction
 from rosafe.interface import BASS, ROSAFE, ComponentError
 from rosafe.representations import STAGES
 from rosafe.setups import read, write
@@ -68,11 +68,11 @@ class Graph(Model):
 
 
 def load(graph: Graph, text: str) -> dict[str, Any]:
-    return asyncio.run(setups.load(graph, {"setup": text}))
+    return asyncio.run(setup_transaction.load(graph, {"setup": text}))
 
 
 def saved(graph: Graph, full: bool = False) -> str:
-    return str(asyncio.run(setups.save(graph, {"full": full}))["setup"])
+    return str(asyncio.run(setup_transaction.save(graph, {"full": full}))["setup"])
 
 
 def refused(graph: Graph, text: str) -> ComponentError:
@@ -177,7 +177,7 @@ def test_a_bass_that_refuses() -> None:
 def test_a_cancelled_load_leaves_nothing() -> None:
     async def cancelled(number: int) -> Graph:
         graph = Graph()
-        task = asyncio.create_task(setups.load(graph, {"setup": SETUP}))
+        task = asyncio.create_task(setup_transaction.load(graph, {"setup": SETUP}))
         graph.cancel[number] = task
         with pytest.raises(asyncio.CancelledError):
             await task

@@ -7,9 +7,9 @@ from typing import Any
 
 import pytest
 
-from rosafe.genomix import setups
+from rosafe.client import setup_transaction
 from rosafe.interface import ComponentError
-from rosafe.tree import building
+from rosafe.tree import tree_builder
 from tests.setups.test_loading import Graph
 
 COUNT = 60
@@ -27,12 +27,12 @@ async def among(graph: Graph, text: str, **values: Any) -> tuple[Any, dict[str, 
     Returns the answer to the first (or its exception), that to the second, and how many processors the setup made from
     the second's beginning to its end.
     """
-    first = asyncio.create_task(setups.load(graph, {"setup": text}))
+    first = asyncio.create_task(setup_transaction.load(graph, {"setup": text}))
     while len(graph.processors) < 10:
         await asyncio.sleep(0)
     before = len(graph.processors)
     async with graph.turns.turn():
-        second = await building.build(graph, values)
+        second = await tree_builder.build(graph, values)
         between = len(graph.processors) - before - len(second["created"])
     try:
         return await first, second, between
@@ -73,7 +73,7 @@ def test_a_setup_alone_gives_way_to_nobody_and_two_follow_each_other() -> None:
     graph = Graph()
 
     async def both() -> list[dict[str, Any]]:
-        return list(await asyncio.gather(*(setups.load(graph, {"setup": SETUP}) for _ in range(2))))
+        return list(await asyncio.gather(*(setup_transaction.load(graph, {"setup": SETUP}) for _ in range(2))))
 
     first, second = sorted(asyncio.run(both()), key=lambda answer: len(answer["reused"]))  # whichever began
     assert (first["created"], second["created"]) == (NAMES, [])
@@ -84,12 +84,12 @@ def test_a_cancelled_setup_leaves_the_turn_to_others() -> None:
     graph = Graph()
 
     async def cancel() -> dict[str, Any]:
-        task = asyncio.create_task(setups.load(graph, {"setup": SETUP}))
+        task = asyncio.create_task(setup_transaction.load(graph, {"setup": SETUP}))
         while len(graph.processors) < 10:
             await asyncio.sleep(0)
         task.cancel()
         async with graph.turns.turn():
-            built = await building.build(graph, {"representation": "ild"})
+            built = await tree_builder.build(graph, {"representation": "ild"})
         with pytest.raises(asyncio.CancelledError):
             await task
         return built
@@ -101,7 +101,7 @@ def test_a_cancelled_setup_leaves_the_turn_to_others() -> None:
 def test_what_an_earlier_build_used_does_not_stay_for_ever() -> None:
     """The names of its processors may be those of a later build, of which nothing is left if it fails."""
     graph = Graph()
-    asyncio.run(building.build(graph, {"representation": "time"}))
+    asyncio.run(tree_builder.build(graph, {"representation": "time"}))
     graph.processors.clear()
     real = graph._make
 
@@ -112,5 +112,5 @@ def test_what_an_earlier_build_used_does_not_stay_for_ever() -> None:
 
     graph._make = make  # type: ignore[method-assign]
     with pytest.raises(ComponentError, match=r"^no$"):
-        asyncio.run(building.build(graph, {"representation": "ild"}))
+        asyncio.run(tree_builder.build(graph, {"representation": "ild"}))
     assert not graph.processors

@@ -17,7 +17,7 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from rosafe.bass.socket_client import SocketClient
-from rosafe.component import wire
+from rosafe.component import serialization
 from tests.genomix.world import HttpError
 from tests.harness import run_together, wait_for
 from tests.ros.session import reader
@@ -87,7 +87,7 @@ def few_files(pid: int, more: int) -> Iterator[None]:
 
 def a_message_of_4_gib(world: World, chance: random.Random) -> None:
     """A publisher of Audio, and clients of services, say that so much is to come, and send it."""
-    publisher = peers.LyingPublisher("/bass/Audio", wire.message_class("bass", AUDIO), TOO_MUCH)
+    publisher = peers.LyingPublisher("/bass/Audio", serialization.message_class("bass", AUDIO), TOO_MUCH)
     with world.bounded_memory(), publisher.known(world.graph):
         wait_for(publisher.closed.is_set, what=lambda: f"end of the connection, {publisher.sent} bytes were sent")
     for node in NODES:
@@ -240,7 +240,7 @@ def a_mixed_load(world: World, chance: random.Random) -> None:
     """Subscribers that never read, clients that die, garbage everywhere, a master killed again and again."""
     over = later(world.size.mixed_seconds)
     topic = world.afe.topic("gammatone")
-    message_class = wire.message_class("rosAFE", "::rosAFE::TimeFrequencySignalPortStruct")
+    message_class = serialization.message_class("rosAFE", "::rosAFE::TimeFrequencySignalPortStruct")
     addresses: list[Address] = [world.http_address, world.socket_address]
     for node in NODES:
         addresses += doors(world.graph, node).values()
@@ -249,7 +249,7 @@ def a_mixed_load(world: World, chance: random.Random) -> None:
     with following(world) as follower, ExitStack() as stack:
         for _ in range(20):
             stack.enter_context(peers.deaf_subscriber(world.graph, "rosAFE", topic, message_class))
-        audio_class = wire.message_class("bass", AUDIO)
+        audio_class = serialization.message_class("bass", AUDIO)
         for _ in range(10):
             stack.enter_context(peers.deaf_subscriber(world.graph, "bass", "/bass/Audio", audio_class))
         stack.callback(rubbish.join)

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import rospy
 
-from rosafe.component import wire
+from rosafe.component import serialization
 from tests.harness import run_together, wait_for
 from tests.ros.session import reader, told
 from tests.soak.world import NAMES, World, following, wait_out
@@ -38,7 +38,7 @@ def subscriber_dies(world: World, chance: random.Random) -> None:
 
 def garbage(world: World, chance: random.Random) -> None:
     """A second publisher of Audio sends what nobody can use, amid the messages of bass."""
-    message_class = wire.message_class("bass", "::binaudio::portStruct")
+    message_class = serialization.message_class("bass", "::binaudio::portStruct")
     publisher = rospy.Publisher("/bass/Audio", message_class, queue_size=100, tcp_nodelay=True)
     try:
         wait_for(lambda: publisher.get_num_connections(), what="rosAFE connects to the second publisher")

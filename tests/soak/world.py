@@ -17,11 +17,12 @@ import numpy as np
 import rospy
 import soundfile
 
-from rosafe.component import registration, wire
+from rosafe.component import serialization
 from rosafe.interface import BASS, CORE_REPRESENTATIONS, ROSAFE
 from rosafe.interface.arguments import check_parameters
 from rosafe.offline.chain import Chain
-from rosafe.tree.window import SlidingWindow, frames_in
+from rosafe.transport import registration
+from rosafe.tree.sliding_window import SlidingWindow, frames_in
 from tests import harness
 from tests.genomix.world import Http, genomixd
 from tests.harness import free_port, proc, run_together, wait_for
@@ -329,7 +330,7 @@ class Follower:
 def following(world: World) -> Iterator[Follower]:
     """A follower of the input's port, from the next block on."""
     follower = Follower(world)
-    message_class = wire.message_class("rosAFE", ROSAFE.port("inputProcPort").idl)
+    message_class = serialization.message_class("rosAFE", ROSAFE.port("inputProcPort").idl)
     subscriber = rospy.Subscriber(world.afe.topic("input"), message_class, follower.append, buff_size=2**22)
     try:
         yield follower

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from rosafe.component.paths import private_temporary
+from rosafe.transport.paths import private_temporary
 
 
 @pytest.fixture

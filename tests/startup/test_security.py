@@ -14,14 +14,14 @@ from pathlib import Path
 import pytest
 
 from rosafe.bass import socket_server
-from rosafe.component import door, inbound, pulse
 from rosafe.genomix import daemon, sessions
-from rosafe.genomix import server as api
+from rosafe.genomix import routes as api
 from rosafe.http_server import connections
 from rosafe.interface import MAX_SETUP
 from rosafe.interface.rosafe import MAX_PARAMETERS
-from rosafe.live import client, hub, server
+from rosafe.live import client, server, views
 from rosafe.setups import markup, reading
+from rosafe.transport import handshake_server, self_check, server_limits
 from tests.genomix.world import Http, genomixd
 from tests.harness import PYTHON, ROOT, Graph, MasterProcess, free_port, proc
 from tests.http_server.test_limits import MEMORY
@@ -115,13 +115,13 @@ def test_what_the_page_says_listens(setting: str, tmp_path: Path) -> None:
 
 def test_the_bounds_of_the_page() -> None:
     wanted = [
-        door.OPENING_SECONDS,
-        door.MAX_PENDING,
-        inbound.HEADER_BYTES,
-        inbound.BODY_BYTES,
-        (door.DESCRIPTORS, door.RESERVE),
+        handshake_server.OPENING_SECONDS,
+        handshake_server.MAX_PENDING,
+        server_limits.HEADER_BYTES,
+        server_limits.BODY_BYTES,
+        (handshake_server.DESCRIPTORS, handshake_server.RESERVE),
         "what the longest that makes sense has",
-        pulse.PERIOD,
+        self_check.PERIOD,
         (socket_server.MAX_CLIENTS, socket_server.IDLE_SECONDS),
         (api.LIMITS.max_connections, api.LIMITS.max_connections // 2),
         (api.LIMITS.request_seconds, connections.STALL_SECONDS),
@@ -132,7 +132,7 @@ def test_the_bounds_of_the_page() -> None:
         (MAX_PARAMETERS, reading.MAX_PARAMETER_VALUES),
         (server.MAX_CLIENTS, server.LIMITS.max_connections, server.LIMITS.max_connections // 2),
         (server.LIMITS.request_seconds, server.LIMITS.max_header_bytes // 2**20, MEMORY),
-        (f"{client.MAX_MESSAGE >> 20} MiB", client.MAX_PENDING, client.MAX_VIEWS, hub.MAX_VIEWS),
+        (f"{client.MAX_MESSAGE >> 20} MiB", client.MAX_PENDING, client.MAX_VIEWS, views.MAX_VIEWS),
         (client.BYTES_PER_SECOND, 1 / client.PERIOD, client.STALL_SECONDS),
     ]
     shown = [
@@ -140,7 +140,7 @@ def test_the_bounds_of_the_page() -> None:
         for numbers in (entry if isinstance(entry, tuple) else (entry,) for entry in wanted)
     ]
     assert [bound for *_, bound in rows("Bounds")] == shown
-    assert pulse.FAILURES == 2
+    assert self_check.FAILURES == 2
     assert connections.BUFFER == 4 * 1024
 
 

@@ -14,7 +14,7 @@ import rosgraph
 import rosmaster.master_api
 
 from rosafe import interface
-from rosafe.component.succession import REASON, Succession
+from rosafe.transport.succession import REASON, Succession
 from tests.harness import SCRIPTS, Graph, Process, free_port, wait_for
 
 

@@ -17,7 +17,7 @@ from types import SimpleNamespace, TracebackType
 from typing import Any
 
 HANG_SECONDS = 30.0  # no thread gets its turn for so long: the scheduler itself has failed
-MOST_PASSES = 10  # of time, one after the other, in which nothing happens: nothing ever will
+MAX_PASSES = 10  # of time, one after the other, in which nothing happens: nothing ever will
 
 
 class Abandoned(BaseException):
@@ -114,7 +114,7 @@ class Scheduler:
         able = [task for task in in_turn if not task.finished and task.ready()]
         if able:
             self._passes = 0
-        elif self._passes < MOST_PASSES:
+        elif self._passes < MAX_PASSES:
             self._passes += 1
             able = [task for task in in_turn if not task.finished and task.in_time is not None and task.in_time()]
         if not able:

@@ -10,17 +10,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rosafe.dsp.guard import FloatArray
-from rosafe.dsp.signal import SignalFormat
+from rosafe.declarations.parameter import Parameter
+from rosafe.declarations.representation import Part, Representation
+from rosafe.dsp.numeric_limits import FloatArray
+from rosafe.dsp.signal_format import SignalFormat
 from rosafe.dsp.stage import Output, Stage
 from rosafe.interface import ComponentError
 from rosafe.representations import KINDS, STAGES
 from rosafe.tree.block import Block
-from rosafe.tree.changes import ParameterUpdates
+from rosafe.tree.parameter_updates import ParameterUpdates
 from rosafe.tree.states import State
 from rosafe.tree.tree import Tree
-from rosafe.vocabulary.parameter import Parameter
-from rosafe.vocabulary.representation import Part, Representation
 from tests.harness import PATIENCE, wait_for
 
 from .support import RATE, Feed, Recorder, use_plain_stages

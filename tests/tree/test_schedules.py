@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rosafe.tree import changes, history, processor, tree, workers
+from rosafe.tree import history, parameter_updates, processor, tree, workers
 from rosafe.tree.block import Block
 from rosafe.tree.processor import Processor
 from rosafe.tree.states import State, StateMachine
@@ -88,7 +88,7 @@ class Log:
 
 def use(patch: pytest.MonkeyPatch, threading: Any) -> None:
     """Let the tree's code take locks and threads from there."""
-    for module in (changes, history, processor, tree, workers):
+    for module in (parameter_updates, history, processor, tree, workers):
         patch.setattr(module, "threading", threading)
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import rosafe
-from rosafe.dsp.signal import SignalFormat
+from rosafe.dsp.signal_format import SignalFormat
 from rosafe.interface import ComponentError
 from rosafe.representations import STAGES
 from rosafe.tree import sizes

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rosafe.dsp.signal import SignalFormat
+from rosafe.dsp.signal_format import SignalFormat
 from rosafe.tree.block import Block
 from rosafe.tree.states import FINAL_STATES, State, StateMachine
 

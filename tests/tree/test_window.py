@@ -8,10 +8,10 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from rosafe.dsp.signal import SignalFormat
+from rosafe.dsp.signal_format import SignalFormat
 from rosafe.tree.block import Block
 from rosafe.tree.history import History
-from rosafe.tree.window import MAX_PIECES, SlidingWindow, WindowView, frames_in
+from rosafe.tree.sliding_window import MAX_PIECES, SlidingWindow, WindowView, frames_in
 
 ROWS = st.sampled_from([(2,), (2, 3), (3,), (2, 5)])
 SIZES = st.lists(st.one_of(st.integers(0, 5), st.integers(0, 60)), max_size=3 * MAX_PIECES)

@@ -119,7 +119,7 @@ class BagFile:
     def __init__(self, descriptor: int, sample_rate: int, frames_per_chunk: int, topic: str, newest: int = 0) -> None:
         import rosbag
 
-        from rosafe.component import wire
+        from rosafe.component import serialization
         from rosafe.interface import BASS
 
         self._descriptor = descriptor
@@ -130,7 +130,7 @@ class BagFile:
         self._newest = newest
         self._held = 0  # frames of the window that are of this recording
         self._time_ns = 0  # when the newest one was acquired
-        self._message_class = wire.message_class("bass", BASS.port("Audio").idl)
+        self._message_class = serialization.message_class("bass", BASS.port("Audio").idl)
         self._window = AudioWindow(BAG_CHUNKS * frames_per_chunk)
         self._bag = rosbag.Bag(os.fdopen(descriptor, "w+b", closefd=False), "w")
 

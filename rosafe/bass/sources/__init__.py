@@ -7,8 +7,8 @@ import threading
 from collections.abc import Iterator
 
 from rosafe.bass.sources.base import Chunk, SoundSource, device_error
+from rosafe.declarations.text import did_you_mean
 from rosafe.interface import ComponentError
-from rosafe.vocabulary.words import did_you_mean
 
 __all__ = ["Chunk", "SoundSource", "device_lines", "open_source"]
 

@@ -20,21 +20,22 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from .. import memory
-from .library import FRAMES, Status, loaded
+from rosafe.dsp import buffer_pool
+
+from .loader import FRAMES, Status, loaded
 
 FloatArray = NDArray[np.float64]
 
-MOST_POLES = 128  # of a gammatone filter
-MOST_SECTIONS = 8  # of a low-pass
+MAX_POLES = 128  # of a gammatone filter
+MAX_SECTIONS = 8  # of a low-pass
 MAX_LAGS = 1024  # of a correlation; FFT is faster beyond
-MOST_LOOPS = 32  # of adaptation
-MOST_SIZE = 4096  # samples of a frame whose autocorrelation is made
-MOST_POINTS = 8192  # real ones of a Fourier transform
+MAX_LOOPS = 32  # of adaptation
+MAX_SIZE = 4096  # samples of a frame whose autocorrelation is made
+MAX_POINTS = 8192  # real ones of a Fourier transform
 
 REAL_SIZE = 8  # bytes of a float64
 _pack = struct.Struct(FRAMES).pack
-MOST_LANES = 8  # float64 in a register
+MAX_LANES = 8  # float64 in a register
 
 CLIPPINGS = ("clp", "clc", "sgn")
 RECTIFICATIONS = ("none", "halfwave", "fullwave", "square", "compressed")
@@ -58,7 +59,7 @@ def gammatone(
     output: FloatArray,
     envelope: FloatArray | None,
 ) -> None:
-    """Gammatone filters: as `rosafe.dsp.gammatone.filter_by_scipy`. Rows of `output` may lie apart (`rows_evenly_strided`)."""
+    """Gammatone filters, as `rosafe.dsp.gammatone.filter_by_scipy`. `output` has evenly strided rows."""
     channels, order = sections.shape[:2]
     _function("rosafe_gammatone")(
         _address(block),
@@ -85,7 +86,7 @@ def rectify_and_filter(
 
     The envelope of the same shape is for `compressed`. Rows of `output` may lie apart (`rows_evenly_strided`); or it is
     `block`. The twin is `RECTIFIERS` of rosafe/representations/haircell.py, or `compressed` there, and
-    `rosafe.dsp.cascade.Cascade`.
+    `rosafe.dsp.sos_filter.Cascade`.
     """
     _function("rosafe_biquads")(
         RECTIFICATIONS.index(rectification),
@@ -114,7 +115,7 @@ def adaptation(
 
     The other arguments are the attributes of `Loops` there.
     """
-    output = memory.empty(block.shape)
+    output = buffer_pool.empty(block.shape)
     constants = np.stack((thresholds, offsets, gains), axis=1)
     loops = np.stack((retentions, 1 - retentions, limits), axis=1)
     _function("rosafe_adaptation")(
@@ -227,9 +228,10 @@ def level_differences(frames: FrameReader, epsilon: float) -> FloatArray:
 def ratemap(frames: FrameReader, squared: bool, section: FloatArray, state: FloatArray) -> FloatArray:
     """Weighted sums of what a leaky integrator makes of each frame's samples, or of the squares of that, (*rows, F).
 
-    The integrator is `section` (1, 6), as of `rosafe.dsp.cascade.leaky_integrator`, with its `state` (1, *rows, 2). The
-    history of `frames` has been through it, the block goes now. The twin is `rosafe.dsp.framing.Framing.means` after
-    `rosafe.dsp.cascade.Cascade`.
+    The integrator is `section` (1, 6), as of `rosafe.dsp.sos_filter.leaky_integrator`, with its `state`
+    (1, *rows, 2). The history
+    of `frames` has been through it, the block goes now. The twin is `rosafe.dsp.framing.Framing.means` after
+    `rosafe.dsp.sos_filter.Cascade`.
     """
     rates = np.empty((*frames.block.shape[:-1], frames.number))
     _function("rosafe_ratemap")(frames.packed, squared, -section[0, 4], _address(state), _address(rates))
@@ -241,7 +243,7 @@ def modulation(frames: FrameReader, sections: FloatArray, state: FloatArray) -> 
 
     Of samples (*rows, N), with the sections' state (M, *rows, 2). The history of `frames` is (*rows, M), and what has
     come out already, the block goes in now. The twin is `rosafe.dsp.framing.Framing.means` of the magnitudes of what
-    `rosafe.dsp.cascade.Parallel` makes.
+    `rosafe.dsp.sos_filter.Parallel` makes.
     """
     means = np.empty((*frames.tail.store.array.shape[:-1], frames.number))
     _function("rosafe_modulation")(frames.packed, len(sections), *map(_address, (sections, state, means)))
@@ -291,7 +293,8 @@ def transient_map(
     """The frames of a map from `first` on, `output` (2, C, F), of strengths and levels (2, C, n).
 
     Each is made from those that lie up to `reach` frames from it; n is at least first + F + reach. `thresholds` are the
-    least strength and the least level. The twin is `columns` of rosafe/representations/transientmaps.py, with a `fuse`
+    least strength and the least level. The twin is `columns` of
+    rosafe/representations/onset_offset_maps.py, with a `fuse`
     of 0 where peaks are not fused.
     """
     ears, channels, count = output.shape
@@ -316,11 +319,11 @@ def autocorrelations(
 ) -> FloatArray:
     """Normalised autocorrelations of centre-clipped frames at the lags of `corrections` (L,), (*rows, L, F).
 
-    A frame has an even number of samples up to `MOST_SIZE`. The twin is
+    A frame has an even number of samples up to `MAX_SIZE`. The twin is
     `rosafe.representations.autocorrelation.autocorrelate`.
     """
     rows = frames.block.shape[:-1]
-    output = memory.empty((*rows, len(corrections), frames.number))
+    output = buffer_pool.empty((*rows, len(corrections), frames.number))
     transform = Transform.of(2 * len(frames.weights.array) - 1)
     _function("rosafe_autocorrelations")(
         frames.packed,
@@ -376,7 +379,7 @@ def gabor_responses(
     levels: FloatArray, count: int, reach: int, places: NDArray[np.int64], weights: FloatArray
 ) -> FloatArray:
     """As `rosafe.representations.gabor.respond_by_scipy`."""
-    frames = -(-count // MOST_LANES) * MOST_LANES
+    frames = -(-count // MAX_LANES) * MAX_LANES
     padded = np.zeros((*levels.shape[:-1], frames + 2 * reach))
     padded[..., : levels.shape[-1]] = levels
     sums = np.empty((len(levels), len(places), frames))

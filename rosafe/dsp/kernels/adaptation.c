@@ -8,7 +8,7 @@
  * N / D too, and the next loop takes N / (D s): one division for each loop in place of three. */
 #include "vector.h"
 
-enum { SPAN = 32, ROWS = 16, GROUPS = ROWS / LANES, MOST_LOOPS = 32 };
+enum { SPAN = 32, ROWS = 16, GROUPS = ROWS / LANES, MAX_LOOPS = 32 };
 
 /* Quotients are bounded: no state becomes 0 or infinite whatever comes. Sound stays far within. */
 #define LEAST 1e-100
@@ -37,7 +37,7 @@ INLINE void limit(vec v, vec m, vec rate, vec *n, vec *d) {
 
 /* One sample of GROUPS groups of rows, through all loops. */
 INLINE void step(const int limited, const int64_t count, const loop *loops, const double *rates, vec x[GROUPS],
-                 vec states[MOST_LOOPS][GROUPS], const row_constants rows[GROUPS]) {
+                 vec states[MAX_LOOPS][GROUPS], const row_constants rows[GROUPS]) {
     if (limited) {
         vec n[GROUPS], d[GROUPS];
         UNROLL for (int g = 0; g < GROUPS; g++) n[g] = x[g], d[g] = all(1.0);
@@ -62,7 +62,7 @@ INLINE void step(const int limited, const int64_t count, const loop *loops, cons
 }
 
 INLINE void run(const int limited, const int64_t count, const loop *loops, const double *rates, vec *samples, int64_t n,
-                vec states[MOST_LOOPS][GROUPS], const row_constants rows[GROUPS]) {
+                vec states[MAX_LOOPS][GROUPS], const row_constants rows[GROUPS]) {
     for (int64_t t = 0; t < n; t++) step(limited, count, loops, rates, samples + t * GROUPS, states, rows);
 }
 
@@ -73,13 +73,13 @@ void rosafe_adaptation(const double *block, int64_t rows, int64_t n, double fact
                        const double *of_loops, int64_t count, int64_t limited, double *state, double *output) {
     uint32_t mode = enter();
     const loop *loops = (const loop *)of_loops;
-    double rates[MOST_LOOPS];
+    double rates[MAX_LOOPS];
     for (int64_t j = 0; j < count; j++) rates[j] = -2 / (loops[j].m * 0.69314718055994530942);
     for (int64_t first = 0; first < rows; first += ROWS) {
         const double *from[ROWS]; /* lanes without a row do the last one once more */
         double *to[ROWS];
         int64_t row[ROWS];
-        vec states[MOST_LOOPS][GROUPS], samples[SPAN * GROUPS];
+        vec states[MAX_LOOPS][GROUPS], samples[SPAN * GROUPS];
         row_constants own[GROUPS];
         for (int k = 0; k < ROWS; k++) {
             row[k] = least(first + k, rows - 1);

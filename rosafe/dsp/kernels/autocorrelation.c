@@ -5,9 +5,9 @@
  * which halves in time, takes them so. */
 #include "fourier.h"
 #include "framed.h"
-#include "power.h"
+#include "vector_pow.h"
 
-enum { MOST_SIZE = 4096 /* of a frame: as many complex points are the power of 2 above two of them */ };
+enum { MAX_SIZE = 4096 /* of a frame: as many complex points are the power of 2 above two of them */ };
 
 enum clipping { COMPRESS, CLIP_ONLY, SIGN };
 
@@ -100,9 +100,9 @@ void rosafe_autocorrelations(const framed *of, int64_t how, double alpha, double
     const int64_t rows = of->rows, number_of_frames = of->number, held = of->held, n = of->n, size = of->size;
     uint32_t mode = enter();
     for (int64_t first = 0; first < rows * number_of_frames; first += LANES) {
-        complexes x[MOST_POINTS];
+        complexes x[MAX_POINTS];
         vec *samples = &x[0].re;
-        double joined[LANES][MOST_SIZE];
+        double joined[LANES][MAX_SIZE];
         const double *from[LANES];
         double *to[LANES];
         for (int k = 0; k < LANES; k++) { /* lanes without a frame do the last one once more */

@@ -4,11 +4,11 @@
  *
  * A section's sample waits for the one before it, some ten cycles; sixteen rows at a time fill the wait. Spans of samples are
  * read, go through one section after the other and are written; meanwhile they stay in the first-level cache. */
-#include "power.h"
+#include "vector_pow.h"
 
 #define COMPRESSION -0.77 /* of the envelope, in rosafe/representations/haircell.py */
 
-enum { SPAN = 64, ROWS = 16, GROUPS = ROWS / LANES, MOST_SECTIONS = 8 };
+enum { SPAN = 64, ROWS = 16, GROUPS = ROWS / LANES, MAX_SECTIONS = 8 };
 
 enum rectification { NONE, HALF_WAVE, FULL_WAVE, SQUARE, COMPRESSED };
 
@@ -51,7 +51,7 @@ void rosafe_biquads(int64_t how, const double *block, const double *envelope, in
     uint32_t mode = enter();
     for (int64_t first = 0; first < rows; first += ROWS) {
         int64_t row[ROWS]; /* lanes without a row do the last one once more */
-        vec states[MOST_SECTIONS][2 * GROUPS];
+        vec states[MAX_SECTIONS][2 * GROUPS];
         for (int k = 0; k < ROWS; k++) {
             row[k] = least(first + k, rows - 1);
             for (int64_t s = 0; s < count; s++)

@@ -3,7 +3,7 @@
  * c[m] = sum_t l[t+m] r[t] for m from -reach to reach, over sqrt(sum l^2 sum r^2 + eps) (rosafe/representations/crosscorrelation.py).
  * A frame, of any channel, in each lane. */
 #include "framed.h"
-#include "products.h"
+#include "correlation_blocks.h"
 
 /* Samples from..until of the rows times `window` to `to` from t on; returns `energy` and theirs. */
 static vec put(const double *const rows[LANES], const double *window, int64_t from, int64_t until, vec *to, int64_t t,
@@ -41,7 +41,7 @@ INLINE vec put_both(const frames *of, const double *window, int64_t from, int64_
 
 /* Samples from..until of frames that begin at different samples are joined: their borders lie apart. */
 static void join(frames *of, const int64_t starts[LANES], int64_t held, int64_t from, int64_t until,
-                 double joined[LANES][SPAN + MOST_LAGS]) {
+                 double joined[LANES][SPAN + MAX_LAGS]) {
     for (int k = 0; k < LANES; k++) {
         int64_t middle = most(from, least(until, held - starts[k]));
         memcpy(joined[k], of->old[k] + from, (middle - from) * sizeof(double));
@@ -52,7 +52,7 @@ static void join(frames *of, const int64_t starts[LANES], int64_t held, int64_t 
 }
 
 /* Rows are (2, channels). output is (channels, 2 reach + 1, frames), the channels channel_stride apart. 2 reach + 1 is at most
- * MOST_LAGS. */
+ * MAX_LAGS. */
 void rosafe_correlations(const framed *of, int64_t reach, double epsilon, double *output, int64_t channel_stride) {
     const int64_t channels = of->rows / 2, number = of->number, held = of->held, n = of->n, size = of->size;
     const double *window = of->weights;
@@ -62,7 +62,7 @@ void rosafe_correlations(const framed *of, int64_t reach, double epsilon, double
     short_sequence r;
     sums c;
     for (int64_t first = 0; first < channels * number; first += LANES) {
-        vec correlation[MOST_LAGS], energy[2] = {};
+        vec correlation[MAX_LAGS], energy[2] = {};
         double *to[LANES];
         int64_t channel[LANES], start[LANES];
         for (int64_t m = 0; m < lags; m++) correlation[m] = (vec){};
@@ -76,7 +76,7 @@ void rosafe_correlations(const framed *of, int64_t reach, double epsilon, double
             /* r from `begin` to `end`; of l, up to `reach` more on either side */
             int64_t end = least(begin + span, size), l_begin = most(0, begin - reach), l_end = least(size, end + reach);
             for (int ear = 0; ear < 2; ear++) {
-                double joined[LANES][SPAN + MOST_LAGS];
+                double joined[LANES][SPAN + MAX_LAGS];
                 frames mine = {.border = held - start[0]};
                 for (int k = 0; k < LANES; k++) {
                     int64_t row = ear * channels + channel[k];

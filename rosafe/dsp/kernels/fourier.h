@@ -8,7 +8,7 @@
 
 #include "vector.h"
 
-enum { MOST_POINTS = 4096 /* complex ones */ };
+enum { MAX_POINTS = 4096 /* complex ones */ };
 
 typedef struct {
     vec re, im;

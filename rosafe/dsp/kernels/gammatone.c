@@ -12,7 +12,7 @@
  * first-level cache, so that any order costs the same per pole. */
 #include "vector.h"
 
-enum { SPAN = 64 /* TURN_SPAN of rosafe/dsp/gammatone.py */, TOGETHER = 4, MOST_POLES = 128 };
+enum { SPAN = 64 /* TURN_SPAN of rosafe/dsp/gammatone.py */, TOGETHER = 4, MAX_POLES = 128 };
 
 typedef struct {
     vec re, im;
@@ -103,7 +103,7 @@ void rosafe_gammatone(const double *block, int64_t n, int64_t channels, int64_t 
     for (int64_t first = 0; first < channels; first += LANES) {
         turns by;
         complexes pole;
-        vec gains[MOST_POLES / TOGETHER];
+        vec gains[MAX_POLES / TOGETHER];
         int64_t channel[LANES]; /* lanes without a channel do the last one once more */
         for (int k = 0; k < LANES; k++) {
             channel[k] = least(first + k, channels - 1);
@@ -113,7 +113,7 @@ void rosafe_gammatone(const double *block, int64_t n, int64_t channels, int64_t 
         }
         design(pole, gains[0], least(SPAN, position + n), &by);
         for (int ear = 0; ear < 2; ear++) {
-            complexes last[MOST_POLES], samples[SPAN];
+            complexes last[MAX_POLES], samples[SPAN];
             double *states[LANES];
             for (int k = 0; k < LANES; k++) {
                 states[k] = state + 2 * order * (ear * channels + channel[k]);

@@ -2,11 +2,11 @@
  * correlations of frames from which an echo was taken out. The rest takes no time and is done in Python. */
 #include "fourier.h"
 #include "framed.h"
-#include "products.h"
+#include "correlation_blocks.h"
 
 #include <math.h>
 
-#define SQUARE_TINY 1e-145 /* samples below it are 0, as in rosafe/dsp/guard.py */
+#define SQUARE_TINY 1e-145 /* samples below it are 0, as in rosafe/dsp/numeric_limits.py */
 
 /* --- windowed frames --- */
 
@@ -57,19 +57,19 @@ void rosafe_windowed(const framed *of, double *windowed, double *sums, double *p
 
 /* --- spectra --- */
 
-enum { TOGETHER = 8 /* rows in memory, whatever LANES */ };
+enum { INTERLEAVED_ROWS = 8 /* rows in memory, whatever LANES */ };
 
 /* samples (number, 2, channels, size), an even size; gains (channels), factors (number, 2, channels); for each of the points
- * and one more, power (rows / TOGETHER, points + 1, TOGETHER), where rows are the 2 channels and more up to a multiple of
- * TOGETHER, and sums (number, 2, points + 1). Tables are for transforms of `points` complex numbers, at most MOST_POINTS, of
+ * and one more, power (rows / INTERLEAVED_ROWS, points + 1, INTERLEAVED_ROWS), where rows are the 2 channels and more up to a multiple of
+ * INTERLEAVED_ROWS, and sums (number, 2, points + 1). Tables are for transforms of `points` complex numbers, at most MAX_POINTS, of
  * which the samples are not more than 2 points. */
 void rosafe_add_spectra(const double *samples, int64_t channels, int64_t number_of_frames, int64_t size, const double *gains,
                         const double *factors, int64_t points, const double *twiddles, const int64_t *places,
                         const double *turns, double *power, double *sums) {
     const int64_t rows = 2 * channels;
     const int64_t half = size <= points && points >= 4; /* the upper half is 0 and is not read */
-    complexes x[MOST_POINTS];
-    vec spectra[MOST_POINTS + 1], weighted[2][MOST_POINTS + 1];
+    complexes x[MAX_POINTS];
+    vec spectra[MAX_POINTS + 1], weighted[2][MAX_POINTS + 1];
     uint32_t mode = enter();
     for (int64_t f = 0; f < number_of_frames; f++) {
         for (int ear = 0; ear < 2; ear++) memset(weighted[ear], 0, (points + 1) * sizeof(vec));
@@ -94,10 +94,10 @@ void rosafe_add_spectra(const double *samples, int64_t channels, int64_t number_
                 spectra[k] = both[0];
                 spectra[points - k] = both[1];
             }
-            double *mine = power + first / TOGETHER * TOGETHER * (points + 1) + first % TOGETHER;
+            double *mine = power + first / INTERLEAVED_ROWS * INTERLEAVED_ROWS * (points + 1) + first % INTERLEAVED_ROWS;
             for (int64_t k = 0; k <= points; k++) {
-                spectra[k] = fused(gain, spectra[k], load(mine + k * TOGETHER));
-                *(vec_anywhere *)(mine + k * TOGETHER) = spectra[k];
+                spectra[k] = fused(gain, spectra[k], load(mine + k * INTERLEAVED_ROWS));
+                *(vec_anywhere *)(mine + k * INTERLEAVED_ROWS) = spectra[k];
             }
             for (int64_t ear = first / channels; ear <= least(first + LANES - 1, rows - 1) / channels; ear++)
                 for (int64_t k = 0; k <= points; k++)
@@ -183,7 +183,7 @@ static void correlate(const double *const l[LANES], const double *const r[LANES]
 
 /* Frames (number, rows, size), with these steps from one frame or row to the next, and their filters: (number, rows, TAPS), or
  * (number, 1, TAPS) where they are alike for all rows. The result is that of all pairs of frames through their filters:
- * correlations (number, rows, 2 reach + 1), of at most MOST_LAGS lags, and energies (2, number, rows). The longest sequence
+ * correlations (number, rows, 2 reach + 1), of at most MAX_LAGS lags, and energies (2, number, rows). The longest sequence
  * that a filter makes has `longest` samples; in `scratch` is room for two of these, and for LANES rows of twice the size and
  * 2 reach samples. */
 void rosafe_correlate_filtered(const double *left, int64_t left_frame, int64_t left_row, const int64_t *left_shifts,
@@ -224,7 +224,7 @@ void rosafe_correlate_filtered(const double *left, int64_t left_frame, int64_t l
             filtered(l_all, l_size, back, one, -reach, size + reach, l_row);
             l[k] = l_row, to[k] = correlations + pair * lags;
         }
-        vec c[MOST_LAGS];
+        vec c[MAX_LAGS];
         correlate(l, r, size, lags, c);
         write_rows(c, 1, lags, to);
     }

@@ -7,10 +7,10 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from . import MOST_LANES, REAL_SIZE, FloatArray, FrameReader, Transform, _address, _function
+from . import MAX_LANES, REAL_SIZE, FloatArray, FrameReader, Transform, _address, _function
 
 TAPS = 6  # of a filter that takes an echo out
-BATCH = 8  # rows that lie in memory sample by sample
+INTERLEAVED_ROWS = 8  # rows that lie in memory sample by sample
 
 
 class Windowed(NamedTuple):
@@ -54,7 +54,7 @@ def windowed(frames: FrameReader, output: Windowed) -> None:
 def add_spectra(
     samples: FloatArray, points: int, gains: FloatArray, factors: FloatArray, power: FloatArray
 ) -> FloatArray:
-    """As `rosafe.representations.precedence.add_spectra`, of a power of 2 up to MOST_POINTS points; w is even."""
+    """As `rosafe.representations.precedence.add_spectra`, of a power of 2 up to MAX_POINTS points; w is even."""
     count, ears, channels, size = samples.shape
     transform = Transform.of(points)
     sums, factors = np.empty((count, ears, power.shape[1])), np.ascontiguousarray(factors)
@@ -73,11 +73,11 @@ def add_spectra(
 def correlate_filtered(
     left: FloatArray, left_taps: Taps, right: FloatArray, right_taps: Taps, reach: int
 ) -> tuple[FloatArray, FloatArray]:
-    """As `rosafe.representations.precedence.correlate_filtered`, of at most MOST_LAGS lags."""
+    """As `rosafe.representations.precedence.correlate_filtered`, of at most MAX_LAGS lags."""
     count, rows, size = left.shape
     correlations, energies = np.empty((count, rows, 2 * reach + 1)), np.empty((2, count, rows))
     longest = size + max(0, int(left_taps.shifts.max(initial=0)), int(right_taps.shifts.max(initial=0)))
-    scratch = np.empty(2 * MOST_LANES * (size + reach) + 2 * longest)
+    scratch = np.empty(2 * MAX_LANES * (size + reach) + 2 * longest)
     filters = [np.ascontiguousarray(array) for taps in (left_taps, right_taps) for array in taps]
     _function("rosafe_correlate_filtered")(
         _address(left),

@@ -1,4 +1,4 @@
-/* Onset and offset maps: which peaks of the strengths stay (rosafe/representations/transientmaps.py).
+/* Onset and offset maps: which peaks of the strengths stay (rosafe/representations/onset_offset_maps.py).
  *
  * Each frame of a map is that of the whole algorithm on a window of frames around it, from which nothing is left out that
  * could matter: peaks are found and sorted once for many windows, as a window only decides which of them it holds; the

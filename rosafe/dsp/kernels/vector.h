@@ -17,7 +17,7 @@
 #define UNROLL _Pragma("GCC unroll 32") /* -O2 leaves even loops over four things rolled */
 #endif
 
-/* As in rosafe/dsp/guard.py: samples are bounded to LIMIT, and what is below TINY is nothing. */
+/* As in rosafe/dsp/numeric_limits.py: samples are bounded to LIMIT, and what is below TINY is nothing. */
 #define LIMIT 1e70
 #define TINY 1e-200
 

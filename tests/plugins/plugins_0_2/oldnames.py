@@ -4,11 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from rosafe.declarations.parameter import Parameter
+from rosafe.declarations.representation import Derived, Part, Representation
 from rosafe.dsp.framing import FramedStage, frame_parameters
 from rosafe.dsp.stage import Stage
 from rosafe.representations.ild import Ild
-from rosafe.vocabulary.parameter import Parameter
-from rosafe.vocabulary.representation import Derived, Part, Representation
 
 
 class Every(Stage):

@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from rosafe.declarations.parameter import Parameter
+from rosafe.declarations.representation import Representation
 from rosafe.dsp.framing import FramedStage, frame_parameters
-from rosafe.vocabulary.parameter import Parameter
-from rosafe.vocabulary.representation import Representation
 
 
 class ZeroCrossings(FramedStage):

@@ -1,0 +1,1 @@
+"""ROS clients of components: the graph, TCPROS connections, actions, services and setups."""

@@ -1,0 +1,189 @@
+"""Activities as a client sees them: goals of an action server that are sent, acknowledged, cancelled and ended."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import functools
+import importlib
+import itertools
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from rosafe.client import installed_components
+from rosafe.client.graph import Graph, middleware_error
+from rosafe.client.tcpros import component_exception
+from rosafe.component import explicit_defaults
+from rosafe.interface import ComponentError
+
+ANSWER_SECONDS = 5.0  # for the first sign of life of a goal
+REPEAT_SECONDS = 0.1  # between two tries to send a goal; a goal that arrives twice counts once
+RESULT_SECONDS = 1.0  # the result of a goal follows its last status at once
+
+_ACTIVE = frozenset((1, 6))  # actionlib_msgs/GoalStatus: ACTIVE, PREEMPTING
+_ENDED = frozenset((2, 3, 4, 5, 8, 9))  # PREEMPTED, SUCCEEDED, ABORTED, REJECTED, RECALLED, LOST
+_REJECTED = 5
+
+
+class Goal:
+    """One activity that was asked for. `error` counts once `ended` is set: None where the end was normal."""
+
+    def __init__(self, number: str, client: ActionClient) -> None:
+        self.id = number
+        self._client = client
+        self.seen = asyncio.Event()  # the component knows of it
+        self.acknowledged = asyncio.Event()  # it runs, or has ended
+        self.ended = asyncio.Event()
+        self.error: ComponentError | None = None
+        self.warning = ""  # of the component, once it is acknowledged
+        self.outputs: dict[str, Any] = {}  # once it has ended without an error
+
+    def cancel(self) -> None:
+        """Ask the component to end the activity."""
+        self._client.cancel(self)
+
+    def forget(self) -> None:
+        """Follow the activity no further."""
+        self._client.forget(self)
+
+    def end(self, error: ComponentError | None) -> None:
+        """Record the end; the first one counts."""
+        if not self.ended.is_set():
+            self.error = error
+            for event in (self.seen, self.acknowledged, self.ended):
+                event.set()
+
+
+class ActionClient:
+    """Sends goals to one action of one component instance. Make it with `create`."""
+
+    _numbers = itertools.count(1)
+
+    def __init__(self, graph: Graph, package: str, instance: str, action: str) -> None:
+        self._graph = graph
+        self._instance = instance
+        self._name = f"/{instance}/{action}"
+        self._loop = asyncio.get_running_loop()
+        self._goals: dict[str, Goal] = {}
+        self._subscribers: list[Any] = []
+        self._publishers: dict[str, Any] = {}
+        messages = importlib.import_module(f"{package}.msg")
+        self._goal_class = getattr(messages, f"{action}ActionGoal")
+        self._result_class = getattr(messages, f"{action}ActionResult")
+
+    @classmethod
+    async def create(cls, graph: Graph, package: str, instance: str, action: str) -> ActionClient:
+        """A client that is registered with the master; ComponentError where there is none."""
+        await graph.become_node()
+        await graph.master("getPid")  # rospy would wait for the master without end
+        client = cls(graph, package, instance, action)
+        await asyncio.to_thread(client._register)
+        return client
+
+    def _register(self) -> None:
+        import rospy
+        from actionlib_msgs.msg import GoalID, GoalStatusArray
+
+        for part, kind, callback in (
+            ("result", self._result_class, self._on_result),
+            ("status", GoalStatusArray, self._on_status),
+        ):
+            forward = functools.partial(self._forward, callback)
+            self._subscribers.append(rospy.Subscriber(f"{self._name}/{part}", kind, forward, tcp_nodelay=True))
+        for part, kind in (("cancel", GoalID), ("goal", self._goal_class)):
+            self._publishers[part] = rospy.Publisher(
+                f"{self._name}/{part}", kind, queue_size=64, tcp_nodelay=True, headers=explicit_defaults.HEADER
+            )
+
+    def _forward(self, callback: Callable[[Any], None], message: Any) -> None:
+        """From rospy's thread to ours."""
+        if not self._loop.is_closed():
+            self._loop.call_soon_threadsafe(callback, message)
+
+    async def close(self) -> None:
+        """Leave the action's topics; goals that are under way end with an error."""
+        for goal in self.goals():
+            goal.end(middleware_error(f"{self._instance} was unloaded"))
+        topics = [*self._subscribers, *self._publishers.values()]
+        await asyncio.gather(*(asyncio.to_thread(topic.unregister) for topic in topics))
+
+    # --- goals ---
+
+    async def send(self, values: Mapping[str, Any]) -> Goal:
+        """Send a goal made of `values`; it is in the component's hands on return.
+
+        Raises ComponentError where the component shows no sign of having got it.
+        """
+        goal = Goal(f"{self._graph.name}-{next(self._numbers)}", self)
+        self._goals[goal.id] = goal
+        message = self._goal_class()
+        message.goal_id.id = goal.id
+        installed_components.fill(message.goal, values)
+        try:
+            await asyncio.wait_for(self._hand_over(goal, message), ANSWER_SECONDS)
+        except TimeoutError:
+            self.cancel(goal)  # should it arrive after all
+            self.forget(goal)
+            raise middleware_error(
+                f"{self._instance} did not answer {self._name} within {ANSWER_SECONDS:g} s"
+            ) from None
+        except BaseException:
+            self.forget(goal)
+            raise
+        return goal
+
+    async def _hand_over(self, goal: Goal, message: Any) -> None:
+        while not goal.seen.is_set():
+            # Not before the way back is there: a result is sent once, and not to those who come later.
+            if all(topic.get_num_connections() for topic in (*self._subscribers, self._publishers["goal"])):
+                self._publishers["goal"].publish(message)
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(goal.seen.wait(), REPEAT_SECONDS)
+
+    def cancel(self, goal: Goal) -> None:
+        """Ask the component to end the activity."""
+        from actionlib_msgs.msg import GoalID
+
+        self._publishers["cancel"].publish(GoalID(id=goal.id))
+
+    def forget(self, goal: Goal) -> None:
+        """Follow the activity no further."""
+        self._goals.pop(goal.id, None)
+
+    def goals(self) -> list[Goal]:
+        """Those that are under way."""
+        return list(self._goals.values())
+
+    def _on_status(self, message: Any) -> None:
+        for status in message.status_list:
+            goal = self._goals.get(status.goal_id.id)
+            if goal is None:
+                continue
+            goal.seen.set()
+            if status.status in _ACTIVE:
+                goal.warning = status.text
+                goal.acknowledged.set()
+            elif status.status in _ENDED:
+                self._loop.call_later(RESULT_SECONDS, self._end, goal, _without_result(status))
+
+    def _on_result(self, message: Any) -> None:
+        goal = self._goals.get(message.status.goal_id.id)
+        if goal is None:
+            return
+        if message.result.genom_success:
+            goal.outputs = installed_components.outputs(message.result)
+            self._end(goal, None)
+        elif message.result.genom_exdetail:
+            self._end(goal, component_exception(message.result.genom_exdetail))
+        else:
+            self._end(goal, _without_result(message.status))
+
+    def _end(self, goal: Goal, error: ComponentError | None) -> None:
+        self._goals.pop(goal.id, None)
+        goal.end(error)
+
+
+def _without_result(status: Any) -> ComponentError:
+    if status.status == _REJECTED:
+        return ComponentError("::genom::too_many_activities", status.text)
+    return middleware_error(f"the activity ended without a result (actionlib status {status.status} {status.text})")

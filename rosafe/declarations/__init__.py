@@ -1,0 +1,1 @@
+"""Declarations that everything else is built from: types, parameters, representations, named errors."""

@@ -1,0 +1,110 @@
+"""Recursive filters that run on from block to block: cascades of first- and second-order sections."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from rosafe.dsp.numeric_limits import FLUSH_INTERVAL, flush_denormals
+
+
+class SosFilter:
+    """Second-order sections with their state, from rest.
+
+    Parameters
+    ----------
+    sections : ndarray (S, 6)
+        Real or complex sections as in `scipy.signal.sosfilt`: b0, b1, b2, 1, a1, a2.
+    """
+
+    def __init__(self, sections: NDArray[Any]) -> None:
+        self.sections = np.ascontiguousarray(sections)
+        self.state: NDArray[Any] | None = None  # (S, *rows, 2), direct form II transposed; None is rest
+        self._position = 0
+
+    def reset(self) -> None:
+        """Back to rest."""
+        self.state = None
+
+    def ensure_state(self, rows: tuple[int, ...]) -> NDArray[Any]:
+        """The state for a block of `rows`. Other rows than in the last block mean a start from rest."""
+        shape = (len(self.sections), *rows, 2)
+        if self.state is None or self.state.shape != shape:
+            self.state = np.zeros(shape, self.sections.dtype)
+            self._position = 0
+        return self.state
+
+    def process(self, block: NDArray[Any]) -> NDArray[Any]:
+        """Filter (*rows, N) along its last axis; `block` itself where there are no sections."""
+        state = self.ensure_state(block.shape[:-1])
+        if len(self.sections) == 0:
+            return block
+        if block.size == 0:
+            return np.zeros(block.shape, state.dtype)
+        result = np.empty(block.shape, state.dtype)
+        for span, whole in _spans(self._position, block.shape[-1]):
+            result[..., span], state = scipy.signal.sosfilt(self.sections, block[..., span], zi=state)
+            if whole:
+                state = np.ascontiguousarray(state)
+                flush_denormals(state)
+        self.state = np.ascontiguousarray(state)
+        self._position += block.shape[-1]
+        return result
+
+
+class SosFilterBank:
+    """Second-order sections with their states, from rest, which all get the same samples.
+
+    Parameters
+    ----------
+    sections : ndarray (M, 6)
+        Real sections as in `scipy.signal.sosfilt`: b0, b1, b2, 1, a1, a2.
+    """
+
+    def __init__(self, sections: NDArray[np.float64]) -> None:
+        self.sections = np.ascontiguousarray(sections)
+        self.state = np.empty((len(sections), 0, 2))  # (M, *rows, 2), direct form II transposed
+        self._position = 0
+
+    def started(self, rows: tuple[int, ...]) -> NDArray[np.float64]:
+        """The states for a block of `rows`. Other rows than in the last block mean a start from rest."""
+        shape = (len(self.sections), *rows, 2)
+        if self.state.shape != shape:
+            self.state = np.zeros(shape)
+            self._position = 0
+        return self.state
+
+    def process(self, block: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Filter (*rows, N) along its last axis by each section: (*rows, M, N)."""
+        states = self.started(block.shape[:-1])
+        result = np.empty((*block.shape[:-1], len(self.sections), block.shape[-1]))
+        for number, section in enumerate(self.sections):
+            for span, whole in _spans(self._position, block.shape[-1]):
+                state = states[number][np.newaxis]
+                result[..., number, span], state = scipy.signal.sosfilt([section], block[..., span], zi=state)
+                states[number] = state[0]
+                if whole:
+                    flush_denormals(states[number])
+        self._position += block.shape[-1]
+        return result
+
+
+def _spans(position: int, count: int) -> Iterator[tuple[slice, bool]]:
+    """The next `count` samples behind `position`, cut at multiples of `FLUSH_INTERVAL`; whether each piece ends at one.
+
+    States are looked at there, and nowhere else: so it leaves no trace how sound was cut into blocks.
+    """
+    first = 0
+    while first < count:
+        end = min(count, first + FLUSH_INTERVAL - (position + first) % FLUSH_INTERVAL)
+        yield slice(first, end), (position + end) % FLUSH_INTERVAL == 0
+        first = end
+
+
+def leaky_integrator(retention: float) -> NDArray[np.float64]:
+    """The section of u[n] = r u[n-1] + (1-r) x[n]; its first state value is r u[n]."""
+    return np.array([[1.0 - retention, 0.0, 0.0, 1.0, -retention, 0.0]])

@@ -1,0 +1,106 @@
+"""Onset and offset strength: how fast the level of each channel rises and falls.
+
+* A. S. Bregman (1990), "Auditory scene analysis: the perceptual organization of sound", MIT Press
+* A. Klapuri (1999), "Sound onset detection by applying psychoacoustic knowledge", Proc. ICASSP, 3089-3092
+"""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import numpy as np
+
+from rosafe.declarations.parameter import Parameter
+from rosafe.declarations.representation import Representation
+from rosafe.dsp.numeric_limits import FloatArray
+from rosafe.dsp.signal_format import SignalFormat
+from rosafe.dsp.stage import Stage
+
+SILENCE = 1e-200  # rates below this are taken as this: -2000 dB
+
+
+def _limit(name: str, what: str) -> Parameter:
+    return Parameter(name, "double", 30.0, f"Upper limit of {what} strength (dB)", 0.0, 1000.0, True, unit="dB")
+
+
+class _Strength(Stage):
+    """How many dB the level changes by from frame to frame in one direction, bounded; (2, C, F) to (2, C, F).
+
+    The level 10 log10(max(R, 1e-200)) dB is provided to those who need it. Other channels than before mean a new
+    beginning; otherwise the last level stays, whatever changes.
+    """
+
+    EXTRAS = ("level",)
+    RISING: ClassVar[bool]
+
+    _last: FloatArray | None = None  # level of the last frame, (2, C, 1); None before the first one
+
+    def process(self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None) -> FloatArray:
+        rates = self._as_valid_block(block)
+        levels: FloatArray = np.log10(np.maximum(rates, SILENCE))
+        levels *= 10.0
+        self.provided = {"level": levels} if "level" in self.provide else {}
+        strength = np.empty(levels.shape)
+        if levels.shape[-1] == 0:
+            return strength
+        if self._last is None or self._last.shape[:-1] != levels.shape[:-1]:
+            self._last = levels[..., :1]  # the first frame has changed by nothing
+        before = np.concatenate((self._last, levels[..., :-1]), axis=-1)
+        more, less = (levels, before) if self.RISING else (before, levels)
+        np.subtract(more, less, out=strength)
+        np.maximum(strength, 0.0, out=strength)
+        np.minimum(strength, self._limit, out=strength)
+        self._last = levels[..., -1:].copy()
+        return strength
+
+    def reset(self) -> None:
+        self._last = None
+        self.provided = {}
+
+    def input_format_changed(self, before: SignalFormat) -> None:
+        if self.input_format.center_frequencies != before.center_frequencies:
+            self._last = None
+
+    def build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
+        (self._limit,) = values.values()
+
+
+class OnsetStrength(_Strength):
+    """How fast levels rise, (2, C, F) to (2, C, F) in dB.
+
+    min(max(L[k] - L[k-1], 0), ons_maxOnsetdB), with L the level of each channel in dB; 0 in the first frame.
+    """
+
+    REPRESENTATION = Representation(
+        kind="onsetStrength",
+        doc="Onset strength",
+        parent="ratemap",
+        axes=("ear", "channel", "time"),
+        unit="dB",
+        parameters=(_limit("ons_maxOnsetdB", "onset"),),
+        request="OnsetProc",
+        port_doc="Onset strengths (dB)",
+    )
+    RISING = True
+
+
+class OffsetStrength(_Strength):
+    """How fast levels fall, (2, C, F) to (2, C, F) in dB.
+
+    min(max(L[k-1] - L[k], 0), ofs_maxOffsetdB), with L the level of each channel in dB; 0 in the first frame.
+
+    In exact silence after sound the ratemap's integrator decays: the offset stays at what that loses from frame to
+    frame, 10.86 dB by default, until the level is -2000 dB.
+    """
+
+    REPRESENTATION = Representation(
+        kind="offsetStrength",
+        doc="Offset strength",
+        parent="ratemap",
+        axes=("ear", "channel", "time"),
+        unit="dB",
+        parameters=(_limit("ofs_maxOffsetdB", "offset"),),
+        request="OffsetProc",
+        port_doc="Offset strengths (dB)",
+    )
+    RISING = False

@@ -1,0 +1,1 @@
+"""ROS transport of a node: servers with limits, registration at the master, publishers, self-check."""

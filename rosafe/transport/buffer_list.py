@@ -1,0 +1,20 @@
+"""A serialized message as a list of buffers, which is sent without being joined."""
+
+from __future__ import annotations
+
+from typing import Any
+
+
+class BufferList:
+    """A serialized message in pieces, for one `sendmsg`. The buffers are not copied and must not change."""
+
+    def __init__(self) -> None:
+        self.pieces: list[Any] = []
+        self.size = 0  # bytes
+
+    def write(self, data: Any, /) -> None:
+        """Append the bytes of a contiguous buffer."""
+        size = data.nbytes if hasattr(data, "nbytes") else len(data)
+        if size:
+            self.pieces.append(data)
+            self.size += size
