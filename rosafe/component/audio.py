@@ -40,7 +40,7 @@ class Counters:
     gaps: int = 0  # events in which frames were lost
     streams: int = 0  # streams begun
     dropped: int = 0  # unread frames of old streams
-    discontinuities: int = 0  # times that the samples of a window did not fit those before
+    breaks: int = 0  # times that the samples of a window did not fit those before
     last_loss: str = "none"  # where the last loss was
 
 
@@ -180,7 +180,7 @@ class AudioRing:
         if not fits:
             self._discontinuity = self._newest + 1
             self._times.begin(self.sample_rate)
-            self.counters.discontinuities += 1
+            self.counters.breaks += 1
             if not self._in_discontinuity:
                 self._report(
                     f"Audio: the index went on to {message.lastFrameIndex}, but the samples up to {self._newest} are "

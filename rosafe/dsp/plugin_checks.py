@@ -61,8 +61,8 @@ def checked(stage: type[Stage], file: str = "") -> type[Stage]:
         "PLUGIN_FILE": path,
         "PLUGIN_LINE": _line_of(stage, path),
         "CHECKS_NAN": _checks_nan(stage, path),
-        "OVERWRITES": False,
-        "APART": False,
+        "SUPPORTS_IN_PLACE": False,
+        "CHANNEL_INDEPENDENT": False,
     }
     made: type[Stage] = types.new_class(
         stage.__name__, (CheckedStage, stage), {}, lambda namespace: namespace.update(names)

@@ -378,11 +378,11 @@ class RosafeNode:
             )
         elif lag := self._ring.lag:
             status.summary(DiagnosticStatus.WARN, lag)
-        elif counters.lost or counters.dropped or counters.refused or counters.discontinuities:
+        elif counters.lost or counters.dropped or counters.refused or counters.breaks:
             status.summary(
                 DiagnosticStatus.WARN,
                 f"{counters.lost} frames lost in {counters.gaps} gaps, {counters.dropped} dropped, "
-                f"{counters.refused} messages refused, {counters.discontinuities} breaks",
+                f"{counters.refused} messages refused, {counters.breaks} breaks",
             )
         else:
             status.summary(DiagnosticStatus.OK, "no frames lost" if counters.messages else "no audio yet")

@@ -121,7 +121,7 @@ class Chain:
         with the next block; it does not go on beyond that, so memory is bounded. What it raises ends the run.
     branches : int
         From the filterbank on, the tree has so many branches at most, of a part of the channels each, if all that is
-        computed is so `Stage.APART`. Then no parameter can be changed.
+        computed is so `Stage.CHANNEL_INDEPENDENT`. Then no parameter can be changed.
 
     Raises
     ------

@@ -122,7 +122,7 @@ def test_nothing_is_there() -> None:
 def test_alsaaudio_of_debian_cannot_capture(tmp_path: Path) -> None:
     (tmp_path / "alsaaudio.py").write_text("PCM_CAPTURE = 1\n")
     program = (
-        "import pathlib, sys; from rosafe.commands import __main__ as cli; from rosafe.component import paths;"
+        "import pathlib, sys; from rosafe.commands import __main__ as cli; from rosafe.transport import paths;"
         f"paths.PYPI_DIR = pathlib.Path({str(tmp_path)!r}); sys.exit(cli.main(['doctor', '--json']))"
     )
     done = python(program)

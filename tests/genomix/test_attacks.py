@@ -37,9 +37,9 @@ MUCH = 150  # MB that an attack may take
 HASTY = """
 import sys
 from dataclasses import replace
-from rosafe.genomix import daemon, server
+from rosafe.genomix import daemon, routes
 from rosafe.http_server import connections
-server.LIMITS = replace(server.LIMITS, request_seconds=1.0, max_answers=50 * 2**20)
+routes.LIMITS = replace(routes.LIMITS, request_seconds=1.0, max_answers=50 * 2**20)
 connections.STALL_SECONDS = 1.0
 connections.YIELD_SECONDS = 0.2
 sys.exit(daemon.main(["-v", "-p", "0"]))

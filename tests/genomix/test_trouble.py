@@ -228,8 +228,8 @@ sys.exit(node.main([]))
 # genomixd with little patience.
 HASTY_GENOMIXD = """
 import sys
-from rosafe.genomix import daemon, server
-server.ANSWER_SECONDS = 1.5
+from rosafe.genomix import daemon, routes
+routes.ANSWER_SECONDS = 1.5
 sys.exit(daemon.main(["-v", "-p", "0"]))
 """
 
@@ -288,8 +288,9 @@ def test_what_is_acknowledged_runs(empty_world: World, tmp_path: Path) -> None:
 # genomixd that waits as long for a component as one takes to start on a busy machine.
 PATIENT_GENOMIXD = """
 import sys
-from rosafe.genomix import daemon, proxy
-proxy.APPEAR_SECONDS = 60.0
+from rosafe.client import component_client
+from rosafe.genomix import daemon
+component_client.APPEAR_SECONDS = 60.0
 sys.exit(daemon.main(["-v", "-p", "0"]))
 """
 

@@ -22,8 +22,8 @@ BROKEN = f"""
 import sys
 sys.path.insert(0, {str(harness.ROOT)!r})
 from pathlib import Path
-from rosafe.live import hub, robot
-append, piece = hub.View.append, hub.View.piece
+from rosafe.live import components, views
+append, piece = views.View.append, views.View.piece
 def late(view, first, columns, end):
     append(view, first if first >= {OFFSET} else first + {OFFSET}, columns, end + {OFFSET} / view.rate)
 def failing(view, *arguments):
@@ -33,8 +33,8 @@ def failing(view, *arguments):
 async def no_devices(self, arguments):
     raise RuntimeError("no devices today")
 broken = sys.argv.pop(1)
-hub.View.append, hub.View.piece = late, failing
-robot.ComponentFacade.devices = no_devices
+views.View.append, views.View.piece = late, failing
+components.ComponentFacade.devices = no_devices
 from rosafe.commands.__main__ import main
 sys.exit(main(sys.argv[1:]))
 """

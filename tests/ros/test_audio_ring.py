@@ -234,7 +234,7 @@ def test_any_chunks_give_the_same_blocks(chunks: list[int], block: int, late: in
         assert position == late + len(came) + 1
     assert came == [source.sample(f) for f in range(late + 1, late + 1 + len(came))]
     assert len(came) == sum(chunks) // block * block
-    assert ring.counters.lost == ring.counters.discontinuities == 0
+    assert ring.counters.lost == ring.counters.breaks == 0
 
 
 @pytest.mark.parametrize(

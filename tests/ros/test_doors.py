@@ -372,7 +372,7 @@ def test_a_window_that_is_a_little_too_long_is_refused_and_the_stream_goes_on(af
 
 LISTENING = """
 import sys, rospy
-from rosafe.component import registration
+from rosafe.transport import registration
 from bass.msg import binaudio_portStruct
 from std_msgs.msg import String
 registration.init_node("plain_listener", ["plain_listener"])

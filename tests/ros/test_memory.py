@@ -7,8 +7,8 @@ from tests.harness import PYTHON, ROOT, Graph, proc
 # Fills memory from many threads with pieces of all sizes, frees all but a few, and prints the MiB that stay resident.
 SPREAD = """
 import random, threading
-from rosafe.component import memory
-memory.limit_arenas()
+from rosafe.component import malloc_tuning
+malloc_tuning.limit_arenas()
 def resident():
     return int(next(line for line in open("/proc/self/status") if line.startswith("VmRSS")).split()[1]) // 1024
 kept, before = [], resident()
@@ -19,7 +19,7 @@ def work(seed):
 threads = [threading.Thread(target=work, args=(seed,)) for seed in range(12)]
 [thread.start() for thread in threads]
 [thread.join() for thread in threads]
-memory.trim()
+malloc_tuning.trim()
 print(resident() - before)
 """
 

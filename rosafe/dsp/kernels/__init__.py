@@ -86,7 +86,7 @@ def rectify_and_filter(
 
     The envelope of the same shape is for `compressed`. Rows of `output` may lie apart (`rows_evenly_strided`); or it is
     `block`. The twin is `RECTIFIERS` of rosafe/representations/haircell.py, or `compressed` there, and
-    `rosafe.dsp.sos_filter.Cascade`.
+    `rosafe.dsp.sos_filter.SosFilter`.
     """
     _function("rosafe_biquads")(
         RECTIFICATIONS.index(rectification),
@@ -216,7 +216,7 @@ class FrameReader(NamedTuple):
 def level_differences(frames: FrameReader, epsilon: float) -> FloatArray:
     """10 log10((R + epsilon) / (L + epsilon)) of the two ears' energies of each frame, (2, C, N) to (C, F).
 
-    Energies are weighted sums of squares. The twin is `rosafe.dsp.framing.Framing.means` with
+    Energies are weighted sums of squares. The twin is `rosafe.dsp.framing.FrameGrid.means` with
     `rosafe.representations.ild.Ild`.
     """
     channels = frames.block.shape[1]
@@ -230,8 +230,8 @@ def ratemap(frames: FrameReader, squared: bool, section: FloatArray, state: Floa
 
     The integrator is `section` (1, 6), as of `rosafe.dsp.sos_filter.leaky_integrator`, with its `state`
     (1, *rows, 2). The history
-    of `frames` has been through it, the block goes now. The twin is `rosafe.dsp.framing.Framing.means` after
-    `rosafe.dsp.sos_filter.Cascade`.
+    of `frames` has been through it, the block goes now. The twin is `rosafe.dsp.framing.FrameGrid.means` after
+    `rosafe.dsp.sos_filter.SosFilter`.
     """
     rates = np.empty((*frames.block.shape[:-1], frames.number))
     _function("rosafe_ratemap")(frames.packed, squared, -section[0, 4], _address(state), _address(rates))
@@ -242,8 +242,8 @@ def modulation(frames: FrameReader, sections: FloatArray, state: FloatArray) -> 
     """Weighted sums of the magnitudes of what parallel sections (M, 6) make of each frame's samples, (*rows, M, F).
 
     Of samples (*rows, N), with the sections' state (M, *rows, 2). The history of `frames` is (*rows, M), and what has
-    come out already, the block goes in now. The twin is `rosafe.dsp.framing.Framing.means` of the magnitudes of what
-    `rosafe.dsp.sos_filter.Parallel` makes.
+    come out already, the block goes in now. The twin is `rosafe.dsp.framing.FrameGrid.means` of the magnitudes of what
+    `rosafe.dsp.sos_filter.SosFilterBank` makes.
     """
     means = np.empty((*frames.tail.store.array.shape[:-1], frames.number))
     _function("rosafe_modulation")(frames.packed, len(sections), *map(_address, (sections, state, means)))
