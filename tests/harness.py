@@ -264,7 +264,7 @@ class Graph:
 
         return rosgraph.Master("/harness", master_uri=self.uri).getSystemState()
 
-    def _is_up(self, name: str, component: interface.Component, process: Process) -> bool:
+    def _is_up(self, name: str, component: interface.ComponentSpec, process: Process) -> bool:
         if not process.alive:
             raise AssertionError(f"ended at once: {process}")
         _, subscribed, served = ({entry for entry, _ in kind} for kind in self._state())

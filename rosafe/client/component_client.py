@@ -15,9 +15,9 @@ from rosafe.client.asyncio_tools import run_shared
 from rosafe.client.graph import Graph, NotRegisteredError, middleware_error
 from rosafe.client.installed_components import cannot_load
 from rosafe.client.tcpros import (
-    Connection,
     ConnectionRejected,
     ServiceClient,
+    TcprosConnection,
     TopicReader,
     component_exception,
     connect_service,
@@ -37,10 +37,10 @@ from rosafe.interface import (
     REQUIRED,
     ROSAFE,
     SAVE_SETUP,
-    Component,
     ComponentError,
+    ComponentSpec,
     Parameter,
-    Port,
+    PortSpec,
     Representation,
     Service,
     ros_type,
@@ -65,7 +65,9 @@ _COMPOSITES = {
 class Value:
     """A result: members by name, with their IDL types."""
 
-    def __init__(self, component: Component, members: tuple[tuple[str, str], ...], values: Mapping[str, Any]) -> None:
+    def __init__(
+        self, component: ComponentSpec, members: tuple[tuple[str, str], ...], values: Mapping[str, Any]
+    ) -> None:
         self.component = component
         self.members = members
         self.values = values
@@ -80,7 +82,7 @@ class Value:
             self.values = {**self.values, "warning": warning}
 
     @property
-    def content(self) -> tuple[Component, tuple[tuple[str, str], ...], Mapping[str, Any]]:
+    def content(self) -> tuple[ComponentSpec, tuple[tuple[str, str], ...], Mapping[str, Any]]:
         """The component, the members with their types, and the values, as encoders take them."""
         return self.component, self.members, self.values
 
@@ -104,7 +106,7 @@ def _size(value: Any) -> int:
 class ComponentClient:
     """The component `instance` of the interface `component`. Several sessions may share one."""
 
-    def __init__(self, graph: Graph, component: Component, instance: str) -> None:
+    def __init__(self, graph: Graph, component: ComponentSpec, instance: str) -> None:
         self.component = component
         self.instance = instance
         self._graph = graph
@@ -283,7 +285,7 @@ class ComponentClient:
             connection = await self._client("connect_port").connect()
             self._link = asyncio.create_task(self._wait_for_end(connection))
 
-    async def _wait_for_end(self, connection: Connection) -> None:
+    async def _wait_for_end(self, connection: TcprosConnection) -> None:
         try:
             await connection.closed()
         finally:
@@ -299,14 +301,14 @@ class ComponentClient:
 
     # --- ports ---
 
-    def port(self, name: str) -> Port | None:
+    def port(self, name: str) -> PortSpec | None:
         """The port called `name` (aliases count), if there is one."""
         try:
             return self.component.port(name)
         except KeyError:
             return None
 
-    async def read(self, port: Port, element: str) -> Value:
+    async def read(self, port: PortSpec, element: str) -> Value:
         """The newest sample of a port, keyed by the port's name; zeros where it has none yet.
 
         Raises ComponentError: ``::genom::no_such_outport`` where there is no such port or element.
@@ -322,7 +324,7 @@ class ComponentClient:
         sample.data = message
         return sample
 
-    async def _other_element(self, topic: str, port: Port, element: str) -> str:
+    async def _other_element(self, topic: str, port: PortSpec, element: str) -> str:
         """An element that differs in the case of letters only: the user's guide reads 'crossCorrelation'."""
         missing = f"{port.name} has no element {element[:80]!r}"
         try:
@@ -335,13 +337,13 @@ class ComponentClient:
         names = ", ".join(t.removeprefix(f"{topic}/") for t in topics) or "none"
         raise _no_port(f"{missing}; there are: {names}")
 
-    def _reader(self, port: Port) -> TopicReader:
+    def _reader(self, port: PortSpec) -> TopicReader:
         if port.idl not in self._readers:
             kind = installed_components.message_class(self.component.name, port.idl)
             self._readers[port.idl] = TopicReader(self._graph, self.instance, kind)
         return self._readers[port.idl]
 
-    async def _read(self, port: Port, element: str) -> Any:
+    async def _read(self, port: PortSpec, element: str) -> Any:
         topic, reader = f"/{self.instance}/{port.name}", self._reader(port)
         try:
             if not port.multiple:
@@ -441,7 +443,7 @@ def _no_port(what: str) -> ComponentError:
     return ComponentError("::genom::no_such_outport", what=what)
 
 
-def _zero(component: Component, idl: str) -> Any:
+def _zero(component: ComponentSpec, idl: str) -> Any:
     if idl.startswith("sequence<"):
         return []
     if idl.startswith("::"):

@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 from rosafe.declarations.plugins import FOLDERS
 from rosafe.interface import BASS, KINDS, REQUEST, ROSAFE, ComponentError
-from rosafe.setups import Setup, SetupError, Sound, dry_run, plan, read, wanted, write
+from rosafe.setups import AcquireSettings, Setup, SetupError, dry_run, plan, read, wanted, write
 from rosafe.setups.plan import refused
 from rosafe.tree import tree_planner as request
 from rosafe.tree.tree_builder import (
@@ -31,19 +31,19 @@ PAUSE = 0.1
 Undo = Callable[[], Awaitable[object]]
 
 
-class Component(Services, Protocol):
+class ComponentProtocol(Services, Protocol):
     """A rosAFE on a graph with others."""
 
     def other(self, instance: str) -> AbstractAsyncContextManager[Services]:
         """Another component of the graph; ComponentError where none of that name is there."""
 
 
-async def save(component: Component, values: Mapping[str, Any]) -> dict[str, Any]:
+async def save(component: ComponentProtocol, values: Mapping[str, Any]) -> dict[str, Any]:
     """The outputs of `interface.SAVE_SETUP`: the text of what `capture` finds."""
     return {"setup": write(await capture(component), bool(values.get("full", False)))}
 
 
-async def capture(component: Component) -> Setup:
+async def capture(component: ComponentProtocol) -> Setup:
     """The setup that would make the tree, the connection and the acquisition that are there."""
     topic = await component.port_connected(AUDIO)
     there = (await component.outputs("getProcessors", {}))["processors"]
@@ -56,11 +56,11 @@ async def capture(component: Component) -> Setup:
     if topic:
         async with _bass(component, topic) as bass:
             if bass is not None and (now := await bass.outputs("getAcquisition", {}))["running"]:
-                sound = Sound.of(now)
+                sound = AcquireSettings.of(now)
     return Setup(sound, {AUDIO: topic} if topic else {}, tuple(processors))
 
 
-async def load(component: Component, values: Mapping[str, Any]) -> dict[str, Any]:
+async def load(component: ComponentProtocol, values: Mapping[str, Any]) -> dict[str, Any]:
     """Make all that the setup in `values` describes; the outputs of `interface.LOAD_SETUP`.
 
     Processors, connection and acquisition that are there already are used. Where anything fails, or the task is
@@ -80,7 +80,7 @@ async def load(component: Component, values: Mapping[str, Any]) -> dict[str, Any
         return await apply(component, setup)
 
 
-async def apply(component: Component, setup: Setup, wait: float = 0.0) -> dict[str, Any]:
+async def apply(component: ComponentProtocol, setup: Setup, wait: float = 0.0) -> dict[str, Any]:
     """As `load`, for a setup that was read; `wait` seconds for what it hears, where that is just starting."""
     undoing: list[Undo] = []
     made: list[str] = []
@@ -103,7 +103,7 @@ async def apply(component: Component, setup: Setup, wait: float = 0.0) -> dict[s
     return {"created": [name for name in names if name in made], "reused": reused, "sound": sound}
 
 
-async def _undo(component: Component, made: list[str], undoing: list[Undo]) -> None:
+async def _undo(component: ComponentProtocol, made: list[str], undoing: list[Undo]) -> None:
     await remove(component, made)
     for undo in reversed(undoing):
         with contextlib.suppress(ComponentError):  # what failed first is told
@@ -113,21 +113,21 @@ async def _undo(component: Component, made: list[str], undoing: list[Undo]) -> N
 # --- sound ------------------------------------------------------------------------------------------------------
 
 
-async def _topic(component: Component, setup: Setup) -> str:
+async def _topic(component: ComponentProtocol, setup: Setup) -> str:
     """What the Audio port is to hear; nothing where that is left open and nobody publishes the usual."""
     topic = setup.connections.get(AUDIO, "") or await component.port_connected(AUDIO)
     usual = f"/{REQUEST.parameter('connect').default}"
     return topic or (usual if setup.sound is not None or await component.published(usual) else "")
 
 
-async def _wait_for_topic(component: Component, topic: str, seconds: float) -> None:
+async def _wait_for_topic(component: ComponentProtocol, topic: str, seconds: float) -> None:
     deadline = asyncio.get_running_loop().time() + seconds
     while topic and asyncio.get_running_loop().time() < deadline and not await component.published(topic):
         await asyncio.sleep(PAUSE)
 
 
 @contextlib.asynccontextmanager
-async def _bass(component: Component, topic: str) -> AsyncIterator[Services | None]:
+async def _bass(component: ComponentProtocol, topic: str) -> AsyncIterator[Services | None]:
     """The bass that publishes `topic`; None where that is none of ours."""
     instance, _, port = topic.removeprefix("/").rpartition("/")
     if not instance or "/" in instance or port != AUDIO:
@@ -142,7 +142,7 @@ async def _bass(component: Component, topic: str) -> AsyncIterator[Services | No
 
 
 async def _sound(
-    component: Component, setup: Setup, topic: str, found: list[ExistingProcessor], undoing: list[Undo]
+    component: ComponentProtocol, setup: Setup, topic: str, found: list[ExistingProcessor], undoing: list[Undo]
 ) -> str:
     """Have the setup's sound acquired: "started" or "reused"; "" where it has none. All that can be checked is."""
     rate = next((p.rate for p in found if not p.parent), 0.0)
@@ -170,7 +170,7 @@ async def _sound(
 
 
 async def _acquire(
-    component: Component, bass: Services, values: Mapping[str, Any], topic: str, undoing: list[Undo]
+    component: ComponentProtocol, bass: Services, values: Mapping[str, Any], topic: str, undoing: list[Undo]
 ) -> None:
     async def stop() -> None:
         async with _bass(component, topic) as again:
@@ -181,7 +181,7 @@ async def _acquire(
     undoing.append(stop)
 
 
-async def _connect(component: Component, topic: str, before: str, undoing: list[Undo]) -> None:
+async def _connect(component: ComponentProtocol, topic: str, before: str, undoing: list[Undo]) -> None:
     await component.outputs("connect_port", {"local": AUDIO, "remote": topic})
     if before:
         undoing.append(lambda: component.outputs("connect_port", {"local": AUDIO, "remote": before}))
@@ -190,7 +190,7 @@ async def _connect(component: Component, topic: str, before: str, undoing: list[
 # --- processors -------------------------------------------------------------------------------------------------
 
 
-async def _make(component: Component, setup: Setup, made: list[str], patient: bool) -> list[str]:
+async def _make(component: ComponentProtocol, setup: Setup, made: list[str], patient: bool) -> list[str]:
     """The names in the tree of the setup's processors, once they are all there.
 
     `patient`: the sound has just been started, and may need a while.

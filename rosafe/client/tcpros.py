@@ -44,7 +44,7 @@ class ConnectionRejected(Exception):
     """The other side answered the connection with an error; the text is its own."""
 
 
-class Connection:
+class TcprosConnection:
     """One TCPROS connection after the exchange of headers."""
 
     def __init__(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter, header: Mapping[str, str]) -> None:
@@ -53,10 +53,10 @@ class Connection:
         self.header = header
 
     @classmethod
-    async def open(cls, address: tuple[str, int], header: Mapping[str, str]) -> Connection:
+    async def open(cls, address: tuple[str, int], header: Mapping[str, str]) -> TcprosConnection:
         """Connect and exchange headers; OSError, Refused or asyncio.TimeoutError."""
 
-        async def attempt() -> Connection:
+        async def attempt() -> TcprosConnection:
             reader, writer = await asyncio.open_connection(*address, limit=READ_BUFFER)
             try:
                 _keep_alive(writer.get_extra_info("socket"))
@@ -143,7 +143,7 @@ async def decode(message: Any, data: bytearray) -> Any:
     return await asyncio.to_thread(message.deserialize, data)
 
 
-async def connect_service(graph: Graph, instance: str, header: Mapping[str, str]) -> Connection:
+async def connect_service(graph: Graph, instance: str, header: Mapping[str, str]) -> TcprosConnection:
     """A connection to the service of `instance` that `header` names: where it was the last time, or the master says.
 
     Raises Unknown, Refused or OSError, and ComponentError where the master has to be asked and is not there.
@@ -152,13 +152,13 @@ async def connect_service(graph: Graph, instance: str, header: Mapping[str, str]
     failure: Exception | None = None
     if known is not None:
         try:
-            return await Connection.open(known, header)
+            return await TcprosConnection.open(known, header)
         except (ConnectionRejected, OSError) as problem:
             failure = problem
     address = await graph.service_address(header["service"])
     if failure is not None and address == known:
         raise failure
-    connection = await Connection.open(address, header)
+    connection = await TcprosConnection.open(address, header)
     graph.note_reachable(instance, address)
     return connection
 
@@ -189,14 +189,14 @@ class ServiceClient:
         # The plugin whose request this is: it has to be there at both ends
         self._plugin = next((kind for kind in PLUGINS if KINDS[kind].request == service), "")
         self._slots = asyncio.Semaphore(CONNECTIONS)
-        self._idle: list[Connection] = []
+        self._idle: list[TcprosConnection] = []
 
     async def check(self) -> None:
         """Return if the component can be reached, else raise ComponentError."""
         async with self._slots:
             self._return_to_pool(await self.connect())
 
-    async def connect(self) -> Connection:
+    async def connect(self) -> TcprosConnection:
         """A connection to the service; ComponentError where the component cannot be reached."""
         while self._idle:
             connection = self._idle.pop()
@@ -232,7 +232,7 @@ class ServiceClient:
             f"{self._instance} was started without the plugin {self._plugin}; set {plugins.FOLDERS} and restart it"
         )
 
-    def _return_to_pool(self, connection: Connection) -> None:
+    def _return_to_pool(self, connection: TcprosConnection) -> None:
         """Take back a connection that is fit for another call."""
         if connection.open_still:
             self._idle.append(connection)
@@ -325,7 +325,7 @@ class TopicReader:
             "tcp_nodelay": "1",
             "message_definition": self._class._full_text,
         }
-        connection = await Connection.open(address, header)
+        connection = await TcprosConnection.open(address, header)
         try:
             data = await connection.message()
         finally:

@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any
 
 from rosafe.commands import CommandError
-from rosafe.commands._workers import SIGNAL_SECONDS, Interrupts, Report, Work, attempt
+from rosafe.commands._workers import SIGNAL_SECONDS, Interrupts, TaskReport, Work, attempt
 from rosafe.tree.workers import VARIABLE
 from rosafe.version import VERSION
 
@@ -32,7 +32,7 @@ def run_on(
     works: Sequence[Work],
     jobs: int,
     failures: tuple[type[Exception], ...],
-    report: Callable[[int, Report], None],
+    report: Callable[[int, TaskReport], None],
     signals: Interrupts,
 ) -> None:
     """As `run_parallel`, on the workers of the scheduler at `address`, or on `jobs` of one's own where that is `local`.
@@ -164,15 +164,17 @@ def _import_nothing_from_the_working_directory(folder: str) -> None:
         multiprocessing.set_executable(str(python))
 
 
-def _attempt(work: Work, failures: tuple[type[Exception], ...], version: str) -> Report:
+def _attempt(work: Work, failures: tuple[type[Exception], ...], version: str) -> TaskReport:
     """What a worker does. Its processes are as many as there are cores to use; in each, one thread computes."""
     if version != VERSION:
-        return Report(0.0, failure=f"the worker has rosafe {VERSION}, not {version}: install the same on all machines")
+        return TaskReport(
+            0.0, failure=f"the worker has rosafe {VERSION}, not {version}: install the same on all machines"
+        )
     os.environ[VARIABLE] = "1"
     return attempt(work, failures, lambda done, total: None)
 
 
-def _outcome(future: Any, address: str) -> Report:
+def _outcome(future: Any, address: str) -> TaskReport:
     from distributed.scheduler import KilledWorker
 
     if future.cancelled():
@@ -180,9 +182,9 @@ def _outcome(future: Any, address: str) -> Report:
     problem = future.exception()
     if problem is None:
         told = future.result()
-        assert isinstance(told, Report)
+        assert isinstance(told, TaskReport)
         return told
     if isinstance(problem, KilledWorker):
-        return Report(0.0, failure="each worker that tried it has died: is there not enough memory?")
+        return TaskReport(0.0, failure="each worker that tried it has died: is there not enough memory?")
     text = f"{type(problem).__name__}: {problem}".partition("\n")[0]
-    return Report(0.0, failure=f"a worker could not do it ({text}); are rosafe and its packages installed there?")
+    return TaskReport(0.0, failure=f"a worker could not do it ({text}); are rosafe and its packages installed there?")

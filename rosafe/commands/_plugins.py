@@ -22,7 +22,7 @@ LIMIT_SECONDS = 10.0  # for importing all plugins
 TRIAL_SECONDS = 300.0  # for trying the representations of one file
 
 
-class Report(NamedTuple):
+class PluginReport(NamedTuple):
     """What the child process found.
 
     Attributes
@@ -56,18 +56,18 @@ class Trial(NamedTuple):
     costs: dict[str, float]
 
 
-def report(extra: str = "") -> Report:
+def report(extra: str = "") -> PluginReport:
     """Import all plugins, and the file `extra` too, in a child process; its output goes to standard error."""
     messages, end = _run([], extra, LIMIT_SECONDS)
     if messages and "kinds" in messages[-1]:
-        return Report(**messages[-1])
+        return PluginReport(**messages[-1])
     origin = messages[-1]["importing"] if messages else "plugins"
     reason = (
         f"the process that imported it ended with {end}"
         if end
         else f"its import did not end within {LIMIT_SECONDS:g} s"
     )
-    return Report({}, [f"{origin}: {reason}; a node that imports it would not start either"], [])
+    return PluginReport({}, [f"{origin}: {reason}; a node that imports it would not start either"], [])
 
 
 def trials(kinds: list[str], extra: str = "") -> list[Trial]:

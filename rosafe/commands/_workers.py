@@ -18,7 +18,7 @@ Progress = Callable[[int, int], None]
 Work = Callable[[Progress], Any]
 
 
-class Report(NamedTuple):
+class TaskReport(NamedTuple):
     """How a piece of work stands: the part that is done, or (at its end) its result, or why it failed."""
 
     part: float
@@ -64,7 +64,7 @@ def run_parallel(
     works: Sequence[Work],
     jobs: int,
     failures: tuple[type[Exception], ...],
-    report: Callable[[int, Report], None],
+    report: Callable[[int, TaskReport], None],
     signals: Interrupts,
 ) -> None:
     """Run all `works` in at most `jobs` processes, and wait for them; whatever ends this ends those that run, too.
@@ -139,16 +139,16 @@ def _start(serve: Callable[[Connection], None], others: list[Connection]) -> tup
     return ours, process  # type: ignore[return-value]  # a ForkProcess is a Process
 
 
-def _receive(connection: Connection, process: multiprocessing.Process) -> Report:
+def _receive(connection: Connection, process: multiprocessing.Process) -> TaskReport:
     try:
         told = connection.recv()
-        assert isinstance(told, Report)
+        assert isinstance(told, TaskReport)
         return told
     except (EOFError, ConnectionResetError):
         process.join()
         code = process.exitcode or 0
         how = f"signal {-code}" if code < 0 else f"exit code {code}"
-        return Report(0.0, failure=f"ended too early, with {how}")
+        return TaskReport(0.0, failure=f"ended too early, with {how}")
 
 
 def _serve(
@@ -163,14 +163,14 @@ def _serve(
         _send(connection, attempt(works[index], failures, partial(_tell, connection, signals, [0.0])))
 
 
-def attempt(work: Work, failures: tuple[type[Exception], ...], progress: Progress) -> Report:
+def attempt(work: Work, failures: tuple[type[Exception], ...], progress: Progress) -> TaskReport:
     """Do one piece of work; its last report."""
     try:
-        return Report(1.0, result=work(progress))
+        return TaskReport(1.0, result=work(progress))
     except failures as problem:
-        return Report(0.0, failure=str(problem) or type(problem).__name__)
+        return TaskReport(0.0, failure=str(problem) or type(problem).__name__)
     except MemoryError:
-        return Report(0.0, failure="there is not enough memory")
+        return TaskReport(0.0, failure="there is not enough memory")
 
 
 def _tell(connection: Connection, signals: Interrupts, due: list[float], done: int, total: int) -> None:
@@ -178,10 +178,10 @@ def _tell(connection: Connection, signals: Interrupts, due: list[float], done: i
     now = time.monotonic()
     if now >= due[0]:
         due[0] = now + REPORT_SECONDS
-        _send(connection, Report(done / total))
+        _send(connection, TaskReport(done / total))
 
 
-def _send(writer: Connection, report: Report) -> None:
+def _send(writer: Connection, report: TaskReport) -> None:
     try:
         writer.send(report)
     except BrokenPipeError:

@@ -25,7 +25,7 @@ from typing import Any, NamedTuple, cast
 from rosafe.commands import CommandError
 from rosafe.commands._parameters import add_settings, parameters_of, parse_settings
 from rosafe.commands._progress import Display, bytes_text
-from rosafe.commands._workers import Interrupted, Interrupts, Report, run_parallel
+from rosafe.commands._workers import Interrupted, Interrupts, TaskReport, run_parallel
 from rosafe.interface import CORE_REPRESENTATIONS, KINDS, ROSAFE, Parameter
 from rosafe.interface.arguments import check_outputs
 from rosafe.terminal import printable
@@ -378,7 +378,7 @@ class _Corpus:
         text = why if name in why else f"{name}: {why}"
         self.failed[name] = printable(text)
 
-    def report(self, index: int, told: Report) -> None:
+    def report(self, index: int, told: TaskReport) -> None:
         """How a file stands."""
         source, target = self._sources[index], self._targets[index]
         if told.failure:

@@ -289,14 +289,14 @@ def _opened(part: AtomicOutput | None, options: argparse.Namespace, source: Soun
 
 
 def _open_output(part: AtomicOutput, options: argparse.Namespace, source: SoundSource) -> Output:
-    from rosafe.bass.recording.outputs import BagFile, WavFile
+    from rosafe.bass.recording.outputs import BagWriter, WavFile
 
     descriptor = part.begin()
     if part.target.suffix.lower() == ".wav":
         return WavFile(descriptor, source.sample_rate)
     # A stream that others hear too keeps its numbers and its name.
     chunk, newest = getattr(source, "frames_per_chunk", options.chunk), getattr(source, "newest", 0)
-    return BagFile(descriptor, source.sample_rate, chunk, source.name if options.topic else _TOPIC, newest)
+    return BagWriter(descriptor, source.sample_rate, chunk, source.name if options.topic else _TOPIC, newest)
 
 
 def _summary(recorder: SoundRecorder, name: str, sample_rate: int) -> str:

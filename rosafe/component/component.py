@@ -57,7 +57,7 @@ class ComponentNode:
         Turns the ValueError of a refused argument into the component's exception.
     """
 
-    def __init__(self, component: interface.Component, bad_value: Callable[[ValueError], ComponentError]) -> None:
+    def __init__(self, component: interface.ComponentSpec, bad_value: Callable[[ValueError], ComponentError]) -> None:
         self.component = component
         self.name = rospy.get_name()
         self.finished = threading.Event()
@@ -381,6 +381,6 @@ class ComponentNode:
 _DATE = time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(os.path.getmtime(interface.__file__)))
 
 
-def _digest(component: interface.Component) -> str:
+def _digest(component: interface.ComponentSpec) -> str:
     """A fingerprint of the interface, 32 hex digits."""
     return hashlib.md5(re.sub(r" at 0x\w+", "", repr(component)).encode()).hexdigest()

@@ -36,7 +36,7 @@ _MAX_RECORD = 2**31 - 1  # bytes; numpy's layouts go no further
 ROW_BYTES = 4096  # rows of a window in pieces shorter than this are copied together: quicker than handling each
 
 
-class Writer(Protocol):
+class ByteSink(Protocol):
     """Where messages are written to: a BytesIO, or `BufferList`."""
 
     def write(self, data: Any, /) -> Any:
@@ -65,7 +65,7 @@ def _pack_nested(view: WindowView) -> memoryview:
     return record.reshape(1).view(np.uint8).data
 
 
-def _write_rows(out: Writer, pieces: Sequence[np.ndarray], frames: int) -> None:
+def _write_rows(out: ByteSink, pieces: Sequence[np.ndarray], frames: int) -> None:
     """As `_pack_nested`, of arrays (..., n) that together make `frames`: row by row as they lie, without a copy."""
     if pieces[0].ndim == 1:
         out.write(_COUNT.pack(frames))
@@ -77,7 +77,7 @@ def _write_rows(out: Writer, pieces: Sequence[np.ndarray], frames: int) -> None:
             _write_rows(out, rows, frames)
 
 
-def _write_signal(out: Writer, levels: int, value: Any) -> None:
+def _write_signal(out: ByteSink, levels: int, value: Any) -> None:
     if isinstance(value, genpy.Message):  # of the generated class, as in a message that was made without it
         value.serialize(out)
         return
@@ -111,7 +111,7 @@ def _member(value: Any, name: str) -> Any:
     return value[name] if isinstance(value, dict) else getattr(value, name)
 
 
-def encode(out: Writer, component: interface.Component, idl: str, value: Any) -> None:
+def encode(out: ByteSink, component: interface.ComponentSpec, idl: str, value: Any) -> None:
     """Append `value` (a message, or a dict by member name) of IDL type `idl` to `out`."""
     if idl in _SCALARS:
         out.write(struct.pack("<" + _SCALARS[idl], value))
@@ -198,7 +198,7 @@ class AttrDict(dict):
             raise AttributeError(name) from None
 
 
-def decode(reader: _Reader, component: interface.Component, idl: str) -> Any:
+def decode(reader: _Reader, component: interface.ComponentSpec, idl: str) -> Any:
     """The next value of IDL type `idl`: structs as `AttrDict`, signals and numeric sequences as read-only arrays."""
     if idl in _SCALARS:
         form = "<" + _SCALARS[idl]
@@ -219,9 +219,9 @@ def decode(reader: _Reader, component: interface.Component, idl: str) -> Any:
 
 
 def _codec(
-    component: interface.Component, members: tuple[tuple[str, str], ...]
-) -> tuple[Callable[[Any, Writer], None], Callable[[Any, bytes], Any]]:
-    def serialize(self: Any, out: Writer) -> None:
+    component: interface.ComponentSpec, members: tuple[tuple[str, str], ...]
+) -> tuple[Callable[[Any, ByteSink], None], Callable[[Any, bytes], Any]]:
+    def serialize(self: Any, out: ByteSink) -> None:
         try:
             for name, kind in members:
                 encode(out, component, kind, getattr(self, name))

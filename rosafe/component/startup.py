@@ -24,7 +24,7 @@ from rosafe.transport import master, paths, systemd
 from rosafe.version import VERSION
 
 if TYPE_CHECKING:
-    from rosafe.interface import Component  # which needs numpy, and `rosafe doctor` must not
+    from rosafe.interface import ComponentSpec  # which needs numpy, and `rosafe doctor` must not
 
 MASTER_SECONDS = 5.0  # `roscore & rosAFE-ros &` starts both at once, and roscore takes a second or two
 START_SECONDS = 20.0  # a node that is not up by then waits for something that does not come
@@ -34,7 +34,7 @@ SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _ENVIRONMENT_REMAPPINGS = {"__ip": "ROS_IP", "__hostname": "ROS_HOSTNAME", "__master": "ROS_MASTER_URI"}
 
 
-class Node(Protocol):
+class RosNode(Protocol):
     """What `run_server` needs of a node; `shutdown` may be called twice."""
 
     finished: threading.Event
@@ -46,13 +46,13 @@ class _Failure(Exception):
     """The node cannot start; the text is the one line that the user gets."""
 
 
-class _Ended(Exception):
+class _WaitInterrupted(Exception):
     """A signal came while the node was waiting for a master, as it was told to."""
 
 
 def run_server(
-    component: Component,
-    build: Callable[..., Node],
+    component: ComponentSpec,
+    build: Callable[..., RosNode],
     argv: list[str] | None = None,
     prepare: Callable[[], object] = lambda: None,
     more_options: Mapping[str, Mapping[str, Any]] = MappingProxyType({}),
@@ -91,7 +91,7 @@ def run_server(
     try:
         own = {name: getattr(options, name) for name in (flag.lstrip("-") for flag in more_options)}
         node = _start(component, functools.partial(build, **own), options, remappings, received, prepare)
-    except _Ended:
+    except _WaitInterrupted:
         return 0
     except (_Failure, generate.GenerationError, master.MasterError, ComponentError, OSError) as problem:
         print(f"{component.name}-ros: {printable(problem)}", file=sys.stderr)
@@ -124,7 +124,7 @@ class Parser(argparse.ArgumentParser):
 
 
 def _parse(
-    component: Component, arguments: list[str], more_options: Mapping[str, Mapping[str, Any]]
+    component: ComponentSpec, arguments: list[str], more_options: Mapping[str, Mapping[str, Any]]
 ) -> argparse.Namespace:
     program = f"{component.name}-ros"
     more = "".join(f" [{' '.join((name, told.get('metavar', ''))).strip()}]" for name, told in more_options.items())
@@ -161,13 +161,13 @@ def _parse(
 
 
 def _start(
-    component: Component,
-    build: Callable[..., Node],
+    component: ComponentSpec,
+    build: Callable[..., RosNode],
     options: argparse.Namespace,
     remappings: list[str],
     received: list[int],
     prepare: Callable[[], object],
-) -> Node:
+) -> RosNode:
     mappings = dict(remapping.split(":=", 1) for remapping in remappings)
     instance = _instance(options, remappings)
     if not re.fullmatch("[A-Za-z][A-Za-z0-9_]*", instance):
@@ -231,7 +231,7 @@ def _await_master(uri: str, received: list[int], patient: str) -> None:
             return master.check_master(uri, lambda: bool(received))
         except master.MasterError:
             if received and patient:
-                raise _Ended from None
+                raise _WaitInterrupted from None
             if received or (time.monotonic() > deadline and not patient):
                 raise
         if patient and not told:
@@ -312,7 +312,7 @@ def log_to_stderr() -> None:
 # --- end --------------------------------------------------------------------------------------------------------
 
 
-def _serve(node: Node, received: list[int]) -> None:
+def _serve(node: RosNode, received: list[int]) -> None:
     """Wait until `node` is to end (`received` is where the signals arrive) and end it."""
     import rospy
 

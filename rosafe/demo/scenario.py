@@ -12,7 +12,7 @@ from rosafe.demo import sound as sounds
 from rosafe.demo.progress import Progress
 from rosafe.demo.recorder import PortRecorder
 from rosafe.demo.session import NAMES, POLL_SECONDS, DemoError, DemoSession, acquire, requests
-from rosafe.demo.sound import Sound
+from rosafe.demo.sound import DemoSound
 from rosafe.terminal import printable
 from rosafe.view import estimates, report
 from rosafe.view.representations import Representations
@@ -88,7 +88,7 @@ def _say_command(command: str) -> None:
     print(f"$ {printable(command)}", flush=True)
 
 
-def _build(session: DemoSession, recorder: PortRecorder, sound: Sound) -> tuple[int, int]:
+def _build(session: DemoSession, recorder: PortRecorder, sound: DemoSound) -> tuple[int, int]:
     """Make the guide's requests; returns the position (`PortRecorder.position`) after which to follow."""
     steps = requests(sound)
     for service, arguments in steps[:-PARALLEL]:
@@ -103,7 +103,9 @@ def _build(session: DemoSession, recorder: PortRecorder, sound: Sound) -> tuple[
     return position
 
 
-def _follow(session: DemoSession, recorder: PortRecorder, sound: Sound, seconds: float, start: tuple[int, int]) -> None:
+def _follow(
+    session: DemoSession, recorder: PortRecorder, sound: DemoSound, seconds: float, start: tuple[int, int]
+) -> None:
     """Follow the ports for so long, or until the sound ends."""
     print(f"following {len(recorder.ports)} ports for {seconds:.1f} s", flush=True)
     progress = Progress(recorder, seconds)
@@ -147,7 +149,7 @@ def _say_ports(recorder: PortRecorder) -> None:
     )
 
 
-def _say_path(shown: Representations, sound: Sound) -> None:
+def _say_path(shown: Representations, sound: DemoSound) -> None:
     from_ild, from_correlation = estimates.azimuth_from_ild(shown), estimates.azimuth_from_correlation(shown)
     truth = sound.true_azimuth(shown.times) if sound.true_azimuth else None
     length = shown.times[-1] - shown.times[0]
@@ -159,7 +161,7 @@ def _say_path(shown: Representations, sound: Sound) -> None:
         print(f"the two agree on the side in {100 * agreement:.0f} % of the frames", flush=True)
 
 
-def _draw(shown: Representations, sound: Sound, picture: Path) -> None:
+def _draw(shown: Representations, sound: DemoSound, picture: Path) -> None:
     from rosafe.view import axes, figure  # matplotlib takes a second to import
 
     channels = len(shown.center_frequencies)

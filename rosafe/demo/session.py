@@ -13,7 +13,7 @@ from typing import Any
 from rosafe import interface
 from rosafe.component import generate
 from rosafe.demo.processes import Child, ProcessGroup
-from rosafe.demo.sound import Sound
+from rosafe.demo.sound import DemoSound
 from rosafe.transport.master import PrivateMaster
 from rosafe.transport.paths import CODE_DIR
 
@@ -30,7 +30,7 @@ class DemoError(Exception):
     """The demonstration cannot go on; the text is the one line that the user gets."""
 
 
-def acquire(sound: Sound) -> tuple[str, dict[str, Any]]:
+def acquire(sound: DemoSound) -> tuple[str, dict[str, Any]]:
     """The request that starts the sound."""
     return (
         "/bass/Acquire",
@@ -43,7 +43,7 @@ def acquire(sound: Sound) -> tuple[str, dict[str, Any]]:
     )
 
 
-def requests(sound: Sound) -> list[tuple[str, dict[str, Any]]]:
+def requests(sound: DemoSound) -> list[tuple[str, dict[str, Any]]]:
     """The guide's requests in its order, with the parameters that a user is likely to change."""
     return [
         ("/rosAFE/connect_port", {"local": "Audio", "remote": "bass/Audio"}),

@@ -23,7 +23,7 @@ HIGHEST = 8000.0  # Hz, the guide's fb_highFreqHz
 
 
 @dataclass(frozen=True)
-class Sound:
+class DemoSound:
     """A source of sound and how to work on it.
 
     Attributes
@@ -78,7 +78,7 @@ class Sound:
         return HIGHEST if self.sample_rate >= 2 * HIGHEST else float(self.sample_rate * 9 // 20)
 
 
-def choose(argument: str) -> Sound:
+def choose(argument: str) -> DemoSound:
     """The sound that the user means: a sound file, ``scene:``, ``file:PATH`` or an ALSA device.
 
     Raises
@@ -90,12 +90,12 @@ def choose(argument: str) -> Sound:
         sample_rate = _checked(argument, 0)
         walk = re.search(r"[?&]seconds=([^&]+)", argument)
         truth = functools.partial(scene_azimuth, walk=float(walk[1]) if walk else WALK_SECONDS)
-        return Sound(argument, sample_rate, sample_rate, "A source walks from left to right", true_azimuth=truth)
+        return DemoSound(argument, sample_rate, sample_rate, "A source walks from left to right", true_azimuth=truth)
     if argument.startswith("file:"):
-        return Sound(argument, 0, _checked(argument, 0), argument)
+        return DemoSound(argument, 0, _checked(argument, 0), argument)
     if _names_file(argument):
         return _file(Path(argument).expanduser())
-    return Sound(argument, DEFAULT_RATE, DEFAULT_RATE, argument, has_beginning=False)
+    return DemoSound(argument, DEFAULT_RATE, DEFAULT_RATE, argument, has_beginning=False)
 
 
 def _names_file(argument: str) -> bool:
@@ -103,11 +103,11 @@ def _names_file(argument: str) -> bool:
     return "/" in argument.partition(":")[0] or path.suffix.lower() in SOUND_FILES or path.expanduser().is_file()
 
 
-def _file(path: Path) -> Sound:
+def _file(path: Path) -> DemoSound:
     file = AudioFile(path)
     file.close()
     device = f"file:{path.absolute()}"
-    sound = Sound(device, 0, _checked(device, 0), path.name)
+    sound = DemoSound(device, 0, _checked(device, 0), path.name)
     length = file.frames / file.sample_rate
     note = f"{path.name}: {length:.1f} s at {file.sample_rate} Hz"
     if sound.highest_frequency < HIGHEST:

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from rosafe.declarations.signals import LEVELS
-from rosafe.interface import Component
+from rosafe.interface import ComponentSpec
 
 STRUCTURE, SEQUENCE, END = b"{", b"[", b"."
 NUMBER, TEXT, NUMBERS, SIGNAL, ERROR = b"d", b"s", b"D", b"S", b"!"
@@ -53,7 +53,7 @@ def _numbers(values: Any) -> bytes:
 # --- values of IDL types ----------------------------------------------------------------------------------------
 
 
-def pieces(component: Component, idl: str, value: Any) -> Iterator[bytes]:
+def pieces(component: ComponentSpec, idl: str, value: Any) -> Iterator[bytes]:
     """The bytes of `value`, as `rosafe.component.serialization.decode` gives it, of IDL type `idl`."""
     if idl in LEVELS:
         yield from _signal(LEVELS[idl], value)
@@ -74,7 +74,9 @@ def pieces(component: Component, idl: str, value: Any) -> Iterator[bytes]:
         yield number(value)
 
 
-def structure(component: Component, members: Sequence[tuple[str, str]], value: Mapping[str, Any]) -> Iterator[bytes]:
+def structure(
+    component: ComponentSpec, members: Sequence[tuple[str, str]], value: Mapping[str, Any]
+) -> Iterator[bytes]:
     """The bytes of a structure with the given (name, IDL type) members."""
     yield STRUCTURE
     for name, kind in members:

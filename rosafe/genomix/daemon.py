@@ -16,7 +16,7 @@ from concurrent.futures import ThreadPoolExecutor
 from rosafe.client.graph import JOIN_SECONDS, Graph
 from rosafe.component import generate, startup
 from rosafe.genomix.names import Names, parameter_name
-from rosafe.genomix.routes import Server
+from rosafe.genomix.routes import HttpApi
 from rosafe.genomix.sessions import Sessions
 from rosafe.http_server.access import host_name, own_names
 from rosafe.terminal import printable
@@ -126,7 +126,7 @@ async def _serve(options: argparse.Namespace, told: startup.DaemonFork | None) -
     sys.setswitchinterval(startup.SWITCH_SECONDS)
     graph = Graph(os.environ["ROS_MASTER_URI"], server=True)
     names = Names(graph, parameter_name(sys.argv[1:]), {*own_names(), options.host, *options.name})
-    server = Server(Sessions(graph), names)
+    server = HttpApi(Sessions(graph), names)
     try:
         port = await server.start(options.host, options.port)
         logging.getLogger("genomixd").info("serving http://%s:%d", options.host, port)

@@ -81,7 +81,7 @@ Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 T = TypeVar("T")
 
 
-class Server:
+class HttpApi:
     """The HTTP server for `sessions`.
 
     Parameters

@@ -17,7 +17,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from rosafe.declarations.signals import LEVELS
-from rosafe.interface import Component
+from rosafe.interface import ComponentSpec
 
 STEP = 1024  # numbers formatted at a time: about 0.3 ms, during which no other thread runs
 
@@ -125,7 +125,7 @@ SYNTAXES = {syntax.name: syntax for syntax in (JSON, TCL)}
 # --- values of IDL types ----------------------------------------------------------------------------------------
 
 
-def pieces(syntax: Syntax, component: Component, idl: str, value: Any) -> Iterator[str]:
+def pieces(syntax: Syntax, component: ComponentSpec, idl: str, value: Any) -> Iterator[str]:
     """The text of `value`, as `rosafe.component.serialization.decode` gives it, of IDL type `idl`, in short pieces."""
     if idl in LEVELS:
         yield from _signal(syntax, LEVELS[idl], value)
@@ -140,7 +140,7 @@ def pieces(syntax: Syntax, component: Component, idl: str, value: Any) -> Iterat
 
 
 def structure(
-    syntax: Syntax, component: Component, members: Sequence[tuple[str, str]], value: Mapping[str, Any]
+    syntax: Syntax, component: ComponentSpec, members: Sequence[tuple[str, str]], value: Mapping[str, Any]
 ) -> Iterator[str]:
     """The text of a structure with the given (name, IDL type) members."""
     yield syntax.open("struct")
@@ -150,7 +150,7 @@ def structure(
     yield syntax.close("struct")
 
 
-def _elements(syntax: Syntax, component: Component, element: str, values: Any) -> Iterator[str]:
+def _elements(syntax: Syntax, component: ComponentSpec, element: str, values: Any) -> Iterator[str]:
     if isinstance(values, np.ndarray):
         yield from _array(syntax, values)
         return

@@ -30,12 +30,12 @@ from .rosafe import (
     ROSAFE,
     SAVE_SETUP,
 )
-from .service import Component, Port, Service
+from .service import ComponentSpec, PortSpec, Service
 
 COMPONENTS = {c.name: c for c in (ROSAFE, BASS)}
 
 
-def all_services() -> Iterator[tuple[Component, Service]]:
+def all_services() -> Iterator[tuple[ComponentSpec, Service]]:
     """Every (component, service) pair on the ROS graph."""
     for component in COMPONENTS.values():
         for service in component.on_graph:
@@ -66,10 +66,10 @@ __all__ = [
     "REQUIRED",
     "ROSAFE",
     "SAVE_SETUP",
-    "Component",
     "ComponentError",
+    "ComponentSpec",
     "Parameter",
-    "Port",
+    "PortSpec",
     "Representation",
     "Service",
     "all_services",

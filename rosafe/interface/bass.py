@@ -5,7 +5,7 @@ from __future__ import annotations
 from rosafe.declarations.parameter import Parameter
 
 from .genom import COMMON_SERVICES, GENOM_STATE, GENOM_STATE_PORT
-from .service import Component, Port, Service, Struct
+from .service import ComponentSpec, PortSpec, Service, Struct
 
 BINAUDIO: dict[str, Struct] = {
     "::binaudio::timestamp": (("sec", "unsigned long"), ("nsec", "unsigned long")),
@@ -20,7 +20,7 @@ BINAUDIO: dict[str, Struct] = {
     ),
 }
 
-BASS = Component(
+BASS = ComponentSpec(
     name="bass",
     doc="Binaural audio streaming server: captures sound and publishes a sliding window of it",
     services=(
@@ -80,7 +80,7 @@ BASS = Component(
         *COMMON_SERVICES,
     ),
     ports=(
-        Port("Audio", "::binaudio::portStruct", "The newest audio: a window that slides by one chunk"),
+        PortSpec("Audio", "::binaudio::portStruct", "The newest audio: a window that slides by one chunk"),
         GENOM_STATE_PORT,
     ),
     tasks=("capture", "socket"),

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from rosafe.declarations.idl import ros_type
 
-from .service import Component, Service, Struct
+from .service import ComponentSpec, Service, Struct
 
 FOLDERS = {"rosAFE": ".", "bass": "bass"}  # ROS package -> its folder in the checkout
 REPLY: Struct = (("genom_success", "boolean"), ("genom_exdetail", "string"))
@@ -30,7 +30,7 @@ def _of_service(service: Service) -> Iterator[tuple[str, str]]:
         yield f"action/{service.name}.action", _text(f"activity {service.name}", request, REPLY, ())
 
 
-def interface_files(component: Component) -> dict[str, str]:
+def interface_files(component: ComponentSpec) -> dict[str, str]:
     """The text of each interface file of a package, by its path there, such as ``srv/Stop.srv``."""
     files = {}
     for idl, fields in component.structs.items():
@@ -49,7 +49,7 @@ def _listed(cmake: str, paths: list[str]) -> str:
     return cmake
 
 
-def all_files(root: Path, components: tuple[Component, ...]) -> dict[Path, str | None]:
+def all_files(root: Path, components: tuple[ComponentSpec, ...]) -> dict[Path, str | None]:
     """Every file below the checkout `root` that comes from the table, and its text; None for one that must go."""
     found: dict[Path, str | None] = {}
     for component in components:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from rosafe.declarations.parameter import REQUIRED, Parameter
 
-from .service import Port, Service, Struct
+from .service import PortSpec, Service, Struct
 
 GENOM_EXCEPTIONS: dict[str, Struct] = {
     "incompatible_digest": (("client", "::genom::version"), ("server", "::genom::version")),
@@ -77,4 +77,4 @@ GENOM_STATE: dict[str, Struct] = {
         ("version", "string"),
     ),
 }
-GENOM_STATE_PORT = Port("genom_state", "::genom_state::component", "Tasks and live activities of the component")
+GENOM_STATE_PORT = PortSpec("genom_state", "::genom_state::component", "Tasks and live activities of the component")

@@ -9,7 +9,7 @@ from rosafe.declarations.idl import ros_type
 from rosafe.declarations.parameter import REQUIRED, Parameter
 from rosafe.declarations.representation import Representation
 
-from .service import Component, Port, Service
+from .service import ComponentSpec, PortSpec, Service
 
 HEAD = """# Requests, parameters and ports
 
@@ -30,7 +30,7 @@ Made from the interface table by `python3 -m rosafe.interface`.
 """
 
 
-def markdown(components: Iterable[Component], kinds: Mapping[str, Representation]) -> str:
+def markdown(components: Iterable[ComponentSpec], kinds: Mapping[str, Representation]) -> str:
     """The whole document."""
     lines = [HEAD]
     for component in components:
@@ -38,7 +38,7 @@ def markdown(components: Iterable[Component], kinds: Mapping[str, Representation
     return "\n".join(lines)
 
 
-def _component(component: Component, kinds: Mapping[str, Representation]) -> Iterator[str]:
+def _component(component: ComponentSpec, kinds: Mapping[str, Representation]) -> Iterator[str]:
     yield f"## {component.name}\n"
     yield f"{component.doc}.\n"
     for service in component.on_graph:
@@ -53,7 +53,7 @@ def _component(component: Component, kinds: Mapping[str, Representation]) -> Ite
     )
 
 
-def _service(component: Component, service: Service, kinds: Mapping[str, Representation]) -> Iterator[str]:
+def _service(component: ComponentSpec, service: Service, kinds: Mapping[str, Representation]) -> Iterator[str]:
     yield f"### {service.name}" + (" (activity)" if service.activity else "") + "\n"
     yield f"{service.doc}.\n"
     if service.parameters:
@@ -85,12 +85,12 @@ def _type(idl: str) -> str:
     return f"`{ros_type(idl)}`"
 
 
-def _topic(component: Component, port: Port) -> str:
+def _topic(component: ComponentSpec, port: PortSpec) -> str:
     name = f"/{component.name}/{port.name}" + ("/<name>" if port.multiple else "")
     return f"`{name}`" if port.output else f"`{port.name}` (input, see connect_port)"
 
 
-def _port_doc(port: Port) -> str:
+def _port_doc(port: PortSpec) -> str:
     return port.doc + ("; one topic per processor" if port.multiple else "")
 
 

@@ -14,7 +14,7 @@ from rosafe.representations.registry import CORE_KINDS
 
 from .bass import BINAUDIO
 from .genom import COMMON_SERVICES, GENOM_STATE, GENOM_STATE_PORT
-from .service import Component, Port, Service, Struct
+from .service import ComponentSpec, PortSpec, Service, Struct
 
 MAX_SECONDS = 600.0  # longest port or history
 MAX_BLOCK = 10_000_000  # frames
@@ -264,7 +264,7 @@ _FUNCTIONS = (
 # --- the component ----------------------------------------------------------------------------------------------
 
 
-def derive(kinds: Kinds) -> Component:
+def derive(kinds: Kinds) -> ComponentSpec:
     """The component whose processors are of these kinds."""
     adding = tuple(_creation_service(kind, kinds) for kind in kinds.values())
     composites = _whole_trees(kinds)
@@ -274,22 +274,24 @@ def derive(kinds: Kinds) -> Component:
         interrupts=tuple(service.name for service in adding),
     )
     ports = (
-        Port(kind.port, LAYOUTS[kind.kind].idl, kind.port_doc, multiple=bool(kind.parent), aliases=kind.port_aliases)
+        PortSpec(
+            kind.port, LAYOUTS[kind.kind].idl, kind.port_doc, multiple=bool(kind.parent), aliases=kind.port_aliases
+        )
         for kind in kinds.values()
     )
-    return Component(
+    return ComponentSpec(
         name="rosAFE",
         doc="The Two!Ears auditory front-end: a tree of processors that compute auditory representations",
         services=(*adding, *_FUNCTIONS, stop, *COMMON_SERVICES),
         ports=(
-            Port("Audio", "::binaudio::portStruct", "Binaural audio to work on", output=False),
+            PortSpec("Audio", "::binaudio::portStruct", "Binaural audio to work on", output=False),
             *ports,
-            Port(
+            PortSpec(
                 "frameTime",
                 "::rosAFE::frameTime",
                 "With each block, when its newest audio frame was captured, and how many frames a second come",
             ),
-            Port("dataObj", "::rosAFE::dataObjSt", "Advertised as in the original and, as there, never written"),
+            PortSpec("dataObj", "::rosAFE::dataObjSt", "Advertised as in the original and, as there, never written"),
             GENOM_STATE_PORT,
         ),
         tasks=("init", *(service.task for service in adding)),

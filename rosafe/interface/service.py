@@ -71,7 +71,7 @@ class Service:
 
 
 @dataclass(frozen=True)
-class Port:
+class PortSpec:
     """A data port: one topic, or one topic per element where `multiple`."""
 
     name: str
@@ -83,13 +83,13 @@ class Port:
 
 
 @dataclass(frozen=True)
-class Component:
+class ComponentSpec:
     """The interface of one component (ROS package)."""
 
     name: str
     doc: str
     services: tuple[Service, ...]
-    ports: tuple[Port, ...]
+    ports: tuple[PortSpec, ...]
     tasks: tuple[str, ...]
     exceptions: Mapping[str, str]  # short name -> meaning
     structs: Mapping[str, Struct]  # by IDL name
@@ -115,7 +115,7 @@ class Component:
                 return service
         raise KeyError(name)
 
-    def port(self, name: str) -> Port:
+    def port(self, name: str) -> PortSpec:
         """The port called `name` (aliases count), or KeyError."""
         for port in self.ports:
             if name == port.name or name in port.aliases:

@@ -11,7 +11,7 @@ from rosafe.bass.sources import device_lines
 from rosafe.client.component_client import ComponentClient, describe_parameter
 from rosafe.client.graph import Graph
 from rosafe.interface import BASS, KINDS, LOAD_SETUP, REQUEST, ROSAFE, SAVE_SETUP, ComponentError, Service
-from rosafe.live.plot_data import Processor, Tree
+from rosafe.live.plot_data import ProcessorInfo, TreeSnapshot
 from rosafe.tree import tree_planner
 
 LOOK_SECONDS = 3.0  # for the answer of a component that is well
@@ -40,7 +40,7 @@ class ComponentFacade:
         for proxy in (self._rosafe, self._bass):
             await proxy.close()
 
-    async def tree(self) -> Tree:
+    async def tree(self) -> TreeSnapshot:
         """The processors; ComponentError where rosAFE does not answer."""
         try:
             told = await asyncio.wait_for(self._rosafe.outputs("getProcessors", {}), LOOK_SECONDS)
@@ -48,7 +48,7 @@ class ComponentFacade:
             name = self._rosafe.instance
             raise ComponentError("::genom::mwerr", what=f"{name} does not answer") from None
         try:
-            return Tree([Processor.of(one) for one in told["processors"]])
+            return TreeSnapshot([ProcessorInfo.of(one) for one in told["processors"]])
         except ValueError as problem:
             raise ComponentError("::genom::mwerr", what=f"getProcessors: {problem}") from None
 

@@ -21,7 +21,7 @@ from rosafe.http_server.access import own_names
 from rosafe.live.access import TokenAuth
 from rosafe.live.components import ComponentFacade
 from rosafe.live.health import Health
-from rosafe.live.server import Server
+from rosafe.live.server import WebServer
 from rosafe.live.views import Hub
 
 THREADS = 8  # that wait for rospy
@@ -55,7 +55,7 @@ async def serve(options: Options) -> None:
     loop.set_default_executor(ThreadPoolExecutor(THREADS, "rospy"))
     graph = Graph(os.environ["ROS_MASTER_URI"], "rosafe_live", server=True)
     robot = ComponentFacade(graph, options.instance, options.bass)
-    server: Server | None = None
+    server: WebServer | None = None
     opened: Path | None = None
     publishing: asyncio.Task[None] | None = None
     try:
@@ -77,7 +77,7 @@ async def serve(options: Options) -> None:
             "save": robot.save_setup,
             "load": robot.load_setup,
         }
-        server = Server(robot, hub, Health(options.instance, options.bass), door, asks, options.watch)
+        server = WebServer(robot, hub, Health(options.instance, options.bass), door, asks, options.watch)
         news = server.news
         try:
             port = await server.start(options.host, options.port)
@@ -107,7 +107,7 @@ async def serve(options: Options) -> None:
         await graph.close()
 
 
-async def _publish_images(hub: Hub, server: Server) -> None:
+async def _publish_images(hub: Hub, server: WebServer) -> None:
     from rosafe.live import image_topics  # matplotlib's colours take a moment
 
     lookers = await asyncio.to_thread(image_topics.Images, hub)

@@ -21,7 +21,7 @@ MAX_SIZE = 2**20  # of an axis
 
 
 @dataclass(frozen=True)
-class Processor:
+class ProcessorInfo:
     """A processor as getProcessors tells of it, its parameters as texts."""
 
     name: str
@@ -33,7 +33,7 @@ class Processor:
     values: Mapping[str, str] = field(hash=False)
 
     @classmethod
-    def of(cls, told: Mapping[str, Any]) -> Processor:
+    def of(cls, told: Mapping[str, Any]) -> ProcessorInfo:
         """Return a processor from the struct of getProcessors; ValueError if its numbers make no sense."""
         if not 0 <= told["rate"] <= MAX_RATE:
             raise ValueError(f"{told['name']}: expected a frame rate up to {MAX_RATE} Hz, got {told['rate']}")
@@ -65,10 +65,10 @@ class Processor:
         return {place.field: (*size[1:], *size[:1]) for place, size in zip(places, sizes, strict=True)}
 
 
-class Tree:
+class TreeSnapshot:
     """The processors of a component, by name."""
 
-    def __init__(self, processors: Sequence[Processor] = ()) -> None:
+    def __init__(self, processors: Sequence[ProcessorInfo] = ()) -> None:
         self.processors = {processor.name: processor for processor in processors}
 
     @property
@@ -76,14 +76,14 @@ class Tree:
         """Of the audio, Hz; 0 without an input."""
         return next((p.rate for p in self.processors.values() if p.kind == "input"), 0.0)
 
-    def child(self, parent: str, kind: str) -> Processor | None:
+    def child(self, parent: str, kind: str) -> ProcessorInfo | None:
         """The first processor of `kind` that hangs on `parent`."""
         return next((p for p in self.processors.values() if p.parent == parent and p.kind == kind), None)
 
-    def coordinates(self, processor: Processor, axis: str, size: int) -> list[Any] | None:
+    def coordinates(self, processor: ProcessorInfo, axis: str, size: int) -> list[Any] | None:
         """What lies along an axis: Hz, s or words, as it or a processor above it declares; None where nobody does."""
         unit = {"channel": "Hz", "filter": "Hz", "lag": "s"}.get(axis, "")
-        one: Processor | None = processor
+        one: ProcessorInfo | None = processor
         while one is not None and one.kind in KINDS:
             kind = KINDS[one.kind]
             units = {p.name: p.unit for p in kind.parameters} | {d.name: d.unit for d in kind.derived}
@@ -129,7 +129,7 @@ class PlotLayout:
         Of a column: all rows of the left ear from below, then those of the right one.
     """
 
-    def __init__(self, tree: Tree, processor: Processor, part: int, row: int) -> None:
+    def __init__(self, tree: TreeSnapshot, processor: ProcessorInfo, part: int, row: int) -> None:
         kind = KINDS[processor.kind]
         if not 0 <= part < len(kind.parts):
             raise ValueError(f"{processor.name} has no part {part}")

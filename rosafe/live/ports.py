@@ -12,7 +12,7 @@ import rospy
 
 from rosafe.component import serialization
 from rosafe.interface import LAYOUTS
-from rosafe.live.plot_data import Processor
+from rosafe.live.plot_data import ProcessorInfo
 from rosafe.sound.windows import MAX_INDEX, MAX_WINDOW, new_frames, split_new_frames, window_error
 from rosafe.terminal import printable
 from rosafe.transport.log_throttle import ThrottledLog
@@ -84,7 +84,7 @@ class _Subscription:
         raise NotImplementedError
 
 
-class Port(_Subscription):
+class PortReader(_Subscription):
     """The topic of one processor, subscribed from the making of this until `close`.
 
     Parameters
@@ -111,10 +111,10 @@ class Port(_Subscription):
 
     def __init__(
         self,
-        processor: Processor,
+        processor: ProcessorInfo,
         rows: Mapping[str, tuple[int, ...]],
         sample_rate: float,
-        take: Callable[[Port, Any], None],
+        take: Callable[[PortReader, Any], None],
     ) -> None:
         self.rate, self.sample_rate = processor.rate, sample_rate
         self.newest = self.fresh = self.lost = 0

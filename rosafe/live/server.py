@@ -20,7 +20,7 @@ from rosafe.live.access import HEADERS, TokenAuth
 from rosafe.live.client import Ask, BrowserConnection
 from rosafe.live.components import ComponentFacade, catalogue, format_error
 from rosafe.live.health import Health
-from rosafe.live.plot_data import Tree
+from rosafe.live.plot_data import TreeSnapshot
 from rosafe.live.views import Hub, Key
 from rosafe.version import VERSION
 
@@ -60,7 +60,7 @@ class ViewSubscriber(Protocol):
         """The server ends."""
 
 
-class Server:
+class WebServer:
     """The live page of `robot`.
 
     Parameters
@@ -215,7 +215,7 @@ class Server:
         for client in self._clients:
             client.tell("status", status)
 
-    async def _update_tree(self, tree: Tree) -> None:
+    async def _update_tree(self, tree: TreeSnapshot) -> None:
         changed = await asyncio.to_thread(self._hub.on_tree_changed, tree)
         shown = [
             {"name": p.name, "kind": p.kind, "parent": p.parent, "topic": p.topic, "rate": p.rate, "values": p.values}

@@ -15,8 +15,8 @@ import numpy as np
 from rosafe.bass.recording.levels import LevelMeter
 from rosafe.client.errors import too_many
 from rosafe.interface import KINDS
-from rosafe.live.plot_data import COLUMNS, PlotLayout, Processor, Tree, quantize
-from rosafe.live.ports import Audio, Port
+from rosafe.live.plot_data import COLUMNS, PlotLayout, ProcessorInfo, TreeSnapshot, quantize
+from rosafe.live.ports import Audio, PortReader
 from rosafe.view.estimates import AZIMUTHS, lag_of_azimuth
 
 HISTORY_SECONDS = 12.0  # that a page gets at once
@@ -115,9 +115,9 @@ class View:
 class _SharedSubscription:
     """A port and the pictures that are made of it."""
 
-    def __init__(self, port: Port) -> None:
+    def __init__(self, port: PortReader) -> None:
         self.port = port
-        self.callbacks: dict[Key, Callable[[Port, Any], None]] = {}
+        self.callbacks: dict[Key, Callable[[PortReader, Any], None]] = {}
 
 
 class Hub:
@@ -132,7 +132,7 @@ class Hub:
     """
 
     def __init__(self, audio_topic: str, news: Callable[[], None]) -> None:
-        self.tree = Tree()
+        self.tree = TreeSnapshot()
         self.audio: Audio | None = None
         self.latencies: dict[str, float] = {}  # s, by topic: from the capture of the newest frame until it was here
         self.clipped_at = 0.0  # s of the audio
@@ -216,7 +216,7 @@ class Hub:
             self._views[key], self._told[key] = view, picture.describe()
             self._watch(key, processor, _PlotWriter(picture, view, self._news))
 
-    def _begin_direction(self, key: Key, processor: Processor) -> None:
+    def _begin_direction(self, key: Key, processor: ProcessorInfo) -> None:
         if processor.kind != "crossCorrelation":
             raise ValueError(f"{processor.name} tells no direction")
         itd, ic = (self.tree.child(processor.name, kind) for kind in ("itd", "ic"))
@@ -242,18 +242,18 @@ class Hub:
         if itd and ic:
             self._watch(key, ic, track.ic)
 
-    def _lags(self, processor: Processor) -> np.ndarray:
+    def _lags(self, processor: ProcessorInfo) -> np.ndarray:
         return np.array(self.tree.coordinates(processor, "lag", processor.shape[1]) or [0.0])
 
-    def _watch(self, key: Key, processor: Processor, take: Callable[[Port, Any], None]) -> None:
+    def _watch(self, key: Key, processor: ProcessorInfo, take: Callable[[PortReader, Any], None]) -> None:
         topic = processor.topic
         if topic not in self._watched:
-            port = Port(processor, processor.output_shape(), self.tree.sample_rate, self._dispatch)
+            port = PortReader(processor, processor.output_shape(), self.tree.sample_rate, self._dispatch)
             self._watched[topic] = _SharedSubscription(port)
         self._watched[topic].callbacks[key] = take
         self._needs.setdefault(key, []).append(topic)
 
-    def _dispatch(self, port: Port, message: Any) -> None:
+    def _dispatch(self, port: PortReader, message: Any) -> None:
         with self._lock:  # a port's first message may come while its first taker is still on the way
             watched, audio = self._watched.get(port.topic), self.audio
             if watched is None or watched.port is not port:
@@ -267,7 +267,7 @@ class Hub:
 
     # --- changes of the tree ---
 
-    def on_tree_changed(self, tree: Tree) -> set[Key]:
+    def on_tree_changed(self, tree: TreeSnapshot) -> set[Key]:
         """Go over to what the tree has become; the keys whose views are others now, or gone."""
         with self._lock:
             before, self.tree = self.tree, tree
@@ -279,7 +279,7 @@ class Hub:
                     self._let_go(key)
             return changed
 
-    def _affected_views(self, key: Key, tree: Tree) -> list[Any]:
+    def _affected_views(self, key: Key, tree: TreeSnapshot) -> list[Any]:
         """All that a view of `key` depends on."""
         one = tree.processors.get(key.name)
         told: list[Any] = [tree.sample_rate]
@@ -309,7 +309,7 @@ class _PlotWriter:
     def __init__(self, picture: PlotLayout, view: View, news: Callable[[], None]) -> None:
         self._picture, self._view, self._news = picture, view, news
 
-    def __call__(self, port: Port, message: Any) -> None:
+    def __call__(self, port: PortReader, message: Any) -> None:
         picture, view = self._picture, self._view
         arrays = [getattr(message, field) for field in picture.fields]
         frames = arrays[0].shape[-1]
@@ -357,15 +357,15 @@ class _DirectionTracker:
         self._lock = threading.Lock()
         self._waiting: dict[str, tuple[int, int, np.ndarray, float]] = {}
 
-    def itd(self, port: Port, message: Any) -> None:
+    def itd(self, port: PortReader, message: Any) -> None:
         """A message of itd."""
         self._together("itd", port, message)
 
-    def ic(self, port: Port, message: Any) -> None:
+    def ic(self, port: PortReader, message: Any) -> None:
         """A message of ic."""
         self._together("ic", port, message)
 
-    def _together(self, which: str, port: Port, message: Any) -> None:
+    def _together(self, which: str, port: PortReader, message: Any) -> None:
         """Take one of the two; what both tell of is used, also of blocks that came in another order."""
         with self._lock:
             self._waiting[which] = (port.index, port.newest, message.left, port.end)
@@ -385,12 +385,12 @@ class _DirectionTracker:
             lag = np.divide((weights * lags).sum(axis=0), total, out=np.full(total.shape, np.nan), where=heard)
             self._put(newest, lag, end)
 
-    def _missing(self, newest: int, port: Port) -> int:
+    def _missing(self, newest: int, port: PortReader) -> int:
         """How many frames up to the newest one the view does not have."""
         following = self._view.next if 0 < self._view.next <= newest else newest - port.fresh
         return newest - following
 
-    def peak(self, port: Port, message: Any) -> None:
+    def peak(self, port: PortReader, message: Any) -> None:
         """A message of the cross-correlation."""
         count = min(self._missing(port.newest, port), message.left.shape[-1])
         if count == 0:

@@ -31,7 +31,7 @@ _PIPE = 2**20  # bytes that wait between the processes
 Arrays = dict[str, tuple[np.ndarray, dict[str, Any]]]  # with the attributes of each
 
 
-class _Ended(Exception):
+class _ChildEnded(Exception):
     """The child process has ended before its output was complete."""
 
 
@@ -77,14 +77,14 @@ def _take(child: subprocess.Popen[bytes]) -> tuple[dict[str, Any], Arrays]:
     pipe = _Pipe(child)
     try:
         pipe.read(1, START)
-    except (_Ended, TimeoutError):
+    except (_ChildEnded, TimeoutError):
         raise OSError(errno.ENOEXEC, f"{_python()} cannot be started to read it: {pipe.end()}") from None
     try:
         head = json.loads(pipe.read(int.from_bytes(pipe.read(8), "little")))
         arrays = head["arrays"]
         refuse_over_available(sum(math.prod(one["shape"], start=8.0) for one in arrays), "its arrays")
         return head["attributes"], {one["name"]: (pipe.array(one), one["attributes"]) for one in arrays}
-    except _Ended:
+    except _ChildEnded:
         raise ValueError(pipe.end()) from None
     except TimeoutError:
         raise ValueError(f"nothing could be read for {STALL} s") from None
@@ -110,7 +110,7 @@ class _Pipe:
                 raise TimeoutError
             count = os.readv(self._descriptor, [buffer])
             if not count:
-                raise _Ended
+                raise _ChildEnded
             buffer = buffer[count:]
 
     def read(self, count: int, seconds: int | None = None) -> bytearray:

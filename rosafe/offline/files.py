@@ -18,7 +18,7 @@ from rosafe.offline.chain import Chain, needed
 from rosafe.offline.formats import Format, check_format, format_of, read
 from rosafe.offline.process import DEFAULT_BLOCK
 from rosafe.offline.result_metadata import Contents
-from rosafe.offline.sounds import Sound, open_sound
+from rosafe.offline.sounds import SoundReader, open_sound
 from rosafe.output import OutputError, new_folder, new_path
 from rosafe.representations import STAGES
 from rosafe.sound.audiofile import AudioFileError
@@ -169,7 +169,7 @@ def _as_loaded(value: Any) -> Any:
 
 
 def _stream(
-    sound: Sound,
+    sound: SoundReader,
     path: Path,
     form: Format,
     about: Mapping[str, Any],
@@ -214,7 +214,7 @@ def _contents(chain: Chain, about: dict[str, Any], wanted: Sequence[str], frames
     )
 
 
-def _blocks(sound: Sound, block_frames: int) -> Iterator[np.ndarray]:
+def _blocks(sound: SoundReader, block_frames: int) -> Iterator[np.ndarray]:
     for at in range(0, sound.frames, block_frames):
         wanted = min(block_frames, sound.frames - at)
         block = sound.read(wanted)

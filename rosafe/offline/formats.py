@@ -20,7 +20,7 @@ from rosafe.offline.containers import read_h5, read_mat73, read_zarr
 from rosafe.offline.in_memory_formats import CsvWriter, Mat5Writer, NpzWriter
 from rosafe.offline.mat5 import read_mat5
 from rosafe.offline.readers import read_csv, read_npz
-from rosafe.offline.result_metadata import Contents, Writer, checked, is_number, is_texts, sample_times
+from rosafe.offline.result_metadata import Contents, ResultWriter, checked, is_number, is_texts, sample_times
 from rosafe.offline.streaming_formats import H5Writer, Mat73Writer, ZarrWriter
 
 MAT5_MOST = 2**30  # bytes of a variable; MATLAB's version 5 ends at 2**31, and scipy needs an array twice
@@ -48,7 +48,7 @@ class Format:
     """
 
     extension: str
-    writer: Callable[[Contents], type[Writer]]
+    writer: Callable[[Contents], type[ResultWriter]]
     read: Callable[..., dict[str, Any]]
     begins: bytes = b""
     module: str = ""
@@ -65,7 +65,7 @@ class Format:
         return self.begins.startswith(begin) or (self.begins.startswith(b"MATLAB") and not any(begin))
 
 
-def _mat_writer(contents: Contents) -> type[Writer]:
+def _mat_writer(contents: Contents) -> type[ResultWriter]:
     largest = max((8 * math.prod(shape) for shape in contents.shapes.values()), default=0)
     if largest > MAT5_MOST:
         return Mat73Writer

@@ -52,7 +52,7 @@ class Contents:
         return {k: v if isinstance(v, (int, float)) or k in _TEXTS else json.dumps(v) for k, v in everything.items()}
 
 
-class Writer(Protocol):
+class ResultWriter(Protocol):
     """Takes the arrays as they come; different ones from different threads at the same time.
 
     Parameters

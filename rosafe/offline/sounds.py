@@ -25,7 +25,7 @@ SOUNDS = frozenset(
 )
 
 
-class Sound(Protocol):
+class SoundReader(Protocol):
     """Two ears, read from the beginning to the end."""
 
     path: Path
@@ -40,7 +40,7 @@ class Sound(Protocol):
         """Close the file."""
 
 
-def open_sound(path: str | Path, channels: tuple[int, int] | None = None, topic: str | None = None) -> Sound:
+def open_sound(path: str | Path, channels: tuple[int, int] | None = None, topic: str | None = None) -> SoundReader:
     """Open a sound file or a bag.
 
     Parameters

@@ -7,17 +7,17 @@ rosafe/client/setup_transaction.py does it on a running graph.
 from __future__ import annotations
 
 from .markup import SetupError
-from .plan import Plan, dry_run, plan
+from .plan import SetupPlan, dry_run, plan
 from .reading import read, read_parameters
-from .setup import Setup, SetupProcessor, Sound, wanted
+from .setup import AcquireSettings, Setup, SetupProcessor, wanted
 from .writing import write
 
 __all__ = [
-    "Plan",
+    "AcquireSettings",
     "Setup",
     "SetupError",
+    "SetupPlan",
     "SetupProcessor",
-    "Sound",
     "dry_run",
     "plan",
     "read",

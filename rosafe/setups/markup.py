@@ -31,13 +31,13 @@ class SetupError(ValueError):
         super().__init__(f"line {line}: {what}")
 
 
-class Node(NamedTuple):
+class YamlNode(NamedTuple):
     """A value and its line. One of `text`, `items` and `pairs` is there; none is where nothing stands."""
 
     line: int
     text: str | None = None
-    items: tuple[Node, ...] | None = None
-    pairs: tuple[tuple[Node, Node], ...] | None = None
+    items: tuple[YamlNode, ...] | None = None
+    pairs: tuple[tuple[YamlNode, YamlNode], ...] | None = None
 
     @property
     def empty(self) -> bool:
@@ -50,14 +50,14 @@ class Node(NamedTuple):
             raise SetupError(self.line, f"{what}: wanted is a word")
         return self.text
 
-    def members(self, what: str, known: tuple[str, ...] = ()) -> list[tuple[str, Node, Node]]:
+    def members(self, what: str, known: tuple[str, ...] = ()) -> list[tuple[str, YamlNode, YamlNode]]:
         """The names, keys and values of a map; SetupError where a name is there twice, or is none of those `known`.
 
         Nothing is an empty map.
         """
         if self.pairs is None and not self.empty:
             raise SetupError(self.line, f"{what}: wanted are lines with NAME: VALUE")
-        members: dict[str, tuple[str, Node, Node]] = {}
+        members: dict[str, tuple[str, YamlNode, YamlNode]] = {}
         for key, value in self.pairs or ():
             name = key.word(f"{what}: a name")
             if name in members:
@@ -70,7 +70,7 @@ class Node(NamedTuple):
         return list(members.values())
 
 
-def parse(text: str, most: int = MAX_VALUES) -> Node:
+def parse(text: str, most: int = MAX_VALUES) -> YamlNode:
     """Return the one document of `text`. Raises SetupError, also if it has more than `most` values."""
     _check_directives(text)
     try:
@@ -83,7 +83,7 @@ def parse(text: str, most: int = MAX_VALUES) -> Node:
         raise SetupError(1, f"not YAML: {str(problem).splitlines()[0]}") from None
     if len(documents) > 1:
         raise SetupError(documents[1].line, "a second document; wanted is one")
-    return documents[0] if documents else Node(1)
+    return documents[0] if documents else YamlNode(1)
 
 
 def _check_directives(text: str) -> None:
@@ -101,11 +101,11 @@ def _counted(events: Iterator[yaml.Event], most: int) -> Iterator[yaml.Event]:
         yield event
 
 
-def _build(events: Iterator[yaml.Event], event: yaml.Event, depth: int) -> Node:
+def _build(events: Iterator[yaml.Event], event: yaml.Event, depth: int) -> YamlNode:
     line = event.start_mark.line + 1
     if type(event) is yaml.ScalarEvent and event.anchor is event.tag is None:  # most are
         nothing = not event.style and event.value in ("", "~", "null")
-        return Node(line, None if nothing else event.value)
+        return YamlNode(line, None if nothing else event.value)
     if isinstance(event, yaml.AliasEvent) or event.anchor is not None:
         raise SetupError(line, "anchors and aliases (& and *) are not taken")
     if event.tag is not None:
@@ -113,11 +113,11 @@ def _build(events: Iterator[yaml.Event], event: yaml.Event, depth: int) -> Node:
     if depth == MAX_DEPTH:
         raise SetupError(line, "nested too deeply")
     if isinstance(event, yaml.SequenceStartEvent):
-        return Node(line, items=tuple(_until(events, yaml.SequenceEndEvent, depth)))
+        return YamlNode(line, items=tuple(_until(events, yaml.SequenceEndEvent, depth)))
     nodes = _until(events, yaml.MappingEndEvent, depth)
-    return Node(line, pairs=tuple(zip(nodes, nodes, strict=True)))
+    return YamlNode(line, pairs=tuple(zip(nodes, nodes, strict=True)))
 
 
-def _until(events: Iterator[yaml.Event], end: type[yaml.Event], depth: int) -> Iterator[Node]:
+def _until(events: Iterator[yaml.Event], end: type[yaml.Event], depth: int) -> Iterator[YamlNode]:
     while not isinstance(event := next(events), end):
         yield _build(events, event, depth + 1)

@@ -13,7 +13,7 @@ from rosafe.tree.tree_planner import ExistingProcessor, ServiceCall, creation_ca
 from .setup import Setup, SetupProcessor
 
 
-class Plan(NamedTuple):
+class SetupPlan(NamedTuple):
     """The names of the setup's processors in the tree (parents first), of those that are there, and what to do."""
 
     names: list[str]
@@ -21,7 +21,7 @@ class Plan(NamedTuple):
     steps: list[ServiceCall]
 
 
-def plan(setup: Setup, found: Sequence[ExistingProcessor]) -> Plan:
+def plan(setup: Setup, found: Sequence[ExistingProcessor]) -> SetupPlan:
     """What to do for `setup` in a tree that consists of `found`.
 
     A processor of the same name that is the same, to the last digit, is used. There is but one input, and it is used
@@ -48,7 +48,7 @@ def plan(setup: Setup, found: Sequence[ExistingProcessor]) -> Plan:
             _compare(wanted, parent, same, sample_rate)
             names[wanted.name] = same.name
             reused.append(same.name)
-    return Plan(list(names.values()), reused, steps)
+    return SetupPlan(list(names.values()), reused, steps)
 
 
 def _compare(wanted: SetupProcessor, parent: str, there: ExistingProcessor, sample_rate: float) -> None:

@@ -11,8 +11,8 @@ from rosafe.declarations.text import did_you_mean
 from rosafe.interface import KINDS, MAX_SETUP, REQUEST, Parameter, Representation
 from rosafe.tree.tree_planner import kind_of
 
-from .markup import Node, SetupError, parse
-from .setup import ACQUIRE, INPUT_PORTS, Setup, SetupProcessor, Sound, parameters_of
+from .markup import SetupError, YamlNode, parse
+from .setup import ACQUIRE, INPUT_PORTS, AcquireSettings, Setup, SetupProcessor, parameters_of
 
 MAX_PROCESSORS = 10_000  # more than a node takes
 MAX_PARAMETER_VALUES = 2**15  # of a request, all of whose parameters are read while sound is processed
@@ -22,7 +22,7 @@ _OF_TREES = tuple(p for p in REQUEST.parameters if p.name not in ("representatio
 _BOOLEANS = {**dict.fromkeys(("true", "yes", "on"), True), **dict.fromkeys(("false", "no", "off"), False)}
 
 
-class _Entry(NamedTuple):
+class _ProcessorEntry(NamedTuple):
     """A processor, with the line of its name and that of its parent's."""
 
     line: int
@@ -45,10 +45,10 @@ def read(text: str, absent: list[str] | None = None) -> Setup:
         raise SetupError(1, f"{len(text)} characters are too many for a setup, at most {MAX_SETUP}")
     document = parse(text)
     sections = {name: node for name, _, node in document.members("a setup", ("sound", "connections", "processors"))}
-    nothing = Node(document.line)
+    nothing = YamlNode(document.line)
     sound = sections.get("sound", nothing)
     return Setup(
-        None if sound.empty else Sound.of(_values(sound, ACQUIRE, "sound")),
+        None if sound.empty else AcquireSettings.of(_values(sound, ACQUIRE, "sound")),
         dict(_connections(sections.get("connections", nothing))),
         _ordered(_processors(sections.get("processors", nothing), absent)),
     )
@@ -70,7 +70,7 @@ def read_parameters(text: str) -> dict[str, Any]:
     return _values(parse(text, MAX_PARAMETER_VALUES), _OF_TREES, "parameters")
 
 
-def _connections(node: Node) -> Iterator[tuple[str, str]]:
+def _connections(node: YamlNode) -> Iterator[tuple[str, str]]:
     for port, _, value in node.members("connections", INPUT_PORTS):
         topic = value.word(f"connections: {port}")
         if len(topic) > MAX_STRING or not _TOPIC.fullmatch(topic):
@@ -81,7 +81,7 @@ def _connections(node: Node) -> Iterator[tuple[str, str]]:
 # --- parameters -------------------------------------------------------------------------------------------------
 
 
-def _values(node: Node, parameters: tuple[Parameter, ...], what: str, but: tuple[str, ...] = ()) -> dict[str, Any]:
+def _values(node: YamlNode, parameters: tuple[Parameter, ...], what: str, but: tuple[str, ...] = ()) -> dict[str, Any]:
     """The checked values of a map of parameters, without those members that are none of them, `but` others."""
     values: dict[str, Any] = {}
     for name, key, value in node.members(what):
@@ -101,7 +101,7 @@ def _values(node: Node, parameters: tuple[Parameter, ...], what: str, but: tuple
     return values
 
 
-def _value(parameter: Parameter, node: Node) -> Any:
+def _value(parameter: Parameter, node: YamlNode) -> Any:
     sequence = parameter.idl.startswith("sequence<")
     if node.text is not None:
         return parameter.check(_parsed(parameter, node.text))
@@ -128,7 +128,7 @@ def _parsed(parameter: Parameter, text: str) -> Any:
 # --- processors -------------------------------------------------------------------------------------------------
 
 
-def _processors(node: Node, absent: list[str] | None) -> dict[str, _Entry]:
+def _processors(node: YamlNode, absent: list[str] | None) -> dict[str, _ProcessorEntry]:
     members = node.members("processors")
     if len(members) > MAX_PROCESSORS:
         raise SetupError(members[MAX_PROCESSORS][1].line, f"more than {MAX_PROCESSORS} processors")
@@ -139,7 +139,7 @@ def _processors(node: Node, absent: list[str] | None) -> dict[str, _Entry]:
     return {name: _processor(name, key, value) for name, key, value in members}
 
 
-def _of_unknown_kinds(members: Sequence[tuple[str, Node, Node]]) -> dict[str, str]:
+def _of_unknown_kinds(members: Sequence[tuple[str, YamlNode, YamlNode]]) -> dict[str, str]:
     """A line for each processor of an unknown kind, and for each one below it, by name."""
     without: dict[str, str] = {}
     parents: dict[str, str] = {}
@@ -157,7 +157,7 @@ def _of_unknown_kinds(members: Sequence[tuple[str, Node, Node]]) -> dict[str, st
     return without
 
 
-def _processor(name: str, key: Node, node: Node) -> _Entry:
+def _processor(name: str, key: YamlNode, node: YamlNode) -> _ProcessorEntry:
     what = short_repr(name)
     members = {member: value for member, _, value in node.members(what)}
     if "kind" not in members:
@@ -177,10 +177,10 @@ def _processor(name: str, key: Node, node: Node) -> _Entry:
         _ = wanted.level
     except ValueError as problem:
         raise SetupError(key.line, f"{what}: {problem}") from None
-    return _Entry(key.line, parent_line, wanted)
+    return _ProcessorEntry(key.line, parent_line, wanted)
 
 
-def _kind(node: Node, what: str) -> Representation:
+def _kind(node: YamlNode, what: str) -> Representation:
     word = node.word(f"{what}: kind")
     try:
         return kind_of(word)
@@ -197,7 +197,7 @@ def _check_name(name: str, line: int, kind: Representation) -> None:
         raise SetupError(line, f"{short_repr(name)} names a topic too: letters, digits and _ only")
 
 
-def _ordered(entries: Mapping[str, _Entry]) -> tuple[SetupProcessor, ...]:
+def _ordered(entries: Mapping[str, _ProcessorEntry]) -> tuple[SetupProcessor, ...]:
     """The processors, each after its parent and else in the order of the setup; SetupError where they are no tree."""
     inputs = [entry for entry in entries.values() if not entry.wanted.parent]
     if len(inputs) > 1:
@@ -216,7 +216,7 @@ def _ordered(entries: Mapping[str, _Entry]) -> tuple[SetupProcessor, ...]:
     return tuple(ordered.values())
 
 
-def _check_parent(entry: _Entry, entries: Mapping[str, _Entry]) -> None:
+def _check_parent(entry: _ProcessorEntry, entries: Mapping[str, _ProcessorEntry]) -> None:
     wanted = entry.wanted
     if not wanted.parent:
         return

@@ -18,13 +18,13 @@ MAX_NAME_ATTEMPTS = 1000  # ways to say what a processor was made with
 
 
 @dataclass(frozen=True)
-class Sound:
+class AcquireSettings:
     """What bass is to acquire: those arguments of its Acquire, by name, that are not at their defaults."""
 
     given: Mapping[str, Any]
 
     @classmethod
-    def of(cls, values: Mapping[str, Any]) -> Sound:
+    def of(cls, values: Mapping[str, Any]) -> AcquireSettings:
         """The sound with these (checked) arguments."""
         return cls({p.name: values[p.name] for p in ACQUIRE if values.get(p.name, p.default) != p.default})
 
@@ -93,7 +93,7 @@ class SetupProcessor:
 class Setup:
     """A tree of processors with its sound. `processors` are ordered: parents first."""
 
-    sound: Sound | None = None
+    sound: AcquireSettings | None = None
     connections: Mapping[str, str] = field(default_factory=dict)  # input port -> topic
     processors: tuple[SetupProcessor, ...] = ()
 

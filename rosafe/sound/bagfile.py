@@ -39,7 +39,7 @@ class NotClosedError(BagError):
     """The bag has no index, since its recorder did not close it, or its end is missing."""
 
 
-class Connection(NamedTuple):
+class BagConnection(NamedTuple):
     """One publisher of a topic."""
 
     topic: str
@@ -47,7 +47,7 @@ class Connection(NamedTuple):
     md5sum: str
 
 
-class BagFile:
+class BagReader:
     """A bag, open for reading.
 
     Parameters
@@ -104,7 +104,7 @@ class BagFile:
         if "encryptor" in header:
             raise BagError("is encrypted")
 
-    def _read_connections(self) -> dict[int, Connection]:
+    def _read_connections(self) -> dict[int, BagConnection]:
         if self._count > MAX_CONNECTIONS:
             raise BagError(f"is not a whole bag: {self._count} connections, at most {MAX_CONNECTIONS} go")
         records = _FileSlice(self._descriptor, self._index, self._size)
@@ -114,7 +114,7 @@ class BagFile:
                 header = _read_header(records, _CONNECTION)
                 data = _fields(_read(records, MAX_HEADER))
                 texts = (_text(header, "topic"), _text(data, "type"), _text(data, "md5sum"))
-                found[_number(header, "conn", 4)] = Connection(*texts)
+                found[_number(header, "conn", 4)] = BagConnection(*texts)
         except BagError as problem:
             raise NotClosedError(str(problem)) from None
         return found

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rosafe.sound.bagfile import BagError, BagFile, NotClosedError
+from rosafe.sound.bagfile import BagError, BagReader, NotClosedError
 from rosafe.sound.windows import MAX_WINDOW, WindowStream, window_error
 
 TYPE = "binaudio_portStruct"  # of the port Audio, in the package bass or another
@@ -86,7 +86,7 @@ class Recording:
     ) -> None:
         self._path = Path(os.path.expanduser(path))
         try:
-            self._bag = BagFile(self._path, MAX_MESSAGE, stopping)
+            self._bag = BagReader(self._path, MAX_MESSAGE, stopping)
         except (OSError, ValueError) as problem:  # ValueError: a path that no file can have
             raise BagSoundError(f"{path}: {getattr(problem, 'strerror', None) or problem}") from None
         except NotClosedError:

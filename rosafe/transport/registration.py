@@ -31,7 +31,7 @@ from rospy.impl.registration import (
 
 from rosafe.transport import master, paths, server_limits
 from rosafe.transport.connector import Connector
-from rosafe.transport.succession import Handler, Succession
+from rosafe.transport.succession import NodeApiHandler, Succession
 
 CHECK_SECONDS = 1.0  # between two looks whether the master still knows this node; between two tries without one
 SETTLE_SECONDS = 1.0  # that a request waits for the master to know what it has changed
@@ -41,7 +41,7 @@ _NOUNS = {Registration.PUB: "Publisher", Registration.SUB: "Subscriber", Registr
 
 
 @dataclass(frozen=True, eq=False)
-class _Entry:
+class _Registration:
     """One thing that was offered once: made again under the same name, it is another one."""
 
     kind: str
@@ -69,8 +69,8 @@ class Registrar(RegistrationListener):
         self._master: Any = master.proxy(manager.master_uri)
         self._pid: int | None = None  # of the master; None before it was asked
         self._turn = threading.Condition()
-        self._offered: dict[tuple[str, str], _Entry] = {}
-        self._last_reported: dict[tuple[str, str], _Entry] = {}  # what the master may know; of this thread alone
+        self._offered: dict[tuple[str, str], _Registration] = {}
+        self._last_reported: dict[tuple[str, str], _Registration] = {}  # what the master may know; of this thread alone
         self._settled = 0  # the master knows as much as after so many changes
         self._master_lost = False  # it did not answer the last time
         self._again = 1  # rounds in which all is told: a call that came to no end may have an effect later
@@ -81,7 +81,7 @@ class Registrar(RegistrationListener):
 
     def reg_added(self, resolved_name: str, data_type_or_uri: str, reg_type: str) -> None:
         with self._turn:
-            self._offered[reg_type, resolved_name] = _Entry(reg_type, resolved_name, data_type_or_uri)
+            self._offered[reg_type, resolved_name] = _Registration(reg_type, resolved_name, data_type_or_uri)
             self._changed()
 
     def reg_removed(self, resolved_name: str, data_type_or_uri: str, reg_type: str) -> None:
@@ -104,7 +104,7 @@ class Registrar(RegistrationListener):
             (Registration.SRV, services.get_services()),
         ):
             for name, data in there:
-                self._offered[kind, name] = self._last_reported[kind, name] = _Entry(kind, name, data)
+                self._offered[kind, name] = self._last_reported[kind, name] = _Registration(kind, name, data)
         self._thread.start()
 
     def settle(self, seconds: float = SETTLE_SECONDS) -> bool:
@@ -157,7 +157,7 @@ class Registrar(RegistrationListener):
             else:
                 self._found(changes)
 
-    def _tell(self, offered: dict[tuple[str, str], _Entry]) -> None:
+    def _tell(self, offered: dict[tuple[str, str], _Registration]) -> None:
         """Make the master know exactly `offered` of this node."""
         renewed = not self._is_known()
         if renewed:
@@ -194,7 +194,7 @@ class Registrar(RegistrationListener):
             return []
         return value
 
-    def _provider(self, entry: _Entry) -> str:
+    def _provider(self, entry: _Registration) -> str:
         """The address under which `entry` is registered."""
         return entry.data if entry.kind == Registration.SRV else str(self.manager.uri)
 
@@ -253,7 +253,7 @@ def init_node(name: str, argv: list[str], anonymous: bool = False, unless_taken:
     """
     global _registrar
     server_limits.install()
-    rospy.impl.init.ROSHandler = Handler
+    rospy.impl.init.ROSHandler = NodeApiHandler
     uri = master.uri()
     # All that rospy itself asks of the master, such as parameters, goes through this proxy.
     rospy.core._xmlrpc_cache[uri] = rospy.core._LockedServerProxy(uri, transport=master.Transport())

@@ -76,7 +76,7 @@ class Succession:
         return owner not in (address, self._predecessor) and not self.ignores(address)
 
 
-class Handler(ROSHandler):
+class NodeApiHandler(ROSHandler):
     """The XML-RPC methods of this node, with the rule of this module."""
 
     def __init__(self, name: str, master_uri: str) -> None:

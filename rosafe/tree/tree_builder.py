@@ -12,7 +12,7 @@ from typing import Any, Protocol, TypeVar
 from rosafe.interface import BLOCK_AND_BUFFERS, KINDS, REQUEST, ROSAFE, ComponentError
 from rosafe.representations import BUILTIN
 from rosafe.tree import tree_planner as request
-from rosafe.tree.tree_planner import ExistingProcessor, Plan, ServiceCall, TreeRequest
+from rosafe.tree.tree_planner import ExistingProcessor, ServiceCall, TreePlan, TreeRequest
 
 MAX_ATTEMPTS = 20  # plans that others' changes of the tree may spoil before the error is told
 INPUT_SECONDS = 1.5  # longer than an InputProc waits for sound
@@ -178,7 +178,7 @@ async def wait_for_input(component: Services) -> None:
         await asyncio.sleep(POLL_SECONDS)
 
 
-async def _take_steps(component: Services, wish: TreeRequest, plan: Plan, made: list[str]) -> None:
+async def _take_steps(component: Services, wish: TreeRequest, plan: TreePlan, made: list[str]) -> None:
     if plan.steps and plan.steps[0].makes == plan.dependencies[0]:
         await _connect(component, wish)
     for step in plan.steps:

@@ -44,7 +44,7 @@ class ServiceCall(NamedTuple):
     makes: str = ""
 
 
-class Plan(NamedTuple):
+class TreePlan(NamedTuple):
     """The names from the input down to the wanted processor, and what to do for those that are not there."""
 
     dependencies: list[str]
@@ -165,7 +165,7 @@ def _level(kind: Representation, checked: Mapping[str, Any]) -> ProcessorSpec:
 # --- what to do -------------------------------------------------------------------------------------------------
 
 
-def plan(wish: TreeRequest, found: Sequence[ExistingProcessor], reserved: Collection[str] = ()) -> Plan:
+def plan(wish: TreeRequest, found: Sequence[ExistingProcessor], reserved: Collection[str] = ()) -> TreePlan:
     """What to do for `wish` in a tree that consists of `found`; new processors get none of the names `reserved`.
 
     What is there and fits is used, as far down as possible; the rest is made below it, under new names.
@@ -186,7 +186,7 @@ def plan(wish: TreeRequest, found: Sequence[ExistingProcessor], reserved: Collec
         names.add(name)
         steps += creation_call(level, name, dependencies[-1] if dependencies else "", wish.input_values)
         dependencies.append(name)
-    return Plan(dependencies, steps)
+    return TreePlan(dependencies, steps)
 
 
 def _check_input(root: ExistingProcessor, level: ProcessorSpec) -> None:

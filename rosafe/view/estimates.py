@@ -16,7 +16,7 @@ from rosafe.view.representations import Representations
 AZIMUTHS = np.arange(-90.0, 90.5, 1.0)  # degrees; what the estimates choose from
 SMOOTHING = 0.1  # s; both estimates look at so much sound at a time
 RANGE_DB = 35.0  # frames this far below the loudest hold no source
-FLOOR = 1e-14  # power per channel below which level differences are biased by 0.1 dB (rosafe/representations/ild.py, EPSILON)
+FLOOR = 1e-14  # power per channel below which level differences are biased by 0.1 dB; see EPSILON in ild.py
 
 
 def sphere_ild(center_frequencies: np.ndarray, azimuths: np.ndarray = AZIMUTHS) -> np.ndarray:

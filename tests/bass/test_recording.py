@@ -16,7 +16,7 @@ import soundfile
 
 from rosafe.bass.recording import outputs
 from rosafe.bass.recording.levels import LevelMeter
-from rosafe.bass.recording.outputs import BagFile, WavFile
+from rosafe.bass.recording.outputs import BagWriter, WavFile
 from rosafe.bass.recording.recorder import SoundRecorder
 from rosafe.bass.sources import base, open_source
 from rosafe.bass.sources.base import Chunk
@@ -143,7 +143,7 @@ def test_bag_holds_every_frame_under_its_number_and_time(tmp_path: Path, no_paus
     import rosbag
 
     samples = bags.stream(500)
-    file = BagFile(empty(tmp_path / "a.bag"), RATE, 10, "/left/Audio", newest=700)
+    file = BagWriter(empty(tmp_path / "a.bag"), RATE, 10, "/left/Audio", newest=700)
     file.write(samples[:, :35], 5_000_000_000)
     file.lose(15)
     file.write(samples[:, 50:], 6_000_000_000)  # more than a window
@@ -162,7 +162,7 @@ def test_bag_holds_every_frame_under_its_number_and_time(tmp_path: Path, no_paus
 
 def test_bag_of_less_than_a_window(tmp_path: Path, no_pauses: None) -> None:
     samples = bags.stream(25)
-    file = BagFile(empty(tmp_path / "a.bag"), RATE, 10, "/bass/Audio", newest=5)
+    file = BagWriter(empty(tmp_path / "a.bag"), RATE, 10, "/bass/Audio", newest=5)
     file.write(samples, 10**9)
     file.close()
     assert np.array_equal(play(tmp_path / "a.bag")[0][:, :25], samples)
@@ -172,7 +172,7 @@ def test_bag_stops_while_there_is_room_for_its_index(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, no_pauses: None
 ) -> None:
     samples = bags.stream(200)
-    file = BagFile(empty(tmp_path / "a.bag"), RATE, 10, "/bass/Audio")
+    file = BagWriter(empty(tmp_path / "a.bag"), RATE, 10, "/bass/Audio")
     file.write(samples[:, :100], 10**9)
     monkeypatch.setattr(outputs, "BAG_RESERVE", 2**62)
     with pytest.raises(OSError, match="the disk is full"):

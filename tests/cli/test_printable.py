@@ -11,7 +11,7 @@ import pytest
 from rosafe.commands.__main__ import main
 from rosafe.node.tree_state_file import TreeStateFile
 from rosafe.setups import Setup
-from rosafe.setups.setup import Sound
+from rosafe.setups.setup import AcquireSettings
 from rosafe.terminal import printable
 from tests.cli.command import SMALL, noise, rosafe, write
 from tests.harness import PYTHON, SCRIPTS, Graph
@@ -144,7 +144,9 @@ def test_what_a_node_logs(graph: Graph) -> None:
 
 def test_what_the_keeper_of_a_tree_reports(tmp_path: Path) -> None:
     reports: list[str] = []
-    keeper = TreeStateFile(tmp_path / EVIL / "tree.yaml", lambda: Setup(Sound({"device": "scene:"})), reports.append)
+    keeper = TreeStateFile(
+        tmp_path / EVIL / "tree.yaml", lambda: Setup(AcquireSettings({"device": "scene:"})), reports.append
+    )
     keeper.save()
     assert SHOWN in keeper.problem and keeper.problem.isprintable()
     assert reports == [f"the tree is not kept: {keeper.problem}"]

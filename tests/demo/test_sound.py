@@ -9,7 +9,7 @@ import pytest
 import soundfile
 
 from rosafe.demo import session
-from rosafe.demo.sound import Sound, choose
+from rosafe.demo.sound import DemoSound, choose
 from rosafe.interface import ComponentError
 from rosafe.sound.audiofile import AudioFileError
 
@@ -99,7 +99,7 @@ def test_commands_can_be_copied_into_a_shell() -> None:
         "hw:1,0",
         "file:/ü/{x}, y: z",
     ):
-        sound = Sound(device, 0, 44100, "x")
+        sound = DemoSound(device, 0, 44100, "x")
         for service, arguments in session.requests(sound):
             command = session.command_line(service, arguments)
             assert shlex.split(session.shown(command)) == command

@@ -196,7 +196,7 @@ def test_topics_that_are_no_messages_are_no_ports(tmp_path: Path, monkeypatch: p
     topics = {f"/left/{number}": kind for number, kind in enumerate(kinds)}
     assert installed_components.with_ports(arm, "left", topics | {"/left/a": "arm/arm_point"}).ports == (
         *arm.ports,
-        interface.Port("a", "::arm::arm_point", ""),
+        interface.PortSpec("a", "::arm::arm_point", ""),
     )
 
 

@@ -10,7 +10,7 @@ import pytest
 import rosafe
 from rosafe import interface
 from rosafe.declarations.idl import SCALARS
-from rosafe.interface import BASS, ROSAFE, Component, Service
+from rosafe.interface import BASS, ROSAFE, ComponentSpec, Service
 from tests import harness
 
 FOLDERS = {"rosAFE": harness.ROOT, "bass": harness.ROOT / "bass"}
@@ -32,19 +32,19 @@ def parts(path: Path) -> list[list[tuple[str, str]]]:
     return found
 
 
-def names(component: Component, kind: str) -> set[str]:
+def names(component: ComponentSpec, kind: str) -> set[str]:
     return {path.stem for path in (FOLDERS[component.name] / kind).glob(f"*.{kind}")}
 
 
 @SERVICES
-def test_srv(component: Component, service: Service) -> None:
+def test_srv(component: ComponentSpec, service: Service) -> None:
     request = [(p.ros, p.name) for p in service.parameters]
     outputs = [(interface.ros_type(idl), name) for name, idl in service.outputs]
     assert parts(FOLDERS[component.name] / "srv" / f"{service.name}.srv") == [request, REPLY + outputs]
 
 
 @SERVICES
-def test_action(component: Component, service: Service) -> None:
+def test_action(component: ComponentSpec, service: Service) -> None:
     path = FOLDERS[component.name] / "action" / f"{service.name}.action"
     assert path.exists() == service.activity
     if service.activity:
@@ -52,28 +52,28 @@ def test_action(component: Component, service: Service) -> None:
 
 
 @COMPONENTS
-def test_msg(component: Component) -> None:
+def test_msg(component: ComponentSpec) -> None:
     for idl, fields in component.structs.items():
         path = FOLDERS[component.name] / "msg" / f"{interface.ros_type(idl)}.msg"
         assert parts(path) == [[(interface.ros_type(kind), name) for name, kind in fields]], idl
 
 
 @COMPONENTS
-def test_no_file_is_without_an_entry(component: Component) -> None:
+def test_no_file_is_without_an_entry(component: ComponentSpec) -> None:
     assert names(component, "msg") == {interface.ros_type(idl) for idl in component.structs}
     assert names(component, "srv") == {s.name for s in component.on_graph}
     assert names(component, "action") == {s.name for s in component.activities}
 
 
 @COMPONENTS
-def test_cmake_lists_every_file(component: Component) -> None:
+def test_cmake_lists_every_file(component: ComponentSpec) -> None:
     text = (FOLDERS[component.name] / "CMakeLists.txt").read_text("utf-8").split()
     for kind in ("msg", "srv", "action"):
         assert {word.removesuffix(f".{kind}") for word in text if word.endswith(f".{kind}")} == names(component, kind)
 
 
 @COMPONENTS
-def test_ports_and_outputs_have_types(component: Component) -> None:
+def test_ports_and_outputs_have_types(component: ComponentSpec) -> None:
     used = [p.idl for p in component.ports] + [idl for s in component.on_graph for _, idl in s.outputs]
     for idl in used:
         base = idl.removeprefix("sequence<").removesuffix(">")
@@ -114,7 +114,7 @@ DEFAULTS = {
 
 
 @pytest.mark.parametrize(("component", "service"), list(interface.all_services()), ids=lambda x: x.name)
-def test_defaults(component: Component, service: Service) -> None:
+def test_defaults(component: ComponentSpec, service: Service) -> None:
     if service.name in LATER:
         kind = LATER[service.name]
         parent = interface.KINDS[kind.parent]
@@ -128,7 +128,7 @@ def test_defaults(component: Component, service: Service) -> None:
 
 
 @SERVICES
-def test_defaults_pass_their_own_check(component: Component, service: Service) -> None:
+def test_defaults_pass_their_own_check(component: ComponentSpec, service: Service) -> None:
     for parameter in service.parameters:
         if parameter.default is not interface.REQUIRED:
             parameter.check(parameter.default)
@@ -165,7 +165,7 @@ def test_exceptions() -> None:
 
 
 @COMPONENTS
-def test_version_is_that_of_the_package(component: Component) -> None:
+def test_version_is_that_of_the_package(component: ComponentSpec) -> None:
     manifest = ElementTree.parse(FOLDERS[component.name] / "package.xml")
     assert manifest.findtext("version") == rosafe.__version__
     assert manifest.findtext("name") == component.name

@@ -9,21 +9,21 @@ import pytest
 
 from rosafe.interface import KINDS, format_value
 from rosafe.live.client import BrowserConnection, _keys
-from rosafe.live.plot_data import PlotLayout, Processor, Tree, quantize
+from rosafe.live.plot_data import PlotLayout, ProcessorInfo, TreeSnapshot, quantize
 from rosafe.live.views import FLOAT, PIECE, QUANTISED, Key, View
 
 FREQUENCIES = [100.0, 200.0, 400.0]
 RNG = np.random.default_rng(3)
 
 
-def processor(kind: str, rate: float, shape: tuple[int, ...], **values: str) -> Processor:
+def processor(kind: str, rate: float, shape: tuple[int, ...], **values: str) -> ProcessorInfo:
     parent = KINDS[kind].parent
-    return Processor(kind, kind, parent, f"/rosAFE/{kind}", rate, shape, values)
+    return ProcessorInfo(kind, kind, parent, f"/rosAFE/{kind}", rate, shape, values)
 
 
-def tree(*processors: Processor) -> Tree:
+def tree(*processors: ProcessorInfo) -> TreeSnapshot:
     filterbank = processor("gammatone", 44100, (2, 3), fb_cfHz=format_value(FREQUENCIES))
-    return Tree([filterbank, processor("ihc", 44100, (2, 3)), *processors])
+    return TreeSnapshot([filterbank, processor("ihc", 44100, (2, 3)), *processors])
 
 
 def test_a_cochleagram_is_in_decibels() -> None:
@@ -45,7 +45,7 @@ def test_a_magnitude_has_twice_the_decibels() -> None:
 
 def test_a_signal_is_an_envelope() -> None:
     one = processor("input", 44100, (2,))
-    picture = PlotLayout(Tree([one]), one, 0, -1)
+    picture = PlotLayout(TreeSnapshot([one]), one, 0, -1)
     assert (picture.group, picture.rate) == (441, 100)
     sound = RNG.normal(size=(2, 4410))
     columns = picture.columns(list(sound))
@@ -57,7 +57,7 @@ def test_a_signal_is_an_envelope() -> None:
 def test_levels_of_a_filterbank_are_those_of_the_mean_power() -> None:
     one = processor("gammatone", 44100, (2, 3), fb_cfHz=format_value(FREQUENCIES))
     signal = RNG.normal(size=(3, 882))
-    columns = PlotLayout(Tree([one]), one, 0, -1).columns([signal, signal])
+    columns = PlotLayout(TreeSnapshot([one]), one, 0, -1).columns([signal, signal])
     power = (signal.reshape(3, 2, 441) ** 2).mean(axis=2)
     assert np.allclose(columns[:3], 10 * np.log10(power), atol=1e-4)
 
@@ -75,7 +75,7 @@ def test_correlations_of_one_channel_or_of_all(row: int) -> None:
 
 def test_pitch_is_a_line_that_may_have_gaps() -> None:
     one = processor("pitch", 100, (2, 3))
-    picture = PlotLayout(Tree([one]), one, 0, 2)
+    picture = PlotLayout(TreeSnapshot([one]), one, 0, 2)
     values = np.array([[1.0, np.nan], [3, 4], [5, 6]])
     assert picture.describe()["choices"] == ["pitch", "rawPitch", "confidence"]
     assert np.array_equal(picture.columns([values, values + 1]), [[5, 6], [6, 7]])
@@ -83,7 +83,7 @@ def test_pitch_is_a_line_that_may_have_gaps() -> None:
 
 def test_many_rows_are_drawn_together() -> None:
     one = processor("gabor", 100, (2, 300))
-    picture = PlotLayout(Tree([one]), one, 0, -1)
+    picture = PlotLayout(TreeSnapshot([one]), one, 0, -1)
     values = RNG.random((300, 2))
     assert picture.rows == 100
     assert np.allclose(picture.columns([values, values])[:100], values.reshape(100, 3, 2).mean(axis=1), atol=1e-6)
@@ -95,7 +95,7 @@ def test_each_kind_has_a_picture() -> None:
         largest = max(representation.parts, key=lambda part: len(part.axes))
         one = processor(kind, 100, tuple(sizes[axis] for axis in largest.axes if axis != "time"))
         for index, part in enumerate(representation.parts):
-            picture = PlotLayout(Tree([one]), one, index, -1)
+            picture = PlotLayout(TreeSnapshot([one]), one, index, -1)
             rows = [sizes[axis] for axis in part.axes if axis not in ("ear", "time")]
             array = np.ones((*rows[1:], *rows[:1], 4))  # the second axis outermost
             assert picture.columns([array] * picture.ears).shape == (picture.size, 4), (kind, part)

@@ -145,9 +145,10 @@ def test_plain_english_has_no_marker() -> None:
 
 # --- references -------------------------------------------------------------------------------------------------
 
-_NAME = r"(?<![\w./:<>{}*-])[\w+-]+(?:/[\w+-]+)*\."
+_NAME = r"(?<![\w./:<>{}$*-])[\w+-]+(?:/[\w+-]+)*\."
 _PATH = re.compile(rf"{_NAME}(?:py|md|c|h|js|css|html|sh|tcl|m|rst|ipynb)\b(?![\w/*]|\.\w)")
 _MODULE = re.compile(r"(?<![\w./:-])rosafe(?:\.[a-z]\w+)+(?:\.[A-Z_]\w+)*(?![\w/-])")
+FOLDERS = {path.name for root in (ROOT, PACKAGE, ROOT / "tests") for path in root.iterdir() if path.is_dir()}
 _UNITS = {"rosafe.launch", "rosafe.target", "rosafe.service"}  # files of roslaunch and systemd
 
 
@@ -171,7 +172,7 @@ def test_each_path_that_is_named_exists() -> None:
         f"{path.relative_to(ROOT)}: {name}"
         for path in referring(*SUFFIXES, ".rst", ".toml", ".txt")
         for name in _PATH.findall(prose_of(path))
-        if "/" in name and not exists(name, path)
+        if "/" in name and name.split("/")[0] in FOLDERS and not exists(name, path)
     }
     assert not missing
 

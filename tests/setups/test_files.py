@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from rosafe.interface import KINDS, MAX_SETUP, Parameter
 from rosafe.representations import STAGES
-from rosafe.setups import Setup, SetupError, SetupProcessor, Sound, read, wanted, write
+from rosafe.setups import AcquireSettings, Setup, SetupError, SetupProcessor, read, wanted, write
 from rosafe.setups.setup import parameters_of
 from rosafe.tree.tree_planner import ExistingProcessor
 
@@ -34,7 +34,7 @@ processors:
 
 def test_what_a_person_writes() -> None:
     setup = read(TREE)
-    assert setup.sound == Sound({"device": "scene:"})
+    assert setup.sound == AcquireSettings({"device": "scene:"})
     assert setup.connections == {"Audio": "/bass/Audio"}
     assert [(w.name, w.kind, w.parent, dict(w.given)) for w in setup.processors] == [
         ("input", "input", "", {"nFramesPerBlock": 4410}),

@@ -36,7 +36,7 @@ def pid(graph: Graph, name: str) -> int:
         return 0
 
 
-def taken_over(graph: Graph, component: interface.Component, old: Process, new: Process) -> None:
+def taken_over(graph: Graph, component: interface.ComponentSpec, old: Process, new: Process) -> None:
     """Check that `new` has the place of `old` for good: its name, its services, its actions."""
     name = f"/{component.name}"
     assert old.wait() == 0

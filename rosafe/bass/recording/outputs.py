@@ -98,7 +98,7 @@ class WavFile:
             self._file.close()
 
 
-class BagFile:
+class BagWriter:
     """A bag for `rosbag play` and the source `bag:`: overlapping windows on one topic, in which every frame has the
     number that it has in the stream.
 
