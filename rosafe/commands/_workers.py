@@ -79,7 +79,7 @@ def run_parallel(
     failures : tuple of exception types
         What a piece of work may fail with; the text of the exception is the report's.
     report : callable
-        Called with the number of a piece of work and its `Report`: now and then, and once with its last.
+        Called with the number of a piece of work and its `TaskReport`: now and then, and once with its last.
     signals : Interrupts
         What ends it by `Interrupted`.
     """

@@ -222,7 +222,7 @@ def _instance(options: argparse.Namespace, remappings: list[str]) -> str:
 def _await_master(uri: str, received: list[int], patient: str) -> None:
     """Give a master that is just starting a moment; MasterError where none is there by then, or at a signal.
 
-    The program that is `patient` says so and waits for ever; a signal is `_Ended` to it.
+    The program that is `patient` says so and waits for ever; a signal is `_WaitInterrupted` to it.
     """
     deadline = time.monotonic() + MASTER_SECONDS
     told = False

@@ -218,7 +218,7 @@ class FramedStage(Stage):
         self._buffer = FrameBuffer()
 
     def _means(self, samples: FloatArray, squared: bool) -> FloatArray:
-        """`Framing.means` of the frames that `samples` (*rows, N) complete, (*rows, F), by numpy."""
+        """`FrameGrid.means` of the frames that `samples` (*rows, N) complete, (*rows, F), by numpy."""
         means = self._framing.means(self._buffer.append(samples), squared)
         self._buffer.drop(means.shape[-1] * self._framing.hop)
         return means

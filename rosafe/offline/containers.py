@@ -103,7 +103,7 @@ class _Pipe:
         self._poll.register(self._descriptor, select.POLLIN)
 
     def fill(self, buffer: memoryview, seconds: int | None = None) -> None:
-        """Fill a buffer; `_Ended`, or TimeoutError after `seconds` (`STALL`) without a byte."""
+        """Fill a buffer; `_ChildEnded`, or TimeoutError after `seconds` (`STALL`) without a byte."""
         while buffer:
             # of 1 s each: while the processes are stopped, no time passes
             if not any(self._poll.poll(1000) for _ in range(seconds or STALL)):

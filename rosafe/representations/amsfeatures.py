@@ -185,7 +185,7 @@ class AmsFeatures(FramedStage):
             for begin in range(0, count, at_once):
                 part = slice(begin, begin + at_once)
                 spectra = np.abs(scipy.fft.rfft(frames[:, some, part] * self.window, points)[..., : len(triangles)])
-                # not a matrix product: see `Framing.means`
+                # not a matrix product: see `FrameGrid.means`
                 result[:, some, :, part] = np.einsum("ecfb,bm->ecmf", spectra, triangles)
         self._buffer.drop(count * self._framing.hop)
         return result

@@ -285,7 +285,7 @@ def respond_by_scipy(levels: FloatArray, count: int, made: Patterns) -> FloatArr
     """As `filter_responses`."""
     matrix = _matrix(levels.shape[1])
     result = np.empty((2, len(made.places), count))
-    for ear in range(2):  # not a dense product: OpenBLAS would start threads for it, see `Framing.means`
+    for ear in range(2):  # not a dense product: OpenBLAS would start threads for it, see `FrameGrid.means`
         frames = sliding_window_view(levels[ear], 2 * CONTEXT_FRAMES + 1, axis=-1)[:, :count]  # (C, F, 39)
         result[ear] = matrix @ frames.swapaxes(1, 2).reshape(-1, count)
     return result

@@ -1,4 +1,4 @@
-"""Blocks of a signal: what processors hand each other, and where the first ones come from."""
+"""Blocks of a signal, which processors exchange, and the source of the first ones."""
 
 from __future__ import annotations
 
@@ -12,20 +12,23 @@ from rosafe.dsp.signal_format import SignalFormat
 
 
 class Block(NamedTuple):
-    """What one processor released; it is not written again, but by an only child whom nobody asks for it (`place`).
+    """A block released by a processor.
+
+    It is read-only, except that a sole child may overwrite it in place (`Processor.output_buffer_for`) if no other
+    consumer needs it.
 
     Attributes
     ----------
     number : int
-        Counts the input's blocks from 0.
+        Number of the input's block, from 0.
     parts : tuple of ndarray
         Samples or frames along the last axis: an array for each part of the representation.
     next_index : int
-        Index of the audio frame after the last one that this block knows of.
-    signal : Signal
-        Its format.
+        Index of the audio frame after the last one that this block depends on.
+    signal : SignalFormat
+        The format of the block.
     extras : mapping of str to ndarray
-        By-products for those children that need them, such as the envelope.
+        By-products that children need, such as the envelope.
     """
 
     number: int
@@ -36,7 +39,7 @@ class Block(NamedTuple):
 
     @property
     def data(self) -> FloatArray:
-        """The first part, which is what children take."""
+        """The first part, which is the input of children."""
         return self.parts[0]
 
     @property
@@ -46,27 +49,27 @@ class Block(NamedTuple):
 
 
 class Source(Protocol):
-    """Where the input reads. Called with no lock of the tree's held, and `read` by one thread at a time.
+    """The source of the input's blocks. The tree calls it without holding a lock, and `read` from one thread at a time.
 
     Attributes
     ----------
     sample_rate : float
         In Hz.
     ended : bool
-        Nothing more will come; what has come may still be read.
+        Whether no further sound will arrive; blocks that have arrived may still be read.
     """
 
     sample_rate: float
     ended: bool
 
     def open(self, wake: Callable[[], None]) -> None:
-        """From now on call `wake` whenever there may be a block to read, or the end. It returns at once.
+        """Call `wake` from now on whenever there may be a block to read, or the end. `wake` returns immediately.
 
-        There may be one already: the tree looks once without being called.
+        The tree reads once without being woken, because a block may be there already.
         """
 
     def read(self) -> tuple[NDArray[Any], int] | None:
-        """The next block, (2, n), and the index of the frame after it; None where there is none yet, or no more."""
+        """Return the next block, (2, n), and the index of the frame after it, or None if there is none."""
 
     def stop(self) -> None:
-        """Nobody will read any more."""
+        """Stop: the tree reads no further block."""

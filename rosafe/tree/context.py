@@ -1,4 +1,4 @@
-"""What all processors of one tree have in common: workers, and who hears of what they do."""
+"""The context that all processors of a tree share: workers, listener and observers."""
 
 from __future__ import annotations
 
@@ -16,34 +16,34 @@ if TYPE_CHECKING:
 
 
 class TreeListener(Protocol):
-    """Who hears of what the processors do. Called by workers, of which others go on; must not wait for the tree."""
+    """Callbacks for processor events. They run on worker threads and must not block on the tree."""
 
     def on_added(self, processor: Processor) -> None:
-        """A processor is about to start; nothing was released yet. Where this raises, it is taken out again."""
+        """A processor is about to start and has released nothing yet. If this raises, the processor is removed again."""
 
     def on_executed(self, processor: Processor, seconds: float) -> None:
-        """One block was computed in so many seconds; the last one perhaps after `on_removed`."""
+        """One block was computed in `seconds`. The call for the last block may follow `on_removed`."""
 
     def on_released(self, processor: Processor, block: Block) -> None:
         """A processor with consumers released a block. One worker calls at a time, and never after `on_removed`."""
 
     def on_removed(self, processor: Processor) -> None:
-        """The processor is gone; `processor.error` tells why where it was not asked to."""
+        """The processor was removed; `processor.error` is the reason if it failed."""
 
 
-# Gets (processor, state that it enters, number of the block at hand or None). Called under the tree's lock: no waiting.
+# Called with (processor, new state, number of the current block or None), under the tree's lock: must not block.
 Observer = Callable[["Processor", State, "int | None"], None]
 
 
 @dataclass(frozen=True)
 class TreeContext:
-    """What all processors of one tree have in common.
+    """The context that all processors of a tree share.
 
-    `on_failure` is called, by the worker, where a processor's `error` is set.
+    The worker calls `on_failure` after it has set the `error` of a processor.
     """
 
     workers: Workers
     listener: TreeListener
     on_failure: Callable[[Processor], None]
-    finished_condition: threading.Condition  # on the tree's lock: somebody may have come to its end
+    finished_condition: threading.Condition  # on the tree's lock: notified when a processor is finished
     observers: list[Observer] = field(default_factory=list)

@@ -1,4 +1,4 @@
-"""A processor of the tree as others see it: what it computes, of what, in which format, and what it has put out."""
+"""The public, thread-safe side of a processor: its stage, its formats, its parameters and its output."""
 
 from __future__ import annotations
 
@@ -11,31 +11,31 @@ from rosafe.tree.history import History, HistorySlice
 from rosafe.tree.parameter_updates import ParameterUpdates
 from rosafe.tree.states import StateMachine
 
-EARS = (2,)  # leading shape of what the input takes
+EARS = (2,)  # leading shape of the input's blocks
 
 
 class Member(StateMachine):
-    """What can be asked of a processor, from any thread.
+    """The properties of a processor that any thread may read.
 
     Parameters
     ----------
     name : str
-        The user's name for it.
+        The name given by the user.
     stage : Stage
-        The numerics.
+        The computation.
     parent : Member or None
         None for the input.
     history_seconds : float
-        How much of its output it remembers.
+        Length of the history of its output.
 
     Attributes
     ----------
     kind : str
-        Its representation's.
+        The kind of its representation.
     error : BaseException or None
-        Why it came to its end.
+        The reason for its failure.
     blocks : int
-        That it has worked on.
+        Number of blocks processed.
     """
 
     parent: Member | None
@@ -54,17 +54,17 @@ class Member(StateMachine):
 
     @property
     def stage(self) -> Stage:
-        """As it will be after all changes, to be asked and not to be run."""
+        """The stage after all pending parameter updates, for queries only."""
         return self.changes.final_stage
 
     @property
     def representation(self) -> Representation:
-        """The declaration of what it computes."""
+        """The declaration of its representation."""
         return self.stage.REPRESENTATION
 
     @property
     def input_shape(self) -> tuple[int, ...]:
-        """Leading shape of what it takes."""
+        """Leading shape of its input."""
         return EARS if self.parent is None else self.parent.output_shape
 
     @property
@@ -74,12 +74,12 @@ class Member(StateMachine):
 
     @property
     def output_shape(self) -> tuple[int, ...]:
-        """That of the first part, which its children take."""
+        """Leading shape of the first part, which is the input of its children."""
         return self.stage.output_rows(self.input_shape)
 
     @property
     def axes(self) -> tuple[tuple[str, ...], ...]:
-        """What lies along the dimensions of each part, time last."""
+        """The names of the dimensions of each part, time last."""
         return tuple(part.axes for part in self.representation.parts)
 
     @property
@@ -94,22 +94,22 @@ class Member(StateMachine):
 
     @property
     def next_index(self) -> int:
-        """Of the audio frame after the newest one that its output knows of."""
+        """Index of the audio frame after the newest one that its output depends on."""
         return self.history.next_index
 
     def parameters(self) -> dict[str, Any]:
-        """The values from the next block on, in the order of the parameter structure."""
+        """Return the values from the next block on, in the order of the parameter structure."""
         return self.stage.parameters
 
     def derived(self) -> dict[str, Any]:
-        """What follows from these."""
+        """Return the values derived from the parameters."""
         return self.stage.derived
 
     def values(self) -> dict[str, Any]:
-        """Both, of one moment."""
+        """Return parameters and derived values of the same moment."""
         stage = self.stage
         return {**stage.parameters, **stage.derived}
 
     def take(self, reader: str) -> HistorySlice:
-        """What it released since `reader` asked last, at most the history."""
+        """Return the output since the last call by `reader`, at most the history."""
         return self.history.read_new(reader)

@@ -1,4 +1,4 @@
-"""Parameter changes of one processor: planned on copies of its stage, made between two blocks."""
+"""Parameter updates of one processor: validated on copies of its stage, applied between two blocks."""
 
 from __future__ import annotations
 
@@ -15,40 +15,43 @@ from rosafe.tree.block import Block
 
 
 class ParameterUpdate(NamedTuple):
-    """A change that waits for the processor's next block, or for a later one."""
+    """An update that waits for the processor's next block, or for a later one."""
 
-    block: int  # of the input; it is made before this one, or the next one if that is a later one
+    block: int  # of the input: it is applied before this block, or before the next one if that is later
     name: str
     value: Any
-    needs: str  # of the parent's by-products, from then on
+    needs: str  # the extra of the parent that is required from then on
 
 
 class ParameterUpdates:
-    """The stage of a processor as it is at work, and as it will be.
+    """The active stage of a processor, and the stage after all pending updates.
 
-    A change is made before the first block that the stage can then work on: a method that needs the parent's envelope
-    waits for a block that has it, one that goes with the parent's coming format only waits for that.
+    An update is applied before the first block that the updated stage can process. A method that requires the parent's
+    envelope waits for a block that carries it; one that fits only the parent's coming format waits for that format.
 
     Attributes
     ----------
-    planned : Stage
-        As it will be after all changes, its own and its parents': to be asked, and not to be run.
+    final_stage : Stage
+        The stage after all pending updates, its own and its parents'. For queries only: it is never run.
     """
 
     def __init__(self, stage: Stage) -> None:
         self.final_stage = stage
         self._active = stage
         self._queue: list[ParameterUpdate] = []
-        self._lock = threading.Lock()  # guards _waiting, and the exchange of _working
+        self._lock = threading.Lock()  # guards _queue, and the replacement of _active
 
     def preview(self, name: str, value: Any) -> Stage:
-        """The stage after one more change, which is not made yet; ValueError where it refuses that."""
+        """Return the stage after one more update, without applying it. Raises ValueError if the stage rejects it."""
         stage = copy.copy(self.final_stage)
         stage.configure(**{name: value})
         return stage
 
     def preview_input(self, given: SignalFormat) -> Stage:
-        """The stage under a parent that puts out another format, or ValueError; `final_stage` where it is the same."""
+        """Return the stage for another output format of the parent, or `final_stage` if it is the same.
+
+        Raises ValueError if the stage rejects the format.
+        """
         if given == self.final_stage.input_format:
             return self.final_stage
         stage = copy.copy(self.final_stage)
@@ -62,7 +65,7 @@ class ParameterUpdates:
             self._queue.append(ParameterUpdate(block, name, value, planned.required_extra))
 
     def needs(self, number: int) -> str:
-        """Which of the parent's by-products block `number` should carry."""
+        """Return the extra of the parent that block `number` should carry, or an empty string."""
         if not self._queue:
             return self._active.required_extra
         with self._lock:
@@ -70,7 +73,7 @@ class ParameterUpdates:
             return due[-1].needs if due else self._active.required_extra
 
     def stage_for_block(self, block: Block) -> Stage | None:
-        """The stage to work on `block`, after all changes that are due and go with it; None where none can."""
+        """Return the stage for `block` after all due updates that fit it, or None if no stage can process it."""
         stage = self._active
         if not self._queue and block.signal is stage.input_format:
             needs = stage.required_extra
@@ -90,9 +93,9 @@ class ParameterUpdates:
 
 
 def _changed(stage: Stage, given: SignalFormat, changes: Sequence[ParameterUpdate]) -> Stage | None:
-    """`stage` after `changes`, with blocks of the format `given`, or None where that cannot be.
+    """Return `stage` after `changes` for blocks of the format `given`, or None if that is not possible.
 
-    It shares the state of `stage`, which does not notice.
+    The result shares the state of `stage`, which is not modified.
     """
     if given == stage.input_format and not changes:
         stage.set_input_format(given)

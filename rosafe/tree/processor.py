@@ -1,4 +1,4 @@
-"""One processor of the tree: a task that goes through waitExec, exec, waitRelease and release, block after block."""
+"""A processor of the tree: a task with the states waitExec, exec, waitRelease and release for each block."""
 
 from __future__ import annotations
 
@@ -19,27 +19,27 @@ from rosafe.tree.workers import WAKE_THRESHOLD_SECONDS
 
 T = TypeVar("T")
 NOTHING: frozenset[str] = frozenset()
-ESTIMATE_GROWTH = 2.0  # what a processor usually takes is the least of late; that is forgotten at this pace per block
+ESTIMATE_GROWTH = 2.0  # the estimate is the recent minimum; it may grow by this factor per block
 
 
 class Processor(Member):
-    """A node of the tree. Made and wired by `Tree`; the public members are safe from any thread.
+    """A node of the tree, created and connected by `Tree`. The public members may be used from any thread.
 
     Locks are acquired in this order: tree's requests, `_publish_lock`, then the tree's or those of updates and history.
 
     Parameters
     ----------
     name, stage, parent, history_seconds
-        As of `Member`.
-    company : Company
-        The others.
+        As in `Member`.
+    context : TreeContext
+        Shared by all processors of the tree.
     source : Source or None
-        Where the input reads.
+        The source of the input's blocks.
 
     Attributes
     ----------
-    place : callable or None
-        Called with the input block; returns the array that `Stage.process` gets as `out`. Only for stages that take it.
+    output_buffer_for : callable or None
+        Called with the input block; returns the array for the argument `out` of `Stage.process`, for stages that have it.
     """
 
     parent: Processor | None
@@ -51,28 +51,28 @@ class Processor(Member):
         stage: Stage,
         parent: Processor | None,
         history_seconds: float,
-        company: TreeContext,
+        context: TreeContext,
         source: Source | None = None,
     ) -> None:
         super().__init__(name, stage, parent, history_seconds)
-        # No more than 30 attributes in all, with those of `Member` and `StateMachine`: beyond, each takes longer.
-        self.observers = company.observers
+        # At most 30 attributes, with those of `Member` and `StateMachine`: with more, each access takes longer.
+        self.observers = context.observers
         self.blocked_since = 0.0
         self.estimated_seconds = math.inf
         self.output_buffer_for: Callable[[Block], FloatArray | None] | None = None
-        self._context = company
-        self._lock = company.workers.lock
+        self._context = context
+        self._lock = context.workers.lock
         self._source = source
         self._started = False
-        self._publish_seconds = 0.0  # seconds that the listener took for the last block
-        self._publish_lock = threading.Lock()  # `on_released` and `ended` exclude each other
+        self._publish_seconds = 0.0  # duration of the last call of the listener
+        self._publish_lock = threading.Lock()  # `on_released` and `on_removed` exclude each other
 
     # --- life ---
 
     def start(self) -> None:
-        """Begin to work, with the block that the parent released last."""
+        """Start to work, with the block that the parent released last."""
         with self._lock:
-            self._context.workers.add_client()  # nothing is attached where the system has no thread left
+            self._context.workers.add_client()  # raises before anything is attached if no thread can be started
             self._started = True
             self.attach()
             self._context.workers.wake()
@@ -81,13 +81,13 @@ class Processor(Member):
             self._wake()
 
     def _wake(self) -> None:
-        """The source may have something."""
+        """Check whether the source has a block."""
         with self._lock:
             self.notify_input()
             self._context.workers.wake()
 
     def end(self) -> None:
-        """Take it out of the tree, at once; whoever works on it still will not be heard."""
+        """Remove the processor immediately. The result of a computation still in progress is discarded."""
         with self._lock:
             self.remove()
             if self._started:
@@ -99,12 +99,12 @@ class Processor(Member):
             self._context.listener.on_removed(self)
 
     def join(self, timeout: float | None = None) -> bool:
-        """Wait until nobody works on it and nobody will; whether that is so."""
+        """Wait until it is finished. Return False after `timeout` seconds."""
         with self._lock:
             return bool(self._context.finished_condition.wait_for(lambda: self.finished, timeout))
 
     def ask(self, question: Callable[[Processor], T]) -> T | None:
-        """`question(self)`, or None if its plugin raises instead of answering: the processor has failed then."""
+        """Return `question(self)`, or None if its plugin raises; the processor has failed in this case."""
         try:
             return question(self)
         except PluginError as problem:
@@ -118,10 +118,10 @@ class Processor(Member):
     def on_finished(self) -> None:
         self._context.finished_condition.notify_all()
 
-    # --- what workers do ---
+    # --- called by workers ---
 
     def work(self) -> None:
-        """Take the next step: tell of the last block, or compute the next one."""
+        """Publish the last block, or compute the next one."""
         try:
             if self.unpublished_block is not None:
                 self._publish(self.unpublished_block, monotonic())
@@ -130,19 +130,19 @@ class Processor(Member):
                 self._read(self._source)
             if self.current_block is not None:
                 self._compute(self.current_block)
-        except BaseException as problem:  # whatever it was: the tree must hear of it, and nobody may wait for this one
+        except BaseException as problem:  # any failure must reach the tree, and no other processor may keep waiting
             self.error = problem
             with self._lock:
                 self.end_of_stream()
-            self.blocked_since = monotonic()  # by requests
+            self.blocked_since = monotonic()  # requests may block the callback
             self._context.on_failure(self)
             self.blocked_since = 0.0
 
     def _read(self, source: Source) -> None:
-        """Take the next block of the source, if there is one, or come to the end with it."""
+        """Read the next block of the source if there is one, or end with the source."""
         self.blocked_since = monotonic()
         while True:
-            ended = source.ended  # looked at first: what has come before the end is read
+            ended = source.ended  # read first: blocks that arrived before the end are still processed
             got = source.read()
             if got is not None or ended == source.ended:
                 break
@@ -164,13 +164,12 @@ class Processor(Member):
         with self._lock:
             self.finish_block(private)
         self._context.listener.on_executed(self, seconds)
-        if (
-            self.unpublished_block is not None and self._publish_seconds < WAKE_THRESHOLD_SECONDS
-        ):  # else once nothing deeper in the tree is ready
+        # A slow listener is called later, when no deeper processor is ready.
+        if self.unpublished_block is not None and self._publish_seconds < WAKE_THRESHOLD_SECONDS:
             self._publish(self.unpublished_block, ended)
 
     def _process(self, taken: Block) -> Block | None:
-        """What comes out for a block; None where that cannot be used."""
+        """Compute the output for a block. Return None if no stage accepts it."""
         stage = self.changes.stage_for_block(taken)
         if stage is None:
             return None
@@ -189,12 +188,12 @@ class Processor(Member):
         return Block(taken.number, parts, next_index, stage.output_format, stage.provided)
 
     def _requested_extras(self, stage: Stage, number: int) -> frozenset[str]:
-        """The by-products that children need of block `number`."""
+        """Return the extras that children need of block `number`."""
         wanted = [needs for child in tuple(self.children) if (needs := child.changes.needs(number))]
         return frozenset(stage.EXTRAS).intersection(wanted) if wanted else NOTHING
 
     def _publish(self, block: Block, begun: float) -> None:
-        """Tell the world of the block that was released last."""
+        """Add the last released block to the history and notify the listener."""
         self.unpublished_block = None
         if not self.has_consumers:
             return
@@ -208,7 +207,7 @@ class Processor(Member):
 
 
 def subtree(processor: Processor) -> Iterator[Processor]:
-    """`processor` and all below it, leaves first."""
+    """Yield `processor` and its descendants, leaves first."""
     for child in list(processor.children):
         yield from subtree(child)
     yield processor

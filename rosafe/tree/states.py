@@ -1,9 +1,9 @@
-"""What a processor is at, and the tokens that it exchanges with its parent and its children. No threads in here.
+"""The state machine of a processor, and the tokens it exchanges with parent and children. It contains no threads.
 
-    waitExec --begin--> exec --done--> waitRelease --once no child holds the last block--> release --rest--> waitExec
+    waitExec --begin_work--> exec --finish_block--> waitRelease --once no child holds the last block--> release --end_work--> waitExec
 
-A parent releases a block only while nobody holds a token of its last one; every child then gets a token of its own,
-takes the block with it, and gives it back when done. Children read the parent's memory.
+A parent releases a block only if no child holds a token of the previous one. Each child then gets a token, reads the
+block from the parent's memory, and returns the token when it is finished.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ from rosafe.tree.block import Block
 
 
 class State(enum.Enum):
-    """The four states of the user guide (figure 11), and the two ends."""
+    """The four states of the user guide (figure 11) and two final states."""
 
     WAIT_EXEC = "waitExec"
     EXEC = "exec"
     WAIT_RELEASE = "waitRelease"
     RELEASE = "release"
-    DONE = "done"  # its input has come to its end
+    DONE = "done"  # its input has ended
     REMOVED = "removed"
 
 
@@ -31,35 +31,35 @@ class State(enum.Enum):
 WAIT_EXEC, EXEC, WAIT_RELEASE, RELEASE = State.WAIT_EXEC, State.EXEC, State.WAIT_RELEASE, State.RELEASE
 DONE, REMOVED = FINAL_STATES = (State.DONE, State.REMOVED)
 
-NO_BLOCK = Block(0, (), 0, SignalFormat.sound(1.0))  # to be told of a block that nobody hears of
+NO_BLOCK = Block(0, (), 0, SignalFormat.sound(1.0))  # stands for an unpublished block without consumers
 
 
 class StateMachine:
-    """States and tokens of one processor. All is done with the tree's lock held.
+    """States and tokens of one processor. All methods are called with the tree's lock held.
 
     Attributes
     ----------
     depth : int
-        How many there are above it.
-    at_work : bool
-        A worker is at it, from `begin_work` to `end_work`.
-    called : bool
-        Of the input: there may be sound to read.
-    taken : Block or None
-        What the worker has to work on.
-    heard : bool
-        Somebody may want the last block later: the world is told of it, and a new child begins with it. Else its memory
-        is free, and still in the cache, as soon as the children have done with it.
-    shared : Block or None
-        Released last; a new child begins with it. None where it is not `has_consumers`.
-    untold : Block or None
-        Released last, until the world has been told of it; `NO_BLOCK` where it is not `has_consumers`.
+        Number of ancestors.
+    busy : bool
+        Whether a worker works on it, from `begin_work` to `end_work`.
+    input_pending : bool
+        Only for the input: whether there may be sound to read.
+    current_block : Block or None
+        The block that the worker processes.
+    has_consumers : bool
+        Whether the last block is retained: it is published, and a new child starts from it. If False, its memory is
+        reused as soon as the children are finished, while it is still in the cache.
+    last_block : Block or None
+        The block released last, from which a new child starts. None without consumers.
+    unpublished_block : Block or None
+        The block released last, until it is published; `NO_BLOCK` without consumers.
     observers : sequence of callable
-        Get the processor, the state that it enters, and the number of the block at hand, or None. No waiting.
+        Called with the processor, its new state, and the number of the current block or None. They must not block.
     """
 
     observers: Sequence[Callable[[Any, State, int | None], None]] = ()
-    skipped = False  # an instance has it only during the call that `skip` was made in
+    skipped = False  # set on an instance only during the call in which `skip` was called
 
     def __init__(self, parent: StateMachine | None) -> None:
         self.parent = parent
@@ -71,23 +71,23 @@ class StateMachine:
         self.has_consumers = True
         self.last_block: Block | None = None
         self.unpublished_block: Block | None = None
-        self._pending_block: Block | None = None  # computed, and to be released as soon as no child holds the last one
-        self._next_block: Block | None = None  # the parent's, not taken yet
-        self._block_owner: StateMachine | None = None  # whose block it holds: the input may be replaced meanwhile
-        self._readers: set[StateMachine] = set()  # children that have not given the last block back
+        self._pending_block: Block | None = None  # computed; is released when no child holds the previous one
+        self._next_block: Block | None = None  # the parent's block that this one has not begun yet
+        self._block_owner: StateMachine | None = None  # whose block it holds; the input may be replaced meanwhile
+        self._readers: set[StateMachine] = set()  # children that still hold the last block
 
-    # --- what a processor adds ---
+    # --- hooks of a processor ---
 
     def on_ready(self) -> None:
-        """It has become ready."""
+        """Called when it becomes ready."""
 
     def on_finished(self) -> None:
-        """It is `finished`."""
+        """Called when it is `finished`."""
 
-    # --- coming and going ---
+    # --- attach, remove, end ---
 
     def attach(self) -> None:
-        """Become a child of its parent, and begin with the block that this has released last, if there is one."""
+        """Become a child of its parent, starting from the parent's last block if there is one."""
         if self.parent is None:
             return
         self.parent.children.append(self)
@@ -96,19 +96,19 @@ class StateMachine:
         self._end_if_exhausted()
 
     def notify_input(self) -> None:
-        """There may be sound to read."""
+        """Note that there may be sound to read."""
         self.input_pending = True
         if self.ready:
             self.on_ready()
 
     def move(self, parent: StateMachine) -> None:
-        """Become a child of another parent, which has released nothing yet; a block that was not taken is dropped."""
+        """Become a child of another parent, which has released nothing yet. A block that was not begun is dropped."""
         self._detach()
         self.parent, self._next_block = parent, None
         parent.children.append(self)
 
     def remove(self) -> None:
-        """Gone at once: its parent waits for it no longer, and it will release nothing more."""
+        """Remove it immediately: the parent no longer waits for it, and it releases no further block."""
         self._set_state(REMOVED)
         self.last_block = self._pending_block = self._next_block = None
         self._detach()
@@ -116,7 +116,7 @@ class StateMachine:
             self.on_finished()
 
     def end_of_stream(self) -> None:
-        """Nothing more will come of it; children may still take the block released last."""
+        """Mark the stream as ended. Children may still take the last released block."""
         self.release_input()
         self._set_state(DONE)
         if self.parent is not None and self._next_block is not None:  # it has failed
@@ -140,29 +140,26 @@ class StateMachine:
 
     @property
     def removed(self) -> bool:
-        """Whether it was removed."""
+        """Return whether it was removed."""
         return self.state is REMOVED
 
     @property
     def finished(self) -> bool:
-        """Whether nobody works on it and nobody ever will."""
+        """Return whether no worker works on it, now or later."""
         return self.state in FINAL_STATES and not self.busy
 
     # --- the four states ---
 
     @property
     def ready(self) -> bool:
-        """Whether there is something to do: a block to take, or one to tell of."""
+        """Return whether there is a block to process or to publish."""
         if self.busy:
             return False
         state = self.state
         return self._next_block is not None or self.input_pending if state is WAIT_EXEC else state is RELEASE
 
     def begin_work(self) -> bool:
-        """Somebody works on it from now on, and takes the block that waits for it, if there is one.
-
-        False where there is nothing to do.
-        """
+        """Begin to work on the next block, or to publish the last one. Return False if there is nothing to do."""
         if self.busy:
             return False
         state = self.state
@@ -185,13 +182,13 @@ class StateMachine:
         return True
 
     def accept_input_block(self, block: Block) -> None:
-        """The input has read a block."""
-        self.input_pending = True  # perhaps there is more
+        """Process a block that the input has read."""
+        self.input_pending = True  # there may be more
         self.current_block = block
         self._set_state(EXEC, block.number)
 
     def finish_block(self, private: Block | None) -> None:
-        """It has computed `private`, or nothing: that is released at once or as soon as no child holds the last one."""
+        """Accept the computed block `private`, if any. It is released when no child holds the previous one."""
         if self.skipped:
             del self.skipped
         self.release_input()
@@ -205,19 +202,19 @@ class StateMachine:
                 self._release(private)
 
     def skip(self) -> None:
-        """Release the parent's block during a long computation: siblings continue, this one misses blocks meanwhile."""
+        """Return the parent's block during a long computation: siblings continue, this processor misses blocks."""
         self.skipped = True
         self.release_input()
 
     def release_input(self) -> None:
-        """Return the parent's block, which may release its next one then."""
+        """Return the parent's block, so that the parent can release the next one."""
         reading = self._block_owner
         if reading is not None:
             self._block_owner = None
             reading._reader_done(self)
 
     def end_work(self) -> None:
-        """Nobody works on it any more."""
+        """End the work on it; it may be ready again."""
         self.busy, self.current_block = False, None
         state = self.state
         if state is EXEC or (state is RELEASE and self.unpublished_block is None):
@@ -241,7 +238,7 @@ class StateMachine:
             self._release(block)
 
     def _release(self, block: Block) -> None:
-        """Called, while no child holds a block, by whoever has made that possible, which is mostly a child."""
+        """Release a block. Called when no child holds the previous one, usually from the child that returned it last."""
         self.state = RELEASE
         if self.observers:
             self._tell_observers(block.number)

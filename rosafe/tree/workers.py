@@ -1,12 +1,13 @@
-"""Who runs what when: threads, as many as there are cores to use, that take up whatever task is ready.
+"""Task scheduler: a pool of threads, one per available core, that run tasks as they become ready.
 
-A worker that has finished a task goes on with the deepest one that is ready, mostly what it has just made ready: the
-block is still in its cache. Of several it takes one that it did the last time, whose state and memory are there. It
-wakes another worker only where something is left over and one is idle, and both together are worth it. On one core no
-thread is ever switched so; on several, siblings and successive blocks are worked on at the same time.
+A worker that has finished a task continues with the deepest ready task, usually the one it has just made ready: the
+block is still in its cache. Among several it prefers one that it ran before, whose state is in its cache too. It wakes
+another worker only if a task remains, a worker is idle, and the tasks are long enough. With one core there is therefore
+no switching between threads; with several, siblings and successive blocks are processed concurrently.
 
-Only those who compute count. A worker that somebody else holds up (a listener that does not return, a source that does
-not answer), or whose processor was removed, loses its seat to another one after `BLOCKED_TIMEOUT_SECONDS` seconds.
+Only computing workers count towards the limit. A worker that is blocked by other code (a listener that does not return,
+a source that does not respond), or whose processor was removed, loses its slot to another worker after
+`BLOCKED_TIMEOUT_SECONDS`.
 """
 
 from __future__ import annotations
@@ -22,15 +23,13 @@ from typing import Protocol
 
 VARIABLE = "ROSAFE_WORKERS"
 MAX_WORKERS = 1024
-BLOCKED_TIMEOUT_SECONDS = 0.05  # seconds
-WAKE_THRESHOLD_SECONDS = (
-    2.5e-4  # seconds: a call takes some ten microseconds of two workers, which then want the interpreter in turn
-)
-WORKER = "rosafe worker"  # what the names of their threads begin with
+BLOCKED_TIMEOUT_SECONDS = 0.05
+WAKE_THRESHOLD_SECONDS = 2.5e-4  # waking costs two workers some 10 us each, and they then compete for the GIL
+WORKER = "rosafe worker"  # prefix of the threads' names
 
 
 def workers_to_use(wanted: int | str | None = None) -> int:
-    """How many workers there should be: `wanted`, else what ROSAFE_WORKERS says, else one for each core to use."""
+    """Return the number of workers: `wanted`, or the value of ROSAFE_WORKERS, or the number of available cores."""
     text = os.environ.get(VARIABLE, "").strip()
     name, given = ("workers", str(wanted)) if wanted is not None else (VARIABLE, text)
     if not given:
@@ -41,65 +40,65 @@ def workers_to_use(wanted: int | str | None = None) -> int:
 
 
 class Task(Protocol):
-    """What workers do. One works on it at a time; `begin` and `rest` are called with the lock held.
+    """A task of the workers. One worker runs it at a time; `begin_work` and `end_work` are called with the lock held.
 
-    It may be pushed more often than there is something to do.
+    It may be pushed even if there is nothing to do.
     """
 
     depth: int
-    estimated_seconds: float  # seconds that it takes, or more than that
-    blocked_since: float  # time.monotonic() at which somebody else began to hold it up; 0 where nobody does
+    estimated_seconds: float  # an upper estimate of its duration
+    blocked_since: float  # time.monotonic() since which other code blocks it; 0 if none does
 
     @property
     def removed(self) -> bool:
-        """Whether nobody wants the result of what is being done any more."""
+        """Return whether the result of the current work is no longer needed."""
 
     def begin_work(self) -> bool:
-        """Somebody works on it from now on; False where there is nothing to do."""
+        """Begin to work on it. Return False if there is nothing to do."""
 
     def work(self) -> None:
-        """Do it. Raises nothing."""
+        """Run the task. Raises nothing."""
 
     def end_work(self) -> None:
-        """Nobody works on it any more; it may be ready again."""
+        """End the work on it; it may be ready again."""
 
 
 class _Worker:
-    """What one of the threads is at."""
+    """The task of one thread, and whether it occupies a slot."""
 
     def __init__(self) -> None:
         self.task: Task | None = None
-        self.has_slot = False  # counts as one of those who compute
+        self.has_slot = False  # counts towards the limit
 
 
 class Workers:
-    """The threads of one tree. There are none before the first member comes and after the last one has gone.
+    """The threads of one tree. They exist while there is at least one client (a processor).
 
     Parameters
     ----------
     lock : threading.RLock
         The tree's lock. All but `join` is called with it held.
     count : int
-        How many may compute at the same time.
+        The number of workers that may compute at the same time.
     """
 
     def __init__(self, lock: threading.RLock, count: int) -> None:
         self.lock = lock
         self.count = count
         self._clients = 0
-        self._ready: list[tuple[int, int, Task]] = []  # a heap: the deepest first, of these the one that came last
+        self._ready: list[tuple[int, int, Task]] = []  # a heap: the deepest first, of these the newest
         self._sequence = itertools.count(0, -1)
-        self._free_slots = count  # seats that nobody has
-        self._idle = 0  # threads that wait for a task, or are about to begin, and
-        self._woken = 0  # those of them that are called already
-        self._last: dict[int, _Worker] = {}  # who did a task the last time, by its id
+        self._free_slots = count  # slots that no worker occupies
+        self._idle = 0  # threads that wait for a task or are about to start, and
+        self._woken = 0  # those of them that were notified already
+        self._last: dict[int, _Worker] = {}  # the worker that ran a task last, by its id
         self._task_available = threading.Condition(lock)
         self._watch = threading.Condition(lock)
         self._workers: list[_Worker] = []
         self._threads: dict[str, threading.Thread] = {}
 
     def add_client(self) -> None:
-        """One member more. RuntimeError where the system has no thread left for the first one."""
+        """Add a client. Raises RuntimeError if the system cannot start the first thread."""
         self._clients += 1
         try:
             if not self._threads:
@@ -111,7 +110,7 @@ class Workers:
             raise
 
     def remove_client(self) -> None:
-        """One member less."""
+        """Remove a client; the threads end with the last one."""
         self._clients -= 1
         if self._clients == 0:
             self._ready, self._last = [], {}
@@ -119,7 +118,7 @@ class Workers:
             self._watch.notify_all()
 
     def join(self) -> None:
-        """Wait until all threads have ended, as they do when there are no members."""
+        """Wait until all threads have ended, after the last client was removed."""
         with self.lock:
             threads = list(self._threads.values())
         for thread in threads:
@@ -128,11 +127,11 @@ class Workers:
     # --- tasks ---
 
     def push(self, task: Task) -> None:
-        """`task` is ready. Who is no worker calls `wake` after that."""
+        """Add a ready task. A caller that is not a worker calls `wake` afterwards."""
         heapq.heappush(self._ready, (-task.depth, next(self._sequence), task))
 
     def wake(self) -> None:
-        """Call an idle worker, or start one, for each task that waits, as far as there are seats."""
+        """Notify an idle worker, or start one, for each waiting task, within the free slots."""
         for _ in range(min(len(self._ready), self._free_slots) - self._woken):
             if self._idle > self._woken:
                 self._woken += 1
@@ -140,11 +139,11 @@ class Workers:
                 continue
             try:
                 self._start_worker()
-            except RuntimeError:  # the system has none left: those that there are must do
+            except RuntimeError:  # no thread can be started: the existing ones continue
                 return
 
     def _should_wake_another(self, own: Task) -> bool:
-        """Whether what waits would wait too long for a worker that takes up `own` now, or keep it busy for too long."""
+        """Return whether the waiting tasks, and `own` before them, take one worker longer than the threshold."""
         seconds = own.estimated_seconds
         for _, _, task in self._ready:
             if seconds > WAKE_THRESHOLD_SECONDS:
@@ -153,7 +152,7 @@ class Workers:
         return seconds > WAKE_THRESHOLD_SECONDS
 
     def _pop_task(self, me: _Worker) -> Task:
-        """The deepest one; of several that of `me`."""
+        """Return the deepest task, preferably one that `me` ran last."""
         ready, last = self._ready, self._last
         depth, _, task = ready[0]
         if len(ready) > 1 and last.get(id(task)) is not me:
@@ -198,7 +197,7 @@ class Workers:
             del self._threads[name]
 
     def _wait_for_task(self, me: _Worker) -> Task | None:
-        """A task that has begun, and a seat for it, as soon as there are both; None where the thread is to end."""
+        """Wait for a task and a slot, and begin the task. Return None if the thread has to end."""
         while self._clients:
             if me.has_slot or self._free_slots:
                 while self._ready:
@@ -213,7 +212,7 @@ class Workers:
                         self.wake()
                     return task
             self._release_slot(me)
-            if self._idle >= self.count:  # others have come in the place of those that were held up
+            if self._idle >= self.count:  # others have replaced those that were blocked
                 break
             self._idle += 1
             self._task_available.wait()
@@ -223,12 +222,12 @@ class Workers:
         return None
 
     def _release_slot(self, me: _Worker) -> None:
-        """Give the seat back, if there still is one."""
+        """Return the slot, if the worker still has one."""
         self._free_slots += me.has_slot
         me.task, me.has_slot = None, False
 
     def _monitor_blocked(self) -> None:
-        """Give the seats of those that are held up to others."""
+        """Give the slots of blocked workers to others."""
         with self.lock:
             while self._clients:
                 self._watch.wait(BLOCKED_TIMEOUT_SECONDS)

@@ -7,7 +7,7 @@
 #include <string.h>
 
 /* The samples of each row are the `held` ones of the history and the n of the block behind them; they are counted from the
- * first one on. Made by `Frames.packed` of rosafe/dsp/kernels/__init__.py. */
+ * first one on. Made by `FrameReader.packed` of rosafe/dsp/kernels/__init__.py. */
 typedef struct {
     const double *history;
     int64_t history_stride; /* from a row to the next */
