@@ -84,7 +84,7 @@ class RosafeNode:
         kept = Setup() if self._keeper is None else self._keeper.saved()
         if self._keeper is not None and self._keeper.absent:
             rospy.logwarn(self._keeper.absent)
-        self._restoring_thread = Setup(None, kept.connections, kept.processors)  # what is not there yet
+        self._tree_to_restore = Setup(None, kept.connections, kept.processors)  # what is not there yet
         self._sound = kept.sound  # which is not ours to make; but a file that has one keeps it
         self._restoring = ""  # why it is not there yet
         self._data_object = self._node.advertise(
@@ -159,8 +159,8 @@ class RosafeNode:
     def _setup(self) -> Setup:
         """The tree, or the one that is to come back, with the connection that there is now."""
         connections = {"Audio": self._audio_topic} if self._audio_topic else {}
-        if self._restoring_thread.processors:
-            return Setup(self._sound, connections, self._restoring_thread.processors)
+        if self._tree_to_restore.processors:
+            return Setup(self._sound, connections, self._tree_to_restore.processors)
         found = [processor.ask(self._found) for processor in self._tree.processors]
         return Setup(self._sound, connections, tuple(wanted(one) for one in found if one is not None))
 
@@ -171,31 +171,31 @@ class RosafeNode:
         return ExistingProcessor(processor.name, processor.kind, parent.name if parent is not None else "", values)
 
     def _begin_to_come_back(self) -> None:
-        topic = self._restoring_thread.connections.get("Audio", "")
+        topic = self._tree_to_restore.connections.get("Audio", "")
         if topic:
             self._connect_audio(topic)  # whether or not somebody publishes it yet
-        if self._restoring_thread.processors:
+        if self._tree_to_restore.processors:
             self._restoring = f"waiting for sound on {topic or 'the Audio port'}"
             threading.Thread(target=self._restore_tree, name="come back", daemon=True).start()
 
     def _restore_tree(self) -> None:
         """Build the tree that was there, as soon as there is sound of a rate at which that is possible."""
         tried: set[int] = set()
-        while self._restoring_thread.processors and not self.finished.wait(POLL_SECONDS):
+        while self._tree_to_restore.processors and not self.finished.wait(POLL_SECONDS):
             rate = self._ring.sample_rate
             asked = any(activity.service.name == "InputProc" for activity in self._node.activities.live())
             if rate == 0 or rate in tried or asked:
                 continue
             tried.add(rate)
             try:
-                dry_run(self._restoring_thread, rate)
-                self._rebuild(self._restoring_thread)
+                dry_run(self._tree_to_restore, rate)
+                self._rebuild(self._tree_to_restore)
             except ComponentError as problem:
                 self._restoring = str(problem)
-                if self._restoring_thread.processors:  # else somebody has begun another one
+                if self._tree_to_restore.processors:  # else somebody has begun another one
                     rospy.logerr(f"the tree of {self._keeper and self._keeper.path} does not come back: {problem}")
             else:
-                rospy.loginfo(f"{len(self._restoring_thread.processors)} processors are back")
+                rospy.loginfo(f"{len(self._tree_to_restore.processors)} processors are back")
                 self._abort_restore()
 
     def _rebuild(self, setup: Setup) -> None:
@@ -210,13 +210,13 @@ class RosafeNode:
                 if activity.error is not None:
                     raise activity.error
         except ComponentError:
-            if self._restoring_thread is setup:
+            if self._tree_to_restore is setup:
                 self._tree.stop()
             raise
 
     def _abort_restore(self) -> None:
         """From now on what is there counts."""
-        self._restoring_thread, self._restoring = Setup(), ""
+        self._tree_to_restore, self._restoring = Setup(), ""
         self._keep()
 
     # --- processors ---
@@ -240,7 +240,7 @@ class RosafeNode:
                 processor = self._tree.add_input(values["name"], reader, frames, *buffers, parameters)
                 self._input_services = {p.name: values[p.name] for p in BLOCK_AND_BUFFERS}
                 if not comes_back:
-                    self._restoring_thread = Setup()  # somebody wants a tree of his own
+                    self._tree_to_restore = Setup()  # somebody wants a tree of his own
         except BaseException:
             reader.stop()
             raise
@@ -360,7 +360,7 @@ class RosafeNode:
         self._keep()
 
     def _stop(self, values: dict[str, Any]) -> None:
-        self._restoring_thread = Setup()
+        self._tree_to_restore = Setup()
         self._tree.stop()
         self._keep()
 
@@ -400,7 +400,7 @@ class RosafeNode:
         else:
             status.summary(DiagnosticStatus.OK, "the tree is kept")
         status.add("file", str(self._keeper.path))
-        status.add("to come back", " ".join(one.name for one in self._restoring_thread.processors) or "nothing")
+        status.add("to come back", " ".join(one.name for one in self._tree_to_restore.processors) or "nothing")
         return status
 
 

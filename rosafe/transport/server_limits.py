@@ -7,8 +7,8 @@ connects to the publishers that the master names, and reads what they send.
 rospy reads openings in its accept loops, believes every length, and ends the loops where descriptors run out. `install`
 puts these in place of it, before `rospy.init_node`; this is the only place where rospy itself is changed:
 
-* ``rosgraph.xmlrpc.ThreadingXMLRPCServer``: requests are read by a `HandshakeServer`, and only whole ones are looked at.
-* ``rospy.impl.tcpros_base.TCPServer``: headers are read by a `HandshakeServer`; topics go to rospy, services are served here.
+* ``rosgraph.xmlrpc.ThreadingXMLRPCServer``: a `HandshakeServer` reads requests; only complete ones are parsed.
+* ``rospy.impl.tcpros_base.TCPServer``: a `HandshakeServer` reads headers; rospy gets topics, services are served here.
 * ``rospy.impl.tcpros_base.read_ros_handshake_header`` and ``TCPROSTransportProtocol.read_messages``: what publishers
   send to our subscribers is bounded.
 * ``rospy.impl.tcpros_pubsub.ServerProxy``: their answers to calls are bounded too (see also `connector`).

@@ -19,7 +19,7 @@ class TreeListener(Protocol):
     """Callbacks for processor events. They run on worker threads and must not block on the tree."""
 
     def on_added(self, processor: Processor) -> None:
-        """A processor is about to start and has released nothing yet. If this raises, the processor is removed again."""
+        """A processor is about to start and has released nothing yet. If this raises, it is removed again."""
 
     def on_executed(self, processor: Processor, seconds: float) -> None:
         """One block was computed in `seconds`. The call for the last block may follow `on_removed`."""

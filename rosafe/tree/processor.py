@@ -39,7 +39,7 @@ class Processor(Member):
     Attributes
     ----------
     output_buffer_for : callable or None
-        Called with the input block; returns the array for the argument `out` of `Stage.process`, for stages that have it.
+        Called with the input block; returns the argument `out` of `Stage.process`, for stages that have one.
     """
 
     parent: Processor | None

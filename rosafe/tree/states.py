@@ -1,6 +1,7 @@
 """The state machine of a processor, and the tokens it exchanges with parent and children. It contains no threads.
 
-    waitExec --begin_work--> exec --finish_block--> waitRelease --once no child holds the last block--> release --end_work--> waitExec
+    waitExec --begin_work--> exec --finish_block--> waitRelease --no child holds the last block--> release
+    release --end_work--> waitExec
 
 A parent releases a block only if no child holds a token of the previous one. Each child then gets a token, reads the
 block from the parent's memory, and returns the token when it is finished.
@@ -238,7 +239,7 @@ class StateMachine:
             self._release(block)
 
     def _release(self, block: Block) -> None:
-        """Release a block. Called when no child holds the previous one, usually from the child that returned it last."""
+        """Release a block when no child holds the previous one; usually called by the child that returned it last."""
         self.state = RELEASE
         if self.observers:
             self._tell_observers(block.number)
