@@ -68,17 +68,17 @@ class Clock:
         self._seconds = block / RATE
         self._lock = threading.Lock()
 
-    def added(self, processor: Any) -> None:
+    def on_added(self, processor: Any) -> None:
         pass
 
-    def executed(self, processor: Any, seconds: float) -> None:
+    def on_executed(self, processor: Any, seconds: float) -> None:
         pass
 
-    def ended(self, processor: Any) -> None:
+    def on_removed(self, processor: Any) -> None:
         if processor.error is not None:
             print(f"{processor!r}: {processor.error!r}", file=sys.stderr)
 
-    def released(self, processor: Any, block: Any) -> None:
+    def on_released(self, processor: Any, block: Any) -> None:
         if processor.kind == "ild":
             late = time.monotonic() - self.begun - block.next_index / RATE
             with self._lock:

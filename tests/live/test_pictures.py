@@ -192,10 +192,10 @@ def test_a_slow_client_gets_the_newest_columns_and_keeps_nothing_waiting() -> No
     view = View(1, 100.0, FLOAT)
 
     class OneView:
-        def look(self, key: Key) -> tuple[View, dict[str, Any]]:
+        def subscribe(self, key: Key) -> tuple[View, dict[str, Any]]:
             return view, {}
 
-        def leave(self, key: Key, left: View) -> None:
+        def unsubscribe(self, key: Key, left: View) -> None:
             pass
 
     async def scenario() -> list[bytes]:
