@@ -1,6 +1,6 @@
-"""Features of a sound for a classifier: means over time of some outputs, named and with units. features.py [SOUND]
+"""Compute features of a sound for a classifier: means of outputs over time, with names and units: features.py [SOUND]
 
-It wants xarray: pip install 'rosafe[files]'
+Needs xarray: pip install '.[files]' in the checkout
 """
 
 import sys

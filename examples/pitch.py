@@ -1,4 +1,4 @@
-"""The pitch of a voice, from the summary of all channels' autocorrelations. pitch.py [SOUND]; one channel will do."""
+"""Estimate the pitch of a voice from the autocorrelations of all channels: pitch.py [SOUND]; mono files work, too."""
 
 import sys
 
@@ -14,8 +14,8 @@ else:  # a buzz that glides from 150 to 300 Hz
     frequency = np.linspace(150, 300, 2 * rate)
     sound = 0.1 * (np.cumsum(frequency) / rate % 1 < 0.1)
 
-result = rosafe.process(sound, rate, outputs="pitch")
-pitch = result["pitch"][0, 0]  # Hz; NaN where there is none
+result = rosafe.process(sound, rate, parameters=rosafe.PRESETS["speech"], outputs="pitch")
+pitch = result["pitch"][0, 0]  # Hz; NaN: no pitch
 for at in np.arange(0.25, result["pitch_time"][-1], 0.5):
     near = np.abs(result["pitch_time"] - at) < 0.1
     voiced = pitch[near][np.isfinite(pitch[near])]

@@ -1,4 +1,4 @@
-"""A picture of what both ears hear: ratemaps, level and time differences. ratemap.py [SOUND [PICTURE]]"""
+"""Plot ratemaps and the level and time differences between the ears: ratemap.py [SOUND [PICTURE]]"""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""Level differences of what two microphones hear, live, until Ctrl-C. It wants: pip install sounddevice"""
+"""Print the level difference between two microphones until Ctrl-C. Needs: pip install sounddevice"""
 
 import numpy as np
 import sounddevice

@@ -1,4 +1,4 @@
-"""Sound that comes block by block, here from a file of any length. stream_wav.py SOUND"""
+"""Process sound block by block, here from a file of any length: stream_wav.py SOUND"""
 
 import sys
 
@@ -7,6 +7,8 @@ import soundfile
 
 import rosafe
 
+if len(sys.argv) != 2:
+    sys.exit("usage: stream_wav.py SOUND")
 path = sys.argv[1]
 stream = rosafe.Stream(soundfile.info(path).samplerate, outputs=["ild"])
 for block in soundfile.blocks(path, blocksize=1600):  # (n, 2)

@@ -1,1 +1,1 @@
-"""The capture node `bass`: sound from ALSA devices, files and a built-in scene onto the port Audio."""
+"""The capture node `bass`: publishes sound from ALSA devices, files and a built-in scene on the port Audio."""

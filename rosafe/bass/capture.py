@@ -1,4 +1,4 @@
-"""The acquisition loop: from a source to snapshots of the window on the port Audio. No ROS in here."""
+"""The acquisition loop: from a source to snapshots of the window on the port Audio. Does not use ROS."""
 
 from __future__ import annotations
 
@@ -12,38 +12,38 @@ import numpy as np
 from rosafe import interface
 from rosafe.bass.sources import SoundSource
 from rosafe.bass.sources.base import hwparams_error, loss_text, wall_time_ns
+from rosafe.sound.windows import MAX_WINDOW
 
-MAX_WINDOW = 2**24  # frames on the port, 380 s at 44.1 kHz; what goes beyond is a slip of the finger
-LATE_CHUNKS = 2  # behind the clock by more than this, chunks are published together
+LATE_CHUNKS = 2  # if capture is later than this, chunks are published together
 
 
 @dataclass(frozen=True)
 class Snapshot:
-    """The port's content at one moment. The arrays are read-only and stay as they are."""
+    """The content of the port at one time. The arrays are read-only and do not change."""
 
     sample_rate: int
     chunks_on_port: int
     frames_per_chunk: int
-    last_frame_index: int  # frames streamed so far, lost ones included
+    last_frame_index: int  # number of frames so far, including lost frames
     left: np.ndarray  # int32, (frames_per_chunk * chunks_on_port,), newest last
     right: np.ndarray
-    time_ns: int  # when the newest frame was acquired, since 1970; 0 before there was one
+    time_ns: int  # when the newest frame was acquired, since 1970; 0 before the first frame
 
 
 def check_window(frames_per_chunk: int, chunks_on_port: int) -> None:
-    """Refuse a window that nobody can want, by ``::bass::e_hwparams``."""
+    """Raise ``::bass::e_hwparams`` if the window on the port is too long."""
     if frames_per_chunk * chunks_on_port > MAX_WINDOW:
         raise hwparams_error(
-            f"{chunks_on_port} chunks of {frames_per_chunk} frames are too many for the port, "
-            f"at most {MAX_WINDOW} frames go together"
+            f"nChunksOnPort: expected at most {MAX_WINDOW} frames on the port, "
+            f"got {chunks_on_port} chunks of {frames_per_chunk} frames"
         )
 
 
 class AudioWindow:
-    """The newest `frames` frames of a two-channel int32 signal; before there are so many, zeros come first.
+    """The newest `frames` frames of a two-channel int32 signal, preceded by zeros until there are enough.
 
-    Frames are appended to a buffer in which the window moves; where it ends, a new one begins. So what a view shows
-    never changes, and appending costs the same for long and short windows.
+    Frames are appended to a buffer in which the window moves; at its end, a new buffer begins. The content of a view
+    therefore never changes, and the cost of appending does not depend on the length of the window.
     """
 
     def __init__(self, frames: int) -> None:
@@ -52,17 +52,17 @@ class AudioWindow:
         self._end = frames
 
     def append(self, samples: np.ndarray) -> None:
-        """Shift left and put `samples`, (2, n), at the end."""
+        """Append `samples`, (2, n)."""
         samples = samples[:, -self.frames :]
         self._make_room(samples.shape[1])
         self._buffer[:, self._end : self._end + samples.shape[1]] = samples
         self._end += samples.shape[1]
 
     def skip(self, frames: int) -> None:
-        """Shift left by `frames` frames of silence."""
+        """Append `frames` frames of silence."""
         frames = min(frames, self.frames)
         self._make_room(frames)
-        self._end += frames  # never written before, so zero
+        self._end += frames  # still zero, as this part was never written
 
     def _make_room(self, frames: int) -> None:
         if self._end + frames > self._buffer.shape[1]:
@@ -71,7 +71,7 @@ class AudioWindow:
             self._buffer, self._end = fresh, self.frames
 
     def view(self) -> np.ndarray:
-        """The window as it is now: int32, (2, frames), read-only, valid for ever."""
+        """Return the current window: int32, (2, frames), read-only; it never changes."""
         view = self._buffer[:, self._end - self.frames : self._end]
         view.flags.writeable = False
         return view
@@ -83,18 +83,18 @@ class Capture:
     Parameters
     ----------
     source : SoundSource
-        Open; it stays the caller's to close.
+        Open; the caller closes it.
     frames_per_chunk, chunks_on_port : int
         Size of the window; see `check_window`.
     publish : callable
-        Takes every new `Snapshot`.
+        Called with each new `Snapshot`.
     report : callable
-        Takes one line about each loss of sound.
+        Called with one line for each loss of sound.
 
     Raises
     ------
     interface.ComponentError
-        ``::bass::e_nomem`` where the window does not fit into memory.
+        ``::bass::e_nomem`` if the window does not fit into memory.
     """
 
     def __init__(
@@ -116,11 +116,11 @@ class Capture:
             self._window = AudioWindow(frames_per_chunk * chunks_on_port)
         except MemoryError:
             raise interface.BASS.error(
-                "e_nomem", f"no memory for {chunks_on_port} chunks of {frames_per_chunk} frames"
+                "e_nomem", f"not enough memory for {chunks_on_port} chunks of {frames_per_chunk} frames"
             ) from None
 
     def run(self, stopping: threading.Event, cycle: Callable[[float], None]) -> None:
-        """Read and publish until the source ends, fails or is told to stop; `cycle` takes the seconds of each turn."""
+        """Read and publish until the source ends or fails, or a stop; `cycle` gets the seconds that each chunk took."""
         known_lost = 0
         while not stopping.is_set():
             chunk = self.source.read()
@@ -144,12 +144,12 @@ class Capture:
             self.publish()
 
     def _may_defer_publish(self, late: float) -> bool:
-        """Whether to catch up first, and publish with a later chunk; never so long that a reader could miss a frame."""
+        """Return whether to publish with a later chunk, to catch up; never so late that a reader could miss a frame."""
         sample_rate, _, frames_per_chunk = self._sizes
         return late * sample_rate > LATE_CHUNKS * frames_per_chunk and self._unpublished * 2 <= self._window.frames
 
     def publish(self) -> None:
-        """Publish the window as it is: at first all zeros, with index 0 and no stamp."""
+        """Publish the current window; before the first frame all zeros, with index 0 and without a stamp."""
         left, right = self._window.view()
         self._unpublished = 0
         self._publish(Snapshot(*self._sizes, self.last_frame_index, left, right, self._time_ns))

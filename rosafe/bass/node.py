@@ -1,18 +1,22 @@
-"""The bass node: its requests, the port Audio, its health."""
+"""The bass node: requests, the port Audio, diagnostics."""
 
 from __future__ import annotations
 
+import contextlib
 import importlib
 import threading
-from typing import Any
+from collections.abc import Iterator
+from typing import Any, cast
 
 import rospy
 from diagnostic_msgs.msg import DiagnosticStatus
 
 from rosafe.bass.capture import Capture, Snapshot, check_window
+from rosafe.bass.scene_truth import TruthPublisher, TruthSource
 from rosafe.bass.socket_server import DEFAULT_HOST, DEFAULT_PORT, DedicatedSocket
 from rosafe.bass.sources import SoundSource, device_lines, open_source
-from rosafe.bass.sources.alsa import AlsaSource, DeviceBusyError
+from rosafe.bass.sources.alsa import AlsaSource
+from rosafe.bass.sources.pcm import DeviceBusyError
 from rosafe.component import serialization
 from rosafe.component.activities import Activity
 from rosafe.component.component import ComponentNode
@@ -21,10 +25,11 @@ from rosafe.interface import BASS, ComponentError
 from rosafe.terminal import printable
 from rosafe.transport import master
 from rosafe.transport.log_throttle import ThrottledLog
+from rosafe.transport.publisher import Publisher
 
 
 class BassNode:
-    """The component `bass`. Make it after `rospy.init_node`.
+    """The component `bass`. Create it after `rospy.init_node`.
 
     ROS parameters, read at each DedicatedSocket: ``socket_host`` (default 127.0.0.1; empty for all interfaces) and
     ``socket_port`` (default 8081) in the node's namespace.
@@ -35,9 +40,11 @@ class BassNode:
         self.finished = self._node.finished
         self._message_class = serialization.message_class("bass", BASS.port("Audio").idl)
         self._audio = self._node.advertise("Audio", self._message_class)
+        self._truth_class = importlib.import_module("bass.msg").SceneTruth
+        self._truth = Publisher(f"{self._node.name}/sceneTruth", self._truth_class)
         self._snapshot: Snapshot | None = None
-        self._source: SoundSource | None = None  # of the acquisition under way
-        self._acquired: dict[str, Any] = {}  # what that was asked for
+        self._source: SoundSource | None = None  # of the running acquisition
+        self._acquired: dict[str, Any] = {}  # parameters of the running acquisition
         self._last_end = self._last_loss = "none"
         self._log_loss = ThrottledLog(rospy.logwarn)
         self._log_clients = ThrottledLog(rospy.logwarn)
@@ -47,14 +54,14 @@ class BassNode:
         self._node.activity("DedicatedSocket", self._dedicated_socket)
         self._node.activity("CloseSocket", lambda activity, _: activity.interrupt_others())
         self._node.function("ListDevices", self._list_devices)
-        self._node.function("Stop", lambda _: None)  # the table says what it interrupts
+        self._node.function("Stop", lambda _: None)  # the interface table lists the activities that it interrupts
         self._node.function("getAcquisition", self._get_acquisition)
         self._node.diagnostics.add("capture", self._health)
-        importlib.import_module("rosafe.bass.sources.scene")  # scipy takes long: before a request waits for it
+        importlib.import_module("rosafe.bass.sources.scene")  # importing scipy takes long and must not delay a request
         self._node.start()
 
     def shutdown(self, by: str) -> None:
-        """End the acquisition and the socket."""
+        """Stop the acquisition and the socket."""
         self._node.shutdown(by)
 
     # --- Acquire ---
@@ -62,7 +69,7 @@ class BassNode:
     def _acquire(self, activity: Activity, values: dict[str, Any]) -> None:
         device, frames_per_chunk, chunks = values["device"], values["nFramesPerChunk"], values["nChunksOnPort"]
         check_window(frames_per_chunk, chunks)
-        # Whatever can fail comes before the running acquisition ends, so that a mistake leaves that as it is.
+        # All steps that can fail precede the end of the running acquisition, so that an error does not stop it.
         source = self._open(activity, device, values["sampleRate"], frames_per_chunk)
         try:
             capture = Capture(source, frames_per_chunk, chunks, self._publish, self._note_loss)
@@ -72,12 +79,13 @@ class BassNode:
             capture.publish()
             rospy.loginfo(f"acquiring from {device} at {source.sample_rate} Hz")
             activity.running()
-            capture.run(activity.stop_requested, self._node.meters["capture"].cycle)
+            with self._truth_of(source):
+                capture.run(activity.stop_requested, self._node.meters["capture"].cycle)
             self._last_end = f"{device}: {'stopped' if activity.stop_requested.is_set() else 'end of the source'}"
             rospy.loginfo(f"the acquisition has ended: {self._last_end}")
         except ComponentError as problem:
             self._last_end = str(problem)
-            if activity.begun.is_set():  # whoever asked has had an answer already
+            if activity.begun.is_set():  # the client has its response already
                 rospy.logerr(f"the acquisition has ended: {problem}")
             raise
         finally:
@@ -85,13 +93,29 @@ class BassNode:
                 self._source = None
             source.close()
 
+    @contextlib.contextmanager
+    def _truth_of(self, source: SoundSource) -> Iterator[None]:
+        """Publish the true directions of a scene while it runs."""
+        if not hasattr(source, "truth"):
+            yield
+            return
+        frames: tuple[str, ...] = ("world", "head")
+        with contextlib.suppress(*master.FAILURES):  # without a master, the defaults
+            frames = tuple(str(rospy.get_param(f"~{name}_frame", name)) for name in frames)
+        publisher = TruthPublisher(cast(TruthSource, source), self._truth, self._truth_class, frames)
+        publisher.start()
+        try:
+            yield
+        finally:
+            publisher.stop()
+
     def _open(self, activity: Activity, device: str, sample_rate: int, frames_per_chunk: int) -> SoundSource:
         try:
             return open_source(device, sample_rate, frames_per_chunk, activity.stop_requested)
         except DeviceBusyError:
             if not isinstance(self._source, AlsaSource):
                 raise
-        # Likely busy with our own acquisition, perhaps under another name.
+        # The device is probably in use by this node's acquisition, perhaps under another name.
         activity.interrupt_others()
         return open_source(device, sample_rate, frames_per_chunk, activity.stop_requested)
 
@@ -114,7 +138,7 @@ class BassNode:
             )
         )
 
-    # --- the other requests ---
+    # --- other requests ---
 
     def _get_acquisition(self, _: dict[str, Any]) -> dict[str, Any]:
         if self._source is None:
@@ -127,7 +151,7 @@ class BassNode:
                 print(printable(line), flush=True)
 
     def _dedicated_socket(self, activity: Activity, _: dict[str, Any]) -> None:
-        activity.interrupt_others()  # it has the address
+        activity.interrupt_others()  # a running server uses the address
         try:
             host = rospy.get_param("~socket_host", DEFAULT_HOST)
             port = rospy.get_param("~socket_port", DEFAULT_PORT)
@@ -160,5 +184,5 @@ class BassNode:
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run `bass-ros`; returns its exit code."""
+    """Run `bass-ros` and return its exit code."""
     return run_server(BASS, BassNode, argv)

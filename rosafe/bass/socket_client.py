@@ -1,4 +1,4 @@
-"""A client of DedicatedSocket, for programs without ROS: `blocks` gives the stream in order. Needs numpy only.
+"""Client of DedicatedSocket for programs without ROS: `blocks` yields the stream in order. Needs only numpy.
 
 >>> from rosafe.bass.socket_client import blocks
 >>> for block in blocks("127.0.0.1", 8081, frames=4410):        # doctest: +SKIP
@@ -16,26 +16,26 @@ from typing import NamedTuple
 
 import numpy as np
 
-TIMEOUT_SECONDS = 10.0  # for an answer
-POLL_SECONDS = 0.02  # between two requests where nothing is new
-RESTART_SECONDS = 1.0  # without anything new, look whether the stream began anew
+TIMEOUT_SECONDS = 10.0  # for a response
+POLL_SECONDS = 0.02  # between two requests when no new frames are available
+RESTART_SECONDS = 1.0  # without new frames, until the client checks whether the stream was restarted
 _HEADER = struct.Struct("<iiq")
-_MOST = 2**24  # frames: no window is longer
+_MAX_FRAMES = 2**24  # maximum length of the window
 _CLOSED = "bass has closed the connection"
 
 
 class Received(NamedTuple):
     """Some frames of the stream."""
 
-    first: int  # number of the first one, as bass counts; less than expected where the stream began anew
+    first: int  # frame index of the first one; less than expected if the stream was restarted
     samples: np.ndarray  # int32, (2, n): left, right
-    lost: int  # frames before it that were asked for too late
+    lost: int  # number of frames before `first` that were requested too late
 
 
 class SocketClient:
-    """One connection.
+    """One connection to a DedicatedSocket.
 
-    Raises OSError where there is nobody, or where the connection breaks.
+    Raises OSError if the connection cannot be made, or breaks.
     """
 
     def __init__(self, host: str = "127.0.0.1", port: int = 8081, timeout: float = TIMEOUT_SECONDS) -> None:
@@ -43,22 +43,22 @@ class SocketClient:
         self._stream = self._connection.makefile("rb")
 
     def read(self, frames: int, first: int) -> Received:
-        """Up to `frames` frames from number `first` (from 1 on); none where nothing is new."""
+        """Return up to `frames` frames from frame index `first` (from 1) on; none if no new frames are available."""
         try:
             self._connection.sendall(b"Read Port - N %d - nfr %d\n" % (frames, first))
             header = self._take(_HEADER.size)
-        except (BrokenPipeError, ConnectionResetError):  # the latter with a request that it has not read
+        except (BrokenPipeError, ConnectionResetError):  # reset: bass had not read the request
             raise ConnectionError(_CLOSED) from None
         count, lost, following = _HEADER.unpack(header)
-        if not 0 <= count <= min(frames, _MOST) or lost < 0 or following < count:
-            raise ConnectionError(f"what answers is no bass: {count} frames where {frames} were asked for")
+        if not 0 <= count <= min(frames, _MAX_FRAMES) or lost < 0 or following < count:
+            raise ConnectionError(f"expected at most {frames} frames from bass, got {count}: this is not a bass")
         samples = np.frombuffer(self._take(8 * count), "<i4").reshape(2, count)
         return Received(following - count, samples, lost)
 
     def newest(self) -> int:
-        """Number of the newest frame; 0 where there is none."""
-        whole = self.read(_MOST, 1)
-        return whole.first + whole.samples.shape[1] - 1
+        """Return the index of the newest frame; 0 if there is none."""
+        window = self.read(_MAX_FRAMES, 1)
+        return window.first + window.samples.shape[1] - 1
 
     def _take(self, size: int) -> bytes:
         data = self._stream.read(size)
@@ -86,37 +86,37 @@ def blocks(
     patience: float | None = None,
     stopping: threading.Event | None = None,
 ) -> Generator[Received, None, None]:
-    """The stream, for ever unless told otherwise, in blocks of at most `frames` frames.
+    """Yield the stream in blocks of at most `frames` frames, without end by default.
 
     Parameters
     ----------
     host, port : str, int
-        Where a bass serves DedicatedSocket.
+        Address of the DedicatedSocket of a bass.
     first : int, optional
-        Number of the frame to begin with; by default the next one to come.
+        Index of the first frame; by default the next one that is captured.
     patience : float, optional
-        End after so many seconds without anything new.
+        End after this many seconds without new frames.
     stopping : threading.Event, optional
         End once it is set.
 
     Raises
     ------
     OSError
-        Nobody serves, or the connection breaks (CloseSocket, the end of bass).
+        The connection cannot be made, or breaks (CloseSocket, the end of bass).
     """
     stopping = stopping or threading.Event()
     with SocketClient(host, port) as client:
         following = client.newest() + 1 if first is None else first
-        heard = looked = time.monotonic()
+        received = checked = time.monotonic()
         while not stopping.wait(POLL_SECONDS):
             while (block := client.read(frames, following)).samples.shape[1]:
                 following = block.first + block.samples.shape[1]
                 yield block
-                heard = looked = time.monotonic()
+                received = checked = time.monotonic()
             now = time.monotonic()
-            if patience is not None and now - heard > patience:
+            if patience is not None and now - received > patience:
                 return
-            if now - looked > RESTART_SECONDS:
-                looked = now
+            if now - checked > RESTART_SECONDS:
+                checked = now
                 if client.newest() + 1 < following:
                     following = 1

@@ -1,8 +1,8 @@
-"""DedicatedSocket: the Audio port's content over plain TCP, for clients without ROS. No ROS in here.
+"""DedicatedSocket: the content of the port Audio over plain TCP, for clients without ROS. Does not use ROS.
 
 A request is a text with ``Read Port``, ``N <int>`` and ``nfr <int>``, such as ``Read Port - N 4410 - nfr 1``, with or
 without a line end: up to N frames from frame nfr on. The answer is little-endian: int32 n, int32 loss (frames from nfr
-on that were no longer there), int64 nfr to ask for next, n int32 of the left ear, n int32 of the right ear.
+on that were no longer available), int64 next nfr, n int32 of the left ear, n int32 of the right ear.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ from rosafe.bass.capture import Snapshot
 
 DEFAULT_HOST, DEFAULT_PORT = "127.0.0.1", 8081
 MAX_CLIENTS = 31
-QUIET_SECONDS = 0.05  # after which a request without a line end is taken for complete
-DEAD_SECONDS = 10.0  # without taking a byte of an answer, a client counts as dead
-IDLE_SECONDS = 10.0  # without a whole request, a client goes where another one wants in
-PAUSE_SECONDS = 0.5  # without accepting, where the process has no file descriptor left
-_MAX_REQUEST = 4096  # bytes without a request in them, then they are forgotten
+QUIET_SECONDS = 0.05  # without further bytes, until a request without a line end counts as complete
+DEAD_SECONDS = 10.0  # without accepting a byte of an answer, until a client is disconnected
+IDLE_SECONDS = 10.0  # without a complete request, until a client can be disconnected in favour of a new one
+PAUSE_SECONDS = 0.5  # in accepting connections when the process has no file descriptor left
+_MAX_REQUEST = 4096  # bytes that are kept if they contain no complete request
 _MARK = b"Read Port"
 _COUNT, _FIRST = re.compile(rb"N[^\w-]*(-?\d{1,40})"), re.compile(rb"nfr[^\w-]*(-?\d{1,40})")
-_KEEP_ALIVE = (  # finds those who left without a word within a minute or two
+_KEEP_ALIVE = (  # detects clients that have disappeared, within two minutes
     (socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1),
     (socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 60),
     (socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, 10),
@@ -37,7 +37,7 @@ _HEADER = struct.Struct("<iiq")
 
 
 def read_frames(snapshot: Snapshot | None, count: int, first: int) -> bytes:
-    """The answer to a request for `count` frames from index `first` on."""
+    """Return the answer to a request for `count` frames from index `first` on."""
     if snapshot is None:
         return _HEADER.pack(0, 0, min(first, 2**63 - 1))
     last, length = snapshot.last_frame_index, len(snapshot.left)
@@ -52,9 +52,9 @@ def read_frames(snapshot: Snapshot | None, count: int, first: int) -> bytes:
 
 
 def take_requests(inbox: bytearray, quiet: bool) -> Iterator[tuple[int, int]]:
-    """Take all complete requests (count, first) out of `inbox`.
+    """Remove all complete requests from `inbox` and yield their (count, first).
 
-    One is complete at a line end, where the next begins, or when nothing more came for a while (`quiet`).
+    A request is complete at a line end, at the beginning of the next request, or after a pause (`quiet`).
     """
     ends = [match.end() for match in re.finditer(rb"[\n\r\0]", inbox)]
     complete = max(ends[-1] if ends else 0, inbox.rfind(_MARK))
@@ -70,7 +70,7 @@ def take_requests(inbox: bytearray, quiet: bool) -> Iterator[tuple[int, int]]:
 
 
 def _parse(text: bytes) -> tuple[int, int] | None:
-    """The (count, first) that `text` asks for, if it does; what is negative counts as 0."""
+    """Return the (count, first) of a request; None if `text` is not a request. Negative numbers count as 0."""
     count, first = _COUNT.search(text), _FIRST.search(text)
     return (max(0, int(count[1])), max(0, int(first[1]))) if text.startswith(_MARK) and count and first else None
 
@@ -81,27 +81,29 @@ class _Client:
         self.inbox = bytearray()
         self.requests: list[tuple[int, int]] = []
         self.outbox = memoryview(b"")
-        self.pending = False  # whether the inbox may hold a request without a line end
-        self.heard = self.moved = self.asked = time.monotonic()
+        self.pending = False  # whether the inbox may contain a request without a line end
+        self.received = self.sent = self.requested = time.monotonic()  # last bytes in, bytes out, complete request
 
 
 class DedicatedSocket:
-    """The server. Each client has at most one answer under way, so a slow one takes no more memory than a window.
-    Where all places are taken, a client that has asked for nothing for `IDLE_SECONDS` makes room for a new one.
+    """A server that holds at most one answer per client, so that a slow client needs no more memory than a window.
+
+    If the maximum number of clients is connected, a client without a request for `IDLE_SECONDS` is replaced by a new
+    one.
 
     Parameters
     ----------
     snapshot : callable
-        Returns the port's content, or None where there was no acquisition yet.
+        Returns the content of the port, or None before the first acquisition.
     host, port : str, int
-        Address to serve.
+        Address of the server.
     report : callable
-        Takes a line about clients turned away or sent away.
+        Called with a line about each client that is rejected or disconnected.
 
     Raises
     ------
     OSError
-        The address cannot be had.
+        The address cannot be used.
     """
 
     def __init__(
@@ -115,10 +117,10 @@ class DedicatedSocket:
         self.address = self._listener.getsockname()
         self._selector = selectors.DefaultSelector()
         self._selector.register(self._listener, selectors.EVENT_READ)
-        self._paused: float | None = None  # since when nobody is accepted
+        self._paused: float | None = None  # when accepting was paused
 
     def serve(self, stopping: threading.Event) -> None:
-        """Answer clients until told to stop; then close all connections."""
+        """Answer clients until a stop; then close all connections."""
         try:
             while not stopping.is_set():
                 for key, events in self._selector.select(0.01 if self._has_idle_clients() else 0.05):
@@ -142,12 +144,12 @@ class DedicatedSocket:
             connection, (address, *_) = self._listener.accept()
         except OSError as problem:
             if problem.errno in (errno.EMFILE, errno.ENFILE):
-                self._report(f"DedicatedSocket: nobody is let in for a while: {problem.strerror}")
-                self._selector.unregister(self._listener)  # it would be ready again and again
+                self._report(f"DedicatedSocket: pausing new connections: {problem.strerror}")
+                self._selector.unregister(self._listener)  # it would be ready all the time
                 self._paused = time.monotonic()
-            return  # else the client was gone before we came
-        if len(self._clients) >= MAX_CLIENTS and not self._make_room():
-            self._report(f"DedicatedSocket: {address} turned away, {MAX_CLIENTS} clients are connected")
+            return  # with another error, the client has disconnected already
+        if len(self._clients) >= MAX_CLIENTS and not self._drop_idle_client():
+            self._report(f"DedicatedSocket: {address} rejected: the limit of {MAX_CLIENTS} clients is reached")
             connection.close()
             return
         connection.setblocking(False)
@@ -163,14 +165,14 @@ class DedicatedSocket:
             self._selector.register(self._listener, selectors.EVENT_READ)
             self._paused = None
 
-    def _make_room(self) -> bool:
-        """Send away who has asked for nothing for longest, if that is long; those who take an answer go last."""
+    def _drop_idle_client(self) -> bool:
+        """Disconnect the client that has been idle longest, preferably one without a pending answer, if any is idle."""
         now = time.monotonic()
-        idle = [client for client in self._clients.values() if now - client.asked > IDLE_SECONDS]
+        idle = [client for client in self._clients.values() if now - client.requested > IDLE_SECONDS]
         if not idle:
             return False
-        longest = min(idle, key=lambda client: (bool(client.outbox), client.asked))
-        self._report(f"DedicatedSocket: a client that has asked for nothing for {now - longest.asked:.0f} s goes")
+        longest = min(idle, key=lambda client: (bool(client.outbox), client.requested))
+        self._report(f"DedicatedSocket: disconnecting a client without a request for {now - longest.requested:.0f} s")
         self._drop(longest)
         return True
 
@@ -185,36 +187,36 @@ class DedicatedSocket:
                 data = client.connection.recv(_MAX_REQUEST)
                 if not data:
                     return self._drop(client)
-                client.heard = time.monotonic()
+                client.received = time.monotonic()
                 client.inbox += data
                 client.requests += take_requests(client.inbox, quiet=False)
                 client.pending = bool(client.inbox)
             self._send(client)
-        except OSError:  # reset by the client: no more to do for it
+        except OSError:  # reset by the client
             self._drop(client)
 
     def _send(self, client: _Client) -> None:
         while client.requests or client.outbox:
             if not client.outbox:
                 client.outbox = memoryview(read_frames(self._snapshot(), *client.requests.pop(0)))
-                client.moved = client.asked = time.monotonic()
+                client.sent = client.requested = time.monotonic()
             try:
                 sent = client.connection.send(client.outbox)
             except BlockingIOError:
                 break
             client.outbox = client.outbox[sent:]
-            client.moved = time.monotonic()
-        # While an answer is under way nothing more is read; what the client sends waits in the kernel.
-        wanted = selectors.EVENT_WRITE if client.outbox else selectors.EVENT_READ
-        self._selector.modify(client.connection, wanted, client)
+            client.sent = time.monotonic()
+        # Nothing is read while an answer is being sent; further requests wait in the kernel.
+        events = selectors.EVENT_WRITE if client.outbox else selectors.EVENT_READ
+        self._selector.modify(client.connection, events, client)
 
     def _check_idle_clients(self) -> None:
-        """Answer requests without a line end, and drop clients who do not take their answers."""
+        """Answer requests without a line end, and disconnect clients that do not accept their answers."""
         now = time.monotonic()
         for client in list(self._clients.values()):
-            if client.outbox and now - client.moved > DEAD_SECONDS:
+            if client.outbox and now - client.sent > DEAD_SECONDS:
                 self._drop(client)
-            elif client.pending and not client.outbox and now - client.heard > QUIET_SECONDS:
+            elif client.pending and not client.outbox and now - client.received > QUIET_SECONDS:
                 client.pending = False
                 client.requests += take_requests(client.inbox, quiet=True)
                 self._handle_client(client, 0)

@@ -1,8 +1,8 @@
-"""What the representations share: frames, windows, the ERB scale, filters, guards, and the base class of all stages.
+"""Code shared by representations: frames, windows, the ERB scale, filters, numeric limits, the base class of stages.
 
-Needs numpy and scipy only; knows no ROS, no threads and no names of services. Every stage takes blocks of any length
-and gives the same numbers however the signal is cut into blocks (to the last bit with kernels, 1e-12 without; where
-gain control starts is the one exception). Finite input gives finite output.
+It depends on numpy and scipy only, not on ROS, threads or service names. Each stage accepts blocks of any length, and
+its output does not depend on the block boundaries (bit-identical with kernels, to 1e-12 without; the start of gain
+control is the only exception). Finite input gives finite output.
 
-Modules here `import scipy`, which loads `scipy.signal` at its first use: that takes longer than all the rest.
+Modules use `import scipy`, which loads `scipy.signal` at its first use: that import takes longer than all others.
 """

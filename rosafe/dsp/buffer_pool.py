@@ -1,7 +1,7 @@
-"""Memory for very large blocks, which is used again when nobody holds the block any more.
+"""A pool of buffers for very large blocks; a buffer returns to the pool when its last reference is dropped.
 
-The C library gives what is larger than 32 MiB back to the system at once, which clears each page that it hands out
-again: that takes as long as the filters themselves take.
+The C library returns memory above 32 MiB to the system immediately, and the system clears each page when it is
+allocated again: that takes as long as the filters themselves.
 """
 
 from __future__ import annotations
@@ -15,17 +15,17 @@ import numpy as np
 
 from rosafe.dsp.numeric_limits import FloatArray
 
-SMALLEST, LARGEST = 2**24, 2**28  # bytes of the blocks that are kept
-MAX_IDLE_PER_SIZE = 2  # idle ones of a size
-SIZES = 2  # of which idle ones are kept
+MIN_BYTES, MAX_BYTES = 2**24, 2**28  # of a buffer in the pool
+MAX_IDLE_PER_SIZE = 2  # idle buffers of each size
+MAX_SIZES = 2  # sizes with idle buffers
 
 _idle: dict[int, deque[FloatArray]] = {}
 
 
 def empty(shape: tuple[int, ...]) -> FloatArray:
-    """As `numpy.empty`, of float64."""
+    """Return an uninitialised float64 array, as `numpy.empty`."""
     count = math.prod(shape)
-    if not SMALLEST <= 8 * count <= LARGEST:
+    if not MIN_BYTES <= 8 * count <= MAX_BYTES:
         return np.empty(shape)
     try:
         memory = _idle[count].pop()
@@ -35,7 +35,7 @@ def empty(shape: tuple[int, ...]) -> FloatArray:
 
 
 class _PooledArray:
-    """The memory of one array and its views: numpy lets go of this with the last one of them."""
+    """The memory of one array and its views: numpy drops this object together with the last of them."""
 
     _memory: FloatArray | None = None
 
@@ -43,10 +43,10 @@ class _PooledArray:
         self.__array_interface__: dict[str, Any] = {**memory.__array_interface__, "shape": shape}
         self._memory = memory
 
-    def __del__(self) -> None:  # on any thread and at any time: single steps, which need no lock
-        if self._memory is None:  # there was no memory for the rest of this
+    def __del__(self) -> None:  # on any thread, at any time: atomic steps, which need no lock
+        if self._memory is None:  # __init__ has failed for lack of memory
             return
-        with contextlib.suppress(MemoryError):  # then it is freed
+        with contextlib.suppress(MemoryError):  # the buffer is freed then
             _idle.setdefault(len(self._memory), deque(maxlen=MAX_IDLE_PER_SIZE)).append(self._memory)
-            for size in list(_idle)[:-SIZES]:
+            for size in list(_idle)[:-MAX_SIZES]:
                 _idle.pop(size, None)

@@ -2,7 +2,7 @@
 
 E. A. Lopez-Poveda and R. Meddis (2001), "A human nonlinear cochlear filterbank", J. Acoust. Soc. Am. 110, 3107-3118,
 in the form of the CASP model: M. L. Jepsen, S. D. Ewert and T. Dau (2008), "A computational model of human auditory
-signal processing and perception", J. Acoust. Soc. Am. 124, 422-438. Input: velocity of the stapes in m/s, that is level
+signal processing and perception", J. Acoust. Soc. Am. 124, 422-438. Input: velocity of the stapes in m/s, from level
 scaling and middle ear filter with pp_bUnityComp off. `fb_nGamma` and `fb_bwERBs` do not apply.
 """
 
@@ -16,9 +16,9 @@ from .numeric_limits import FloatArray, clamp
 from .sos_filter import SosFilter
 
 COMPRESSION = 10**-0.60206
-HIGHEST_FITTED = 1000.0  # Hz; above, the nonlinear path has the gains of CASP_GAIN_FREQUENCY
+MAX_FITTED_FREQUENCY = 1000.0  # Hz; above it, the nonlinear path has the gains of CASP_GAIN_FREQUENCY
 CASP_GAIN_FREQUENCY = 1500.0  # Hz
-LOWEST = 1.0  # Hz; the power laws were fitted from 250 Hz on and end in nonsense far below
+MIN_FREQUENCY = 1.0  # Hz; the power laws were fitted from 250 Hz on and are meaningless far below
 
 
 class DrnlBank:
@@ -37,7 +37,7 @@ class DrnlBank:
     Raises
     ------
     ValueError
-        Where a frequency is below 1 Hz, or one of a channel's filters would lie at or above half the sample rate.
+        If a frequency is below 1 Hz, or if a filter of a channel would be at or above half the sample rate.
     """
 
     def __init__(self, sample_rate: float, frequencies: FloatArray) -> None:
@@ -47,19 +47,17 @@ class DrnlBank:
         self.reset()
 
     def reset(self) -> None:
-        """All filters back to rest."""
+        """Reset the state of all filters."""
         for channel in self.channels:
             channel.reset()
-        self._last = np.zeros((2, len(self.channels), 1))
+        self._last = np.zeros((0, len(self.channels), 1))  # output of each ear
 
-    def process(
-        self, block: FloatArray, with_envelope: bool, output: FloatArray | None = None
-    ) -> tuple[FloatArray, FloatArray | None]:
-        """Filter (2, N): output (2, C, N), into `output` where that is given; and the envelope if wanted, else None."""
+    def process(self, block: FloatArray, with_envelope: bool, output: FloatArray) -> FloatArray | None:
+        """Filter (ears, N) into `output` (ears, C, N). Return the envelope, or None."""
         block = clamp(block)
-        if output is None:
-            output = np.empty((2, len(self.channels), block.shape[-1]))
-        with kernels.denormals_off():  # tails of the many filters go through them within a block
+        if len(self._last) != len(block):
+            self._last = np.zeros((len(block), len(self.channels), 1))
+        with kernels.denormals_off():  # the tails of the many filters reach denormals within a block
             for index, channel in enumerate(self.channels):
                 output[:, index] = channel.process(block)
         envelope = None
@@ -68,11 +66,11 @@ class DrnlBank:
             envelope = np.hypot(output, (output * self._cos - delayed) / self._sin)
         if block.shape[-1]:
             self._last = output[..., -1:].copy()
-        return output, envelope
+        return envelope
 
 
 class _Channel:
-    """One characteristic frequency; numbers from table III of Lopez-Poveda and Meddis as used in CASP."""
+    """The filters of one characteristic frequency, with constants of table III of Lopez-Poveda and Meddis (CASP)."""
 
     def __init__(self, sample_rate: float, frequency: float) -> None:
         def power_law(intercept: float, slope: float, at: float = frequency) -> float:
@@ -85,14 +83,15 @@ class _Channel:
             sections: FloatArray = scipy.signal.butter(2, cutoff, fs=sample_rate, output="sos")
             return sections
 
-        if frequency < LOWEST:
-            raise ValueError(f"fb_cfHz: drnl has no channel at {frequency:.6g} Hz, below {LOWEST:.12g} Hz")
+        if frequency < MIN_FREQUENCY:
+            raise ValueError(f"fb_cfHz: expected at least {MIN_FREQUENCY:.12g} Hz for drnl, got {frequency:.6g} Hz")
         linear_centre, linear_cutoff = power_law(-0.06762, 1.01679), power_law(-0.06762, 1.01)
         centre, cutoff = power_law(-0.05252, 1.01650), power_law(-0.05252, 1.01)
         highest = max(linear_centre, linear_cutoff, centre, cutoff)
         if highest >= sample_rate / 2:
             raise ValueError(
-                f"fb_cfHz: drnl at {frequency:.12g} Hz has a filter at {highest:.6g} Hz, not below half the sample rate"
+                f"fb_cfHz: expected channels with all filters below half the sample rate, got drnl at "
+                f"{frequency:.12g} Hz, which has a filter at {highest:.6g} Hz"
             )
         linear = [resonator(linear_centre, power_law(0.03728, 0.75))] * 2 + [lowpass(linear_cutoff)] * 4
         linear_sections = np.vstack(linear)
@@ -101,27 +100,27 @@ class _Channel:
         self.linear = SosFilter(linear_sections)
         self.before = SosFilter(resonance)
         self.after = SosFilter(np.vstack([resonance, lowpass(cutoff)]))
-        fitted = frequency if frequency <= HIGHEST_FITTED else CASP_GAIN_FREQUENCY
+        fitted = frequency if frequency <= MAX_FITTED_FREQUENCY else CASP_GAIN_FREQUENCY
         self.slope = power_law(1.40298, 0.81916, fitted)
         self.compressive_gain = power_law(1.61912, -0.81867, fitted)
 
     def reset(self) -> None:
-        for cascade in (self.linear, self.before, self.after):
-            cascade.reset()
+        for section in (self.linear, self.before, self.after):
+            section.reset()
 
     def process(self, block: FloatArray) -> FloatArray:
-        broken = self._broken_stick(self.before.process(block))
-        output: FloatArray = self.linear.process(block) + self.after.process(broken)
+        compressed = self._broken_stick(self.before.process(block))
+        output: FloatArray = self.linear.process(block) + self.after.process(compressed)
         return output
 
     def _broken_stick(self, samples: FloatArray) -> FloatArray:
-        """sign(x) min(a abs(x), b abs(x)**c)."""
+        """Return sign(x) min(a abs(x), b abs(x)**c)."""
         size = np.abs(samples)
         return np.copysign(np.minimum(self.slope * size, self.compressive_gain * size**COMPRESSION), samples)
 
 
 def _resonator(centre: float, width: float) -> FloatArray:
-    """Real second-order gammatone section (1, 6), unit gain at `centre`; both in cycles per sample."""
+    """Return a real second-order gammatone section (1, 6) of unit gain at `centre`, both in cycles per sample."""
     decay = np.exp(-2 * np.pi * width)
     alpha = -decay * np.cos(2 * np.pi * centre)
     delay = np.exp(-2j * np.pi * centre)

@@ -1,4 +1,4 @@
-"""The gammatone filterbank: per channel a cascade of equal complex one-pole filters.
+"""The gammatone filterbank: in each channel a cascade of equal complex one-pole filters.
 
 R. D. Patterson, I. Nimmo-Smith, J. Holdsworth and P. Rice (1987), "An efficient auditory filterbank based on the
 gammatone function", APU report 2341; V. Hohmann (2002), "Frequency analysis and synthesis using a gammatone
@@ -16,7 +16,7 @@ from .erb import bandwidth
 from .numeric_limits import FLUSH_INTERVAL, FloatArray, clamp, flush_denormals
 
 POLES_PER_SECTION = 4
-TURN_SPAN = 64  # samples; SPAN of kernels/gammatone.c, which takes no other `position` than below it
+TURN_SPAN = 64  # samples; SPAN of kernels/gammatone.c, whose `position` must be below it
 
 
 class GammatoneBank:
@@ -24,8 +24,8 @@ class GammatoneBank:
 
     With beta = 2 pi b ERB(f) / fs, theta = 2 pi f / fs, p = exp(-beta - j theta) and g = 1 - exp(-beta), a channel is
     y = 2 Re(H x), H(z) = (g / (1 - p / z))**n; ERB as in `erb.bandwidth`. Its impulse response is
-    h[k] = 2 g**n binomial(k + n - 1, n - 1) exp(-beta k) cos(theta k), a sampled gammatone but for the polynomial in
-    the place of k**(n - 1). One-pole sections keep 1e-13 of accuracy where the expanded polynomial
+    h[k] = 2 g**n binomial(k + n - 1, n - 1) exp(-beta k) cos(theta k), a sampled gammatone with this polynomial
+    instead of k**(n - 1). One-pole sections keep 1e-13 of accuracy where the expanded polynomial
     of the original loses up to 5e-7 in the lowest channels.
 
     Parameters
@@ -47,30 +47,29 @@ class GammatoneBank:
         self.reset()
 
     def reset(self) -> None:
-        """All filters back to rest."""
-        self._state = np.zeros((2, *self._sections.shape[:2]), np.complex128)
-        self._position = 0  # samples of a span that have come
+        """Reset the state of all filters."""
+        self._state = np.zeros((0, *self._sections.shape[:2]), np.complex128)  # of each ear
+        self._position = 0  # samples since the start of the span
 
-    def process(
-        self, block: FloatArray, with_envelope: bool, output: FloatArray | None = None
-    ) -> tuple[FloatArray, FloatArray | None]:
-        """Filter (2, N): output (2, C, N), and the envelope 2 abs(H x) of the same shape if wanted, else None.
+    def process(self, block: FloatArray, with_envelope: bool, output: FloatArray) -> FloatArray | None:
+        """Filter (ears, N) into `output` (ears, C, N) with evenly strided rows.
 
-        It goes into `output` where that is given; its rows may lie apart (`kernels.rows_apart`).
+        A change of the number of ears resets the filters. Returns the envelope 2 abs(H x), or None.
         """
-        if output is None:
-            output = buffer_pool.empty((2, len(self._sections), block.shape[-1]))
+        if len(self._state) != len(block):
+            self._state = np.zeros((len(block), *self._sections.shape[:2]), np.complex128)
+            self._position = 0
         envelope = buffer_pool.empty(output.shape) if with_envelope else None
         run = kernels.gammatone if kernels.compiled() else filter_by_scipy
         run(block, self._sections, self._state, self._position, output, envelope)
         self._position = (self._position + block.shape[-1]) % TURN_SPAN
-        return output, envelope
+        return envelope
 
 
 def _sections(poles: NDArray[np.complex128], gains: FloatArray, order: int) -> NDArray[np.complex128]:
-    """A one-pole section (b0, 0, 0, 1, -p, 0) per channel and pole, (C, order, 6).
+    """Return a one-pole section (b0, 0, 0, 1, -p, 0) for each channel and pole, (C, order, 6).
 
-    All gains of four poles are in the first one's, which saves time, and keeps filters of many poles from underflow.
+    The gain of four poles is in the first of them, which saves time and avoids underflow in filters of many poles.
     """
     sections = np.zeros((len(poles), order, 6), np.complex128)
     sections[..., 0] = sections[..., 3] = 1
@@ -89,22 +88,22 @@ def filter_by_scipy(
     output: FloatArray,
     envelope: FloatArray | None,
 ) -> None:
-    """Filter (2, N) into `output` (2, C, N), and the modulus into `envelope`; the twin of `kernels.gammatone`.
+    """Filter (ears, N) into `output` (ears, C, N), and the modulus into `envelope`, as `kernels.gammatone` does.
 
-    `state` (2, C, order) runs on from block to block: what each pole put out last, turned to frequency 0 by the pole's
-    angle for each of the `position` samples that have come since phases began anew, as they do every `TURN_SPAN`.
+    `state` (ears, C, order) is updated: the last output of each pole, turned to frequency 0 by the angle of the pole
+    for each of the `position` samples since the start of the span of `TURN_SPAN` samples.
     """
     block = clamp(block)
     poles = -sections[..., 4]
     lengths = np.abs(poles)
     turns = np.divide(poles, lengths, out=np.ones_like(poles), where=lengths > 0)
-    state *= lengths * turns**position  # as that of direct form II transposed, p y[n]
+    state *= lengths * turns**position  # the state of direct form II transposed, p y[n]
     for first in range(0, block.shape[-1], FLUSH_INTERVAL):
         span = slice(first, first + FLUSH_INTERVAL)
-        for channel, cascade in enumerate(sections):
-            before = np.zeros((len(cascade), 2, 2), np.complex128)
+        for channel, poles_of_channel in enumerate(sections):
+            before = np.zeros((len(poles_of_channel), len(block), 2), np.complex128)
             before[..., 0] = state[:, channel].T
-            analytic, after = scipy.signal.sosfilt(cascade, block[:, span], zi=before)
+            analytic, after = scipy.signal.sosfilt(poles_of_channel, block[:, span], zi=before)
             state[:, channel] = after[..., 0].T
             output[:, channel, span] = analytic.real
             if envelope is not None:

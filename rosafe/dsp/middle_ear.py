@@ -16,7 +16,8 @@ from .numeric_limits import FloatArray
 ORDER = 512
 MODELS = ("jepsen", "lopezpoveda")
 
-# Nominal peaks of the two filters, inverted by pp_bUnityComp (the real ones lie up to 0.5 dB beside, by sample rate).
+# Nominal peaks of the two filters, inverted by pp_bUnityComp. The actual peaks, which depend on the sample rate, differ
+# by up to 0.5 dB.
 PEAK_DB = {"jepsen": 55.9986, "lopezpoveda": 66.2888}
 
 REFERENCE_DB_SPL = 104.0  # level at which the displacement was measured
@@ -103,7 +104,7 @@ STAPES_IMPEDANCE = np.array(
 
 
 def middle_ear_fir(model: str, sample_rate: float, unity: bool) -> FloatArray:
-    """Impulse response (513,) of the middle ear.
+    """Return the impulse response (513,) of the middle ear.
 
     Parameters
     ----------
@@ -112,25 +113,25 @@ def middle_ear_fir(model: str, sample_rate: float, unity: bool) -> FloatArray:
     sample_rate : float
         In Hz.
     unity : bool
-        Raise the peak to a nominal 0 dB; otherwise the output for an input of RMS 1 at 100 dB SPL is in m/s.
+        Scale the peak to a nominal 0 dB; otherwise the output for an input of RMS 1 at 100 dB SPL is in m/s.
 
     Raises
     ------
     ValueError
-        Where the sample rate is so low that no measured point lies below half of it.
+        If the sample rate is so low that no measured point is below half of it.
     """
     nyquist = sample_rate / 2
     lowest = {"jepsen": STAPES_IMPEDANCE[0, 0], "lopezpoveda": STAPES_VELOCITY_EXTRAPOLATED[0, 0]}[model]
     if nyquist <= lowest:
-        raise ValueError(f"pp_middleEarModel: {model} needs a sample rate above {2 * lowest:.12g} Hz")
+        raise ValueError(f"pp_middleEarModel: {model} requires a sample rate above {2 * lowest:.12g} Hz")
     fir = _jepsen(nyquist) if model == "jepsen" else _lopezpoveda(nyquist)
     return fir * 10 ** (PEAK_DB[model] / 20) if unity else fir
 
 
 def _frequency_sampling(frequencies: FloatArray, amplitudes: FloatArray) -> FloatArray:
-    """FIR design of MATLAB's ``fir2``, without its snapping of the breakpoints to the grid, which costs 2 dB at 100 Hz.
+    """Design an FIR filter as ``fir2`` of MATLAB, but do not move breakpoints to the grid (an error of 2 dB at 100 Hz).
 
-    `scipy.signal.firwin2` refuses so few grid points.
+    `scipy.signal.firwin2` does not accept such a small number of grid points.
     """
     grid = np.linspace(0.0, frequencies[-1], ORDER + 1)
     delay = np.exp(-1j * np.pi * (ORDER / 2) * np.arange(ORDER + 1) / ORDER)
@@ -148,7 +149,7 @@ def _jepsen(nyquist: float) -> FloatArray:
 
 def _lopezpoveda(nyquist: float) -> FloatArray:
     frequencies, displacements = STAPES_DISPLACEMENT.T
-    # µm peak-to-peak at the reference level to m/s; the factor sqrt(2) is the one of the published MATLAB design
+    # from µm peak-to-peak at the reference level to m/s; the factor sqrt(2) is in the published MATLAB design
     velocities = displacements * 1e-6 * 2 * np.pi * frequencies * 10 ** (-REFERENCE_DB_SPL / 20) * np.sqrt(2)
     table = np.vstack([STAPES_VELOCITY_EXTRAPOLATED, np.column_stack([frequencies, velocities])])
     table = table[np.argsort(table[:, 0])]
@@ -166,7 +167,7 @@ def _lopezpoveda(nyquist: float) -> FloatArray:
 
 
 def _minimum_phase(fir: FloatArray) -> FloatArray:
-    """The minimum phase response with the magnitude of `fir` on a grid of its own length."""
+    """Return the minimum phase response with the magnitude of `fir` on a grid of the same length."""
     magnitude = np.maximum(np.abs(scipy.fft.fft(fir)), np.finfo(np.float64).tiny)
     phase = -np.imag(scipy.signal.hilbert(np.log(magnitude)))
     response: FloatArray = scipy.fft.ifft(magnitude * np.exp(1j * phase)).real

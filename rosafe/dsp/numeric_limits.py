@@ -1,4 +1,4 @@
-"""What keeps every number finite and fast: a bound on huge samples, and 0 for tiny samples and filter states."""
+"""Limits that keep all numbers finite and fast: huge samples are clamped, tiny samples and filter states become 0."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from numpy.typing import NDArray
 
 FloatArray = NDArray[np.float64]
 
-# Samples beyond this are taken as this. Even the product of two energies of squared windows stays finite:
-# (2**31 * 1e70**2)**2 = 5e298. Sound has amplitudes around 1 (100 dB SPL), so nothing real comes near.
+EPSILON = 2.2204e-16  # machine epsilon, with the digits of the original's source
+
+# Larger samples are clamped to this. Even the product of two energies of squared windows stays finite:
+# (2**31 * 1e70**2)**2 = 5e298. Sound has amplitudes around 1 (100 dB SPL), far below.
 LIMIT = 1e70
 
-# Samples that are smaller than this become 0, and filter states now and then. The square of the smallest
-# audible amplitude is some 1e-20; the smallest normal double is 2e-308, and arithmetic below it is many times slower.
+# Samples below this become 0, and filter states at intervals. The square of the smallest audible amplitude is about
+# 1e-20; the smallest normal double is 2e-308, and arithmetic below it is many times slower.
 TINY = 1e-200
-SQUARE_TINY = 1e-145  # the same where samples are squared and weighted
+SQUARE_TINY = 1e-145  # the same for samples that are squared and weighted
 
-FLUSH_INTERVAL = (
-    4096  # samples that a filter goes on by before its state is looked at: it may become tiny in a long block
-)
+FLUSH_INTERVAL = 4096  # samples between two checks of a filter's state, which may become denormal in a long block
 
 
 def clamp(block: FloatArray, tiny: float = TINY) -> FloatArray:
-    """`block` with samples bounded to ±LIMIT, and 0 for those below `tiny`; `block` itself where none is like that."""
+    """Clamp samples to ±LIMIT, and to 0 below `tiny`. Return `block` itself if no sample changes."""
     size = np.abs(block)
     below = size < tiny
     if size.max(initial=0.0) <= LIMIT and not (below & (block != 0)).any():
@@ -35,6 +35,6 @@ def clamp(block: FloatArray, tiny: float = TINY) -> FloatArray:
 
 
 def flush_denormals(state: NDArray[Any]) -> None:
-    """Set to 0, in place, what is smaller than TINY in a contiguous real or complex `state`."""
+    """Set numbers below TINY in a contiguous real or complex `state` to 0, in place."""
     parts = state.view(np.float64)
     parts[np.abs(parts) < TINY] = 0.0

@@ -1,13 +1,14 @@
-"""The names of 0.2 for plugins that were written for it. To be removed in the next release."""
+"""The names of version 0.2, for plugins that were written for it. They will be removed in the next release."""
 
 from __future__ import annotations
 
 import ast
+from collections.abc import Iterator
 from functools import cached_property
 from types import FunctionType
 from typing import Any
 
-# What a subclass of Stage may override: the name in 0.2, and the present one
+# Members that a subclass of Stage may override: the name in 0.2, and the current one
 OVERRIDES = {
     "PREFIX": "prefix",
     "PROVIDES": "EXTRAS",
@@ -21,7 +22,7 @@ ATTRIBUTES = {"_values": "values", "given": "input_format", "output": "output_fo
 
 
 class _Alias:
-    """Another name of an attribute. It can be read, not set: a plugin may use the name for something else."""
+    """An alias of an attribute, for reading only: a plugin may use the name for an attribute of its own."""
 
     def __init__(self, name: str) -> None:
         self._name = name
@@ -31,7 +32,7 @@ class _Alias:
 
 
 class OldNames:
-    """Base class of Stage. Each name that a subclass defines is defined by its other name, too, when it is created."""
+    """Base class of Stage, which defines each member of a new subclass by its old and its current name."""
 
     _values, given, output = map(_Alias, ATTRIBUTES.values())
 
@@ -49,37 +50,33 @@ class OldNames:
             cls.output_format.__set_name__(cls, "output_format")  # type: ignore[attr-defined]
 
 
-# Modules from which plugins of 0.2 import what is in rosafe.plugin now
+# Modules from which plugins of 0.2 import the names of rosafe.plugin
 MODULES = ("rosafe.dsp.framing", "rosafe.dsp.stage", "rosafe.vocabulary.parameter", "rosafe.vocabulary.representation")
 
 
 def used(source: bytes) -> list[str]:
-    """The old names that a plugin uses, each with the present one.
+    """Return the old names in the source of a plugin, each with the current one.
 
-    Raises SyntaxError or ValueError for what is not Python.
+    Raises SyntaxError or ValueError if the source is not valid Python.
     """
     renamed = {**OVERRIDES, **ATTRIBUTES}
-    found: dict[str, None] = {}
+    found: set[str] = set()
     for node in ast.walk(ast.parse(source)):
-        names: list[str] = []
-        if isinstance(node, ast.ImportFrom):
-            if node.module in MODULES:
-                found[f"{node.module} (now rosafe.plugin)"] = None
-        elif isinstance(node, ast.ClassDef):
-            for item in node.body:
-                if isinstance(item, ast.FunctionDef):
-                    names.append(item.name)
-                elif isinstance(item, ast.Assign):
-                    names += [target.id for target in item.targets if isinstance(target, ast.Name)]
-                elif isinstance(item, ast.AnnAssign) and isinstance(item.target, ast.Name):
-                    names.append(item.target.id)
-        elif isinstance(node, ast.Attribute):
-            owner = node.value
-            is_self = isinstance(owner, ast.Name) and owner.id == "self"
-            is_super = isinstance(owner, ast.Call) and isinstance(owner.func, ast.Name) and owner.func.id == "super"
-            if (is_self or is_super) and isinstance(node.ctx, ast.Load):
-                names.append(node.attr)
-        for name in names:
-            if name in renamed:
-                found[f"{name} (now {renamed[name]})"] = None
+        if isinstance(node, ast.ImportFrom) and node.module in MODULES:
+            found.add(f"{node.module} (now rosafe.plugin)")
+        found.update(f"{name} (now {renamed[name]})" for name in _members(node) if name in renamed)
     return sorted(found)
+
+
+def _members(node: ast.AST) -> Iterator[str]:
+    """Yield the names that a class defines in its body, or the attribute of `self` or `super()` that is read."""
+    if isinstance(node, ast.ClassDef):
+        for item in node.body:
+            if isinstance(item, ast.FunctionDef):
+                yield item.name
+            targets = item.targets if isinstance(item, ast.Assign) else [getattr(item, "target", None)]
+            yield from (target.id for target in targets if isinstance(target, ast.Name))
+    elif isinstance(node, ast.Attribute) and isinstance(node.ctx, ast.Load):
+        owner = node.value.func if isinstance(node.value, ast.Call) else node.value
+        if isinstance(owner, ast.Name) and owner.id == ("super" if isinstance(node.value, ast.Call) else "self"):
+            yield node.attr

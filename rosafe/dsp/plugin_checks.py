@@ -1,6 +1,6 @@
-"""Checks of plugins at run time: read-only input, checked results, and errors that name the plugin, its file and line.
+"""Checks of plugins at run time: read-only input, checked results, and errors with the plugin, its file and line.
 
-`checked` makes a subclass of a plugin's stage that does this. Stages of rosafe itself are not wrapped and pay nothing.
+`checked` creates a subclass of a plugin's stage with these checks. Built-in stages are not wrapped.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import logging
 import math
 import re
 import sys
+import traceback
 import types
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import contextmanager
@@ -20,7 +21,7 @@ import numpy as np
 
 from rosafe.declarations.checks import MAX_TEXT
 from rosafe.declarations.parameter import REQUIRED, Parameter
-from rosafe.declarations.representation import Part
+from rosafe.declarations.representation import Derived, Part
 
 from .numeric_limits import FloatArray
 from .signal_format import SignalFormat
@@ -32,18 +33,18 @@ _PUBLIC = re.compile(r"^\s*(from|import)\s+rosafe\.plugin\b|^\s*from\s+rosafe\s+
 
 
 class PluginError(ValueError):
-    """A plugin's stage failed or does not do what it declares; the text names the plugin, its file and the line."""
+    """A plugin's stage failed or violates its declaration; the text names the plugin, its file and the line."""
 
 
 def checked(stage: type[Stage], file: str = "") -> type[Stage]:
-    """A subclass of a plugin's stage whose input is read-only and whose results are checked.
+    """Return a subclass of a plugin's stage whose input is read-only and whose results are checked.
 
     Parameters
     ----------
     stage : type
         The plugin's class, with a declaration.
     file : str
-        Where it is defined, for messages; by default the file of its module.
+        The file that defines it, for messages; by default that of its module.
 
     Returns
     -------
@@ -64,21 +65,21 @@ def checked(stage: type[Stage], file: str = "") -> type[Stage]:
         "SUPPORTS_IN_PLACE": False,
         "CHANNEL_INDEPENDENT": False,
     }
-    made: type[Stage] = types.new_class(
+    subclass: type[Stage] = types.new_class(
         stage.__name__, (CheckedStage, stage), {}, lambda namespace: namespace.update(names)
     )
-    made.TAKES_OUT = stage.TAKES_OUT
-    return made
+    subclass.TAKES_OUT = stage.TAKES_OUT
+    return subclass
 
 
 def _file_of(stage: type[Stage]) -> str:
-    """The file of the first function that the class itself defines."""
+    """Return the file of the first function that the class itself defines."""
     codes = (getattr(value, "__code__", None) for value in vars(stage).values())
     return next((code.co_filename for code in codes if code is not None), "unknown file")
 
 
 def _checks_nan(stage: type[Stage], file: str) -> bool:
-    """Plugins written for 0.2 may return NaN."""
+    """Return whether to reject NaN: not if it is declared, nor in plugins written for 0.2."""
     if stage.REPRESENTATION.allow_nan:
         return False
     try:
@@ -88,7 +89,7 @@ def _checks_nan(stage: type[Stage], file: str) -> bool:
 
 
 def _line_of(stage: type[Stage], file: str) -> int:
-    """Where the method that computes begins, or else the class."""
+    """Return the first line of the method that computes, otherwise that of the class."""
     for name in ("frame", "process", "__init__"):
         code = getattr(inspect.unwrap(getattr(stage, name, None) or stage), "__code__", None)
         if code is not None and code.co_filename == file:
@@ -100,40 +101,42 @@ def _line_of(stage: type[Stage], file: str) -> int:
 
 
 def read_only(array: FloatArray) -> FloatArray:
-    """A view of a contiguous array that cannot be written, nor made writable again."""
+    """Return a view of a contiguous array that cannot be written or made writable again."""
     return np.asarray(memoryview(array).toreadonly())  # type: ignore[arg-type]
 
 
 class _Count:
-    """The number of frames that a stage received and returned, compared with its `output_count`.
+    """Compares the number of frames that a stage received and returned with its `output_count`.
 
-    After a change of parameters the phase of its frames is unknown: then only their rate is compared.
+    After a change of parameters the phase of its frames is unknown: only their rate is compared.
     """
 
     def __init__(self, since_start: bool = True) -> None:
         self._since_start = since_start
         self._received = self._returned = 0
-        self._most = 0  # frames returned for one block
+        self._max_returned = 0  # for one block
         self._aligned = since_start  # False until the first frame after a change
 
     def expected(self, stage: Stage, received: int, returned: int) -> int:
-        """How many frames should have been returned for the block; `returned` itself if that is plausible."""
+        """Return the expected number of frames for the block; `returned` itself if that is plausible."""
         self._received += received
         self._returned += returned
         if self._since_start:
             count = super(CheckedStage, stage).output_count(self._received)  # type: ignore[misc]
             return returned + _whole(count, "output_count") - self._returned
-        self._most = max(self._most, returned)
+        self._max_returned = max(self._max_returned, returned)
         if not self._aligned:
             if returned:
                 self._aligned, self._received, self._returned = True, 0, 0
             return returned
         due = self._received * stage.output_format.rate / stage.input_format.rate
-        return returned if abs(self._returned - due) < 2 + self._most else returned + round(due) - self._returned
+        return (
+            returned if abs(self._returned - due) < 2 + self._max_returned else returned + round(due) - self._returned
+        )
 
 
 def text_of_exception(problem: BaseException) -> str:
-    """The text of an exception; some classes raise when they are asked for it."""
+    """Return the text of an exception, even if its class fails to convert itself to a string."""
     try:
         return str(problem)
     except Exception:
@@ -147,38 +150,36 @@ def _whole(value: Any, name: str) -> int:
 
 
 def _rows(value: Any, name: str) -> Rows:
-    if not isinstance(value, tuple):
-        raise TypeError(f"{name}: expected a tuple of integers, got {value!r:.80}")
-    if not all(isinstance(n, (int, np.integer)) and not isinstance(n, bool) and n >= 0 for n in value):
+    valid = isinstance(value, tuple) and all(
+        isinstance(n, (int, np.integer)) and not isinstance(n, bool) and n >= 0 for n in value
+    )
+    if not valid:
         raise TypeError(f"{name}: expected a tuple of integers, got {value!r:.80}")
     return tuple(map(int, value))
 
 
-def _values(given: Any, declared: Collection[tuple[str, str]], name: str) -> dict[str, Any]:
-    """Those of the mapping `given` that are declared as (name, type), each of its type."""
-    if not isinstance(given, Mapping):
-        raise TypeError(f"{name}: expected a dict, got {given!r:.80}")
-    missing = [key for key, _ in declared if key not in given]
-    if missing:
+def _values(values: Any, declared: Collection[Parameter | Derived], name: str) -> dict[str, Any]:
+    """Return the declared ones of `values`, after a check of their types."""
+    if not isinstance(values, Mapping):
+        raise TypeError(f"{name}: expected a dict, got {values!r:.80}")
+    if missing := [one.name for one in declared if one.name not in values]:
         raise TypeError(f"{name}: {', '.join(missing)} is missing")
-    result = {}
-    for key, idl in declared:
+    for one in declared:
         try:
-            Parameter(key, idl, REQUIRED, "x", most=sys.maxsize).check(given[key])
+            Parameter(one.name, one.idl, REQUIRED, "x", most=sys.maxsize).check(values[one.name])
         except ValueError as problem:
             raise TypeError(f"{name}: {problem}") from None
-        result[key] = given[key]
-    return result
+    return {one.name: values[one.name] for one in declared}
 
 
 class CheckedStage(Stage):
-    """Base class, before the plugin's own, of what `checked` returns."""
+    """The first base class of the classes that `checked` creates; the plugin's own class is the second."""
 
     PLUGIN: ClassVar[type[Stage]]
     PLUGIN_FILE: ClassVar[str]
     PLUGIN_LINE: ClassVar[int]
     CHECKS_NAN: ClassVar[bool]
-    CONVERTS: ClassVar[bool] = True  # real arrays of another number type, and those that are not contiguous
+    CONVERTS: ClassVar[bool] = True  # arrays of other real types, and arrays that are not contiguous
     _warned: ClassVar[set[str]] = set()  # kinds whose arrays were converted
 
     def __init__(self, *arguments: Any, **parameters: Any) -> None:
@@ -192,17 +193,17 @@ class CheckedStage(Stage):
 
     @classmethod
     def describe_plugin(cls) -> str:
-        """Kind and file, for messages."""
+        """Return the kind and the file, for messages."""
         return f"plugin {cls.REPRESENTATION.kind} ({cls.PLUGIN_FILE})"
 
     @classmethod
-    def _violation(cls, what: str, line: int = 0) -> PluginError:
-        return PluginError(f"plugin {cls.REPRESENTATION.kind} ({cls.PLUGIN_FILE}:{line or cls.PLUGIN_LINE}): {what}")
+    def _violation(cls, text: str, line: int = 0) -> PluginError:
+        return PluginError(f"plugin {cls.REPRESENTATION.kind} ({cls.PLUGIN_FILE}:{line or cls.PLUGIN_LINE}): {text}")
 
     @classmethod
     @contextmanager
     def _locating(cls, name: str, refuses: bool = False) -> Iterator[None]:
-        """Make a `PluginError` of anything that the method `name` raises.
+        """Convert any exception of the method `name` to a `PluginError`.
 
         A method that `refuses` values may raise a ValueError that begins with the name of a parameter.
         """
@@ -217,19 +218,16 @@ class CheckedStage(Stage):
 
     @classmethod
     def _is_fault(cls, problem: ValueError) -> bool:
-        """Whether the plugin's own code raised it for something other than a parameter's value."""
-        names = [n for p in cls.REPRESENTATION.parameters for n in (p.name, *p.aliases, *p.former)]
-        return cls._line(problem) > 0 and not text_of_exception(problem).startswith(tuple(names))
+        """Return whether the plugin's own code raised it for another reason than the value of a parameter."""
+        names = tuple(cls.REPRESENTATION.value_names)
+        return cls._line(problem) > 0 and not text_of_exception(problem).startswith(names)
 
     @classmethod
     def _line(cls, problem: BaseException) -> int:
-        """The line of the plugin's file where it happened; 0 if it was not there."""
-        line, trace = 0, problem.__traceback__
-        while trace is not None:
-            if trace.tb_frame.f_code.co_filename == cls.PLUGIN_FILE:
-                line = trace.tb_lineno
-            trace = trace.tb_next
-        return line
+        """Return the line of the plugin's file in which the exception was raised; 0 if it was raised elsewhere."""
+        trace = traceback.walk_tb(problem.__traceback__)
+        lines = [line for frame, line in trace if frame.f_code.co_filename == cls.PLUGIN_FILE]
+        return lines[-1] if lines else 0
 
     @classmethod
     def _raise(cls, name: str, problem: BaseException) -> NoReturn:
@@ -239,17 +237,7 @@ class CheckedStage(Stage):
     # --- blocks ---
 
     def process(self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None) -> Output:
-        given: list[FloatArray] = [read_only(block)]
-        if extra is not None or out is not None:
-            given.append(extra if extra is None else read_only(extra))  # type: ignore[arg-type]
-        if out is not None:
-            given.append(out)
-        try:
-            output = super().process(*given)
-        except KeyboardInterrupt:
-            raise
-        except BaseException as problem:
-            self._raise("process", problem)
+        output = self._call_process(block, extra, out)
         parts = output if isinstance(output, tuple) else (output,)
         rows = self.__rows.get(block.shape[:-1]) or self._expected_rows(block.shape[:-1])
         if len(parts) != len(rows):
@@ -271,13 +259,28 @@ class CheckedStage(Stage):
             self._check_extra(name)
         return parts if isinstance(output, tuple) else parts[0]
 
+    def _call_process(self, block: FloatArray, extra: FloatArray | None, out: FloatArray | None) -> Output:
+        """Call `process` of the plugin with read-only arrays, and without trailing arguments that are None."""
+        arguments: list[Any] = [read_only(block)]
+        if extra is not None or out is not None:
+            arguments.append(None if extra is None else read_only(extra))
+        if out is not None:
+            arguments.append(out)
+        try:
+            return super().process(*arguments)
+        except KeyboardInterrupt:
+            raise
+        except BaseException as problem:
+            self._raise("process", problem)
+
     def _part(
         self, array: Any, rows: Rows, part: Part, shared: Collection[FloatArray], out: FloatArray | None
     ) -> FloatArray:
-        """One array of the output, checked against its declaration."""
-        if not isinstance(array, np.ndarray) or array.dtype.kind not in "fiub":
-            told = f"{array.dtype} array" if isinstance(array, np.ndarray) else type(array).__name__
-            raise self._violation(f"{part.name}: expected a float64 array, got {told}")
+        """Return one array of the output after a comparison with its declaration."""
+        if not isinstance(array, np.ndarray):
+            raise self._violation(f"{part.name}: expected a float64 array, got {type(array).__name__}")
+        if array.dtype.kind not in "fiub":
+            raise self._violation(f"{part.name}: expected a float64 array, got {array.dtype} array")
         if array.ndim == 0 or array.shape[:-1] != rows:
             shape = ", ".join(map(str, (*rows, "frames")))
             raise self._violation(f"{part.name}: expected shape ({shape}), got {array.shape}")
@@ -310,7 +313,7 @@ class CheckedStage(Stage):
             super().reset()
         self.__count = _Count()
 
-    # --- what it declares ---
+    # --- declared properties ---
 
     def reconfigure(self, given: SignalFormat, changes: Collection[Mapping[str, Any]]) -> None:
         changed = given != self.input_format or any(changes)
@@ -322,24 +325,23 @@ class CheckedStage(Stage):
             self._inspect()
 
     def _inspect(self) -> None:
-        """Check all that can be asked without a block."""
+        """Check all members that can be read without a block."""
         if not {"input_format", "values", "provide", "provided"} <= vars(self).keys():
             raise self._violation("__init__: expected a call of super().__init__(input_format, **parameters)")
         if not isinstance(self.output_format, SignalFormat):
-            raise self._violation(f"output_format: expected a Signal, got {type(self.output_format).__name__}")
+            raise self._violation(f"output_format: expected a SignalFormat, got {type(self.output_format).__name__}")
         for name in ("parameters", "derived", "required_extra", "look_ahead"):
             getattr(self, name)
 
     @property
     def parameters(self) -> dict[str, Any]:
         with self._locating("parameters"):
-            declared = [(p.name, p.idl) for p in self.REPRESENTATION.parameters]
-            return _values(super().parameters, declared, "parameters")
+            return _values(super().parameters, self.REPRESENTATION.parameters, "parameters")
 
     @property
     def derived(self) -> dict[str, Any]:
         with self._locating("derived"):
-            return _values(super().derived, [(d.name, d.idl) for d in self.REPRESENTATION.derived], "derived")
+            return _values(super().derived, self.REPRESENTATION.derived, "derived")
 
     @property
     def required_extra(self) -> str:
@@ -383,6 +385,6 @@ class CheckedStage(Stage):
 
 
 def plugin_of(stage: Stage | type[Stage]) -> str:
-    """The plugin that a stage comes from, by kind and file; empty for a stage of rosafe itself."""
+    """Return the kind and the file of the plugin of a stage; empty for a built-in stage."""
     kind = stage if isinstance(stage, type) else type(stage)
     return kind.describe_plugin() if issubclass(kind, CheckedStage) else ""

@@ -1,23 +1,28 @@
-"""From seconds to whole numbers of samples."""
+"""Rounding of durations to whole numbers of samples."""
 
 from __future__ import annotations
 
 import math
 
-MAX_SAMPLES = 2**31 - 1  # longest window, hop or lag: more cannot be meant, nor held in memory
+MAX_SAMPLES = 2**31 - 1  # of a window, hop or lag; more would not fit into memory
 
 
 def round_half_away(value: float) -> int:
-    """`value` >= 0 rounded as C's and MATLAB's ``round`` do: 220.5 is 221 (Python's ``round`` says 220)."""
+    """Round `value` >= 0 as ``round`` of C and MATLAB does: 220.5 to 221 (``round`` of Python returns 220)."""
     below = math.floor(value)
     return below + (value - below >= 0.5)
 
 
-def sample_count(name: str, samples: float) -> int:
-    """`samples` rounded half away from zero; ValueError naming `name` if that is below 1 or absurdly many."""
+def check_length(name: str, samples: float) -> float:
+    """Return `samples`, or raise ValueError with `name` if they are too many."""
     if samples > MAX_SAMPLES:
-        raise ValueError(f"{name}: too long, {samples:.6g} samples")
-    count = round_half_away(samples)
+        raise ValueError(f"{name}: expected at most {MAX_SAMPLES} samples, got {samples:.6g}")
+    return samples
+
+
+def sample_count(name: str, samples: float) -> int:
+    """Round `samples` half away from zero. Raise ValueError with `name` if the result is below 1 or too large."""
+    count = round_half_away(check_length(name, samples))
     if count < 1:
-        raise ValueError(f"{name}: too short for this sample rate")
+        raise ValueError(f"{name}: expected at least one sample at this sample rate, got {samples:.6g}")
     return count

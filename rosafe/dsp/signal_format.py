@@ -1,4 +1,4 @@
-"""What flows from a processor to those that hang on it, beside the samples: rates, frames, channels."""
+"""The format of the signal between a processor and its children: rates, frames, channels."""
 
 from __future__ import annotations
 
@@ -7,24 +7,26 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class SignalFormat:
-    """The format of a stage's input or output. Equal formats mean that what comes goes on as before.
+    """The format of a stage's input or output. If a format equals the previous one, the signal continues unchanged.
 
     Attributes
     ----------
     sample_rate : float
-        Of the sound (Hz).
+        Sample rate of the sound (Hz).
     rate : float
-        Of this signal: samples or frames per second (Hz).
+        Samples or frames of this signal per second (Hz).
     framed : bool
         Whether it is in frames; frame k covers the samples of sound from k * hop to k * hop + window.
     hop, window : int
-        In samples of the sound.
+        Samples of the sound.
     center_frequencies : tuple of float
-        Of the channels (Hz), where there are any.
+        Centre frequencies of the channels (Hz); empty if there are none.
     filterbank : str
-        The type of filterbank that it comes from; empty before it.
+        The type of the filterbank; empty for signals before it.
     lags : int
-        The greatest lag in samples of the sound, where there is a lag axis.
+        The largest lag in samples of the sound, if there is a lag axis.
+    ears : int
+        The length of axes of ears: 1 for a signal of one ear, which only `rosafe.process` and `Stream` compute.
     """
 
     sample_rate: float
@@ -35,8 +37,9 @@ class SignalFormat:
     center_frequencies: tuple[float, ...] = ()
     filterbank: str = ""
     lags: int = 0
+    ears: int = 2
 
     @classmethod
-    def sound(cls, sample_rate: float) -> SignalFormat:
-        """That of samples of sound."""
-        return cls(sample_rate, sample_rate)
+    def sound(cls, sample_rate: float, ears: int = 2) -> SignalFormat:
+        """Return the format of samples of sound."""
+        return cls(sample_rate, sample_rate, ears=ears)

@@ -1,4 +1,4 @@
-"""Recursive filters that run on from block to block: cascades of first- and second-order sections."""
+"""Recursive filters with state: cascades and banks of first- and second-order sections."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rosafe.dsp.numeric_limits import FLUSH_INTERVAL, flush_denormals
 
 
 class SosFilter:
-    """Second-order sections with their state, from rest.
+    """A cascade of second-order sections with its state, initially at rest.
 
     Parameters
     ----------
@@ -23,15 +23,15 @@ class SosFilter:
 
     def __init__(self, sections: NDArray[Any]) -> None:
         self.sections = np.ascontiguousarray(sections)
-        self.state: NDArray[Any] | None = None  # (S, *rows, 2), direct form II transposed; None is rest
+        self.state: NDArray[Any] | None = None  # (S, *rows, 2), direct form II transposed; None at rest
         self._position = 0
 
     def reset(self) -> None:
-        """Back to rest."""
+        """Reset the state to rest."""
         self.state = None
 
     def ensure_state(self, rows: tuple[int, ...]) -> NDArray[Any]:
-        """The state for a block of `rows`. Other rows than in the last block mean a start from rest."""
+        """Return the state for a block of leading shape `rows`. A change of that shape resets it."""
         shape = (len(self.sections), *rows, 2)
         if self.state is None or self.state.shape != shape:
             self.state = np.zeros(shape, self.sections.dtype)
@@ -39,7 +39,7 @@ class SosFilter:
         return self.state
 
     def process(self, block: NDArray[Any]) -> NDArray[Any]:
-        """Filter (*rows, N) along its last axis; `block` itself where there are no sections."""
+        """Filter (*rows, N) along its last axis. Return `block` itself if there are no sections."""
         state = self.ensure_state(block.shape[:-1])
         if len(self.sections) == 0:
             return block
@@ -56,31 +56,12 @@ class SosFilter:
         return result
 
 
-class SosFilterBank:
-    """Second-order sections with their states, from rest, which all get the same samples.
-
-    Parameters
-    ----------
-    sections : ndarray (M, 6)
-        Real sections as in `scipy.signal.sosfilt`: b0, b1, b2, 1, a1, a2.
-    """
-
-    def __init__(self, sections: NDArray[np.float64]) -> None:
-        self.sections = np.ascontiguousarray(sections)
-        self.state = np.empty((len(sections), 0, 2))  # (M, *rows, 2), direct form II transposed
-        self._position = 0
-
-    def started(self, rows: tuple[int, ...]) -> NDArray[np.float64]:
-        """The states for a block of `rows`. Other rows than in the last block mean a start from rest."""
-        shape = (len(self.sections), *rows, 2)
-        if self.state.shape != shape:
-            self.state = np.zeros(shape)
-            self._position = 0
-        return self.state
+class SosFilterBank(SosFilter):
+    """M real second-order sections in parallel, all of which filter the same samples."""
 
     def process(self, block: NDArray[np.float64]) -> NDArray[np.float64]:
         """Filter (*rows, N) along its last axis by each section: (*rows, M, N)."""
-        states = self.started(block.shape[:-1])
+        states = self.ensure_state(block.shape[:-1])
         result = np.empty((*block.shape[:-1], len(self.sections), block.shape[-1]))
         for number, section in enumerate(self.sections):
             for span, whole in _spans(self._position, block.shape[-1]):
@@ -94,9 +75,9 @@ class SosFilterBank:
 
 
 def _spans(position: int, count: int) -> Iterator[tuple[slice, bool]]:
-    """The next `count` samples behind `position`, cut at multiples of `FLUSH_INTERVAL`; whether each piece ends at one.
+    """Split the `count` samples from `position` on at multiples of `FLUSH_INTERVAL`; yield whether each ends at one.
 
-    States are looked at there, and nowhere else: so it leaves no trace how sound was cut into blocks.
+    Denormal states are flushed only there, so that the result does not depend on block boundaries.
     """
     first = 0
     while first < count:
@@ -105,6 +86,6 @@ def _spans(position: int, count: int) -> Iterator[tuple[slice, bool]]:
         first = end
 
 
-def leaky_integrator(retention: float) -> NDArray[np.float64]:
-    """The section of u[n] = r u[n-1] + (1-r) x[n]; its first state value is r u[n]."""
-    return np.array([[1.0 - retention, 0.0, 0.0, 1.0, -retention, 0.0]])
+def leaky_integrator(decay_factor: float) -> NDArray[np.float64]:
+    """Return the section of u[n] = r u[n-1] + (1-r) x[n]; its first state value is r u[n]."""
+    return np.array([[1.0 - decay_factor, 0.0, 0.0, 1.0, -decay_factor, 0.0]])

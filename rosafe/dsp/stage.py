@@ -1,4 +1,4 @@
-"""What all stages have in common: declared parameters that change atomically, checked blocks, formats that follow."""
+"""The base class of stages: declared parameters that change atomically, checked blocks, derived formats."""
 
 from __future__ import annotations
 
@@ -22,36 +22,33 @@ SAMPLE_RATE = Parameter(
     "sample_rate", "double", REQUIRED, "Samples per second (Hz)", 0.0, 1e9, open_minimum=True, unit="Hz"
 )
 FLOAT64 = np.dtype(np.float64)
-Output = FloatArray | tuple[FloatArray, ...]  # a tuple where the representation has several parts
+Output = FloatArray | tuple[FloatArray, ...]  # a tuple if the representation has several parts
 
 
 class Stage(OldNames):
-    """One processor of the chain: blocks in, blocks out, state kept between.
+    """The computation of a processor: it converts blocks to blocks and keeps its state between them.
 
-    A representation is a subclass with its declaration. It implements `build`, `process`, `reset`, and what differs
-    from the defaults here of `output_rows`, `output_format`, `output_count`, `look_ahead`, `required_extra`,
-    `input_format_changed`, `state_size`, `block_size_dependent`.
+    A representation is a subclass with a declaration. It implements `build`, `process` and `reset`. If the defaults do
+    not fit, it also overrides `output_rows`, `output_format`, `output_count`, `look_ahead`, `required_extra`,
+    `input_format_changed`, `state_size` or `block_size_dependent`.
 
-    The rule for every stage: `build`, and so `configure` and `set_input_format`, puts new objects in place of what it
-    changes (filters, framings, tables) and never alters those that are there. A shallow copy of a stage is therefore a
-    second one that may be configured while the first one works; the tree tries changes on such copies, and may throw
-    them away or put them to work with the state as it is then.
+    Rule: `build`, and therefore `configure` and `set_input_format`, replaces the objects that it changes (filters,
+    framings, tables) and never modifies them. A shallow copy of a stage can therefore be configured while the original
+    computes. The tree tries updates on such copies; it discards them, or uses them with the state of that moment.
 
     Parameters
     ----------
-    input_format : Signal or float
-        The format of the blocks that `process` gets, or the sample rate (Hz) of sound.
+    input_format : SignalFormat or float
+        The format of the blocks for `process`, or the sample rate (Hz) of sound.
     **parameters
-        By their declared names; what is not given has its default.
+        Values by their declared names; other parameters have their defaults.
 
     Attributes
     ----------
-    input_format : Signal
-        The format of the blocks that `process` gets.
     values : dict of str to object
         The checked value of each parameter, by its name.
     provide : frozenset of str
-        Which of `EXTRAS` the children need; `process` stores these in `provided`.
+        Those of the `EXTRAS` that the children need; `process` stores them in `provided`.
     provided : dict of str to ndarray
         The extras of the last block.
 
@@ -62,21 +59,21 @@ class Stage(OldNames):
     """
 
     REPRESENTATION: ClassVar[Representation]
-    DECLARED_WITHIN: ClassVar[Representation | None] = None  # of a variant: with the names that the stage itself uses
-    INPUT: ClassVar[tuple[str, ...]] = ("ear", "channel", "time")  # axes of the blocks that come
-    EXTRAS: ClassVar[tuple[str, ...]] = ()  # by-products that children may need, such as the envelope
+    DECLARED_WITHIN: ClassVar[Representation | None] = None  # of a variant: the names within the stage
+    INPUT: ClassVar[tuple[str, ...]] = ("ear", "channel", "time")  # axes of the input blocks
+    EXTRAS: ClassVar[tuple[str, ...]] = ()  # by-products for children, such as the envelope
     SUPPORTS_IN_PLACE: ClassVar[bool] = False  # `out` may be the input block
     TAKES_OUT: ClassVar[bool]  # whether `process` has the argument `out`; determined when the class is created
-    CHANNEL_INDEPENDENT: ClassVar[bool] = (
-        False  # what it makes of a channel depends on no other one, not even in the last bit
-    )
+    CHANNEL_INDEPENDENT: ClassVar[bool] = False  # the output of a channel depends on no other one, to the last bit
 
     def __init_subclass__(cls, **arguments: Any) -> None:
         super().__init_subclass__(**arguments)
         cls.TAKES_OUT = callable(cls.process) and "out" in inspect.signature(cls.process).parameters
 
     def __init__(self, input_format: SignalFormat | float, **parameters: Any) -> None:
-        if not isinstance(input_format, SignalFormat):
+        if isinstance(input_format, SignalFormat):
+            SAMPLE_RATE.check(input_format.sample_rate)
+        else:
             input_format = SignalFormat.sound(SAMPLE_RATE.check(input_format))
         self.input_format = input_format
         self.provide: frozenset[str] = frozenset()
@@ -89,9 +86,9 @@ class Stage(OldNames):
 
     @classmethod
     def effective_values(cls, values: Mapping[str, Any]) -> dict[str, Any]:
-        """What `parameters` tells of a stage with these (checked) values, as far as no sample rate is needed for that.
+        """Return `parameters` of a stage with these checked values, as far as it does not depend on the sample rate.
 
-        ValueError for values that go together at no sample rate.
+        Raises ValueError for a combination of values that is invalid at all sample rates.
         """
         return dict(values)
 
@@ -99,9 +96,9 @@ class Stage(OldNames):
     def resolve_rate_defaults(
         cls, values: Mapping[str, Any], given: Collection[str], sample_rate: float
     ) -> dict[str, Any]:
-        """`values`, where the defaults of those not `given` that follow the sample rate (Hz) are what it makes of them.
+        """Return `values` with the defaults for this sample rate (Hz) of parameters that are not `given`.
 
-        These parameters are declared with `follows_rate`.
+        Only parameters declared with `follows_rate` have such defaults.
         """
         return dict(values)
 
@@ -110,16 +107,16 @@ class Stage(OldNames):
         """Return `values` as a request may hold them, to create an equal stage."""
         return dict(values)
 
-    # --- what it is -------------------------------------------------------------------------------------------
+    # --- properties -------------------------------------------------------------------------------------------
 
     @property
     def sample_rate(self) -> float:
-        """Of the sound (Hz)."""
+        """The sample rate of the sound (Hz)."""
         return self.input_format.sample_rate
 
     @property
     def parameters(self) -> dict[str, Any]:
-        """The values in force, in the order of the component's parameter structure."""
+        """The current values, in the order of the component's parameter structure."""
         return dict(self.values)
 
     @property
@@ -129,59 +126,59 @@ class Stage(OldNames):
 
     @cached_property
     def output_format(self) -> SignalFormat:
-        """The format of what `process` returns; follows from `input_format` and `values`, and is updated after them."""
+        """The format of the output, computed from `input_format` and `values` and updated when they change."""
         return self.input_format
 
     @property
     def required_extra(self) -> str:
-        """Which of the parent's `EXTRAS` `process` gets with each block; empty for none."""
+        """The name of the parent's extra that `process` needs with each block; empty for none."""
         return ""
 
     @property
     def block_size_dependent(self) -> bool:
-        """Whether the output depends on how sound is cut, beyond rounding. Plugins are not asked: theirs may."""
+        """Whether the output depends on block boundaries by more than rounding. Always assumed for plugins."""
         return False
 
     @property
     def look_ahead(self) -> int:
-        """How many frames of its input must have come after one before that one can be put out."""
+        """The number of input frames that must follow a frame before that frame can be output."""
         return 0
 
     def output_rows(self, rows: tuple[int, ...]) -> tuple[int, ...]:
-        """The output's shape without its last (time) axis, given the input's; of the first part, if there are more."""
+        """Return the leading shape of the output (of its first part), without the time axis, for that of the input."""
         return rows
 
     def part_rows(self, rows: tuple[int, ...]) -> tuple[tuple[int, ...], ...]:
-        """`output_rows` of each part."""
+        """Return `output_rows` of each part."""
         return (self.output_rows(rows),)
 
     def state_size(self, rows: tuple[int, ...]) -> int:
-        """How many numbers it keeps between blocks of leading shape `rows`, at most, besides a frame of its input.
+        """Return the maximum number of numbers kept between blocks of leading shape `rows`, besides an input frame.
 
-        Asked before anything of that size is made. Those that keep no more than a few for each row need not say so.
+        Called before the state is allocated. Stages that keep only a few numbers per row need not override it.
         """
         return 0
 
     def output_count(self, count: int) -> int:
-        """The number of samples or frames returned after `count` samples or frames of input since the start."""
+        """Return the number of samples or frames of output after `count` samples or frames of input since the start."""
         return max(0, count - self.look_ahead)
 
-    # --- changes ----------------------------------------------------------------------------------------------
+    # --- updates ----------------------------------------------------------------------------------------------
 
     def configure(self, **changes: Any) -> None:
-        """Change parameters between blocks; a ValueError leaves everything as it was.
+        """Change parameters between blocks. A ValueError changes nothing.
 
-        A parameter that is set counts as changed even where it had the value already, as in the original.
-        Which states start anew is said by each stage.
+        A parameter that is set counts as changed even if the value is the same, as in the original. Each stage
+        documents which of its states a change resets.
         """
         self.reconfigure(self.input_format, [changes])
 
     def set_input_format(self, given: SignalFormat) -> None:
-        """From now on blocks have the format `given`: the parent has changed. A ValueError changes nothing."""
+        """Change the format of the blocks after an update of the parent. A ValueError changes nothing."""
         self.reconfigure(given, ())
 
     def reconfigure(self, given: SignalFormat, changes: Collection[Mapping[str, Any]]) -> None:
-        """Apply `set_input_format` and several `configure` at once: only the final state has to be valid."""
+        """Apply `set_input_format` and several calls of `configure` together: only the final state has to be valid."""
         if given == self.input_format and not any(changes):
             self.input_format = given
             return
@@ -199,26 +196,25 @@ class Stage(OldNames):
         self.__dict__.update(tried.__dict__)
 
     def input_format_changed(self, before: SignalFormat) -> None:
-        """Design again for `input_format`, which was `before`; the rule of `build` holds.
+        """Recompute objects that depend on `input_format`, which was `before`; the rule of `build` applies.
 
-        Override it if something that `build` computes depends on the format. A change of the number of rows is noticed
-        by `process` alone.
+        Override it if `build` uses the format. Only `process` detects a change of the number of rows.
         """
 
     def _update_output_format(self) -> None:
-        """Compute `output_format` again. An equal one remains the same object, which is quick to compare."""
+        """Recompute `output_format`. An equal format remains the same object, which is fast to compare."""
         before = self.__dict__.pop("output_format", None)
         if self.output_format == before:
             self.__dict__["output_format"] = before
 
     def build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
-        """Design for `values` and drop the states that the `changed` ones invalidate; ValueError before any effect.
+        """Compute filters and tables for `values`, and reset the states that the `changed` parameters invalidate.
 
-        New objects replace the old ones: see the rule above.
+        Raise ValueError before any change. Replace objects, do not modify them: see the rule of the class.
         """
 
     def _checked_values(self, changes: Mapping[str, Any]) -> dict[str, Any]:
-        """All values after `changes`, each checked."""
+        """Return all values after `changes`, each checked."""
         checked = {}
         for name, value in changes.items():
             parameter = self._parameter(name)
@@ -246,9 +242,9 @@ class Stage(OldNames):
         extra : ndarray, optional
             The parent's by-product of the same block that `required_extra` names.
         out : ndarray, (..., M), optional
-            Where the caller wants the output: evenly strided rows, each contiguous. It may be ignored. It can be
-            `block` if the stage `SUPPORTS_IN_PLACE`: the output then stays in the cache. A stage whose `process` does
-            not             have this argument is called without it.
+            Array for the output: evenly strided rows, each contiguous. It may be ignored. It can be `block` if the
+            stage `SUPPORTS_IN_PLACE`: the output then stays in the cache. If `process` of a stage does not have this
+            argument, it is called without it.
 
         Returns
         -------
@@ -258,33 +254,39 @@ class Stage(OldNames):
         Raises
         ------
         ValueError
-            For blocks of another shape or type.
+            If the shape or type of a block is wrong.
         """
         raise NotImplementedError
 
     def reset(self) -> None:
-        """Back to the state before the first block; parameters stay."""
+        """Reset the state to that before the first block; keep the parameters."""
 
     def _output_array(self, shape: tuple[int, ...], out: FloatArray | None = None) -> FloatArray:
-        """`out` if it is suitable for an output of this shape, otherwise a new array."""
+        """Return `out` if it is suitable for an output of this shape, otherwise a new array."""
         if out is None or out.shape != shape or out.dtype != FLOAT64 or not kernels.rows_evenly_strided(out):
             return buffer_pool.empty(shape)
         return out
 
     def _as_valid_block(self, block: Any) -> FloatArray:
-        """`block` as contiguous float64 of the right shape, or ValueError."""
-        ears, dimensions = self.INPUT[0] == "ear", len(self.INPUT)
-        quick = type(block) is np.ndarray and block.dtype is FLOAT64 and block.flags.c_contiguous
-        if quick and block.ndim == dimensions and (not ears or len(block) == 2):
-            return block  # what comes from a stage: no time is lost on the rest
-        array = np.asarray(block)
-        right = array.ndim == dimensions and (not ears or len(array) == 2)
-        if not right or array.dtype.kind not in "iuf":
-            axes = ", ".join("2 ears" if axis == "ear" else f"{axis}s" for axis in self.INPUT[:-1])
-            raise ValueError(f"block: {array.dtype} of shape {array.shape} is not numbers in ({axes}, samples)")
-        return np.asarray(array, np.float64, order="C")
+        """Return `block` as contiguous float64. Raise ValueError if its shape or type is wrong."""
+        axes = self.INPUT
+        usable = type(block) is np.ndarray and block.dtype is FLOAT64 and block.flags.c_contiguous
+        if usable and block.ndim == len(axes) and (axes[0] != "ear" or len(block) == self.input_format.ears):
+            return block  # the usual case, output of a stage
+        return _converted(block, axes, self.input_format.ears)
+
+
+def _converted(block: Any, axes: tuple[str, ...], ears: int) -> FloatArray:
+    """Convert `block` to contiguous float64. Raise ValueError if it does not have these `axes` and `ears`."""
+    array = np.asarray(block)
+    right = array.ndim == len(axes) and (axes[0] != "ear" or len(array) == ears)
+    if not right or array.dtype.kind not in "iuf":
+        of_ears = "1 ear" if ears == 1 else f"{ears} ears"
+        shape = ", ".join(of_ears if axis == "ear" else f"{axis}s" for axis in (*axes[:-1], "sample"))
+        raise ValueError(f"block: expected numbers of shape ({shape}), got {array.dtype} of shape {array.shape}")
+    return np.asarray(array, np.float64, order="C")
 
 
 def parts_of(output: Output) -> Sequence[FloatArray]:
-    """The arrays of an output, one for each part."""
+    """Return the arrays of an output, one for each part."""
     return output if isinstance(output, tuple) else (output,)

@@ -1,4 +1,4 @@
-"""Variants of a representation: the same computation as another kind, with its own defaults and names of parameters."""
+"""Variants of a representation: the same computation as a kind of its own, with other defaults and parameter names."""
 
 from __future__ import annotations
 
@@ -9,14 +9,12 @@ from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any, ClassVar
 
-from rosafe.declarations.representation import Representation
-
 from .signal_format import SignalFormat
 from .stage import Stage
 
 
 def variant(base: type[Stage], kind: str, prefix: str, doc: str = "", **defaults: Any) -> type[Stage]:
-    """A subclass of a representation's stage that computes the same as another kind.
+    """Create a subclass of the stage of a representation that performs the same computation as another kind.
 
     Parameters
     ----------
@@ -25,24 +23,25 @@ def variant(base: type[Stage], kind: str, prefix: str, doc: str = "", **defaults
     kind : str
         The name of the new kind.
     prefix : str
-        What the names of its parameters begin with: ``rm_decaySec`` of a ratemap becomes ``<prefix>_decaySec``.
+        The prefix of its parameter names: ``rm_decaySec`` of a ratemap becomes ``<prefix>_decaySec``.
     doc : str
-        What it computes, in one line; by default what `base` says.
+        The computation, in one line; by default that of `base`.
     **defaults
-        Default values by the new names; all others are those of `base`.
+        Default values by the new names; other defaults are those of `base`.
 
     Returns
     -------
     type
-        The stage, which belongs to the module of the caller.
+        The stage, a class of the calling module.
 
     Raises
     ------
     ValueError
-        For a default of an unknown parameter, or out of its range.
+        If a default is for an unknown parameter, or out of range.
     """
     known = base.REPRESENTATION
-    names = {name: _renamed(name, prefix) for name in (*(p.name for p in known.parameters), *_derived(known))}
+    inner_names = [*(p.name for p in known.parameters), *(d.name for d in known.derived)]
+    names = {name: f"{prefix}_{name.partition('_')[2]}" for name in inner_names}
     unknown = set(defaults) - set(names.values())
     if unknown:
         raise ValueError(f"{min(unknown)}: expected one of {', '.join(names.values())}")
@@ -74,18 +73,10 @@ def variant(base: type[Stage], kind: str, prefix: str, doc: str = "", **defaults
     return type(kind[:1].upper() + kind[1:], (_Variant, base), attributes)
 
 
-def _renamed(name: str, prefix: str) -> str:
-    return f"{prefix}_{name.partition('_')[2]}"
-
-
-def _derived(known: Representation) -> Iterator[str]:
-    return (d.name for d in known.derived)
-
-
 class _Variant(Stage):
-    """Translates the names of parameters; within the stage they are those of the original."""
+    """Translates parameter names between callers and the stage of the base, which uses its own names."""
 
-    NAMES: ClassVar[Mapping[str, str]]  # of parameters and derived values, by those within the stage
+    NAMES: ClassVar[Mapping[str, str]]  # of parameters and derived values, by the names within the stage
 
     def __init__(self, input_format: SignalFormat | float, **parameters: Any) -> None:
         inward = self._inward(parameters)
@@ -102,7 +93,7 @@ class _Variant(Stage):
 
     @classmethod
     def _is_inner(cls, values: Mapping[str, Any]) -> bool:
-        """Whether the stage's own code asks."""
+        """Return whether the names are those within the stage, because its own code is the caller."""
         return not set(values) <= set(cls.NAMES.values())
 
     @classmethod
@@ -112,7 +103,7 @@ class _Variant(Stage):
     @classmethod
     @contextmanager
     def _translating(cls) -> Iterator[None]:
-        """Use the names of the variant in errors."""
+        """Replace the names within the stage by those of the variant in errors."""
         try:
             yield
         except ValueError as problem:

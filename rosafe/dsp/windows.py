@@ -1,7 +1,7 @@
 """Analysis windows, symmetric, by the names of the original.
 
 F. J. Harris (1978), "On the use of windows for harmonic analysis with the discrete Fourier transform", Proc. IEEE 66,
-51-83; of the exact forms there are several, these are MATLAB's.
+51-83; several exact forms exist; these are MATLAB's.
 """
 
 from __future__ import annotations
@@ -11,18 +11,18 @@ import scipy
 
 from .numeric_limits import FloatArray
 
-NAMES = ("hamming", "hanning", "hann", "blackman", "triang", "sqrt_win")  # which the original's processors know
+NAMES = ("hamming", "hanning", "hann", "blackman", "triang", "sqrt_win")  # windows of the original's processors
 ALL_NAMES = (*NAMES, "rectwin")
 
 
 def window(name: str, length: int) -> FloatArray:
-    """The symmetric window `name` of `length` samples.
+    """Return the symmetric window `name` of `length` samples.
 
     With N = `length` and i from 0 to N - 1:
 
     ======== ===================================================================================
-    hann     (1 - cos(2 pi i / (N - 1))) / 2, zero at both ends
-    hanning  (1 - cos(2 pi (i + 1) / (N + 1))) / 2, whose zeros lie one sample outside
+    hann     (1 - cos(2 pi i / (N - 1))) / 2, 0 at both ends
+    hanning  (1 - cos(2 pi (i + 1) / (N + 1))) / 2, with its zeros one sample outside
     hamming  0.54 - 0.46 cos(2 pi i / (N - 1))
     blackman 0.42 - 0.5 cos(2 pi i / (N - 1)) + 0.08 cos(4 pi i / (N - 1))
     triang   rising (2 i + 1) / N for even N, 2 (i + 1) / (N + 1) for odd N; falling likewise
@@ -30,7 +30,7 @@ def window(name: str, length: int) -> FloatArray:
     rectwin  1
     ======== ===================================================================================
 
-    ValueError for other names.
+    Raises ValueError for other names.
     """
     values: FloatArray
     if name == "hanning":
@@ -42,5 +42,5 @@ def window(name: str, length: int) -> FloatArray:
     elif name in NAMES:
         values = scipy.signal.windows.get_window(name, length, fftbins=False)
     else:
-        raise ValueError(f"window: {name!r} is not one of {', '.join(ALL_NAMES)}")
+        raise ValueError(f"window: expected one of {', '.join(ALL_NAMES)}, got {name!r}")
     return values

@@ -1,1 +1,1 @@
-"""What a person gets to see: where a source is, pictures and tables. No ROS in here."""
+"""Plots, tables and xarray datasets of results; direction estimates. Independent of ROS."""

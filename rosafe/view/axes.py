@@ -1,4 +1,4 @@
-"""What all pictures share: their style, images over time, axes of channels, and how they are written."""
+"""Helpers shared by all plots: style, images over time, frequency axes, and saving."""
 
 from __future__ import annotations
 
@@ -35,31 +35,31 @@ _STYLE = {
 
 @contextmanager
 def style() -> Iterator[None]:
-    """The pictures' own settings, whatever the user's are; numbers that are too large for an axis are no warning."""
-    with require("matplotlib.style", "pictures").context(["default", _STYLE]), np.errstate(all="ignore"):
+    """Use the style of rosAFE instead of the user's; suppress warnings about values too large for an axis."""
+    with require("matplotlib.style", "plots").context(["default", _STYLE]), np.errstate(all="ignore"):
         yield
 
 
 def save(figure: Figure, path: Path, replace: bool = True) -> None:
-    """Write the picture as PNG, in the place of one that is there if `replace`; OutputError where that cannot be."""
+    """Save a figure as PNG; an existing file is replaced if `replace`. Raise OutputError if it cannot be written."""
     with (
         new_file(path, replace) as descriptor,
         os.fdopen(descriptor, "wb", closefd=False) as stream,
-        style(),  # some settings matter only now
+        style(),  # some settings apply when the figure is saved
     ):
         figure.savefig(stream, format="png", metadata={"Software": "rosAFE"})
 
 
 def image(axes: Axes, data: np.ndarray, extent: tuple[float, float, float, float], **options: Any) -> Any:
-    """Rows from below, (rows, columns), between left, right, bottom and top of `extent`."""
+    """Draw an array (rows, columns), first row at the bottom, between left, right, bottom and top of `extent`."""
     return axes.imshow(data, extent=extent, origin="lower", aspect="auto", interpolation="nearest", **options)
 
 
 def frequency_axis(
-    axes: Axes, frequencies: np.ndarray, most: int, name: str = "centre frequency (Hz)", axis: str = "y"
+    axes: Axes, frequencies: np.ndarray, max_ticks: int, name: str = "centre frequency (Hz)", axis: str = "y"
 ) -> None:
-    """Channels at even distances, which is the ear's scale; at most so many labels, which are real frequencies."""
+    """Label an axis on which the channels are equidistant (the ERB scale) with the frequencies of some channels."""
     count = len(frequencies)
-    ticks = np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
+    ticks = np.unique(np.linspace(0, count - 1, min(count, max_ticks)).round().astype(int))
     labels = [f"{frequencies[tick]:.0f}" if frequencies[tick] >= 10 else f"{frequencies[tick]:.2g}" for tick in ticks]
     axes.set(**{f"{axis}ticks": ticks, f"{axis}ticklabels": labels, f"{axis}label": name})

@@ -1,4 +1,4 @@
-"""What lies along the axes of a result, from what its declaration says of them: seconds, hertz, words."""
+"""Coordinates of the axes of a result, derived from its declaration: times, frequencies, lags, names of features."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ MAX_COORDINATE = 1e12  # seconds or hertz along an axis
 
 
 def check_result(result: Any) -> None:
-    """ValueError where it is no result at all, but such as the name of a file."""
+    """Raise ValueError if `result` is not a mapping, for example a file name."""
     if not isinstance(result, Mapping):
         kind = type(result).__name__
-        raise ValueError(f"result: {kind} is not what rosafe.process returns, or rosafe.load, which reads a file")
+        raise ValueError(f"result: expected a result of rosafe.process, or of rosafe.load for a file, got {kind}")
 
 
 def frame_times(
     result: Mapping[str, Any], kind: Representation, count: int, sample_rate: float | None = None
 ) -> np.ndarray:
-    """The middle of each of `count` frames of a kind (s); ValueError where the result does not tell its sample rate."""
+    """Return the centre of each of `count` frames of a kind (s). Raise ValueError if the sample rate is not known."""
     name = kind.kind
     if f"{name}_time" in result:
         return _checked(f"{name}_time", result[f"{name}_time"])[:count]
@@ -38,27 +38,27 @@ def _rate(result: Mapping[str, Any], name: str, sample_rate: float | None) -> fl
     for lags in ("cc_lags", "ac_lags", "prec_lags"):
         if np.size(result.get(lags, ())) > 1:
             return 1 / float(np.diff(result[lags][:2])[0])
-    raise ValueError(f"{name}: the result does not tell the sample rate; give it as sample_rate (Hz)")
+    raise ValueError(f"{name}: the sample rate of the result is not known; pass it as sample_rate (Hz)")
 
 
-def along(result: Mapping[str, Any], kind: Representation, axis: str, size: int) -> np.ndarray:
-    """Frequencies (Hz), lags (s) or words along an axis of a kind; numbers from 0 where nothing is known."""
+def axis_coordinates(result: Mapping[str, Any], kind: Representation, axis: str, size: int) -> np.ndarray:
+    """Return the frequencies (Hz), lags (s) or names along an axis of a kind; indices if they are not known."""
     if axis == "feature" and len(kind.features) == size:
         return np.asarray(kind.features)
     while kind.parent and any(axis in part.axes for part in KINDS[kind.parent].parts):
-        kind = KINDS[kind.parent]  # the one that brought the axis in
-    wanted = {"channel": "Hz", "filter": "Hz", "lag": "s", "feature": ""}[axis]
+        kind = KINDS[kind.parent]  # the representation that introduces the axis
+    unit = {"channel": "Hz", "filter": "Hz", "lag": "s", "feature": ""}[axis]
     units = {one.name: one.unit for one in kind.parameters} | {one.name: one.unit for one in kind.derived}
     for name in kind.coordinates:
         values = result.get(name, ())
-        if units[name] == wanted and len(values) == size:
-            return _checked(name, values) if wanted else np.asarray(values)
+        if units[name] == unit and len(values) == size:
+            return _checked(name, values) if unit else np.asarray(values)
     return np.arange(size)
 
 
 def _checked(name: str, values: Any) -> np.ndarray:
-    """Values along an axis; ValueError where they cannot be drawn."""
-    found = np.asarray(values, np.float64)
-    if found.size and not np.abs(found).max() < MAX_COORDINATE:
+    """Return the coordinates of an axis; raise ValueError if they are not finite or too large."""
+    coordinates = np.asarray(values, np.float64)
+    if coordinates.size and not np.abs(coordinates).max() < MAX_COORDINATE:
         raise ValueError(f"{name}: expected numbers between -{MAX_COORDINATE:g} and {MAX_COORDINATE:g}")
-    return found
+    return coordinates

@@ -1,4 +1,4 @@
-"""Which representations are shown as levels: powers and amplitudes, with so many dB for a factor of 10."""
+"""Representations that are shown as levels: dB per factor of 10, which is 10 for powers and 20 for amplitudes."""
 
 from __future__ import annotations
 

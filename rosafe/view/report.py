@@ -1,4 +1,4 @@
-"""Results as text: the table of ports, where the source was, levels. ASCII only, for any terminal."""
+"""Results as text: the table of ports, the path of the source, levels. ASCII only, for any terminal."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-RULER = 41  # characters from 90 degrees left to 90 degrees right; odd, so that one is straight ahead
+RULER = 41  # characters from 90 degrees left to 90 degrees right; odd, so that one of them is 0 degrees
 SILENCE_DB = -120.0
 
 
 @dataclass(frozen=True)
 class PortRow:
-    """What came on one port.
+    """The messages received from one port.
 
     Attributes
     ----------
@@ -24,9 +24,9 @@ class PortRow:
     frames : int
         Frames received.
     frame_rate : int
-        Frames per second, as the messages say.
+        Frames per second, from the metadata of the messages.
     lost : int
-        Frames that should have come between those that came.
+        Frames missing between the received ones.
     """
 
     topic: str
@@ -38,7 +38,7 @@ class PortRow:
 
 
 def port_table(rows: Sequence[PortRow]) -> str:
-    """The table of ports, a line for each."""
+    """Return the table of ports, one line for each."""
     head = ("port", "type", "msg/s", "frames", "frames/s", "lost")
     cells = [
         (row.topic, row.type, f"{row.message_rate:.2f}", str(row.frames), str(row.frame_rate), str(row.lost))
@@ -55,60 +55,54 @@ def port_table(rows: Sequence[PortRow]) -> str:
 
 
 def side(azimuth: float) -> str:
-    """An azimuth in words, always 12 characters: ``41 deg right``."""
+    """Return an azimuth (degrees, left positive) as text of 12 characters, for example ``41 deg right``."""
     if not np.isfinite(azimuth):
-        return "nobody".rjust(12)
+        return "no source".rjust(12)
     whole = round(float(azimuth))
-    words = f"{abs(whole)} deg {'right' if whole > 0 else 'left'}" if whole else "ahead"
-    return words.rjust(12)
+    text = f"{abs(whole)} deg {'left' if whole > 0 else 'right'}" if whole else "ahead"
+    return text.rjust(12)
 
 
 def ruler(marks: Mapping[str, float]) -> str:
-    """A line from left to right with a letter at each azimuth (degrees); X where two fall together."""
+    """Return a line from left to right with a letter at each azimuth (degrees, left positive); X if two coincide."""
     line = ["-"] * RULER
     line[RULER // 2] = "+"
     for letter, azimuth in marks.items():
         if np.isfinite(azimuth):
-            place = round((float(np.clip(azimuth, -90, 90)) + 90) / 180 * (RULER - 1))
+            place = round((90 - float(np.clip(azimuth, -90, 90))) / 180 * (RULER - 1))
             line[place] = letter if line[place] in "-+" else "X"
     return "|" + "".join(line) + "|"
 
 
-def path_table(
-    times: np.ndarray,
-    from_ild: np.ndarray,
-    from_correlation: np.ndarray,
-    true_azimuth: np.ndarray | None = None,
-    every: float = 0.5,
-) -> str:
-    """Where the source was: a line for every `every` seconds with the medians of the azimuths (degrees) in them.
+def path_table(times: np.ndarray, series: Mapping[str, np.ndarray], every: float = 0.5) -> str:
+    """Return the path of the source: one line per `every` seconds with the median azimuths.
 
     Parameters
     ----------
-    times, from_ild, from_correlation, true_azimuth : ndarray, (F,)
-        Seconds and degrees; NaN where there is no source.
+    times : ndarray, (F,)
+        Seconds.
+    series : mapping
+        Azimuths (F,) in degrees, left positive, by name; NaN where there is no source. The first letters of the names
+        mark them on the ruler.
     """
     scale = "left".ljust(RULER // 2 - 1) + "ahead" + "right".rjust(RULER // 2 - 1)
-    series = {"levels": from_ild, "correlation": from_correlation}
-    if true_azimuth is not None:
-        series["truth"] = true_azimuth
     lines = [f"   time   {scale}   " + "  ".join(name.rjust(12) for name in series)]
     steps = np.floor(times / every).astype(int)
     for step in np.unique(steps):
         inside = steps == step
-        medians = [_median(values[inside]) for values in series.values()]
-        marks = dict(zip("IC", medians, strict=False))
-        words = "  ".join(side(azimuth) for azimuth in medians)
-        lines.append(f"{step * every:6.2f} s  {ruler(marks)}  {words}")
+        medians = {name: _median(values[inside]) for name, values in series.items()}
+        marks = {name[0].upper(): azimuth for name, azimuth in medians.items()}
+        texts = "  ".join(side(azimuth) for azimuth in medians.values())
+        lines.append(f"{step * every:6.2f} s  {ruler(marks)}  {texts}")
     return "\n".join(lines)
 
 
 def _median(values: np.ndarray) -> float:
-    heard = values[np.isfinite(values)]
-    return float(np.median(heard)) if len(heard) else float("nan")
+    valid = values[np.isfinite(values)]
+    return float(np.median(valid)) if len(valid) else float("nan")
 
 
 def level_db(samples: np.ndarray) -> float:
-    """Level (dB) of samples with full scale 1.0; at least `SILENCE_DB`."""
+    """Return the level (dB) of samples with full scale 1.0; at least `SILENCE_DB`."""
     power = float(np.mean(np.square(samples))) if len(samples) else 0.0
     return max(SILENCE_DB, 10 * np.log10(power)) if power > 0 else SILENCE_DB

@@ -1,4 +1,4 @@
-"""The representations that are shown, on one time axis, from `rosafe.process` or from the ports."""
+"""Ratemap, level difference and cross-correlation on one time axis, from `rosafe.process` or from the ports."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ class Representations:
     center_frequencies : ndarray, (C,)
         Hz, in the order of the channels.
     lags : ndarray, (L,)
-        Seconds; positive where the left ear hears later.
+        Seconds; positive if the sound reaches the left ear later.
     ratemap : ndarray, (2, C, F)
         Power, left and right ear.
     ild : ndarray, (C, F)
-        dB, positive where the right ear is louder.
+        dB, positive if the right ear is louder.
     correlation : ndarray, (L, F)
         Cross-correlation, averaged over the channels.
     """
@@ -38,30 +38,27 @@ class Representations:
 
     @classmethod
     def from_process(cls, result: Mapping[str, Any], start: float = 0.0) -> Representations:
-        """What `rosafe.process` returned, with ``rm_scaling`` power (the default).
+        """Return the representations of a result of `rosafe.process` with ``rm_scaling`` power (the default).
 
         Parameters
         ----------
         result : mapping
-            Holds `ild`, `ratemap`, `crossCorrelation`, `gammatone` or any other that brings `fb_cfHz`, and the rates.
+            Contains `ild`, `ratemap` and `crossCorrelation` with their frame rates, and `fb_cfHz`.
         start : float
-            Time of the signal's first sample (s).
+            Time of the first sample of the signal (s).
 
         The times are exact for windows of two hops (the default).
         """
-        series = {
-            "ild": result["ild"],
-            "ratemap": result["ratemap"],
-            "correlation": result["crossCorrelation"].mean(axis=0),
-        }
-        rates = [result[f"{kind}_frameRate"] for kind in ("ild", "ratemap", "crossCorrelation")]
-        times = [
-            start + (1 + np.arange(data.shape[-1])) / rate for data, rate in zip(series.values(), rates, strict=True)
-        ]
+
+        def series(kind: str, data: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            return start + (1 + np.arange(data.shape[-1])) / result[f"{kind}_frameRate"], data
+
         return cls.aligned(
             result["fb_cfHz"],
             result["cc_lags"],
-            **{name: (time, data) for (name, data), time in zip(series.items(), times, strict=True)},
+            ratemap=series("ratemap", result["ratemap"]),
+            ild=series("ild", result["ild"]),
+            correlation=series("crossCorrelation", result["crossCorrelation"].mean(axis=0)),
         )
 
     @classmethod
@@ -73,9 +70,9 @@ class Representations:
         ild: tuple[np.ndarray, np.ndarray],
         correlation: tuple[np.ndarray, np.ndarray],
     ) -> Representations:
-        """Bring three series, each (times, data), to the times of `ild` that all of them cover: nearest frames.
+        """Align three series, each (times, data), to the times of `ild`: the nearest frame of each series is used.
 
-        Nothing is invented: times that one of them does not cover are left out.
+        Times that are not covered by all series are omitted.
         """
         series = (ratemap, ild, correlation)
         if any(len(times) == 0 for times, _ in series):
@@ -89,7 +86,7 @@ class Representations:
         return cls(times, np.asarray(center_frequencies), np.asarray(lags), *at_times)
 
     def tail(self, seconds: float) -> Representations:
-        """The last `seconds` of it."""
+        """Return the last `seconds`."""
         first = int(np.searchsorted(self.times, self.times[-1] - seconds)) if len(self.times) else 0
         return Representations(
             self.times[first:],
@@ -101,11 +98,11 @@ class Representations:
         )
 
 
-def _nearest(sorted_values: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """For each of `wanted` the index of the nearest value."""
-    if len(sorted_values) == 0 or len(wanted) == 0:
+def _nearest(sorted_values: np.ndarray, targets: np.ndarray) -> np.ndarray:
+    """Return the index of the nearest value for each target."""
+    if len(sorted_values) == 0 or len(targets) == 0:
         return np.zeros(0, int)
-    right = np.clip(np.searchsorted(sorted_values, wanted), 1, max(1, len(sorted_values) - 1))
+    right = np.clip(np.searchsorted(sorted_values, targets), 1, max(1, len(sorted_values) - 1))
     right = np.minimum(right, len(sorted_values) - 1)
     left = np.maximum(right - 1, 0)
-    return np.where(wanted - sorted_values[left] <= sorted_values[right] - wanted, left, right)
+    return np.where(targets - sorted_values[left] <= sorted_values[right] - targets, left, right)

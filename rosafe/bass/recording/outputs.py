@@ -1,45 +1,30 @@
-"""Where recorded sound goes: a WAV of any length, or a bag of windows as on the port Audio."""
+"""Outputs of recordings: a WAV file of any length, or a bag with windows as on the port Audio."""
 
 from __future__ import annotations
 
 import os
 import struct
-from typing import IO, Protocol
+from typing import IO
 
 import numpy as np
 
 from rosafe.bass.capture import AudioWindow
 
-HEADER_SECONDS = 1.0  # of sound; that much of a WAV is lost at most where the process is killed
-RIFF_LIMIT = 2**32 - 1  # bytes of a WAV; what is longer becomes an RF64
-BAG_CHUNKS = 4  # in the windows of a bag, so that a reader may miss three messages in a row
-BAG_RESERVE = 64 * 2**20  # bytes of the disk that a bag leaves free: what it needs to be closed
-
-
-class Output(Protocol):
-    """A file that grows."""
-
-    frames: int  # in it, lost ones included
-
-    def write(self, samples: np.ndarray, time_ns: int) -> None:
-        """Append int32 (2, n), the last of which was acquired at `time_ns` since 1970. OSError where it fails."""
-
-    def lose(self, frames: int) -> None:
-        """Append that many frames of silence, in the place of lost ones."""
-
-    def close(self) -> None:
-        """Make the file complete: what was written is in it, even after an OSError."""
+HEADER_SECONDS = 1.0  # of sound: the maximum loss of a WAV if the process is killed
+RIFF_LIMIT = 2**32 - 1  # bytes; a longer file is written as RF64
+BAG_CHUNKS = 4  # in a window of a bag, so that a reader can miss three consecutive messages
+BAG_RESERVE = 64 * 2**20  # bytes of free disk space that are needed to close a bag
 
 
 class WavFile:
-    """A WAV of two channels of 32 bits; from 4 GiB on an RF64 (EBU Tech 3306), which libsndfile reads like any WAV.
+    """A WAV file of two channels with 32 bits; from 4 GiB on an RF64 (EBU Tech 3306), which libsndfile reads as a WAV.
 
-    Its header is brought up to date every second of sound, so that a recording is never lost as a whole.
+    Its header is updated every second of sound, so that an interrupted recording can be read.
 
     Parameters
     ----------
     descriptor : int
-        Of an empty file, open for writing; it stays open.
+        Of an empty file, open for writing; `close` leaves it open.
     sample_rate : int
         Hz.
     """
@@ -49,14 +34,14 @@ class WavFile:
 
     def __init__(self, descriptor: int, sample_rate: int) -> None:
         self._sample_rate = sample_rate
-        self.frames = 0
-        self._in_header = 0  # frames that the header knows of
+        self.frames = 0  # number of frames in the file, including lost frames
+        self._in_header = 0  # number of frames according to the header
         self._file: IO[bytes] = os.fdopen(descriptor, "wb", buffering=0, closefd=False)
         self._write_header()
 
     def write(self, samples: np.ndarray, time_ns: int) -> None:
-        """Append `samples`; a WAV has no place for the time."""
-        # Unbuffered: the file's length always says how many frames are in it.
+        """Append `samples`, int32 (2, n). A WAV cannot store their time. Raises OSError."""
+        # Unbuffered, so that the number of frames always follows from the file's length.
         rest = np.ascontiguousarray(samples.T, "<i4").data.cast("B")
         while rest:
             rest = rest[self._file.write(rest) :]
@@ -65,7 +50,7 @@ class WavFile:
             self._write_header()
 
     def lose(self, frames: int) -> None:
-        """Append silence."""
+        """Append silence in place of `frames` lost frames. Raises OSError."""
         while frames > 0:
             count = min(frames, 2**16)
             self.write(np.zeros((2, count), np.int32), 0)
@@ -90,7 +75,7 @@ class WavFile:
         self._in_header = self.frames
 
     def close(self) -> None:
-        """Cut off what is no whole frame, and complete the header."""
+        """Truncate the file to complete frames and update the header, also after an OSError."""
         if not self._file.closed:
             self.frames = max(0, os.fstat(self._file.fileno()).st_size - self._HEADER) // self._FRAME
             os.ftruncate(self._file.fileno(), self._HEADER + self.frames * self._FRAME)
@@ -99,21 +84,20 @@ class WavFile:
 
 
 class BagWriter:
-    """A bag for `rosbag play` and the source `bag:`: overlapping windows on one topic, in which every frame has the
-    number that it has in the stream.
+    """A bag for `rosbag play` and the source `bag:`: overlapping windows on one topic, with the stream's frame indices.
 
     Parameters
     ----------
     descriptor : int
-        Of an empty file, open for reading and writing; it stays open.
+        Of an empty file, open for reading and writing; `close` leaves it open.
     sample_rate : int
         Hz.
     frames_per_chunk : int
-        A message at most brings so many new frames.
+        Maximum number of new frames in a message.
     topic : str
         Name of the port in the bag.
     newest : int
-        Number of the frame before the first one that will be written.
+        Index of the frame before the first one that will be written.
     """
 
     def __init__(self, descriptor: int, sample_rate: int, frames_per_chunk: int, topic: str, newest: int = 0) -> None:
@@ -126,19 +110,19 @@ class BagWriter:
         self._sample_rate = sample_rate
         self._chunk = frames_per_chunk
         self._topic = topic
-        self.frames = 0
+        self.frames = 0  # number of frames in the file, including lost frames
         self._newest = newest
-        self._held = 0  # frames of the window that are of this recording
-        self._time_ns = 0  # when the newest one was acquired
+        self._held = 0  # number of frames in the window that belong to this recording
+        self._time_ns = 0  # when the newest frame was acquired
         self._message_class = serialization.message_class("bass", BASS.port("Audio").idl)
         self._window = AudioWindow(BAG_CHUNKS * frames_per_chunk)
         self._bag = rosbag.Bag(os.fdopen(descriptor, "w+b", closefd=False), "w")
 
     def write(self, samples: np.ndarray, time_ns: int) -> None:
-        """Append messages that show `samples`."""
+        """Append messages with `samples`, int32 (2, n), the last of which was acquired at `time_ns` since 1970."""
         disk = os.fstatvfs(self._descriptor)
         if disk.f_bavail * disk.f_frsize < BAG_RESERVE:
-            raise OSError(28, f"the disk is full but for {BAG_RESERVE >> 20} MiB")
+            raise OSError(28, f"expected at least {BAG_RESERVE >> 20} MiB of free disk space")
         count = samples.shape[1]
         for begin in range(0, count, self._chunk):
             piece = samples[:, begin : begin + self._chunk]
@@ -146,17 +130,17 @@ class BagWriter:
             self._count(piece.shape[1])
             behind = count - begin - piece.shape[1]
             self._time_ns = time_ns - behind * 1_000_000_000 // self._sample_rate
-            # Not before the window is full, for readers take all of a first window for sound.
+            # The first window must be full, as readers use all of it.
             if self._held == self._window.frames:
-                self._put()
+                self._write_message()
 
     def _count(self, frames: int) -> None:
         self.frames += frames
         self._newest += frames
         self._held = min(self._held + frames, self._window.frames)
 
-    def _put(self) -> None:
-        """Append a message that shows what there is of the window."""
+    def _write_message(self) -> None:
+        """Append a message with the part of the window that belongs to this recording."""
         import genpy
 
         full = self._held == self._window.frames
@@ -174,19 +158,22 @@ class BagWriter:
         self._bag.write(self._topic, message, genpy.Time(seconds, nanoseconds))
 
     def lose(self, frames: int) -> None:
-        """Let the numbers go on, and silence be in the windows."""
-        self._put_unshown()
+        """Append silence in place of `frames` lost frames, and advance the frame index."""
+        self._write_incomplete_window()
         self._window.skip(frames)
         self._count(frames)
 
-    def _put_unshown(self) -> None:
-        """Show what has filled no window yet."""
+    def _write_incomplete_window(self) -> None:
+        """Write the first frames if they have not filled a window yet."""
         if 0 < self._held < self._window.frames:
-            self._put()
+            self._write_message()
 
     def close(self) -> None:
-        """Write the bag's index."""
+        """Write the bag's index, also after an OSError."""
         try:
-            self._put_unshown()
+            self._write_incomplete_window()
         finally:
             self._bag.close()
+
+
+Output = WavFile | BagWriter

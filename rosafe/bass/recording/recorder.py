@@ -1,4 +1,4 @@
-"""The recording loop: from a source into an output and a meter. No ROS in here."""
+"""The recording loop: from a source to an output and a level meter. Does not use ROS."""
 
 from __future__ import annotations
 
@@ -19,24 +19,24 @@ class SoundRecorder:
     Parameters
     ----------
     source : SoundSource
-        Open; it stays the caller's to close.
+        Open; the caller closes it.
     output : Output or None
-        Where the sound goes.
+        Destination of the sound.
     frames : int or None
-        How many to record; None for all.
+        Number of frames to record; None for all.
     show : callable
-        Takes every piece of sound, int32 (2, n), and how many frames were lost so far.
+        Called with each piece of sound, int32 (2, n), and the number of frames lost so far.
     report : callable
-        Takes a line about each loss.
+        Called with a line about each loss.
 
     Attributes
     ----------
     frames : int
-        Recorded so far, with silence for lost ones.
+        Number of frames recorded so far, including silence for lost frames.
     lost : int
-        How many of the source's frames were lost.
-    levels : Levels
-        Of all that was recorded.
+        Number of frames that the source has lost.
+    levels : LevelMeter
+        Levels of the recording.
     """
 
     def __init__(
@@ -57,9 +57,9 @@ class SoundRecorder:
         self._report = report
 
     def run(self, stopping: threading.Event) -> bool:
-        """Record until the source ends, which returns True, or enough is there, or told to stop.
+        """Record until the requested length, a stop, or the end of the source; return whether the source has ended.
 
-        Raises ComponentError where the source fails, and OSError where the output does.
+        Raises ComponentError if the source fails, and OSError if the output fails.
         """
         while not stopping.is_set() and self._room() > 0:
             chunk = self._source.read()

@@ -1,4 +1,4 @@
-"""A source that asks a bass's DedicatedSocket, on this machine or another."""
+"""A source that reads the DedicatedSocket of a bass, on this machine or another one."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from rosafe.bass.sources.base import Chunk, device_error
 
 
 class SocketSource:
-    """The frames that come from now on.
+    """The frames that are captured after the source was created.
 
     Parameters
     ----------
     host, port : str, int
-        Where the socket is.
+        Address of the socket.
     sample_rate : int
-        Hz; the protocol does not tell it, so it is taken as true.
+        Hz; it is not part of the protocol and cannot be checked.
 
     Attributes
     ----------
     newest : int
-        Number of the frame before the first one that is read.
+        Index of the frame before the first one that is read.
 
     Raises
     ------
     ComponentError
-        ``::bass::e_device`` where nobody serves there.
+        ``::bass::e_device`` if the connection cannot be made.
     """
 
     def __init__(self, host: str, port: int, sample_rate: int, stopping: threading.Event) -> None:
@@ -40,14 +40,14 @@ class SocketSource:
             with SocketClient(host, port) as client:
                 self.newest = client.newest()
         except OSError as problem:
-            raise device_error(f"{self.name}: {problem.strerror or problem}: call DedicatedSocket of bass") from None
+            raise device_error(f"{self.name}: {problem.strerror or problem}; call DedicatedSocket of bass") from None
         self._next = self.newest + 1
         self._blocks = blocks(host, port, first=self._next, patience=STALL_SECONDS, stopping=stopping)
 
     def read(self) -> Chunk | None:
-        """What is new, of any length; None once nothing new has come for some seconds.
+        """Return the new frames, in any number; None if no new frame arrives for some seconds.
 
-        Raises ``::bass::e_device`` where another stream begins, or the socket is closed.
+        Raises ``::bass::e_device`` if a new stream begins, or the socket is closed.
         """
         try:
             block = next(self._blocks, None)
@@ -56,7 +56,7 @@ class SocketSource:
         if block is None:
             return None
         if block.first - block.lost != self._next:
-            raise device_error(f"{self.name}: a new stream begins (its frames count from {block.first})")
+            raise device_error(f"{self.name}: a new stream begins at frame {block.first}")
         self._next = block.first + block.samples.shape[1]
         self.overruns += block.lost > 0
         self.lost_frames += block.lost

@@ -1,4 +1,4 @@
-"""Where sound comes from: `open_source` turns a device name into a source. No ROS in here but for bags."""
+"""Sound sources: `open_source` opens the source that a device name denotes. Only bags need ROS."""
 
 from __future__ import annotations
 
@@ -13,19 +13,20 @@ from rosafe.interface import ComponentError
 __all__ = ["Chunk", "SoundSource", "device_lines", "open_source"]
 
 DEFAULT_RATE = 44100
-_CONTROL = re.compile("[\0-\x1f\x7f-\x9f\u2028\u2029]")  # would make several lines of a line in the log
-# What ListDevices says of the sources that need no hardware: name, contents.
+_CONTROL = re.compile("[\0-\x1f\x7f-\x9f\u2028\u2029]")  # would break a line of the log
+# Name and description of each source without hardware, for ListDevices.
 BUILT_IN = (
     ("file:PATH", "a sound file in real time; ?loop=1 repeats it, ?start=SECONDS skips its beginning, ?channels=3,4"),
-    ("bag:PATH", "what rosbag recorded of a port Audio; ?topic=/bass/Audio, ?loop=1, ?start=SECONDS"),
-    ("scene:", "a source that walks from far left to far right and back; ?seconds=10&level=-30&seed=0"),
+    ("bag:PATH", "a recording of a port Audio by rosbag; ?topic=/bass/Audio, ?loop=1, ?start=SECONDS"),
+    ("scene:FILE.yaml", "a scene of several sources with known truth; docs/scenes.md describes the file"),
+    ("scene:", "a source that moves from far left to far right and back; ?seconds=10&level=-30&seed=0"),
 )
 
 
 def device_lines() -> Iterator[str]:
-    """What ListDevices prints: the built-in sources, then a line for each capture PCM as the original does.
+    """Yield the lines of ListDevices: the built-in sources, then each capture PCM in the format of the original.
 
-    Raises ``::bass::e_nodevice`` after the built-in ones where there is no sound card at all.
+    Raises ``::bass::e_nodevice`` after the built-in sources if there is no sound card.
     """
     from rosafe.bass.sources.libasound import capture_devices
 
@@ -41,23 +42,23 @@ def open_source(device: str, sample_rate: int, frames_per_chunk: int, stopping: 
     Parameters
     ----------
     device : str
-        ``file:PATH``, ``bag:PATH``, ``scene:`` or the name of an ALSA capture device, each with options after a
-        question mark. It may come from anywhere: nothing in it is evaluated.
+        ``file:PATH``, ``bag:PATH``, ``scene:``, ``scene:FILE.yaml`` or the name of an ALSA capture device; all but
+        a scene file with options after a question mark. It may come from an untrusted client: nothing is evaluated.
     sample_rate : int
         Hz; 0 is the file's or bag's own rate, or 44100 with other sources.
     frames_per_chunk : int
-        Length of what `SoundSource.read` returns.
+        Length of the chunks that `SoundSource.read` returns.
     stopping : threading.Event
         Once set, a waiting `read` returns None.
 
     Raises
     ------
     interface.ComponentError
-        ``::bass::e_device`` or ``::bass::e_hwparams``, with one line that says why.
+        ``::bass::e_device`` or ``::bass::e_hwparams``, with the reason in one line.
     """
     if _CONTROL.search(device):
-        raise device_error(f"{device!r}: line ends, null bytes and the like are in no device's name")
-    # Imported here: a missing library must only hurt those who use its source.
+        raise device_error(f"{device!r}: expected the name of a device, got control characters in it")
+    # Imported here, so that a missing library affects only the source that needs it.
     if device.startswith("file:"):
         from rosafe.bass.sources.file import FileSource
 
@@ -69,8 +70,13 @@ def open_source(device: str, sample_rate: int, frames_per_chunk: int, stopping: 
     if device.startswith("scene:"):
         from rosafe.bass.sources.scene import SceneSource
 
+        if device[len("scene:") :].partition("?")[0]:
+            from rosafe.bass.sources.scene_file import SceneFileSource
+
+            return SceneFileSource(device[len("scene:") :], sample_rate, frames_per_chunk, stopping)
         return SceneSource(device[len("scene:") :], sample_rate or DEFAULT_RATE, frames_per_chunk, stopping)
-    from rosafe.bass.sources.alsa import AlsaSource, DeviceBusyError
+    from rosafe.bass.sources.alsa import AlsaSource
+    from rosafe.bass.sources.pcm import DeviceBusyError
 
     try:
         return AlsaSource(device, sample_rate or DEFAULT_RATE, frames_per_chunk, stopping)

@@ -1,11 +1,14 @@
-"""What all sources share: the protocol, errors, options in device names, cutting into chunks, pacing in real time."""
+"""Code shared by the sources: protocol, errors, options in device names, division into chunks, real-time pacing."""
 
 from __future__ import annotations
 
+import argparse
+import os
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
 import numpy as np
@@ -18,112 +21,103 @@ class Chunk(NamedTuple):
     """One chunk of sound."""
 
     samples: np.ndarray  # int32, (2, frames_per_chunk): left, right
-    gap: int  # frames that were lost between the chunk before and this one
-    time: float  # when its last frame was acquired, on time.monotonic's clock
+    gap: int  # number of frames lost between the previous chunk and this one
+    time: float  # when its last frame was acquired, on the clock of time.monotonic
 
 
 def wall_time_ns(moment: float) -> int:
-    """A moment of time.monotonic's clock as ns since 1970, by the wall clock as it is now.
+    """Convert a time on the clock of time.monotonic to ns since 1970.
 
-    A clock that somebody sets shows in the result, as it should.
+    The current wall clock is used, so the result follows when the clock is set.
     """
     return time.time_ns() - int((time.monotonic() - moment) * 1e9)
 
 
 def loss_text(frames: int, index: int, sample_rate: int) -> str:
-    """How it is told that `frames` frames were lost soon after frame `index` of a stream."""
+    """Return the message that `frames` frames were lost after frame `index` of a stream."""
     return f"lost {frames} frames ({frames / sample_rate:.3f} s) after frame {index} ({index / sample_rate:.2f} s)"
 
 
 class SoundSource(Protocol):
-    """Something to read sound from, already open."""
+    """An open source of sound."""
 
     name: str
     sample_rate: int  # Hz
-    overruns: int  # how often sound was lost so far
-    lost_frames: int  # how many frames were lost so far; they count in the stream's index
+    overruns: int  # number of losses so far
+    lost_frames: int  # number of frames lost so far; they are included in the stream's frame index
 
     def read(self) -> Chunk | None:
-        """Wait for the next chunk; None at the end of the source or when it is told to stop.
+        """Wait for the next chunk; None at the end of the source or after a stop.
 
-        Raises ComponentError where the source fails for good.
+        Raises ComponentError if the source fails permanently.
         """
 
     def close(self) -> None:
-        """Give the device back; `read` must not be called any more."""
+        """Release the device; `read` must not be called afterwards."""
 
 
 def device_error(why: str) -> ComponentError:
-    """``::bass::e_device``: not there, busy, unreadable or gone."""
+    """Return ``::bass::e_device``: the device is missing, busy, unreadable or lost."""
     return interface.BASS.error("e_device", why)
 
 
 def hwparams_error(why: str) -> ComponentError:
-    """``::bass::e_hwparams``: there, but not offering what was asked for."""
+    """Return ``::bass::e_hwparams``: the device exists, but does not support the request."""
     return interface.BASS.error("e_hwparams", why)
 
 
-def parse_options(device: str, text: str, known: Mapping[str, Callable[[str], Any]]) -> dict[str, Any]:
-    """The options `text` (``loop=1&start=2.5``) of a device name, each converted by its function in `known`.
+def check_sample_rate(name: str | Path, requested: int, actual: int) -> None:
+    """Raise ``::bass::e_hwparams`` if the `requested` sample rate (Hz; 0 for any) is not the `actual` one."""
+    if requested not in (0, actual):
+        raise hwparams_error(f"{name}: expected {requested} Hz, got {actual} Hz; a sample rate of 0 accepts it")
 
-    Raises ``::bass::e_device`` for an option that is unknown or cannot be converted, naming it and what there is.
+
+def parse_options(device: str, text: str, known: Mapping[str, Callable[[str], Any]]) -> dict[str, Any]:
+    """Parse the options `text` (``loop=1&start=2.5``) of a device name; each is converted by its function in `known`.
+
+    Raises ``::bass::e_device``, with the name of the option, if it is unknown or cannot be converted.
     """
     values = {}
     for item in filter(None, text.split("&")):
         name, _, value = item.partition("=")
         if name not in known:
-            raise device_error(f"{device}: no option {name!r}; there are: {', '.join(known)}")
+            raise device_error(f"{device}: unknown option {name!r}; expected one of {', '.join(known)}")
         try:
             values[name] = known[name](value)
-        except ValueError as problem:
-            raise device_error(f"{device}: {name}={value} is not {problem}") from None
+        except (ValueError, argparse.ArgumentTypeError) as problem:
+            raise device_error(f"{device}: {name}: {problem}") from None
     return values
 
 
-def number(low: float, high: float) -> Callable[[str], float]:
-    """A converter for `parse_options`: a number from `low` to `high`."""
-
-    def convert(text: str) -> float:
-        wanted = f"a number from {low:g} to {high:g}"
-        try:
-            value = float(text)
-        except ValueError:
-            raise ValueError(wanted) from None
-        if not low <= value <= high:  # NaN too
-            raise ValueError(wanted)
-        return value
-
-    return convert
-
-
-def flag(text: str) -> bool:
-    """A converter for `parse_options`: 0 or 1."""
-    if text not in ("0", "1"):
-        raise ValueError("0 or 1")
-    return text == "1"
+def split_path(text: str) -> tuple[str, str]:
+    """Split a device name into path and options. If a file of the whole name exists, there are no options."""
+    if "?" not in text or os.path.isfile(os.path.expanduser(text)):
+        return text, ""
+    path, _, options = text.rpartition("?")
+    return path, options
 
 
 class Chunker:
-    """Cuts a stream that comes in pieces of any length, with losses between them, into chunks.
+    """Divides a stream of pieces of any length, with losses between them, into chunks.
 
-    A loss at the beginning of a chunk is the gap before it. One within a chunk fills that up with zeros, and what is
-    left of it is the gap before the next.
+    A loss at the beginning of a chunk is the gap before that chunk. A loss within a chunk fills the rest of the chunk
+    with zeros, and the remainder of the loss is the gap before the next chunk.
     """
 
     def __init__(self, frames_per_chunk: int) -> None:
-        self.pending = 0  # frames, lost ones included, that came and were not taken yet
+        self.pending = 0  # frames that were added or lost, and are not taken yet
         self._length = frames_per_chunk
         self._chunk = np.zeros((2, frames_per_chunk), np.int32)
         self._filled = 0
-        self._gap = 0  # before the chunk at hand
-        self._queue: deque[np.ndarray | int] = deque()  # what is beyond it: samples, or how many frames were lost
+        self._gap = 0  # before the current chunk
+        self._queue: deque[np.ndarray | int] = deque()  # following samples, or numbers of lost frames
 
     def add(self, samples: np.ndarray) -> None:
-        """Frames that came, int32 (2, n)."""
+        """Append frames, int32 (2, n)."""
         self._push(samples, samples.shape[1])
 
     def lose(self, frames: int) -> None:
-        """Frames that did not come."""
+        """Append a loss of `frames` frames."""
         self._push(frames, frames)
 
     def _push(self, piece: np.ndarray | int, frames: int) -> None:
@@ -145,7 +139,7 @@ class Chunker:
             elif self._filled:
                 taken = min(room, piece)
                 rest = piece - taken
-                self._filled += taken  # a chunk is made of zeros
+                self._filled += taken  # the chunk was created with zeros
             else:
                 taken, rest = piece, 0
                 self._gap += taken
@@ -153,9 +147,9 @@ class Chunker:
                 self._queue.appendleft(rest)
 
     def take(self, whole: bool = True) -> tuple[np.ndarray, int] | None:
-        """The next chunk, int32 (2, frames_per_chunk), and the gap before it; None where it is not complete.
+        """Return the next chunk, int32 (2, frames_per_chunk), and the gap before it; None if it is not complete.
 
-        With `whole` false, what has come of it, filled up with zeros; None where nothing has.
+        With `whole` false, return an incomplete chunk too, padded with zeros; None if it is empty.
         """
         if self._filled < (self._length if whole else 1):
             return None
@@ -167,20 +161,66 @@ class Chunker:
 
 
 class Pacer:
-    """Lets frames pass in real time: one that is late is followed without waiting, so nothing ever drifts."""
+    """Paces frames in real time. After a delay it catches up, so that the pace does not drift."""
 
     def __init__(self, sample_rate: int, stopping: threading.Event) -> None:
         self.sample_rate = sample_rate
         self.frames = 0
         self._stopping = stopping
-        self._start: float | None = None  # the clock starts at the first wait
+        self.started: float | None = None  # the clock starts at the first wait
 
     def wait(self, frames: int) -> float | None:
-        """Wait until `frames` more frames have had their time; when that was, or None when told to stop."""
-        if self._start is None:
-            self._start = time.monotonic()
+        """Wait until the end of the next `frames` frames. Return the time of this end, or None after a stop."""
+        if self.started is None:
+            self.started = time.monotonic()
         self.frames += frames
-        due = self._start + self.frames / self.sample_rate
+        due = self.started + self.frames / self.sample_rate
         if self._stopping.wait(max(0.0, due - time.monotonic())):
             return None
         return due
+
+
+class PacedSource:
+    """A source whose pieces, pairs of a gap and the samples after it, are divided into chunks in real time.
+
+    Subclasses call `_start` when they know the sample rate.
+    """
+
+    def __init__(self, name: str, stopping: threading.Event) -> None:
+        self.name = name
+        self.sample_rate = 0
+        self.overruns = 0
+        self.lost_frames = 0
+        self._stopping = stopping
+
+    def _start(self, sample_rate: int, frames_per_chunk: int, pieces: Iterator[tuple[int, np.ndarray]]) -> None:
+        self.sample_rate = sample_rate
+        self._frames_per_chunk = frames_per_chunk
+        self._pieces = pieces
+        self._chunks = Chunker(frames_per_chunk)
+        self._pacer = Pacer(sample_rate, self._stopping)
+
+    def read(self) -> Chunk | None:
+        """Return the next chunk at its time, the last one padded with zeros; None after the end or a stop."""
+        while (chunk := self._chunks.take()) is None:
+            piece = next(self._pieces, None)
+            if piece is None:
+                chunk = self._chunks.take(whole=False)
+                break
+            gap, samples = piece
+            self.overruns += gap > 0
+            self.lost_frames += gap
+            self._chunks.lose(gap)
+            self._chunks.add(samples)
+        if chunk is None:
+            return None
+        due = self._pacer.wait(chunk[1] + self._frames_per_chunk)
+        return None if due is None else Chunk(*chunk, due)
+
+    @property
+    def started(self) -> float | None:
+        """When the first frame was due, on the clock of time.monotonic; None before the first `read`."""
+        return self._pacer.started
+
+    def close(self) -> None:
+        """Release the device; by default there is none."""

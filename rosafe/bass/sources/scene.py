@@ -1,44 +1,33 @@
-"""The source `scene:`: a built-in binaural scene, a talker who walks from far left to far right and back again.
+"""The source `scene:`: a built-in binaural scene, a talker that moves from far left to far right and back.
 
 The head is the sphere of rosafe/sound/head.py.
 """
 
 from __future__ import annotations
 
+import itertools
 import threading
 
 import numpy as np
 from scipy import signal
 
-from rosafe.bass.sources.base import Chunk, Pacer, device_error, hwparams_error, number, parse_options
+from rosafe.bass.sources.base import PacedSource, device_error, hwparams_error, parse_options
+from rosafe.localization.scene import Truth
+from rosafe.option_types import number, seconds, whole_number
 from rosafe.sound.audiofile import to_int32
 from rosafe.sound.head import HEAD_TIME, ear_delay, shadow_gain
 
 WALK_SECONDS = 10.0
 LEVEL_DB = -30.0
-MIN_RATE = 1000  # Hz; below, nothing of the sound would be left
-_BLOCK = 4096  # frames made at once, whatever the chunks, so that the samples never depend on them
-_REACH = 3  # frames on each side that the interpolation looks at
+MIN_RATE = 1000  # Hz; almost no sound would remain below
+_BLOCK = 4096  # frames computed at once, for any chunk length, so that the samples do not depend on it
+_REACH = 3  # frames on each side that the interpolation uses
 _PITCH = (125.0, 25.0, 0.37)  # Hz: mean, excursion and speed of the talker's gliding voice
 _SYLLABLE = 0.25  # s
 
 
-def scene_azimuth(seconds: np.ndarray | float, walk: float = WALK_SECONDS) -> np.ndarray:
-    """Where the source is: degrees from straight ahead, -90 far left, 90 far right.
-
-    Parameters
-    ----------
-    seconds : array_like
-        Time since the scene's first frame.
-    walk : float
-        Seconds from one side to the other (option `seconds`); then it walks back.
-    """
-    way = np.mod(np.asarray(seconds, dtype=np.float64) / walk, 2.0)
-    return 90.0 - 180.0 * np.abs(way - 1.0)
-
-
 class Scene:
-    """The samples of the scene, in order. The same for the same options and sample rate, however they are asked for.
+    """The samples of the scene, in order. They depend only on options and sample rate, not on the block length.
 
     Parameters
     ----------
@@ -49,7 +38,7 @@ class Scene:
     level : float
         RMS level of the source, before the head, in dB below full scale.
     seed : int
-        Another seed, another noise.
+        Seed of the noise.
     """
 
     def __init__(self, sample_rate: int, seconds: float = WALK_SECONDS, level: float = LEVEL_DB, seed: int = 0) -> None:
@@ -58,16 +47,21 @@ class Scene:
         self._carrier = _Carrier(sample_rate, seed)
         first_second = _Carrier(sample_rate, seed).block(np.arange(sample_rate) / sample_rate)
         self._gain = 10 ** (level / 20) / np.sqrt(np.mean(first_second**2))
-        # The shadow is alpha + (1 - alpha) / (1 + s / (2 omega0)): its pole stands still while the source walks.
+        # The shadow is alpha + (1 - alpha) / (1 + s / (2 omega0)): its pole is fixed while the source moves.
         self._pole = signal.bilinear([1.0], [HEAD_TIME / 2, 1.0], sample_rate)
         self._pole_state = np.zeros(1)
         self._history = _REACH + int(np.ceil(HEAD_TIME * (1 + np.pi / 2) * sample_rate)) + _REACH
         self._ears = np.zeros((2, self._history + _BLOCK))
-        self._frame = 0  # the first one of the next block
+        self._frame = 0  # number of the first frame of the next block
         self._block = np.zeros((2, 0), np.int32)
 
+    def azimuth(self, times: np.ndarray | float) -> np.ndarray:
+        """Return the azimuth of the talker at `times` (s from the first frame): degrees, left positive."""
+        phase = np.mod(np.asarray(times, dtype=np.float64) / self.seconds, 2.0)
+        return np.asarray(180.0 * np.abs(phase - 1.0) - 90.0)
+
     def frames(self, count: int) -> np.ndarray:
-        """The next `count` frames: int32, (2, count)."""
+        """Return the next `count` frames: int32, (2, count)."""
         parts = [self._block[:, :count]]
         self._block = self._block[:, count:]
         missing = count - parts[0].shape[1]
@@ -81,21 +75,21 @@ class Scene:
     def _next_block(self) -> np.ndarray:
         times = (self._frame + np.arange(_BLOCK)) / self.sample_rate
         self._frame += _BLOCK
-        azimuth = np.radians(scene_azimuth(times, self.seconds))
+        azimuth = np.radians(self.azimuth(times))
         source = self._gain * self._carrier.block(times)
         lowpassed, self._pole_state = signal.lfilter(*self._pole, source, zi=self._pole_state)
         out = np.empty((2, _BLOCK))
-        for ear, incidence in enumerate((np.pi / 2 + azimuth, np.pi / 2 - azimuth)):
+        for ear, incidence in enumerate((np.pi / 2 - azimuth, np.pi / 2 + azimuth)):
             history = self._ears[ear]
             history[: self._history] = history[_BLOCK:]
             history[self._history :] = lowpassed + shadow_gain(incidence) * (source - lowpassed)
-            # The nearest that an ear comes is one head radius before the centre; no sample may come from the future.
+            # An ear is at most one head radius closer than the centre; with HEAD_TIME no sample is in the future.
             delay = (ear_delay(incidence) + HEAD_TIME) * self.sample_rate + _REACH
             out[ear] = _interpolate(history, self._history + np.arange(_BLOCK) - delay)
         return to_int32(out)
 
 
-class SceneSource:
+class SceneSource(PacedSource):
     """The scene in real time.
 
     Parameters
@@ -105,43 +99,35 @@ class SceneSource:
         scale (default -30), ``seed`` of the noise (default 0).
     """
 
-    overruns = 0
-    lost_frames = 0
+    frames = None  # it has no end
 
     def __init__(self, text: str, sample_rate: int, frames_per_chunk: int, stopping: threading.Event) -> None:
-        self.name = f"scene:{text}"
+        super().__init__(f"scene:{text}", stopping)
         if text and not text.startswith("?"):
-            raise device_error(f"{self.name}: options follow a question mark, such as scene:?seconds=5")
+            raise device_error(f"{self.name}: expected options after a question mark, such as scene:?seconds=5")
         options = parse_options(self.name, text[1:], _OPTIONS)
         if sample_rate < MIN_RATE:
-            raise hwparams_error(f"{self.name}: offers sample rates from {MIN_RATE} Hz, asked for were {sample_rate}")
-        self.sample_rate = sample_rate
-        self._scene = Scene(sample_rate, **options)
-        self._frames_per_chunk = frames_per_chunk
-        self._pacer = Pacer(sample_rate, stopping)
+            raise hwparams_error(f"{self.name}: expected a sample rate of at least {MIN_RATE} Hz, got {sample_rate}")
+        self._scene = scene = Scene(sample_rate, **options)
+        self._start(sample_rate, frames_per_chunk, ((0, scene.frames(frames_per_chunk)) for _ in itertools.count()))
 
-    def read(self) -> Chunk | None:
-        """The next chunk in its time; None when told to stop."""
-        samples = self._scene.frames(self._frames_per_chunk)
-        due = self._pacer.wait(self._frames_per_chunk)
-        return None if due is None else Chunk(samples, 0, due)
-
-    def close(self) -> None:
-        """Nothing to give back."""
+    def truth(self, time: float) -> Truth:
+        """Return the true direction at a time in s from the first frame, left positive."""
+        return Truth(0.0, ("talker",), (float(self._scene.azimuth(time)),))
 
 
-def _seed(text: str) -> int:
-    if not (text.isascii() and text.isdigit() and len(text) <= 18):
-        raise ValueError("a whole number of at most 18 digits")
-    return int(text)
-
-
-_OPTIONS = {"seconds": number(0.1, 86400), "level": number(-120, 0), "seed": _seed}
+_OPTIONS = {
+    "seconds": seconds(0.1, 86400),
+    "level": number(-120, 0, "a number"),
+    "seed": whole_number(0, 10**18 - 1),
+}
 
 
 class _Carrier:
-    """What the source utters, (block,) of float64: voiced syllables and bursts of noise, up to a fifth of the sample
-    rate (where the interpolation is still exact) and at most 8 kHz."""
+    """The signal of the source, (block,) of float64: voiced syllables and bursts of noise.
+
+    Its bandwidth is a fifth of the sample rate, up to which the interpolation is exact, and at most 8 kHz.
+    """
 
     def __init__(self, sample_rate: int, seed: int) -> None:
         top = min(8000.0, sample_rate / 5)
@@ -153,10 +139,10 @@ class _Carrier:
         self._band_state = np.zeros((self._band.shape[0], 2))
 
     def block(self, times: np.ndarray) -> np.ndarray:
-        """The samples at `times` (s), which must follow those of the call before."""
+        """Return the samples at `times` (s), which must follow those of the previous call."""
         within = np.mod(times, _SYLLABLE) / _SYLLABLE
         voiced, self._tilt_state = signal.lfilter(*self._tilt, self._voice(times), zi=self._tilt_state)
-        # random_raw is the same in every version of numpy; the distributions on top of it may not be.
+        # random_raw is the same in all versions of numpy; distributions may differ.
         uniform = (self._random.random_raw(len(times)) >> np.uint64(11)) * 2.0**-52 - 1.0
         noise, self._band_state = signal.sosfilt(self._band, uniform, zi=self._band_state)
         voiced *= np.where(within < 0.7, np.sin(np.pi * within / 0.7) ** 2, 0.0)
@@ -164,7 +150,7 @@ class _Carrier:
         return 2.0 * voiced + 3.0 * noise
 
     def _voice(self, times: np.ndarray) -> np.ndarray:
-        """A sum of equal harmonics, in closed form, with an RMS of 1."""
+        """Return a sum of equal harmonics, in closed form, with an RMS of 1."""
         mean, excursion, speed = _PITCH
         glide = excursion / speed * (1.0 - np.cos(2 * np.pi * speed * times))
         half = np.pi * np.mod(mean * times + glide / (2 * np.pi), 1.0)  # half the phase of the fundamental
@@ -176,15 +162,15 @@ class _Carrier:
 
 
 def _interpolate(samples: np.ndarray, positions: np.ndarray) -> np.ndarray:
-    """`samples` at fractional `positions`: Lagrange interpolation through the six nearest."""
+    """Return `samples` at fractional `positions`, by Lagrange interpolation through the six nearest samples."""
     base = np.floor(positions).astype(np.intp)
-    part = positions - base
-    offsets = [part - k for k in range(-2, 4)]  # distances from the six points
-    before = [np.ones_like(part)]
+    fraction = positions - base
+    offsets = [fraction - k for k in range(-2, 4)]  # distances from the six points
+    before = [np.ones_like(fraction)]
     for offset in offsets[:-1]:
         before.append(before[-1] * offset)
-    after = np.ones_like(part)
-    result = np.zeros_like(part)
+    after = np.ones_like(fraction)
+    result = np.zeros_like(fraction)
     # Denominators of the basis polynomials: products of the distances between the points.
     for k, denominator in zip(range(5, -1, -1), (120.0, -24.0, 12.0, -12.0, 24.0, -120.0), strict=True):
         result += samples[base + (k - 2)] * (before[k] * after) / denominator

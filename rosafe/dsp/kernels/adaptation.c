@@ -1,18 +1,18 @@
-/* Adaptation loops: per row a cascade of divisions by low-passed versions of the quotients themselves
+/* Adaptation loops: for each row a cascade of divisions by the low-pass filtered quotients
  * (rosafe/representations/adaptation.py).
  *
  * v = x; then for each loop v = limited(v / s), s = a s + b v, where limited(v) = 1 + m tanh((v - 1) / m) for v > 1.
  *
- * A row in each lane. Of tanh(u) = (1 - e) / (1 + e), e = exp(-2 u) = 2^k exp(r) with |r| at most ln(2) / 2; exp(r) is
- * Padé's quotient (E + O) / (E - O) of polynomials of degree 5, exact to 1e-15. What comes out of a loop is then a quotient
- * N / D too, and the next loop takes N / (D s): one division for each loop in place of three. */
+ * One row per lane. In tanh(u) = (1 - e) / (1 + e), e = exp(-2 u) = 2^k exp(r) with |r| at most ln(2) / 2; exp(r) is
+ * Padé's quotient (E + O) / (E - O) of polynomials of degree 5, accurate to 1e-15. The output of a loop is then a quotient
+ * N / D, and the next loop computes N / (D s): one division per loop instead of three. */
 #include "vector.h"
 
 enum { SPAN = 32, ROWS = 16, GROUPS = ROWS / LANES, MAX_LOOPS = 32 };
 
-/* Quotients are bounded: no state becomes 0 or infinite whatever comes. Sound stays far within. */
-#define LEAST 1e-100
-#define MOST 1e100
+/* Quotients are limited so that no state becomes 0 or infinite; those of sound are far within the limits. */
+#define MIN_QUOTIENT 1e-100
+#define MAX_QUOTIENT 1e100
 
 typedef struct {
     double a, b, m;
@@ -22,10 +22,10 @@ typedef struct {
     vec threshold, offset, gain;
 } row_constants;
 
-/* 1 + m tanh((v - 1) / m) for v > 1, else v, as n / d; rate is -2 / (m ln 2). */
+/* 1 + m tanh((v - 1) / m) for v > 1, otherwise v, as n / d; rate is -2 / (m ln 2). */
 INLINE void limit(vec v, vec m, vec rate, vec *n, vec *d) {
-    const double L = 0.69314718055994530942, to_integer = 0x1.8p52; /* added, it leaves the nearest integer in the lowest bits */
-    vec exponent = larger(fused(larger(v, all(1.0)), rate, -rate), all(-60.0)); /* of e, to base 2; beyond, tanh is 1 */
+    const double L = 0.69314718055994530942, to_integer = 0x1.8p52; /* adding it puts the nearest integer into the lowest bits */
+    vec exponent = larger(fused(larger(v, all(1.0)), rate, -rate), all(-60.0)); /* of e, to base 2; below the limit, tanh is 1 */
     vec shifted = exponent + to_integer, f = exponent - (shifted - to_integer), f2 = f * f;
     vec power = (vec)(((lanes)shifted << 52) + 0x3FF0000000000000L);
     vec even = fused(fused(all(L * L * L * L / 1008), f2, all(L * L / 9)), f2, all(1.0));
@@ -35,7 +35,7 @@ INLINE void limit(vec v, vec m, vec rate, vec *n, vec *d) {
     *n = fused(*d, smaller(v, all(1.0)), m * fused(even, less, -(odd * more)));
 }
 
-/* One sample of GROUPS groups of rows, through all loops. */
+/* Apply all loops to one sample of GROUPS groups of rows. */
 INLINE void step(const int limited, const int64_t count, const loop *loops, const double *rates, vec x[GROUPS],
                  vec states[MAX_LOOPS][GROUPS], const row_constants rows[GROUPS]) {
     if (limited) {
@@ -43,7 +43,7 @@ INLINE void step(const int limited, const int64_t count, const loop *loops, cons
         UNROLL for (int g = 0; g < GROUPS; g++) n[g] = x[g], d[g] = all(1.0);
         for (int64_t j = 0; j < count; j++)
             UNROLL for (int g = 0; g < GROUPS; g++) {
-                vec s = states[j][g], v = larger(n[g] / (d[g] * s), all(LEAST));
+                vec s = states[j][g], v = larger(n[g] / (d[g] * s), all(MIN_QUOTIENT));
                 if (j > 0) states[j - 1][g] = fused(all(loops[j - 1].a), states[j - 1][g], all(loops[j - 1].b) * (v * s));
                 limit(v, all(loops[j].m), all(rates[j]), n + g, d + g);
             }
@@ -54,7 +54,7 @@ INLINE void step(const int limited, const int64_t count, const loop *loops, cons
     } else {
         for (int64_t j = 0; j < count; j++)
             UNROLL for (int g = 0; g < GROUPS; g++) {
-                x[g] = bounded(x[g] / states[j][g], LEAST, MOST);
+                x[g] = bounded(x[g] / states[j][g], MIN_QUOTIENT, MAX_QUOTIENT);
                 states[j][g] = fused(all(loops[j].a), states[j][g], all(loops[j].b) * x[g]);
             }
     }
@@ -66,9 +66,9 @@ INLINE void run(const int limited, const int64_t count, const loop *loops, const
     for (int64_t t = 0; t < n; t++) step(limited, count, loops, rates, samples + t * GROUPS, states, rows);
 }
 
-/* block and output (rows, n); samples are squared and times `factor` first, where that is not 0. constants (channels, 3):
- * threshold, offset and gain of the output, where `channels` is 1 or such that row i is one of channel i % channels;
- * loops (count, 3): a, b and m, without limits where `clamp` is 0; state (count, rows). */
+/* block and output (rows, n); if `factor` is not 0, samples are first squared and multiplied by it. constants
+ * (channels, 3): threshold, offset and gain of the output; row i belongs to channel i % channels.
+ * loops (count, 3): a, b and m, without limits if `clamp` is 0; state (count, rows). */
 void rosafe_adaptation(const double *block, int64_t rows, int64_t n, double factor, const double *constants, int64_t channels,
                        const double *of_loops, int64_t count, int64_t limited, double *state, double *output) {
     uint32_t mode = enter();
@@ -76,7 +76,7 @@ void rosafe_adaptation(const double *block, int64_t rows, int64_t n, double fact
     double rates[MAX_LOOPS];
     for (int64_t j = 0; j < count; j++) rates[j] = -2 / (loops[j].m * 0.69314718055994530942);
     for (int64_t first = 0; first < rows; first += ROWS) {
-        const double *from[ROWS]; /* lanes without a row do the last one once more */
+        const double *from[ROWS]; /* lanes without a row repeat the last one */
         double *to[ROWS];
         int64_t row[ROWS];
         vec states[MAX_LOOPS][GROUPS], samples[SPAN * GROUPS];

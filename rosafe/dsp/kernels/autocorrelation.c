@@ -1,13 +1,13 @@
 /* Autocorrelation of centre-clipped frames by FFT (rosafe/representations/autocorrelation.py).
  *
- * A frame in each lane. A frame and zeros, N real numbers, are taken for N / 2 complex ones, and so is the power spectrum on
- * its way back. Out of the transform there, which halves in frequency, they come in reversed order, and the transform back,
- * which halves in time, takes them so. */
+ * One frame per lane. A zero-padded frame, N real numbers, is treated as N / 2 complex ones, and so is the power spectrum in
+ * the inverse transform. The output of the transform (decimation in frequency) is in digit-reversed order, which the inverse
+ * transform (decimation in time) expects. */
 #include "fourier.h"
 #include "framed.h"
 #include "vector_pow.h"
 
-enum { MAX_SIZE = 4096 /* of a frame: as many complex points are the power of 2 above two of them */ };
+enum { MAX_SIZE = 4096 /* samples of a frame; its zero-padded transform has at most as many complex points */ };
 
 enum clipping { COMPRESS, CLIP_ONLY, SIGN };
 
@@ -33,8 +33,8 @@ static void back(complexes *x, int64_t n, const number *w) {
     butterflies_back(x, n, w);
 }
 
-/* From the transform of N real numbers taken for n = N / 2 complex ones, to that of the real numbers' powers taken likewise.
- * Points k and n - k, at places[k], go together; turns[k] = exp(2 pi i k / N). */
+/* Convert the transform of N real numbers, treated as n = N / 2 complex ones, to that of their power spectrum.
+ * Points k and n - k, at places[k], are processed together; turns[k] = exp(2 pi i k / N). */
 INLINE void to_powers(const int squared, complexes *x, int64_t n, const int64_t (*places)[2], const number *turns,
                       double exponent) {
     for (int64_t k = 0; k <= n / 2; k++) {
@@ -47,7 +47,8 @@ INLINE void to_powers(const int squared, complexes *x, int64_t n, const int64_t 
     }
 }
 
-/* The circular autocorrelation, times some number, of 2 n real numbers in x, of which the upper half is 0. The upper half of x need not be set where n is at least 4. */
+/* The circular autocorrelation, up to a factor, of 2 n real numbers in x. Their upper half is 0; it need not be set if n is
+ * at least 4. */
 static void autocorrelate(complexes *x, int64_t n, const number *twiddles, const int64_t (*places)[2], const number *turns,
                           double exponent) {
     there_from_half(x, n, twiddles);
@@ -60,7 +61,7 @@ static void autocorrelate(complexes *x, int64_t n, const number *twiddles, const
 
 /* --- frames --- */
 
-/* Samples of the rows, windowed, to x; returns the largest, and to *lowest the smallest. */
+/* Write windowed samples of the rows to x; return the largest, and the smallest in *lowest. */
 INLINE vec windowed(const double *const rows[LANES], const double *window, int64_t size, vec *x, vec *lowest) {
     vec high = all(-INFINITY), low = all(INFINITY);
     for (int64_t t = 0; t < size; t++) {
@@ -76,7 +77,7 @@ INLINE vec windowed(const double *const rows[LANES], const double *window, int64
 
 INLINE vec magnitude(vec x) { return larger(x, -x); }
 
-/* Where x reaches over `above` or under -`below`, in one way or the other; 0 elsewhere. All times `scale`. */
+/* Clip x: 0 between -`below` and `above`, otherwise by one of the methods; all multiplied by `scale`. */
 INLINE void clip(const enum clipping how, vec *x, int64_t size, vec above, vec below, vec scale) {
     for (int64_t t = 0; t < size; t++) {
         vec y = x[t];
@@ -91,9 +92,8 @@ INLINE void clip(const enum clipping how, vec *x, int64_t size, vec above, vec b
     }
 }
 
-/* Tables are for transforms of `points` complex numbers, of which
- * 2 points is at least 2 size - 1; the size is even. corrections (lags) are by what to multiply each lag. output is (rows,
- * lags, number). */
+/* Tables are for transforms of `points` complex numbers; 2 points is at least 2 size - 1, and the size is even. corrections
+ * (lags) are factors of the lags. output is (rows, lags, number). */
 void rosafe_autocorrelations(const framed *of, int64_t how, double alpha, double exponent, int64_t points,
                              const double *twiddles, const int64_t *places, const double *turns, const double *corrections,
                              int64_t lags, double *output) {
@@ -105,7 +105,7 @@ void rosafe_autocorrelations(const framed *of, int64_t how, double alpha, double
         double joined[LANES][MAX_SIZE];
         const double *from[LANES];
         double *to[LANES];
-        for (int k = 0; k < LANES; k++) { /* lanes without a frame do the last one once more */
+        for (int k = 0; k < LANES; k++) { /* lanes without a frame repeat the last one */
             int64_t which = least(first + k, rows * number_of_frames - 1);
             int64_t row = which / number_of_frames, frame = which % number_of_frames, start = of->skip + frame * of->hop;
             to[k] = output + row * lags * number_of_frames + frame;

@@ -1,9 +1,9 @@
-/* The inner hair cell: rectification or compression, and low-pass: second-order sections that all rows share.
+/* The inner hair cell: rectification or compression, then a low-pass of second-order sections, the same for all rows.
  *
  * Direct form II transposed, as scipy.signal.sosfilt: y = b0 x + s1, s1 = b1 x - a1 y + s2, s2 = b2 x - a2 y.
  *
- * A section's sample waits for the one before it, some ten cycles; sixteen rows at a time fill the wait. Spans of samples are
- * read, go through one section after the other and are written; meanwhile they stay in the first-level cache. */
+ * Each sample of a section depends on the previous one, which takes about ten cycles; sixteen rows at a time hide this
+ * latency. Spans of samples are read, filtered by one section after the other and written; they stay in the L1 cache. */
 #include "vector_pow.h"
 
 #define COMPRESSION -0.77 /* of the envelope, in rosafe/representations/haircell.py */
@@ -12,7 +12,7 @@ enum { SPAN = 64, ROWS = 16, GROUPS = ROWS / LANES, MAX_SECTIONS = 8 };
 
 enum rectification { NONE, HALF_WAVE, FULL_WAVE, SQUARE, COMPRESSED };
 
-/* n samples of a group of rows, (n, GROUPS), to what the sections take. A half wave comes so from the rows. */
+/* Convert n samples of a group of rows, (n, GROUPS), to the input of the sections. Half-wave rectification is done on reading. */
 INLINE void rectify(int64_t how, const vec *envelopes, int64_t n, vec *samples) {
     for (int64_t t = 0; t < n; t++) {
         vec x = samples[t * GROUPS];
@@ -28,7 +28,7 @@ INLINE void rectify(int64_t how, const vec *envelopes, int64_t n, vec *samples) 
     }
 }
 
-/* n samples of all groups through a section with its state (2, GROUPS). */
+/* Filter n samples of all groups by a section with its state (2, GROUPS). */
 INLINE void filter(const double *b0_b1_b2_1_a1_a2, int64_t n, vec *samples, vec *state) {
     vec b[3], minus_a[3], s1[GROUPS], s2[GROUPS];
     UNROLL for (int i = 0; i < 3; i++) b[i] = all(b0_b1_b2_1_a1_a2[i]), minus_a[i] = all(-b0_b1_b2_1_a1_a2[3 + i]);
@@ -43,14 +43,13 @@ INLINE void filter(const double *b0_b1_b2_1_a1_a2, int64_t n, vec *samples, vec 
     UNROLL for (int g = 0; g < GROUPS; g++) state[g] = s1[g], state[GROUPS + g] = s2[g];
 }
 
-/* block and envelope (rows, n), envelope null where it is not asked for; output likewise, rows `stride` apart, or the block
- * itself, of which ROWS rows are read before they are written; sections
- * (count, 6), state (count, rows, 2). */
+/* block and envelope (rows, n); envelope may be null. output has the same shape with rows `stride` apart, or is the block
+ * itself, of which ROWS rows are read before they are written. sections (count, 6), state (count, rows, 2). */
 void rosafe_biquads(int64_t how, const double *block, const double *envelope, int64_t rows, int64_t n,
                     const double *sections, int64_t count, double *state, double *output, int64_t stride) {
     uint32_t mode = enter();
     for (int64_t first = 0; first < rows; first += ROWS) {
-        int64_t row[ROWS]; /* lanes without a row do the last one once more */
+        int64_t row[ROWS]; /* lanes without a row repeat the last one */
         vec states[MAX_SECTIONS][2 * GROUPS];
         for (int k = 0; k < ROWS; k++) {
             row[k] = least(first + k, rows - 1);

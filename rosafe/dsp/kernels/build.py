@@ -1,10 +1,10 @@
-"""Builds the kernels with gcc or clang, once: the libraries lie in a folder named after all that went into them.
+"""Builds the kernels with gcc or clang, once, in a folder whose name contains a hash of sources and flags.
 
-On x86-64 there is one for processors with SSE4.2, one for those with AVX2 and FMA and one for those with AVX-512, so
-that a folder serves any machine; on aarch64, where all have NEON, one for all.
+On x86-64 there are libraries for SSE4.2, for AVX2 with FMA, and for AVX-512, so that a folder can be used on any
+machine; on aarch64 there is one, for NEON.
 
-Runs as a script too, without anything but Python: ``build.py`` builds where the kernels look for it, and
-``build.py FOLDER`` below FOLDER. It does nothing where they are there already.
+It is also a script that requires only Python: ``build.py`` builds in the default folder, ``build.py FOLDER`` below
+FOLDER. It does nothing if the libraries exist already.
 """
 
 from __future__ import annotations
@@ -23,24 +23,24 @@ from pathlib import Path
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[2]
 
-COMPILER = "ROSAFE_COMPILER"  # environment variable: the compiler to take; else the first of COMPILERS that is there
+COMPILER = "ROSAFE_COMPILER"  # environment variable: the compiler; by default the first available one of COMPILERS
 COMPILERS = ("gcc", "clang")
-# levels of processors, and their names for the compiler
+# levels of instruction sets, and their names for the compiler
 ISA_LEVELS = {"x86_64": {2: "x86-64-v2", 3: "x86-64-v3", 4: "x86-64-v4"}, "aarch64": {8: "armv8-a"}}
-# -O3 is slower: it unrolls what is unrolled already. Without -ffp-contract=off products and sums are fused at will;
-# without -fno-math-errno square roots are taken one by one.
+# -O3 is slower: it unrolls loops that are unrolled already. Without -ffp-contract=off the compiler may fuse products
+# and sums; without -fno-math-errno square roots are not vectorised.
 FLAGS = ("-std=gnu11", "-O2", "-ffp-contract=off", "-fno-math-errno", "-fPIC", "-shared", "-Wall", "-Wextra")
-COMPILE_TIMEOUT_SECONDS = 120  # seconds for the compiler, which takes about three
+COMPILE_TIMEOUT_SECONDS = 120  # the compiler takes about 3 s
 SUMS = "libraries.sha256"  # in each folder, for sha256sum
-KEPT = 3  # folders that stay: programs of other versions may want theirs again
+MAX_FOLDERS = 3  # programs of other versions may use the other folders
 
 
 class BuildError(Exception):
-    """There are no libraries and none can be built; one line says why."""
+    """The libraries do not exist and cannot be built; one line with the reason."""
 
 
 def digest() -> str:
-    """A name for what the sources and flags give."""
+    """Return a hash of the sources and flags."""
     sha = hashlib.sha256(f"{ISA_LEVELS} {FLAGS} {os.environ.get(COMPILER, '')}\0".encode())
     for source in sorted(HERE.glob("*.[ch]")):
         sha.update(f"{source.name}\0".encode())
@@ -49,27 +49,27 @@ def digest() -> str:
 
 
 def place() -> Path:
-    """Where libraries are: in ``.generated`` of a checkout, or beside this file where catkin has installed it."""
+    """Return the folder of the libraries: ``.generated`` of a checkout, or the folder of this file if installed."""
     return ROOT / ".generated" if (ROOT / "pyproject.toml").is_file() else HERE
 
 
 def libraries(below: Path | None = None) -> dict[int, Path]:
-    """The library for each level of this machine's kind, ascending. They are built if they are not there.
+    """Return the library for each level of this architecture, ascending. Build them if they do not exist.
 
     Parameters
     ----------
     below : Path, optional
-        The folder to look and build in; `place()` by default.
+        The folder to search and build in; `place()` by default.
 
     Raises
     ------
     BuildError
-        If there are none, and no compiler, no permission to write, or the wrong processor; or if other users could
-        have put them there.
+        If they do not exist and there is no compiler, no write permission or the wrong processor; or if other users
+        could have written them.
     """
     levels = ISA_LEVELS.get(platform.machine())
     if levels is None:
-        raise BuildError(f"the kernels are for {' and '.join(ISA_LEVELS)}, and this machine is {platform.machine()}")
+        raise BuildError(f"the kernels are for {' and '.join(ISA_LEVELS)}, but this machine is {platform.machine()}")
     base = place() if below is None else below
     folder = base / f"kernels-{digest()}"
     try:
@@ -87,7 +87,7 @@ def _paths(folder: Path, levels: dict[int, str]) -> dict[int, Path]:
 
 
 def _refuse_foreign(*paths: Path) -> None:
-    """BuildError if anybody but root, this user and the owner of this program could have written what is there."""
+    """Raise BuildError if users other than root, this user and the owner of this program could have written a path."""
     for path in filter(os.path.lexists, paths):
         found = path.stat()
         if found.st_mode & stat.S_IWOTH and not found.st_mode & stat.S_ISVTX:
@@ -102,7 +102,7 @@ def _refuse_foreign(*paths: Path) -> None:
 
 
 def _missing_libraries(folder: Path, levels: dict[int, str]) -> list[str]:
-    """The names of the libraries that are not in `folder`, or not as they were built."""
+    """Return the names of the libraries that are missing in `folder` or have changed since they were built."""
     try:
         sums = {line[66:]: line[:64] for line in (folder / SUMS).read_text("ascii").splitlines()}
     except (FileNotFoundError, NotADirectoryError, UnicodeDecodeError):
@@ -115,13 +115,13 @@ def _sum(path: Path) -> str:
 
 
 def _compiler() -> str:
-    asked = os.environ.get(COMPILER)
-    if asked and shutil.which(asked) is None:
-        raise BuildError(f"the kernels are not built, and {COMPILER} is {asked[:40]!r}, which is no program here")
-    for name in (asked,) if asked else COMPILERS:
+    chosen = os.environ.get(COMPILER)
+    for name in (chosen,) if chosen else COMPILERS:
         if shutil.which(name):
             return name
-    raise BuildError("the kernels are not built, and there is no gcc to build them: install gcc")
+    if chosen:
+        raise BuildError(f"the kernels are not built; {COMPILER}: expected a program, got {chosen[:40]!r}")
+    raise BuildError("the kernels are not built, and there is no compiler; install gcc")
 
 
 def _build(folder: Path, levels: dict[int, str]) -> None:
@@ -129,23 +129,23 @@ def _build(folder: Path, levels: dict[int, str]) -> None:
     compiler = _compiler()
     base.mkdir(mode=0o755, parents=True, exist_ok=True)
     with open(base / "kernels.lock", "w") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)  # given back by the kernel even if this process is killed
-        for orphan in base.glob("kernels-*.new-*"):  # nobody else builds now: left by one that was killed
+        fcntl.flock(lock, fcntl.LOCK_EX)  # released by the system even if this process is killed
+        for orphan in base.glob("kernels-*.new-*"):  # left by a process that was killed
             shutil.rmtree(orphan)
         if _missing_libraries(folder, levels):
-            workshop = Path(tempfile.mkdtemp(prefix=f"{folder.name}.new-", dir=base))
+            temporary = Path(tempfile.mkdtemp(prefix=f"{folder.name}.new-", dir=base))
             try:
-                built = compile_sources(compiler, levels, workshop).values()
-                (workshop / SUMS).write_text("".join(f"{_sum(path)}  {path.name}\n" for path in built), "ascii")
-                for path in (*workshop.iterdir(), workshop):  # for other users, too, whatever this one's umask is
+                built = compile_sources(compiler, levels, temporary).values()
+                (temporary / SUMS).write_text("".join(f"{_sum(path)}  {path.name}\n" for path in built), "ascii")
+                for path in (*temporary.iterdir(), temporary):  # readable by other users, independent of the umask
                     path.chmod(0o755)
-                    _sync(path)  # else a power cut could leave empty files
-                if folder.is_dir():  # something has been lost there
+                    _sync(path)  # otherwise a power failure could leave empty files
+                if folder.is_dir():  # incomplete
                     shutil.rmtree(folder)
-                workshop.rename(folder)
+                temporary.rename(folder)
                 _sync(base)
             except BaseException:
-                shutil.rmtree(workshop)
+                shutil.rmtree(temporary)
                 raise
         _discard_old(base)
 
@@ -161,12 +161,12 @@ def _sync(path: Path) -> None:
 def compile_sources(
     compiler: str, levels: dict[int, str], folder: Path, sources: Path = HERE, options: tuple[str, ...] = ()
 ) -> dict[int, Path]:
-    """A library in `folder` for each of the `level_differences`, all at once, each by a compiler of its own.
+    """Compile a library in `folder` for each of the `levels`, concurrently.
 
     Raises
     ------
     BuildError
-        With the first thing that the compiler has to say.
+        With the first error of the compiler.
     """
     name, files = Path(compiler).name, sorted(map(str, sources.glob("*.c")))
     environment = {**os.environ, "LC_ALL": "C"}
@@ -177,30 +177,30 @@ def compile_sources(
             command = [compiler, *FLAGS, *options, f"-march={levels[level]}", "-o", str(path), *files, "-lm"]
             running.append(subprocess.Popen(command, stdin=subprocess.DEVNULL, stderr=subprocess.PIPE, env=environment))
         for process in running:
-            _, said = process.communicate(timeout=COMPILE_TIMEOUT_SECONDS)
+            _, output = process.communicate(timeout=COMPILE_TIMEOUT_SECONDS)
             if process.returncode != 0:
-                lines = said.decode(errors="replace").strip().splitlines()
+                lines = output.decode(errors="replace").strip().splitlines()
                 errors = [line for line in lines if "error" in line] or lines or [f"status {process.returncode}"]
                 raise BuildError(f"{name} cannot build the kernels: {errors[0]}")
     except subprocess.TimeoutExpired as problem:
         raise BuildError(f"{name} took more than {COMPILE_TIMEOUT_SECONDS} seconds for the kernels") from problem
     finally:
         for process in running:
-            process.kill()  # one that is done already takes no notice
+            process.kill()  # no effect if it has ended
             process.wait()
     for path in paths.values():
         if not path.is_file() or path.stat().st_size == 0:
-            raise BuildError(f"{name} cannot build the kernels: it says nothing, and there is no {path.name}")
+            raise BuildError(f"{name} cannot build the kernels: it reports no error, but {path.name} is missing")
     return paths
 
 
 def _discard_old(base: Path) -> None:
-    for old in sorted(base.glob("kernels-*"), key=lambda folder: -folder.stat().st_mtime)[KEPT:]:
+    for old in sorted(base.glob("kernels-*"), key=lambda folder: -folder.stat().st_mtime)[MAX_FOLDERS:]:
         shutil.rmtree(old)
 
 
 def main(arguments: list[str]) -> int:
-    """Build and print the paths; 1 where that is impossible."""
+    """Build and print the paths; return 1 if that fails."""
     if len(arguments) > 1 or arguments[:1] in (["-h"], ["--help"]):
         print("usage: build.py [FOLDER]", file=sys.stderr)
         return 2
@@ -208,7 +208,7 @@ def main(arguments: list[str]) -> int:
         for path in libraries(Path(arguments[0]) if arguments else None).values():
             print(path)
     except BuildError as problem:
-        print(f"rosafe: {problem}; numpy and scipy will serve", file=sys.stderr)
+        print(f"rosafe: {problem}; numpy and scipy will be used", file=sys.stderr)
         return 1
     return 0
 

@@ -1,4 +1,4 @@
-"""For pip, which pyproject.toml tells of it: puts the compiled kernels into a wheel where there is a compiler."""
+"""Build hooks for pip, named in pyproject.toml: they add the compiled kernels to a wheel if there is a compiler."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ COMPILES = bool(shutil.which("gcc")) and platform.system() == "Linux" and platfo
 
 
 class BuildPy(build_py):  # type: ignore[misc]
-    """The modules, and the libraries beside their sources; where that fails, it is tried again at first use."""
+    """Adds the libraries to the modules; if the build fails, the first use of the kernels tries again."""
 
     def run(self) -> None:
-        """Build."""
+        """Copy the modules and build the libraries."""
         if not self.editable_mode:
-            shutil.rmtree(self.build_lib, ignore_errors=True)  # what is gone by now, older builds still have
+            shutil.rmtree(self.build_lib, ignore_errors=True)  # may contain deleted modules of older builds
         super().run()
         if COMPILES and not self.editable_mode:
             built = Path(self.build_lib, "rosafe", "dsp", "kernels")
@@ -33,13 +33,13 @@ class BuildPy(build_py):  # type: ignore[misc]
 
 
 class Wheel(bdist_wheel):  # type: ignore[misc]
-    """Of one platform if anything is compiled, and for any Python 3: the libraries are not linked with it."""
+    """A wheel for one platform if it contains libraries, and for any Python 3, as they are not linked with Python."""
 
     def initialize_options(self) -> None:
-        """Tell the other commands."""
+        """Mark the distribution as platform-specific for the other commands."""
         super().initialize_options()
         self.distribution.has_ext_modules = lambda: COMPILES
 
     def get_tag(self) -> tuple[str, str, str]:
-        """Python, its ABI, the platform."""
+        """Return the tags of Python, ABI and platform."""
         return "py3", "none", super().get_tag()[2]

@@ -1,14 +1,13 @@
-/* Blocks of frames into their place in the whole. */
+/* Concatenation of blocks of frames. */
 
 #include <stdint.h>
 #include <string.h>
 
-/* Whose places in the whole stay in the first-level cache while block after block adds its few frames to them. */
+/* rows whose destinations stay in the L1 cache while the few frames of each block are copied */
 enum { ROWS = 64 };
 
-/* Each of the `blocks` has `rows` rows, of its own of the `lengths`, one behind the other; those of `whole` lie `stride`
-   apart. */
-void rosafe_join(int64_t count, const double *const *blocks, const int64_t *lengths, int64_t rows, double *whole,
+/* Each of the `blocks` has `rows` contiguous rows of the length in `lengths`; the rows of `whole` are `stride` apart. */
+void rosafe_concatenate(int64_t count, const double *const *blocks, const int64_t *lengths, int64_t rows, double *whole,
                  int64_t stride)
 {
     for (int64_t first = 0; first < rows; first += ROWS) {
@@ -19,7 +18,7 @@ void rosafe_join(int64_t count, const double *const *blocks, const int64_t *leng
             const double *from = blocks[block];
             for (int64_t row = first; row < until; row++)
                 if (length < 32)
-                    for (int64_t i = 0; i < length; i++) /* a call for each of these would take longer */
+                    for (int64_t i = 0; i < length; i++) /* a call of memcpy for each row would take longer */
                         to[row * stride + i] = from[row * length + i];
                 else
                     memcpy(to + row * stride, from + row * length, length * sizeof *to);

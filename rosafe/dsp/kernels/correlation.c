@@ -1,11 +1,11 @@
-/* Cross-correlation of the two ears' frames over few lags, in the time domain.
+/* Cross-correlation of the frames of both ears over few lags, in the time domain.
  *
- * c[m] = sum_t l[t+m] r[t] for m from -reach to reach, over sqrt(sum l^2 sum r^2 + eps) (rosafe/representations/crosscorrelation.py).
- * A frame, of any channel, in each lane. */
+ * c[m] = sum_t l[t+m] r[t] for m from -reach to reach, divided by sqrt(sum l^2 sum r^2 + eps), see
+ * rosafe/representations/crosscorrelation.py. One frame, of any channel, per lane. */
 #include "framed.h"
 #include "correlation_blocks.h"
 
-/* Samples from..until of the rows times `window` to `to` from t on; returns `energy` and theirs. */
+/* Write samples from..until of the rows times `window` to `to` from t on; return `energy` plus their energy. */
 static vec put(const double *const rows[LANES], const double *window, int64_t from, int64_t until, vec *to, int64_t t,
                vec energy) {
     int64_t i = from;
@@ -26,20 +26,20 @@ static vec put(const double *const rows[LANES], const double *window, int64_t fr
     return energy;
 }
 
-/* Where the samples of each lane's frame are: those before the border in the history, the others in the block. */
+/* Location of the samples of the frame in each lane: before the border in the history, otherwise in the block. */
 typedef struct {
     const double *old[LANES], *new[LANES];
     int64_t border;
 } frames;
 
-/* As `put`. */
+/* The same as `put` for one lane at a time. */
 INLINE vec put_both(const frames *of, const double *window, int64_t from, int64_t until, vec *to, int64_t t, vec energy) {
     const int64_t middle = most(from, least(until, of->border));
     energy = put(of->old, window, from, middle, to, t, energy);
     return put(of->new, window, middle, until, to, t + middle - from, energy);
 }
 
-/* Samples from..until of frames that begin at different samples are joined: their borders lie apart. */
+/* Copy samples from..until of frames that begin at different samples and therefore have different borders. */
 static void join(frames *of, const int64_t starts[LANES], int64_t held, int64_t from, int64_t until,
                  double joined[LANES][SPAN + MAX_LAGS]) {
     for (int k = 0; k < LANES; k++) {
@@ -66,14 +66,14 @@ void rosafe_correlations(const framed *of, int64_t reach, double epsilon, double
         double *to[LANES];
         int64_t channel[LANES], start[LANES];
         for (int64_t m = 0; m < lags; m++) correlation[m] = (vec){};
-        for (int k = 0; k < LANES; k++) { /* lanes without a frame do the last one once more */
+        for (int k = 0; k < LANES; k++) { /* lanes without a frame repeat the last one */
             int64_t which = least(first + k, channels * number - 1);
             channel[k] = which % channels;
             start[k] = of->skip + which / channels * of->hop;
             to[k] = output + channel[k] * channel_stride + which / channels;
         }
         for (int64_t begin = 0; begin < size; begin += span) {
-            /* r from `begin` to `end`; of l, up to `reach` more on either side */
+            /* r from `begin` to `end`; l with up to `reach` more samples on either side */
             int64_t end = least(begin + span, size), l_begin = most(0, begin - reach), l_end = least(size, end + reach);
             for (int ear = 0; ear < 2; ear++) {
                 double joined[LANES][SPAN + MAX_LAGS];

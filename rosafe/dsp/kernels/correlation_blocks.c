@@ -6,11 +6,11 @@
  *     c1 = B r0 + C r1 + D r2
  *     c2 = C r0 + D r1 + E r2,
  *
- * which takes five products of a ninth of the size instead of nine: a polynomial of degree 4 is known from its values at five
- * points, here 0, 1, -1, 2 and infinity, and this is that read backwards (A. L. Toom's way for products, S. Winograd's for FIR
- * filters: Arithmetic Complexity of Computations, SIAM 1980). Each of the five is split in the same way: 25 products instead
- * of 81, with sums that are exact to some 1e-15 of the largest. What they take is made of nine samples at a time, in one
- * go. They are done directly, as many lags at a time as there are registers for their sums. */
+ * which takes five products of a ninth of the size instead of nine: a polynomial of degree 4 is determined by its values at
+ * five points, here 0, 1, -1, 2 and infinity, and this is the transposed algorithm (A. L. Toom for products, S. Winograd for
+ * FIR filters: Arithmetic Complexity of Computations, SIAM 1980). Each of the five is split in the same way: 25 products
+ * instead of 81, with sums accurate to about 1e-15 of the largest. Their inputs are computed from nine samples at a time in
+ * one pass. They are evaluated directly, as many lags at a time as there are registers for the sums. */
 #include "correlation_blocks.h"
 
 enum {
@@ -19,7 +19,7 @@ enum {
     POINTS = 5,
     PHASES = WAYS * WAYS,
     PRODUCTS = POINTS * POINTS,
-    APART = 4, /* so that samples of all products at the same time do not want the same place in the cache */
+    APART = 4, /* padding: samples of all products at the same time must not map to the same cache set */
 };
 
 INLINE void some_lags(const int lags, const vec *l, const vec *r, int64_t n, vec *c) {
@@ -28,7 +28,7 @@ INLINE void some_lags(const int lags, const vec *l, const vec *r, int64_t n, vec
     for (int64_t t = 0; t < n; t++) {
         vec x = r[t];
         UNROLL for (int m = 0; m < lags; m++) sum[m] = fused(l[t + m], x, sum[m]);
-        if (LANES < 8) __asm__ volatile(""); /* keeps GCC from moving sums to memory; AVX-512 has registers enough */
+        if (LANES < 8) __asm__ volatile(""); /* keeps GCC from spilling sums to memory; AVX-512 has enough registers */
     }
     UNROLL for (int m = 0; m < lags; m++) c[m] = sum[m];
 }
@@ -46,11 +46,11 @@ static void direct(const vec *l, const vec *r, int64_t n, int64_t lags, vec *c) 
     }
 }
 
-/* What the product for a point takes of l, of A to E, and of r: r's polynomial there. */
+/* The inputs of the product for a point: a combination of A to E of l, and the polynomial of r at that point. */
 INLINE vec of_l(const int point, vec a, vec b, vec c, vec d, vec e) {
     const vec apart = b - d;
     return point == 0   ? fused(all(-0.5), apart, a - c)
-           : point == 1 ? apart + (b + c) /* twice, as `combine` knows */
+           : point == 1 ? apart + (b + c) /* twice the value; `combine` corrects it */
            : point == 2 ? fused(all(3.0), c - b, apart) /* six times */
            : point == 3 ? apart /* minus six times */
                         : fused(all(2.0), apart, e - c);
@@ -64,7 +64,7 @@ INLINE vec of_r(const int point, vec a, vec b, vec c) {
                         : c;
 }
 
-/* c0, c1 and c2 of the five products. */
+/* Compute c0, c1 and c2 from the five products. */
 INLINE void combine(const vec *products, vec *c) {
     const vec plus = products[1] * 0.5, minus = products[2] * (1.0 / 6), two = products[3] * (-1.0 / 6);
     c[0] = products[0] + ((plus + minus) + two);

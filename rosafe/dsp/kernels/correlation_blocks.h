@@ -5,9 +5,9 @@
 #include "vector.h"
 
 enum {
-    SPAN = 1024,      /* samples at a time: all that belongs to these stays in the second-level cache */
-    MAX_LAGS = 1024, /* FFT is faster beyond */
-    SPARE = 20,       /* places behind a sequence, for `product` */
+    SPAN = 1024,      /* samples at a time: their data stay in the L2 cache */
+    MAX_LAGS = 1024, /* FFT is faster for more */
+    SPARE = 20,       /* elements after a sequence, for `product` */
 };
 
 typedef vec long_sequence[SPAN + MAX_LAGS + SPARE]; /* l */
@@ -18,8 +18,8 @@ INLINE void put_zeros(vec *to, int64_t t, int64_t until) {
     for (; t < until; t++) to[t] = (vec){};
 }
 
-/* For n samples r and `lags` lags, at most SPAN and MAX_LAGS. Behind the n + lags - 1 samples l, the n samples r and the
- * sums, up to SPARE places are written. */
+/* For n samples r and `lags` lags, at most SPAN and MAX_LAGS. Up to SPARE elements are written after the n + lags - 1 samples
+ * l, the n samples r and the sums. */
 INTERNAL void product(long_sequence l, short_sequence r, int64_t n, int64_t lags, sums c);
 
 #endif

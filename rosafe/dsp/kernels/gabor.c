@@ -1,16 +1,16 @@
 /* Gabor features (rosafe/representations/gabor.py): sums of levels times the weights of many patterns of channels and frames.
- * A frame in each lane; each weight is read once for several registers of them. The order of the sums does not depend on how
- * many frames there are. */
+ * One frame per lane; each weight is read once for several registers of frames. The order of summation does not depend on the
+ * number of frames. */
 #include "vector.h"
 
-enum { TOGETHER = 2 /* registers of frames of each ear that share the reading of a weight */ };
+enum { TOGETHER = 2 /* registers of frames of each ear for which a weight is read once */ };
 
-/* The channels and frames that a feature takes in, those next to frame 0 included, and where its weights begin. */
+/* The channels and frames of a feature, including those next to frame 0, and the offset of its weights. */
 typedef struct {
     int64_t first, channels, reach, weights;
 } pattern;
 
-/* Of `count` registers of frames from `level_differences` on, of the left ear and, `ear` further, of the right one. */
+/* The sums of `count` registers of frames from `levels` on, for the left ear and, at an offset of `ear`, for the right one. */
 INLINE void add_products(const int count, const double *levels, int64_t ear, int64_t stride, const pattern *of,
                          const double *weights, double *left, double *right) {
     vec sum[2][TOGETHER] = {};
@@ -29,9 +29,9 @@ INLINE void add_products(const int count, const double *levels, int64_t ear, int
     }
 }
 
-/* levels (2, channels, reach + frames + reach), where frames are a multiple of 8; patterns (features), sums (2, features,
+/* levels (2, channels, reach + frames + reach), with a multiple of 8 frames; patterns (features), sums (2, features,
  * frames). */
-void rosafe_patterns(const double *levels, int64_t channels, int64_t frames, int64_t reach, const pattern *patterns,
+void rosafe_gabor_responses(const double *levels, int64_t channels, int64_t frames, int64_t reach, const pattern *patterns,
                      int64_t features, const double *weights, double *sums) {
     const int64_t stride = frames + 2 * reach, ear = channels * stride;
     uint32_t mode = enter();

@@ -1,15 +1,15 @@
-/* The gammatone filterbank: per row (ear and channel) a cascade of equal complex one-pole filters.
+/* The gammatone filterbank: for each row (ear and channel) a cascade of equal complex one-pole filters.
  *
  * y[t] = x[t] + s, s = p y[t] with the complex pole p = r exp(i a), `order` times; the input is scaled before every fourth
  * pole. The output is the real part, the envelope the modulus. (V. Hohmann (2002), Acta Acustica united with Acustica 88;
  * direct form II transposed, as in rosafe/dsp/gammatone.py.)
  *
- * What runs is z[t] = exp(-i a t) y[t], with the input turned likewise: there a pole takes z[t] = x[t] + r z[t-1], half of
- * the arithmetic. Angles count from the beginning of a span of samples, so that there is a small table of turns.
- * Spans go on from block to block, and states stay as they are: blocks leave no trace in the numbers.
+ * The kernel computes z[t] = exp(-i a t) y[t] from the input rotated in the same way: a pole is then z[t] = x[t] + r z[t-1],
+ * half of the arithmetic. Angles are counted from the start of a span of samples, so that a small table is sufficient.
+ * Spans and states continue across blocks: the output does not depend on block boundaries.
  *
- * A row in each lane. Up to four poles at a time have their states in registers; between them, spans of samples stay in the
- * first-level cache, so that any order costs the same per pole. */
+ * One row per lane. The states of up to four poles at a time are in registers; between these groups, spans of samples stay in
+ * the L1 cache, so that the time per pole does not depend on the order. */
 #include "vector.h"
 
 enum { SPAN = 64 /* TURN_SPAN of rosafe/dsp/gammatone.py */, TOGETHER = 4, MAX_POLES = 128 };
@@ -22,14 +22,14 @@ INLINE complexes times(complexes a, complexes b) {
     return (complexes){fused(a.re, b.re, -(a.im * b.im)), fused(a.re, b.im, a.im * b.re)};
 }
 
-/* Of the channels in the lanes. */
+/* Tables of the channels in the lanes. */
 typedef struct {
     vec radius;               /* of the pole */
-    complexes there[SPAN];    /* the turns of the input, times the first gain */
-    complexes back[SPAN + 1]; /* those of the output */
+    complexes there[SPAN];    /* rotation of the input, times the first gain */
+    complexes back[SPAN + 1]; /* rotation of the output */
 } turns;
 
-/* For the samples of a span that come before `until`. */
+/* Fill the tables for the samples of a span before `until`. */
 static void design(complexes pole, vec gain, int64_t until, turns *by) {
     const vec radius = root(fused(pole.re, pole.re, pole.im * pole.im)), none = (vec)((lanes)all(1.0) & (radius == 0));
     by->radius = radius;
@@ -39,7 +39,7 @@ static void design(complexes pole, vec gain, int64_t until, turns *by) {
     for (int64_t t = 0; t < until; t++) by->there[t] = (complexes){by->back[t].re * gain, by->back[t].im * -gain};
 }
 
-/* Samples on their way: from an ear's x for the first poles, to rows of `output` and perhaps `envelope` from the last ones. */
+/* Source and destination of samples: x of an ear for the first poles, rows of `output` and `envelope` (or null) for the last. */
 typedef struct {
     const double *x;
     complexes *samples;
@@ -53,7 +53,7 @@ INLINE void write_some(const vec *samples, const int n, double *const rows[LANES
         UNROLL for (int k = 0; k < LANES; k++) rows[k][t] = samples[0][k];
 }
 
-/* n samples, 1 or TILE, from t on through `poles` poles, whose last outputs are z. */
+/* Filter n samples, 1 or TILE, from t on by `poles` poles, whose last outputs are z. */
 INLINE void step(const int poles, const int first, const int n, const turns *by, way on, int64_t t, complexes *z) {
     vec output[TILE], envelope[TILE] = {};
     UNROLL for (int i = 0; i < n; i++) {
@@ -74,7 +74,7 @@ INLINE void step(const int poles, const int first, const int n, const turns *by,
     if (on.envelope) write_some(envelope, n, on.envelope, t);
 }
 
-/* The samples from t until `until` of a span; at its end the states turn to the next one. */
+/* Filter the samples t to `until` of a span; at its end, rotate the states for the next span. */
 INLINE void run(const int poles, const int first, const turns *by, way on, int64_t t, int64_t until, complexes *last) {
     complexes z[TOGETHER];
     UNROLL for (int k = 0; k < poles; k++) z[k] = last[k];
@@ -95,16 +95,16 @@ static void run_some(int64_t poles, const turns *by, way on, int64_t t, int64_t 
 INLINE double gain_of(const double *sections, int64_t number) { return sections[12 * number]; }
 INLINE const double *minus_pole_of(const double *sections, int64_t number) { return sections + 12 * number + 8; }
 
-/* block (2, n), sections (channels, order, 6) complex, state (2, channels, order) complex: z of each pole, after `position`
- * samples of a span; output (2, channels, n) with rows `stride` apart, envelope (2, channels, n) or null. */
-void rosafe_gammatone(const double *block, int64_t n, int64_t channels, int64_t order, const double *sections,
-                      double *state, int64_t position, double *output, int64_t stride, double *envelope) {
+/* block (ears, n), sections (channels, order, 6) complex, state (ears, channels, order) complex: z of each pole, after `position`
+ * samples of a span; output (ears, channels, n) with rows `stride` apart, envelope (ears, channels, n) or null. */
+void rosafe_gammatone(const double *block, int64_t ears, int64_t n, int64_t channels, int64_t order,
+                      const double *sections, double *state, int64_t position, double *output, int64_t stride, double *envelope) {
     uint32_t mode = enter();
     for (int64_t first = 0; first < channels; first += LANES) {
         turns by;
         complexes pole;
         vec gains[MAX_POLES / TOGETHER];
-        int64_t channel[LANES]; /* lanes without a channel do the last one once more */
+        int64_t channel[LANES]; /* lanes without a channel repeat the last one */
         for (int k = 0; k < LANES; k++) {
             channel[k] = least(first + k, channels - 1);
             pole.re[k] = -minus_pole_of(sections, channel[k] * order)[0];
@@ -112,7 +112,7 @@ void rosafe_gammatone(const double *block, int64_t n, int64_t channels, int64_t 
             for (int64_t p = 0; p < order; p += TOGETHER) gains[p / TOGETHER][k] = gain_of(sections, channel[k] * order + p);
         }
         design(pole, gains[0], least(SPAN, position + n), &by);
-        for (int ear = 0; ear < 2; ear++) {
+        for (int64_t ear = 0; ear < ears; ear++) {
             complexes last[MAX_POLES], samples[SPAN];
             double *states[LANES];
             for (int k = 0; k < LANES; k++) {
@@ -122,7 +122,7 @@ void rosafe_gammatone(const double *block, int64_t n, int64_t channels, int64_t 
                     last[p].im[k] = states[k][2 * p + 1];
                 }
             }
-            for (int64_t at = -position; at < n; at += SPAN) { /* where a span begins, perhaps before the block */
+            for (int64_t at = -position; at < n; at += SPAN) { /* start of a span, possibly before the block */
                 const int64_t from = most(0, -at), until = least(SPAN, n - at);
                 double x[SPAN + LANES], *rows[LANES], *envelopes[LANES];
                 for (int64_t t = from; t < until; t += LANES)

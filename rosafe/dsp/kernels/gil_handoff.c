@@ -1,16 +1,16 @@
-/* One after the other out of the kernels: who comes out wants the interpreter's lock.
+/* Serialise threads that leave a kernel: each of them is about to acquire the GIL.
  *
- * A thread that finds that lock taken goes to sleep, and to wake it takes longer than what others do with it, which is some
- * Python from one kernel to the next. So it waits here, awake, until the thread that came out last is in a kernel again, or
- * has been out for so long that it does something else. Nothing but time depends on this. */
+ * A thread that finds the GIL locked sleeps, and waking it takes longer than the other thread holds the GIL, for some Python
+ * between two kernels. Therefore a thread waits here actively until the thread that left a kernel last has entered one again,
+ * or has been outside for longer than the limit. Only the running time depends on this. */
 #include "vector.h"
 
 #include <time.h>
 
-enum { MOST = 50000 /* nanoseconds, for one other thread */, LONGEST = 20 * MOST };
+enum { MAX_WAIT = 50000 /* nanoseconds, for one other thread */, MAX_TOTAL_WAIT = 20 * MAX_WAIT };
 
-static int64_t outside; /* which coming out is the last one, if that thread is still out; else 0 */
-static int64_t count;   /* of all */
+static int64_t outside; /* number of the last exit from a kernel if that thread is still outside, otherwise 0 */
+static int64_t count;   /* of all exits */
 static __thread int64_t mine;
 
 static int64_t now(void) {
@@ -33,10 +33,10 @@ void gate_out(void) {
     if (replaced(0, mine)) return;
     for (int64_t other = 0, since = 0, begun = now(); !replaced(0, mine);) {
         const int64_t last = __atomic_load_n(&outside, __ATOMIC_RELAXED), time = now();
-        if (time - begun > LONGEST) return;
+        if (time - begun > MAX_TOTAL_WAIT) return;
         if (last != other)
             other = last, since = time;
-        else if (time - since > MOST && replaced(other, mine))
+        else if (time - since > MAX_WAIT && replaced(other, mine))
             return;
     }
 }

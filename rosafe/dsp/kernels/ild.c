@@ -1,8 +1,8 @@
-/* The interaural level difference: energies of windowed frames, and the ratio of the ears' in dB
+/* The interaural level difference: energies of windowed frames, and their ratio between the ears in dB
  * (rosafe/representations/ild.py).
  *
- * No sample waits for the one before, so neighbouring samples of a row are in the lanes. Each frame is summed on its own, which
- * makes any window and hop cost the same per product, and in an order that knows nothing of blocks. */
+ * Samples do not depend on each other, therefore the lanes contain consecutive samples of a row. Each frame is summed
+ * separately: the time per product does not depend on window and hop, nor the order of summation on block boundaries. */
 #include "framed.h"
 
 #include <math.h>
@@ -14,13 +14,13 @@ INLINE vec square(vec x) {
     return x * x;
 }
 
-/* The n samples of a frame, of which those before the border are old ones. */
+/* The n samples of a frame; those before the border are in the history. */
 typedef struct {
     const double *old, *new;
     int64_t border;
 } halves;
 
-/* As many of them from t on, in one piece; `joined` has room for them. */
+/* Return some of them from t on as one contiguous array; `joined` is a buffer for it. */
 INLINE const double *in_one_piece(const halves *x, int64_t t, int64_t n, double *joined) {
     if (t >= x->border) return x->new + t;
     if (t + n <= x->border) return x->old + t;
@@ -46,9 +46,9 @@ INLINE double weighted_energy(const halves *x, const double *weights, int64_t n)
     return total(joined_chains(sum));
 }
 
-/* The rows are the left ear's channels, then the right ear's. levels is (rows / 2, number) with
- * 10 log10((right + epsilon) / (left + epsilon)); in `energies` is room for (rows, number). */
-void rosafe_levels(const framed *of, double epsilon, double *energies, double *levels) {
+/* The rows are the channels of the left ear, then of the right ear. levels is (rows / 2, number) with
+ * 10 log10((right + epsilon) / (left + epsilon)); energies is a buffer of (rows, number). */
+void rosafe_level_differences(const framed *of, double epsilon, double *energies, double *levels) {
     const int64_t rows = of->rows, number = of->number, held = of->held, n = of->n;
     uint32_t mode = enter();
     for (int64_t row = 0; row < rows; row++) {

@@ -1,4 +1,4 @@
-"""Finds and loads the compiled library, or tells why numpy and scipy serve instead."""
+"""Find and load the compiled library, or report why numpy and scipy are used instead."""
 
 from __future__ import annotations
 
@@ -10,24 +10,24 @@ from typing import NamedTuple
 
 from rosafe.dsp.kernels import build
 
-KERNELS_VARIABLE = (
-    "ROSAFE_KERNELS"  # environment variable: 0 for numpy and scipy, 2, 3... for at most that level of processor
-)
+# Environment variable: 0 for numpy and scipy, 2, 3... for at most this level of instruction set
+KERNELS_VARIABLE = "ROSAFE_KERNELS"
 
-INSTRUCTIONS = {2: "SSE4.2", 3: "AVX2 and FMA", 4: "AVX-512", 8: "NEON"}  # that the levels are for
+INSTRUCTIONS = {2: "SSE4.2", 3: "AVX2 and FMA", 4: "AVX-512", 8: "NEON"}  # by level
 
 _INTEGER, _REAL, _ARRAY, _BITS = ctypes.c_int64, ctypes.c_double, ctypes.c_void_p, ctypes.c_uint32
-_FRAMES = ctypes.c_char_p  # `FRAMES`, packed: one argument takes a tenth of the time of so many
+_FRAMES = ctypes.c_char_p  # `FRAMES`, packed: one argument is ten times as fast as one for each field
 FRAMES = "PqqPqPqqqqPqqqq"  # for the module struct: `framed` of framed.h; P is an address
 _ARGUMENTS = {
-    "rosafe_gammatone": (_ARRAY, *[_INTEGER] * 3, *[_ARRAY] * 2, _INTEGER, _ARRAY, _INTEGER, _ARRAY),
+    "rosafe_gammatone": (_ARRAY, *[_INTEGER] * 4, *[_ARRAY] * 2, _INTEGER, _ARRAY, _INTEGER, _ARRAY),
     "rosafe_biquads": (_INTEGER, _ARRAY, _ARRAY, _INTEGER, _INTEGER, _ARRAY, _INTEGER, _ARRAY, _ARRAY, _INTEGER),
     "rosafe_adaptation": (_ARRAY, _INTEGER, _INTEGER, _REAL, *[_ARRAY, _INTEGER] * 2, _INTEGER, _ARRAY, _ARRAY),
-    "rosafe_levels": (_FRAMES, _REAL, _ARRAY, _ARRAY),
+    "rosafe_level_differences": (_FRAMES, _REAL, _ARRAY, _ARRAY),
     "rosafe_ratemap": (_FRAMES, _INTEGER, _REAL, _ARRAY, _ARRAY),
     "rosafe_modulation": (_FRAMES, _INTEGER, *[_ARRAY] * 3),
-    "rosafe_patterns": (_ARRAY, *[_INTEGER] * 3, _ARRAY, _INTEGER, _ARRAY, _ARRAY),
-    "rosafe_join": (_INTEGER, _ARRAY, _ARRAY, _INTEGER, _ARRAY, _INTEGER),
+    "rosafe_gabor_responses": (_ARRAY, *[_INTEGER] * 3, _ARRAY, _INTEGER, _ARRAY, _ARRAY),
+    "rosafe_concatenate": (_INTEGER, _ARRAY, _ARRAY, _INTEGER, _ARRAY, _INTEGER),
+    "rosafe_mixture": (_INTEGER, _ARRAY, _INTEGER, _ARRAY, _ARRAY),
     "rosafe_denormals_off": (),
     "rosafe_denormals_as": (_BITS,),
     "rosafe_correlations": (_FRAMES, _INTEGER, _REAL, _ARRAY, _INTEGER),
@@ -45,7 +45,7 @@ _ARGUMENTS = {
 
 
 class Status(NamedTuple):
-    """Which implementation runs, and why."""
+    """The implementation in use, and the reason."""
 
     compiled: bool
     detail: str
@@ -54,25 +54,25 @@ class Status(NamedTuple):
         return self.detail
 
 
-@functools.cache  # without a lock: two threads at once do the same twice, to the same end
+@functools.cache  # without a lock: two threads may both load it, with the same result
 def loaded() -> tuple[ctypes.CDLL | None, Status]:
-    """The library with its functions declared, or None; once found out, it stays so in this process.
+    """Return the library with its functions declared, or None; the result is fixed for this process.
 
-    Takes a fraction of a millisecond, and a second where the library must be built first.
+    It takes a fraction of a millisecond, or a second if the library must be built first.
     """
     switch = os.environ.get(KERNELS_VARIABLE, "").strip()
     if switch == "0":
-        return None, Status(False, f"numpy and scipy, as {KERNELS_VARIABLE}=0 says")
+        return None, Status(False, f"numpy and scipy, because {KERNELS_VARIABLE} is 0")
     try:
         paths = build.libraries()
-        least = min(paths)
-        level = load(paths[least]).rosafe_processor_level()  # which can be asked of this one on any processor
+        lowest = min(paths)
+        level = load(paths[lowest]).rosafe_processor_level()  # this function runs on any processor
         if level not in paths:
-            raise build.BuildError(f"the kernels need a processor with {INSTRUCTIONS[least]} ({paths[least].stem})")
+            raise build.BuildError(f"the kernels need a processor with {INSTRUCTIONS[lowest]} ({paths[lowest].stem})")
         reason = f"the processor has {INSTRUCTIONS[level]}"
         if switch not in ("", *map(str, paths)):
             choices = ", ".join(map(str, (0, *list(paths)[:-1])))
-            reason += f" ({KERNELS_VARIABLE} is {switch[:20]!r}, which means nothing: {choices} or {max(paths)} would)"
+            reason += f" ({KERNELS_VARIABLE}: expected {choices} or {max(paths)}, got {switch[:20]!r}; it is ignored)"
         elif switch and int(switch) < level:
             level, reason = int(switch), f"{reason}, but {KERNELS_VARIABLE} is {switch}"
         path = paths[level]
@@ -84,8 +84,8 @@ def loaded() -> tuple[ctypes.CDLL | None, Status]:
 
 
 def load(path: Path) -> ctypes.CDLL:
-    """The library with its functions declared."""
-    library = ctypes.CDLL(str(path))  # releases the interpreter lock during calls
+    """Load a library and declare its functions."""
+    library = ctypes.CDLL(str(path))  # releases the GIL during calls
     for name, arguments in _ARGUMENTS.items():
         function = getattr(library, name)
         function.argtypes, function.restype = arguments, None

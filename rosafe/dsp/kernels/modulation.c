@@ -1,9 +1,9 @@
-/* Modulation filters in parallel, and means of what they put out over moving windows (rosafe/representations/amsfeatures.py).
+/* Modulation filters in parallel, and means of their output over sliding windows (rosafe/representations/amsfeatures.py).
  *
- * A filter in each lane; all get the same samples. Second-order sections in direct form II transposed, in the very order of
- * operations of scipy.signal.sosfilt: at a thousandth of the sample rate, what is rounded otherwise would show. A section's
- * sample waits for the one before it; several registers of filters fill the wait. Each frame that touches a span of samples
- * adds those one by one, so that only the tail that is kept goes to memory, and blocks leave no trace in the sums. */
+ * One filter per lane; all filter the same samples. Second-order sections in direct form II transposed, in the same order of
+ * operations as scipy.signal.sosfilt: different rounding would be noticeable at a thousandth of the sample rate. Each sample
+ * of a section depends on the previous one; several registers of filters hide this latency. Each frame that overlaps a span
+ * adds its samples one by one: only the buffered tail is written to memory, and sums do not depend on block boundaries. */
 #include "framed.h"
 
 enum { SPAN = 64, FILTERS = 16 /* at a time */, GROUPS = FILTERS / LANES };
@@ -29,7 +29,7 @@ INLINE void filter(section *sections, const double *x, int64_t n, vec magnitudes
     UNROLL for (int g = 0; g < GROUPS; g++) sections[g].s1 = s1[g], sections[g].s2 = s2[g];
 }
 
-/* The n magnitudes of which the first is sample `at`: adds them to each frame's sum, of each of the lanes that are used. */
+/* Add n magnitudes, the first of which is sample `at`, to the sum of each frame for the lanes in use. */
 INLINE void add_magnitudes(vec magnitudes[SPAN][GROUPS], int64_t at, int64_t n, const framed *of, int64_t used,
                            double *sums) {
     int64_t frame = first_frame(of, at);
@@ -43,8 +43,8 @@ INLINE void add_magnitudes(vec magnitudes[SPAN][GROUPS], int64_t at, int64_t n, 
     }
 }
 
-/* The samples that are held and summed are those that come out: magnitudes, in rows * filters rows, `filters` of them to each
- * of the rows of the block. state is (filters, rows, 2), means (rows, filters, number). */
+/* The samples that are buffered and summed are output magnitudes: rows * filters rows, `filters` for each row of the block.
+ * state is (filters, rows, 2), means (rows, filters, number). */
 void rosafe_modulation(const framed *frames, int64_t filters, const double *b0_b1_b2_1_a1_a2, double *state, double *means) {
     const int64_t rows = frames->rows, number = frames->number, held = frames->held, n = frames->n;
     const int64_t tail_from = frames->tail_from, tail_stride = frames->tail_stride;
@@ -56,7 +56,7 @@ void rosafe_modulation(const framed *frames, int64_t filters, const double *b0_b
             const int64_t used = least(FILTERS, filters - first), line = row * filters + first;
             section sections[GROUPS];
             double *mine = means + line * number;
-            for (int k = 0; k < FILTERS; k++) { /* lanes without a filter do the last one once more */
+            for (int k = 0; k < FILTERS; k++) { /* lanes without a filter repeat the last one */
                 const int64_t which = least(k, used - 1);
                 const double *design = b0_b1_b2_1_a1_a2 + 6 * (first + which), *before = state + 2 * ((first + which) * rows + row);
                 section *of = &sections[k / LANES];

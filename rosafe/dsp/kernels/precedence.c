@@ -1,5 +1,5 @@
-/* Precedence (rosafe/representations/precedence.py): windowed frames, spectra that are summed over frames and channels, and
- * correlations of frames from which an echo was taken out. The rest takes no time and is done in Python. */
+/* Precedence (rosafe/representations/precedence.py): windowed frames, spectra summed over frames and channels, and
+ * correlations of frames after removal of an echo. The rest takes little time and is done in Python. */
 #include "fourier.h"
 #include "framed.h"
 #include "correlation_blocks.h"
@@ -10,7 +10,7 @@
 
 /* --- windowed frames --- */
 
-/* n samples x times `window` to y, which is added to `sums` too; takes part in the largest one and the energy. */
+/* Write n samples x times `window` to y and add them to `sums`; update the largest sample and the energy. */
 static void window_samples(const double *x, const double *window, int64_t n, double *y, double *sums, double *peak,
                            double *energy) {
     vec largest = all(*peak), squares = {};
@@ -34,7 +34,7 @@ static void window_samples(const double *x, const double *window, int64_t n, dou
     }
 }
 
-/* Nothing is done to the tail. windowed is (number, rows, size), peaks and energies (number, rows); sums (number, 2, size),
+/* The tail is not written. windowed is (number, rows, size), peaks and energies (number, rows); sums (number, 2, size),
  * one for each half of the rows. */
 void rosafe_windowed(const framed *of, double *windowed, double *sums, double *peaks, double *energies) {
     const int64_t rows = of->rows, number = of->number, held = of->held, size = of->size;
@@ -57,12 +57,12 @@ void rosafe_windowed(const framed *of, double *windowed, double *sums, double *p
 
 /* --- spectra --- */
 
-enum { INTERLEAVED_ROWS = 8 /* rows in memory, whatever LANES */ };
+enum { INTERLEAVED_ROWS = 8 /* rows in memory, independent of LANES */ };
 
-/* samples (number, 2, channels, size), an even size; gains (channels), factors (number, 2, channels); for each of the points
- * and one more, power (rows / INTERLEAVED_ROWS, points + 1, INTERLEAVED_ROWS), where rows are the 2 channels and more up to a multiple of
- * INTERLEAVED_ROWS, and sums (number, 2, points + 1). Tables are for transforms of `points` complex numbers, at most MAX_POINTS, of
- * which the samples are not more than 2 points. */
+/* samples (number, 2, channels, size) of even size; gains (channels), factors (number, 2, channels); power
+ * (rows / INTERLEAVED_ROWS, points + 1, INTERLEAVED_ROWS), with 2 channels rounded up to a multiple of INTERLEAVED_ROWS as
+ * rows; sums (number, 2, points + 1). Tables are for transforms of `points` complex numbers, at most MAX_POINTS; size is at
+ * most 2 points. */
 void rosafe_add_spectra(const double *samples, int64_t channels, int64_t number_of_frames, int64_t size, const double *gains,
                         const double *factors, int64_t points, const double *twiddles, const int64_t *places,
                         const double *turns, double *power, double *sums) {
@@ -76,7 +76,7 @@ void rosafe_add_spectra(const double *samples, int64_t channels, int64_t number_
         for (int64_t first = 0; first < rows; first += LANES) {
             const double *from[LANES];
             vec gain, factor[2] = {};
-            for (int k = 0; k < LANES; k++) { /* lanes without a row do the last one once more, and count nothing */
+            for (int k = 0; k < LANES; k++) { /* lanes without a row repeat the last one with a weight of 0 */
                 const int64_t row = least(first + k, rows - 1);
                 from[k] = samples + (f * rows + row) * size;
                 gain[k] = 0.25 * gains[row % channels];
@@ -109,14 +109,14 @@ void rosafe_add_spectra(const double *samples, int64_t channels, int64_t number_
     leave(mode);
 }
 
-/* --- correlations of what filters make of frames ---
+/* --- correlations of filtered frames ---
  *
- * A filter that lengthens the right ear's frame is applied to the left one's instead, the other way round: that gives the
- * same sums, over no more samples than a frame has. */
+ * A filter that lengthens the frame of the right ear is applied to that of the left ear instead, time-reversed: this gives the
+ * same sums over no more samples than a frame has. */
 
 enum { TAPS = 6 };
 
-/* n samples of the sum of `taps` sequences times their values; returns the energy. */
+/* Write n samples of the sum of `taps` sequences times their values; return the energy. */
 INLINE double add_up(const int taps, const double *const *x, const double *values, int64_t n, double *y) {
     vec squares = {};
     int64_t t = 0;
@@ -135,12 +135,12 @@ INLINE double add_up(const int taps, const double *const *x, const double *value
     return energy;
 }
 
-/* y[t] = sum_i values[i] x[t - shifts[i]] for t from `from` up to `until`, where x is 0 outside of its `size` samples; returns
+/* y[t] = sum_i values[i] x[t - shifts[i]] for t from `from` up to `until`, with x = 0 outside of its `size` samples; return
  * the energy. */
 static double filtered(const double *x, int64_t size, const int64_t *shifts, const double *values, int64_t from,
                        int64_t until, double *y) {
     double energy = 0.0;
-    for (int64_t t = from, end; t < until; t = end) { /* stretches over which the same taps meet samples */
+    for (int64_t t = from, end; t < until; t = end) { /* ranges in which the same taps overlap x */
         const double *begin[TAPS];
         double value[TAPS];
         int taps = 0;
@@ -181,11 +181,10 @@ static void correlate(const double *const l[LANES], const double *const r[LANES]
     }
 }
 
-/* Frames (number, rows, size), with these steps from one frame or row to the next, and their filters: (number, rows, TAPS), or
- * (number, 1, TAPS) where they are alike for all rows. The result is that of all pairs of frames through their filters:
- * correlations (number, rows, 2 reach + 1), of at most MAX_LAGS lags, and energies (2, number, rows). The longest sequence
- * that a filter makes has `longest` samples; in `scratch` is room for two of these, and for LANES rows of twice the size and
- * 2 reach samples. */
+/* Frames (number, rows, size), with the given steps between frames and rows, and their filters: (number, rows, TAPS), or
+ * (number, 1, TAPS) if they are the same for all rows. Results for all pairs of filtered frames: correlations
+ * (number, rows, 2 reach + 1), of at most MAX_LAGS lags, and energies (2, number, rows). The longest filtered sequence has
+ * `longest` samples; scratch is a buffer for two of these, and for LANES rows of twice the size and 2 reach samples. */
 void rosafe_correlate_filtered(const double *left, int64_t left_frame, int64_t left_row, const int64_t *left_shifts,
                                const double *left_values, const double *right, int64_t right_frame, int64_t right_row,
                                const int64_t *right_shifts, const double *right_values, int64_t number, int64_t rows,
@@ -199,7 +198,7 @@ void rosafe_correlate_filtered(const double *left, int64_t left_frame, int64_t l
         double *to[LANES];
         for (int k = 0; k < LANES; k++) {
             const int64_t pair = first + k, frame = pair / rows, row = pair % rows;
-            if (pair >= pairs) { /* a lane without a pair does the one before once more */
+            if (pair >= pairs) { /* a lane without a pair repeats the previous one */
                 l[k] = l[k - 1], r[k] = r[k - 1], to[k] = to[k - 1];
                 continue;
             }

@@ -9,44 +9,44 @@ from numpy.typing import NDArray
 
 from . import MAX_LANES, REAL_SIZE, FloatArray, FrameReader, Transform, _address, _function
 
-TAPS = 6  # of a filter that takes an echo out
-INTERLEAVED_ROWS = 8  # rows that lie in memory sample by sample
+TAPS = 6  # of a filter that removes an echo
+INTERLEAVED_ROWS = 8  # rows that are interleaved in memory
 
 
 class Windowed(NamedTuple):
-    """Frames of the two ears times a window, and what can be said of them at once."""
+    """Windowed frames of both ears with their sums, peaks and energies."""
 
     samples: FloatArray  # (F, 2, C, w)
     sums: FloatArray  # over channels, (F, 2, w)
-    peaks: FloatArray  # the largest sample of each, (F, 2, C)
-    energies: FloatArray  # the sum of squares of each, (F, 2, C)
+    peaks: FloatArray  # the largest sample of each frame, (F, 2, C)
+    energies: FloatArray  # the sum of squares of each frame, (F, 2, C)
 
     @classmethod
-    def room(cls, frames: int, channels: int, size: int) -> Windowed:
-        """To be filled."""
+    def allocate(cls, frames: int, channels: int, size: int) -> Windowed:
+        """Return uninitialised arrays."""
         each = (frames, 2, channels)
         return cls(np.empty((*each, size)), np.empty((frames, 2, size)), np.empty(each), np.empty(each))
 
     def first(self, frames: int) -> Windowed:
-        """That of the first frames."""
+        """Return a view of the first frames."""
         return Windowed(*(array[:frames] for array in self))
 
 
 class Taps(NamedTuple):
-    """Filters y[t] = sum_i values[i] x[t - shifts[i]]; y begins where x does and is shifts[-1] samples longer."""
+    """Filters y[t] = sum_i values[i] x[t - shifts[i]]; y starts with x and is shifts[-1] samples longer."""
 
     shifts: NDArray[np.int64]  # (..., TAPS), ascending
     values: FloatArray  # (..., TAPS)
 
     def of(self, *place: Any) -> Taps:
-        """Those at `place`."""
+        """Return the filters at an index."""
         return Taps(self.shifts[place], self.values[place])
 
 
 def windowed(frames: FrameReader, output: Windowed) -> None:
-    """The frames of (2, C, N), windowed by their weights, to `output`; the tail is left alone.
+    """Write the frames of (2, C, N), multiplied by their weights, to `output`; the tail is not written.
 
-    The twin is `rosafe.representations.precedence.windowed`.
+    The equivalent is `rosafe.representations.precedence.windowed`.
     """
     _function("rosafe_windowed")(frames.packed, *map(_address, output))
 
@@ -54,7 +54,7 @@ def windowed(frames: FrameReader, output: Windowed) -> None:
 def add_spectra(
     samples: FloatArray, points: int, gains: FloatArray, factors: FloatArray, power: FloatArray
 ) -> FloatArray:
-    """As `rosafe.representations.precedence.add_spectra`, of a power of 2 up to MAX_POINTS points; w is even."""
+    """Compute `rosafe.representations.precedence.add_spectra` with a power of 2 up to MAX_POINTS points; w is even."""
     count, ears, channels, size = samples.shape
     transform = Transform.of(points)
     sums, factors = np.empty((count, ears, power.shape[1])), np.ascontiguousarray(factors)
@@ -73,7 +73,7 @@ def add_spectra(
 def correlate_filtered(
     left: FloatArray, left_taps: Taps, right: FloatArray, right_taps: Taps, reach: int
 ) -> tuple[FloatArray, FloatArray]:
-    """As `rosafe.representations.precedence.correlate_filtered`, of at most MAX_LAGS lags."""
+    """Compute `rosafe.representations.precedence.correlate_filtered` for at most MAX_LAGS lags."""
     count, rows, size = left.shape
     correlations, energies = np.empty((count, rows, 2 * reach + 1)), np.empty((2, count, rows))
     longest = size + max(0, int(left_taps.shifts.max(initial=0)), int(right_taps.shifts.max(initial=0)))

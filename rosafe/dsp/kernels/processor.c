@@ -1,5 +1,5 @@
-/* Which of the libraries the processor can run, what compiled this one, and how a thread takes denormal numbers. The first
- * function is compiled for any x86-64, so that it can be asked of the library for the least processors anywhere. */
+/* The instruction set of the processor, the compiler of this library, and the handling of denormal numbers in a thread. The
+ * first function is compiled for any x86-64, so that every processor can call it in the library for the lowest level. */
 #include "vector.h"
 
 /* 4, 3 or 2 for x86-64-v4 (AVX-512), x86-64-v3 (AVX2, FMA) or x86-64-v2 (SSE4.2), 0 for less; 8 for ARMv8. */
@@ -23,6 +23,6 @@ const char *rosafe_compiler(void) {
 #endif
 }
 
-/* For what is not a kernel; returns what to give back to rosafe_denormals_as. */
+/* For code outside of kernels; returns the argument for rosafe_denormals_as. */
 uint32_t rosafe_denormals_off(void) { return denormals_off(); }
 void rosafe_denormals_as(uint32_t before) { denormals_as(before); }

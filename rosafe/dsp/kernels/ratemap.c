@@ -1,8 +1,8 @@
-/* The ratemap: a leaky integrator, then sums over moving windows of its output or the square of that.
+/* The ratemap: a leaky integrator, then sums over sliding windows of its output or of the squared output.
  *
- * u[t] = s + (1 - r) x[t], s = r u[t] (rosafe/representations/ratemap.py). A row in each lane. Samples go in spans that stay
- * in the first-level cache, and each frame that touches a span adds its part of it. So every sample is read once, and of what
- * is integrated only the tail that is kept goes to memory. Spans are counted from where the signal began. */
+ * u[t] = s + (1 - r) x[t], s = r u[t] (rosafe/representations/ratemap.py). One row per lane. Samples are processed in
+ * spans that stay in the L1 cache, and each frame that overlaps a span adds its part. Every sample is read once, and only the
+ * buffered tail of the integrated samples is written to memory. Spans are counted from the start of the signal. */
 #include "framed.h"
 
 enum { SPAN = 128 };
@@ -20,8 +20,8 @@ INLINE vec weighted(const int squared, const vec *x, const double *weights, int6
     return joined_chains(sum);
 }
 
-/* The n samples x of the first `rows` of the lanes, of which the first is number `at`: adds their part to the sum of each
- * frame. The sums of a row lie one behind the other. */
+/* Add n samples x of the first `rows` lanes, the first of which is sample `at`, to the sum of each frame. The sums of a row
+ * are contiguous. */
 INLINE void add_frames(const int squared, const vec *x, int64_t at, int64_t n, const framed *of, int64_t rows, double *sums) {
     int64_t frame = first_frame(of, at);
     for (int64_t begin; frame < of->number && (begin = of->skip + frame * of->hop) < at + n; frame++) {
@@ -32,38 +32,38 @@ INLINE void add_frames(const int squared, const vec *x, int64_t at, int64_t n, c
     }
 }
 
-/* A sample through the integrator. */
-INLINE vec integrated(vec x, double retention, vec *s) {
-    const vec in = bounded(x, -LIMIT, LIMIT) * (1.0 - retention), u = in + *s;
-    *s = fused(all(retention), *s, in * retention);
+/* Integrate one sample. */
+INLINE vec integrated(vec x, double decay_factor, vec *s) {
+    const vec in = bounded(x, -LIMIT, LIMIT) * (1.0 - decay_factor), u = in + *s;
+    *s = fused(all(decay_factor), *s, in * decay_factor);
     return u;
 }
 
-/* u of n samples of the rows; s is that before the first one, then that behind the last. */
-INLINE void integrate(const double *const rows[LANES], int64_t n, double retention, vec *s, vec *u) {
+/* Compute u of n samples of the rows and update the state s. */
+INLINE void integrate(const double *const rows[LANES], int64_t n, double decay_factor, vec *s, vec *u) {
     int64_t t = 0;
     for (; t + TILE <= n; t += TILE) {
         vec tile[TILE];
         read_tile(rows, t, tile);
-        UNROLL for (int i = 0; i < TILE; i++) u[t + i] = integrated(tile[i], retention, s);
+        UNROLL for (int i = 0; i < TILE; i++) u[t + i] = integrated(tile[i], decay_factor, s);
     }
-    for (; t < n; t++) u[t] = integrated(gathered(rows, t), retention, s);
+    for (; t < n; t++) u[t] = integrated(gathered(rows, t), decay_factor, s);
 }
 
-/* As many rows as there are lanes, or fewer, from `row` on. */
-INLINE void run(const int squared, const framed *of, int64_t row, double retention, double *state, double *sums) {
+/* Process at most LANES rows from `row` on. */
+INLINE void run(const int squared, const framed *of, int64_t row, double decay_factor, double *state, double *sums) {
     const int64_t rows = least(LANES, of->rows - row), held = of->held, n = of->n, tail_from = of->tail_from;
     const double *from[LANES];
     double *kept[LANES];
     vec s, u[SPAN];
-    for (int k = 0; k < LANES; k++) s[k] = state[2 * least(k, rows - 1)]; /* lanes without a row do the last one once more */
+    for (int k = 0; k < LANES; k++) s[k] = state[2 * least(k, rows - 1)]; /* lanes without a row repeat the last one */
     for (int64_t at = of->number ? 0 : held, end, old; at < held + n; at = end) {
         end = least(at + SPAN - (of->position + at) % SPAN, held + n);
         old = most(0, least(end, held) - at);
         for (int k = 0; k < LANES; k++) from[k] = of->history + (row + least(k, rows - 1)) * of->history_stride + at;
         read_rows(from, old, -2 * LIMIT, 2 * LIMIT, u, 1);
         for (int k = 0; k < LANES; k++) from[k] = of->block + (row + least(k, rows - 1)) * n + at + old - held;
-        integrate(from, end - at - old, retention, &s, u + old);
+        integrate(from, end - at - old, decay_factor, &s, u + old);
         add_frames(squared, u, at, end - at, of, rows, sums);
         const int64_t first = most(at, tail_from);
         for (int k = 0; k < LANES; k++) kept[k] = of->tail + (row + least(k, rows - 1)) * of->tail_stride + first - tail_from;
@@ -72,16 +72,16 @@ INLINE void run(const int squared, const framed *of, int64_t row, double retenti
     for (int64_t k = 0; k < rows; k++) state[2 * k] = s[k];
 }
 
-/* The history has been integrated already, the block has not. state is (rows, 2), of which the second belongs to the twin's
- * form; rates (rows, number). */
-void rosafe_ratemap(const framed *of, int64_t squared, double retention, double *state, double *rates) {
+/* The history is integrated already, the block is not. state is (rows, 2); the second number is only used without kernels.
+ * rates (rows, number). */
+void rosafe_ratemap(const framed *of, int64_t squared, double decay_factor, double *state, double *rates) {
     uint32_t mode = enter();
     memset(rates, 0, of->rows * of->number * sizeof(double));
     for (int64_t row = 0; row < of->rows; row += LANES) {
         if (squared)
-            run(1, of, row, retention, state + 2 * row, rates + row * of->number);
+            run(1, of, row, decay_factor, state + 2 * row, rates + row * of->number);
         else
-            run(0, of, row, retention, state + 2 * row, rates + row * of->number);
+            run(0, of, row, decay_factor, state + 2 * row, rates + row * of->number);
     }
     leave(mode);
 }

@@ -1,10 +1,10 @@
-/* Spectral features: fourteen numbers of each frame's spectrum (rosafe/representations/spectralfeatures.py has the formulas).
+/* Spectral features: fourteen numbers of the spectrum of each frame; formulas in rosafe/representations/spectralfeatures.py.
  *
- * One frame after the other, as there are few: what takes time elsewhere is to begin and end the many sums. */
+ * Frames are processed one after the other, as there are few; in numpy, most of the time is the overhead of the many sums. */
 #include <math.h>
 #include <stdint.h>
 
-#define E 1e-15 /* keeps quotients and logarithms finite */
+#define E 1e-15 /* added to denominators and arguments of logarithms */
 
 enum { CENTROID, CREST, SPREAD, ENTROPY, BRIGHTNESS, HFC, DECREASE, FLATNESS, FLUX, KURTOSIS, SKEWNESS, IRREGULARITY,
        ROLLOFF, VARIATION, FEATURES };
@@ -24,7 +24,7 @@ static void take(const double *rates, int64_t step, int64_t channels, spectrum *
     of->norm = sqrt(squares) + E;
 }
 
-/* The frequency below which the part `threshold` of the energy lies. */
+/* The frequency below which the sum reaches `threshold`. */
 static double rolloff(const double *x, const double *frequencies, double threshold) {
     double below = 0.0, above = x[0];
     int64_t c = 0;
@@ -42,7 +42,7 @@ static void describe(const spectrum *now, const spectrum *before, int64_t channe
     const double others = channels > 1 ? channels - 1 : 1;
     double sum = 0.0, largest = 0.0, first = 0.0, second = 0.0, brightness = 0.0, slope = 0.0, logarithms = 0.0;
     double flux = 0.0, irregularity = 0.0, product = 0.0;
-    int silent = 0; /* whether any channel is */
+    int silent = 0; /* whether any channel is silent */
     for (int64_t c = 0; c < channels; c++) {
         sum += x[c];
         largest = fmax(largest, x[c]);
@@ -94,8 +94,8 @@ static void describe(const spectrum *now, const spectrum *before, int64_t channe
     features[VARIATION * step] = 1 - product / (now->norm * before->norm);
 }
 
-/* spectra is (rows, channels, n), `last` (rows, channels) the frame before; none of them is negative. features is (rows,
- * FEATURES, n). Room for work (4, channels). */
+/* spectra is (rows, channels, n), `last` (rows, channels) the previous frame; none of them is negative. features is (rows,
+ * FEATURES, n); work is a buffer of (4, channels). */
 void rosafe_spectral_features(const double *spectra, const double *last, int64_t rows, int64_t channels, int64_t n,
                               const double *frequencies, double bright, double part, double *work, double *features) {
     double highest = 0.0;

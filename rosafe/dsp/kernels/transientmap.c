@@ -1,9 +1,8 @@
-/* Onset and offset maps: which peaks of the strengths stay (rosafe/representations/onset_offset_maps.py).
+/* Onset and offset maps: selection of peaks of the strengths (rosafe/representations/onset_offset_maps.py).
  *
- * Each frame of a map is that of the whole algorithm on a window of frames around it, from which nothing is left out that
- * could matter: peaks are found and sorted once for many windows, as a window only decides which of them it holds; the
- * strongest ones claim their surroundings in an array of cells of `fuse` frames; and fragments are followed from the units
- * of the frame on, no further than it takes to know that they are large enough. */
+ * Each frame of a map is the result of the whole algorithm on a window of frames around it. Peaks are found and sorted once
+ * for many windows, because a window only selects some of them. The strongest peaks claim their neighbourhood in an array of
+ * cells of `fuse` frames. Fragments are followed from the units of the frame only until they are known to be large enough. */
 #include "vector.h"
 
 #include <stdlib.h>
@@ -20,7 +19,7 @@ static int stronger_or_earlier(const void *a, const void *b) {
     return (p->middle > q->middle) - (p->middle < q->middle);
 }
 
-/* The peaks among the n frames of a channel, whose first one is number `from`; returns how many. */
+/* Find the peaks among n frames of a channel, the first of which is frame `from`; return their number. */
 static int64_t find_peaks(const double *strengths, const double *levels, double least_strength, double least_level,
                           int64_t from, int64_t n, peak *peaks) {
     int64_t number = 0, start = 0;
@@ -38,7 +37,7 @@ static int64_t find_peaks(const double *strengths, const double *levels, double 
     return number;
 }
 
-/* Whether no peak that was claimed lies less than `fuse` frames from `at`, which is claimed then. */
+/* Claim `at` if no claimed peak is less than `fuse` frames away; return whether it was claimed. */
 static int claim(int64_t at, int64_t fuse, int64_t *claimed) {
     int64_t cell = 1 + at / fuse;
     if (claimed[cell] >= 0 || (claimed[cell - 1] >= 0 && at - claimed[cell - 1] < fuse) ||
@@ -48,7 +47,7 @@ static int claim(int64_t at, int64_t fuse, int64_t *claimed) {
     return 1;
 }
 
-/* Whether at least `spread` of the `alive` units (channels, width), those with that `stamp`, hang together with `unit`. */
+/* Return whether at least `spread` of the `alive` units (channels, width), those with that `stamp`, are connected to `unit`. */
 static int is_large(int64_t unit, const int64_t *alive, int64_t stamp, int64_t channels, int64_t width, int64_t spread,
                     int64_t *visited, int64_t visit, int64_t *found) {
     int64_t number = 1;
@@ -67,10 +66,10 @@ static int is_large(int64_t unit, const int64_t *alive, int64_t stamp, int64_t c
     return number == spread;
 }
 
-/* strengths and levels are (rows, n), rows `stride` apart, `channels` of them for each ear. Puts out the frames `first` to
- * first + count - 1, map (rows, count), each from the `reach` frames before it, or those there are, to the `reach` frames
- * behind it; n is at least first + count + reach. `at_once` frames share their peaks.
- * Room for: peaks (channels, capacity), capacity at least half of at_once + 2 reach; number (channels); claimed
+/* strengths and levels are (rows, n), rows `stride` apart, `channels` of them for each ear. Computes the frames `first` to
+ * first + count - 1, map (rows, count), each from up to `reach` frames before it and `reach` frames after it; n is at least
+ * first + count + reach. `at_once` frames share a search for peaks.
+ * Buffers: peaks (channels, capacity), capacity at least half of at_once + 2 reach; number (channels); claimed
  * (2 reach / fuse + 3), if fuse is not 0; units (2, channels, 2 spread - 1), all 0; found (spread). */
 void rosafe_transient_map(const double *strengths, const double *levels, int64_t stride, int64_t rows, int64_t channels,
                           int64_t first, int64_t count, int64_t reach, int64_t at_once, double least_strength,
@@ -80,7 +79,7 @@ void rosafe_transient_map(const double *strengths, const double *levels, int64_t
     int64_t *const alive = units, *const visited = units + channels * width;
     int64_t stamp = 0, visit = 0;
     memset(map, 0, rows * count * sizeof(double));
-    for (int64_t row = 0; row < rows; row += channels) /* an ear's first one */
+    for (int64_t row = 0; row < rows; row += channels) /* the first row of an ear */
         for (int64_t begin = first; begin < first + count; begin += at_once) {
             int64_t end = least(first + count, begin + at_once), from = most(0, begin - reach);
             for (int64_t c = 0; c < channels; c++) {

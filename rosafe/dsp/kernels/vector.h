@@ -1,23 +1,22 @@
-/* One register of doubles, in vector extensions of GCC and clang: what all kernels are made of.
+/* One register of doubles, by the vector extensions of GCC and clang: the basis of all kernels.
  *
- * Two doubles, four with AVX2, eight with AVX-512; the kernels are written for any number of lanes. The
- * recursive ones keep a row (an ear's channel) in each lane: the samples of one row depend on one another, those of several
- * rows do not. Rounding is that of what is written: a product and a sum are fused where `fused` says so, if the processor can, and nowhere else
- * (-ffp-contract=off). */
+ * Two doubles, four with AVX2, eight with AVX-512; the kernels are written for any number of lanes. Recursive kernels process
+ * one row (a channel of an ear) per lane: the samples of one row depend on each other, those of several rows do not. Rounding
+ * follows the source: a product and a sum are fused only by `fused`, if the processor supports it (-ffp-contract=off). */
 #ifndef ROSAFE_VECTOR_H
 #define ROSAFE_VECTOR_H
 
 #include <stdint.h>
 
 #define INLINE static inline __attribute__((always_inline))
-#define INTERNAL __attribute__((visibility("hidden"))) /* between the sources; not for Python */
+#define INTERNAL __attribute__((visibility("hidden"))) /* shared by the sources; not for Python */
 #ifdef __clang__
 #define UNROLL _Pragma("clang loop unroll(full)")
 #else
-#define UNROLL _Pragma("GCC unroll 32") /* -O2 leaves even loops over four things rolled */
+#define UNROLL _Pragma("GCC unroll 32") /* -O2 does not unroll even loops of four iterations */
 #endif
 
-/* As in rosafe/dsp/numeric_limits.py: samples are bounded to LIMIT, and what is below TINY is nothing. */
+/* As in rosafe/dsp/numeric_limits.py: samples are clamped to LIMIT, and become 0 below TINY. */
 #define LIMIT 1e70
 #define TINY 1e-200
 
@@ -45,15 +44,15 @@ INLINE vec root(vec a) {
     return a;
 }
 
-/* --- what takes the processor's own instructions --- */
+/* --- instructions of the processor --- */
 
-/* a b + c. GCC finds the instructions for vectors neither here nor in `smaller`, clang does. */
+/* a b + c. Unlike clang, GCC does not generate the vector instructions here and in `smaller`. */
 INLINE vec fused(vec a, vec b, vec c) {
 #if defined __clang__ && (defined __FMA__ || defined __aarch64__)
     UNROLL for (int k = 0; k < LANES; k++) c[k] = __builtin_fma(a[k], b[k], c[k]);
     return c;
 #elif defined __AVX512F__
-    return __builtin_ia32_vfmaddpd512_mask(a, b, c, -1, 4 /* rounding as usual */);
+    return __builtin_ia32_vfmaddpd512_mask(a, b, c, -1, 4 /* current rounding mode */);
 #elif defined __FMA__
     return __builtin_ia32_vfmaddpd256(a, b, c);
 #elif defined __aarch64__
@@ -87,7 +86,7 @@ INLINE vec larger(vec a, vec b) {
 #endif
 }
 
-/* At most LANES doubles, 0 in the lanes behind them; what lies there is not touched. */
+/* At most LANES doubles, 0 in the remaining lanes; memory after the doubles is not accessed. */
 INLINE vec load_first(const double *from, int64_t n) {
 #if defined __AVX512F__
     return __builtin_ia32_loadupd512_mask((const void *)from, (vec){}, n < LANES ? (1 << n) - 1 : -1);
@@ -98,8 +97,8 @@ INLINE vec load_first(const double *from, int64_t n) {
 #endif
 }
 
-/* Denormal numbers are 0 inside the kernels: they are below anything that is heard, and make arithmetic many times
- * slower. The bits are those of the control register for "flush to zero", on x86 for "denormals are zero" too. */
+/* Denormal numbers are 0 inside the kernels: they are inaudible and make arithmetic many times slower.
+ * The bits are those of the control register for "flush to zero", on x86 for "denormals are zero" too. */
 #if defined __x86_64__
 INLINE uint32_t control(void) { return __builtin_ia32_stmxcsr(); }
 INLINE void denormals_as(uint32_t before) { __builtin_ia32_ldmxcsr(before); }
@@ -119,7 +118,7 @@ INLINE uint32_t denormals_off(void) {
     return before;
 }
 
-/* --- the way into a kernel and out of it --- */
+/* --- entry to and exit from a kernel --- */
 
 INTERNAL void gate_in(void);
 INTERNAL void gate_out(void);
@@ -132,10 +131,10 @@ INLINE void leave(uint32_t before) {
     gate_out();
 }
 
-/* --- lanes in another order ---
+/* --- permutations of lanes ---
  *
- * Of two registers the even ones of each pair of neighbours in turn, and the odd ones; of four samples of every second row the
- * first two or the last two, a row's pair after the other; and of such registers, those of a row. */
+ * The even and the odd lanes of two registers, interleaved; the first or the last two of four samples of every second row,
+ * pair by pair; and from such registers the samples of one row. */
 
 #if defined __AVX512F__
 INLINE vec evens(vec a, vec b) { return __builtin_shufflevector(a, b, 0, 8, 2, 10, 4, 12, 6, 14); }

@@ -6,13 +6,13 @@
 
 #include <math.h>
 
-/* x to the power of `exponent`, 0 where x < TINY. Of x = 2^e m with m between sqrt(1/2) and sqrt(2), log m is a series in
- * (m - 1) / (m + 1); 2^f with f between -1/2 and 1/2 is the exponential series. Both end where they are exact. */
+/* x to the power of `exponent`, 0 if x < TINY. With x = 2^e m with m between sqrt(1/2) and sqrt(2), log m is a series in
+ * (m - 1) / (m + 1); 2^f with f between -1/2 and 1/2 is the exponential series. Both are truncated at full precision. */
 INLINE vec power(vec x, double exponent) {
     static const double LOG[] = {1. / 23, 1. / 21, 1. / 19, 1. / 17, 1. / 15, 1. / 13, 1. / 11, 1. / 9, 1. / 7, 1. / 5, 1. / 3, 1};
     static const double EXP[] = {1. / 6227020800, 1. / 479001600, 1. / 39916800, 1. / 3628800, 1. / 362880, 1. / 40320,
                                  1. / 5040, 1. / 720, 1. / 120, 1. / 24, 1. / 6, 1. / 2, 1, 1};
-    const double to_integer = 0x1.8p52; /* added, it leaves the nearest integer in the lowest bits */
+    const double to_integer = 0x1.8p52; /* adding it puts the nearest integer into the lowest bits */
     const lanes bits = (lanes)larger(x, all(TINY)), large = (bits & ((1L << 52) - 1)) > 0x6A09E667F3BCC;
     vec m = (vec)((bits & ((1L << 52) - 1)) | ((1023L + large) << 52));
     vec e = (vec)(((bits >> 52) - 1023 - large) + (lanes)all(to_integer)) - all(to_integer);

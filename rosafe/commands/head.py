@@ -1,0 +1,71 @@
+"""Learn the model of a head once, for `rosafe localize --head FILE`, from a SOFA file or from recordings.
+
+RECORDINGS.csv has the columns file, azimuth_deg: sound files with two ears of one source at a known direction each,
+left positive. The directions must surround the head, at most 30 degrees apart; several files for one direction are
+allowed."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from rosafe import option_types
+from rosafe.commands import CommandError
+from rosafe.commands._parameters import add_settings, parameters_of
+
+_RATE = 44100
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments."""
+    parser.usage = "rosafe head learn HEAD.sofa|RECORDINGS.csv -o FILE [--rate HZ] [--set NAME=VALUE ...] [--force]"
+    parser.add_argument("action", choices=("learn",), help="what to do")
+    parser.add_argument("inputs", nargs="*", metavar="SOURCE", help="SOFA file, or CSV file with a list of recordings")
+    parser.add_argument("-o", "--to", dest="to", metavar="FILE", required=True, help="the model")
+    parser.add_argument(
+        "--rate",
+        type=option_types.whole_number(8000, 768_000),
+        metavar="HZ",
+        help=f"sample rate of the sounds to localize (default: {_RATE}; that of the recordings)",
+    )
+    add_settings(parser, "rosafe process -h lists them")
+    parser.add_argument("--force", action="store_true", help="replace FILE if it exists")
+    parser.epilog = (
+        "example:\n"
+        "  rosafe head learn /usr/share/libmysofa/default.sofa -o kemar.head\n"
+        "  rosafe localize speech.wav --head kemar.head"
+    )
+
+
+def run(options: argparse.Namespace) -> int:
+    """Learn and write the model."""
+    inputs = [*options.inputs, *options.more_inputs]
+    if len(inputs) != 1:
+        options.usage_error(f"expected one SOFA file or one list of recordings, got {len(inputs)}")
+    target = Path(options.to)
+    if target.exists() and not options.force:
+        raise CommandError(f"{target}: exists already; --force replaces it")
+    from rosafe.localization.head import Head
+    from rosafe.localization.model_cache import terminal_progress
+    from rosafe.localization.recordings import learn_recordings
+    from rosafe.localization.training import learn_head
+    from rosafe.sound.audiofile import AudioFileError
+
+    parameters = parameters_of(options.settings) or None
+    progress = terminal_progress(inputs[0])
+    try:
+        if inputs[0].lower().endswith(".csv"):
+            model = learn_recordings(inputs[0], options.rate, parameters, progress)
+        else:
+            model = learn_head(Head.from_sofa(inputs[0]), float(options.rate or _RATE), parameters, progress)
+        if progress:
+            progress(1.0)
+        model.save(target, options.force)
+    except (ValueError, AudioFileError) as problem:
+        raise CommandError(str(problem)) from None
+    print(
+        f"{target}: {len(model.azimuths)} directions, {model.channels} channels, {model.sample_rate:g} Hz",
+        file=sys.stderr,
+    )
+    return 0

@@ -1,0 +1,1 @@
+"""Directions of sounds: heads, scenes with known truth, direction models, localization and tracking. No ROS."""

@@ -1,0 +1,92 @@
+"""Interaural cues of frames, quantized for the tables of a direction model."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rosafe.declarations.text import short_repr
+from rosafe.dsp.numeric_limits import FloatArray
+
+KINDS = ("itd", "ild", "ic", "ratemap")  # the representations that localization needs
+# Sound is amplified by 100 dB: the representations add a small constant to energies, which would matter at low levels.
+PARAMETERS = {"pp_bLevelScaling": True, "pp_refSPLdB": 0.0}
+ITD_BINS, MAX_ITD = 67, 1.1e-3  # of the histogram from -MAX_ITD to MAX_ITD, s
+ILD_BINS, MAX_ILD = 61, 30.0  # dB
+COHERENCE_CLASSES = 6
+COHERENCE_RANGE = 2.6  # decades of 1 - coherence below 1
+LEVEL_CLASSES, LEVEL_STEP = 8, 2.0  # level of a channel above its floor in the window, dB
+CLASSES = COHERENCE_CLASSES * LEVEL_CLASSES
+FLOOR_QUANTILE = 0.02  # of the levels in a window: the floor
+MIN_LEVEL = -130.0  # dB, of the ratemap of a sound with full scale 1; channels below have no cues
+
+
+class Cues(NamedTuple):
+    """Cues of F frames; all arrays are (F, C)."""
+
+    itd_row: NDArray[np.intp]  # row of the ITD table for level class 0
+    ild_row: NDArray[np.intp]  # the same of the ILD table
+    level: FloatArray  # dB, both ears
+    valid: NDArray[np.bool_]  # level and coherence suffice
+
+    def select(self, frames: Any) -> Cues:
+        """Return the cues of some frames."""
+        return Cues(self.itd_row[frames], self.ild_row[frames], self.level[frames], self.valid[frames])
+
+
+def scaling_db(parameters: Mapping[str, Any]) -> float:
+    """Return the gain in dB with which the representations are computed."""
+    return float(100.0 - parameters["pp_refSPLdB"]) if parameters["pp_bLevelScaling"] else 0.0
+
+
+def quantize(features: Mapping[str, Any], gain_db: float) -> Cues:
+    """Quantize the representations `itd`, `ild`, `ic` (C, F) and `ratemap` (2, C, F); see `scaling_db`."""
+    itd, ild, coherence, ratemap = (np.asarray(features[kind], np.float64) for kind in KINDS)
+    minimum = MIN_LEVEL + gain_db
+    level = 10 * np.log10(np.maximum(ratemap[0] + ratemap[1], 10 ** ((minimum - 10) / 10)))
+    decades = np.log10(np.maximum(1 - coherence, 1e-9)) + COHERENCE_RANGE
+    coherence_class = _bin(decades / COHERENCE_RANGE, COHERENCE_CLASSES)
+    first = (np.arange(len(itd))[:, np.newaxis] * COHERENCE_CLASSES + coherence_class) * LEVEL_CLASSES
+    return Cues(
+        np.ascontiguousarray((first * ITD_BINS + _bin((itd / MAX_ITD + 1) / 2, ITD_BINS)).T),
+        np.ascontiguousarray((first * ILD_BINS + _bin((ild / MAX_ILD + 1) / 2, ILD_BINS)).T),
+        np.ascontiguousarray(level.T),
+        np.ascontiguousarray(((level > minimum) & (coherence > 0)).T),
+    )
+
+
+def _bin(values: FloatArray, count: int) -> NDArray[np.intp]:
+    """Return the bin of values from 0 to 1; those outside belong to the first or the last one."""
+    return np.clip(np.floor(values * count), 0, count - 1).astype(np.intp)
+
+
+def floors(levels: FloatArray) -> FloatArray:
+    """Return the floor (C,) of the levels (F, C) of a window in dB."""
+    rank = int(FLOOR_QUANTILE * len(levels))
+    return np.asarray(np.partition(levels, rank, axis=0)[rank])
+
+
+def level_class(level: FloatArray, floor: FloatArray) -> NDArray[np.intp]:
+    """Return the class of levels (..., C) above a floor (C,)."""
+    return np.clip(np.floor((level - floor) / LEVEL_STEP), 0, LEVEL_CLASSES - 1).astype(np.intp)
+
+
+def check_features(features: Mapping[str, Any], channels: int) -> dict[str, FloatArray]:
+    """Return the features that localization needs as float64; ValueError if one is missing or has another shape."""
+    if not isinstance(features, Mapping):
+        raise ValueError(f"features: expected a mapping with {', '.join(KINDS)}, got {type(features).__name__}")
+    missing = [kind for kind in KINDS if kind not in features]
+    if missing:
+        raise ValueError(f"features: expected {', '.join(KINDS)}, got none for {', '.join(missing)}")
+    arrays = {kind: np.asarray(features[kind], np.float64) for kind in KINDS}
+    frames = arrays["itd"].shape[-1] if arrays["itd"].ndim else -1
+    for kind, array in arrays.items():
+        shape = (2, channels, frames) if kind == "ratemap" else (channels, frames)
+        if array.shape != shape:
+            raise ValueError(f"features[{kind!r}]: expected shape {shape}, got {short_repr(array.shape)}")
+        if not np.isfinite(array).all():
+            raise ValueError(f"features[{kind!r}]: expected finite numbers, got NaN or infinity")
+    return arrays

@@ -1,0 +1,217 @@
+"""A direction model: how likely the interaural cues of each channel are for each direction, learned from sound.
+
+T. May, S. van de Par and A. Kohlrausch (2011), "A probabilistic model for robust localization based on a binaural
+auditory front-end", IEEE Trans. Audio Speech Lang. Process. 19, 1-13, learn the joint distribution of ITD and ILD
+of each channel in several conditions. Here ITD and ILD are independent histograms, conditional on the interaural
+coherence and on the level of the channel above its floor in the window. Both depend on the noise and
+reverberation in a frame and determine how much its cues count.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import zipfile
+import zlib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
+
+from rosafe.declarations.text import short_repr
+from rosafe.dsp.numeric_limits import FloatArray
+from rosafe.input import open_regular
+from rosafe.localization import angles
+from rosafe.localization.cues import (
+    CLASSES,
+    COHERENCE_CLASSES,
+    ILD_BINS,
+    ITD_BINS,
+    LEVEL_CLASSES,
+    Cues,
+    floors,
+    level_class,
+)
+from rosafe.output import new_file
+from rosafe.terminal import printable
+
+FORMAT = "rosafe direction model 1"
+WINDOW = 100  # frames for which a floor is estimated while learning
+_SMOOTHING = 0.75  # bins, along ITD and ILD
+_CLASS_SMOOTHING = 0.5  # classes
+_PRIOR_COUNT = 10.0  # frames that the distribution over all directions counts for
+# Exceptions of the reader of npz archives, and of the conversion of their content, for damaged files
+_DAMAGED = (
+    OSError,
+    ValueError,
+    KeyError,
+    TypeError,
+    AttributeError,
+    EOFError,
+    ArithmeticError,
+    zipfile.BadZipFile,
+    zlib.error,
+    RuntimeError,
+)
+
+
+class DirectionModel:
+    """Log-likelihood ratios of cues for directions, relative to the mean over all directions.
+
+    Attributes
+    ----------
+    azimuths : ndarray, (A,)
+        Degrees in head coordinates.
+    sample_rate : float
+        Of the sound, Hz.
+    parameters : dict
+        Of the representations, by the names of docs/parameters.md.
+    is_sphere : bool
+        Whether front and back are equal.
+    level_gain_db : float
+        Level of a sound in dB full scale less that of the ratemap summed over ears and channels.
+    itd_table, ild_table : ndarray of float32, (rows + 1, A)
+        See `rosafe.localization.cues`; the last row is zero.
+    """
+
+    def __init__(self, description: Mapping[str, Any], itd_table: np.ndarray, ild_table: np.ndarray) -> None:
+        self.azimuths = angles.grid()
+        self.sample_rate = float(description["sample_rate"])
+        self.parameters = dict(description["parameters"])
+        self.head = str(description["head"])
+        self.is_sphere = bool(description["is_sphere"])
+        self.level_gain_db = float(description["level_gain_db"])
+        # Half precision, as in files, so that a learned and a loaded model give the same numbers.
+        self.itd_table = np.asarray(itd_table, np.float16).astype(np.float32)
+        self.ild_table = np.asarray(ild_table, np.float16).astype(np.float32)
+
+    @property
+    def channels(self) -> int:
+        """The number of channels."""
+        return (len(self.itd_table) - 1) // (CLASSES * ITD_BINS)
+
+    def rows(self, cues: Cues, floor: FloatArray) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Return the rows (F, C) of both tables."""
+        levels = level_class(cues.level, floor)
+        itd_row = np.where(cues.valid, cues.itd_row + levels * ITD_BINS, len(self.itd_table) - 1)
+        ild_row = np.where(cues.valid, cues.ild_row + levels * ILD_BINS, len(self.ild_table) - 1)
+        return itd_row, ild_row
+
+    def terms(self, itd_row: NDArray[np.intp], ild_row: NDArray[np.intp]) -> NDArray[np.float32]:
+        """Return log-likelihood ratios (F, C, A) for the rows (F, C) of `rows`."""
+        return self.itd_table[itd_row] + self.ild_table[ild_row]
+
+    def sum_of(self, itd_row: NDArray[np.intp], ild_row: NDArray[np.intp]) -> FloatArray:
+        """Return the sum (C, A) of `terms` over frames."""
+        itd = self.itd_table[itd_row].sum(axis=0, dtype=np.float64)
+        return np.asarray(itd + self.ild_table[ild_row].sum(axis=0, dtype=np.float64))
+
+    # --- files ---
+
+    def save(self, path: str | Path, replace: bool = True) -> None:
+        """Write the model as one file (an npz archive with tables in half precision)."""
+        description = {
+            "format": FORMAT,
+            "sample_rate": self.sample_rate,
+            "parameters": self.parameters,
+            "head": self.head,
+            "is_sphere": self.is_sphere,
+            "level_gain_db": self.level_gain_db,
+        }
+        with new_file(path, replace) as descriptor, open(descriptor, "wb", closefd=False) as file:
+            np.savez(
+                file,
+                description=np.array(json.dumps(description)),
+                itd_table=self.itd_table.astype(np.float16),
+                ild_table=self.ild_table.astype(np.float16),
+            )
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> DirectionModel:
+        """Read a model.
+
+        Raises
+        ------
+        ValueError
+            The file is missing, damaged or no model: one line that names it.
+        """
+        name = printable(os.fspath(path))
+        try:
+            with open_regular(Path(path).expanduser()) as file, np.load(file, allow_pickle=False) as archive:
+                description = json.loads(str(archive["description"]))
+                tables = archive["itd_table"], archive["ild_table"]
+            if description.get("format") != FORMAT:
+                raise ValueError(f"format {short_repr(description.get('format'))}")
+            model = cls(description, *tables)
+            model.check_tables()
+        except FileNotFoundError:
+            raise ValueError(f"{name}: expected a learned model, got a missing file") from None
+        except _DAMAGED as problem:
+            reason = getattr(problem, "strerror", None) or str(problem)
+            raise ValueError(
+                f"{name}: expected a model of rosafe head learn, got another or a damaged file: {short_repr(reason)}"
+            ) from None
+        return model
+
+    def check_tables(self) -> None:
+        """Raise ValueError if the tables do not belong together."""
+        rows = self.channels * CLASSES
+        expected = (rows * ITD_BINS + 1, len(self.azimuths)), (rows * ILD_BINS + 1, len(self.azimuths))
+        if (self.itd_table.shape, self.ild_table.shape) != expected or not self.channels:
+            raise ValueError("tables of unexpected shape")
+        if not (np.isfinite(self.itd_table).all() and np.isfinite(self.ild_table).all()):
+            raise ValueError("tables that are not finite")
+
+
+class Histograms:
+    """Counts of cues for the directions of the grid, from which a model is made.
+
+    Parameters
+    ----------
+    channels : int
+        Number of channels.
+    directions : int
+        Number of directions.
+    """
+
+    def __init__(self, channels: int, directions: int) -> None:
+        self._shape = channels, COHERENCE_CLASSES, LEVEL_CLASSES
+        self.itd = np.zeros((directions, *self._shape, ITD_BINS), np.float32)
+        self.ild = np.zeros((directions, *self._shape, ILD_BINS), np.float32)
+
+    def add(self, direction: int, cues: Cues) -> None:
+        """Count the cues of successive frames from one direction; floors are those of windows of `WINDOW` frames."""
+        for begin in range(0, max(1, len(cues.level) - WINDOW // 2), WINDOW):
+            part = cues.select(slice(begin, begin + WINDOW))
+            levels = level_class(part.level, floors(part.level))
+            for counts, rows, bins in ((self.itd, part.itd_row, ITD_BINS), (self.ild, part.ild_row, ILD_BINS)):
+                flat = counts[direction].reshape(-1)
+                flat += np.bincount((rows + levels * bins)[part.valid], minlength=flat.size).astype(np.float32)
+
+    def mirror(self, source: NDArray[np.intp]) -> None:
+        """Add to each direction d the counts of direction `source[d]` with the ears exchanged."""
+        self.itd += self.itd[source][..., ::-1]
+        self.ild += self.ild[source][..., ::-1]
+
+    def tables(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the tables of log-likelihood ratios for ITD and ILD."""
+        return _log_ratios(self.itd), _log_ratios(self.ild)
+
+
+def _log_ratios(counts: np.ndarray) -> np.ndarray:
+    """Return log(p(bin | direction) / p(bin)) of counts (A, C, K, S, bins) as (C * K * S * bins + 1, A)."""
+    smooth = counts
+    for axis, width in ((2, _CLASS_SMOOTHING), (3, _CLASS_SMOOTHING), (4, _SMOOTHING)):
+        smooth = gaussian_filter1d(smooth, width, axis=axis, mode="nearest")
+    mean = smooth.sum(axis=0) + 1e-4
+    mean /= mean.sum(axis=-1, keepdims=True)
+    total = smooth.sum(axis=-1, keepdims=True) + _PRIOR_COUNT
+    smooth += _PRIOR_COUNT * mean
+    smooth /= total
+    smooth /= mean
+    table = np.zeros((mean.size + 1, len(counts)), np.float32)
+    np.log(smooth.reshape(len(counts), -1).T, out=table[:-1])
+    return table

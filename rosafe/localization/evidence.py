@@ -1,0 +1,141 @@
+"""The evidence for each direction in the frames of a sliding window, in head and in world coordinates."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+from numpy.typing import NDArray
+
+from rosafe.dsp.numeric_limits import FloatArray
+from rosafe.localization import angles
+from rosafe.localization.cues import Cues, floors
+from rosafe.localization.direction_model import DirectionModel
+
+
+class EvidenceWindow:
+    """Log-likelihood ratios of the last frames, summed over channels and frames.
+
+    The floor of a channel is that of the whole window. If a floor changes, the evidence of its channel is computed
+    again for all frames of the window, so that a result depends on the sound in the window only.
+
+    Parameters
+    ----------
+    model : DirectionModel
+        The model.
+    frames : int
+        Length of the window.
+    """
+
+    def __init__(self, model: DirectionModel, frames: int) -> None:
+        self._model = model
+        self._frames = frames
+        channels = model.channels
+        self._cues = Cues(
+            np.zeros((frames, channels), np.intp),
+            np.zeros((frames, channels), np.intp),
+            np.zeros((frames, channels)),
+            np.zeros((frames, channels), bool),
+        )
+        self._yaw = np.zeros(frames)
+        self._power = np.zeros(frames)
+        self._sums = np.zeros((channels, len(model.azimuths)))  # of all frames, world coordinates
+        self._floor = np.full(channels, np.nan)
+        self._count = 0  # frames since the start
+
+    @property
+    def filled(self) -> int:
+        """The number of frames in the window."""
+        return min(self._count, self._frames)
+
+    def extend(self, cues: Cues, power: FloatArray, yaw: FloatArray) -> None:
+        """Add the cues (F, C) of frames, their power and the direction of the head (degrees) in world coordinates."""
+        if len(yaw) > self._frames:
+            self._count += len(yaw) - self._frames
+            cues, power, yaw = cues.select(slice(-self._frames, None)), power[-self._frames :], yaw[-self._frames :]
+        positions = self._count + np.arange(len(yaw))
+        places = positions % self._frames
+        few = 2 * len(yaw) < self.filled  # otherwise it is faster to begin again
+        replaced = places[positions >= self._frames]
+        if few and len(replaced):
+            self._sums -= self._evidence(replaced)
+        self._count += len(yaw)
+        for kept, new in zip(self._cues, cues, strict=True):
+            kept[places] = new
+        self._yaw[places] = yaw
+        self._power[places] = power
+        floor = floors(self._cues.level[: self.filled])
+        changed = (floor != self._floor) | (not few)
+        self._floor = floor
+        if few:
+            self._sums += self._evidence(places)
+        if changed.any():
+            self._sums[changed] = self._evidence(slice(0, self.filled), changed)
+
+    def _evidence(self, frames: Any, channels: Any = slice(None)) -> FloatArray:
+        """Return the evidence (C, A) of frames in world coordinates."""
+        cues = self._cues.select(frames)
+        itd_row, ild_row = self._model.rows(cues, self._floor)
+        itd_row, ild_row = itd_row[:, channels], ild_row[:, channels]
+        yaw = self._yaw[frames]
+        if np.all(yaw == yaw[0]):
+            total = self._model.sum_of(itd_row, ild_row)
+            return rotate(total, np.full(len(total), yaw[0]))
+        evidence = self._model.terms(itd_row, ild_row)
+        shape = evidence.shape
+        turned = rotate(evidence.reshape(-1, shape[-1]), np.repeat(yaw, shape[1]))
+        return np.asarray(turned.reshape(shape).sum(axis=0, dtype=np.float64))
+
+    def count_units(self) -> int:
+        """Return the number of frames of all channels that have cues."""
+        return int(np.count_nonzero(self._cues.valid[: self.filled]))
+
+    def power(self) -> float:
+        """Return the mean power of the frames."""
+        return float(self._power[: self.filled].mean()) if self._count else 0.0
+
+    def sums(self) -> FloatArray:
+        """Return the evidence (C, A) of each channel, summed over the frames, in world coordinates."""
+        return self._sums
+
+    def level(self, frames: int) -> FloatArray:
+        """Return the mean level (C,) of the last `frames` frames in dB."""
+        power = 10 ** (self._cues.level[self._last(frames)] / 10)
+        return np.asarray(10 * np.log10(power.mean(axis=0)))
+
+    def _last(self, frames: int) -> NDArray[np.intp]:
+        """Return the places of the last `frames` frames, of fewer if there are fewer."""
+        number = min(frames, self.filled)
+        return (self._count - number + np.arange(number)) % self._frames
+
+    def units(self, frames: int, noise: FloatArray) -> tuple[NDArray[Any], FloatArray, NDArray[np.bool_]]:
+        """Return the evidence (U, A) of each channel with cues of the last `frames` frames, in world coordinates.
+
+        The second array (U,) contains their powers, divided by the number of frames, and the third one (U,) whether
+        their level exceeds that of `noise` (C,) in dB.
+        """
+        places = self._last(frames)
+        cues = self._cues.select(places)
+        itd_row, ild_row = self._model.rows(cues, self._floor)
+        yaw = np.broadcast_to(self._yaw[places, np.newaxis], cues.valid.shape)[cues.valid]
+        evidence = rotate(self._model.terms(itd_row[cues.valid], ild_row[cues.valid]), yaw)
+        powers = 10 ** (cues.level[cues.valid] / 10) / max(1, len(places))
+        return evidence, powers, (cues.level > noise)[cues.valid]
+
+
+def rotate(evidence: NDArray[Any], yaw: FloatArray) -> NDArray[Any]:
+    """Return evidence (F, A) of head coordinates in world coordinates, for the yaw (F,) of the head in degrees.
+
+    Evidence is interpolated linearly between directions of the grid.
+    """
+    if not yaw.any():
+        return evidence
+    steps = np.mod(yaw, 360.0) / angles.SPACING
+    whole = np.floor(steps).astype(np.intp)
+    part = (steps - whole)[:, np.newaxis].astype(evidence.dtype)
+    directions = evidence.shape[-1]
+    circle = np.concatenate((evidence, evidence, evidence[:, :1]), axis=1)
+    turns = sliding_window_view(circle, directions + 1, axis=1)  # the direction before the first one, then all
+    turned = turns[np.arange(len(yaw)), (-whole - 1) % directions]
+    return np.asarray((1 - part) * turned[:, 1:] + part * turned[:, :-1])

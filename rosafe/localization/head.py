@@ -1,0 +1,232 @@
+"""`rosafe.Head`: a head as its impulse responses around the horizontal plane; rendering and interaural cues."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from fractions import Fraction
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import scipy.signal
+
+from rosafe.declarations.checks import is_number
+from rosafe.declarations.text import short_repr
+from rosafe.dsp.erb import bandwidth
+from rosafe.dsp.numeric_limits import FloatArray
+from rosafe.localization import angles
+from rosafe.localization.filters import HOP, HeadFilters, SourceRenderer
+from rosafe.localization.sofa import MAX_RATE, MIN_RATE, read_sofa
+from rosafe.localization.sphere import sphere_responses
+
+_SYMMETRY = 1e-6  # of the energy; below, two ears count as mirrored
+_CUE_RATE = 48000.0  # Hz, at which the cues of the sphere are computed
+_MAX_ITD = 0.0012  # s
+
+
+class Head:
+    """A head: impulse responses of both ears for directions in the horizontal plane.
+
+    Create it by `Head.sphere` or `Head.from_sofa`.
+
+    Parameters
+    ----------
+    name : str
+        `sphere`, or the path of the SOFA file.
+    azimuths : ndarray, (A,)
+        Measured directions in degrees, left positive, ascending in (-180, 180].
+    responses : ndarray, (A, 2, N), or None
+        Impulse responses of the left and the right ear; None for the sphere, whose responses are computed.
+    sample_rate : float
+        Of the responses, Hz.
+
+    Attributes
+    ----------
+    is_sphere : bool
+        Whether front and back have equal interaural cues in all directions.
+
+    Examples
+    --------
+    >>> import numpy as np, rosafe
+    >>> head = rosafe.Head.sphere()
+    >>> ears = head.render(np.random.default_rng(1).standard_normal(8000), 16000, azimuth=60)
+    >>> ears.shape, bool(np.std(ears[0]) > np.std(ears[1]))
+    ((2, 8000), True)
+    """
+
+    def __init__(self, name: str, azimuths: FloatArray, responses: FloatArray | None, sample_rate: float) -> None:
+        self.name = name
+        self.azimuths = azimuths
+        self.is_sphere = responses is None
+        self._responses = responses
+        self._rate = sample_rate
+        self._filters = lru_cache(maxsize=4)(self._make_filters)
+
+    @classmethod
+    def sphere(cls) -> Head:
+        """Return a rigid sphere with a radius of 8.75 cm and ears at -90 and 90 degrees.
+
+        See `rosafe.sound.head`: Woodworth's delays and the head shadow of Brown and Duda (1998).
+        """
+        return cls("sphere", angles.grid(), None, _CUE_RATE)
+
+    @classmethod
+    def from_sofa(cls, path: str | os.PathLike[str]) -> Head:
+        """Read a head from a SOFA file with the convention SimpleFreeFieldHRIR (AES69).
+
+        Parameters
+        ----------
+        path : str or Path
+            The file. Directions within 1 degree of the horizontal plane are used; they must surround the head with
+            gaps of at most 30 degrees.
+
+        Raises
+        ------
+        ValueError
+            The file is missing, damaged, no SOFA file or unsuitable: one line that names it.
+        """
+        read = read_sofa(path)
+        return cls(os.fspath(path), read.azimuths, read.responses, read.sample_rate)
+
+    def __repr__(self) -> str:
+        return f"<Head {self.name}: {len(self.azimuths)} directions>"
+
+    @property
+    def key(self) -> str:
+        """A digest of the responses, equal for equal heads."""
+        digest = hashlib.sha256(f"{self._rate} {self.is_sphere}".encode())
+        if self._responses is not None:
+            digest.update(self.azimuths.tobytes())
+            digest.update(np.ascontiguousarray(self._responses).tobytes())
+        return digest.hexdigest()
+
+    def is_symmetric(self) -> bool:
+        """Return whether the responses at -a are those at a with the ears exchanged, for all azimuths a."""
+        if self._responses is None:
+            return True
+        mirrored = angles.wrap(-self.azimuths)
+        order = np.argsort(mirrored)
+        if not np.allclose(mirrored[order], self.azimuths, atol=1e-3):
+            return False
+        swapped = self._responses[order][:, ::-1]
+        return bool(np.sum((swapped - self._responses) ** 2) <= _SYMMETRY * np.sum(self._responses**2))
+
+    def filters(self, sample_rate: float) -> HeadFilters:
+        """Return the filters at a sample rate (Hz)."""
+        return self._filters(_checked_rate(sample_rate))
+
+    def _make_filters(self, sample_rate: float) -> HeadFilters:
+        if self._responses is None:
+            return HeadFilters(self.azimuths, sphere_responses(self.azimuths, sample_rate))
+        ratio = Fraction(sample_rate / self._rate).limit_denominator(1000)
+        responses = self._responses
+        if ratio != 1:
+            responses = scipy.signal.resample_poly(responses, ratio.numerator, ratio.denominator, axis=-1) / float(
+                ratio
+            )
+        return HeadFilters(self.azimuths, responses)
+
+    def render(self, signal: Any, sample_rate: float, azimuth: Any) -> FloatArray:
+        """Render a signal at a direction.
+
+        Parameters
+        ----------
+        signal : array_like, (N,)
+            The sound of the source.
+        sample_rate : float
+            In Hz.
+        azimuth : float or array_like, (N,)
+            Degrees relative to the head, left positive; one per sample for a source that moves. A moving direction is
+            taken every 256 samples and interpolated without clicks.
+
+        Returns
+        -------
+        ndarray, (2, N)
+            Left and right ear. The delays of the responses are included.
+
+        Raises
+        ------
+        ValueError
+            For a signal that is not one-dimensional and finite, or an azimuth of another shape.
+        """
+        samples = np.asarray(signal)
+        if samples.ndim != 1 or samples.dtype.kind not in "iuf":
+            raise ValueError(f"signal: expected numbers of shape (N,), got {samples.dtype} of shape {samples.shape}")
+        samples = samples.astype(np.float64)
+        if not np.isfinite(samples).all():
+            raise ValueError("signal: expected finite samples, got NaN or infinity")
+        filters = self.filters(sample_rate)
+        directions = _checked_azimuth(azimuth, len(samples))
+        if not len(samples):
+            return np.empty((2, 0))
+        if directions.ndim == 0:
+            response = filters.response(float(angles.wrap(directions)))
+            return np.asarray(scipy.signal.oaconvolve(samples[np.newaxis], response, axes=-1)[:, : len(samples)])
+        hops = -(-len(samples) // HOP)
+        padded = np.zeros(hops * HOP)
+        padded[: len(samples)] = samples
+        at_hops = directions[np.minimum(np.arange(hops + 1) * HOP, len(samples) - 1)]
+        return SourceRenderer(filters).process(padded, angles.wrap(at_hops))[:, : len(samples)]
+
+    def itd(self, frequencies: Any, azimuths: Any = None) -> FloatArray:
+        """Return interaural time differences (A, C) in s, positive if the left ear hears later.
+
+        Parameters
+        ----------
+        frequencies : array_like, (C,)
+            Centre frequencies in Hz. The ITD is the lag of the maximum of the cross-correlation of both responses
+            behind a filter with the equivalent rectangular bandwidth.
+        azimuths : array_like, (A,), optional
+            Degrees; the measured directions by default.
+        """
+        return self._cues(frequencies, azimuths)[0]
+
+    def ild(self, frequencies: Any, azimuths: Any = None) -> FloatArray:
+        """Return interaural level differences (A, C) in dB, positive if the right ear is louder.
+
+        Parameters
+        ----------
+        frequencies : array_like, (C,)
+            Centre frequencies in Hz, of filters as for `itd`.
+        azimuths : array_like, (A,), optional
+            Degrees; the measured directions by default.
+        """
+        return self._cues(frequencies, azimuths)[1]
+
+    def _cues(self, frequencies: Any, azimuths: Any) -> tuple[FloatArray, FloatArray]:
+        centers = np.atleast_1d(np.asarray(frequencies, np.float64))
+        rate = self._rate
+        if centers.ndim != 1 or not (np.isfinite(centers).all() and (centers > 0).all() and (centers < rate / 2).all()):
+            raise ValueError(
+                f"frequencies: expected values above 0 and below {rate / 2:g} Hz, got {short_repr(frequencies)}"
+            )
+        filters = self.filters(rate)
+        at = filters.at(angles.wrap(np.atleast_1d(self.azimuths if azimuths is None else azimuths)))
+        bins = np.fft.rfftfreq(filters.size, 1 / rate)
+        distance = (bins - centers[:, np.newaxis]) / (1.019 * np.asarray(bandwidth(centers))[:, np.newaxis])
+        weights = (1 + distance**2) ** -4.0  # power response of a gammatone filter of order 4
+        energies = np.einsum("aef,cf->eac", np.abs(at) ** 2, weights)
+        size = 16 * filters.size
+        lags = np.arange(-int(_MAX_ITD * 16 * rate), int(_MAX_ITD * 16 * rate) + 1)
+        cross = (at[:, 0] * np.conj(at[:, 1]))[:, np.newaxis] * weights
+        itd = np.empty(cross.shape[:2])
+        for row, spectrum in enumerate(cross):
+            itd[row] = lags[np.fft.irfft(spectrum, size)[:, lags].argmax(axis=1)] / (16 * rate)
+        return itd, 10 * np.log10(energies[1] / energies[0])
+
+
+def _checked_rate(sample_rate: Any) -> float:
+    if not is_number(sample_rate) or not MIN_RATE <= sample_rate <= MAX_RATE:
+        raise ValueError(f"sample_rate: expected {MIN_RATE:g} to {MAX_RATE:g} Hz, got {short_repr(sample_rate)}")
+    return float(sample_rate)
+
+
+def _checked_azimuth(azimuth: Any, count: int) -> FloatArray:
+    directions = np.asarray(azimuth)
+    fits = directions.dtype.kind in "iuf" and directions.shape in ((), (count,))
+    if not fits or not np.isfinite(directions).all():
+        raise ValueError(
+            f"azimuth: expected one finite number in degrees, or one per sample, got {short_repr(azimuth)}"
+        )
+    return directions.astype(np.float64)

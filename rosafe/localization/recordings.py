@@ -1,0 +1,115 @@
+"""Learn a direction model from recordings of sources at known directions."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from rosafe.dsp.numeric_limits import FloatArray
+from rosafe.localization import angles, training
+from rosafe.localization.direction_model import DirectionModel
+from rosafe.localization.results import read_recordings
+from rosafe.localization.sofa import MAX_GAP
+from rosafe.localization.training import SNR_DB, Progress
+from rosafe.offline.sounds import open_sound
+from rosafe.terminal import printable
+
+MAX_SECONDS = 60.0  # of sound that is used for a direction
+MIN_SECONDS = 1.0
+_MIXED = 24  # pieces of recordings from other directions that make a diffuse noise
+
+
+def learn_recordings(
+    path: str | os.PathLike[str],
+    sample_rate: float | None = None,
+    parameters: Mapping[str, Any] | None = None,
+    progress: Progress | None = None,
+) -> DirectionModel:
+    """Learn a model from the recordings that a CSV file lists in the columns `file` and `azimuth_deg`.
+
+    The sounds of all directions together, mixed at random, are the diffuse noise of training. The evidence for
+    directions of the grid between two recorded ones is interpolated.
+
+    Parameters
+    ----------
+    path : str or Path
+        The list.
+    sample_rate : float, optional
+        Sample rate of all recordings; by default that of the first one.
+    parameters : mapping, optional
+        Of the representations, as of `rosafe.process`.
+    progress : callable, optional
+        Called with the part that is done, from 0 to 1.
+
+    Raises
+    ------
+    ValueError, AudioFileError
+        The list or a recording cannot be used: one line.
+    """
+    sounds: dict[float, list[FloatArray]] = {}
+    for file, azimuth in read_recordings(path):
+        with contextlib.closing(open_sound(file)) as reader:
+            sample_rate = sample_rate or reader.sample_rate
+            if reader.sample_rate != sample_rate:
+                raise ValueError(
+                    f"{printable(file)}: expected a sample rate of {sample_rate:g} Hz, got {reader.sample_rate}"
+                )
+            frames = min(reader.frames, round(MAX_SECONDS * sample_rate))
+            sounds.setdefault(round(float(angles.wrap(azimuth)), 3), []).append(reader.read(frames) / 2.0**31)
+    assert sample_rate is not None
+    recorded = {azimuth: _normalized(np.concatenate(parts, axis=1)) for azimuth, parts in sorted(sounds.items())}
+    _check(recorded, sample_rate, printable(os.fspath(path)))
+    azimuths = np.array(list(recorded))
+    histograms, description = training.count(
+        _sounds(recorded, sample_rate, progress), sample_rate, parameters, azimuths, f"recordings {os.fspath(path)}"
+    )
+    itd, ild = (_interpolated(table, azimuths) for table in histograms.tables())
+    return DirectionModel({**description, "is_sphere": False}, itd, ild)
+
+
+def _normalized(sound: FloatArray) -> FloatArray:
+    return sound / max(float(np.sqrt(np.mean(sound**2))), 1e-12)
+
+
+def _check(recorded: Mapping[float, FloatArray], sample_rate: float, name: str) -> None:
+    azimuths = np.array(list(recorded))
+    gap = float(np.max(np.diff(azimuths, append=azimuths[0] + 360.0)))
+    if gap > MAX_GAP + 1e-6:
+        raise ValueError(
+            f"{name}: expected directions all around the head, at most {MAX_GAP:g} degrees apart, got {gap:g}"
+        )
+    for azimuth, sound in recorded.items():
+        if sound.shape[1] < MIN_SECONDS * sample_rate or not np.std(sound) > 0.5:
+            raise ValueError(f"{name}: expected at least {MIN_SECONDS:g} s of sound from {azimuth:g} degrees")
+
+
+def _sounds(
+    recorded: Mapping[float, FloatArray], sample_rate: float, progress: Progress | None
+) -> Iterator[tuple[float, FloatArray]]:
+    """Return each recording at each signal-to-noise ratio."""
+    random = np.random.default_rng(1)
+    everything = list(recorded.values())
+    for number, (azimuth, sound) in enumerate(recorded.items()):
+        count = sound.shape[1]
+        for snr in SNR_DB:
+            noise = np.zeros((2, count))
+            for _ in range(_MIXED):
+                other = everything[random.integers(len(everything))]
+                noise += np.resize(np.roll(other, -int(random.integers(other.shape[1])), axis=1).T, (count, 2)).T
+            yield azimuth, sound + _normalized(noise) * 10 ** (-snr / 20)
+        if progress:
+            progress((number + 1) / (len(recorded) + 1))
+
+
+def _interpolated(table: np.ndarray, azimuths: FloatArray) -> np.ndarray:
+    """Return a table (rows, directions of `azimuths`) for the directions of the grid."""
+    grid = angles.grid()
+    index = np.searchsorted(azimuths, grid, side="right") - 1
+    following = (index + 1) % len(azimuths)
+    step = np.mod(azimuths[following] - azimuths[index], 360.0)
+    part = (np.mod(grid - azimuths[index], 360.0) / np.where(step == 0, 360.0, step)).astype(np.float32)
+    return np.asarray((1 - part) * table[:, index] + part * table[:, following])

@@ -1,0 +1,136 @@
+"""Write the results of `rosafe.localize` as CSV and JSON; read the yaw of a head and lists of recordings."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+import os
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from rosafe.declarations.text import short_repr
+from rosafe.input import read_regular
+from rosafe.terminal import printable
+
+MAX_TABLE = 1 << 28  # bytes
+YAW_COLUMNS = ("time_s", "head_yaw_deg")
+RECORDING_COLUMNS = ("file", "azimuth_deg")
+
+
+def estimates_csv(result: Mapping[str, Any]) -> str:
+    """Return one line for each window: `time_s, azimuth_deg, confidence, level_db`; an azimuth may be `nan`."""
+    columns = (result["time"], result["azimuth"], result["confidence"], result["level_db"])
+    lines = [
+        f"{time:.3f},{azimuth:.1f},{sure:.4f},{level:.2f}" for time, azimuth, sure, level in zip(*columns, strict=True)
+    ]
+    return "\n".join(["time_s,azimuth_deg,confidence,level_db", *lines]) + "\n"
+
+
+def tracks_csv(result: Mapping[str, Any]) -> str:
+    """Return one line for each source and time: `id, time_s, azimuth_deg, azimuth_std_deg, probability`."""
+    lines = ["id,time_s,azimuth_deg,azimuth_std_deg,probability"]
+    for track in result["tracks"]:
+        columns = (track["time"], track["azimuth"], track["azimuth_std"], track["probability"])
+        lines += [
+            f"{track['id']},{time:.3f},{azimuth:.1f},{std:.1f},{probability:.4f}"
+            for time, azimuth, std, probability in zip(*columns, strict=True)
+        ]
+    return "\n".join(lines) + "\n"
+
+
+def as_json(result: Mapping[str, Any]) -> str:
+    """Return estimates and tracks as JSON; an azimuth may be `null`."""
+
+    def numbers(values: np.ndarray, digits: int) -> list[float | None]:
+        return [None if math.isnan(value) else round(float(value), digits) for value in values]
+
+    document = {
+        "time_s": numbers(result["time"], 3),
+        "azimuth_deg": numbers(result["azimuth"], 1),
+        "confidence": numbers(result["confidence"], 4),
+        "level_db": numbers(result["level_db"], 2),
+        "tracks": [
+            {
+                "id": track["id"],
+                "first_time_s": round(track["first_time"], 3),
+                "last_time_s": round(track["last_time"], 3),
+                "time_s": numbers(track["time"], 3),
+                "azimuth_deg": numbers(track["azimuth"], 1),
+                "azimuth_std_deg": numbers(track["azimuth_std"], 1),
+                "probability": numbers(track["probability"], 4),
+            }
+            for track in result["tracks"]
+        ],
+    }
+    return json.dumps(document, allow_nan=False) + "\n"
+
+
+def read_yaw(path: str | os.PathLike[str]) -> list[list[float]]:
+    """Return [time in s, degrees] from a CSV file with the columns `time_s` and `head_yaw_deg`, such as a truth file.
+
+    ValueError, one line that names the file and the line, if that is not possible.
+    """
+    points: list[list[float]] = []
+    for number, (time, yaw) in _rows(path, YAW_COLUMNS):
+        try:
+            point = [float(time), float(yaw)]
+        except ValueError:
+            point = [math.nan, math.nan]
+        if not all(map(math.isfinite, point)):
+            raise ValueError(f"{printable(path)}, line {number}: expected numbers in {', '.join(YAW_COLUMNS)}")
+        if points and point[0] < points[-1][0]:
+            raise ValueError(f"{printable(path)}, line {number}: expected ascending times")
+        if not points or point != points[-1]:  # a truth file has a line for each source
+            points.append(point)
+    if not points:
+        raise ValueError(f"{printable(path)}: expected lines with {', '.join(YAW_COLUMNS)}, got none")
+    return points
+
+
+def read_recordings(path: str | os.PathLike[str]) -> list[tuple[str, float]]:
+    """Return (file, azimuth in degrees) from a CSV file with these columns; files are relative to it."""
+    folder = os.path.dirname(os.fspath(path))
+    recordings = []
+    for number, (file, azimuth) in _rows(path, RECORDING_COLUMNS):
+        try:
+            degrees = float(azimuth)
+        except ValueError:
+            degrees = math.nan
+        if not file or not math.isfinite(degrees):
+            got = short_repr(f"{file},{azimuth}")
+            raise ValueError(f"{printable(path)}, line {number}: expected a file and an azimuth in degrees, got {got}")
+        recordings.append((os.path.join(folder, os.path.expanduser(file)), degrees))
+    if not recordings:
+        raise ValueError(f"{printable(path)}: expected lines with {', '.join(RECORDING_COLUMNS)}, got none")
+    return recordings
+
+
+def _rows(path: str | os.PathLike[str], columns: tuple[str, str]) -> list[tuple[int, tuple[str, str]]]:
+    """Return number and two columns of each line of a CSV file with a header."""
+    name = printable(os.fspath(path))
+    try:
+        data = read_regular(path, MAX_TABLE + 1)
+        if len(data) > MAX_TABLE:
+            raise ValueError(f"expected at most {MAX_TABLE} bytes")
+        text = data.decode("utf-8-sig")
+        rows = [[cell.strip() for cell in row] for row in csv.reader(io.StringIO(text))]
+    except UnicodeDecodeError:
+        raise ValueError(f"{name}: expected a CSV file in UTF-8, got other bytes") from None
+    except (OSError, ValueError, csv.Error) as problem:
+        raise ValueError(f"{name}: {getattr(problem, 'strerror', None) or short_repr(str(problem))}") from None
+    header = rows[0] if rows else []
+    missing = [column for column in columns if column not in header]
+    if missing:
+        raise ValueError(f"{name}: expected the columns {', '.join(columns)}, got {short_repr(', '.join(header))}")
+    places = [header.index(column) for column in columns]
+    found = []
+    for number, row in enumerate(rows[1:], 2):
+        if any(row):
+            if len(row) <= max(places):
+                raise ValueError(f"{name}, line {number}: expected {len(header)} columns, got {len(row)}")
+            found.append((number, (row[places[0]], row[places[1]])))
+    return found

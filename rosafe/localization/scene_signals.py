@@ -1,0 +1,120 @@
+"""Signals of the sources of a scene, with an RMS of 1: sound files, noise, tone and vowel."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from fractions import Fraction
+from typing import Protocol
+
+import numpy as np
+import scipy.signal
+
+from rosafe.dsp.numeric_limits import FloatArray
+from rosafe.sound.audiofile import AudioFile, AudioFileError
+
+ENDLESS = 2**62  # frames
+MAX_FILE_FRAMES = 2**25  # of one sound file
+_RAMP_SECONDS = 0.005  # at the beginning of a noise, tone or vowel
+_FORMANTS = ((730.0, 90.0), (1090.0, 110.0), (2440.0, 170.0))  # Hz, of /a/: frequency and bandwidth
+
+
+class SourceSignal(Protocol):
+    """A signal, addressed by frame."""
+
+    frames: int  # its length
+
+    def samples(self, begin: int, count: int) -> FloatArray:
+        """Return the frames from `begin` on; zeros behind the end."""
+
+
+class FileSignal:
+    """The mean of the channels of a sound file, resampled to the rate of the scene and scaled to an RMS of 1."""
+
+    def __init__(self, path: str | os.PathLike[str], sample_rate: int, loop: bool) -> None:
+        with contextlib.closing(AudioFile(os.fspath(path))) as file:
+            if file.frames * max(1.0, sample_rate / file.sample_rate) > MAX_FILE_FRAMES:
+                raise AudioFileError(f"{path}: expected at most {MAX_FILE_FRAMES} frames, got {file.frames}")
+            samples = file.read(file.frames).mean(axis=0)
+            ratio = Fraction(sample_rate, file.sample_rate)
+        if ratio != 1:
+            samples = scipy.signal.resample_poly(samples, ratio.numerator, ratio.denominator)
+        power = float(np.sqrt(np.mean(samples**2)))
+        if not power > 0:
+            raise AudioFileError(f"{path}: expected a sound, got silence")
+        self._samples = (samples / power).astype(np.float32)
+        self.stored = len(samples)
+        self.frames = ENDLESS if loop else len(samples)
+
+    def samples(self, begin: int, count: int) -> FloatArray:
+        """See `SourceSignal`; a loop repeats without a gap."""
+        length = len(self._samples)
+        if self.frames == ENDLESS:
+            return self._samples[(begin + np.arange(count)) % length].astype(np.float64)
+        part = np.zeros(count)
+        available = self._samples[begin : begin + count]
+        part[: len(available)] = available
+        return part
+
+
+class NoiseSignal:
+    """White noise."""
+
+    frames = ENDLESS
+
+    def __init__(self, sample_rate: int, seed: int, number: int) -> None:
+        self._ramp = _RAMP_SECONDS * sample_rate
+        self._seed = seed, 2 + number
+
+    def samples(self, begin: int, count: int) -> FloatArray:
+        """See `SourceSignal`."""
+        random = np.random.PCG64(list(self._seed))
+        random.advance(begin)
+        raw = (random.random_raw(count) >> np.uint64(11)) * 2.0**-52 - 1.0
+        return np.sqrt(3.0) * raw * _ramp(begin, count, self._ramp)
+
+
+class ToneSignal:
+    """A pure tone."""
+
+    frames = ENDLESS
+
+    def __init__(self, sample_rate: int, frequency: float) -> None:
+        self._ramp = _RAMP_SECONDS * sample_rate
+        self._step = frequency / sample_rate
+
+    def samples(self, begin: int, count: int) -> FloatArray:
+        """See `SourceSignal`."""
+        phase = np.mod((begin + np.arange(count)) * self._step, 1.0)
+        return np.sqrt(2.0) * np.sin(2 * np.pi * phase) * _ramp(begin, count, self._ramp)
+
+
+class VowelSignal:
+    """The vowel /a/: harmonics of the fundamental frequency, 6 dB per octave down, with three formants."""
+
+    frames = ENDLESS
+
+    def __init__(self, sample_rate: int, frequency: float) -> None:
+        self._ramp = _RAMP_SECONDS * sample_rate
+        self._step = frequency / sample_rate
+        harmonics = np.arange(1, max(2, int(min(8000.0, 0.45 * sample_rate) / frequency) + 1))
+        tone = harmonics * frequency
+        resonances = [1 / np.abs(1 - (tone / f) ** 2 + 1j * tone * width / f**2) for f, width in _FORMANTS]
+        gains = np.sum(resonances, axis=0) / harmonics
+        self._harmonics = harmonics
+        self._gains = np.sqrt(2.0) * gains / np.sqrt(np.sum(gains**2))
+
+    def samples(self, begin: int, count: int) -> FloatArray:
+        """See `SourceSignal`."""
+        phase = 2 * np.pi * np.mod((begin + np.arange(count)) * self._step, 1.0)
+        total = np.zeros(count)
+        for harmonic, gain in zip(self._harmonics, self._gains, strict=True):
+            total += gain * np.sin(harmonic * phase)
+        return total * _ramp(begin, count, self._ramp)
+
+
+def _ramp(begin: int, count: int, length: float) -> FloatArray:
+    """Return the gains of a linear fade-in of `length` frames."""
+    if begin >= length:
+        return np.ones(count)
+    return np.minimum(1.0, (begin + np.arange(count)) / length)

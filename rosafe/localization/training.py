@@ -1,0 +1,214 @@
+"""Learn a direction model: from a head, with synthetic sounds in diffuse noise, or from recordings.
+
+Multi-condition training follows T. May, S. van de Par and A. Kohlrausch (2011) and N. Ma, T. May and G. J. Brown
+(2017), "Exploiting deep neural networks and head movements for robust binaural localization of multiple sources in
+reverberant environments", IEEE/ACM Trans. Audio Speech Lang. Process. 25, 2444-2453.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import Any
+
+import numpy as np
+import scipy.fft
+import scipy.signal
+
+from rosafe.dsp.numeric_limits import FloatArray
+from rosafe.interface.arguments import check_parameters
+from rosafe.localization import angles, cues
+from rosafe.localization.direction_model import DirectionModel, Histograms
+from rosafe.localization.head import Head
+from rosafe.offline.process import process
+from rosafe.offline.stream import Stream
+
+SNR_DB = (30.0, 20.0, 12.0, 6.0, 2.0, -2.0, -6.0)
+# Noise without modulation, whose level is near its floor although nothing disturbs it: a small part of the sounds, as
+# most sounds near their floor are disturbed.
+STEADY_SNR_DB = 40.0
+STEADY_PART, MIN_STEADY_SECONDS = 0.1, 0.1  # of the length of another sound; at least
+SOUND_SECONDS = 1000.0  # of all directions and SNRs together
+NOISE_SECONDS = 12.0
+NOISE_SOURCES = 36
+_SKIP_SECONDS = 0.05  # at the beginning of a sound, until the filters have settled
+_MODULATION_RATE = 100.0  # Hz, of the sampled envelopes
+_LEVEL = 0.05  # RMS of the training sounds
+Progress = Callable[[float], None]
+
+
+def describe(sample_rate: float, parameters: Mapping[str, Any] | None) -> dict[str, Any]:
+    """Return the description, as of `Stream.describe`, of the representations for localization.
+
+    ValueError if the frames of the representations have different hops or windows.
+    """
+    described = Stream(sample_rate, {**cues.PARAMETERS, **check_parameters(parameters)}, list(cues.KINDS)).describe()
+    values = described["parameters"]
+    for name in ("wSizeSec", "hSizeSec"):
+        if len({values[f"{prefix}_{name}"] for prefix in ("cc", "ild", "rm")}) > 1:
+            raise ValueError(f"parameters: expected equal values of cc_{name}, ild_{name} and rm_{name}")
+    if values["rm_scaling"] != "power":
+        raise ValueError(f"rm_scaling: expected 'power' for localization, got {values['rm_scaling']!r}")
+    return described
+
+
+def model_parameters(described: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the parameters that a model depends on: all but the normalization of integer input."""
+    return {name: value for name, value in described["parameters"].items() if not name.startswith("in_")}
+
+
+def learn_head(
+    head: Head, sample_rate: float, parameters: Mapping[str, Any] | None = None, progress: Progress | None = None
+) -> DirectionModel:
+    """Learn the model of a head.
+
+    Parameters
+    ----------
+    head : Head
+        The head.
+    sample_rate : float
+        Of the sounds to localize, Hz.
+    parameters : mapping, optional
+        Of the representations, as of `rosafe.process`.
+    progress : callable, optional
+        Called with the part that is done, from 0 to 1.
+    """
+    filters = head.filters(sample_rate)
+    directions = angles.grid()
+    symmetric = head.is_symmetric()
+    if symmetric:
+        directions = directions[directions >= 0]
+    if head.is_sphere:
+        directions = directions[directions <= 90]
+    random = np.random.default_rng(1)
+    noises = _noise_pool(lambda azimuth: filters.response(azimuth), sample_rate, random)
+    seconds = SOUND_SECONDS / (len(directions) * len(SNR_DB))
+    length = scipy.fft.next_fast_len(round((seconds + _SKIP_SECONDS) * sample_rate), real=True)
+    steady_length = max(round(STEADY_PART * length), round(MIN_STEADY_SECONDS * sample_rate))
+
+    def sounds() -> Iterator[tuple[float, FloatArray]]:
+        for number, azimuth in enumerate(directions):
+            response = filters.response(float(azimuth))[:, np.newaxis]
+            dry = np.stack(
+                [
+                    *(_training_sound(number + index, length, sample_rate, random) for index in range(len(SNR_DB))),
+                    random.standard_normal(length),
+                ]
+            )
+            wet = scipy.signal.oaconvolve(dry[np.newaxis], response, axes=-1)[..., :length]
+            for index, snr in enumerate((*SNR_DB, STEADY_SNR_DB)):
+                noise = noises[(number + index) % 2]
+                count = length if index < len(SNR_DB) else min(length, steady_length)
+                begin = random.integers(noise.shape[1] - count)
+                yield float(azimuth), wet[:, index, :count] + noise[:, begin : begin + count] * 10 ** (-snr / 20)
+            if progress:
+                progress((number + 1) / (len(directions) + 1))
+
+    grid = angles.grid()
+    histograms, description = count(sounds(), sample_rate, parameters, grid, head.key)
+    if head.is_sphere:
+        behind = np.abs(grid) > 90
+        source = _indices(grid, np.where(grid >= 0, 180 - grid, -180 - grid))
+        histograms.itd[behind], histograms.ild[behind] = histograms.itd[source[behind]], histograms.ild[source[behind]]
+    if symmetric:
+        histograms.mirror(_indices(grid, -grid))
+        poles = _indices(grid, np.array([0.0, 180.0]))
+        for counts in (histograms.itd, histograms.ild):
+            counts[poles] = counts[poles].sum(axis=0)
+    return DirectionModel({**description, "is_sphere": head.is_sphere}, *histograms.tables())
+
+
+def count(
+    sounds: Iterable[tuple[float, FloatArray]],
+    sample_rate: float,
+    parameters: Mapping[str, Any] | None,
+    azimuths: FloatArray,
+    key: str,
+) -> tuple[Histograms, dict[str, Any]]:
+    """Count the cues of sounds, pairs of one of `azimuths` and both ears (2, n) with a power of 1 before the head.
+
+    Returns the histograms and the description of the model.
+    """
+    described = describe(sample_rate, parameters)
+    values = model_parameters(described)
+    histograms = Histograms(len(described["fb_cfHz"]), len(azimuths))
+    skip = int(np.ceil(_SKIP_SECONDS * described["itd_frameRate"]))
+    powers = np.zeros(2)  # of the sounds, and of their ratemaps
+    for azimuth, sound in sounds:
+        scaled = sound * _LEVEL
+        features = process(scaled, sample_rate, parameters=values, outputs=list(cues.KINDS))
+        quantized = cues.quantize(features, cues.scaling_db(values))
+        direction = int(np.abs(angles.difference(azimuths, azimuth)).argmin())
+        histograms.add(direction, quantized.select(slice(skip, None)))
+        powers += np.mean(scaled**2), features["ratemap"].sum(axis=(0, 1)).mean()
+    return histograms, {
+        "sample_rate": sample_rate,
+        "parameters": values,
+        "head": key,
+        "level_gain_db": float(10 * np.log10(powers[0] / powers[1])),
+    }
+
+
+def _indices(grid: FloatArray, azimuths: FloatArray) -> np.ndarray:
+    return np.abs(angles.difference(grid, azimuths[:, np.newaxis])).argmin(axis=1)
+
+
+# --- sounds ---
+
+
+def _noise_pool(
+    response: Callable[[float], FloatArray], sample_rate: float, random: np.random.Generator
+) -> tuple[FloatArray, FloatArray]:
+    """Return diffuse noise (2, n) with a power of 1 before the head: white, and with a spectrum like speech."""
+    azimuths = np.arange(NOISE_SOURCES) * 360 / NOISE_SOURCES
+    first = response(0.0)
+    count = round(NOISE_SECONDS * sample_rate)
+    size = scipy.fft.next_fast_len(count + first.shape[1], real=True)
+    spectrum = np.zeros((2, size // 2 + 1), complex)
+    for azimuth in azimuths:
+        source = np.fft.rfft(random.standard_normal(count) / np.sqrt(NOISE_SOURCES), size)
+        spectrum += source * np.fft.rfft(response(float(angles.wrap(azimuth))), size)
+    shape = _speech_shape(np.fft.rfftfreq(size, 1 / sample_rate))
+    return np.fft.irfft(spectrum, size)[:, :count], np.fft.irfft(spectrum * shape, size)[:, :count]
+
+
+def _speech_shape(frequencies: FloatArray) -> FloatArray:
+    """Return gains of a long-term spectrum like that of speech: flat to 500 Hz, then 6 dB/octave; mean power 1."""
+    gain = 1 / np.sqrt(1 + (frequencies / 500.0) ** 2)
+    return np.asarray(gain / np.sqrt(np.mean(gain**2)))
+
+
+def _training_sound(number: int, count: int, sample_rate: float, random: np.random.Generator) -> FloatArray:
+    """Return a sound with an RMS of 1: noise with a random envelope, or voiced and unvoiced sounds in turn."""
+    if number % 2:
+        sound = random.standard_normal(count) * _envelope(count, sample_rate, 8.0, 9.0, random)
+    else:
+        frequencies = np.fft.rfftfreq(count, 1 / sample_rate)
+        voiced = _shaped(_pulses(count, sample_rate, random), (1 + (frequencies / 800.0) ** 2) ** -0.4)
+        unvoiced = _shaped(random.standard_normal(count), (1 + (frequencies / 500.0) ** 2) ** -0.25)
+        sound = voiced * _envelope(count, sample_rate, 4.0, 12.0, random)
+        sound += 0.6 * unvoiced * _envelope(count, sample_rate, 4.0, 12.0, random)
+    return np.asarray(sound / np.sqrt(np.mean(sound**2)))
+
+
+def _shaped(sound: FloatArray, gains: FloatArray) -> FloatArray:
+    shaped = np.fft.irfft(np.fft.rfft(sound) * gains, len(sound))
+    return np.asarray(shaped / np.std(shaped))
+
+
+def _pulses(count: int, sample_rate: float, random: np.random.Generator) -> FloatArray:
+    """Return pulses with a gliding rate between 70 and 300 Hz."""
+    times = np.arange(count) / sample_rate
+    glide = 0.3 * np.sin(2 * np.pi * random.uniform(0.3, 1.0) * times + random.uniform(0, 2 * np.pi))
+    phase = np.cumsum(random.uniform(90, 240) * 2**glide) / sample_rate
+    return np.diff(np.floor(phase), prepend=0.0)
+
+
+def _envelope(
+    count: int, sample_rate: float, cutoff: float, deviation: float, random: np.random.Generator
+) -> FloatArray:
+    """Return a random envelope: levels low-pass filtered at `cutoff` Hz with a standard deviation in dB."""
+    points = int(count / sample_rate * _MODULATION_RATE) + 2
+    levels = scipy.signal.lfilter(*scipy.signal.butter(2, cutoff, fs=_MODULATION_RATE), random.standard_normal(points))
+    levels *= deviation / max(float(np.std(levels)), 1e-9)
+    times = np.arange(count) * (_MODULATION_RATE / sample_rate)
+    return 10 ** (np.interp(times, np.arange(points), levels) / 20)
