@@ -1,4 +1,4 @@
-"""Activities as a client sees them: goals of an action server that are sent, acknowledged, cancelled and ended."""
+"""Clients of activities: goals that are sent to an action server, acknowledged, cancelled and ended."""
 
 from __future__ import annotations
 
@@ -11,14 +11,15 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from rosafe.client import installed_components
-from rosafe.client.graph import Graph, middleware_error
+from rosafe.client.errors import middleware_error
+from rosafe.client.graph import Graph
 from rosafe.client.tcpros import component_exception
 from rosafe.component import explicit_defaults
 from rosafe.interface import ComponentError
 
-ANSWER_SECONDS = 5.0  # for the first sign of life of a goal
-REPEAT_SECONDS = 0.1  # between two tries to send a goal; a goal that arrives twice counts once
-RESULT_SECONDS = 1.0  # the result of a goal follows its last status at once
+ANSWER_SECONDS = 5.0  # until the first status of a goal
+REPEAT_SECONDS = 0.1  # between two attempts to send a goal; the server ignores a goal that arrives twice
+RESULT_SECONDS = 1.0  # from the last status of a goal to its result, which normally follows immediately
 
 _ACTIVE = frozenset((1, 6))  # actionlib_msgs/GoalStatus: ACTIVE, PREEMPTING
 _ENDED = frozenset((2, 3, 4, 5, 8, 9))  # PREEMPTED, SUCCEEDED, ABORTED, REJECTED, RECALLED, LOST
@@ -26,28 +27,29 @@ _REJECTED = 5
 
 
 class Goal:
-    """One activity that was asked for. `error` counts once `ended` is set: None where the end was normal."""
+    """One requested activity. `error` is valid once `ended` is set: None if the activity has ended normally."""
 
     def __init__(self, number: str, client: ActionClient) -> None:
         self.id = number
         self._client = client
-        self.seen = asyncio.Event()  # the component knows of it
+        self.seen = asyncio.Event()  # the component has received it
         self.acknowledged = asyncio.Event()  # it runs, or has ended
         self.ended = asyncio.Event()
         self.error: ComponentError | None = None
-        self.warning = ""  # of the component, once it is acknowledged
-        self.outputs: dict[str, Any] = {}  # once it has ended without an error
+        self.warning = ""  # of the component, when it is acknowledged
+        self.outputs: dict[str, Any] = {}  # when it has ended without an error
 
     def cancel(self) -> None:
         """Ask the component to end the activity."""
         self._client.cancel(self)
 
     def forget(self) -> None:
-        """Follow the activity no further."""
-        self._client.forget(self)
+        """Stop following the activity."""
+        self._client.goals.pop(self.id, None)
 
     def end(self, error: ComponentError | None) -> None:
-        """Record the end; the first one counts."""
+        """Record the end, unless it is recorded already, and stop following the activity."""
+        self.forget()
         if not self.ended.is_set():
             self.error = error
             for event in (self.seen, self.acknowledged, self.ended):
@@ -55,7 +57,7 @@ class Goal:
 
 
 class ActionClient:
-    """Sends goals to one action of one component instance. Make it with `create`."""
+    """Sends goals to one action of one component instance. Use `create` to construct it."""
 
     _numbers = itertools.count(1)
 
@@ -64,7 +66,7 @@ class ActionClient:
         self._instance = instance
         self._name = f"/{instance}/{action}"
         self._loop = asyncio.get_running_loop()
-        self._goals: dict[str, Goal] = {}
+        self.goals: dict[str, Goal] = {}  # in progress, by id
         self._subscribers: list[Any] = []
         self._publishers: dict[str, Any] = {}
         messages = importlib.import_module(f"{package}.msg")
@@ -73,9 +75,9 @@ class ActionClient:
 
     @classmethod
     async def create(cls, graph: Graph, package: str, instance: str, action: str) -> ActionClient:
-        """A client that is registered with the master; ComponentError where there is none."""
+        """Return a client that is registered at the master; ComponentError if the master does not answer."""
         await graph.become_node()
-        await graph.master("getPid")  # rospy would wait for the master without end
+        await graph.master("getPid")  # rospy would wait for the master without a time limit
         client = cls(graph, package, instance, action)
         await asyncio.to_thread(client._register)
         return client
@@ -96,13 +98,13 @@ class ActionClient:
             )
 
     def _forward(self, callback: Callable[[Any], None], message: Any) -> None:
-        """From rospy's thread to ours."""
+        """Run a callback of rospy's thread in the event loop."""
         if not self._loop.is_closed():
             self._loop.call_soon_threadsafe(callback, message)
 
     async def close(self) -> None:
-        """Leave the action's topics; goals that are under way end with an error."""
-        for goal in self.goals():
+        """Unregister from the action's topics; goals in progress end with an error."""
+        for goal in list(self.goals.values()):
             goal.end(middleware_error(f"{self._instance} was unloaded"))
         topics = [*self._subscribers, *self._publishers.values()]
         await asyncio.gather(*(asyncio.to_thread(topic.unregister) for topic in topics))
@@ -110,31 +112,29 @@ class ActionClient:
     # --- goals ---
 
     async def send(self, values: Mapping[str, Any]) -> Goal:
-        """Send a goal made of `values`; it is in the component's hands on return.
+        """Send a goal with `values`; return it when the component has received it.
 
-        Raises ComponentError where the component shows no sign of having got it.
+        Raises ComponentError if the component does not confirm that.
         """
         goal = Goal(f"{self._graph.name}-{next(self._numbers)}", self)
-        self._goals[goal.id] = goal
+        self.goals[goal.id] = goal
         message = self._goal_class()
         message.goal_id.id = goal.id
         installed_components.fill(message.goal, values)
         try:
-            await asyncio.wait_for(self._hand_over(goal, message), ANSWER_SECONDS)
-        except TimeoutError:
-            self.cancel(goal)  # should it arrive after all
-            self.forget(goal)
-            raise middleware_error(
-                f"{self._instance} did not answer {self._name} within {ANSWER_SECONDS:g} s"
-            ) from None
-        except BaseException:
-            self.forget(goal)
-            raise
+            await asyncio.wait_for(self._send_until_seen(goal, message), ANSWER_SECONDS)
+        except BaseException as problem:
+            goal.forget()
+            if not isinstance(problem, TimeoutError):
+                raise
+            self.cancel(goal)  # in case it still arrives
+            what = f"{self._instance} did not answer {self._name} within {ANSWER_SECONDS:g} s"
+            raise middleware_error(what) from None
         return goal
 
-    async def _hand_over(self, goal: Goal, message: Any) -> None:
+    async def _send_until_seen(self, goal: Goal, message: Any) -> None:
         while not goal.seen.is_set():
-            # Not before the way back is there: a result is sent once, and not to those who come later.
+            # A result is sent once, and not to later subscribers: send the goal only when all topics are connected.
             if all(topic.get_num_connections() for topic in (*self._subscribers, self._publishers["goal"])):
                 self._publishers["goal"].publish(message)
             with contextlib.suppress(TimeoutError):
@@ -146,17 +146,9 @@ class ActionClient:
 
         self._publishers["cancel"].publish(GoalID(id=goal.id))
 
-    def forget(self, goal: Goal) -> None:
-        """Follow the activity no further."""
-        self._goals.pop(goal.id, None)
-
-    def goals(self) -> list[Goal]:
-        """Those that are under way."""
-        return list(self._goals.values())
-
     def _on_status(self, message: Any) -> None:
         for status in message.status_list:
-            goal = self._goals.get(status.goal_id.id)
+            goal = self.goals.get(status.goal_id.id)
             if goal is None:
                 continue
             goal.seen.set()
@@ -164,22 +156,19 @@ class ActionClient:
                 goal.warning = status.text
                 goal.acknowledged.set()
             elif status.status in _ENDED:
-                self._loop.call_later(RESULT_SECONDS, self._end, goal, _without_result(status))
+                self._loop.call_later(RESULT_SECONDS, goal.end, _without_result(status))
 
     def _on_result(self, message: Any) -> None:
-        goal = self._goals.get(message.status.goal_id.id)
+        goal = self.goals.get(message.status.goal_id.id)
         if goal is None:
             return
+        error = None
         if message.result.genom_success:
             goal.outputs = installed_components.outputs(message.result)
-            self._end(goal, None)
         elif message.result.genom_exdetail:
-            self._end(goal, component_exception(message.result.genom_exdetail))
+            error = component_exception(message.result.genom_exdetail)
         else:
-            self._end(goal, _without_result(message.status))
-
-    def _end(self, goal: Goal, error: ComponentError | None) -> None:
-        self._goals.pop(goal.id, None)
+            error = _without_result(message.status)
         goal.end(error)
 
 

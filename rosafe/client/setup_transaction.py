@@ -1,4 +1,4 @@
-"""Saves what a rosAFE and its bass do as a setup, and loads one: as one transaction on the services of a graph."""
+"""Saves the state of rosAFE and bass as a setup, and loads a setup as one transaction of service calls."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Mapping
 from contextlib import AbstractAsyncContextManager
 from typing import Any, Protocol
 
+from rosafe.client.errors import middleware_error
 from rosafe.declarations.plugins import FOLDERS
 from rosafe.interface import BASS, KINDS, REQUEST, ROSAFE, ComponentError
-from rosafe.setups import AcquireSettings, Setup, SetupError, dry_run, plan, read, wanted, write
-from rosafe.setups.plan import refused
+from rosafe.setups import AcquireSettings, Setup, SetupError, dry_run, plan, read, setup_processor, write
 from rosafe.tree import tree_planner as request
 from rosafe.tree.tree_builder import (
     MAX_ATTEMPTS,
@@ -25,33 +25,32 @@ from rosafe.tree.tree_builder import (
 from rosafe.tree.tree_planner import ExistingProcessor
 
 AUDIO = "Audio"
-SOUND_SECONDS = 10.0  # from Acquire to the first sound; a sound card takes a second or two
+SOUND_SECONDS = 10.0  # from Acquire to the first audio; a sound card takes a second or two
 PAUSE = 0.1
 
 Undo = Callable[[], Awaitable[object]]
 
 
 class ComponentProtocol(Services, Protocol):
-    """A rosAFE on a graph with others."""
+    """The rosAFE component that a setup is saved from or loaded into, with access to the other components."""
 
     def other(self, instance: str) -> AbstractAsyncContextManager[Services]:
-        """Another component of the graph; ComponentError where none of that name is there."""
+        """Return another component of the graph; ComponentError if there is none of that name."""
 
 
 async def save(component: ComponentProtocol, values: Mapping[str, Any]) -> dict[str, Any]:
-    """The outputs of `interface.SAVE_SETUP`: the text of what `capture` finds."""
+    """Return the outputs of `interface.SAVE_SETUP`: the setup of `capture` as text."""
     return {"setup": write(await capture(component), bool(values.get("full", False)))}
 
 
 async def capture(component: ComponentProtocol) -> Setup:
-    """The setup that would make the tree, the connection and the acquisition that are there."""
+    """Return a setup of the present tree, connection and acquisition."""
     topic = await component.port_connected(AUDIO)
-    there = (await component.outputs("getProcessors", {}))["processors"]
-    for processor in there:
+    for processor in (await component.outputs("getProcessors", {}))["processors"]:
         if processor["kind"] not in KINDS:
-            unknown = f"{processor['name']!r} is of kind {processor['kind']}, which is not known here"
-            raise refused(f"{unknown}: set {FOLDERS} as for the node")
-    processors = [wanted(found) for found in await list_processors(component)]
+            unknown = f"{processor['name']!r} is of kind {processor['kind']}, which is not available here"
+            raise ROSAFE.error("e_badNewValue", what=f"{unknown}; set {FOLDERS} as for the node")
+    processors = [setup_processor(found) for found in await list_processors(component)]
     sound = None
     if topic:
         async with _bass(component, topic) as bass:
@@ -61,52 +60,52 @@ async def capture(component: ComponentProtocol) -> Setup:
 
 
 async def load(component: ComponentProtocol, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Make all that the setup in `values` describes; the outputs of `interface.LOAD_SETUP`.
+    """Create everything that the setup in `values` describes; return the outputs of `interface.LOAD_SETUP`.
 
-    Processors, connection and acquisition that are there already are used. Where anything fails, or the task is
-    cancelled, what was made is undone, as far as nothing of others hangs on it.
+    An existing processor, connection or acquisition is used if it agrees with the setup. If anything fails, or the task
+    is cancelled, all changes are undone, except those that other clients depend on meanwhile.
 
     Raises
     ------
     ComponentError
-        ``::rosAFE::e_badNewValue`` for a text that is no setup, ``e_existsAlready`` where something else is there, and
-        those of the component and of bass.
+        ``::rosAFE::e_badNewValue`` if the text is not a setup, ``e_existsAlready`` if an existing object differs from
+        it, and the errors of the component and of bass.
     """
     try:
         setup = await asyncio.to_thread(read, values["setup"])
     except SetupError as problem:
-        raise refused(str(problem)) from None
-    async with component.turns.setup(wanted.name for wanted in setup.processors), component.turns.turn():
+        raise ROSAFE.error("e_badNewValue", what=str(problem)) from None
+    async with component.turns.setup(processor.name for processor in setup.processors), component.turns.turn():
         return await apply(component, setup)
 
 
 async def apply(component: ComponentProtocol, setup: Setup, wait: float = 0.0) -> dict[str, Any]:
-    """As `load`, for a setup that was read; `wait` seconds for what it hears, where that is just starting."""
-    undoing: list[Undo] = []
-    made: list[str] = []
+    """Load a setup object like `load`; wait up to `wait` seconds until the topic of its audio is published."""
+    undo_steps: list[Undo] = []
+    created: list[str] = []
     try:
         found = await list_processors(component)
         request_plan = plan(setup, found)
-        now, topic = await component.port_connected(AUDIO), await _topic(component, setup)
+        connected, topic = await component.port_connected(AUDIO), await _topic(component, setup)
         await _wait_for_topic(component, topic, wait)
-        if found and now and topic != now:
-            what = f"the tree hears {now}, in the setup {topic}: call Stop first"
+        if found and connected and topic != connected:
+            what = f"the tree is connected to {connected}, the setup expects {topic}; call Stop first"
             raise ROSAFE.error("e_existsAlready", what=what)
-        sound = await _sound(component, setup, topic, found, undoing)
-        if topic and topic != now and (setup.connections or request_plan.steps):
-            await shield_until_done(_connect(component, topic, now, undoing))
-        names = await _make(component, setup, made, patient=sound == "started")
+        sound = await _sound(component, setup, topic, found, undo_steps)
+        if topic and topic != connected and (setup.connections or request_plan.steps):
+            await shield_until_done(_connect(component, topic, connected, undo_steps))
+        names = await _create(component, setup, created, wait_for_sound=sound == "started")
     except BaseException:
-        await shield_until_done(_undo(component, made, undoing))
+        await shield_until_done(_undo(component, created, undo_steps))
         raise
-    reused = [name for name in names if name not in made]
-    return {"created": [name for name in names if name in made], "reused": reused, "sound": sound}
+    reused = [name for name in names if name not in created]
+    return {"created": [name for name in names if name in created], "reused": reused, "sound": sound}
 
 
-async def _undo(component: ComponentProtocol, made: list[str], undoing: list[Undo]) -> None:
-    await remove(component, made)
-    for undo in reversed(undoing):
-        with contextlib.suppress(ComponentError):  # what failed first is told
+async def _undo(component: ComponentProtocol, created: list[str], undo_steps: list[Undo]) -> None:
+    await remove(component, created)
+    for undo in reversed(undo_steps):
+        with contextlib.suppress(ComponentError):  # the first error is reported
             await undo()
 
 
@@ -114,10 +113,10 @@ async def _undo(component: ComponentProtocol, made: list[str], undoing: list[Und
 
 
 async def _topic(component: ComponentProtocol, setup: Setup) -> str:
-    """What the Audio port is to hear; nothing where that is left open and nobody publishes the usual."""
+    """Return the topic for the Audio port; empty if the setup has none and the default topic is not published."""
     topic = setup.connections.get(AUDIO, "") or await component.port_connected(AUDIO)
-    usual = f"/{REQUEST.parameter('connect').default}"
-    return topic or (usual if setup.sound is not None or await component.published(usual) else "")
+    default = f"/{REQUEST.parameter('connect').default}"
+    return topic or (default if setup.sound is not None or await component.published(default) else "")
 
 
 async def _wait_for_topic(component: ComponentProtocol, topic: str, seconds: float) -> None:
@@ -128,7 +127,7 @@ async def _wait_for_topic(component: ComponentProtocol, topic: str, seconds: flo
 
 @contextlib.asynccontextmanager
 async def _bass(component: ComponentProtocol, topic: str) -> AsyncIterator[Services | None]:
-    """The bass that publishes `topic`; None where that is none of ours."""
+    """Yield the bass component that publishes `topic`; None if another node publishes it."""
     instance, _, port = topic.removeprefix("/").rpartition("/")
     if not instance or "/" in instance or port != AUDIO:
         yield None
@@ -142,69 +141,64 @@ async def _bass(component: ComponentProtocol, topic: str) -> AsyncIterator[Servi
 
 
 async def _sound(
-    component: ComponentProtocol, setup: Setup, topic: str, found: list[ExistingProcessor], undoing: list[Undo]
+    component: ComponentProtocol, setup: Setup, topic: str, found: list[ExistingProcessor], undo_steps: list[Undo]
 ) -> str:
-    """Have the setup's sound acquired: "started" or "reused"; "" where it has none. All that can be checked is."""
-    rate = next((p.rate for p in found if not p.parent), 0.0)
-    if setup.sound is None:
-        if rate:
-            await asyncio.to_thread(dry_run, setup, rate)
-        return ""
-    values = setup.sound.values
-    rate = rate or values["sampleRate"]
-    if rate:
+    """Check the setup, and start its sound; return "started", "reused", or "" if it has none."""
+    values = setup.sound.values if setup.sound is not None else {"sampleRate": 0.0}
+    if rate := next((p.rate for p in found if not p.parent), 0.0) or values["sampleRate"]:
         await asyncio.to_thread(dry_run, setup, rate)
+    if setup.sound is None:
+        return ""
     async with _bass(component, topic) as bass:
         if bass is None:
-            what = f"the setup has a sound, but no bass publishes {topic}: start it with: bass-ros"
-            raise ComponentError("::genom::mwerr", what=what)
-        now = await bass.outputs("getAcquisition", {})
-        if not now["running"]:
-            await shield_until_done(_acquire(component, bass, values, topic, undoing))
+            raise middleware_error(f"the setup has a sound, but no bass publishes {topic}; start it with: bass-ros")
+        running = await bass.outputs("getAcquisition", {})
+        if not running["running"]:
+            await shield_until_done(_acquire(component, bass, values, topic, undo_steps))
             return "started"
         for name, value in values.items():
-            if now[name] != value:
-                what = f"bass acquires with {name} {now[name]}, in the setup {value}: call its Stop first"
+            if running[name] != value:
+                what = f"bass acquires with {name} {running[name]}, the setup expects {value}; call its Stop first"
                 raise ROSAFE.error("e_existsAlready", what=what)
         return "reused"
 
 
 async def _acquire(
-    component: ComponentProtocol, bass: Services, values: Mapping[str, Any], topic: str, undoing: list[Undo]
+    component: ComponentProtocol, bass: Services, values: Mapping[str, Any], topic: str, undo_steps: list[Undo]
 ) -> None:
     async def stop() -> None:
-        async with _bass(component, topic) as again:
-            if again is not None:
-                await again.outputs("Stop", {})
+        async with _bass(component, topic) as started:
+            if started is not None:
+                await started.outputs("Stop", {})
 
     await bass.outputs("Acquire", values)
-    undoing.append(stop)
+    undo_steps.append(stop)
 
 
-async def _connect(component: ComponentProtocol, topic: str, before: str, undoing: list[Undo]) -> None:
+async def _connect(component: ComponentProtocol, topic: str, previous: str, undo_steps: list[Undo]) -> None:
     await component.outputs("connect_port", {"local": AUDIO, "remote": topic})
-    if before:
-        undoing.append(lambda: component.outputs("connect_port", {"local": AUDIO, "remote": before}))
+    if previous:
+        undo_steps.append(lambda: component.outputs("connect_port", {"local": AUDIO, "remote": previous}))
 
 
 # --- processors -------------------------------------------------------------------------------------------------
 
 
-async def _make(component: ComponentProtocol, setup: Setup, made: list[str], patient: bool) -> list[str]:
-    """The names in the tree of the setup's processors, once they are all there.
+async def _create(component: ComponentProtocol, setup: Setup, created: list[str], wait_for_sound: bool) -> list[str]:
+    """Create the missing processors of the setup; return the names of all of them in the tree.
 
-    `patient`: the sound has just been started, and may need a while.
+    `wait_for_sound`: the sound was just started, and its first block may arrive only after some seconds.
     """
-    problem = ComponentError("::genom::mwerr", what="others change the tree all the time")
-    deadline = asyncio.get_running_loop().time() + (SOUND_SECONDS if patient else 0.0)
-    tries = 0
-    while tries < MAX_ATTEMPTS:
-        now = plan(setup, await list_processors(component))
+    problem = middleware_error(f"gave up after {MAX_ATTEMPTS} attempts: other clients keep changing the tree")
+    deadline = asyncio.get_running_loop().time() + (SOUND_SECONDS if wait_for_sound else 0.0)
+    attempts = 0
+    while attempts < MAX_ATTEMPTS:
+        current = plan(setup, await list_processors(component))
         try:
-            for step in now.steps:
-                await shield_until_done(execute_step(component, step, made))
+            for step in current.steps:
+                await shield_until_done(execute_step(component, step, created))
                 if await component.turns.give_way():
-                    break  # the others may have changed the tree
+                    break  # other clients may have changed the tree
         except ComponentError as error:
             if error.ex == "::rosAFE::e_noData" and asyncio.get_running_loop().time() < deadline:
                 await asyncio.sleep(PAUSE)
@@ -212,10 +206,10 @@ async def _make(component: ComponentProtocol, setup: Setup, made: list[str], pat
                 continue
             if not request.is_race(error):
                 raise
-            problem, tries = error, tries + 1
+            problem, attempts = error, attempts + 1
             if error.ex == request.INTERRUPTED:
                 await wait_for_input(component)
         else:
-            if not now.steps:
-                return now.names
+            if not current.steps:
+                return current.names
     raise problem

@@ -1,7 +1,7 @@
-"""ROS' TCP protocol as coroutines: service calls on kept connections, and the newest message of a latched topic.
+"""TCPROS clients as coroutines: service calls on pooled connections, and the latest message of a latched topic.
 
-rospy's own clients block a thread for as long as a component does not answer; these have time limits, can be
-cancelled, and serve hundreds of callers from one thread.
+rospy's clients block a thread until the component answers. These have time limits, can be cancelled, and serve hundreds
+of callers on one thread.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ import importlib
 import io
 import json
 import os
-import socket
 import struct
 from collections.abc import Mapping
 from typing import Any
@@ -21,27 +20,28 @@ import rosgraph.network
 
 from rosafe.client import installed_components
 from rosafe.client.asyncio_tools import run_shared
-from rosafe.client.graph import Graph, NotRegisteredError, middleware_error
-from rosafe.client.values import bad_value
+from rosafe.client.errors import bad_value, middleware_error
+from rosafe.client.graph import Graph, NotRegisteredError
 from rosafe.component import explicit_defaults
 from rosafe.declarations import plugins
 from rosafe.interface import KINDS, PLUGINS, ComponentError
+from rosafe.transport.handshake_server import keep_alive
 
 CONNECT_SECONDS = 3.0
-CONNECTIONS = 4  # at once per service or type of topic; rospy's nodes take few new ones at a time
-MAX_MESSAGE = 2**30  # bytes of a message or an answer that holds something
-MAX_TEXT = 256 * 1024  # bytes of a header, with the definition of a type in it, or of an error
-SAMPLE_SECONDS = 0.3  # a latched message comes at once; where none comes there is none yet
-MESSAGE_SECONDS = 30.0  # for the rest of it
+MAX_CONNECTIONS = 4  # at the same time per service or type of topic; rospy's nodes accept few new ones at a time
+MAX_MESSAGE = 2**30  # bytes of a message, or of an answer with outputs
+MAX_TEXT = 256 * 1024  # bytes of a header, which includes the definition of a type, or of an error
+SAMPLE_SECONDS = 0.3  # a latched message arrives immediately; after this time the topic has none yet
+MESSAGE_SECONDS = 30.0  # from the first bytes of a message to the last
 READ_BUFFER = 2**20
-LARGE = 64 * 1024  # bytes of a message that is decoded on a thread: one with structures may take seconds
+LARGE = 64 * 1024  # bytes; a longer message is decoded on a thread, because one with structures may take seconds
 
 _LENGTH = struct.Struct("<I")
-_GARBAGE = (asyncio.IncompleteReadError, rosgraph.network.ROSHandshakeException, ValueError, struct.error)
+_INVALID_DATA = (asyncio.IncompleteReadError, rosgraph.network.ROSHandshakeException, ValueError, struct.error)
 
 
 class ConnectionRejected(Exception):
-    """The other side answered the connection with an error; the text is its own."""
+    """The peer answered with an error, whose text this is, or not according to the protocol."""
 
 
 class TcprosConnection:
@@ -54,34 +54,31 @@ class TcprosConnection:
 
     @classmethod
     async def open(cls, address: tuple[str, int], header: Mapping[str, str]) -> TcprosConnection:
-        """Connect and exchange headers; OSError, Refused or asyncio.TimeoutError."""
-
-        async def attempt() -> TcprosConnection:
-            reader, writer = await asyncio.open_connection(*address, limit=READ_BUFFER)
-            try:
-                _keep_alive(writer.get_extra_info("socket"))
-                writer.write(rosgraph.network.encode_ros_handshake_header(header))
-                answer = await _read_frame(reader, MAX_TEXT)
-                fields = rosgraph.network.decode_ros_handshake_header(_LENGTH.pack(len(answer)) + answer)
-                if "error" in fields:
-                    raise ConnectionRejected(fields["error"])
-            except BaseException:
-                writer.close()
-                raise
-            return cls(reader, writer, fields)
-
+        """Connect and exchange headers; raises OSError, ConnectionRejected or TimeoutError."""
         try:
-            return await asyncio.wait_for(attempt(), CONNECT_SECONDS)
-        except _GARBAGE as problem:
-            raise ConnectionRejected(f"no ROS node: {problem}") from None
+            async with asyncio.timeout(CONNECT_SECONDS):
+                reader, writer = await asyncio.open_connection(*address, limit=READ_BUFFER)
+                try:
+                    keep_alive(writer.get_extra_info("socket"), idle=15, interval=5, count=3)
+                    writer.write(rosgraph.network.encode_ros_handshake_header(header))
+                    answer = await _read_frame(reader, MAX_TEXT)
+                    fields = rosgraph.network.decode_ros_handshake_header(_LENGTH.pack(len(answer)) + answer)
+                    if "error" in fields:
+                        raise ConnectionRejected(fields["error"])
+                except BaseException:
+                    writer.close()
+                    raise
+                return cls(reader, writer, fields)
+        except _INVALID_DATA as problem:
+            raise ConnectionRejected(f"not a ROS node: {problem}") from None
 
     @property
-    def open_still(self) -> bool:
-        """Whether the other side has neither closed nor sent anything unasked."""
+    def reusable(self) -> bool:
+        """Whether the connection is open at both ends."""
         return not (self._writer.is_closing() or self._reader.at_eof())
 
     async def closed(self) -> None:
-        """Wait until the other side closes the connection."""
+        """Wait until the peer closes the connection."""
         try:
             while await self._reader.read(READ_BUFFER):
                 continue
@@ -92,7 +89,7 @@ class TcprosConnection:
         self._writer.close()
 
     async def request(self, payload: bytes, limit: int) -> bytearray:
-        """One service call, answered with up to `limit` bytes; Refused with the text of an answer that is an error."""
+        """Call the service and return an answer of up to `limit` bytes; ConnectionRejected for an error."""
         self._writer.write(_LENGTH.pack(len(payload)) + payload)
         good = await self._reader.readexactly(1) == b"\1"
         answer = await _read_frame(self._reader, limit if good else MAX_TEXT)
@@ -101,7 +98,7 @@ class TcprosConnection:
         return answer
 
     async def message(self) -> bytearray | None:
-        """The latched message of a topic; None where it has none yet."""
+        """Return the latched message of a topic; None if it has none yet."""
         try:
             length = await asyncio.wait_for(self._reader.readexactly(4), SAMPLE_SECONDS)
         except TimeoutError:
@@ -109,44 +106,36 @@ class TcprosConnection:
         return await asyncio.wait_for(_read_body(self._reader, length, MAX_MESSAGE), MESSAGE_SECONDS)
 
 
-def _keep_alive(sock: socket.socket) -> None:
-    """Notice within half a minute that the other host is gone without a word."""
-    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-    sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPIDLE, 15)
-    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPINTVL, 5)
-    sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_KEEPCNT, 3)
-
-
 async def _read_frame(reader: asyncio.StreamReader, limit: int) -> bytearray:
-    """A length and as many bytes."""
+    """Read a length and return as many bytes."""
     return await _read_body(reader, await reader.readexactly(4), limit)
 
 
 async def _read_body(reader: asyncio.StreamReader, prefix: bytes, limit: int) -> bytearray:
     (length,) = _LENGTH.unpack(prefix)
     if length > limit:
-        raise ConnectionRejected(f"a message of {length} bytes is more than genomixd takes")
-    frame = bytearray()  # it grows as bytes come: what is only claimed takes no memory
+        raise ConnectionRejected(f"message: expected at most {limit} bytes, got {length}")
+    frame = bytearray()  # it grows with the data received, so that a wrong length allocates no memory
     while len(frame) < length:
-        part = await reader.read(length - len(frame))
-        if not part:
+        data = await reader.read(length - len(frame))
+        if not data:
             raise asyncio.IncompleteReadError(bytes(frame[:64]), length)
-        frame += part
+        frame += data
     return frame
 
 
 async def decode(message: Any, data: bytearray) -> Any:
-    """Return `message` filled from `data`; other requests go on meanwhile if that takes long."""
+    """Return `message` with the members in `data`; a long message is decoded on a thread."""
     if len(data) < LARGE:
         return message.deserialize(data)
     return await asyncio.to_thread(message.deserialize, data)
 
 
 async def connect_service(graph: Graph, instance: str, header: Mapping[str, str]) -> TcprosConnection:
-    """A connection to the service of `instance` that `header` names: where it was the last time, or the master says.
+    """Connect to the service of `instance` that `header` names, at its last address or the one that the master has.
 
-    Raises Unknown, Refused or OSError, and ComponentError where the master has to be asked and is not there.
+    Raises NotRegisteredError, ConnectionRejected or OSError, and ComponentError if the master is needed and does not
+    answer.
     """
     known = graph.known_address(instance)
     failure: Exception | None = None
@@ -167,7 +156,7 @@ async def connect_service(graph: Graph, instance: str, header: Mapping[str, str]
 
 
 class ServiceClient:
-    """Calls one service of one component instance, on connections that are kept."""
+    """Calls one service of one component instance, on pooled connections."""
 
     def __init__(self, graph: Graph, package: str, instance: str, service: str) -> None:
         self._graph = graph
@@ -186,29 +175,29 @@ class ServiceClient:
         }
         outputs = self._response_class.__slots__[2:]  # after genom_success and genom_exdetail
         self._limit = MAX_MESSAGE if outputs else MAX_TEXT
-        # The plugin whose request this is: it has to be there at both ends
+        # The plugin that this request belongs to; both the component and this process need it.
         self._plugin = next((kind for kind in PLUGINS if KINDS[kind].request == service), "")
-        self._slots = asyncio.Semaphore(CONNECTIONS)
+        self._slots = asyncio.Semaphore(MAX_CONNECTIONS)
         self._idle: list[TcprosConnection] = []
 
     async def check(self) -> None:
-        """Return if the component can be reached, else raise ComponentError."""
+        """Raise ComponentError if the component cannot be reached."""
         async with self._slots:
             self._return_to_pool(await self.connect())
 
     async def connect(self) -> TcprosConnection:
-        """A connection to the service; ComponentError where the component cannot be reached."""
+        """Return a connection to the service; ComponentError if the component cannot be reached."""
         while self._idle:
             connection = self._idle.pop()
-            if connection.open_still:
+            if connection.reusable:
                 return connection
             connection.close()
         try:
             return await connect_service(self._graph, self._instance, self._header)
         except NotRegisteredError:
-            if self._plugin and await self._graph.serves(f"/{self._instance}/connect_port"):
+            if self._plugin and await self._graph.is_service(f"/{self._instance}/connect_port"):
                 raise self._without_plugin() from None
-            raise middleware_error(f"{self._instance} is not running: nobody serves {self.name}") from None
+            raise not_running(self._instance, self.name) from None
         except ConnectionRejected as problem:
             if self._plugin and "is not a provider of" in str(problem):
                 raise self._without_plugin() from None
@@ -223,9 +212,8 @@ class ServiceClient:
             raise middleware_error(f"{self._instance} does not answer: no connection to {self.name}") from None
         except OSError as problem:
             why = os.strerror(problem.errno or 0)
-            raise middleware_error(
-                f"{self._instance} is not running any more, though the master still lists it ({why})"
-            ) from None
+            what = f"{self._instance} is not running any more, though it is still registered at the master ({why})"
+            raise middleware_error(what) from None
 
     def _without_plugin(self) -> ComponentError:
         return middleware_error(
@@ -233,22 +221,22 @@ class ServiceClient:
         )
 
     def _return_to_pool(self, connection: TcprosConnection) -> None:
-        """Take back a connection that is fit for another call."""
-        if connection.open_still:
+        """Keep a connection for another call if it is still open."""
+        if connection.reusable:
             self._idle.append(connection)
         else:
             connection.close()
 
     async def call(self, values: Mapping[str, Any], timeout: float) -> Any:
-        """The response, with arrays in it, to a request made of `values`.
+        """Return the response, which may contain arrays, to a request with `values`.
 
-        Raises ComponentError: the component's own exception, or ``::genom::mwerr`` where none came.
+        Raises ComponentError ``::genom::mwerr`` if no valid response arrives.
         """
         buffer = io.BytesIO()
         try:
             installed_components.fill(self._request_class(), values).serialize(buffer)
-        except UnicodeEncodeError:  # bytes of a command line that are no UTF-8
-            raise bad_value(f"{self.name}: half a surrogate pair is no character") from None
+        except UnicodeEncodeError:  # bytes of a command line that are not UTF-8
+            raise bad_value(f"{self.name}: contains an unpaired UTF-16 surrogate") from None
         try:
             answer = await asyncio.wait_for(self._ask(buffer.getvalue()), timeout)
         except TimeoutError:
@@ -256,21 +244,19 @@ class ServiceClient:
         try:
             return await decode(self._response_class(), answer)
         except genpy.DeserializationError as problem:
-            raise middleware_error(f"{self.name} answers garbage: {problem}") from None
+            raise middleware_error(f"{self.name}: the response cannot be decoded: {problem}") from None
 
     async def _ask(self, request: bytes) -> bytearray:
         async with self._slots:
             connection = await self.connect()
             try:
                 answer = await connection.request(request, self._limit)
-            except ConnectionRejected as problem:
+            except BaseException as problem:
                 connection.close()
-                raise middleware_error(f"{self.name}: {problem}") from None
-            except (asyncio.IncompleteReadError, OSError):
-                connection.close()
-                raise middleware_error(f"{self._instance} ended before it answered {self.name}") from None
-            except BaseException:
-                connection.close()
+                if isinstance(problem, ConnectionRejected):
+                    raise middleware_error(f"{self.name}: {problem}") from None
+                if isinstance(problem, (asyncio.IncompleteReadError, OSError)):
+                    raise middleware_error(f"{self._instance} ended before it answered {self.name}") from None
                 raise
             self._return_to_pool(connection)
             return answer
@@ -285,19 +271,19 @@ class ServiceClient:
 
 
 class TopicReader:
-    """Reads the newest message of latched topics of one type of message."""
+    """Reads the latest message of latched topics of one message type."""
 
     def __init__(self, graph: Graph, instance: str, message_class: Any) -> None:
         self._graph = graph
         self._instance = instance
         self._class = message_class
-        self._slots = asyncio.Semaphore(CONNECTIONS)
-        self._reads: dict[str, asyncio.Task[Any]] = {}  # that have not begun yet
+        self._slots = asyncio.Semaphore(MAX_CONNECTIONS)
+        self._reads: dict[str, asyncio.Task[Any]] = {}  # that have not started yet
 
     async def read(self, topic: str) -> Any:
-        """The message, None where the topic has none yet, or Unknown where the component has no such topic.
+        """Return the message, None if the topic has none yet; NotRegisteredError if the component has no such topic.
 
-        Those who ask while connections are few get the same message, one that is fetched after they asked.
+        Callers that wait for a free connection share one message, which is read when a connection is free.
         """
         if topic not in self._reads:
             self._reads[topic] = run_shared(self._read(topic))
@@ -306,7 +292,7 @@ class TopicReader:
     async def _read(self, topic: str) -> Any:
         async with self._slots:
             del self._reads[topic]
-            # The node is asked first: one that is asked for a topic that it does not have logs kilobytes.
+            # Check at the node first: a connection for a topic that it does not have makes it log kilobytes.
             address = await self._graph.topic_address(topic, self._instance)
             try:
                 return await self._fetch(address, topic)
@@ -314,7 +300,7 @@ class TopicReader:
                 raise middleware_error(f"{topic}: {problem}") from None
             except (TimeoutError, OSError, asyncio.IncompleteReadError) as problem:
                 why = type(problem).__name__
-                raise middleware_error(f"{self._instance} does not give out {topic} any more ({why})") from None
+                raise middleware_error(f"{self._instance} does not publish {topic} any more ({why})") from None
 
     async def _fetch(self, address: tuple[str, int], topic: str) -> Any:
         header = {
@@ -333,8 +319,13 @@ class TopicReader:
         return None if data is None else await decode(self._class(), data)
 
 
+def not_running(instance: str, service: str) -> ComponentError:
+    """Return the error of a component whose service is not registered."""
+    return middleware_error(f"{instance} is not running: {service} is not registered")
+
+
 def component_exception(exdetail: str) -> ComponentError:
-    """The exception that a component's `genom_exdetail` names."""
+    """Return the exception that a component reports in `genom_exdetail`."""
     try:
         body = json.loads(exdetail)
     except (ValueError, RecursionError):
@@ -343,6 +334,6 @@ def component_exception(exdetail: str) -> ComponentError:
         detail, what = body.get("detail"), body.get("what")
         known = {str(name): value for name, value in detail.items()} if isinstance(detail, dict) else {}
         error = ComponentError(body["ex"], what if isinstance(what, str) else str(known.get("what", "")))
-        error.detail = known  # whatever its members are called
+        error.detail = known  # not passed as keywords, because the names are arbitrary
         return error
     return ComponentError("::genom::unkex", what=str(body)[:127])

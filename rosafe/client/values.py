@@ -1,4 +1,4 @@
-"""What clients send as arguments, checked and converted by the interface table before anything goes to a component."""
+"""Arguments of clients: check and convert them with the interface table before they are sent to a component."""
 
 from __future__ import annotations
 
@@ -10,25 +10,26 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from rosafe.client.errors import bad_value
 from rosafe.declarations.idl import element
 from rosafe.declarations.parameter import StructParameter
 from rosafe.declarations.text import did_you_mean
-from rosafe.interface import KINDS, REQUEST, REQUIRED, ComponentError, Parameter, Service
+from rosafe.interface import KINDS, REQUEST, REQUIRED, Parameter, Service
 from rosafe.tree.tree_planner import kind_of
 
-_WORDS = {
+_BOOLEANS = {
     **dict.fromkeys(("1", "true", "yes", "on", "t"), True),
     **dict.fromkeys(("0", "false", "no", "off", "f"), False),
 }
 _WHOLE = re.compile(r"[+-]?[0-9]{1,30}")
-MANY = 20  # parameters in one line
+MAX_TYPED = 20  # parameters that an error message lists with their types
 _STRUCTURES = {name for kind in KINDS.values() for name in (kind.kind, kind.word)}
-# members of those structures all the same
+# Members of these structures that are not parameters.
 _NO_PARAMETERS = {"name", *(derived.name for kind in KINDS.values() for derived in kind.derived)}
 
 
 def tcl_list(text: str) -> list[str] | None:
-    """The words of a Tcl list, or None if `text` is not one. Braces are understood, quotes and backslashes are not."""
+    """Return the elements of a Tcl list with braces; None if `text` is not one, or has quotes or backslashes."""
     words: list[str] = []
     at = 0
     while at < len(text):
@@ -51,67 +52,65 @@ def tcl_list(text: str) -> list[str] | None:
     return words
 
 
-def bad_value(what: str) -> ComponentError:
-    """The error of an argument that is not sent at all."""
-    return ComponentError("::genom::serialization", what=what)
-
-
 def parse_input(text: str) -> Any:
-    """The JSON value `text`, or the error that says why it is none; nothing stands for no arguments."""
+    """Return the value of the JSON `text`; an empty text stands for no arguments.
+
+    Raises ``::genom::serialization`` if the text is not valid JSON.
+    """
     if not text.strip():
         return {}
     try:
         value = json.loads(text)
         json.dumps(value, ensure_ascii=False).encode()
     except UnicodeEncodeError:
-        raise bad_value("input: half a surrogate pair is no character") from None
+        raise bad_value("input: contains an unpaired UTF-16 surrogate") from None
     except (ValueError, RecursionError) as problem:
-        raise bad_value(f"input is not JSON: {problem}") from None
+        raise bad_value(f"input: expected JSON: {problem}") from None
     return value
 
 
-def complete(service: Service, given: Any) -> dict[str, Any]:
-    """All arguments of `service`: those `given`, checked, and the defaults of the others.
+def complete(service: Service, text_args: Any) -> dict[str, Any]:
+    """Return the values of all parameters of `service`: converted `text_args`, and defaults for the others.
 
     Parameters
     ----------
     service : Service
-    given : mapping or sequence
-        By name (aliases count, any order), or by position in the order of declaration. The numbers and booleans of
-        clients without types may be texts.
+    text_args : mapping or sequence
+        Arguments by name or alias in any order, or by position in the order of declaration. Clients without types may
+        pass numbers and booleans as texts.
 
     Returns
     -------
     dict
-        Values by the parameters' own names, of the right Python types. Ranges are the component's business.
+        Values by the parameters' names, as the declared Python types. The component checks the ranges.
 
     Raises
     ------
     ComponentError
-        ``::genom::serialization`` whose `what` names the argument and says what is allowed.
+        ``::genom::serialization`` whose `what` names the parameter and its allowed values.
     """
-    values = _converted(service, _named(service, given))
+    values = _converted(service, _named(service, text_args))
     _require(service, values)
-    # What follows the sample rate is the component's to choose: no number asks it to.
+    # NaN makes the component choose the default of a parameter that depends on the sample rate.
     known = service.completed(values)
     return {p.name: known.get(p.name, math.nan) for p in service.parameters}
 
 
-def partial(given: Any) -> dict[str, Any]:
-    """The arguments of `interface.REQUEST` that are `given`, and no others.
+def partial(text_args: Any) -> dict[str, Any]:
+    """Return the values of `interface.REQUEST` for the arguments that are present, without defaults for the others.
 
-    An object, or an array of the representation and, where there are any, an object of the others: by position nobody
-    knows them. A structure of getParameters, or an array of one, stands for its members. null stands for what is not
-    given.
+    `text_args` is an object, or an array of the representation and an optional object with the other arguments, which
+    have no positions. A structure of getParameters, or an array of one, stands for its members. null stands for an
+    argument that is not present.
 
     Raises
     ------
     ComponentError
-        As `complete`.
+        See `complete`.
     """
-    pairs = _positional_after_kind(given) if isinstance(given, (list, tuple)) else _named(REQUEST, given)
-    unfolded = [pair for name, value in pairs for pair in _expand_structures(name, value)]
-    values = _converted(REQUEST, [(name, value) for name, value in unfolded if value is not None])
+    pairs = _positional_after_kind(text_args) if isinstance(text_args, (list, tuple)) else _named(REQUEST, text_args)
+    expanded = [pair for name, value in pairs for pair in _expand_structures(name, value)]
+    values = _converted(REQUEST, [(name, value) for name, value in expanded if value is not None])
     _require(REQUEST, values)
     try:
         kind_of(values["representation"])
@@ -120,17 +119,15 @@ def partial(given: Any) -> dict[str, Any]:
     return values
 
 
-def _positional_after_kind(given: Sequence[Any]) -> list[tuple[str, Any]]:
-    words = list(given)
-    parameters = words.pop() if words and isinstance(words[-1], Mapping) else {}
+def _positional_after_kind(text_args: Sequence[Any]) -> list[tuple[str, Any]]:
+    words = list(text_args)
+    others = words.pop() if words and isinstance(words[-1], Mapping) else {}
     if len(words) == 2 and words[1] in (None, "", []):  # an empty matrix of MATLAB
         words.pop()
     if len(words) > 1:
-        given_instead = str(words[1])[:80]
-        raise bad_value(
-            f"{REQUEST.name}: after representation come the parameters in one object, not {given_instead!r}"
-        )
-    return [*(("representation", word) for word in words), *parameters.items()]
+        what = "expected the parameters in one object after representation"
+        raise bad_value(f"{REQUEST.name}: {what}, got {str(words[1])[:80]!r}")
+    return [*(("representation", word) for word in words), *others.items()]
 
 
 def _expand_structures(name: str, value: Any) -> list[tuple[str, Any]]:
@@ -138,7 +135,7 @@ def _expand_structures(name: str, value: Any) -> list[tuple[str, Any]]:
         return [(name, value)]
     structures = value if isinstance(value, list) else [value]
     if len(structures) > 1 or not all(isinstance(structure, Mapping) for structure in structures):
-        raise bad_value(f"{name}: wanted is an object with parameters, as an element of getParameters")
+        raise bad_value(f"{name}: expected an object with parameters, such as an element of getParameters")
     return [pair for structure in structures for pair in structure.items() if pair[0] not in _NO_PARAMETERS]
 
 
@@ -159,22 +156,22 @@ def _require(service: Service, values: Mapping[str, Any]) -> None:
 
 
 def expected(service: Service) -> str:
-    """One line with the names of the parameters, and with their types unless they are many."""
+    """Return one line with the names of the parameters, and with their types unless there are many."""
     if not service.parameters:
         return f"{service.name} takes no parameters"
-    if len(service.parameters) > MANY:
-        return f"{service.name} takes " + ", ".join(p.name for p in service.parameters)
-    return f"{service.name} takes " + ", ".join(f"{p.name} ({p.idl})" for p in service.parameters)
+    typed = len(service.parameters) <= MAX_TYPED
+    return f"{service.name} takes " + ", ".join(f"{p.name} ({p.idl})" if typed else p.name for p in service.parameters)
 
 
-def _named(service: Service, given: Any) -> list[tuple[str, Any]]:
-    if isinstance(given, Mapping):
-        return list(given.items())
-    if isinstance(given, (list, tuple)):
-        if len(given) > len(service.parameters):
-            raise bad_value(f"{len(given)} arguments are too many; {expected(service)}")
-        return [(p.name, value) for p, value in zip(service.parameters, given, strict=False)]
-    raise bad_value(f"input is neither an object nor an array; {expected(service)}")
+def _named(service: Service, text_args: Any) -> list[tuple[str, Any]]:
+    """Return pairs of names and values."""
+    if isinstance(text_args, Mapping):
+        return list(text_args.items())
+    if not isinstance(text_args, (list, tuple)):
+        raise bad_value(f"input: expected an object or an array; {expected(service)}")
+    if len(text_args) > len(service.parameters):
+        raise bad_value(f"{len(text_args)} arguments are too many; {expected(service)}")
+    return [(p.name, value) for p, value in zip(service.parameters, text_args, strict=False)]
 
 
 def _parameter(service: Service, name: str) -> Parameter:
@@ -187,7 +184,7 @@ def _parameter(service: Service, name: str) -> Parameter:
 
 def _convert(service: Service, parameter: Parameter, value: Any) -> Any:
     checks = parameter
-    if not parameter.checked_by_client:  # the component names what it allows
+    if not parameter.checked_by_client:  # the component checks the value and names the allowed ones
         checks = dataclasses.replace(parameter, minimum=None, maximum=None, least=0, choices=(), spellings={})
     try:
         return checks.check(_typed_value(parameter, value))
@@ -197,7 +194,7 @@ def _convert(service: Service, parameter: Parameter, value: Any) -> Any:
 
 
 def _typed_value(parameter: Parameter, value: Any) -> Any:
-    """`value` with texts turned into what the type of the parameter asks for."""
+    """Return `value` with texts converted to the type of the parameter."""
     if not isinstance(parameter, StructParameter):
         return _typed(parameter.idl, value)
     of = element(parameter.idl)
@@ -207,22 +204,19 @@ def _typed_value(parameter: Parameter, value: Any) -> Any:
         items = _by_index(value) if isinstance(value, Mapping) else value
         one = dataclasses.replace(parameter, idl=of)
         return [_typed_value(one, item) for item in items] if isinstance(items, list) else items
-    return _typed_members(parameter, value) if isinstance(value, Mapping) else value
-
-
-def _typed_members(parameter: StructParameter, values: Mapping[str, Any]) -> dict[str, Any]:
-    typed = dict(values)
+    if not isinstance(value, Mapping):
+        return value
+    typed = dict(value)
     for member in parameter.members:
-        value = values.get(member.name)
-        if isinstance(value, str) and element(member.idl):
-            value = _parse(value, sequence=True)
         if member.name in typed:
-            typed[member.name] = _typed_value(member, value)
+            item = typed[member.name]
+            is_text = isinstance(item, str) and element(member.idl)
+            typed[member.name] = _typed_value(member, _parse(item, sequence=True) if is_text else item)
     return typed
 
 
 def _parse(text: str, sequence: bool) -> Any:
-    """The sequence or structure that a text is, in JSON or as a Tcl list or dict; the text itself if it is neither."""
+    """Return the sequence or structure in a text: JSON, a Tcl list or dict; the text itself if it is neither."""
     with contextlib.suppress(ValueError, RecursionError):
         parsed = json.loads(text)
         if isinstance(parsed, list if sequence else dict):
@@ -234,9 +228,8 @@ def _parse(text: str, sequence: bool) -> Any:
 
 
 def _typed(idl: str, value: Any) -> Any:
-    """`value` with texts turned into numbers and booleans, where the type asks for those and the text is one."""
-    if idl.startswith("sequence<"):
-        of = element(idl)
+    """Return `value` with texts converted to numbers and booleans if the type requires it and the text is valid."""
+    if of := element(idl):
         if isinstance(value, Mapping):
             value = _by_index(value)
         if isinstance(value, list):
@@ -248,7 +241,7 @@ def _typed(idl: str, value: Any) -> Any:
         return value
     text = value.strip()
     if idl == "boolean":
-        return _WORDS.get(text.lower(), value)
+        return _BOOLEANS.get(text.lower(), value)
     if _WHOLE.fullmatch(text):
         return int(text)
     try:
@@ -258,8 +251,8 @@ def _typed(idl: str, value: Any) -> Any:
 
 
 def _by_index(items: Mapping[str, Any]) -> list[Any]:
-    """``{"0": a, "1": b}`` as a list; ValueError where the keys are not the indexes from 0 on."""
-    wanted = [str(i) for i in range(len(items))]
-    if sorted(items) != sorted(wanted):
-        raise ValueError("the keys of a sequence given as an object are its indexes, from 0 on")
-    return [items[i] for i in wanted]
+    """Return ``{"0": a, "1": b}`` as a list; ValueError if the keys are not the indexes from 0 on."""
+    indexes = [str(i) for i in range(len(items))]
+    if sorted(items) != sorted(indexes):
+        raise ValueError("expected the indexes from 0 on as the keys of a sequence")
+    return [items[i] for i in indexes]

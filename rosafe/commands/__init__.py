@@ -1,22 +1,21 @@
 """The subcommands of `rosafe`, one module each; a module's name is the command's.
 
-A command is a module with a docstring, whose first line (less its full stop) is shown in `rosafe -h` and whose whole
-is the head of its own help, and two functions::
+A command is a module with a docstring and two functions. `rosafe -h` shows the first line of the docstring, and the
+command's own help begins with all of it::
 
     def configure(parser: argparse.ArgumentParser) -> None:   # adds arguments; may set `parser.epilog`
-    def run(options: argparse.Namespace) -> int:              # does it; returns the exit code
+    def run(options: argparse.Namespace) -> int:              # runs the command; returns the exit code
 
-`configure` may call `parser.set_defaults(interspersed=[])`: `run` finds there the words that stand behind an option,
-for which argparse has no place.
+`configure` may call `parser.set_defaults(interspersed=[])`; `run` then finds the positional arguments that follow an
+option in this list, because argparse cannot assign them.
 
-`rosafe -h` reads their docstrings and imports none; what is slow to import is imported in `run`; and `doctor` works
-where even numpy is missing. `run` may raise `CommandError`, and
-call `options.usage_error(text)`, which exits with 2. Modules whose names
-begin with _ are parts of commands.
+`rosafe -h` reads the docstrings without importing the modules. Slow imports belong in `run`. `doctor` has to work even
+if numpy is missing. `run` may raise `CommandError` (exit code 1) and may call `options.usage_error(text)` (exit code
+2). Modules whose names begin with an underscore are shared by several commands.
 """
 
 from __future__ import annotations
 
 
 class CommandError(Exception):
-    """The command cannot do it: the text is the one line that the user gets, and the exit code is 1."""
+    """A failure of the command. Its text is printed as one line, and the exit code is 1."""

@@ -1,4 +1,4 @@
-"""The command `rosafe`: finds its subcommands in `rosafe.commands` and runs one."""
+"""The command `rosafe`: find the subcommands in `rosafe.commands` and run one of them."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import ast
 import importlib
 import importlib.util
 import inspect
+import os
 import pkgutil
 import sys
 from pathlib import Path
@@ -19,14 +20,16 @@ from rosafe.output import OutputError
 from rosafe.terminal import printable
 from rosafe.version import VERSION
 
-_WITHOUT_PLUGINS = ("check", "doctor", "record", "trace")  # they compute nothing, or import plugins in another process
+# compute nothing or built-in representations only, or import plugins in a child process
+_WITHOUT_PLUGINS = ("check", "doctor", "record", "trace", "validate")
+_ONE_BLAS_THREAD = ("localize",)  # multiplies small matrices: more threads take several times the processor time
 _EPILOG = """example:
   rosafe process speech.wav -o speech.npz --outputs ild,ratemap --set fb_nChannels=64
   rosafe process -h          # all options and parameters"""
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run `rosafe`; returns its exit code. A wrong command line raises SystemExit(2); -h and --version (0)."""
+    """Run `rosafe` and return its exit code. SystemExit: 2 for a wrong command line, 0 after -h and --version."""
     name = "rosafe"
     try:
         words = without_names(sys.argv[1:] if argv is None else argv)
@@ -44,7 +47,7 @@ def main(argv: list[str] | None = None) -> int:
         print(f"{name}: {printable(problem)}", file=sys.stderr)
         return 1
     except ModuleNotFoundError as problem:
-        if not problem.name or problem.name.startswith("rosafe."):  # a fault of ours
+        if not problem.name or problem.name.startswith("rosafe."):  # a bug of this package
             raise
         print(f"{name}: {printable(missing.advice(problem.name))}", file=sys.stderr)
         return 1
@@ -53,10 +56,10 @@ def main(argv: list[str] | None = None) -> int:
 
 
 def _parser(words: list[str]) -> argparse.ArgumentParser:
-    """With the one subcommand that the command line begins with; otherwise with a line on each, and no imports."""
+    """Return a parser with the subcommand of the command line, or with a line for each without importing any."""
     parser = Parser(
         prog="rosafe",
-        description="The Two!Ears auditory front-end without ROS, and tools around it.",
+        description="The Two!Ears auditory front-end without ROS, and its tools.",
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
@@ -68,6 +71,8 @@ def _parser(words: list[str]) -> argparse.ArgumentParser:
     if chosen in names:
         if chosen in _WITHOUT_PLUGINS:
             plugins.disable()
+        if chosen in _ONE_BLAS_THREAD:
+            os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy is imported
         _add(subparsers, chosen)
     else:
         for name in names:
@@ -85,7 +90,7 @@ def _summary(text: str) -> str:
 def _add(subparsers: argparse._SubParsersAction[Parser], name: str) -> None:
     try:
         module = importlib.import_module(f"{commands.__name__}.{name}")
-    except ModuleNotFoundError as problem:  # the others are there all the same, `doctor` above all
+    except ModuleNotFoundError as problem:  # the other commands still work, above all `doctor`
         why = missing.advice(str(problem.name))
         subparsers.add_parser(name, help=why, add_help=False).set_defaults(missing=why)
         return
@@ -102,7 +107,7 @@ def _add(subparsers: argparse._SubParsersAction[Parser], name: str) -> None:
 
 
 def program() -> int:
-    """Run `rosafe` as a program of its own, with the standard streams of this process."""
+    """Run `rosafe` as a program with the standard streams of this process."""
     return streams.run("rosafe", main)
 
 

@@ -1,4 +1,4 @@
-"""A running rosAFE for the commands that make requests of one: found on the graph, or a line that says what to do."""
+"""Find a running rosAFE on the ROS graph for the commands that send requests, or report how to start one."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ if TYPE_CHECKING:
     from rosafe.client.component_client import ComponentClient
     from rosafe.client.graph import Graph
 
-PAUSE = 0.2  # seconds between two looks, where a component is waited for
+POLL_SECONDS = 0.2  # between two attempts to reach a component or the master
 
 
 def prepare(wait: float = 0.0) -> None:
-    """Have messages and a ROS master, which may take `wait` seconds to come; else Failure."""
+    """Generate the messages and wait at most `wait` seconds for a ROS master. Raises CommandError if either fails."""
     from rosafe.component import generate
     from rosafe.transport import master
 
@@ -34,48 +34,48 @@ def prepare(wait: float = 0.0) -> None:
             except master.MasterError:
                 if time.monotonic() > deadline:
                     raise
-            time.sleep(PAUSE)
+            time.sleep(POLL_SECONDS)
     except (generate.GenerationError, master.MasterError) as problem:
         raise CommandError(str(problem)) from None
 
 
 @asynccontextmanager
 async def component(instance: str, wait: float = 0.0) -> AsyncIterator[ComponentClient]:
-    """The rosAFE of that name, which may take `wait` seconds to come; Failure where there is none."""
+    """Provide a client of the rosAFE node `instance`. Raises CommandError if there is none within `wait` seconds."""
     from rosafe.client.graph import Graph
 
     graph = Graph(os.environ["ROS_MASTER_URI"])
     try:
         try:
-            proxy = await _found(graph, instance, wait)
+            client = await _find(graph, instance, wait)
         except ComponentError as problem:
             named = "" if instance == ROSAFE.name else f" -i {instance}"
             hint = f"; start it with: rosAFE-ros{named}" if problem.ex == "::genom::mwerr" else ""
             raise CommandError(format_error(problem) + hint) from None
         try:
-            yield proxy
+            yield client
         finally:
-            await proxy.close()
+            await client.close()
     finally:
         await graph.close()
 
 
-async def _found(graph: Graph, instance: str, wait: float) -> ComponentClient:
+async def _find(graph: Graph, instance: str, wait: float) -> ComponentClient:
     from rosafe.client.component_client import ComponentClient, names
 
     deadline = time.monotonic() + wait
     while True:
         try:
-            proxy = await ComponentClient.load(graph, names(ROSAFE.name, instance)[1])
-            await proxy.check(ROSAFE.name)
-            return proxy
+            client = await ComponentClient.load(graph, names(ROSAFE.name, instance)[1])
+            await client.check(ROSAFE.name)
+            return client
         except ComponentError as problem:
             if problem.ex != "::genom::mwerr" or time.monotonic() > deadline:
                 raise
-        await asyncio.sleep(PAUSE)
+        await asyncio.sleep(POLL_SECONDS)
 
 
 def format_error(problem: ComponentError) -> str:
-    """The exception in one line: its name, and what it is about."""
-    what = problem.what or ROSAFE.exceptions.get(problem.ex.rpartition("::")[2], "")
-    return problem.ex + (f": {what}" if what else "")
+    """Return the exception as one line: name and reason."""
+    reason = problem.what or ROSAFE.exceptions.get(problem.ex.rpartition("::")[2], "")
+    return problem.ex + (f": {reason}" if reason else "")

@@ -1,4 +1,4 @@
-"""Many pieces of work on the workers of a Dask scheduler, on this machine or on many."""
+"""Run tasks on the workers of a Dask scheduler, on one machine or several."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from rosafe.tree.workers import VARIABLE
 from rosafe.version import VERSION
 
 LOCAL = "local"
-TASKS_IN_FLIGHT = 8  # pieces of work that are with the scheduler, for each thread of its workers
+TASKS_IN_FLIGHT = 8  # tasks submitted to the scheduler for each thread of its workers
 CONNECT_SECONDS = 10
 MAX_STARTS = 3  # of a worker process that dies before it is ready
 
@@ -35,10 +35,10 @@ def run_on(
     report: Callable[[int, TaskReport], None],
     signals: Interrupts,
 ) -> None:
-    """As `run_parallel`, on the workers of the scheduler at `address`, or on `jobs` of one's own where that is `local`.
+    """Do the same as `run_parallel` on the workers of the scheduler at `address`, or on `jobs` local ones (`local`).
 
-    What a worker that dies was at, others do again, a few times: that is the scheduler's doing. Raises Failure where
-    there is no scheduler, or no longer.
+    The scheduler gives the task of a worker that died to another one, a few times. Raises CommandError if the
+    scheduler cannot be reached or has ended.
     """
     with ExitStack() as stack:
         dead: list[str] = []
@@ -53,7 +53,7 @@ def run_on(
             if dead:
                 raise CommandError(f"--dask {address}: {dead[0]}; --jobs {jobs} does the work without Dask")
             if client.status not in ("running", "connecting"):
-                raise CommandError(f"the Dask scheduler at {address} is gone; --resume goes on where this ended")
+                raise CommandError(f"the Dask scheduler at {address} has ended; continue with --resume")
             room = (
                 max(TASKS_IN_FLIGHT * sum(client.nthreads().values()), TASKS_IN_FLIGHT) - len(running)
                 if not ended.qsize()
@@ -62,8 +62,8 @@ def run_on(
             for _, (index, work) in zip(range(room), waiting, strict=False):
                 running[index] = client.submit(partial(_attempt, work, failures, VERSION), pure=False)
                 running[index].add_done_callback(partial(_note, ended, index))
-            for index in _taken(ended):
-                report(index, _outcome(running.pop(index), address))
+            for index in _ended_tasks(ended):
+                report(index, _task_report(running.pop(index), address))
                 left -= 1
 
 
@@ -71,8 +71,8 @@ def _note(ended: queue.SimpleQueue[int], index: int, future: Any) -> None:
     ended.put(index)
 
 
-def _taken(ended: queue.SimpleQueue[int]) -> Iterator[int]:
-    """All that have ended; waits a moment for the first."""
+def _ended_tasks(ended: queue.SimpleQueue[int]) -> Iterator[int]:
+    """Yield the numbers of the ended tasks; wait at most `SIGNAL_SECONDS` for the first."""
     with contextlib.suppress(queue.Empty):
         yield ended.get(timeout=SIGNAL_SECONDS)
         while True:
@@ -83,16 +83,16 @@ def _client(address: str, jobs: int, stack: ExitStack, dead: list[str]) -> Any:
     """Connect to the scheduler; for a local one, `dead` gets a line if its workers cannot be started."""
     from distributed import Client
 
-    # Dask logs errors under the names of its modules and of their callers; here each failure is one line instead.
+    # Dask logs errors under the names of its modules and of their callers; this command prints one line per failure.
     for name in ["", *(name for name in logging.root.manager.loggerDict if name.partition(".")[0] == "distributed")]:
         logging.getLogger(name).setLevel(logging.CRITICAL)
     if address == LOCAL:
         return stack.enter_context(Client(_local_cluster(jobs, stack, dead)))
     try:
         return stack.enter_context(Client(address, timeout=CONNECT_SECONDS, set_as_default=False))
-    except (OSError, ValueError, TypeError) as problem:  # the two latter: an address that is none
+    except (OSError, ValueError, TypeError) as problem:  # the last two: an invalid address
         why = str(problem).partition("\n")[0]
-        raise CommandError(f"--dask {address}: no Dask scheduler answers there ({why})") from None
+        raise CommandError(f"--dask {address}: no Dask scheduler answers ({why})") from None
 
 
 def _local_cluster(jobs: int, stack: ExitStack, dead: list[str]) -> Any:
@@ -101,9 +101,9 @@ def _local_cluster(jobs: int, stack: ExitStack, dead: list[str]) -> Any:
     from distributed.core import Status
 
     class LimitedNanny(Nanny):
-        """Gives up a worker that dies `MAX_STARTS` times before it is ready.
+        """Nanny that abandons a worker which dies `MAX_STARTS` times before it is ready.
 
-        Dask would restart it without end, or (later versions) never, without telling anybody.
+        Dask would restart it endlessly or, in later versions, never, without an error.
         """
 
         starting = False
@@ -133,7 +133,7 @@ def _local_cluster(jobs: int, stack: ExitStack, dead: list[str]) -> Any:
 
     folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="rosafe-dask-"))
     _import_nothing_from_the_working_directory(folder)
-    # TLS with keys of its own: a Dask worker executes what anyone sends who can connect to it.
+    # TLS with temporary keys: a Dask worker executes any code that a peer sends.
     cluster = LocalCluster(
         n_workers=0,
         threads_per_worker=1,
@@ -151,9 +151,9 @@ def _local_cluster(jobs: int, stack: ExitStack, dead: list[str]) -> Any:
 
 
 def _import_nothing_from_the_working_directory(folder: str) -> None:
-    """Have Python processes that are started from here search no modules in the working directory, which may be data.
+    """Exclude the working directory, which may contain data, from the module path of child processes.
 
-    The `folder` is private to this process.
+    `folder` is private to this process.
     """
     if sys.version_info >= (3, 11):
         os.environ["PYTHONSAFEPATH"] = "1"
@@ -165,26 +165,26 @@ def _import_nothing_from_the_working_directory(folder: str) -> None:
 
 
 def _attempt(work: Work, failures: tuple[type[Exception], ...], version: str) -> TaskReport:
-    """What a worker does. Its processes are as many as there are cores to use; in each, one thread computes."""
+    """Run a task in a worker. There is one worker process per core, so one thread computes in each."""
     if version != VERSION:
         return TaskReport(
-            0.0, failure=f"the worker has rosafe {VERSION}, not {version}: install the same on all machines"
+            0.0, failure=f"worker: expected rosafe {version}, got {VERSION}; install the same version on all machines"
         )
     os.environ[VARIABLE] = "1"
     return attempt(work, failures, lambda done, total: None)
 
 
-def _outcome(future: Any, address: str) -> TaskReport:
+def _task_report(future: Any, address: str) -> TaskReport:
     from distributed.scheduler import KilledWorker
 
     if future.cancelled():
-        raise CommandError(f"the Dask scheduler at {address} is gone; --resume goes on where this ended")
+        raise CommandError(f"the Dask scheduler at {address} has ended; continue with --resume")
     problem = future.exception()
     if problem is None:
-        told = future.result()
-        assert isinstance(told, TaskReport)
-        return told
+        report = future.result()
+        assert isinstance(report, TaskReport)
+        return report
     if isinstance(problem, KilledWorker):
-        return TaskReport(0.0, failure="each worker that tried it has died: is there not enough memory?")
+        return TaskReport(0.0, failure="each worker that ran it has died; check the memory of the workers")
     text = f"{type(problem).__name__}: {problem}".partition("\n")[0]
-    return TaskReport(0.0, failure=f"a worker could not do it ({text}); are rosafe and its packages installed there?")
+    return TaskReport(0.0, failure=f"a worker failed ({text}); check that rosafe and its packages are installed there")

@@ -1,4 +1,4 @@
-"""The processes of a robot's hearing: those that are there are used, the others started, watched and ended."""
+"""Processes of the front-end: use those that run, start the others, monitor them and end them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import os
 import re
 from collections.abc import Awaitable, Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
 import aiohttp
@@ -23,28 +23,28 @@ if TYPE_CHECKING:
     from rosafe.client.graph import Graph
 
 START_SECONDS = 30.0
-END_SECONDS = 6.0  # a second more than our servers take
-PAUSE = 0.1
+END_SECONDS = 6.0  # one second more than the servers need
+POLL_SECONDS = 0.1
 _COLOUR = re.compile(r"\x1b\[[0-9;]*m")
 _URL = re.compile(r"http://\S+")
 
 
 @dataclass
 class ManagedProcess:
-    """One process, as the screen shows it."""
+    """One process and its state on the screen."""
 
     name: str
     state: str = "starts"
     detail: str = ""
-    child: Child | None = None  # where it was started here
+    child: Child | None = None  # if it was started here
 
-    def look(self) -> None:
-        """Notice that it has ended, if it has."""
+    def poll(self) -> None:
+        """Update the state if the process has ended."""
         if self.child is not None and self.child.has_ended() and self.state != "ended":
             code = self.child.process.returncode
             lines = [line for line in _COLOUR.sub("", self.child.err).splitlines() if line.strip()]
             self.state = "ended"
-            if code < 0:  # it had no last words
+            if code < 0:  # without a last message
                 self.detail = f"killed by signal {-code}"
             else:
                 self.detail = f"exit code {code}" + (f": {lines[-1].strip()}" if lines else "")
@@ -52,15 +52,15 @@ class ManagedProcess:
 
 @dataclass
 class Launcher:
-    """Everything from the master to the page, in an environment `env`. Use it as a context manager."""
+    """All processes from the master to the live page, in the environment `env`. Use it as a context manager."""
 
     env: Mapping[str, str]
     parts: dict[str, ManagedProcess] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._children = ProcessGroup(self.env)  # nodes and servers
-        # Which the others need until they have ended; roscore ends its rosmaster and rosout where it is told to, not
-        # where it is killed.
+        # The other processes need the master until they have ended. roscore ends rosmaster and rosout after SIGTERM,
+        # but not after SIGKILL.
         self._masters = ProcessGroup(self.env, orphaned="TERM")
 
     def __enter__(self) -> Launcher:
@@ -72,9 +72,9 @@ class Launcher:
 
     @property
     def ended(self) -> list[ManagedProcess]:
-        """Those that were started here and have ended by themselves."""
+        """Processes that were started here and have ended by themselves."""
         for part in self.parts.values():
-            part.look()
+            part.poll()
         return [part for part in self.parts.values() if part.state == "ended"]
 
     def start(self, name: str, *command: str, master: bool = False) -> ManagedProcess:
@@ -84,36 +84,36 @@ class Launcher:
         return part
 
     async def start_master(self) -> None:
-        """Have a ROS master; Failure where there is none, and none can be started."""
+        """Use the running ROS master or start one. Raises CommandError if neither is possible."""
         uri = self.env["ROS_MASTER_URI"]
         if await _answers(uri):
             self.parts["roscore"] = ManagedProcess("roscore", "runs", f"{uri}, was there")
             return
         if not master.is_local(uri):
-            raise CommandError(f"there is no ROS master at {uri}, and it is for that machine to start it: roscore")
+            raise CommandError(f"no ROS master at {uri}; start roscore on that machine")
         part = self.start("roscore", "roscore", "-p", str(urlsplit(uri).port or 11311), master=True)
         await self._until(part, lambda: _answers(uri))
         part.detail = uri
 
     async def start_node(self, graph: Graph, name: str, *options: str) -> ComponentClient | None:
-        """Have the component `name`, and a proxy of it; None where it does not come up."""
-        there = await _proxy(graph, name) if self.parts["roscore"].child is None else None
-        if there is not None:
+        """Use the running component `name` or start it. Return a client of it, or None if it does not start."""
+        running = await _client(graph, name) if self.parts["roscore"].child is None else None
+        if running is not None:
             self.parts[name] = ManagedProcess(name, "runs", "was there")
-            return there
+            return running
         part = self.start(name, paths.program(f"{name}-ros"), *options)
         found: list[ComponentClient] = []
 
         async def is_up() -> bool:
-            proxy = await _proxy(graph, name)
-            found.extend([proxy] if proxy is not None else [])
-            return proxy is not None
+            client = await _client(graph, name)
+            found.extend([client] if client is not None else [])
+            return client is not None
 
         await self._until(part, is_up)
         return found[0] if found else None
 
     async def start_genomixd(self, port: int) -> None:
-        """Have a genomixd on `port`."""
+        """Use the running genomixd on `port` or start one."""
         url = f"http://127.0.0.1:{port}"
         if await _is_genomixd(url):
             self.parts["genomixd"] = ManagedProcess("genomixd", "runs", f"{url}, was there")
@@ -123,22 +123,35 @@ class Launcher:
         if part.state == "runs":
             part.detail = url
 
+    async def start_localizer(self, graph: Graph, settings: Mapping[str, Any]) -> None:
+        """Use the running localizer or start one with these settings."""
+        from rosafe.client import localizer
+
+        if self.parts["roscore"].child is None and await localizer.is_registered(graph):
+            self.parts["localizer"] = ManagedProcess("localizer", "runs", "was there")
+            return
+        await localizer.set_parameters(graph, settings)
+        part = self.start("localizer", paths.program("rosafe"), "localize")
+        await self._until(part, lambda: localizer.is_registered(graph))
+        if part.state == "runs":
+            part.detail = f"head: {settings.get('head', 'sphere')}"
+
     async def start_page(self, port: int, browser: bool) -> None:
-        """Serve the live page."""
+        """Start the server of the live page."""
         options = ["--port", str(port), *(() if browser else ("--no-browser",))]
         part = self.start("page", paths.program("rosafe"), "live", *options)
 
-        async def tells_url() -> bool:
+        async def prints_url() -> bool:
             return part.child is not None and bool(_URL.search(part.child.out))
 
-        await self._until(part, tells_url)
+        await self._until(part, prints_url)
         if part.child is not None and (url := _URL.search(part.child.out)):
             part.detail = url[0]
 
     async def _until(self, part: ManagedProcess, condition: Callable[[], Awaitable[bool]]) -> None:
         deadline = asyncio.get_running_loop().time() + START_SECONDS
         while True:
-            part.look()
+            part.poll()
             if part.state == "ended":
                 return
             if await condition():
@@ -147,10 +160,10 @@ class Launcher:
             if asyncio.get_running_loop().time() > deadline:
                 part.state, part.detail = "late", f"not up after {START_SECONDS:g} s"
                 return
-            await asyncio.sleep(PAUSE)
+            await asyncio.sleep(POLL_SECONDS)
 
     def lines(self) -> Iterator[str]:
-        """What the screen shows."""
+        """Yield the lines of the screen."""
         for part in self.parts.values():
             yield printable(f"{part.name:9} {part.state:7} {part.detail}".rstrip())
 
@@ -163,15 +176,15 @@ async def _answers(uri: str) -> bool:
     return True
 
 
-async def _proxy(graph: Graph, name: str) -> ComponentClient | None:
+async def _client(graph: Graph, name: str) -> ComponentClient | None:
     from rosafe.client.component_client import ComponentClient
 
     try:
-        proxy = await ComponentClient.load(graph, name)
-        await proxy.check(COMPONENTS[name].name)
+        client = await ComponentClient.load(graph, name)
+        await client.check(COMPONENTS[name].name)
     except ComponentError:
         return None
-    return proxy
+    return client
 
 
 async def _is_genomixd(url: str) -> bool:
@@ -184,7 +197,7 @@ async def _is_genomixd(url: str) -> bool:
 
 
 def environment() -> dict[str, str]:
-    """That of this process, with what the children need besides."""
+    """Return the environment of this process with the additions that the children need."""
     from rosafe.component import generate
 
     master.set_local_defaults()

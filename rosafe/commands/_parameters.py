@@ -1,4 +1,4 @@
-"""What the commands that compute have in common: --set NAME=VALUE and --outputs NAME,..."""
+"""Options shared by the commands that compute: --set NAME=VALUE and --outputs NAME,..."""
 
 from __future__ import annotations
 
@@ -7,10 +7,11 @@ from collections.abc import Sequence
 from typing import Any
 
 from rosafe.interface.arguments import check_parameter
+from rosafe.interface.remarks import PRESETS
 
 
 class _Settings(argparse.Action):
-    """Words after --set: settings as far as they look so, the others are input files."""
+    """Arguments after --set: those with an equals sign are settings, the others are input files."""
 
     def __call__(
         self,
@@ -21,13 +22,13 @@ class _Settings(argparse.Action):
     ) -> None:
         words = list(values or ())
         if "=" not in words[0]:
-            parser.error(f"--set {words[0]}: wanted is NAME=VALUE")
+            parser.error(f"--set: expected NAME=VALUE, got {words[0]!r}")
         namespace.settings = namespace.settings + [word for word in words if "=" in word]
         namespace.more_inputs = namespace.more_inputs + [word for word in words if "=" not in word]
 
 
 def add_settings(parser: argparse.ArgumentParser, where: str) -> None:
-    """Add --set; `where` says where the parameters are described. Input files behind it are in `more_inputs`."""
+    """Add --set. `where` says where the parameters are described. Input files after it are put in `more_inputs`."""
     parser.add_argument(
         "--set",
         dest="settings",
@@ -40,8 +41,47 @@ def add_settings(parser: argparse.ArgumentParser, where: str) -> None:
     parser.set_defaults(more_inputs=[])
 
 
-def parameters_of(settings: list[str]) -> dict[str, Any]:
-    """The values by name; ValueError for what cannot be, and for a name that is there twice."""
+def ear_channels(text: str) -> tuple[int, int]:
+    """Convert the value of --channels, such as ``3,4``."""
+    from rosafe.sound.audiofile import channel_pair
+
+    try:
+        return channel_pair(text)
+    except ValueError as problem:
+        raise argparse.ArgumentTypeError(str(problem)) from None
+
+
+def add_preset(parser: argparse.ArgumentParser) -> None:
+    """Add --preset."""
+    parser.add_argument(
+        "--preset",
+        choices=sorted(PRESETS),
+        help="parameters for a purpose, which --set can change: "
+        + "; ".join(f"{name}: {_as_settings(values)}" for name, values in PRESETS.items()),
+    )
+
+
+def _as_settings(values: dict[str, Any]) -> str:
+    return " ".join(f"{name}={value}" for name, value in values.items())
+
+
+def add_float_handling(parser: argparse.ArgumentParser) -> None:
+    """Add --no-clip."""
+    parser.add_argument(
+        "--no-clip",
+        action="store_true",
+        help="process the samples of float files as they are; by default those beyond full scale are clipped, as by "
+        "the node",
+    )
+
+
+def clipping_warning(count: int) -> str:
+    """Return the message about clipped samples."""
+    return f"{count} samples beyond full scale were clipped, as by the node; --no-clip processes them as they are"
+
+
+def parameters_of(settings: list[str], preset: str | None = None) -> dict[str, Any]:
+    """Return the values by name. Raises ValueError for invalid settings and for a name that occurs twice."""
     values: dict[str, Any] = {}
     for setting in settings:
         name, _, text = setting.partition("=")
@@ -49,9 +89,9 @@ def parameters_of(settings: list[str]) -> dict[str, Any]:
         if name in values:
             raise ValueError(f"{name} is given twice")
         values[name] = value
-    return values
+    return {**PRESETS[preset], **values} if preset else values
 
 
 def parse_settings(text: str | None) -> list[str] | None:
-    """The words between the commas of an option; None where it was not given."""
+    """Return the names between the commas of an option, or None if the option was not given."""
     return None if text is None else [word.strip() for word in text.split(",")]

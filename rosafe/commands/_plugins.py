@@ -1,4 +1,4 @@
-"""Import and try plugins in a child process, which they may block or end, and report what was found.
+"""Import and test plugins in a child process, because they may block or end it, and report the findings.
 
 ``python3 -m rosafe.commands._plugins FD [KIND...]`` is that process: it writes one JSON object per line to the file
 descriptor.
@@ -19,18 +19,18 @@ from typing import Any, NamedTuple
 from rosafe.declarations import plugins
 
 LIMIT_SECONDS = 10.0  # for importing all plugins
-TRIAL_SECONDS = 300.0  # for trying the representations of one file
+TRIAL_SECONDS = 300.0  # for testing the representations of one file
 
 
 class PluginReport(NamedTuple):
-    """What the child process found.
+    """Findings of the child process.
 
     Attributes
     ----------
     kinds : dict of str to str
-        The origin of each representation that is no built-in one.
+        The origin of each representation that a plugin defines.
     problems, warnings : list of str
-        A line for each plugin that is left out, and for each remark about one.
+        One line for each plugin that is left out, and one for each warning.
     """
 
     kinds: dict[str, str]
@@ -39,16 +39,16 @@ class PluginReport(NamedTuple):
 
 
 class Trial(NamedTuple):
-    """What `rosafe.testing.check_representation` says of one representation.
+    """Result of `rosafe.testing.check_representation` for one representation.
 
     Attributes
     ----------
     kind : str
         The representation.
     error : str
-        Why it fails; empty if it passes.
+        The reason of a failure; empty if all checks passed.
     costs : dict of str to float
-        Milliseconds of computing per second of sound, of this and the built-in representations.
+        Processor time in ms per second of sound, of this and of the built-in representations.
     """
 
     kind: str
@@ -57,7 +57,7 @@ class Trial(NamedTuple):
 
 
 def report(extra: str = "") -> PluginReport:
-    """Import all plugins, and the file `extra` too, in a child process; its output goes to standard error."""
+    """Import all plugins and the file `extra` in a child process, whose output goes to standard error."""
     messages, end = _run([], extra, LIMIT_SECONDS)
     if messages and "kinds" in messages[-1]:
         return PluginReport(**messages[-1])
@@ -67,21 +67,21 @@ def report(extra: str = "") -> PluginReport:
         if end
         else f"its import did not end within {LIMIT_SECONDS:g} s"
     )
-    return PluginReport({}, [f"{origin}: {reason}; a node that imports it would not start either"], [])
+    return PluginReport({}, [f"{origin}: {reason}; a node that imports it does not start either"], [])
 
 
 def trials(kinds: list[str], extra: str = "") -> list[Trial]:
-    """Try representations in a child process, with the file `extra` among the plugins."""
+    """Test representations in a child process, with the file `extra` among the plugins."""
     messages, end = _run(kinds, extra, TRIAL_SECONDS)
     done = [Trial(**message) for message in messages if "kind" in message]
     if len(done) < len(kinds):
-        reason = f"the process that tried it ended with {end}" if end else f"it did not end within {TRIAL_SECONDS:g} s"
+        reason = f"the process that tested it ended with {end}" if end else f"it did not end within {TRIAL_SECONDS:g} s"
         done.append(Trial(kinds[len(done)], reason, {}))
     return done
 
 
 def _run(kinds: list[str], extra: str, limit: float) -> tuple[list[Any], str]:
-    """The messages of a child process, and how it ended; empty if it was ended after `limit` seconds."""
+    """Return the messages of a child process and how it ended (an empty text if it was killed after `limit` s)."""
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     if extra:
         environment[plugins.FOLDERS] = os.pathsep.join([*plugins.named(), extra])
@@ -106,7 +106,7 @@ def _run(kinds: list[str], extra: str, limit: float) -> tuple[list[Any], str]:
 
 
 def _kill(child: subprocess.Popen[bytes]) -> None:
-    """End the child and the processes that plugins have started in it."""
+    """Kill the child and the processes that plugins have started in it."""
     with contextlib.suppress(ProcessLookupError):
         os.killpg(child.pid, signal.SIGKILL)
     child.wait()
@@ -117,33 +117,33 @@ def _end(code: int) -> str:
 
 
 def main() -> None:
-    """The child process."""
+    """Run as the child process."""
     output = int(sys.argv[1])
     os.set_inheritable(output, False)
 
-    def tell(**message: object) -> None:
+    def send(**message: object) -> None:
         os.write(output, json.dumps(message).encode() + b"\n")
 
-    plugins.before_import = lambda origin: tell(importing=origin)
+    plugins.before_import = lambda origin: send(importing=origin)
     from rosafe.representations import PLUGINS, PROBLEMS, WARNINGS
 
     for kind in sys.argv[2:]:
-        _try(kind, tell)
+        _test(kind, send)
     if not sys.argv[2:]:
-        tell(kinds=PLUGINS, problems=PROBLEMS, warnings=WARNINGS)
-    os._exit(0)  # not waiting for threads that a plugin may have started
+        send(kinds=PLUGINS, problems=PROBLEMS, warnings=WARNINGS)
+    os._exit(0)  # does not wait for threads that a plugin may have started
 
 
-def _try(kind: str, tell: Callable[..., None]) -> None:
+def _test(kind: str, send: Callable[..., None]) -> None:
     from rosafe.representations import STAGES
     from rosafe.testing import check_representation
 
     try:
-        tell(kind=kind, error="", costs=check_representation(STAGES[kind]))
+        send(kind=kind, error="", costs=check_representation(STAGES[kind]))
     except AssertionError as problem:
-        tell(kind=kind, error=" ".join(str(problem).split()), costs={})
-    except Exception as problem:  # of the plugin's code
-        tell(kind=kind, error=" ".join(f"{type(problem).__name__}: {problem}".split()), costs={})
+        send(kind=kind, error=" ".join(str(problem).split()), costs={})
+    except Exception as problem:  # raised by the plugin
+        send(kind=kind, error=" ".join(f"{type(problem).__name__}: {problem}".split()), costs={})
 
 
 if __name__ == "__main__":

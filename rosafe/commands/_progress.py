@@ -1,105 +1,99 @@
-"""How far a long piece of work is, on a terminal as one live line, else as a plain line now and then."""
+"""Progress of work on files: one live line on a terminal, otherwise a plain line now and then."""
 
 from __future__ import annotations
 
-import shutil
-import time
 from collections.abc import Sequence
 from typing import TextIO
 
+from tqdm import tqdm
+
 from rosafe.terminal import printable
 
-LIVE_SECONDS = 0.1  # at least, between two looks of the live line
-PLAIN_SECONDS = 10.0  # between two plain lines
-BAR = 24  # characters
-_CLEAR = "\r\x1b[K"
+LIVE_SECONDS = 0.1  # minimum time between two updates of the live line
+PLAIN_SECONDS = 10.0  # minimum time between two plain lines
+_PLAIN = "{percentage:3.0f} %{postfix}  {remaining} left"
+_LIVE = "[{bar:24}] " + _PLAIN
 
 
-class Display:
-    """Shows how far several things are together.
+class ProgressDisplay:
+    """Display of the progress of several files together.
 
     Parameters
     ----------
     stream : text file
-        Where it goes; a live line if that is a terminal.
+        The output; a live line is drawn if it is a terminal.
     sizes : sequence of float
-        How much each thing counts.
+        The weight of each file.
     quiet : bool
-        Show nothing but messages.
+        Show messages only.
     """
 
     def __init__(self, stream: TextIO, sizes: Sequence[float], quiet: bool) -> None:
+        tqdm.monitor_interval = 0  # no extra thread, because the command forks
         self._stream = stream
         self._sizes = [max(size, 1.0) for size in sizes]
-        self._parts = [0.0] * len(sizes)
-        self._all = sum(self._sizes)
-        self._done = self._skipped = 0.0  # sizes
-        self._ended = self._computed = 0  # files
-        self._quiet = quiet
-        self._live = stream.isatty()
-        self._begun = time.monotonic()
-        self._due = self._begun + (0.0 if self._live else PLAIN_SECONDS)
+        self._fractions = [0.0] * len(sizes)
+        self._ended = self._computed = 0
+        live = stream.isatty()
+        self._bar = tqdm(
+            total=sum(self._sizes),
+            file=stream if live else _LineWriter(stream),
+            disable=quiet,
+            leave=False,
+            delay=0.0 if live else PLAIN_SECONDS,
+            mininterval=LIVE_SECONDS if live else PLAIN_SECONDS,
+            miniters=0,
+            smoothing=0,
+            dynamic_ncols=live,
+            ascii="-#",
+            bar_format=_LIVE if live else _PLAIN,
+        )
 
-    def update(self, index: int, part: float, last: bool = False, skipped: bool = False) -> None:
-        """Of thing `index`, `part` (0 to 1) is done; with `last` it is over, with `skipped` without any work."""
-        self._done += self._sizes[index] * (part - self._parts[index])
-        self._parts[index] = part
+    def update(self, index: int, fraction: float, last: bool = False, skipped: bool = False) -> None:
+        """Set the finished `fraction` of a file; `last` marks its end, `skipped` a file that needed no work."""
+        step = self._sizes[index] * (fraction - self._fractions[index])
+        self._fractions[index] = fraction
         self._ended += last
         self._computed += last and not skipped
-        self._skipped += self._sizes[index] * skipped
-        now = time.monotonic()
-        if self._quiet or now < self._due:
+        if self._bar.disable:
             return
-        if self._live:
-            self._due = now + LIVE_SECONDS
-            width = shutil.get_terminal_size().columns - 1
-            self._write(_CLEAR + f"[{self._bar()}] {self._text(now)}"[:width])
-        else:
-            self._due = now + PLAIN_SECONDS
-            self._write(self._text(now) + "\n")
+        if skipped:
+            self._bar.initial += self._sizes[index]  # the estimate of the remaining time ignores it
+        if len(self._sizes) > 1:
+            text = f"{self._ended} of {len(self._sizes)} files"
+            elapsed = self._bar.format_dict["elapsed"]
+            if self._computed and elapsed > 0:
+                text += f", {self._computed / elapsed:.3g} files/s"
+            self._bar.set_postfix_str(text, refresh=False)
+        self._bar.update(step)
 
     def message(self, text: str) -> None:
-        """A line that stays."""
-        self.clear()
-        self._write(printable(text) + "\n")
-        if self._live:
-            self._due = 0.0  # draw it again at once
-
-    def clear(self) -> None:
-        """Take the live line away."""
-        if self._live and not self._quiet:
-            self._write(_CLEAR)
-
-    def _write(self, text: str) -> None:
-        self._stream.write(text)
+        """Write a line that remains above the live line."""
+        self._bar.clear()
+        self._stream.write(printable(text) + "\n")
         self._stream.flush()
 
-    def _bar(self) -> str:
-        full = int(self._done / self._all * BAR + 1e-9)
-        return "#" * full + "-" * (BAR - full)
-
-    def _text(self, now: float) -> str:
-        passed = now - self._begun
-        text = f"{100 * self._done / self._all:3.0f} %"
-        if len(self._parts) > 1:
-            text += f"  {self._ended} of {len(self._parts)} files"
-            if self._computed and passed > 0:
-                text += f"  {self._computed / passed:.3g} files/s"
-        worked = self._done - self._skipped
-        if worked > 0 and passed > 1:
-            text += f"  {clock(passed * (self._all - self._done) / worked)} left"
-        return text
+    def close(self) -> None:
+        """Remove the live line."""
+        self._bar.close()
 
 
-def clock(seconds: float) -> str:
-    """``0:07``, ``12:34`` or ``1:02:03``."""
-    minutes, second = divmod(round(seconds), 60)
-    hours, minute = divmod(minutes, 60)
-    return f"{hours}:{minute:02}:{second:02}" if hours else f"{minute}:{second:02}"
+class _LineWriter:
+    """Text file for tqdm that writes each new state of the bar as a line of its own."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+
+    def write(self, text: str) -> None:
+        if line := text.strip():
+            self._stream.write(f"{line}\n")
+
+    def flush(self) -> None:
+        self._stream.flush()
 
 
 def bytes_text(count: float) -> str:
-    """``12 bytes``, ``3.4 MB``."""
+    """Return a size as ``12 bytes`` or ``3.4 MB``."""
     for unit, size in (("TB", 1e12), ("GB", 1e9), ("MB", 1e6), ("kB", 1e3)):
         if count >= size:
             return f"{count / size:.1f} {unit}"

@@ -1,4 +1,4 @@
-"""Many pieces of work in a few processes, which tell how far they are."""
+"""Run tasks in several processes, which report their progress."""
 
 from __future__ import annotations
 
@@ -11,15 +11,15 @@ from functools import partial
 from multiprocessing.connection import Connection, wait
 from typing import Any, NamedTuple, cast
 
-SIGNAL_SECONDS = 0.1  # at most, until a signal is seen
-REPORT_SECONDS = 0.1  # at least, between two reports of one piece of work
+SIGNAL_SECONDS = 0.1  # maximum time until a signal is noticed
+REPORT_SECONDS = 0.1  # minimum time between two reports of one task
 
 Progress = Callable[[int, int], None]
 Work = Callable[[Progress], Any]
 
 
 class TaskReport(NamedTuple):
-    """How a piece of work stands: the part that is done, or (at its end) its result, or why it failed."""
+    """Progress of a task: the finished fraction or, at its end, its result or the reason of its failure."""
 
     part: float
     result: Any = None
@@ -31,17 +31,17 @@ class TaskReport(NamedTuple):
 
 
 class Interrupted(SystemExit):
-    """A signal asks for the end; the exit code is the one that shells give it."""
+    """A signal requested the end. The exit code is the one that shells use for this signal."""
 
     def __init__(self, number: int) -> None:
         super().__init__(128 + number)
 
 
 class Interrupts:
-    """Notes the first SIGINT, SIGTERM or SIGHUP, here and in processes that are forked from here.
+    """Record of the first SIGINT, SIGTERM or SIGHUP in this process and in processes forked from it.
 
-    It is raised by those who ask. An exception out of the handler itself could come anywhere: in Thread.join, it makes
-    Python 3.11 believe that the thread has ended.
+    `check` raises it. An exception raised by the handler itself could interrupt any statement: in Thread.join it makes
+    Python 3.11 assume that the thread has ended.
     """
 
     def __init__(self) -> None:
@@ -55,7 +55,7 @@ class Interrupts:
         self._received = self._received or number
 
     def check(self) -> None:
-        """Raise `Interrupted` if there was a signal."""
+        """Raise `Interrupted` if a signal was received."""
         if self._received:
             raise Interrupted(self._received)
 
@@ -67,26 +67,26 @@ def run_parallel(
     report: Callable[[int, TaskReport], None],
     signals: Interrupts,
 ) -> None:
-    """Run all `works` in at most `jobs` processes, and wait for them; whatever ends this ends those that run, too.
+    """Run all `works` in at most `jobs` processes and wait for them. An exception here ends these processes.
 
     Parameters
     ----------
     works : sequence of callable
-        Called in another process with a function that takes (done, all), to be called often: it ends the work by
-        an exception once a signal has come. Returns something that can be pickled.
+        The tasks. Each is called in another process with a function (done, total), which the task has to call often:
+        the function raises an exception after a signal. The result of a task has to be picklable.
     jobs : int
-        Processes. Each does one piece of work after the other; one that dies fails with that alone.
+        Number of processes. Each runs one task at a time; if it dies, only this task fails.
     failures : tuple of exception types
-        What a piece of work may fail with; the text of the exception is the report's.
+        Exceptions that mark a task as failed; the text of the exception goes into the report.
     report : callable
-        Called with the number of a piece of work and its `TaskReport`: now and then, and once with its last.
+        Called with the number of a task and its `TaskReport`: repeatedly, and once with the last report.
     signals : Interrupts
-        What ends it by `Interrupted`.
+        Raises `Interrupted` after a signal.
     """
     waiting = iter(range(len(works)))
     left = len(works)
     idle: list[Connection] = []
-    busy: dict[Connection, int] = {}  # and the work that each is at
+    busy: dict[Connection, int] = {}  # the task of each
     processes: dict[Connection, multiprocessing.Process] = {}
     try:
         while left:
@@ -98,25 +98,25 @@ def run_parallel(
             while idle and (index := next(waiting, None)) is not None:
                 connection = idle.pop()
                 busy[connection] = index
-                with contextlib.suppress(BrokenPipeError):  # it has died; its end of the pipe tells
+                with contextlib.suppress(BrokenPipeError):  # the process has died; reading from the pipe reports this
                     connection.send(index)
             for ready in wait(list(busy), SIGNAL_SECONDS):
                 connection = cast(Connection, ready)
                 index = busy[connection]
-                told = _receive(connection, processes[connection])
-                if told.failure:
-                    signals.check()  # the same Ctrl-C may have ended the child sooner than us
-                if told.last:
+                task = _receive(connection, processes[connection])
+                if task.failure:
+                    signals.check()  # the same Ctrl-C may have ended the child first
+                if task.last:
                     left -= 1
                     del busy[connection]
                     if processes[connection].exitcode is None:
                         idle.append(connection)
                     else:
                         del processes[connection]
-                report(index, told)
+                report(index, task)
     finally:
         for connection in processes:
-            connection.close()  # who waits for work ends
+            connection.close()  # ends idle processes
         for process in processes.values():
             process.terminate()
         for process in processes.values():
@@ -124,56 +124,56 @@ def run_parallel(
 
 
 def _start(serve: Callable[[Connection], None], others: list[Connection]) -> tuple[Connection, multiprocessing.Process]:
-    """A new process, and the pipe to it."""
+    """Start a process; return the connection to it and the process."""
     context = multiprocessing.get_context("fork")  # no need to import everything again
-    ours, its = context.Pipe()
+    parent_end, child_end = context.Pipe()
 
     def child() -> None:
-        for connection in (ours, *others):  # a pipe that nobody else has tells when the one at its other end is gone
+        for connection in (parent_end, *others):  # otherwise the end of the parent would not close the pipe
             connection.close()
-        serve(its)
+        serve(child_end)
 
     process = context.Process(target=child)
     process.start()
-    its.close()
-    return ours, process  # type: ignore[return-value]  # a ForkProcess is a Process
+    child_end.close()
+    return parent_end, process  # type: ignore[return-value]  # a ForkProcess is a Process
 
 
 def _receive(connection: Connection, process: multiprocessing.Process) -> TaskReport:
     try:
-        told = connection.recv()
-        assert isinstance(told, TaskReport)
-        return told
+        report = connection.recv()
+        assert isinstance(report, TaskReport)
+        return report
     except (EOFError, ConnectionResetError):
         process.join()
         code = process.exitcode or 0
-        how = f"signal {-code}" if code < 0 else f"exit code {code}"
-        return TaskReport(0.0, failure=f"ended too early, with {how}")
+        reason = f"signal {-code}" if code < 0 else f"exit code {code}"
+        return TaskReport(0.0, failure=f"the process ended too early, with {reason}")
 
 
 def _serve(
     works: Sequence[Work], failures: tuple[type[Exception], ...], signals: Interrupts, connection: Connection
 ) -> None:
-    """What a process does, until the one that started it closes the pipe or is no longer there."""
+    """Run tasks in a process until its parent closes the pipe or ends."""
     while True:
         try:
             index = connection.recv()
         except (EOFError, ConnectionResetError):
             return
-        _send(connection, attempt(works[index], failures, partial(_tell, connection, signals, [0.0])))
+        _send(connection, attempt(works[index], failures, partial(_send_progress, connection, signals, [0.0])))
 
 
 def attempt(work: Work, failures: tuple[type[Exception], ...], progress: Progress) -> TaskReport:
-    """Do one piece of work; its last report."""
+    """Run one task and return its last report."""
     try:
         return TaskReport(1.0, result=work(progress))
     except failures as problem:
         return TaskReport(0.0, failure=str(problem) or type(problem).__name__)
     except MemoryError:
-        return TaskReport(0.0, failure="there is not enough memory")
+        return TaskReport(0.0, failure="out of memory")
 
 
-def _tell(connection: Connection, signals: Interrupts, due: list[float], done: int, total: int) -> None:
+def _send_progress(connection: Connection, signals: Interrupts, due: list[float], done: int, total: int) -> None:
     signals.check()
     now = time.monotonic()
     if now >= due[0]:

@@ -1,8 +1,8 @@
-"""Check a plugin file: import, declaration, and whether its stages do what the tree relies on.
+"""Check a plugin file: import, declaration, and whether its stages follow the rules that the tree relies on.
 
-The stages are tried on blocks of different lengths, at the limits of all parameters, on silence, loud and long sound,
-and so on; their cost is compared with that of the built-in representations. All of this happens in child processes,
-together with the plugins that ROSAFE_PLUGINS names: one may be the parent."""
+The stages are tested with blocks of different lengths, at the limits of all parameters, with silence, loud and long
+sound, and so on. Their cost is compared with that of the built-in representations. The tests run in child processes
+with all plugins that ROSAFE_PLUGINS names, because one of these may be the parent."""
 
 from __future__ import annotations
 
@@ -28,22 +28,14 @@ def run(options: argparse.Namespace) -> int:
     """Check the file and print one line for each finding."""
     origin, extra = _origin(options.file)
     report = _plugins.report(extra)
-    errors = [line for line in report.problems if line.startswith(f"{origin}: ")]
     kinds = [kind for kind, where in report.kinds.items() if where == origin]
-    if not errors and not report.kinds and report.problems:  # another plugin ended the process, or blocked it
-        errors = report.problems
-    if not errors and not kinds:
-        errors = [f"{origin}: it defines no representation, that is, no class with a REPRESENTATION"]
-    warnings = [line for line in report.warnings if line.startswith(f"{origin}: ")]
-    if os.path.basename(origin).startswith(plugins.SKIPPED):
-        warnings.append(
-            f"{origin}: files whose names begin with {', '.join(plugins.SKIPPED)} are not loaded from folders"
-        )
     trials = _plugins.trials(kinds, extra) if kinds else []
+    errors = _import_errors(report, origin, kinds)
     errors += [f"{origin}: {trial.kind}: {trial.error}" for trial in trials if trial.error]
-    for state, lines in (("ERROR", errors), ("warning", warnings)):
-        for line in lines:
-            print(f"{state:8}{printable(line)}")
+    for line in errors:
+        print(f"{'ERROR':8}{printable(line)}")
+    for line in _warnings(report, origin):
+        print(f"{'warning':8}{printable(line)}")
     for trial in trials:
         if not trial.error:
             print(f"{'ok':8}{printable(origin)}: {trial.kind}: the declaration and the stage passed all checks")
@@ -51,17 +43,34 @@ def run(options: argparse.Namespace) -> int:
     return 1 if errors else 0
 
 
+def _import_errors(report: _plugins.PluginReport, origin: str, kinds: list[str]) -> list[str]:
+    errors = [line for line in report.problems if line.startswith(f"{origin}: ")]
+    if not errors and not report.kinds:  # another plugin ended or blocked the process
+        errors = report.problems
+    if not errors and not kinds:
+        errors = [f"{origin}: expected a class with a REPRESENTATION, got none"]
+    return errors
+
+
+def _warnings(report: _plugins.PluginReport, origin: str) -> list[str]:
+    warnings = [line for line in report.warnings if line.startswith(f"{origin}: ")]
+    if os.path.basename(origin).startswith(plugins.SKIPPED):
+        prefixes = ", ".join(plugins.SKIPPED)
+        warnings.append(f"{origin}: files whose names begin with {prefixes} are not loaded from folders")
+    return warnings
+
+
 def _print_costs(trial: _plugins.Trial) -> None:
-    """Milliseconds per second of sound, each without its parents."""
+    """Print the processor time in ms per second of sound, each without the parents."""
     print(f"{'cost':8}{trial.kind} takes {trial.costs[trial.kind]:.3g} ms per second of sound at 44.1 kHz; built in:")
     others = [f"{kind} {cost:.3g}" for kind, cost in trial.costs.items() if kind != trial.kind]
     print(textwrap.fill(", ".join(others), 100, initial_indent=" " * 8, subsequent_indent=" " * 8))
 
 
 def _origin(file: str) -> tuple[str, str]:
-    """The path under which `file` is loaded, and the file itself unless it is in one of the folders of plugins."""
+    """Return the path from which `file` is loaded, and the file itself unless a plugin folder contains it."""
     if not (os.path.isfile(file) and file.endswith(".py")):
-        raise CommandError(f"{printable(file)}: expected a Python file (.py), found none")
+        raise CommandError(f"{printable(file)}: expected a Python file (.py)")
     path = os.path.abspath(file)
     if os.pathsep in path:
         raise CommandError(

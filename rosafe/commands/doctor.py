@@ -1,7 +1,6 @@
-"""Tell what is there of all that running needs.
+"""Check the installation and report what to do about missing parts.
 
-With what to do about the rest. One line for each thing: `ok`, `note` (not needed by everything, or not now), or
-`MISSING`."""
+One line for each part: `ok`, `note` (not needed by all commands, or not now), or `MISSING`."""
 
 from __future__ import annotations
 
@@ -28,8 +27,8 @@ from rosafe.transport import master, paths
 
 OK, NOTE, MISSING = "ok", "note", "MISSING"
 
-PYTHON = "/usr/bin/python3"  # the one that Debian's ROS packages are for
-# What scripts/install brings: Python module -> Debian package.
+PYTHON = "/usr/bin/python3"  # the Python of Debian's ROS packages
+# Installed by scripts/install: Python module -> Debian package.
 _ROS = {
     "rospy": "python3-rospy",
     "rosgraph": "python3-rosgraph",
@@ -49,19 +48,19 @@ _ROS_COMMANDS = {
     "rosmsg": "python3-rosmsg",
     "rosnode": "python3-rosnode",
 }
-_NUMBERS = {"numpy": "python3-numpy", "scipy.signal": "python3-scipy"}
+_NUMBERS = {"numpy": "python3-numpy", "scipy.signal": "python3-scipy", "tqdm": "python3-tqdm"}
 _SOUND_FILES = {"soundfile": "python3-soundfile"}
 _PLOTS = {"matplotlib": "python3-matplotlib"}
 _HTTP = {"aiohttp": "python3-aiohttp"}
 _TCL = {"tkinter": "python3-tk"}
 _TCL_COMMANDS = {"tclsh": "tcl"}
-_EXTRAS = ("h5py", "zarr", "xarray", "distributed")  # nothing but what is named after them needs them
-# What pip does not bring, and nobody misses who uses the library.
+_EXTRAS = ("h5py", "zarr", "xarray", "distributed")  # needed only by the formats and commands of the same names
+# Not installed by pip, and not needed by users of the library.
 _OF_NODES = ("ROS", "messages", "master", "address", "alsaaudio", "sound devices", "HTTP server", "Tcl")
 
 
 class Finding(NamedTuple):
-    """How one thing stands, and what to do about it (empty where there is nothing to do)."""
+    """State of one part, and the next step for the user (empty if none is needed)."""
 
     state: str
     detail: str
@@ -70,38 +69,35 @@ class Finding(NamedTuple):
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
-    parser.add_argument("--json", action="store_true", help="the same as JSON, for programs")
-    parser.epilog = (
-        "exit status: 0 if all that running needs is there, 1 if something is missing\n\n"
-        "example:\n  rosafe doctor --json"
-    )
+    parser.add_argument("--json", action="store_true", help="print JSON")
+    parser.epilog = "exit status: 0 if no required part is missing, 1 otherwise\n\nexample:\n  rosafe doctor --json"
 
 
 def run(options: argparse.Namespace) -> int:
-    """Look at everything and print it; 0 if nothing is missing."""
+    """Run all checks and print the findings; return 0 if no required part is missing."""
     findings = {name: _examine(check) for name, check in CHECKS.items()}
     if missing.by_pip():
         for name in _OF_NODES:
             if findings[name].state == MISSING:
                 findings[name] = Finding(
-                    NOTE, f"only for nodes and their clients: {findings[name].detail.split('; ')[0]}"
+                    NOTE, f"needed only by nodes and their clients: {findings[name].detail.split('; ')[0]}"
                 )
-    lacking = any(finding.state == MISSING for finding in findings.values())
+    incomplete = any(finding.state == MISSING for finding in findings.values())
     if options.json:
         checks = [{"name": name, **finding._asdict()} for name, finding in findings.items()]
-        print(json.dumps({"ok": not lacking, "checks": checks}, indent=2))
+        print(json.dumps({"ok": not incomplete, "checks": checks}, indent=2))
     else:
         width = max(map(len, findings))
         for name, (state, detail, todo) in findings.items():
             print(printable(f"{state:8}{name:{width}}  {detail}" + (f"  ->  {todo}" if todo else "")))
-    return 1 if lacking else 0
+    return 1 if incomplete else 0
 
 
 def _examine(check: Callable[[], Finding]) -> Finding:
     try:
         return check()
-    except Exception as problem:  # whatever is broken here is what the user wants to know of
-        return Finding(MISSING, f"cannot tell: {type(problem).__name__}: {' '.join(str(problem).split())}")
+    except Exception as problem:  # the user needs to know about any failure
+        return Finding(MISSING, f"the check failed: {type(problem).__name__}: {' '.join(str(problem).split())}")
 
 
 # --- the checks -------------------------------------------------------------------------------------------------
@@ -109,16 +105,20 @@ def _examine(check: Callable[[], Finding]) -> Finding:
 
 def _install_command() -> str:
     root = paths.source_root()
-    return "run " + ("scripts/install of a checkout" if root is None else str(root / "scripts" / "install"))
+    if root is not None:
+        return f"run {root}/scripts/install"
+    return (
+        "apt install rosafe" if paths.install_prefix() == paths.SYSTEM_PREFIX else "run scripts/install of a checkout"
+    )
 
 
 def _needs(modules: dict[str, str], commands: dict[str, str] | None = None) -> Finding:
-    """Whether modules can be imported and commands found, each with the Debian package that brings it."""
+    """Check that modules can be imported and commands exist; each is mapped to its Debian package."""
     found, wrong = [], []
     for name, package in modules.items():
         try:
             importlib.import_module(name)
-        except Exception as problem:  # a module may fail with anything where something below it is broken
+        except Exception as problem:  # a broken dependency may raise any exception
             wrong.append(f"{name} ({package}): {' '.join(str(problem).split())}")
         else:
             top = name.partition(".")[0]
@@ -138,7 +138,7 @@ def _needs(modules: dict[str, str], commands: dict[str, str] | None = None) -> F
 def _python() -> Finding:
     text = f"Python {platform.python_version()}, {sys.executable}"
     if not missing.by_pip() and os.path.realpath(sys.executable) != os.path.realpath(PYTHON):
-        return Finding(MISSING, text, f"run it with {PYTHON}, which Debian's ROS packages are for")
+        return Finding(MISSING, text, f"use {PYTHON}, the Python of Debian's ROS packages")
     return Finding(OK, text)
 
 
@@ -152,22 +152,22 @@ def _messages() -> Finding:
         module = importlib.import_module(f"{package}.msg")
     where = Path(str(module.__file__)).parents[2]
     if stale:
-        return Finding(NOTE, f"fresh in {where}, but {stale}", f". {paths.CODE_DIR}/scripts/env.sh")
-    return Finding(OK, f"fresh, in {where}")
+        return Finding(NOTE, f"up to date in {where}, but {stale}", f". {paths.CODE_DIR}/scripts/env.sh")
+    return Finding(OK, f"up to date, in {where}")
 
 
 def _stale_in_shell() -> str:
-    """What is wrong with the messages that rostopic and its like find in this shell; empty where nothing is."""
+    """Return the fault of the messages that rostopic finds in this shell, or an empty text."""
     if paths.source_root() is None:
         return ""
     entries = [entry for entry in os.environ.get("PYTHONPATH", "").split(":") if entry]
     first = next((Path(entry) for entry in entries if Path(entry, "rosAFE", "msg").is_dir()), None)
     if first is None:
-        return "rostopic and its like do not find them in this shell"
-    if plugins.named():  # their messages are in another folder, which only a process that imports them knows
+        return "ROS commands such as rostopic do not find them in this shell"
+    if plugins.named():  # plugins use another folder, which only a process that imports them knows
         return ""
-    wanted = generate.environment()["PYTHONPATH"].split(":")[0]
-    return "" if os.path.realpath(first) == os.path.realpath(wanted) else f"this shell has others, in {first}"
+    expected = generate.environment()["PYTHONPATH"].split(":")[0]
+    return "" if os.path.realpath(first) == os.path.realpath(expected) else f"this shell uses others, in {first}"
 
 
 def _plots() -> Finding:
@@ -176,11 +176,11 @@ def _plots() -> Finding:
 
 
 def _extras() -> Finding:
-    there = [name for name in _EXTRAS if importlib.util.find_spec(name)]
-    lacking = [f"{name} ({missing.install(name)})" for name in _EXTRAS if name not in there]
-    if lacking:
-        return Finding(NOTE, f"{', '.join(there) or 'none'}; without {', '.join(lacking)}")
-    return Finding(OK, ", ".join(there))
+    found = [name for name in _EXTRAS if importlib.util.find_spec(name)]
+    absent = [f"{name} ({missing.install(name)})" for name in _EXTRAS if name not in found]
+    if absent:
+        return Finding(NOTE, f"{', '.join(found) or 'none'}; not installed: {', '.join(absent)}")
+    return Finding(OK, ", ".join(found))
 
 
 def _alsaaudio() -> Finding:
@@ -202,7 +202,7 @@ def _devices() -> Finding:
     except ComponentError as problem:
         return Finding(NOTE, str(problem), "the devices file: and scene: need none")
     if not devices:
-        return Finding(NOTE, "no sound card here can capture", "the devices file: and scene: need none")
+        return Finding(NOTE, "no sound card can capture", "the devices file: and scene: need none")
     return Finding(OK, ", ".join(f"hw:{card},{device} [{pcm}]" for card, device, _, pcm in devices))
 
 
@@ -213,12 +213,12 @@ def _kernels() -> Finding:
 
 def _plugins() -> Finding:
     if not (plugins.named() or importlib.metadata.entry_points(group=plugins.ENTRY_POINTS)):
-        return Finding(OK, f"none; {plugins.FOLDERS} names folders of them")
+        return Finding(OK, f"none; {plugins.FOLDERS} names their folders")
     report = _child.report()
-    found = ", ".join(report.kinds) or "none that can be used"
+    found = ", ".join(report.kinds) or "none can be used"
     if report.problems:
         remarks = "; ".join((*(f"left out: {line}" for line in report.problems), *report.warnings))
-        return Finding(NOTE, f"{found}; {remarks}", "correct them, and try each with: rosafe check FILE")
+        return Finding(NOTE, f"{found}; {remarks}", "correct them and check each with: rosafe check FILE")
     return Finding(NOTE if report.warnings else OK, "; ".join((found, *report.warnings)))
 
 
@@ -240,7 +240,7 @@ def _address() -> Finding:
     if wrong:
         return Finding(MISSING, wrong, todo)
     shown = [f"{name} is {environ[name]}" for name in ("ROS_HOSTNAME", "ROS_IP") if environ.get(name)]
-    return Finding(OK, shown[0] if shown else f"nodes are called by this machine's name, {platform.node()}")
+    return Finding(OK, shown[0] if shown else f"nodes are reached by the name of this machine, {platform.node()}")
 
 
 CHECKS: dict[str, Callable[[], Finding]] = {

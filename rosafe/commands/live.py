@@ -1,9 +1,9 @@
-"""Show what the robot hears in a browser, and let it be changed there.
+"""Show and control a running bass and rosAFE in a browser.
 
-Prints an address with a token; who has it sees both ears' cochleagrams, level differences, the direction of the
-source, levels, losses and loads, and can add representations, change parameters, start and stop the sound. The page
-is served from here: the network needs no Internet. It joins the ROS graph of bass and rosAFE, and subscribes to nothing
-that nobody looks at."""
+Prints a URL with a token. The page shows the cochleagrams of both ears, level differences, the direction of the source,
+levels, losses and loads. It can add representations, change parameters, and start and stop the sound. All files come
+from this server, so that no Internet access is needed. The server joins the ROS graph of bass and rosAFE, and
+subscribes only to ports that are displayed."""
 
 from __future__ import annotations
 
@@ -11,34 +11,33 @@ import argparse
 import asyncio
 import os
 
+from rosafe import option_types
 from rosafe.commands import CommandError
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
-    parser.add_argument("--port", type=_port, default=8090, help="TCP port (default: 8090; 0: a free one)")
+    parser.add_argument(
+        "--port", type=option_types.port(), default=8090, help="TCP port (default: 8090; 0: any free port)"
+    )
     parser.add_argument(
         "--host",
         default="127.0.0.1",
         metavar="ADDRESS",
-        help="address to listen on (default: 127.0.0.1, this machine alone; 0.0.0.0: all)",
+        help="address to listen on (default: 127.0.0.1, this machine only; 0.0.0.0: all)",
     )
-    parser.add_argument("--no-browser", action="store_true", help="open no browser")
-    parser.add_argument("--watch", action="store_true", help="a page that changes nothing")
-    parser.add_argument("--images", action="store_true", help="publish pictures for rviz, too (sensor_msgs/Image)")
-    parser.add_argument("-i", "--instance", default="rosAFE", metavar="NAME", help="of rosAFE's node (default: rosAFE)")
-    parser.add_argument("--bass", default="bass", metavar="NAME", help="of bass' node (default: bass)")
+    parser.add_argument("--no-browser", action="store_true", help="do not open a browser")
+    parser.add_argument("--watch", action="store_true", help="read-only page")
+    parser.add_argument("--images", action="store_true", help="also publish images for rviz (sensor_msgs/Image)")
+    parser.add_argument(
+        "-i", "--instance", default="rosAFE", metavar="NAME", help="name of the rosAFE node (default: rosAFE)"
+    )
+    parser.add_argument("--bass", default="bass", metavar="NAME", help="name of the bass node (default: bass)")
     parser.epilog = (
         "examples:\n"
         "  rosafe live\n"
-        "  rosafe live --host 0.0.0.0 --watch --no-browser    # for the robot's network; see docs/security.md"
+        "  rosafe live --host 0.0.0.0 --watch --no-browser    # for the network of the robot; see docs/security.md"
     )
-
-
-def _port(text: str) -> int:
-    if not (text.isascii() and text.isdigit() and int(text[:10]) <= 65535):
-        raise argparse.ArgumentTypeError(f"{text!r} is no port: 0 to 65535")
-    return int(text)
 
 
 def run(options: argparse.Namespace) -> int:
@@ -51,19 +50,16 @@ def run(options: argparse.Namespace) -> int:
     try:
         generate.ensure_messages()
         master.check_master(os.environ["ROS_MASTER_URI"])
-        startup.ensure_log_directory()
-        from rosafe.client.component_client import names
-        from rosafe.live import daemon
-
-        instance, bass = (names(name, name)[1] for name in (options.instance, options.bass))
-        told = daemon.Options(
-            options.port, options.host, not options.no_browser, options.watch, instance, bass, options.images
-        )
-        asyncio.run(daemon.serve(told))
     except (generate.GenerationError, master.MasterError) as problem:
         raise CommandError(str(problem)) from None
-    except ComponentError as problem:
-        raise CommandError(str(problem)) from None
-    except daemon.AddressInUse as problem:
+    startup.ensure_log_directory()
+    from rosafe.client.component_client import names  # needs the messages
+    from rosafe.http_server.listener import ListenError
+    from rosafe.live import daemon
+
+    try:
+        options.instance, options.bass = (names(name, name)[1] for name in (options.instance, options.bass))
+        asyncio.run(daemon.serve(options))
+    except (ComponentError, ListenError) as problem:
         raise CommandError(str(problem)) from None
     return 0

@@ -1,46 +1,58 @@
-"""Draw the representations of a sound file, or of what `rosafe process` has made of one.
+"""Draw the representations of a sound file or of a result of `rosafe process`.
 
-The picture is a PNG beside it, or where -o says: time in seconds, channels at their centre frequencies, colours with
-their units. Correlations are means over the channels, modulation spectrograms are those of the loudest moment, unless
---at or --channel says otherwise. Pitch lies over the ratemap, maps over strengths."""
+The picture is a PNG beside the input, or the file that -o names. It shows time in seconds, channels at their centre
+frequencies, and colours with their units. By default, correlations are means over the channels, and modulation
+spectrograms are those of the loudest moment; --at and --channel select others. Pitch is drawn over the ratemap, and
+onset and offset maps over the strengths."""
 
 from __future__ import annotations
 
 import argparse
 import contextlib
+import sys
+import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rosafe.commands import CommandError
-from rosafe.commands._parameters import add_settings, parameters_of, parse_settings
+from rosafe.commands._parameters import (
+    add_float_handling,
+    add_preset,
+    add_settings,
+    clipping_warning,
+    parameters_of,
+    parse_settings,
+)
 from rosafe.interface import KINDS
 from rosafe.interface.arguments import check_outputs
 
 if TYPE_CHECKING:
     import numpy as np
 
-_DEFAULT = ("input", "ratemap", "pitch", "onsetMap", "ild", "itd")  # of a sound
+_DEFAULT = ("input", "ratemap", "pitch", "onsetMap", "ild", "itd")  # outputs of a sound
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
     parser.usage = (
         "rosafe plot SOUND|RESULT [-o PNG] [--outputs NAME,...] [--set NAME=VALUE ...]\n"
-        "                   [--ear left|right] [--at S] [--channel HZ] [--force]"
+        "                   [--preset NAME] [--ear left|right] [--at S] [--channel HZ] [--no-clip] [--force]"
     )
     parser.add_argument(
         "inputs", nargs="*", metavar="SOUND|RESULT", help="sound file or rosbag, or result of rosafe process"
     )
     parser.add_argument(
-        "-o", "--to", dest="to", metavar="PNG", help="the picture, replaced if it is there (default: beside)"
+        "-o", "--to", dest="to", metavar="PNG", help="the picture, replaced if it exists (default: beside the input)"
     )
     parser.add_argument(
         "--outputs",
         metavar="NAME,...",
-        help=f"what to draw of {', '.join(KINDS)} (default: {','.join(_DEFAULT)} of a sound, all of a result)",
+        help=f"outputs to draw, of {', '.join(KINDS)} (default: {','.join(_DEFAULT)} for a sound, all for a result)",
     )
-    add_settings(parser, "rosafe process -h tells them; for sounds only")
+    add_settings(parser, "rosafe process -h lists them; for sounds only")
+    add_preset(parser)
+    add_float_handling(parser)
     parser.add_argument("--ear", choices=("left", "right"), help="draw one ear only")
     parser.add_argument("--at", type=float, metavar="S", help="draw channels against lags, or filters, at this time")
     parser.add_argument("--channel", type=float, metavar="HZ", help="draw lags, or filters, of this channel over time")
@@ -54,33 +66,39 @@ def configure(parser: argparse.ArgumentParser) -> None:
 
 
 def run(options: argparse.Namespace) -> int:
-    """Draw it."""
+    """Draw the picture."""
     inputs = [*options.inputs, *options.more_inputs]
     if len(inputs) != 1:
-        options.usage_error("wanted is one sound file, or one result")
+        options.usage_error(f"expected exactly one sound file or result, got {len(inputs)}")
     source = Path(inputs[0])
     target = Path(source.with_suffix(".png") if options.to is None else options.to)
     if target.suffix.lower() != ".png":
-        raise CommandError(f"-o {target}: a picture ends in .png")
+        raise CommandError(f"-o: expected a name ending in .png, got {target}")
     from matplotlib.figure import Figure
 
     from rosafe.offline.formats import FORMATS
     from rosafe.offline.process import process
     from rosafe.sound.audiofile import AudioFileError
     from rosafe.view.axes import save
-    from rosafe.view.plot import UNDER, draw
+    from rosafe.view.plot import BACKGROUNDS, draw
 
     names = parse_settings(options.outputs)
     result: Mapping[str, Any]
     try:
         if source.suffix.lower() in FORMATS:
+            if options.preset:
+                options.usage_error("--preset: a result already has its parameters")
             result = _result(source, options.settings)
         else:
-            sound, rate = _sound(source)
+            sound, rate = _sound(source, not options.no_clip)
             names = check_outputs(names) if names else _default(len(sound))
-            outputs = [*names, *(UNDER[name] for name in names if name in UNDER)]
-            made = process(sound, rate, parameters=parameters_of(options.settings), outputs=outputs)
-            result = {**made, "sample_rate": rate}
+            outputs = [*names, *(BACKGROUNDS[name] for name in names if name in BACKGROUNDS)]
+            parameters = parameters_of(options.settings, options.preset)
+            with warnings.catch_warnings(record=True) as caught:
+                warnings.simplefilter("always", UserWarning)
+                result = process(sound, rate, parameters=parameters, outputs=outputs)
+            for text in dict.fromkeys(str(one.message) for one in caught):
+                print(f"rosafe plot: {text}", file=sys.stderr)
         figure = draw(Figure(), result, names, options.ear, at=options.at, channel=options.channel)
     except (AudioFileError, ValueError) as problem:
         raise CommandError(str(problem)) from None
@@ -92,25 +110,28 @@ def _result(path: Path, settings: list[str]) -> Mapping[str, Any]:
     from rosafe.offline.formats import load
 
     if settings:
-        raise ValueError("--set: a result is drawn as it is; name the sound instead")
+        raise ValueError("--set: a result already has its parameters; name the sound instead")
     try:
         return load(path)
     except OSError as problem:
         raise ValueError(f"{path}: {problem.strerror}") from None
 
 
-def _sound(path: Path) -> tuple[np.ndarray, int]:
-    """One ear or two (ears, N), and the sample rate (Hz)."""
+def _sound(path: Path, clip: bool) -> tuple[np.ndarray, int]:
+    """Return the sound, (ears, N) with one or two ears, and its sample rate in Hz."""
     from rosafe.offline.sounds import BAG, open_sound
     from rosafe.sound.audiofile import AudioFile, AudioFileError
 
-    with contextlib.closing(open_sound(path) if path.suffix.lower() == BAG else AudioFile(path)) as file:
+    with contextlib.closing(open_sound(path) if path.suffix.lower() == BAG else AudioFile(path, clip)) as file:
         if isinstance(file, AudioFile) and file.channels > 2:
             raise AudioFileError(
-                f"{path} has {file.channels} channels; wanted are two, left and right ear, or one: "
-                "draw what rosafe process makes of it with --channels"
+                f"{path}: expected one or two channels, got {file.channels}; "
+                "draw the result of rosafe process --channels A,B instead"
             )
-        return file.read(file.frames), file.sample_rate
+        sound = file.read(file.frames)
+        if file.clipped:
+            print(f"rosafe plot: {path}: {clipping_warning(file.clipped)}", file=sys.stderr)
+        return sound, file.sample_rate
 
 
 def _default(ears: int) -> list[str]:

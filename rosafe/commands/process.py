@@ -1,10 +1,10 @@
-"""Compute auditory representations of sounds: files, and whole folders of them.
+"""Compute auditory representations of sound files and of folders with sound files.
 
-Reads WAV, FLAC, Ogg, MP3 and whatever else libsndfile reads, and rosbags: two channels, left and right ear, or those
-that --channels names. Writes a file of results beside each, or where -o says; rosafe.load and rosafe plot read it.
-Unless --outputs says otherwise, what is in frames is kept: ild, ratemap and crossCorrelation.
-The numbers are those of the node on the same samples, bit for bit; so samples are taken as 32-bit integers
-(float files are scaled by 2^31-1 and rounded), and in_doNormalize is true unless told otherwise."""
+Reads all formats of libsndfile (WAV, FLAC, Ogg, MP3, ...) and rosbags. A sound has two channels, left and right ear;
+--channels selects them. Writes one file of results beside each sound or to the path of -o; rosafe.load and rosafe plot
+read it. By default the framed outputs are kept: ild, ratemap and crossCorrelation.
+The results equal those of the node for the same samples, bit for bit. Therefore samples are read as 32-bit integers
+(float files are scaled by 2^31-1 and rounded), and in_doNormalize is true by default."""
 
 from __future__ import annotations
 
@@ -22,18 +22,28 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
+from rosafe import option_types
 from rosafe.commands import CommandError
-from rosafe.commands._parameters import add_settings, parameters_of, parse_settings
-from rosafe.commands._progress import Display, bytes_text
+from rosafe.commands._parameters import (
+    add_float_handling,
+    add_preset,
+    add_settings,
+    clipping_warning,
+    ear_channels,
+    parameters_of,
+    parse_settings,
+)
+from rosafe.commands._progress import ProgressDisplay, bytes_text
 from rosafe.commands._workers import Interrupted, Interrupts, TaskReport, run_parallel
 from rosafe.interface import CORE_REPRESENTATIONS, KINDS, ROSAFE, Parameter
 from rosafe.interface.arguments import check_outputs
+from rosafe.interface.remarks import NO_FRAMES, warnings_of
 from rosafe.terminal import printable
 
 _BLOCK = ROSAFE.service("InputProc").parameter("nFramesPerBlock")
 _MAX_JOBS = 10_000
 _EXTENSIONS = (".npz", ".h5", ".mat", ".zarr", ".csv")
-_NAMED = 20  # failures that are named at the end, where failed.csv has them all
+_NAMED = 20  # failures that are printed at the end if failed.csv lists all of them
 
 # --- the command line -------------------------------------------------------------------------------------------
 
@@ -43,101 +53,96 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.usage = (
         "rosafe process PATH [PATH ...] [-o OUT] [--set NAME=VALUE ...] [--outputs NAME,...]\n"
         "                      [--format EXT] [--channels A,B] [--topic NAME] [--block N]\n"
+        "                      [--preset NAME] [--pad] [--no-clip]\n"
         "                      [--resume | --force] [--jobs N | --dask ADDRESS|local] [-v | -q]"
     )
     parser.add_argument(
         "inputs",
         nargs="*",
         metavar="PATH",
-        help="sound file, rosbag (.bag), or folder with such",
+        help="sound file, rosbag (.bag), or folder with such files",
     )
     parser.add_argument(
         "-o",
         "--to",
         dest="to",
         metavar="OUT",
-        help=f"file of results, ending in {', '.join(_EXTENSIONS)}, replaced where there is one; or, for several files "
-        "or ending in /, the folder for all results, made where there is none (default: beside each input)",
+        help=f"file of results, ending in {', '.join(_EXTENSIONS)}, replaced if it exists; or, for several files "
+        "or if it ends in /, the folder for all results, created if necessary (default: beside each input)",
     )
     add_settings(parser, "see below")
     parser.add_argument(
         "--outputs",
         metavar="NAME,...",
-        help=f"what to keep of {', '.join(KINDS)} (default: ild,ratemap,crossCorrelation; the original's seven are "
-        f"{', '.join(CORE_REPRESENTATIONS)}); what none of them needs is not computed",
+        help=f"outputs to keep, of {', '.join(KINDS)} (default: ild,ratemap,crossCorrelation; the original has "
+        f"{', '.join(CORE_REPRESENTATIONS)}); only what they need is computed",
     )
     parser.add_argument(
         "--format",
         choices=[extension[1:] for extension in _EXTENSIONS],
-        help="of results whose names -o does not say (default: npz)",
+        help="format of results that -o does not name (default: npz)",
     )
     parser.add_argument(
         "--channels",
-        type=_channels,
+        type=ear_channels,
         metavar="A,B",
         help="the channels (from 1) that are the left and the right ear; 1,1 for mono (default: 1,2 of two)",
     )
     parser.add_argument(
-        "--topic", metavar="NAME", help="the port Audio in rosbags (default: /bass/Audio, or the only one)"
+        "--topic", metavar="NAME", help="topic of the sound in rosbags (default: /bass/Audio, or the only one)"
     )
     parser.add_argument(
         "--block",
-        type=partial(_count, maximum=cast(float, _BLOCK.maximum)),
+        type=option_types.whole_number(1, cast(float, _BLOCK.maximum)),
         default=_BLOCK.default,
         metavar="N",
-        help=f"frames at a time, as the node's {_BLOCK.name} (default: {_BLOCK.default})",
+        help=f"frames per block, as {_BLOCK.name} of the node (default: {_BLOCK.default})",
     )
     parser.add_argument(
         "--jobs",
-        type=partial(_count, maximum=_MAX_JOBS),
+        type=option_types.whole_number(1, _MAX_JOBS),
         default=len(os.sched_getaffinity(0)),
         metavar="N",
-        help="files processed at the same time (default: as many as there are processor cores)",
+        help="number of files processed concurrently (default: number of processor cores)",
     )
     parser.add_argument(
         "--dask",
         metavar="ADDRESS|local",
         help="send the files to the workers of the Dask scheduler at tcp://HOST:8786; local starts --jobs workers here",
     )
+    parser.add_argument(
+        "--pad",
+        action="store_true",
+        help="complete the last frames with zeros: each framed output gets ceil(N / hop) frames",
+    )
+    add_preset(parser)
+    add_float_handling(parser)
     kept = parser.add_mutually_exclusive_group()
-    kept.add_argument("--resume", action="store_true", help="go on: leave results that are complete as they are")
+    kept.add_argument(
+        "--resume", action="store_true", help="continue an interrupted run: keep results that are complete"
+    )
     kept.add_argument("--force", action="store_true", help="replace results that -o does not name")
     loud = parser.add_mutually_exclusive_group()
-    loud.add_argument("-v", "--verbose", action="store_true", help="a line for each file")
-    loud.add_argument("-q", "--quiet", action="store_true", help="say nothing unless something is wrong")
+    loud.add_argument("-v", "--verbose", action="store_true", help="print a line for each file")
+    loud.add_argument("-q", "--quiet", action="store_true", help="print errors only")
     parser.epilog = _epilog()
-
-
-def _channels(text: str) -> tuple[int, int]:
-    from rosafe.sound.audiofile import channel_pair
-
-    try:
-        return channel_pair(text)
-    except ValueError as problem:
-        raise argparse.ArgumentTypeError(f"{text!r} is not {problem}") from None
-
-
-def _count(text: str, maximum: float) -> int:
-    if not (text.isascii() and text.isdigit()) or not 1 <= int(text[:20]) <= maximum:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 1 to {maximum:.0f}")
-    return int(text)
 
 
 def _epilog() -> str:
     parts = [named for kind in KINDS.values() for named in kind.outputs.items()]
     lines = [
-        "A file of results holds, as rosafe.process returns them and rosafe.load reads them, of the outputs:",
+        "A file of results contains these outputs, as rosafe.process and rosafe.load return them:",
         *(f"  {name} ({', '.join(part.axes)}) {part.unit}".rstrip() for name, part in parts),
-        "what lies along their axes:",
+        "the coordinates of their axes:",
         *textwrap.wrap(_coordinates(), 100, initial_indent="  ", subsequent_indent="  "),
-        "KIND_time in s of each kind, and KIND_frameRate in Hz of those in frames. Besides: sample_rate in Hz,",
-        "block_frames, parameters (all of them with their values, as JSON), source (the name of the input),",
-        "rosafe_version, axes and units. A .csv holds one output of two axes.",
+        "KIND_time in s of each representation, KIND_frameRate in Hz of framed ones; furthermore sample_rate in Hz,",
+        "block_frames, parameters (all values as JSON), source (name of the input), clipped (number of samples),",
+        "rosafe_version, axes and units. A .csv file contains one output with two axes.",
         "",
-        "In a folder -o the results lie as the inputs do in theirs. What fails is named at the end and in failed.csv",
-        "there, and does not keep the others.",
+        "A folder -o gets the subfolders of the input folder. Failures are printed at the end and listed in",
+        "failed.csv there; the other files are processed.",
         "",
-        "exit status: 0 all done, 1 something failed (the other files are done), 2 wrong command line, 130 interrupted",
+        "exit status: 0 success, 1 a file failed (the others are done), 2 wrong command line, 130 interrupted",
         "",
         "examples:",
         "  rosafe process speech.wav --outputs ild,ratemap --set fb_nChannels=64 ihc_method=bernstein",
@@ -173,88 +178,93 @@ def _parameter_lines(parameter: Parameter) -> list[str]:
         *textwrap.wrap(
             f"{parameter.name}={default}  ({limits})", 100, initial_indent=" " * 4, subsequent_indent=" " * 8
         ),
-        f"        {parameter.doc}",
+        *textwrap.wrap(parameter.doc, 112, initial_indent=" " * 8, subsequent_indent=" " * 8),
     ]
 
 
-# --- the work ---------------------------------------------------------------------------------------------------
+# --- processing -------------------------------------------------------------------------------------------------
 
 
 def run(options: argparse.Namespace) -> int:
-    """Process all files; 0 if all went well."""
+    """Process all files and return 0, or 1 if one failed."""
     inputs = [Path(name) for name in (*options.inputs, *options.more_inputs)]
     if not inputs:
-        options.usage_error("no sound file is named")
+        options.usage_error("PATH: expected a sound file or folder, got none")
     if options.dask is not None and not re.fullmatch(r"local|((tcp|tls)://)?[^/\s]+:\d{1,5}", options.dask):
-        options.usage_error(f"--dask {options.dask}: wanted is a scheduler, such as tcp://HOST:8786, or local")
+        options.usage_error(f"--dask: expected a scheduler, such as tcp://HOST:8786, or local, got {options.dask!r}")
     folder, file = _output_path(inputs, options)
-    # Once, for all processes that are forked from this one.
-    from rosafe.offline.corpus import compute
-    from rosafe.output import OutputError
-    from rosafe.sound.audiofile import AudioFileError
-
     try:
         plan = _plan(inputs, folder, file, options)
     except ValueError as problem:
         raise CommandError(str(problem)) from None
     signals = Interrupts()
-    made = _make_folder(folder)
+    created = _create_folder(folder)
     if options.dask:
         plan = _for_dask(plan, options)
-    else:
-        importlib.import_module("scipy.signal")
-    works = [partial(compute, *pair, plan.settings) for pair in zip(plan.sources, plan.targets, strict=True)]
     corpus = _Corpus(plan.names, plan.targets, options)
-    for path, why in plan.problems:
-        corpus.fail(str(path), why)
+    for path, reason in plan.problems:
+        corpus.fail(str(path), reason)
     try:
-        if works:
-            _runner(options, len(works))(
-                works, options.jobs, (AudioFileError, OutputError, ValueError), corpus.report, signals
-            )
+        _compute(plan, corpus, options, signals)
     except BaseException as problem:
-        corpus.display.clear()
+        corpus.display.close()
         if isinstance(problem, Interrupted):
-            left = "is left as .part, to be used up" if options.dask else "is removed"
-            again = "; --resume goes on" if folder is not None else ""
-            corpus.display.message(f"rosafe process: interrupted; what was not finished {left}{again}")
-        _remove_empty(plan.targets, folder, made)
+            state = "remain as .part files" if options.dask else "were removed"
+            hint = "; continue with --resume" if folder is not None else ""
+            corpus.display.message(f"rosafe process: interrupted; unfinished results {state}{hint}")
+        _remove_empty_folders(plan.targets, folder, created)
         raise
-    corpus.display.clear()
+    corpus.display.close()
     corpus.end(folder, inputs)
-    _remove_empty(plan.targets, folder, made)
+    _remove_empty_folders(plan.targets, folder, created)
     return 1 if corpus.failed else 0
 
 
-class _Plan(NamedTuple):
-    """What is to be done."""
+def _compute(plan: _Plan, corpus: _Corpus, options: argparse.Namespace, signals: Interrupts) -> None:
+    """Compute all results, in several processes or on the workers of Dask."""
+    from rosafe.offline.corpus import compute
+    from rosafe.output import OutputError
+    from rosafe.sound.audiofile import AudioFileError
 
-    names: list[Path]  # of the inputs, as they are told of
+    if not options.dask:
+        importlib.import_module("scipy.signal")  # imported once for all processes that are forked from this one
+    works = [partial(compute, *pair, plan.settings) for pair in zip(plan.sources, plan.targets, strict=True)]
+    if works:
+        run_tasks = _runner(options, len(works))
+        run_tasks(works, options.jobs, (AudioFileError, OutputError, ValueError), corpus.report, signals)
+
+
+class _Plan(NamedTuple):
+    """Files to process, and the settings."""
+
+    names: list[Path]  # of the inputs, as they are printed
     sources: list[Path]
     targets: list[Path]
     settings: Any
-    problems: list[tuple[Path, str]]  # known before
+    problems: list[tuple[Path, str]]  # known before any file is processed
 
 
 def _plan(inputs: list[Path], folder: Path | None, file: Path | None, options: argparse.Namespace) -> _Plan:
-    """All that is to be done, checked as far as that can be without reading the files; ValueError."""
+    """Return the plan, checked as far as possible without reading the files. Raises ValueError."""
     from rosafe.offline.corpus import Settings, find, output_paths
     from rosafe.offline.files import OUTPUTS
     from rosafe.offline.formats import FORMATS, check_format, format_of
 
-    parameters = parameters_of(options.settings)
+    parameters = parameters_of(options.settings, options.preset)
     outputs = check_outputs(OUTPUTS if options.outputs is None else parse_settings(options.outputs))
-    form = FORMATS[f".{options.format or 'npz'}"] if file is None else format_of(file)
-    check_format(form, outputs)
+    for text in warnings_of(parameters, outputs):
+        print(f"rosafe process: {text}", file=sys.stderr)
+    file_format = FORMATS[f".{options.format or 'npz'}"] if file is None else format_of(file)
+    check_format(file_format, outputs)
     if options.dask:
         importlib.import_module("distributed")
     items, problems = find(inputs, folder)
     if file is not None:
         targets = [file]
     elif folder is not None:
-        targets = output_paths(items, folder, form.extension)
+        targets = output_paths(items, folder, file_format.extension)
     else:
-        targets = output_paths([item._replace(place=item.source) for item in items], Path(), form.extension)
+        targets = output_paths([item._replace(place=item.source) for item in items], Path(), file_format.extension)
     settings = Settings(
         parameters,
         outputs,
@@ -264,21 +274,23 @@ def _plan(inputs: list[Path], folder: Path | None, file: Path | None, options: a
         options.force or (file is not None and not options.resume),
         options.resume,
         folder is not None,
+        options.pad,
+        not options.no_clip,
     )
     sources = [item.source for item in items]
     return _Plan(sources, sources, targets, settings, problems)
 
 
 def _for_dask(plan: _Plan, options: argparse.Namespace) -> _Plan:
-    """The same for workers, who have folders of their own.
+    """Return the plan for Dask workers, whose working directories differ.
 
-    A scheduler has done again what a worker that died had finished but not told of. So what is there already is refused
-    here, and a worker that finds a result which is complete takes it for its own.
+    A scheduler repeats a task that a worker finished without reporting it before it died. Therefore existing results
+    are refused here, and a worker accepts a complete result as its own.
     """
     names, sources, targets, problems = [], [], [], list(plan.problems)
     for name, target in zip(plan.names, plan.targets, strict=True):
         if not (plan.settings.replace or options.resume) and os.path.lexists(target):
-            problems.append((name, f"{name}: {target} is there already; --resume leaves it, --force replaces it"))
+            problems.append((name, f"{name}: {target} already exists; --resume keeps it, --force replaces it"))
             continue
         names.append(name)
         sources.append(Path(os.path.abspath(name)))
@@ -292,7 +304,7 @@ def _runner(options: argparse.Namespace, count: int) -> Any:
         from rosafe.commands._dask import run_on
 
         return partial(run_on, options.dask)
-    if count > 1:  # the cores have a process each, and its tree needs no more of them
+    if count > 1:  # one process per core; its tree needs no further workers
         from rosafe.tree.workers import VARIABLE
 
         cores = len(os.sched_getaffinity(0))
@@ -301,32 +313,31 @@ def _runner(options: argparse.Namespace, count: int) -> Any:
 
 
 def _output_path(inputs: list[Path], options: argparse.Namespace) -> tuple[Path | None, Path | None]:
-    """The folder for the results, or the file for the one; Failure where it can be neither."""
+    """Return the folder for the results, or the file for the only result. Raises CommandError if -o names neither."""
     out = options.to
-    one = len(inputs) == 1 and not os.path.isdir(inputs[0])
+    single = len(inputs) == 1 and not os.path.isdir(inputs[0])
     if out is None:
-        for path in inputs:
-            if os.path.isdir(path):
-                raise CommandError(f"{path} is a folder: name one for its results with -o")
+        if folder := next(filter(os.path.isdir, inputs), None):
+            raise CommandError(f"{folder} is a folder; name a folder for its results with -o")
         return None, None
     if out == "":
-        options.usage_error("-o wants a name")
+        options.usage_error("-o: expected a path, got an empty text")
     extension = os.path.splitext(out)[1].lower()
-    if out.endswith("/") or (os.path.isdir(out) and not (one and extension == ".zarr")):
+    if out.endswith("/") or (os.path.isdir(out) and not (single and extension == ".zarr")):
         return Path(out), None
-    if one:
-        if extension not in _EXTENSIONS:
-            raise CommandError(f"-o {out}: results end in {', '.join(_EXTENSIONS)}; the name of a folder ends in /")
-        if options.format and extension != f".{options.format}":
-            options.usage_error(f"-o {out} and --format {options.format} are different formats")
-        return None, Path(out)
-    if extension:
-        raise CommandError(f"-o {out}: for several files, wanted is a folder, ending in / or there already")
-    return Path(out), None
+    if not single:
+        if extension:
+            raise CommandError(f"-o: for several files, expected an existing folder or a name ending in /, got {out!r}")
+        return Path(out), None
+    if extension not in _EXTENSIONS:
+        raise CommandError(f"-o: expected a name ending in {', '.join(_EXTENSIONS)}, or in / for a folder, got {out!r}")
+    if options.format and extension != f".{options.format}":
+        options.usage_error(f"-o {out} and --format {options.format} are different formats")
+    return None, Path(out)
 
 
-def _make_folder(folder: Path | None) -> Path | None:
-    """Make the folder for the results; the topmost one that was not there. Failure where it cannot be made."""
+def _create_folder(folder: Path | None) -> Path | None:
+    """Create the folder for the results. Return the topmost folder that is new. Raises CommandError on failure."""
     if folder is None or os.path.isdir(folder):
         return None
     new = folder
@@ -341,8 +352,8 @@ def _make_folder(folder: Path | None) -> Path | None:
     return new
 
 
-def _remove_empty(targets: Sequence[Path], folder: Path | None, made: Path | None) -> None:
-    """Folders for results that are empty, all having failed; of those that were there before, none."""
+def _remove_empty_folders(targets: Sequence[Path], folder: Path | None, created: Path | None) -> None:
+    """Remove empty folders for results, except those that existed before."""
     if folder is None:
         return
     below: set[Path] = set()
@@ -354,7 +365,7 @@ def _remove_empty(targets: Sequence[Path], folder: Path | None, made: Path | Non
     for path in sorted(below, key=lambda path: len(path.parts), reverse=True):
         with contextlib.suppress(OSError):
             path.rmdir()
-    while made is not None and (folder == made or made in folder.parents):
+    while created is not None and (folder == created or created in folder.parents):
         try:
             folder.rmdir()
         except OSError:
@@ -363,49 +374,54 @@ def _remove_empty(targets: Sequence[Path], folder: Path | None, made: Path | Non
 
 
 class _Corpus:
-    """What is said of all files together, on the way and at the end."""
+    """Progress and summary of all files."""
 
     def __init__(self, sources: Sequence[Path], targets: Sequence[Path], options: argparse.Namespace) -> None:
-        self.display = Display(sys.stderr, [_size(path) for path in sources], options.quiet)
+        self.display = ProgressDisplay(sys.stderr, [_size(path) for path in sources], options.quiet)
         self.failed: dict[str, str] = {}
         self._sources, self._targets, self._options = sources, targets, options
         self._begun = time.monotonic()
         self._done = self._skipped = self._size = self._warnings = 0
         self._seconds = 0.0
 
-    def fail(self, name: str, why: str) -> None:
-        """Note that a file has failed."""
-        text = why if name in why else f"{name}: {why}"
+    def fail(self, name: str, reason: str) -> None:
+        """Record the failure of a file."""
+        text = reason if name in reason else f"{name}: {reason}"
         self.failed[name] = printable(text)
 
-    def report(self, index: int, told: TaskReport) -> None:
-        """How a file stands."""
+    def report(self, index: int, task: TaskReport) -> None:
+        """Update the display with the progress of a file."""
         source, target = self._sources[index], self._targets[index]
-        if told.failure:
-            self.fail(str(source), told.failure.replace("--force replaces", "--resume leaves it, --force replaces"))
-        elif told.last:
-            self._note(source, target, told.result)
-        skipped = told.last and not told.failure and told.result.skipped
-        self.display.update(index, 1.0 if told.last else told.part, told.last, skipped)
+        if task.failure:
+            self.fail(str(source), task.failure.replace("--force replaces", "--resume keeps it, --force replaces"))
+        elif task.last:
+            self._add_result(source, target, task.result)
+        skipped = task.last and not task.failure and task.result.skipped
+        self.display.update(index, 1.0 if task.last else task.part, task.last, skipped)
 
-    def _note(self, source: Path, target: Path, done: Any) -> None:
+    def _add_result(self, source: Path, target: Path, done: Any) -> None:
         if done.skipped and self._options.resume:
             self._skipped += 1
-            text = f"{source} -> {target}: complete already"
+            text = f"{source} -> {target}: already complete"
         else:
             self._done += 1
             self._seconds += done.seconds
             self._size += done.size
             self._warnings += done.not_finite > 0
+            if done.clipped:
+                self.display.message(f"rosafe process: {source}: {clipping_warning(done.clipped)}")
+            if done.empty:
+                names = ", ".join(done.empty)
+                self.display.message(f"rosafe process: {source}: {names}: no frames: {NO_FRAMES}; see --pad")
             text = f"{source} -> {target}: {done.seconds:.1f} s of sound, {bytes_text(done.size)}"
             if done.not_finite:
-                text += f"; {done.not_finite} samples that were NaN or infinite are silence or full scale"
+                text += f"; {done.not_finite} samples were NaN or infinite and were replaced by silence or full scale"
         if self._options.verbose or (len(self._sources) == 1 and not self._options.quiet):
             kept = "" if self._options.outputs or done.skipped else "; ild, ratemap, crossCorrelation (see --outputs)"
             self.display.message(text + kept)
 
     def end(self, folder: Path | None, inputs: Sequence[Path]) -> None:
-        """The sum, what has failed, and where all of that is listed."""
+        """Print the summary and the failures, and write failed.csv."""
         if len(self._sources) > 1 and not self._options.quiet:
             self.display.message(self._summary())
         order = {str(source): index for index, source in enumerate(self._sources)}
@@ -421,9 +437,9 @@ class _Corpus:
                     write_failed(folder, [*self._sources, *inputs], self.failed)
                     listed = bool(self.failed)
             except (OutputError, OSError) as problem:
-                why = f"{folder / FAILED}: {problem.strerror}" if isinstance(problem, OSError) else str(problem)
-                shown.append(why)
-                self.failed[str(folder)] = why
+                reason = f"{folder / FAILED}: {problem.strerror}" if isinstance(problem, OSError) else str(problem)
+                shown.append(reason)
+                self.failed[str(folder)] = reason
         many = listed and len(shown) > _NAMED
         for text in shown[: _NAMED if many else None]:
             self.display.message(f"rosafe process: {text}")
@@ -432,7 +448,7 @@ class _Corpus:
 
     def _summary(self) -> str:
         counts = [f"{self._done} done"]
-        counts += [f"{self._skipped} complete already"] if self._skipped else []
+        counts += [f"{self._skipped} already complete"] if self._skipped else []
         counts += [f"{len(self.failed)} failed"] if self.failed else []
         passed = time.monotonic() - self._begun
         text = f"{self._done + self._skipped + len(self.failed)} files: {', '.join(counts)}"
@@ -441,10 +457,10 @@ class _Corpus:
             if not self._options.outputs:
                 text += "; ild, ratemap, crossCorrelation (see --outputs)"
         if self._warnings:
-            text += f"; {self._warnings} with NaN or infinite samples, which are silence or full scale"
+            text += f"; {self._warnings} with NaN or infinite samples, which were replaced by silence or full scale"
         return text
 
 
 def _size(path: Path) -> float:
-    """How much a file counts in the display."""
+    """Return the weight of a file in the display: its size in bytes."""
     return float(os.path.getsize(path)) if os.path.isfile(path) else 0.0

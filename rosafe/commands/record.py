@@ -1,26 +1,26 @@
-"""Record sound to a WAV or a bag, with a level meter; without an output, only the meter.
+"""Record sound to a WAV file or a rosbag with a level meter; without an output, show the meter only.
 
-The sound is that of a running bass (the topic /bass/Audio), or of a --device without ROS: a sound card, file:PATH,
-bag:PATH or scene:, named as for bass's Acquire. OUT.wav holds the exact samples, 32 bits wide; from 4 GiB on it is an
-RF64, which libsndfile reads like any WAV. OUT.bag is for `rosbag play` and the device bag:. What was lost on the way
-is silence in its place, and reported. Ctrl-C ends it, with a file that is complete."""
+The sound comes from a running bass (topic /bass/Audio) or, without ROS, from a --device: a sound card, file:PATH,
+bag:PATH or scene:, named as for Acquire of bass. OUT.wav contains the exact samples with 32 bits; above 4 GiB it is an
+RF64 file, which libsndfile reads like any WAV. OUT.bag is for `rosbag play` and the device bag:. Lost frames are
+replaced by silence and reported. Ctrl-C ends the recording with a complete file."""
 
 from __future__ import annotations
 
 import argparse
-import math
 import os
 import sys
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from rosafe import option_types
 from rosafe.commands import CommandError
 from rosafe.commands._workers import Interrupted, Interrupts
 from rosafe.interface import ComponentError
-from rosafe.output import PART, AtomicOutput, OutputError
+from rosafe.output import PART, AtomicOutput, OutputError, write_whole
 from rosafe.terminal import printable
 
 if TYPE_CHECKING:
@@ -31,10 +31,10 @@ if TYPE_CHECKING:
 
 _TOPIC = "/bass/Audio"
 _EARS = ("left", "right")
-_RATE = 44100  # of a device without a rate of its own
-_MAX_SECONDS = 1e7
+_RATE = 44100  # of a device that does not define a rate
+_MIN_SECONDS, _MAX_SECONDS = 1e-6, 1e7
 _CALIBRATION_SECONDS = 5.0
-_DIFFERENCE = 1.0  # dB between the ears, from where on one value is not for both
+_DIFFERENCE = 1.0  # dB; above this difference between the ears, one value does not fit both
 
 # --- the command line -------------------------------------------------------------------------------------------
 
@@ -49,88 +49,64 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("output", nargs="?", metavar="OUT", help="file to write, ending in .wav or .bag")
     source = parser.add_mutually_exclusive_group()
-    source.add_argument("--device", metavar="NAME", help="record from there without ROS; see --list")
-    source.add_argument("--topic", metavar="NAME", help=f"the port Audio to listen to (default: {_TOPIC})")
+    source.add_argument("--device", metavar="NAME", help="record from this device without ROS; see --list")
+    source.add_argument("--topic", metavar="NAME", help=f"topic of the sound (default: {_TOPIC})")
     source.add_argument(
-        "--socket", type=_address, metavar="HOST:PORT", help="ask a bass's DedicatedSocket; needs --rate"
+        "--socket", type=_address, metavar="HOST:PORT", help="read from DedicatedSocket of a bass; needs --rate"
     )
     parser.add_argument(
         "--calibrate",
-        type=_spl,
+        type=option_types.number(0, 200, "a level in dB SPL, such as 94,"),
         metavar="SPL",
-        help="a calibrator of so many dB SPL is on a microphone, usually 94: say which pp_refSPLdB fits (after 5 s)",
+        help="print pp_refSPLdB for a calibrator of SPL dB (usually 94) on one microphone; takes 5 s",
     )
-    parser.add_argument("--list", action="store_true", help="say which devices there are, and end")
+    parser.add_argument("--list", action="store_true", help="list the devices and exit")
     parser.add_argument(
         "--rate",
-        type=_count(768_000),
+        type=option_types.whole_number(1, 768_000),
         default=0,
         metavar="HZ",
-        help="sample rate; nothing is resampled (default: the source's own; 44100 for sound cards and scene:)",
+        help="sample rate; nothing is resampled (default: that of the source; 44100 for sound cards and scene:)",
     )
-    parser.add_argument("--seconds", type=_seconds, metavar="S", help="end after so much sound (default: at Ctrl-C)")
+    parser.add_argument(
+        "--seconds",
+        type=option_types.seconds(_MIN_SECONDS, _MAX_SECONDS),
+        metavar="S",
+        help="end after S seconds of sound (default: at Ctrl-C)",
+    )
     parser.add_argument(
         "--chunk",
-        type=_count(1_000_000),
+        type=option_types.whole_number(1, 1_000_000),
         metavar="N",
-        help="frames that a --device gives at a time (default: 50 ms of --rate)",
+        help="frames per chunk of a --device (default: 50 ms at --rate)",
     )
-    parser.add_argument("--force", action="store_true", help="replace OUT where it is there already")
-    parser.add_argument("-q", "--quiet", action="store_true", help="no meter; losses and the summary only")
+    parser.add_argument("--force", action="store_true", help="replace OUT if it exists")
+    parser.add_argument("-q", "--quiet", action="store_true", help="no meter; print losses and the summary only")
     parser.epilog = (
-        "The meter shows, for each ear, the highest sample (peak) and the root mean square (rms) in dB below full\n"
-        "scale, CLIP where samples were at the end of the scale, and the frames lost so far. On a terminal that is\n"
-        "one live line, with peak/rms behind bars of the rms; else a line for each second.\n\n"
-        "exit status: 0 recorded, 1 something failed (what was recorded until then is kept), 2 wrong command line\n\n"
+        "The meter shows for each ear the highest sample (peak) and the root mean square (rms) in dB below full\n"
+        "scale, CLIP if samples reached full scale, and the number of lost frames. On a terminal it is one live\n"
+        "line with bars of the rms, followed by peak/rms; otherwise a line per second.\n\n"
+        "exit status: 0 recorded, 1 failure (the sound recorded until then is kept), 2 wrong command line\n\n"
         "examples:\n"
         "  rosafe record --device plughw:1,0              # check the levels of a sound card\n"
         "  rosafe record speech.wav --device plughw:1,0   # until Ctrl-C\n"
-        "  rosafe record speech.bag --seconds 60          # what a running bass captures\n"
+        "  rosafe record speech.bag --seconds 60          # the sound of a running bass\n"
         "  rosafe record --calibrate 94 --device plughw:1,0"
     )
-
-
-def _count(maximum: int) -> Any:
-    def convert(text: str) -> int:
-        if not (text.isascii() and text.isdigit() and 1 <= int(text[:20]) <= maximum):
-            raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 1 to {maximum}")
-        return int(text)
-
-    return convert
-
-
-def _seconds(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = 0.0
-    if not 0 < value <= _MAX_SECONDS:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number of seconds above 0, up to {_MAX_SECONDS:.0f}")
-    return value
-
-
-def _spl(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0 <= value <= 200:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a level from 0 to 200 dB SPL, such as 94")
-    return value
 
 
 def _address(text: str) -> tuple[str, int]:
     host, _, port = text.rpartition(":")
     if not (host and port.isascii() and port.isdigit() and 0 < int(port[:6]) < 65536):
-        raise argparse.ArgumentTypeError(f"{text!r} is not HOST:PORT, such as 127.0.0.1:8081")
+        raise argparse.ArgumentTypeError(f"expected HOST:PORT, such as 127.0.0.1:8081, got {text!r}")
     return host.strip("[]"), int(port)
 
 
-# --- the work ---------------------------------------------------------------------------------------------------
+# --- recording ---------------------------------------------------------------------------------------------------
 
 
 def run(options: argparse.Namespace) -> int:
-    """Record; 0 if all went well."""
+    """Record and return the exit code."""
     if options.list:
         return _list()
     path = _check(options)
@@ -140,7 +116,7 @@ def run(options: argparse.Namespace) -> int:
     def work() -> None:
         try:
             outcome.append(_record(path, options, stopping))
-        except BaseException as problem:  # for the main thread, which alone sees signals
+        except BaseException as problem:  # raised again in the main thread, which alone receives signals
             outcome.append(problem)
 
     thread = threading.Thread(target=work, daemon=True)
@@ -157,7 +133,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _list() -> int:
-    """As bass's ListDevices; a machine without a sound card is no failure here."""
+    """Print the devices as ListDevices of bass does. A machine without a sound card is not an error."""
     from rosafe.bass.sources import device_lines
 
     try:
@@ -169,24 +145,29 @@ def _list() -> int:
 
 
 def _check(options: argparse.Namespace) -> Path | None:
-    """Complete the options, and say where the output goes; Failure, or a usage error, where that cannot be."""
+    """Complete the options and return the path of the output. Raises CommandError, or exits with a usage error."""
     if options.socket and not options.rate:
-        options.usage_error("--socket needs --rate: the protocol does not tell the sample rate")
+        options.usage_error("--socket needs --rate, because the protocol does not contain the sample rate")
+    if "" in (options.device, options.topic):
+        options.usage_error("--device and --topic: expected a name, got an empty text")
     if options.calibrate is not None:
         options.seconds = options.seconds or _CALIBRATION_SECONDS
-    if options.chunk is None:
-        options.chunk = max(1, (options.rate or _RATE) // 20)
-    if "" in (options.device, options.topic):
-        options.usage_error("--device and --topic want a name")
+    options.chunk = options.chunk or max(1, (options.rate or _RATE) // 20)
     if options.output is None:
         return None
     path = Path(os.path.expanduser(options.output))
     if path.suffix.lower() not in (".wav", ".bag"):
-        options.usage_error(f"{options.output}: wanted is a name that ends in .wav or .bag")
-    for replaced in (path, path.with_name(path.name + PART)):
-        if options.force and replaced.exists() and _is_input(replaced, options.device or ""):
-            raise CommandError(f"{replaced} is the input itself")
+        options.usage_error(f"OUT: expected a name that ends in .wav or .bag, got {options.output}")
+    if options.force:
+        _check_replaced(path, options.device or "")
     return path
+
+
+def _check_replaced(path: Path, device: str) -> None:
+    """Raise CommandError if the output would replace the input."""
+    for replaced in (path, path.with_name(path.name + PART)):
+        if replaced.exists() and _is_input(replaced, device):
+            raise CommandError(f"{replaced} is also the input; choose another name")
 
 
 def _is_input(path: Path, device: str) -> bool:
@@ -216,7 +197,7 @@ def _open_source(options: argparse.Namespace, stopping: threading.Event) -> Soun
         try:
             become_node("rosafe_record")
         except (MasterError, GenerationError) as problem:
-            raise CommandError(f"{problem}; or record a --device without ROS") from None
+            raise CommandError(f"{problem}; or record from a --device without ROS") from None
         return TopicSource(options.topic or _TOPIC, options.rate, stopping)
     except ComponentError as problem:
         raise CommandError(problem.reason) from None
@@ -227,9 +208,15 @@ def _record(path: Path | None, options: argparse.Namespace, stopping: threading.
     from rosafe.commands._meter import Meter
 
     with ExitStack() as stack:
-        # Its place comes first, so that of two recorders the second one is told, whatever they listen to.
-        part = None if path is None else stack.enter_context(closing(AtomicOutput(path, options.force, precious=True)))
+        # The file is created before the source is opened, so that a second recorder of the same file fails at once.
+        part = (
+            None
+            if path is None
+            else stack.enter_context(closing(AtomicOutput(path, options.force, keep_leftover=True)))
+        )
         source = stack.enter_context(closing(_open_source(options, stopping)))
+        if path is not None:
+            _check_truth(path, options.force)
         meter = Meter(sys.stdout, source.sample_rate, options.quiet)
         limit = None if options.seconds is None else max(1, round(options.seconds * source.sample_rate))
         with _opened(part, options, source) as output:
@@ -239,33 +226,70 @@ def _record(path: Path | None, options: argparse.Namespace, stopping: threading.
             except ComponentError as problem:
                 raise CommandError(problem.reason) from None
             finally:
-                meter.message(_summary(recorder, str(path or "heard"), source.sample_rate))
+                meter.message(_summary(recorder, str(path or "sound"), source.sample_rate))
         if ended:
             meter.message(f"{source.name} has ended")
     if options.calibrate is not None:
-        _tell_reference(options.calibrate, recorder.levels)
+        _print_reference(options.calibrate, recorder.levels)
     return 0
 
 
-def _tell_reference(spl: float, levels: LevelMeter) -> None:
-    """Say which level of reference makes the louder ear right; Failure where what was heard cannot tell."""
+def _truth_path(path: Path) -> Path | None:
+    """Return the path of the truth of a recording; only WAV files can have one."""
+    return path.with_suffix(".truth.csv") if path.suffix.lower() == ".wav" else None
+
+
+def _check_truth(path: Path, replace: bool) -> None:
+    """Raise CommandError if the truth of another recording exists, which would seem to be that of the new one."""
+    truth_path = _truth_path(path)
+    if truth_path is not None and os.path.lexists(truth_path) and not replace:
+        raise CommandError(f"{truth_path} already exists; --force replaces it")
+
+
+def _complete(part: AtomicOutput, replace: bool, source: SoundSource, frames: int) -> None:
+    """Move the recording to its place; the truth of a scene is beside it, or no truth.
+
+    The truth is written first, because the lock of the recording ends when it is moved: another recorder of the same
+    file could complete its recording in between.
+    """
+    truth_path, truth = _truth_path(part.target), getattr(source, "truth", None)
+    if truth_path is None:
+        return part.complete()
+    if os.path.lexists(truth_path):
+        if not replace:
+            raise OutputError(f"{truth_path} was created meanwhile; the recording is {part.name}")
+        truth_path.unlink()
+    if truth is not None:
+        from rosafe.localization.scene import truth_csv
+
+        write_whole(truth_path, truth_csv(truth, frames / source.sample_rate).encode())
+    try:
+        part.complete()
+    except BaseException:
+        truth_path.unlink(missing_ok=True)
+        raise
+    return None
+
+
+def _print_reference(spl: float, levels: LevelMeter) -> None:
+    """Print the reference level that fits the louder ear. Raises CommandError if the sound is not suitable."""
     from rosafe.bass.recording.levels import SILENCE, reference
 
     if any(levels.clipped):
-        raise CommandError("the sound was clipped: turn the microphone down, and begin anew")
-    heard = [levels.rms(ear) for ear in range(2)]
-    if max(heard) == SILENCE:
-        raise CommandError("there was only silence: is the calibrator on, and the device the right one?")
-    wanted = [reference(spl, level) for level in heard]
-    print(f"pp_refSPLdB={max(wanted):.2f}")
-    if abs(wanted[0] - wanted[1]) > _DIFFERENCE:
-        ears = ", ".join(f"{ear} {value:.2f}" for ear, value in zip(_EARS, wanted, strict=True))
-        print(f"rosafe record: the ears differ ({ears}); this is for the louder one", file=sys.stderr)
+        raise CommandError("the sound was clipped; reduce the gain of the microphone and calibrate again")
+    measured = [levels.rms(ear) for ear in range(2)]
+    if max(measured) == SILENCE:
+        raise CommandError("the sound was silent; check the calibrator and the name of the device")
+    references = [reference(spl, level) for level in measured]
+    print(f"pp_refSPLdB={max(references):.2f}")
+    if abs(references[0] - references[1]) > _DIFFERENCE:
+        ears = ", ".join(f"{ear} {value:.2f}" for ear, value in zip(_EARS, references, strict=True))
+        print(f"rosafe record: the ears differ ({ears}); the printed value is for the louder one", file=sys.stderr)
 
 
 @contextmanager
 def _opened(part: AtomicOutput | None, options: argparse.Namespace, source: SoundSource) -> Iterator[Output | None]:
-    """The output, if one is wanted; complete and in its place at the end, whatever happens, if there is sound in it."""
+    """Provide the output, if there is one. At the end the file is completed and moved to its place if it has sound."""
     if part is None:
         yield None
         return
@@ -274,17 +298,17 @@ def _opened(part: AtomicOutput | None, options: argparse.Namespace, source: Soun
         try:
             yield output
         finally:
-            part.keep = output.frames > 0  # even where it cannot be closed
+            part.keep = output.frames > 0  # even if it cannot be closed
             output.close()
             part.keep = output.frames > 0
             if part.keep:
-                part.complete()
-    except BrokenPipeError:  # nobody reads the meter any more
+                _complete(part, options.force, source, output.frames)
+    except BrokenPipeError:  # the reader of the meter has ended
         raise
     except FileExistsError:
-        raise OutputError(f"{part.target} has come into being meanwhile; the recording is {part.name}") from None
+        raise OutputError(f"{part.target} was created meanwhile; the recording is {part.name}") from None
     except OSError as problem:
-        left = f"; what was recorded is in {part.name}" if part.keep and part.name.exists() else ""
+        left = f"; the recording is in {part.name}" if part.keep and part.name.exists() else ""
         raise OutputError(f"{part.error(problem)}{left}") from None
 
 
@@ -294,7 +318,7 @@ def _open_output(part: AtomicOutput, options: argparse.Namespace, source: SoundS
     descriptor = part.begin()
     if part.target.suffix.lower() == ".wav":
         return WavFile(descriptor, source.sample_rate)
-    # A stream that others hear too keeps its numbers and its name.
+    # A published stream keeps its frame numbers and its name.
     chunk, newest = getattr(source, "frames_per_chunk", options.chunk), getattr(source, "newest", 0)
     return BagWriter(descriptor, source.sample_rate, chunk, source.name if options.topic else _TOPIC, newest)
 

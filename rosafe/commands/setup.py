@@ -1,25 +1,27 @@
-"""Save the tree of a running rosAFE with its sound as a file, and build it again from that.
+"""Save the tree of a running rosAFE with its sound to a file, or create it from a file.
 
-`save` writes what bass acquires, what the Audio port hears, and every processor with its parent and parameters, to the
-last digit. `load` makes all that: wholly, or nothing is changed. What is there already and the same is used; where
-something else has a name of the setup's, or bass acquires something else, it is refused. docs/setups.md describes the
-file, which is meant to be read and written by people."""
+`save` writes the acquisition of bass, the topic of the port Audio, and all processors with their parents and exact
+parameters. `load` creates all of this, or changes nothing. Existing processors that are equal are reused. The setup is
+refused if a different processor has one of its names, or if bass acquires from another device. docs/setups.md describes
+the file, which can be edited by hand."""
 
 from __future__ import annotations
 
 import argparse
 import asyncio
 import sys
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from rosafe import option_types
 from rosafe.commands import CommandError
 from rosafe.commands._component import component, format_error, prepare
 from rosafe.input import read_regular
 from rosafe.interface import MAX_SETUP, ROSAFE, ComponentError
 from rosafe.output import write_whole
-from rosafe.setups import Setup, SetupError, read, write
+from rosafe.setups import LOCALIZER_FILES, Setup, SetupError, read, write
 from rosafe.terminal import printable
 
 
@@ -30,21 +32,21 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "       rosafe setup load FILE.yaml [--keep FILE] [--wait SECONDS] [-i INSTANCE]\n"
         "       rosafe setup -h"
     )
-    parser.add_argument("action", choices=("save", "load"), help="what to do")
-    parser.add_argument("file", metavar="FILE.yaml", help="the setup; - is the standard output or input")
-    parser.add_argument("--full", action="store_true", help="save: write what has its default value, too")
+    parser.add_argument("action", choices=("save", "load"), help="action")
+    parser.add_argument("file", metavar="FILE.yaml", help="the setup; - means standard output or input")
+    parser.add_argument("--full", action="store_true", help="save: also write parameters with default values")
     parser.add_argument(
         "--keep",
         metavar="FILE",
         default="",
-        help="load: where FILE, in which the node keeps its tree, holds processors, load no others, but sound alone",
+        help="load: if FILE, the saved tree of the node, contains processors, load the sound only",
     )
     parser.add_argument(
         "--wait",
-        type=_seconds,
+        type=option_types.seconds(0, 3600),
         default=0.0,
         metavar="SECONDS",
-        help="wait so long for master and nodes that are just starting (default: 0)",
+        help="maximum time to wait for master and nodes that are starting (default: 0)",
     )
     parser.add_argument(
         "-i",
@@ -54,7 +56,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         help=f"name of the rosAFE node (default: {ROSAFE.name})",
     )
     parser.epilog = (
-        "exit status: 0 done, 1 refused (nothing has changed), 2 wrong command line\n\n"
+        "exit status: 0 success, 1 refused (nothing was changed), 2 wrong command line\n\n"
         "examples:\n"
         "  rosafe setup save tree.yaml\n"
         "  rosafe setup load tree.yaml\n"
@@ -62,18 +64,8 @@ def configure(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def _seconds(text: str) -> float:
-    try:
-        seconds = float(text)
-    except ValueError:
-        seconds = -1.0
-    if not 0 <= seconds <= 3600:
-        raise argparse.ArgumentTypeError(f"{text!r} is no time: seconds from 0 to 3600")
-    return seconds
-
-
 def run(options: argparse.Namespace) -> int:
-    """Save or load."""
+    """Save or load the setup."""
     if options.full and options.action == "load":
         options.usage_error("--full is for save")
     if options.keep and options.action == "save":
@@ -83,53 +75,73 @@ def run(options: argparse.Namespace) -> int:
     if setup is not None:
         show(asyncio.run(load(setup, options.instance, options.wait)))
     else:
-        _keep(options.file, asyncio.run(_saved(options)))
+        _save(options.file, asyncio.run(_captured(options)))
     return 0
 
 
 def read_file(name: str) -> Setup:
-    """The setup in the file `name`; Failure, with file and line, where there is none."""
+    """Read the setup in the file `name`. Raises CommandError with file and line if it is not valid."""
     try:
-        limit = 4 * MAX_SETUP + 1  # bytes of that many characters, and one more
+        limit = 4 * MAX_SETUP + 1  # maximum number of bytes, and one more
         data = sys.stdin.buffer.read(limit) if name == "-" else read_regular(name, limit)
-        return read(data.decode("utf-8-sig"))
+        setup = read(data.decode("utf-8-sig"))
+        return setup if setup.localizer is None else replace(setup, localizer=_absolute(setup.localizer, Path(name)))
     except UnicodeDecodeError:
-        raise CommandError(f"{name}: not a setup: the file is not UTF-8") from None
+        raise CommandError(f"{name}: expected a setup in UTF-8") from None
     except OSError as problem:
         raise CommandError(f"{name}: {problem.strerror or problem}") from None
     except SetupError as problem:
         raise CommandError(f"{name}, {problem}") from None
 
 
+def _absolute(localizer: Mapping[str, Any], setup_file: Path) -> dict[str, Any]:
+    """Return the settings of the localizer with absolute paths; relative ones are relative to the setup."""
+
+    def path(value: str) -> str:
+        return str((setup_file.parent / Path(value).expanduser()).absolute())
+
+    return {
+        name: path(value) if name in LOCALIZER_FILES and value not in ("", "sphere", "none") else value
+        for name, value in localizer.items()
+    }
+
+
 def without_saved_tree(setup: Setup, keep: str) -> Setup:
-    """What is to be loaded of `setup` for a node that keeps its tree in the file `keep`: that comes back by itself."""
+    """Return `setup` without processors if the node restores its own tree from the file `keep`."""
     if keep and Path(keep).exists() and read_file(keep).processors:
         return replace(setup, processors=())
     return setup
 
 
 async def load(setup: Setup, instance: str, wait: float = 0.0) -> dict[str, Any]:
-    """Build it on a running rosAFE; the outputs of `interface.LOAD_SETUP`, or Failure."""
-    from rosafe.client import setup_transaction
+    """Apply the setup to a running rosAFE, and set the parameters of the localizer, which reads them when it starts.
 
-    async with component(instance, wait) as proxy:
+    Returns the outputs of `interface.LOAD_SETUP`, and `localizer`: running, set or empty. Raises CommandError.
+    """
+    from rosafe.client import localizer, setup_transaction
+
+    async with component(instance, wait) as client:
         try:
-            return await setup_transaction.apply(proxy, setup, wait)
+            answer = {**await setup_transaction.apply(client, setup, wait), "localizer": ""}
+            if setup.localizer is not None:
+                await localizer.set_parameters(client.graph, setup.localizer)
+                answer["localizer"] = "running" if await localizer.is_registered(client.graph) else "set"
+            return answer
         except ComponentError as problem:
             raise CommandError(format_error(problem)) from None
 
 
-async def _saved(options: argparse.Namespace) -> str:
+async def _captured(options: argparse.Namespace) -> str:
     from rosafe.client import setup_transaction
 
-    async with component(options.instance, options.wait) as proxy:
+    async with component(options.instance, options.wait) as client:
         try:
-            return write(await setup_transaction.capture(proxy), options.full)
+            return write(await setup_transaction.capture(client), options.full)
         except ComponentError as problem:
             raise CommandError(format_error(problem)) from None
 
 
-def _keep(name: str, text: str) -> None:
+def _save(name: str, text: str) -> None:
     if name == "-":
         print(text, end="")
     else:
@@ -138,9 +150,13 @@ def _keep(name: str, text: str) -> None:
 
 
 def show(answer: dict[str, Any]) -> None:
-    """A line for the sound and one for each processor."""
+    """Print a line for the sound and one for each processor."""
     if answer["sound"]:
         print(f"{answer['sound']:7}  sound")
-    for how in ("reused", "created"):
-        for name in answer[how]:
-            print(f"{how:7}  {printable(name)}")
+    for state in ("reused", "created"):
+        for name in answer[state]:
+            print(f"{state:7}  {printable(name)}")
+    if answer["localizer"] == "running":
+        print("set      parameters of the localizer, which has to be restarted to use them")
+    elif answer["localizer"]:
+        print("set      parameters of the localizer; start it with: rosafe localize")

@@ -1,13 +1,13 @@
-"""Show what the processors do at the same time: of a running rosAFE node, or on a sound file.
+"""Trace the concurrent work of processors, in a running rosAFE node or on a sound file.
 
-Prints, for each processor, its share of the time in the four states of the user guide (waitExec, exec, waitRelease,
-release), for each worker how much of the time it computes, and for how long parents, children and siblings compute at
-the same time. With -o, every step goes into a file that https://ui.perfetto.dev and chrome://tracing show: a row for
-each processor and each worker, with the numbers of the blocks. ROSAFE_WORKERS says how many workers there are.
+Prints the share of time that each processor spends in the four states of the user guide (waitExec, exec, waitRelease,
+release), the load of each worker, and for how long parents, children and siblings compute concurrently. With -o, all
+steps are written to a file for https://ui.perfetto.dev and chrome://tracing, with a row for each processor and worker
+and the numbers of the blocks. ROSAFE_WORKERS sets the number of workers.
 
-Without SOUND it listens to a node, which traces only while this command does. Where the node keeps up, it waits for
-sound most of the time, and a parent has nothing to do while its children work. With SOUND, a file with two channels,
-the default tree computes as fast as it goes, without ROS. Ctrl-C ends it early."""
+Without SOUND the command subscribes to a node, which traces only during the subscription. A node that keeps up waits
+for sound most of the time, and a parent is idle while its children work. With SOUND, a file with two channels, the
+default tree computes at full speed without ROS. Ctrl-C ends the trace early."""
 
 from __future__ import annotations
 
@@ -23,51 +23,46 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from rosafe import option_types
 from rosafe.commands import CommandError
+from rosafe.declarations.block_length import DEFAULT_FRAMES_PER_BLOCK, MAX_FRAMES_PER_BLOCK
 from rosafe.output import new_file
 from rosafe.terminal import printable
 
 if TYPE_CHECKING:
     from rosafe.tree.trace import Event
 
-_ANSWER_SECONDS = 3.0  # for a node to find out that somebody listens, and between two of its messages
-_MAX_SECONDS = 3600.0
-_MAX_BLOCK = 10_000_000
+_ANSWER_SECONDS = 3.0  # for a node to notice the subscription, and between two of its messages
+_MIN_SECONDS, _MAX_SECONDS = 1e-3, 3600.0
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
-    parser.add_argument("sound", nargs="?", type=Path, metavar="SOUND", help="compute this file, without ROS")
-    parser.add_argument("-o", "--output", type=Path, metavar="FILE", help="write the trace there, as JSON")
     parser.add_argument(
-        "--seconds", type=_seconds, default=5.0, metavar="S", help="how long, or so much sound (default: %(default)g)"
+        "sound", nargs="?", type=Path, metavar="SOUND", help="trace the computation of this file, without ROS"
     )
-    parser.add_argument("--node", default="rosAFE", metavar="NAME", help="the instance (default: %(default)s)")
+    parser.add_argument("-o", "--output", type=Path, metavar="FILE", help="write the trace to FILE as JSON")
     parser.add_argument(
-        "--block", type=_block, default=12000, metavar="N", help="frames per block of SOUND (default: %(default)s)"
+        "--seconds",
+        type=option_types.seconds(_MIN_SECONDS, _MAX_SECONDS),
+        default=5.0,
+        metavar="S",
+        help="duration of the trace, or of the sound (default: %(default)g)",
     )
-    parser.add_argument("--force", action="store_true", help="replace FILE if it is there")
+    parser.add_argument("--node", default="rosAFE", metavar="NAME", help="name of the node (default: %(default)s)")
+    parser.add_argument(
+        "--block",
+        type=option_types.whole_number(1, MAX_FRAMES_PER_BLOCK),
+        default=DEFAULT_FRAMES_PER_BLOCK,
+        metavar="N",
+        help="frames per block of SOUND (default: %(default)s)",
+    )
+    parser.add_argument("--force", action="store_true", help="replace FILE if it exists")
     parser.epilog = "examples:\n  rosafe trace --seconds 10 -o trace.json\n  rosafe trace speech.wav -o trace.json"
 
 
-def _seconds(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0 < value <= _MAX_SECONDS:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number of seconds up to {_MAX_SECONDS:g}")
-    return value
-
-
-def _block(text: str) -> int:
-    if not (text.isascii() and text.isdigit()) or not 1 <= int(text[:20]) <= _MAX_BLOCK:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number from 1 to {_MAX_BLOCK}")
-    return int(text)
-
-
 def run(options: argparse.Namespace) -> int:
-    """Listen or compute, write, print."""
+    """Trace a node or a computation, write the file and print the summary."""
     output: Path | None = options.output
     with nullcontext() if output is None else new_file(output, options.force) as descriptor:
         if options.sound is not None:
@@ -80,8 +75,8 @@ def run(options: argparse.Namespace) -> int:
         from rosafe.tree.trace import Trace
 
         trace = Trace(events)
-        if not trace.spans:
-            raise CommandError(f"{title} has no processors: nothing to trace")
+        if not trace.intervals:
+            raise CommandError(f"{title} has no processors; create some first")
         if descriptor is not None:
             with os.fdopen(descriptor, "w", encoding="utf-8", closefd=False) as stream:
                 json.dump(trace.chrome(title), stream)
@@ -93,7 +88,7 @@ def run(options: argparse.Namespace) -> int:
 
 
 def _compute(path: Path, seconds: float, block: int) -> list[Event]:
-    """What the default tree does on the first `seconds` of a sound file."""
+    """Return the events of the default tree for the first `seconds` of a sound file."""
     from rosafe.interface import CORE_REPRESENTATIONS
     from rosafe.interface.arguments import check_parameters
     from rosafe.offline.chain import Chain
@@ -105,7 +100,7 @@ def _compute(path: Path, seconds: float, block: int) -> list[Event]:
         sound = AudioFile(path)
         try:
             if sound.channels != 2:
-                raise CommandError(f"{path} has {sound.channels} channels, wanted are two: left and right ear")
+                raise CommandError(f"{path}: expected two channels, left and right ear, got {sound.channels}")
             frames = min(sound.frames, math.ceil(seconds * sound.sample_rate))
             blocks = (sound.read(min(block, frames - first)) for first in range(0, frames, block))
             values = {"in_doNormalize": True, **check_parameters(None)}
@@ -120,7 +115,7 @@ def _compute(path: Path, seconds: float, block: int) -> list[Event]:
 
 
 def _listen(node: str, seconds: float) -> list[Event]:
-    """What the node tells in so many seconds, or until Ctrl-C."""
+    """Return the events that the node publishes within `seconds`, or until Ctrl-C."""
     import rospy
     from std_msgs.msg import String
 
@@ -139,12 +134,12 @@ def _listen(node: str, seconds: float) -> list[Event]:
         try:
             events += read(messages.get(timeout=_ANSWER_SECONDS))
         except queue.Empty:
-            raise CommandError(f"{node} does not answer: is there a rosAFE-ros of this name?") from None
+            raise CommandError(f"{node} does not publish a trace; check that a rosAFE-ros has this name") from None
         deadline = time.monotonic() + seconds
         while (left := deadline - time.monotonic()) > 0:
             events += read(messages.get(timeout=left + _ANSWER_SECONDS))
     except queue.Empty:
-        print(f"rosafe trace: {printable(node)} has fallen silent", file=sys.stderr)
+        print(f"rosafe trace: {printable(node)} has stopped publishing", file=sys.stderr)
     except KeyboardInterrupt:
         if not events:
             raise

@@ -1,7 +1,7 @@
-"""Start all that a robot needs to hear: a ROS master, bass, rosAFE, genomixd, a setup, and the page.
+"""Start the complete front-end: a ROS master, bass, rosAFE, genomixd, a setup, the localizer, and the live page.
 
-What runs already is used, and stays; what was started here ends with Ctrl-C. With a FILE.yaml, which
-`rosafe setup save` writes and docs/setups.md describes, sound and processors are there as well."""
+Processes that already run are used and continue afterwards. Processes that were started here end with Ctrl-C. FILE.yaml
+is a setup with sound and processors; `rosafe setup save` writes one, and docs/setups.md describes it."""
 
 from __future__ import annotations
 
@@ -12,58 +12,77 @@ import shutil
 import sys
 from collections.abc import AsyncIterator, Iterable
 from contextlib import asynccontextmanager
-from typing import TYPE_CHECKING
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
+from rosafe import option_types
 from rosafe.commands import CommandError
 from rosafe.interface import ComponentError
-from rosafe.setups import Setup
+from rosafe.setups import AcquireSettings, Setup
 
 if TYPE_CHECKING:
     from rosafe.client.component_client import ComponentClient
     from rosafe.client.graph import Graph
     from rosafe.commands._launcher import Launcher, ManagedProcess
 
-PERIOD = 1.0  # seconds between two looks at all
+POLL_SECONDS = 1.0  # between two queries of the state of all nodes
 
 
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments."""
-    parser.usage = "rosafe up [FILE.yaml] [--live] [--keep FILE] [--port PORT] [--live-port PORT] [--no-browser]"
+    parser.usage = (
+        "rosafe up [FILE.yaml] [--device DEVICE] [--localize] [--head FILE] [--live] [--keep FILE] [--port PORT]\n"
+        "                 [--live-port PORT] [--no-browser]"
+    )
     parser.add_argument("file", metavar="FILE.yaml", nargs="?", help="the setup to load (default: none)")
-    parser.add_argument("--live", action="store_true", help="serve the page too, as `rosafe live` does")
+    parser.add_argument("--device", metavar="DEVICE", help="capture from DEVICE, instead of the sound of FILE.yaml")
+    parser.add_argument(
+        "--localize", action="store_true", help="also track the directions of sources, as `rosafe localize` does"
+    )
+    parser.add_argument(
+        "--head",
+        metavar="FILE",
+        help="head for --localize: SOFA file or model (default: that of FILE.yaml, otherwise a sphere)",
+    )
+    parser.add_argument("--live", action="store_true", help="also serve the live page, as `rosafe live` does")
     parser.add_argument(
         "--keep",
         metavar="FILE",
         default="",
-        help="as rosAFE-ros takes it, where that is started here; FILE.yaml then gives the sound, and the first tree",
+        help="option for a rosAFE-ros that is started here; FILE.yaml then defines the sound and the first tree",
     )
-    parser.add_argument("--port", type=_port, default=8080, help="of genomixd (default: 8080)")
-    parser.add_argument("--live-port", type=_port, default=8090, metavar="PORT", help="of the page (default: 8090)")
-    parser.add_argument("--no-browser", action="store_true", help="open no browser")
+    parser.add_argument(
+        "--port", type=option_types.port(minimum=1), default=8080, help="port of genomixd (default: 8080)"
+    )
+    parser.add_argument(
+        "--live-port",
+        type=option_types.port(minimum=1),
+        default=8090,
+        metavar="PORT",
+        help="port of the live page (default: 8090)",
+    )
+    parser.add_argument("--no-browser", action="store_true", help="do not open a browser")
     parser.epilog = (
-        "exit status: 0 ended as it was told to, 1 something did not start or has ended, 2 wrong command line\n\n"
+        "exit status: 0 ended by Ctrl-C, 1 a process did not start or ended by itself, 2 wrong command line\n\n"
         "examples:\n"
         "  rosafe up\n"
-        "  rosafe up setups/scene.yaml --live     # the built-in scene, and what comes of it\n"
-        "  rosafe up tree.yaml"
+        "  rosafe up setups/scene.yaml --live     # the built-in scene and its representations\n"
+        "  rosafe up tree.yaml\n"
+        "  rosafe up --device plughw:1,0 --localize --head robot.head --live     # sources around a robot"
     )
-
-
-def _port(text: str) -> int:
-    if not (text.isascii() and text.isdigit() and 0 < int(text[:10]) <= 65535):
-        raise argparse.ArgumentTypeError(f"{text!r} is no port: 1 to 65535")
-    return int(text)
 
 
 def run(options: argparse.Namespace) -> int:
-    """Start everything, show how it is, and end what was started."""
+    """Start the processes, show their states, and end them."""
     from rosafe.commands._launcher import Launcher, environment
     from rosafe.commands.setup import read_file, without_saved_tree
     from rosafe.component import generate
     from rosafe.transport import master
 
-    # What is wrong with it is told before anything starts.
+    # Errors in the setup are reported before any process starts.
     setup = without_saved_tree(read_file(options.file), options.keep) if options.file else None
+    if options.device:
+        setup = replace(setup or Setup(), sound=AcquireSettings.of({"device": options.device}))
     try:
         env = environment()
         master.check_address(env["ROS_MASTER_URI"])
@@ -73,9 +92,18 @@ def run(options: argparse.Namespace) -> int:
     with Launcher(env) as stack:
         asyncio.run(_Session(options, setup, stack).run())
         if sys.stdout.isatty():
-            print("ending what was started here", flush=True)
+            print("ending the processes that were started here", flush=True)
         refused = any(part.state == "refused" for part in stack.parts.values())
         return int(refused or bool(stack.ended))
+
+
+def _localizer_settings(options: argparse.Namespace, setup: Setup | None) -> dict[str, Any] | None:
+    """Return the settings of the localizer, or None if none is to be started."""
+    of_setup = setup.localizer if setup is not None else None
+    if of_setup is None and not options.localize and not options.head:
+        return None
+    head = {"head": os.path.abspath(os.path.expanduser(options.head))} if options.head else {}
+    return {**(of_setup or {}), **head}
 
 
 class _Session:
@@ -89,7 +117,7 @@ class _Session:
         self._end = asyncio.Event()
 
     async def run(self) -> None:
-        """Until a signal comes."""
+        """Run until a signal is received."""
         from rosafe.component import startup
 
         loop = asyncio.get_running_loop()
@@ -101,7 +129,7 @@ class _Session:
         try:
             await asyncio.wait({work, end}, return_when=asyncio.FIRST_COMPLETED)
             if work.done():
-                work.result()  # raises what has failed
+                work.result()  # raises the exception of a failure
         finally:
             for task in (work, end, show):
                 task.cancel()
@@ -111,9 +139,9 @@ class _Session:
     async def _show(self) -> None:
         while True:
             for part in self._stack.parts.values():
-                part.look()
+                part.poll()
             self._screen.show(self._stack.lines())
-            await asyncio.sleep(PERIOD / 4)
+            await asyncio.sleep(POLL_SECONDS / 4)
 
     async def _work(self) -> None:
         options, stack = self._options, self._stack
@@ -126,12 +154,14 @@ class _Session:
                 stack.start_genomixd(options.port),
             )
             await self._load(afe)
+            if (settings := _localizer_settings(options, self._setup)) is not None:
+                await stack.start_localizer(graph, settings)
             if options.live:
                 await stack.start_page(options.live_port, not options.no_browser)
-            self._screen.say("Ctrl-C ends what was started here")
+            self._screen.say("Press Ctrl-C to end the processes that were started here")
             while True:
                 await self._poll(bass, afe)
-                await asyncio.sleep(PERIOD)
+                await asyncio.sleep(POLL_SECONDS)
 
     async def _load(self, afe: ComponentClient | None) -> None:
         from rosafe.client import setup_transaction
@@ -140,25 +170,26 @@ class _Session:
 
         if self._setup is None:
             return
-        part = self._stack.parts["setup"] = ManagedProcess("setup", "loads", self._options.file)
+        name = self._options.file or self._options.device
+        part = self._stack.parts["setup"] = ManagedProcess("setup", "loads", name)
         if afe is None:
-            part.state, part.detail = "refused", "rosAFE does not run"
+            part.state, part.detail = "refused", "rosAFE is not running"
             return
         try:
             answer = await setup_transaction.apply(afe, self._setup, wait=10.0)
             part.state = "loaded"
-            part.detail = f"{self._options.file}: {len(answer['created'])} created, {len(answer['reused'])} reused"
+            part.detail = f"{name}: {len(answer['created'])} created, {len(answer['reused'])} reused"
         except ComponentError as problem:
             part.state, part.detail = "refused", format_error(problem)
 
     async def _poll(self, bass: ComponentClient | None, afe: ComponentClient | None) -> None:
-        """Say of the nodes what they do."""
-        for name, proxy in (("bass", bass), ("rosAFE", afe)):
+        """Update the states of the nodes."""
+        for name, client in (("bass", bass), ("rosAFE", afe)):
             part = self._stack.parts[name]
-            if proxy is None or part.state == "ended":
+            if client is None or part.state == "ended":
                 continue
             try:
-                part.detail = await (_acquisition if name == "bass" else _tree)(proxy) + _tree_origin(part)
+                part.detail = await (_acquisition if name == "bass" else _tree)(client) + _tree_origin(part)
                 part.state = "runs"
             except ComponentError as problem:
                 part.state, part.detail = "silent", str(problem)
@@ -190,24 +221,24 @@ async def _graph() -> AsyncIterator[Graph]:
 
 
 class _Screen:
-    """The state of all parts: on a terminal written over itself, elsewhere a line for each change."""
+    """Display of the state of all processes: redrawn on a terminal, otherwise a line for each change."""
 
     def __init__(self, terminal: bool) -> None:
         self._terminal = terminal
         self._lines: list[str] = []
-        self._said: list[str] = []
+        self._notes: list[str] = []
 
     def say(self, text: str) -> None:
-        """Show a line below all others."""
-        self._said.append(text)
+        """Add a line below all others."""
+        self._notes.append(text)
 
     def show(self, lines: Iterable[str]) -> None:
-        """Show how it is now."""
-        now = [*lines, *self._said]
+        """Show the current state."""
+        now = [*lines, *self._notes]
         if now == self._lines:
             return
         if self._terminal:
-            # Lines are left whole for the terminal to wrap: an address is to be copied from there.
+            # The terminal wraps long lines; they are not cut, so that URLs can be copied.
             width = shutil.get_terminal_size().columns
             above = sum(max(1, -(-len(line) // width)) for line in self._lines)
             up = f"\x1b[{above}F\x1b[J" if above else ""

@@ -1,1 +1,1 @@
-"""The demonstration: the nodes, the guide's requests, seven ports, a table and a picture, with one command."""
+"""The demonstration: starts the nodes, sends the requests of the user guide, records seven ports and plots them."""

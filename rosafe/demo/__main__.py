@@ -1,4 +1,4 @@
-"""`python3 -m rosafe.demo`, what scripts/demo runs."""
+"""Entry point of `python3 -m rosafe.demo`, which scripts/demo runs."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""The command `scripts/demo`: options, the course of the demonstration, signals and exit codes."""
+"""The commands `scripts/demo` and `rosafe demo`: options, signals, clean-up and exit codes."""
 
 from __future__ import annotations
 
@@ -12,48 +12,49 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NoReturn
 
+from rosafe import option_types
 from rosafe.terminal import printable
 
 DEFAULT_DEVICE = "scene:"
 DEFAULT_SECONDS = 10.0
-SHORTEST, LONGEST = 2.0, 600.0
+MIN_SECONDS, MAX_SECONDS = 2.0, 600.0
 PLOT_FILE = "rosafe-demo.png"
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class _Stopped(BaseException):
-    """A signal came that ends the program."""
+    """A signal that ends the program was received."""
 
 
 class _Signals:
-    """Turns the signals that end a program into `_Stopped` in the main thread, wherever that is.
+    """Signal handlers that raise `_Stopped` in the main thread.
 
     Attributes
     ----------
     received : int
-        The first one that came, or 0.
+        The first signal that was received, or 0.
     """
 
     def __init__(self) -> None:
         self.received = 0
         for number in SIGNALS:
-            if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # nohup wants it ignored
-                signal.signal(number, self._take)
+            if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:  # ignored under nohup
+                signal.signal(number, self._stop)
 
-    def _take(self, number: int, frame: object) -> None:
+    def _stop(self, number: int, frame: object) -> None:
         self.defer()
         self.received = number
         raise _Stopped
 
     def check(self) -> None:
-        """Raise `_Stopped` where that got lost: Python drops what is raised while it destroys an object."""
+        """Raise `_Stopped` again if it was lost: Python discards exceptions that are raised in a destructor."""
         if self.received:
             raise _Stopped
 
     def defer(self) -> None:
-        """From now on only remember signals: nothing may cut the end short."""
+        """Only remember signals from now on, so that they do not interrupt the clean-up."""
         for number in SIGNALS:
-            if signal.getsignal(number) == self._take:
+            if signal.getsignal(number) == self._stop:
                 signal.signal(number, self._remember)
 
     def _remember(self, number: int, frame: object) -> None:
@@ -62,35 +63,24 @@ class _Signals:
 
 class _Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
-        self.exit(2, f"demo: {message}; scripts/demo -h shows what is possible\n")
-
-
-def _seconds(text: str) -> float:
-    try:
-        seconds = float(text)
-    except ValueError:
-        seconds = float("nan")
-    if not SHORTEST <= seconds <= LONGEST:
-        raise argparse.ArgumentTypeError(f"{text!r} is no number of seconds from {SHORTEST:g} to {LONGEST:g}")
-    return seconds
+        self.exit(2, f"demo: {message}; run scripts/demo -h for the options\n")
 
 
 def _sound(text: str) -> str:
     if not text.strip():
-        raise argparse.ArgumentTypeError("it is empty: name a sound file or a device, or leave it out for scene:")
+        raise argparse.ArgumentTypeError(
+            "expected a sound file or a device, got an empty text; omit the argument for scene:"
+        )
     return text
 
 
-def _parse(arguments: list[str] | None) -> argparse.Namespace:
-    parser = _Parser(
-        prog="scripts/demo",
-        description="Sound goes in, seven auditory representations come out on ROS topics, and a picture of them.",
-        epilog="examples:\n"
-        "  scripts/demo                              the built-in scene\n"
-        "  scripts/demo speech.wav --seconds 5       a sound file with two channels\n"
-        "  scripts/demo plughw:1,0 --out /tmp/me     a microphone pair",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-        allow_abbrev=False,
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments."""
+    parser.epilog = (
+        "examples:\n"
+        f"  {parser.prog}                              the built-in scene\n"
+        f"  {parser.prog} speech.wav --seconds 5       a sound file with two channels\n"
+        f"  {parser.prog} plughw:1,0 --out /tmp/me     a microphone pair"
     )
     parser.add_argument(
         "sound",
@@ -98,63 +88,70 @@ def _parse(arguments: list[str] | None) -> argparse.Namespace:
         nargs="?",
         default=DEFAULT_DEVICE,
         metavar="WAV or ALSA device",
-        help="sound file, ALSA capture device or scene: (default: %(default)s, which walks from left to right in 10 s)",
+        help="sound file, ALSA capture device or scene: (default: %(default)s, a source moves left to right in 10 s)",
     )
     parser.add_argument(
-        "--seconds", type=_seconds, default=DEFAULT_SECONDS, metavar="N", help="seconds of sound (default: 10)"
+        "--seconds",
+        type=option_types.seconds(MIN_SECONDS, MAX_SECONDS),
+        default=DEFAULT_SECONDS,
+        metavar="N",
+        help="seconds of audio (default: 10)",
     )
     parser.add_argument(
         "--out",
         type=Path,
         default=Path("rosafe-demo"),
         metavar="DIR",
-        help=f"folder for the picture, {PLOT_FILE} (default: ./rosafe-demo)",
+        help=f"folder for the figure, {PLOT_FILE} (default: ./rosafe-demo)",
     )
-    return parser.parse_args(arguments)
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the demonstration.
+    """Run `scripts/demo` and return its exit code, as `run`. SystemExit: 2 for a wrong command line, 0 after -h."""
+    parser = _Parser(
+        prog="scripts/demo",
+        description="Process audio into seven auditory representations on ROS topics, and save a figure of them.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
+    )
+    configure(parser)
+    return run(parser.parse_args(arguments))
 
-    Returns
-    -------
-    int
-        0 at its end, 1 where something failed, 128 + number where a signal ended it. A wrong command line raises
-        SystemExit(2), and -h SystemExit(0).
-    """
+
+def run(options: argparse.Namespace) -> int:
+    """Run the demonstration; return 0 on success, 1 after a failure, 128 + number after a signal."""
     signals = _Signals()
     try:
-        options = _parse(arguments)
         try:
             with (
                 _without_empty_folders(options.out, signals),
                 tempfile.TemporaryDirectory(prefix="rosafe-demo-") as scratch,
             ):
                 return _run(options, signals, scratch)
-        except BrokenPipeError:  # nobody reads what is printed: `scripts/demo | head`
-            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for what Python still has to flush
+        except BrokenPipeError:  # the reader of the output has ended: `scripts/demo | head`
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # for output that Python has not flushed
             return 1
     except BaseException:
         if not signals.received:
             raise
-        return 128 + signals.received  # a library may have made another error of it (numpy does while it is imported)
+        return 128 + signals.received  # a library may have converted it to another error (numpy does during its import)
 
 
 @contextlib.contextmanager
 def _without_empty_folders(path: Path, signals: _Signals) -> Iterator[None]:
-    """Take `path` and its parents away again at the end, those that were not there before and that hold nothing."""
-    made = [folder for folder in (path, *path.parents) if not os.path.exists(folder)]
+    """Remove `path` and its parents at the end if they did not exist before and are empty."""
+    created = [folder for folder in (path, *path.parents) if not os.path.exists(folder)]
     try:
         yield
     finally:
         signals.defer()
-        for folder in made:
+        for folder in created:
             if os.path.isdir(folder) and not any(folder.iterdir()):
                 folder.rmdir()
 
 
 def _run(options: argparse.Namespace, signals: _Signals, scratch: str) -> int:
-    """The demonstration, with its failures as one line; `scratch` is a folder for log files and caches."""
+    """Run the demonstration and print a failure as one line; `scratch` is a folder for log files and caches."""
     from rosafe.component.generate import GenerationError
     from rosafe.demo import scenario
     from rosafe.interface import ComponentError

@@ -1,4 +1,4 @@
-"""Child processes that never outlive this one, whatever ends it."""
+"""Child processes that always end with this process."""
 
 from __future__ import annotations
 
@@ -8,22 +8,21 @@ import subprocess
 import tempfile
 import time
 from collections.abc import Mapping
-from types import TracebackType
 from typing import IO
 
-END_SECONDS = 2.0  # for a gentle end; nobody but this process has to do with the children
-_WITH_PARENT = ("sh", "-c", '[ "$PPID" = "$0" ] && exec "$@"')  # against a death just before setpriv
+END_SECONDS = 2.0  # from SIGTERM to SIGKILL
+_WITH_PARENT = ("sh", "-c", '[ "$PPID" = "$0" ] && exec "$@"')  # do nothing if the parent died before setpriv
 
 
 class Child:
-    """A running command with a session of its own; what it prints is kept in files that have no name.
+    """A running command in its own session; its output is stored in unnamed files.
 
-    The kernel signals it when the thread that started it dies: `orphaned`, such as KILL.
+    When the thread that started it dies, the kernel sends it the signal `orphaned`, such as KILL.
     """
 
     def __init__(self, command: list[str], env: Mapping[str, str], orphaned: str) -> None:
         self.command = command
-        self._out: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115  # as long as the child is of interest
+        self._out: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115  # open as long as this object exists
         self._err: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115
         self.process = subprocess.Popen(
             ["setpriv", "--pdeathsig", orphaned, "--", *_WITH_PARENT, str(os.getpid()), *command],
@@ -31,28 +30,28 @@ class Child:
             stdin=subprocess.DEVNULL,
             stdout=self._out,
             stderr=self._err,
-            start_new_session=True,  # a Ctrl-C in the terminal is for this process alone, which then ends the child
+            start_new_session=True,  # Ctrl-C in the terminal reaches only this process, which then ends the child
         )
 
     @property
     def out(self) -> str:
-        """What it has printed on stdout so far."""
-        return os.pread(self._out.fileno(), 1_000_000, 0).decode("utf-8", "replace")
+        """Output on stdout so far."""
+        return _content(self._out)
 
     @property
     def err(self) -> str:
-        """What it has printed on stderr so far."""
-        return os.pread(self._err.fileno(), 1_000_000, 0).decode("utf-8", "replace")
+        """Output on stderr so far."""
+        return _content(self._err)
 
     def has_ended(self) -> bool:
-        """Whether it is gone."""
+        """Return whether the process has ended."""
         return self.process.poll() is not None
 
 
 class ProcessGroup:
-    """All children of this process, ended together. For the main thread only: the kernel watches that.
+    """All children of this process. Use it in the main thread only, because the kernel watches the starting thread.
 
-    Where this process is killed, they are, too; `orphaned` is TERM for those that have children of their own to end.
+    If this process is killed, the kernel sends the children `orphaned`: KILL, or TERM if they have children to end.
     """
 
     def __init__(self, env: Mapping[str, str], orphaned: str = "KILL") -> None:
@@ -67,7 +66,7 @@ class ProcessGroup:
         return child
 
     def close(self, seconds: float = END_SECONDS) -> None:
-        """End all that still run: gently, and by force after so many seconds."""
+        """Send SIGTERM to all children, and SIGKILL to those that are still running after `seconds`."""
         for child in self._all:
             _signal_group(child, signal.SIGTERM)
         deadline = time.monotonic() + seconds
@@ -79,15 +78,11 @@ class ProcessGroup:
                 child.process.wait()
         self._all.clear()
 
-    def __enter__(self) -> ProcessGroup:
-        return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()
+def _content(file: IO[bytes]) -> str:
+    return os.pread(file.fileno(), 1_000_000, 0).decode("utf-8", "replace")
 
 
 def _signal_group(child: Child, number: int) -> None:
-    if not child.has_ended():  # its number may be another process's later
+    if not child.has_ended():  # otherwise, its process id may have been reused
         os.killpg(child.process.pid, number)

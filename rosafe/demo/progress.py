@@ -1,4 +1,4 @@
-"""What is shown while it runs: one line that is drawn anew on a terminal, a line per second elsewhere."""
+"""The progress display: one line that is updated on a terminal, or one line per second in a file."""
 
 from __future__ import annotations
 
@@ -7,33 +7,34 @@ import time
 
 import numpy as np
 
+from rosafe.demo.direction import DirectionFinder
 from rosafe.demo.recorder import PortRecorder
-from rosafe.view import estimates, report
+from rosafe.view import report
 
 REFRESH_SECONDS = 0.1
 LINE_SECONDS = 1.0
-LOOK_BACK = 0.25  # s; levels and side are of the newest sound
-BAR = 7  # the line fits into 80 columns
+WINDOW_SECONDS = 0.25  # of the newest audio, for levels
+BAR = 7  # characters, so that the line fits into 80 columns
 QUIET_DB, LOUD_DB = -70.0, -10.0
 
 
 class Progress:
-    """The display of one recording of `seconds` seconds."""
+    """The display of a recording of `seconds` seconds."""
 
-    def __init__(self, recorder: PortRecorder, seconds: float) -> None:
-        self._recorder = recorder
+    def __init__(self, recorder: PortRecorder, finder: DirectionFinder | None, seconds: float) -> None:
+        self._recorder, self._finder = recorder, finder
         self._seconds = seconds
         self._live = sys.stdout.isatty()
         self._next = 0.0
 
     def show(self, elapsed: float) -> None:
-        """Show where things are, if it is time to."""
+        """Show the progress if the refresh period has passed."""
         now = time.monotonic()
         if now < self._next:
             return
         self._next = now + (REFRESH_SECONDS if self._live else LINE_SECONDS)
-        levels = [report.level_db(samples) for samples in self._recorder.newest_sound(LOOK_BACK)]
-        azimuth = self._azimuth()
+        levels = [report.level_db(samples) for samples in self._recorder.newest_audio(WINDOW_SECONDS)]
+        azimuth = self._finder.azimuth if self._finder else float("nan")
         if self._live:
             left, right = (_bar(level) for level in levels)
             line = f"{elapsed:5.1f}/{self._seconds:.1f} s  L {left[::-1]}|{right} R  {report.ruler({'@': azimuth})}"
@@ -45,14 +46,8 @@ class Progress:
                 flush=True,
             )
 
-    def _azimuth(self) -> float:
-        shown = self._recorder.representations().tail(LOOK_BACK)
-        heard = estimates.azimuth_from_ild(shown) if len(shown.times) else np.zeros(0)
-        heard = heard[np.isfinite(heard)]
-        return float(np.median(heard)) if len(heard) else float("nan")
-
     def close(self) -> None:
-        """Leave the line."""
+        """End the line."""
         if self._live:
             print(flush=True)
 

@@ -1,4 +1,4 @@
-"""One session as the user guide describes it: a master, the two nodes, and requests by rosservice."""
+"""A session as described in the user guide: a master, the two nodes, and requests by rosservice."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ import re
 import shlex
 import time
 from collections.abc import Callable, Mapping, Sequence
-from types import TracebackType
 from typing import Any
 
 from rosafe import interface
@@ -19,24 +18,24 @@ from rosafe.transport.paths import CODE_DIR
 
 START_SECONDS = 30.0
 REQUEST_SECONDS = 30.0
-_RESET = "\x1b[0m"  # rospy's log lines are coloured
+_RESET = "\x1b[0m"  # end of the colour of a log line of rospy
 POLL_SECONDS = 0.02
 NODES = {"bass": "bass-ros", "rosAFE": "rosAFE-ros"}
-# From kind of processor to the name that it gets: those of the guide.
+# Name of the processor by kind, as in the user guide.
 NAMES = {kind: representation.name for kind, representation in interface.CORE_REPRESENTATIONS.items()}
 
 
 class DemoError(Exception):
-    """The demonstration cannot go on; the text is the one line that the user gets."""
+    """The demonstration cannot continue; the text is one line for the user."""
 
 
 def acquire(sound: DemoSound) -> tuple[str, dict[str, Any]]:
-    """The request that starts the sound."""
+    """Return the request that starts the capture."""
     return (
         "/bass/Acquire",
         {
             "device": sound.device,
-            "sampleRate": sound.asked_rate,
+            "sampleRate": sound.requested_rate,
             "nFramesPerChunk": sound.frames_per_chunk,
             "nChunksOnPort": 20,
         },
@@ -44,7 +43,7 @@ def acquire(sound: DemoSound) -> tuple[str, dict[str, Any]]:
 
 
 def requests(sound: DemoSound) -> list[tuple[str, dict[str, Any]]]:
-    """The guide's requests in its order, with the parameters that a user is likely to change."""
+    """Return the requests of the user guide, with the parameters that a user is likely to change."""
     return [
         ("/rosAFE/connect_port", {"local": "Audio", "remote": "bass/Audio"}),
         acquire(sound),
@@ -64,7 +63,7 @@ def requests(sound: DemoSound) -> list[tuple[str, dict[str, Any]]]:
                 "name": NAMES["gammatone"],
                 "upperDepName": NAMES["preProc"],
                 "fb_lowFreqHz": 80,
-                "fb_highFreqHz": int(sound.highest_frequency),
+                "fb_highFreqHz": int(sound.max_frequency),
                 "fb_nERBs": 1,
             },
         ),
@@ -85,7 +84,7 @@ def requests(sound: DemoSound) -> list[tuple[str, dict[str, Any]]]:
 
 
 def command_line(service: str, arguments: Mapping[str, Any]) -> list[str]:
-    """The command for a request; `shlex.join` makes of it what a user types."""
+    """Return the command for a request as a list of arguments."""
     yaml = ", ".join(f"{name}: {_yaml(value)}" for name, value in arguments.items())
     return ["rosservice", "call", service, f"{{{yaml}}}"]
 
@@ -97,8 +96,8 @@ def _yaml(value: Any) -> str:
     return "'" + text.replace("'", "''") + "'"
 
 
-def shown(command: list[str]) -> str:
-    """The command as it is typed, in double quotes where that reads better than the shell's own way."""
+def shell_command(command: list[str]) -> str:
+    """Return the command as typed in a shell, with double quotes if the argument allows them."""
     argument = command[-1]
     if set('"$`\\!') & set(argument):
         return shlex.join(command)
@@ -106,14 +105,14 @@ def shown(command: list[str]) -> str:
 
 
 class DemoSession:
-    """A private master with both nodes on it, in an environment of their own. Everything ends with `close`.
+    """A private master with both nodes in their own environment. `close` ends all of them.
 
     Parameters
     ----------
     folder : str
-        For log files.
+        Folder for log files.
     check : callable
-        Called often while waiting; may raise to end that.
+        Called repeatedly while waiting; may raise an exception to end the wait.
 
     Raises
     ------
@@ -123,7 +122,7 @@ class DemoSession:
 
     def __init__(self, folder: str, check: Callable[[], None]) -> None:
         self._check = check
-        # Nothing of a graph that the user may be working on: this one is apart.
+        # The session must not connect to another graph of the user.
         for name in [name for name in os.environ if name.startswith("ROS_")]:
             del os.environ[name]
         os.environ.update(ROS_IP="127.0.0.1", ROS_LOG_DIR=folder, ROS_HOME=folder, **generate.environment())
@@ -134,13 +133,13 @@ class DemoSession:
         self._children = ProcessGroup(os.environ)
         self.nodes: dict[str, Child] = {}
         self._joined = False
-        self._ending = False  # that they end is no accident any more
+        self._ending = False  # the nodes are expected to end
 
     def start_nodes(self) -> None:
-        """Start both nodes and wait until they serve."""
+        """Start both nodes and wait until their services are registered."""
         for name, script in NODES.items():
             self.nodes[name] = self._children.start(script)
-        self.wait(self._served, START_SECONDS, "the nodes do not start")
+        self.wait(self._has_all_services, START_SECONDS, "the nodes do not start")
 
     def join(self) -> None:
         """Make this process a node of the session."""
@@ -149,25 +148,25 @@ class DemoSession:
         self._joined = True
         rospy.init_node("rosafe_demo", argv=["rosafe_demo"], disable_signals=True, log_level=rospy.FATAL)
 
-    def _served(self) -> bool:
-        """Whether all services of both nodes are there."""
+    def _has_all_services(self) -> bool:
+        """Return whether all services of both nodes are registered."""
         import rosgraph
 
-        served = {service for service, _ in rosgraph.Master("/rosafe_demo").getSystemState()[2]}
-        wanted = {f"/{component.name}/{service.name}" for component, service in interface.all_services()}
-        return wanted <= served
+        registered = {service for service, _ in rosgraph.Master("/rosafe_demo").getSystemState()[2]}
+        expected = {f"/{component.name}/{service.name}" for component, service in interface.all_services()}
+        return expected <= registered
 
-    def wait(self, condition: Callable[[], bool], seconds: float, otherwise: str) -> None:
-        """Wait for `condition`; DemoError saying `otherwise` after so many seconds, or where a node ends."""
+    def wait(self, condition: Callable[[], bool], seconds: float, error: str) -> None:
+        """Wait for `condition`; raise DemoError(`error`) after `seconds`, or another DemoError if a node ends."""
         deadline = time.monotonic() + seconds
         while not condition():
             self.check_nodes()
             if time.monotonic() > deadline:
-                raise DemoError(otherwise)
+                raise DemoError(error)
             time.sleep(POLL_SECONDS)
 
     def check_nodes(self) -> None:
-        """DemoError where a node has ended."""
+        """Raise DemoError if a node has ended."""
         self._check()
         for name, child in self.nodes.items():
             if child.has_ended() and not self._ending:
@@ -176,54 +175,46 @@ class DemoSession:
                 lines = child.err.strip().splitlines()
                 raise DemoError(f"{NODES[name]} {how}" + (f": {lines[-1]}" if lines else ""))
 
-    def request(self, service: str, arguments: Mapping[str, Any], say: Callable[[str], None]) -> None:
-        """Make one request with rosservice, telling its command line; DemoError where it is refused."""
-        self.requests_together([(service, arguments)], say)
+    def request(self, service: str, arguments: Mapping[str, Any], show: Callable[[str], None]) -> None:
+        """Send a request with rosservice and print its command; raise DemoError if it is rejected."""
+        self.request_parallel([(service, arguments)], show)
 
-    def requests_together(self, wanted: Sequence[tuple[str, Mapping[str, Any]]], say: Callable[[str], None]) -> None:
-        """Make requests that do not depend on each other at the same time."""
+    def request_parallel(self, steps: Sequence[tuple[str, Mapping[str, Any]]], show: Callable[[str], None]) -> None:
+        """Send requests that are independent of each other at the same time."""
         calls = []
-        for service, arguments in wanted:
+        for service, arguments in steps:
             command = command_line(service, arguments)
-            say(shown(command))
+            show(shell_command(command))
             calls.append((service, self._children.start(*command)))
         for service, call in calls:
             self.wait(call.has_ended, REQUEST_SECONDS, f"{service} does not answer")
             if call.process.returncode != 0 or "genom_success: True" not in call.out:
-                raise DemoError(f"{service} was refused: {self._reason(service, call)}")
+                raise DemoError(f"{service} failed: {self._reason(service, call)}")
 
     def _reason(self, service: str, call: Child) -> str:
-        """Why, in one line: what the node logged, which says more than what is on the wire."""
+        """Return why a request failed in one line: the log of the node, which has more details than the answer."""
         _, component, request = service.split("/")
-        told = re.findall(rf"{request}: (::.*)", self.nodes[component].err)
-        if told:
-            return str(told[-1]).removesuffix(_RESET)
+        logged = re.findall(rf"{request}: (::.*)", self.nodes[component].err)
+        if logged:
+            return str(logged[-1]).removesuffix(_RESET)
         lines = (call.err.strip() or call.out.strip()).splitlines()
         return " ".join(lines) if lines else f"exit code {call.process.returncode}"
 
-    def why_silent(self) -> str:
-        """What bass said of an acquisition that failed; empty where it came to the end of its source."""
+    def capture_error(self) -> str:
+        """Return why the capture has failed; empty if it has reached the end of its source."""
         failures = re.findall(r"\[ERROR\].*the acquisition has ended: (.*)", self.nodes["bass"].err)
         return failures[-1].removesuffix(_RESET) if failures else ""
 
-    def kill_nodes(self, say: Callable[[str], None]) -> None:
-        """Ask both nodes to end; `close` waits for it."""
+    def kill_nodes(self, show: Callable[[str], None]) -> None:
+        """Ask both nodes to end; `close` waits for them."""
         self._ending = True
-        self.requests_together([(f"/{name}/kill", {}) for name in NODES], say)
+        self.request_parallel([(f"/{name}/kill", {}) for name in NODES], show)
 
     def close(self) -> None:
-        """End everything, whatever state it is in."""
+        """End the nodes, the requests and the master."""
         self._children.close()
         if self._joined:
             import rospy
 
             rospy.signal_shutdown("the demonstration is over")
         self._master.close()
-
-    def __enter__(self) -> DemoSession:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self.close()

@@ -1,6 +1,6 @@
-"""The live page: what the robot hears, in any browser; `rosafe live`.
+"""The live page of `rosafe live`: the audio and the output of the processors, in a browser.
 
-`server` speaks HTTP, `client` is one page, `hub` the pictures that somebody looks at, `ports` what is subscribed for
-them, `pictures` what can be shown and how it is reduced, `robot` what the components are asked, `health` what they tell
-of themselves. `page/` is what the browser gets.
+`server` is the HTTP server, `client` the connection of one page, `subscriptions` the views that it shows, `views` the
+views of all pages, `ports` the topics that they read, `plot_data` the reduction of frames to the columns of a plot,
+`components` the requests to the components, `health` the content of /diagnostics. `page/` is served to the browser.
 """

@@ -1,4 +1,4 @@
-"""Who may use the live page: those who know the token, under a name of this machine, and no page from elsewhere."""
+"""Access control of the live page: a token, the Host header and the Origin header."""
 
 from __future__ import annotations
 
@@ -25,14 +25,15 @@ HEADERS = {
 
 
 class TokenAuth:
-    """Who may use the live page: requests under a name of this machine, not of other pages; the socket needs the token.
+    """Checks the requests: the Host header must name this machine, the Origin header this page.
 
-    The files of the page contain no secret. Cookies are not used: browsers send them to every port of a host.
+    The WebSocket also requires the token. The files of the page contain no secret and do not. Cookies are not used,
+    because browsers send them to every port of a host.
 
     Parameters
     ----------
     hosts : collection of str
-        Names, besides IP addresses and localhost, by which clients may call this machine.
+        Host names that are accepted in addition to IP addresses and localhost.
 
     Attributes
     ----------
@@ -45,7 +46,7 @@ class TokenAuth:
         self._hosts = {host_name(host) for host in hosts}
 
     def check(self, headers: Mapping[str, str], query: Mapping[str, str]) -> None:
-        """Raise HttpRefusal for requests to another name, of other pages, or with a wrong token."""
+        """Raise HttpRefusal if the request is for another host, from another page, or has a wrong token."""
         check_host(headers, self._hosts, "use its IP address")
         check_same_origin(headers)
         if "token" in query:
@@ -53,9 +54,6 @@ class TokenAuth:
 
     def check_token(self, query: Mapping[str, str]) -> None:
         """Raise HttpRefusal unless the query has the token."""
-        if not _equal(query.get("token", ""), self.token):
-            raise HttpRefusal(403, "the token is missing or an old one; open the URL that `rosafe live` has printed")
-
-
-def _equal(given: str, secret: str) -> bool:
-    return hmac.compare_digest(given.encode("utf-8", "replace"), secret.encode())
+        token = query.get("token", "").encode("utf-8", "replace")
+        if not hmac.compare_digest(token, self.token.encode()):
+            raise HttpRefusal(403, "the token is missing or outdated; open the URL that `rosafe live` has printed")

@@ -1,123 +1,118 @@
-"""What the page asks of the components: the tree, its changes, the sound. Refusals come with the component's reason."""
+"""Requests of the page to the components: the tree, its changes and the capture of audio."""
 
 from __future__ import annotations
 
 import asyncio
 import re
-from collections.abc import Mapping
+from collections.abc import Awaitable, Callable, Mapping
+from contextlib import suppress
 from typing import Any
 
 from rosafe.bass.sources import device_lines
-from rosafe.client.component_client import ComponentClient, describe_parameter
+from rosafe.client.component_client import ComponentClient
+from rosafe.client.description import describe_parameter
 from rosafe.client.graph import Graph
 from rosafe.interface import BASS, KINDS, LOAD_SETUP, REQUEST, ROSAFE, SAVE_SETUP, ComponentError, Service
 from rosafe.live.plot_data import ProcessorInfo, TreeSnapshot
 from rosafe.tree import tree_planner
 
-LOOK_SECONDS = 3.0  # for the answer of a component that is well
-# What the page needs to show something of each sort, where there is nothing yet.
-DEFAULT_REPRESENTATIONS = ("ratemap", "ild", "itd", "ic")
+Action = Callable[[Mapping[str, Any]], Awaitable[dict[str, Any]]]
+
+TREE_TIMEOUT_SECONDS = 3.0  # for the answer to getProcessors
+DEFAULT_REPRESENTATIONS = ("ratemap", "ild", "itd", "ic")  # one for each type of plot
 
 
 class ComponentFacade:
-    """A rosAFE and a bass on the graph.
+    """The requests to one rosAFE and one bass.
 
     Parameters
     ----------
     graph : Graph
     instance, bass : str
-        Their names.
+        Names of the two nodes.
     """
 
     def __init__(self, graph: Graph, instance: str, bass: str) -> None:
         self._graph = graph
         self._rosafe = ComponentClient(graph, ROSAFE, instance)
         self._bass = ComponentClient(graph, BASS, bass)
-        self.audio_topic = f"/{bass}/Audio"
 
     async def close(self) -> None:
-        """Let go of all connections."""
-        for proxy in (self._rosafe, self._bass):
-            await proxy.close()
+        """Close all connections."""
+        await self._rosafe.close()
+        await self._bass.close()
 
     async def tree(self) -> TreeSnapshot:
-        """The processors; ComponentError where rosAFE does not answer."""
+        """Return the processors; raise ComponentError if rosAFE does not answer."""
         try:
-            told = await asyncio.wait_for(self._rosafe.outputs("getProcessors", {}), LOOK_SECONDS)
+            answer = await asyncio.wait_for(self._rosafe.outputs("getProcessors", {}), TREE_TIMEOUT_SECONDS)
+            return TreeSnapshot([ProcessorInfo.of(processor) for processor in answer["processors"]])
         except TimeoutError:
-            name = self._rosafe.instance
-            raise ComponentError("::genom::mwerr", what=f"{name} does not answer") from None
-        try:
-            return TreeSnapshot([ProcessorInfo.of(one) for one in told["processors"]])
+            raise ComponentError("::genom::mwerr", what=f"{self._rosafe.instance} does not answer") from None
         except ValueError as problem:
             raise ComponentError("::genom::mwerr", what=f"getProcessors: {problem}") from None
 
-    # --- what can be asked for; each takes what the page sends and returns what it gets ---
+    # --- requests: each takes the values of the page and returns the answer ---
 
     async def devices(self, _: Mapping[str, Any]) -> dict[str, Any]:
-        """The names that Acquire takes, as ListDevices prints them."""
+        """Return the devices that Acquire accepts, as printed by ListDevices."""
 
-        def look() -> list[dict[str, str]]:
-            found = []
-            try:
+        def list_devices() -> list[dict[str, str]]:
+            devices = []
+            with suppress(ComponentError):  # no sound card: only the built-in sources, which come first
                 for line in device_lines():
                     name, _, doc = line.partition(" ")
-                    found.append({"name": name, "doc": re.sub(r"[\[\]]", "", doc)})
-            except ComponentError:  # no sound card: the built-in ones are there
-                pass
-            return found
+                    devices.append({"name": name, "doc": re.sub(r"[\[\]]", "", doc)})
+            return devices
 
-        return {"devices": await asyncio.to_thread(look)}
+        return {"devices": await asyncio.to_thread(list_devices)}
 
-    async def acquire(self, given: Mapping[str, Any]) -> dict[str, Any]:
-        """Start the sound."""
+    async def acquire(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Start the capture of audio."""
         service = self._bass.service("Acquire")
-        await self._bass.call(service, self._bass.arguments(service, {**given}))
+        await self._bass.call(service, self._bass.arguments(service, {**values}))
         return {}
 
     async def stop_capture(self, _: Mapping[str, Any]) -> dict[str, Any]:
-        """Stop the sound."""
+        """Stop the capture of audio."""
         await self._bass.outputs("Stop", {})
         return {}
 
-    async def build(self, given: Mapping[str, Any]) -> dict[str, Any]:
-        """Build what a representation needs, or find it, as `rosafe request`."""
-        values = dict(given)
+    async def build(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Build a representation with all processors that it needs, or find it, as `rosafe request` does."""
         kind = KINDS.get(str(values.get("representation", "")))
         if kind is not None:
-            values["representation"] = kind.word
-        return await self._ask(REQUEST, values)
+            values = {**values, "representation": kind.word}
+        return await self._call(REQUEST, values)
 
     async def build_default_tree(self, _: Mapping[str, Any]) -> dict[str, Any]:
-        """Build all that the page shows where it is opened for the first time."""
+        """Build the default representations."""
         created: list[str] = []
         for kind in DEFAULT_REPRESENTATIONS:
             created += (await self.build({"representation": kind}))["created"]
         return {"created": created}
 
-    async def modify(self, given: Mapping[str, Any]) -> dict[str, Any]:
-        """Change one parameter."""
-        return await self._ask(self._rosafe.service("modifyParameter"), given)
+    def actions(self) -> dict[str, Action]:
+        """Return the requests of the page by name."""
+        modify, remove = (self._rosafe.service(name) for name in ("modifyParameter", "removeProcessor"))
+        return {
+            "devices": self.devices,
+            "acquire": self.acquire,
+            "silence": self.stop_capture,
+            "build": self.build,
+            "usual": self.build_default_tree,
+            "modify": lambda values: self._call(modify, values),
+            "remove": lambda values: self._call(remove, values),
+            "save": lambda _: self._call(SAVE_SETUP, {}),
+            "load": lambda values: self._call(LOAD_SETUP, values),
+        }
 
-    async def remove(self, given: Mapping[str, Any]) -> dict[str, Any]:
-        """Remove a processor and all below it."""
-        return await self._ask(self._rosafe.service("removeProcessor"), given)
-
-    async def save_setup(self, _: Mapping[str, Any]) -> dict[str, Any]:
-        """The tree with its sound, as the text of a setup."""
-        return await self._ask(SAVE_SETUP, {})
-
-    async def load_setup(self, given: Mapping[str, Any]) -> dict[str, Any]:
-        """Build what the text of a setup says: wholly, or nothing changes."""
-        return await self._ask(LOAD_SETUP, given)
-
-    async def _ask(self, service: Service, given: Mapping[str, Any]) -> dict[str, Any]:
-        values = self._rosafe.arguments(service, {**given})
-        return dict((await self._rosafe.call(service, values)).values)
+    async def _call(self, service: Service, values: Mapping[str, Any]) -> dict[str, Any]:
+        return dict((await self._rosafe.call(service, self._rosafe.arguments(service, {**values}))).values)
 
 
 def catalogue() -> dict[str, Any]:
-    """What the table says of each kind of processor, and of the parameters of Acquire and InputProc."""
+    """Return the declarations of all kinds of processors and of the parameters of Acquire and InputProc."""
     return {
         "kinds": {
             kind.kind: {
@@ -135,8 +130,7 @@ def catalogue() -> dict[str, Any]:
 
 
 def format_error(problem: ComponentError) -> str:
-    """A refusal in one line: its name, and what it is about."""
+    """Return an error in one line: its name and its reason."""
     name = problem.ex.rpartition("::")[2]
-    known = {**BASS.exceptions, **ROSAFE.exceptions}
-    what = problem.what or known.get(name, "")
-    return f"{name}: {what}" if what else problem.ex
+    reason = problem.what or {**BASS.exceptions, **ROSAFE.exceptions}.get(name, "")
+    return f"{name}: {reason}" if reason else problem.ex

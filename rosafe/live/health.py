@@ -1,4 +1,4 @@
-"""What the nodes tell of themselves: loads, states, and what was lost and when. Listens only while somebody looks."""
+"""The content of /diagnostics: loads, states and losses of the nodes. Subscribed only while a page is open."""
 
 from __future__ import annotations
 
@@ -8,23 +8,24 @@ import time
 from collections import deque
 from typing import Any
 
-STALE_AFTER_SECONDS = 3.5  # since a node told of itself last; it does so every second
+STALE_AFTER_SECONDS = 3.5  # since the last message of a node, which sends one per second
+LOCALIZER = "localizer: localization"  # name of its status
 MAX_LOSSES = 50
-MAX_DIGITS = 15  # of a counter: the page has no longer whole numbers
+MAX_DIGITS = 15  # of a counter: JavaScript has no longer integers
 MAX_LOADS = 10_000  # processors
 MAX_TEXT = 500  # characters
 _LOAD = re.compile(r"(\S+), (\w+), (\d{1,15}) blocks, (\d{1,9}(?:\.\d{1,9})?) ms/s", re.ASCII)
-# counters of rosAFE's audio, and what a rise of them means
-_COUNTED = {
-    "lost": "audio frames were lost on their way to rosAFE",
-    "dropped": "frames of an earlier sound were dropped unread",
-    "refused": "audio messages were refused",
-    "breaks": "break in the sound: its windows did not fit",
+# Counters in the audio status of rosAFE, and the text for an increase.
+_AUDIO_COUNTERS = {
+    "lost": "audio frames were lost between bass and rosAFE",
+    "dropped": "frames of an earlier stream were discarded",
+    "refused": "audio messages were rejected",
+    "breaks": "interruptions of the audio: its windows did not fit together",
 }
 
 
 class Health:
-    """Follows /diagnostics between `listen` and `close`.
+    """Subscribes to /diagnostics between `listen` and `close`.
 
     Parameters
     ----------
@@ -35,74 +36,74 @@ class Health:
     def __init__(self, instance: str, bass: str) -> None:
         self._rosafe, self._bass = instance, bass
         self._names = (f"{instance}: audio", f"{instance}: processors", f"{bass}: capture")
+        self._localizer: tuple[float, str] | None = None  # time of the message (monotonic), and its text
         self._lock = threading.Lock()
         self._subscriber: Any = None
-        self._ended = False
+        self._closed = False
         self._values: dict[str, dict[str, str]] = {}
-        self._told: dict[str, float] = {}
+        self._received_at: dict[str, float] = {}
         self._losses: deque[dict[str, Any]] = deque(maxlen=MAX_LOSSES)
 
     def listen(self) -> None:
-        """Begin; may block for a moment."""
+        """Subscribe; may block for a moment."""
         import rospy
         from diagnostic_msgs.msg import DiagnosticArray
 
         with self._lock:
-            if self._subscriber is None and not self._ended:
-                self._subscriber = rospy.Subscriber("/diagnostics", DiagnosticArray, self._take, queue_size=10)
+            if self._subscriber is None and not self._closed:
+                self._subscriber = rospy.Subscriber("/diagnostics", DiagnosticArray, self._receive, queue_size=10)
 
-    def close(self, for_good: bool = False) -> None:
-        """Listen no longer, or never again, whoever is about to begin."""
+    def close(self, permanent: bool = False) -> None:
+        """Unsubscribe; if `permanent`, a later `listen` has no effect."""
         with self._lock:
-            self._ended = self._ended or for_good
+            self._closed = self._closed or permanent
             if self._subscriber is not None:
                 self._subscriber.unregister()
                 self._subscriber = None
             self._values.clear()
-            self._told.clear()
+            self._received_at.clear()
 
-    def _take(self, message: Any) -> None:
-        now = time.monotonic()
+    def _receive(self, message: Any) -> None:
         for status in message.status:
-            if status.name not in self._names:  # of other nodes, which are as many as there may be
+            if status.name == LOCALIZER:
+                self._localizer = time.monotonic(), status.message[:MAX_TEXT]
+            if status.name not in self._names:
                 continue
             values = {entry.key: entry.value[:MAX_TEXT] for entry in status.values[:MAX_LOADS]}
             with self._lock:
                 if self._subscriber is None:
                     return
-                before, self._values[status.name] = self._values.get(status.name), values
-                self._told[status.name] = now
-            if before is not None:
-                self._compare(status.name, before, values)
+                before = self._values.get(status.name)
+                self._values[status.name] = values
+                self._received_at[status.name] = time.monotonic()
+                if before is not None:
+                    self._note_losses(status.name, before, values)
 
-    def _compare(self, name: str, before: dict[str, str], values: dict[str, str]) -> None:
-        """Note what has been lost between two messages of a node."""
+    def _note_losses(self, name: str, before: dict[str, str], values: dict[str, str]) -> None:
+        """Compare two messages of a node and record its losses in between."""
+        counters = {}
         if name == f"{self._rosafe}: audio":
-            for counter, what in _COUNTED.items():
-                if (more := _number(values, counter) - _number(before, counter)) > 0:
-                    self.note(f"{more} {what}")
+            counters = _AUDIO_COUNTERS
         elif name == f"{self._bass}: capture":
-            more = _number(values, "lost frames") - _number(before, "lost frames")
-            if more > 0:
-                self.note(f"{more} frames were lost at the sound card")
-
-    def note(self, what: str) -> None:
-        """Remember a loss, with the time of day."""
-        with self._lock:
-            self._losses.append({"at": time.time(), "what": what})
+            counters = {"lost frames": "frames were lost at the sound card"}
+        for counter, text in counters.items():
+            if (lost := _number(values, counter) - _number(before, counter)) > 0:
+                self._losses.append({"at": time.time(), "what": f"{lost} {text}"})
 
     def status(self) -> dict[str, Any]:
-        """What the page shows."""
+        """Return the status as shown by the page."""
         now = time.monotonic()
         with self._lock:
-            fresh = {name for name, at in self._told.items() if now - at < STALE_AFTER_SECONDS}
+            fresh = {name for name, at in self._received_at.items() if now - at < STALE_AFTER_SECONDS}
             capture = self._values.get(f"{self._bass}: capture", {})
             audio = self._values.get(f"{self._rosafe}: audio", {})
             tree = self._values.get(f"{self._rosafe}: processors", {})
             device = capture.get("device", "none")
+            localizer = self._localizer
             return {
                 "bass": f"{self._bass}: capture" in fresh,
                 "rosafe": f"{self._rosafe}: audio" in fresh,
+                "localizer": localizer[1] if localizer and now - localizer[0] < STALE_AFTER_SECONDS else None,
                 "device": "" if device == "none" else device,
                 "lastEnd": capture.get("last end", ""),
                 "lost": _number(audio, "lost") + _number(audio, "dropped") + _number(capture, "lost frames"),
@@ -118,7 +119,7 @@ def _number(values: dict[str, str], key: str) -> int:
 
 
 def _load(text: str) -> dict[str, Any]:
-    """What rosAFE says of a processor."""
+    """Parse the diagnostics of a processor."""
     match = _LOAD.fullmatch(text)
     if match is None:
         return {"state": text[:80], "blocks": 0, "load": 0.0}

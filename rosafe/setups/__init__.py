@@ -1,7 +1,7 @@
-"""Setups: a tree of processors with its sound as a file that people read and write (docs/setups.md); no ROS.
+"""Setups: text files that describe a tree of processors with its sound (docs/setups.md). Does not use ROS.
 
-`read` and `write` go from text to `Setup` and back; `plan` tells what to do for one in a tree that is there already.
-rosafe/client/setup_transaction.py does it on a running graph.
+`read` and `write` convert between text and `Setup`; `plan` determines the requests that load a setup into an existing
+tree. rosafe/client/setup_transaction.py sends these requests to a running graph.
 """
 
 from __future__ import annotations
@@ -9,10 +9,12 @@ from __future__ import annotations
 from .markup import SetupError
 from .plan import SetupPlan, dry_run, plan
 from .reading import read, read_parameters
-from .setup import AcquireSettings, Setup, SetupProcessor, wanted
+from .setup import LOCALIZER, LOCALIZER_FILES, AcquireSettings, Setup, SetupProcessor, setup_processor
 from .writing import write
 
 __all__ = [
+    "LOCALIZER",
+    "LOCALIZER_FILES",
     "AcquireSettings",
     "Setup",
     "SetupError",
@@ -22,6 +24,6 @@ __all__ = [
     "plan",
     "read",
     "read_parameters",
-    "wanted",
+    "setup_processor",
     "write",
 ]

@@ -1,7 +1,7 @@
-"""The little of YAML that setups and lists of parameters are in: nodes that know their lines; scalars, lists, maps.
+"""Parser for the subset of YAML in setups and lists of parameters: scalars, lists and maps, with line numbers.
 
-Texts come from anywhere, over the network too. Tags, anchors and merging are refused, so that nothing grows or is
-evaluated; the meaning of a scalar is decided by its parameter, not by YAML. Directives are refused before libyaml sees
+The texts can come from untrusted sources. Tags, anchors and merging are rejected, so that no text expands or is
+evaluated; the parameter, not YAML, determines the meaning of a scalar. Directives are rejected before libyaml sees
 them, because it needs quadratic time for many %TAG lines; the time for everything else is proportional to the length of
 the text and the number of its values, and both are limited.
 """
@@ -14,25 +14,25 @@ from typing import Any, NamedTuple
 
 import yaml
 
-from rosafe.declarations.parameter import short_repr
+from rosafe.declarations.text import short_repr
 
-MAX_DEPTH = 6  # a setup has 4
+MAX_DEPTH = 6  # a setup needs 4
 MAX_VALUES = 2**18  # scalars, lists and maps of a setup, ends of lists and maps included: less than a second of parsing
 _LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)
-_DIRECTIVE = re.compile("%(?<![^\n\r\x85\u2028\u2029\ufeff]%)[^\n\r\x85\u2028\u2029]*")  # behind a break of YAML 1.1
+_DIRECTIVE = re.compile("%(?<![^\n\r\x85\u2028\u2029\ufeff]%)[^\n\r\x85\u2028\u2029]*")  # at a start of line (YAML 1.1)
 _VERSION = re.compile(r"%YAML[ \t]+1\.[12][ \t]*([ \t]#.*)?")
 _FRAMES = (yaml.StreamStartEvent, yaml.StreamEndEvent, yaml.DocumentStartEvent, yaml.DocumentEndEvent)
 
 
 class SetupError(ValueError):
-    """A setup cannot be used; the text is one line that names the line of the setup."""
+    """The setup is invalid; the text is one line that starts with the line number in the setup."""
 
     def __init__(self, line: int, what: str) -> None:
         super().__init__(f"line {line}: {what}")
 
 
 class YamlNode(NamedTuple):
-    """A value and its line. One of `text`, `items` and `pairs` is there; none is where nothing stands."""
+    """A value and its line number. A scalar has `text`, a list `items`, a map `pairs`; an empty value has none."""
 
     line: int
     text: str | None = None
@@ -41,40 +41,39 @@ class YamlNode(NamedTuple):
 
     @property
     def empty(self) -> bool:
-        """Whether nothing stands there."""
+        """Whether the value is empty."""
         return self.text is self.items is self.pairs is None
 
-    def word(self, what: str) -> str:
-        """The text; SetupError where there is none."""
+    def scalar(self, what: str) -> str:
+        """Return the text. Raises SetupError, which names `what`, if the node is not a scalar."""
         if self.text is None:
-            raise SetupError(self.line, f"{what}: wanted is a word")
+            raise SetupError(self.line, f"{what}: expected a single value")
         return self.text
 
     def members(self, what: str, known: tuple[str, ...] = ()) -> list[tuple[str, YamlNode, YamlNode]]:
-        """The names, keys and values of a map; SetupError where a name is there twice, or is none of those `known`.
+        """Return the names, keys and values of a map. An empty value is an empty map.
 
-        Nothing is an empty map.
+        Raises SetupError, which names `what`, if the node is not a map, a name occurs twice or is not `known`.
         """
         if self.pairs is None and not self.empty:
-            raise SetupError(self.line, f"{what}: wanted are lines with NAME: VALUE")
+            raise SetupError(self.line, f"{what}: expected lines with NAME: VALUE")
         members: dict[str, tuple[str, YamlNode, YamlNode]] = {}
         for key, value in self.pairs or ():
-            name = key.word(f"{what}: a name")
+            name = key.scalar(f"{what}: a name")
             if name in members:
-                raise SetupError(
-                    key.line, f"{what}: {short_repr(name)} is there twice, first in line {members[name][1].line}"
-                )
+                first = members[name][1].line
+                raise SetupError(key.line, f"{what}: {short_repr(name)} occurs twice, first in line {first}")
             if known and name not in known:
-                raise SetupError(key.line, f"{what}: unknown {short_repr(name)}; there are: {', '.join(known)}")
+                raise SetupError(key.line, f"{what}: unknown {short_repr(name)}; expected one of {', '.join(known)}")
             members[name] = name, key, value
         return list(members.values())
 
 
-def parse(text: str, most: int = MAX_VALUES) -> YamlNode:
-    """Return the one document of `text`. Raises SetupError, also if it has more than `most` values."""
+def parse(text: str, max_values: int = MAX_VALUES) -> YamlNode:
+    """Return the one document of `text`. Raises SetupError, also if it has more than `max_values` values."""
     _check_directives(text)
     try:
-        events = _counted(yaml.parse(text, Loader=_LOADER), most)
+        events = _counted(yaml.parse(text, Loader=_LOADER), max_values)
         documents = [_build(events, event, 0) for event in events if not isinstance(event, _FRAMES)]
     except yaml.MarkedYAMLError as problem:
         mark = problem.problem_mark or problem.context_mark
@@ -82,7 +81,7 @@ def parse(text: str, most: int = MAX_VALUES) -> YamlNode:
     except (yaml.YAMLError, UnicodeError) as problem:
         raise SetupError(1, f"not YAML: {str(problem).splitlines()[0]}") from None
     if len(documents) > 1:
-        raise SetupError(documents[1].line, "a second document; wanted is one")
+        raise SetupError(documents[1].line, "expected one document, got a second document")
     return documents[0] if documents else YamlNode(1)
 
 
@@ -91,25 +90,26 @@ def _check_directives(text: str) -> None:
     for number, found in enumerate(_DIRECTIVE.finditer(text)):
         if number or not _VERSION.fullmatch(found[0]):
             line = len(re.findall("\r\n|[\n\r\x85\u2028\u2029]", text[: found.start()])) + 1
-            raise SetupError(line, f"expected no directive but one %YAML 1.1 or 1.2, got {short_repr(found[0][:80])}")
+            directive = short_repr(found[0][:80])
+            raise SetupError(line, f"expected no directive except one %YAML 1.1 or 1.2, got {directive}")
 
 
-def _counted(events: Iterator[yaml.Event], most: int) -> Iterator[yaml.Event]:
+def _counted(events: Iterator[yaml.Event], max_values: int) -> Iterator[yaml.Event]:
     for count, event in enumerate(events):
-        if count > most + 4:  # the four that frame a document
-            raise SetupError(event.start_mark.line + 1, f"expected at most {most} values, got more")
+        if count > max_values + 4:  # four events start and end the stream and the document
+            raise SetupError(event.start_mark.line + 1, f"expected at most {max_values} values, got more")
         yield event
 
 
 def _build(events: Iterator[yaml.Event], event: yaml.Event, depth: int) -> YamlNode:
     line = event.start_mark.line + 1
-    if type(event) is yaml.ScalarEvent and event.anchor is event.tag is None:  # most are
-        nothing = not event.style and event.value in ("", "~", "null")
-        return YamlNode(line, None if nothing else event.value)
+    if type(event) is yaml.ScalarEvent and event.anchor is event.tag is None:  # the most frequent case
+        empty = not event.style and event.value in ("", "~", "null")
+        return YamlNode(line, None if empty else event.value)
     if isinstance(event, yaml.AliasEvent) or event.anchor is not None:
-        raise SetupError(line, "anchors and aliases (& and *) are not taken")
+        raise SetupError(line, "anchors and aliases (& and *) are not supported")
     if event.tag is not None:
-        raise SetupError(line, f"tags ({short_repr(event.tag)}) are not taken")
+        raise SetupError(line, f"tags ({short_repr(event.tag)}) are not supported")
     if depth == MAX_DEPTH:
         raise SetupError(line, "nested too deeply")
     if isinstance(event, yaml.SequenceStartEvent):

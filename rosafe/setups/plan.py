@@ -1,12 +1,12 @@
-"""What to do for a setup in a tree that is there already: which processors serve, and the requests for the others."""
+"""Plan how to load a setup into an existing tree: the processors to reuse, and the requests for the others."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 from rosafe.dsp.signal_format import SignalFormat
-from rosafe.interface import BLOCK_AND_BUFFERS, ROSAFE, ComponentError, format_value
+from rosafe.interface import ROSAFE, format_value
 from rosafe.representations import STAGES
 from rosafe.tree.tree_planner import ExistingProcessor, ServiceCall, creation_call
 
@@ -14,84 +14,79 @@ from .setup import Setup, SetupProcessor
 
 
 class SetupPlan(NamedTuple):
-    """The names of the setup's processors in the tree (parents first), of those that are there, and what to do."""
+    """Names in the tree of the setup's processors (parents first), the names of those reused, and the calls to make."""
 
     names: list[str]
     reused: list[str]
     steps: list[ServiceCall]
 
 
-def plan(setup: Setup, found: Sequence[ExistingProcessor]) -> SetupPlan:
-    """What to do for `setup` in a tree that consists of `found`.
+def plan(setup: Setup, existing: Sequence[ExistingProcessor]) -> SetupPlan:
+    """Return the plan for `setup` in a tree that consists of the `existing` processors.
 
-    A processor of the same name that is the same, to the last digit, is used. There is but one input, and it is used
-    under whatever name.
+    A processor is reused if its name and all its values are the same, to the last digit. A tree has only one input,
+    which is reused under any name.
 
     Raises
     ------
     ComponentError
-        ``::rosAFE::e_existsAlready`` where one of that name is another one.
+        ``::rosAFE::e_existsAlready`` if the tree has a different processor of the same name.
     """
-    there = {p.name: p for p in found}
-    sample_rate = next((p.rate for p in found if not p.parent), 0.0)
-    names: dict[str, str] = {}  # in the tree, of those in the setup
+    by_name = {p.name: p for p in existing}
+    tree_input = next((p for p in existing if not p.parent), None)
+    sample_rate = tree_input.rate if tree_input else 0.0
+    names: dict[str, str] = {}  # from the setup to the tree
     reused, steps = [], []
-    for wanted in setup.processors:
-        parent = names.get(wanted.parent, "")
-        same = there.get(wanted.name)
-        if not wanted.parent:
-            same = next((p for p in found if not p.parent and p.kind == wanted.kind), same)
+    for processor in setup.processors:
+        parent = names.get(processor.parent, "")
+        same = by_name.get(processor.name)
+        if not processor.parent and tree_input is not None and tree_input.kind == processor.kind:
+            same = tree_input
         if same is None:
-            names[wanted.name] = wanted.name
-            steps += creation_call(wanted.level, wanted.name, parent, wanted.input_values)
+            names[processor.name] = processor.name
+            steps += creation_call(processor.spec, processor.name, parent, processor.input_values)
         else:
-            _compare(wanted, parent, same, sample_rate)
-            names[wanted.name] = same.name
+            difference = _difference(processor, parent, same, sample_rate)
+            if difference:
+                advice = "remove it first (the input: Stop), or load another setup"
+                raise ROSAFE.error("e_existsAlready", what=f"{same.name!r} exists already and {difference}; {advice}")
+            names[processor.name] = same.name
             reused.append(same.name)
     return SetupPlan(list(names.values()), reused, steps)
 
 
-def _compare(wanted: SetupProcessor, parent: str, there: ExistingProcessor, sample_rate: float) -> None:
-    """Return where `there` is what is wanted, else raise e_existsAlready with the difference."""
-    if there.kind != wanted.kind:
-        _refuse(there, f"is of kind {there.kind}, in the setup of kind {wanted.kind}")
-    if there.parent != parent:
-        _refuse(there, f"hangs on {there.parent!r}, in the setup on {wanted.parent!r}")
-    if not wanted.parent:
-        for p in BLOCK_AND_BUFFERS:
-            value = wanted.input_values[p.name]
-            if there.values.get(p.name, value) != value:
-                _differs(there, p.name, value)
-    if not wanted.level.matches(there, sample_rate):
-        told: Mapping[str, Any] = wanted.level.in_force
-        first = [*wanted.given, *told]  # what the setup says itself tells most
-        name = next(name for name in first if name in told and there.values[name] != told[name])
-        _differs(there, name, told[name])
+def _difference(processor: SetupProcessor, parent: str, existing: ExistingProcessor, sample_rate: float) -> str:
+    """Return how `existing` differs from the setup's `processor`, whose parent is `parent` in the tree; '' if equal."""
+    if existing.kind != processor.kind:
+        return f"is of kind {existing.kind}, in the setup of kind {processor.kind}"
+    if existing.parent != parent:
+        return f"is a child of {existing.parent!r}, in the setup of {processor.parent!r}"
+    if not processor.parent:
+        for name, value in processor.input_values.items():
+            if existing.values.get(name, value) != value:
+                return _other_value(existing, name, value)
+    if processor.spec.matches(existing, sample_rate):
+        return ""
+    effective = processor.spec.effective
+    names = [*processor.explicit, *effective]  # a value that the setup contains is the most informative
+    name = next(name for name in names if name in effective and existing.values[name] != effective[name])
+    return _other_value(existing, name, effective[name])
 
 
-def _differs(there: ExistingProcessor, name: str, value: Any) -> None:
-    _refuse(there, f"has {name} {format_value(there.values.get(name))[:80]}, in the setup {format_value(value)[:80]}")
-
-
-def _refuse(there: ExistingProcessor, how: str) -> None:
-    what = f"{there.name!r} is there already and {how}: remove it first (the input: Stop), or load another setup"
-    raise ROSAFE.error("e_existsAlready", what=what)
+def _other_value(existing: ExistingProcessor, name: str, value: Any) -> str:
+    return f"has {name} {format_value(existing.values.get(name))[:80]}, in the setup {format_value(value)[:80]}"
 
 
 def dry_run(setup: Setup, sample_rate: float) -> None:
-    """Whether all processors of `setup` can be made for sound of `sample_rate` (Hz): ComponentError where not."""
+    """Raise ComponentError if a processor of `setup` cannot be created for sound of `sample_rate` (Hz)."""
     formats: dict[str, SignalFormat | float] = {"": float(sample_rate)}
-    providers: dict[str, Sequence[str]] = {"": ()}
-    for wanted in setup.processors:
+    extras: dict[str, Sequence[str]] = {"": ()}
+    for processor in setup.processors:
         try:
-            stage = STAGES[wanted.kind](formats[wanted.parent], **wanted.values)
-            if stage.required_extra and stage.required_extra not in providers[wanted.parent]:
-                raise ValueError(f"it needs the {stage.required_extra} of {wanted.parent!r}, which has none")
+            stage = STAGES[processor.kind](formats[processor.parent], **processor.values)
+            if stage.required_extra and stage.required_extra not in extras[processor.parent]:
+                raise ValueError(f"requires the {stage.required_extra}, which {processor.parent!r} does not provide")
         except ValueError as problem:
-            raise refused(f"{wanted.name!r} at {sample_rate:g} Hz: {problem}") from None
-        formats[wanted.name], providers[wanted.name] = stage.output_format, stage.EXTRAS
-
-
-def refused(why: str) -> ComponentError:
-    """The component's exception for a setup that cannot be."""
-    return ROSAFE.error("e_badNewValue", what=why)
+            what = f"{processor.name!r} at {sample_rate:g} Hz: {problem}"
+            raise ROSAFE.error("e_badNewValue", what=what) from None
+        formats[processor.name], extras[processor.name] = stage.output_format, stage.EXTRAS

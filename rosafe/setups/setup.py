@@ -1,4 +1,4 @@
-"""What a setup is made of: sound, connections, processors with their parents and parameters."""
+"""The contents of a setup: sound, connections, and processors with their parents and parameters."""
 
 from __future__ import annotations
 
@@ -14,24 +14,35 @@ from rosafe.representations import STAGES
 from rosafe.tree.tree_planner import ExistingProcessor, ProcessorSpec
 
 ACQUIRE = BASS.service("Acquire").parameters
-MAX_NAME_ATTEMPTS = 1000  # ways to say what a processor was made with
+# The settings of the localizer node, which are also its private ROS parameters.
+LOCALIZER = (
+    Parameter("head", "string", "sphere", "Head: sphere, or a SOFA file or a learned model"),
+    Parameter("seconds", "double", 0.5, "Window of integration", minimum=0.01, maximum=60.0, unit="s"),
+    Parameter("world_frame", "string", "", "Coordinate frame of the azimuths; empty: the frame of the head"),
+    Parameter("head_frame", "string", "head", "Coordinate frame of the head"),
+    Parameter("audio_delay", "double", 0.0, "Latency of the sound card", minimum=-5.0, maximum=5.0, unit="s"),
+    Parameter("noise", "string", "", "File of rosafe localize --calibrate-noise"),
+)
+LOCALIZER_FILES = ("head", "noise")  # settings that name files
+INPUT_PORTS = tuple(port.name for port in ROSAFE.ports if not port.output)
+MAX_ATTEMPTS = 1000  # combinations of parameters that are tried to describe a processor
 
 
 @dataclass(frozen=True)
 class AcquireSettings:
-    """What bass is to acquire: those arguments of its Acquire, by name, that are not at their defaults."""
+    """Arguments of bass' Acquire; `explicit` are those that differ from their defaults, by name."""
 
-    given: Mapping[str, Any]
+    explicit: Mapping[str, Any]
 
     @classmethod
     def of(cls, values: Mapping[str, Any]) -> AcquireSettings:
-        """The sound with these (checked) arguments."""
+        """Return the settings with these (checked) arguments."""
         return cls({p.name: values[p.name] for p in ACQUIRE if values.get(p.name, p.default) != p.default})
 
     @property
     def values(self) -> dict[str, Any]:
         """All arguments."""
-        return {p.name: self.given.get(p.name, p.default) for p in ACQUIRE}
+        return {p.name: self.explicit.get(p.name, p.default) for p in ACQUIRE}
 
 
 @dataclass(frozen=True)
@@ -42,15 +53,15 @@ class SetupProcessor:
     ----------
     name, kind : str
     parent : str
-        The name of another one of the same setup; empty for the input.
-    given : mapping
-        The parameters that are not at their defaults, checked; of an input those of InputProc, too.
+        The name of another processor of the same setup; empty for the input.
+    explicit : mapping
+        The checked parameters that differ from their defaults; for an input also those of InputProc.
     """
 
     name: str
     kind: str
     parent: str = ""
-    given: Mapping[str, Any] = field(default_factory=dict)
+    explicit: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def representation(self) -> Representation:
@@ -59,50 +70,50 @@ class SetupProcessor:
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        """All that can be given."""
+        """All parameters that a setup can contain for it."""
         return parameters_of(self.representation)
 
     @property
     def values(self) -> dict[str, Any]:
         """All parameters of its kind."""
-        return {**_defaults(self.representation.parameters), **self._own}
+        return {**_defaults(self.representation.parameters), **self._explicit_of_kind}
 
     @property
     def all_values(self) -> dict[str, Any]:
-        """All that can be given."""
-        return {p.name: self.given.get(p.name, p.check(p.default)) for p in self.parameters}
+        """All parameters that a setup can contain for it, with their values."""
+        return {**_defaults(self.parameters), **self.explicit}
 
     @property
     def input_values(self) -> dict[str, Any]:
-        """The parameters of InputProc that modifyParameter does not take."""
-        return {p.name: self.given.get(p.name, p.default) for p in BLOCK_AND_BUFFERS}
+        """The parameters of InputProc that modifyParameter does not accept."""
+        return {p.name: self.explicit.get(p.name, p.default) for p in BLOCK_AND_BUFFERS}
 
     @property
-    def _own(self) -> dict[str, Any]:
-        return {p.name: self.given[p.name] for p in self.representation.parameters if p.name in self.given}
+    def _explicit_of_kind(self) -> dict[str, Any]:
+        return {p.name: self.explicit[p.name] for p in self.representation.parameters if p.name in self.explicit}
 
     @cached_property
-    def level(self) -> ProcessorSpec:
-        """As requests for whole trees see it; ValueError for values that go together at no sample rate."""
-        return ProcessorSpec(
-            self.representation, self.values, STAGES[self.kind].effective_values(self.values), self._own
-        )
+    def spec(self) -> ProcessorSpec:
+        """The processor in the form of tree requests. Raises ValueError for values that no sample rate allows."""
+        effective = STAGES[self.kind].effective_values(self.values)
+        return ProcessorSpec(self.representation, self.values, effective, self._explicit_of_kind)
 
 
 @dataclass(frozen=True)
 class Setup:
-    """A tree of processors with its sound. `processors` are ordered: parents first."""
+    """A tree of processors with its sound. `processors` are ordered: parents first.
+
+    `localizer` has the settings of the localizer node, which `rosafe up` then starts; None without a localizer.
+    """
 
     sound: AcquireSettings | None = None
     connections: Mapping[str, str] = field(default_factory=dict)  # input port -> topic
     processors: tuple[SetupProcessor, ...] = ()
-
-
-INPUT_PORTS = tuple(port.name for port in ROSAFE.ports if not port.output)
+    localizer: Mapping[str, Any] | None = None
 
 
 def parameters_of(kind: Representation) -> tuple[Parameter, ...]:
-    """All parameters that a processor of `kind` can be given in a setup."""
+    """Return all parameters that a setup can contain for a processor of `kind`."""
     return kind.parameters if kind.parent else (*BLOCK_AND_BUFFERS, *kind.parameters)
 
 
@@ -110,44 +121,44 @@ def _defaults(parameters: tuple[Parameter, ...]) -> dict[str, Any]:
     return {p.name: p.check(p.default) for p in parameters}
 
 
-def wanted(found: ExistingProcessor) -> SetupProcessor:
-    """The processor that `found` tells of, with as few parameters as tell all of it.
+def setup_processor(found: ExistingProcessor) -> SetupProcessor:
+    """Describe an existing processor with as few explicit parameters as possible.
 
-    What follows from others, such as the channels of a filterbank from their number, is left out.
+    Parameters that follow from others, such as the channels of a filterbank from their number, are left out.
     """
     if found.kind not in KINDS:
         raise ROSAFE.error(
             "e_badNewValue",
-            what=f"{found.name!r} is a {found.kind}, of a plugin that this program was started without; "
+            what=f"{found.name!r} is of kind {found.kind}, of a plugin that this program has not loaded; "
             f"set {plugins.FOLDERS} and restart it",
         )
     kind = KINDS[found.kind]
-    told = {p.name: found.values[p.name] for p in kind.parameters}
-    defaults = _defaults(kind.parameters)
-    given = _given(found.kind, told, defaults)
+    explicit = _shortest_description(found.kind, {p.name: found.values[p.name] for p in kind.parameters})
     if not kind.parent:
-        of_the_input = {p.name: found.values.get(p.name, p.default) for p in BLOCK_AND_BUFFERS}
-        given = {p.name: of_the_input[p.name] for p in BLOCK_AND_BUFFERS if of_the_input[p.name] != p.default} | given
-    return SetupProcessor(found.name, found.kind, found.parent, given)
+        values = {p.name: found.values.get(p.name, p.default) for p in BLOCK_AND_BUFFERS}
+        explicit = {p.name: values[p.name] for p in BLOCK_AND_BUFFERS if values[p.name] != p.default} | explicit
+    return SetupProcessor(found.name, found.kind, found.parent, explicit)
 
 
-def _given(kind: str, told: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[str, Any]:
-    differing = {name: value for name, value in told.items() if value != defaults[name]}
+def _shortest_description(kind: str, values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a small part of the `values` from which, with the defaults of `kind`, all `values` follow."""
+    defaults = _defaults(KINDS[kind].parameters)
+    differing = {name: value for name, value in values.items() if value != defaults[name]}
 
-    def tells(names: frozenset[str]) -> bool:
+    def suffices(names: frozenset[str]) -> bool:
         try:
-            return STAGES[kind].effective_values({**defaults, **{n: v for n, v in told.items() if n in names}}) == told
+            return STAGES[kind].effective_values(defaults | {n: v for n, v in values.items() if n in names}) == values
         except ValueError:
             return False
 
-    everything = frozenset(differing)
-    ways = (
-        everything - set(left_out)
-        for count in range(len(everything) + 1)
+    all_names = frozenset(differing)
+    candidates = (
+        all_names - set(left_out)
+        for count in range(len(all_names) + 1)
         for left_out in itertools.combinations(differing, count)
     )
-    names = next(filter(tells, itertools.islice(ways, MAX_NAME_ATTEMPTS)), everything)
+    names = next(filter(suffices, itertools.islice(candidates, MAX_ATTEMPTS)), all_names)
     for name in differing:
-        if name in names and tells(names - {name}):
+        if name in names and suffices(names - {name}):
             names -= {name}
     return {name: value for name, value in differing.items() if name in names}

@@ -1,4 +1,4 @@
-"""From a setup to the text that `read` takes: as a person would write it, and true to the last digit."""
+"""Write a setup as readable YAML, from which `read` returns exactly the same setup."""
 
 from __future__ import annotations
 
@@ -8,12 +8,11 @@ import yaml
 
 from .setup import Setup, SetupProcessor
 
-_HEAD = "# A setup of rosAFE: `rosafe setup load FILE` builds it. What is not given has its default.\n"
-_HEAD_FULL = "# A setup of rosAFE: `rosafe setup load FILE` builds it.\n"
+_HEAD = "# A setup of rosAFE; load it with `rosafe setup load FILE`."
 
 
 class _Dumper(yaml.SafeDumper):
-    """Maps in lines of their own, lists in brackets."""
+    """Writes one line for each item of a map, and lists in brackets."""
 
     def increase_indent(self, flow: bool = False, indentless: bool = False) -> None:
         super().increase_indent(flow, False)
@@ -27,30 +26,34 @@ _Dumper.add_representer(list, _list)
 
 
 def write(setup: Setup, full: bool = False) -> str:
-    """The YAML text of a setup; with `full`, what has its default too.
+    """Return the YAML text of a setup; with `full`, parameters at their defaults are included.
 
-    Numbers are written as Python does, with as many digits as it takes to read the same number.
+    Numbers are written as by Python, with the digits that are necessary to read the same number.
     """
     sections: dict[str, Any] = {}
     if setup.sound is not None:
-        given, values = setup.sound.given, setup.sound.values
-        sections["sound"] = {n: value for n, value in values.items() if full or n == "device" or n in given}
+        explicit = setup.sound.explicit
+        sections["sound"] = {
+            name: value for name, value in setup.sound.values.items() if full or name == "device" or name in explicit
+        }
     if setup.connections:
         sections["connections"] = dict(setup.connections)
     if setup.processors:
-        sections["processors"] = {wanted.name: _processor(wanted, full) for wanted in setup.processors}
-    head = _HEAD_FULL if full else _HEAD
-    return head + "".join(
+        sections["processors"] = {processor.name: _members(processor, full) for processor in setup.processors}
+    if setup.localizer is not None:
+        sections["localizer"] = dict(setup.localizer)
+    head = _HEAD if full else f"{_HEAD} Omitted parameters have their defaults."
+    return f"{head}\n" + "".join(
         "\n" + yaml.dump({name: section}, Dumper=_Dumper, sort_keys=False, allow_unicode=True, width=120)
         for name, section in sections.items()
     )
 
 
-def _processor(wanted: SetupProcessor, full: bool) -> dict[str, Any]:
-    values = wanted.all_values if full else wanted.given
-    parent = {"parent": wanted.parent} if wanted.parent else {}
+def _members(processor: SetupProcessor, full: bool) -> dict[str, Any]:
+    values = processor.all_values if full else processor.explicit
+    parent = {"parent": processor.parent} if processor.parent else {}
     return {
-        "kind": wanted.kind,
+        "kind": processor.kind,
         **parent,
-        **{p.name: values[p.name] for p in wanted.parameters if p.name in values},
+        **{p.name: values[p.name] for p in processor.parameters if p.name in values},
     }

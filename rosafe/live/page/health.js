@@ -1,4 +1,4 @@
-// How well it goes: latency, load, what was lost and when.
+// The Health section: delays, load, losses and failures.
 
 import { el } from "./ui.js";
 
@@ -12,14 +12,15 @@ export class Health {
 
   status(status, tree, link) {
     const load = Object.values(status.loads).reduce((sum, one) => sum + one.load, 0);
-    const delays = tree.map((one) => status.latencies[one.topic]).filter((one) => one !== undefined);
-    const delay = (value) => (value === null || value === undefined || status.silent === null || status.silent > 2 ? "–" : `${(value * 1e3).toFixed(0)} ms`);
+    const latencies = tree.map((one) => status.latencies[one.topic]).filter((one) => one !== undefined);
+    const silent = status.silent === null || status.silent > 2;
+    const milliseconds = (value) => (silent || value === null ? "–" : `${(value * 1e3).toFixed(0)} ms`);
     this.#show([
-      ["Sound until here", delay(status.delay), "from the capture of the newest sample until it was here"],
-      ["Pictures until here", delay(delays.length ? Math.max(...delays) : null), "from the capture of the newest sample of a block until what was computed of it was here; the slowest port that is shown"],
-      ["Load of all processors", `${load.toFixed(0)} ms/s`, "time spent computing in each second"],
-      ["Lost frames", String(status.lost), "of the sound, since the nodes started"],
-      ["To this page", `${(link.rate / 1000).toFixed(0)} kB/s`, "what this page receives"],
+      ["Audio delay", milliseconds(status.delay), "from the capture of the newest sample to its arrival at this server"],
+      ["Plot delay", milliseconds(latencies.length ? Math.max(...latencies) : null), "from the capture of the newest sample of a block to the arrival of its results at this server; the slowest port shown"],
+      ["Load of all processors", `${load.toFixed(0)} ms/s`, "computing time per second"],
+      ["Lost frames", String(status.lost), "of the audio, since the nodes started"],
+      ["Data rate", `${(link.rate / 1000).toFixed(0)} kB/s`, "received by this page"],
     ]);
     this.failures.hidden = !status.failures.length;
     this.failures.replaceChildren(...status.failures.map((text) => el("li", { text })));
@@ -28,6 +29,6 @@ export class Health {
   }
 
   #show(facts) {
-    this.facts.replaceChildren(...facts.flatMap(([name, value, why]) => [el("dt", { text: name, title: why }), el("dd", { text: value })]));
+    this.facts.replaceChildren(...facts.flatMap(([name, value, explanation]) => [el("dt", { text: name, title: explanation }), el("dd", { text: value })]));
   }
 }

@@ -1,19 +1,18 @@
-// The connection to the server: requests with answers, news by their subject, columns of pictures.
+// The WebSocket to the server: requests and answers, messages by subject, columns of plots.
 
 const FORMAT = 2;
-const HEAD = 8;
-const PIECE = 40;
-const FAILED = [1002, 1003, 1007, 1009, 1011]; // codes after which another try would fail, too
+const HEADER_BYTES = 8;
+const PIECE_BYTES = 40;
+const FATAL_CODES = [1002, 1003, 1007, 1009, 1011]; // close codes after which reconnecting would fail again
 
 export class Link extends EventTarget {
   #socket = null;
   #number = 0;
-  #waiting = new Map();
-  #pause = 500;
+  #pending = new Map();
+  #retryDelay = 500;
   #address;
   bytes = 0;
-  pictures = 0;
-  refusal = ""; // why the server does not accept this page
+  refusal = ""; // why the server rejects this page
 
   constructor(token) {
     super();
@@ -25,57 +24,56 @@ export class Link extends EventTarget {
     socket.binaryType = "arraybuffer";
     socket.addEventListener("open", () => {
       this.#socket = socket;
-      this.#pause = 500;
+      this.#retryDelay = 500;
       this.refusal = "";
-      this.#tell("open", {});
+      this.#emit("open", {});
     });
     socket.addEventListener("message", (event) => {
-      if (typeof event.data === "string") this.#news(JSON.parse(event.data));
-      else this.#columns(event.data);
+      if (typeof event.data === "string") this.#receiveText(JSON.parse(event.data));
+      else this.#receiveColumns(event.data);
     });
     socket.addEventListener("close", async ({ code, reason }) => {
-      if (!this.#socket) await this.#askWhy();
+      if (!this.#socket) await this.#fetchRefusal();
       this.#socket = null;
-      for (const { reject } of this.#waiting.values()) reject(new Error("the connection to the server is lost"));
-      this.#waiting.clear();
-      const failed = FAILED.includes(code);
-      this.#tell("close", { reason, failed });
-      if (failed) return;
-      setTimeout(() => this.open(), this.#pause);
-      this.#pause = Math.min(5000, this.#pause * 1.6);
+      for (const { reject } of this.#pending.values()) reject(new Error("the connection to the server was lost"));
+      this.#pending.clear();
+      const fatal = FATAL_CODES.includes(code);
+      this.#emit("close", { reason, fatal });
+      if (fatal) return;
+      setTimeout(() => this.open(), this.#retryDelay);
+      this.#retryDelay = Math.min(5000, this.#retryDelay * 1.6);
     });
   }
 
-  // Browsers do not tell scripts why a WebSocket was refused; the same request without one does.
-  async #askWhy() {
+  // Browsers hide from scripts why a WebSocket was rejected; the same request by HTTP returns the reason.
+  async #fetchRefusal() {
     const answer = await fetch(this.#address, { signal: AbortSignal.timeout(3000) }).catch(() => null);
     this.refusal = answer && [403, 503].includes(answer.status) ? (await answer.text()).trim() : "";
   }
 
-  ask(what, given = {}) {
+  request(action, values = {}) {
     if (!this.#socket) return Promise.reject(new Error("there is no connection to the server"));
     const id = ++this.#number;
-    this.#socket.send(JSON.stringify({ id, do: what, with: given }));
-    return new Promise((resolve, reject) => this.#waiting.set(id, { resolve, reject }));
+    this.#socket.send(JSON.stringify({ id, do: action, with: values }));
+    return new Promise((resolve, reject) => this.#pending.set(id, { resolve, reject }));
   }
 
-  #news(message) {
+  #receiveText(message) {
     if (message.about !== "answer") {
-      this.#tell(message.about, message);
+      this.#emit(message.about, message);
       return;
     }
-    const waiting = this.#waiting.get(message.id);
-    this.#waiting.delete(message.id);
-    if (message.error !== undefined) waiting?.reject(new Error(message.error));
-    else waiting?.resolve(message.ok);
+    const pending = this.#pending.get(message.id);
+    this.#pending.delete(message.id);
+    if (message.error !== undefined) pending?.reject(new Error(message.error));
+    else pending?.resolve(message.ok);
   }
 
-  #columns(buffer) {
+  #receiveColumns(buffer) {
     const bytes = new DataView(buffer);
     if (bytes.getUint16(0, true) !== FORMAT) return;
     this.bytes += buffer.byteLength;
-    this.pictures += 1;
-    let at = HEAD;
+    let at = HEADER_BYTES;
     for (let left = bytes.getUint16(2, true); left > 0; left -= 1) {
       const piece = {
         number: bytes.getUint32(at, true),
@@ -88,19 +86,19 @@ export class Link extends EventTarget {
       const numbers = piece.count * piece.size;
       const floats = bytes.getUint8(at + 32) === 1;
       if (floats) {
-        piece.values = new Float32Array(buffer, at + PIECE, numbers);
+        piece.values = new Float32Array(buffer, at + PIECE_BYTES, numbers);
       } else {
         const low = bytes.getFloat32(at + 24, true);
         const step = (bytes.getFloat32(at + 28, true) - low) / 254;
-        const steps = new Uint8Array(buffer, at + PIECE, numbers);
-        piece.values = Float32Array.from(steps, (one) => (one === 255 ? NaN : low + one * step));
+        const steps = new Uint8Array(buffer, at + PIECE_BYTES, numbers);
+        piece.values = Float32Array.from(steps, (value) => (value === 255 ? NaN : low + value * step));
       }
-      this.#tell("columns", piece);
-      at += PIECE + Math.ceil((numbers * (floats ? 4 : 1)) / 8) * 8;
+      this.#emit("columns", piece);
+      at += PIECE_BYTES + Math.ceil((numbers * (floats ? 4 : 1)) / 8) * 8;
     }
   }
 
-  #tell(name, detail) {
-    this.dispatchEvent(new CustomEvent(name, { detail }));
+  #emit(subject, detail) {
+    this.dispatchEvent(new CustomEvent(subject, { detail }));
   }
 }

@@ -1,90 +1,92 @@
-// The live page: brings its parts together.
+// The live page: creates its parts and connects them to the messages of the server.
 
+import { azimuthText } from "./axes.js";
 import { Health } from "./health.js";
 import { Link } from "./link.js";
-import { direction } from "./panel.js";
-import { Pictures } from "./pictures.js";
+import { Plots } from "./plots.js";
 import { Meters, Source } from "./source.js";
 import { TreeView } from "./tree.js";
-import { el, store, stored, tried } from "./ui.js";
+import { el, loadSetting, reportErrors, saveSetting } from "./ui.js";
 
 const SPANS = [5, 10, 30];
-const SILENT = 1.2; // seconds without sound that are worth a word
+const SILENCE_SECONDS = 1.2; // without audio, until the page reports it
 
-// The token is to stay in no history and on no screen. It is kept for reloads, for this window and this server only.
+// The token is removed from the address bar and the history. It is kept for reloads, for this window and server only.
 let token = new URLSearchParams(location.search).get("token");
 try {
   if (token) sessionStorage.setItem("rosafe.token", token);
   else token = sessionStorage.getItem("rosafe.token");
 } catch {
-  // a browser that keeps nothing forgets it
+  // the browser does not allow session storage
 }
 if (location.search) history.replaceState(null, "", location.pathname);
 
-const at = (id) => document.getElementById(id);
+const byId = (id) => document.getElementById(id);
 const link = new Link(token ?? "");
-const pictures = new Pictures(link, at("pictures"));
-const meters = new Meters(at("meters"));
-const health = new Health(at("health"));
+const plots = new Plots(link, byId("plots"));
+const meters = new Meters(byId("meters"));
+const health = new Health(byId("health"));
 let source = null;
 let tree = null;
 let processors = [];
 let status = null;
 let watch = false;
 
-pictures.meter = (piece) => meters.take(piece);
+plots.onLevels = (piece) => meters.update(piece);
 
-// --- dark and light ---
+// --- theme ---
 
-function dress(theme) {
+function applyTheme(theme) {
   document.documentElement.dataset.theme = theme;
   const style = getComputedStyle(document.documentElement);
   const colour = (name) => style.getPropertyValue(`--${name}`).trim();
-  pictures.theme = {
+  plots.theme = {
     dark: theme === "dark", font: getComputedStyle(document.body).fontFamily,
     cursor: theme === "dark" ? "rgba(255, 255, 255, 0.65)" : "rgba(20, 24, 30, 0.65)", track: "#ffb454",
-    letter: Math.round(0.82 * parseFloat(getComputedStyle(document.body).fontSize)),
+    fontSize: Math.round(0.82 * parseFloat(getComputedStyle(document.body).fontSize)),
     ...Object.fromEntries(["text", "muted", "surface", "plot", "grid", "left", "right", "accent"].map((name) => [name, colour(name)])),
   };
-  at("theme").textContent = theme === "dark" ? "☾" : "☀";
+  byId("theme").textContent = theme === "dark" ? "☾" : "☀";
 }
 
-const wishes = matchMedia("(prefers-color-scheme: light)");
-dress(stored("theme", wishes.matches ? "light" : "dark"));
-addEventListener("resize", () => dress(document.documentElement.dataset.theme));
-at("theme").addEventListener("click", () => {
+const prefersLight = matchMedia("(prefers-color-scheme: light)");
+applyTheme(loadSetting("theme", prefersLight.matches ? "light" : "dark"));
+addEventListener("resize", () => applyTheme(document.documentElement.dataset.theme));
+byId("theme").addEventListener("click", () => {
   const theme = document.documentElement.dataset.theme === "dark" ? "light" : "dark";
-  store("theme", theme);
-  dress(theme);
+  saveSetting("theme", theme);
+  applyTheme(theme);
 });
 
-// --- the view ---
+// --- view controls ---
 
-at("span").append(...SPANS.map((span) => el("button", {
-  text: `${span} s`, "data-span": String(span), "aria-pressed": String(span === pictures.span),
+byId("span").append(...SPANS.map((span) => el("button", {
+  text: `${span} s`, "data-span": String(span), "aria-pressed": String(span === plots.span),
   onclick: () => {
-    pictures.span = span;
-    store("span", span);
-    for (const button of at("span").children) button.setAttribute("aria-pressed", String(Number(button.dataset.span) === span));
+    plots.span = span;
+    saveSetting("span", span);
+    for (const button of byId("span").children) button.setAttribute("aria-pressed", String(Number(button.dataset.span) === span));
   },
 })));
 
 function freeze(on) {
-  const frozen = pictures.freeze(on);
-  at("freeze").setAttribute("aria-pressed", String(frozen));
-  at("freeze").textContent = frozen ? "Frozen" : "Freeze";
+  const frozen = plots.freeze(on);
+  byId("freeze").setAttribute("aria-pressed", String(frozen));
+  byId("freeze").textContent = frozen ? "Frozen" : "Freeze";
 }
 
-at("freeze").addEventListener("click", () => freeze(pictures.frozen === null));
-at("png").addEventListener("click", () => pictures.save());
+byId("freeze").addEventListener("click", () => freeze(plots.frozen === null));
+byId("directions").addEventListener("click", () => plots.toggleDirections());
+plots.addEventListener("change", () => byId("directions").setAttribute("aria-pressed", String(plots.isOpen(""))));
+byId("png").addEventListener("click", () => plots.save());
 document.addEventListener("keydown", (event) => {
   if (event.key === " " && ["BODY", "CANVAS"].includes(document.activeElement?.tagName)) {
     event.preventDefault();
-    freeze(pictures.frozen === null);
+    freeze(plots.frozen === null);
   }
 });
 
-document.body.dataset.tab = "pictures";
+document.body.dataset.tab = "plots";
 for (const tab of document.querySelectorAll("[data-tab]:not(body)")) {
   tab.addEventListener("click", () => {
     document.body.dataset.tab = tab.dataset.tab;
@@ -92,104 +94,105 @@ for (const tab of document.querySelectorAll("[data-tab]:not(body)")) {
   });
 }
 
-// --- what the server tells ---
+// --- messages of the server ---
 
 link.addEventListener("hello", ({ detail }) => {
   watch = detail.watch;
-  pictures.kinds = detail.kinds;
-  source = new Source(link, at("source"), watch);
-  tree = new TreeView(link, at("tree"), at("processor"), pictures, detail, watch);
-  if (!watch) source.look();
-  pictures.reconnect();
+  plots.kinds = detail.kinds;
+  source = new Source(link, byId("source"), watch);
+  tree = new TreeView(link, byId("tree"), byId("processor"), plots, detail, watch);
+  if (!watch) source.loadDevices();
+  plots.resubscribe();
 });
 
 link.addEventListener("tree", ({ detail }) => {
   processors = detail.processors;
-  pictures.grow(processors, processors.length > 0 || (status && !status.problem));
-  tree?.tree(processors);
-  if (tree?.wanted && processors.some((one) => one.name === tree.wanted)) {
-    const one = processors.find((each) => each.name === tree.wanted);
-    tree.wanted = null;
-    if (!pictures.isOpen(one.name)) pictures.toggle(one);
+  plots.updateTree(processors, processors.length > 0 || (status && !status.problem));
+  tree?.update(processors);
+  const built = processors.find((one) => one.name === tree?.openWhenBuilt);
+  if (built) {
+    tree.openWhenBuilt = null;
+    if (!plots.isOpen(built.name)) plots.toggle(built);
   }
-  invite();
+  showEmptyState();
 });
 
-let counted = { bytes: 0, at: performance.now() };
+let measured = { bytes: 0, at: performance.now() };
 link.addEventListener("status", ({ detail }) => {
   const now = performance.now();
-  if (now - counted.at > 900) {
-    link.rate = ((link.bytes - counted.bytes) / (now - counted.at)) * 1000;
-    counted = { bytes: link.bytes, at: now };
+  if (now - measured.at > 900) {
+    link.rate = ((link.bytes - measured.bytes) / (now - measured.at)) * 1000;
+    measured = { bytes: link.bytes, at: now };
   }
   status = detail;
   source?.status(detail);
   tree?.status(detail);
   health.status(detail, processors, link);
-  if (detail.silent === null || detail.silent > SILENT) meters.rest();
-  if (!detail.problem && !processors.length) pictures.grow([], true);
-  for (const panel of pictures.panels) if (detail.problem) panel.problem = detail.problem;
-  tell();
-  invite();
+  plots.setDirectionHint(detail.localizer === null ? "no localizer is running; start it with: rosafe localize" : `localizer: ${detail.localizer}`);
+  if (detail.silent === null || detail.silent > SILENCE_SECONDS) meters.showSilence();
+  if (!detail.problem && !processors.length) plots.updateTree([], true);
+  for (const panel of plots.panels) if (detail.problem) panel.problem = detail.problem;
+  announce();
+  showEmptyState();
 });
 link.rate = 0;
 
-let closed = "";
-link.addEventListener("open", () => { closed = ""; });
+let closeReason = "";
+link.addEventListener("open", () => { closeReason = ""; });
 link.addEventListener("close", ({ detail }) => {
   status = null;
-  if (detail.reason || !closed) closed = detail.reason;
-  if (detail.failed) closed = `the server has closed the connection: ${closed || "no reason given"}; reload the page`;
-  tell();
+  if (detail.reason || !closeReason) closeReason = detail.reason;
+  if (detail.fatal) closeReason = `the server has closed the connection: ${closeReason || "no reason given"}; reload the page`;
+  announce();
 });
 
-function tell() {
-  const [state, text] = told();
-  at("state").dataset.state = state;
-  at("state").textContent = text;
-  at("state").title = text;
+function announce() {
+  const [state, text] = statusText();
+  byId("state").dataset.state = state;
+  byId("state").textContent = text;
+  byId("state").title = text;
 }
 
-function told() {
-  if (!status) return ["bad", closed || link.refusal || "no connection to the server"];
+function statusText() {
+  if (!status) return ["bad", closeReason || link.refusal || "no connection to the server"];
   if (status.problem) return ["bad", status.problem];
   const malformed = Object.entries(status.malformed);
   if (malformed.length) return ["bad", malformed.map(([topic, why]) => `${topic}: malformed messages are ignored: ${why}`).join("; ")];
-  if (!status.bass && (status.silent === null || status.silent > SILENT)) return ["bad", "no sound: bass is not running"];
-  if (status.silent === null || status.silent > SILENT) return ["warn", "no sound: nothing is acquired"];
+  if (!status.bass && (status.silent === null || status.silent > SILENCE_SECONDS)) return ["bad", "no audio: bass is not running"];
+  if (status.silent === null || status.silent > SILENCE_SECONDS) return ["warn", "no audio: the capture is stopped"];
   if (status.failures.length) return ["bad", status.failures[0]];
-  const heard = pictures.heard();
-  const where = heard ? direction(heard.view, heard.lag) : "";
-  return ["live", `${watch ? "watching" : "live"}${where ? ` · source ${where}` : ""}`];
+  const sources = plots.presentDirections().map(azimuthText);
+  const where = sources.length ? ` · source${sources.length > 1 ? "s" : ""} ${sources.join(", ")}` : "";
+  return ["live", `${watch ? "watching" : "live"}${where}`];
 }
 
-setInterval(() => { if (status && !status.problem) tell(); }, 250);
+setInterval(() => { if (status && !status.problem) announce(); }, 250);
 
-// What to do where there is nothing to see.
-let invited = "";
-function invite() {
-  const silent = !status || status.silent === null || status.silent > SILENT;
-  const words = JSON.stringify([status?.problem, silent, processors.length, watch]);
-  if (words === invited) return;
-  invited = words;
+// Instructions that are shown while no plot is open.
+let shownState = "";
+function showEmptyState() {
+  const silent = !status || status.silent === null || status.silent > SILENCE_SECONDS;
+  const state = JSON.stringify([status?.problem, silent, processors.length, watch]);
+  if (state === shownState) return;
+  shownState = state;
   const parts = [];
-  if (status?.problem) parts.push(el("h2", { text: "rosAFE does not answer" }), el("p", { text: status.problem }), el("p", { text: "The page goes on by itself once it is there: rosAFE-ros starts it." }));
-  else if (processors.length) parts.push(el("h2", { text: "No picture is open" }), el("p", { text: "The eye beside a processor opens one." }));
+  if (status?.problem) parts.push(el("h2", { text: "rosAFE does not answer" }), el("p", { text: status.problem }), el("p", { text: "This page continues when rosAFE answers. If it is not running, start rosAFE-ros." }));
+  else if (processors.length) parts.push(el("h2", { text: "No plot is open" }), el("p", { text: "Click the eye next to a processor to open its plot." }));
   else {
     parts.push(el("h2", { text: "There are no processors yet" }));
-    if (watch) parts.push(el("p", { text: "This page only watches; it shows them once somebody has built some." }));
-    else if (silent) parts.push(el("p", { text: "Start the sound first, under Sound." }));
+    if (watch) parts.push(el("p", { text: "This page can only watch. It shows the processors that other clients build." }));
+    else if (silent) parts.push(el("p", { text: "Start the capture first, under Audio." }));
     else {
-      const go = el("button", { class: "primary", text: "Build cochleagram, level and time differences", onclick: async () => {
-        go.disabled = true;
-        await tried(link.ask("usual"));
-        go.disabled = false;
+      const button = el("button", { class: "primary", text: "Build cochleagram, level and time differences", onclick: async () => {
+        button.disabled = true;
+        await reportErrors(link.request("usual"));
+        button.disabled = false;
       } });
-      parts.push(el("p", { text: "One click builds what this page is for; Add… builds anything else." }), go);
+      parts.push(el("p", { text: "This creates the default plots. Click Add… for other representations." }), button);
     }
   }
-  pictures.empty.replaceChildren(...parts);
+  plots.empty.replaceChildren(...parts);
 }
 
-invite();
+showEmptyState();
 link.open();

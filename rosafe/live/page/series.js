@@ -1,12 +1,12 @@
-// The newest columns of one picture, and the clock that all pictures scroll by.
+// The newest columns of one plot, and the clock by which all plots scroll.
 
-const KEPT = 32; // seconds
+const HISTORY_SECONDS = 32;
 
 export class Series {
   constructor(size, rate) {
     this.size = size;
     this.rate = rate;
-    this.capacity = Math.max(16, Math.ceil(KEPT * rate));
+    this.capacity = Math.max(16, Math.ceil(HISTORY_SECONDS * rate));
     this.values = new Float32Array(size * this.capacity).fill(NaN);
     this.clear();
   }
@@ -17,13 +17,13 @@ export class Series {
     this.end = -Infinity;
   }
 
-  // Takes a piece in; returns the columns [from, to) that are others now, and whether all before them are void.
+  // Append a piece of a message. Return the columns [from, to) that have changed, and whether the audio has restarted.
   append(piece) {
     const after = piece.first + piece.count * piece.stride;
-    let anew = false;
+    let restarted = false;
     if (piece.first < this.first || piece.first > this.next + this.capacity || after < this.next - 1 || !this.next) {
       this.first = this.next = piece.first;
-      anew = true;
+      restarted = true;
     }
     const from = Math.min(this.next, piece.first);
     for (let column = this.next; column < piece.first; column += 1) this.#column(column).fill(NaN);
@@ -35,7 +35,7 @@ export class Series {
     this.first = Math.max(this.first, this.next - this.capacity);
     this.end = piece.end;
     this.zero = piece.end - after / this.rate;
-    return { from, to: after, anew };
+    return { from, to: after, restarted };
   }
 
   #column(column) {
@@ -43,7 +43,7 @@ export class Series {
     return this.values.subarray(at, at + this.size);
   }
 
-  // The column at a time of the audio; null where there is none.
+  // The column at a time of the audio, or null.
   at(time) {
     const column = Math.floor((time - this.zero) * this.rate);
     return column >= this.first && column < this.next ? this.#column(column) : null;
@@ -53,44 +53,45 @@ export class Series {
     return (time - this.zero) * this.rate;
   }
 
-  each(from, to, take) {
+  forEach(from, to, visit) {
     const first = Math.max(this.first, Math.ceil(from));
     const last = Math.min(this.next, Math.floor(to));
-    for (let column = first; column < last; column += 1) take(this.#column(column), column);
+    for (let column = first; column < last; column += 1) visit(this.#column(column), column);
   }
 }
 
-// Blocks come a few times a second; the clock lags behind them by so little that pictures move without a jerk.
+// The time of the audio at the right edge of the plots (the head). Blocks arrive a few times per second; the clock is
+// slightly late, so that the plots scroll smoothly.
 export class Clock {
-  #notes = [];
+  #samples = [];
   #last = new Map();
   #offset = null;
   #end = -Infinity;
 
-  note(series, now) {
+  observe(series, now) {
     const before = this.#last.get(series);
     this.#last.set(series, { end: series.end, now });
     if (series.end < this.#end - 5) this.reset();
     this.#end = Math.max(this.#end, series.end);
-    const grown = before ? series.end - before.end : 0;
-    if (!before || grown <= 0 || grown > 1.5 * (now - before.now) + 0.3) return; // what had been kept for us
-    this.#notes.push({ now, offset: before.end - now });
-    while (this.#notes[0].now < now - 4) this.#notes.shift();
+    const added = before ? series.end - before.end : 0;
+    if (!before || added <= 0 || added > 1.5 * (now - before.now) + 0.3) return; // columns from before the subscription
+    this.#samples.push({ now, offset: before.end - now });
+    while (this.#samples[0].now < now - 4) this.#samples.shift();
   }
 
   reset() {
-    this.#notes = [];
+    this.#samples = [];
     this.#offset = null;
     this.#end = -Infinity;
     this.#last.clear();
   }
 
-  // The time of the audio that the right edge shows; null before there is any.
+  // The time of the audio at the right edge, or null before the first column.
   head(now) {
     if (!Number.isFinite(this.#end)) return null;
-    const wanted = this.#notes.length ? Math.min(...this.#notes.map((note) => note.offset)) : this.#end - 0.4 - now;
-    if (this.#offset === null || Math.abs(wanted - this.#offset) > 1.5) this.#offset = wanted;
-    else this.#offset += (wanted - this.#offset) * 0.06;
+    const target = this.#samples.length ? Math.min(...this.#samples.map((sample) => sample.offset)) : this.#end - 0.4 - now;
+    if (this.#offset === null || Math.abs(target - this.#offset) > 1.5) this.#offset = target;
+    else this.#offset += (target - this.#offset) * 0.06;
     return Math.min(now + this.#offset, this.#end);
   }
 }

@@ -1,30 +1,30 @@
-// The tree of processors: loads, states, and one processor's parameters; adding and removing.
+// The Processors section: the tree with loads and states, the parameters of one processor, adding and removing.
 
 import { title } from "./panel.js";
-import { el, offer, svg, toast, tried } from "./ui.js";
+import { download, el, reportErrors, svg, toast } from "./ui.js";
 
 const EYE = "M2 12s3.6-6.5 10-6.5S22 12 22 12s-3.6 6.5-10 6.5S2 12 2 12zM12 9.2a2.8 2.8 0 1 0 0 5.6 2.8 2.8 0 0 0 0-5.6z";
 
 export class TreeView {
-  constructor(link, element, details, pictures, catalogue, watch) {
-    Object.assign(this, { link, element, details, pictures, catalogue, watch });
+  constructor(link, element, details, plots, catalogue, watch) {
+    Object.assign(this, { link, element, details, plots, catalogue, watch });
     this.processors = [];
     this.loads = {};
-    this.chosen = null;
+    this.selected = null;
     this.rows = el("ul");
-    this.rowsBy = new Map();
+    this.rowsByName = new Map();
     const add = el("button", { class: "more", text: "Add…", title: "Add a representation", onclick: () => this.#dialog() });
     const file = el("input", { type: "file", accept: ".yaml,.yml", hidden: true, id: "setup-file", onchange: () => this.#load(file) });
     const setups = el("div", { class: "row setups" },
-      el("button", { class: "quiet", id: "save-setup", text: "Save setup", title: "Save tree and sound as a file", onclick: () => this.#save() }),
-      ...(watch ? [] : [el("button", { class: "quiet", text: "Load setup…", title: "Build what a file says, wholly or not at all", onclick: () => file.click() }), file]));
-    this.refusal = el("p", { class: "error", role: "alert" });
-    this.refused = new Map(); // why, by the name of the chosen processor's parameter: its fields may be made anew meanwhile
-    element.replaceChildren(el("div", { class: "head" }, el("h2", { text: "Processors" }), ...(watch ? [] : [add])), this.rows, setups, this.refusal);
-    pictures.addEventListener("change", () => this.#eyes());
+      el("button", { class: "quiet", id: "save-setup", text: "Save setup", title: "Save tree and audio input as a setup file", onclick: () => this.#save() }),
+      ...(watch ? [] : [el("button", { class: "quiet", text: "Load setup…", title: "Build the tree of a setup file, completely or not at all", onclick: () => file.click() }), file]));
+    this.error = el("p", { class: "error", role: "alert" });
+    this.rejected = new Map(); // errors by parameter of the selected processor; kept when its fields are created again
+    element.replaceChildren(el("div", { class: "head" }, el("h2", { text: "Processors" }), ...(watch ? [] : [add])), this.rows, setups, this.error);
+    plots.addEventListener("change", () => this.#updateButtons());
   }
 
-  tree(processors) {
+  update(processors) {
     this.processors = processors;
     const depth = new Map();
     const ordered = [];
@@ -36,84 +36,84 @@ export class TreeView {
       }
     };
     walk("", 0);
-    this.rowsBy.clear();
+    this.rowsByName.clear();
     this.rows.replaceChildren(...ordered.map((one) => this.#row(one, depth.get(one.name))));
-    if (!ordered.length) this.rows.append(el("li", { class: "help", text: "There are none yet." }));
-    this.#eyes();
+    if (!ordered.length) this.rows.append(el("li", { class: "help", text: "No processors yet." }));
+    this.#updateButtons();
     this.status({ loads: this.loads });
-    const still = processors.find((one) => one.name === this.chosen);
-    if (!still) this.#choose(null);
-    else if (!this.details.contains(document.activeElement)) this.#choose(still);
+    const selected = processors.find((one) => one.name === this.selected);
+    if (!selected) this.#select(null);
+    else if (!this.details.contains(document.activeElement)) this.#select(selected);
   }
 
   #row(one, level) {
-    const load = el("span", { class: "load", title: "computing, per second" });
-    const eye = el("button", { class: "eye", "aria-label": `picture of ${one.name}`, title: "Show or hide its picture", onclick: () => this.pictures.toggle(one) }, svg(EYE));
+    const load = el("span", { class: "load", title: "computing time per second" });
+    const eye = el("button", { class: "eye", "aria-label": `plot of ${one.name}`, title: "Show or hide the plot", onclick: () => this.plots.toggle(one) }, svg(EYE));
     const name = el("button", { class: "name", title: `${one.name}: ${this.catalogue.kinds[one.kind]?.doc ?? one.kind}`, onclick: () => this.#click(one) },
       el("b", { text: one.name }), el("span", { text: one.name === one.kind ? "" : one.kind }));
     name.style.paddingLeft = `${6 + 9 * level}px`;
     const row = el("li", { class: "node" }, name, load, eye);
-    this.rowsBy.set(one.name, { row, load, eye });
+    this.rowsByName.set(one.name, { row, load, eye });
     return row;
   }
 
-  #eyes() {
-    for (const [name, { row, eye }] of this.rowsBy) {
-      eye.setAttribute("aria-pressed", String(this.pictures.isOpen(name)));
-      row.classList.toggle("chosen", name === this.chosen);
+  #updateButtons() {
+    for (const [name, { row, eye }] of this.rowsByName) {
+      eye.setAttribute("aria-pressed", String(this.plots.isOpen(name)));
+      row.classList.toggle("selected", name === this.selected);
     }
   }
 
   status(status) {
     this.loads = status.loads;
-    for (const [name, { load }] of this.rowsBy) {
-      const told = status.loads[name];
+    for (const [name, { load: element }] of this.rowsByName) {
+      const load = status.loads[name];
       const bar = el("i");
-      bar.style.width = `${Math.min(100, told ? told.load / 2 : 0)}%`; // all of it: 200 ms/s
-      load.classList.toggle("hot", Boolean(told && told.load > 500));
-      load.replaceChildren(told ? `${told.load.toFixed(told.load < 10 ? 1 : 0)} ms/s` : "", bar);
-      load.title = told ? `${told.state}, ${told.blocks} blocks` : "";
+      bar.style.width = `${Math.min(100, load ? load.load / 2 : 0)}%`; // full width: 200 ms/s
+      element.classList.toggle("hot", Boolean(load && load.load > 500));
+      element.replaceChildren(load ? `${load.load.toFixed(load.load < 10 ? 1 : 0)} ms/s` : "", bar);
+      element.title = load ? `${load.state}, ${load.blocks} blocks` : "";
     }
-    if (this.state && this.chosen) this.state.textContent = this.#state();
+    if (this.state && this.selected) this.state.textContent = this.#state();
   }
 
   #state() {
-    const told = this.loads[this.chosen];
-    return told ? `${told.state}, ${told.blocks} blocks, ${told.load.toFixed(1)} ms/s` : "";
+    const load = this.loads[this.selected];
+    return load ? `${load.state}, ${load.blocks} blocks, ${load.load.toFixed(1)} ms/s` : "";
   }
 
   // --- setups ---
 
   async #save() {
-    const saved = await tried(this.link.ask("save"));
-    if (saved) offer(new Blob([saved.setup], { type: "application/yaml" }), "setup.yaml");
+    const saved = await reportErrors(this.link.request("save"));
+    if (saved) download(new Blob([saved.setup], { type: "application/yaml" }), "setup.yaml");
   }
 
   async #load(file) {
-    const [chosen] = file.files;
+    const [setup] = file.files;
     file.value = "";
-    if (!chosen) return;
-    this.refusal.textContent = "";
+    if (!setup) return;
+    this.error.textContent = "";
     try {
-      const made = await this.link.ask("load", { setup: await chosen.text() });
-      toast(made.created.length ? `built ${made.created.join(", ")}` : "all of it is there already");
+      const answer = await this.link.request("load", { setup: await setup.text() });
+      toast(answer.created.length ? `built ${answer.created.join(", ")}` : "all processors exist already");
     } catch (problem) {
-      this.refusal.textContent = problem.message;
+      this.error.textContent = problem.message;
     }
   }
 
-  // --- one processor ---
+  // --- the selected processor ---
 
   #click(one) {
-    this.refused.clear();
-    this.#choose(this.chosen === one.name ? null : one);
-    if (this.chosen) this.details.scrollIntoView({ block: "nearest", behavior: "smooth" });
+    this.rejected.clear();
+    this.#select(this.selected === one.name ? null : one);
+    if (this.selected) this.details.scrollIntoView({ block: "nearest", behavior: "smooth" });
   }
 
-  #choose(one) {
-    this.chosen = one?.name ?? null;
+  #select(one) {
+    this.selected = one?.name ?? null;
     this.details.hidden = !one;
-    this.#eyes();
+    this.#updateButtons();
     if (!one) return;
     const kind = this.catalogue.kinds[one.kind];
     const above = one.kind === "input" ? this.catalogue.input : {};
@@ -132,35 +132,35 @@ export class TreeView {
 
   #field(one, name, parameter, fixed = false) {
     const value = one.values[name] ?? "";
-    const why = this.refused.get(name) ?? "";
-    const problem = el("p", { class: "error", role: "alert", hidden: !why, text: why });
-    problem.id = `e-${one.name}-${name}`;
+    const reason = this.rejected.get(name) ?? "";
+    const error = el("p", { class: "error", role: "alert", hidden: !reason, text: reason });
+    error.id = `e-${one.name}-${name}`;
     const input = control(parameter, value);
     input.id = `p-${one.name}-${name}`;
     input.dataset.parameter = name;
     input.disabled = this.watch || fixed;
     const field = el("div", { class: "field" }, el("label", { for: input.id, text: name }, parameter.unit ? el("span", { class: "unit", text: ` ${parameter.unit}` }) : ""), input,
-      el("p", { class: "help", text: help(parameter) + (fixed ? "; set when the input was made" : "") }), problem);
+      el("p", { class: "help", text: help(parameter) + (fixed ? "; set when the input was created" : "") }), error);
     input.addEventListener("change", async () => {
       try {
-        await this.link.ask("modify", { nameProc: one.name, nameParam: name, newValue: read(input) });
-        this.#tell(one, name, "");
+        await this.link.request("modify", { nameProc: one.name, nameParam: name, newValue: read(input) });
+        this.#showError(one, name, "");
         field.classList.add("done");
         setTimeout(() => field.classList.remove("done"), 1200);
-      } catch (refusal) {
-        this.#tell(one, name, refusal.message);
+      } catch (problem) {
+        this.#showError(one, name, problem.message);
         write(input, this.processors.find((each) => each.name === one.name)?.values[name] ?? value);
       }
     });
     return field;
   }
 
-  #tell(one, name, why) {
-    if (this.chosen !== one.name) return;
-    if (why) this.refused.set(name, why);
-    else this.refused.delete(name);
-    const problem = document.getElementById(`e-${one.name}-${name}`);
-    if (problem) Object.assign(problem, { textContent: why, hidden: !why });
+  #showError(one, name, text) {
+    if (this.selected !== one.name) return;
+    if (text) this.rejected.set(name, text);
+    else this.rejected.delete(name);
+    const error = document.getElementById(`e-${one.name}-${name}`);
+    if (error) Object.assign(error, { textContent: text, hidden: !text });
   }
 
   #below(name) {
@@ -170,18 +170,18 @@ export class TreeView {
 
   #remove(one, below) {
     const dialog = document.getElementById("dialog");
-    const go = el("button", { class: "primary", text: "Remove", onclick: async () => {
+    const confirm = el("button", { class: "primary", text: "Remove", onclick: async () => {
       dialog.close();
-      await tried(this.link.ask("remove", { name: one.name }), `${one.name} is removed`);
+      await reportErrors(this.link.request("remove", { name: one.name }), `removed ${one.name}`);
     } });
     dialog.replaceChildren(
       el("h2", { text: `Remove ${one.name}?` }),
-      el("p", { text: below.length ? `What hangs on it goes too: ${below.join(", ")}.` : "Nothing else hangs on it." }),
-      el("div", { class: "row end" }, el("button", { text: "Keep it", onclick: () => dialog.close() }), go));
+      el("p", { text: below.length ? `The processors below it are removed as well: ${below.join(", ")}.` : "There are no processors below it." }),
+      el("div", { class: "row end" }, el("button", { text: "Cancel", onclick: () => dialog.close() }), confirm));
     dialog.showModal();
   }
 
-  // --- one more ---
+  // --- adding a representation ---
 
   #dialog() {
     const dialog = document.getElementById("dialog");
@@ -189,18 +189,18 @@ export class TreeView {
     const choice = el("select", { "aria-label": "representation" }, ...kinds.map(([kind]) => el("option", { value: kind, text: `${title(kind)} (${kind})` })));
     const doc = el("p", { class: "help" });
     const groups = el("div", {});
-    const problem = el("p", { class: "error", role: "alert" });
-    const go = el("button", { class: "primary", text: "Build" });
+    const error = el("p", { class: "error", role: "alert" });
+    const confirm = el("button", { class: "primary", text: "Build" });
     const show = () => {
       const kind = this.catalogue.kinds[choice.value];
-      doc.textContent = `${kind.doc}. Built with all that it needs; what is there with the same parameters is used.`;
+      doc.textContent = `${kind.doc}. Built with all processors that it needs; existing ones with the same parameters are reused.`;
       groups.replaceChildren(...[...kind.chain].reverse().map((name, index) => {
         const { parameters } = this.catalogue.kinds[name];
         if (!Object.keys(parameters).length) return "";
         return el("details", { open: index === 0 }, el("summary", { text: `Parameters of ${name}` }),
           el("div", { class: "fields" }, ...Object.entries(parameters).map(([id, parameter]) => {
             const input = control(parameter, "");
-            input.dataset.given = id;
+            input.dataset.value = id;
             if (input.tagName === "SELECT") input.prepend(el("option", { value: "", text: `default: ${parameter.default}`, selected: true }));
             else if (input.type === "checkbox") input.checked = Boolean(parameter.default);
             else input.placeholder = String(parameter.default);
@@ -212,26 +212,26 @@ export class TreeView {
     choice.addEventListener("change", show);
     choice.value = "itd" in this.catalogue.kinds ? "itd" : choice.value;
     show();
-    go.addEventListener("click", async () => {
-      const given = { representation: choice.value };
-      for (const input of groups.querySelectorAll("[data-given]")) {
+    confirm.addEventListener("click", async () => {
+      const values = { representation: choice.value };
+      for (const input of groups.querySelectorAll("[data-value]")) {
         const text = read(input);
-        if (input.type === "checkbox" ? String(input.checked) !== input.dataset.default : text !== "") given[input.dataset.given] = text;
+        if (input.type === "checkbox" ? String(input.checked) !== input.dataset.default : text !== "") values[input.dataset.value] = text;
       }
-      problem.textContent = "";
-      go.disabled = true;
+      error.textContent = "";
+      confirm.disabled = true;
       try {
-        const made = await this.link.ask("build", given);
+        const answer = await this.link.request("build", values);
         dialog.close();
-        toast(made.created.length ? `built ${made.created.join(", ")}` : `${made.name} is there already`);
-        this.wanted = made.name;
-      } catch (refusal) {
-        problem.textContent = refusal.message;
+        toast(answer.created.length ? `built ${answer.created.join(", ")}` : `${answer.name} exists already`);
+        this.openWhenBuilt = answer.name;
+      } catch (problem) {
+        error.textContent = problem.message;
       }
-      go.disabled = false;
+      confirm.disabled = false;
     });
-    dialog.replaceChildren(el("h2", { text: "Add a representation" }), choice, doc, groups, problem,
-      el("div", { class: "row end" }, el("button", { text: "Cancel", onclick: () => dialog.close() }), go));
+    dialog.replaceChildren(el("h2", { text: "Add a representation" }), choice, doc, groups, error,
+      el("div", { class: "row end" }, el("button", { text: "Cancel", onclick: () => dialog.close() }), confirm));
     choice.style.width = "100%";
     dialog.showModal();
   }
@@ -243,7 +243,7 @@ function control(parameter, value) {
     return el("select", {}, ...options.map((choice) => el("option", { value: choice, text: choice, selected: choice === value })));
   }
   if (parameter.type === "boolean") return el("input", { type: "checkbox", checked: value === "1" || value === "true" });
-  // A text, whatever it holds: the component itself says what it does not take, and why.
+  // A text field: the component checks the value and explains its errors.
   return el("input", { type: "text", inputmode: /sequence|string/.test(parameter.type) ? "text" : "decimal", value, spellcheck: "false", autocomplete: "off" });
 }
 
@@ -259,6 +259,6 @@ function write(input, value) {
 
 function help(parameter) {
   const range = parameter.range ? `; ${parameter.range}` : "";
-  const usual = parameter.default === "" || (Array.isArray(parameter.default) && !parameter.default.length) ? "" : `; default ${parameter.default === true ? 1 : parameter.default === false ? 0 : parameter.default}`;
-  return parameter.doc + range + usual;
+  const fallback = parameter.default === "" || (Array.isArray(parameter.default) && !parameter.default.length) ? "" : `; default ${parameter.default === true ? 1 : parameter.default === false ? 0 : parameter.default}`;
+  return parameter.doc + range + fallback;
 }

@@ -1,4 +1,4 @@
-// Small helpers: elements, messages, numbers as people write them.
+// Helpers for elements, messages, numbers with units, downloads and settings.
 
 export function el(tag, properties = {}, ...children) {
   const element = document.createElement(tag);
@@ -30,8 +30,8 @@ export function toast(text, bad = false) {
   setTimeout(() => note.remove(), bad ? 9000 : 4000);
 }
 
-// The promise of an answer, with what went wrong shown.
-export async function tried(promise, done = "") {
+// Await a promise; show an error as a message and return null.
+export async function reportErrors(promise, done = "") {
   try {
     const answer = await promise;
     if (done) toast(done);
@@ -62,27 +62,27 @@ export function number(value) {
   return value.toFixed(size < 1 ? 3 : size < 100 ? 1 : 0).replace("-", "−");
 }
 
-// As a number beside an axis: no zeros at its end.
+// A number on an axis, without trailing zeros.
 export function tick(value) {
   const text = number(value);
   return text.includes(".") && !text.includes("e") ? text.replace(/\.?0+$/, "") : text;
 }
 
-// A value with its unit; seconds are told in ms or µs.
+// A value with its unit; times below 1 s are given in ms or µs.
 export function quantity(value, unit) {
   if (!Number.isFinite(value)) return "none";
   if (unit === "s") return seconds(value).replace("-", "−");
   return unit ? `${number(value)} ${unit}` : number(value);
 }
 
-// Lets the user keep a file.
-export function offer(blob, name) {
+// Save a file on the user's computer.
+export function download(blob, name) {
   const link = el("a", { href: URL.createObjectURL(blob), download: name });
   link.click();
   setTimeout(() => URL.revokeObjectURL(link.href), 1000);
 }
 
-export function stored(name, fallback) {
+export function loadSetting(name, fallback) {
   try {
     return JSON.parse(localStorage.getItem(`rosafe.${name}`)) ?? fallback;
   } catch {
@@ -90,10 +90,10 @@ export function stored(name, fallback) {
   }
 }
 
-export function store(name, value) {
+export function saveSetting(name, value) {
   try {
     localStorage.setItem(`rosafe.${name}`, JSON.stringify(value));
   } catch {
-    // a browser that keeps nothing forgets it
+    // the browser does not allow local storage
   }
 }

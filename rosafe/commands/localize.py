@@ -1,0 +1,258 @@
+"""Find the directions of sources: in a sound file or rosbag with two ears, or, without SOUND, as a ROS node.
+
+Azimuths are in degrees, left of straight ahead positive. The output is a CSV with a line every 10 ms (time_s,
+azimuth_deg, confidence, level_db) on the standard output, or the files that -o names: OUT.csv with the sources in
+OUT.tracks.csv, OUT.json, or OUT.png, a picture of the posterior and the sources over time.
+
+Without SOUND it is the ROS node localizer: it requests the representations that it needs from a running rosAFE, and
+publishes the tracked sources on /localizer/sources, /localizer/poses (for rviz) and /localizer/posterior at 10 Hz,
+until Ctrl-C. The options of the node are also private ROS parameters: ~head, ~seconds, ~world_frame, ~head_frame,
+~rosafe, ~connect, ~audio_delay, ~noise. With --check or --calibrate-noise it measures and ends.
+docs/directions.md describes it."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import functools
+import importlib
+import sys
+import warnings
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from rosafe import option_types
+from rosafe.commands import CommandError
+from rosafe.commands._parameters import add_settings, ear_channels, parameters_of
+from rosafe.output import OutputError, new_file, write_whole
+from rosafe.terminal import printable
+
+_SUFFIXES = (".csv", ".json", ".png")
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments."""
+    parser.usage = (
+        "rosafe localize SOUND [--head FILE] [--seconds S] [--yaw FILE.csv] [-o OUT.csv|.json|.png]\n"
+        "                       [--channels L,R] [--set NAME=VALUE ...] [--force]\n"
+        "       rosafe localize [--head FILE] [--seconds S] [--world-frame NAME] [--head-frame NAME] [--rosafe NAME]\n"
+        "                       [--connect TOPIC] [--set NAME=VALUE ...] [--name NAME] [-b] [--wait] [NAME:=VALUE ...]"
+    )
+    parser.add_argument("inputs", nargs="*", metavar="SOUND", help="sound file or rosbag with two ears")
+    parser.add_argument(
+        "--head",
+        metavar="FILE",
+        help="SOFA file, or a model that `rosafe head learn` has written (default: a sphere, which cannot distinguish "
+        "front from back)",
+    )
+    parser.add_argument(
+        "--seconds",
+        type=option_types.seconds(0.01, 60.0),
+        metavar="S",
+        help="window of integration (default: 0.5)",
+    )
+    parser.add_argument(
+        "--yaw", metavar="FILE.csv", help="head rotation: columns time_s, head_yaw_deg; a .truth.csv is accepted"
+    )
+    parser.add_argument(
+        "-o", "--to", dest="to", metavar="OUT", action="append", help="OUT.csv, OUT.json or OUT.png; may be repeated"
+    )
+    parser.add_argument(
+        "--channels", metavar="L,R", type=ear_channels, help="channels (from 1) of the left and the right ear"
+    )
+    add_settings(parser, "rosafe process -h lists them")
+    parser.add_argument("--force", action="store_true", help="replace OUT if it exists")
+    _add_node(parser)
+    parser.epilog = (
+        "The first use of a head, sample rate and parameters takes up to 30 s: a model is learned and kept in\n"
+        "$XDG_CACHE_HOME/rosafe. docs/localization.md describes the method and its accuracy.\n\n"
+        "examples:\n"
+        "  rosafe localize speech.wav --head /usr/share/libmysofa/default.sofa\n"
+        "  rosafe localize scene.wav --head kemar.head --yaw scene.truth.csv -o scene.csv -o scene.png\n"
+        "  rosafe localize --head robot.head --world-frame world --audio-delay 0.03    # the node\n"
+        "  rosafe localize --head robot.head --check                                   # are the ears swapped?\n"
+        "  rosafe localize --head robot.head --calibrate-noise 10                      # fans and motors only"
+    )
+
+
+def _add_node(parser: argparse.ArgumentParser) -> None:
+    group = parser.add_argument_group("options of the node")
+    group.add_argument(
+        "--world-frame",
+        metavar="NAME",
+        help="coordinate frame of the azimuths, from tf (default: they are relative to the head, which must not turn)",
+    )
+    group.add_argument("--head-frame", metavar="NAME", help="coordinate frame of the head (default: head)")
+    group.add_argument("--rosafe", metavar="NAME", help="name of the rosAFE node (default: rosAFE)")
+    group.add_argument(
+        "--connect",
+        metavar="TOPIC",
+        help="topic of the sound for a new input (default: bass/Audio, unless the port Audio is connected)",
+    )
+    group.add_argument(
+        "--audio-delay",
+        type=option_types.seconds(-5.0, 5.0),
+        metavar="S",
+        help="latency of the sound card in s: earlier times are used for the rotation of the head (default: 0)",
+    )
+    group.add_argument(
+        "--noise",
+        metavar="FILE",
+        help="noise level that --calibrate-noise writes or the node reads; none: no file (default: noise.json in "
+        "$XDG_CACHE_HOME/rosafe, if it exists)",
+    )
+    group.add_argument(
+        "--calibrate-noise",
+        type=option_types.seconds(0.5, 600.0),
+        metavar="SECONDS",
+        help="measure the level of the steady noise, write it to the file of --noise, and end",
+    )
+    group.add_argument(
+        "--check",
+        action="store_true",
+        help="ask for sounds from three directions, report swapped or silent ears, and end",
+    )
+    group.add_argument(
+        "-i", "--name", dest="instance", metavar="NAME", default="localizer", help="name of the node (localizer)"
+    )
+    group.add_argument(
+        "-b", "--background", action="store_true", help="run in the background when the node has started"
+    )
+    group.add_argument("--wait", action="store_true", help="wait for a ROS master without a time limit")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Localize and write the results."""
+    inputs = [name for name in (*options.inputs, *options.more_inputs) if ":=" not in name]
+    if len(inputs) > 1:
+        options.usage_error(f"expected one sound file, got {len(inputs)}")
+    return _localize(inputs[0], options) if inputs else _run_node(options)
+
+
+def _localize(path: str, options: argparse.Namespace) -> int:
+    """Localize the sources in a file."""
+    targets = [Path(target) for target in options.to or ()]
+    for target in targets:
+        if target.suffix.lower() not in _SUFFIXES:
+            options.usage_error(f"-o {target}: expected a name that ends in {', '.join(_SUFFIXES)}")
+    from rosafe.localization.localize import localize
+    from rosafe.localization.results import read_yaw
+    from rosafe.sound.audiofile import AudioFileError
+
+    try:
+        yaw: Any = read_yaw(options.yaw) if options.yaw else 0.0
+        sound, rate = _sound(path, options.channels)
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always", UserWarning)
+            result = localize(
+                sound,
+                rate,
+                options.head or "sphere",
+                options.seconds or 0.5,
+                parameters_of(options.settings) or None,
+                head_yaw=yaw,
+            )
+    except (AudioFileError, ValueError) as problem:
+        raise CommandError(str(problem)) from None
+    for warning in caught:
+        if issubclass(warning.category, UserWarning):
+            print(f"rosafe localize: {printable(warning.message)}", file=sys.stderr)
+    if not targets:
+        from rosafe.localization.results import estimates_csv
+
+        sys.stdout.write(estimates_csv(result))
+    for target in targets:
+        _write(target, result, options.force, path)
+    return 0
+
+
+def _run_node(options: argparse.Namespace) -> int:
+    """Run the node until it ends."""
+    for name in ("yaw", "to", "channels", "force"):
+        if getattr(options, name):
+            options.usage_error(f"expected a sound file with {'-o' if name == 'to' else '--' + name}")
+    from rosafe.component import startup
+
+    if options.check and options.calibrate_noise is not None:
+        options.usage_error("expected either --check or --calibrate-noise")
+    try:
+        given = {**vars(options), "parameters": parameters_of(options.settings) or None}
+    except ValueError as problem:
+        raise CommandError(str(problem)) from None
+    if options.check or options.calibrate_noise is not None:
+        return _measure(given, options)
+    remappings = [*startup.names_given()[1:], *(name for name in options.inputs if ":=" in name)]
+
+    def build(instance: str) -> startup.RosNode:
+        from rosafe.localizer_node.node import LocalizerNode  # needs the messages
+
+        return LocalizerNode(given)
+
+    prepare = functools.partial(importlib.import_module, "rosafe.localizer_node.node")
+    return startup.run_node("rosafe localize", build, options, remappings, prepare)
+
+
+def _measure(given: Mapping[str, Any], options: argparse.Namespace) -> int:
+    """Check the ears, or calibrate the noise level, with the settings of the node."""
+    from rosafe.component.generate import GenerationError
+    from rosafe.component.startup import become_node
+    from rosafe.transport.master import MasterError
+
+    try:
+        become_node("rosafe_localize")
+    except (MasterError, GenerationError) as problem:
+        raise CommandError(str(problem)) from None
+    from rosafe.localizer_node import ear_check, noise_calibration, noise_measurement
+    from rosafe.localizer_node.frame_listener import FrameListener, NoFramesError
+    from rosafe.localizer_node.settings import read_settings
+
+    def say(text: str) -> None:
+        print(text, flush=True)
+
+    try:
+        settings = read_settings(given, f"/{options.instance}/")
+        with FrameListener(settings) as listener:
+            if options.check:
+                report = ear_check.check_ears(listener, say)
+                for line in report.lines if report is not None else ():
+                    say(line)
+                return 1 if report is None or report.problems else 0
+            path = noise_calibration.file_of(settings.noise) or noise_calibration.default_path()
+            noise_measurement.calibrate(listener, options.calibrate_noise, path, say)
+    except (NoFramesError, ValueError, OSError, OutputError) as problem:
+        raise CommandError(printable(str(problem))) from None
+    return 0
+
+
+def _sound(path: str, channels: tuple[int, int] | None) -> tuple[Any, int]:
+    from rosafe.offline.sounds import open_sound
+
+    with contextlib.closing(open_sound(path, channels)) as file:
+        return file.read(file.frames), file.sample_rate
+
+
+def _write(target: Path, result: Mapping[str, Any], force: bool, name: str) -> None:
+    from rosafe.localization import results
+
+    suffix = target.suffix.lower()
+    if suffix == ".png":
+        from matplotlib.figure import Figure
+
+        from rosafe.view.axes import save
+        from rosafe.view.directions import draw
+
+        save(draw(Figure(), result, printable(Path(name).name)), target, force)
+    elif suffix == ".json":
+        _write_text(target, results.as_json(result), force)
+    else:
+        _write_text(target, results.estimates_csv(result), force)
+        _write_text(target.with_suffix(".tracks.csv"), results.tracks_csv(result), force)
+
+
+def _write_text(target: Path, text: str, force: bool) -> None:
+    if force:
+        write_whole(target, text.encode())
+        return
+    with new_file(target, False) as descriptor, open(descriptor, "wb", closefd=False) as file:
+        file.write(text.encode())

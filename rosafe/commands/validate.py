@@ -1,0 +1,80 @@
+"""Compare each representation with publications, closed forms, a measured head and other toolboxes.
+
+One line is printed for each comparison: the deviation, its tolerance and the source of the reference values. Toolboxes
+that are not installed are skipped. Nothing is installed, and no network is needed. docs/validation.md is the page that
+-o writes."""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from rosafe.commands import CommandError
+
+if TYPE_CHECKING:
+    from rosafe.validation.report import Row
+
+
+def configure(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments."""
+    parser.usage = "rosafe validate [--short] [--self-test] [-o FILE.md]"
+    parser.add_argument("--short", action="store_true", help="without other toolboxes")
+    parser.add_argument(
+        "--self-test",
+        action="store_true",
+        help="disturb each representation a little; each comparison has to detect it",
+    )
+    parser.add_argument(
+        "-o",
+        "--to",
+        dest="to",
+        metavar="FILE.md",
+        help="write a page with a table, and pictures beside it; they are replaced if they exist",
+    )
+    parser.epilog = (
+        "exit status: 0 if all comparisons passed (with --self-test: if all disturbances were detected), 1 if not\n\n"
+        "examples:\n"
+        "  rosafe validate\n"
+        "  rosafe validate --self-test\n"
+        "  rosafe validate -o validation.md"
+    )
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run the comparisons and print or write their results."""
+    target = Path(options.to) if options.to else None
+    if target and options.self_test:
+        options.usage_error("-o: expected without --self-test, whose results the page contains as well")
+    if target and target.suffix.lower() != ".md":
+        raise CommandError(f"-o: expected a name ending in .md, got {target}")
+    if target and not target.parent.is_dir():
+        raise CommandError(f"{target}: expected an existing folder {target.parent}")
+    from rosafe.validation import report
+
+    begin, disturbed = time.monotonic(), options.self_test
+    comparisons = report.comparisons(options.short)
+    rows = report.run(comparisons, disturbed, lambda row: print(report.line(row, disturbed), flush=True))
+    computed = [row for row in rows if not row.skipped]
+    good = sum(row.passed is not disturbed for row in computed)
+    word = "disturbances detected" if disturbed else "comparisons passed"
+    print(f"{good} of {len(computed)} {word}, {len(rows) - len(computed)} skipped, in {time.monotonic() - begin:.0f} s")
+    if target:
+        _write(target, rows, report.run(comparisons, disturbed=True))
+    return 0 if good == len(computed) else 1
+
+
+def _write(target: Path, rows: list[Row], disturbed: list[Row]) -> None:
+    """Write the page, and a picture for each group of comparisons that has curves."""
+    from rosafe.output import write_whole
+    from rosafe.validation import figures, report
+
+    pictures = {}
+    for group in dict.fromkeys(row.comparison.group for row in rows):
+        members = [row for row in rows if row.comparison.group == group]
+        if any(row.curve for row in members):
+            picture = target.with_name(f"{target.stem}-{group}.png")
+            figures.draw(members, picture)
+            pictures[f"Reference values and measured values: {group}"] = picture.name
+    write_whole(target, report.markdown(rows, disturbed, pictures).encode())

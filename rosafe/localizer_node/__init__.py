@@ -1,0 +1,1 @@
+"""The localizer node: tracked directions of sources from the representations of a running rosAFE."""

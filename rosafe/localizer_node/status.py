@@ -1,0 +1,77 @@
+"""The state of the localizer: its activity or the missing part, in the log at each change and in /diagnostics."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from typing import Any
+
+import rospy
+from diagnostic_msgs.msg import DiagnosticStatus
+
+OK, WARN, ERROR = DiagnosticStatus.OK, DiagnosticStatus.WARN, DiagnosticStatus.ERROR
+
+
+class NodeStatus:
+    """The state of the localizer: the worst state of its parts, among several the newest.
+
+    Parameters
+    ----------
+    changed : callable
+        Called after each change.
+    """
+
+    def __init__(self, changed: Callable[[], None]) -> None:
+        self._changed = changed
+        self._lock = threading.Lock()
+        self._causes: dict[str, tuple[int, str]] = {}  # by part of the node
+        self._values: dict[str, str] = {}
+        self._logged = ""
+
+    def set(self, part: str, level: int, text: str, log: bool = True) -> None:
+        """Set the state of a part of the node; a new text of the whole node is logged once."""
+        with self._lock:
+            self._causes.pop(part, None)
+            self._causes[part] = level, text
+            level, text = self._summary()
+            new = text != self._logged
+            if new and log:
+                self._logged = text
+        if new:
+            if log:
+                (rospy.loginfo if level == OK else rospy.logwarn)(text)
+            self._changed()
+
+    def clear(self, part: str) -> None:
+        """Remove the state of a part."""
+        with self._lock:
+            self._causes.pop(part, None)
+
+    def state(self) -> tuple[int, str]:
+        """Return the worst level and its newest text."""
+        with self._lock:
+            return self._summary()
+
+    def value(self, key: str, value: Any) -> None:
+        """Set an entry of /diagnostics."""
+        self._values[key] = str(value)
+
+    def count(self, key: str, number: int) -> None:
+        """Add to a number in /diagnostics."""
+        self._values[key] = str(int(self._values.get(key, 0)) + number)
+
+    def _summary(self) -> tuple[int, str]:
+        """Return the worst level and its newest text."""
+        if not self._causes:
+            return OK, "starting"
+        worst = max(level for level, _ in self._causes.values())
+        return worst, next(text for level, text in reversed(self._causes.values()) if level == worst)
+
+    def report(self, status: Any) -> Any:
+        """Fill in a status of /diagnostics."""
+        with self._lock:
+            level, text = self._summary()
+        status.summary(level, text)
+        for key, value in list(self._values.items()):
+            status.add(key, value)
+        return status
