@@ -1,8 +1,8 @@
-"""The one table of the component interface: requests, parameters, types, exceptions and ports of `rosAFE` and `bass`.
+"""The interface table: requests, parameters, types, exceptions and ports of the components `rosAFE` and `bass`.
 
-The nodes, the HTTP server, the Tcl help, the documentation and the files below msg/, srv/ and action/ all come from
-this table; it comes from the declarations of the representations (rosafe/representations). Nothing else states a
-parameter's name, type, default, range or order.
+The nodes, the HTTP server, the Tcl help, the documentation and the files in msg/, srv/ and action/ are derived from
+this table. It is derived from the declarations of the representations (rosafe/representations), the only place that
+defines the name, type, default, range and order of a parameter.
 """
 
 from __future__ import annotations
@@ -23,7 +23,6 @@ from .rosafe import (
     FIND,
     LAYOUTS,
     LOAD_SETUP,
-    MAX_BLOCK,
     MAX_SECONDS,
     MAX_SETUP,
     REQUEST,
@@ -36,7 +35,7 @@ COMPONENTS = {c.name: c for c in (ROSAFE, BASS)}
 
 
 def all_services() -> Iterator[tuple[ComponentSpec, Service]]:
-    """Every (component, service) pair on the ROS graph."""
+    """Yield every (component, service) pair on the ROS graph."""
     for component in COMPONENTS.values():
         for service in component.on_graph:
             yield component, service
@@ -55,7 +54,6 @@ __all__ = [
     "LAYOUTS",
     "LOAD_SETUP",
     "MAX_ACTIVITIES",
-    "MAX_BLOCK",
     "MAX_SECONDS",
     "MAX_SEQUENCE",
     "MAX_SETUP",

@@ -1,4 +1,4 @@
-"""`python3 -m rosafe.interface`: write all files that come from the interface table anew."""
+"""`python3 -m rosafe.interface`: write all files that are derived from the interface table."""
 
 from __future__ import annotations
 
@@ -8,31 +8,34 @@ from pathlib import Path
 
 from rosafe.representations.registry import builtin_stages
 
-from . import BASS, files, reference
+from . import BASS, citation_file, citing, files, reference
 from .rosafe import derive
 
 ROOT = Path(__file__).parents[2]
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Write them, or say which are stale; 1 where some are."""
+    """Write the files and list those that changed; with ``--check`` only list them, and return 1 if there are any."""
     parser = argparse.ArgumentParser(
         prog="python3 -m rosafe.interface",
-        description="Write .msg, .srv and .action files, their lists in CMakeLists.txt and docs/parameters.md anew.",
+        description="Write the .msg, .srv and .action files, their lists in CMakeLists.txt, docs/parameters.md, "
+        "docs/citing.md and CITATION.cff.",
         epilog="example: python3 -m rosafe.interface --check",
     )
-    parser.add_argument("--check", action="store_true", help="write nothing, only name what is stale")
+    parser.add_argument("--check", action="store_true", help="write nothing, only list the files that are out of date")
     options = parser.parse_args(argv)
-    kinds = {kind: stage.REPRESENTATION for kind, stage in builtin_stages().items()}  # no plugins of whoever runs this
+    kinds = {kind: stage.REPRESENTATION for kind, stage in builtin_stages().items()}  # without the user's plugins
     components = (derive(kinds), BASS)
-    wanted = files.all_files(ROOT, components)
-    wanted[ROOT / "docs" / "parameters.md"] = reference.markdown(components, kinds)
-    stale = files.stale(wanted)
+    expected = files.all_files(ROOT, components)
+    expected[ROOT / "docs" / "parameters.md"] = reference.markdown(components, kinds)
+    expected[ROOT / "docs" / "citing.md"] = citing.markdown(kinds)
+    expected[ROOT / "CITATION.cff"] = citation_file.text(citing.references(kinds.values(), {}))
+    stale = files.stale(expected)
     for path in stale:
         print(path.relative_to(ROOT))
     if options.check:
         return 1 if stale else 0
-    files.write(wanted)
+    files.write(expected)
     return 0
 
 

@@ -1,7 +1,8 @@
-"""The component `bass`, which captures binaural sound, and the type of its port."""
+"""The component `bass`, which captures binaural audio, and the type of its port."""
 
 from __future__ import annotations
 
+from rosafe.declarations.idl import TIME
 from rosafe.declarations.parameter import Parameter
 
 from .genom import COMMON_SERVICES, GENOM_STATE, GENOM_STATE_PORT
@@ -28,12 +29,17 @@ BASS = ComponentSpec(
             "Acquire",
             "Capture from a device and publish on Audio until stopped",
             (
-                Parameter("device", "string", "hw:1,0", "ALSA name of the sound device, file:PATH, bag:PATH or scene:"),
+                Parameter(
+                    "device",
+                    "string",
+                    "hw:1,0",
+                    "ALSA name of the sound device, file:PATH, bag:PATH, scene: or scene:FILE.yaml",
+                ),
                 Parameter(
                     "sampleRate",
                     "unsigned long",
                     44100,
-                    "Sample rate (Hz); 0: the source's own with file: and bag:, else 44100",
+                    "Sample rate (Hz); 0: that of the source with file: and bag:, otherwise 44100",
                     0,
                     768000,
                     zero_is_default=False,
@@ -54,7 +60,7 @@ BASS = ComponentSpec(
         Service("Stop", "Stop the acquisition", interrupts=("Acquire",)),
         Service(
             "getAcquisition",
-            "What is acquired at the moment: the arguments of the Acquire that runs",
+            "The arguments of the running Acquire",
             outputs=(
                 ("running", "boolean"),
                 ("device", "string"),
@@ -87,9 +93,18 @@ BASS = ComponentSpec(
     exceptions={
         "e_nomem": "out of memory",
         "e_nodevice": "no sound card",
-        "e_device": "the device does not exist, is busy or is gone",
-        "e_hwparams": "the device does not offer what was asked for",
+        "e_device": "the device does not exist, is busy or was disconnected",
+        "e_hwparams": "the device does not support the requested parameters",
         "e_swparams": "the device's software parameters cannot be set",
     },
     structs={**BINAUDIO, **GENOM_STATE},
+    messages={
+        "SceneTruth": (
+            ("stamp", TIME),
+            ("frameIndex", "unsigned long long"),
+            ("head_yaw", "double"),
+            ("names", "sequence<string>"),
+            ("azimuths", "sequence<double>"),
+        ),
+    },
 )

@@ -1,6 +1,6 @@
-"""What must exist as files: `.msg`, `.srv` and `.action`, their lists in CMakeLists.txt, and docs/parameters.md.
+"""Files derived from the interface table: `.msg`, `.srv` and `.action` files, and their lists in CMakeLists.txt.
 
-`python3 -m rosafe.interface` writes them anew from the table, `--check` says which are stale.
+`python3 -m rosafe.interface` writes them; with `--check` it lists those that are out of date.
 """
 
 from __future__ import annotations
@@ -31,17 +31,18 @@ def _of_service(service: Service) -> Iterator[tuple[str, str]]:
 
 
 def interface_files(component: ComponentSpec) -> dict[str, str]:
-    """The text of each interface file of a package, by its path there, such as ``srv/Stop.srv``."""
-    files = {}
-    for idl, fields in component.structs.items():
-        files[f"msg/{ros_type(idl)}.msg"] = _text(f"IDL struct {idl}", fields)
+    """Return the text of each interface file of a package by its path in the package, such as ``srv/Stop.srv``."""
+    files = {
+        f"msg/{ros_type(idl)}.msg": _text(f"IDL struct {idl}", fields) for idl, fields in component.structs.items()
+    }
+    files |= {f"msg/{name}.msg": _text(f"message {name}", fields) for name, fields in component.messages.items()}
     for service in component.on_graph:
         files.update(_of_service(service))
     return files
 
 
 def _listed(cmake: str, paths: list[str]) -> str:
-    """The text of a CMakeLists.txt with its lists of interface files as they should be."""
+    """Return the text of a CMakeLists.txt with updated lists of interface files."""
     for folder, command in _LISTS.items():
         names = sorted(path.removeprefix(f"{folder}/") for path in paths if path.startswith(f"{folder}/"))
         lines = "".join(f"  {name}\n" for name in names)
@@ -50,7 +51,7 @@ def _listed(cmake: str, paths: list[str]) -> str:
 
 
 def all_files(root: Path, components: tuple[ComponentSpec, ...]) -> dict[Path, str | None]:
-    """Every file below the checkout `root` that comes from the table, and its text; None for one that must go."""
+    """Return the text of every derived file in the checkout `root`; None for a file that must be deleted."""
     found: dict[Path, str | None] = {}
     for component in components:
         folder = root / FOLDERS[component.name]
@@ -64,16 +65,12 @@ def all_files(root: Path, components: tuple[ComponentSpec, ...]) -> dict[Path, s
 
 
 def stale(files: dict[Path, str | None]) -> list[Path]:
-    """Those that are not as they should be."""
-
-    def now(path: Path) -> str | None:
-        return path.read_text("utf-8") if path.exists() else None
-
-    return [path for path, text in files.items() if now(path) != text]
+    """Return the files that are out of date."""
+    return [p for p, text in files.items() if (p.read_text("utf-8") if p.exists() else None) != text]
 
 
 def write(files: dict[Path, str | None]) -> None:
-    """Make them so."""
+    """Write or delete the files that are out of date."""
     for path in stale(files):
         text = files[path]
         if text is None:

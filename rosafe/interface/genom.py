@@ -1,4 +1,4 @@
-"""What every GenoM component has: exceptions, common requests, and the state that it publishes."""
+"""The parts common to all GenoM components: exceptions, requests, and the published state."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ GENOM_EXCEPTIONS: dict[str, Struct] = {
     "syserr": (("code", "long"),),
 }
 
-MAX_ACTIVITIES = 256  # per task, its permanent one included; the original takes 32
+MAX_ACTIVITIES = 256  # per task, including its permanent one; deviation: the original has at most 32
 
 _PORT_NAMES = (
     Parameter("local", "string", REQUIRED, "Name of this component's input port"),

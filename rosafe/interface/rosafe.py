@@ -1,10 +1,11 @@
-"""The component `rosAFE`, derived from the representations that there are: requests, ports, structs, tasks."""
+"""The component `rosAFE`, derived from the available representations: requests, ports, structs, tasks."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
 
+from rosafe.declarations.block_length import DEFAULT_FRAMES_PER_BLOCK, MAX_FRAMES_PER_BLOCK
 from rosafe.declarations.idl import TIME
 from rosafe.declarations.parameter import REQUIRED, Parameter
 from rosafe.declarations.representation import Representation
@@ -16,23 +17,21 @@ from .bass import BINAUDIO
 from .genom import COMMON_SERVICES, GENOM_STATE, GENOM_STATE_PORT
 from .service import ComponentSpec, PortSpec, Service, Struct
 
-MAX_SECONDS = 600.0  # longest port or history
-MAX_BLOCK = 10_000_000  # frames
-MAX_SETUP = 4 * 2**20  # characters of a setup; over HTTP, the length of a URL is what bounds it
-MAX_PARAMETERS = 2**18  # characters of the parameters of a request for a whole tree, by a service of ROS
+MAX_SECONDS = 600.0  # of a port or history
+MAX_SETUP = 4 * 2**20  # characters of a setup; over HTTP, the URL length is the lower limit
+MAX_PARAMETERS = 2**18  # characters of the parameters of a request for a whole tree, as a ROS service
 
 Kinds = Mapping[str, Representation]  # parents first
 
 LAYOUTS = {kind: layout(representation) for kind, representation in KINDS.items()}
-CORE_REPRESENTATIONS = {
-    kind: KINDS[kind] for kind in CORE_KINDS if kind in KINDS
-}  # what getParameters and getSignals report
+# Representations that getParameters and getSignals return.
+CORE_REPRESENTATIONS = {kind: KINDS[kind] for kind in CORE_KINDS if kind in KINDS}
 
 # --- types ------------------------------------------------------------------------------------------------------
 
 
 def parameter_struct(kind: str) -> str:
-    """The struct of getParameters for one of the original's kinds."""
+    """Return the struct of getParameters for one of the original's kinds."""
     if kind == "crossCorrelation":
         return "::rosAFE::crossCorrelationParametres"
     return f"::rosAFE::{kind.removesuffix('Proc')}ProcsParametres"
@@ -75,7 +74,14 @@ def _structs(kinds: Kinds) -> dict[str, Struct]:
 # --- requests ---------------------------------------------------------------------------------------------------
 
 BLOCK_AND_BUFFERS = (
-    Parameter("nFramesPerBlock", "unsigned long", 12000, "Frames in one block", 1, MAX_BLOCK),
+    Parameter(
+        "nFramesPerBlock",
+        "unsigned long",
+        DEFAULT_FRAMES_PER_BLOCK,
+        "Frames in one block",
+        1,
+        MAX_FRAMES_PER_BLOCK,
+    ),
     Parameter(
         "bufferSize_s_port",
         "double",
@@ -90,7 +96,7 @@ BLOCK_AND_BUFFERS = (
         "bufferSize_s_getSignal",
         "double",
         1.0,
-        "Seconds of signal that getSignals can return; raised to two blocks where it is less",
+        "Seconds of signal that getSignals can return; at least two blocks",
         0.0,
         MAX_SECONDS,
         open_minimum=True,
@@ -107,7 +113,7 @@ _PROCESSOR_THROWS = (
 
 
 def _creation_service(representation: Representation, kinds: Kinds) -> Service:
-    """The request that adds a processor."""
+    """Return the request that adds a processor."""
     name = Parameter("name", "string", representation.name, representation.name_doc)
     parent = representation.parent
     if not parent:
@@ -133,21 +139,21 @@ def _creation_service(representation: Representation, kinds: Kinds) -> Service:
 
 
 def _whole_trees(kinds: Kinds) -> tuple[Service, ...]:
-    """The requests for a representation and all that it needs: to build it, and to find what is there of it."""
+    """Return the requests for whole trees: build or find a representation with its ancestors, save or load a setup."""
     build = Service(
         "request",
-        "Build what a representation needs, or find it in the tree of processors",
+        "Build a representation with all processors that it needs; existing processors are used",
         (
             Parameter(
                 "representation",
                 "string",
                 REQUIRED,
-                "What is wanted, such as ild",
+                "The representation, such as ild",
                 choices=tuple(kind.word for kind in kinds.values()),
             ),
-            Parameter("connect", "string", "bass/Audio", "Topic for the Audio port, where a new input needs one"),
+            Parameter("connect", "string", "bass/Audio", "Topic for the Audio port, if a new input needs one"),
             *BLOCK_AND_BUFFERS,
-            *{p.name: p for kind in kinds.values() for p in kind.parameters}.values(),  # some are of two kinds
+            *{p.name: p for kind in kinds.values() for p in kind.parameters}.values(),  # two kinds share some
         ),
         outputs=(
             ("name", "string"),
@@ -163,18 +169,18 @@ def _whole_trees(kinds: Kinds) -> tuple[Service, ...]:
     find = replace(
         build,
         name="find",
-        doc="What the request would use for a representation if all of it is there; nothing is made",
+        doc="Find the processors that `request` would use, if all of them exist; none is created",
         throws=("::rosAFE::e_noSuchProcessor", "::rosAFE::e_existsAlready", "::rosAFE::e_badNewValue"),
     )
     save = Service(
         "saveSetup",
-        "The tree of processors with its sound, as the text of a file that loadSetup takes",
-        (Parameter("full", "boolean", False, "Flag to write what has its default value, too"),),
+        "The tree of processors and its sound, as the text of a setup file for loadSetup",
+        (Parameter("full", "boolean", False, "Flag to include parameters that have their default values"),),
         outputs=(("setup", "string"),),
     )
     load = Service(
         "loadSetup",
-        "Build all that a setup describes, beside what is there: wholly, or nothing is changed",
+        "Build the tree that a setup describes, in addition to existing processors: completely, or without any change",
         (Parameter("setup", "string", REQUIRED, "The text of a setup (YAML)", longest=MAX_SETUP),),
         outputs=(("created", "sequence<string>"), ("reused", "sequence<string>"), ("sound", "string")),
         throws=_INPUT_THROWS,
@@ -183,22 +189,22 @@ def _whole_trees(kinds: Kinds) -> tuple[Service, ...]:
 
 
 def _ros_service(composites: tuple[Service, ...]) -> tuple[Service, ...]:
-    """The request for a whole tree, as a service of ROS."""
+    """Return the request for a whole tree as a ROS service."""
     build = composites[0]
     parameters = (
-        Parameter("representation", "string", REQUIRED, "What is wanted, such as ild: see request.md"),
+        Parameter("representation", "string", REQUIRED, "The representation, such as ild: see request.md"),
         Parameter(
             "parameters",
             "string",
             "",
-            "Parameters of it and of all above it, as YAML: 'fb_nChannels: 16, pi_rangeHz: [80, 300]'",
+            "Parameters of it and of its ancestors, as YAML: 'fb_nChannels: 16, pi_rangeHz: [80, 300]'",
             longest=MAX_PARAMETERS,
         ),
         Parameter(
             "connect",
             "string",
             "",
-            "Topic for the Audio port, where a new input needs one; empty: bass/Audio, unless it is connected",
+            "Topic for the Audio port, if a new input needs one; empty: bass/Audio, unless the port is connected",
         ),
     )
     return (replace(build, parameters=parameters),)
@@ -227,13 +233,13 @@ _FUNCTIONS = (
     ),
     Service(
         "getProcessors",
-        "All processors of every kind: what they are, hang on and put out, and their parameters",
+        "All processors of every kind: their kinds, parents, outputs and parameters",
         outputs=(("processors", "sequence<::rosAFE::processor>"),),
         throws=("::rosAFE::e_noMemory",),
     ),
     Service(
         "getRepresentation",
-        "What one processor, of whatever kind, put out since this was last asked for it",
+        "The output of one processor of any kind since the last call for this processor",
         (Parameter("name", "string", "name", "The name of the processor"),),
         outputs=(("parts", "sequence<::rosAFE::representation>"),),
         throws=("::rosAFE::e_noMemory", "::rosAFE::e_noSuchProcessor"),
@@ -261,11 +267,30 @@ _FUNCTIONS = (
     ),
 )
 
+# Messages of the localizer, in ROS types: their topics are not ports. Angles are in rad, left positive (REP 103).
+_LOCALIZER_MESSAGES: dict[str, Struct] = {
+    "SoundSource": (
+        ("id", "unsigned long"),
+        ("azimuth", "double"),
+        ("azimuth_std", "double"),
+        ("probability", "double"),
+        ("level", "double"),
+        ("first_seen", TIME),
+        ("last_seen", TIME),
+    ),
+    "SoundSources": (("header", "::Header"), ("sources", "sequence<::SoundSource>")),
+    "DirectionPosterior": (
+        ("header", "::Header"),
+        ("azimuths", "sequence<double>"),
+        ("probability", "sequence<double>"),
+    ),
+}
+
 # --- the component ----------------------------------------------------------------------------------------------
 
 
 def derive(kinds: Kinds) -> ComponentSpec:
-    """The component whose processors are of these kinds."""
+    """Return the component whose processors are of these kinds."""
     adding = tuple(_creation_service(kind, kinds) for kind in kinds.values())
     composites = _whole_trees(kinds)
     stop = Service(
@@ -284,12 +309,12 @@ def derive(kinds: Kinds) -> ComponentSpec:
         doc="The Two!Ears auditory front-end: a tree of processors that compute auditory representations",
         services=(*adding, *_FUNCTIONS, stop, *COMMON_SERVICES),
         ports=(
-            PortSpec("Audio", "::binaudio::portStruct", "Binaural audio to work on", output=False),
+            PortSpec("Audio", "::binaudio::portStruct", "Binaural audio to process", output=False),
             *ports,
             PortSpec(
                 "frameTime",
                 "::rosAFE::frameTime",
-                "With each block, when its newest audio frame was captured, and how many frames a second come",
+                "For each block, the capture time of its newest audio frame and the measured sample rate",
             ),
             PortSpec("dataObj", "::rosAFE::dataObjSt", "Advertised as in the original and, as there, never written"),
             GENOM_STATE_PORT,
@@ -306,6 +331,7 @@ def derive(kinds: Kinds) -> ComponentSpec:
             "e_badNewValue": "a value of the wrong type or out of its range",
         },
         structs={**_structs(kinds), **BINAUDIO, **GENOM_STATE},
+        messages=_LOCALIZER_MESSAGES,
         client_side_services=composites,
         ros_services=_ros_service(composites),
     )
@@ -313,3 +339,4 @@ def derive(kinds: Kinds) -> ComponentSpec:
 
 ROSAFE = derive(KINDS)
 REQUEST, FIND, SAVE_SETUP, LOAD_SETUP = ROSAFE.client_side_services
+WHOLE_TREES = (REQUEST, FIND)  # requests with parameters of all kinds, in which defaults are not filled in

@@ -1,20 +1,30 @@
-"""What a component's interface is made of: requests, ports, exceptions, structs."""
+"""The classes that describe the interface of a component: requests, ports, exceptions, structs."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
 
 from rosafe.declarations.errors import ComponentError
 from rosafe.declarations.idl import TIME, TIME_MEMBERS
 from rosafe.declarations.parameter import REQUIRED, Parameter
 from rosafe.declarations.signals import Struct
 
+_N = TypeVar("_N", Parameter, "PortSpec", "Service")
 
-def _unset(parameter: Parameter, value: Any) -> bool:
-    """Whether `value` means the default in a ROS request, which carries none."""
+
+def _find(items: Iterable[_N], name: str) -> _N:
+    """Return the item with the given name or alias, or raise KeyError."""
+    for item in items:
+        if name == item.name or name in item.aliases:
+            return item
+    raise KeyError(name)
+
+
+def _is_unset(parameter: Parameter, value: Any) -> bool:
+    """Return whether `value` stands for the default in a ROS request, which has no defaults of its own."""
     if isinstance(value, bool) or not parameter.zero_is_default or parameter.default is REQUIRED:
         return False
     return bool(len(value) == 0 if hasattr(value, "__len__") else value == 0)  # "" and [] have a length
@@ -24,8 +34,9 @@ def _unset(parameter: Parameter, value: Any) -> bool:
 class Service:
     """One request of a component.
 
-    `activity` requests live until they end or are stopped and have an action beside the service; the others are
-    functions that answer at once. `interrupts` names the activity of which running instances end when this begins.
+    An `activity` request lives until it ends or is stopped, and has an action in addition to the service; the others
+    are functions that return immediately. `interrupts` names activities: when this request begins, their running
+    instances end.
     """
 
     name: str
@@ -39,40 +50,37 @@ class Service:
     aliases: tuple[str, ...] = ()
 
     def parameter(self, name: str) -> Parameter:
-        """The parameter called `name` (aliases count), or KeyError."""
-        for parameter in self.parameters:
-            if name == parameter.name or name in parameter.aliases:
-                return parameter
-        raise KeyError(name)
+        """Return the parameter with the given name or alias, or raise KeyError."""
+        return _find(self.parameters, name)
 
-    def completed(self, given: Mapping[str, Any]) -> dict[str, Any]:
-        """All values, in the order of declaration: those `given`, and the defaults of the others.
+    def completed(self, values: Mapping[str, Any]) -> dict[str, Any]:
+        """Return `values` with the defaults of the other parameters, in the order of declaration.
 
-        Without those that follow the sample rate and are not given.
+        Parameters that depend on the sample rate have no default here, and are left out.
         """
-        known = (p for p in self.parameters if p.name in given or not p.follows_rate)
-        return {p.name: given.get(p.name, p.default) for p in known}
+        known = (p for p in self.parameters if p.name in values or not p.follows_rate)
+        return {p.name: values.get(p.name, p.default) for p in known}
 
     def from_ros(self, request: Any, literal: bool = False) -> dict[str, Any]:
-        """The values of a ROS request or goal, not yet checked; 0, "" and [] there stand for the default.
+        """Return the unchecked values of a ROS request or goal, in which 0, "" and [] stand for the default.
 
-        A client that knows the defaults, and has filled them in, means all `literal`; for what follows the sample rate
-        it has none, and says so with NaN.
+        The values of a client that fills in the defaults itself are `literal`. Such a client marks parameters that
+        depend on the sample rate, and that it leaves unset, by NaN.
         """
         values = {p.name: getattr(request, p.name) for p in self.parameters}
         if literal:
-            unknown = [p.name for p in self.parameters if p.follows_rate and math.isnan(values[p.name])]
-            return {name: value for name, value in values.items() if name not in unknown}
-        return self.completed({p.name: values[p.name] for p in self.parameters if not _unset(p, values[p.name])})
+            unset = {p.name for p in self.parameters if p.follows_rate and math.isnan(values[p.name])}
+            return {name: value for name, value in values.items() if name not in unset}
+        return self.completed({p.name: values[p.name] for p in self.parameters if not _is_unset(p, values[p.name])})
 
     def check(self, values: Mapping[str, Any]) -> dict[str, Any]:
-        """All values as their parameters' Python types, or ValueError naming the first that is refused."""
+        """Return all values as the Python types of their parameters; ValueError names the first that is rejected."""
         return {p.name: p.check(p.resolve_choice(values[p.name])) for p in self.parameters if p.name in values}
 
 
 @dataclass(frozen=True)
 class PortSpec:
-    """A data port: one topic, or one topic per element where `multiple`."""
+    """A data port: one topic, or one topic per element if `multiple`."""
 
     name: str
     idl: str
@@ -93,47 +101,38 @@ class ComponentSpec:
     tasks: tuple[str, ...]
     exceptions: Mapping[str, str]  # short name -> meaning
     structs: Mapping[str, Struct]  # by IDL name
-    # What genomixd makes of several services, for its clients to call like one.
+    # Messages of topics that are not ports, by their ROS names.
+    messages: Mapping[str, Struct] = field(default_factory=dict)
+    # Requests that clients such as genomixd carry out by calling several services.
     client_side_services: tuple[Service, ...] = ()
-    # Composites that the component carries out itself, under the same names, for ROS' own tools: these fill in every
-    # field of a request, hence one text stands for all parameters. genomixd's clients do not see these.
+    # Those of them that the component also offers as ROS services of the same names. ROS tools fill in every field of
+    # a request, hence one string holds all parameters. Clients of genomixd do not see these.
     ros_services: tuple[Service, ...] = ()
 
     @property
     def on_graph(self) -> tuple[Service, ...]:
-        """All that are services of ROS."""
+        """All requests that are ROS services."""
         return (*self.services, *self.ros_services)
-
-    def members(self, idl: str) -> Struct:
-        """The members of a struct, or of ROS' own time, of which no file is made."""
-        return TIME_MEMBERS if idl == TIME else self.structs[idl]
-
-    def service(self, name: str) -> Service:
-        """The service called `name` (aliases count), or KeyError."""
-        for service in self.on_graph:
-            if name == service.name or name in service.aliases:
-                return service
-        raise KeyError(name)
-
-    def port(self, name: str) -> PortSpec:
-        """The port called `name` (aliases count), or KeyError."""
-        for port in self.ports:
-            if name == port.name or name in port.aliases:
-                return port
-        raise KeyError(name)
 
     @property
     def activities(self) -> tuple[Service, ...]:
         """The requests that live until they end or are stopped."""
         return tuple(s for s in self.services if s.activity)
 
-    @property
-    def functions(self) -> tuple[Service, ...]:
-        """The requests that answer at once."""
-        return tuple(s for s in self.services if not s.activity)
+    def members(self, idl: str) -> Struct:
+        """Return the members of a struct, or of the ROS type time, for which no file is written."""
+        return TIME_MEMBERS if idl == TIME else self.structs[idl]
+
+    def service(self, name: str) -> Service:
+        """Return the service with the given name or alias, or raise KeyError."""
+        return _find(self.on_graph, name)
+
+    def port(self, name: str) -> PortSpec:
+        """Return the port with the given name or alias, or raise KeyError."""
+        return _find(self.ports, name)
 
     def error(self, short: str, why: str = "", **detail: Any) -> ComponentError:
-        """The component's exception `short`, such as ``e_noData``."""
+        """Return the component's exception `short`, such as ``e_noData``; KeyError if it is not declared."""
         if short not in self.exceptions:
             raise KeyError(short)
         return ComponentError(f"::{self.name}::{short}", why, **detail)

@@ -1,16 +1,17 @@
-"""The chain of processors that some outputs need: what `rosafe.process` and the file front end run on."""
+"""The chain of processors that a set of outputs needs: the engine of `rosafe.process` and of `process_file`."""
 
 from __future__ import annotations
 
+import bisect
 import itertools
 import threading
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from types import TracebackType
 from typing import Any
 
 import numpy as np
 
+from rosafe.declarations.block_length import DEFAULT_FRAMES_PER_BLOCK
 from rosafe.dsp import kernels
 from rosafe.interface import KINDS, ComponentError
 from rosafe.offline.signals import frame_times
@@ -21,50 +22,52 @@ from rosafe.tree.context import Observer
 from rosafe.tree.processor import Processor
 from rosafe.tree.tree import Tree
 
-# A block that is put together has no more frames, and no processor puts out more for it
-MAX_FRAMES = 12000  # as InputProc's blocks by default
+# Limits of a block that is merged from smaller ones: its frames, and the output of any processor for it
+MAX_FRAMES = DEFAULT_FRAMES_PER_BLOCK
 MAX_BYTES = 2**22
 
-FILTERBANK = "gammatone"  # from which on there are channels
-SHARED_KINDS = ("input", "preProc")
+FILTERBANK = "gammatone"  # the first kind that has channels
+SHARED_KINDS = ("input", "preProc")  # computed once, even if the tree has several branches
 
 
 class _GatedSource:
-    """Feeds blocks to the tree, one after the other, once `start` says that the whole tree stands.
+    """Feeds blocks to the tree after `start` has been called, which follows the creation of the whole tree.
 
-    Those that have no more than `most` frames together are put together.
+    Successive blocks with at most `max_frames` frames in total are merged.
     """
+
+    waiting = False
 
     def __init__(self, blocks: Iterable[np.ndarray], sample_rate: float) -> None:
         self.sample_rate = sample_rate
         self.ended = False
         self._blocks = iter(blocks)
-        self._next: np.ndarray | None = None  # which has been fetched already
+        self._next: np.ndarray | None = None  # a block that was fetched but did not fit
         self._frames = 0
-        self._most: int | None = None  # frames that are put together; nothing flows yet
+        self._max_frames: int | None = None  # of a merged block; None before `start`
         self._wake: Callable[[], None] = lambda: None
 
     def open(self, wake: Callable[[], None]) -> None:
         self._wake = wake
 
-    def start(self, most: int) -> None:
-        """Let the signal flow, in blocks of up to `most` frames where they are smaller."""
-        self._most = most
+    def start(self, max_frames: int) -> None:
+        """Open the gate; merge blocks up to `max_frames` frames."""
+        self._max_frames = max_frames
         self._wake()
 
     def read(self) -> tuple[np.ndarray, int] | None:
-        if self._most is None or self.ended:
+        if self._max_frames is None or self.ended:
             return None
         blocks: list[np.ndarray] = []
         frames = 0
         while (block := next(self._blocks, None) if self._next is None else self._next) is not None:
             self._next = block
-            if blocks and frames + block.shape[-1] > self._most:
+            if blocks and frames + block.shape[-1] > self._max_frames:
                 break
             self._next = None
             blocks.append(block)
             frames += block.shape[-1]
-            if frames >= self._most or self.ended:  # which somebody else says
+            if frames >= self._max_frames or self.ended:  # another thread may end it
                 break
         if not blocks:
             self.stop()
@@ -78,12 +81,12 @@ class _GatedSource:
 
 
 class _Listener:
-    """Hands on what is released, and keeps the first error, which ends the run."""
+    """Forwards released blocks, and stores the first error, which ends the run."""
 
-    def __init__(self, source: _GatedSource, keep: Callable[[str, int, Block], None]) -> None:
+    def __init__(self, source: _GatedSource, on_block: Callable[[str, int, Block], None]) -> None:
         self.branches: dict[Processor, int] = {}
         self._source = source
-        self._keep = keep
+        self._on_block = on_block
         self._lock = threading.Lock()
         self.error: BaseException | None = None
 
@@ -94,7 +97,7 @@ class _Listener:
         pass
 
     def on_released(self, processor: Processor, block: Block) -> None:
-        self._keep(processor.kind, self.branches[processor], block)
+        self._on_block(processor.kind, self.branches[processor], block)
 
     def on_removed(self, processor: Processor) -> None:
         if processor.error is not None:
@@ -103,55 +106,73 @@ class _Listener:
             self._source.stop()
 
 
+class FrameLimiter:
+    """Limits outputs to the frames that begin within the signal; others result from padding."""
+
+    def __init__(self, frames: int) -> None:
+        self._frames = frames
+        self._starts: dict[tuple[str, int], int] = {}  # audio frame at which the next frame of an output begins
+
+    def kept(self, kind: str, branch: int, block: Block) -> int:
+        """Return how many frames of the next block of an output to keep."""
+        hop, start, count = block.signal.hop, self._starts.get((kind, branch), 0), block.data.shape[-1]
+        self._starts[kind, branch] = start + count * hop
+        return min(count, max(0, -((start - self._frames) // hop)))
+
+
 class Chain:
-    """The processors that some outputs need, standing in a tree; nothing flows before `run`. A context manager.
+    """A tree with the processors that some outputs need. It computes nothing before `run`. A context manager.
 
     Parameters
     ----------
-    blocks : iterable of ndarray, (2, n), int32 or float
-        The signal; it is asked for the next block when the chain has room for it.
+    blocks : iterable of ndarray, (ears, n), int32 or float
+        The signal. The next block is fetched when the chain can take it.
     sample_rate : float
         In Hz.
-    parameters : mapping
+    values : mapping
         From `rosafe.interface.arguments.check_parameters`.
     outputs : sequence of str
         Kinds, from `rosafe.interface.arguments.check_outputs`.
-    keep : callable
-        Called with the kind, the number of the branch and each block of it, in their order, while the chain goes on
-        with the next block; it does not go on beyond that, so memory is bounded. What it raises ends the run.
+    on_block : callable
+        Called with the kind, the number of the branch and each block of it, in their order. The chain computes at most
+        the next block meanwhile, so memory is bounded. An exception from it ends the run.
+    ears : int
+        The number of rows of `blocks`, from `computed_ears`.
     branches : int
-        From the filterbank on, the tree has so many branches at most, of a part of the channels each, if all that is
-        computed is so `Stage.CHANNEL_INDEPENDENT`. Then no parameter can be changed.
+        Maximum number of branches of the tree from the filterbank on. Each computes a part of the channels. There is
+        one branch only if a stage is not `Stage.CHANNEL_INDEPENDENT`. With several, no parameter can be changed.
 
     Raises
     ------
     ValueError
-        Parameters that do not go together, or not with the sample rate.
+        The parameters are not compatible with each other or with the sample rate.
     """
 
     def __init__(
         self,
         blocks: Iterable[np.ndarray],
         sample_rate: float,
-        parameters: Mapping[str, Any],
+        values: Mapping[str, Any],
         outputs: Iterable[str],
-        keep: Callable[[str, int, Block], None],
+        on_block: Callable[[str, int, Block], None],
         branches: int = 1,
+        ears: int = 2,
     ) -> None:
         self.sample_rate = sample_rate
+        self._ears = ears
         self._source = _GatedSource(blocks, sample_rate)
-        self._listener = _Listener(self._source, keep)
+        self._listener = _Listener(self._source, on_block)
         self._tree = Tree(self._listener)
-        self._processors: dict[str, list[Processor]] = {}  # of each kind one, or one for each branch
+        self._processors: dict[str, list[Processor]] = {}  # for each kind: one, or one for each branch
         self._outputs = frozenset(outputs)
-        self._derived: dict[int, dict[str, Any]] = {}  # from parameters, from which block on
+        self._derived: dict[int, dict[str, Any]] = {}  # derived values by the first block that they apply to
         try:
             with _as_value_error():
-                self._build(needed(outputs), parameters, branches)
+                self._build(needed(outputs), values, branches)
         except BaseException:
             self.close()
             raise
-        self._remember(0)
+        self._record_derived(0)
 
     def _build(self, kinds: list[str], values: Mapping[str, Any], branches: int) -> None:
         divided = (
@@ -159,82 +180,79 @@ class Chain:
             and kernels.compiled()
             and all(STAGES[kind].CHANNEL_INDEPENDENT for kind in kinds if kind not in SHARED_KINDS)
         )
-        over = in_place_kinds(kinds, self._outputs)
+        in_place = in_place_kinds(kinds, self._outputs)
         for kind in kinds:  # parents come first
             parent = KINDS[kind].parent
-            mine = {p.name: values[p.name] for p in KINDS[kind].parameters if p.name in values}
-            made = self._processors[kind] = []
+            own = {p.name: values[p.name] for p in KINDS[kind].parameters if p.name in values}
+            added = self._processors[kind] = []
             if not parent:
-                made.append(self._tree.add_input(kind, self._source, 0, 0.0, 0.0, mine))
+                added.append(self._tree.add_input(kind, self._source, 0, 0.0, 0.0, own, self._ears))
             elif kind == FILTERBANK and divided:
                 (above,) = self._processors[parent]
-                frequencies = STAGES[kind](above.signal, **mine).output_format.center_frequencies
+                frequencies = STAGES[kind](above.signal, **own).output_format.center_frequencies
                 for share in _shares(frequencies, branches):
-                    made.append(self._tree.add(kind, f"{kind} {len(made)}", parent, {**mine, "fb_cfHz": share}))
+                    added.append(self._tree.add(kind, f"{kind} {len(added)}", parent, {**own, "fb_cfHz": share}))
             else:
                 for above in self._processors[parent]:
-                    made.append(self._tree.add(kind, above.name.replace(parent, kind), above.name, mine))
-            for branch, processor in enumerate(made):
+                    added.append(self._tree.add(kind, above.name.replace(parent, kind), above.name, own))
+            for branch, processor in enumerate(added):
                 self._listener.branches[processor] = branch
                 processor.has_consumers = kind in self._outputs
-                if kind in over:
-                    processor.output_buffer_for = _taken
+                if kind in in_place:
+                    processor.output_buffer_for = _input_data
 
     def schedule(self, block: int, name: str, value: Any) -> None:
-        """Change a (checked) parameter before block `block`; the blocks of successive calls ascend. Or ValueError."""
+        """Change a (checked) parameter before block `block`. Blocks must ascend from call to call. Or ValueError."""
         with _as_value_error():
             self._tree.schedule(block, name, value)
-        self._remember(block)
+        self._record_derived(block)
 
-    def _remember(self, block: int) -> None:
-        self._derived[block] = {k: v for p, *_ in self._processors.values() for k, v in p.derived().items()}
+    def _record_derived(self, block: int) -> None:
+        self._derived[block] = {k: v for p, *_ in self._processors.values() for k, v in p.stage.derived.items()}
 
-    def set_output_allocator(self, kind: str, branch: int, place: Callable[[int], np.ndarray | None]) -> None:
-        """Let the stage of a `kind` that nothing hangs on write where `place` says for so many frames, if it can.
+    def set_output_allocator(self, kind: str, branch: int, allocate: Callable[[int], np.ndarray | None]) -> None:
+        """Let a stage without children write into the array that `allocate` returns for a number of frames.
 
-        Stages that return frames, and those that do not take `out`, cannot, and are not asked.
+        It has no effect on stages that return frames or do not take `out`.
         """
         processor = self._processors[kind][branch]
-        if (
-            processor.stage.TAKES_OUT and not processor.signal.framed and not processor.children
-        ):  # children take blocks in one piece
-            processor.output_buffer_for = lambda taken: place(taken.data.shape[-1])
+        childless = not processor.children  # children need contiguous blocks
+        if processor.stage.TAKES_OUT and not processor.signal.framed and childless:
+            processor.output_buffer_for = lambda block: allocate(block.data.shape[-1])
 
     def observe(self, observer: Observer) -> None:
-        """Tell `observer` of every state that a processor enters."""
+        """Call `observer` with every state that a processor enters."""
         self._tree.observe(observer)
 
-    def run(self, together: bool = False) -> None:
-        """Let the signal flow and wait for its end; raises what the first processor failed with.
+    def run(self, merge: bool = False) -> None:
+        """Compute the whole signal. Raises the error of the first processor that fails.
 
-        Small blocks may go through `together`, where that cannot be seen in the numbers.
+        With `merge`, small blocks are merged if this does not change the numbers.
         """
-        self._source.start(self._most_together() if together else 0)
+        self._source.start(self._max_merged_frames() if merge else 0)
         for processor in self._all():
             processor.join()
         if self._listener.error is not None:
             raise self._listener.error
 
     def close(self) -> None:
-        """End the run, if it is not over, and all threads."""
+        """End the run if it is in progress, and all threads."""
         self._tree.stop()
         self._tree.join()
 
     def __enter__(self) -> Chain:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *exception: object) -> None:
         self.close()
 
-    # --- what it is ---
+    # --- properties ---
 
     def _all(self) -> list[Processor]:
         return list(itertools.chain(*self._processors.values()))
 
     def shapes(self, kind: str, frames: int) -> dict[str, list[tuple[int, ...]]]:
-        """Shape of each part of an output, in each branch, for so many frames if no parameter changes on the way."""
+        """Return the shape of each part of an output in each branch, for `frames` audio frames without a change."""
         processors = self._processors[kind]
         count = self._count(processors[0], frames)
         branches = zip(*(processor.output_shapes for processor in processors), strict=True)
@@ -244,72 +262,108 @@ class Chain:
         }
 
     def _count(self, processor: Processor, frames: int) -> int:
-        """How many frames it puts out for so many of the signal."""
+        """Return the number of output frames for `frames` audio frames."""
         return processor.stage.output_count(
             frames if processor.parent is None else self._count(processor.parent, frames)
         )
 
     def times(self, kind: str, frames: int) -> np.ndarray:
-        """The middle of each frame of an output (s), for a signal of so many frames."""
+        """Return the middle of each frame of an output (s) for a signal of `frames` audio frames."""
         processor = self._processors[kind][0]
         return frame_times(processor.signal, 0, self._count(processor, frames))
 
+    def complete_count(self, kind: str, frames: int) -> int:
+        """Return the number of output frames that begin within `frames` audio frames."""
+        return -(-frames // self._processors[kind][0].signal.hop)
+
+    def padding(self, frames: int) -> int:
+        """Return the number of audio frames after the signal that complete the last frame of each output."""
+        outputs = [(self._processors[kind][0], self.complete_count(kind, frames)) for kind in self._outputs]
+
+        def completes(extra: int) -> bool:
+            return all(self._count(processor, frames + extra) >= count for processor, count in outputs)
+
+        limit = 1
+        while not completes(limit):
+            limit *= 2
+        return bisect.bisect_left(range(limit), True, key=completes)
+
     def largest_block(self, frames: int) -> tuple[str, int]:
-        """Which processor puts out most for one block of so many frames, and how many bytes that can be."""
+        """Return the kind with the largest output for a block of `frames` audio frames, and its bytes."""
         seconds = frames / self.sample_rate
-        taken = {p: sizes.output_size(p.stage, p.input_shape, seconds) for p in self._all()}
-        largest = max(taken, key=lambda processor: taken[processor])
-        return largest.kind, int(taken[largest])
+        size, kind = max((sizes.output_size(p.stage, p.input_shape, seconds), p.kind) for p in self._all())
+        return kind, int(size)
 
-    def _most_together(self) -> int:
-        """Frames of the largest block that may come in the place of smaller ones; 0 where that could be seen.
+    def _max_merged_frames(self) -> int:
+        """Return the maximum number of frames of a merged block; 0 if merging could change the numbers.
 
-        It cannot where kernels run: with them, blocks leave no trace in the numbers, not in the last bits either. With
-        numpy and scipy, and in plugins, they may; and changes are made before blocks as they are.
+        With kernels the numbers do not depend on block boundaries, to the last bit. With numpy, scipy and plugins they
+        may. Parameter changes apply to blocks as they were given.
         """
         processors = self._all()
-        changed = len(self._derived) > 1
-        seen = not kernels.compiled() or any(p.kind not in BUILTIN or p.stage.block_size_dependent for p in processors)
-        if changed or seen:
+        dependent = any(p.kind not in BUILTIN or p.stage.block_size_dependent for p in processors)
+        if dependent or not kernels.compiled() or len(self._derived) > 1:
             return 0
         frame = max(sizes.output_size(p.stage, p.input_shape, 1 / self.sample_rate) for p in processors)
         return min(MAX_FRAMES, int(MAX_BYTES / frame))
 
     def describe(self) -> dict[str, Any]:
-        """Axes of what runs, `fb_cfHz` (Hz), `cc_lags` (s); rates of the outputs, `ild_frameRate` and its like (Hz).
+        """Return axes such as `fb_cfHz` (Hz) and `cc_lags` (s), and the frame rates of the outputs (Hz).
 
-        Rates and what is a parameter are told as they are at last, what follows from parameters as where it is longest.
+        Rates, and axes that are parameters, are the last ones. Of derived axes it is the longest one.
         """
         described: dict[str, Any] = {}
         for kind, (processor, *others) in self._processors.items():
-            parameters = processor.parameters()
+            parameters = processor.stage.parameters
             for name in processor.representation.coordinates:
                 values = (
                     parameters[name] if name in parameters else max((d[name] for d in self._derived.values()), key=len)
                 )
-                if kind == FILTERBANK:  # its channels
-                    values = list(itertools.chain(values, *(other.parameters()[name] for other in others)))
-                words = any(isinstance(value, str) for value in values)
-                described[name] = list(values) if words else np.array(values, np.float64)
+                if kind == FILTERBANK:  # its channels are spread over the branches
+                    values = list(itertools.chain(values, *(other.stage.parameters[name] for other in others)))
+                described[name] = axis_values(values)
             if processor.signal.framed and kind in self._outputs:
                 described[f"{kind}_frameRate"] = processor.rate
         return described
 
 
+def axis_values(values: Sequence[Any]) -> list[str] | np.ndarray:
+    """Return the values of an axis: names as a list, numbers as an array."""
+    return list(values) if any(isinstance(value, str) for value in values) else np.array(values, np.float64)
+
+
 def needed(outputs: Iterable[str]) -> list[str]:
-    """The kinds of processors to run for `outputs`, parents first."""
-    wanted = {kind.kind for kind in KINDS.values() if not kind.parent}
+    """Return the kinds of processors that `outputs` need, parents first."""
+    found = {kind.kind for kind in KINDS.values() if not kind.parent}
     for kind in outputs:
         while kind:
-            wanted.add(kind)
+            found.add(kind)
             kind = KINDS[kind].parent
-    return [kind for kind in KINDS if kind in wanted]
+    return [kind for kind in KINDS if kind in found]
+
+
+def computed_ears(ears: int, outputs: Iterable[str]) -> int:
+    """Return the number of ears to compute for a signal: one ear is computed as two equal ones for plugins."""
+    return 2 if any(kind not in BUILTIN or KINDS[kind].binaural for kind in needed(outputs)) else ears
+
+
+def effective_parameters(values: Mapping[str, Any], kinds: Iterable[str], sample_rate: float) -> dict[str, Any]:
+    """Return all parameters; those whose default follows the sample rate only for processors that are computed.
+
+    Sequences are lists, as in files.
+    """
+    result = {p.name: p.default for kind in KINDS.values() for p in kind.parameters if not p.follows_rate}
+    result |= values
+    for kind in needed(kinds):
+        own = {p.name: values.get(p.name, p.default) for p in KINDS[kind].parameters}
+        result |= STAGES[kind].resolve_rate_defaults(own, own.keys() & values.keys(), sample_rate)
+    return {name: list(value) if isinstance(value, tuple) else value for name, value in result.items()}
 
 
 def in_place_kinds(kinds: Collection[str], outputs: Collection[str]) -> list[str]:
-    """Of all `kinds` that run, those that may write over the blocks that they take, which nobody else wants.
+    """Return the kinds that may overwrite their input blocks because no other consumer needs them.
 
-    Kernels do; numpy does not, and plugins must not.
+    Kernels can overwrite; numpy cannot, and plugins must not.
     """
     if not kernels.compiled():
         return []
@@ -322,20 +376,20 @@ def in_place_kinds(kinds: Collection[str], outputs: Collection[str]) -> list[str
 
 
 def _shares(frequencies: Sequence[float], count: int) -> list[list[float]]:
-    """`frequencies` in up to `count` parts, of as many as a kernel takes together, but for the last one."""
+    """Split `frequencies` into at most `count` parts. All except the last one fill the lanes of a kernel."""
     groups = -(-len(frequencies) // kernels.MAX_LANES)
     count = min(count, groups)
     ends = [kernels.MAX_LANES * (groups * number // count) for number in range(count + 1)]
     return [list(frequencies[first:end]) for first, end in itertools.pairwise(ends)]
 
 
-def _taken(block: Block) -> np.ndarray:
+def _input_data(block: Block) -> np.ndarray:
     return block.data
 
 
 @contextmanager
 def _as_value_error() -> Iterator[None]:
-    """Make ValueError of the interface's named exceptions."""
+    """Convert the interface's named exceptions to ValueError."""
     try:
         yield
     except ComponentError as problem:

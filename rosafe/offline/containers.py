@@ -1,4 +1,4 @@
-"""Reading of HDF5 files and Zarr folders, in a child process: a damaged file cannot crash or block this one."""
+"""Read HDF5 files and Zarr folders in a child process, so that a damaged file cannot crash or block this one."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ from rosafe.offline.isolated import MAX_TEXT, blocks
 from rosafe.offline.memory import refuse_over_available
 from rosafe.offline.result_metadata import is_scalar, new_array, parse_metadata, restored
 
-STALL = 10  # seconds without a sign of the child process, after which the file counts as damaged
+STALL = 10  # seconds without output of the child process, after which the file counts as damaged
 START = 60  # seconds that the child process may take to start
 _PROGRAM = os.path.abspath(Path(__file__).with_name("isolated.py"))
-_PIPE = 2**20  # bytes that wait between the processes
+_PIPE = 2**20  # bytes of the buffer between the processes
 
 Arrays = dict[str, tuple[np.ndarray, dict[str, Any]]]  # with the attributes of each
 
@@ -36,12 +36,12 @@ class _ChildEnded(Exception):
 
 
 def read_container(kind: str, path: Path, which: str) -> tuple[dict[str, Any], Arrays]:
-    """The attributes and arrays of a file, as `rosafe.offline.isolated` sends them.
+    """Return the attributes and arrays of a file, as `rosafe.offline.isolated` sends them.
 
     Raises
     ------
     ValueError
-        The file is damaged, or not allowed, or nothing more has come of it for `STALL` seconds.
+        The file is damaged or not allowed, or the child process has sent nothing for `STALL` seconds.
     OSError
         The child process cannot be started.
     """
@@ -64,7 +64,7 @@ def read_container(kind: str, path: Path, which: str) -> tuple[dict[str, Any], A
 
 
 def _python() -> str:
-    """The interpreter that runs this, also inside other programs; OSError if there is none."""
+    """Return the path of the interpreter, also if Python is embedded in another program; OSError if none is found."""
     version = f"python{sys.version_info.major}.{sys.version_info.minor}"
     folders = (sys.exec_prefix, sys.base_exec_prefix)
     for path in (sys.executable, *(os.path.join(folder, "bin", version) for folder in folders), shutil.which(version)):
@@ -103,9 +103,9 @@ class _Pipe:
         self._poll.register(self._descriptor, select.POLLIN)
 
     def fill(self, buffer: memoryview, seconds: int | None = None) -> None:
-        """Fill a buffer; `_ChildEnded`, or TimeoutError after `seconds` (`STALL`) without a byte."""
+        """Fill a buffer; `_ChildEnded`, or TimeoutError after `seconds` (default: `STALL`) without a byte."""
         while buffer:
-            # of 1 s each: while the processes are stopped, no time passes
+            # in steps of 1 s: time during which both processes are stopped does not count
             if not any(self._poll.poll(1000) for _ in range(seconds or STALL)):
                 raise TimeoutError
             count = os.readv(self._descriptor, [buffer])
@@ -114,13 +114,13 @@ class _Pipe:
             buffer = buffer[count:]
 
     def read(self, count: int, seconds: int | None = None) -> bytearray:
-        """The next `count` bytes."""
+        """Return the next `count` bytes."""
         content = bytearray(count)
         self.fill(memoryview(content), seconds)
         return content
 
     def array(self, described: dict[str, Any]) -> np.ndarray:
-        """The next array."""
+        """Return the next array."""
         shape, block, dtype = tuple(described["shape"]), tuple(described["block"]), np.dtype(described["dtype"])
         array = new_array(shape, dtype)
         buffer = new_array((math.prod(block),), dtype)
@@ -134,7 +134,7 @@ class _Pipe:
         return array
 
     def end(self) -> str:
-        """Why the child process has ended."""
+        """Return the reason why the child process has ended."""
         try:
             _, text = self._child.communicate(timeout=1)
         except subprocess.TimeoutExpired:
@@ -146,7 +146,7 @@ class _Pipe:
 
 
 def read_h5(path: Path, arrays: bool = True) -> dict[str, Any]:
-    """What is in an .h5; without its arrays, only what `told` gives. ValueError where it is damaged."""
+    """Return the contents of an .h5; without `arrays`, only the metadata. ValueError if it is damaged."""
     attributes, found = read_container("h5", path, "all" if arrays else "none")
     return {**_numbers(found), **parse_metadata(attributes)}
 

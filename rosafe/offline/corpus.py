@@ -1,4 +1,4 @@
-"""Many sounds at once: which files there are in folders, where the result of each goes, and which have failed."""
+"""Batches of sounds: the files in folders, the path of each result, and the list of failures."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from rosafe.offline.sounds import SOUNDS
 from rosafe.output import OutputError, write_whole
 
 FAILED = "failed.csv"
-_HEAD = ["input", "why"]
+_HEADER = ["input", "why"]
 
 
 class FileJob(NamedTuple):
-    """A sound, and its place below the folder of results, before its name gets the end of a format."""
+    """A sound, and the path of its result relative to the folder of results, without the suffix of a format."""
 
     source: Path
     place: PurePath
@@ -30,7 +30,7 @@ class FileJob(NamedTuple):
 
 @dataclass(frozen=True)
 class Settings:
-    """What is done with each, as `process_file` takes it."""
+    """Options of `process_file` that apply to all sounds."""
 
     parameters: Mapping[str, Any]
     outputs: Sequence[str]
@@ -40,10 +40,12 @@ class Settings:
     replace: bool = False
     resume: bool = False
     make_folders: bool = False
+    pad: bool = False
+    clip: bool = True
 
 
 def compute(source: Path, target: Path, settings: Settings, progress: Callable[[int, int], None]) -> Any:
-    """`process_file`, by `settings`."""
+    """Call `process_file` with `settings`."""
     from rosafe.offline.files import process_file
 
     try:
@@ -62,25 +64,26 @@ def compute(source: Path, target: Path, settings: Settings, progress: Callable[[
         channels=settings.channels,
         topic=settings.topic,
         resume=settings.resume,
+        pad=settings.pad,
+        clip=settings.clip,
     )
 
 
-# --- what there is ----------------------------------------------------------------------------------------------
+# --- input files ------------------------------------------------------------------------------------------------
 
 
-def find(inputs: Sequence[Path], besides: Path | None = None) -> tuple[list[FileJob], list[tuple[Path, str]]]:
-    """The sounds that are meant by files and folders, and what is wrong with some of these.
+def find(inputs: Sequence[Path], excluded: Path | None = None) -> tuple[list[FileJob], list[tuple[Path, str]]]:
+    """Return the sounds in files and folders, and a list of problems, each with its path.
 
-    Folders are searched all the way down, symbolic links followed, each real folder once; names that begin with a dot
-    are left out. Of one folder the places are what lies below it; of several inputs those of a folder begin with its
-    name.
+    Folders are searched recursively, including symbolic links, each real folder once. Names that begin with a dot are
+    skipped. Result paths are relative to a single input folder; with several inputs they begin with the folder's name.
 
     Parameters
     ----------
     inputs : sequence of Path
         Files, of any name, and folders.
-    besides : Path, optional
-        A folder that is not searched, where it lies below one that is: that of the results.
+    excluded : Path, optional
+        A folder that is not searched: that of the results.
     """
     items: list[FileJob] = []
     problems: list[tuple[Path, str]] = []
@@ -89,22 +92,22 @@ def find(inputs: Sequence[Path], besides: Path | None = None) -> tuple[list[File
             items.append(FileJob(path, PurePath(path.name or "_")))
             continue
         root = PurePath() if len(inputs) == 1 else PurePath(Path(os.path.abspath(path)).name)
-        before = len(items) + len(problems)
-        for found in _sounds(path, besides, problems):
+        count = len(items) + len(problems)
+        for found in _sounds(path, excluded, problems):
             items.append(FileJob(found, root / found.relative_to(path)))
-        if len(items) + len(problems) == before:
-            problems.append((path, f"{path}: there is no sound file in this folder"))
+        if len(items) + len(problems) == count:
+            problems.append((path, f"{path}: this folder contains no sound files"))
     return items, problems
 
 
-def _sounds(folder: Path, besides: Path | None, problems: list[tuple[Path, str]]) -> list[Path]:
-    """The sounds below a folder, sorted. Folders are searched without recursion: they may be nested to any depth.
+def _sounds(folder: Path, excluded: Path | None, problems: list[tuple[Path, str]]) -> list[Path]:
+    """Return the sounds below a folder, sorted. The search is iterative, so that folders may be nested to any depth.
 
-    Each real folder is searched once: links are followed last, and only to folders that were not reached without them.
+    Links are followed last, and only to folders that were not reached without them.
     """
     found: list[Path] = []
     waiting, links = [folder], deque[Path]()
-    seen = _identity(besides) - _identity(folder)
+    seen = _identity(excluded) - _identity(folder)
     while waiting or links:
         path = waiting.pop() if waiting else links.popleft()
         try:
@@ -129,7 +132,7 @@ def _sounds(folder: Path, besides: Path | None, problems: list[tuple[Path, str]]
 
 
 def _identity(folder: Path | None) -> set[tuple[int, int]]:
-    """Device and inode of a folder; empty if there is none."""
+    """Return device and inode of a folder; empty if it does not exist."""
     try:
         status = os.stat(folder or "")
     except OSError:
@@ -146,13 +149,13 @@ def make_folder(folder: Path) -> None:
         path.mkdir(exist_ok=True)
 
 
-# --- where it goes ----------------------------------------------------------------------------------------------
+# --- output paths -----------------------------------------------------------------------------------------------
 
 
 def output_paths(items: Sequence[FileJob], folder: Path, extension: str) -> list[Path]:
-    """The result of each: its name without its end, or with it where two of a folder would get one name.
+    """Return the path of each result. The suffix of the sound is kept if two results would have one name without it.
 
-    ValueError where two would go to one place all the same.
+    ValueError if two results would have one path nevertheless.
     """
     names = [str(item.place.with_name(item.place.stem)) for item in items]
     while True:
@@ -170,43 +173,43 @@ def output_paths(items: Sequence[FileJob], folder: Path, extension: str) -> list
     for item, target in zip(items, targets, strict=True):
         other = seen.setdefault(os.path.realpath(target), item.source)
         if other is not item.source:
-            raise ValueError(f"{other} and {item.source} would both go to {target}")
+            raise ValueError(f"{other} and {item.source} would both be written to {target}")
     return targets
 
 
-# --- what has failed --------------------------------------------------------------------------------------------
+# --- failures ---------------------------------------------------------------------------------------------------
 
 
 def write_failed(folder: Path, inputs: Sequence[Path], failed: Mapping[str, str]) -> None:
-    """Bring the list of what has failed in a folder of results up to date; it goes where nothing is left on it.
+    """Update the list of failures in a folder of results. An empty list is deleted.
 
     Parameters
     ----------
     folder : Path
-        Of the results.
+        The folder of results.
     inputs : sequence of Path
-        Files and folders that were tried now; others on the list stay there.
+        Files and folders that were processed now. Entries of others are kept.
     failed : mapping
-        Why, by the name of the input.
+        The reason by the name of the input.
     """
     path = folder / FAILED
-    tried = set(map(str, inputs))
+    processed = set(map(str, inputs))
     kept: dict[str, str] = {}
     if path.exists():
         with TextIOWrapper(open_regular(path), "utf-8", "surrogateescape", newline="") as file:
             rows = csv.reader(file)
             try:
-                if next(rows, None) != _HEAD:
+                if next(rows, None) != _HEADER:
                     raise csv.Error
-                kept = {row[0]: row[1] for row in rows if len(row) == 2 and not tried & {row[0], *_folders(row[0])}}
+                kept = {row[0]: row[1] for row in rows if len(row) == 2 and not processed & {row[0], *_folders(row[0])}}
             except csv.Error:
-                raise OutputError(f"{path} is something else, and stays as it is") from None
+                raise OutputError(f"{path} is not a list of failures; it is left unchanged") from None
     rest = {**kept, **failed}
     if not rest:
         path.unlink(missing_ok=True)
         return
     text = StringIO()
-    csv.writer(text, lineterminator="\n").writerows([_HEAD, *rest.items()])
+    csv.writer(text, lineterminator="\n").writerows([_HEADER, *rest.items()])
     write_whole(path, text.getvalue().encode("utf-8", "surrogateescape"))
 
 

@@ -1,4 +1,4 @@
-"""`process_file`: a sound file of any length to a file of results, in memory that does not grow with it."""
+"""`process_file`: compute a result file from a sound file of any length, in constant memory."""
 
 from __future__ import annotations
 
@@ -6,47 +6,50 @@ import os
 import threading
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, closing
+from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from rosafe.declarations.block_length import DEFAULT_FRAMES_PER_BLOCK
 from rosafe.interface import KINDS
 from rosafe.interface.arguments import check_outputs, check_parameters
-from rosafe.offline.chain import Chain, needed
-from rosafe.offline.formats import Format, check_format, format_of, read
-from rosafe.offline.process import DEFAULT_BLOCK
-from rosafe.offline.result_metadata import Contents
+from rosafe.offline.chain import Chain, FrameLimiter, computed_ears, effective_parameters
+from rosafe.offline.formats import Format, check_format, format_of, new_output, read
+from rosafe.offline.result_metadata import Contents, ResultWriter
+from rosafe.offline.signals import of_ears
 from rosafe.offline.sounds import SoundReader, open_sound
-from rosafe.output import OutputError, new_folder, new_path
-from rosafe.representations import STAGES
+from rosafe.output import OutputError
 from rosafe.sound.audiofile import AudioFileError
 from rosafe.tree import sizes
 from rosafe.tree.block import Block
 from rosafe.version import VERSION
 
-OUTPUTS = ("ild", "ratemap", "crossCorrelation")  # by default: those of the original that are in frames
+OUTPUTS = ("ild", "ratemap", "crossCorrelation")  # the default: framed outputs of the original
+_OPTIONS = ("channels", "topic", "pad", "clip")  # entries of a file that may be absent
 _TOO_LARGE = (
-    "one block of output would take {taken:.1f} GB, allowed are {limit:.1f} GB; "
+    "one block of output would take {taken:.1f} GB, more than the limit of {limit:.1f} GB; "
     "take fewer channels or lags, or a smaller --block"
 )
 
 
 class FileResult(NamedTuple):
-    """What came of a file."""
+    """Summary of a processed file."""
 
     seconds: float  # of sound
-    size: int  # of the output, in bytes
-    skipped: bool = False  # it was complete already
-    not_finite: int = 0  # samples that were NaN or infinite
+    size: int  # bytes of the output
+    skipped: bool = False  # because the output was complete
+    not_finite: int = 0  # NaN or infinite samples
+    clipped: int = 0  # samples that were limited to full scale
+    empty: tuple[str, ...] = ()  # outputs without frames
 
 
 def process_file(
     source: str | Path,
     target: str | Path,
     parameters: Mapping[str, Any] | None = None,
-    block_frames: int = DEFAULT_BLOCK,
+    block_frames: int = DEFAULT_FRAMES_PER_BLOCK,
     outputs: Sequence[str] | None = None,
     replace: bool = False,
     progress: Callable[[int, int], None] = lambda done, frames: None,
@@ -54,182 +57,219 @@ def process_file(
     channels: tuple[int, int] | None = None,
     topic: str | None = None,
     resume: bool = False,
+    pad: bool = False,
+    clip: bool = True,
 ) -> FileResult:
-    """Compute the auditory representations of a sound file, block by block, as they come into a file.
+    """Compute the auditory representations of a sound file, block by block, and write them to a file.
 
     The numbers are those of `rosafe.process` on the file's int32 samples, and of the node on the same samples, bit
-    for bit. The file holds what `rosafe.load` returns.
-    Nothing of the name `target` is there before it is complete.
+    for bit. `rosafe.load` reads the result. `target` does not exist before it is complete.
 
     Parameters
     ----------
     source : path
-        Sound file of two channels, left and right ear, or a rosbag (.bag).
+        Sound file of two channels, left and right ear, or a rosbag (.bag). A mono file is accepted if `outputs` are
+        given and none of them compares two ears.
     target : path
-        The file of results; the end of its name (.npz, .h5, .mat, .zarr, .csv) is the format. Where it exists it is
-        left alone, unless `replace`.
+        The result file. The end of its name (.npz, .h5, .mat, .zarr, .csv) is the format. An existing file is an error
+        unless `replace`.
     parameters, outputs
-        As of `rosafe.process`, but that `ild`, `ratemap` and `crossCorrelation` are the default; `in_doNormalize` is
-        True by default.
+        As in `rosafe.process`, except that `ild`, `ratemap` and `crossCorrelation` are the default outputs, and
+        `in_doNormalize` is True by default.
     block_frames : int
-        Frames that are read at a time; small blocks are processed together. The output for one takes at most 1 GiB.
+        Frames that are read at a time; small blocks are merged. The output of a block takes at most 1 GiB.
     progress : callable
-        Called now and then with the frames that are done and those that there are. What it raises ends the work.
+        Called repeatedly with the number of processed frames and that of all frames. An exception from it ends the
+        processing.
     channels : tuple of two int, optional
-        Which channels of the file (from 1) are the left and the right ear; ``(1, 1)`` for mono.
+        The channels of the file (from 1) for the left and the right ear; ``(1, 1)`` for mono.
     topic : str, optional
         The port Audio in a bag; /bass/Audio by default, or the only one.
     resume : bool
-        Leave `target` alone where it is complete already, and replace it where it is damaged, or older than `source`.
+        Skip `target` if it is complete; replace it if it is damaged or older than `source`.
+    pad : bool
+        Whether the last frames are completed by zeros, as in `rosafe.process`.
+    clip : bool
+        Whether samples of float files are converted to int32, which limits them to full scale, as the node does. If
+        not, they are processed as they are, and `in_doNormalize` is False by default.
 
     Returns
     -------
-    Done
-        Seconds of sound and bytes of output, and whether it was there already.
+    FileResult
 
     Raises
     ------
     AudioFileError
-        The file cannot be read, or has not two channels.
+        The file cannot be read, or does not have two channels.
     ValueError
-        Parameters or outputs that cannot be, for this file's sample rate or at all, or for this format.
+        Invalid parameters or outputs, or ones that do not fit the sample rate or the format.
     OutputError
-        The output is there already, or (with `resume`) was made otherwise, or there is no room for it, or it cannot be
+        The output exists, or (with `resume`) was computed with other options, or the disk is full, or it cannot be
         written.
     """
-    values, wanted = check_parameters(parameters), check_outputs(OUTPUTS if outputs is None else outputs)
+    values, kinds = check_parameters(parameters), check_outputs(OUTPUTS if outputs is None else outputs)
     form = format_of(target)
-    check_format(form, wanted)
-    about: dict[str, Any] = {
+    check_format(form, kinds)
+    about = _options_of(source, block_frames, channels, topic, pad, clip)
+    if resume and os.path.lexists(target):
+        if _complete(form, Path(target), about, values, kinds) and not _source_modified(source, target):
+            return FileResult(0.0, 0, True)
+        replace = True
+    one_ear = outputs is not None and not any(KINDS[kind].binaural for kind in kinds)
+    with closing(open_sound(source, channels, topic, one_ear, clip)) as sound:
+        if os.path.exists(target) and os.path.samefile(sound.path, target):
+            raise OutputError(f"{target} is the input file")
+        if sound.floats:
+            values.setdefault("in_doNormalize", False)
+        with new_output(form, target, replace) as path:
+            empty = _FileRun(sound, path, form, about, values, kinds, progress).run()
+            size = sum(part.stat().st_size for part in path.rglob("*")) if form.folder else path.stat().st_size
+        return FileResult(sound.frames / sound.sample_rate, size, False, sound.not_finite, sound.clipped, empty)
+
+
+def _options_of(
+    source: str | Path, block_frames: int, channels: tuple[int, int] | None, topic: str | None, pad: bool, clip: bool
+) -> dict[str, Any]:
+    """Return the entries of the result that describe the options."""
+    return {
         "rosafe_version": VERSION,
         "source": os.fsencode(os.path.basename(source)).decode("utf-8", "backslashreplace"),
         "block_frames": block_frames,
         **({"channels": list(channels)} if channels else {}),
         **({"topic": topic} if topic else {}),
+        **({"pad": 1} if pad else {}),
+        **({} if clip else {"clip": 0}),
     }
-    if resume and os.path.lexists(target):
-        if _complete(form, Path(target), about, values, wanted) and not _source_modified(source, target):
-            return FileResult(0.0, 0, True)
-        replace = True
-    with closing(open_sound(source, channels, topic)) as sound:
-        if os.path.exists(target) and os.path.samefile(sound.path, target):
-            raise OutputError(f"{target} is the input itself")
-        place: AbstractContextManager[Path] = (
-            new_folder(target, replace, form.folder) if form.folder else new_path(target, replace)
-        )
-        with place as path:
-            _stream(sound, path, form, about, values, wanted, progress)
-            size = sum(part.stat().st_size for part in path.rglob("*")) if form.folder else path.stat().st_size
-        return FileResult(sound.frames / sound.sample_rate, size, False, sound.not_finite)
 
 
 def _complete(
-    form: Format, target: Path, about: Mapping[str, Any], values: Mapping[str, Any], wanted: Sequence[str]
+    form: Format, target: Path, about: Mapping[str, Any], values: Mapping[str, Any], kinds: Sequence[str]
 ) -> bool:
-    """Whether the output is there and whole; OutputError where it is something else."""
+    """Return whether the output exists and is complete; OutputError if it is a different file."""
     try:
-        there = read(form, target, arrays=False)
+        existing = read(form, target, arrays=False)
     except ValueError:
         if form.is_one(target):
             return False
-        raise OutputError(f"{target} is no result of rosafe process; --force replaces it") from None
+        raise OutputError(f"{target} is not a result of rosafe process; --force replaces it") from None
     except OSError as problem:
         raise OutputError(f"{target}: {problem.strerror or problem}") from None
-    names = {name for kind in wanted for name in KINDS[kind].outputs}
-    rate = there.get("sample_rate")
-    if isinstance(rate, (int, float)):
-        about = {**about, "parameters": _parameters(values, wanted, rate)}
-    other = [name for name in about if there.get(name) != _as_loaded(about[name])]
-    other += [name for name in ("channels", "topic") if name in there and name not in about]
-    other += ["outputs"] if set(there["axes"]) != names else []
-    if other:
-        raise OutputError(f"{target} was made with other {other[0]}; take another -o, or --force computes it again")
+    names = {name for kind in kinds for name in KINDS[kind].outputs}
+    if "clip" in about:  # whether the file contains floats is not known here
+        values = {"in_doNormalize": existing["parameters"].get("in_doNormalize"), **values}
+    about = {**about, "parameters": effective_parameters(values, kinds, existing["sample_rate"])}
+    different = [name for name in about if existing.get(name) != about[name]]
+    different += [name for name in _OPTIONS if name in existing and name not in about]
+    different += ["outputs"] if set(existing["axes"]) != names else []
+    if different:
+        raise OutputError(
+            f"{target} was computed with other {different[0]}; choose another -o, or --force computes it again"
+        )
     return True
 
 
 def _source_modified(source: str | Path, target: str | Path) -> bool:
-    """Whether the input has been written since; one that has gone, or is from the future, has not."""
+    """Return whether the source is newer than the result. False if the source is missing or dated in the future."""
     return os.path.exists(source) and os.stat(target).st_mtime_ns < os.stat(source).st_mtime_ns <= time.time_ns()
 
 
-def _parameters(values: Mapping[str, Any], wanted: Sequence[str], sample_rate: float) -> dict[str, Any]:
-    """All parameters as they are in force, where `values` are given; what follows the rate only where it matters."""
-    told = {p.name: p.default for kind in KINDS.values() for p in kind.parameters if not p.follows_rate} | dict(values)
-    for kind in needed(wanted):
-        mine = {p.name: values.get(p.name, p.default) for p in KINDS[kind].parameters}
-        told |= STAGES[kind].resolve_rate_defaults(mine, values.keys(), sample_rate)
-    return told
+class _FileRun:
+    """The computation of one file."""
+
+    def __init__(
+        self,
+        sound: SoundReader,
+        path: Path,
+        form: Format,
+        about: Mapping[str, Any],
+        values: Mapping[str, Any],
+        kinds: list[str],
+        progress: Callable[[int, int], None],
+    ) -> None:
+        self._sound, self._path, self._form, self._kinds, self._values = sound, path, form, kinds, values
+        self._about = about
+        self._progress = progress
+        self._padding = 0
+        self._limiter = FrameLimiter(sound.frames)
+        self._done = dict.fromkeys(kinds, 0)
+        self._lock = threading.Lock()
+        self._writer: ResultWriter
+
+    def run(self) -> tuple[str, ...]:
+        """Compute and write everything. Return the names of outputs without frames."""
+        sound, kinds = self._sound, self._kinds
+        ears = computed_ears(sound.channels, kinds)
+        with Chain(self._blocks(ears), sound.sample_rate, self._values, kinds, self._write, ears=ears) as chain:
+            kind, taken = chain.largest_block(min(self._about["block_frames"], sound.frames))
+            sizes.check_memory(sizes.MAX_BYTES, taken, f"{kind}: {_TOO_LARGE}", 1e9)  # several exist at a time
+            self._padding = chain.padding(sound.frames) if "pad" in self._about else 0
+            contents = self._contents(chain)
+            writer_class = self._form.writer(contents)
+            _check_disk_space(self._path, writer_class.size(contents))
+            with closing(writer_class(self._path, contents)) as self._writer:
+                chain.run(merge=True)
+                contents.about["clipped"] = sound.clipped
+                self._writer.finish()
+        return tuple(name for name, shape in contents.shapes.items() if not shape[-1])
+
+    def _blocks(self, ears: int) -> Iterator[np.ndarray]:
+        sound, length = self._sound, self._about["block_frames"]
+        for first in range(0, sound.frames, length):
+            count = min(length, sound.frames - first)
+            block = sound.read(count)
+            if block.shape[1] != count:
+                raise AudioFileError(
+                    f"{sound.path} is truncated: expected {sound.frames} frames, got {first + block.shape[1]}"
+                )
+            yield np.broadcast_to(block, (ears, count))
+        for first in range(0, self._padding, length):
+            yield np.zeros((ears, min(length, self._padding - first)), np.float64 if sound.floats else np.int32)
+
+    def _write(self, kind: str, branch: int, block: Block) -> None:
+        kept = self._limiter.kept(kind, branch, block)
+        for (name, part), data in zip(KINDS[kind].outputs.items(), block.parts, strict=True):
+            self._writer.append(name, of_ears(self._sound.channels, part.axes, data)[..., :kept])
+        with self._lock:
+            self._done[kind] = min(block.next_index, self._sound.frames)
+            self._progress(min(self._done.values()), self._sound.frames)
+
+    def _contents(self, chain: Chain) -> Contents:
+        frames, kinds = self._sound.frames, self._kinds
+        parts = {name: part for kind in kinds for name, part in KINDS[kind].outputs.items()}
+        described = chain.describe()
+        names = {name: value for name, value in described.items() if isinstance(value, list)}
+        framed = [kind for kind in kinds if f"{kind}_frameRate" in described]
+        times = {f"{kind}_time": self._times(chain, kind) for kind in framed}
+        shapes = {}
+        for kind in kinds:
+            for name, (shape,) in chain.shapes(kind, frames).items():
+                ears = (self._sound.channels,) if parts[name].axes[0] == "ear" else shape[:1]
+                count = chain.complete_count(kind, frames) if self._padding else shape[-1]
+                shapes[name] = (*ears, *shape[1:-1], count) if len(shape) > 1 else (count,)
+        rate = self._sound.sample_rate
+        parameters = effective_parameters(self._values, kinds, rate)
+        return Contents(
+            shapes,
+            {name: part.axes for name, part in parts.items()},
+            {name: part.unit for name, part in parts.items()},
+            {**{name: value for name, value in described.items() if name not in names}, **times},
+            {"sample_rate": rate, "parameters": parameters, **self._about, **names, "clipped": 0},
+        )
+
+    def _times(self, chain: Chain, kind: str) -> np.ndarray:
+        frames = self._sound.frames
+        if not self._padding:
+            return chain.times(kind, frames)
+        return chain.times(kind, frames + self._padding)[: chain.complete_count(kind, frames)]
 
 
-def _as_loaded(value: Any) -> Any:
-    """As it comes back from a file: tuples are lists."""
-    if isinstance(value, Mapping):
-        return {name: _as_loaded(one) for name, one in value.items()}
-    return list(value) if isinstance(value, tuple) else value
-
-
-def _stream(
-    sound: SoundReader,
-    path: Path,
-    form: Format,
-    about: Mapping[str, Any],
-    values: Mapping[str, Any],
-    wanted: list[str],
-    progress: Callable[[int, int], None],
-) -> None:
-    done = dict.fromkeys(wanted, 0)
-    telling = threading.Lock()
-
-    def keep(kind: str, branch: int, block: Block) -> None:
-        for name, data in zip(KINDS[kind].outputs, block.parts, strict=True):
-            writer.append(name, data)
-        with telling:
-            done[kind] = block.next_index
-            progress(min(done.values()), sound.frames)
-
-    block_frames = about["block_frames"]
-    with Chain(_blocks(sound, block_frames), sound.sample_rate, values, wanted, keep) as chain:
-        kind, taken = chain.largest_block(min(block_frames, sound.frames))
-        sizes.check_memory(sizes.MAX_BYTES, taken, f"{kind}: {_TOO_LARGE}", 1e9)  # several are under way at a time
-        rate = {"sample_rate": sound.sample_rate, "parameters": _parameters(values, wanted, sound.sample_rate)}
-        contents = _contents(chain, {**rate, **about}, wanted, sound.frames)
-        made = form.writer(contents)
-        _check_room(path, made.size(contents))
-        with closing(made(path, contents)) as writer:
-            chain.run(together=True)
-            writer.finish()
-
-
-def _contents(chain: Chain, about: dict[str, Any], wanted: Sequence[str], frames: int) -> Contents:
-    parts = {name: part for kind in wanted for name, part in KINDS[kind].outputs.items()}
-    described = chain.describe()
-    words = {name: value for name, value in described.items() if isinstance(value, list)}
-    times = {f"{kind}_time": chain.times(kind, frames) for kind in wanted if f"{kind}_frameRate" in described}
-    return Contents(
-        {name: shape for kind in wanted for name, (shape,) in chain.shapes(kind, frames).items()},
-        {name: part.axes for name, part in parts.items()},
-        {name: part.unit for name, part in parts.items()},
-        {**{name: value for name, value in described.items() if name not in words}, **times},
-        {**about, **words},
-    )
-
-
-def _blocks(sound: SoundReader, block_frames: int) -> Iterator[np.ndarray]:
-    for at in range(0, sound.frames, block_frames):
-        wanted = min(block_frames, sound.frames - at)
-        block = sound.read(wanted)
-        if block.shape[1] != wanted:
-            raise AudioFileError(f"{sound.path} is cut off: {at + block.shape[1]} of {sound.frames} frames are there")
-        yield block
-
-
-def _check_room(path: Path, size: int) -> None:
-    """OutputError where the disk has less than `size` bytes left, before hours of work."""
+def _check_disk_space(path: Path, size: int) -> None:
+    """Raise OutputError if less than `size` bytes are free on the disk, before hours of computation."""
     disk = os.statvfs(path)
     free = disk.f_bavail * disk.f_frsize
     if size > free:
         raise OutputError(
-            f"the output would take {_bytes_text(size)}, {_bytes_text(free)} are free there; name fewer --outputs"
+            f"the output would take {_bytes_text(size)}, but only {_bytes_text(free)} are free; name fewer --outputs"
         )
 
 

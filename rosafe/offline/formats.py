@@ -1,4 +1,4 @@
-"""The formats of result files, by the ends of their names; `load` reads any of them."""
+"""The formats of result files, by the suffix of the name, and `load`, which reads all of them."""
 
 from __future__ import annotations
 
@@ -6,13 +6,14 @@ import importlib.util
 import math
 import os
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import AbstractContextManager, closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from rosafe.declarations.parameter import short_repr
+from rosafe.declarations.text import short_repr
 from rosafe.input import open_descriptor, open_regular
 from rosafe.interface import KINDS, Representation
 from rosafe.missing import require
@@ -20,31 +21,33 @@ from rosafe.offline.containers import read_h5, read_mat73, read_zarr
 from rosafe.offline.in_memory_formats import CsvWriter, Mat5Writer, NpzWriter
 from rosafe.offline.mat5 import read_mat5
 from rosafe.offline.readers import read_csv, read_npz
+from rosafe.offline.result import Result
 from rosafe.offline.result_metadata import Contents, ResultWriter, checked, is_number, is_texts, sample_times
 from rosafe.offline.streaming_formats import H5Writer, Mat73Writer, ZarrWriter
+from rosafe.output import new_folder, new_path
 
-MAT5_MOST = 2**30  # bytes of a variable; MATLAB's version 5 ends at 2**31, and scipy needs an array twice
+MAX_MAT5 = 2**30  # bytes of a variable; the limit of MATLAB's version 5 is 2**31, and scipy copies an array
 _MAX_EMPTY = 2**20  # along each axis of an array without numbers
 _MAT73_MAGIC = b"MATLAB 7.3"
 
 
 @dataclass(frozen=True)
 class Format:
-    """One of them.
+    """A format of result files.
 
     Attributes
     ----------
     extension : str
     writer : callable
-        The class of its writer, given the contents.
+        Returns the class of its writer for given contents.
     read : callable
-        Of a path, and whether the arrays are wanted.
+        Takes the path, and whether to read the arrays.
     begins : bytes
-        What its files begin with.
+        The first bytes of its files.
     module : str
-        What must be installed.
+        A package that must be installed.
     folder : str
-        The name of a file that each has in it, where it is a folder.
+        If results are folders: the name of a file that each of them contains.
     """
 
     extension: str
@@ -55,7 +58,7 @@ class Format:
     folder: str = ""
 
     def is_one(self, path: Path) -> bool:
-        """Whether what is there looks as if it were one, or the beginning of one."""
+        """Return whether an existing file looks like a result of this format, or the beginning of one."""
         if self.folder:
             return path.is_dir() and ((path / self.folder).exists() or not any(path.iterdir()))
         if not path.is_file():
@@ -67,7 +70,7 @@ class Format:
 
 def _mat_writer(contents: Contents) -> type[ResultWriter]:
     largest = max((8 * math.prod(shape) for shape in contents.shapes.values()), default=0)
-    if largest > MAT5_MOST:
+    if largest > MAX_MAT5:
         return Mat73Writer
     return Mat5Writer
 
@@ -91,25 +94,27 @@ FORMATS = {
 
 
 def format_of(path: str | os.PathLike[str]) -> Format:
-    """The format of a result file by its name; ValueError where it is none."""
+    """Return the format of a result file by the suffix of its name; ValueError if the suffix is unknown."""
     extension = Path(path).suffix.lower()
     if extension not in FORMATS:
-        raise ValueError(f"{path}: results end in {', '.join(FORMATS)}")
+        raise ValueError(f"{path}: expected a name that ends in {', '.join(FORMATS)}")
     return FORMATS[extension]
 
 
 def check_format(form: Format, outputs: Iterable[str]) -> None:
-    """ValueError where a format cannot hold these outputs; ModuleNotFoundError where what it needs is not installed."""
+    """Raise ValueError if a format cannot store these outputs, or ModuleNotFoundError if its package is missing."""
     if form.module:
         require(form.module, f"{form.extension} files")
     if form.extension == ".csv":
         parts = [part for kind in outputs for part in KINDS[kind].outputs.values()]
         if len(parts) != 1 or len(parts[0].axes) != 2:
-            able = [kind for kind, one in KINDS.items() if [len(p.axes) for p in one.outputs.values()] == [2]]
-            raise ValueError(f"a .csv holds one output of two axes: name one of {', '.join(able)} with --outputs")
+            possible = [kind for kind, one in KINDS.items() if [len(p.axes) for p in one.outputs.values()] == [2]]
+            raise ValueError(
+                f"a .csv contains one output of two axes; name one of {', '.join(possible)} with --outputs"
+            )
 
 
-def load(path: str | os.PathLike[str]) -> dict[str, Any]:
+def load(path: str | os.PathLike[str]) -> Result:
     """Read a file that `rosafe process` has written.
 
     Parameters
@@ -119,17 +124,18 @@ def load(path: str | os.PathLike[str]) -> dict[str, Any]:
 
     Returns
     -------
-    dict
-        What `rosafe.process` returns for the same samples, number for number; beside that `sample_rate` (Hz),
-        `block_frames`, `parameters` (dict: all of them, for `rosafe.process`), `source` (name of the input),
-        `channels` and `topic` where some were chosen, `rosafe_version`, and `axes` and `units` of each output.
+    Result
+        The result of `rosafe.process` for the same samples, with the same bits and attributes. It also has the keys
+        `sample_rate` (Hz), `block_frames`, `parameters` (a dict of all of them, for `rosafe.process`), `source` (name
+        of the input), `channels` and `topic` if they were given, `clipped` (number of samples of a sound file that were
+        limited to full scale), `rosafe_version`, and `axes` and `units` of each output.
 
     Raises
     ------
     ValueError
-        It is no such file, or damaged.
+        It is not a result file, or it is damaged.
     OSError
-        It is not there, or cannot be read.
+        It does not exist, or cannot be read.
     ModuleNotFoundError
         h5py or zarr is not installed.
     """
@@ -139,26 +145,68 @@ def load(path: str | os.PathLike[str]) -> dict[str, Any]:
         _check_arrays(result)
     except ValueError as problem:
         raise ValueError(f"{path} is damaged: {problem}") from None
-    for kind in KINDS.values():  # what has no frames has a number for each sample
-        there = [name for name in kind.outputs if name in result["axes"]]
-        if there and f"{kind.kind}_time" not in result:
-            result[f"{kind.kind}_time"] = sample_times(result[there[0]].shape[-1], result["sample_rate"])
-    return result
+    for kind in KINDS.values():  # times of samples are not stored
+        stored = [name for name in kind.outputs if name in result["axes"]]
+        if stored and f"{kind.kind}_time" not in result:
+            result[f"{kind.kind}_time"] = sample_times(result[stored[0]].shape[-1], result["sample_rate"])
+    if result.get("dtype") == "float32":
+        result |= {name: result[name].astype(np.float32) for name in result["axes"]}
+    return Result(
+        result,
+        parameters=result["parameters"],
+        sample_rate=result["sample_rate"],
+        version=result.get("rosafe_version", ""),
+        clipped=result.get("clipped", 0),
+    )
+
+
+def save(result: Result, path: str | os.PathLike[str]) -> None:
+    """Write a result to a file, which is replaced if it exists; see `Result.save`."""
+    form = format_of(path)
+    check_format(form, result.kinds)
+    axes, units = result.axes, result.units
+    times = {f"{kind}_time" for kind in result.kinds if f"{kind}_frameRate" not in result}  # of samples: not stored
+    coordinates = {name: value for name, value in result.items() if name in units.keys() - axes.keys() - times}
+    names = {name: value for name, value in coordinates.items() if isinstance(value, list)}
+    options = ("source", "block_frames", "channels", "topic", "pad", "clip")
+    about = {name: result[name] for name in options if name in result}
+    about |= {"rosafe_version": result.version, "sample_rate": result.sample_rate, "parameters": result.parameters}
+    about |= {"clipped": result.clipped, **names}
+    if any(result[name].dtype == np.float32 for name in axes):
+        about["dtype"] = "float32"
+    contents = Contents(
+        {name: result[name].shape for name in axes},
+        axes,
+        {name: units[name] for name in axes},
+        {name: value for name, value in coordinates.items() if name not in names},
+        about,
+    )
+    writer_class = form.writer(contents)
+    with new_output(form, path, replace=True) as place, closing(writer_class(place, contents)) as writer:
+        for name in axes:
+            writer.append(name, np.asarray(result[name], np.float64))
+        writer.finish()
+
+
+def new_output(form: Format, path: str | os.PathLike[str], replace: bool) -> AbstractContextManager[Path]:
+    """Return a context that yields an empty file or folder, which becomes `path` on success."""
+    return new_folder(Path(path), replace, form.folder) if form.folder else new_path(Path(path), replace)
 
 
 def _check_arrays(result: Mapping[str, Any]) -> None:
-    """ValueError where outputs, or what lies along their axes, are missing or of another type."""
+    """Raise ValueError if outputs or coordinates are missing or have another type."""
     missing = result["axes"].keys() - result.keys()
     if missing:
-        raise ValueError(f"{', '.join(map(short_repr, sorted(missing)))} is not in it")
+        raise ValueError(f"it lacks {', '.join(map(short_repr, sorted(missing)))}")
     for name, axes in result["axes"].items():
         _check_array(name, result[name], len(axes))
     for kind in KINDS.values():
-        _check_kind(kind, result)
+        _check_outputs(kind, result)
+        _check_coordinates(kind, result)
 
 
-def _check_kind(kind: Representation, result: Mapping[str, Any]) -> None:
-    """ValueError where an output of a kind, or what lies along its axes, is not what its declaration says."""
+def _check_outputs(kind: Representation, result: Mapping[str, Any]) -> None:
+    """Raise ValueError if axes or times of the outputs of a kind do not match its declaration."""
     outputs = [name for name in kind.outputs if name in result]
     for name in outputs:
         if result["axes"].get(name) != kind.outputs[name].axes:
@@ -170,6 +218,10 @@ def _check_kind(kind: Representation, result: Mapping[str, Any]) -> None:
         _check_array(time, result[time], 1)
         if any(result[name].shape[-1] != len(result[time]) for name in outputs):
             raise ValueError(f"{time}: its length is not that of {outputs[0]}")
+
+
+def _check_coordinates(kind: Representation, result: Mapping[str, Any]) -> None:
+    """Raise ValueError if the frame rate or a coordinate of a kind does not match its declaration."""
     rate = result.get(f"{kind.kind}_frameRate", 1.0)
     if not is_number(rate) or not 0 < rate < math.inf:
         raise ValueError(f"{kind.kind}_frameRate: expected a positive number")
@@ -189,20 +241,20 @@ def _check_array(name: str, value: Any, dimensions: int) -> None:
 
 
 def read(form: Format, path: Path, arrays: bool = True) -> dict[str, Any]:
-    """What is in a file; without its arrays, only what tells runs apart. Errors as those of `load`."""
+    """Return the contents of a file; without `arrays`, only the metadata. Raises the errors of `load`."""
     if not path.exists():
         raise FileNotFoundError(2, os.strerror(2), str(path))
-    if form.module and not importlib.util.find_spec(form.module):  # it need not be imported here
+    if form.module and not importlib.util.find_spec(form.module):  # the child process imports it
         require(form.module, f"{form.extension} files")
     if form.folder and not path.is_dir():
         raise ValueError(f"{path}: expected a directory, got a file")
     if not form.folder:
-        os.close(open_descriptor(path))  # HDF5 opens whatever it is given
+        os.close(open_descriptor(path))  # HDF5 would open other files than regular ones
     try:
         result = checked(form.read(path, arrays))
     except (ValueError, OverflowError, RecursionError, MemoryError) as problem:  # json.JSONDecodeError, too
-        raise ValueError(f"{path} is no result of rosafe process, or damaged: {problem}") from None
+        raise ValueError(f"{path} is not a result of rosafe process, or damaged: {problem}") from None
     for name in ("axes", "parameters", "sample_rate"):
         if name not in result:
-            raise ValueError(f"{path} is no result of rosafe process: {name} is not in it")
+            raise ValueError(f"{path} is not a result of rosafe process: it lacks {name}")
     return result

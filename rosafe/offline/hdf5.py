@@ -1,4 +1,4 @@
-"""HDF5 files that are being written: a full disk is an OSError, where the library alone would end the process."""
+"""Write HDF5 files such that a full disk raises OSError. With the library alone it would end the process."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from typing import Any
 
 
 class _File(io.RawIOBase):
-    """An empty file on the disk that h5py opens as a Python object.
+    """A file object for h5py, on an empty file on the disk.
 
-    A write that fails inside the library, as on a full disk, leaves it in a state in which closing the HDF5 file ends
-    the process. So after the first failure everything written is kept in memory and read from there: these are the
-    library's own caches, a few MB, because its callers stop at the first error.
+    If a write fails inside the library, as on a full disk, closing the HDF5 file later ends the process. After the
+    first failure all data are therefore kept in memory and read from there. These are a few MB of the library's caches,
+    because callers stop at the first error.
 
     Attributes
     ----------
@@ -31,7 +31,7 @@ class _File(io.RawIOBase):
         self.problem: OSError | None = None
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        self._at = offset + (self._end if whence == os.SEEK_END else 0)  # the library uses no other
+        self._at = offset + (self._end if whence == os.SEEK_END else 0)  # the library does not use SEEK_CUR
         return self._at
 
     def readinto(self, buffer: Any) -> int:
@@ -78,20 +78,20 @@ class _File(io.RawIOBase):
 class Hdf5:
     """An HDF5 file that is being written.
 
-    All calls of the library run on one thread of its own. Python runs signal handlers in the main thread only, so a
-    KeyboardInterrupt cannot get into the library either.
+    All calls of the library run on a separate thread. KeyboardInterrupt cannot occur there, because Python runs signal
+    handlers in the main thread only.
 
     Parameters
     ----------
     path : Path
         An empty file.
-    options
-        Of `h5py.File`.
+    **options
+        For `h5py.File`.
 
     Raises
     ------
     OSError
-        It cannot be written.
+        The file cannot be written.
     """
 
     def __init__(self, path: Path, **options: Any) -> None:
@@ -111,18 +111,18 @@ class Hdf5:
             raise
 
     def call(self, work: Callable[..., object], *arguments: Any) -> None:
-        """Run ``work(group, *arguments)``; OSError if anything could not be written so far."""
+        """Run ``work(group, *arguments)``; OSError if this or an earlier write has failed."""
         self.check()
         self._thread.submit(lambda: work(self._group, *arguments)).result()
         self.check()
 
     def check(self) -> None:
-        """Raise the OSError with which writing has failed, if it has."""
+        """Raise the OSError of the first write that has failed, if any."""
         if self._file.problem is not None:
             raise self._file.problem
 
     def close(self) -> None:
-        """Close the file, whatever has failed; only `check` tells that."""
+        """Close the file. Failures are reported only by `check`."""
         if not self._file.closed:
             self._thread.submit(self._close).result()
             self._thread.shutdown()

@@ -1,4 +1,4 @@
-"""Formats that want each array whole: .npz, MATLAB's version 5 .mat, and .csv. Large arrays wait on the disk."""
+"""Formats written from whole arrays: .npz, version 5 .mat of MATLAB, and .csv. Large arrays are kept on the disk."""
 
 from __future__ import annotations
 
@@ -7,94 +7,79 @@ import math
 import os
 import tempfile
 import zipfile
-from contextlib import ExitStack
-from pathlib import Path
+from abc import abstractmethod
 from typing import Any, BinaryIO
 
 import numpy as np
 
-from rosafe.offline.result_metadata import Contents, sample_times
+from rosafe.offline.result_metadata import Contents, ResultWriter, sample_times
 
-HEAD = 2**10  # bytes at most in a file for each thing in it, and once more, beside its numbers or letters
-IN_MEMORY = 2**28  # bytes of all arrays together; from there on they are on the disk
+MAX_OVERHEAD = 2**10  # bytes in a file for each entry, and once for the file, in addition to numbers and letters
+IN_MEMORY = 2**28  # bytes of all arrays together; larger ones are kept on the disk
 CSV_HEAD = "# rosafe "
 
 
-class WholeWriter:
-    """Gathers the arrays, and writes all at the end. Subclasses say how, in `_write`.
+class InMemoryWriter(ResultWriter):
+    """Collects the arrays, and writes them all at the end. Subclasses implement `_write`."""
 
-    Parameters
-    ----------
-    path : Path
-        An empty file.
-    contents : Contents
-    """
-
-    def __init__(self, path: Path, contents: Contents) -> None:
-        self._path = path
-        self._contents = contents
-        self._at = dict.fromkeys(contents.shapes, 0)
-        self._open = ExitStack()
-        try:
-            self._arrays = {name: self._array(shape) for name, shape in contents.shapes.items()}
-        except BaseException:
-            self.close()
-            raise
+    def _begin(self) -> None:
+        self._ends = dict.fromkeys(self._contents.shapes, 0)  # of the frames that have been appended
+        self._arrays = {name: self._array(shape) for name, shape in self._contents.shapes.items()}
 
     @classmethod
     def size(cls, contents: Contents) -> int:
-        """Bytes on the disk that it takes at a time."""
-        taken = sum(8 * math.prod(shape) for shape in contents.shapes.values())
-        return taken if taken <= IN_MEMORY else 2 * taken
+        """Return the maximum number of bytes on the disk while it is written."""
+        return contents.size if contents.size <= IN_MEMORY else 2 * contents.size
 
     def _array(self, shape: tuple[int, ...]) -> np.ndarray:
         count = math.prod(shape)
         if self.size(self._contents) <= IN_MEMORY or not count:
             return np.empty(shape)
         file = self._open.enter_context(tempfile.TemporaryFile(dir=self._path.parent))  # noqa: SIM115
-        os.posix_fallocate(file.fileno(), 0, 8 * count)  # a full disk must show here: in a map, it kills
+        os.posix_fallocate(file.fileno(), 0, 8 * count)  # fails on a full disk; a write to the map would be fatal
         return np.memmap(file, np.float64, "r+", 0, shape, "F")
 
     def append(self, name: str, block: np.ndarray) -> None:
-        """The next part of an array, of its shape but for the last axis."""
-        at = self._at[name]
-        self._at[name] = at + block.shape[-1]
-        self._arrays[name][..., at : at + block.shape[-1]] = block
+        """Append a block to an array, along the last axis."""
+        first = self._ends[name]
+        end = self._ends[name] = first + block.shape[-1]
+        self._arrays[name][..., first:end] = block
 
     def finish(self) -> None:
         """Write the file."""
         with open(self._path, "r+b") as file:
-            # A full disk must show before numpy and scipy write, who leave files open that they cannot complete.
+            # On a full disk this fails. numpy and scipy would leave files open that they cannot complete.
             sizes = [np.asarray(value).nbytes for value in self._everything().values()]
-            os.posix_fallocate(file.fileno(), 0, sum(sizes) + HEAD * (len(sizes) + 1))
+            os.posix_fallocate(file.fileno(), 0, sum(sizes) + MAX_OVERHEAD * (len(sizes) + 1))
             self._write(file)
             file.truncate()
 
     def _everything(self) -> dict[str, Any]:
         return {**self._arrays, **self._contents.fixed, **self._contents.flat()}
 
+    @abstractmethod
     def _write(self, file: BinaryIO) -> None:
-        raise NotImplementedError
+        """Write the contents to the open file."""
 
     def close(self) -> None:
-        """Let go of what waited on the disk."""
+        """Release the arrays."""
         self._arrays = {}
-        self._open.close()
+        super().close()
 
 
-class NpzWriter(WholeWriter):
-    """For numpy.load."""
+class NpzWriter(InMemoryWriter):
+    """Writes .npz for numpy.load."""
 
     def _write(self, file: BinaryIO) -> None:
-        # As numpy.savez, which leaves an archive that it cannot complete to the garbage collector, and that complains.
+        # Not numpy.savez: the garbage collector would report the archive that it leaves open on failure.
         with zipfile.ZipFile(file, "w") as archive:
             for name, value in self._everything().items():
                 with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:
                     np.lib.format.write_array(entry, np.asanyarray(value), allow_pickle=False)
 
 
-class Mat5Writer(WholeWriter):
-    """MATLAB's version 5, which Octave reads as well."""
+class Mat5Writer(InMemoryWriter):
+    """Writes MATLAB's version 5, which Octave reads too."""
 
     def _write(self, file: BinaryIO) -> None:
         from scipy.io import savemat
@@ -102,8 +87,8 @@ class Mat5Writer(WholeWriter):
         savemat(file, self._everything(), long_field_names=True, oned_as="column")
 
 
-class CsvWriter(WholeWriter):
-    """One output of two axes: a row for each moment, which is its first column; what else there is, as JSON above."""
+class CsvWriter(InMemoryWriter):
+    """Writes one output of two axes: a row per frame, with the time first. The other entries are JSON in line 1."""
 
     def _write(self, file: BinaryIO) -> None:
         contents = self._contents

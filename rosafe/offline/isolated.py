@@ -1,11 +1,10 @@
 """Program of a child process that reads HDF5 files and Zarr folders: damaged ones can crash or block their libraries.
 
-It is run by file name, imports nothing of rosafe, and is given one argument, a JSON object: `path`, `kind` (h5, mat
-or zarr), `arrays` (which to send: all, texts or none) and `modules` (folders to import from). Its standard output is
-one byte once the libraries are loaded; the length of a head (8 bytes) and the head, JSON: `attributes`, and for each
-array that follows `name`, `shape`, `dtype`, `block` and `attributes`; then the numbers, block by block, in row-major
-order.
-An error is one line on standard error, and exit status 1.
+It is run by file name and imports nothing of rosafe. Its argument is a JSON object with `path`, `kind` (h5, mat or
+zarr), `arrays` (which to send: all, texts or none) and `modules` (folders to import from). It writes to standard
+output: one byte when the libraries are loaded; the length of the header (8 bytes); the header, a JSON object with
+`attributes` and a list `arrays` of `name`, `shape`, `dtype`, `block` and `attributes`; then the numbers of the arrays,
+block by block, in row-major order. On an error it writes one line to standard error and exits with status 1.
 """
 
 from __future__ import annotations
@@ -22,6 +21,7 @@ import itertools
 import json
 import math
 import os
+import re
 import resource
 import stat
 import time
@@ -30,21 +30,21 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-MAX_MEMORY = 2**31  # bytes of address space besides what the libraries take
+MAX_MEMORY = 2**31  # bytes of address space in addition to that of the libraries
 MAX_CHUNK = 2**28  # bytes of a chunk
-MAX_CHUNKS = 2**20  # of an array
-MAX_ARRAYS = 4096  # of a file
+MAX_CHUNKS = 2**20  # chunks of an array
+MAX_ARRAYS = 4096  # arrays of a file
 MAX_TEXT = 2**20  # bytes of an attribute or of a file of metadata
 MAX_SIZE = 2**30  # bytes of all arrays of a small file
-MAX_RATIO = 1000  # of the bytes of all arrays to those of a large file
-BLOCK = 2**22  # bytes that are sent at a time, about
-_STALL = 20  # seconds of processor time for one block: a process without a parent ends
+MAX_RATIO = 1000  # bytes of all arrays divided by the bytes of a large file
+BLOCK = 2**22  # bytes, approximately, that are sent at a time
+_STALL = 20  # seconds of processor time for one block; it ends a process whose parent has died
 
 Slices = tuple[slice, ...]
 
 
 class Array(NamedTuple):
-    """An array to be sent: `read` gives the numbers of a block; all blocks but the last of an axis have one shape."""
+    """An array to be sent. `read` returns the numbers of a block; only the last block along an axis may be smaller."""
 
     name: str
     shape: tuple[int, ...]
@@ -55,7 +55,7 @@ class Array(NamedTuple):
 
 
 def blocks(shape: tuple[int, ...], block: tuple[int, ...]) -> Iterator[Slices]:
-    """Where the blocks of an array are, in row-major order."""
+    """Yield the slices of each block of an array, in row-major order."""
     starts = (range(0, length, step) for length, step in zip(shape, block, strict=True))
     for corner in itertools.product(*starts):
         parts = zip(corner, block, shape, strict=True)
@@ -63,21 +63,21 @@ def blocks(shape: tuple[int, ...], block: tuple[int, ...]) -> Iterator[Slices]:
 
 
 def check_array(name: str, shape: tuple[int, ...], chunks: tuple[int, ...] | None, dtype: np.dtype[Any]) -> None:
-    """ValueError for an array that is not one of numbers, or is cut into absurd chunks (None: not cut)."""
+    """Raise ValueError unless an array is one of numbers with reasonable chunks (None: not chunked)."""
     if dtype.kind not in "fiu" or dtype.itemsize > 8:
         raise ValueError(f"{name}: expected numbers of at most 64 bits, got {str(dtype)[:40]}")
     if chunks is None:
         return
     if len(chunks) != len(shape) or not all(n >= 0 for n in shape) or not all(n > 0 for n in chunks):
-        raise ValueError(f"{name}: its chunks do not fit its shape")
+        raise ValueError(f"{name}: its chunks do not match its shape")
     if math.prod(chunks) * dtype.itemsize > MAX_CHUNK:
         raise ValueError(f"{name}: a chunk takes more than {MAX_CHUNK // 2**20} MiB")
     if math.prod(-(-length // chunk) for length, chunk in zip(shape, chunks, strict=True)) > MAX_CHUNKS:
-        raise ValueError(f"{name}: it is cut into more than {MAX_CHUNKS} chunks")
+        raise ValueError(f"{name}: it has more than {MAX_CHUNKS} chunks")
 
 
 def check_size(taken: float, size: int) -> None:
-    """ValueError where arrays of `taken` bytes are more than what a file of `size` bytes may hold."""
+    """Raise ValueError if arrays of `taken` bytes are too large for a file of `size` bytes."""
     if taken > max(MAX_SIZE, MAX_RATIO * size):
         raise ValueError(f"its arrays would take {taken / 2**20:.0f} MiB of memory, and it has {size} bytes")
 
@@ -86,7 +86,7 @@ def check_size(taken: float, size: int) -> None:
 
 
 def open_h5(path: str) -> tuple[dict[str, Any], list[Array]]:
-    """The attributes and the arrays of an HDF5 file; ValueError for what could lead out of it."""
+    """Return the attributes and the arrays of an HDF5 file; ValueError for references to other files."""
     import h5py
 
     file = h5py.File(path, "r", locking=False)
@@ -101,7 +101,7 @@ def open_h5(path: str) -> tuple[dict[str, Any], list[Array]]:
 
 
 def _allow_no_more_files() -> None:
-    """External storage, external links and virtual datasets are refused; and could not be opened either."""
+    """Set the limit of open files to those that are open: a reference to another file that is overlooked then fails."""
     for codec in ("ascii", "utf-8", "latin-1"):  # modules that h5py would open later
         codecs.lookup(codec)
     lowest = os.dup(0)
@@ -125,7 +125,7 @@ def _h5_array(file: Any, name: str) -> Array:
     allowed = (h5z.FILTER_DEFLATE, h5z.FILTER_SHUFFLE, h5z.FILTER_FLETCHER32, h5z.FILTER_SZIP, h5z.FILTER_LZF)
     for index in range(plan.get_nfilters()):
         if plan.get_filter(index)[0] not in allowed:
-            raise ValueError(f"{name}: filter {plan.get_filter(index)[0]} is not one of those that are read")
+            raise ValueError(f"{name}: filter {plan.get_filter(index)[0]} is not supported")
     if found.get_type().get_class() not in (h5t.INTEGER, h5t.FLOAT):
         raise ValueError(f"{name} is not an array of numbers")
     if found.get_space().get_simple_extent_type() not in (h5s.SIMPLE, h5s.SCALAR):
@@ -139,7 +139,7 @@ def _h5_array(file: Any, name: str) -> Array:
 
 
 def _block(shape: tuple[int, ...], chunks: tuple[int, ...], itemsize: int) -> tuple[int, ...]:
-    """As many whole chunks as `BLOCK` holds, along the last axis first."""
+    """Return the shape of a block: as many whole chunks as fit into `BLOCK`, along the last axis first."""
     block = [min(chunk, max(1, length)) for chunk, length in zip(chunks, shape, strict=True)]
     for axis in reversed(range(len(block))):
         more = max(1, BLOCK // (math.prod(block) * itemsize))
@@ -170,10 +170,10 @@ _FILLS = {"NaN": math.nan, "Infinity": math.inf, "-Infinity": -math.inf, None: 0
 
 
 def open_zarr(path: str) -> tuple[dict[str, Any], list[Array]]:
-    """The attributes and the arrays of a Zarr group of format 2; ValueError for codecs that are not in the list.
+    """Return the attributes and the arrays of a Zarr group of format 2; ValueError for codecs that are not in the list.
 
-    Of the folder only regular files are opened, and no symbolic links; the library itself, which finds codecs by the
-    names that a file gives, is not used.
+    Only regular files in the folder are opened, and no symbolic links. The zarr library is not used, because it loads
+    any codec that a file names.
     """
     root = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
     names = [name for name in sorted(os.listdir(root)) if not name.startswith(".")]
@@ -193,7 +193,7 @@ def open_zarr(path: str) -> tuple[dict[str, Any], list[Array]]:
     return attributes, [_zarr_array(root, name) for name in names]
 
 
-def _open_inside(folder: int, name: str, flags: int = os.O_NONBLOCK) -> int:
+def _open_in_folder(folder: int, name: str, flags: int = os.O_NONBLOCK) -> int:
     try:
         return os.open(name, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC | flags, dir_fd=folder)
     except OSError as problem:
@@ -208,20 +208,20 @@ def _exists(folder: int, name: str) -> bool:
     return True
 
 
-def _content(folder: int, name: str, most: int) -> bytes:
-    """What is in a regular file."""
-    with open(_open_inside(folder, name), "rb") as file:
+def _content(folder: int, name: str, max_size: int) -> bytes:
+    """Return the contents of a regular file."""
+    with open(_open_in_folder(folder, name), "rb") as file:
         found = os.fstat(file.fileno())
         if not stat.S_ISREG(found.st_mode):
             raise ValueError(f"{_quoted(name)} is not a regular file")
-        if found.st_size > most:
-            raise ValueError(f"{_quoted(name)}: it takes more than {most} bytes")
+        if found.st_size > max_size:
+            raise ValueError(f"{_quoted(name)}: it takes more than {max_size} bytes")
         return file.read(found.st_size)
 
 
-def _metadata(folder: int, name: str, most: int = 1) -> dict[str, Any]:
+def _metadata(folder: int, name: str, max_texts: int = 1) -> dict[str, Any]:
     try:
-        found = json.loads(_content(folder, name, most * MAX_TEXT))
+        found = json.loads(_content(folder, name, max_texts * MAX_TEXT))
     except RecursionError:
         raise ValueError(f"{name}: nested too deeply") from None
     if not isinstance(found, dict):
@@ -230,37 +230,40 @@ def _metadata(folder: int, name: str, most: int = 1) -> dict[str, Any]:
 
 
 def _checked(name: str, metadata: Any) -> tuple[tuple[int, ...], tuple[int, ...], np.dtype[Any], Any]:
-    """Shape, chunks, type and codec of an array; ValueError for what is not allowed."""
+    """Return shape, chunks, type and codec of an array; ValueError if one is not supported."""
     metadata = metadata if isinstance(metadata, dict) else {}
     if metadata.get("zarr_format") != 2:
         raise ValueError(f"{name} is not an array of format 2")
     if metadata.get("filters"):
         raise ValueError(f"{name}: expected no filters")
-    compressor = metadata.get("compressor")
+    codec = _codec(name, metadata.get("compressor"))
+    if metadata.get("dimension_separator", ".") != "." or metadata.get("order") not in ("C", "F"):
+        raise ValueError(f"{name}: order or dimension_separator is not supported")
+    dtype = metadata.get("dtype")
+    if not isinstance(dtype, str) or not re.fullmatch("[<>|][fiu][1248]", dtype):
+        raise ValueError(f"{name} is not an array of numbers")
+    shape, chunks = (_lengths(name, metadata.get(key)) for key in ("shape", "chunks"))
+    check_array(name, shape, chunks, np.dtype(dtype))
+    return shape, chunks, np.dtype(dtype), codec
+
+
+def _codec(name: str, compressor: Any) -> str | None:
     codec = compressor.get("id") if isinstance(compressor, dict) else compressor
     if not (codec is None or (isinstance(codec, str) and codec in _CODECS)):
         raise ValueError(f"{name}: expected one of the codecs {', '.join(_CODECS)} or none, got another one")
-    if metadata.get("dimension_separator", ".") != "." or metadata.get("order") not in ("C", "F"):
-        raise ValueError(f"{name}: order or dimension_separator is not one that is read")
-    if not isinstance(metadata.get("dtype"), str) or len(metadata["dtype"]) > 3:
-        raise ValueError(f"{name} is not an array of numbers")
-    try:
-        dtype = np.dtype(metadata["dtype"])
-    except TypeError:
-        raise ValueError(f"{name} is not an array of numbers") from None
-    shape, chunks = metadata.get("shape"), metadata.get("chunks")
-    for lengths in (shape, chunks):
-        if not isinstance(lengths, list) or len(lengths) > 32 or not all(type(n) is int for n in lengths):
-            raise ValueError(f"{name}: shape and chunks: expected lists of integers")
-    assert isinstance(shape, list) and isinstance(chunks, list)
-    check_array(name, tuple(shape), tuple(chunks), dtype)
-    return tuple(shape), tuple(chunks), dtype, codec
+    return codec
+
+
+def _lengths(name: str, lengths: Any) -> tuple[int, ...]:
+    if not isinstance(lengths, list) or len(lengths) > 32 or not all(type(n) is int for n in lengths):
+        raise ValueError(f"{name}: shape and chunks: expected lists of integers")
+    return tuple(lengths)
 
 
 def _zarr_array(root: int, name: str) -> Array:
     from numcodecs import registry
 
-    folder = _open_inside(root, name, os.O_DIRECTORY)
+    folder = _open_in_folder(root, name, os.O_DIRECTORY)
     name = _quoted(name) if not name.isidentifier() else name
     if _exists(folder, "zarr.json") or not _exists(folder, ".zarray"):
         raise ValueError(f"{name} is not an array of format 2")
@@ -288,15 +291,15 @@ def _zarr_array(root: int, name: str) -> Array:
 # --- the process --------------------------------------------------------------------------------------------------
 
 
-def limit(what: int, most: int) -> None:
-    """Set a limit of this process for good."""
-    hard = resource.getrlimit(what)[1]
-    most = most if hard == resource.RLIM_INFINITY else min(most, hard)
-    resource.setrlimit(what, (most, most))
+def limit(resource_number: int, maximum: int) -> None:
+    """Set a resource limit of this process permanently."""
+    hard = resource.getrlimit(resource_number)[1]
+    maximum = maximum if hard == resource.RLIM_INFINITY else min(maximum, hard)
+    resource.setrlimit(resource_number, (maximum, maximum))
 
 
 def _address_space() -> int:
-    """Bytes that this process has mapped; how much the libraries map depends on their versions and on the machine."""
+    """Return the bytes that this process has mapped, which depend on the versions of the libraries and the machine."""
     try:
         with open("/proc/self/statm", encoding="ascii") as file:
             return int(file.read().split()[0]) * resource.getpagesize()
@@ -328,12 +331,12 @@ def _more_time() -> None:
 
 
 def _is_text(array: Array) -> bool:
-    """Whether this is a text or a single number of MATLAB's."""
+    """Return whether an array is a text or a single number of MATLAB."""
     return array.attributes.get("MATLAB_class") == "char" or math.prod(array.shape) == 1
 
 
 def send(path: str, kind: str, which: str) -> None:
-    """Check a file, and write it to the standard output."""
+    """Check a file, and write its contents to the standard output."""
     size = _size_on_disk(path)
     attributes, arrays = open_zarr(path) if kind == "zarr" else open_h5(path)
     check_size(sum(math.prod(array.shape) * array.dtype.itemsize for array in arrays), size)
@@ -353,7 +356,7 @@ def send(path: str, kind: str, which: str) -> None:
 
 
 def main() -> None:
-    """Do what the argument says."""
+    """Run the program."""
     request = json.loads(sys.argv[1])
     limit(resource.RLIMIT_CORE, 0)
     limit(resource.RLIMIT_FSIZE, 0)
@@ -368,7 +371,7 @@ def main() -> None:
         send(request["path"], request["kind"], request["arrays"])
     except MemoryError:
         sys.exit(f"reading it takes more than {MAX_MEMORY // 2**20} MiB of memory")
-    except Exception as problem:  # of damaged files the libraries raise anything
+    except Exception as problem:  # on damaged files the libraries raise any exception
         sys.exit((str(problem).splitlines() or [type(problem).__name__])[0][:300])
 
 

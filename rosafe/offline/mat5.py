@@ -1,6 +1,6 @@
-"""Reading of MATLAB's version 5: arrays of numbers and texts. The format: "MAT-File Format", The MathWorks.
+"""Read MATLAB's version 5: arrays of numbers, and texts. The format: "MAT-File Format", The MathWorks.
 
-A damaged file crashes the interpreter in scipy's reader.
+scipy's reader is not used, because damaged files crash the interpreter in it.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from rosafe.offline.result_metadata import ABOUT, MAX_TEXT, is_scalar, new_array
 
 _HEAD = 128  # bytes
 _MATRIX, _COMPRESSED = 14, 15
-# types of data and classes of arrays: what numpy calls them
+# numpy's names of data types and array classes
 _TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
 _CLASSES = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8"}
 _CHARACTERS, _COMPLEX = 4, 0x800
@@ -30,7 +30,7 @@ _ENCODINGS = {1: "latin-1", 2: "latin-1", 4: "utf-16", 16: "utf-8", 17: "utf-16"
 
 
 class _Element(NamedTuple):
-    """The beginning of an element: its type, where its data begin and end, and where the next one begins."""
+    """Header of an element: its type, the offsets of its data, and the offset of the next element."""
 
     kind: int
     start: int
@@ -39,7 +39,7 @@ class _Element(NamedTuple):
 
 
 class _Source:
-    """Elements of a file, or of what was compressed in it, from the present position to `end`."""
+    """Elements of a file, or of decompressed data, from the present position to `end`."""
 
     def __init__(self, file: BinaryIO, end: int, order: str) -> None:
         self.file = file
@@ -53,31 +53,31 @@ class _Source:
         if first >> 16:  # up to four bytes in the place of the length
             found = _Element(first & 0xFFFF, at + 4, at + 4 + (first >> 16), at + 8)
             if first >> 16 > 4:
-                raise ValueError("an element of four bytes is longer")
+                raise ValueError("a small element is longer than four bytes")
             self.file.seek(at + 4)
             return found
         end = at + 8 + count
         return _Element(first, at + 8, end, end if first == _COMPRESSED else min(self.end, end + -count % 8))
 
     def take(self, count: int) -> bytes:
-        """The next `count` bytes."""
+        """Return the next `count` bytes."""
         content = self.file.read(count) if count <= self.end - self.file.tell() else b""
         if len(content) != count:
             raise ValueError("it is cut off")
         return content
 
-    def small(self, kinds: tuple[int, ...], most: int) -> tuple[int, bytes]:
-        """The type and the data of the next element, which is short."""
+    def small(self, kinds: tuple[int, ...], max_size: int) -> tuple[int, bytes]:
+        """Return the type and the data of the next element; ValueError if it is longer than `max_size` bytes."""
         found = self.element()
-        if found.kind not in kinds or found.end - found.start > most:
-            raise ValueError(f"an element of type {found.kind} with {found.end - found.start} bytes is not expected")
+        if found.kind not in kinds or found.end - found.start > max_size:
+            raise ValueError(f"unexpected element of type {found.kind} with {found.end - found.start} bytes")
         content = self.take(found.end - found.start)
         self.file.seek(found.after)
         return found.kind, content
 
 
 def read_mat5(path: Path, arrays: bool = True) -> dict[str, Any]:
-    """What is in a version 5 .mat; without its arrays, only what `told` gives. ValueError where it is damaged."""
+    """Return the contents of a version 5 .mat; without `arrays`, only the metadata. ValueError if it is damaged."""
     with open_regular(path) as file:
         size = os.fstat(file.fileno()).st_size
         found = dict(_variables(file, size, arrays))
@@ -88,7 +88,7 @@ def read_mat5(path: Path, arrays: bool = True) -> dict[str, Any]:
 
 
 def _variables(file: BinaryIO, size: int, arrays: bool) -> Iterator[tuple[str, Any]]:
-    """Names and values of the variables; without `arrays`, of those that tell runs apart."""
+    """Yield names and values of the variables; without `arrays`, only of those in `ABOUT`."""
     head = file.read(_HEAD)
     order = {b"\x00\x01IM": "<", b"\x01\x00MI": ">"}.get(head[124:])
     if order is None:
@@ -116,7 +116,7 @@ def _variables(file: BinaryIO, size: int, arrays: bool) -> Iterator[tuple[str, A
 
 
 def _inflated(content: bytes, order: str, total: int, size: int) -> bytes:
-    """The array that is compressed in `content`, after `total` bytes of others, of a file of `size` bytes."""
+    """Return the decompressed array. `total` is the size of the arrays before it, `size` that of the file (bytes)."""
     inflate = zlib.decompressobj()
     try:
         tag = inflate.decompress(content, 8)
@@ -128,7 +128,7 @@ def _inflated(content: bytes, order: str, total: int, size: int) -> bytes:
 
 
 def _matrix(source: _Source, arrays: bool, total: int, size: int) -> tuple[str, Any]:
-    """The name and the value of an array, which is read if it is wanted."""
+    """Return the name and the value of an array; the value is None if it is not needed."""
     order = source.order
     flags = struct.unpack(f"{order}II", source.small((6,), 8)[1].ljust(8, b"\0"))[0]
     lengths = np.frombuffer(source.small((5,), 4 * 32)[1][: 4 * 32], f"{order}i4")

@@ -1,4 +1,4 @@
-"""Whether what is to be made fits into the memory, asked before it is made."""
+"""Checks that data will fit into the memory, made before anything of that size is allocated."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _MEMINFO = Path("/proc/meminfo")
 
 
 def available() -> int:
-    """Bytes that this process can fill; what the machine has, where the system does not tell how much others hold."""
+    """Return the bytes that this process can use; all of the machine's if the system does not report what is free."""
     try:
         found = re.search(r"^MemAvailable: +(\d+) kB", _MEMINFO.read_text(), re.MULTILINE)
     except OSError:  # a chroot without /proc, or another system
@@ -20,14 +20,13 @@ def available() -> int:
     return min(sizes.machine_memory(), int(found[1]) * 1024) if found else sizes.machine_memory()
 
 
-def refuse_over_available(taken: float, what: str, advice: str = "") -> None:
-    """ValueError, with `advice`, where so many bytes are more than there are: the system would end the process."""
-    text = f"{what} would take {{taken:.1f}} GB of memory, this machine has {{limit:.1f}} GB left{advice}"
-    sizes.check_memory(available(), taken, text, 1e9)
+def refuse_over_available(size: float, subject: str, advice: str = "") -> None:
+    """Raise ValueError, with `advice`, if `size` bytes are more than available: the system would end the process."""
+    text = f"{subject} would take {{taken:.1f}} GB of memory, this machine has {{limit:.1f}} GB left{advice}"
+    sizes.check_memory(available(), size, text, 1e9)
 
 
-def check_arrays(before: int, size: int, taken: float) -> None:
-    """ValueError where arrays of `taken` bytes, after `before` bytes, are too large for a file of `size` bytes, or for
-    the memory that is left."""
-    check_size(before + taken, size)
-    refuse_over_available(taken, "its arrays")
+def check_arrays(before: int, file_size: int, size: float) -> None:
+    """Raise ValueError if arrays of `size` bytes, after `before` bytes, are too large for the file or the memory."""
+    check_size(before + size, file_size)
+    refuse_over_available(size, "its arrays")

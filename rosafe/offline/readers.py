@@ -1,4 +1,4 @@
-"""Reading of .npz and .csv: sizes and types are checked before anything of that size is read."""
+"""Read .npz and .csv. Sizes and types are checked before memory is allocated."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from rosafe.offline.in_memory_formats import CSV_HEAD
 from rosafe.offline.memory import check_arrays
 from rosafe.offline.result_metadata import ABOUT, MAX_TEXT, checked, from_json, is_number, new_array, parse_metadata
 
-_MAX_MEMBERS = 4096  # of an .npz
+_MAX_MEMBERS = 4096  # members of an .npz
 _MAX_HEADER = 4096  # bytes of the header of an array
-_BLOCK = 2**20  # bytes that are read at a time
+_BLOCK = 2**20  # bytes read at a time
 _MAGIC = re.compile(rb"\x93NUMPY[\x01-\x03]\x00", re.DOTALL)
 _HEADER = re.compile(
     r"\{'descr': '([<>|=]?[biufU]\d{1,7})', 'fortran_order': (True|False), 'shape': \(([0-9, ]{0,500})\),? ?\}\s{0,500}"
@@ -35,13 +35,13 @@ _DAMAGED = (
     OSError,
     TypeError,
 )
-_ENCRYPTED = 1  # of the flags of a member
-_LONGEST_NUMBER = 32  # characters of a number in a .csv; repr makes at most 24
+_ENCRYPTED = 1  # flag of a member
+_MAX_NUMBER_LENGTH = 32  # characters of a number in a .csv; repr makes at most 24
 _MAX_CSV_HEAD = 2**24  # bytes
 
 
 def read_npz(path: Path, arrays: bool = True) -> dict[str, Any]:
-    """What is in an .npz; without its arrays, only what `told` gives. ValueError where it is damaged."""
+    """Return the contents of an .npz; without `arrays`, only the metadata. ValueError if it is damaged."""
     with open_regular(path) as stream:
         size = os.fstat(stream.fileno()).st_size
         try:
@@ -53,7 +53,7 @@ def read_npz(path: Path, arrays: bool = True) -> dict[str, Any]:
 
 
 def _members(file: zipfile.ZipFile, size: int, arrays: bool) -> Iterator[tuple[str, zipfile.ZipInfo]]:
-    """Names and places of the arrays to be read, after a check of what they all take."""
+    """Yield names and members of the arrays to be read, after a check of the total size."""
     members = file.infolist()
     if len(members) > _MAX_MEMBERS:
         raise ValueError(f"it holds more than {_MAX_MEMBERS} arrays")
@@ -68,7 +68,7 @@ def _members(file: zipfile.ZipFile, size: int, arrays: bool) -> Iterator[tuple[s
 
 
 def _member(file: zipfile.ZipFile, member: zipfile.ZipInfo) -> np.ndarray:
-    """An array, as numpy writes it."""
+    """Read an array in numpy's format."""
     with file.open(member) as content:
         version = content.read(8)
         width = 2 if version[6:7] == b"\x01" else 4
@@ -93,7 +93,7 @@ def _fill(content: IO[bytes], buffer: memoryview) -> None:
         if len(part) != min(_BLOCK, len(buffer) - at):
             raise ValueError("it is cut off")
         buffer[at : at + _BLOCK] = part
-    if content.read(1):  # which checks the sum of the whole, too
+    if content.read(1):  # reading to the end also verifies the checksum
         raise ValueError("an array is longer than it says")
 
 
@@ -103,7 +103,7 @@ def read_csv(path: Path, arrays: bool = True) -> dict[str, Any]:
         head = file.readline(_MAX_CSV_HEAD)
         begin = CSV_HEAD.encode()
         if not head.startswith(begin):
-            raise ValueError("its first line is not that of rosafe process")
+            raise ValueError("its first line was not written by rosafe process")
         about = from_json(head.removeprefix(begin), _MAX_CSV_HEAD)
         if not isinstance(about, dict) or not isinstance(about.get("axes"), dict) or len(about["axes"]) != 1:
             raise ValueError("its first line does not describe one output")
@@ -129,16 +129,16 @@ def _vector(name: str, value: Any) -> np.ndarray | float:
 
 
 def _table(file: BinaryIO, rows: int, width: int) -> np.ndarray:
-    """The rows of a .csv, each of `width` numbers."""
+    """Read the rows of a .csv, each of `width` numbers."""
     size = os.fstat(file.fileno()).st_size
     if not 0 <= 2 * rows * width <= size:  # a digit and a comma for each number
         raise ValueError(f"it is cut off: {rows} rows do not fit into {size} bytes")
     check_arrays(0, size, 16 * rows * width)
     table = new_array((rows, width), np.dtype(np.float64))
     for index, row in enumerate(table):
-        numbers = file.readline(_LONGEST_NUMBER * width).split(b",")
+        numbers = file.readline(_MAX_NUMBER_LENGTH * width).split(b",")
         if len(numbers) != width:
-            raise ValueError(f"it is cut off, or damaged: row {index + 1} of {rows} has not {width} numbers")
+            raise ValueError(f"it is cut off, or damaged: expected {width} numbers in row {index + 1} of {rows}")
         try:
             row[:] = [float(number) for number in numbers]
         except ValueError:

@@ -1,4 +1,4 @@
-"""Sound as users of the library hand it over: one ear or two, along either axis, of floats or whole numbers."""
+"""Signals as users of the library pass them: one ear or two, along either axis, as floats or integers."""
 
 from __future__ import annotations
 
@@ -11,43 +11,47 @@ from rosafe.dsp.signal_format import SignalFormat
 from rosafe.interface import CORE_REPRESENTATIONS, KINDS
 from rosafe.interface.arguments import check_outputs
 
-_CHECKED_TOGETHER = 2**18  # frames; no large array is made for the check
-_WANTED = "wanted is (N,) or (1, N) for one ear, (2, N) or (N, 2) for two"
+_CHECK_FRAMES = 2**18  # checked at a time, so that no large array is allocated
+_SHAPES = "shape (N,) or (1, N) for one ear, (2, N) or (N, 2) for two"
 
 
-def ears_view(signal: Any, upright: bool = False) -> np.ndarray:
+def ears_view(signal: Any, frames_first: bool = False) -> np.ndarray:
     """Return a signal as (1, N) or (2, N) of its own number type, without a copy if it is an array.
 
     Parameters
     ----------
     signal : array_like
         (N,) or (1, N), one ear; (2, N) or (N, 2), two. Floats, int32 or int16.
-    upright : bool
-        Whether (2, 2) is (N, 2), as what came before it was.
+    frames_first : bool
+        Whether (2, 2) is read as (N, 2).
 
     Raises
     ------
     ValueError
         For another shape or type, and for masked arrays.
     """
-    try:
-        array = np.asanyarray(signal)
-    except ValueError as problem:
-        raise ValueError(f"signal is no array: {problem}") from None
-    rows = signal if not isinstance(signal, (np.ndarray, memoryview)) and isinstance(signal, Sequence) else ()
-    if isinstance(array, np.ma.MaskedArray) or any(isinstance(row, np.ma.MaskedArray) for row in rows):
-        raise ValueError("signal: expected an array without a mask, got a masked array; call its method filled(0)")
-    array = np.asarray(array)
-    if array.ndim == 0:  # such as the name of a file
-        raise ValueError(f"signal is no array, but {type(signal).__name__}; {_WANTED}")
+    array = _as_array(signal)
     if array.ndim == 1:
         array = array[np.newaxis]
     if array.ndim != 2 or not (array.shape[0] in (1, 2) or array.shape[1] == 2):
-        raise ValueError(f"signal has shape {np.shape(signal)}; {_WANTED}")
-    whole = array.dtype.kind == "i" and array.dtype.itemsize in (2, 4)
-    if not whole and array.dtype.kind != "f":
-        raise ValueError(f"signal is of type {array.dtype}, wanted is a float type, int32 or int16")
-    return array.T if is_frames_first(array, upright) else array
+        raise ValueError(f"signal: expected {_SHAPES}, got shape {np.shape(signal)}")
+    if array.dtype.kind != "f" and not (array.dtype.kind == "i" and array.dtype.itemsize in (2, 4)):
+        raise ValueError(f"signal: expected a float type, int32 or int16, got {array.dtype}")
+    return array.T if is_frames_first(array, frames_first) else array
+
+
+def _as_array(signal: Any) -> np.ndarray:
+    """Convert to an array of at least one axis; ValueError for masked arrays, scalars and ragged lists."""
+    try:
+        array = np.asanyarray(signal)
+    except ValueError as problem:
+        raise ValueError(f"signal: expected an array, got {type(signal).__name__}: {problem}") from None
+    rows = signal if not isinstance(signal, (np.ndarray, memoryview)) and isinstance(signal, Sequence) else ()
+    if isinstance(array, np.ma.MaskedArray) or any(isinstance(row, np.ma.MaskedArray) for row in rows):
+        raise ValueError("signal: expected an array without a mask, got a masked array; call its method filled(0)")
+    if array.ndim == 0:  # such as the name of a file
+        raise ValueError(f"signal: expected an array of {_SHAPES}, got {type(signal).__name__}")
+    return np.asarray(array)
 
 
 def as_samples(ears: np.ndarray) -> np.ndarray:
@@ -60,36 +64,75 @@ def as_samples(ears: np.ndarray) -> np.ndarray:
 
 
 def check_finite(ears: np.ndarray) -> None:
-    """Raise ValueError if a signal as of `ears_view` holds NaN or infinite samples."""
+    """Raise ValueError if a signal as of `ears_view` contains NaN or infinite samples."""
     if ears.dtype.kind == "f":
-        for first in range(0, ears.shape[1], _CHECKED_TOGETHER):
-            if not np.isfinite(as_samples(ears[:, first : first + _CHECKED_TOGETHER])).all():
-                raise ValueError("signal holds NaN or infinite samples")
+        for first in range(0, ears.shape[1], _CHECK_FRAMES):
+            if not np.isfinite(as_samples(ears[:, first : first + _CHECK_FRAMES])).all():
+                raise ValueError("signal: expected finite samples, got NaN or infinite ones")
 
 
-def is_frames_first(signal: np.ndarray, upright: bool = False) -> bool:
-    """Whether a signal of two axes is (N, 2), as `ears_view` takes it."""
-    return signal.shape[1] == 2 and (signal.shape[0] > 2 or signal.shape[0] == 0 or (upright and len(signal) == 2))
+def is_frames_first(signal: np.ndarray, frames_first: bool = False) -> bool:
+    """Return whether `ears_view` reads a signal of two axes as (N, 2)."""
+    return signal.shape[1] == 2 and (signal.shape[0] not in (1, 2) or (frames_first and len(signal) == 2))
+
+
+class BlockReader:
+    """Converts the blocks of a stream to samples. All blocks have the format of the first one.
+
+    Attributes
+    ----------
+    ears : int
+        1 or 2; 0 before the first block.
+    whole : bool
+        Whether the samples are integers.
+    """
+
+    def __init__(self) -> None:
+        self.ears = 0
+        self.whole = False
+        self._frames_first = False
+
+    def view(self, block: Any) -> np.ndarray:
+        """Return a block as `ears_view` does; ValueError if its format differs from that of the first block."""
+        shape = np.shape(block)
+        view = ears_view(np.transpose(block) if self.ears == 2 and shape == (1, 2) else block, self._frames_first)
+        if self.ears and len(view) != self.ears:
+            earlier = ("one ear", "two ears")[self.ears - 1]
+            raise ValueError(f"block: expected {earlier} as in the blocks before, got shape {shape}")
+        if self.ears and (view.dtype.kind == "i") != self.whole:
+            names = ("floats", "integers")
+            raise ValueError(f"block: expected {names[self.whole]} as in the blocks before, got {view.dtype}")
+        return view
+
+    def accept(self, block: Any, view: np.ndarray) -> None:
+        """Remember the format of a block that has been checked completely."""
+        shape = np.shape(block)
+        self.ears, self.whole = len(view), view.dtype.kind == "i"
+        if len(shape) == 2 and shape != (2, 2):
+            self._frames_first = is_frames_first(np.asarray(block)) or shape == (1, 2)
 
 
 def outputs_of(ears: int, outputs: Any) -> list[str]:
-    """The outputs to keep of a signal of so many ears, as `check_outputs`; ValueError where one ear is not enough."""
+    """Return the outputs as `check_outputs`; ValueError if a binaural output is requested for one ear.
+
+    The default for one ear is that for two without the binaural outputs.
+    """
     if outputs is None and ears == 1:
         return [kind for kind in CORE_REPRESENTATIONS if not KINDS[kind].binaural]
-    wanted = check_outputs(outputs)
-    both = [kind for kind in wanted if KINDS[kind].binaural]
-    if ears == 1 and both:
-        raise ValueError(f"outputs: {', '.join(both)} compare two ears, and the signal has one")
-    return wanted
+    checked = check_outputs(outputs)
+    binaural = [kind for kind in checked if KINDS[kind].binaural]
+    if ears == 1 and binaural:
+        raise ValueError(f"outputs: {', '.join(binaural)} compare two ears, and the signal has one")
+    return checked
 
 
 def of_ears(ears: int, axes: tuple[str, ...], data: np.ndarray) -> np.ndarray:
-    """What is kept of an output, computed for two ears that heard the same where there is only one."""
+    """Return the part of an output to keep: for one ear, which may be computed as two equal ones, the first."""
     return data[:1] if ears == 1 and axes[0] == "ear" else data
 
 
 def frame_times(signal: SignalFormat, first: int, count: int) -> np.ndarray:
-    """Seconds from the first sample to the middle of each frame, of so many that begin `first` samples later.
+    """Return the middle of each of `count` frames (s); the first frame begins at sample `first`.
 
     (first + k hop + window / 2) / fs for frame k, n / fs for sample n.
     """

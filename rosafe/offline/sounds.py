@@ -1,4 +1,4 @@
-"""Where offline processing reads from: two channels of a sound file, or the port Audio in a rosbag."""
+"""Input of offline processing: two channels of a sound file, or the port Audio in a rosbag."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from typing import Protocol
 import numpy as np
 
 from rosafe.sound.audiofile import AudioFile, AudioFileError
-from rosafe.sound.bagsound import BagSoundError, Piece, Recording
+from rosafe.sound.bagsound import BagSoundError, Recording, from_first_samples
 
 BAG = ".bag"
 DEFAULT_TOPIC = "/bass/Audio"
-# What is a sound in a folder: what libsndfile reads, but for formats that need to be told what is in them, and bags.
+# Endings of sound files in a folder: bags, and all formats of libsndfile that have a header
 SOUNDS = frozenset(
     f".{one}"
     for one in (
@@ -26,47 +26,61 @@ SOUNDS = frozenset(
 
 
 class SoundReader(Protocol):
-    """Two ears, read from the beginning to the end."""
+    """A sound of two ears that is read once from beginning to end."""
 
     path: Path
     sample_rate: int  # Hz
     frames: int
-    not_finite: int  # samples that were NaN or infinite, so far
+    channels: int  # 1 or 2
+    floats: bool  # whether `read` returns float64
+    not_finite: int  # number of NaN or infinite samples so far
+    clipped: int  # number of samples so far that were limited to full scale
 
     def read(self, frames: int) -> np.ndarray:
-        """The next `frames` frames, int32 (2, n); fewer at the end."""
+        """Return the next `frames` frames, int32 or float64 (channels, n); fewer at the end."""
 
     def close(self) -> None:
         """Close the file."""
 
 
-def open_sound(path: str | Path, channels: tuple[int, int] | None = None, topic: str | None = None) -> SoundReader:
+def open_sound(
+    path: str | Path,
+    channels: tuple[int, int] | None = None,
+    topic: str | None = None,
+    one_ear: bool = False,
+    clip: bool = True,
+) -> SoundReader:
     """Open a sound file or a bag.
 
     Parameters
     ----------
     path : path
-        A bag where its name ends in .bag.
+        A bag if its name ends in .bag.
     channels : tuple of two int, optional
-        Which of the file's channels (from 1) are the left and the right ear; needed unless it has two.
+        The channels of the file (from 1) for the left and the right ear; required unless it has two.
     topic : str, optional
         The port Audio in a bag; by default /bass/Audio, or the only one.
+    one_ear : bool
+        Whether a mono file is accepted.
+    clip : bool
+        Whether samples of float files are converted to int32; see `rosafe.sound.audiofile.AudioFile`.
 
     Raises
     ------
     AudioFileError
-        The file cannot be read, or has not two channels and none were chosen, or not those that were.
+        The file cannot be read, or lacks the chosen channels, or has not two and none were chosen.
     """
     if Path(path).suffix.lower() == BAG:
         return BagSound(path, topic, channels)
-    file = AudioFile(path)
+    file = AudioFile(path, clip)
     try:
         if channels is not None:
             file.pick(channels)
-        if file.channels != 2:
+        if file.channels != 2 and not (one_ear and file.channels == 1):
             kind = "is mono (one channel)" if file.channels == 1 else f"has {file.channels} channels"
-            cure = "--channels 1,1 gives it to both" if file.channels == 1 else "--channels 1,2 takes those"
-            raise AudioFileError(f"{file.path} {kind}; wanted are two: left and right ear ({cure})")
+            mono = "--channels 1,1 uses it for both, and --outputs ratemap needs one"
+            advice = mono if file.channels == 1 else "--channels 1,2 takes the first two"
+            raise AudioFileError(f"{file.path} {kind}; expected two, left and right ear ({advice})")
     except AudioFileError:
         file.close()
         raise
@@ -74,18 +88,18 @@ def open_sound(path: str | Path, channels: tuple[int, int] | None = None, topic:
 
 
 class BagSound:
-    """The one stream of sound in a bag. What was lost while it was recorded is silence in its place."""
+    """The stream of sound in a bag. Frames that were lost while it was recorded are replaced by silence."""
 
-    not_finite = 0
+    channels, floats, not_finite, clipped = 2, False, 0, 0
 
     def __init__(self, path: str | Path, topic: str | None, channels: tuple[int, int] | None) -> None:
         self.path = Path(path)
         ears = channels or (1, 2)
         if max(ears) > 2:
-            raise AudioFileError(f"{path} has 2 channels: there is no channel {max(ears)}")
+            raise AudioFileError(f"{path}: expected channels 1 to 2, got {max(ears)}")
         self._ears = [ear - 1 for ear in ears]
         try:
-            self._recording = Recording(path, topic, threading.Event(), DEFAULT_TOPIC, "pick one with --topic")
+            self._recording = Recording(path, topic, threading.Event(), DEFAULT_TOPIC, "choose one with --topic")
         except BagSoundError as problem:
             raise AudioFileError(str(problem)) from None
         self.sample_rate = self.frames = 0
@@ -98,30 +112,30 @@ class BagSound:
         self._pieces = self._from_start()
 
     def _measure(self) -> None:
-        """Go through it once: how long it is shows at its end only."""
+        """Read the bag once to find its length and sample rate."""
         try:
             for number, (sample_rate, pieces) in enumerate(self._recording.streams(), 1):
                 if number > 1:
                     raise AudioFileError(
-                        f"{self.path} holds several streams of sound one after the other; take one out with "
+                        f"{self.path} contains several successive streams of sound; extract one with "
                         f"`rosafe record OUT.wav --device 'bag:{self.path}?stream=2'`"
                     )
                 self.sample_rate = sample_rate
-                self.frames = sum(lost + samples.shape[1] for lost, samples in _from_sound(pieces))
+                self.frames = sum(lost + samples.shape[1] for lost, samples in from_first_samples(pieces))
         except BagSoundError as problem:
             raise AudioFileError(str(problem)) from None
         if not self.frames:
-            raise AudioFileError(f"{self.path} holds no sound on {self._recording.topic}")
+            raise AudioFileError(f"{self.path} contains no sound on {self._recording.topic}")
 
     def _from_start(self) -> Iterator[np.ndarray]:
         (_, pieces), *_ = islice(self._recording.streams(), 1)
-        for lost, samples in _from_sound(pieces):
+        for lost, samples in from_first_samples(pieces):
             for at in range(0, lost, 2**20):
                 yield np.zeros((2, min(2**20, lost - at)), np.int32)
             yield samples
 
     def read(self, frames: int) -> np.ndarray:
-        """The next `frames` frames, int32 (2, n); fewer at the end."""
+        """Return the next `frames` frames, int32 (2, n); fewer at the end."""
         taken = [self._rest]
         count = self._rest.shape[1]
         try:
@@ -137,12 +151,3 @@ class BagSound:
     def close(self) -> None:
         """Close the bag."""
         self._recording.close()
-
-
-def _from_sound(pieces: Iterator[Piece]) -> Iterator[Piece]:
-    """From the first sound on: what was lost before it is none of it."""
-    begun = False
-    for lost, samples in pieces:
-        if begun or samples.shape[1]:
-            yield lost * begun, samples
-            begun = True

@@ -1,8 +1,8 @@
-"""All representations: one module each, with declaration and numerics, found by being here or by being a plugin.
+"""All representations, built-in and plugins. Each module of this folder contains declarations and their stages.
 
-A plugin is a Python file in one of the folders that the environment variable ROSAFE_PLUGINS names (as PATH does), or a
-module or class that an installed package names in the entry point group `rosafe.representations`. One that is broken is
-left out and named in `PROBLEMS`; `WARNINGS` are remarks about the others, and `PLUGINS` tells where each kind is from.
+A plugin is a Python file in a folder listed in the environment variable ROSAFE_PLUGINS (in the format of PATH), or a
+module or class in the entry point group `rosafe.representations` of an installed package. A broken plugin is left out
+and listed in `PROBLEMS`. `WARNINGS` are remarks about the other plugins; `PLUGINS` is the origin of each kind.
 """
 
 from __future__ import annotations

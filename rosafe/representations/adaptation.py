@@ -1,18 +1,4 @@
-"""The adaptation stage: feedback loops that emphasise onsets, as the auditory nerve does.
-
-* D. Püschel (1988), "Prinzipien der zeitlichen Analyse beim Hören", doctoral thesis, Universität Göttingen
-* T. Dau, D. Püschel and A. Kohlrausch (1996), "A quantitative model of the 'effective' signal processing in the
-  auditory system. I. Model structure", J. Acoust. Soc. Am. 99, 3615-3622
-* T. Dau, B. Kollmeier and A. Kohlrausch (1997), "Modeling auditory processing of amplitude modulation. I. Detection and
-  masking with narrow-band carriers", J. Acoust. Soc. Am. 102, 2892-2905: the limit of the overshoot
-* J. Breebaart, S. van de Par and A. Kohlrausch (2001), "Binaural processing model based on contralateral inhibition.
-  I. Model structure", J. Acoust. Soc. Am. 110, 1074-1088
-* J. van Dorp Schuitman, D. de Vries and A. Lindau (2013), "Deriving content-specific measures of room acoustic
-  perception using a binaural, nonlinear auditory model", J. Acoust. Soc. Am. 133, 1572-1585
-* E. Terhardt (1979), "Calculating virtual pitch", Hear. Res. 1, 155-182: the threshold of hearing
-* M. L. Jepsen, S. D. Ewert and T. Dau (2008), "A computational model of human auditory signal processing and
-  perception", J. Acoust. Soc. Am. 124, 422-438: behind DRNL
-"""
+"""The adaptation stage: feedback loops that emphasise onsets, as the auditory nerve does."""
 
 from __future__ import annotations
 
@@ -22,18 +8,28 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from rosafe.declarations.literature import (
+    BREEBAART_2001,
+    DAU_1996,
+    DAU_1997,
+    JEPSEN_2008,
+    PUSCHEL_1988,
+    TERHARDT_1979,
+    VANDORP_2013,
+)
 from rosafe.declarations.parameter import Parameter
+from rosafe.declarations.reference import Citation
 from rosafe.declarations.representation import Representation
 from rosafe.dsp import kernels
 from rosafe.dsp.numeric_limits import LIMIT, FloatArray
 from rosafe.dsp.signal_format import SignalFormat
 from rosafe.dsp.stage import Stage
 
-FULL_SCALE_DB = 100.0  # SPL of sound whose rms is 1, and model units that it settles at
-GREATEST_THRESHOLD_DB = 99.0  # from 100 on, there is nothing between threshold and full scale
-DRNL_FACTOR = 1e5  # of the squares: (10**(50 / 20))**2
-MIN_LIMIT = 1e-30  # stands for no room above 1 at all
-LEAST, MOST = 1e-100, 1e100  # bounds of the quotients, far beyond sound: no state becomes 0 or infinite
+FULL_SCALE_DB = 100.0  # SPL of sound with an RMS of 1, and the steady output for it in model units
+MAX_THRESHOLD_DB = 99.0  # at 100, the threshold would be full scale
+DRNL_FACTOR = 1e5  # of the squared samples: (10**(50 / 20))**2
+MIN_LIMIT = 1e-30  # replaces a limit of 0
+MIN_QUOTIENT, MAX_QUOTIENT = 1e-100, 1e100  # far beyond those of sound; they keep states from 0 and infinity
 
 TAU = (0.005, 0.05, 0.129, 0.253, 0.5)
 EVEN_TAU = tuple(np.linspace(0.005, 0.5, 5).tolist())
@@ -47,23 +43,23 @@ SETS: dict[str, dict[str, Any]] = {
 
 
 class Adaptation(Stage):
-    """Adaptation loops, (2, C, N) to (2, C, N) in model units: 0 at the threshold, 100 for steady 100 dB SPL (rms 1).
+    """Adaptation loops, (2, C, N) to (2, C, N) in model units: 0 at the threshold, 100 for steady 100 dB SPL (RMS 1).
 
     With v = max(x, x_min), x_min = 10**((adpt_mindB - 100) / 20), for each time constant tau in turn
 
     * v = v / s
-    * v = 1 + m tanh((v - 1) / m) where v > 1 and adpt_lim > 1; m = (1 - s_rest**2) adpt_lim - 1
+    * v = 1 + m tanh((v - 1) / m) if v > 1 and adpt_lim > 1; m = (1 - s_rest**2) adpt_lim - 1
     * s = a s + (1 - a) v, a = exp(-1 / (tau fs))
 
-    and y = 100 (v - K) / (1 - K). The loops start from rest at x_min, s_rest = x_min**(1/2), x_min**(1/4)..., of which
-    K is the last: it is what x_min comes to. Papers have 2 m / (1 + exp(-2 (v - 1) / m)) - m + 1 for the limit, which
-    is the same.
+    and y = 100 (v - K) / (1 - K). The loops start at rest at x_min, s_rest = x_min**(1/2), x_min**(1/4)...; K, the
+    last of these, is the output for x_min. The limit is given in papers as 2 m / (1 + exp(-2 (v - 1) / m)) - m + 1,
+    which is equal.
 
-    A name in `adpt_model` puts the values of a published set in the place of the other three; an empty one leaves these
-    as they are. adt_vandorpschuitman has a threshold of its own for each channel, that of hearing (at most 99 dB),
-    and leaves adpt_mindB alone. Any change begins anew, from rest.
+    A name in `adpt_model` replaces the other three parameters by a published set; an empty one has no effect.
+    adt_vandorpschuitman uses the threshold of hearing (at most 99 dB) for each channel and ignores adpt_mindB. Any
+    change resets the loops to rest.
 
-    Behind a DRNL filterbank, x becomes (10**(50/20) x)**2 first.
+    After a DRNL filterbank, x is first replaced by (10**(50/20) x)**2.
     """
 
     REPRESENTATION = Representation(
@@ -103,18 +99,31 @@ class Adaptation(Stage):
                 spellings={"adt_breebart": "adt_breebaart"},
             ),
         ),
-        port_doc="What the adaptation loops put out (model units)",
+        port_doc="Output of the adaptation loops (model units)",
+        references=(
+            Citation(PUSCHEL_1988, "feedback loops", (("adpt_model", ("", "adt_dau", "adt_puschel")),)),
+            Citation(DAU_1996, "feedback loops"),
+            Citation(
+                DAU_1997,
+                "limit of the overshoot",
+                (("adpt_model", ("", "adt_dau", "adt_breebaart", "adt_vandorpschuitman")),),
+            ),
+            Citation(BREEBAART_2001, "time constants", (("adpt_model", "adt_breebaart"),)),
+            Citation(VANDORP_2013, "threshold of each channel", (("adpt_model", "adt_vandorpschuitman"),)),
+            Citation(TERHARDT_1979, "threshold of hearing", (("adpt_model", "adt_vandorpschuitman"),)),
+            Citation(JEPSEN_2008, "squared input after DRNL filters", (("fb_type", "drnl"),)),
+        ),
     )
 
-    _state: FloatArray | None  # (n, 2, C); None is rest
+    _state: FloatArray | None  # (n, 2, C); None at rest
 
     def process(self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None) -> FloatArray:
         samples = self._as_valid_block(block)
         loops, channels = self._loops, samples.shape[1]
         if len(loops.thresholds) not in (1, channels):
-            raise ValueError(f"block: {channels} channels, but thresholds of {len(loops.thresholds)}")
+            raise ValueError(f"block: expected {len(loops.thresholds)} channels, got {channels}")
         if self._state is None or self._state.shape[1:] != samples.shape[:-1]:
-            rest = np.broadcast_to(loops.rest[:, np.newaxis], (len(loops.rest), 2, channels))
+            rest = np.broadcast_to(loops.rest[:, np.newaxis], (len(loops.rest), len(samples), channels))
             self._state = np.array(rest, order="C")
         if kernels.compiled():
             return kernels.adaptation(
@@ -148,10 +157,8 @@ class Adaptation(Stage):
         threshold = np.array([values["adpt_mindB"]])
         if values["adpt_model"] == TERHARDT:
             if not self.input_format.center_frequencies:
-                raise ValueError(f"adpt_model: {TERHARDT} needs channels of known frequencies")
-            threshold = np.minimum(
-                hearing_threshold(np.array(self.input_format.center_frequencies)), GREATEST_THRESHOLD_DB
-            )
+                raise ValueError(f"adpt_model: {TERHARDT} requires channels of known frequencies")
+            threshold = np.minimum(hearing_threshold(np.array(self.input_format.center_frequencies)), MAX_THRESHOLD_DB)
         self._loops = Loops.design(
             self.sample_rate,
             threshold,
@@ -163,16 +170,16 @@ class Adaptation(Stage):
 
 
 class Loops(NamedTuple):
-    """n adaptation loops, for C channels of different thresholds, or with C = 1 for any number of equal ones.
+    """n adaptation loops, for C channels with different thresholds, or with C = 1 for all channels.
 
     Attributes
     ----------
     factor : float
-        0, or what the squares of the samples are multiplied with first.
+        0, or the factor by which the squares of the samples are multiplied first.
     thresholds, offsets, gains : ndarray (C,)
-        Smaller samples are taken as the threshold; what comes out, less the offset, is multiplied with the gain.
-    retentions, limits : ndarray (n,)
-        a and m of each loop. Without limits, m is 0 throughout.
+        Samples are raised to the threshold; the output minus the offset is multiplied by the gain.
+    decay_factors, limits : ndarray (n,)
+        a and m of each loop. Without limits, all m are 0.
     rest : ndarray (n, C)
         The states before the first sample.
     """
@@ -189,35 +196,35 @@ class Loops(NamedTuple):
     def design(
         cls, sample_rate: float, threshold_db: FloatArray, tau: list[float], overshoot: float, factor: float
     ) -> Loops:
-        """For thresholds (C,) in dB SPL; with limits there must be one threshold."""
+        """Design loops for thresholds (C,) in dB SPL. Limits require a single threshold."""
         log_threshold = (threshold_db - FULL_SCALE_DB) / 20 * math.log(10)
         logs = log_threshold * 0.5 ** np.arange(1, len(tau) + 1)[:, np.newaxis]
         limits = np.zeros(len(tau))
         if overshoot > 1:  # m tanh(u / m) does not depend on the sign of m
             limits = np.maximum(np.abs(-np.expm1(2 * logs[:, 0]) * overshoot - 1), MIN_LIMIT)
-        with np.errstate(divide="ignore", over="ignore"):  # a time constant may be nothing at all
-            retentions = np.exp(-1 / (np.array(tau) * sample_rate))
+        with np.errstate(divide="ignore", over="ignore"):  # a time constant may be almost 0
+            decay_factors = np.exp(-1 / (np.array(tau) * sample_rate))
         return cls(
             factor,
             np.exp(log_threshold),
             np.exp(logs[-1]),
             -100 / np.expm1(logs[-1]),
-            retentions,
+            decay_factors,
             limits,
             np.exp(logs),
         )
 
 
 def hearing_threshold(frequencies: FloatArray) -> FloatArray:
-    """Threshold of hearing in dB SPL at `frequencies` in Hz (Terhardt 1979)."""
+    """Return the threshold of hearing in dB SPL at `frequencies` in Hz (Terhardt 1979)."""
     f = frequencies / 1000
     return 3.64 * f**-0.8 - 6.5 * np.exp(-0.6 * (f - 3.3) ** 2) + 0.001 * f**4
 
 
 def adapt(samples: FloatArray, loops: Loops, state: FloatArray) -> FloatArray:
-    """What `loops` make of (2, C, N); their `state` (n, 2, C) goes on.
+    """Apply `loops` to (2, C, N) and update their `state` (n, 2, C).
 
-    All loops work at a time, each one on a sample later than the next one's: (n, 2, C) numbers in one operation.
+    All loops advance together, each one sample ahead of the next loop: one operation for (n, 2, C) numbers.
     """
     x = np.clip(samples, -LIMIT, LIMIT)
     if loops.factor:
@@ -228,18 +235,18 @@ def adapt(samples: FloatArray, loops: Loops, state: FloatArray) -> FloatArray:
     a, b, m = (
         values[:, np.newaxis, np.newaxis] for values in (loops.decay_factors, 1 - loops.decay_factors, loops.limits)
     )
-    passed = np.empty((count + 1, *x.shape[1:]))  # what comes to each loop, and what leaves the last
+    passed = np.empty((count + 1, *x.shape[1:]))  # the input of each loop, and the output of the last
     for step in range(number + count - 1 if number else 0):
-        first, end = max(0, step - number + 1), min(count, step + 1)  # the loops that have something to do
+        first, end = max(0, step - number + 1), min(count, step + 1)  # the loops with a sample
         busy = slice(first, end)
         if first == 0:
             passed[0] = x[step]
-        v = np.maximum(passed[busy] / state[busy], LEAST)
+        v = np.maximum(passed[busy] / state[busy], MIN_QUOTIENT)
         if m.any():
             over = np.maximum(v, 1) - 1
             v = np.minimum(v, 1) + m[busy] * np.tanh(over / m[busy])
         else:
-            v = np.minimum(v, MOST)
+            v = np.minimum(v, MAX_QUOTIENT)
         state[busy] = a[busy] * state[busy] + b[busy] * v
         passed[first + 1 : end + 1] = v
         if end == count:

@@ -1,4 +1,4 @@
-"""Whether a plugin goes together with the tree and the other representations. Its fields are checked already."""
+"""Checks of plugins against the tree and the other representations. Their fields have been checked already."""
 
 from __future__ import annotations
 
@@ -6,13 +6,14 @@ import inspect
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from rosafe.declarations.checks import bad_name, short
+from rosafe.declarations.checks import bad_name
 from rosafe.declarations.representation import Representation
 from rosafe.declarations.signals import layout
+from rosafe.declarations.text import short_repr
 from rosafe.dsp.framing import FramedStage
 from rosafe.dsp.stage import Stage
 
-# What the component calls its own requests and topics, and the structures of its messages; see rosafe/interface
+# Names of the component's own requests and topics, and of the structures of its messages; see rosafe/interface
 REQUESTS = [
     "Stop",
     "abort_activity",
@@ -35,7 +36,7 @@ REQUESTS = [
 PORTS = ["Audio", "dataObj", "frameTime", "genom_state", "trace"]
 STRUCTS = ["TimeDomain", "TimeFrequency", "AutoCorrelation", "CrossCorrelation", "Modulation"]
 
-# Types that every client of requests can send: Python, ROS, HTTP, Tcl, MATLAB and the live page
+# Types that every client can send: Python, ROS, HTTP, Tcl, MATLAB and the live page
 TYPES = (
     "boolean",
     "unsigned long",
@@ -56,15 +57,14 @@ METHODS: dict[str, tuple[Any, ...]] = {
     "part_rows": ("rows",),
     "output_count": ("count",),
     "state_size": ("rows",),
-    "frame": ("frames",),
 }
 
 
 def problem_of(stage: Any, others: Mapping[str, type[Stage]]) -> str:
-    """Why `stage` cannot be used beside `others`; empty if it can."""
+    """Return the reason why `stage` cannot be used together with `others`; empty if it can."""
     try:
         return next(_problems(stage, others), "")
-    except Exception as problem:  # attributes of somebody else's class
+    except Exception as problem:  # raised by the plugin's class, for example by one of its properties
         return f"{type(problem).__name__}: {' '.join(str(problem).split())}"
 
 
@@ -74,57 +74,65 @@ def _problems(stage: Any, others: Mapping[str, type[Stage]]) -> Iterator[str]:
         layout(mine)
     except ValueError as problem:
         yield str(problem)
-    yield from _of_class(stage)
+    yield from _class_problems(stage)
     if not mine.parent:
         yield "parent: expected a kind of processor, got none"
     if mine.parent not in others:
-        yield f"parent: {mine.parent!r} is not a known kind; there are {', '.join(others)}"
+        yield f"parent: expected one of {', '.join(others)}, got {mine.parent!r}"
     for parameter in mine.parameters:
         if parameter.idl not in TYPES:
             yield f"parameters: {parameter.name} is of type {parameter.idl}; expected one of {', '.join(TYPES)}"
-    yield from _reserved(mine)
+    yield from _reserved_names(mine)
     for other in others.values():
         yield from _conflicts(mine, other.REPRESENTATION)
-    yield from _extras(stage, others[mine.parent])
+    yield from _extra_problems(stage, others[mine.parent])
 
 
-def _of_class(stage: Any) -> Iterator[str]:
-    """What is wrong with the class itself."""
+def _class_problems(stage: Any) -> Iterator[str]:
+    """Yield the defects of the class itself."""
     mine = stage.REPRESENTATION
     if not (isinstance(stage, type) and issubclass(stage, Stage)):
         yield f"{stage.__name__}: expected a subclass of Stage or FramedStage"
-    for name, arguments in METHODS.items():
-        method = getattr(stage, name, None)
-        if method is None and name == "frame":
-            continue
-        try:
-            inspect.signature(method).bind(None, *arguments)  # type: ignore[arg-type]
-        except (TypeError, ValueError):
-            yield f"{name}: expected a method {name}({', '.join(('self', *arguments))}), got {short(method)}"
-    if stage.process is Stage.process or (
-        stage.process is FramedStage.process and getattr(stage, "frame", None) is FramedStage.frame
-    ):
-        yield "expected a method process, or frame in a FramedStage; there is none"
+    yield from _method_problems(stage)
     if issubclass(stage, FramedStage):
-        prefix = getattr(stage, "prefix", None)
-        if problem := bad_name(prefix):
-            yield f"prefix: {problem}"
-        for end in ("wname", "wSizeSec", "hSizeSec"):
-            if f"{prefix}_{end}" not in {p.name for p in (stage.DECLARED_WITHIN or mine).parameters}:
-                yield f"prefix: there is no parameter {prefix}_{end}; expected frame_parameters({prefix!r})"
+        yield from _prefix_problems(stage)
     if mine.derived and stage.derived is Stage.derived:
         yield f"derived: {mine.derived[0].name} is declared, but the property derived is missing"
-    if len(mine.parts) > 1 and stage.part_rows is Stage.part_rows:
-        yield f"parts: {len(mine.parts)} are declared, but the method part_rows is missing"
     if not isinstance(stage.EXTRAS, (tuple, list)) or any(bad_name(name) for name in stage.EXTRAS):
-        yield f"EXTRAS: expected a tuple of names, got {short(stage.EXTRAS)}"
+        yield f"EXTRAS: expected a tuple of names, got {short_repr(stage.EXTRAS)}"
     for name, kind in (("look_ahead", int), ("required_extra", str)):
         value = getattr(stage, name)
         if not (hasattr(value, "__get__") and not inspect.isfunction(value)) and not isinstance(value, kind):
-            yield f"{name}: expected a property, got {short(value)}"
+            yield f"{name}: expected a property, got {short_repr(value)}"
 
 
-def _extras(stage: type[Stage], parent: type[Stage]) -> Iterator[str]:
+def _method_problems(stage: Any) -> Iterator[str]:
+    framed = issubclass(stage, FramedStage)
+    for name, arguments in {**METHODS, **({"frame": ("frames",)} if hasattr(stage, "frame") else {})}.items():
+        try:
+            inspect.signature(getattr(stage, name)).bind(None, *arguments)
+        except (AttributeError, TypeError, ValueError):
+            method = short_repr(getattr(stage, name, None))
+            yield f"{name}: expected a method {name}({', '.join(('self', *arguments))}), got {method}"
+    if stage.process is Stage.process or (
+        framed and stage.process is FramedStage.process and stage.frame is FramedStage.frame
+    ):
+        yield "expected a method process, or frame in a FramedStage; there is none"
+    if len(parts := stage.REPRESENTATION.parts) > 1 and stage.part_rows is Stage.part_rows:
+        yield f"parts: {len(parts)} are declared, but the method part_rows is missing"
+
+
+def _prefix_problems(stage: type[FramedStage]) -> Iterator[str]:
+    prefix = getattr(stage, "prefix", None)
+    if problem := bad_name(prefix):
+        yield f"prefix: {problem}"
+    names = {parameter.name for parameter in (stage.DECLARED_WITHIN or stage.REPRESENTATION).parameters}
+    for end in ("wname", "wSizeSec", "hSizeSec"):
+        if f"{prefix}_{end}" not in names:
+            yield f"prefix: expected frame_parameters({prefix!r}), which declare {prefix}_{end}"
+
+
+def _extra_problems(stage: type[Stage], parent: type[Stage]) -> Iterator[str]:
     if stage.required_extra is not Stage.required_extra and len(inspect.signature(stage.process).parameters) < 3:
         yield "required_extra: expected a method process(self, block, extra=None) that takes it"
     needed = vars(stage).get("required_extra", "")
@@ -133,7 +141,7 @@ def _extras(stage: type[Stage], parent: type[Stage]) -> Iterator[str]:
 
 
 def _commands(one: Representation) -> tuple[str, ...]:
-    """Its requests and ports, which are commands of one namespace in Tcl and MATLAB."""
+    """Return its requests and ports, which are commands of one namespace in Tcl and MATLAB."""
     return (one.request, *one.request_aliases, one.port, *one.port_aliases)
 
 
@@ -141,32 +149,28 @@ def _words(one: Representation) -> tuple[str, ...]:
     return (one.kind, one.word, *one.word_aliases)
 
 
-def _results(one: Representation) -> set[str]:
-    """The keys of results of `rosafe.process`."""
-    return {*one.outputs, f"{one.kind}_time", f"{one.kind}_frameRate", *one.coordinates}
+def _results(one: Representation) -> list[str]:
+    """Return the keys of results of `rosafe.process`."""
+    return [*one.outputs, f"{one.kind}_time", f"{one.kind}_frameRate", *one.coordinates]
 
 
-def _values(one: Representation) -> set[str]:
-    return {name for p in one.parameters for name in (p.name, *p.aliases, *p.former)} | {d.name for d in one.derived}
-
-
-def _reserved(mine: Representation) -> Iterator[str]:
-    lower = {name.lower() for name in (*REQUESTS, *PORTS)}
+def _reserved_names(mine: Representation) -> Iterator[str]:
+    reserved = {name.lower() for name in (*REQUESTS, *PORTS)}
     commands = [name.lower() for name in _commands(mine)]
     for name in _commands(mine):
-        if name.lower() in lower or name.startswith("genom_"):
+        if name.lower() in reserved or name.startswith("genom_"):
             yield f"request or port: {name!r} is one of the component's own"
         if commands.count(name.lower()) > 1:
             yield f"request or port: there are two called {name!r}, apart from upper and lower case"
     if len(mine.parts) > 1 and mine.kind.lower() in {name.lower() for name in STRUCTS}:
         yield f"kind: {mine.kind!r} is the name of another message"
-    keys = [*mine.outputs, f"{mine.kind}_time", f"{mine.kind}_frameRate", *mine.coordinates]
+    keys = _results(mine)
     if len(set(keys)) < len(keys):
         yield f"coordinates: two results of rosafe.process would have one name, of {', '.join(keys)}"
 
 
 def _conflicts(mine: Representation, other: Representation) -> Iterator[str]:
-    """What both would be called; case does not count where it does not in names of files and commands."""
+    """Yield the names in use already. Those of files and commands are compared without regard to case."""
     for what, names in (("kind or word", _words), ("request or port", _commands), ("task", lambda one: (one.task,))):
         taken = {name.lower() for name in names(other)}
         for name in names(mine):
@@ -174,9 +178,6 @@ def _conflicts(mine: Representation, other: Representation) -> Iterator[str]:
                 yield f"{what}: {other.kind} has {name!r} already"
     if mine.name == other.name:
         yield f"name: {other.kind} has {mine.name!r} already"
-    if len(mine.parts) > 1 < len(other.parts) and mine.kind.lower() == other.kind.lower():
-        yield f"kind: {other.kind} has {mine.kind!r} already"
-    if both := _values(mine) & _values(other):
-        yield f"parameters: {other.kind} has {min(both)!r} already"
-    if both := _results(mine) & _results(other):
-        yield f"results: {other.kind} has {min(both)!r} already"
+    for what, keys in (("parameters", lambda one: one.value_names), ("results", _results)):
+        if both := set(keys(mine)) & set(keys(other)):
+            yield f"{what}: {other.kind} has {min(both)!r} already"

@@ -1,4 +1,4 @@
-"""The filterbank stage: which channels there are, and gammatone or DRNL filters for them."""
+"""The filterbank stage: the centre frequencies of the channels, and gammatone or DRNL filters for them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from rosafe.declarations.literature import GLASBERG_1990, HOHMANN_2002, JEPSEN_2008, LOPEZPOVEDA_2001, PATTERSON_1987
 from rosafe.declarations.parameter import MAX_SEQUENCE, Parameter
+from rosafe.declarations.reference import Citation
 from rosafe.declarations.representation import Representation
 from rosafe.dsp.drnl import DrnlBank
 from rosafe.dsp.erb import erb_rate, erb_rate_to_frequency
@@ -20,25 +22,25 @@ from rosafe.dsp.signal_format import SignalFormat
 from rosafe.dsp.stage import Stage
 
 MAX_CHANNELS = MAX_SEQUENCE
-MAX_RELATIVE_FREQUENCY = 0.475  # of the sample rate, for channels: speech at 16 kHz has them up to 7600 Hz
+MAX_RELATIVE_FREQUENCY = 0.475  # of the sample rate: channels up to 7600 Hz at 16 kHz
 
 
 class Filterbank(Stage):
-    """Frequency channels of the ear signals, (2, N) to (2, C, N). Any change of a parameter starts all filters anew.
+    """Frequency channels of the ear signals, (2, N) to (2, C, N). Any change of a parameter resets all filters.
 
-    Channels come from the list `fb_cfHz`; without one, `fb_nChannels` of them lie evenly on the ERB-rate scale from
-    `fb_lowFreqHz` to `fb_highFreqHz`; where that is 0, every `fb_nERBs` from the lowest on and strictly below the
-    highest. A change goes the same way: what was set last decides (numbers of ERBs drop number and list, number and
-    range drop the list, an empty list brings the others back).
+    Centre frequencies are given by the list `fb_cfHz`. If it is empty, `fb_nChannels` of them are spaced evenly on the
+    ERB-rate scale from `fb_lowFreqHz` to `fb_highFreqHz`. If that number is 0, there is one every `fb_nERBs` from the
+    lowest frequency on, strictly below the highest. In an update, the parameter set last decides: `fb_nERBs` clears
+    number and list, number and range clear the list, and an empty list restores the effect of the others.
 
-    `parameters` tells the channels in force: with a list, `fb_nERBs` is 0 and the range its first and last element;
+    `parameters` reports the current channels: with a list, `fb_nERBs` is 0 and the range is its first and last element;
     with a number of channels n, `fb_nERBs` is the width of the range divided by n, as in the original.
 
-    Where `fb_highFreqHz` has never been given and a channel at its default would lie at or above half of the sample
-    rate, 0.475 of that rate is in its place.
+    If `fb_highFreqHz` has never been given and a channel at its default would be at or above half of the sample rate,
+    0.475 of that rate is used instead.
 
-    The envelope of the output, (2, C, N), is provided to those who need it: 2 abs(H x) for gammatone; for DRNL see
-    `DrnlBank`. It costs time.
+    The envelope of the output, (2, C, N), is computed if a child requires it: 2 abs(H x) for gammatone; for DRNL see
+    `DrnlBank`. It takes additional time.
     """
 
     REPRESENTATION = Representation(
@@ -112,24 +114,33 @@ class Filterbank(Stage):
         coordinates=("fb_cfHz",),
         name_doc="The name of this activity",
         request_aliases=("Gammatone",),
-        port_doc="What each filterbank put out",
+        port_doc="Output of each filterbank",
         word="filterbank",
+        references=(
+            Citation(GLASBERG_1990, "spacing of the channels and bandwidth"),
+            Citation(PATTERSON_1987, "gammatone filters", (("fb_type", "gammatone"),)),
+            Citation(
+                HOHMANN_2002, "implementation as a cascade of complex one-pole filters", (("fb_type", "gammatone"),)
+            ),
+            Citation(LOPEZPOVEDA_2001, "DRNL filters", (("fb_type", "drnl"),)),
+            Citation(JEPSEN_2008, "parameters of the DRNL filters", (("fb_type", "drnl"),)),
+        ),
     )
     INPUT = ("ear", "time")
     EXTRAS = ("envelope",)
     CHANNEL_INDEPENDENT = True
 
-    _given: frozenset[str] = frozenset()  # of what follows the rate
+    _given: frozenset[str] = frozenset()  # parameters with a default that follows the sample rate
 
     @classmethod
     def effective_values(cls, values: Mapping[str, Any]) -> dict[str, Any]:
         frequencies = center_frequencies(values).tolist()
-        told = {**values, "fb_nChannels": len(frequencies), "fb_cfHz": frequencies}
+        reported = {**values, "fb_nChannels": len(frequencies), "fb_cfHz": frequencies}
         if values["fb_cfHz"]:
-            told.update(fb_lowFreqHz=frequencies[0], fb_highFreqHz=frequencies[-1], fb_nERBs=0.0)
+            reported.update(fb_lowFreqHz=frequencies[0], fb_highFreqHz=frequencies[-1], fb_nERBs=0.0)
         elif values["fb_nChannels"]:
-            told["fb_nERBs"] = float(erb_rate(frequencies[-1]) - erb_rate(frequencies[0])) / len(frequencies)
-        return told
+            reported["fb_nERBs"] = float(erb_rate(frequencies[-1]) - erb_rate(frequencies[0])) / len(frequencies)
+        return reported
 
     @classmethod
     def resolve_rate_defaults(
@@ -154,8 +165,8 @@ class Filterbank(Stage):
 
     def process(self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None) -> FloatArray:
         samples = self._as_valid_block(block)
-        place = self._output_array((2, len(self._frequencies), samples.shape[-1]), out)
-        output, envelope = self._bank.process(samples, "envelope" in self.provide, place)
+        output = self._output_array((len(samples), len(self._frequencies), samples.shape[-1]), out)
+        envelope = self._bank.process(samples, "envelope" in self.provide, output)
         self.provided = {} if envelope is None else {"envelope": envelope}
         return output
 
@@ -182,9 +193,10 @@ class Filterbank(Stage):
         values = self.resolve_rate_defaults(values, self._given, self.sample_rate)
         frequencies = center_frequencies(values)
         if frequencies.max() >= self.sample_rate / 2:
+            name = "fb_cfHz" if values["fb_cfHz"] else "fb_highFreqHz"
             raise ValueError(
-                f"{_chosen_by(values)}: a channel at {frequencies.max():.12g} Hz is not below half the sample rate; "
-                f"{MAX_RELATIVE_FREQUENCY * self.sample_rate:.12g} Hz would do"
+                f"{name}: expected channels below half the sample rate, got one at {frequencies.max():.12g} Hz; "
+                f"use at most {MAX_RELATIVE_FREQUENCY * self.sample_rate:.12g} Hz"
             )
         bank: GammatoneBank | DrnlBank
         if values["fb_type"] == "drnl":
@@ -194,29 +206,25 @@ class Filterbank(Stage):
         self._bank, self._frequencies, self.provided = bank, frequencies, {}
 
 
-def _chosen_by(values: Mapping[str, Any]) -> str:
-    return "fb_cfHz" if values["fb_cfHz"] else "fb_highFreqHz"
-
-
 def center_frequencies(values: Mapping[str, Any]) -> FloatArray:
-    """Centre frequencies (C,) in Hz that the checked parameters of `Filterbank` ask for; ValueError if impossible."""
+    """Return the centre frequencies (C,) in Hz for checked parameters of `Filterbank`, or raise ValueError."""
     if values["fb_cfHz"]:
         return np.array(values["fb_cfHz"])
     low, high, count, step = (values[f"fb_{name}"] for name in ("lowFreqHz", "highFreqHz", "nChannels", "nERBs"))
     if low > high or (low == high and count != 1):
-        raise ValueError(f"fb_lowFreqHz: {low:.12g} Hz is not below fb_highFreqHz ({high:.12g} Hz)")
+        raise ValueError(f"fb_lowFreqHz: expected less than fb_highFreqHz ({high:.12g} Hz), got {low:.12g} Hz")
     low_rate, high_rate = float(erb_rate(low)), float(erb_rate(high))
     if count:
         frequencies = erb_rate_to_frequency(np.linspace(low_rate, high_rate, count))
         frequencies[-1] = high
     else:
         frequencies = erb_rate_to_frequency(low_rate + step * np.arange(_steps_below(high_rate - low_rate, step)))
-    frequencies[0] = low  # the ends are what was asked for, not that after rounding there and back
+    frequencies[0] = low  # the exact value of the parameter, not its conversion to ERBs and back
     return frequencies
 
 
 def _steps_below(span: float, step: float) -> int:
-    """How many of 0, step, 2 step... lie strictly below `span`, whatever rounding does to a span of whole steps."""
+    """Return how many of 0, step, 2 step... are strictly below `span`, allowing for rounding errors."""
     if span / step > MAX_CHANNELS:
-        raise ValueError(f"fb_nERBs: {step:.12g} gives too many channels, at most {MAX_CHANNELS}")
+        raise ValueError(f"fb_nERBs: expected a distance that gives at most {MAX_CHANNELS} channels, got {step:.12g}")
     return max(1, math.ceil(span / step - 1e-9))

@@ -1,14 +1,4 @@
-"""The inner hair cell stage: rectification and loss of phase locking, by the models in use.
-
-* dau: T. Dau, D. Püschel and A. Kohlrausch (1996), "A quantitative model of the 'effective' signal processing in the
-  auditory system. I. Model structure", J. Acoust. Soc. Am. 99, 3615-3622
-* breebart: J. Breebaart, S. van de Par and A. Kohlrausch (2001), "Binaural processing model based on contralateral
-  inhibition. I. Model structure", J. Acoust. Soc. Am. 110, 1074-1088
-* bernstein: L. R. Bernstein, S. van de Par and C. Trahiotis (1999), "The normalized interaural correlation: accounting
-  for NoSπ thresholds obtained with Gaussian and 'low-noise' masking noise", J. Acoust. Soc. Am. 106, 870-876
-* joergensen: S. Jørgensen and T. Dau (2011), "Predicting speech intelligibility based on the signal-to-noise envelope
-  power ratio after modulation-frequency selective processing", J. Acoust. Soc. Am. 130, 1475-1487
-"""
+"""The inner hair cell stage: rectification and loss of phase locking, by one of several models."""
 
 from __future__ import annotations
 
@@ -18,26 +8,30 @@ from typing import Any
 import numpy as np
 import scipy
 
+from rosafe.declarations.literature import BERNSTEIN_1999, BREEBAART_2001, DAU_1996, JORGENSEN_2011, MAJDAK_2022
 from rosafe.declarations.parameter import Parameter
+from rosafe.declarations.reference import Citation
 from rosafe.declarations.representation import Representation
 from rosafe.dsp import kernels
 from rosafe.dsp.numeric_limits import SQUARE_TINY, TINY, FloatArray, clamp
 from rosafe.dsp.sos_filter import SosFilter
 from rosafe.dsp.stage import Stage
 
-# Butterworth low-pass after the rectification: order, cutoff (Hz), how many in cascade
+# Butterworth low-pass after the rectification: order, cutoff (Hz), number in cascade
 LOWPASS = {
     "joergensen": (1, 150.0, 1),
     "dau": (2, 1000.0, 1),
+    "dau1996": (1, 1000.0, 1),
     "breebart": (1, 2000.0, 5),
     "bernstein": (2, 425.0, 1),
 }
-# before the low-pass; "none" where it is not named
+# before the low-pass; "none" for other methods
 RECTIFICATION = {
     "halfwave": "halfwave",
     "fullwave": "fullwave",
     "square": "square",
     "dau": "halfwave",
+    "dau1996": "halfwave",
     "breebart": "halfwave",
     "bernstein": "compressed",
 }
@@ -49,11 +43,11 @@ RECTIFIERS: dict[str, Callable[[FloatArray], FloatArray]] = {
     "square": lambda samples: np.square(clamp(samples, SQUARE_TINY)),
 }
 ENVELOPE_METHODS = ("hilbert", "joergensen", "bernstein")
-METHODS = ("none", "halfwave", "fullwave", "square", "hilbert", "joergensen", "dau", "breebart", "bernstein")
+METHODS = ("none", "halfwave", "fullwave", "square", "hilbert", "joergensen", "dau", "breebart", "bernstein", "dau1996")
 
 
 class InnerHairCell(Stage):
-    """Firing probability from basilar membrane motion, (2, C, N) to (2, C, N). A change starts the filter anew.
+    """Firing probability from basilar membrane motion, (2, C, N) to (2, C, N). A change resets the filter.
 
     ========== ===================================================================================================
     none       x
@@ -62,14 +56,15 @@ class InnerHairCell(Stage):
     square     x**2
     hilbert    the envelope
     joergensen envelope, low-pass of order 1 at 150 Hz
-    dau        max(x, 0), low-pass of order 2 at 1 kHz
+    dau        max(x, 0), low-pass of order 2 at 1 kHz, as in Two!Ears
+    dau1996    max(x, 0), low-pass of order 1 at 1 kHz, as `ihc_dau1996` of the Auditory Modeling Toolbox
     breebart   max(x, 0), five low-passes of order 1 at 2 kHz, together 3 dB down at 770 Hz
-    bernstein  max(envelope**-0.77 x, 0)**2, low-pass of order 2 at 425 Hz; 0 where there is no envelope
+    bernstein  max(envelope**-0.77 x, 0)**2, low-pass of order 2 at 425 Hz; 0 if the envelope is 0
     ========== ===================================================================================================
 
-    All low-passes are Butterworth filters by the bilinear transform with prewarping. The envelope is the filterbank's
-    (`GammatoneBank`, `DrnlBank`), sample by sample: the result does not depend on blocks, as that of an FFT would.
-    ValueError where a low-pass would lie at or above half the sample rate.
+    All low-passes are Butterworth filters by the bilinear transform with prewarping. The envelope is an extra of the
+    filterbank (`GammatoneBank`, `DrnlBank`), computed sample by sample: unlike with an FFT, the result does not depend
+    on block boundaries. A low-pass at or above half the sample rate is a ValueError.
     """
 
     REPRESENTATION = Representation(
@@ -79,8 +74,17 @@ class InnerHairCell(Stage):
         axes=("ear", "channel", "time"),
         parameters=(Parameter("ihc_method", "string", "dau", "The IHC method name", choices=METHODS, fallback="dau"),),
         name_doc="The name of this activity",
-        port_doc="What each inner hair cell processor put out",
+        port_doc="Output of each inner hair cell processor",
         word="innerhaircell",
+        references=(
+            Citation(DAU_1996, "half-wave rectification and low-pass at 1 kHz", (("ihc_method", ("dau", "dau1996")),)),
+            Citation(MAJDAK_2022, "order of the low-pass", (("ihc_method", "dau1996"),)),
+            Citation(BREEBAART_2001, "half-wave rectification and low-pass of order 5", (("ihc_method", "breebart"),)),
+            Citation(
+                BERNSTEIN_1999, "compression of the envelope and low-pass at 425 Hz", (("ihc_method", "bernstein"),)
+            ),
+            Citation(JORGENSEN_2011, "envelope and low-pass at 150 Hz", (("ihc_method", "joergensen"),)),
+        ),
     )
 
     SUPPORTS_IN_PLACE = True
@@ -97,7 +101,7 @@ class InnerHairCell(Stage):
         if not self.required_extra:
             envelope = None
         elif envelope is None or np.shape(envelope) != samples.shape:
-            raise ValueError(f"envelope: {method} needs one of the shape of the block")
+            raise ValueError(f"envelope: {method} requires one of the shape of the block")
         elif rectification == "compressed":
             envelope = self._as_valid_block(envelope)
         else:
@@ -120,14 +124,14 @@ class InnerHairCell(Stage):
         if method in LOWPASS:
             order, cutoff, times = LOWPASS[method]
             if cutoff >= self.sample_rate / 2:
-                raise ValueError(f"ihc_method: {method} needs a sample rate above {2 * cutoff:.12g} Hz")
+                raise ValueError(f"ihc_method: {method} requires a sample rate above {2 * cutoff:.12g} Hz")
             sections = np.tile(scipy.signal.butter(order, cutoff, fs=self.sample_rate, output="sos"), (times, 1))
         self._lowpass = SosFilter(sections)
 
 
 def compressed(samples: FloatArray, envelope: FloatArray) -> FloatArray:
-    """max(envelope**-0.77 samples, 0)**2, 0 where there is no envelope."""
+    """Return max(envelope**-0.77 samples, 0)**2, and 0 if the envelope is 0."""
     result = np.power(envelope, COMPRESSION, out=np.zeros_like(envelope), where=envelope >= TINY)
     result *= samples
-    # the bound tells only where an envelope is smaller by far than the signal it is said to belong to
+    # the limit has an effect only if an envelope is far below its signal
     return np.square(clamp(np.maximum(result, 0.0, out=result), SQUARE_TINY))

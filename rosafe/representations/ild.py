@@ -1,23 +1,19 @@
-"""The interaural level difference stage.
-
-As in T. May, S. van de Par and A. Kohlrausch (2011), "A probabilistic model for robust localization based on a binaural
-auditory front-end", IEEE Trans. Audio Speech Lang. Process. 19, 1-13.
-"""
+"""The interaural level difference stage."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from rosafe.declarations.literature import MAY_2011
+from rosafe.declarations.reference import Citation
 from rosafe.declarations.representation import Representation
 from rosafe.dsp import kernels
 from rosafe.dsp.framing import FramedStage, frame_parameters
-from rosafe.dsp.numeric_limits import FloatArray
-
-EPSILON = 2.2204e-16  # the original's literal
+from rosafe.dsp.numeric_limits import EPSILON, FloatArray
 
 
 class Ild(FramedStage):
-    """Level of the right ear over the left in dB, (2, C, N) to (C, F); positive where the right ear is louder.
+    """Level of the right ear over the left in dB, (2, C, N) to (C, F); positive if the right ear is louder.
 
     10 log10((E_R + eps) / (E_L + eps)) with E = mean((window x)**2) per frame; silence gives 0 dB.
     """
@@ -30,6 +26,7 @@ class Ild(FramedStage):
         unit="dB",
         parameters=frame_parameters("ild"),
         port_doc="Interaural level differences (dB), in `left`",
+        references=(Citation(MAY_2011),),
     )
     prefix = "ild"
     CHANNEL_INDEPENDENT = True

@@ -1,4 +1,4 @@
-"""The input stage: sound card samples become floating point numbers."""
+"""The input stage: conversion of sound card samples to floating point numbers."""
 
 from __future__ import annotations
 
@@ -6,17 +6,19 @@ from typing import Any
 
 import numpy as np
 
+from rosafe.declarations.literature import TWOEARS_2018
 from rosafe.declarations.parameter import Parameter
+from rosafe.declarations.reference import Citation
 from rosafe.declarations.representation import Representation
 from rosafe.dsp.numeric_limits import FloatArray, clamp
 from rosafe.dsp.stage import Stage
 
 
 class Input(Stage):
-    """Scaling of the samples: y = x / in_normalizeValue if in_doNormalize, else y = x. It has no state.
+    """Scaling of the samples: y = x / in_normalizeValue if in_doNormalize, otherwise y = x. It has no state.
 
-    Full scale of int32 becomes 1 with the default of 2**31 - 1. Samples beyond ±1e70 are taken as that, those
-    below 1e-200 as 0.
+    Full scale of int32 becomes 1 with the default of 2**31 - 1. Samples beyond ±1e70 are clamped, those
+    below 1e-200 become 0.
     """
 
     REPRESENTATION = Representation(
@@ -31,16 +33,17 @@ class Input(Stage):
         ),
         name_doc="Name of the activity",
         port="inputProcPort",
-        port_doc="What the input processor put out",
+        port_doc="Output of the input processor",
+        references=(Citation(TWOEARS_2018),),
     )
     INPUT = ("ear", "time")
 
     def process(self, block: Any, extra: FloatArray | None = None, out: FloatArray | None = None) -> FloatArray:
-        """(2, N) of int32 or float to (2, N); ValueError for NaN and infinities."""
+        """Convert (2, N) of int32 or float to (2, N). NaN and infinities are a ValueError."""
         samples = self._as_valid_block(block)
-        if np.asarray(block).dtype.kind == "f":  # of whole numbers, all are finite and within the limit
+        if np.asarray(block).dtype.kind == "f":  # whole numbers are always finite and within the limit
             if not np.isfinite(samples).all():
-                raise ValueError("block: there are samples that are not finite")
+                raise ValueError("block: expected finite samples, got NaN or infinity")
             samples = clamp(samples)
         return samples / self._divisor
 

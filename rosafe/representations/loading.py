@@ -1,15 +1,17 @@
-"""Imports the modules of plugins. What one of them does, or fails with, at import does not affect the others."""
+"""Imports the modules of plugins. Side effects and failures of one import do not affect the others."""
 
 from __future__ import annotations
 
 import contextlib
+import functools
 import grp
+import importlib.metadata
 import importlib.util
 import os
 import pwd
 import stat
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
@@ -18,10 +20,11 @@ import numpy as np
 
 from rosafe.declarations import plugins
 from rosafe.dsp import old_names
+from rosafe.dsp.plugin_checks import text_of_exception
 
 
 class Loaded(NamedTuple):
-    """A module, or a class, of which a plugin consists."""
+    """The module or class of a plugin."""
 
     origin: str  # the path of the file, or the entry point
     found: Any
@@ -29,39 +32,38 @@ class Loaded(NamedTuple):
 
 
 def described(problem: BaseException) -> str:
-    """An exception as one line."""
-    try:
-        text = str(problem)
-    except Exception:
-        text = ""
-    where = f" (line {problem.lineno})" if isinstance(problem, SyntaxError) and problem.lineno else ""
-    return " ".join(f"{type(problem).__name__}: {text}".split()) + where
+    """Return an exception as one line."""
+    line = f" (line {problem.lineno})" if isinstance(problem, SyntaxError) and problem.lineno else ""
+    return " ".join(f"{type(problem).__name__}: {text_of_exception(problem)}".split()) + line
 
 
 def load(problems: list[str], warnings: list[str]) -> Iterator[Loaded]:
-    """Each plugin that can be imported; a line for each of the others is appended to `problems`."""
-    for folder in map(os.path.abspath, plugins.folders()):
-        for path in _files(folder, problems, warnings):
-            try:
-                with _contained(path):
-                    module = _imported(path)
-            except BaseException as problem:  # SystemExit and KeyboardInterrupt included: this is other people's code
-                problems.append(f"{path}: {described(problem)}")
-            else:
-                yield Loaded(path, module, path)
-    for point in plugins.entry_points():
-        origin = f"{point.name} ({point.value})"
+    """Yield each plugin that can be imported; append a line for each of the others to `problems`."""
+    for origin, load_plugin in _candidates(problems, warnings):
         try:
             with _contained(origin):
-                found = point.load()
-        except BaseException as problem:
+                found, path = load_plugin()
+        except BaseException as problem:  # including SystemExit and KeyboardInterrupt: the code is not ours
             problems.append(f"{origin}: {described(problem)}")
         else:
-            yield Loaded(origin, found, str(getattr(sys.modules.get(point.module), "__file__", "")))
+            yield Loaded(origin, found, path)
+
+
+def _candidates(problems: list[str], warnings: list[str]) -> Iterator[tuple[str, Callable[[], tuple[Any, str]]]]:
+    """Yield the origin of each plugin, and a function that imports it and returns it with its file."""
+    for folder in map(os.path.abspath, plugins.folders()):
+        for path in _files(folder, problems, warnings):
+            yield path, functools.partial(_import_file, path)
+    for point in plugins.entry_points():
+        yield f"{point.name} ({point.value})", functools.partial(_load_entry_point, point)
+
+
+def _load_entry_point(point: importlib.metadata.EntryPoint) -> tuple[Any, str]:
+    return point.load(), str(getattr(sys.modules.get(point.module), "__file__", ""))
 
 
 def _files(folder: str, problems: list[str], warnings: list[str]) -> list[str]:
-    """The files in `folder` that may be plugins; `folder` may be one of them."""
+    """Return the files in `folder` that may be plugins; `folder` may be such a file itself."""
     if os.path.isfile(folder) and folder.endswith(".py"):
         folder, name = os.path.split(folder)
         chosen = [name]
@@ -69,70 +71,68 @@ def _files(folder: str, problems: list[str], warnings: list[str]) -> list[str]:
         try:
             names = sorted(os.listdir(folder))
         except OSError as problem:
-            problems.append(
-                f"{folder}: named in {plugins.FOLDERS}, and not a folder that can be read: {problem.strerror}"
-            )
+            problems.append(f"{folder}: {plugins.FOLDERS}: expected a readable folder, got: {problem.strerror}")
             return []
         chosen = [name for name in names if name.endswith(".py") and not name.startswith(plugins.SKIPPED)]
     if folder not in sys.path:
-        sys.path.append(folder)  # last: for modules that the plugins share, not for replacing others
+        sys.path.append(folder)  # last, so that modules shared by plugins cannot replace others
     paths = [os.path.join(folder, name) for name in chosen]
     warnings += filter(None, map(_writable_by_others, [folder, *paths]))
     return paths
 
 
 def _writable_by_others(path: str) -> str:
-    """A warning if other users can change what is at `path`, which is run with the rights of this process."""
+    """Return a warning if other users can change the code at `path`, which this process executes."""
     try:
         status = os.stat(path)
-        own_group = grp.getgrgid(status.st_gid)
+        group = grp.getgrgid(status.st_gid)
         me = pwd.getpwuid(os.geteuid()).pw_name
     except (OSError, KeyError):
         return ""
     if status.st_uid not in (0, os.geteuid()):
-        who = f"user {status.st_uid}"
+        writer = f"user {status.st_uid}"
     elif status.st_mode & stat.S_IWOTH:
-        who = "all users"
-    elif status.st_mode & stat.S_IWGRP and (status.st_gid != os.getegid() or {*own_group.gr_mem} - {me}):
-        who = f"group {own_group.gr_name}"
+        writer = "all users"
+    elif status.st_mode & stat.S_IWGRP and (status.st_gid != os.getegid() or {*group.gr_mem} - {me}):
+        writer = f"group {group.gr_name}"
     else:
         return ""
-    return f"{path}: can be changed by {who}, and plugins run with your rights; chmod go-w {path}"
+    return f"{path}: can be changed by {writer}, and plugins run with your rights; chmod go-w {path}"
 
 
-def _imported(path: str) -> ModuleType:
+def _import_file(path: str) -> tuple[ModuleType, str]:
     name = f"rosafe_plugin_{Path(path).stem}"
     number = 2
-    while name in sys.modules:  # a file of the same name in another folder
+    while name in sys.modules:  # a file with the same name in another folder
         name, number = f"rosafe_plugin_{Path(path).stem}_{number}", number + 1
     spec = importlib.util.spec_from_file_location(name, path)
     assert spec is not None
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module  # dataclasses and pickle look it up there
+    sys.modules[name] = module  # required by dataclasses and pickle
     try:
         spec.loader.exec_module(module)
     except BaseException:
         del sys.modules[name]
         raise
-    return module
+    return module, path
 
 
 @contextlib.contextmanager
 def _contained(origin: str) -> Iterator[None]:
-    """Keep what a plugin does at import from others: standard output, working directory, environment, sys.path.
+    """Undo changes by the import of a plugin: working directory, environment, sys.path, numpy's error handling.
 
-    What it prints goes to standard error: the shell evaluates the output of scripts/env.sh, and programs read that of
-    commands.
+    Its output is redirected to standard error, because the shell evaluates the output of scripts/env.sh and programs
+    parse that of commands.
     """
     plugins.before_import(origin)
-    environment, path, errors = dict(os.environ), list(sys.path), np.geterr()
+    environment, path = dict(os.environ), list(sys.path)
     folder = os.open(".", os.O_RDONLY | os.O_CLOEXEC)
     sys.stdout.flush()
     output = os.dup(1)
     os.dup2(2, 1)
     try:
-        with contextlib.redirect_stdout(sys.stderr):
+        with contextlib.redirect_stdout(sys.stderr), np.errstate():
             yield
     finally:
         os.dup2(output, 1)
@@ -143,11 +143,10 @@ def _contained(origin: str) -> Iterator[None]:
             os.environ.clear()
             os.environ.update(environment)
         sys.path[:] = path
-        np.seterr(**errors)
 
 
 def old_names_used(path: str) -> list[str]:
-    """The names of 0.2 in the source at `path`."""
+    """Return the names of version 0.2 in the source at `path`."""
     try:
         return old_names.used(Path(path).read_bytes())
     except (OSError, SyntaxError, ValueError):

@@ -1,12 +1,4 @@
-"""Medial olivocochlear attenuation: how much the efferent reflex turns the cochlear amplifier down.
-
-* N. R. Clark, G. J. Brown, T. Jürgens and R. Meddis (2012), "A frequency-selective feedback model of auditory efferent
-  suppression and its implications for the recognition of speech in noise", J. Acoust. Soc. Am. 132, 1535-1541
-* M. C. Liberman (1988), "Response properties of cochlear efferent neurons: monaural vs. binaural stimulation and the
-  effects of noise", J. Neurophysiol. 60, 1779-1798
-* B. C. Backus and J. J. Guinan (2006), "Time-course of the human medial olivocochlear reflex", J. Acoust. Soc. Am. 119,
-  2889-2904
-"""
+"""The medial olivocochlear stage: attenuation of the cochlear amplifier by the efferent reflex."""
 
 from __future__ import annotations
 
@@ -14,14 +6,16 @@ from typing import Any
 
 import numpy as np
 
+from rosafe.declarations.literature import BACKUS_2006, CLARK_2012, LIBERMAN_1988
 from rosafe.declarations.parameter import Parameter
+from rosafe.declarations.reference import Citation
 from rosafe.declarations.representation import Representation
 from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.dsp.stage import Stage
 
-FACTORS = (-0.00012411, -0.051322, -6.3528, -206.11)  # of the cubic P(y), the attenuation in dB of a level in dB
-RISE, FALL = (float(level) for level in np.sort(np.roots(np.polyder(FACTORS))))  # between these it rises
-SILENCE = 1e-200  # anything that is as far below RISE
+FACTORS = (-0.00012411, -0.051322, -6.3528, -206.11)  # of the cubic P(y), the attenuation in dB for a level in dB
+RISE, FALL = (float(level) for level in np.sort(np.roots(np.polyder(FACTORS))))  # P rises between these levels
+SILENCE = 1e-200  # any value with a level far below RISE
 
 
 def _factor(name: str, side: str) -> Parameter:
@@ -31,14 +25,14 @@ def _factor(name: str, side: str) -> Parameter:
 
 
 class Moc(Stage):
-    """Attenuation in dB that the level of each channel asks for, (2, C, F) to (2, C, F); it has no state.
+    """Attenuation in dB for the level of each channel, (2, C, F) to (2, C, F); it has no state.
 
-    y = 20 log10(R), at least moc_thresholdRatedB, and then no less than -181.858339 and no more than -93.821837 dB,
-    between which P(y) = -0.00012411 y**3 - 0.051322 y**2 - 6.3528 y - 206.11 rises; the attenuation is P(y), no less
-    than 0 and no more than moc_maxAttenuationdB. Where R is 0 or less, it is 0.
+    y = 20 log10(R), raised to at least moc_thresholdRatedB, then limited to -181.858339 to -93.821837 dB, the range in
+    which P(y) = -0.00012411 y**3 - 0.051322 y**2 - 6.3528 y - 206.11 rises. The attenuation is P(y), limited to 0 to
+    moc_maxAttenuationdB. It is 0 if R is 0 or less.
 
-    Made for a DRNL filterbank with calibrated level. The attenuation is put out and not fed back to the filterbank;
-    factors other than 1 would act there only, and are refused.
+    Designed for a DRNL filterbank with calibrated level. The attenuation is output but not fed back to the filterbank.
+    Factors other than 1 would have an effect only there and are therefore a ValueError.
     """
 
     REPRESENTATION = Representation(
@@ -54,7 +48,7 @@ class Moc(Stage):
                 "moc_thresholdRatedB",
                 "double",
                 -180.0,
-                "Ratemap level below which there is no more change (dB)",
+                "Ratemap level below which the attenuation is constant (dB)",
                 -1000.0,
                 0.0,
                 aliases=("moc_mocThresholdRatedB",),
@@ -72,23 +66,28 @@ class Moc(Stage):
             ),
         ),
         port_doc="Attenuations (dB)",
+        references=(
+            Citation(CLARK_2012, "attenuation by the rate"),
+            Citation(LIBERMAN_1988, "efferent responses"),
+            Citation(BACKUS_2006, "human reflex"),
+        ),
     )
 
     def process(self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None) -> FloatArray:
         rates = self._as_valid_block(block)
         levels = 20 * np.log10(np.maximum(rates, SILENCE))
-        np.minimum(np.maximum(levels, self._least, out=levels), FALL, out=levels)
+        np.minimum(np.maximum(levels, self._min_level, out=levels), FALL, out=levels)
         attenuation = np.full(levels.shape, FACTORS[0])
         for factor in FACTORS[1:]:
             attenuation *= levels
             attenuation += factor
-        np.minimum(np.maximum(attenuation, 0.0, out=attenuation), self._most, out=attenuation)
+        np.minimum(np.maximum(attenuation, 0.0, out=attenuation), self._max_attenuation, out=attenuation)
         attenuation[rates <= 0] = 0.0
         return attenuation
 
     def build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
         for name in ("moc_extIpsi", "moc_extContra"):
             if values[name] != 1:
-                raise ValueError(f"{name}: {values[name]:.12g} is not 1, and the attenuation is not fed back")
-        self._least = max(RISE, values["moc_thresholdRatedB"])
-        self._most = values["moc_maxAttenuationdB"]
+                raise ValueError(f"{name}: expected 1, as the attenuation is not fed back, got {values[name]:.12g}")
+        self._min_level = max(RISE, values["moc_thresholdRatedB"])
+        self._max_attenuation = values["moc_maxAttenuationdB"]

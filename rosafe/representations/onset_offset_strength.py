@@ -1,8 +1,4 @@
-"""Onset and offset strength: how fast the level of each channel rises and falls.
-
-* A. S. Bregman (1990), "Auditory scene analysis: the perceptual organization of sound", MIT Press
-* A. Klapuri (1999), "Sound onset detection by applying psychoacoustic knowledge", Proc. ICASSP, 3089-3092
-"""
+"""The onset and offset strength stages: rise and fall of the level of each channel from frame to frame."""
 
 from __future__ import annotations
 
@@ -10,13 +6,15 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from rosafe.declarations.literature import BREGMAN_1990, KLAPURI_1999
 from rosafe.declarations.parameter import Parameter
+from rosafe.declarations.reference import Citation
 from rosafe.declarations.representation import Representation
 from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.dsp.signal_format import SignalFormat
 from rosafe.dsp.stage import Stage
 
-SILENCE = 1e-200  # rates below this are taken as this: -2000 dB
+SILENCE = 1e-200  # lower rates are raised to this: -2000 dB
 
 
 def _limit(name: str, what: str) -> Parameter:
@@ -24,16 +22,16 @@ def _limit(name: str, what: str) -> Parameter:
 
 
 class _Strength(Stage):
-    """How many dB the level changes by from frame to frame in one direction, bounded; (2, C, F) to (2, C, F).
+    """The change of the level from frame to frame in one direction, limited, in dB; (2, C, F) to (2, C, F).
 
-    The level 10 log10(max(R, 1e-200)) dB is provided to those who need it. Other channels than before mean a new
-    beginning; otherwise the last level stays, whatever changes.
+    The level 10 log10(max(R, 1e-200)) dB is provided as an extra. A change of the channels resets the last level; all
+    other changes keep it.
     """
 
     EXTRAS = ("level",)
     RISING: ClassVar[bool]
 
-    _last: FloatArray | None = None  # level of the last frame, (2, C, 1); None before the first one
+    _last: FloatArray | None = None  # level of the last frame, (2, C, 1); None before the first frame
 
     def process(self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None) -> FloatArray:
         rates = self._as_valid_block(block)
@@ -44,12 +42,10 @@ class _Strength(Stage):
         if levels.shape[-1] == 0:
             return strength
         if self._last is None or self._last.shape[:-1] != levels.shape[:-1]:
-            self._last = levels[..., :1]  # the first frame has changed by nothing
+            self._last = levels[..., :1]  # the change of the first frame is 0
         before = np.concatenate((self._last, levels[..., :-1]), axis=-1)
         more, less = (levels, before) if self.RISING else (before, levels)
-        np.subtract(more, less, out=strength)
-        np.maximum(strength, 0.0, out=strength)
-        np.minimum(strength, self._limit, out=strength)
+        np.clip(np.subtract(more, less, out=strength), 0.0, self._limit, out=strength)
         self._last = levels[..., -1:].copy()
         return strength
 
@@ -66,7 +62,7 @@ class _Strength(Stage):
 
 
 class OnsetStrength(_Strength):
-    """How fast levels rise, (2, C, F) to (2, C, F) in dB.
+    """The rise of the level, (2, C, F) to (2, C, F) in dB.
 
     min(max(L[k] - L[k-1], 0), ons_maxOnsetdB), with L the level of each channel in dB; 0 in the first frame.
     """
@@ -80,17 +76,21 @@ class OnsetStrength(_Strength):
         parameters=(_limit("ons_maxOnsetdB", "onset"),),
         request="OnsetProc",
         port_doc="Onset strengths (dB)",
+        references=(
+            Citation(KLAPURI_1999, "rise of the level in each channel"),
+            Citation(BREGMAN_1990, "grouping by common onset"),
+        ),
     )
     RISING = True
 
 
 class OffsetStrength(_Strength):
-    """How fast levels fall, (2, C, F) to (2, C, F) in dB.
+    """The fall of the level, (2, C, F) to (2, C, F) in dB.
 
     min(max(L[k-1] - L[k], 0), ofs_maxOffsetdB), with L the level of each channel in dB; 0 in the first frame.
 
-    In exact silence after sound the ratemap's integrator decays: the offset stays at what that loses from frame to
-    frame, 10.86 dB by default, until the level is -2000 dB.
+    In exact silence after sound the ratemap's integrator decays: the offset is constant, 10.86 dB per frame by
+    default, until the level is -2000 dB.
     """
 
     REPRESENTATION = Representation(
@@ -102,5 +102,9 @@ class OffsetStrength(_Strength):
         parameters=(_limit("ofs_maxOffsetdB", "offset"),),
         request="OffsetProc",
         port_doc="Offset strengths (dB)",
+        references=(
+            Citation(KLAPURI_1999, "change of the level in each channel"),
+            Citation(BREGMAN_1990, "grouping by common offset"),
+        ),
     )
     RISING = False

@@ -1,8 +1,4 @@
-"""The pitch stage: the period that the channels have in common.
-
-* R. Meddis and L. O'Mard (1997), "A unitary model of pitch perception", J. Acoust. Soc. Am. 102, 1811-1820
-* M. Slaney and R. F. Lyon (1990), "A perceptual pitch detector", Proc. ICASSP, 357-360
-"""
+"""The pitch stage: the period common to all channels."""
 
 from __future__ import annotations
 
@@ -14,31 +10,33 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
+from rosafe.declarations.literature import MEDDIS_1997, SLANEY_1990
 from rosafe.declarations.parameter import Parameter
+from rosafe.declarations.reference import Citation
 from rosafe.declarations.representation import Representation
 from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.dsp.rounding import round_half_away
 from rosafe.dsp.signal_format import SignalFormat
 from rosafe.dsp.stage import Stage
 
-MEMORY_SECONDS = 5.0  # of confidences
+CONFIDENCE_SECONDS = 5.0  # time over which the greatest confidence is determined
 MAX_ORDER = 99  # of the median
 
 
 class Pitch(Stage):
-    """Fundamental frequency, (2, C, L, F) to (2, 3, F): rows pitch (Hz, NaN for none), rawPitch (Hz, 0) and confidence.
+    """Fundamental frequency, (2, C, L, F) to (2, 3, F): rows pitch (Hz or NaN), rawPitch (Hz or 0), confidence.
 
-    1. s[l] = mean over channels of the autocorrelation, for 1 / max(pi_rangeHz) <= l / fs <= 1 / min(pi_rangeHz)
-    2. rawPitch = fs / l and confidence = s[l] at the highest peak of s inside that range, the first of equals, a
-       plateau counting at its middle; both 0 where no peak is above 0
+    1. s[l] = mean over channels of the autocorrelation, for 1 / pi_rangeHz[1] <= l / fs <= 1 / pi_rangeHz[0]
+    2. rawPitch = fs / l and confidence = s[l] at the highest peak of s within that range, the first of equals; the peak
+       of a plateau is at its middle; both are 0 if no peak is above 0
     3. q[k] = rawPitch[k], or 0 if confidence[k] is below pi_confThres times the greatest confidence of the last 5 s
     4. pitch[k] = median of q[k - floor(n/2)] to q[k + ceil(n/2) - 1], n = pi_medianOrder; q is 0 before the first frame
 
-    A frame comes out when the ceil(n/2) - 1 frames behind it have come. A change begins nothing anew: q and rawPitch
-    stay what they are for frames that have come, and the next frame that comes out is the first that has not.
-    Where channels change, all begins anew, and frames that were held back are dropped.
+    A frame is output when the following ceil(n/2) - 1 frames have arrived. A change of a parameter keeps q and rawPitch
+    of past frames, and the next output frame follows the previous one. A change of the channels resets the state and
+    drops pending frames.
 
-    ValueError where there are fewer than 3 lags in the range.
+    A range with fewer than 3 lags is a ValueError.
     """
 
     REPRESENTATION = Representation(
@@ -53,7 +51,7 @@ class Pitch(Stage):
                 "pi_rangeHz",
                 "sequence<double>",
                 (80.0, 400.0),
-                "Range of plausible pitches (Hz)",
+                "Lowest and highest plausible pitch (Hz)",
                 0.0,
                 open_minimum=True,
                 aliases=("p_pitchRangeHz",),
@@ -65,7 +63,7 @@ class Pitch(Stage):
                 "pi_confThres",
                 "double",
                 0.7,
-                "Least confidence, relative to the greatest of the last 5 s",
+                "Minimum confidence, relative to the greatest of the last 5 s",
                 0.0,
                 1.0,
                 aliases=("p_confThresPerc",),
@@ -81,13 +79,17 @@ class Pitch(Stage):
             ),
         ),
         port_doc="pitch (Hz), rawPitch (Hz) and confidence as channels",
+        references=(
+            Citation(MEDDIS_1997, "sum of the autocorrelations of all channels"),
+            Citation(SLANEY_1990, "peak of the sum"),
+        ),
     )
     INPUT = ("ear", "channel", "lag", "time")
 
     _channels: int  # of the last block; 0 before the first
-    _confidences: FloatArray  # (2, n), of the last 5 s of frames that have come
-    _frames: FloatArray  # (2, 3, n): q, rawPitch and confidence of the last frames that have been put out, then of
-    _pending_frames: int  # so many that have not
+    _confidences: FloatArray  # (ears, n), of the last 5 s
+    _frames: FloatArray  # (ears, 3, n): q, rawPitch and confidence of the last output frames, then of the pending ones
+    _pending_frames: int
 
     def __init__(self, input_format: SignalFormat | float, **parameters: Any) -> None:
         self.reset()
@@ -104,10 +106,9 @@ class Pitch(Stage):
         correlations = self._as_valid_block(block)
         channels, lags = correlations.shape[1:3]
         if lags != self.input_format.lags + 1:
-            raise ValueError(f"block: {lags} lags, and not {self.input_format.lags + 1}")
+            raise ValueError(f"block: expected {self.input_format.lags + 1} lags, got {lags}")
         if channels != self._channels:
-            self.reset()
-            self._channels = channels
+            self._begin(len(correlations), channels)
         summary = correlations[:, :, self._range].sum(axis=1) / channels
         lag, confidence = highest_peak(np.ascontiguousarray(summary.swapaxes(1, 2)))
         raw = np.divide(self.sample_rate, lag + self._range.start, out=np.zeros(lag.shape), where=confidence > 0)
@@ -116,7 +117,7 @@ class Pitch(Stage):
         return self._emit(np.stack((chosen, raw, confidence), axis=1))
 
     def _emit(self, arriving: FloatArray) -> FloatArray:
-        """What can be put out when frames (2, 3, F) of q, rawPitch and confidence have come."""
+        """Return the frames to output after new frames (2, 3, F) of q, rawPitch and confidence."""
         frames = np.concatenate((self._frames, arriving), axis=-1)
         held = self._pending_frames + arriving.shape[-1]
         count, order = max(0, held - self.look_ahead), self.values["pi_medianOrder"]
@@ -132,9 +133,13 @@ class Pitch(Stage):
         return output
 
     def reset(self) -> None:
-        self._channels = 0
-        self._confidences = np.empty((2, 0))
-        self._frames = np.zeros((2, 3, MAX_ORDER // 2))  # as many as the longest median wants
+        self._begin(0, 0)
+
+    def _begin(self, ears: int, channels: int) -> None:
+        """Reset for blocks of this leading shape."""
+        self._channels = channels
+        self._confidences = np.empty((ears, 0))
+        self._frames = np.zeros((ears, 3, MAX_ORDER // 2))  # enough for the longest median
         self._pending_frames = 0
 
     @cached_property
@@ -148,39 +153,42 @@ class Pitch(Stage):
             self.reset()
 
     def build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
-        low, high = min(values["pi_rangeHz"]), max(values["pi_rangeHz"])
+        low, high = values["pi_rangeHz"]
+        if low >= high:
+            raise ValueError(f"pi_rangeHz: expected the lowest and the highest pitch, got {low:.12g}, {high:.12g} Hz")
         seconds = np.arange(self.input_format.lags + 1) / self.sample_rate
         within = np.flatnonzero((seconds >= 1 / high) & (seconds <= 1 / low))
         if len(within) < 3:
             raise ValueError(
-                f"pi_rangeHz: {low:.12g} to {high:.12g} Hz are {len(within)} lags of the autocorrelation, wanted are 3"
+                f"pi_rangeHz: expected at least 3 lags of the autocorrelation, got {len(within)} from "
+                f"{low:.12g} to {high:.12g} Hz"
             )
         self._range = slice(int(within[0]), int(within[-1]) + 1)
-        self._reach = max(1, round_half_away(MEMORY_SECONDS * self.input_format.rate))  # frames
+        self._reach = max(1, round_half_away(CONFIDENCE_SECONDS * self.input_format.rate))  # frames
 
 
 def highest_peak(curves: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
-    """Place and height of the highest peak of each of curves (..., n), n being 3 or more; without one, height 0.
+    """Return index and height of the highest peak of each of curves (..., n), n >= 3; the height is 0 without a peak.
 
-    Of equally high ones, the first. A plateau is one peak, at its middle, rounded down. The ends are no peaks, and
-    below 0 there are none.
+    Of equally high peaks, it is the first. A plateau is one peak at its middle, rounded down. The ends and values below
+    0 do not count as peaks.
     """
     inner = curves[..., 1:-1]
     tops = (inner > curves[..., :-2]) & (inner >= curves[..., 2:])
     heights = np.where(tops, inner, -np.inf)
     place = heights.argmax(axis=-1)[..., np.newaxis]
     height = np.take_along_axis(heights, place, axis=-1)
-    if (height > np.take_along_axis(curves, place + 2, axis=-1)).all():  # no plateaus, as mostly
+    if (height > np.take_along_axis(curves, place + 2, axis=-1)).all():  # no plateaus: the usual case
         return place[..., 0] + 1, np.maximum(height[..., 0], 0.0)
     return _highest_of_plateaus(curves)
 
 
 def _highest_of_plateaus(curves: FloatArray) -> tuple[NDArray[np.int64], FloatArray]:
-    """As `highest_peak`, where there may be plateaus, or no peak at all."""
+    """Compute `highest_peak` of curves that may have plateaus or no peak."""
     here, following = curves[..., :-1], curves[..., 1:]
     rises = following > here
     number = 2 * np.arange(curves.shape[-1])
-    # of each step, twice its number, and one more where it falls; level ones are taken for the next one that is not
+    # twice the index of each step, plus 1 if it falls; level steps get the value of the next step that is not level
     steps = np.where(rises, number[:-1], np.where(following < here, number[:-1] + 1, number[-1]))
     steps = np.minimum.accumulate(steps[..., ::-1], axis=-1)[..., ::-1][..., 1:]
     peaks = rises[..., :-1] & (steps & 1 == 1)
@@ -191,17 +199,17 @@ def _highest_of_plateaus(curves: FloatArray) -> tuple[NDArray[np.int64], FloatAr
 
 
 def running_maximum(before: FloatArray, values: FloatArray, reach: int) -> tuple[FloatArray, FloatArray]:
-    """The last `reach` of all values, and the largest of each of `values` (2, F) and the reach - 1 in front of it.
+    """Return the last `reach` values, and the maximum of each of `values` (2, F) and the reach - 1 values before it.
 
-    No value is below 0. `before` (2, n) are those in front of the first.
+    No value is below 0. `before` (2, n) are the values before the first.
     """
     past = before[:, max(0, before.shape[1] - reach + 1) :]
-    past = np.concatenate((np.zeros((2, reach - 1 - past.shape[1])), past, values), axis=1)
+    past = np.concatenate((np.zeros((len(past), reach - 1 - past.shape[1])), past, values), axis=1)
     greatest = np.empty(values.shape)
     for first in range(0, values.shape[1], reach):
         part = slice(first, first + reach)
         greatest[:, part] = np.maximum.accumulate(values[:, part], axis=1)
-        # the largest from each of those before to their end
+        # the maximum from each earlier value to the last of them
         ends = np.maximum.accumulate(past[:, first : first + reach - 1][:, ::-1], axis=1)[:, ::-1]
         both = greatest[:, part][:, : reach - 1]
         np.maximum(both, ends[:, : both.shape[1]], out=both)

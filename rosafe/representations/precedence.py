@@ -1,12 +1,4 @@
-"""The precedence stage: time and level differences of the first wave front, with a reflection taken out of the ears.
-
-* J. Braasch (2013), "A precedence effect model to simulate localization dominance using an adaptive, stimulus
-  parameter-based inhibition process", J. Acoust. Soc. Am. 134, 420-435
-* R. M. Stern, A. S. Zeiberg and C. Trahiotis (1988), "Lateralization of complex binaural stimuli: a weighted-image
-  model", J. Acoust. Soc. Am. 84, 156-165
-* H. Wallach, E. B. Newman and M. R. Rosenzweig (1949), "The precedence effect in sound localization", Am. J. Psychol.
-  62, 315-336
-"""
+"""The precedence stage: time and level differences of the first wave front, after removal of a reflection."""
 
 from __future__ import annotations
 
@@ -18,42 +10,42 @@ from typing import Any
 import numpy as np
 import scipy
 
+from rosafe.declarations.literature import BRAASCH_2013, STERN_1988, WALLACH_1949
 from rosafe.declarations.parameter import Parameter
+from rosafe.declarations.reference import Citation
 from rosafe.declarations.representation import Derived, Part, Representation
 from rosafe.dsp import kernels
-from rosafe.dsp.framing import FrameBuffer, FramedStage, frame_parameters
+from rosafe.dsp.framing import BATCH, FrameBuffer, FramedStage, frame_parameters
 from rosafe.dsp.kernels import precedence as by_kernel
 from rosafe.dsp.kernels.precedence import INTERLEAVED_ROWS, TAPS, Taps, Windowed
-from rosafe.dsp.numeric_limits import SQUARE_TINY, TINY, FloatArray, clamp
-from rosafe.dsp.rounding import MAX_SAMPLES, round_half_away
+from rosafe.dsp.numeric_limits import EPSILON, SQUARE_TINY, TINY, FloatArray, clamp
+from rosafe.dsp.rounding import check_length, round_half_away
 from rosafe.dsp.signal_format import SignalFormat
 
-EPSILON = 2.2204e-16  # the original's literal
-SECONDS = 0.01  # that autocorrelations reach
-LOWEST = 100.0  # Hz: channels below weigh as one here
-ACTIVE_PEAK_RATIO = 10 ** (-12 / 20)  # of the highest peak of all channels: those that reach it are active
-MAX_FEW_ACTIVE = 5  # active channels; where there are no more, each channel is normalised
-MIN_ENERGY_RATIO = 1e-3  # of the strongest channel; weaker ones are left out then
-NOISE = 1e-13  # of what a correlation can be at most: what rounding leaves of a 0
-GAINS = np.arange(101) / 100  # that an echo may have
-RATIOS = GAINS / (1 + GAINS**2)  # of an autocorrelation at the echo's delay and at lag 0
-MAX_GAIN = 0.9  # of these
-SMALL, LARGE = 0, 1  # the two ways to clean
+MAX_LAG_SECONDS = 0.01  # of autocorrelations
+MIN_FREQUENCY = 100.0  # Hz: lower channels are weighted as at this frequency
+ACTIVE_PEAK_RATIO = 10 ** (-12 / 20)  # of the highest peak of all channels; channels that reach it are active
+MAX_FEW_ACTIVE = 5  # active channels; if there are no more, each channel is normalised
+MIN_ENERGY_RATIO = 1e-3  # of the strongest channel; weaker channels are ignored then
+NOISE = 1e-13  # of the maximum possible correlation: smaller ones are rounding errors of 0
+GAINS = np.arange(101) / 100  # possible gains of an echo
+RATIOS = GAINS / (1 + GAINS**2)  # autocorrelation at the delay of the echo, divided by that at lag 0
+MAX_GAIN = 0.9
+SMALL, LARGE = 0, 1  # the two filters that remove the echo
 PAIRS = np.array([(SMALL, SMALL), (LARGE, LARGE), (SMALL, LARGE), (LARGE, SMALL)])  # for left and right
-BATCH = 2**18  # samples per ear that are worked on at a time, to bound memory and stay in the cache
 
 
 class RunningSums:
-    """What has been summed since the start.
+    """The sums since the start.
 
     Attributes
     ----------
     gains, weights : ndarray (C,)
-        Of the channels' autocorrelations, and of the correlations that come out.
+        Weights of the autocorrelations of the channels, and of the output correlations.
     power : ndarray (2 C / 8, K, 8)
-        Spectra of the channels' weighted autocorrelations; the rows are those of the left ear, then of the right one.
+        Spectra of the weighted autocorrelations of the channels; rows of the left ear, then of the right one.
     energies : ndarray (2, C)
-        These autocorrelations at lag 0, where they are largest.
+        These autocorrelations at lag 0, their maximum.
     pairs : ndarray (4, L)
         Correlations of the `PAIRS`.
     """
@@ -62,36 +54,35 @@ class RunningSums:
         self.begin(np.empty(0), 0, 0)
 
     def begin(self, frequencies: FloatArray, bins: int, lags: int) -> None:
-        """Nothing has come yet of the channels at these frequencies (Hz)."""
+        """Reset the sums for channels at these frequencies (Hz)."""
         channels = len(frequencies)
-        self.gains, self.weights = 1 / np.maximum(frequencies, LOWEST), weights(frequencies)
+        self.gains, self.weights = 1 / np.maximum(frequencies, MIN_FREQUENCY), weights(frequencies)
         self.power = np.zeros((math.ceil(2 * channels / INTERLEAVED_ROWS), bins, INTERLEAVED_ROWS))
         self.energies = np.zeros((2, channels))
         self.pairs = np.zeros((len(PAIRS), lags))
 
 
 class Precedence(FramedStage):
-    """Of each frame of (2, C, N), with an echo taken out: ITD (C, F) in s, ILD (C, F) in dB, correlation (C, L, F).
+    """ITD (C, F) in s, ILD (C, F) in dB and correlation (C, L, F) of frames of (2, C, N) after removal of an echo.
 
-    Positive differences mean that the source is on the right: the left ear hears it later, the right one louder. With x
-    a frame times the window (hanning), fs the sample rate, f the centre frequencies and XC(a, b)[m] = sum a[n+m] b[n]:
+    Positive differences mean a source on the right: the left ear lags, the right one is louder. With x a frame times
+    the window (hanning), fs the sample rate, f the centre frequencies and XC(a, b)[m] = sum a[n+m] b[n]:
 
     1. Each ear's autocorrelations up to 10 ms, divided by max(f, 100 Hz), are summed since the start for each channel,
-       and these over channels to s. Where no more than 5 channels have their peaks within 12 dB of the highest one,
-       each channel is divided by its maximum before, and those with less than 0.001 of the strongest are left out.
-    2. The echo's delay d is where s is largest from 0.75 ms on; its gain b = 0, 0.01... 0.9 is the first one with
+       and these over channels to s. If no more than 5 channels have their peaks within 12 dB of the highest one, each
+       channel is first divided by its maximum, and channels with less than 0.001 of the strongest are ignored.
+    2. The delay d of the echo is the maximum of s from 0.75 ms on. Its gain b = 0, 0.01... 0.9 is the first one with
        b / (1 + b**2) >= s[d] / max s; it is faded by t = 1 up to 6 ms, (1 - (d - 1 - 6 Q) / (14 Q - 1))**4 up to
        20 ms, Q being 1 ms.
-    3. There are two ways to clean x: sum over i of (-b t)**i x[n - i d], which is 5 d longer than the frame, or sum
-       over i of (-1)**(i+1) b**(6-i) t**(5-i) x[n + (6-i) d], which is d shorter; i = 0...5.
-    4. Of the four pairs that these make for both ears, with all channels added up, correlations up to 1 ms are summed
-       since the start. The pair with the largest maximum is used.
+    3. Two filters remove the echo from x: sum over i of (-b t)**i x[n - i d], which is 5 d longer than the frame, and
+       sum over i of (-1)**(i+1) b**(6-i) t**(5-i) x[n + (6-i) d], which is d shorter; i = 0...5.
+    4. There are four pairs of these filters for both ears. For each pair, correlations of the sum of all channels up to
+       1 ms are summed since the start. The pair with the largest maximum is used.
     5. Its correlation in each channel is XC(l, r) / sqrt(sum l**2 sum r**2 + eps) W(f), with `weights` W. The ITD is
-       the lag of the first maximum, 0 where all lags are equal; the ILD 10 log10(sum r**2 / sum l**2), 0 where an ear
-       is silent.
+       the lag of the first maximum, 0 if all lags are equal. The ILD is 10 log10(sum r**2 / sum l**2), 0 if an ear is
+       silent.
 
-    Any parameter that is set begins the sums since the start anew, and so do other channels. Where centre frequencies
-    are not known they count as 0.
+    Any change of a parameter or of the channels resets the sums. Unknown centre frequencies are taken as 0.
     """
 
     REPRESENTATION = Representation(
@@ -104,7 +95,7 @@ class Precedence(FramedStage):
             Part("cc", ("channel", "lag", "time")),
         ),
         parameters=(
-            replace(frame_parameters("prec")[1], minimum=SECONDS),
+            replace(frame_parameters("prec")[1], minimum=MAX_LAG_SECONDS),
             frame_parameters("prec")[2],
             Parameter(
                 "prec_maxDelaySec",
@@ -121,6 +112,11 @@ class Precedence(FramedStage):
         coordinates=("prec_lags",),
         centred="lag",
         port_doc="Interaural time differences (s), level differences (dB) and correlations of the first wave front",
+        references=(
+            Citation(BRAASCH_2013),
+            Citation(STERN_1988, "weights of the channels"),
+            Citation(WALLACH_1949, "precedence effect"),
+        ),
     )
     prefix = "prec"
 
@@ -137,7 +133,7 @@ class Precedence(FramedStage):
     def state_size(self, rows: tuple[int, ...]) -> int:
         bins = self._points // 2 + 1
         groups = -(-math.prod(rows) // INTERLEAVED_ROWS) * INTERLEAVED_ROWS
-        return bins * (groups + 4)  # sums of spectra, and the tables of the transform
+        return bins * (groups + 4)  # sums of spectra, and tables of the transform
 
     def process(
         self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None
@@ -154,24 +150,22 @@ class Precedence(FramedStage):
             frames = self._frames(samples, self._framing.pinned)
             count = frames.number
         else:
-            views = self._framing.frames(self._buffer.append(clamp(samples, SQUARE_TINY)))
+            views = self._new_frames(clamp(samples, SQUARE_TINY))
             count = views.shape[-2]
         itd, ild = np.empty((channels, count)), np.empty((channels, count))
         cc = np.empty((channels, 2 * self._max_lag + 1, count))
         at_once = min(count, max(1, BATCH // max(1, channels * self._size)))
-        room = Windowed.room(at_once, channels, self._size)
+        buffers = Windowed.allocate(at_once, channels, self._size)
         for first in range(0, count, max(1, at_once)):
             part = slice(first, min(first + at_once, count))
-            taken = room.first(part.stop - first)
+            batch = buffers.first(part.stop - first)
             if compiled:
-                by_kernel.windowed(frames.part(first, part.stop - first), taken)
+                by_kernel.windowed(frames.part(first, part.stop - first), batch)
             else:
-                windowed(views[..., part, :], self._framing.window, taken)
-            self._localise(taken, itd[:, part], ild[:, part], cc[..., part])
+                windowed(views[..., part, :], self._framing.window, batch)
+            self._localise(batch, itd[:, part], ild[:, part], cc[..., part])
         if compiled:
             frames.save_tail()
-        else:
-            self._buffer.drop(count * self._framing.hop)
         return itd, ild, cc
 
     def reset(self) -> None:
@@ -188,23 +182,22 @@ class Precedence(FramedStage):
 
     def build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
         rate = self.sample_rate
-        lag, first_delay = values["prec_maxDelaySec"] * rate, math.floor(0.75 * rate / 1000)
-        if lag > MAX_SAMPLES:
-            raise ValueError(f"prec_maxDelaySec: too long, {lag:.6g} samples")
+        lag = check_length("prec_maxDelaySec", values["prec_maxDelaySec"] * rate)
+        first_delay = math.floor(0.75 * rate / 1000)
         if first_delay < 1:
-            raise ValueError(f"sample_rate: {rate:.12g} Hz is too low for precedence, which needs 1334 Hz")
+            raise ValueError(f"sample_rate: expected at least 1334 Hz for precedence, got {rate:.12g} Hz")
         super().build({**values, "prec_wname": "hanning"}, changed)
         self._size = len(self._framing.window)
         self._max_lag, self._pair_reach = math.ceil(lag), math.ceil(rate / 1000)
-        self._first_delay, self._last_delay = first_delay, round_half_away(SECONDS * rate)
+        self._first_delay, self._last_delay = first_delay, round_half_away(MAX_LAG_SECONDS * rate)
         self._lag_weights = fading(np.arange(self._last_delay + 1), round_half_away(rate / 1000))
         self._points = 1 << (self._size + self._last_delay - 1).bit_length()
         self._running = RunningSums()
 
-    # --- some frames ----------------------------------------------------------------------------------------------
+    # --- a batch of frames -----------------------------------------------------------------------------------------
 
     def _localise(self, frames: Windowed, itd: FloatArray, ild: FloatArray, cc: FloatArray) -> None:
-        """Fill in the results (C, F), (C, F) and (C, L, F)."""
+        """Compute the results (C, F), (C, F) and (C, L, F)."""
         count, running = itd.shape[1], self._running
         filters = self._filters(self._autocorrelations(frames))
 
@@ -218,7 +211,7 @@ class Precedence(FramedStage):
         left, right = frames.samples[:, 0], frames.samples[:, 1]
         place = np.arange(count)[:, np.newaxis]
         l_taps, r_taps = (filters.of(place, ear, best[:, [ear]]) for ear in range(2))  # (F, 1)
-        reach = min(self._max_lag, self._size + (TAPS - 1) * self._last_delay - 1)  # beyond, nothing overlaps
+        reach = min(self._max_lag, self._size + (TAPS - 1) * self._last_delay - 1)  # no overlap at longer lags
         lags, energies = self._correlate(left, l_taps, right, r_taps, reach)
         lags *= (running.weights / np.sqrt(energies[0] * energies[1] + EPSILON))[..., np.newaxis]
         if reach < self._max_lag:
@@ -230,7 +223,7 @@ class Precedence(FramedStage):
         ild[...] = 10 * (levels[1] - levels[0]).T
 
     def _autocorrelations(self, frames: Windowed) -> FloatArray:
-        """Summed since the start and over channels, (F, 2, lags from 0 on)."""
+        """Return autocorrelations summed over channels and since the start, (F, 2, lags from 0 on)."""
         running = self._running
         energies = np.cumsum(np.concatenate((running.energies[np.newaxis], frames.energies * running.gains)), axis=0)
         running.energies = energies[-1].copy()
@@ -247,11 +240,11 @@ class Precedence(FramedStage):
         lags: FloatArray = scipy.fft.irfft(spectra, self._points)
         lags = lags[..., : self._last_delay + 1]
         lags[np.abs(lags) < NOISE * lags[..., :1]] = 0.0
-        lags[..., self._size :] = 0.0  # nothing overlaps
+        lags[..., self._size :] = 0.0  # no overlap
         return lags
 
     def _filters(self, lags: FloatArray) -> Taps:
-        """What cleans frames whose `_autocorrelations` are these: (F, 2 ears, 2 ways) filters."""
+        """Return the filters (F, 2 ears, 2 filters) that remove the echo from frames with these autocorrelations."""
         delays = self._first_delay + lags[..., self._first_delay :].argmax(axis=-1)
         largest = lags.max(axis=-1)
         echo = np.take_along_axis(lags, delays[..., np.newaxis], axis=-1)[..., 0]
@@ -274,23 +267,23 @@ class Precedence(FramedStage):
 
 
 def fading(delays: Any, millisecond: int) -> FloatArray:
-    """How much of an echo counts, by its delay: all of it up to 6 ms, nothing from 20 ms on."""
+    """Return the weight of an echo by its delay: 1 up to 6 ms, 0 from 20 ms on."""
     late = (delays - 1 - 6 * millisecond) / (14 * millisecond - 1)
     return np.where(delays <= 6 * millisecond, 1.0, np.where(delays <= 20 * millisecond, (1 - late) ** 4, 0.0))
 
 
 def weights(frequencies: FloatArray) -> FloatArray:
-    """How much channels tell of a source's direction: W of Stern et al. (1988), greatest at some 600 Hz."""
+    """Return the weights W of channels by Stern et al. (1988), with a maximum at about 600 Hz."""
     low = np.minimum(frequencies, 1200.0)
     level: FloatArray = 0.0938272 * low - 0.000112586 * low**2 + 3.99154e-8 * low**3
     return 10 ** (level / 10) / 276
 
 
-# --- the twins of the kernels -----------------------------------------------------------------------------------
+# --- the same without kernels -----------------------------------------------------------------------------------
 
 
 def windowed(frames: FloatArray, window: FloatArray, output: Windowed) -> None:
-    """Frames (2, C, F, w) times the window (w,)."""
+    """Multiply frames (2, C, F, w) by the window (w,)."""
     np.multiply(frames.transpose(2, 0, 1, 3), window, out=output.samples)
     np.sum(output.samples, axis=2, out=output.sums)
     np.max(output.samples, axis=-1, out=output.peaks)
@@ -300,10 +293,10 @@ def windowed(frames: FloatArray, window: FloatArray, output: Windowed) -> None:
 def add_spectra(
     samples: FloatArray, points: int, gains: FloatArray, factors: FloatArray, power: FloatArray
 ) -> FloatArray:
-    """Add the power spectra of frames (F, 2, C, w), times `gains` (C,), to `power` as of `RunningSums`, frame by frame.
+    """Add the power spectra of frames (F, 2, C, w), times `gains` (C,), to `power` of `RunningSums`, frame by frame.
 
-    Returns what `power` is with each frame, times `factors` (F, 2, C) and summed over channels: (F, 2, K). The spectra
-    are of `points` points, K is half of these and one more.
+    Returns `power` after each frame, times `factors` (F, 2, C) and summed over channels: (F, 2, K). The transform has
+    `points` points, and K = points / 2 + 1.
     """
     sums = np.empty((len(samples), 2, power.shape[1]))
     row = np.arange(2 * len(gains)).reshape(2, -1)
@@ -318,9 +311,9 @@ def add_spectra(
 def correlate_filtered(
     left: FloatArray, left_taps: Taps, right: FloatArray, right_taps: Taps, reach: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Correlations of frames (F, A, w) of the two ears, each through its filter, over lags up to `reach`: (F, A, L).
+    """Correlate frames (F, A, w) of the two ears, each after its filter, over lags up to `reach`: (F, A, L).
 
-    The filters are (F, A), or (F, 1) for all alike. Also returns the filtered frames' energies, (2, F, A).
+    The filters are (F, A), or (F, 1) for all rows. Also returns the energies of the filtered frames, (2, F, A).
     """
     correlations, energies = np.empty((*left.shape[:2], 2 * reach + 1)), np.empty((2, *left.shape[:2]))
     alike = left_taps.shifts.shape[1] == 1
@@ -338,7 +331,7 @@ def correlate_filtered(
 
 
 def _filtered(rows: FloatArray, taps: Taps) -> FloatArray:
-    """(A, w) through one filter, with at least one sample."""
+    """Filter (A, w) by one filter; the result has at least one sample."""
     size = rows.shape[1]
     result = np.zeros((len(rows), max(1, size + taps.shifts[-1])))
     for shift, value in zip(*taps, strict=True):

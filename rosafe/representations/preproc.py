@@ -1,9 +1,4 @@
-"""The pre-processing stage: DC removal, pre-emphasis, gain control, level scaling and middle ear, in this order.
-
-Gain control: J. Tchorz and B. Kollmeier (2003), "SNR estimation based on amplitude modulation analysis with
-applications to noise suppression", IEEE Trans. Speech Audio Process. 11, 184-192. Pre-emphasis: S. Young et al. (2006),
-The HTK Book. Level: as in M. L. Jepsen, S. D. Ewert and T. Dau (2008), J. Acoust. Soc. Am. 124, 422-438.
-"""
+"""The pre-processing stage: DC removal, pre-emphasis, gain control, level scaling and middle ear, in this order."""
 
 from __future__ import annotations
 
@@ -12,7 +7,16 @@ from typing import Any
 import numpy as np
 import scipy
 
+from rosafe.declarations.literature import (
+    GOODE_1994,
+    JEPSEN_2008,
+    LOPEZPOVEDA_2001,
+    TCHORZ_2003,
+    TWOEARS_2018,
+    YOUNG_2006,
+)
 from rosafe.declarations.parameter import Parameter
+from rosafe.declarations.reference import Citation
 from rosafe.declarations.representation import Representation
 from rosafe.dsp.middle_ear import MODELS, middle_ear_fir
 from rosafe.dsp.numeric_limits import SQUARE_TINY, FloatArray, clamp
@@ -25,10 +29,10 @@ LEVEL_OF_RMS_1 = 100.0  # dB SPL
 
 
 class PreProc(Stage):
-    """Conditioning of the ear signals, (2, N) to (2, N). Any change of a parameter starts all filters anew.
+    """Conditioning of the ear signals, (2, N) to (2, N). Any change of a parameter resets all filters.
 
     DC removal is a Butterworth high-pass of order 4, in second-order sections. Level scaling multiplies by
-    10**((100 - pp_refSPLdB) / 20): inside, an RMS of 1 stands for 100 dB SPL.
+    10**((100 - pp_refSPLdB) / 20): in the tree, an RMS of 1 corresponds to 100 dB SPL.
     """
 
     REPRESENTATION = Representation(
@@ -87,7 +91,7 @@ class PreProc(Stage):
                 "Middle ear filter model (jepsen or lopezpoveda)",
                 choices=tuple(MODELS),
                 fallback="jepsen",
-                spellings={"jespen": "jepsen"},  # as the user guide writes it
+                spellings={"jespen": "jepsen"},  # as in the user guide
             ),
             Parameter(
                 "pp_bUnityComp", "boolean", False, "Compensation to have maximum of unity gain for middle ear filter"
@@ -95,8 +99,38 @@ class PreProc(Stage):
         ),
         name_doc="The name of this activity",
         request="PreProc",
-        port_doc="What each pre-processor put out",
+        port_doc="Output of each pre-processor",
         word="time",
+        references=(
+            Citation(TWOEARS_2018, "order of the steps"),
+            Citation(YOUNG_2006, "pre-emphasis", (("pp_bPreEmphasis", True),)),
+            Citation(TCHORZ_2003, "gain control", (("pp_bNormalizeRMS", True),)),
+            Citation(JEPSEN_2008, "level convention", (("pp_bLevelScaling", True),)),
+            Citation(
+                GOODE_1994,
+                "measurements of the middle ear",
+                (
+                    ("pp_bMiddleEarFiltering", True),
+                    ("pp_middleEarModel", "lopezpoveda"),
+                ),
+            ),
+            Citation(
+                LOPEZPOVEDA_2001,
+                "middle-ear filter",
+                (
+                    ("pp_bMiddleEarFiltering", True),
+                    ("pp_middleEarModel", "lopezpoveda"),
+                ),
+            ),
+            Citation(
+                JEPSEN_2008,
+                "middle-ear filter",
+                (
+                    ("pp_bMiddleEarFiltering", True),
+                    ("pp_middleEarModel", "jepsen"),
+                ),
+            ),
+        ),
     )
     INPUT = ("ear", "time")
 
@@ -121,7 +155,7 @@ class PreProc(Stage):
         if values["pp_bRemoveDC"]:
             cutoff = values["pp_cutoffHzDC"]
             if cutoff >= self.sample_rate / 2:
-                raise ValueError(f"pp_cutoffHzDC: {cutoff:.12g} Hz is not below half the sample rate")
+                raise ValueError(f"pp_cutoffHzDC: expected less than half the sample rate, got {cutoff:.12g} Hz")
             steps.append(
                 SosFilter(scipy.signal.butter(DC_ORDER, cutoff, "highpass", fs=self.sample_rate, output="sos"))
             )
@@ -133,7 +167,7 @@ class PreProc(Stage):
             fir = middle_ear_fir(values["pp_middleEarModel"], self.sample_rate, values["pp_bUnityComp"])
             steps.append(Fir(fir))
         self._steps = steps
-        # A constant factor may come after the middle ear as well as before it.
+        # A constant factor can be applied after the middle ear as well as before it.
         self._gain = 10 ** ((LEVEL_OF_RMS_1 - values["pp_refSPLdB"]) / 20) if values["pp_bLevelScaling"] else 1.0
 
 
@@ -145,10 +179,12 @@ class PreEmphasis:
         self.reset()
 
     def reset(self) -> None:
-        self.last = np.zeros((2, 1))  # x[n-1]
+        self.last = np.zeros((0, 1))  # x[n-1] of each ear
 
     def process(self, block: FloatArray) -> FloatArray:
-        """Filter (2, N)."""
+        """Filter (ears, N)."""
+        if len(self.last) != len(block):
+            self.last = np.zeros((len(block), 1))
         delayed = np.concatenate((self.last, block), axis=-1)
         self.last = delayed[:, -1:].copy()
         return block - self.coefficient * delayed[:, :-1]
@@ -158,8 +194,8 @@ class GainControl:
     """Division by the running RMS of the louder ear: y = x / max over ears of (sqrt(p) + 1e-8).
 
     p[n] = r p[n-1] + (1 - r) x[n]**2 with r = exp(-1 / time_constant). Each ear starts with its first block that is not
-    all zero, from the mean square p[-1] of that block's first samples, one time constant at most. This start is the
-    one thing in the chain that depends on where blocks are cut.
+    all zero. p[-1] is the mean square of the first samples of that block, at most one time constant. This start is the
+    only result in the chain that depends on block boundaries.
 
     Parameters
     ----------
@@ -170,16 +206,16 @@ class GainControl:
     FLOOR = 1e-8
 
     def __init__(self, time_constant: float) -> None:
-        self.retention = float(np.exp(-1 / time_constant))
-        self.start_span = max(1.0, time_constant)
+        self.decay_factor = float(np.exp(-1 / time_constant))
+        self.start_samples = max(1.0, time_constant)
         self.reset()
 
     def reset(self) -> None:
-        self.started = [False, False]
-        self.power = [SosFilter(leaky_integrator(self.retention)) for _ in range(2)]
+        self.started = [False, False]  # one ear uses the first
+        self.power = [SosFilter(leaky_integrator(self.decay_factor)) for _ in range(2)]
 
     def process(self, block: FloatArray) -> FloatArray:
-        """Normalise (2, N)."""
+        """Normalise (ears, N)."""
         gain = np.zeros(block.shape[-1])
         for ear, samples in enumerate(block):
             squares = np.square(clamp(samples, SQUARE_TINY))
@@ -191,25 +227,27 @@ class GainControl:
 
     def _start(self, ear: int, squares: FloatArray) -> None:
         if squares.any():
-            span = round_half_away(min(len(squares), self.start_span))
-            self.power[ear].state = np.array([[self.retention * squares[:span].mean(), 0.0]])
+            count = round_half_away(min(len(squares), self.start_samples))
+            self.power[ear].state = np.array([[self.decay_factor * squares[:count].mean(), 0.0]])
             self.started[ear] = True
 
 
 class Fir:
-    """A finite impulse response, by direct convolution: exact, and no faster by FFT at some 500 taps."""
+    """An FIR filter by direct convolution: exact, and as fast as an FFT at about 500 taps."""
 
     def __init__(self, taps: FloatArray) -> None:
         self.taps = taps
         self.reset()
 
     def reset(self) -> None:
-        self.history = np.zeros((2, len(self.taps) - 1))
+        self.history = np.zeros((0, len(self.taps) - 1))  # of each ear
 
     def process(self, block: FloatArray) -> FloatArray:
-        """Filter (2, N)."""
+        """Filter (ears, N)."""
         if block.shape[-1] == 0:
             return block
+        if len(self.history) != len(block):
+            self.history = np.zeros((len(block), len(self.taps) - 1))
         samples = np.concatenate((self.history, block), axis=-1)
         self.history = samples[:, block.shape[-1] :].copy()
         return np.array([np.convolve(ear, self.taps, mode="valid") for ear in samples])

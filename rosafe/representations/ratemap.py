@@ -1,7 +1,4 @@
-"""The ratemap (cochleagram) stage: smoothed firing rate per frame.
-
-G. J. Brown and M. Cooke (1994), "Computational auditory scene analysis", Comput. Speech Lang. 8, 297-336.
-"""
+"""The ratemap (cochleagram) stage: smoothed firing rate per frame."""
 
 from __future__ import annotations
 
@@ -9,7 +6,9 @@ from typing import Any
 
 import numpy as np
 
+from rosafe.declarations.literature import BROWN_1994
 from rosafe.declarations.parameter import Parameter
+from rosafe.declarations.reference import Citation
 from rosafe.declarations.representation import Representation
 from rosafe.dsp import kernels
 from rosafe.dsp.framing import FramedStage, frame_parameters
@@ -21,8 +20,8 @@ class Ratemap(FramedStage):
     """Leaky integration and mean per frame, (2, C, N) to (2, C, F).
 
     u[n] = r u[n-1] + (1 - r) x[n] with r = exp(-1 / (fs rm_decaySec)); then, per frame, mean(window u) for `magnitude`
-    or mean((window u)**2) for `power`. A change of rm_decaySec or rm_scaling starts the integrator anew; the samples
-    integrated before stay buffered.
+    or mean((window u)**2) for `power`. A change of rm_decaySec or rm_scaling resets the integrator but keeps
+    the buffered samples.
     """
 
     REPRESENTATION = Representation(
@@ -55,6 +54,7 @@ class Ratemap(FramedStage):
         request_aliases=("Ratemap",),
         port_aliases=("ratemapProcPort",),
         port_doc="Ratemaps",
+        references=(Citation(BROWN_1994),),
     )
     prefix = "rm"
     CHANNEL_INDEPENDENT = True
@@ -75,5 +75,5 @@ class Ratemap(FramedStage):
     def build(self, values: dict[str, Any], changed: frozenset[str]) -> None:
         super().build(values, changed)
         if changed & {"rm_decaySec", "rm_scaling"}:
-            retention = float(np.exp(-1 / (self.sample_rate * values["rm_decaySec"])))
-            self._integrator = SosFilter(leaky_integrator(retention))
+            decay_factor = float(np.exp(-1 / (self.sample_rate * values["rm_decaySec"])))
+            self._integrator = SosFilter(leaky_integrator(decay_factor))

@@ -1,4 +1,4 @@
-"""Finds the representations: the modules of this folder, then plugins; parents first."""
+"""Finds all representations: the modules of this folder, then plugins. Parents precede their children."""
 
 from __future__ import annotations
 
@@ -9,18 +9,18 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from rosafe.declarations.checks import short
 from rosafe.declarations.representation import Representation
+from rosafe.declarations.text import short_repr
 from rosafe.dsp.plugin_checks import checked
 from rosafe.dsp.stage import Stage
 from rosafe.representations import checks, loading
 
-# The original's processors, in its order: also that of getParameters and getSignals, which report no others.
+# The processors of the original, in its order, which getParameters and getSignals also use; they report no others.
 CORE_KINDS = ("input", "preProc", "gammatone", "ihc", "ild", "ratemap", "crossCorrelation")
 
 
 def _stages_in(found: Any) -> list[type[Stage]]:
-    """The classes with a declaration that a module itself defines, each once; or the class of an entry point."""
+    """Return the classes with a declaration that a module itself defines, or the class of an entry point."""
     if not isinstance(found, ModuleType):
         return [found]
     own = {id(v): v for v in vars(found).values() if isinstance(v, type) and v.__module__ == found.__name__}
@@ -28,7 +28,7 @@ def _stages_in(found: Any) -> list[type[Stage]]:
 
 
 def builtin_stages() -> dict[str, type[Stage]]:
-    """The representations of this folder by kind, without plugins; parents first."""
+    """Return the representations of this folder by kind, without plugins; parents first."""
     found: dict[str, type[Stage]] = {}
     for info in pkgutil.iter_modules([str(Path(__file__).parent)]):
         if info.name != Path(__file__).stem:
@@ -38,7 +38,7 @@ def builtin_stages() -> dict[str, type[Stage]]:
 
 
 def _ordered(stages: Mapping[str, type[Stage]]) -> dict[str, type[Stage]]:
-    """The original's first, then by name, parents before their children; without those whose parent is missing."""
+    """Sort by `CORE_KINDS`, then by name, with parents before their children; drop kinds whose parent is missing."""
     waiting = sorted(stages, key=lambda kind: (CORE_KINDS.index(kind) if kind in CORE_KINDS else len(CORE_KINDS), kind))
     ordered: dict[str, type[Stage]] = {}
     while ready := [kind for kind in waiting if stages[kind].REPRESENTATION.parent in ("", *ordered)]:
@@ -48,16 +48,16 @@ def _ordered(stages: Mapping[str, type[Stage]]) -> dict[str, type[Stage]]:
 
 
 class _Search:
-    """All representations, of plugins too.
+    """All representations, including plugins.
 
     Attributes
     ----------
     stages : dict of str to type
-        By kind, parents first.
+        The stages by kind, parents first.
     plugins : dict of str to str
         The origin of each plugin, by kind: the path of its file, or its entry point.
     problems, warnings : list of str
-        A line for each plugin that is left out, and for each remark about one.
+        A line for each plugin that is left out, and for each remark about a plugin.
     """
 
     def __init__(self) -> None:
@@ -76,32 +76,32 @@ class _Search:
         self.stages = _ordered(self.stages)
 
     def _declared(self, origin: str, stage: Any) -> bool:
-        """Whether `stage` has a declaration; its absence is a problem."""
+        """Return whether `stage` has a declaration; append a problem if it has none."""
         declared = getattr(stage, "REPRESENTATION", None)
         if isinstance(stage, type) and isinstance(declared, Representation):
             return True
-        name = getattr(stage, "__name__", short(stage))
-        self.problems.append(f"{origin}: {name}: REPRESENTATION: expected a Representation, got {short(declared)}")
+        name = getattr(stage, "__name__", short_repr(stage))
+        self.problems.append(f"{origin}: {name}: REPRESENTATION: expected a Representation, got {short_repr(declared)}")
         return False
 
     def _accept(self, offered: list[tuple[str, type[Stage]]]) -> None:
-        """Take those that go together; the parent of a plugin may be another one, whatever their order."""
+        """Accept plugins without conflicts, in any order: the parent of a plugin may be another plugin."""
         while offered:
-            taken = next((one for one in offered if not checks.problem_of(one[1], self.stages)), None)
-            if taken is None:
+            accepted = next((one for one in offered if not checks.problem_of(one[1], self.stages)), None)
+            if accepted is None:
                 break
-            origin, stage = taken
+            origin, stage = accepted
             declared = stage.REPRESENTATION
-            if stage.INPUT is Stage.INPUT:  # which the author need not repeat
+            if stage.INPUT is Stage.INPUT:  # the default: the axes of the parent
                 stage.INPUT = self.stages[declared.parent].REPRESENTATION.parts[0].axes
             self.stages[declared.kind], self.plugins[declared.kind] = checked(stage), origin
             self.warnings += [
-                f"{origin}: {declared.kind}: the boolean {p.name} has the default True, and a plain ROS request "
-                "cannot tell False from a value that is not given; declare the inverse parameter with the default False"
+                f"{origin}: {declared.kind}: the boolean {p.name} has the default True, but a plain ROS request "
+                "cannot distinguish False from an omitted value; declare the inverse parameter with the default False"
                 for p in declared.parameters
                 if p.idl == "boolean" and p.default
             ]
-            offered.remove(taken)
+            offered.remove(accepted)
         for origin, stage in offered:
             problem = checks.problem_of(stage, self.stages)
             self.problems.append(f"{origin}: {stage.REPRESENTATION.kind}: {problem}")
@@ -109,4 +109,4 @@ class _Search:
 
 _SEARCH = _Search()
 STAGES, PLUGINS, PROBLEMS, WARNINGS = _SEARCH.stages, _SEARCH.plugins, _SEARCH.problems, _SEARCH.warnings
-BUILTIN = frozenset(builtin_stages())  # kinds that are no plugins
+BUILTIN = frozenset(builtin_stages())  # kinds that are not plugins

@@ -1,17 +1,4 @@
-"""Spectral features: fourteen numbers that describe the shape of each frame's spectrum.
-
-* G. Peeters, B. L. Giordano, P. Susini, N. Misdariis and S. McAdams (2011), "The Timbre Toolbox: extracting audio
-  descriptors from musical signals", J. Acoust. Soc. Am. 130, 2902-2916
-* H. Misra, S. Ikbal, H. Bourlard and H. Hermansky (2004), "Spectral entropy based feature for robust ASR", Proc.
-  ICASSP, 193-196
-* K. Jensen and T. H. Andersen (2004), "Real-time beat estimation using feature extraction", in Computer Music Modeling
-  and Retrieval, LNCS 2771, Springer, 13-22
-* A. Lerch (2012), "An introduction to audio content analysis", Wiley
-* G. Tzanetakis and P. Cook (2002), "Musical genre classification of audio signals", IEEE Trans. Speech Audio Process.
-  10, 293-302
-* E. Scheirer and M. Slaney (1997), "Construction and evaluation of a robust multifeature speech/music discriminator",
-  Proc. ICASSP, 1331-1334
-"""
+"""The spectral features stage: fourteen numbers that describe the shape of the spectrum of each frame."""
 
 from __future__ import annotations
 
@@ -23,22 +10,31 @@ from typing import Any
 
 import numpy as np
 
+from rosafe.declarations.literature import (
+    JENSEN_2004,
+    LERCH_2012,
+    MISRA_2004,
+    PEETERS_2011,
+    SCHEIRER_1997,
+    TZANETAKIS_2002,
+)
 from rosafe.declarations.parameter import Parameter
+from rosafe.declarations.reference import Citation
 from rosafe.declarations.representation import Representation
 from rosafe.dsp import kernels
 from rosafe.dsp.numeric_limits import LIMIT, FloatArray
 from rosafe.dsp.signal_format import SignalFormat
 from rosafe.dsp.stage import Stage
 
-E = 1e-15  # keeps quotients and logarithms finite
-LARGEST = LIMIT**2  # of the rates: the square of the largest sample
+E = 1e-15  # added to denominators and arguments of logarithms
+MAX_RATE = LIMIT**2  # the square of the largest sample
 
 
 @dataclass
 class Spectra:
-    """Spectra x_c of F frames with what several features make of them. Arrays are (C, 2, F), or (2, F) in each frame.
+    """Spectra x_c of F frames with intermediate results of several features. Arrays are (C, 2, F) or (2, F).
 
-    `extended` is (C, 2, F + 1): each spectrum's predecessor lies before it.
+    `extended` is (C, 2, F + 1): the spectra with the spectrum before the first one.
     """
 
     extended: FloatArray
@@ -56,7 +52,7 @@ class Spectra:
 
     @cached_property
     def total(self) -> FloatArray:
-        """X + E, X the sum over channels."""
+        """X + E, with X the sum over channels."""
         return self.x.sum(axis=0) + E
 
     @cached_property
@@ -65,7 +61,7 @@ class Spectra:
 
     @cached_property
     def center(self) -> FloatArray:
-        """Of gravity, in Hz."""
+        """The centre of gravity in Hz."""
         return self.moment(self.frequencies)
 
     @cached_property
@@ -75,7 +71,7 @@ class Spectra:
 
     @cached_property
     def deviations(self) -> FloatArray:
-        """From the mean over the channels, in standard deviations."""
+        """The deviations from the mean over the channels, in standard deviations."""
         deviations = self.x - self.mean
         channels = len(deviations)
         squares = np.einsum("cef,cef->ef", deviations, deviations)
@@ -87,7 +83,7 @@ class Spectra:
         return np.sqrt(np.einsum("cef,cef->ef", self.extended, self.extended)) + E
 
     def moment(self, weights: FloatArray) -> FloatArray:
-        """sum w_c x_c / (X + E)."""
+        """Return sum w_c x_c / (X + E)."""
         return np.einsum("c,cef->ef", weights, self.x) / self.total
 
 
@@ -172,21 +168,21 @@ class SpectralFeatures(Stage):
     crest        max x_c / (m + E)
     spread       sqrt(sum (f_c - g)**2 x_c / (X + E)) / f_max
     entropy      -sum p_c ln(p_c + E) / ln C
-    brightness   sum of x_c where f_c > sf_brCF, over X + E
+    brightness   sum of x_c with f_c > sf_brCF, over X + E
     hfc          sum f_c**2 x_c / (X + E), in Hz**2
     decrease     sum over c >= 1 of (x_c - x_0) / c, over E + sum over c >= 1 of x_c
-    flatness     exp(mean ln x_c) / (m + E); 0 where a channel is silent
+    flatness     exp(mean ln x_c) / (m + E); 0 if a channel is silent
     flux         sqrt(mean (D_c[k] - D_c[k-1])**2) in dB; 0 in the first frame
     kurtosis     mean ((x_c - m) / (s + E))**4, less 3
     skewness     mean ((x_c - m) / (s + E))**3
     irregularity sqrt(mean over c >= 1 of (D_c - D_(c-1))**2) in dB
-    rolloff      f_r / f_max, with f_r where x_0 + ... + x_c, joined by straight lines, reaches sf_roPerc X; f_0 where
-                 x_0 is enough; 0 for silence
-    variation    1 - sum x_c[k] x_c[k-1] / ((||x[k]|| + E) (||x[k-1]|| + E)); the first frame goes before itself
+    rolloff      f_r / f_max, with f_r where x_0 + ... + x_c, linearly interpolated, reaches sf_roPerc X; f_0 if
+                 x_0 alone reaches it; 0 for silence
+    variation    1 - sum x_c[k] x_c[k-1] / ((||x[k]|| + E) (||x[k-1]|| + E)); the first frame is its own predecessor
     ============ ====================================================================================================
 
-    Silence gives 0, but for kurtosis, -3, and variation, 1. With one channel, entropy, irregularity and s are 0.
-    Parameters change nothing but what is put out; other channels than before are a new beginning.
+    Silence gives 0, except for kurtosis (-3) and variation (1). With one channel, entropy, irregularity and s are 0.
+    A change of a parameter keeps the state; a change of the channels resets it.
     """
 
     REPRESENTATION = Representation(
@@ -199,7 +195,7 @@ class SpectralFeatures(Stage):
                 "sf_requests",
                 "sequence<string>",
                 ("all",),
-                "Features, in this order; all of them where one is all",
+                "Features, in this order; all of them if one is all",
                 choices=("all", *FEATURES),
                 least=1,
             ),
@@ -227,6 +223,14 @@ class SpectralFeatures(Stage):
         ),
         coordinates=("sf_requests",),
         port_doc="Spectral features, [feature][frame]",
+        references=(
+            Citation(PEETERS_2011, "descriptors of the spectrum"),
+            Citation(MISRA_2004, "entropy"),
+            Citation(JENSEN_2004, "high-frequency content"),
+            Citation(LERCH_2012, "crest, flatness, skewness and kurtosis"),
+            Citation(TZANETAKIS_2002, "centroid, roll-off and flux"),
+            Citation(SCHEIRER_1997, "roll-off and flux of speech and music"),
+        ),
     )
 
     _last: FloatArray | None = None  # the last spectra, (2, C, 1)
@@ -251,19 +255,19 @@ class SpectralFeatures(Stage):
         rates = self._as_valid_block(block)
         channels, known = rates.shape[1], len(self._frequencies)
         if not channels == known > 0:
-            raise ValueError(f"block: {channels} channels, and the center frequencies of {known} are known")
+            raise ValueError(f"block: expected {known} channels, those with known centre frequencies, got {channels}")
         if rates.shape[-1] == 0:
-            return np.empty((2, len(self._words), 0))
-        spectra = np.minimum(np.maximum(rates, 0.0), LARGEST)
+            return np.empty((len(rates), len(self._words), 0))
+        spectra = np.minimum(np.maximum(rates, 0.0), MAX_RATE)
         before = spectra[..., :1].copy() if self._last is None else self._last
         self._last = spectra[..., -1:].copy()
         bright, part = self.values["sf_brCF"], self.values["sf_roPerc"]
         if not kernels.compiled():
             extended = np.concatenate((before, spectra), axis=-1).swapaxes(0, 1)
             of = Spectra(np.ascontiguousarray(extended), self._frequencies, bright, part)
-            made = {word: FEATURES[word](of) for word in dict.fromkeys(self._words)}
-            return np.stack([made[word] for word in self._words], axis=1)
-        features = np.empty((2, len(FEATURES), rates.shape[-1]))
+            by_name = {word: FEATURES[word](of) for word in dict.fromkeys(self._words)}
+            return np.stack([by_name[word] for word in self._words], axis=1)
+        features = np.empty((len(rates), len(FEATURES), rates.shape[-1]))
         kernels.spectral_features(spectra, before, self._frequencies, bright, part, features)
         return features if self._words == tuple(ORDER) else features.take([ORDER[word] for word in self._words], axis=1)
 

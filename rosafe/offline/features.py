@@ -1,0 +1,142 @@
+"""Features from results: levels in dB and deltas; and several sounds in one call."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+import scipy.signal
+
+from rosafe.offline.process import process
+from rosafe.offline.result import Result
+from rosafe.tree.workers import workers_to_use
+
+_TINY = np.finfo(np.float64).tiny
+
+
+def to_db(
+    values: npt.ArrayLike, reference: float | str = 1.0, floor: float | None = -80.0, power: bool = False
+) -> npt.NDArray[Any]:
+    """Convert amplitudes or powers to levels in dB.
+
+    Parameters
+    ----------
+    values : array_like
+        Not negative, for example a ratemap.
+    reference : float or "max", optional
+        The value of 0 dB; "max" is the largest of `values`.
+    floor : float or None, optional
+        The lowest level in dB, relative to the reference. None for no limit: 0 becomes -inf.
+    power : bool, optional
+        Whether `values` are powers: 10 log10 instead of 20 log10. A ratemap is a power if `rm_scaling` is ``power``.
+
+    Returns
+    -------
+    ndarray
+        Levels in dB, of the shape and floating type of `values`.
+
+    Raises
+    ------
+    ValueError
+        For negative values, and for a reference that is not positive.
+
+    Examples
+    --------
+    >>> import rosafe
+    >>> rosafe.to_db([1.0, 0.1, 0.0])
+    array([  0., -20., -80.])
+    """
+    array = np.asarray(values)
+    array = array if array.dtype.kind == "f" else array.astype(np.float64)
+    if np.any(array < 0):
+        raise ValueError(f"values: expected no negative numbers, got {np.nanmin(array):g}")
+    largest = reference == "max"
+    if not largest and (isinstance(reference, str) or not reference > 0):
+        raise ValueError(f'reference: expected a positive number or "max", got {reference!r}')
+    one = max(float(np.nanmax(array, initial=0.0)), _TINY) if largest else float(reference)
+    with np.errstate(divide="ignore"):
+        levels = (10.0 if power else 20.0) * np.log10(array / array.dtype.type(one))
+    return levels if floor is None else np.maximum(levels, array.dtype.type(floor))
+
+
+def deltas(values: npt.ArrayLike, width: int = 9, order: int = 1, axis: int = -1) -> npt.NDArray[np.float64]:
+    """Return the slope of values over frames: the first (or higher) derivative of a local polynomial fit.
+
+    The fit is that of Savitzky and Golay (Anal. Chem. 36, 1964, 1627-1639) with a polynomial of degree `order`, as in
+    `librosa.feature.delta`. At both ends, the polynomial of the first and last `width` frames is used.
+
+    Parameters
+    ----------
+    values : array_like
+        For example a ratemap, (2, C, F).
+    width : int, optional
+        Number of frames of the fit: odd, at least 3, more than `order`, at most the number of frames.
+    order : int, optional
+        1 for deltas, 2 for delta-deltas.
+    axis : int, optional
+        The axis of the frames.
+
+    Returns
+    -------
+    ndarray
+        Change per frame**order, with the shape of `values`.
+
+    Raises
+    ------
+    ValueError
+        For an unsuitable width or order.
+
+    Examples
+    --------
+    >>> import numpy as np, rosafe
+    >>> rosafe.deltas(2.0 * np.arange(10)).round(9)
+    array([2., 2., 2., 2., 2., 2., 2., 2., 2., 2.])
+    """
+    array = np.asarray(values, np.float64)
+    frames = array.shape[axis] if array.ndim else 0
+    if order < 1 or width % 2 != 1 or not max(3, order + 1) <= width <= frames:
+        raise ValueError(
+            f"width: expected an odd number of frames from {max(3, order + 1)} to {frames} and an order of at least 1, "
+            f"got width {width} and order {order}"
+        )
+    slopes: npt.NDArray[np.float64] = scipy.signal.savgol_filter(
+        array, width, order, deriv=order, axis=axis, mode="interp"
+    )
+    return slopes
+
+
+def process_batch(signals: Iterable[Any], sample_rate: float, **options: Any) -> list[Result]:
+    """Compute the representations of several sounds, concurrently on the available cores.
+
+    Parameters
+    ----------
+    signals : iterable of array_like
+        Sounds as for `rosafe.process`, which may differ in length. An array (B, 2, N) is a batch of B sounds.
+    sample_rate : float
+        In Hz, of all sounds.
+    **options
+        `parameters`, `outputs`, `pad` and further arguments of `rosafe.process`.
+
+    Returns
+    -------
+    list of Result
+        In the order of the sounds; each is equal to the result of `rosafe.process`.
+
+    Raises
+    ------
+    ValueError
+        As `rosafe.process`; the message begins with the number of the sound, from 0.
+    """
+
+    def compute(numbered: tuple[int, Any]) -> Result:
+        number, signal = numbered
+        try:
+            return process(signal, sample_rate, **options)
+        except ValueError as problem:
+            raise ValueError(f"sound {number}: {problem}") from None
+
+    with ThreadPoolExecutor(workers_to_use()) as pool:
+        return list(pool.map(compute, enumerate(signals)))

@@ -1,0 +1,177 @@
+"""Comparisons of the binaural representations with closed forms and known stimuli."""
+
+from __future__ import annotations
+
+import numpy as np
+import scipy.signal
+
+from rosafe.declarations.literature import BRAASCH_2013, FALLER_2004, MAY_2011, WALLACH_1949
+from rosafe.dsp.numeric_limits import FloatArray
+from rosafe.validation.comparison import (
+    Collection,
+    Curve,
+    Measured,
+    Origin,
+    Process,
+    parameter,
+    scaled,
+    shifted,
+)
+from rosafe.validation.stimuli import delayed, largest, noise
+
+ROWS = Collection()
+RATE = 16000
+
+
+@ROWS.add(
+    "ild",
+    "noise with level differences from -30 to 30 dB",
+    Origin("known difference, right over left", MAY_2011),
+    "dB",
+    1e-4,  # the front-end adds 2.2e-16 to the energies
+    scaled("ild", 1 + 1e-5),
+)
+def level_differences(process: Process) -> Measured:
+    expected = np.arange(-30.0, 31, 10)
+    measured = []
+    for difference in expected:
+        signal = noise(4000) * np.array([[1.0], [10 ** (difference / 20)]])
+        values = process(signal, RATE, {}, ["ild"])["ild"]
+        measured.append(values.flat[np.argmax(np.abs(values - difference))])
+    curve = Curve(expected, expected, measured, "level difference (dB)", "ILD (dB)")
+    return Measured(largest(np.array(measured) - expected), curve)
+
+
+@ROWS.add(
+    "crossCorrelation",
+    "hair cell outputs for noise, partly common to both ears",
+    Origin("`scipy.signal.correlate` of windowed frames, normalised by their energies", MAY_2011),
+    "",
+    1e-9,  # the front-end adds 2.2e-16 to the product of the energies
+    parameter("cc_wname", "hamming"),
+)
+def cross_correlation(process: Process) -> Measured:
+    signal = np.stack((noise(3200, 1) + noise(3200, 2), np.roll(noise(3200, 1), 5) + noise(3200, 3)))
+    result = process(signal, RATE, {"fb_nChannels": 8}, ["ihc", "crossCorrelation"])
+    window, frame, lags = scipy.signal.windows.hann(320), 12, result["cc_lags"]
+    reach = len(lags) // 2
+    worst, curve = 0.0, None
+    for channel in range(8):
+        left, right = result["ihc"][:, channel, 160 * frame : 160 * frame + 320] * window
+        full = scipy.signal.correlate(left, right, method="direct")[319 - reach : 320 + reach]
+        expected = full / np.sqrt(np.sum(left**2) * np.sum(right**2))
+        measured = result["crossCorrelation"][channel, :, frame]
+        worst = max(worst, largest(measured - expected))
+        curve = curve or Curve(1e3 * lags, expected, measured, "lag (ms)", "cross-correlation")
+    return Measured(worst, curve)
+
+
+@ROWS.add(
+    "itd",
+    "noise with delays from -0.6 to 0.6 ms, channels from 300 Hz to 1.5 kHz, median over the frames",
+    Origin("known delay, positive if the left ear is late", MAY_2011),
+    "µs",
+    2.0,  # parabola through three lags of 62.5 µs
+    shifted("itd", 3e-6, "s"),
+)
+def time_differences(process: Process) -> Measured:
+    expected = np.linspace(-600, 600, 9)
+    measured, worst, source = [], 0.0, noise(RATE)
+    for delay in expected:
+        signal = np.stack((delayed(source, 1e-6 * delay, RATE), source))
+        parameters = {"fb_lowFreqHz": 300.0, "fb_highFreqHz": 1500.0, "cc_wSizeSec": 0.1}
+        channels = 1e6 * np.median(process(signal, RATE, parameters, ["itd"])["itd"], axis=-1)
+        measured.append(np.median(channels))
+        worst = max(worst, largest(channels - delay))
+    return Measured(worst, Curve(expected, expected, measured, "delay (µs)", "ITD (µs)"))
+
+
+@ROWS.add(
+    "ic",
+    "noise with interaural correlations from 0.5 to 1, long frames, no rectification",
+    Origin("known correlation of Gaussian noise", FALLER_2004),
+    "",
+    0.02,  # 4 s of noise
+    shifted("ic", -0.04),
+)
+def coherence(process: Process) -> Measured:
+    expected = np.array([0.5, 0.7, 0.9, 1.0])
+    measured = []
+    common, other = (noise(4 * RATE, seed) for seed in (1, 2))
+    filters = {"fb_lowFreqHz": 1000.0, "fb_highFreqHz": 4000.0, "fb_nChannels": 5}
+    parameters = {**filters, "ihc_method": "none", "cc_wSizeSec": 1.0, "cc_hSizeSec": 0.5, "cc_maxDelaySec": 0.0005}
+    for correlation in expected:
+        signal = np.stack((common, correlation * common + np.sqrt(1 - correlation**2) * other))
+        measured.append(process(signal, RATE, parameters, ["ic"])["ic"].mean())
+    curve = Curve(expected, expected, measured, "correlation", "IC")
+    return Measured(largest(np.array(measured) - expected), curve)
+
+
+def lead_and_lag(itd: float, level_db: float) -> FloatArray:
+    """Return noise with a reflection after 4 ms: the lead with an ITD in s, the lag with the opposite one."""
+    lead, echo = noise(RATE // 2, 5), 10 ** (level_db / 20) * np.roll(noise(RATE // 2, 5), round(0.004 * RATE))
+    return np.stack((delayed(lead, itd, RATE) + echo, lead + delayed(echo, itd, RATE)))
+
+
+@ROWS.add(
+    "precedence",
+    "noise and its reflection of -3 dB from the other side after 4 ms, ITDs of 0.375 and -0.375 ms",
+    Origin("lead dominates the lateral position", WALLACH_1949),
+    "µs",
+    63.0,  # one lag
+    shifted("precedence_itd", 62.5e-6, "s"),
+)
+def first_wave_front(process: Process) -> float:
+    return _lead_error(process, -3.0)
+
+
+@ROWS.add(
+    "precedence",
+    "the same with a reflection of -20 to -6 dB",
+    Origin("localization dominance of the lead by removal of the lag", BRAASCH_2013),
+    "µs",
+    1.0,
+    shifted("precedence_itd", 62.5e-6, "s"),
+)
+def localization_dominance(process: Process) -> float:
+    return max(_lead_error(process, level) for level in (-20.0, -10.0, -6.0))
+
+
+def _lead_error(process: Process, level_db: float) -> float:
+    worst = 0.0
+    for itd in (0.000375, -0.000375):
+        result = process(lead_and_lag(itd, level_db), RATE, {}, ["precedence"])
+        channels = (result["fb_cfHz"] > 300) & (result["fb_cfHz"] < 1300)
+        values = result["precedence_itd"][channels, 10:]
+        worst = max(worst, abs(float(np.median(values)) - itd))
+    return 1e6 * worst
+
+
+@ROWS.add(
+    "precedence",
+    "pairs of clicks of equal level, the second one from the other side after 2 to 7 ms; frames with clicks",
+    Origin("localization of the pair at the first click", WALLACH_1949),
+    "µs",
+    1.0,
+    shifted("precedence_itd", 62.5e-6, "s"),
+)
+def click_pairs(process: Process) -> Measured:
+    delays, itd, found = np.array([2.0, 3, 4, 5, 7]), 0.000375, []
+    for delay in delays:
+        result = process(_clicks(itd, 1e-3 * delay), RATE, {"rm_decaySec": 0.001}, ["precedence", "ratemap"])
+        channels = (result["fb_cfHz"] > 300) & (result["fb_cfHz"] < 1300)
+        levels = result["ratemap"][0].sum(0)
+        frames = np.flatnonzero(levels > 0.3 * levels.max())
+        found.append(float(np.median(result["precedence_itd"][channels][:, frames[frames > 10]])))
+    measured, expected = 1e6 * np.array(found), np.full(len(delays), 1e6 * itd)
+    curve = Curve(delays, expected, measured, "delay of the second click (ms)", "ITD (µs)")
+    return Measured(largest(measured - expected), curve)
+
+
+def _clicks(itd: float, delay: float) -> FloatArray:
+    """Return pairs of clicks every 0.1 s for 1 s: the first with an ITD in s, the second with the opposite one."""
+    signal, shift = np.zeros((2, RATE)), round(itd * RATE)
+    for begin in np.arange(0.05, 0.95, 0.1):
+        first, second = round(begin * RATE), round(begin * RATE) + round(delay * RATE)
+        signal[[0, 1, 1, 0], [first + shift, first, second + shift, second]] += 1.0
+    return signal

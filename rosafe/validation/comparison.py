@@ -1,0 +1,208 @@
+"""Comparisons of a representation with an independent reference, and the disturbances that they have to detect."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from rosafe.declarations.reference import Reference
+from rosafe.declarations.text import short_repr
+from rosafe.dsp.numeric_limits import FloatArray
+from rosafe.offline.result import Result
+
+KEMAR = Path("/usr/share/libmysofa/default.sofa")  # MIT KEMAR, in Debian's libmysofa1
+
+Process = Callable[[Any, float, Mapping[str, Any], Sequence[str]], Result]
+Change = Callable[[Process], Process]
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Reference values and measured values over a common axis, for a figure."""
+
+    x: Any
+    expected: Any
+    measured: Any
+    x_label: str
+    y_label: str
+    logarithmic: bool = False
+
+
+@dataclass(frozen=True)
+class Measured:
+    """The largest deviation from the reference."""
+
+    deviation: float
+    curve: Curve | None = None
+
+
+@dataclass(frozen=True)
+class Disturbance:
+    """A small error of the representation, which the comparison has to detect."""
+
+    text: str
+    change: Change
+
+
+@dataclass(frozen=True)
+class Origin:
+    """The publication, program or data set of the reference values.
+
+    Attributes
+    ----------
+    text : str
+        A section, equation, table or figure; or the name of a closed form, a program or a data set.
+    reference : Reference or None
+        The publication.
+    """
+
+    text: str = ""
+    reference: Reference | None = None
+
+    @property
+    def markdown(self) -> str:
+        """The text, with a link to the publication."""
+        if self.reference is None:
+            return self.text
+        label = self.reference.label
+        linked = f"[{label}](https://doi.org/{self.reference.doi})" if self.reference.doi else label
+        return f"{linked}, {self.text}" if self.text else linked
+
+    def __str__(self) -> str:
+        if self.reference is None:
+            return self.text
+        return ", ".join(filter(None, (self.reference.label, self.text, self.reference.doi)))
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """One row of the validation.
+
+    Attributes
+    ----------
+    kind : str
+        The representation.
+    subject : str
+        The quantity and the stimulus.
+    source : Origin
+        The publication, program or data set of the reference values.
+    unit : str
+        Of the deviation.
+    tolerance : float
+        The largest deviation of a valid representation.
+    disturbance : Disturbance
+        An error whose deviation exceeds the tolerance.
+    measure : callable
+        Computes the deviation with a function like `process`.
+    requires : str
+        A module, or a path, without which the comparison is skipped.
+    short : bool
+        Whether it is part of the short form, which needs no other toolbox.
+    """
+
+    kind: str
+    subject: str
+    source: Origin
+    unit: str
+    tolerance: float
+    disturbance: Disturbance
+    measure: Callable[[Process], Measured | float]
+    requires: str = ""
+    short: bool = True
+
+    @property
+    def group(self) -> str:
+        """The name of the module that defines it."""
+        return self.measure.__module__.rpartition(".")[2]
+
+    @property
+    def missing(self) -> str:
+        """The reason for which it cannot be computed here; empty if it can."""
+        if "/" in self.requires and not Path(self.requires).exists():
+            return f"{self.requires} is not installed (Debian's libmysofa1)"
+        return _import_problem("h5py" if "/" in self.requires else self.requires) if self.requires else ""
+
+
+@lru_cache
+def _import_problem(module: str) -> str:
+    """Return the reason for which a module cannot be imported; empty if it can."""
+    if not importlib.util.find_spec(module):
+        return f"{module} is not installed"
+    try:
+        importlib.import_module(module)
+    except Exception as problem:  # any failure of another toolbox, which must not end the validation
+        return f"{module} cannot be imported ({type(problem).__name__}: {short_repr(str(problem))})"
+    return ""
+
+
+@dataclass
+class Collection:
+    """The comparisons of a module, in the order of their definition."""
+
+    comparisons: list[Comparison] = field(default_factory=list)
+
+    def add(
+        self,
+        kind: str,
+        subject: str,
+        source: Origin,
+        unit: str,
+        tolerance: float,
+        disturbance: Disturbance,
+        requires: str = "",
+        short: bool = True,
+    ) -> Callable[[Callable[[Process], Measured | float]], Callable[[Process], Measured | float]]:
+        """Return a decorator that adds a comparison; its arguments are the attributes of `Comparison`."""
+
+        def register(measure: Callable[[Process], Measured | float]) -> Callable[[Process], Measured | float]:
+            row = Comparison(kind, subject, source, unit, tolerance, disturbance, measure, requires, short)
+            self.comparisons.append(row)
+            return measure
+
+        return register
+
+
+def parameter(name: str, value: Any) -> Disturbance:
+    """Return a disturbance that computes with another value of a parameter."""
+
+    def change(process: Process) -> Process:
+        return lambda signal, rate, parameters, outputs: process(signal, rate, {**parameters, name: value}, outputs)
+
+    return Disturbance(f"`{name}` = {value}", change)
+
+
+def altered(text: str, name: str, change_array: Callable[[FloatArray], FloatArray]) -> Disturbance:
+    """Return a disturbance of one output."""
+
+    def change(process: Process) -> Process:
+        def run(signal: FloatArray, rate: float, parameters: Mapping[str, Any], outputs: Sequence[str]) -> Result:
+            result = process(signal, rate, parameters, outputs)
+            if name in result:
+                result[name] = change_array(result[name])
+            return result
+
+        return run
+
+    return Disturbance(text, change)
+
+
+def scaled(name: str, factor: float) -> Disturbance:
+    """Return a disturbance that multiplies an output."""
+    return altered(f"{name} multiplied by {factor:.12g}", name, lambda values: values * factor)
+
+
+def shifted(name: str, amount: float, unit: str = "") -> Disturbance:
+    """Return a disturbance that adds a constant to an output."""
+    return altered(f"{name} + {amount:g} {unit}".rstrip(), name, lambda values: values + amount)
+
+
+def late(name: str, frames: int = 1) -> Disturbance:
+    """Return a disturbance that delays an output by some frames or samples."""
+    return altered(f"{name} late by {frames}", name, lambda values: np.roll(values, frames, axis=-1))

@@ -1,0 +1,403 @@
+"""Comparisons of the representations of each ear: rates, transients, periodicity, modulation, spectral shape."""
+
+from __future__ import annotations
+
+from math import pi
+
+import numpy as np
+import scipy.signal
+import scipy.stats
+
+from rosafe.declarations.literature import (
+    BROWN_1994,
+    EWERT_2000,
+    KLAPURI_1999,
+    LICKLIDER_1951,
+    MEDDIS_1997,
+    MISRA_2004,
+    PEETERS_2011,
+    RABINER_1977,
+    SCHADLER_2012,
+    TURGEON_2002,
+)
+from rosafe.dsp.numeric_limits import FloatArray
+from rosafe.interface.remarks import PRESETS
+from rosafe.validation.comparison import (
+    Collection,
+    Curve,
+    Measured,
+    Origin,
+    Process,
+    altered,
+    late,
+    parameter,
+    scaled,
+)
+from rosafe.validation.stimuli import THROUGH, both, complex_tone, largest, noise, through, tone
+
+ROWS = Collection()
+RATE = 16000
+
+
+# --- ratemap and transients --------------------------------------------------------------------------------------
+
+
+@ROWS.add(
+    "ratemap",
+    "decay of the level after the end of a sound",
+    Origin("leaky integrator with a time constant of 8 ms, closed form", BROWN_1994),
+    "dB per frame",
+    1e-6,
+    parameter("rm_decaySec", 0.0080001),
+)
+def ratemap_decay(process: Process) -> Measured:
+    signal = np.concatenate((np.ones(1600), np.zeros(4000)))
+    rates = process(through(signal), RATE, THROUGH, ["ratemap"])["ratemap"][0, 0]
+    measured = 10 * np.log10(rates)[12:]
+    expected = measured[0] - 20 * np.log10(np.e) * 0.01 / 0.008 * np.arange(len(measured))
+    times = 0.01 * (12 + np.arange(len(measured)))
+    return Measured(largest(np.diff(measured - expected)), Curve(times, expected, measured, "time (s)", "level (dB)"))
+
+
+@ROWS.add(
+    "ratemap",
+    "mean power of a tone in Hann windows of 20 ms after integration",
+    Origin("closed form: mean of the squared window times the squared input", BROWN_1994),
+    "(relative)",
+    1e-9,
+    parameter("rm_wname", "hamming"),
+)
+def ratemap_power(process: Process) -> float:
+    rates = process(through(np.full(8000, 0.3)), RATE, THROUGH, ["ratemap"])["ratemap"][0, 0]
+    expected = 0.3**2 * np.mean(scipy.signal.windows.hann(320) ** 2)
+    return abs(rates[-1] / expected - 1)
+
+
+@ROWS.add(
+    "onsetStrength",
+    "sum over the frames of a rise by 20 dB",
+    Origin("logarithmic difference of levels", KLAPURI_1999),
+    "dB",
+    1e-6,
+    scaled("onsetStrength", 1 + 1e-6),
+)
+def onset_sum(process: Process) -> float:
+    signal = np.repeat([0.01, 0.1], 8000)
+    strengths = process(through(signal), RATE, THROUGH, ["onsetStrength"])["onsetStrength"][0, 0]
+    return abs(float(strengths[30:].sum()) - 20)  # after the start of the integrator
+
+
+@ROWS.add(
+    "offsetStrength",
+    "strength in each frame of silence after a sound",
+    Origin("closed form: decay of the integrator, 10.857 dB per frame", KLAPURI_1999),
+    "dB",
+    1e-6,
+    parameter("rm_decaySec", 0.0080001),
+)
+def offset_decay(process: Process) -> float:
+    signal = np.concatenate((np.ones(1600), np.zeros(1600)))
+    strengths = process(through(signal), RATE, THROUGH, ["offsetStrength"])["offsetStrength"][0, 0]
+    return largest(strengths[12:] - 20 * np.log10(np.e) * 0.01 / 0.008)
+
+
+ONSETS = (0.2, 0.55, 0.9, 1.3)  # s; the bursts last 0.15 s
+
+
+def bursts() -> FloatArray:
+    """Return bursts of noise at known times in a weak background, 2 s."""
+    gain = np.full(2 * RATE, 0.01)
+    for begin in ONSETS:
+        gain[round(begin * RATE) : round((begin + 0.15) * RATE)] = 1.0
+    return both(gain * noise(2 * RATE))
+
+
+def transient_error(process: Process, output: str, times: np.ndarray) -> float:
+    """Return the largest distance of a marked frame to its time, or of a time to the next marked frame, in ms."""
+    marked = process(bursts(), RATE, {"trm_minStrengthdB": 8.0}, [output])[output][0]
+    active = np.flatnonzero(marked.sum(0) >= 10)  # in a third of the channels
+    if not len(active):
+        return np.inf
+    frames = 0.01 * active + 0.01  # middle of the window
+    distances = np.abs(frames[:, None] - times)
+    return 1e3 * float(max(distances.min(0).max(), distances.min(1).max()))
+
+
+@ROWS.add(
+    "onsetMap",
+    "four bursts of noise: times of the marked frames, missed and false ones included",
+    Origin("known times; events common to neighbouring channels", TURGEON_2002),
+    "ms",
+    20.0,
+    late("onsetMap", 2),
+)
+def onset_times(process: Process) -> float:
+    return transient_error(process, "onsetMap", np.array(ONSETS))
+
+
+@ROWS.add(
+    "offsetMap",
+    "ends of four bursts of noise: times of the marked frames, missed and false ones included",
+    Origin("known times; events common to neighbouring channels", TURGEON_2002),
+    "ms",
+    30.0,  # the integrator decays for some frames
+    late("offsetMap", 2),
+)
+def offset_times(process: Process) -> float:
+    return transient_error(process, "offsetMap", np.array(ONSETS) + 0.15)
+
+
+# --- periodicity -------------------------------------------------------------------------------------------------
+
+
+@ROWS.add(
+    "autocorrelation",
+    "hair cell output for a vowel-like sound, without clipping",
+    Origin("`scipy.signal.correlate` of windowed frames, divided by the number of products", LICKLIDER_1951),
+    "",
+    1e-11,
+    parameter("ac_K", 2.0000001),
+)
+def autocorrelation(process: Process) -> Measured:
+    signal = both(complex_tone(150, range(1, 20), RATE, 0.2) + 0.1 * noise(3200))
+    result = process(signal, RATE, {"fb_nChannels": 6, "ac_clipAlpha": 0.0}, ["ihc", "autocorrelation"])
+    window, frame = scipy.signal.windows.hann(320), 12
+    worst, curve = 0.0, None
+    for channel in range(6):
+        x = result["ihc"][0, channel, 160 * frame : 160 * frame + 320] * window
+        full = scipy.signal.correlate(x, x, method="direct")[319:]
+        expected = (full / full[0] * 320 / (320 - np.arange(320)))[:319]
+        measured = result["autocorrelation"][0, channel, :, frame]
+        worst = max(worst, largest(measured - expected))
+        lags = 1e3 * np.arange(200) / RATE
+        curve = curve or Curve(lags, expected[:200], measured[:200], "lag (ms)", "autocorrelation")
+    return Measured(worst, curve)
+
+
+@ROWS.add(
+    "autocorrelation",
+    "centre clipping at 60 % of the extremes of a frame",
+    Origin("`scipy.signal.correlate` of the clipped frame", RABINER_1977),
+    "",
+    1e-11,
+    parameter("ac_clipAlpha", 0.7),
+)
+def clipping(process: Process) -> float:
+    signal = noise(3200)
+    output = process(through(signal), RATE, THROUGH, ["autocorrelation"])["autocorrelation"][0, 0, :, 5]
+    x = signal[800:1120] * scipy.signal.windows.hann(320)
+    x = np.where((x >= 0.6 * x.max()) | (x <= 0.6 * x.min()), x, 0.0)
+    full = scipy.signal.correlate(x, x, method="direct")[319:]
+    return largest(output - (full / full[0] * 320 / (320 - np.arange(320)))[:319])
+
+
+def median_pitch(process: Process, signal: FloatArray) -> float:
+    """Return the median of the pitch in Hz; 1 if most frames have none."""
+    pitches = process(signal, RATE, PRESETS["speech"], ["pitch"])["pitch"][0, 0]
+    return float(np.median(np.nan_to_num(pitches, nan=1.0)))
+
+
+@ROWS.add(
+    "pitch",
+    "harmonic complexes from 100 to 390 Hz",
+    Origin("known fundamental frequency", MEDDIS_1997),
+    "samples of the period",
+    0.51,  # pitch is found at whole lags
+    altered("one lag more", "pitch", lambda values: 1 / (1 / values + 1 / RATE)),
+)
+def pitch_of_complexes(process: Process) -> Measured:
+    expected = np.array([100.0, 123, 160, 199, 240, 311, 390])
+    measured = []
+    for f0 in expected:
+        signal = both(complex_tone(f0, range(1, int(5000 / f0)), RATE, 0.3))
+        measured.append(median_pitch(process, signal))
+    periods = RATE / np.array(measured) - RATE / expected
+    return Measured(largest(periods), Curve(expected, expected, measured, "fundamental (Hz)", "pitch (Hz)"))
+
+
+@ROWS.add(
+    "pitch",
+    "missing fundamental: harmonics 3 to 6 of 125, 200 and 250 Hz",
+    Origin("residue pitch, known fundamental frequency", LICKLIDER_1951),
+    "samples of the period",
+    0.51,
+    altered("one lag more", "pitch", lambda values: 1 / (1 / values + 1 / RATE)),
+)
+def missing_fundamental(process: Process) -> float:
+    worst = 0.0
+    for f0 in (125.0, 200.0, 250.0):
+        signal = both(complex_tone(f0, range(3, 7), RATE, 0.3))
+        worst = max(worst, abs(RATE / median_pitch(process, signal) - RATE / f0))
+    return worst
+
+
+# --- modulation and spectral shape -------------------------------------------------------------------------------
+
+
+@ROWS.add(
+    "amsFeatures",
+    "response of the modulation filter at 64 Hz to modulations from 16 to 256 Hz",
+    Origin("band-pass with Q = 1 of one pole pair, closed form by the bilinear transform", EWERT_2000),
+    "dB",
+    0.02,
+    parameter("ams_cfHz", [4.0, 64.5]),
+)
+def modulation_filter(process: Process) -> Measured:
+    centre, rate = 64.0, RATE / 4
+    frequencies = np.array([16.0, 32, 40, 64, 104, 128, 256])
+    parameters = {**THROUGH, "ams_cfHz": [4.0, centre], "ams_wSizeSec": 0.5, "ams_hSizeSec": 0.25}
+    measured = []
+    for frequency in frequencies:
+        signal = through(tone(frequency, RATE, 2.0))
+        output = process(signal, RATE, parameters, ["amsFeatures"])["amsFeatures"][0, 0, 1, -1]
+        measured.append(20 * np.log10(output * pi / 2))
+    edges = np.tan(pi * centre * (np.sqrt(1.25) + np.array([-0.5, 0.5])) / rate)
+    warped = np.tan(pi * frequencies / rate)
+    expected = -10 * np.log10(1 + ((warped**2 - edges.prod()) / (warped * (edges[1] - edges[0]))) ** 2)
+    curve = Curve(frequencies, expected, measured, "modulation frequency (Hz)", "gain (dB)", True)
+    return Measured(largest(np.array(measured) - expected), curve)
+
+
+@ROWS.add(
+    "amsFeatures",
+    "strongest filter for noise that is modulated at 8, 32 and 128 Hz",
+    Origin("known modulation frequencies", EWERT_2000),
+    "octaves",
+    0.01,
+    altered("each filter exchanged for its neighbour", "amsFeatures", lambda values: np.roll(values, 1, axis=2)),
+)
+def modulation_frequency(process: Process) -> float:
+    worst, centres = 0.0, [4.0, 8.0, 16.0, 32.0, 64.0, 128.0, 256.0]
+    for frequency in (8.0, 32.0, 128.0):
+        signal = both((1 + tone(frequency, RATE, 2.0)) * noise(2 * RATE))
+        features = process(signal, RATE, {"ams_cfHz": centres}, ["amsFeatures"])["amsFeatures"][0]
+        levels = features[10:].mean((0, 2)) / np.sqrt(centres)  # noise has a level proportional to the bandwidth
+        found = centres[1 + int(np.argmax(levels[1:]))]  # the first filter is a low-pass
+        worst = max(worst, abs(float(np.log2(found / frequency))))
+    return worst
+
+
+@ROWS.add(
+    "spectralFeatures",
+    "centroid, spread, crest, flatness, skewness, kurtosis of the ratemap of noise",
+    Origin("numpy and scipy.stats on the same ratemap", PEETERS_2011),
+    "(relative)",
+    1e-6,  # small constants in the denominators
+    scaled("spectralFeatures", 1.00001),
+)
+def spectral_shape(process: Process) -> float:
+    words = ["centroid", "spread", "crest", "flatness", "skewness", "kurtosis"]
+    result = process(both(noise(8000)), RATE, {"sf_requests": words}, ["ratemap", "spectralFeatures"])
+    rates, frequencies = result["ratemap"][0], result["fb_cfHz"]
+    worst = 0.0
+    for frame in range(5, rates.shape[1]):
+        x = rates[:, frame]
+        centroid = np.average(frequencies, weights=x)
+        spread = np.sqrt(np.average((frequencies - centroid) ** 2, weights=x))
+        count = len(x)
+        ratio = np.sqrt(count / (count - 1))  # the front-end normalises with the unbiased deviation
+        expected = [
+            centroid / frequencies[-1],
+            spread / frequencies[-1],
+            x.max() / x.mean(),
+            scipy.stats.gmean(x) / x.mean(),
+            scipy.stats.skew(x) / ratio**3,
+            scipy.stats.kurtosis(x, fisher=False) / ratio**4 - 3,
+        ]
+        worst = max(worst, largest((result["spectralFeatures"][0, :, frame] - expected) / np.abs(expected)))
+    return worst
+
+
+@ROWS.add(
+    "spectralFeatures",
+    "entropy of the ratemap of noise and of a tone",
+    Origin("scipy.stats.entropy, normalised by the logarithm of the number of channels", MISRA_2004),
+    "",
+    1e-6,
+    scaled("spectralFeatures", 1.0001),
+)
+def spectral_entropy(process: Process) -> float:
+    worst = 0.0
+    for signal in (noise(4000), tone(1000, RATE, 0.25)):
+        result = process(both(signal), RATE, {"sf_requests": ["entropy"]}, ["ratemap", "spectralFeatures"])
+        rates = result["ratemap"][0]
+        expected = scipy.stats.entropy(rates, base=len(rates))
+        worst = max(worst, largest((result["spectralFeatures"][0, 0] - expected)[3:]))
+    return worst
+
+
+@ROWS.add(
+    "gabor",
+    "number of features for 23 channels from 124 to 3657 Hz",
+    Origin("311 features", SCHADLER_2012),
+    "features",
+    0.0,
+    parameter("fb_nChannels", 24),
+)
+def gabor_count(process: Process) -> float:
+    parameters = {"fb_nChannels": 23, "fb_lowFreqHz": 124.0, "fb_highFreqHz": 3657.0, "rm_wSizeSec": 0.025}
+    return abs(process(both(noise(16000)), RATE, parameters, ["gabor"])["gabor"].shape[1] - 311.0)
+
+
+@ROWS.add(
+    "gabor",
+    "ratio of the responses to level modulations of 12 and 5 Hz, four temporal filters",
+    Origin("cosines in a Hann envelope of 3.5 half periods, closed form", SCHADLER_2012),
+    "dB",
+    0.1,
+    altered("5 % of the previous frame added", "gabor", lambda values: values + 0.05 * np.roll(values, 1, axis=-1)),
+)
+def gabor_filters(process: Process) -> Measured:
+    step, modulations = 0.01, np.array([5.0, 12.0])
+    times = np.arange(8 * RATE) / RATE
+    level = np.cos(2 * pi * np.outer(times, modulations)).sum(-1)
+    centres = np.geomspace(200, 6000, CHANNELS)
+    carrier = np.sum([tone(frequency, RATE, 8.0, 0.02) for frequency in centres], axis=0)
+    result = process(both(carrier * 10 ** (level / 20)), RATE, {"fb_cfHz": list(centres)}, ["ratemap", "gabor"])
+    places, omegas = temporal_filters()
+    last = slice(result["gabor"].shape[-1] - 200, result["gabor"].shape[-1])
+    basis = np.exp(-2j * pi * step * np.outer(np.arange(200), modulations))
+    weights = 0.5 + 0.5 * np.cos(2 * pi * (np.arange(CHANNELS) - CHANNELS // 2) / (3 * CHANNELS))
+    incoming = np.abs(weights @ np.log10(result["ratemap"][0][:, last]) @ basis)
+    outgoing = np.abs(result["gabor"][0][places, last] @ basis)
+    measured = 20 * np.log10(outgoing[:, 1] / outgoing[:, 0] / (incoming[1] / incoming[0]))
+    expected = np.array([_temporal_ratio(omega, 2 * pi * step * modulations) for omega in omegas])
+    curve = Curve(omegas / (2 * pi * step), expected, measured, "temporal filter (Hz)", "12 Hz over 5 Hz (dB)")
+    return Measured(largest(measured - expected), curve)
+
+
+CHANNELS = 23
+
+
+def modulation_axis(size: float, spacing: float) -> np.ndarray:
+    """Return the positive modulation frequencies of the filters along one axis, ascending, in radians."""
+    width = 8 * spacing / 3.5
+    frequencies = [pi / 2]
+    while frequencies[0] * (1 - width / 2) / (1 + width / 2) > 3.5 * pi / size:
+        frequencies.insert(0, frequencies[0] * (1 - width / 2) / (1 + width / 2))
+    return np.array(frequencies)
+
+
+def temporal_filters() -> tuple[list[int], np.ndarray]:
+    """Return the places of the features without spectral modulation, and their temporal frequencies (radians)."""
+    omegas, kappas = modulation_axis(40, 0.2), modulation_axis(3 * CHANNELS, 0.3)
+    places, count = [], 0
+    for omega in (0.0, *omegas):
+        for kappa in (*(-kappas[::-1] if omega else ()), 0.0, *kappas):
+            size = min(3.5 * pi / abs(kappa), 3 * CHANNELS) if kappa else 3 * CHANNELS
+            distance = max(1, (2 * int(np.ceil(size / 2)) - 1) // 4)  # channels between the features of a filter
+            if omega and not kappa:
+                places.append(count)
+            count += sum((channel - CHANNELS // 2) % distance == 0 for channel in range(CHANNELS))
+    return places, omegas
+
+
+def _temporal_ratio(omega: float, modulations: np.ndarray) -> float:
+    """Return the response of a temporal Gabor filter to the second modulation over that to the first, in dB."""
+    length = 3.5 * pi / omega
+    u = np.arange(-19, 20)
+    envelope = np.where(np.abs(u) < length / 2, 0.5 + 0.5 * np.cos(2 * pi * u / length), 0.0)
+    weights = envelope * np.cos(omega * u)
+    weights -= envelope * weights.sum() / envelope.sum()
+    response = np.abs(np.exp(-1j * np.outer(modulations, u)) @ weights)
+    return float(20 * np.log10(response[1] / response[0]))

@@ -1,0 +1,512 @@
+"""Comparisons of the periphery: input, preProc, gammatone and DRNL filters, hair cells, adaptation, efferent reflex."""
+
+from __future__ import annotations
+
+import io
+from fractions import Fraction
+from math import gamma, pi, sqrt
+
+import numpy as np
+import scipy.signal
+
+from rosafe.declarations.literature import (
+    BERNSTEIN_1999,
+    BREEBAART_2001,
+    DAU_1996,
+    DAU_1997,
+    GLASBERG_1990,
+    GOODE_1994,
+    HOHMANN_2002,
+    JEPSEN_2008,
+    LOPEZPOVEDA_2001,
+    MAJDAK_2022,
+    PATTERSON_1987,
+    TWOEARS_2018,
+)
+from rosafe.validation.comparison import (
+    Collection,
+    Curve,
+    Disturbance,
+    Measured,
+    Origin,
+    Process,
+    altered,
+    parameter,
+    scaled,
+)
+from rosafe.validation.stimuli import THROUGH, both, fundamental, gain_db, impulse, largest, through, tone
+
+ROWS = Collection()
+BUTTERWORTH = "closed form of the Butterworth filter by the bilinear transform"
+
+
+# --- input and preProc -------------------------------------------------------------------------------------------
+
+
+@ROWS.add(
+    "input",
+    "samples of a 32-bit WAV file in memory",
+    Origin("decoded by libsndfile to floating point"),
+    "of full scale",
+    1e-9,  # libsndfile divides by 2**31, the original by 2**31 - 1
+    parameter("in_normalizeValue", 2**31 + 30),
+)
+def pcm_scale(process: Process) -> float:
+    import soundfile
+
+    samples = np.random.default_rng(1).integers(-(2**31), 2**31, (2, 500), dtype=np.int32)
+    file = io.BytesIO()
+    soundfile.write(file, samples.T, 16000, "PCM_32", format="WAV")
+    file.seek(0)
+    decoded, _ = soundfile.read(file, dtype="float64")
+    result = process(samples, 16000, {"in_doNormalize": True}, ["input"])
+    return largest(result["input"] - decoded.T)
+
+
+@ROWS.add(
+    "preProc",
+    "DC removal: response of order 4 from 20 Hz to 7 kHz",
+    Origin(BUTTERWORTH),
+    "dB",
+    1e-6,
+    parameter("pp_cutoffHzDC", 100.0001),
+)
+def dc_removal(process: Process) -> Measured:
+    rate, cutoff = 16000.0, 100.0
+    frequencies = np.geomspace(20, 7000, 60)
+    parameters = {"pp_bRemoveDC": True, "pp_cutoffHzDC": cutoff}
+    output = process(both(impulse(16000)), rate, parameters, ["preProc"])["preProc"][0]
+    ratio = np.tan(pi * cutoff / rate) / np.tan(pi * frequencies / rate)
+    expected, measured = -10 * np.log10(1 + ratio**8), gain_db(output, frequencies, rate)
+    return Measured(
+        largest(measured - expected), Curve(frequencies, expected, measured, "frequency (Hz)", "gain (dB)", True)
+    )
+
+
+@ROWS.add(
+    "preProc",
+    "level scaling: RMS of a tone of 1 Pa (94 dB SPL) for rms 1 at 100 dB SPL",
+    Origin("level convention", JEPSEN_2008),
+    "dB",
+    1e-9,
+    parameter("pp_refSPLdB", 94.00001),
+)
+def level_scale(process: Process) -> float:
+    signal = both(tone(1000, 16000, 0.1, sqrt(2)))
+    output = process(signal, 16000, {"pp_bLevelScaling": True, "pp_refSPLdB": 94.0}, ["preProc"])["preProc"]
+    return abs(20 * np.log10(np.sqrt(np.mean(output[0] ** 2))) - 6.0)
+
+
+@ROWS.add(
+    "preProc",
+    "pre-emphasis: response from 20 Hz to 7 kHz",
+    Origin("closed form of a first difference"),
+    "dB",
+    1e-9,
+    parameter("pp_coefPreEmphasis", 0.97000001),
+)
+def pre_emphasis(process: Process) -> float:
+    frequencies = np.geomspace(20, 7000, 60)
+    output = process(both(impulse(64)), 16000, {"pp_bPreEmphasis": True}, ["preProc"])["preProc"][0]
+    expected = 20 * np.log10(np.abs(1 - 0.97 * np.exp(-2j * pi * frequencies / 16000)))
+    return largest(gain_db(output, frequencies, 16000) - expected)
+
+
+@ROWS.add(
+    "preProc",
+    "gain control: RMS of a tone after ten time constants, and level difference of the ears",
+    Origin("closed form: 1 in the louder ear; the difference remains"),
+    "dB",
+    0.01,
+    altered("a gain of each ear of its own", "preProc", lambda x: x / np.std(x, axis=-1, keepdims=True)),
+)
+def gain_control(process: Process) -> float:
+    signal = tone(500, 16000, 1.0, 0.03) * np.array([[1.0], [0.5]])
+    parameters = {"pp_bNormalizeRMS": True, "pp_intTimeSecRMS": 0.05}
+    output = process(signal, 16000, parameters, ["preProc"])["preProc"][:, -8000:]
+    levels = 10 * np.log10(np.mean(output**2, axis=-1))
+    return largest(levels - [0, 20 * np.log10(0.5)])
+
+
+STAPES = {  # Hz: peak-to-peak displacement of the stapes in µm at 104 dB SPL
+    400: 0.19953,
+    600: 0.22909,
+    800: 0.21878,
+    1000: 0.15136,
+    1200: 0.1,
+    1600: 0.05754,
+    2000: 0.03311,
+    2600: 0.0182,
+    3000: 0.01259,
+    4000: 0.007,
+    5000: 0.005,
+    6000: 0.003,
+}
+
+
+@ROWS.add(
+    "preProc",
+    "middle ear (lopezpoveda): velocity of the stapes from 400 Hz to 6 kHz",
+    Origin("measured displacements", GOODE_1994),
+    "dB",
+    0.5,  # the filter interpolates between the measured points
+    scaled("preProc", 1.1),
+)
+def middle_ear(process: Process) -> Measured:
+    rate = 44100.0
+    parameters = {"pp_bMiddleEarFiltering": True, "pp_middleEarModel": "lopezpoveda", "pp_bUnityComp": False}
+    output = process(both(impulse(4096)), rate, parameters, ["preProc"])["preProc"][0]
+    frequencies = np.array(list(STAPES), float)
+    velocity = np.array(list(STAPES.values())) * 1e-6 * 2 * pi * frequencies / (20e-6 * 10 ** (104 / 20))
+    expected = 20 * np.log10(velocity * sqrt(2))  # convention of the front-end: per amplitude, input in 20 µPa
+    measured = gain_db(output, frequencies, rate)
+    return Measured(
+        largest(measured - expected), Curve(frequencies, expected, measured, "frequency (Hz)", "gain (dB)", True)
+    )
+
+
+# --- filterbanks -------------------------------------------------------------------------------------------------
+
+
+@ROWS.add(
+    "gammatone",
+    "spacing of the centre frequencies on the ERB-number scale, 80 Hz to 8 kHz",
+    Origin("equation 4", GLASBERG_1990),
+    "ERB",
+    0.005,  # 21.4 log10 of the publication is rounded: 9.294 in place of 9.265 ln
+    parameter("fb_nERBs", 1.01),
+)
+def erb_spacing(process: Process) -> Measured:
+    frequencies = process(np.zeros((2, 10)), 44100, {"fb_nERBs": 1.0}, ["gammatone"])["fb_cfHz"]
+    numbers = 21.4 * np.log10(4.37 * frequencies / 1000 + 1)
+    spacing = np.diff(numbers)
+    return Measured(
+        largest(spacing - 1),
+        Curve(frequencies[1:], np.ones(len(spacing)), spacing, "centre frequency (Hz)", "spacing (ERB)", True),
+    )
+
+
+@ROWS.add(
+    "gammatone",
+    "equivalent rectangular bandwidth of the filters, 100 Hz to 8 kHz",
+    Origin("equation 3", GLASBERG_1990),
+    "(relative)",
+    0.005,
+    parameter("fb_bwERBs", 1.03),
+)
+def bandwidths(process: Process) -> Measured:
+    rate, centres = 44100.0, np.geomspace(100, 8000, 12)
+    response = process(both(impulse(44100)), rate, {"fb_cfHz": list(centres)}, ["gammatone"])["gammatone"][0]
+    spectra = np.abs(np.fft.rfft(response)) ** 2
+    measured = spectra.sum(-1) / spectra.max(-1) * rate / response.shape[-1]
+    expected = 24.7 * (4.37 * centres / 1000 + 1)
+    return Measured(
+        largest(measured / expected - 1),
+        Curve(centres, expected, measured, "centre frequency (Hz)", "bandwidth (Hz)", True),
+    )
+
+
+@ROWS.add(
+    "gammatone",
+    "impulse responses, all-pole form, 80 Hz to 7.6 kHz",
+    Origin("closed form of a cascade of complex one-pole filters", HOHMANN_2002),
+    "of the peak",
+    1e-11,
+    parameter("fb_bwERBs", 1.018 * (1 + 1e-9)),
+)
+def impulse_responses(process: Process) -> float:
+    rate, count = 44100.0, 8000
+    result = process(both(impulse(count)), rate, {}, ["gammatone"])
+    centres, k = result["fb_cfHz"][:, None], np.arange(count)
+    decay = 2 * pi * 1.018 * (24.7 + 0.108 * centres) / rate
+    envelope = 2 * (1 - np.exp(-decay)) ** 4 * (k + 1) * (k + 2) * (k + 3) / 6 * np.exp(-decay * k)
+    expected = envelope * np.cos(2 * pi * centres / rate * k)
+    return largest((result["gammatone"][0] - expected) / np.abs(expected).max(-1, keepdims=True))
+
+
+@ROWS.add(
+    "gammatone",
+    "correlation with the gammatone function of continuous time at 1 kHz",
+    Origin("definition of the gammatone", PATTERSON_1987),
+    "(1 - r)",
+    1e-6,
+    parameter("fb_bwERBs", 1.02),
+)
+def gammatone_function(process: Process) -> Measured:
+    rate, centre = 44100.0, 1000.0
+    response = process(both(impulse(1500)), rate, {"fb_cfHz": [centre]}, ["gammatone"])["gammatone"][0, 0]
+    width = 1.018 * (24.7 + 0.108 * centre)
+    # the cascade of four one-pole filters corresponds to t**3 at (k + 2) samples
+    k = np.arange(1500)
+    wave = ((k + 2) / rate) ** 3 * np.exp(-2 * pi * width * k / rate) * np.cos(2 * pi * centre * k / rate)
+    wave *= np.abs(response).max() / np.abs(wave).max()
+    r = np.corrcoef(response, wave)[0, 1]
+    return Measured(
+        1 - float(r), Curve(1e3 * k[:700] / rate, wave[:700], response[:700], "time (ms)", "impulse response")
+    )
+
+
+def power_law(intercept: float, slope: float, frequency: float) -> float:
+    """Return a parameter of DRNL for a channel, as regression over the logarithm of its frequency."""
+    return float(10 ** (intercept + slope * np.log10(frequency)))
+
+
+def transfer(
+    frequency: float, rate: float, centre: float, width: float, cutoff: float, counts: tuple[int, int]
+) -> complex:
+    """Return the response to a tone of some sections of a gammatone filter and of a Butterworth low-pass."""
+    alpha, decay = -np.exp(-2 * pi * width / rate) * np.cos(2 * pi * centre / rate), np.exp(-2 * pi * width / rate)
+    filters = ([1, alpha], [1, 2 * alpha, decay**2])
+    tones = 2 * pi * np.array([frequency, centre]) / rate
+    section, peak = scipy.signal.freqz(*filters, worN=tones)[1]
+    low = scipy.signal.freqz(*scipy.signal.butter(2, cutoff, fs=rate), worN=tones)[1][0]
+    return complex((section / abs(peak)) ** counts[0] * low ** counts[1])
+
+
+def drnl_output(velocities: np.ndarray, frequency: float, rate: float) -> np.ndarray:
+    """Return the level of the response of DRNL to tones at its frequency, in dB, by closed forms of both paths."""
+    fit = frequency if frequency <= 1000 else 1500.0
+    exponent = 10**-0.60206
+    linear, compressive = power_law(1.40298, 0.81916, fit), power_law(1.61912, -0.81867, fit)
+    # fundamental of sign(cos) |cos|**exponent
+    factor = 2 / sqrt(pi) * gamma(1 + exponent / 2) / gamma(1.5 + exponent / 2)
+    best, width = power_law(-0.05252, 1.0165, frequency), power_law(-0.03193, 0.7, frequency)
+    filters = transfer(frequency, rate, best, width, power_law(-0.05252, 1.01, frequency), (2, 0))
+    after = transfer(frequency, rate, best, width, power_law(-0.05252, 1.01, frequency), (2, 1))
+    driven = velocities * abs(filters)
+    knee = (compressive / linear) ** (1 / (1 - exponent))
+    stick = np.where(driven < knee, linear * driven, factor * compressive * driven**exponent)
+    nonlinear = stick * filters / abs(filters) * after
+    centre, wide = power_law(-0.06762, 1.01679, frequency), power_law(0.03728, 0.75, frequency)
+    weak = transfer(frequency, rate, centre, wide, power_law(-0.06762, 1.01, frequency), (2, 4))
+    return 20 * np.log10(np.abs(nonlinear + velocities * power_law(4.20405, -0.47909, frequency) * weak))
+
+
+@ROWS.add(
+    "gammatone",
+    "DRNL: input-output curve at 4 kHz, for tones of 100 pm/s to 30 µm/s",
+    Origin("broken-stick compression of 0.25 dB/dB, parameters of Jepsen et al. (2008)", LOPEZPOVEDA_2001),
+    "dB",
+    0.1,
+    parameter("fb_cfHz", [3990.0]),
+)
+def drnl_growth(process: Process) -> Measured:
+    rate, frequency = 44100.0, 4000.0
+    velocities = 10 ** np.array([-10, -9, -8, -7, -6, -5.5, -5, -4.5])  # m/s; apart from the knee at 0.2 µm/s
+    measured = []
+    for velocity in velocities:
+        signal = both(tone(frequency, rate, 0.1, velocity))
+        output = process(signal, rate, {"fb_type": "drnl", "fb_cfHz": [frequency]}, ["gammatone"])["gammatone"]
+        measured.append(20 * np.log10(abs(fundamental(output[0, 0], frequency, rate))))
+    expected = drnl_output(velocities, frequency, rate)
+    return Measured(
+        largest(np.array(measured) - expected),
+        Curve(20 * np.log10(velocities), expected, measured, "input (dB re 1 m/s)", "output (dB)"),
+    )
+
+
+# --- hair cells --------------------------------------------------------------------------------------------------
+
+
+def hair_cell_gain(process: Process, method: str, frequencies: np.ndarray, rate: float) -> np.ndarray:
+    """Return the gain in dB of the low-pass of a hair cell for the fundamental of rectified tones."""
+    gains = []
+    for frequency in frequencies:
+        signal = both(tone(frequency, rate, 0.2))
+        parameters = {"fb_cfHz": [float(frequency)]}
+        output = process(signal, rate, {**parameters, "ihc_method": method}, ["ihc"])["ihc"][0, 0]
+        plain = process(signal, rate, {**parameters, "ihc_method": "halfwave"}, ["ihc"])["ihc"][0, 0]
+        gains.append(abs(fundamental(output, frequency, rate)) / abs(fundamental(plain, frequency, rate)))
+    return 20 * np.log10(gains)
+
+
+def lowpass_row(process: Process, method: str, order: int) -> Measured:
+    """Compare with a Butterworth low-pass at 1 kHz."""
+    rate, frequencies = 40000.0, np.array([250.0, 500, 1000, 2000, 4000])
+    measured = hair_cell_gain(process, method, frequencies, rate)
+    ratio = np.tan(pi * frequencies / rate) / np.tan(pi * 1000 / rate)
+    expected = -10 * np.log10(1 + ratio ** (2 * order))
+    return Measured(
+        largest(measured - expected), Curve(frequencies, expected, measured, "frequency (Hz)", "gain (dB)", True)
+    )
+
+
+def other_cutoff(factor: float) -> Disturbance:
+    """Return a disturbance of the cutoff of a hair cell, by computing at another sample rate."""
+
+    def change(process: Process) -> Process:
+        return lambda signal, rate, values, outputs: process(signal, rate * factor, values, outputs)
+
+    return Disturbance(f"cutoff divided by {factor:g}", change)
+
+
+ROWS.add(
+    "ihc",
+    "dau: gain of the low-pass for tones from 250 Hz to 4 kHz",
+    Origin(f"{BUTTERWORTH}, order 2 at 1 kHz (Two!Ears)", TWOEARS_2018),
+    "dB",
+    0.001,
+    other_cutoff(1.001),
+)(lambda process: lowpass_row(process, "dau", 2))
+ROWS.add(
+    "ihc",
+    "dau1996: gain of the low-pass for tones from 250 Hz to 4 kHz",
+    Origin(f"{BUTTERWORTH}, order 1 at 1 kHz (`ihc_dau1996` of AMT)", MAJDAK_2022),
+    "dB",
+    0.001,
+    other_cutoff(1.001),
+)(lambda process: lowpass_row(process, "dau1996", 1))
+
+
+@ROWS.add(
+    "ihc",
+    "breebart: frequency at which the low-pass is 3 dB down",
+    Origin("fifth-order low-pass with a cutoff of 770 Hz", BREEBAART_2001),
+    "Hz",
+    3.0,  # rounded in the publication
+    other_cutoff(1.01),
+)
+def breebaart_cutoff(process: Process) -> float:
+    frequencies = np.array([740.0, 760, 770, 780, 800])
+    gains = hair_cell_gain(process, "breebart", frequencies, 192000.0)
+    return abs(float(np.interp(10 * np.log10(2), -gains, frequencies)) - 770.0)
+
+
+@ROWS.add(
+    "ihc",
+    "bernstein: growth of the output for 60 dB of input level",
+    Origin("envelope compressed by an exponent of 0.23, then squared: 0.46 dB/dB", BERNSTEIN_1999),
+    "dB",
+    0.01,
+    altered("output with the exponent 1.001", "ihc", lambda values: values**1.001),
+)
+def bernstein_growth(process: Process) -> Measured:
+    levels = np.arange(-60.0, 1, 10)
+    parameters = {"fb_cfHz": [4000.0], "ihc_method": "bernstein"}
+    outputs = []
+    for level in levels:
+        output = process(both(tone(4000, 32000, 0.1, 10 ** (level / 20))), 32000, parameters, ["ihc"])["ihc"][0, 0]
+        outputs.append(20 * np.log10(np.mean(output[-800:])))
+    measured = np.array(outputs) - outputs[-1]
+    expected = 2 * 0.23 * levels
+    return Measured(largest(measured - expected), Curve(levels, expected, measured, "input (dB)", "output (dB)"))
+
+
+@ROWS.add(
+    "ihc",
+    "hilbert: depth of a 20 Hz amplitude modulation of a tone at 4 kHz",
+    Origin("closed form: three spectral lines, each with the gain of the filter at its frequency"),
+    "of the depth",
+    1e-3,
+    altered("envelope with the exponent 1.01", "ihc", lambda values: values**1.01),
+)
+def modulation_depth(process: Process) -> float:
+    rate, centre, modulation, depth = 32000.0, 4000.0, 20.0, 0.5
+    carrier, slow = tone(centre, rate, 0.5), tone(modulation, rate, 0.5)
+    parameters = {"fb_cfHz": [centre], "ihc_method": "hilbert"}
+    envelope = process(both((1 + depth * slow) * carrier), rate, parameters, ["ihc"])["ihc"][0, 0]
+    decay = 2 * pi * 1.018 * (24.7 + 0.108 * centre) / rate
+    side = abs((1 - np.exp(-decay)) / (1 - np.exp(-decay - 2j * pi * modulation / rate))) ** 4
+    measured = abs(fundamental(envelope, modulation, rate)) / np.mean(envelope[len(envelope) // 2 :])
+    return abs(measured / (depth * side) - 1)
+
+
+# --- adaptation and efferent reflex ------------------------------------------------------------------------------
+
+
+LEVELS = np.arange(0.0, 101, 20)  # dB SPL
+LEAST = 1e-5  # 0 dB SPL
+
+
+def model_units(values: np.ndarray) -> np.ndarray:
+    """Scale the output of the last of five loops to 0 model units at 0 dB SPL and 100 at 100 dB SPL."""
+    return 100 * (values - LEAST ** (1 / 32)) / (1 - LEAST ** (1 / 32))
+
+
+def adapted(process: Process, seconds: float, limit: float) -> np.ndarray:
+    """Return the first and the last sample of the response to constant input of each level, (levels, 2)."""
+    parameters = {**THROUGH, "adpt_lim": limit}
+    outputs = []
+    for level in LEVELS:
+        signal = through(np.full(round(16000 * seconds), 10 ** ((level - 100) / 20)))
+        output = process(signal, 16000, parameters, ["adaptation"])["adaptation"][0, 0]
+        outputs.append([output[0], output[-1]])
+    return np.array(outputs)
+
+
+@ROWS.add(
+    "adaptation",
+    "steady response to constant input from 0 to 100 dB SPL",
+    Origin("square root of the input in each of five loops", DAU_1996),
+    "MU",
+    0.01,
+    scaled("adaptation", 1.001),
+)
+def adapted_growth(process: Process) -> Measured:
+    measured = adapted(process, 8.0, 0.0)[:, 1]
+    expected = model_units(10 ** ((LEVELS - 100) / 20 / 32))
+    return Measured(largest(measured - expected), Curve(LEVELS, expected, measured, "level (dB SPL)", "output (MU)"))
+
+
+@ROWS.add(
+    "adaptation",
+    "overshoot without limit: first response from rest, 0 to 100 dB SPL",
+    Origin("input divided by the rest states of five loops, closed form", DAU_1996),
+    "(relative)",
+    1e-9,
+    parameter("adpt_mindB", 1e-6),
+)
+def overshoot(process: Process) -> float:
+    measured = adapted(process, 0.001, 0.0)[1:, 0]
+    expected = model_units(10 ** ((LEVELS - 100) / 20) / LEAST ** (31 / 32))[1:]
+    return largest(measured / expected - 1)
+
+
+@ROWS.add(
+    "adaptation",
+    "limited overshoot: first response from rest, 0 to 100 dB SPL, limit 10",
+    Origin("limiting function of each loop, closed form", DAU_1997),
+    "(relative)",
+    1e-9,
+    parameter("adpt_lim", 10.000001),
+)
+def limited_overshoot(process: Process) -> Measured:
+    measured = adapted(process, 0.001, 10.0)[:, 0]
+    values = 10 ** ((LEVELS - 100) / 20)
+    for loop in range(1, 6):
+        rest = LEAST ** (2.0**-loop)
+        ceiling = (1 - rest**2) * 10 - 1
+        values = values / rest
+        limited = 1 + ceiling * (2 / (1 + np.exp(-2 * (values - 1) / ceiling)) - 1)
+        values = np.where(values > 1, limited, values)
+    expected = model_units(values)
+    curve = Curve(LEVELS, expected, measured, "level (dB SPL)", "first output (MU)")
+    return Measured(largest((measured - expected)[1:] / expected[1:]), curve)
+
+
+@ROWS.add(
+    "moc",
+    "attenuation for ratemap levels from -200 to -80 dB",
+    Origin("cubic of the Two!Ears front-end in exact fractions, between its extremes", TWOEARS_2018),
+    "dB",
+    1e-9,
+    scaled("moc", 1 + 1e-9),
+)
+def efferent_attenuation(process: Process) -> Measured:
+    levels, measured = [], []
+    for level in range(-100, -39, 4):
+        signal = through(np.full(2400, 10 ** (level / 20)))
+        result = process(signal, 16000, {**THROUGH, "rm_scaling": "power"}, ["ratemap", "moc"])
+        levels.append(20 * np.log10(result["ratemap"][0, 0, -1]))
+        measured.append(result["moc"][0, 0, -1])
+    expected = [_cubic(min(max(level, -180.0), -93.821837)) for level in levels]
+    curve = Curve(levels, expected, measured, "20 log10 of the ratemap (dB)", "attenuation (dB)")
+    return Measured(largest(np.subtract(measured, expected)), curve)
+
+
+def _cubic(level: float) -> float:
+    """Evaluate the cubic without rounding."""
+    y = Fraction(level)
+    factors = [Fraction(text) for text in ("-0.00012411", "-0.051322", "-6.3528", "-206.11")]
+    value = sum(factor * y ** (3 - power) for power, factor in enumerate(factors))
+    return float(min(max(value, Fraction(0)), Fraction(40)))
