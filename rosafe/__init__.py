@@ -1,7 +1,9 @@
 """rosAFE: the Two!Ears auditory front-end for ROS 1, in Python.
 
-For arrays and pictures: `process` computes auditory representations of a signal in memory, `Stream` of sound that comes
-block by block; `plot` draws them, `to_xarray` names their axes; `load` reads what `rosafe process` has written.
+`process` computes auditory representations of a signal in memory, `Stream` those of sound that arrives block by block.
+`plot` draws them, `to_xarray` converts them to an xarray Dataset, and `load` reads result files. `to_db` and `deltas`
+compute features from them, `process_batch` processes several sounds, and `PRESETS` are parameters for a purpose.
+`resynthesize` and `Resynthesizer` return from the filterbank to sound; `enhance` selects the sound from a direction.
 docs/tutorial.md begins with a sound file.
 """
 
@@ -12,29 +14,68 @@ from typing import TYPE_CHECKING, Any
 
 from rosafe.version import VERSION as __version__
 
-__all__ = ["Stream", "__version__", "load", "plot", "process", "to_xarray"]
+__all__ = [
+    "PRESETS",
+    "Head",
+    "Localizer",
+    "Result",
+    "Resynthesizer",
+    "Stream",
+    "__version__",
+    "deltas",
+    "direction_mask",
+    "enhance",
+    "load",
+    "localize",
+    "plot",
+    "process",
+    "process_batch",
+    "resynthesize",
+    "to_db",
+    "to_xarray",
+]
 
 if TYPE_CHECKING:
+    from rosafe.interface.remarks import PRESETS
+    from rosafe.localization.enhancement import direction_mask, enhance
+    from rosafe.localization.head import Head
+    from rosafe.localization.localize import localize
+    from rosafe.localization.localizer import Localizer
+    from rosafe.offline.features import deltas, process_batch, to_db
     from rosafe.offline.formats import load
     from rosafe.offline.process import process
+    from rosafe.offline.result import Result
+    from rosafe.offline.resynthesis import Resynthesizer, resynthesize
     from rosafe.offline.stream import Stream
     from rosafe.view.dataset import to_xarray
     from rosafe.view.plot import plot
 
-# The numerics load numpy and scipy, which programs that only speak ROS need not wait for.
-_WHERE = {
+# Imported on first use: programs that need only ROS do not wait for numpy and scipy.
+_MODULES = {
+    "Head": "rosafe.localization.head",
+    "Localizer": "rosafe.localization.localizer",
+    "PRESETS": "rosafe.interface.remarks",
+    "Result": "rosafe.offline.result",
+    "Resynthesizer": "rosafe.offline.resynthesis",
     "Stream": "rosafe.offline.stream",
+    "deltas": "rosafe.offline.features",
+    "direction_mask": "rosafe.localization.enhancement",
+    "enhance": "rosafe.localization.enhancement",
     "load": "rosafe.offline.formats",
+    "localize": "rosafe.localization.localize",
     "plot": "rosafe.view.plot",
     "process": "rosafe.offline.process",
+    "process_batch": "rosafe.offline.features",
+    "resynthesize": "rosafe.offline.resynthesis",
+    "to_db": "rosafe.offline.features",
     "to_xarray": "rosafe.view.dataset",
 }
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _WHERE:
+    if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = globals()[name] = getattr(importlib.import_module(_WHERE[name]), name)
+    value = globals()[name] = getattr(importlib.import_module(_MODULES[name]), name)
     return value
 
 

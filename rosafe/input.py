@@ -1,4 +1,4 @@
-"""Files that the product reads: regular files only, since a FIFO, socket or device can block or never end."""
+"""Read input files. Only regular files are accepted, because a FIFO, socket or device can block or never end."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ _KINDS = {
 def open_descriptor(path: str | os.PathLike[str]) -> int:
     """Open a regular file for reading and return its descriptor.
 
-    This never blocks, also if the file is replaced by a FIFO meanwhile.
+    This never blocks, even if the file is replaced by a FIFO in the meantime.
 
     Raises
     ------
     OSError
-        There is no such file, or it cannot be opened, or it is not a regular file; `strerror` is the reason for people.
+        The file does not exist, cannot be opened, or is not a regular file; `strerror` is the reason.
     ValueError
-        No file can have this name.
+        The name is not valid for a file.
     """
-    _check(os.stat(path), path)  # before it is opened: to open a device may have effects
+    _check(os.stat(path), path)  # before it is opened, because opening a device can have effects
     descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NOCTTY | os.O_NONBLOCK)
     try:
         _check(os.fstat(descriptor), path)
@@ -39,15 +39,15 @@ def open_descriptor(path: str | os.PathLike[str]) -> int:
 
 
 def open_regular(path: str | os.PathLike[str]) -> BufferedReader:
-    """Open a regular file as a binary stream. Errors as those of `open_descriptor`."""
+    """Open a regular file as a binary stream. Raises the errors of `open_descriptor`."""
     return os.fdopen(open_descriptor(path), "rb")
 
 
 def read_regular(path: str | os.PathLike[str], limit: int) -> bytes:
-    """Return the first `limit` bytes of a regular file, fewer if it is shorter. Errors as `open_descriptor`."""
+    """Return the first `limit` bytes of a regular file, or fewer. Raises the errors of `open_descriptor`."""
     with open_regular(path) as file:
         data: bytes | None = file.read(limit)
-    if data is None:  # some files of /proc and /sys are regular by name only
+    if data is None:  # some files of /proc and /sys only claim to be regular
         raise BlockingIOError(errno.EAGAIN, os.strerror(errno.EAGAIN), str(path))
     return data
 
@@ -57,5 +57,5 @@ def _check(status: os.stat_result, path: str | os.PathLike[str]) -> None:
     kind = stat.S_IFMT(status.st_mode)
     if kind != stat.S_IFREG:
         number = errno.EISDIR if kind == stat.S_IFDIR else errno.EINVAL
-        what = f"expected a regular file, got {_KINDS.get(kind, 'something else')}"
-        raise OSError(number, what, os.fspath(path))
+        reason = f"expected a regular file, got {_KINDS.get(kind, 'another kind of file')}"
+        raise OSError(number, reason, os.fspath(path))

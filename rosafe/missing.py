@@ -1,4 +1,4 @@
-"""What to install where a package is absent: one line for whoever asks for what needs it."""
+"""Advice on missing packages: one line that names the package and how to install it."""
 
 from __future__ import annotations
 
@@ -8,26 +8,27 @@ import importlib.metadata
 from pathlib import Path
 from types import ModuleType
 
-# Module: what pip is to install, and Debian's package where scripts/install does not bring it anyway.
+# Module: extra of this project, and Debian's package if scripts/install does not install it
 _PACKAGES = {
-    "matplotlib": ("'rosafe[plot]'", ""),
-    "h5py": ("'rosafe[files]'", "python3-h5py"),
-    "xarray": ("'rosafe[files]'", "python3-xarray"),
-    "zarr": ("'rosafe[files]'", "python3-zarr"),
-    "distributed": ("'rosafe[dask]'", "python3-distributed"),
-    "dask": ("'rosafe[dask]'", "python3-distributed"),
-    "alsaaudio": ("pyalsaaudio", ""),
+    "matplotlib": ("plot", ""),
+    "h5py": ("files", ""),
+    "xarray": ("files", "python3-xarray"),
+    "zarr": ("files", "python3-zarr"),
+    "distributed": ("dask", "python3-distributed"),
+    "dask": ("dask", "python3-distributed"),
 }
-_ROS = ("ros", "bass", "genpy", "genmsg", "actionlib", "diagnostic_", "std_msgs")  # what their names begin with
-_BESIDE_ROS = ("aiohttp", "tkinter", "_tkinter", "yaml")  # what only its clients and nodes want
+_OTHER_NAMES = {"alsaaudio": "pyalsaaudio", "yaml": "PyYAML"}  # of packages for pip
+_DEBIAN_DIR = Path("/usr/lib/python3/dist-packages")  # of the package python3-rosafe
+_ROS = ("ros", "bass", "genpy", "genmsg", "actionlib", "diagnostic_", "std_msgs")  # prefixes of ROS packages
+_WITH_ROS = ("aiohttp", "tkinter", "_tkinter", "yaml")  # packages that only nodes and clients need
 
 
 @functools.cache
 def by_pip() -> bool:
-    """Whether pip has brought this package: then ROS, Tcl and sound cards are none of its business."""
+    """Return whether rosafe was installed by pip, that is, without the support of ROS, Tcl and sound cards."""
     here = Path(__file__)
     for found in importlib.metadata.distributions(name="rosafe"):
-        if found.read_text("INSTALLER") is None:  # what a build has left in a checkout
+        if found.read_text("INSTALLER") is None:  # left by a build in a checkout
             continue
         file = Path(str(found.locate_file("rosafe/missing.py")))
         if '"editable": true' in (found.read_text("direct_url.json") or "") or (file.exists() and file.samefile(here)):
@@ -36,25 +37,28 @@ def by_pip() -> bool:
 
 
 def install(module: str) -> str:
-    """What to do where a module is not installed."""
+    """Return how to install a module."""
     top = module.partition(".")[0]
-    pip, debian = _PACKAGES.get(top, (top, ""))
+    extra, debian = _PACKAGES.get(top, ("", ""))
     if not by_pip():
-        return f"apt install {debian}, or pip install {top}" if debian else "run scripts/install"
-    if top.startswith(_ROS) or top in _BESIDE_ROS:
-        return "pip does not bring it: run scripts/install of a checkout, on Debian 12"
-    return f"pip install {pip}"
+        if debian:
+            return f"apt install {debian}, or pip install {top}"
+        return "apt install rosafe" if _DEBIAN_DIR in Path(__file__).parents else "run scripts/install"
+    if top.startswith(_ROS) or top in _WITH_ROS:
+        return "pip does not install it: run scripts/install of a checkout, on Debian 12 or 13"
+    # Not `rosafe[...]`: on PyPI, which does not have this project, the name could belong to others.
+    return f"pip install '.[{extra}]' in a checkout" if extra else f"pip install {_OTHER_NAMES.get(top, top)}"
 
 
 def advice(module: str) -> str:
-    """That a module is not installed, and what to do about it, in one line without a full stop."""
+    """Return one line, without a full stop, that a module is not installed and how to install it."""
     return f"the Python package {module.partition('.')[0]} is not installed; {install(module)}"
 
 
-def require(module: str, what: str) -> ModuleType:
-    """Import `module`, which `what` needs; ModuleNotFoundError of one line where it is not installed."""
+def require(module: str, purpose: str) -> ModuleType:
+    """Import `module` for `purpose`; ModuleNotFoundError with one line of advice if it is not installed."""
     try:
         return importlib.import_module(module)
     except ModuleNotFoundError as problem:
         absent = problem.name or module
-        raise ModuleNotFoundError(f"{what}: {advice(absent)}", name=absent) from None
+        raise ModuleNotFoundError(f"{purpose}: {advice(absent)}", name=absent) from None

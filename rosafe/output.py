@@ -1,4 +1,4 @@
-"""Files and folders that the product writes: complete or not there, never two writers in one."""
+"""Atomic output: a file or folder appears only when it is complete, and has one writer at a time."""
 
 from __future__ import annotations
 
@@ -15,83 +15,90 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-PART = ".part"  # what the name of an unfinished output ends with
-_AT_FDCWD, _RENAME_NOREPLACE, _RENAME_EXCHANGE = -100, 1, 2  # of renameat2
+PART = ".part"  # suffix of an unfinished output
+_AT_FDCWD, _RENAME_NOREPLACE, _RENAME_EXCHANGE = -100, 1, 2  # constants of renameat2
 
 
 class OutputError(Exception):
-    """The output cannot be written; the text is one line that says why."""
+    """The output cannot be written; the text is one line with the reason, and `errno` the error number."""
+
+    def __init__(self, text: str, error_number: int | None = None) -> None:
+        super().__init__(text)
+        self.errno = error_number or errno.EIO
 
 
 class AtomicOutput:
-    """An output on its way, in a file beside its place whose name ends with ``.part``.
+    """An unfinished output file, named after its target with the suffix ``.part``.
 
-    That name is always the same, and the file is locked: two writers for one place notice each other, and what a killed
-    process has left is found.
+    The name is fixed and the file is locked. A second writer of the same target is therefore rejected, and a part that
+    a killed process has left is found.
 
     Parameters
     ----------
     target : path
-        Where the output goes, links followed: to a new file, or in the place of one.
+        The path of the output; links are followed.
     replace : bool
-        Whether it may take the place of a file that is there, now or at the end.
-    precious : bool
-        Whether what a killed process has left under the name of the part is kept, unless `replace`. Else it is used up.
+        Whether it may replace an existing file.
+    keep_leftover : bool
+        Whether a part that a killed process has left is an error, unless `replace`. Otherwise it is overwritten.
+    mode : int
+        Permissions of a new part, of which the umask removes some.
 
     Attributes
     ----------
     name : Path
-        Of the part.
+        The path of the part.
     descriptor : int
-        Of the part, open for reading and writing. Nothing has been changed in it before `begin`.
+        The part, open for reading and writing. It is unchanged before `begin`.
     keep : bool
-        Whether `close` leaves it where it is.
+        Whether `close` keeps the part.
 
     Raises
     ------
     OutputError
-        The place is taken, or another process writes to it (the text says which), or nothing can be written there.
+        The target exists, or another process (named in the text) is writing it, or it cannot be written.
     """
 
-    def __init__(self, target: str | Path, replace: bool, precious: bool = False) -> None:
+    def __init__(self, target: str | Path, replace: bool, keep_leftover: bool = False, mode: int = 0o666) -> None:
         self.target = Path(target)
-        self._path = _place(self.target, replace)
+        self._path = _checked_target(self.target, replace)
         self.name = self._path.with_name(self._path.name + PART)
         self._replace = replace
         self._begun = self.keep = False
+        self._mode = mode
         try:
             self.descriptor = _locked(self.name, self._open)
         except OSError as problem:
             raise self.error(problem) from None
-        if precious and not replace and self._left_over():
+        if keep_leftover and not replace and self._left_over():
             self.close()
             raise OutputError(
-                f"{self.name} is what an interrupted recording has left: rename or remove it; --force replaces it"
+                f"{self.name} was left by an interrupted recording; rename or remove it, or replace it with --force"
             )
 
     def _open(self) -> int:
         flags = os.O_RDWR | os.O_CREAT | os.O_CLOEXEC | os.O_NOFOLLOW | os.O_NONBLOCK
-        descriptor = os.open(self.name, flags, 0o666)
+        descriptor = os.open(self.name, flags, self._mode)
         found = os.fstat(descriptor)
         if not stat.S_ISREG(found.st_mode) or found.st_nlink > 1:
             os.close(descriptor)
-            raise OSError(errno.EEXIST, f"{self.name} is there, and no file of its own")
+            raise OSError(errno.EEXIST, f"{self.name} exists and is not a regular file with one link")
         return descriptor
 
     def _left_over(self) -> bool:
         return not self._begun and os.fstat(self.descriptor).st_size > 0
 
     def begin(self) -> int:
-        """Empty it of what somebody else has left; returns the descriptor."""
+        """Truncate the part. Return its descriptor."""
         os.ftruncate(self.descriptor, 0)
         self._begun = True
         return self.descriptor
 
     def complete(self) -> None:
-        """Let it take its place; OSError where it cannot, FileExistsError where that is taken now."""
-        os.fsync(self.descriptor)  # else a power cut could leave an empty file of that name
+        """Rename the part to the target; FileExistsError if that was created meanwhile, or another OSError."""
+        os.fsync(self.descriptor)  # otherwise a power cut could leave an empty file of that name
         if not _is_at(self.name, self.descriptor):
-            raise FileNotFoundError(errno.ENOENT, f"{self.name} is not there any more")
+            raise FileNotFoundError(errno.ENOENT, f"{self.name} has been removed")
         if self._replace:
             self.name.rename(self._path)
         else:
@@ -100,36 +107,36 @@ class AtomicOutput:
         _sync_folder(self._path.parent)
 
     def close(self) -> None:
-        """Unlock it; what is not complete goes, unless it is to be kept or is still what somebody else has left."""
+        """Unlock the part, and remove it unless it is complete, to be kept, or an unchanged leftover."""
         if not (self.keep or self._left_over()) and _is_at(self.name, self.descriptor):
             self.name.unlink()
         os.close(self.descriptor)
 
     def error(self, problem: OSError) -> OutputError:
-        """What to say of a failure to write."""
-        return OutputError(f"cannot write {self.target}: {problem.strerror or problem}")
+        """Return the OutputError for a failure to write."""
+        return OutputError(f"cannot write {self.target}: {problem.strerror or problem}", problem.errno)
 
 
 @contextmanager
-def new_file(target: str | Path, replace: bool) -> Iterator[int]:
-    """A descriptor of an empty file that takes the place `target` if all goes well, and else is gone.
+def new_file(target: str | Path, replace: bool, mode: int = 0o666) -> Iterator[int]:
+    """Yield the descriptor of an empty file that becomes `target` on success and is removed on failure.
 
-    Raises OutputError as `Part` does, and for an OSError from within.
+    Raises OutputError as `AtomicOutput` does, and for an OSError in the body.
     """
-    with _new_part(target, replace) as part:
+    with _new_part(target, replace, mode) as part:
         yield part.descriptor
 
 
 @contextmanager
 def new_path(target: str | Path, replace: bool) -> Iterator[Path]:
-    """As `new_file`, for those who open files by name: the name of the empty file, which must be written in place."""
+    """As `new_file`, but yield the path of the empty file, which must be written in place."""
     with _new_part(target, replace) as part:
         yield part.name
 
 
 @contextmanager
-def _new_part(target: str | Path, replace: bool) -> Iterator[AtomicOutput]:
-    part = AtomicOutput(target, replace)
+def _new_part(target: str | Path, replace: bool, mode: int = 0o666) -> Iterator[AtomicOutput]:
+    part = AtomicOutput(target, replace, mode=mode)
     try:
         part.begin()
         yield part
@@ -142,39 +149,39 @@ def _new_part(target: str | Path, replace: bool) -> Iterator[AtomicOutput]:
 
 @contextmanager
 def new_folder(target: str | Path, replace: bool, sign: str) -> Iterator[Path]:
-    """An empty folder that takes the place `target`, links followed, if all goes well, and else is gone.
+    """Yield an empty folder that becomes `target` on success and is removed on failure.
 
-    As with `Part`, its name until then ends with ``.part``, it is locked, and what a killed process left is used up.
+    As for `AtomicOutput`, its name has the suffix ``.part`` until then, it is locked, and a leftover is overwritten.
 
     Parameters
     ----------
     target : path
-        Where the folder goes.
+        The path of the folder; links are followed.
     replace : bool
-        Whether it may take the place of a folder that is there, if that holds a file of the name `sign`.
+        Whether it may replace an existing folder that contains a file `sign`.
     sign : str
-        What tells such a folder from one that somebody keeps other things in.
+        The name of a file by which folders of this kind are recognised.
 
     Raises
     ------
     OutputError
-        The place is taken, or another process writes to it, or nothing can be written there; an OSError from within.
+        The target exists, or another process is writing it, or it cannot be written; and for an OSError in the body.
     """
     path = _real(target)
     try:
         if os.path.lexists(path):
             _check_replaceable(Path(target), path, replace, sign)
         elif not path.parent.is_dir():
-            raise OutputError(f"cannot write {target}: there is no folder {path.parent}")
+            raise OutputError(f"cannot write {target}: the folder {path.parent} does not exist")
         part = path.with_name(path.name + PART)
         descriptor = _locked(part, lambda: _open_folder(part))
         try:
-            for left in part.iterdir():
-                _remove(left)
+            for leftover in part.iterdir():
+                _remove(leftover)
             yield part
             sync_tree(part)
             if not _is_at(part, descriptor):
-                raise FileNotFoundError(errno.ENOENT, f"{part} is not there any more")
+                raise FileNotFoundError(errno.ENOENT, f"{part} has been removed")
             if os.path.lexists(path):
                 _check_replaceable(Path(target), path, replace, sign)
                 _exchange(part, path)
@@ -191,11 +198,11 @@ def new_folder(target: str | Path, replace: bool, sign: str) -> Iterator[Path]:
 
 def _check_replaceable(target: Path, path: Path, replace: bool, sign: str) -> None:
     if not path.is_dir():
-        raise OutputError(f"{target} is there already, and no folder")
+        raise OutputError(f"{target} already exists and is not a folder")
     if not replace:
-        raise OutputError(f"{target} is there already; --force replaces it")
+        raise OutputError(f"{target} already exists; --force replaces it")
     if any(path.iterdir()) and not (path / sign).exists():
-        raise OutputError(f"{target} is a folder with other things in it, which stay")
+        raise OutputError(f"{target} is a folder with other contents; it is left unchanged")
 
 
 def _open_folder(part: Path) -> int:
@@ -206,15 +213,15 @@ def _open_folder(part: Path) -> int:
 
 
 def _exchange(part: Path, path: Path) -> None:
-    """Put a folder in the place of another, which is removed.
+    """Replace the folder `path` by `part`.
 
-    The old one has the name of the part meanwhile. It is locked, so that no other writer takes it for its own part.
+    The old folder has the name of the part until it is removed. A lock keeps other writers from using it as a part.
     """
     old = _locked(path, lambda: os.open(path, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC | os.O_NOFOLLOW))
     try:
         try:
             _renameat2(part, path, _RENAME_EXCHANGE)
-        except FileExistsError:  # a file system that cannot
+        except FileExistsError:  # not supported by the file system
             shutil.rmtree(path)
             part.rename(path)
         else:
@@ -223,22 +230,22 @@ def _exchange(part: Path, path: Path) -> None:
         os.close(old)
 
 
-def _locked(name: Path, opened: Callable[[], int]) -> int:
-    """The descriptor of the file or folder `name` that `opened` returns, locked; BlockingIOError if another has it."""
+def _locked(name: Path, open_it: Callable[[], int]) -> int:
+    """Return the locked descriptor of the file or folder `name`; BlockingIOError if another process has locked it."""
     while True:
-        descriptor = opened()
+        descriptor = open_it()
         try:
             fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
             if _is_at(name, descriptor):
                 return descriptor
         except BlockingIOError:
-            who = _holder(descriptor)
+            holder = _holder(descriptor)
             os.close(descriptor)
-            raise BlockingIOError(errno.EAGAIN, f"{who} is writing it") from None
+            raise BlockingIOError(errno.EAGAIN, f"{holder} is writing it") from None
         except BaseException:
             os.close(descriptor)
             raise
-        os.close(descriptor)  # the process that had it has just finished, and moved or removed it
+        os.close(descriptor)  # its owner has just moved or removed it: try again
 
 
 def _is_at(name: Path, descriptor: int) -> bool:
@@ -255,34 +262,40 @@ def _remove(path: Path) -> None:
         path.unlink()
 
 
-def write_whole(target: str | Path, data: bytes) -> None:
-    """Put a file with `data` in the place `target`, or leave what is there: after a power cut too. OutputError."""
-    with new_file(target, replace=True) as descriptor:
+def write_whole(target: str | Path, data: bytes, mode: int | None = None) -> None:
+    """Write `data` to the file `target`, which keeps its old contents on failure, also after a power cut.
+
+    Permissions are `mode`, by default those of new files. Raises OutputError.
+    """
+    with new_file(target, True, 0o666 if mode is None else mode) as descriptor:
+        if mode is not None:
+            os.fchmod(descriptor, mode)  # also of a part that was left
         rest = memoryview(data)
         while rest:
             rest = rest[os.write(descriptor, rest) :]
 
 
-def _place(target: Path, replace: bool) -> Path:
-    """Where the output goes, links followed; OutputError where that is taken or cannot be."""
+def _checked_target(target: Path, replace: bool) -> Path:
+    """Return the real path of the output; OutputError if it exists or cannot be written."""
     path = _real(target)
     try:
         found = path.lstat()
     except FileNotFoundError:
         if not path.parent.is_dir():
-            raise OutputError(f"cannot write {target}: there is no folder {path.parent}") from None
+            text = f"cannot write {target}: the folder {path.parent} does not exist"
+            raise OutputError(text, errno.ENOENT) from None
         return path
     except OSError as problem:
-        raise OutputError(f"cannot write {target}: {problem.strerror or problem}") from None
+        raise OutputError(f"cannot write {target}: {problem.strerror or problem}", problem.errno) from None
     if not stat.S_ISREG(found.st_mode):
         raise OutputError(f"{target} is not a regular file")
     if not replace:
-        raise OutputError(f"{target} is there already; --force replaces it")
+        raise OutputError(f"{target} already exists; --force replaces it")
     return path
 
 
 def _real(target: str | Path) -> Path:
-    """The absolute path of the output, links followed; OutputError if there is none."""
+    """Return the absolute path of the output with links followed; OutputError if it cannot be determined."""
     try:
         return Path(os.path.realpath(target))
     except FileNotFoundError:
@@ -292,21 +305,21 @@ def _real(target: str | Path) -> Path:
 
 
 def _renameat2(name: Path, path: Path, flag: int) -> None:
-    """Rename to nothing, or exchange the two; FileExistsError where `path` is there, or the file system cannot."""
+    """Call renameat2; FileExistsError if `path` exists, or if the file system does not support the flag."""
     libc = ctypes.CDLL(None, use_errno=True)
     if libc.renameat2(_AT_FDCWD, os.fsencode(name), _AT_FDCWD, os.fsencode(path), flag) == 0:
         return
     problem = ctypes.get_errno()
-    if problem in (errno.EINVAL, errno.ENOSYS) and not os.path.lexists(path):  # a file system that cannot, such as NFS
+    if problem in (errno.EINVAL, errno.ENOSYS) and not os.path.lexists(path):  # not supported, as on NFS
         name.rename(path)
         return
     if problem in (errno.EINVAL, errno.ENOSYS, errno.EEXIST):
-        raise FileExistsError(errno.EEXIST, "it has come into being meanwhile")
+        raise FileExistsError(errno.EEXIST, "it was created meanwhile")
     raise OSError(problem, os.strerror(problem))
 
 
 def sync_tree(folder: Path) -> None:
-    """Have the folder and everything in it on the disk, so that they survive a power cut once they are renamed."""
+    """Write a folder and all files in it to the disk, so that they survive a power cut after a rename."""
     for parent, _, names in os.walk(folder):
         for name in names:
             _sync(Path(parent, name))
@@ -314,7 +327,7 @@ def sync_tree(folder: Path) -> None:
 
 
 def _sync_folder(folder: Path) -> None:
-    with contextlib.suppress(OSError):  # a file system that cannot
+    with contextlib.suppress(OSError):  # not supported by the file system
         _sync(folder)
 
 
@@ -327,14 +340,14 @@ def _sync(path: Path) -> None:
 
 
 def _holder(descriptor: int) -> str:
-    """Which process has the file locked, for people; of those of other users nothing is known."""
-    wanted = os.fstat(descriptor)
-    # This process comes last: forked from the one that writes, it has inherited the locked descriptor.
+    """Return a description of the process that has locked the file; processes of other users are not visible."""
+    locked = os.fstat(descriptor)
+    # This process is checked last: if it was forked from the writer, it has inherited the locked descriptor.
     own = f"/proc/{os.getpid()}/"
     for opened in map(Path, sorted(glob.iglob("/proc/[0-9]*/fd/*"), key=lambda name: name.startswith(own))):
-        with contextlib.suppress(OSError):  # closed by now, or somebody else's
+        with contextlib.suppress(OSError):  # closed meanwhile, or of another user
             process = opened.parents[1]
-            if os.path.samestat(opened.stat(), wanted) and "FLOCK" in (process / "fdinfo" / opened.name).read_text():
+            if os.path.samestat(opened.stat(), locked) and "FLOCK" in (process / "fdinfo" / opened.name).read_text():
                 words = (process / "cmdline").read_bytes().decode(errors="replace").split("\0")[:-1]
                 command = shlex.join(words)[:200]
                 return f"process {process.name} ({command if command.isprintable() else 'unknown'})"

@@ -1,12 +1,12 @@
-"""The public interface for authors of plugins, that is, of representations of their own.
+"""The public interface for authors of plugins, which are representations that are not part of rosAFE.
 
 Import these names from here, and from no other module of rosafe::
 
     from rosafe.plugin import FramedStage, Parameter, Representation, frame_parameters
 
-Stability: within one `API_VERSION` these names, their arguments, and what docs/own-representation.md says about them
-keep their meaning; new ones may be added. If a name has to change, it remains available for one more release under its
-old name, and the log and ``rosafe doctor`` report each plugin that still uses it.
+Stability: within one `API_VERSION` these names, their arguments and their description in docs/own-representation.md do
+not change; new names may be added. If a name has to change, the old name remains available for one more release, and
+the log and ``rosafe doctor`` report each plugin that still uses it.
 
 Attributes
 ----------
@@ -15,6 +15,7 @@ API_VERSION : int
 """
 
 from rosafe.declarations.parameter import Parameter
+from rosafe.declarations.reference import Citation, Reference
 from rosafe.declarations.representation import Derived, Part, Representation
 from rosafe.dsp.framing import FramedStage, frame_parameters
 from rosafe.dsp.stage import Stage
@@ -24,10 +25,12 @@ API_VERSION = 1
 
 __all__ = [
     "API_VERSION",
+    "Citation",
     "Derived",
     "FramedStage",
     "Parameter",
     "Part",
+    "Reference",
     "Representation",
     "Stage",
     "frame_parameters",

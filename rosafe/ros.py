@@ -1,4 +1,4 @@
-"""For clients in Python on the ROS graph: arrays where the generated classes have lists, and the time of any frame."""
+"""For ROS clients in Python: message classes with arrays instead of lists, and the time of each frame."""
 
 from __future__ import annotations
 
@@ -7,32 +7,32 @@ import time
 from collections import deque
 from typing import Any, NamedTuple
 
-KEPT = 600  # lines of a FrameClock: two minutes and more with the default block
+MAX_LINES = 600  # lines of a FrameClock: at least two minutes with the default block
 
 
 def array_msg(generated: Any) -> Any:
-    """As `rosafe.component.serialization.array_msg`: the message class to use in place of a generated one."""
-    from rosafe.component import serialization  # which needs ROS, and generated messages
+    """Return the message class with arrays for a generated one; see `rosafe.component.serialization.array_msg`."""
+    from rosafe.component import serialization  # requires ROS and generated messages
 
     return serialization.array_msg(generated)
 
 
 def array_srv(generated: Any) -> Any:
-    """As `rosafe.component.serialization.array_srv`: the service class to use in place of a generated one."""
+    """Return the service class with arrays for a generated one; see `rosafe.component.serialization.array_srv`."""
     from rosafe.component import serialization
 
     return serialization.array_srv(generated)
 
 
 class Moment(NamedTuple):
-    """When something was captured.
+    """The time at which an audio frame was captured.
 
     Attributes
     ----------
     wall : float
-        In s since 1970, by the clock of the machine that captured it.
+        In s since 1970, by the clock of the capturing machine.
     ros : rospy.Time
-        In ROS time, which with `use_sim_time` is another one.
+        In ROS time, which differs if `use_sim_time` is set.
     """
 
     wall: float
@@ -43,18 +43,18 @@ class _Line(NamedTuple):
     frame: int
     wall: float
     rate: float
-    offset: float  # of ROS time to the stamps' clock, when it came
+    offset: float  # ROS time minus the stamps' clock, at the arrival of the message
 
 
 class FrameClock:
-    """Tells when frames were captured, from the port `frameTime` of a rosAFE; docs/time.md has the formulas.
+    """Computes capture times of frames from the port `frameTime` of a rosAFE node; docs/time.md has the formulas.
 
-    Make it after `rospy.init_node`.
+    Create it after `rospy.init_node`.
 
     Parameters
     ----------
     node : str
-        The rosAFE.
+        The name of the node.
     """
 
     def __init__(self, node: str = "rosAFE") -> None:
@@ -66,65 +66,70 @@ class FrameClock:
         from rosAFE.msg import rosAFE_frameTime
 
         self.topic = f"{node}/frameTime"
-        self._lines: deque[_Line] = deque(maxlen=KEPT)
-        self._come = threading.Condition()
+        self._lines: deque[_Line] = deque(maxlen=MAX_LINES)
+        self._arrived = threading.Condition()
         self._rospy = rospy
         self._subscriber = rospy.Subscriber(self.topic, rosAFE_frameTime, self._take, queue_size=100, tcp_nodelay=True)
 
     def close(self) -> None:
-        """Listen no longer."""
+        """Unsubscribe."""
         self._subscriber.unregister()
 
     def wait(self, timeout: float = 5.0) -> bool:
-        """Wait until times are known, up to `timeout` s; whether they are."""
-        with self._come:
-            return self._come.wait_for(lambda: bool(self._lines), timeout)
+        """Wait up to `timeout` s until times are known. Return whether they are."""
+        with self._arrived:
+            return self._arrived.wait_for(lambda: bool(self._lines), timeout)
+
+    def covers(self, frame: int, within: float) -> bool:
+        """Return whether the time of an audio frame less than `within` frames from `frame` has arrived last."""
+        with self._arrived:
+            return bool(self._lines) and abs(self._lines[-1].frame - frame) < within
 
     def time(self, frame: float) -> Moment:
-        """When audio frame `frame` was captured, as bass and `lastFrameIndex` number them; between two frames, too.
+        """Return the capture time of an audio frame by its frame index, which may be fractional.
 
         Raises
         ------
         LookupError
-            Nothing has come yet.
+            No message has arrived yet.
         """
-        with self._come:
+        with self._arrived:
             if not self._lines:
-                raise LookupError(f"nothing has come on {self.topic} yet: is there an input, and sound?")
+                raise LookupError(f"no message on {self.topic} yet; check that there is an input and sound")
             line = next((line for line in self._lines if line.frame >= frame), self._lines[-1])
         wall = line.wall + (frame - line.frame) / line.rate
         return Moment(wall, self._rospy.Time.from_sec(max(0.0, wall + line.offset)))
 
     def of(self, message: Any, frame: int = -1, window: float = 0.0, hop: float = 0.0) -> Moment:
-        """When the middle of a frame in a port's message was captured.
+        """Return the capture time of the middle of a frame in a port's message.
 
         Parameters
         ----------
         message
-            Of any port of the rosAFE.
+            From any port of the node.
         frame : int
-            Which column of the message; by default the newest. Negative ones count from the end.
+            Column of the message; the newest by default. Negative numbers count from the end.
         window, hop : float
-            The ``wSizeSec`` and ``hSizeSec`` of its processor in s; both 0 for ports whose frames are samples.
+            ``wSizeSec`` and ``hSizeSec`` of the processor in s; both 0 for ports whose frames are samples.
 
         Raises
         ------
         LookupError
-            Nothing has come on `frameTime` yet, or there is no such frame.
+            No message has arrived on `frameTime` yet, or the frame does not exist.
 
         Notes
         -----
-        Frames begin with the first block that a processor gets. Where the hop divides the block, that says where they
-        end, and the answer is exact; else it is wrong by half a hop at most.
+        Frames begin with the first block that a processor receives. If the hop divides the block, the end of the newest
+        frame is known and the result is exact; otherwise the error is at most half a hop.
         """
         frames = int(message.framesOnPort)
         if not -frames <= frame < frames:
-            raise LookupError(f"there is no frame {frame}, the message has {frames}")
+            raise LookupError(f"frame: expected {-frames} to {frames - 1}, got {frame}")
         back = -1 - frame if frame < 0 else frames - 1 - frame
-        newest = int(message.lastFrameIndex) - 1  # the last audio frame that it knows of
+        newest = int(message.lastFrameIndex) - 1  # the last audio frame that the message depends on
         if hop <= 0:
             return self.time(newest - back)
-        with self._come:
+        with self._arrived:
             lines = list(self._lines)[-2:]
         rate = lines[-1].rate if lines else 0.0
         width, step = round(window * rate), max(1, round(hop * rate))
@@ -135,11 +140,11 @@ class FrameClock:
     def _take(self, message: Any) -> None:
         wall = message.stamp.to_sec()
         now, ros_now = time.time(), self._rospy.get_time()
-        # Stamps of a bag that somebody plays are ROS time already; those of a bass that captures are wall-clock time.
+        # Stamps from rosbag play are ROS time; stamps from capture are wall-clock time.
         recorded = abs(wall - ros_now) <= abs(wall - now)
         line = _Line(int(message.frameIndex), wall, float(message.sampleRate), 0.0 if recorded else ros_now - now)
-        with self._come:
-            if self._lines and line.frame <= self._lines[-1].frame:  # another stream
+        with self._arrived:
+            if self._lines and line.frame <= self._lines[-1].frame:  # a new stream
                 self._lines.clear()
             self._lines.append(line)
-            self._come.notify_all()
+            self._arrived.notify_all()

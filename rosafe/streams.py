@@ -1,4 +1,4 @@
-"""Standard streams that are closed, full or no longer read: a program ends with one line and a status, no traceback."""
+"""Handle standard streams that are closed, full or no longer read: one line and an exit status, no traceback."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from typing import Any
 
 
 class StreamError(Exception):
-    """The standard output cannot be written; the text says why."""
+    """The standard output cannot be written; the text is the reason."""
 
 
 class _Output(io.FileIO):
-    """The standard output. Its errors are none of the files that a program writes: no OSError, except a closed pipe."""
+    """The standard output. It raises StreamError, except for a closed pipe, so that OSError stands for other files."""
 
     def write(self, data: Any, /) -> int:
         try:
@@ -26,7 +26,7 @@ class _Output(io.FileIO):
 
 
 class _Messages(io.FileIO):
-    """The standard error. Work goes on without messages that cannot be written."""
+    """The standard error. Messages that cannot be written are dropped."""
 
     lost = False
 
@@ -46,7 +46,7 @@ def run(name: str, main: Callable[[], int]) -> int:
     Parameters
     ----------
     name : str
-        Begins the message about a stream.
+        The program's name, which begins the message about a stream.
     main : callable
         The program; returns its exit status, or raises SystemExit.
 
@@ -65,7 +65,7 @@ def run(name: str, main: Callable[[], int]) -> int:
                 print(end.code, file=sys.stderr)
             code = 1 if isinstance(end.code, str) else end.code or 0
         sys.stdout.flush()
-    except BrokenPipeError:  # the reader has had enough, as `head` does
+    except BrokenPipeError:  # the reader has exited, as `head` does
         _discard(1, 2)
         return 141
     except StreamError as problem:
@@ -76,11 +76,11 @@ def run(name: str, main: Callable[[], int]) -> int:
 
 
 def _open_all() -> _Messages:
-    """Put our own objects in the place of Python's streams, which are None where the shell has closed them."""
+    """Replace Python's standard streams, which are None if the shell has closed them."""
     for number, (stream, flags) in enumerate(
         ((sys.stdin, os.O_WRONLY), (sys.stdout, os.O_RDONLY), (sys.stderr, os.O_RDONLY))
     ):
-        if stream is None:  # no file that is opened later may get its number; and reading or writing fails
+        if stream is None:  # reserve its number; reading and writing fail
             descriptor = os.open(os.devnull, flags)
             if descriptor != number:
                 os.dup2(descriptor, number)
@@ -105,7 +105,7 @@ def _text(raw: io.FileIO, like: Any) -> io.TextIOWrapper:
 
 
 def _discard(*numbers: int) -> None:
-    """Let Python flush at its end what it still has."""
+    """Redirect descriptors to /dev/null, so that Python can flush its buffers at exit."""
     null = os.open(os.devnull, os.O_WRONLY)
     for number in numbers:
         os.dup2(null, number)

@@ -1,13 +1,13 @@
-"""Text for terminals: names of files and texts from the network may contain escape sequences."""
+"""Escape text for terminals: file names and texts from the network may contain escape sequences."""
 
 from __future__ import annotations
 
 
 def printable(text: object, keep: str = "") -> str:
-    r"""Return `text` as one line that a terminal shows and does nothing else with.
+    r"""Return `text` as one line that has no effect on a terminal except to be shown.
 
     Characters that are not printable are escaped as in Python (``\x1b``, ``\n``, ``\u202e``), except those in `keep`.
-    Bytes of a file's name that are not UTF-8 are escaped, too (``\xff``).
+    Bytes of a file name that are not UTF-8 are escaped too (``\xff``).
     """
     line = str(text)
     if line.isprintable():

@@ -1,4 +1,4 @@
-"""For authors of plugins: one call that tries what the tree relies on, on bare stages, without ROS."""
+"""For plugin authors: one call that checks a representation on bare stages, without a tree or ROS."""
 
 from __future__ import annotations
 
@@ -22,57 +22,57 @@ from rosafe.representations import BUILTIN, STAGES
 from rosafe.tree import sizes
 
 _CUTS = ([1], [7, 0, 160], [0, 0, 441], [3, 1000, 50])
-_LOUD = 2.0**31  # the samples of int32 sound that is not normalised
+_LOUD = 2.0**31  # scale of int32 samples that are not normalised
 _LONG_SECONDS = 8.0
-_MAX_BYTES = 2**25  # of the output of a parent at a limit of its parameters, for a short sound
+_MAX_BYTES = 2**25  # output of a parent for a short sound with a parameter at its limit
 _COST_RATE, _COST_SECONDS = 44100.0, 0.5
 
 
 def check_representation(
     kind: type[Stage], sample_rate: float = 16000.0, seconds: float = 0.25, **parameters: Any
 ) -> dict[str, float]:
-    """Raise AssertionError, with the reason, unless a representation does what the tree relies on.
+    """Raise AssertionError, with the reason, unless a representation fulfils the requirements of the tree.
 
-    It tries blocks of different lengths, empty ones included; shape, type and contiguity of each output, finite
-    numbers, the number of frames; that the input is not written, and that output and input share no memory; a change
-    of each parameter and of the number of channels during the sound; parents with their parameters at their limits;
-    derived values; silence, loud and long sound; values out of range; copies of the stage; `reset`.
+    It checks blocks of different lengths, including empty ones; shape, type and contiguity of each output, finite
+    numbers and the number of frames; that the input is not modified and shares no memory with the output; a change of
+    each parameter and of the number of channels during the sound; parents with parameters at their limits; derived
+    values; silence, loud and long sound; values out of range; copies of the stage; and `reset`.
 
     Parameters
     ----------
     kind : type
-        A subclass of Stage with a declaration; its parent is a built-in representation or a plugin that is loaded.
+        A subclass of Stage with a declaration. Its parent is a built-in representation or a loaded plugin.
     sample_rate : float
-        Of the sound (Hz).
+        Sample rate of the test sound (Hz).
     seconds : float
-        How much sound it is tried on.
+        Duration of the test sound.
     **parameters
-        Of the representation, instead of its defaults.
+        Parameters of the representation that replace its defaults.
 
     Returns
     -------
     dict of str to float
-        Milliseconds of computing per second of sound at 44.1 kHz, by kind: this representation first, then the
-        built-in ones, each without its parents.
+        Computing time by kind, without parents, in ms per second of sound at 44.1 kHz: this representation first, then
+        the built-in ones.
     """
     trial = _Trial(kind, sample_rate, parameters)
     sound = _sound(int(seconds * sample_rate))
     with _asserting():
-        trial.try_blocks(sound)
-        trial.try_levels(sound)
+        trial.check_blocks(sound)
+        trial.check_levels(sound)
         for parameter in kind.REPRESENTATION.parameters:
-            trial.refuse(parameter)
-            trial.change(parameter, sound)
-        trial.change_channels(sound)
-        trial.try_parents(sound)
-        trial.copy_and_reset(sound)
-        trial.try_long()
+            trial.check_refusals(parameter)
+            trial.check_change(parameter, sound)
+        trial.check_channel_change(sound)
+        trial.check_parents(sound)
+        trial.check_copy_and_reset(sound)
+        trial.check_long()
         return _costs(trial.kind, parameters)
 
 
 @contextmanager
 def _asserting() -> Iterator[None]:
-    """Violations that are found at run time, too, are assertions here."""
+    """Convert PluginError, which the run-time checks raise, to AssertionError."""
     try:
         yield
     except PluginError as problem:
@@ -80,102 +80,100 @@ def _asserting() -> Iterator[None]:
 
 
 class _Trial:
-    """A stage on its parents."""
+    """Creates and checks a stage with its parents."""
 
     def __init__(self, kind: type[Stage], sample_rate: float, parameters: dict[str, Any]) -> None:
         layout(kind.REPRESENTATION)
         self.kind = _strict(kind)
         self.sample_rate, self.parameters = sample_rate, parameters
 
-    def stages(self, above: Mapping[str, Mapping[str, Any]] | None = None) -> list[Stage]:
-        """New ones, from the input to the one that is tried; `above` are parameters of parents, by kind."""
-        made: list[Stage] = []
+    def stages(self, parent_values: Mapping[str, Mapping[str, Any]] | None = None) -> list[Stage]:
+        """Create stages from the input to the checked one; `parent_values` are parameters of parents, by kind."""
+        created: list[Stage] = []
         for stage in _line(self.kind):
-            values = dict((above or {}).get(stage.REPRESENTATION.kind, {}))
+            values = dict((parent_values or {}).get(stage.REPRESENTATION.kind, {}))
             if stage is self.kind:
                 values |= self.parameters
-            elif not made:
+            elif not created:
                 values.setdefault("in_doNormalize", False)
-            made.append(stage(made[-1].output_format if made else self.sample_rate, **values))
-        return made
+            created.append(stage(created[-1].output_format if created else self.sample_rate, **values))
+        return created
 
     def run(self, sound: FloatArray, lengths: Sequence[int], stages: list[Stage] | None = None) -> list[FloatArray]:
-        """The parts of the output, joined."""
+        """Return the parts of the output for blocks of these lengths (used cyclically), joined."""
         stages = stages or self.stages()
         for parent, child in itertools.pairwise(stages):
             parent.provide = frozenset({child.required_extra} - {""})
-        pieces, at, turn = [], 0, 0
-        while at < sound.shape[-1] or turn < len(lengths):
-            length = lengths[turn % len(lengths)]
-            data: Any = stages[0].process(sound[:, at : at + length])
+        pieces, first, number = [], 0, 0
+        while first < sound.shape[-1] or number < len(lengths):
+            length = lengths[number % len(lengths)]
+            data: Any = stages[0].process(sound[:, first : first + length])
             for parent, stage in itertools.pairwise(stages):
                 block = parts_of(data)[0]
-                if stage is not stages[-1]:
-                    data = stage.process(block, parent.provided.get(stage.required_extra))
-                    continue
                 before = block.copy()
                 data = stage.process(block, parent.provided.get(stage.required_extra))
-                assert np.array_equal(before, block, equal_nan=True), "process writes to its input"
+                changed = stage is stages[-1] and not np.array_equal(before, block, equal_nan=True)
+                assert not changed, "process writes to its input"
             pieces.append(parts_of(data))
-            at, turn = at + length, turn + 1
+            first, number = first + length, number + 1
         return [np.concatenate(arrays, axis=-1) for arrays in zip(*pieces, strict=True)]
 
     # --- sound ---
 
-    def try_blocks(self, sound: FloatArray) -> None:
-        """How the sound is cut into blocks makes no difference (1e-9 of the largest number), nor does later sound."""
+    def check_blocks(self, sound: FloatArray) -> None:
+        """Check that the output depends neither on blocks (to 1e-9 of the largest number) nor on later sound."""
         whole = self.run(sound, [sound.shape[-1]])
-        self.look_at(whole, sound.shape[-1])
+        self.check_shapes(whole, sound.shape[-1])
         for cuts in _CUTS:
-            _assert_equal(self.run(sound, cuts), whole, f"the output depends on blocks: cut into {cuts}")
+            _assert_equal(self.run(sound, cuts), whole, f"the output depends on blocks: lengths {cuts}")
         part = self.run(sound[:, : sound.shape[-1] // 2], [100])
-        wanted = [w[..., : p.shape[-1]] for p, w in zip(part, whole, strict=True)]
-        _assert_equal(part, wanted, "later sound changes frames")
+        expected = [w[..., : p.shape[-1]] for p, w in zip(part, whole, strict=True)]
+        _assert_equal(part, expected, "later sound changes earlier frames")
 
-    def try_levels(self, sound: FloatArray) -> None:
-        """Silence, and loud sound."""
+    def check_levels(self, sound: FloatArray) -> None:
+        """Check silence and loud sound."""
         for name, samples in (("silence", np.zeros_like(sound)), ("loud sound", _LOUD * sound)):
             with _trying(name):
-                self.look_at(self.run(samples, [500]), sound.shape[-1])
+                self.check_shapes(self.run(samples, [500]), sound.shape[-1])
 
-    def try_long(self) -> None:
-        """Long sound: what the stage keeps must not grow with it."""
+    def check_long(self) -> None:
+        """Check that the state of the stage does not grow with the length of the sound."""
         half = _sound(int(_LONG_SECONDS / 2 * self.sample_rate))
         stages = self.stages()
         kept = []
         for _ in range(2):
             with _trying("long sound"):
                 self.run(half, [4000], stages)
-            kept.append(_held(vars(stages[-1])))
+            kept.append(_memory_of(vars(stages[-1])))
         assert kept[1] < 1.5 * kept[0] + 10_000, (
             f"its state grows with the sound: {kept[0]} bytes after {_LONG_SECONDS / 2:g} s, "
             f"{kept[1]} after {_LONG_SECONDS:g} s"
         )
 
-    def look_at(self, output: list[FloatArray], frames: int) -> None:
-        """Shape and number of frames of the whole output; `checked` has looked at each block."""
+    def check_shapes(self, output: list[FloatArray], frames: int) -> None:
+        """Check shape and number of frames of the whole output; the run-time checks have checked each block."""
         stages = self.stages()
         rows: tuple[int, ...] = (2,)
         for stage in stages[:-1]:
             rows, frames = stage.output_rows(rows), stage.output_count(frames)
         last = stages[-1]
-        for part, wanted, array in zip(self.kind.REPRESENTATION.parts, last.part_rows(rows), output, strict=True):
-            shape = (*wanted, last.output_count(frames))
-            assert array.shape == shape, f"{part.name}: expected shape {shape} in all, got {array.shape}"
+        for part, part_rows, array in zip(self.kind.REPRESENTATION.parts, last.part_rows(rows), output, strict=True):
+            shape = (*part_rows, last.output_count(frames))
+            assert array.shape == shape, f"{part.name}: expected shape {shape} for the whole sound, got {array.shape}"
         first = last.part_rows(rows)[0]
-        assert last.output_rows(rows) == first, f"output_rows: expected {first} as the first of part_rows"
+        assert last.output_rows(rows) == first, f"output_rows: expected {first}, the first of part_rows"
         for name, value in {**last.parameters, **last.derived}.items():
-            assert isinstance(format_value(value), str), f"{name}: {value!r} has no text"
+            assert isinstance(format_value(value), str), f"{name}: {value!r} cannot be formatted as text"
 
     # --- parameters ---
 
-    def refuse(self, parameter: Parameter) -> None:
-        """What is out of its range is refused and changes nothing."""
+    def check_refusals(self, parameter: Parameter) -> None:
+        """Check that invalid values are refused and change nothing."""
         bad: list[Any] = [object(), float("nan")]
         if parameter.maximum is not None:
             bad.append(2 * abs(parameter.maximum) + 1)
         if parameter.choices:
-            bad.append("no such word")
+            bad.append("unknown choice")
         for value in bad:
             stage = self.stages()[-1]
             before = stage.parameters
@@ -183,12 +181,12 @@ class _Trial:
                 stage.configure(**{parameter.name: value})
             except ValueError as problem:
                 assert str(problem).startswith(parameter.name), f"{problem}: does not begin with {parameter.name}"
-                assert stage.parameters == before, f"{parameter.name}: was changed though {value!r} was refused"
+                assert stage.parameters == before, f"{parameter.name}: changed although {value!r} was refused"
             else:
                 raise AssertionError(f"{parameter.name}: {value!r} was not refused")
 
-    def change(self, parameter: Parameter, sound: FloatArray) -> None:
-        """Each other value, from the middle of the sound on."""
+    def check_change(self, parameter: Parameter, sound: FloatArray) -> None:
+        """Check changes to other values in the middle of the sound."""
         half = sound.shape[-1] // 2
         for value in _values_of(parameter):
             stages = self.stages()
@@ -206,8 +204,8 @@ class _Trial:
                     continue
                 self.run(sound[:, half:], [160, 0, 7], stages)
 
-    def change_channels(self, sound: FloatArray) -> None:
-        """Another number of channels, from the middle of the sound on."""
+    def check_channel_change(self, sound: FloatArray) -> None:
+        """Check changes of the number of channels in the middle of the sound."""
         stages = self.stages()
         bank = next((i for i, stage in enumerate(stages[:-1]) if stage.REPRESENTATION.kind == "gammatone"), None)
         if bank is None:
@@ -221,8 +219,8 @@ class _Trial:
                 if _follow(stages[bank:]):
                     self.run(sound[:, half:], [160, 0, 7], stages)
 
-    def try_parents(self, sound: FloatArray) -> None:
-        """All parameters of the parents at their limits, one at a time."""
+    def check_parents(self, sound: FloatArray) -> None:
+        """Check the stage with each parameter of its parents at its limits, one at a time."""
         short = sound[:, : int(0.1 * self.sample_rate)]
         for parent in _line(self.kind)[:-1]:
             for parameter in parent.REPRESENTATION.parameters:
@@ -239,52 +237,51 @@ class _Trial:
 
     # --- copies ---
 
-    def copy_and_reset(self, sound: FloatArray) -> None:
-        """A copy that is changed, as the tree does it to try a change, leaves the stage alone; a reset one is new."""
+    def check_copy_and_reset(self, sound: FloatArray) -> None:
+        """Check that changes of a shallow copy do not affect the stage, and that `reset` works."""
         half = sound.shape[-1] // 2
-        touched, left = self.stages(), self.stages()
-        for stages in (touched, left):
+        copied, untouched = self.stages(), self.stages()
+        for stages in (copied, untouched):
             self.run(sound[:, :half], [half], stages)
         with _trying("copy.copy of the stage"):
-            twin = copy.copy(touched[-1])
-            assert type(twin) is type(touched[-1]) and vars(twin).keys() == vars(touched[-1]).keys(), "it is no copy"
+            twin = copy.copy(copied[-1])
+            assert type(twin) is type(copied[-1]) and vars(twin).keys() == vars(copied[-1]).keys(), "it is not a copy"
         for name, value in twin.parameters.items():
             try:
                 twin.configure(**{name: value})
             except PluginError:
                 raise
             except ValueError:
-                continue  # what is reported of a stage need not be what can be set
-        one, other = (self.run(sound[:, half:], [half], stages) for stages in (touched, left))
-        _assert_equal(one, other, "a change of a shallow copy alters the stage: build must make new objects")
-        for stage in touched:
+                continue  # reported parameters need not be settable
+        one, other = (self.run(sound[:, half:], [half], stages) for stages in (copied, untouched))
+        _assert_equal(one, other, "a change of a shallow copy alters the stage: build must create new objects")
+        for stage in copied:
             stage.reset()
-        again, new = self.run(sound, [half], touched), self.run(sound, [half])
-        _assert_equal(again, new, "after reset() it is not as it was when new")
+        again, new = self.run(sound, [half], copied), self.run(sound, [half])
+        _assert_equal(again, new, "after reset() the output differs from that of a new stage")
 
 
 @contextmanager
-def _trying(what: str) -> Iterator[None]:
-    """Name what is tried in what fails; the stage must not fail with anything."""
+def _trying(subject: str) -> Iterator[None]:
+    """Convert any exception to AssertionError, prefixed with the subject of the check."""
     try:
         yield
     except AssertionError as problem:
-        raise AssertionError(f"{what}: {problem}") from problem.__cause__
+        raise AssertionError(f"{subject}: {problem}") from problem.__cause__
     except Exception as problem:
         text = str(problem) if isinstance(problem, PluginError) else f"{type(problem).__name__}: {problem}"
-        raise AssertionError(f"{what}: {text}") from problem
+        raise AssertionError(f"{subject}: {text}") from problem
 
 
 def _strict(kind: type[Stage]) -> type[Stage]:
-    """`kind` with the checks of plugins, and without conversions."""
+    """Return `kind` with the run-time checks of plugins, but without their conversions."""
     if kind.REPRESENTATION.kind in BUILTIN and STAGES[kind.REPRESENTATION.kind] is kind:
         return kind
-    made = checked(kind)
-    return type(kind.__name__, (made,), {"CONVERTS": False, "__module__": kind.__module__})
+    return type(kind.__name__, (checked(kind),), {"CONVERTS": False, "__module__": kind.__module__})
 
 
 def _line(kind: type[Stage]) -> list[type[Stage]]:
-    """The stages from the input to `kind`."""
+    """Return the stages from the input to `kind`."""
     line = [kind]
     while parent := line[0].REPRESENTATION.parent:
         line.insert(0, STAGES[parent])
@@ -292,19 +289,19 @@ def _line(kind: type[Stage]) -> list[type[Stage]]:
 
 
 def _fits(stages: Sequence[Stage]) -> bool:
-    """Whether a short sound does not take too much memory at any stage."""
+    """Return whether the memory that each stage needs for a short sound is acceptable."""
     rows: tuple[int, ...] = (2,)
     for stage in stages:
         if sizes.output_size(stage, rows, 0.25) > _MAX_BYTES or sizes.state_size(stage, rows) > _MAX_BYTES:
             return False
-        if stage.output_format.window > stage.sample_rate:  # a second, of which there is less
+        if stage.output_format.window > stage.sample_rate:  # longer than the sound: 1 s
             return False
         rows = stage.output_rows(rows)
     return True
 
 
 def _follow(stages: Sequence[Stage]) -> bool:
-    """Hand the format of the first one down; False if one refuses it, as it may."""
+    """Pass the format of the first stage down; False if a stage refuses it, which is allowed."""
     for parent, child in itertools.pairwise(stages):
         try:
             child.set_input_format(parent.output_format)
@@ -316,7 +313,7 @@ def _follow(stages: Sequence[Stage]) -> bool:
 
 
 def _limits(parameter: Parameter) -> list[Any]:
-    """The least and the greatest value, or all words."""
+    """Return the minimum and the maximum, or all choices."""
     if parameter.choices:
         return [[word] if element(parameter.idl) else word for word in parameter.choices]
     if parameter.idl == "boolean":
@@ -330,7 +327,7 @@ def _limits(parameter: Parameter) -> list[Any]:
 
 
 def _values_of(parameter: Parameter) -> list[Any]:
-    """Values other than the default that should be possible, or be refused by name."""
+    """Return values other than the default, which a stage should accept or refuse by name."""
     default = parameter.default
     if parameter.choices or parameter.idl == "boolean":
         return _limits(parameter)
@@ -351,26 +348,26 @@ def _is_possible(parameter: Parameter, value: Any) -> bool:
     return True
 
 
-def _held(value: Any, depth: int = 4) -> int:
-    """Bytes of the arrays and numbers that an object keeps."""
+def _memory_of(value: Any, depth: int = 4) -> int:
+    """Return the bytes of the arrays and numbers in an object."""
     if isinstance(value, np.ndarray):
         return int(value.nbytes)
     if depth == 0 or isinstance(value, (str, bytes, type)) or callable(value):
         return 0
     if isinstance(value, Mapping):
-        return sum(_held(one, depth - 1) for one in value.values())
+        return sum(_memory_of(one, depth - 1) for one in value.values())
     if isinstance(value, (int, float, complex)):
         return 8
     if hasattr(value, "__len__") and hasattr(value, "__iter__"):
-        return sum(_held(one, depth - 1) for one in value)
-    return _held(getattr(value, "__dict__", {}), depth - 1)
+        return sum(_memory_of(one, depth - 1) for one in value)
+    return _memory_of(getattr(value, "__dict__", {}), depth - 1)
 
 
 def _costs(kind: type[Stage], parameters: Mapping[str, Any]) -> dict[str, float]:
-    """ms of computing per second of sound, of `kind` and of the built-in representations."""
+    """Return the computing time of `kind` and of the built-in representations, in ms per second of sound."""
     stages: dict[str, type[Stage]] = {kind.REPRESENTATION.kind: kind}
-    for own in (stage for name, stage in STAGES.items() if name in BUILTIN):
-        stages.setdefault(own.REPRESENTATION.kind, own)
+    for name in (name for name in STAGES if name in BUILTIN):
+        stages.setdefault(name, STAGES[name])
     costs: dict[str, float] = {}
     for stage in stages.values():
         _measure(_line(stage), kind, parameters, costs)
@@ -380,38 +377,38 @@ def _costs(kind: type[Stage], parameters: Mapping[str, Any]) -> dict[str, float]
 def _measure(
     line: list[type[Stage]], kind: type[Stage], parameters: Mapping[str, Any], costs: dict[str, float]
 ) -> None:
-    """Add the cost of the last one of `line`; the median of blocks of 50 ms."""
-    made: list[Stage] = []
+    """Add the computing time of the last stage of `line`: the median over blocks of 50 ms."""
+    created: list[Stage] = []
     for stage in line:
         values: dict[str, Any] = dict(parameters) if stage is kind else {}
-        made.append(stage(made[-1].output_format if made else _COST_RATE, **values))
-    for parent, child in itertools.pairwise(made):
+        created.append(stage(created[-1].output_format if created else _COST_RATE, **values))
+    for parent, child in itertools.pairwise(created):
         parent.provide = frozenset({child.required_extra} - {""})
     frames = int(_COST_RATE / 20)
     sound = (_sound(int(_COST_SECONDS * _COST_RATE)) * _LOUD).astype(np.int32)
-    taken = []
+    durations = []
     for at in range(0, sound.shape[-1], frames):
         data: Any = sound[:, at : at + frames]
         extras: Mapping[str, FloatArray] = {}
-        for one in made:
+        for one in created:
             arguments = (data, extras[one.required_extra]) if one.required_extra else (data,)
-            begun = time.thread_time()
+            started = time.thread_time()
             output = one.process(*arguments)
-            spent = time.thread_time() - begun
+            seconds = time.thread_time() - started
             data, extras = parts_of(output)[0], one.provided
-        taken.append(spent)
-    costs[line[-1].REPRESENTATION.kind] = 1e3 * float(np.median(taken)) * _COST_RATE / frames
+        durations.append(seconds)
+    costs[line[-1].REPRESENTATION.kind] = 1e3 * float(np.median(durations)) * _COST_RATE / frames
 
 
 def _sound(frames: int) -> FloatArray:
-    """Noise with a stretch of silence, the right ear quieter."""
+    """Return noise with a pause, at a lower level in the right ear."""
     sound = np.random.default_rng(0).standard_normal((2, frames)) * [[0.1], [0.03]]
     sound[:, frames // 3 : frames // 2] = 0
     return sound
 
 
-def _assert_equal(got: list[FloatArray], wanted: list[FloatArray], what: str) -> None:
-    for a, b in zip(got, wanted, strict=True):
-        assert a.shape == b.shape, f"{what}: shape {a.shape} instead of {b.shape}"
+def _assert_equal(got: list[FloatArray], expected: list[FloatArray], text: str) -> None:
+    for a, b in zip(got, expected, strict=True):
+        assert a.shape == b.shape, f"{text}: expected shape {b.shape}, got {a.shape}"
         scale = max(1e-300, np.abs(b).max(initial=0.0))
-        assert np.allclose(a, b, rtol=0, atol=1e-9 * scale, equal_nan=True), what
+        assert np.allclose(a, b, rtol=0, atol=1e-9 * scale, equal_nan=True), text

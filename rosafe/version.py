@@ -1,3 +1,3 @@
-"""The version, in the one place where it stands; package.xml has it too, as a test sees to."""
+"""The version. A test checks that package.xml has the same."""
 
-VERSION = "0.2.0"
+VERSION = "0.3.0"

@@ -1,1 +1,1 @@
-"""Any component on the ROS graph, as GenoM makes them: requests, ports, wire format, messages, start-up."""
+"""A component on the ROS graph, as GenoM generates them: requests, ports, wire format, messages, start-up."""

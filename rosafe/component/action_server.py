@@ -1,4 +1,4 @@
-"""Action servers of a node, with one thread that publishes the status of all of them periodically."""
+"""Action servers of a node, and one thread that publishes the status of all of them periodically."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ class ActionServer(actionlib.ActionServer):
     Parameters
     ----------
     in_use : threading.Event
-        Is set when the server gets a goal, or its status a subscriber.
+        Set when the server gets a goal, or its status a subscriber.
     """
 
-    frequency: Any = DEFAULT_FREQUENCY  # what the parameters say
+    frequency: Any = DEFAULT_FREQUENCY  # the value of the ROS parameter
 
     def __init__(self, in_use: threading.Event, *arguments: Any) -> None:
         self._in_use = in_use
@@ -55,7 +55,7 @@ class ActionServer(actionlib.ActionServer):
             self._in_use.set()
 
     def publish_again(self, idle: BufferList) -> bool:
-        """Publish the status, which is `idle` of a server without goals; return whether the server is in use."""
+        """Publish the status; `idle` is that of a server without goals. Return whether the server is in use."""
         if self.status_list:
             self.publish_status()
             return True
@@ -65,8 +65,8 @@ class ActionServer(actionlib.ActionServer):
 class StatusPublisher:
     """Publishes the status of all action servers of a node periodically, on one thread.
 
-    Clients find a server by its status, and take one that does not publish it for lost. Servers without goals and
-    subscribers cost nothing; a new subscriber gets the last status at once.
+    Clients discover a server by its status, and treat a server that does not publish it as lost. Servers without goals
+    and subscribers need no computing time; a new subscriber gets the last status immediately.
 
     Parameters
     ----------
@@ -102,7 +102,7 @@ class StatusPublisher:
 
 
 def _frequency(value: Any) -> float:
-    """The frequency in Hz that the parameter's `value` means; 0 if no status is to be published periodically."""
+    """Return the frequency in Hz for the parameter's `value`; 0 if the status is not published periodically."""
     number = float(value) if isinstance(value, (int, float)) and not isinstance(value, bool) else math.nan
     if number <= 0:
         return 0.0

@@ -1,4 +1,4 @@
-"""Activities: requests that live until they end, are stopped or are replaced. No ROS in here."""
+"""Activities: requests that run until they end, are stopped or are replaced. This module contains no ROS."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from rosafe.interface import MAX_ACTIVITIES, ComponentError, Service
 
 Handler = Callable[["Activity", dict[str, Any]], None]
 
-LOAD_SECONDS = 1.0  # the load is that of so much time at least; over less, one cycle would look like overload
+LOAD_SECONDS = 1.0  # minimum time over which the load is measured; in less, one cycle would look like overload
 
 
 class Activity:
-    """One request under way.
+    """A request in progress.
 
-    Its handler runs in a thread of its own, says `running()` once it does what it was asked for, watches
-    `stop_requested`, returns for a normal end and raises ComponentError for any other.
+    Its handler runs in a thread of its own. It calls `running()` when the activity is running, checks
+    `stop_requested`, returns at a normal end, and raises ComponentError otherwise.
     """
 
     def __init__(self, number: int, service: Service, replaced: Callable[[Activity], list[Activity]]) -> None:
@@ -30,51 +30,60 @@ class Activity:
         self.stop_requested = threading.Event()
         self.stopped_by = ""
         self.error: ComponentError | None = None
-        self.warning = ""  # for the requester, where it is granted all the same; to be set before it is `running`
-        self.begun = threading.Event()  # running, or ended without (`error` tells why)
+        self.warning = ""  # for the client of a request that is accepted; must be set before `running()`
+        self.begun = threading.Event()  # running, or ended before (`error` is the reason)
         self.ended = threading.Event()
         self._replaced = replaced
 
     def running(self) -> None:
-        """Tell those who wait for it that the activity does what was asked for."""
+        """Mark the activity as running, and notify the threads that wait for this."""
         self.begun.set()
 
     def interrupt(self, by: str) -> None:
-        """Ask the activity to end; `by` is the service that did so (the first one counts)."""
+        """Request the activity to end. `by` is the service that requests it; only the first one counts."""
         if not self.stop_requested.is_set():
             self.stopped_by = by
             self.stop_requested.set()
 
     def interrupt_waiting(self) -> None:
-        """Interrupt those activities that this one replaces which do not run yet."""
+        """Interrupt the activities that this one replaces and that are not running yet."""
         for activity in self._replaced(self):
             if not activity.begun.is_set():
                 activity.interrupt(self.service.name)
 
     def interrupt_others(self) -> None:
         """End all activities that this one replaces, and wait until they have ended."""
-        replaced = self._replaced(self)
-        for activity in replaced:
-            activity.interrupt(self.service.name)
-        for activity in replaced:
-            activity.ended.wait()
+        _interrupt_and_wait(self._replaced(self), self.service.name)
 
     def raise_if_interrupted(self) -> None:
-        """For handlers that have not come to `running` yet: ``::genom::interrupted`` where they were told to end."""
+        """Raise ``::genom::interrupted`` if the end was requested. For handlers that have not called `running` yet."""
         if self.stop_requested.is_set():
             raise ComponentError("::genom::interrupted", by=self.stopped_by)
 
 
+def _interrupt_and_wait(activities: list[Activity], by: str, seconds: float = 1e9) -> None:
+    deadline = time.monotonic() + seconds
+    for activity in activities:
+        activity.interrupt(by)
+    for activity in activities:
+        activity.ended.wait(max(0.0, deadline - time.monotonic()))
+
+
 def too_many(task: str) -> ComponentError:
     """The exception of a task that has no slot left."""
-    what = f"{task} has {MAX_ACTIVITIES - 1} activities, as many as it takes: end some first"
+    what = f"{task} has {MAX_ACTIVITIES - 1} activities, which is the limit: end some first"
     return ComponentError("::genom::too_many_activities", what)
 
 
-class TaskStatistics:
-    """What one task of the component measured of itself: cycles, their duration, and its load.
+def unexpected_error(problem: BaseException) -> ComponentError:
+    """The exception of a request whose handler failed unexpectedly."""
+    return ComponentError("::genom::unkex", what=f"{type(problem).__name__}: {problem}"[:127])
 
-    The load is the time spent in cycles per time gone by; several processors of one task can make it more than 1.
+
+class TaskStatistics:
+    """Measurements of one task of the component: number and duration of its cycles, and its load.
+
+    The load is the time spent in cycles divided by the elapsed time. It can exceed 1 if a task has several processors.
     """
 
     def __init__(self, name: str) -> None:
@@ -84,21 +93,20 @@ class TaskStatistics:
         self.load = self.load_max = 0.0
         self._busy = 0.0
         self._since = self._start = time.monotonic()
-        self._busy_total = 0.0
         self._lock = threading.Lock()
 
     def cycle(self, seconds: float) -> None:
-        """Count one cycle of work that took `seconds`."""
+        """Count a cycle of `seconds`."""
         with self._lock:
             self.cycles += 1
             self.last = seconds
-            self.longest = max(self.longest, seconds)
+            if seconds > self.longest:
+                self.longest = seconds
             self.total += seconds
             self._busy += seconds
-            self._busy_total += seconds
 
     def snapshot(self) -> dict[str, Any]:
-        """The `rusage` member of genom_state: timings in seconds, and the load of the last second or so."""
+        """Return the member `rusage` of genom_state: timings in seconds, and the load of about the last second."""
         with self._lock:
             now = time.monotonic()
             if now - self._since >= LOAD_SECONDS:
@@ -112,22 +120,22 @@ class TaskStatistics:
                 "load": {
                     "last": self.load,
                     "max": self.load_max,
-                    "avg": self._busy_total / max(now - self._start, 1e-9),
+                    "avg": self.total / max(now - self._start, 1e-9),
                 },
             }
 
 
 class Activities:
-    """All live activities of one component.
+    """All running activities of a component.
 
     Parameters
     ----------
     tasks : iterable of str
-        Names of the component's tasks; each takes `MAX_ACTIVITIES` less its permanent one.
+        Names of the component's tasks. Each accepts `MAX_ACTIVITIES` minus its permanent one.
     changed : callable
-        Called after every beginning and end.
+        Called after each start and end.
     crashed : callable
-        Called with (activity, exception) where a handler failed in a way that no interface exception names.
+        Called with (activity, exception) if a handler raises an exception that the interface does not declare.
     """
 
     def __init__(
@@ -141,18 +149,18 @@ class Activities:
         self._crashed = crashed
         self._numbers = itertools.count(1)
         self._live: dict[int, Activity] = {}
-        self._lock = threading.Lock()
+        self._lock = threading.RLock()
 
     def start(
         self, service: Service, handler: Handler, values: dict[str, Any], on_end: Callable[[Activity], None] | None
     ) -> Activity:
-        """Begin an activity; its thread calls `on_end` at its end, before anybody who waits for that goes on.
+        """Start an activity. Its thread calls `on_end` at its end, before threads that wait for the end continue.
 
-        Raises ``::genom::too_many_activities`` where its task has no slot left, and ``::genom::syserr`` (EAGAIN) where
-        the system has no thread left.
+        Raises ``::genom::too_many_activities`` if the limit of its task is reached, and ``::genom::syserr`` (EAGAIN) if
+        the system cannot start a thread.
         """
         with self._lock:
-            if self._full(service):
+            if self.full(service):
                 raise too_many(service.task)
             activity = Activity(next(self._numbers) % 2**32, service, self._replaced)
             self._live[activity.id] = activity
@@ -170,13 +178,10 @@ class Activities:
             raise ComponentError("::genom::syserr", str(problem), code=errno.EAGAIN) from None
         return activity
 
-    def _full(self, service: Service) -> bool:
-        return sum(a.service.task == service.task for a in self._live.values()) >= MAX_ACTIVITIES - 1
-
     def full(self, service: Service) -> bool:
-        """Whether the task of `service` has no slot left."""
+        """Return whether the task of `service` has reached its limit."""
         with self._lock:
-            return self._full(service)
+            return sum(a.service.task == service.task for a in self._live.values()) >= MAX_ACTIVITIES - 1
 
     def _run(
         self,
@@ -195,9 +200,9 @@ class Activities:
         except MemoryError as problem:
             self._crashed(activity, problem)
             error = ComponentError("::genom::syserr", "there is not enough memory for it", code=errno.ENOMEM)
-        except Exception as problem:  # a fault of ours: the node lives on, the requester and the log are told
+        except Exception as problem:  # a fault of ours: the node continues; it is reported to the client and the log
             self._crashed(activity, problem)
-            error = ComponentError("::genom::unkex", what=f"{type(problem).__name__}: {problem}"[:127])
+            error = unexpected_error(problem)
         with self._lock:
             del self._live[activity.id]
         activity.error = error
@@ -205,7 +210,7 @@ class Activities:
         try:
             if on_end is not None:
                 on_end(activity)
-        finally:  # whoever waits for the end finds that the requester was told
+        finally:  # after the client has been notified
             activity.ended.set()
             self._changed()
 
@@ -213,12 +218,12 @@ class Activities:
         return [a for a in self.live() if a.id < newcomer.id and a.service.name in newcomer.service.interrupts]
 
     def live(self) -> list[Activity]:
-        """The live activities in the order of their numbers."""
+        """Return the running activities in the order of their numbers."""
         with self._lock:
             return sorted(self._live.values(), key=lambda a: a.id)
 
     def find(self, number: int) -> Activity:
-        """The live activity `number`, or ``::genom::no_such_activity``."""
+        """Return the running activity `number`. Raises ``::genom::no_such_activity``."""
         with self._lock:
             try:
                 return self._live[number]
@@ -226,16 +231,7 @@ class Activities:
                 known = join_names([str(one) for one in sorted(self._live)])
                 raise ComponentError("::genom::no_such_activity", f"no activity {number}; there are: {known}") from None
 
-    def interrupt(self, which: Iterable[Activity], by: str) -> None:
-        """Ask each of `which` to end."""
-        for activity in which:
-            activity.interrupt(by)
-
     def interrupt_named(self, names: Iterable[str], by: str, wait: float) -> None:
-        """End the activities of the services `names`, and wait for them up to `wait` seconds in all."""
-        wanted = set(names)
-        chosen = [a for a in self.live() if a.service.name in wanted]
-        self.interrupt(chosen, by)
-        deadline = time.monotonic() + wait
-        for activity in chosen:
-            activity.ended.wait(max(0.0, deadline - time.monotonic()))
+        """End the activities of the services `names`, and wait for them up to `wait` seconds in total."""
+        services = set(names)
+        _interrupt_and_wait([a for a in self.live() if a.service.name in services], by, wait)

@@ -1,28 +1,30 @@
-"""Detects that a reader of the audio ring does not keep up with the stream, and names a block size that would."""
+"""Detection of a reader of the audio ring that does not keep up with the stream, and of a sufficient block size."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 
-LAG_SECONDS = 0.4  # for which whole blocks may wait without a break
-BLOCK_SIZES = (110, 220, 441, 882, 2205, 4410, 12000)  # frames; those that are proposed
-HEADROOM = 3.0  # how much longer a proposed block lasts than a block has taken
+from rosafe.declarations.block_length import DEFAULT_FRAMES_PER_BLOCK
+
+LAG_SECONDS = 0.4  # for which at least one whole block may be waiting
+BLOCK_SIZES = (110, 220, 441, 882, 2205, 4410, DEFAULT_FRAMES_PER_BLOCK)  # frames; the proposed sizes
+HEADROOM = 3.0  # duration of a proposed block, divided by the computing time of a block
 
 
 class LagMonitor:
-    """Follows how many frames wait for one reader.
+    """Monitors the number of frames that wait for one reader.
 
-    A reader that takes its blocks in time leaves less than a whole block waiting after each audio message. If at least
-    one block has waited without a break for `LAG_SECONDS`, the tree does not keep up.
+    After each audio message, less than a whole block waits for a reader that keeps up. If at least one block has been
+    waiting for `LAG_SECONDS` without a break, the tree does not keep up.
 
     Parameters
     ----------
     sample_rate : float
         In Hz.
     frames_per_block : int
-        What the reader takes at a time.
+        Block size of the reader.
     report : callable
-        Gets one line when the tree falls behind, and one when it has caught up.
+        Called with one line when the tree falls behind, and when it has caught up.
     """
 
     def __init__(self, sample_rate: float, frames_per_block: int, report: Callable[[str], None]) -> None:
@@ -34,11 +36,11 @@ class LagMonitor:
         self._blocks = 0  # read since then
 
     def block_read(self) -> None:
-        """Count a block that the reader has taken."""
+        """Count a block that was read."""
         self._blocks += 1
 
     def update(self, waiting: int, now: float) -> None:
-        """Note that `waiting` frames wait for the reader at the time `now` (s, monotonic)."""
+        """Update the number of waiting frames at the time `now` (s, monotonic)."""
         if waiting < self._frames_per_block:
             if self.problem:
                 self.problem = ""
@@ -58,9 +60,9 @@ class LagMonitor:
         )
 
     def _remedy(self, block_seconds: float) -> str:
-        # Most of the time of a short block does not depend on its length, so a longer one takes about as long.
-        wanted = max(HEADROOM * block_seconds * self._sample_rate, self._frames_per_block + 1)
-        longer = next((size for size in BLOCK_SIZES if size >= wanted), None)
+        # Most of the computing time of a short block is independent of its length: a longer one takes about as long.
+        required = max(HEADROOM * block_seconds * self._sample_rate, self._frames_per_block + 1)
+        longer = next((size for size in BLOCK_SIZES if size >= required), None)
         less = "use fewer processors or channels"
         if longer is None:
             return f"longer blocks do not help: {less}"

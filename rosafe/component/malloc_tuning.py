@@ -1,25 +1,26 @@
-"""The C library's memory: kept from growing where many threads take and free blocks of all sizes."""
+"""Settings of the C library's allocator, which limit the memory of many threads that allocate blocks of all sizes."""
 
 from __future__ import annotations
 
 import ctypes
 
-_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD, _M_ARENA_MAX = -1, -3, -8  # malloc.h of glibc
-ARENAS = 2  # pools that threads take memory from; glibc makes eight for each core, and each keeps holes of its own
-LARGE = 8 * 2**20  # bytes; what is larger goes back to the system when it is freed. Blocks by default are 6 MB
-KEPT = 64 * 2**20  # bytes of free memory at a pool's end that are kept for the next block
+_SETTINGS = {  # by the parameter of mallopt, from malloc.h of glibc
+    -8: 2,  # M_ARENA_MAX: pools of the allocator; by default there are eight per core, and each becomes fragmented
+    -3: 8 * 2**20,  # M_MMAP_THRESHOLD: larger blocks return to the system when freed; default blocks have 6 MB
+    -1: 64 * 2**20,  # M_TRIM_THRESHOLD: free memory at the end of a pool that is kept for the next block
+}
 
 
 def limit_arenas() -> None:
-    """Settle this before there are threads. A C library without such settings is left as it is."""
+    """Apply the settings; called before threads are started. A C library without these settings is not changed."""
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:
-        for setting, value in ((_M_ARENA_MAX, ARENAS), (_M_MMAP_THRESHOLD, LARGE), (_M_TRIM_THRESHOLD, KEPT)):
-            mallopt(setting, value)
+        for parameter, value in _SETTINGS.items():
+            mallopt(parameter, value)
 
 
 def trim() -> None:
-    """Return to the system what is free, holes included."""
+    """Return free memory to the system, including gaps between blocks."""
     trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
     if trim is not None:
         trim(0)

@@ -1,9 +1,8 @@
-"""Fast serialisation: the ROS wire format of every struct of the interface table, from and to numpy without lists.
+"""Fast serialization: the ROS wire format of every struct of the interface table, from and to numpy without lists.
 
-`message_class` makes a subclass of a generated message class with the same type name, md5 and bytes on the wire,
-whose sample arrays are numpy arrays. Publishers give it arrays (or the pieces of a sliding window); subscribers get
-read-only views of the received buffer. Users of the package name the generated class instead (`array_msg`, see
-docs/subscribers.md).
+`message_class` returns a subclass of a generated message class with the same type name, md5 and bytes on the wire,
+whose samples are numpy arrays. Publishers assign arrays (or the pieces of a sliding window); subscribers get read-only
+views of the received buffer. Users of the package pass the generated class to `array_msg` (docs/subscribers.md).
 
 In such a message `left` and `right` are arrays of shape (frames,), (channels, frames) or (lags, channels, frames)
 instead of the nested `data`, `dataN` and `dataNxN` lists of the generated class. Structs within it are dicts whose
@@ -14,6 +13,7 @@ from __future__ import annotations
 
 import functools
 import importlib
+import itertools
 import struct
 from collections.abc import Callable, Sequence
 from typing import Any, Protocol
@@ -23,21 +23,23 @@ import numpy as np
 
 from rosafe import interface
 from rosafe.component import generate
-from rosafe.declarations.idl import SCALARS
+from rosafe.declarations.idl import SCALARS, element
 from rosafe.declarations.signals import LEVELS
 from rosafe.tree.sliding_window import WindowView
 
+Members = tuple[tuple[str, str], ...]  # name and IDL type of each member of a struct
+
 _SCALARS = {idl: scalar.code for idl, scalar in SCALARS.items() if scalar.code}
 _SAMPLES: dict[str, np.dtype[Any]] = {idl: np.dtype(f"<{_SCALARS[idl]}") for idl in ("double", "long", "float")}
-# How many levels of nested sequences a signal struct wraps; its one member is the sequence.
+# The number of nested sequences in each signal struct, whose only member is the outer sequence.
 _SIGNALS = {idl: len(levels) for idl, levels in LEVELS.items()}
 _COUNT = struct.Struct("<I")
-_MAX_RECORD = 2**31 - 1  # bytes; numpy's layouts go no further
-ROW_BYTES = 4096  # rows of a window in pieces shorter than this are copied together: quicker than handling each
+_MAX_RECORD = 2**31 - 1  # bytes; the limit of numpy's layouts
+ROW_BYTES = 4096  # shorter rows of the pieces of a window are copied together, which is faster than one by one
 
 
 class ByteSink(Protocol):
-    """Where messages are written to: a BytesIO, or `BufferList`."""
+    """The destination of a message: a BytesIO, or a `BufferList`."""
 
     def write(self, data: Any, /) -> Any:
         """Append the bytes of a buffer."""
@@ -47,7 +49,7 @@ class ByteSink(Protocol):
 
 
 def nested_dtype(shape: tuple[int, ...]) -> np.dtype:
-    """The wire layout of a signal of regular `shape`: at every level a uint32 count, then the elements."""
+    """Return the wire layout of a signal of regular `shape`: at every level a uint32 count, then the elements."""
     layout = _SAMPLES["double"]
     for length in reversed(shape):
         layout = np.dtype([("n", "<u4"), ("d", layout, (length,))])
@@ -55,7 +57,7 @@ def nested_dtype(shape: tuple[int, ...]) -> np.dtype:
 
 
 def _pack_nested(view: WindowView) -> memoryview:
-    """The bytes of a signal of shape (..., frames), each level preceded by its count."""
+    """Return the bytes of a signal of shape (..., frames), each level preceded by its count."""
     record = np.empty((), nested_dtype(view.shape))
     level = record
     for length in view.shape:
@@ -66,7 +68,7 @@ def _pack_nested(view: WindowView) -> memoryview:
 
 
 def _write_rows(out: ByteSink, pieces: Sequence[np.ndarray], frames: int) -> None:
-    """As `_pack_nested`, of arrays (..., n) that together make `frames`: row by row as they lie, without a copy."""
+    """As `_pack_nested`, for arrays (..., n) with `frames` frames in total: row by row, without a copy."""
     if pieces[0].ndim == 1:
         out.write(_COUNT.pack(frames))
         for piece in pieces:
@@ -77,16 +79,16 @@ def _write_rows(out: ByteSink, pieces: Sequence[np.ndarray], frames: int) -> Non
             _write_rows(out, rows, frames)
 
 
-def _write_signal(out: ByteSink, levels: int, value: Any) -> None:
-    if isinstance(value, genpy.Message):  # of the generated class, as in a message that was made without it
+def _write_signal(out: ByteSink, value: Any, levels: int) -> None:
+    if isinstance(value, genpy.Message):  # of the generated class, in a message that was created with it
         value.serialize(out)
         return
-    view = value if isinstance(value, WindowView) else WindowView.of(np.asarray(value, dtype=np.float64))
+    view = value if isinstance(value, WindowView) else WindowView((np.asarray(value, dtype=np.float64),))
     if view.shape == (0,) and levels > 1:  # an absent signal, such as ILD's `right`
         out.write(_COUNT.pack(0))
         return
     if len(view.shape) != levels:
-        raise ValueError(f"a signal of shape {view.shape} where {levels} dimensions are wanted")
+        raise ValueError(f"expected a signal of {levels} dimensions, got shape {view.shape}")
     pieces = view.trimmed()
     if 8 * view.frames >= ROW_BYTES * len(pieces):
         _write_rows(out, pieces, view.frames)
@@ -95,15 +97,15 @@ def _write_signal(out: ByteSink, levels: int, value: Any) -> None:
 
 
 def _samples(value: Any, dtype: np.dtype) -> np.ndarray:
-    """A sequence of numbers as an array, without silent rounding or wrapping."""
+    """Convert a sequence of numbers to an array, without silent rounding or wrapping."""
     array = np.asarray(value)
     if array.ndim != 1:
-        raise ValueError(f"an array of shape {array.shape} where a sequence is wanted")
+        raise ValueError(f"expected a sequence, got an array of shape {array.shape}")
     if array.dtype == dtype or array.size == 0:
         return np.ascontiguousarray(array, dtype)
     converted = array.astype(dtype, casting="same_kind")
     if dtype.kind == "i" and not np.array_equal(converted, array):
-        raise ValueError(f"numbers beyond {dtype}")
+        raise ValueError(f"expected numbers in the range of {dtype}")
     return converted
 
 
@@ -111,29 +113,48 @@ def _member(value: Any, name: str) -> Any:
     return value[name] if isinstance(value, dict) else getattr(value, name)
 
 
-def encode(out: ByteSink, component: interface.ComponentSpec, idl: str, value: Any) -> None:
-    """Append `value` (a message, or a dict by member name) of IDL type `idl` to `out`."""
+Encoder = Callable[[ByteSink, Any], None]  # appends a value to a message
+
+
+def _encoder(component: interface.ComponentSpec, idl: str) -> Encoder:
+    """Return the encoder of IDL type `idl`; a struct is a message, or a dict by member name."""
     if idl in _SCALARS:
-        out.write(struct.pack("<" + _SCALARS[idl], value))
-    elif idl == "string":
-        text = value.encode() if isinstance(value, str) else value
-        out.write(_COUNT.pack(len(text)))
-        out.write(text)
-    elif idl in _SIGNALS:
-        _write_signal(out, _SIGNALS[idl], value)
-    elif idl.startswith("sequence<"):
-        element = idl[len("sequence<") : -1]
-        if element in _SAMPLES:
-            value = _samples(value, _SAMPLES[element])
-        out.write(_COUNT.pack(len(value)))
-        if element in _SAMPLES:
-            out.write(value.view(np.uint8).data)
-        else:
-            for item in value:
-                encode(out, component, element, item)
-    else:
-        for name, kind in component.members(idl):
-            encode(out, component, kind, _member(value, name))
+        pack = struct.Struct("<" + _SCALARS[idl]).pack
+        return lambda out, value: out.write(pack(value))
+    if idl == "string":
+        return _write_string
+    if idl in _SIGNALS:
+        return functools.partial(_write_signal, levels=_SIGNALS[idl])
+    if idl.startswith("sequence<"):
+        kind = element(idl)
+        if kind in _SAMPLES:
+            return functools.partial(_write_samples, dtype=_SAMPLES[kind])
+        return functools.partial(_write_sequence, encode=_encoder(component, kind))
+    members = [(name, _encoder(component, kind)) for name, kind in component.members(idl)]
+
+    def write(out: ByteSink, value: Any) -> None:
+        for name, encode in members:
+            encode(out, _member(value, name))
+
+    return write
+
+
+def _write_string(out: ByteSink, value: str | bytes) -> None:
+    text = value.encode() if isinstance(value, str) else value
+    out.write(_COUNT.pack(len(text)))
+    out.write(text)
+
+
+def _write_samples(out: ByteSink, value: Any, dtype: np.dtype) -> None:
+    array = _samples(value, dtype)
+    out.write(_COUNT.pack(len(array)))
+    out.write(array.view(np.uint8).data)
+
+
+def _write_sequence(out: ByteSink, value: Sequence[Any], encode: Encoder) -> None:
+    out.write(_COUNT.pack(len(value)))
+    for item in value:
+        encode(out, item)
 
 
 # --- reading ----------------------------------------------------------------------------------------------------
@@ -161,7 +182,7 @@ class _Reader:
 
 
 def _read_signal(reader: _Reader, levels: int) -> np.ndarray | list[Any]:
-    """A regular nested sequence as one strided view; a ragged one (no sender of ours makes it) as lists of arrays."""
+    """Return a regular nested sequence as one strided view; a ragged one, which we never send, as lists of arrays."""
     start = reader.at
     shape = [reader.count()]
     while len(shape) < levels:
@@ -179,7 +200,7 @@ def _read_signal(reader: _Reader, levels: int) -> np.ndarray | list[Any]:
         if regular:
             return np.asarray(level[0])
         reader.at = start
-    return _read_ragged(reader, levels)  # raises where it passes the end
+    return _read_ragged(reader, levels)  # raises if it exceeds the buffer
 
 
 def _read_ragged(reader: _Reader, levels: int) -> np.ndarray | list[Any]:
@@ -189,7 +210,7 @@ def _read_ragged(reader: _Reader, levels: int) -> np.ndarray | list[Any]:
 
 
 class AttrDict(dict):
-    """A struct within a message: its members by name, and as attributes."""
+    """A struct in a message: its members by key, and as attributes."""
 
     def __getattr__(self, name: str) -> Any:
         try:
@@ -198,67 +219,97 @@ class AttrDict(dict):
             raise AttributeError(name) from None
 
 
-def decode(reader: _Reader, component: interface.ComponentSpec, idl: str) -> Any:
-    """The next value of IDL type `idl`: structs as `AttrDict`, signals and numeric sequences as read-only arrays."""
+Decoder = Callable[[_Reader], Any]  # returns the next value of a message
+
+
+def _decoder(component: interface.ComponentSpec, idl: str) -> Decoder:
+    """Return the decoder of IDL type `idl`: structs as `AttrDict`, signals and numbers as read-only arrays."""
     if idl in _SCALARS:
-        form = "<" + _SCALARS[idl]
-        return struct.unpack(form, reader.take(struct.calcsize(form)))[0]
+        form = struct.Struct("<" + _SCALARS[idl])
+        return lambda reader: form.unpack(reader.take(form.size))[0]
     if idl == "string":
-        return str(reader.take(reader.count()), "utf-8", "replace")
+        return lambda reader: str(reader.take(reader.count()), "utf-8", "replace")
     if idl in _SIGNALS:
-        return _read_signal(reader, _SIGNALS[idl])
+        return functools.partial(_read_signal, levels=_SIGNALS[idl])
     if idl.startswith("sequence<"):
-        element = idl[len("sequence<") : -1]
-        if element in _SAMPLES:
-            return reader.samples(_SAMPLES[element])
-        return [decode(reader, component, element) for _ in range(reader.count())]
-    return AttrDict((name, decode(reader, component, kind)) for name, kind in component.members(idl))
+        kind = element(idl)
+        if kind in _SAMPLES:
+            return functools.partial(_Reader.samples, dtype=_SAMPLES[kind])
+        decode = _decoder(component, kind)
+        return lambda reader: [decode(reader) for _ in range(reader.count())]
+    return _members_decoder(component, component.members(idl))
+
+
+def _members_decoder(component: interface.ComponentSpec, members: Members) -> Callable[[_Reader], AttrDict]:
+    """Return the decoder of a struct. Successive scalars are read together."""
+    steps: list[tuple[list[str], struct.Struct | Decoder]] = []
+    for scalar, some in itertools.groupby(members, lambda member: member[1] in _SCALARS):
+        if scalar:
+            run = list(some)
+            form = struct.Struct("<" + "".join(_SCALARS[kind] for _, kind in run))
+            steps.append(([name for name, _ in run], form))
+        else:
+            steps += [([name], _decoder(component, kind)) for name, kind in some]
+
+    def read(reader: _Reader) -> AttrDict:
+        values = AttrDict()
+        for names, step in steps:
+            if isinstance(step, struct.Struct):
+                values.update(zip(names, step.unpack(reader.take(step.size)), strict=True))
+            else:
+                values[names[0]] = step(reader)
+        return values
+
+    return read
 
 
 # --- message classes --------------------------------------------------------------------------------------------
 
 
-def _codec(
-    component: interface.ComponentSpec, members: tuple[tuple[str, str], ...]
-) -> tuple[Callable[[Any, ByteSink], None], Callable[[Any, bytes], Any]]:
+def _with_arrays(component: interface.ComponentSpec, generated: type[Any], members: Members) -> type[Any]:
+    """Return a subclass of a generated class that serializes arrays."""
+    encoders = [(name, _encoder(component, kind)) for name, kind in members]
+    decode = _members_decoder(component, members)
+
     def serialize(self: Any, out: ByteSink) -> None:
         try:
-            for name, kind in members:
-                encode(out, component, kind, getattr(self, name))
+            for name, encode in encoders:
+                encode(out, getattr(self, name))
         except (struct.error, TypeError, ValueError, LookupError, AttributeError) as problem:
             raise genpy.SerializationError(f"{self._type}: {name}: {problem}") from problem
 
     def deserialize(self: Any, data: bytes) -> Any:
-        reader = _Reader(data)
-        for name, kind in members:
-            setattr(self, name, decode(reader, component, kind))
+        for name, value in decode(_Reader(data)).items():
+            setattr(self, name, value)
         return self
 
-    return serialize, deserialize
+    return type(generated.__name__, (generated,), {"serialize": serialize, "deserialize": deserialize})
+
+
+def _generated(package: str, module: str, name: str) -> Any:
+    generate.ensure_messages()
+    return getattr(importlib.import_module(f"{package}.{module}"), name)
 
 
 @functools.cache
 def message_class(package: str, idl: str) -> Any:
-    """The message class of struct `idl` in ROS package `package` (`rosAFE` or `bass`), with arrays instead of lists."""
-    generate.ensure_messages()
+    """Return the message class of struct `idl` in ROS package `package` (`rosAFE` or `bass`), with arrays."""
     component = interface.COMPONENTS[package]
-    generated = getattr(importlib.import_module(f"{package}.msg"), interface.ros_type(idl))
-    serialize, deserialize = _codec(component, component.members(idl))
-    return type(generated.__name__, (generated,), {"serialize": serialize, "deserialize": deserialize})
+    return _with_arrays(component, _generated(package, "msg", interface.ros_type(idl)), component.members(idl))
 
 
 def array_msg(generated: Any) -> Any:
-    """The class to subscribe or publish with in place of a generated one: same type and md5, arrays instead of lists.
+    """Return a message class with arrays instead of lists, and the type and md5 of a generated class.
 
     Parameters
     ----------
     generated : type
-        A class of `rosAFE.msg` or `bass.msg` that holds samples, such as `rosAFE_TimeFrequencySignalPortStruct`.
+        A class of `rosAFE.msg` or `bass.msg` with samples, such as `rosAFE_TimeFrequencySignalPortStruct`.
 
     Raises
     ------
     TypeError
-        For anything else.
+        If `generated` is another object.
     """
     package, _, name = str(getattr(generated, "_type", "")).partition("/")
     if package in interface.COMPONENTS:
@@ -267,15 +318,15 @@ def array_msg(generated: Any) -> Any:
                 found = message_class(package, idl)
                 if found._md5sum == generated._md5sum:
                     return found
-    raise TypeError(f"{generated!r} is no message class of rosAFE or bass that holds samples")
+    raise TypeError(f"generated: expected a message class of rosAFE or bass with samples, got {generated!r}")
 
 
 @functools.cache
 def tolerant_message_class(package: str, idl: str, longest: int = 0) -> Any:
-    """As `message_class`, but what cannot be read becomes a message whose `problem` says why (else it is empty).
+    """As `message_class`, but a malformed message is delivered with the reason in `problem`, which is otherwise empty.
 
-    Where deserialisation raises, rospy breaks the connection, and cannot mend it: one bad message would end a topic.
-    Its sequences have up to `longest` elements, if that is given; a message that could hold more is not even read.
+    If deserialization raises, rospy closes the connection and cannot reopen it: one bad message would end a topic.
+    Sequences have up to `longest` elements, if given; a message that could contain more is not read at all.
     """
     strict = message_class(package, idl)
 
@@ -287,30 +338,30 @@ def tolerant_message_class(package: str, idl: str, longest: int = 0) -> Any:
             self.problem = str(problem)
         return self
 
+    def create(self: Any) -> None:
+        """Set no defaults: every message is deserialized next."""
+
     bound = {"longest_sequence": longest} if longest else {}
-    return type(strict.__name__, (strict,), {"deserialize": deserialize, **bound})
+    return type(strict.__name__, (strict,), {"__init__": create, "deserialize": deserialize, **bound})
 
 
 @functools.cache
 def response_class(package: str, service: str) -> Any:
-    """The response class of a service whose outputs hold signals (getSignals), with arrays instead of lists."""
-    generate.ensure_messages()
+    """Return the response class of a service whose outputs contain signals (getSignals), with arrays."""
     component = interface.COMPONENTS[package]
-    generated = getattr(importlib.import_module(f"{package}.srv"), f"{service}Response")
     members = (("genom_success", "boolean"), ("genom_exdetail", "string"), *component.service(service).outputs)
-    serialize, deserialize = _codec(component, members)
-    return type(generated.__name__, (generated,), {"serialize": serialize, "deserialize": deserialize})
+    return _with_arrays(component, _generated(package, "srv", f"{service}Response"), members)
 
 
 def array_srv(generated: Any) -> Any:
-    """The service class to call in place of a generated one whose response holds signals, such as `getSignals`.
+    """Return a service class like a generated one, such as `getSignals`, with arrays in its response.
 
     Raises
     ------
     TypeError
-        For anything that is no service class of rosAFE or bass.
+        If `generated` is not a service class of rosAFE or bass.
     """
     package, _, name = str(getattr(generated, "_type", "")).partition("/")
     if not hasattr(generated, "_response_class") or package not in interface.COMPONENTS:
-        raise TypeError(f"{generated!r} is no service class of rosAFE or bass")
+        raise TypeError(f"generated: expected a service class of rosAFE or bass, got {generated!r}")
     return type(generated.__name__, (generated,), {"_response_class": response_class(package, name)})

@@ -1,4 +1,4 @@
-"""From the shell to a running node and back: options, environment, master, background, signals, a clean end."""
+"""Start and end of a node: options, environment, master, background, signals, clean exit."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import gc
 import os
 import re
 import signal
+import stat
 import sys
 import threading
 import time
@@ -24,18 +25,18 @@ from rosafe.transport import master, paths, systemd
 from rosafe.version import VERSION
 
 if TYPE_CHECKING:
-    from rosafe.interface import ComponentSpec  # which needs numpy, and `rosafe doctor` must not
+    from rosafe.interface import ComponentSpec  # imports numpy, on which `rosafe doctor` must not depend
 
-MASTER_SECONDS = 5.0  # `roscore & rosAFE-ros &` starts both at once, and roscore takes a second or two
-START_SECONDS = 20.0  # a node that is not up by then waits for something that does not come
-END_SECONDS = 4.5  # from the wish to end until the process is gone, whatever its threads do
-SWITCH_SECONDS = 0.0005  # threads that only wait for their turn answer requests ten times faster than with the default
+MASTER_SECONDS = 5.0  # `roscore & rosAFE-ros &` starts both at the same time, and roscore takes a second or two
+START_SECONDS = 20.0  # a node that has not started by then never will
+END_SECONDS = 4.5  # after which a process that is to end is terminated, whatever its threads do
+SWITCH_SECONDS = 0.0005  # of the GIL: requests are answered ten times faster than with the default
 SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _ENVIRONMENT_REMAPPINGS = {"__ip": "ROS_IP", "__hostname": "ROS_HOSTNAME", "__master": "ROS_MASTER_URI"}
 
 
 class RosNode(Protocol):
-    """What `run_server` needs of a node; `shutdown` may be called twice."""
+    """A node for `run_server`; `shutdown` may be called twice."""
 
     finished: threading.Event
 
@@ -43,11 +44,11 @@ class RosNode(Protocol):
 
 
 class _Failure(Exception):
-    """The node cannot start; the text is the one line that the user gets."""
+    """The node cannot start; the text is the line for the user."""
 
 
 class _WaitInterrupted(Exception):
-    """A signal came while the node was waiting for a master, as it was told to."""
+    """A signal arrived while the node was waiting for a master (``--wait``)."""
 
 
 def run_server(
@@ -57,58 +58,89 @@ def run_server(
     prepare: Callable[[], object] = lambda: None,
     more_options: Mapping[str, Mapping[str, Any]] = MappingProxyType({}),
 ) -> int:
-    """Run one component's node until a signal, its `kill` request or the master ends it.
+    """Run the node of a component until a signal, its `kill` request or the master ends it.
 
     Parameters
     ----------
-    component : Component
-        The component; its name is the instance's where the user gives none.
+    component : ComponentSpec
+        The component. Its name is the default name of the instance.
     build : callable
-        Makes and starts the node of the instance that it is given, after `rospy.init_node`. It is given the values of
-        `more_options` too, by name.
+        Called with the name of the instance, and with the values of `more_options` by name, after `rospy.init_node`.
+        It creates and starts the node.
     argv : list of str, optional
         The command line without the program; by default that of this process.
     prepare : callable, optional
-        Called before that, and may take its time: compile something, say.
+        Called before `build`; it may take long, for instance to compile kernels.
     more_options : mapping, optional
-        Options of this component alone, such as ``--strict``, and what argparse is to know of each.
+        Further options of this component, such as ``--strict``, with the arguments for argparse.
 
     Returns
     -------
     int
-        0 after a clean end (or, with -b, once the node is up), 1 where the node could not start. A wrong command line
-        raises SystemExit(2), and -h and --version SystemExit(0).
+        0 after a clean end (or, with -b, when the node has started), 1 if the node could not start. An invalid command
+        line raises SystemExit(2), and -h and --version raise SystemExit(0).
     """
     arguments = sys.argv[1:] if argv is None else argv
     options = _parse(component, [a for a in arguments if ":=" not in a], more_options)
+    own = {name: getattr(options, name) for name in (flag.lstrip("-") for flag in more_options)}
     remappings = [a for a in arguments if ":=" in a]
-    told = DaemonFork() if options.background else None
-    if told is not None and told.in_parent:
-        return told.wait()
+    return run_node(f"{component.name}-ros", functools.partial(build, **own), options, remappings, prepare)
+
+
+def run_node(
+    program: str,
+    build: Callable[[str], RosNode],
+    options: argparse.Namespace,
+    remappings: list[str],
+    prepare: Callable[[], object] = lambda: None,
+) -> int:
+    """Run a node until a signal, its `kill` request or the master ends it.
+
+    Parameters
+    ----------
+    program : str
+        The command, with which messages begin.
+    build : callable
+        Called with the name of the instance after `rospy.init_node`. It creates and starts the node.
+    options : argparse.Namespace
+        With `instance`, the name of the node, and the flags `background` and `wait`.
+    remappings : list of str
+        ROS remappings of the command line.
+    prepare : callable, optional
+        As for `run_server`.
+
+    Returns
+    -------
+    int
+        As `run_server`.
+    """
+    options.instance = dict(one.split(":=", 1) for one in remappings).get("__name", options.instance)
+    fork = DaemonFork() if options.background else None
+    if fork is not None and fork.in_parent:
+        return fork.wait()
     received: list[int] = []
     for number in ending_signals():
         signal.signal(number, lambda number, frame: received.append(number))
     try:
-        own = {name: getattr(options, name) for name in (flag.lstrip("-") for flag in more_options)}
-        node = _start(component, functools.partial(build, **own), options, remappings, received, prepare)
+        node = _start(program, build, options, remappings, received, prepare)
     except _WaitInterrupted:
         return 0
     except (_Failure, generate.GenerationError, master.MasterError, ComponentError, OSError) as problem:
-        print(f"{component.name}-ros: {printable(problem)}", file=sys.stderr)
+        print(f"{program}: {printable(problem)}", file=sys.stderr)
         watchdog(END_SECONDS, 1)
         return 1
-    ready = f"{component.name}-ros: ready as /{_instance(options, remappings)} at {os.environ['ROS_MASTER_URI']}"
-    with contextlib.suppress(OSError):  # whoever read that has gone
+    ready = f"{program}: ready as /{options.instance} at {os.environ['ROS_MASTER_URI']}"
+    with contextlib.suppress(OSError):  # the reader of stderr has ended
         print(printable(ready), file=sys.stderr, flush=True)
-    if told is not None:
-        told.up()
+    if fork is not None:
+        fork.up()
     systemd.notify("READY=1")
     _serve(node, received)
     return 0
 
 
 def ending_signals() -> list[int]:
-    """The signals that end a server: also SIGINT where a script has put it behind `&`, but not SIGHUP under nohup."""
+    """Return the signals that end a server, SIGINT also for a background job of a script, SIGHUP not under nohup."""
     nohup = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
     return [number for number in SIGNALS if not (nohup and number == signal.SIGHUP)]
 
@@ -117,42 +149,44 @@ def ending_signals() -> list[int]:
 
 
 class Parser(argparse.ArgumentParser):
-    """A parser whose errors are one line."""
+    """An argument parser whose errors are one line."""
 
     def error(self, message: str) -> NoReturn:
-        self.exit(2, f"{self.prog}: {printable(message)}; {self.prog} -h shows what is possible\n")
+        self.exit(2, f"{self.prog}: {printable(message)}; {self.prog} -h lists the options\n")
 
 
 def _parse(
     component: ComponentSpec, arguments: list[str], more_options: Mapping[str, Mapping[str, Any]]
 ) -> argparse.Namespace:
     program = f"{component.name}-ros"
-    more = "".join(f" [{' '.join((name, told.get('metavar', ''))).strip()}]" for name, told in more_options.items())
+    more = "".join(f" [{' '.join((name, one.get('metavar', ''))).strip()}]" for name, one in more_options.items())
     parser = Parser(
         prog=program,
         usage=f"{program} [-b] [-i NAME] [--wait]{more} [-h] [--version] [NAME:=VALUE ...]",
         description=f"{component.doc}.",
-        epilog=f"ROS remappings are taken too: topics (a:=b) and __name, __ns, __master, __ip, __hostname, __log.\n\n"
-        f"example:\n  {program} -b -i left        # serves /left/...; returns once the node is up",
+        epilog=f"ROS remappings are accepted: topics (a:=b) and __name, __ns, __master, __ip, __hostname, __log.\n\n"
+        f"example:\n  {program} -b -i left        # serves /left/...; returns when the node has started",
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
-    parser.add_argument("-b", "--background", action="store_true", help="go to the background once the node is up")
+    parser.add_argument(
+        "-b", "--background", action="store_true", help="run in the background when the node has started"
+    )
     parser.add_argument(
         "-i",
         "--instance",
         "--name",
         metavar="NAME",
         default=component.name,
-        help=f"name of the node and first part of all its names (default: {component.name})",
+        help=f"name of the node, with which all its names begin (default: {component.name})",
     )
     parser.add_argument(
         "--wait",
         action="store_true",
-        help=f"wait for a ROS master for ever, as a service at boot must (default: for {MASTER_SECONDS:g} s)",
+        help=f"wait for a ROS master without a time limit, as a boot service must (default: {MASTER_SECONDS:g} s)",
     )
-    for name, told in more_options.items():
-        parser.add_argument(name, **told)
+    for name, keywords in more_options.items():
+        parser.add_argument(name, **keywords)
     parser.add_argument("--version", action="version", version=f"{component.name} {VERSION}")
     return parser.parse_args(arguments)
 
@@ -161,27 +195,28 @@ def _parse(
 
 
 def _start(
-    component: ComponentSpec,
-    build: Callable[..., RosNode],
+    program: str,
+    build: Callable[[str], RosNode],
     options: argparse.Namespace,
     remappings: list[str],
     received: list[int],
     prepare: Callable[[], object],
 ) -> RosNode:
     mappings = dict(remapping.split(":=", 1) for remapping in remappings)
-    instance = _instance(options, remappings)
-    if not re.fullmatch("[A-Za-z][A-Za-z0-9_]*", instance):
-        raise _Failure(f"{instance!r} is no instance name: letters, digits and _ only, a letter first")
+    if not re.fullmatch("[A-Za-z][A-Za-z0-9_]*", options.instance):
+        raise _Failure(
+            f"instance name: expected letters, digits and _, beginning with a letter, got {options.instance!r}"
+        )
     for name, variable in _ENVIRONMENT_REMAPPINGS.items():
         if mappings.get(name):
             os.environ[variable] = mappings[name]
     malloc_tuning.limit_arenas()
     master.set_local_defaults()
-    master.check_address(os.environ["ROS_MASTER_URI"])  # a wrong one does not get better
-    doubt = master.unreachable()
-    if doubt:
-        print(f"{component.name}-ros: warning: {printable(doubt)}", file=sys.stderr, flush=True)
-    _await_master(os.environ["ROS_MASTER_URI"], received, f"{component.name}-ros" if options.wait else "")
+    master.check_address(os.environ["ROS_MASTER_URI"])  # an invalid one is an error immediately
+    warning = master.unreachable()
+    if warning:
+        print(f"{program}: warning: {printable(warning)}", file=sys.stderr, flush=True)
+    _await_master(os.environ["ROS_MASTER_URI"], received, program if options.wait else "")
     generate.ensure_messages()
     paths.prefer_pypi_packages()
     ensure_log_directory()
@@ -189,8 +224,8 @@ def _start(
     limit = watchdog(
         START_SECONDS,
         1,
-        f"{component.name}-ros: not up after {START_SECONDS:g} s: is this machine reachable under the name or address "
-        "in ROS_HOSTNAME or ROS_IP?",
+        f"{program}: not started after {START_SECONDS:g} s: check that this machine is reachable by the "
+        "name or address in ROS_HOSTNAME or ROS_IP",
     )
     sys.setswitchinterval(SWITCH_SECONDS)
     import rospy
@@ -198,34 +233,29 @@ def _start(
     from rosafe.transport import registration
 
     try:
-        registrar = registration.init_node(instance, [f"{component.name}-ros", *remappings])
+        registrar = registration.init_node(options.instance, [program, *remappings])
     except (rospy.ROSException, ValueError) as problem:
         raise _Failure(f"cannot start the node: {problem}") from problem
     log_to_stderr()
     try:
         try:
-            node = build(instance)
+            node = build(options.instance)
         finally:
-            registrar.up()  # whatever has failed, it fails because the node was told to end
+            registrar.up()  # raises if the node was requested to end, which is then the reason for any failure
     except rospy.ROSException as problem:
         raise _Failure(f"cannot start the node: {problem}") from None
-    gc.freeze()  # a look at all that the modules made stops every thread for tens of milliseconds, and finds nothing
+    gc.freeze()  # collecting the objects of modules would stop all threads for tens of milliseconds, without result
     limit.cancel()
     return node
 
 
-def _instance(options: argparse.Namespace, remappings: list[str]) -> str:
-    named = [remapping.partition(":=")[2] for remapping in remappings if remapping.startswith("__name:=")]
-    return str(named[-1] if named else options.instance)
-
-
 def _await_master(uri: str, received: list[int], patient: str) -> None:
-    """Give a master that is just starting a moment; MasterError where none is there by then, or at a signal.
+    """Wait up to `MASTER_SECONDS` for a master. Raises MasterError if there is none, or at a signal.
 
-    The program that is `patient` says so and waits for ever; a signal is `_WaitInterrupted` to it.
+    `patient` is the name of a program that waits without a limit, and reports this. A signal raises `_WaitInterrupted`.
     """
     deadline = time.monotonic() + MASTER_SECONDS
-    told = False
+    reported = False
     while True:
         try:
             return master.check_master(uri, lambda: bool(received))
@@ -234,9 +264,9 @@ def _await_master(uri: str, received: list[int], patient: str) -> None:
                 raise _WaitInterrupted from None
             if received or (time.monotonic() > deadline and not patient):
                 raise
-        if patient and not told:
+        if patient and not reported:
             print(f"{patient}: waiting for a ROS master at {printable(uri)}", file=sys.stderr, flush=True)
-            told = True
+            reported = True
         if patient:
             systemd.notify(f"STATUS=waiting for a ROS master at {uri}", "EXTEND_TIMEOUT_USEC=30000000")
         time.sleep(0.1)
@@ -246,24 +276,24 @@ _NAME = re.compile(r"__\w+:=")
 
 
 def without_names(arguments: list[str]) -> list[str]:
-    """The command line without what roslaunch adds for nodes, such as ``__name:=...``."""
+    """Return the command line without the arguments that roslaunch adds for nodes, such as ``__name:=...``."""
     return [word for word in arguments if not _NAME.match(word)]
 
 
 def names_given() -> list[str]:
-    """What `without_names` leaves out of this process' command line, after the program."""
+    """Return the program of this process and the arguments that `without_names` removes."""
     return [sys.argv[0], *(word for word in sys.argv[1:] if _NAME.match(word))]
 
 
 def become_node(name: str) -> None:
-    """Make this process a node of the graph, whose name begins with `name` unless roslaunch gives another one.
+    """Make this process a ROS node, whose name begins with `name` unless roslaunch sets another one.
 
     Raises
     ------
     MasterError
-        There is no master.
+        No master answers.
     GenerationError
-        There are no messages.
+        The messages cannot be generated.
     """
     import rospy
 
@@ -281,7 +311,7 @@ def become_node(name: str) -> None:
 
 
 def ensure_log_directory() -> None:
-    """Send rospy's log file to a temporary folder where the usual one cannot be written: it is not worth failing."""
+    """Redirect rospy's log file to a temporary folder if the usual one is not writable, instead of failing."""
     import rospkg
 
     if not paths.writable(Path(rospkg.get_log_dir())):
@@ -289,9 +319,9 @@ def ensure_log_directory() -> None:
 
 
 def log_to_stderr() -> None:
-    """Move rospy's information lines to stderr, where its warnings are: stdout belongs to what a request prints.
+    """Redirect rospy's information lines to stderr, where its warnings are: stdout is for the output of requests.
 
-    What they quote from clients and files is escaped.
+    Text that they quote from clients and files is escaped.
     """
     import logging
 
@@ -313,23 +343,23 @@ def log_to_stderr() -> None:
 
 
 def _serve(node: RosNode, received: list[int]) -> None:
-    """Wait until `node` is to end (`received` is where the signals arrive) and end it."""
+    """Wait until `node` has to end, because of a signal in `received` or another reason, and end it."""
     import rospy
 
-    rospy.on_shutdown(lambda: node.shutdown("kill"))  # whoever ends rospy: we, rosnode kill, a new node of this name
-    over = threading.Event()
-    rospy.core.add_shutdown_hook(lambda reason: over.set())  # after rospy's own, which tell the master
+    rospy.on_shutdown(lambda: node.shutdown("kill"))  # by us, rosnode kill, or a new node of this name
+    ended = threading.Event()
+    rospy.core.add_shutdown_hook(lambda reason: ended.set())  # after rospy's own, which unregister at the master
     # An Event must not be set from a signal handler, which may interrupt the wait while that holds its lock.
     while not received and not rospy.is_shutdown() and not node.finished.wait(0.1):
         pass
     systemd.notify("STOPPING=1")
     watchdog(END_SECONDS, 0)
     rospy.signal_shutdown("signal" if received else "kill")
-    over.wait()  # another thread may be at it already; the watchdog bounds this
+    ended.wait()  # another thread may be ending it already; the watchdog limits the time
 
 
 def watchdog(seconds: float, code: int, message: str = "") -> threading.Timer:
-    """End the process with `code` after `seconds` unless it has ended, or the timer is cancelled, by then."""
+    """Exit with `code` after `seconds`, unless the process has ended or the timer was cancelled before."""
 
     def end() -> None:
         if message:
@@ -348,7 +378,7 @@ def watchdog(seconds: float, code: int, message: str = "") -> threading.Timer:
 
 
 class DaemonFork:
-    """The process cut in two: the parent waits for the shell until the child, which becomes the node, is up."""
+    """A fork of this process: the parent waits until the child, which becomes the node, has started."""
 
     def __init__(self) -> None:
         self._reader, self._writer = os.pipe()
@@ -360,23 +390,17 @@ class DaemonFork:
             os.setsid()
 
     def wait(self) -> int:
-        """In the parent: 0 once the child is up, 1 where it ended before (and said why)."""
+        """In the parent: return 0 when the child has started, 1 if it has ended before, with a message."""
         os.close(self._writer)
         with os.fdopen(self._reader, "rb") as pipe:
             return 0 if pipe.read() == b"up" else 1
 
     def up(self) -> None:
-        """In the child: let the parent go, and let go of the terminal or pipe that it leaves."""
+        """In the child: let the parent exit, and close the terminal or pipe that they share."""
         nothing = os.open(os.devnull, os.O_RDWR)
         os.dup2(nothing, 0)
         for stream in (1, 2):
-            if not _is_file(stream):
+            if not stat.S_ISREG(os.fstat(stream).st_mode):
                 os.dup2(nothing, stream)
         os.write(self._writer, b"up")
         os.close(self._writer)
-
-
-def _is_file(stream: int) -> bool:
-    import stat
-
-    return stat.S_ISREG(os.fstat(stream).st_mode)

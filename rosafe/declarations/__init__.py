@@ -1,1 +1,1 @@
-"""Declarations that everything else is built from: types, parameters, representations, named errors."""
+"""Declarations on which all other packages are built: types, parameters, representations, named errors."""

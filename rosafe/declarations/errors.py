@@ -1,4 +1,4 @@
-"""Named exceptions of components, as they go over the wire."""
+"""Named exceptions of components, as sent to clients."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ class ComponentError(Exception):
     ex : str
         Full identifier, such as ``::rosAFE::e_noData`` or ``::genom::no_such_inport``.
     why : str, optional
-        One line for people. It goes along as ``what`` where the exception has no member of that name.
+        The reason, one line of text. It is sent as ``what`` if the exception has no member of that name.
     **detail
-        The exception's members, such as ``what`` of ``::rosAFE::e_badNewValue``.
+        The members of the exception, such as ``what`` of ``::rosAFE::e_badNewValue``.
     """
 
     def __init__(self, ex: str, why: str = "", **detail: Any) -> None:
@@ -29,12 +29,12 @@ class ComponentError(Exception):
 
     @property
     def what(self) -> str:
-        """The reason, for people; empty where none is known."""
+        """The reason as text; empty if it is unknown."""
         return str(self.detail.get("what", "")) or self.reason
 
     @property
     def body(self) -> dict[str, Any]:
-        """As clients get it: ``ex``, ``detail`` only where there are members, ``what`` where none of those is that."""
+        """The error as sent to clients: ``ex``, ``detail`` if it has members, ``what`` if it is not one of these."""
         body: dict[str, Any] = {"ex": self.ex}
         if self.detail:
             body["detail"] = self.detail
@@ -46,5 +46,5 @@ class ComponentError(Exception):
     def exdetail(self) -> str:
         """The JSON text for `genom_exdetail`: `body` without spaces."""
         text = json.dumps(self.body, separators=(",", ":"), ensure_ascii=False)
-        # Half a surrogate pair has no UTF-8; as an escape it is valid JSON.
+        # An unpaired surrogate cannot be encoded in UTF-8; as an escape it is valid JSON.
         return text.encode("utf-8", "backslashreplace").decode()

@@ -1,4 +1,4 @@
-"""The scalar types of the interface: what each is called on the ROS graph, how it is packed, and what fits into it."""
+"""The scalar types of the interface: name on the ROS graph, binary format and range."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 
 class Scalar(NamedTuple):
-    """One IDL type. `code` is that of the struct module; `bounds` are those of whole numbers, both included."""
+    """One IDL type. `code` is its format in the struct module; `bounds` is the inclusive range of a whole number."""
 
     ros: str
     code: str = ""
@@ -35,16 +35,16 @@ SCALARS = {
 
 
 def element(idl: str) -> str:
-    """The type of a sequence's elements; empty where `idl` is no sequence."""
+    """Return the type of the elements of a sequence; empty if `idl` is not a sequence."""
     return idl[len("sequence<") : -1] if idl.startswith("sequence<") else ""
 
 
-TIME = "::ros::time"  # the one struct that ROS has a type of its own for
+TIME = "::ros::time"  # the only struct for which ROS has a type of its own
 TIME_MEMBERS = (("sec", "unsigned long"), ("nsec", "unsigned long"))
 
 
 def ros_type(idl: str) -> str:
-    """The ROS field type of an IDL type: ``unsigned long`` is ``uint32``, ``sequence<double>`` is ``float64[]``."""
+    """Return the ROS type of an IDL type: ``unsigned long`` is ``uint32``, ``sequence<double>`` is ``float64[]``."""
     if idl == TIME:
         return "time"
     if of := element(idl):

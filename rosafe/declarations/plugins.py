@@ -1,4 +1,4 @@
-"""Where plugins are searched for, and whether this process imports any; rosafe/representations loads them."""
+"""The folders and entry points in which plugins are searched; rosafe/representations loads them."""
 
 from __future__ import annotations
 
@@ -11,36 +11,36 @@ ENTRY_POINTS = "rosafe.representations"  # group of entry points of installed pa
 SKIPPED = (".", "_", "test_")  # beginnings of the names of files that are not loaded
 
 _disabled = False
-# Called with the origin of each plugin before it is imported, so that one that ends the process can be named
+# Called with the origin of each plugin before its import, so that a plugin that ends the process can be named
 before_import: Callable[[str], None] = lambda origin: None  # noqa: E731
 
 
 def disable() -> None:
-    """Import no plugins in this process; to be called before rosafe.representations is imported."""
+    """Import no plugins in this process. Call it before rosafe.representations is imported."""
     global _disabled
     _disabled = True
 
 
 def named() -> list[str]:
-    """The folders that the environment names."""
+    """Return the folders in the environment variable."""
     return [folder for folder in os.environ.get(FOLDERS, "").split(os.pathsep) if folder]
 
 
 def folders() -> list[str]:
-    """The folders whose plugins this process imports."""
+    """Return the folders whose plugins this process imports."""
     return [] if _disabled else named()
 
 
 def entry_points() -> importlib.metadata.EntryPoints:
-    """The entry points of installed packages that this process imports."""
+    """Return the entry points of installed packages that this process imports."""
     return importlib.metadata.EntryPoints() if _disabled else importlib.metadata.entry_points(group=ENTRY_POINTS)
 
 
 def expected_modules() -> bool:
-    """Whether there may be plugins to import."""
+    """Return whether there may be plugins to import."""
     return bool(folders() or entry_points())
 
 
 def where() -> str:
-    """Where this process searched, for messages."""
+    """Return the search path of this process, for messages."""
     return f"{FOLDERS} is {os.pathsep.join(named())}" if named() else f"{FOLDERS} is not set"

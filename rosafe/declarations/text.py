@@ -1,31 +1,40 @@
-"""Words in messages: which names there are, and which one was perhaps meant."""
+"""Texts in messages: values and lists of names of limited length, and suggestions for misspelt names."""
 
 from __future__ import annotations
 
 import difflib
 from collections.abc import Collection
+from typing import Any
 
 MANY_NAMES = 20  # in one line
 LONG_NAME = 80  # characters of a name, in a line and for a comparison
 
 
+def short_repr(value: Any) -> str:
+    """Return `value` for a message of one line. It never raises, even if the `repr` of `value` does."""
+    try:
+        text = repr(value)
+    except Exception:
+        text = f"an object of type {type(value).__name__}"
+    text = " ".join(text.split())
+    return text if len(text) <= 80 else text[:77] + "..."
+
+
 def join_names(names: Collection[str]) -> str:
-    """`names` for a message of one line, not too long: ``a, b, c``, or ``none``."""
+    """Return `names` for a message of one line and of limited length: ``a, b, c``, or ``none``."""
     first = [name[:LONG_NAME] for name in list(names)[:MANY_NAMES]]
     more = len(names) - len(first)
     return (", ".join(first) or "none") + (f" and {more} more" if more else "")
 
 
-def closest_matches(word: str, known: Collection[str]) -> str:
-    """The one of the `known` words (at least one) that `word` resembles most, in whatever case."""
+def closest_match(word: str, known: Collection[str], cutoff: float = 0.0) -> str:
+    """Return the `known` word most similar to `word`, in any case; empty if all similarities are below `cutoff`."""
     by_lower = {one.lower(): one for one in reversed(list(known))}
-    lower = word[:LONG_NAME].lower()
-    return by_lower[difflib.get_close_matches(lower, by_lower, 1, 0.0)[0]]
+    close = difflib.get_close_matches(word[:LONG_NAME].lower(), by_lower, 1, cutoff)
+    return by_lower[close[0]] if close else ""
 
 
 def did_you_mean(word: str, known: Collection[str]) -> str:
-    """A hint for the end of a message, ``; did you mean ...?``, where one of the `known` words resembles `word`."""
-    lower = word[:LONG_NAME].lower()
-    by_lower = {one.lower(): one for one in known}
-    close = difflib.get_close_matches(lower, by_lower, 1, 0.75)
-    return f"; did you mean {by_lower[close[0]]}?" if close else ""
+    """Return a hint for the end of a message, ``; did you mean ...?``; empty if no `known` word is similar."""
+    close = closest_match(word, known, 0.75)
+    return f"; did you mean {close}?" if close else ""

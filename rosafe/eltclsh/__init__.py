@@ -1,1 +1,1 @@
-"""eltclsh and elwish: Tcl shells with line editing, on Python's tkinter and readline. No ROS here: that is for Tcl."""
+"""eltclsh and elwish: Tcl shells with line editing, based on tkinter and readline. ROS is accessed from Tcl only."""

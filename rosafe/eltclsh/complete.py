@@ -1,4 +1,4 @@
-"""What TAB offers: commands, what a component's command takes, subcommands and methods, variables, files."""
+"""Completion with TAB: commands, parameters of components, subcommands and methods, variables, files."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from pathlib import Path
 from rosafe.eltclsh.interpreter import Interpreter
 from rosafe.eltclsh.words import Context, Word, scan
 
-_SPACE = " "  # after a word that is complete
+_SPACE = " "  # after a complete word
 
 
 class Completer:
-    """Asks a Tcl interpreter what there is. A match is the whole of what replaces the word, with what follows it."""
+    """Finds completions in a Tcl interpreter. A completion is the new word with its trailing space or bracket."""
 
     def __init__(self, interpreter: Interpreter) -> None:
         self._tcl = interpreter
 
     def complete(self, before: str, word: str) -> list[str]:
-        """What `word` can become; `before` is all that was typed before it."""
+        """Return the completions of `word`; `before` is the text before it."""
         variable = re.search(r"\$(\{?)(?:([\w:]+)\()?$", before)
         if variable:
             brace, array = variable.groups()
@@ -38,7 +38,7 @@ class Completer:
         return self._commands(word) if not words else sorted({*self._variables(word, _SPACE), *self._files(word)})
 
     def _value(self, word: Word) -> str:
-        """The word, with the value of the variable that it may be."""
+        """Return the word, or its value if it is a variable."""
         if word.text.startswith("$"):
             return self._tcl.variable(word.text[1:].strip("{}")) or word.text
         return word.bare
@@ -46,39 +46,41 @@ class Completer:
     # --- commands ---
 
     def _commands(self, word: str) -> list[str]:
-        found = [name + _SPACE for name in self._tcl.elements("info", "commands", _glob(word))]
-        return sorted({*_like(word, found), *self._namespaces(word)})
+        names = [name + _SPACE for name in self._tcl.elements("info", "commands", _glob(word))]
+        return sorted({*_matching(word, names), *self._namespaces(word)})
 
     def _namespaces(self, word: str) -> list[str]:
         parent = word.rpartition("::")[0]
-        return _like(word, (f"{name}::" for name in self._tcl.elements("namespace", "children", f"{parent}::")))
+        return _matching(word, (f"{name}::" for name in self._tcl.elements("namespace", "children", f"{parent}::")))
 
     def _by_command(self, words: list[str], word: str) -> list[str] | None:
-        """What the command itself says it takes: components, ensembles and objects."""
+        """Return the arguments that the command accepts, for components, ensembles and objects; None for others."""
         if not words:
             return None
         kind, parameters, switches, values = self._about(words[0])
         if kind:
             if word.startswith("-"):
-                return _starting(word, switches)
+                return _with_prefix(word, switches)
             given = [w for w in words[1:] if not w.startswith("-")]
             if values and not given:
-                return _starting(word, values)
-            # Members stand in braces, which a first word does not need to be typed with.
-            return _starting("{" + word, [f"{{{name}" for name in parameters]) if len(given) == bool(values) else None
+                return _with_prefix(word, values)
+            if len(given) != bool(values):
+                return None
+            # Parameters are in braces, which are added to the first word.
+            return _with_prefix("{" + word, [f"{{{name}" for name in parameters])
         if len(words) > 1:
             return None
         if self._tcl.elements("namespace", "ensemble", "exists", words[0]) == ["1"]:
             ensemble = ("namespace", "ensemble", "configure", words[0])
-            return _starting(
+            return _with_prefix(
                 word, self._tcl.elements(*ensemble, "-map")[::2] or self._tcl.elements(*ensemble, "-subcommands")
             )
         if self._tcl.elements("info", "object", "isa", "object", words[0]) == ["1"]:
-            return _starting(word, self._tcl.elements("info", "object", "methods", words[0], "-all"))
+            return _with_prefix(word, self._tcl.elements("info", "object", "methods", words[0], "-all"))
         return None
 
     def _about(self, command: str) -> tuple[str, list[str], list[str], list[str]]:
-        """Kind, parameters, switches and values for the first word of a component's command; empty for any other."""
+        """Return kind, parameters, switches and first values of a component's command; empty for other commands."""
         about = self._tcl.elements("::genomix::about", command)
         if len(about) != 4:
             return "", [], [], []
@@ -87,14 +89,14 @@ class Completer:
         return kind, parameters, switches, values
 
     def _dict_members(self, words: list[Word], inside: Context, word: str) -> list[str] | None:
-        """Names of parameters inside the braces of a component's command; None where this is something else."""
+        """Return parameters inside the braces of a component's command; None for other braces."""
         if not words:
             return None
         kind, parameters, _, values = self._about(self._value(words[0]))
         given = [element.bare for element in inside.elements]
         if not kind or sum(not w.text.startswith("-") for w in words[1:]) > bool(values):
             return None
-        return [] if len(given) % 2 else _starting(word, (name for name in parameters if name not in given[::2]))
+        return [] if len(given) % 2 else _with_prefix(word, (name for name in parameters if name not in given[::2]))
 
     # --- variables, files ---
 
@@ -104,17 +106,17 @@ class Completer:
             name for name in found if self._tcl.elements("array", "exists", f"::{name.removeprefix('::')}") == ["1"]
         }
         names = [name + ("(" if name in arrays else tail) for name in found]
-        return sorted({*_like(word, names), *self._namespaces(word)} if word else {*_like(word, names)})
+        return sorted({*_matching(word, names), *self._namespaces(word)} if word else {*_matching(word, names)})
 
     def _array_elements(self, array: str, word: str) -> list[str]:
-        return _starting(word, self._tcl.elements("array", "names", f"::{array.removeprefix('::')}"), ")")
+        return _with_prefix(word, self._tcl.elements("array", "names", f"::{array.removeprefix('::')}"), ")")
 
     def _files(self, word: str, directories_only: bool = False) -> list[str]:
         folder, _, name = word.rpartition("/")
         base = Path(os.path.expanduser(f"{folder}/" if "/" in word else "."))
         try:
             entries = sorted(base.iterdir())
-        except OSError:  # there is no such folder, or not for us
+        except OSError:  # missing folder or missing permission
             return []
         found = []
         for entry in entries:
@@ -127,11 +129,11 @@ class Completer:
     # --- el::completionPatterns ---
 
     def _by_patterns(self, words: list[str], word: str) -> list[str] | None:
-        """What the first rule says whose pattern matches the command and of which a part matches the place.
+        """Return the completions of the first rule for the command, or None.
 
-        The variable is a list of rules ``{command {kind pattern action} ...}``: `p` matches the number of the word,
-        `c` and `C` the word itself (`C` completes what is behind the match), `n` and `N` the word before it or the one
-        before that.
+        The variable is a list of rules ``{command {kind pattern action} ...}``. A pattern of kind `p` matches the
+        number of the word, `c` and `C` the word itself (`C` completes the part after the match), `n` the previous word,
+        and `N` the word before the previous one.
         """
         for rule in self._tcl.elements("set", "::el::completionPatterns"):
             command, *parts = self._tcl.split(rule)
@@ -141,13 +143,13 @@ class Completer:
                 kind, pattern, action = (*self._tcl.split(part), "", "", "")[:3]
                 skipped = self._skipped(kind, pattern, words, word)
                 if skipped is not None:
-                    return [word[:skipped] + match for match in self._act(action, word[skipped:])]
+                    return [word[:skipped] + match for match in self._perform(action, word[skipped:])]
             return None
         return None
 
     @staticmethod
     def _skipped(kind: str, pattern: str, words: list[str], word: str) -> int | None:
-        """How much of the word stays as it is, None where the pattern is not for this place."""
+        """Return the number of characters before the completed part, or None if the pattern does not match."""
         if kind == "p":
             return 0 if re.fullmatch(pattern, str(len(words))) else None
         if kind in ("n", "N"):
@@ -158,14 +160,14 @@ class Completer:
             return None
         return matches[-1].end() if kind == "C" else 0
 
-    def _act(self, action: str, word: str) -> list[str]:
+    def _perform(self, action: str, word: str) -> list[str]:
         match action:
             case "v" | "A":
                 return self._variables(word, _SPACE)
             case "c" | "C" | "N":
                 return self._commands(word)
             case "p":
-                return _starting(word, self._tcl.elements("info", "procs", _glob(word)))
+                return _with_prefix(word, self._tcl.elements("info", "procs", _glob(word)))
             case "n":
                 return self._namespaces(word)
             case "f" | "F":
@@ -173,24 +175,25 @@ class Completer:
             case "d":
                 return self._files(word, directories_only=True)
             case "k":
-                self._tcl.elements("eval", "{*}[package unknown] {} 0-")  # until it is asked, Tcl has not looked
-                return _starting(word, self._tcl.elements("package", "names"))
+                # Tcl searches for packages only when an unknown one is requested.
+                self._tcl.elements("eval", "{*}[package unknown] {} 0-")
+                return _with_prefix(word, self._tcl.elements("package", "names"))
             case "i":
-                return _starting(word, self._tcl.elements("interp", "slaves"))
+                return _with_prefix(word, self._tcl.elements("interp", "slaves"))
         if action.startswith("["):
-            return _starting(word, self._tcl.elements("uplevel", "#0", action[1:-1]))
-        return _starting(word, self._tcl.split(action))
+            return _with_prefix(word, self._tcl.elements("uplevel", "#0", action[1:-1]))
+        return _with_prefix(word, self._tcl.split(action))
 
 
-def _starting(word: str, names: Iterable[str], tail: str = _SPACE) -> list[str]:
+def _with_prefix(word: str, names: Iterable[str], tail: str = _SPACE) -> list[str]:
     return sorted({name + tail for name in names if name.startswith(word)})
 
 
-def _like(word: str, names: Iterable[str]) -> list[str]:
-    """Those that start with the word, written with or without ``::`` in front as the word is."""
+def _matching(word: str, names: Iterable[str]) -> list[str]:
+    """Return the names that start with the word, with a leading ``::`` if the word has one."""
     absolute = word.startswith("::")
-    written = (("::" if absolute else "") + name.removeprefix("::") for name in names)
-    return [name for name in written if name.startswith(word)]
+    candidates = (("::" if absolute else "") + name.removeprefix("::") for name in names)
+    return [name for name in candidates if name.startswith(word)]
 
 
 def _glob(word: str) -> str:

@@ -1,4 +1,4 @@
-# The procedures of eltclsh: leaving, the question at Ctrl-C, and what scripts of the original use.
+# Procedures of eltclsh: exit, the question after Ctrl-C, and procedures for scripts of the original.
 
 namespace eval ::el {
     variable completionPatterns {
@@ -16,10 +16,10 @@ namespace eval ::el {
     }
     variable queryItems 100
     variable maxCols 0
-    variable typed 0 ;# while a command runs that was typed at the prompt
+    variable typed 0 ;# 1 while a command from the prompt is running
 }
 
-# Whether the caller of our caller was typed at the prompt, word for word: only then may it ask for what is missing.
+# Return whether the command that called our caller was typed at the prompt. Only then may it ask for parameters.
 proc ::el::typing {} {
     variable typed
     return [expr {$typed && [info level] <= 2 && [info script] eq ""}]
@@ -32,7 +32,7 @@ proc ::exit {{returnCode 0}} {
     ::el::Exit [expr {$returnCode & 0xff}]
 }
 
-# Ctrl-C at the prompt, or while a command that was typed runs.
+# Handle Ctrl-C at the prompt, or while a command from the prompt is running.
 proc ::el::interrupted {} {
     chan puts "\n*** Got signal SIGINT"
     while 1 {
@@ -46,20 +46,20 @@ proc ::el::interrupted {} {
                 exit
             }
             3 - \u0003 {
-                return [::el::Abandon]
+                return [::el::Cancel]
             }
         }
     }
 }
 
-# shift varName: take the first element off a list, and return it.
+# shift varName: remove the first element of a list and return it.
 proc ::shift {varName} {
     upvar 1 $varName list
     set list [lassign $list first]
     return $first
 }
 
-# wrappedputs line width: print a text in lines of at most so many characters, broken between words.
+# wrappedputs line width: print a text in lines of at most `width` characters, broken between words.
 proc ::wrappedputs {line width} {
     if {![string is entier -strict $width] || $width < 1} {
         return -code error "expected a width above 0 but got \"$width\""
@@ -77,8 +77,8 @@ proc ::wrappedputs {line width} {
     puts $line
 }
 
-# aska type prompt default ?arg?: ask for a value until it is one of the type: bool, short, int, wide, float, double,
-# string, or a list of words to choose from. Nothing or a dot means the default; `arg` is taken as a first answer.
+# aska type prompt default ?arg?: ask the user until the answer is a value of the type: bool, short, int, wide, float,
+# double, string, or a list of choices. An empty answer or a dot selects the default; `arg` is used as the first answer.
 proc ::aska {type prompt default args} {
     if {[llength $args] > 1} {
         return -code error {wrong # args: should be "aska type prompt default ?arg?"}
@@ -100,7 +100,7 @@ proc ::aska {type prompt default args} {
     }
 }
 
-# el::gets, with TAB offering the words of an enumeration.
+# As el::gets, with completion of the choices of an enumeration.
 proc ::el::Choose {type prompt} {
     variable completionPatterns
     if {[::el::Expected $type] ne "enum {$type}"} {
@@ -126,27 +126,27 @@ proc ::el::Expected {type} {
     }
 }
 
-# What was typed, as a value of the type; numbers may be expressions. An error where it is none.
+# Convert an answer to a value of the type, or raise an error. Numbers may be expressions.
 proc ::el::Value {type input} {
     switch -- [::el::Expected $type] {
         boolean {return [expr {bool($input)}]}
         integer - "wide integer" {
             set value [uplevel #0 [list expr $input]]
-            if {$value != entier($value)} {error "no integer"}
+            if {$value != entier($value)} {error "not an integer"}
             return [expr {entier($value)}]
         }
         float - double {return [expr {double([uplevel #0 [list expr $input]])}]}
         string {return [string trim $input]}
         default {
             set input [string trim $input]
-            if {$input ni $type} {error "none of these"}
+            if {$input ni $type} {error "not one of the choices"}
             return $input
         }
     }
 }
 
-# mapscan format words: a value for each line {?opt? type prompt default} of the format: the next of the words, else the
-# user's answer, or the default of what is optional. After the word ".." all others have their defaults.
+# mapscan format words: return a value for each line {?opt? type prompt default} of the format: the next word. After the
+# last word, it is the default of an optional value, or the answer of the user. After "..", defaults are used.
 proc ::mapscan {format words} {
     set values {}
     set defaults 0

@@ -1,20 +1,22 @@
-"""The lines that were typed: readline's list of them, their file in the original's format, and el::history."""
+"""The history of input lines: the list of readline, the file in the format of the original, and el::history."""
 
 from __future__ import annotations
 
+import errno
 import os
 import re
 import readline
-import tempfile
 from pathlib import Path
 from tkinter import TclError
 
-_HEADER = "_HiStOrY_V2_"  # of libedit, which the original uses; everything but plain characters is \ooo there
+from rosafe.output import OutputError, write_whole
+
+_HEADER = "_HiStOrY_V2_"  # of libedit, which the original uses; characters except graphic ASCII are written as \ooo
 _SUBCOMMANDS = ("add", "change", "event", "file", "save", "size", "clear")
 
 
 def decode(text: str) -> list[str]:
-    """The entries of a history file: libedit's, or one plain line for each."""
+    """Return the entries of a history file in the format of libedit, or with one plain line per entry."""
     lines = text.splitlines()
     if lines[:1] != [_HEADER]:
         return lines
@@ -27,7 +29,7 @@ def decode(text: str) -> list[str]:
 
 
 def encode(entries: list[str]) -> str:
-    """The text of a history file with these entries."""
+    """Return the text of a history file with these entries."""
     lines = ["".join(c if "!" <= c <= "~" and c != "\\" else _octal(c) for c in entry) for entry in entries]
     return "\n".join([_HEADER, *lines, ""])
 
@@ -37,7 +39,7 @@ def _octal(character: str) -> str:
 
 
 class LineHistory:
-    """What the arrow keys go through, and where it is kept."""
+    """The lines that the arrow keys recall, and their file."""
 
     def __init__(self, path: Path) -> None:
         self.path: Path | None = _absolute(str(path))
@@ -50,45 +52,41 @@ class LineHistory:
 
     @property
     def entries(self) -> list[str]:
-        """All lines, the oldest first."""
+        """All lines, oldest first."""
         count = readline.get_current_history_length()
         return [str(readline.get_history_item(index)) for index in range(1, count + 1)]
 
     def replace(self, entries: list[str]) -> None:
-        """Forget what is there and take these, or the newest of them."""
+        """Replace all entries by these, or by the newest of them if there are too many."""
         readline.clear_history()
         for entry in entries[max(0, len(entries) - self.size) :]:
             readline.add_history(entry)
 
     def add(self, entry: str) -> None:
-        """Append a line; the oldest one goes where there are too many."""
+        """Append a line, and remove the oldest one if there are too many."""
         readline.add_history(entry)
         while readline.get_current_history_length() > self.size:
             readline.remove_history_item(0)
 
     def save(self) -> None:
-        """Write the file, as a whole or not at all. OSError where that cannot be."""
+        """Write the complete file, readable by its owner only, or raise OSError and keep the old one."""
         if self.path is None:
             return
-        name = ""
         try:
-            handle, name = tempfile.mkstemp(prefix=f"{self.path.name}.", dir=self.path.parent)
-            with os.fdopen(handle, "w", encoding="utf-8") as stream:
-                stream.write(encode(self.entries))
-            os.replace(name, self.path)
-        except OSError as error:
-            if name:
-                os.unlink(name)
-            raise OSError(error.errno, error.strerror, str(self.path)) from error
+            write_whole(self.path, encode(self.entries).encode(), 0o600)
+        except OutputError as error:
+            # Without an error of the system (EIO), or if another process is writing the file, the text has the reason.
+            reason = str(error) if error.errno in (errno.EIO, errno.EAGAIN) else os.strerror(error.errno)
+            raise OSError(error.errno, reason, str(self.path)) from error
 
     def command(self, subcommand: str = "", *arguments: str) -> str:
-        """el::history add|change|event|file|save|size|clear, as the original's manual describes it."""
+        """Implement el::history add|change|event|file|save|size|clear as described in the manual of the original."""
         limits = {"add": (1, 1), "change": (1, 2), "event": (0, 1), "file": (0, 1), "size": (0, 1)}
         if subcommand not in _SUBCOMMANDS:
             raise TclError(f'bad subcommand "{subcommand}": must be {", ".join(_SUBCOMMANDS[:-1])}, or clear')
-        least, most = limits.get(subcommand, (0, 0))
-        if not least <= len(arguments) <= most:
-            raise TclError(f"wrong # args: el::history {subcommand} takes {least} to {most} arguments")
+        minimum, maximum = limits.get(subcommand, (0, 0))
+        if not minimum <= len(arguments) <= maximum:
+            raise TclError(f"wrong # args: el::history {subcommand} takes {minimum} to {maximum} arguments")
         match subcommand:
             case "add":
                 self.add(arguments[0])
@@ -113,7 +111,7 @@ class LineHistory:
         return ""
 
     def _index(self, event: str) -> int:
-        """Events count from 1; 0 is the current one, -1 the one before."""
+        """Return the index of an event: events count from 1, 0 is the current one, -1 the previous one."""
         number, count = _integer(event), readline.get_current_history_length()
         index = number - 1 if number > 0 else count - 1 + number
         if not 0 <= index < count:

@@ -1,4 +1,4 @@
-"""A Tcl interpreter as tclsh has it, and commands in it that are Python functions whose errors arrive in Tcl."""
+"""A Tcl interpreter like that of tclsh, with commands that are Python functions and report errors to Tcl."""
 
 from __future__ import annotations
 
@@ -15,45 +15,45 @@ from rosafe.eltclsh.library import tcl as library
 
 LIBRARY = Path(__file__).resolve().parent
 _CODE = LIBRARY.parents[1]
-# The folder of the Tcl package genomix, seen from a checkout, and from lib/python3/dist-packages of an install prefix.
-PACKAGES = [str(place) for place in (_CODE / "tcl", _CODE.parents[1] / "tcltk") if (place / "genomix").is_dir()]
+# The folder of the Tcl package genomix, in a checkout or relative to lib/python3/dist-packages of an installation.
+PACKAGES = [str(path) for path in (_CODE / "tcl", _CODE.parents[1] / "tcltk") if (path / "genomix").is_dir()]
 
 
 class Interpreter:
-    """Tcl. `tk` is tkinter's own object; values that come from it are texts."""
+    """A Tcl interpreter. `tk` is the object of tkinter; its results are texts."""
 
     def __init__(self) -> None:
         self.tk: Any = tkinter.Tcl().tk
         self.tk.wantobjects(False)
         self.address = self.tk.interpaddr()
-        # For `exec [info nameofexecutable] script`, which otherwise would give the script to Python.
+        # `exec [info nameofexecutable] script` must run this program and not Python.
         library.Tcl_FindExecutable(os.fsencode(os.path.abspath(sys.argv[0])))
         self.tk.eval("unset -nocomplain ::_tkinter_skip_tk_init; namespace eval ::el::python {}")
-        # Python's own commands cannot fail in Tcl's sense: they would arrive as errors without a text.
+        # Python exceptions would be Tcl errors without a message, so the functions return code, result and error code.
         self.tk.eval(
             "proc ::el::Invoke {command args} {lassign [::el::python::$command {*}$args] code result errorcode\n"
             "return -code $code -errorcode $errorcode $result}"
         )
 
-    def command(self, name: str, function: Callable[..., Any]) -> None:
-        """Make `function` the Tcl command `name`; what it raises becomes a Tcl error with a text and an error code."""
-
+    def create_command(self, name: str, function: Callable[..., Any]) -> None:
+        """Create the Tcl command `name`; exceptions of `function` become Tcl errors with message and error code."""
         signature = inspect.signature(function)
 
         def run(*arguments: str) -> tuple[int, Any, Any]:
             try:
                 signature.bind(*arguments)
             except TypeError:
-                told = f'wrong # args: should be "{" ".join([name, *map(_usage, signature.parameters.values())])}"'
-                return 1, told, ("TCL", "WRONGARGS")
+                message = f'wrong # args: should be "{" ".join([name, *map(_usage, signature.parameters.values())])}"'
+                return 1, message, ("TCL", "WRONGARGS")
             try:
                 return 0, function(*arguments), "NONE"
             except tkinter.TclError as error:
                 return 1, str(error) or f"{name} failed", ("ELTCLSH", name)
             except OSError as error:
-                told = error.strerror or str(error)
-                return 1, f"{error.filename}: {told}" if error.filename else told, ("POSIX", str(error.errno), told)
-            except Exception as error:  # it must not get lost on its way through Tcl
+                reason = error.strerror or str(error)
+                message = f"{error.filename}: {reason}" if error.filename else reason
+                return 1, message, ("POSIX", str(error.errno), reason)
+            except Exception as error:  # otherwise, it would be lost in Tcl
                 return 1, f"{name}: {type(error).__name__}: {error}", ("PYTHON", type(error).__name__)
 
         tail = name.replace("::", "_")
@@ -61,26 +61,26 @@ class Interpreter:
         self.tk.call("interp", "alias", "", f"::{name}", "", "::el::Invoke", tail)
 
     def elements(self, *words: str) -> list[str]:
-        """The elements of a command's result, none where it fails."""
+        """Return the elements of the result of a command; empty if the command fails."""
         try:
             return list(self.tk.splitlist(self.tk.call(*words)))
         except tkinter.TclError:
             return []
 
     def split(self, text: str) -> list[str]:
-        """The elements of a Tcl list, none where the text is no list."""
+        """Return the elements of a Tcl list; empty if the text is not a list."""
         return self.elements("lrange", text, "0", "end")
 
     def variable(self, name: str) -> str | None:
-        """The value of a global variable, None where there is none."""
+        """Return the value of a global variable, or None."""
         try:
             return str(self.tk.globalgetvar(name))
         except tkinter.TclError:
             return None
 
-    def say(self, text: str, channel: str = "stdout") -> None:
-        """Write a line, whatever a script has made of `puts`."""
-        with contextlib.suppress(tkinter.TclError):  # the channel is closed: there is nobody to tell
+    def print_line(self, text: str, channel: str = "stdout") -> None:
+        """Print a line, also if a script has replaced `puts`."""
+        with contextlib.suppress(tkinter.TclError):  # the channel is closed
             self.tk.call("chan", "puts", channel, text)
             self.tk.call("chan", "flush", channel)
 

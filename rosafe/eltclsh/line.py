@@ -1,4 +1,4 @@
-"""Lines that are edited in the terminal while Tcl serves its events."""
+"""Line editing in the terminal while Tcl processes its events."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tkinter import TclError
 from rosafe.eltclsh.interpreter import Interpreter
 
 _Handler = ctypes.CFUNCTYPE(None, ctypes.c_void_p)
-_rl = ctypes.CDLL(readline.__file__)  # GNU readline itself is found through it
+_rl = ctypes.CDLL(readline.__file__)  # also finds the symbols of GNU readline
 _rl.rl_callback_handler_install.argtypes = [ctypes.c_char_p, _Handler]
 _rl.rl_callback_handler_install.restype = None
 _libc = ctypes.CDLL(None)
@@ -24,53 +24,53 @@ _STDIN = 0
 
 
 class LineCancelled(Exception):
-    """The line that was being typed is not wanted any more (Ctrl-C)."""
+    """The input line was cancelled (Ctrl-C)."""
 
 
 class LineReader:
-    """Reads lines with GNU readline; `complete(before, word)` gives what the word before the cursor can become."""
+    """Reads lines with GNU readline; `complete(before, word)` returns the completions of the word before the cursor."""
 
     def __init__(self, interpreter: Interpreter, complete: Callable[[str, str], list[str]]) -> None:
         self._interpreter = interpreter
         self._complete = complete
         self._matches: list[str] = []
-        self._ended = self._abandoned = self._active = False
+        self._ended = self._cancelled = self._active = False
         self._line: str | None = None
         self._prompt = ""
-        self._handler = _Handler(self._take)
+        self._handler = _Handler(self._receive)
         readline.set_completer(self._match)
         readline.set_completer_delims(DELIMITERS)
         readline.parse_and_bind("tab: complete")
         readline.parse_and_bind("set show-all-if-ambiguous on")
-        interpreter.command("el::Readable", lambda: _rl.rl_callback_read_char() and "")
+        interpreter.create_command("el::Readable", lambda: _rl.rl_callback_read_char() and "")
 
     def read(self, prompt: str) -> str | None:
-        """The next line without its end, None at the end of the input. Raises Abandoned.
+        """Return the next line without its end, or None at the end of the input. Raise LineCancelled after Ctrl-C.
 
-        A script that runs on an event may ask for a line while another one is being typed; that goes on afterwards.
+        An event script may read a line while another one is being typed; the outer line is continued afterwards.
         """
         outer = (self._prompt, readline.get_line_buffer()) if self._active else None
         if outer:
             self._remove()
-            self._interpreter.say("")
+            self._interpreter.print_line("")
         if "stdin" not in self._interpreter.elements("chan", "names"):  # a script has closed it
             return None
-        self._ended = self._abandoned = False
+        self._ended = self._cancelled = False
         self._prompt = prompt
         try:
             self._install()
-            while not (self._ended or self._abandoned):
+            while not (self._ended or self._cancelled):
                 self._interpreter.tk.dooneevent(0)
-            line, abandoned = self._line, self._abandoned
+            line, cancelled = self._line, self._cancelled
         finally:
             self._remove()
             if outer:
-                self._ended = self._abandoned = False
+                self._ended = self._cancelled = False
                 self._prompt = outer[0]
                 self._install()
                 readline.insert_text(outer[1])
                 readline.redisplay()
-        if abandoned:
+        if cancelled:
             raise LineCancelled
         return line
 
@@ -86,41 +86,41 @@ class LineReader:
         with contextlib.suppress(TclError):  # a script has closed stdin
             self._interpreter.tk.call("chan", "event", "stdin", "readable", self._before)
 
-    def _take(self, text: int | None) -> None:
-        """Called by readline with what was typed, or with nothing at the end of the input."""
+    def _receive(self, text: int | None) -> None:
+        """Receive a line from readline, or None at the end of the input."""
         self._line = None
         if text:
             self._line = ctypes.string_at(text).decode("utf-8", "replace")
             _libc.free(text)
         self._ended = True
-        _rl.rl_callback_handler_remove()  # at once, or it shows the prompt for a next line
+        _rl.rl_callback_handler_remove()  # immediately, otherwise readline shows another prompt
 
     def cancel_line(self) -> bool:
-        """Give up the line that is being typed; False where there is none."""
-        self._abandoned = self._active
+        """Cancel the line that is being typed; return False if there is none."""
+        self._cancelled = self._active
         return self._active
 
     def redisplay(self) -> None:
-        """Show the line again, on a line of its own, after something else was written."""
+        """Show the line again, in a new line, after other output."""
         if self._active:
             _rl.rl_on_new_line()
             _rl.rl_redisplay()
 
     def resized(self) -> None:
-        """The terminal has another size."""
+        """Adapt to a new size of the terminal."""
         _rl.rl_resize_terminal()
 
     def close(self) -> None:
-        """Leave the terminal as it was."""
+        """Restore the terminal."""
         if self._active:
             self._remove()
 
     def key(self, prompt: str = "", signals: bool = True) -> str:
-        """One key, not shown; without `signals`, Ctrl-C is a key too. TclError at the end of the input."""
+        """Read one key without echo; without `signals`, Ctrl-C is a key too. Raise TclError at the end of the input."""
         tk = self._interpreter.tk
         before = tk.call("chan", "event", "stdin", "readable")
         with _single_keys(signals):
-            tk.call("chan", "puts", "-nonewline", "stdout", prompt)  # now that it can be answered
+            tk.call("chan", "puts", "-nonewline", "stdout", prompt)  # printed when input is read
             tk.eval("chan flush stdout; set ::el::key 0; chan event stdin readable {set ::el::key 1}")
             try:
                 while tk.eval("set ::el::key") == "0":
@@ -158,7 +158,7 @@ def _single_keys(signals: bool) -> Iterator[None]:
 
 
 def _is_character(raw: bytes) -> bool:
-    """Whether these bytes are a whole character, or can never become one."""
+    """Return whether these bytes are a complete UTF-8 character, or cannot become one."""
     if raw[0] < 0xC0:
         return True
     return len(raw) >= (2 if raw[0] < 0xE0 else 3 if raw[0] < 0xF0 else 4)

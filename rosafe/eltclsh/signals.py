@@ -1,4 +1,4 @@
-"""The command `signal`, and scripts that run when a signal comes, also while Tcl is busy."""
+"""The command `signal`, and scripts that run when a signal arrives, also while Tcl is busy."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ _NAMES = {number.name.removeprefix("SIG"): number for number in signal.Signals}
 
 
 class Signals:
-    """Which script belongs to which signal.
+    """The scripts for signals.
 
-    Python runs handlers in its main thread, and not as long as that is inside Tcl. So the number of the signal goes
-    through a pipe (`signal.set_wakeup_fd`) to a thread, which asks Tcl to call us at the next place that is safe.
+    Python runs signal handlers in its main thread, but not while this thread is inside Tcl. Therefore the number of the
+    signal is sent through a pipe (`signal.set_wakeup_fd`) to a thread, which asks Tcl to run `_run_scripts` when safe.
     """
 
     def __init__(self, interpreter: Interpreter) -> None:
         self._interpreter = interpreter
         self._actions: dict[int, str] = {}
         self._arrived: deque[int] = deque()
-        self._abandon = False
-        self._running: threading.Thread | None = None
+        self._cancel = False
+        self._forwarder: threading.Thread | None = None
 
     def command(self, name: str, action: str | None = None) -> str | tuple[str, ...]:
-        """signal names | signal NAME ?script|-ignore|-default|-block|-unblock?; the value is what held before."""
+        """Implement `signal names | signal NAME ?script|-ignore|-default|-block|-unblock?`; return the old action."""
         if name == "names" and action is None:
             return tuple(_NAMES)
         number = self._number(name)
@@ -43,11 +43,11 @@ class Signals:
                 self._actions[number] = action
             case "-block" | "-unblock":
                 how = signal.SIG_BLOCK if action == "-block" else signal.SIG_UNBLOCK
-                return tuple(_name(held) for held in signal.pthread_sigmask(how, [number]))
+                return tuple(_name(blocked) for blocked in signal.pthread_sigmask(how, [number]))
             case script:
                 self._listen()
-                signal.signal(number, lambda *_: None)  # the pipe tells; but Python must have a handler
-                # Reading from a server or a terminal ends with Ctrl-C, and goes on after any other signal.
+                signal.signal(number, lambda *_: None)  # the signal is read from the pipe, but Python needs a handler
+                # Ctrl-C interrupts reading from a server or a terminal; other signals do not.
                 signal.siginterrupt(number, number == signal.SIGINT)
                 self._actions[number] = script
         return before
@@ -61,22 +61,22 @@ class Signals:
             raise TclError(f'unknown signal "{name}": see signal names')
         return known
 
-    def abandon(self) -> None:
-        """For a script of ours: what was running ends with an error that nothing catches."""
-        self._abandon = True
+    def cancel(self) -> None:
+        """End the running command, from a signal script, with an error that scripts cannot catch."""
+        self._cancel = True
 
     def _listen(self) -> None:
-        if self._running is not None:
+        if self._forwarder is not None:
             return
-        self._procedure = library.AsyncProc(self._run_scripts)  # must live as long as Tcl knows it
+        self._procedure = library.AsyncProc(self._run_scripts)  # Tcl holds no reference to it
         handler = library.tcl.Tcl_AsyncCreate(self._procedure, None)
         reader, writer = os.pipe()
         os.set_blocking(writer, False)
         signal.set_wakeup_fd(writer, warn_on_full_buffer=False)
-        self._running = threading.Thread(target=self._forward, args=(reader, handler), daemon=True)
-        # Signals are for the main thread, which they are to wake from what it waits for.
+        self._forwarder = threading.Thread(target=self._forward, args=(reader, handler), daemon=True)
+        # Signals must interrupt the main thread, so this thread blocks them.
         before = signal.pthread_sigmask(signal.SIG_BLOCK, signal.valid_signals())
-        self._running.start()
+        self._forwarder.start()
         signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
     def _forward(self, reader: int, handler: int) -> None:
@@ -85,7 +85,7 @@ class Signals:
             library.tcl.Tcl_AsyncMark(handler)
 
     def _run_scripts(self, _data: int, _interp: int, code: int) -> int:
-        """Called by Tcl between two of its instructions, or while it waits for events."""
+        """Run the scripts of received signals. Called by Tcl between two instructions, or while it waits for events."""
         address = self._interpreter.address
         state = library.tcl.Tcl_SaveInterpState(address, code)
         while self._arrived:
@@ -96,14 +96,14 @@ class Signals:
             if result != library.OK:
                 library.tcl.Tcl_BackgroundException(address, result)
         code = int(library.tcl.Tcl_RestoreInterpState(address, state))
-        if self._abandon:
-            self._abandon = False
-            told = library.tcl.Tcl_NewStringObj(b"interrupted", -1)
-            library.tcl.Tcl_CancelEval(address, told, None, library.CANCEL_UNWIND)
+        if self._cancel:
+            self._cancel = False
+            message = library.tcl.Tcl_NewStringObj(b"interrupted", -1)
+            library.tcl.Tcl_CancelEval(address, message, None, library.CANCEL_UNWIND)
         return code
 
 
 def _name(number: int) -> str:
-    with contextlib.suppress(ValueError):  # real-time signals have none
+    with contextlib.suppress(ValueError):  # real-time signals have no name
         return signal.Signals(number).name.removeprefix("SIG")
     return str(number)

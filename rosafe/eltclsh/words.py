@@ -1,20 +1,21 @@
-"""Where the cursor is in a Tcl command that is not finished: which words are before it, and inside which brackets."""
+"""A parser for incomplete Tcl commands: the words before the cursor and the open brackets around it."""
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 
 
 @dataclass(frozen=True)
 class Word:
-    """A word as it was typed, with braces and quotes around it, and where it lies."""
+    """A word as it was typed, including braces and quotes, and its position."""
 
     text: str
     start: int
 
     @property
     def end(self) -> int:
-        """The index behind the word."""
+        """The index after the word."""
         return self.start + len(self.text)
 
     @property
@@ -25,79 +26,83 @@ class Word:
         return self.text
 
 
+_COMMENT, _END = r"(?P<comment>#[^\n]*)|", r"(?P<end>[\n;])|"
+_WORD = r"(?P<escape>\\(?!\n).?)|(?P<blank>[ \t\r]|\\\n)|(?P<character>.)"
+_AT_COMMAND, _IN_COMMAND, _IN_QUOTES = (
+    re.compile(pattern, re.DOTALL) for pattern in (_COMMENT + _END + _WORD, _END + _WORD, _WORD)
+)
+_CLOSERS = {"]": "[", "}": "{", '"': '"'}
+
+
 @dataclass
 class Context:
-    """What is open at one level: the whole text, or a bracket, brace or quote that nothing has closed yet.
+    """The content of an open bracket, brace or quote, or of the whole text.
 
-    `opener` is empty for the whole text; `commands` are the commands in it as lists of complete words, the last one
-    being the one that the cursor is in.
+    Attributes
+    ----------
+    opener : str
+        The bracket, brace or quote; empty for the whole text.
+    commands : list of list of Word
+        The complete words of each command; the cursor is in the last command.
+    word_start : int or None
+        Where the current word starts.
     """
 
     opener: str
-    start: int
     commands: list[list[Word]] = field(default_factory=lambda: [[]])
+    word_start: int | None = None
 
     @property
     def words(self) -> list[Word]:
-        """The complete words of the command that the cursor is in."""
+        """The complete words of the current command."""
         return self.commands[-1]
 
     @property
     def elements(self) -> list[Word]:
-        """All complete words, for braces that hold a list and not a script."""
+        """All complete words, for braces that contain a list and not a script."""
         return [word for command in self.commands for word in command]
 
+    @property
+    def tokens(self) -> re.Pattern[str]:
+        """The pattern of the next token; comments are recognized at the start of a command only."""
+        if self.opener == '"':
+            return _IN_QUOTES
+        return _IN_COMMAND if self.words or self.word_start is not None else _AT_COMMAND
 
-_CLOSERS = {"]": "[", "}": "{", '"': '"'}
+    def end_word(self, text: str, end: int) -> None:
+        """Add the current word, if there is one, to the command."""
+        if self.word_start is not None:
+            self.words.append(Word(text[self.word_start : end], self.word_start))
+            self.word_start = None
 
 
 def scan(text: str) -> tuple[list[Context], Word]:
-    """The levels that are open at the end of `text`, innermost last, and the (perhaps empty) word that ends there."""
-    stack = [Context("", 0)]
-    starts: list[int | None] = [None]  # for each level, where its current word began
+    """Return the contexts that are open at the end of `text`, innermost last, and the (possibly empty) last word."""
+    stack = [Context("")]
     at = 0
-    while at < len(text):
-        character = text[at]
-        context = stack[-1]
-        word_begins = starts[-1] is None
-        if character == "\\" and text[at + 1 : at + 2] != "\n":
-            starts[-1] = at if word_begins else starts[-1]
-            at += 2
-            continue
-        if character in " \t\r\\" or (character in "\n;" and context.opener != '"'):
-            _end_word(context, starts, text, at)
-            if character in "\n;" and context.words:
+    while (token := stack[-1].tokens.match(text, at)) is not None:
+        context, kind, content = stack[-1], token.lastgroup, token[0]
+        if kind in ("blank", "end"):
+            context.end_word(text, at)
+            if kind == "end" and context.words:
                 context.commands.append([])
-            at += 2 if character == "\\" else 1  # a backslash here is one before the end of a line
-            continue
-        if character == "#" and word_begins and not context.words and context.opener != '"':
-            at = text.find("\n", at) if "\n" in text[at:] else len(text)
-            continue
-        if _CLOSERS.get(character) == context.opener and len(stack) > 1:
-            _end_word(context, starts, text, at)
+        elif _CLOSERS.get(content) == context.opener:
+            context.end_word(text, at)
             stack.pop()
-            starts.pop()
-        elif character == "[" or (word_begins and character in '{"'):
-            starts[-1] = at if word_begins else starts[-1]
-            stack.append(Context(character, at))
-            starts.append(None)
-        elif word_begins:
-            starts[-1] = at
-        at += 1
-    begun = starts[-1]
-    start = len(text) if begun is None else begun
+        elif kind != "comment":
+            opens = content == "[" or (content in ("{", '"') and context.word_start is None)
+            if context.word_start is None:
+                context.word_start = at
+            if opens:
+                stack.append(Context(content))
+        at = token.end()
+    start = stack[-1].word_start
+    start = len(text) if start is None else start
     return stack, Word(text[start:], start)
 
 
-def _end_word(context: Context, starts: list[int | None], text: str, at: int) -> None:
-    begun = starts[-1]
-    if begun is not None:
-        context.words.append(Word(text[begun:at], begun))
-        starts[-1] = None
-
-
 def parse(text: str) -> tuple[object, ...]:
-    """el::parse: (text, start, end, words) of the innermost command, words being (type, text, start, end, tokens)."""
+    """Implement el::parse: text, start, end and words (type, text, start, end, tokens) of the innermost command."""
     stack, last = scan(text)
     words = [*stack[-1].words, *([last] if last.text else [])]
     items = []

@@ -1,7 +1,7 @@
-"""Values as bytes that MATLAB and Octave unpack quickly: numbers as they are in memory, under one-byte tags.
+"""The binary format for MATLAB and Octave, which decode it quickly: numbers as in memory, with one-byte tags.
 
-docs/genomixd.md describes the form, `matlab/+genomix/+wire/decode.m` reads it. The reader needs no interface table:
-everything says what it is.
+docs/genomixd.md describes the format, `matlab/+genomix/+wire/decode.m` reads it. The reader needs no interface table,
+because every value has a tag with its type.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from rosafe.declarations.idl import element
 from rosafe.declarations.signals import LEVELS
 from rosafe.interface import ComponentSpec
 
@@ -21,24 +22,24 @@ NUMBER, TEXT, NUMBERS, SIGNAL, ERROR = b"d", b"s", b"D", b"S", b"!"
 
 
 def text(value: str) -> bytes:
-    """Length and UTF-8."""
-    # Half a surrogate pair has no UTF-8; it is told as an escape, as in exdetail.
+    """Return a text: its length, and its characters as UTF-8."""
+    # An unpaired surrogate has no UTF-8 and is escaped, as in exdetail.
     raw = value.encode("utf-8", "backslashreplace")
     return struct.pack("<I", len(raw)) + raw
 
 
 def member(name: str) -> bytes:
-    """What begins a member of a structure; its value follows."""
+    """Return the beginning of a structure's member; its value follows."""
     return TEXT + text(name)
 
 
 def number(value: float | None) -> bytes:
-    """A tagged number; what is not there is NaN."""
+    """Return a tagged number; None becomes NaN."""
     return NUMBER + struct.pack("<d", float("nan") if value is None else _float(value))
 
 
 def _float(value: float) -> float:
-    """A number that a component wrote as text may be larger than any float."""
+    """Return a number as float; one that is too large, such as from a component's JSON, becomes infinite."""
     try:
         return float(value)
     except OverflowError:
@@ -54,17 +55,16 @@ def _numbers(values: Any) -> bytes:
 
 
 def pieces(component: ComponentSpec, idl: str, value: Any) -> Iterator[bytes]:
-    """The bytes of `value`, as `rosafe.component.serialization.decode` gives it, of IDL type `idl`."""
+    """Yield the bytes of `value`, of IDL type `idl`, as in messages with arrays."""
     if idl in LEVELS:
         yield from _signal(LEVELS[idl], value)
-    elif idl.startswith("sequence<"):
-        element = idl[len("sequence<") : -1]
-        if not element.startswith("::") and element != "string":
+    elif of := element(idl):
+        if not of.startswith("::") and of != "string":
             yield _numbers(value)
             return
         yield SEQUENCE
         for item in value:
-            yield from pieces(component, element, item)
+            yield from pieces(component, of, item)
         yield END
     elif idl.startswith("::"):
         yield from structure(component, component.members(idl), value)
@@ -77,7 +77,7 @@ def pieces(component: ComponentSpec, idl: str, value: Any) -> Iterator[bytes]:
 def structure(
     component: ComponentSpec, members: Sequence[tuple[str, str]], value: Mapping[str, Any]
 ) -> Iterator[bytes]:
-    """The bytes of a structure with the given (name, IDL type) members."""
+    """Yield the bytes of a structure with the given (name, IDL type) members."""
     yield STRUCTURE
     for name, kind in members:
         yield member(name)
@@ -86,7 +86,7 @@ def structure(
 
 
 def _signal(levels: tuple[str, ...], value: Any) -> Iterator[bytes]:
-    """A signal in one block, the samples of a channel together; level by level where its parts differ in length."""
+    """Yield a signal as one array, channel by channel; if its parts differ in length, as nested structures."""
     shape = _shape(value, len(levels))
     if shape is None:
         yield STRUCTURE + member(levels[0]) + SEQUENCE
@@ -102,7 +102,7 @@ def _signal(levels: tuple[str, ...], value: Any) -> Iterator[bytes]:
 
 
 def _shape(value: Any, levels: int) -> tuple[int, ...] | None:
-    """How many parts each level has; None where they are not alike."""
+    """Return the number of parts at each level; None if they differ in length."""
     if levels == 1:
         return (len(value),)
     shapes = {_shape(part, levels - 1) for part in value}
@@ -124,7 +124,7 @@ def _rows(value: Any, levels: int) -> Iterator[Any]:
 
 
 def plain(value: Any) -> bytes:
-    """The bytes of a small value made of dicts, lists, strings, numbers, booleans and None."""
+    """Return the bytes of a small value of dicts, lists, strings, numbers, booleans and None."""
     if isinstance(value, Mapping):
         return STRUCTURE + b"".join(member(str(name)) + plain(v) for name, v in value.items()) + END
     if isinstance(value, (list, tuple)):
@@ -135,5 +135,5 @@ def plain(value: Any) -> bytes:
 
 
 def error(body: Mapping[str, Any]) -> bytes:
-    """The bytes of an error's body."""
+    """Return the bytes of an error's body."""
     return ERROR + plain(body)

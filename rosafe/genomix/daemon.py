@@ -1,18 +1,17 @@
-"""The command `genomixd`: options, background, signals, a clean end."""
+"""The command `genomixd`: options, background mode, signals, and shutdown."""
 
 from __future__ import annotations
 
 import argparse
 import asyncio
-import errno
 import logging
 import os
 import resource
-import signal
 import sys
 import threading
-from concurrent.futures import ThreadPoolExecutor
 
+from rosafe import option_types
+from rosafe.client.asyncio_tools import set_up_server, wait_any
 from rosafe.client.graph import JOIN_SECONDS, Graph
 from rosafe.component import generate, startup
 from rosafe.genomix.names import Names, parameter_name
@@ -25,23 +24,23 @@ from rosafe.version import VERSION
 
 DEFAULT_PORT = 8080
 DEFAULT_HOST = "127.0.0.1"
-THREADS = 16  # that wait for rospy
+THREADS = 16  # for blocking calls of rospy
 
 
 def main(argv: list[str] | None = None) -> int:
-    """Run genomixd until a signal ends it; the exit code."""
+    """Run genomixd until a signal ends it; return the exit code."""
     options = _parse(startup.without_names(sys.argv[1:] if argv is None else argv))
     _log_to_stderr(2 if options.debug else min(options.verbose, 2))
-    told = startup.DaemonFork() if options.background else None
-    if told is not None and told.in_parent:
-        return told.wait()
+    fork = startup.DaemonFork() if options.background else None
+    if fork is not None and fork.in_parent:
+        return fork.wait()
     master.set_local_defaults()
     try:
         generate.ensure_messages()
         startup.ensure_log_directory()
-        return asyncio.run(_serve(options, told))
+        return asyncio.run(_serve(options, fork))
     except (generate.GenerationError, OSError, ValueError) as problem:
-        print(f"genomixd: {printable(_told(problem, options))}", file=sys.stderr)
+        print(f"genomixd: {printable(str(problem))}", file=sys.stderr)
         return 1
 
 
@@ -49,28 +48,30 @@ def _parse(arguments: list[str]) -> argparse.Namespace:
     parser = startup.Parser(
         prog="genomixd",
         usage="genomixd [-p PORT] [--host HOST] [--name NAME] [-b] [-d] [-v] [-h] [--version]",
-        description="HTTP server for the components of the ROS graph: Tcl, MATLAB and other clients use them by it.",
+        description="HTTP server that gives Tcl, MATLAB and other clients access to the components of the ROS graph.",
         epilog="example:\n  genomixd -p 8081 &\n  curl http://127.0.0.1:8081/call/rosAFE/getParameters\n\n"
-        "Programs on this machine may use it; with --host others too, whoever can reach that address.",
+        "All programs on this machine can use it; with --host, all machines that can reach that address.",
         formatter_class=argparse.RawDescriptionHelpFormatter,
         allow_abbrev=False,
     )
-    parser.add_argument("-p", "--port", type=_port, default=DEFAULT_PORT, help="TCP port (8080; 0: a free one)")
+    parser.add_argument(
+        "-p", "--port", type=option_types.port(), default=DEFAULT_PORT, help="TCP port (8080; 0: a free one)"
+    )
     parser.add_argument("--host", default=DEFAULT_HOST, help="address to listen on (default: 127.0.0.1)")
     parser.add_argument(
         "--name",
         type=_name,
         action="append",
         default=[],
-        help="a further name by which clients call this machine, such as robot.lab; repeatable",
+        help="an additional name of this machine that clients use, such as robot.lab; repeatable",
     )
-    parser.add_argument("-b", "--background", action="store_true", help="go to the background once it serves")
-    parser.add_argument("-d", "--debug", action="store_true", help="say on stderr what is asked")
-    parser.add_argument("-v", "--verbose", action="count", default=0, help="say more; twice: as -d")
+    parser.add_argument("-b", "--background", action="store_true", help="run in the background when it is ready")
+    parser.add_argument("-d", "--debug", action="store_true", help="log requests on stderr")
+    parser.add_argument("-v", "--verbose", action="count", default=0, help="log more; twice: like -d")
     parser.add_argument(
         "--until-eof",
         action="store_true",
-        help="say the port on stdout, and end with the standard input: a private server of the program that starts it",
+        help="print the port on stdout, and end when the standard input ends: a private server of its parent program",
     )
     parser.add_argument("--version", action="version", version=f"genomixd {VERSION}")
     return parser.parse_args(arguments)
@@ -82,25 +83,8 @@ def _name(text: str) -> str:
     return text
 
 
-def _port(text: str) -> int:
-    if not (text.isascii() and text.isdigit() and int(text) <= 65535):
-        raise argparse.ArgumentTypeError(f"{text!r} is no port: 0 to 65535")
-    return int(text)
-
-
-def _told(problem: Exception, options: argparse.Namespace) -> str:
-    number = getattr(problem, "errno", None)
-    if number == errno.EADDRINUSE:
-        return f"port {options.port} of {options.host} is taken, perhaps by another genomixd; -p chooses another"
-    if number == errno.EACCES:
-        return f"port {options.port} of {options.host} is not for this user; -p chooses another"
-    if isinstance(problem, UnicodeError):  # of a host's name
-        return f"--host: expected a name or address of this machine, got {options.host!r}"
-    return str(problem)
-
-
 class _Formatter(logging.Formatter):
-    """Escapes what a line of the log quotes from clients."""
+    """Escapes control characters in log lines, which may quote clients."""
 
     def formatMessage(self, record: logging.LogRecord) -> str:
         return printable(super().formatMessage(record))
@@ -112,16 +96,12 @@ def _log_to_stderr(verbosity: int) -> None:
     log = logging.getLogger("genomixd")
     log.addHandler(handler)
     log.setLevel((logging.WARNING, logging.INFO, logging.DEBUG)[verbosity])
-    log.propagate = False  # rospy sets up the root for itself
+    log.propagate = False  # rospy configures the root logger
 
 
-async def _serve(options: argparse.Namespace, told: startup.DaemonFork | None) -> int:
+async def _serve(options: argparse.Namespace, fork: startup.DaemonFork | None) -> int:
     loop = asyncio.get_running_loop()
-    end = asyncio.Event()
-    for number in startup.ending_signals():
-        loop.add_signal_handler(number, end.set)
-    signal.signal(signal.SIGPIPE, signal.SIG_IGN)
-    loop.set_default_executor(ThreadPoolExecutor(THREADS, "rospy"))
+    end = set_up_server(THREADS)
     _allow_many_files()
     sys.setswitchinterval(startup.SWITCH_SECONDS)
     graph = Graph(os.environ["ROS_MASTER_URI"], server=True)
@@ -135,14 +115,13 @@ async def _serve(options: argparse.Namespace, told: startup.DaemonFork | None) -
             threading.Thread(target=_wait_for_eof, args=(loop, end), daemon=True).start()
         joining = asyncio.create_task(graph.join())
         ended = asyncio.create_task(graph.gone.wait())
-        # A master that is there is to know the node once it is up; one that is not may come later.
+        # If the master runs, the node is registered before genomixd reports that it is ready. It may also start later.
         await asyncio.wait((joining, ended), timeout=JOIN_SECONDS, return_when=asyncio.FIRST_COMPLETED)
-        if told is not None:
-            told.up()
+        if fork is not None:
+            fork.up()
         systemd.notify("READY=1")
         feeding = asyncio.create_task(_feed_watchdog())
-        waits = [asyncio.create_task(event.wait()) for event in (end, graph.gone)]
-        await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
+        await wait_any(end, graph.gone)
         feeding.cancel()
         systemd.notify("STOPPING=1")
         return int(graph.gone.is_set() and not graph.is_node)
@@ -153,7 +132,7 @@ async def _serve(options: argparse.Namespace, told: startup.DaemonFork | None) -
 
 
 async def _feed_watchdog() -> None:
-    """Tell systemd that requests have their turn, if it asks for that."""
+    """Notify systemd's watchdog, if there is one, that the event loop runs."""
     seconds = systemd.watchdog_seconds()
     while seconds is not None:
         systemd.notify("WATCHDOG=1")
@@ -168,6 +147,6 @@ def _wait_for_eof(loop: asyncio.AbstractEventLoop, end: asyncio.Event) -> None:
 
 
 def _allow_many_files() -> None:
-    """As many connections as the system lets this user have."""
+    """Raise the limit of file descriptors to the hard limit."""
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))

@@ -1,4 +1,4 @@
-"""Further names of this machine, by which clients may call genomixd: `--name` and the ROS parameter `~names`."""
+"""Additional names of this machine that clients of genomixd may use: `--name` and the ROS parameter `~names`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rosafe.client.graph import Graph, NotRegisteredError
 from rosafe.http_server.access import host_name
 from rosafe.interface import ComponentError
 
-READ_SECONDS = 1.0  # between two reads of the parameter, however many clients use unknown names
+READ_SECONDS = 1.0  # between two reads of the parameter, regardless of the number of requests
 
 log = logging.getLogger("genomixd")
 
@@ -23,11 +23,11 @@ class Names:
     Parameters
     ----------
     graph : Graph
-        Whose master has the parameter.
+        The graph whose master has the parameter.
     parameter : str
-        The full name of `~names`: a name, or a list of them.
+        The full name of the ROS parameter `~names`: a name, or a list of them.
     names : iterable of str
-        Those that it accepts without a master.
+        Names that are always accepted.
     """
 
     def __init__(self, graph: Graph, parameter: str, names: Iterable[str]) -> None:
@@ -38,7 +38,7 @@ class Names:
         self._from_parameter: Collection[str] = ()
 
     async def from_parameter(self) -> Collection[str]:
-        """Return the names in `~names`, read at most once a second; those of the last time if no master answers."""
+        """Return the names in `~names`, read at most once a second; the previous ones if the master does not answer."""
         now = asyncio.get_running_loop().time()
         if now >= self._next_read:
             self._next_read = now + READ_SECONDS
@@ -55,14 +55,15 @@ class Names:
 
 
 def parameter_name(arguments: Sequence[str], environ: Mapping[str, str] = os.environ) -> str:
-    """Return the full name of `~names`, of the node's name that roslaunch or `__name:=` gives."""
-    given = dict(text.split(":=", 1) for text in arguments if ":=" in text)
-    place = f"{given.get('__ns', environ.get('ROS_NAMESPACE', ''))}/{given.get('__name', 'genomixd')}/names"
-    return "/" + "/".join(filter(None, place.split("/")))
+    """Return the full name of `~names` for the node name that roslaunch or `__name:=` sets."""
+    remappings = dict(text.split(":=", 1) for text in arguments if ":=" in text)
+    namespace = remappings.get("__ns", environ.get("ROS_NAMESPACE", ""))
+    path = f"{namespace}/{remappings.get('__name', 'genomixd')}/names"
+    return "/" + "/".join(filter(None, path.split("/")))
 
 
 def _parse(value: Any, parameter: str) -> set[str]:
-    """Return the names in the value of a ROS parameter; what is not a name is logged."""
+    """Return the names in the value of a ROS parameter; other texts are logged."""
     names = set()
     for text in value if isinstance(value, list) else [value]:
         name = host_name(text) if isinstance(text, str) else ""

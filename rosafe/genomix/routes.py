@@ -1,9 +1,8 @@
-"""The URL space of genomixd (docs/genomixd.md) on aiohttp, and who may use it."""
+"""The HTTP interface of genomixd (docs/genomixd.md) on aiohttp: routes, access checks and answers."""
 
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import logging
 import re
 from collections.abc import Awaitable, Callable, Coroutine, Iterator
@@ -15,9 +14,9 @@ from urllib.parse import unquote_to_bytes
 from aiohttp import web
 
 from rosafe.client.asyncio_tools import wait_any
-from rosafe.client.component_client import ComponentClient, Value
-from rosafe.client.graph import middleware_error
-from rosafe.client.values import bad_value, parse_input
+from rosafe.client.component_client import Call, ComponentClient, Value
+from rosafe.client.errors import bad_value, middleware_error
+from rosafe.client.values import parse_input
 from rosafe.genomix import binary_format
 from rosafe.genomix.activity_request import Request
 from rosafe.genomix.names import Names
@@ -33,10 +32,10 @@ from rosafe.version import VERSION
 MAX_WAIT_MS = 3_600_000
 FORMATTERS = 4  # threads
 BATCH = 128 * 1024  # characters written at a time
-REFUSAL_SECONDS = 0.05
-ANSWER_SECONDS = 75.0  # for any answer that is not told to wait; a component has 60 s for its part
-HEARTBEAT_SECONDS = 15.0  # between two signs of life to a listener
-LAST_WORDS_SECONDS = 1.0  # that answers under way have at the end
+REFUSAL_SECONDS = 0.05  # from the acknowledgement of a rejected request to its error
+ANSWER_SECONDS = 75.0  # for any answer except /request/wait; a component has 60 s of these
+HEARTBEAT_SECONDS = 15.0  # between two lines to an event listener
+SHUTDOWN_SECONDS = 1.0  # for answers in progress at the end
 
 LIMITS = Limits(
     max_connections=2000,
@@ -62,19 +61,19 @@ _STATUS = {
     "::genom::unkex": 500,
     "::genomix::e_tooMany": 503,
 }
-_COMPONENT_ERROR = 422  # the request was understood, sent and refused
+_COMPONENT_ERROR = 422  # the component has rejected the request
 _SESSION_NAME = re.compile(r"[\w.:@-]{1,100}")
-_PACKED = "packed"  # the one syntax that is not text
-_HELP = """genomixd {version}: components of the ROS graph by HTTP GET.
-Answers are JSON, with syntax=tcl Tcl dicts, with syntax=packed bytes for MATLAB and Octave.
+_PACKED = "packed"  # the only binary syntax
+_HELP = """genomixd {version}: HTTP access (GET) to the components of the ROS graph.
+Answers are JSON; with syntax=tcl they are Tcl dicts, with syntax=packed binary data for MATLAB and Octave.
 /session/start?s=NAME  /session/stop?s=NAME  /session/listen?s=NAME (server-sent events: request, unload, quit)
 /load/COMPONENT[?i=INSTANCE][&as=NAME]  /unload/NAME  /describe/NAME  /components  /rpath?dir=DIR
 /call/NAME/SERVICE[?input=JSON]  /call/NAME/PORT[/ELEMENT]      waits for the result; an activity returns once it runs
-/call/NAME/request?input=["ild",{{"fb_nChannels":16}}]          builds what a representation needs, or finds it
-/send/NAME/SERVICE[?input=JSON][&ack][&oneway]                  returns the request's id and status at once
+/call/NAME/request?input=["ild",{{"fb_nChannels":16}}]          builds a representation with all that it needs
+/send/NAME/SERVICE[?input=JSON][&ack][&oneway]                  returns the request's id and status immediately
 /request/status?id=ID  /request/result?id=ID  /request/wait?id=ID[&ms=N]  /request/abort?id=ID  /request/clean?id=ID
 /requests
-Every URL may carry s=SESSION. docs/genomixd.md tells the rest.
+Every URL accepts s=SESSION. See docs/genomixd.md for details.
 """
 
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
@@ -88,7 +87,7 @@ class HttpApi:
     ----------
     sessions : Sessions
     names : Names
-        Besides IP addresses and localhost, by which clients may call this machine.
+        Names of this machine that are accepted in addition to IP addresses and localhost.
     """
 
     def __init__(self, sessions: Sessions, names: Names) -> None:
@@ -119,26 +118,25 @@ class HttpApi:
             app.router.add_get(path, handler, allow_head=False)
         self._connections = Connections(LIMITS, _format_refusal, log)
         self._listener = HttpListener(app, self._connections)
-        # A few threads for all results: more would only fight for the interpreter.
+        # A few threads for all results: more would only compete for the GIL.
         self._formatters = ThreadPoolExecutor(FORMATTERS, "format")
 
     async def start(self, host: str, port: int) -> int:
-        """Listen and return the port; OSError where that cannot be."""
-        access_log = log if log.isEnabledFor(logging.DEBUG) else None
-        return await self._listener.start(host, port, access_log)
+        """Listen and return the port; OSError if the address cannot be used."""
+        return await self._listener.start(host, port, log if log.isEnabledFor(logging.DEBUG) else None)
 
     async def close(self) -> None:
-        """Stop listening, end all sessions and connections."""
+        """Stop listening, and end all sessions and connections."""
         self._listener.stop_listening()
         await self._sessions.close()
-        await self._listener.close(LAST_WORDS_SECONDS)
+        await self._listener.close(SHUTDOWN_SECONDS)
         self._formatters.shutdown(wait=False, cancel_futures=True)
 
-    # --- who may ---
+    # --- access ---
 
     @web.middleware
     async def _guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        """Refuse what comes from a web page, and put every error into the client's syntax."""
+        """Reject requests from web pages, and return every error in the client's syntax."""
         session: Session | None = None
         connection_of(request).request_parsed()
         try:
@@ -154,7 +152,7 @@ class HttpApi:
         except HttpRefusal as refusal:
             answer = _error(request, _refusal_error(refusal))
             if refusal.status == HTTPStatus.FORBIDDEN:
-                answer.set_status(refusal.status)  # also of a packed answer: the clients know what it means
+                answer.set_status(refusal.status)  # also of a packed answer: clients use the status
             answer.force_close()
             return answer
         except ComponentError as problem:
@@ -164,7 +162,7 @@ class HttpApi:
             return _error(request, ComponentError("::genomix::e_url", what=what), problem.status)
         except (ConnectionResetError, asyncio.CancelledError):
             raise
-        except Exception as problem:  # a fault of ours: the log has all, the client a line
+        except Exception as problem:  # an internal error: the log gets the traceback, the client one line
             log.exception("%s", request.path_qs[:500])
             return _error(request, ComponentError("::genom::unkex", what=f"{type(problem).__name__}: {problem}"[:127]))
         finally:
@@ -182,7 +180,7 @@ class HttpApi:
     def _session(self, request: web.Request) -> Session:
         name = request.query.get("s", "")
         if name and not _SESSION_NAME.fullmatch(name):
-            raise bad_value("s: a session's name has up to 100 letters, digits and . : @ _ -")
+            raise bad_value(f"s: expected up to 100 letters, digits and . : @ _ -, got {name[:100]!r}")
         return self._sessions.get(name, connection_of(request).account.address)
 
     # --- sessions ---
@@ -192,7 +190,7 @@ class HttpApi:
 
     async def _session_start(self, request: web.Request) -> web.Response:
         if not request.query.get("s"):
-            raise bad_value("s: the session needs a name")
+            raise bad_value("s: expected the name of the session")
         return _text(self._session(request).name)
 
     async def _session_stop(self, request: web.Request) -> web.Response:
@@ -201,36 +199,14 @@ class HttpApi:
 
     async def _session_listen(self, request: web.Request) -> web.StreamResponse:
         with self._connections.long_poll(connection_of(request)):
-            return await self._listen(request, self._session(request), _syntax(request))
-
-    async def _listen(self, request: web.Request, session: Session, form: Syntax) -> web.StreamResponse:
-        queue = session.listen()
-        try:
-            response = web.StreamResponse(headers={"Content-Type": "text/event-stream", **_HEADERS})
-            await response.prepare(request)
-            await response.write(b": genomixd\n\n")
-            while True:
-                try:
-                    event, data = await asyncio.wait_for(queue.get(), HEARTBEAT_SECONDS)
-                except TimeoutError:
-                    await response.write(b":\n\n")
-                    continue
-                if isinstance(data, Request):
-                    data = "".join(_unwrapped(form, data.pieces(form)))
-                elif data:
-                    data = "".join(_unwrapped(form, iter((plain(form, data),))))
-                await response.write(_utf8(f"event: {event}\ndata: {data}\n\n"))
-                if event == "quit":
-                    return response
-        finally:
-            session.leave(queue)
+            return await _send_events(request, self._session(request), _syntax(request))
 
     # --- components ---
 
     async def _load(self, request: web.Request) -> web.StreamResponse:
         name = request.query.get("as", "")
         if name and not re.fullmatch(r"[A-Za-z]\w*", name, re.ASCII):
-            raise bad_value("as: letters, digits and _ only, a letter first")
+            raise bad_value(f"as: expected a letter, followed by letters, digits and _, got {name[:80]!r}")
         component, instance = request.match_info["component"], request.query.get("i", "")
         return _small(request, await self._in_time(self._session(request).load(component, instance, name)))
 
@@ -247,7 +223,7 @@ class HttpApi:
         return _small(request, {n: {"component": p.component.name, "instance": p.instance} for n, p in loaded.items()})
 
     async def _rpath(self, request: web.Request) -> web.StreamResponse:
-        # Components are found on the graph: there are no plugins to look for. Scripts of the original say it anyway.
+        # Does nothing, because components are found on the graph. Scripts for the original use it to find plugins.
         return _small(request, {})
 
     # --- requests ---
@@ -256,16 +232,15 @@ class HttpApi:
         name = request.match_info["name"]
         return await self._session(request).component(name, request.query.get("i", ""))
 
-    async def _target(self, request: web.Request) -> tuple[Session, ComponentClient, str, Any, str]:
-        session, path = self._session(request), request.match_info
-        given = parse_input(request.query.get("input", request.query.get("argv", "")))
-        proxy = await self._component(request)
-        return session, proxy, path["service"], given, path.get("element", request.query.get("element", ""))
+    async def _prepare(self, request: web.Request) -> Call:
+        text_args = parse_input(request.query.get("input", request.query.get("argv", "")))
+        element = request.match_info.get("element", request.query.get("element", ""))
+        return (await self._component(request)).prepare_call(request.match_info["service"], text_args, element)
 
     async def _in_time(self, work: Coroutine[Any, Any, T]) -> T:
-        """What `work` returns; ``::genom::mwerr`` where it waits too long, for what is ahead of it, say.
+        """Return the result of `work`, or raise ``::genom::mwerr`` after `ANSWER_SECONDS`.
 
-        It is cancelled then, and not waited for: to undo what it has done may take as long again.
+        The work is then cancelled, but not awaited, because undoing it may take equally long.
         """
         task = asyncio.create_task(work)
         self._sessions.keep(task)
@@ -275,28 +250,24 @@ class HttpApi:
             in_time = task.done()
             task.cancel()
         if not in_time:
-            raise middleware_error(f"no answer within {ANSWER_SECONDS:g} s: other requests take too long")
+            raise middleware_error(f"no answer within {ANSWER_SECONDS:g} s; other requests take too long")
         return task.result()
 
     async def _call(self, request: web.Request) -> web.StreamResponse:
         async def work() -> Value:
-            session, proxy, name, given, element = await self._target(request)
-            return await session.call(proxy, name, given, element)
+            return await self._session(request).call(await self._prepare(request))
 
         return await self._stream(request, await self._in_time(work()))
 
     async def _send(self, request: web.Request) -> web.StreamResponse:
-        session, proxy, name, given, element = await self._in_time(self._target(request))
+        call = await self._in_time(self._prepare(request))
         oneway = _flag(request, "oneway")
-        size = len(request.raw_path)
-        sent = session.send(request.match_info["name"], proxy, name, given, element, not oneway, size)
+        sent = self._session(request).send(request.match_info["name"], call, not oneway, len(request.raw_path))
         if oneway:
             return _small(request, {})
         if _flag(request, "ack"):
-            with contextlib.suppress(TimeoutError):  # then it is still sent, as far as anybody knows
-                await asyncio.wait_for(sent.acknowledged.wait(), ANSWER_SECONDS)
-            with contextlib.suppress(TimeoutError):  # a refusal is acknowledged and then told, at once
-                await asyncio.wait_for(sent.finished.wait(), REFUSAL_SECONDS)
+            await wait_any(sent.acknowledged, timeout=ANSWER_SECONDS)
+            await wait_any(sent.finished, timeout=REFUSAL_SECONDS)
         return _status(request, sent)
 
     def _known(self, request: web.Request) -> Request:
@@ -310,7 +281,7 @@ class HttpApi:
         if known.error is not None:
             raise known.error
         if known.status == "sent":
-            raise ComponentError("::genomix::e_notDone", what=f"{known.id} is not done yet")
+            raise ComponentError("::genomix::e_notDone", what=f"{known.id} has not finished yet")
         return await self._stream(request, known.value)
 
     async def _request_wait(self, request: web.Request) -> web.StreamResponse:
@@ -333,7 +304,7 @@ class HttpApi:
         return _small(request, {r.id: r.status for r in self._session(request).requests.values()})
 
     async def _stream(self, request: web.Request, value: Value) -> web.StreamResponse:
-        """Send a value, however large, in pieces that are made in another thread as fast as the client takes them."""
+        """Send a value of any size; pieces of a large one are formatted on a thread, as fast as the client reads."""
         pieces = _encoded(request, value)
         if value.size <= BATCH // 8:
             return _respond(request, b"".join(pieces))
@@ -350,15 +321,39 @@ class HttpApi:
         return response
 
 
+async def _send_events(request: web.Request, session: Session, form: Syntax) -> web.StreamResponse:
+    """Send the events of a session to a listener until the session ends."""
+    queue = session.listen()
+    try:
+        response = web.StreamResponse(headers={"Content-Type": "text/event-stream", **_HEADERS})
+        await response.prepare(request)
+        await response.write(b": genomixd\n\n")
+        while True:
+            try:
+                event, data = await asyncio.wait_for(queue.get(), HEARTBEAT_SECONDS)
+            except TimeoutError:
+                await response.write(b":\n\n")
+                continue
+            if isinstance(data, Request):
+                data = "".join(_unwrapped(form, data.pieces(form)))
+            elif data:
+                data = _plain_text(form, data)
+            await response.write(_utf8(f"event: {event}\ndata: {data}\n\n"))
+            if event == "quit":
+                return response
+    finally:
+        session.leave(queue)
+
+
 # --- reading ----------------------------------------------------------------------------------------------------
 
 
 def _check_url(request: web.Request) -> None:
-    """Raise ``::genom::serialization`` for a URL that is no text: what was meant would silently be something else."""
+    """Raise ``::genom::serialization`` if the URL is not UTF-8: aiohttp would silently decode another text."""
     try:
         unquote_to_bytes(request.raw_path.encode("utf-8", "surrogateescape")).decode()
     except UnicodeDecodeError:
-        raise bad_value("the URL is not UTF-8") from None
+        raise bad_value("URL: expected UTF-8") from None
 
 
 def _is_packed(request: web.Request) -> bool:
@@ -368,13 +363,13 @@ def _is_packed(request: web.Request) -> bool:
 def _syntax(request: web.Request) -> Syntax:
     name = request.query.get("syntax", "json")
     if name not in SYNTAXES:
-        raise bad_value(f"syntax: {name[:20]!r} is not one of {', '.join((*SYNTAXES, _PACKED))}")
+        raise bad_value(f"syntax: expected one of {', '.join((*SYNTAXES, _PACKED))}, got {name[:20]!r}")
     return SYNTAXES[name]
 
 
-def _written_in(request: web.Request) -> Syntax:
-    """The syntax of an answer; JSON where what is asked for is none, which is an error to be told."""
-    return SYNTAXES.get(request.query.get("syntax", "json"), SYNTAXES["json"])
+def _answer_syntax(request: web.Request) -> Syntax:
+    """Return the syntax of an answer; JSON for the error about an unknown syntax."""
+    return SYNTAXES.get(request.query.get("syntax", "json"), JSON)
 
 
 def _flag(request: web.Request, name: str) -> bool:
@@ -384,7 +379,7 @@ def _flag(request: web.Request, name: str) -> bool:
 def _milliseconds(request: web.Request) -> int:
     text = request.query.get("ms", str(MAX_WAIT_MS))
     if not re.fullmatch(r"[0-9]{1,9}", text):
-        raise bad_value(f"ms: {text[:20]!r} is not a number of milliseconds")
+        raise bad_value(f"ms: expected a number of milliseconds, got {text[:20]!r}")
     return min(int(text), MAX_WAIT_MS)
 
 
@@ -402,20 +397,25 @@ def _text(text: str) -> web.Response:
 
 
 def _utf8(text: str) -> bytes:
-    """Half a surrogate pair, such as a node may send, has no UTF-8; it is told as an escape, as in exdetail."""
+    """Encode a text. An unpaired surrogate, which a node may send, has no UTF-8 and is escaped, as in exdetail."""
     return text.encode("utf-8", "backslashreplace")
 
 
 def _unwrapped(form: Syntax, pieces: Iterator[str]) -> Iterator[str]:
-    """A whole document: in Tcl the outermost braces would make it a list of one."""
+    """Yield a complete document: without the outermost braces in Tcl, which would make it a list of one element."""
     if form is not TCL:
         yield from pieces
         return
-    held = next(pieces)[1:]
+    previous = next(pieces)[1:]
     for piece in pieces:
-        yield held
-        held = piece
-    yield held[:-1]
+        yield previous
+        previous = piece
+    yield previous[:-1]
+
+
+def _plain_text(form: Syntax, value: Any) -> str:
+    """Return the complete document of a small value without a type."""
+    return "".join(_unwrapped(form, iter((plain(form, value),))))
 
 
 def _encoded(request: web.Request, value: Value | Request) -> Iterator[bytes]:
@@ -429,7 +429,7 @@ def _encoded(request: web.Request, value: Value | Request) -> Iterator[bytes]:
 def _media_type(request: web.Request) -> str:
     if _is_packed(request):
         return "application/octet-stream"
-    return f"{_written_in(request).media_type}; charset=utf-8"
+    return f"{_answer_syntax(request).media_type}; charset=utf-8"
 
 
 def _respond(request: web.Request, body: bytes, status: int = 200) -> web.Response:
@@ -439,16 +439,14 @@ def _respond(request: web.Request, body: bytes, status: int = 200) -> web.Respon
 def _small(request: web.Request, value: Any) -> web.Response:
     if _is_packed(request):
         return _respond(request, binary_format.plain(value))
-    form = _syntax(request)
-    return _respond(request, _utf8("".join(_unwrapped(form, iter((plain(form, value),))))))
+    return _respond(request, _utf8(_plain_text(_syntax(request), value)))
 
 
 def _error(request: web.Request, error: ComponentError, status: int = 0) -> web.Response:
-    if _is_packed(request):  # MATLAB and Octave lose the body of an answer with any other status
+    if _is_packed(request):  # MATLAB and Octave ignore the body of an answer with another status than 200
         return _respond(request, binary_format.error(error.body))
-    form = _written_in(request)
-    text = "".join(_unwrapped(form, iter((plain(form, error.body),))))
-    return _respond(request, _utf8(text), status or _STATUS.get(error.ex, _COMPONENT_ERROR))
+    body = _utf8(_plain_text(_answer_syntax(request), error.body))
+    return _respond(request, body, status or _STATUS.get(error.ex, _COMPONENT_ERROR))
 
 
 def _refusal_error(refusal: HttpRefusal) -> ComponentError:

@@ -1,7 +1,7 @@
-"""Values as text: every IDL type in JSON or in Tcl syntax, written piece by piece so that millions of numbers stream.
+"""Values as text: every IDL type in JSON or Tcl syntax, in short pieces, so that large results can be streamed.
 
-Numbers are written in the shortest way that reads back as the same number, booleans as 0 and 1, what is not finite as
-null, but NaN in Tcl as NaN. In JSON a sequence is an array and a structure an object in the order of its declaration.
+A number is written with the fewest digits that represent it exactly, and a boolean as 0 or 1. Infinities and NaN are
+null, but NaN is NaN in Tcl. In JSON a sequence is an array, and a structure an object in the order of its declaration.
 In Tcl both are dicts; the keys of a sequence are its indexes: ``{0 input 1 preProc}``.
 """
 
@@ -12,17 +12,18 @@ import json
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
+from rosafe.declarations.idl import element
 from rosafe.declarations.signals import LEVELS
 from rosafe.interface import ComponentSpec
 
-STEP = 1024  # numbers formatted at a time: about 0.3 ms, during which no other thread runs
+STEP = 1024  # numbers formatted at a time: about 0.3 ms, during which the GIL is held
 
 _PLAIN_WORD = re.compile(r"[\w.:/+,=@%!?*|~^&<>()'-]+", re.ASCII)
-_BRACEABLE = re.compile(r"[^{}\\\r\n]*")  # no line ends: an event is one line
+_BRACEABLE = re.compile(r"[^{}\\\r\n]*")  # no line ends, because an event is one line
 _TCL_ESCAPES = {
     **{ord(mark): "\\" + mark for mark in ' ;"$[]{}\\'},
     **{ord(mark): f"\\{name}" for mark, name in zip("\t\n\r\f\v", "tnrfv", strict=True)},
@@ -30,7 +31,7 @@ _TCL_ESCAPES = {
 
 
 def tcl_word(text: str) -> str:
-    """`text` as one element of a Tcl list, without anything that Tcl could substitute."""
+    """Return `text` as one element of a Tcl list, without any substitution."""
     if _PLAIN_WORD.fullmatch(text):
         return text
     if _BRACEABLE.fullmatch(text):
@@ -38,23 +39,8 @@ def tcl_word(text: str) -> str:
     return text.translate(_TCL_ESCAPES)
 
 
-class Syntax(Protocol):
-    """How one output language writes scalars, sequences and structures."""
-
-    name: str
-    media_type: str
-
-    def string(self, text: str) -> str: ...
-    def numbers(self, start: int, words: list[str]) -> str: ...
-    def open(self, kind: str) -> str: ...
-    def close(self, kind: str) -> str: ...
-    def key(self, index: int, name: str) -> str: ...
-    def item(self, index: int) -> str: ...
-    def not_finite(self, value: float) -> str: ...
-
-
-class _Json:
-    """JSON."""
+class Syntax:
+    """The syntax of scalars, sequences and structures in one output language; this class writes JSON."""
 
     name = "json"
     media_type = "application/json"
@@ -81,8 +67,8 @@ class _Json:
         return "null"
 
 
-class _Tcl:
-    """Tcl dicts; every nested value is one braced word."""
+class _TclSyntax(Syntax):
+    """The syntax of Tcl dicts; every nested value is one braced word."""
 
     name = "tcl"
     media_type = "text/plain"
@@ -117,8 +103,8 @@ def _indexes(start: int, count: int) -> list[str]:
     return list(map(str, range(start, start + count)))
 
 
-JSON: Syntax = _Json()
-TCL: Syntax = _Tcl()
+JSON = Syntax()
+TCL = _TclSyntax()
 SYNTAXES = {syntax.name: syntax for syntax in (JSON, TCL)}
 
 
@@ -126,12 +112,12 @@ SYNTAXES = {syntax.name: syntax for syntax in (JSON, TCL)}
 
 
 def pieces(syntax: Syntax, component: ComponentSpec, idl: str, value: Any) -> Iterator[str]:
-    """The text of `value`, as `rosafe.component.serialization.decode` gives it, of IDL type `idl`, in short pieces."""
+    """Yield the text of `value`, of IDL type `idl`, as in messages with arrays."""
     if idl in LEVELS:
         yield from _signal(syntax, LEVELS[idl], value)
-    elif idl.startswith("sequence<"):
+    elif of := element(idl):
         yield syntax.open("sequence")
-        yield from _elements(syntax, component, idl[len("sequence<") : -1], value)
+        yield from _elements(syntax, component, of, value)
         yield syntax.close("sequence")
     elif idl.startswith("::"):
         yield from structure(syntax, component, component.members(idl), value)
@@ -142,7 +128,7 @@ def pieces(syntax: Syntax, component: ComponentSpec, idl: str, value: Any) -> It
 def structure(
     syntax: Syntax, component: ComponentSpec, members: Sequence[tuple[str, str]], value: Mapping[str, Any]
 ) -> Iterator[str]:
-    """The text of a structure with the given (name, IDL type) members."""
+    """Yield the text of a structure with the given (name, IDL type) members."""
     yield syntax.open("struct")
     for index, (name, kind) in enumerate(members):
         yield syntax.key(index, name)
@@ -150,13 +136,13 @@ def structure(
     yield syntax.close("struct")
 
 
-def _elements(syntax: Syntax, component: ComponentSpec, element: str, values: Any) -> Iterator[str]:
+def _elements(syntax: Syntax, component: ComponentSpec, idl: str, values: Any) -> Iterator[str]:
     if isinstance(values, np.ndarray):
         yield from _array(syntax, values)
         return
     for index, value in enumerate(values):
         yield syntax.item(index)
-        yield from pieces(syntax, component, element, value)
+        yield from pieces(syntax, component, idl, value)
 
 
 def _scalar(syntax: Syntax, idl: str, value: Any) -> str:
@@ -195,7 +181,7 @@ def _array(syntax: Syntax, values: np.ndarray) -> Iterator[str]:
 
 
 def plain(syntax: Syntax, value: Any) -> str:
-    """The text of a small value made of dicts, lists, strings, numbers, booleans and None."""
+    """Return the text of a small value of dicts, lists, strings, numbers, booleans and None."""
     if isinstance(value, Mapping):
         members = (syntax.key(i, str(name)) + plain(syntax, v) for i, (name, v) in enumerate(value.items()))
         return syntax.open("struct") + "".join(members) + syntax.close("struct")
@@ -207,8 +193,3 @@ def plain(syntax: Syntax, value: Any) -> str:
     if value is None:
         return "null"
     return _scalar(syntax, {bool: "boolean", float: "double"}.get(type(value), ""), value)
-
-
-def document(syntax: Syntax, text: str) -> str:
-    """A whole value as it goes out: in Tcl the outermost braces would make it a list of one."""
-    return text[1:-1] if syntax is TCL and text.startswith("{") else text

@@ -1,7 +1,7 @@
-"""Connections of an HTTP server: their number, duration and memory are limited, whatever clients do.
+"""Connections of an HTTP server, with limits on their number, duration and memory that do not depend on clients.
 
-aiohttp receives complete requests, one at a time; what a client sends ahead stays in the kernel, except a small buffer.
-If there is no room for another connection, the one is closed that has been without a request for longest.
+aiohttp receives complete requests, one at a time. Data that a client sends in advance stays in the kernel, except a
+small buffer. If the connection limit is reached, the connection that has been without a request for longest is closed.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from rosafe.http_server.refusal import HttpRefusal
 
 BUFFER = 4 * 1024  # bytes of a request that are not counted; bytes read at a time
 HEADERS_SIZE = 64 * 1024  # bytes of all headers of a request
-STALL_SECONDS = 60.0  # a client that does not read its answer is dropped after
-YIELD_SECONDS = 5.0  # and if others need the memory, after
-LOG_SECONDS = 60.0  # between two log entries that say that the limit is reached
+STALL_SECONDS = 60.0  # until a client that does not read its answer is disconnected
+YIELD_SECONDS = 5.0  # the same, if other clients need the memory
+LOG_SECONDS = 60.0  # between two log entries about the connection limit
 
 _END = re.compile(rb"\r?\n\r?\n")
 _BODY = re.compile(rb"\n(?:content-length:(?![ \t]*0*[ \t]*\r?\n)|transfer-encoding:)", re.IGNORECASE)
@@ -43,7 +43,7 @@ class Limits:
     Attributes
     ----------
     max_connections : int
-        Or half of the file descriptors, if these are fewer. One address has at most half of them.
+        Number of connections, but at most half of the file descriptors. One address has at most half of them.
     max_url : int
         Bytes of a request line.
     max_header_bytes : int
@@ -51,9 +51,9 @@ class Limits:
     max_answers : int
         Bytes of all answers that clients are reading.
     request_seconds : float
-        For a complete request, from its first byte, the first one of a connection from connecting.
+        Time for a complete request from its first byte; for the first request, from the start of the connection.
     idle_seconds : float
-        After which a connection without requests is closed.
+        Time after which a connection without requests is closed.
     """
 
     max_connections: int
@@ -67,8 +67,8 @@ class Limits:
 class ClientAccount:
     """The connections from one address.
 
-    Those without a request in progress, longest first, are `silent` (not authenticated) or `idle` (authenticated).
-    `long_polls` are those with a request that lasts as long as the client likes.
+    Connections without a request in progress are `silent` (not authenticated) or `idle` (authenticated), the longest
+    silence first. `long_polls` are connections with a request whose duration the client determines.
     """
 
     def __init__(self, address: str) -> None:
@@ -94,8 +94,7 @@ class Connections:
         self, limits: Limits, format_refusal: Callable[[HttpRefusal], tuple[bytes, str]], log: logging.Logger
     ) -> None:
         descriptors, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
-        most = limits.max_connections
-        self._max = most if descriptors < 0 else min(most, descriptors // 2)
+        self._max = limits.max_connections if descriptors < 0 else min(limits.max_connections, descriptors // 2)
         self._max_per_address = self._max // 2
         self.limits = limits
         self.format_refusal = format_refusal
@@ -104,10 +103,10 @@ class Connections:
         self._count = 0
         self._logged_at = -LOG_SECONDS
         self.header_bytes = 0  # of long requests
-        self._answers: dict[HttpConnection, tuple[object, int]] = {}  # what is being read, and its bytes
+        self._answers: dict[HttpConnection, tuple[object, int]] = {}  # answers being read, and their bytes
 
     def admit(self, connection: HttpConnection, address: str) -> ClientAccount | None:
-        """Return the account of a new connection; None if there is no room for it and none can be made."""
+        """Return the account of a new connection; None if the limit is reached and no other one can be closed."""
         account = self._accounts.get(address) or ClientAccount(address)
         full = len(account.connections) >= self._max_per_address
         if full or self._count >= self._max:
@@ -128,7 +127,7 @@ class Connections:
             self._log.warning("connection limit reached, now by %s: idle connections are closed", address)
 
     def forget(self, connection: HttpConnection) -> None:
-        """A connection has ended."""
+        """Remove a connection that has ended."""
         account = connection.account
         self._answers.pop(connection, None)
         account.long_polls.discard(connection)
@@ -141,7 +140,7 @@ class Connections:
                 self._accounts.pop(account.address, None)
 
     def make_room_for_header(self, connection: HttpConnection) -> bool:
-        """Close the connections that have been sending a long request for longest; False if that is not enough."""
+        """Close the connections that have been sending a long request for longest; return whether that suffices."""
         for account in list(self._accounts.values()):
             for other in list(account.silent):
                 if self.header_bytes <= self.limits.max_header_bytes:
@@ -152,16 +151,16 @@ class Connections:
 
     @contextlib.contextmanager
     def long_poll(self, connection: HttpConnection) -> Iterator[None]:
-        """Mark a request that lasts as long as its client likes: half of a client's connections are for other ones.
+        """Mark a request whose duration the client determines. Half of a client's connections are for other requests.
 
         Raises
         ------
         HttpRefusal
             If there are too many of them.
         """
-        polls, most = connection.account.long_polls, self._max_per_address // 2
-        if len(polls) >= most:
-            raise HttpRefusal(503, f"{most} requests of this address are listening or waiting")
+        polls, limit = connection.account.long_polls, self._max_per_address // 2
+        if len(polls) >= limit:
+            raise HttpRefusal(503, f"{limit} requests of this address are listening or waiting")
         polls.add(connection)
         try:
             yield
@@ -170,14 +169,14 @@ class Connections:
 
     @contextlib.contextmanager
     def reading_answer(self, connection: HttpConnection, data: object, size: int) -> Iterator[None]:
-        """While a client reads an answer: `data` of `size` bytes, which others may be reading as well.
+        """Account for an answer while a client reads it: `data` of `size` bytes, which other clients may share.
 
-        Clients that do not read theirs make room for it.
+        Clients that have stopped reading their answers are disconnected if the memory is needed.
 
         Raises
         ------
         HttpRefusal
-            If there is no room.
+            If there is not enough memory.
         """
         for other in list(self._answers):
             if self._fits(data, size):
@@ -185,7 +184,9 @@ class Connections:
             if other.stalled(YIELD_SECONDS):
                 other.drop()
         if not self._fits(data, size):
-            raise HttpRefusal(503, f"clients are reading {self.limits.max_answers >> 20} MiB of answers at this moment")
+            raise HttpRefusal(
+                503, f"clients are reading {self.limits.max_answers >> 20} MiB of answers; try again later"
+            )
         self._answers[connection] = (data, size)
         try:
             yield
@@ -193,19 +194,19 @@ class Connections:
             self._answers.pop(connection, None)
 
     def _fits(self, data: object, size: int) -> bool:
-        taken = {id(one): one_size for one, one_size in self._answers.values()}
-        return not taken or id(data) in taken or sum(taken.values()) + size <= self.limits.max_answers
+        sizes = {id(answer): answer_size for answer, answer_size in self._answers.values()}
+        return not sizes or id(data) in sizes or sum(sizes.values()) + size <= self.limits.max_answers
 
 
 def _silent_longest(accounts: Iterable[ClientAccount]) -> HttpConnection | None:
-    """Return the connection that makes room: of the address with most of them; authenticated ones only if need be.
+    """Return the connection to close: of the address with most connections, authenticated ones last.
 
-    Connections whose data were only not read yet are not silent.
+    A connection whose data is still unread is not silent, and is only chosen if all others have unread data as well.
     """
     accounts = sorted(accounts, key=lambda account: len(account.connections), reverse=True)
-    waiting = [*(account.silent for account in accounts), *(account.idle for account in accounts)]
-    every = list(itertools.chain.from_iterable(waiting))
-    return next((one for one in every if not one.has_unread_data), every[0] if every else None)
+    groups = [*(account.silent for account in accounts), *(account.idle for account in accounts)]
+    candidates = list(itertools.chain.from_iterable(groups))
+    return next((one for one in candidates if not one.has_unread_data), candidates[0] if candidates else None)
 
 
 class HttpConnection(web.RequestHandler):
@@ -219,15 +220,14 @@ class HttpConnection(web.RequestHandler):
         )
         self.account = ClientAccount("")
         self.gone = asyncio.Event()
-        self._connections, self._limits = connections, limits
-        self._open = False
+        self._connections = connections
         self._authenticated = False
         self._busy = False  # with a request
         self._is_websocket = False
-        self._ahead = bytearray()  # what has come, and aiohttp has not got yet
-        self._searched = 0  # in that many bytes of it there is no end of a head
+        self._ahead = bytearray()  # received, but not passed on to aiohttp yet
+        self._searched = 0  # bytes of `_ahead` that contain no end of a header
         self._head = 0  # bytes of the request in progress
-        self._counted = 0  # bytes of both that count
+        self._counted = 0  # bytes of both that are accounted for
         self._deadline: asyncio.TimerHandle | None = None
         self._stall: asyncio.TimerHandle | None = None
         self._stalled_at = 0.0
@@ -235,15 +235,15 @@ class HttpConnection(web.RequestHandler):
     # --- for the server ---
 
     def request_parsed(self) -> None:
-        """aiohttp has parsed the request: its deadline is met."""
+        """Note that aiohttp has parsed the request: its deadline is met."""
         self._cancel_deadline()
 
     def mark_authenticated(self) -> None:
-        """From now on connections that have not authenticated make room before this one."""
+        """Mark the client as authenticated: if the limit is reached, other connections are closed first."""
         self._authenticated = True
 
     def become_websocket(self) -> None:
-        """aiohttp gets everything from now on; to be called once the WebSocket is prepared."""
+        """Pass all data on to aiohttp from now on; to be called once the WebSocket is prepared."""
         self._is_websocket = True
         self._socket.set_write_buffer_limits()  # the WebSocket's own limits apply
         super().data_received(bytes(self._ahead))
@@ -252,7 +252,7 @@ class HttpConnection(web.RequestHandler):
         self._socket.resume_reading()
 
     def drop(self) -> None:
-        """Close it immediately, whatever it does; what was not read is lost."""
+        """Close the connection immediately, whatever its state; unread data is lost."""
         self._leave()
         self._socket.abort()
 
@@ -265,11 +265,11 @@ class HttpConnection(web.RequestHandler):
 
     @property
     def has_long_header(self) -> bool:
-        """Whether its bytes count."""
+        """Whether its header is long enough to be accounted for."""
         return self._counted > 0
 
     def stalled(self, seconds: float) -> bool:
-        """Return whether the client has read nothing of its answer for so long."""
+        """Return whether the client has read nothing of its answer for at least `seconds`."""
         return self._stall is not None and self._loop.time() - self._stalled_at >= seconds
 
     # --- the connection ---
@@ -280,11 +280,11 @@ class HttpConnection(web.RequestHandler):
         self._socket.max_size = BUFFER  # type: ignore[attr-defined]  # asyncio reads 256 KiB at a time
         account = self._connections.admit(self, _address(transport.get_extra_info("peername")))
         if account is None:
+            self.gone.set()
             self._socket.write(self._refusal(HttpRefusal(503, "the connection limit is reached")))
             self._socket.close()
             return
         self.account = account
-        self._open = True
         self._start_deadline()
         super().connection_made(transport)
 
@@ -295,8 +295,7 @@ class HttpConnection(web.RequestHandler):
         super().connection_lost(exc)
 
     def _leave(self) -> None:
-        """From now on others may have its place."""
-        self._open = False
+        """Release the connection's place and memory."""
         self.gone.set()
         self._connections.forget(self)
         self._ahead.clear()
@@ -310,7 +309,7 @@ class HttpConnection(web.RequestHandler):
         self.force_close()
 
     def _refusal(self, refusal: HttpRefusal) -> bytes:
-        """Return a complete answer, for cases in which aiohttp is not asked."""
+        """Return a complete answer, for cases in which aiohttp is not involved."""
         body, media_type = self._connections.format_refusal(refusal)
         head = (
             f"HTTP/1.1 {refusal.status} {HTTPStatus(refusal.status).phrase}\r\nContent-Type: {media_type}; "
@@ -321,7 +320,7 @@ class HttpConnection(web.RequestHandler):
     # --- requests ---
 
     def data_received(self, data: bytes) -> None:
-        if not self._open:
+        if self.gone.is_set():
             return
         if self._is_websocket:
             super().data_received(data)
@@ -329,8 +328,8 @@ class HttpConnection(web.RequestHandler):
         self._ahead += data
         self._account_header()
         if self._counted and not self._connections.make_room_for_header(self):
-            limit = self._limits.max_header_bytes
-            self._refuse(HttpRefusal(503, f"long requests take {limit >> 20} MiB at this moment"))
+            limit = self._connections.limits.max_header_bytes
+            self._refuse(HttpRefusal(503, f"long requests occupy {limit >> 20} MiB; try again later"))
         elif not self._busy:
             self._next_request()
         elif len(self._ahead) >= BUFFER:
@@ -338,13 +337,13 @@ class HttpConnection(web.RequestHandler):
 
     def _next_request(self) -> None:
         if not self._searched:
-            del self._ahead[: len(self._ahead) - len(self._ahead.lstrip(b"\r\n"))]  # as RFC 9112, 2.2 asks for
+            del self._ahead[: len(self._ahead) - len(self._ahead.lstrip(b"\r\n"))]  # RFC 9112, section 2.2
         end = _END.search(self._ahead, max(0, self._searched - 3))
         if end is None:
             self._searched = len(self._ahead)
-            most = self._limits.max_url + HEADERS_SIZE
-            if self._searched > most:
-                self._refuse(HttpRefusal(400, f"a request has at most {most >> 10} KiB"))
+            limit = self._connections.limits.max_url + HEADERS_SIZE
+            if self._searched > limit:
+                self._refuse(HttpRefusal(400, f"request: expected at most {limit >> 10} KiB"))
             elif self._ahead and self._deadline is None:
                 self._start_deadline()
             return
@@ -357,7 +356,7 @@ class HttpConnection(web.RequestHandler):
         self._busy = True
         self._waiting.pop(self, None)
         if self._deadline is None:
-            self._start_deadline()  # in case that aiohttp sees no end of it
+            self._start_deadline()  # in case aiohttp does not find the end of the header
         super().data_received(head)
 
     async def finish_response(self, *arguments: Any) -> Any:
@@ -367,7 +366,7 @@ class HttpConnection(web.RequestHandler):
             self._loop.call_soon(self._finished)
 
     def _finished(self) -> None:
-        if not self._open:
+        if self.gone.is_set():
             return
         self._cancel_deadline()
         self._busy, self._head = False, 0
@@ -379,19 +378,19 @@ class HttpConnection(web.RequestHandler):
 
     @property
     def _waiting(self) -> dict[HttpConnection, None]:
-        """The connections of this client that wait for a request, as this one does."""
+        """The connections of this client that wait for a request, in the group of this one."""
         return self.account.idle if self._authenticated else self.account.silent
 
     def handle_error(
         self, request: web.BaseRequest, status: int = 500, exc: BaseException | None = None, message: str | None = None
     ) -> web.Response:
         """Return the answer to an invalid request; aiohttp's own is HTML, with a traceback in the log."""
-        if isinstance(exc, ConnectionError):  # a client that has vanished, or was dropped
+        if isinstance(exc, ConnectionError):  # the client has disconnected, or was disconnected
             raise exc
         if status >= HTTPStatus.INTERNAL_SERVER_ERROR:
             self.log_exception("cannot answer", exc_info=exc)
         if request.writer.output_size > 0:
-            raise ConnectionAbortedError("a part of another answer was sent already")
+            raise ConnectionAbortedError("part of another answer was sent already")
         reason = (message or str(exc) or HTTPStatus(status).phrase).splitlines()[0][:200]
         body, media_type = self._connections.format_refusal(HttpRefusal(status, reason))
         answer = web.Response(body=body, status=status, content_type=media_type, charset="utf-8")
@@ -405,7 +404,7 @@ class HttpConnection(web.RequestHandler):
         self._counted = counted
 
     def _start_deadline(self) -> None:
-        seconds = self._limits.request_seconds
+        seconds = self._connections.limits.request_seconds
         refusal = HttpRefusal(408, f"no complete request within {seconds:g} s")
         self._deadline = self._loop.call_later(seconds, self._refuse, refusal)
 
@@ -429,7 +428,7 @@ class HttpConnection(web.RequestHandler):
 
 
 def _address(peer: Any) -> str:
-    """Return whom a connection counts for: an address, all of this machine, or the network of a host with IPv6."""
+    """Return the account of a connection: its IPv4 address, "loopback", or the /64 network of its IPv6 address."""
     if not peer:
         return ""
     address = ipaddress.ip_address(str(peer[0]).partition("%")[0])

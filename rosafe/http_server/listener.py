@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import functools
 import logging
 
@@ -11,6 +12,23 @@ from aiohttp import web
 from rosafe.http_server.connections import Connections, HttpConnection
 
 BACKLOG = 512  # connections that the kernel completes before they are accepted
+
+
+class ListenError(OSError):
+    """A server cannot listen at an address; the text is one line with the reason and the next step for the user."""
+
+    def __init__(self, problem: OSError | UnicodeError, host: str, port: int) -> None:
+        number = getattr(problem, "errno", None)
+        address = f"port {port} of {host}"
+        if number == errno.EADDRINUSE:
+            text = f"{address} is in use, perhaps by another instance of this program; choose another with --port"
+        elif number == errno.EACCES:
+            text = f"permission denied for {address}; choose another with --port"
+        elif number in (errno.EADDRNOTAVAIL, None):  # None: a UnicodeError
+            text = f"--host: expected a name or address of this machine, got {host!r}"
+        else:
+            text = f"cannot listen on {address}: {getattr(problem, 'strerror', None) or problem}"
+        super().__init__(text)
 
 
 class HttpListener:
@@ -30,11 +48,14 @@ class HttpListener:
         self._listener: asyncio.AbstractServer | None = None
 
     async def start(self, host: str, port: int, access_log: logging.Logger | None = None) -> int:
-        """Listen and return the port; OSError if the address cannot be used."""
+        """Listen and return the port; ListenError if the address cannot be used."""
         await self._runner.setup()
         assert self._runner.server is not None
         connect = functools.partial(HttpConnection, self._connections, self._runner.server, access_log=access_log)
-        self._listener = await asyncio.get_running_loop().create_server(connect, host, port, backlog=BACKLOG)
+        try:
+            self._listener = await asyncio.get_running_loop().create_server(connect, host, port, backlog=BACKLOG)
+        except (OSError, UnicodeError) as problem:
+            raise ListenError(problem, host, port) from None
         return int(self._listener.sockets[0].getsockname()[1])
 
     def stop_listening(self) -> None:
@@ -43,7 +64,7 @@ class HttpListener:
             self._listener.close()
 
     async def close(self, seconds: float) -> None:
-        """Close all connections; requests in progress have `seconds` to end."""
+        """Close all connections. Requests in progress have `seconds` to finish."""
         self.stop_listening()
         if self._runner.server is not None:
             await self._runner.server.shutdown(seconds)

@@ -1,4 +1,4 @@
-"""Words in requests that nobody knows: taken as the original takes them, which is told everywhere, or refused."""
+"""Unknown choices in requests: replaced as in the original, with a warning, or rejected in strict mode."""
 
 from __future__ import annotations
 
@@ -9,62 +9,72 @@ from typing import Any
 import rospy
 
 from rosafe.declarations.parameter import Parameter
+from rosafe.interface.remarks import short_window
 from rosafe.transport import master
 from rosafe.tree.processor import Processor
 
-STRICT_CHOICES_PARAM = "~strict_words"  # the ROS parameter; read whenever there is such a word
+STRICT_CHOICES_PARAM = "~strict_words"  # ROS parameter, read for each unknown choice
 
 
 class ChoiceFallbacks:
-    """What was taken for unknown words, for each processor that has got some.
+    """The warnings about replaced choices of each processor.
 
     Parameters
     ----------
     strict : bool
-        Refuse them, whatever the ROS parameter says.
+        Reject unknown choices, whatever the value of the ROS parameter.
     """
 
     def __init__(self, strict: bool) -> None:
         self._strict = strict
-        self._told: dict[Processor, dict[str, str]] = {}  # by the name of the parameter
+        self._warnings: dict[Processor, dict[str, str]] = {}  # by the name of the parameter
+        self._checked_windows: set[Processor] = set()
         self._lock = threading.Lock()
 
-    def resolving(self, doubts: dict[str, str]) -> Callable[[Parameter, Any], Any]:
-        """What takes known words for unknown ones, unless those are to be refused, and enters that into `doubts`."""
+    def resolving(self, warnings: dict[str, str]) -> Callable[[Parameter, Any], Any]:
+        """Return a function that replaces unknown choices, except in strict mode, and adds a warning to `warnings`."""
 
-        def take(parameter: Parameter, value: Any) -> Any:
-            doubts[parameter.name] = doubt = parameter.substitution_warning(value)
-            return value if doubt and self._refused() else parameter.resolve_choice(value)
+        def resolve(parameter: Parameter, value: Any) -> Any:
+            warnings[parameter.name] = warning = parameter.substitution_warning(value)
+            return value if warning and self._is_strict() else parameter.resolve_choice(value)
 
-        return take
+        return resolve
 
-    def _refused(self) -> bool:
-        if self._strict:
-            return True
+    def _is_strict(self) -> bool:
         try:
-            return bool(rospy.get_param_cached(STRICT_CHOICES_PARAM, False) == 1)  # true, or 1
-        except master.FAILURES:  # nobody says so
+            return self._strict or bool(rospy.get_param_cached(STRICT_CHOICES_PARAM, False) == 1)  # true, or 1
+        except master.FAILURES:
             return False
 
-    def note(self, processor: Processor, doubts: dict[str, str]) -> str:
-        """Log and keep the `doubts` about parameters of a processor, and return them as one line."""
+    def note(self, processor: Processor, warnings: dict[str, str]) -> str:
+        """Log and store the `warnings` about parameters of a processor, and return them as one line."""
         with self._lock:
-            told = {**self._told.pop(processor, {}), **doubts}
-            told = {name: doubt for name, doubt in told.items() if doubt}
-            if told:
-                self._told[processor] = told
-        lines = [f"{processor.name}: {doubt}" for doubt in doubts.values() if doubt]
-        for line in lines:
+            stored = {**self._warnings.pop(processor, {}), **warnings}
+            if any(stored.values()):
+                self._warnings[processor] = {name: warning for name, warning in stored.items() if warning}
+        lines = [f"{processor.name}: {warning}" for warning in warnings.values() if warning]
+        for line in [*lines, *self._window_warnings(processor)]:
             rospy.logwarn(line)
         return "; ".join(lines)
 
-    def forget(self, processor: Processor) -> None:
-        """The processor has ended."""
+    def _window_warnings(self, processor: Processor) -> list[str]:
+        """Return the warning about a window that is too short for the pitch range, once for each processor."""
+        if processor.kind != "pitch" or processor.parent is None or processor in self._checked_windows:
+            return []
         with self._lock:
-            self._told.pop(processor, None)
+            self._checked_windows.add(processor)
+        window = processor.parent.stage.parameters["ac_wSizeSec"]
+        text = short_window(processor.stage.parameters["pi_rangeHz"], window)
+        return [f"{processor.name}: {text}"] if text else []
+
+    def forget(self, processor: Processor) -> None:
+        """Remove the warnings of a processor that has ended."""
+        with self._lock:
+            self._warnings.pop(processor, None)
+            self._checked_windows.discard(processor)
 
     @property
     def lines(self) -> list[str]:
-        """A line for each unknown word that a processor goes by."""
+        """The warnings about the current parameters of all processors."""
         with self._lock:
-            return [f"{processor.name}: {doubt}" for processor, told in self._told.items() for doubt in told.values()]
+            return [f"{p.name}: {warning}" for p, warnings in self._warnings.items() for warning in warnings.values()]

@@ -1,8 +1,8 @@
-"""What the node tells of its processors: getParameters and getSignals of the original's kinds, two services of all."""
+"""Responses about processors: getParameters and getSignals for the original's kinds, two services for all kinds."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 from rosafe.component import serialization
@@ -13,50 +13,56 @@ from rosafe.tree.processor import Processor
 
 
 def parameters(processors: Iterable[Processor]) -> Any:
-    """The `rosAFE_parameters` message: an array for each of the original's kinds, in the order of creation."""
+    """Return the `rosAFE_parameters` message: an array for each of the original's kinds, in the order of creation."""
     import rosAFE.msg as messages
 
-    arrays: dict[str, list[Any]] = {kind: [] for kind in CORE_REPRESENTATIONS}
-    for processor in processors:
-        if processor.kind in arrays:
-            struct = getattr(messages, ros_type(parameter_struct(processor.kind)))
-            values = processor.values()
-            arrays[processor.kind].append(struct(name=processor.name, **values))
-    return messages.rosAFE_parameters(**arrays)
+    def struct(processor: Processor) -> Any:
+        struct_class = getattr(messages, ros_type(parameter_struct(processor.kind)))
+        return struct_class(name=processor.name, **processor.values())
+
+    return messages.rosAFE_parameters(**_by_kind(processors, struct))
 
 
 def signals(processors: Iterable[Processor]) -> dict[str, list[Any]]:
-    """The members of `rosAFE_dataObjSt`: what the original's kinds put out since getSignals was called last."""
+    """Return the members of `rosAFE_dataObjSt`: the output of the original's kinds since the last getSignals."""
+
+    def fields(processor: Processor) -> dict[str, Any]:
+        new = processor.history.read_new("getSignals")
+        return signal_fields(processor.kind, new.parts, new.next_index, new.signal.rate)
+
+    return _by_kind(processors, fields)
+
+
+def _by_kind(processors: Iterable[Processor], convert: Callable[[Processor], Any]) -> dict[str, list[Any]]:
+    """Convert the processors of each of the original's kinds, in the order of creation."""
     arrays: dict[str, list[Any]] = {kind: [] for kind in CORE_REPRESENTATIONS}
     for processor in processors:
         if processor.kind in arrays:
-            taken = processor.take("getSignals")
-            fields = signal_fields(processor.kind, taken.parts, taken.next_index, taken.signal.rate)
-            arrays[processor.kind].append(fields)
+            arrays[processor.kind].append(convert(processor))
     return arrays
 
 
-def descriptions(processors: Iterable[Processor], node: str, of_the_input: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """The `rosAFE_processor` structs of all processors, in the order of creation.
+def descriptions(processors: Iterable[Processor], node: str, input_values: Mapping[str, Any]) -> list[dict[str, Any]]:
+    """Return the `rosAFE_processor` structs of all processors, in the order of creation.
 
     Parameters
     ----------
     processors : iterable of Processor
     node : str
         Full name of the node, such as ``/rosAFE``.
-    of_the_input : mapping
-        What InputProc was asked for, which modifyParameter does not take.
+    input_values : mapping
+        The parameters of InputProc that modifyParameter does not accept.
     """
-    told = [processor.ask(lambda one: _description(one, node, of_the_input)) for processor in processors]
-    return [description for description in told if description is not None]
+    found = [processor.ask(lambda one: _description(one, node, input_values)) for processor in processors]
+    return [description for description in found if description is not None]
 
 
-def _description(processor: Processor, node: str, of_the_input: Mapping[str, Any]) -> dict[str, Any]:
+def _description(processor: Processor, node: str, input_values: Mapping[str, Any]) -> dict[str, Any]:
     kind = processor.representation
     largest = max(range(len(kind.parts)), key=lambda part: len(kind.parts[part].axes))
     values = processor.values()
     if processor.parent is None:
-        values.update(of_the_input)
+        values.update(input_values)
     return {
         "name": processor.name,
         "kind": kind.kind,
@@ -72,8 +78,8 @@ def _description(processor: Processor, node: str, of_the_input: Mapping[str, Any
 
 
 def representation(processor: Processor) -> list[dict[str, Any]]:
-    """The `rosAFE_representation` structs of what a processor put out since this was last asked for it."""
-    taken = processor.take("getRepresentation")
+    """Return the `rosAFE_representation` structs of a processor's output since the last getRepresentation."""
+    taken = processor.history.read_new("getRepresentation")
     return [
         {
             "name": part.name,
@@ -88,7 +94,7 @@ def representation(processor: Processor) -> list[dict[str, Any]]:
 
 
 def response(service: str, **outputs: Any) -> dict[str, Any]:
-    """The answer of a function, with arrays and dicts in the place of lists and messages."""
+    """Return the response of a service, with arrays and dicts in place of lists and messages."""
     return {
         "response": serialization.response_class("rosAFE", service)(genom_success=True, genom_exdetail="", **outputs)
     }

@@ -1,4 +1,4 @@
-"""The topic `trace` of the node: what the processors do, for `rosafe trace`. Nothing is traced while nobody listens."""
+"""The topic `trace` of the node: events of the processors while it has a subscriber, for `rosafe trace`."""
 
 from __future__ import annotations
 
@@ -16,12 +16,11 @@ PERIOD = 0.1  # seconds between two messages
 
 
 class TracePort(rospy.SubscribeListener):
-    """Publishes the events of a tree as JSON while somebody subscribes.
+    """Publishes the events of a tree as JSON while the topic has subscribers.
 
     Parameters
     ----------
     topic : str
-        Its name.
     observe : callable
         `Tree.observe`.
     """
@@ -33,7 +32,7 @@ class TracePort(rospy.SubscribeListener):
         self._publisher = rospy.Publisher(topic, String, self, queue_size=100, tcp_nodelay=True)
 
     def peer_subscribe(self, *_: object) -> None:
-        """Begin with the first subscriber."""
+        """Start tracing with the first subscriber."""
         with self._lock:
             if not self._running:
                 self._running = True
@@ -43,18 +42,18 @@ class TracePort(rospy.SubscribeListener):
         tracer = Tracer()
         stop = self._observe(tracer)
         try:
-            while self._wanted():
+            while self._has_subscribers():
                 self._publisher.publish(String(json.dumps(tracer.take())))
                 threading.Event().wait(PERIOD)
         finally:
             stop()
 
-    def _wanted(self) -> bool:
+    def _has_subscribers(self) -> bool:
         with self._lock:
             self._running = not rospy.is_shutdown() and self._publisher.get_num_connections() > 0
             return self._running
 
 
 def read(message: String) -> list[Event]:
-    """The events of a message."""
+    """Return the events in a message."""
     return [Event(*event) for event in json.loads(message.data)]

@@ -1,4 +1,4 @@
-"""The service `request`: a whole tree by the node's own services, as genomixd makes one by those of the graph."""
+"""The service `request`: builds a whole tree with the node's own services."""
 
 from __future__ import annotations
 
@@ -16,44 +16,44 @@ from rosafe.tree.tree_planner import kind_of
 
 
 class TreeRequestService:
-    """Builds them on `node`; `heard()` is the topic that the Audio port is connected to, or nothing.
+    """Builds trees on `node`, as the `Services` of `rosafe.tree.tree_builder`.
 
-    It is what `rosafe.tree.tree_builder` asks for services.
+    `audio_topic()` returns the topic to which the Audio port is connected, or ''.
     """
 
-    def __init__(self, node: ComponentNode, heard: Callable[[], str]) -> None:
+    def __init__(self, node: ComponentNode, audio_topic: Callable[[], str]) -> None:
         self.instance = node.name.strip("/")
         self._node = node
-        self._heard = heard
+        self._audio_topic = audio_topic
         self.turns = tree_builder.Turns()
-        self._building = threading.Lock()  # one tree at a time: what one has found is not removed by another that fails
+        self._building = threading.Lock()  # one tree at a time: a failing request must not remove another's processors
 
     def build(self, values: Mapping[str, Any]) -> dict[str, Any]:
         """Handle the service."""
-        given: dict[str, Any] = {"representation": values["representation"]}
-        if values["connect"]:
-            given["connect"] = values["connect"]
+        explicit = {name: values[name] for name in ("representation", "connect") if values[name]}
         try:
             kind_of(values["representation"])
-            given |= read_parameters(values["parameters"])
+            explicit |= read_parameters(values["parameters"])
         except ValueError as problem:
             raise ROSAFE.error("e_badNewValue", what=str(problem)) from None
         with self._building:
-            self.turns = tree_builder.Turns()  # of this event loop; there is nobody to give way to
-            return asyncio.run(tree_builder.build(self, given))
+            self.turns = tree_builder.Turns()  # of this event loop, in which no other request runs
+            return asyncio.run(tree_builder.build(self, explicit))
 
     async def outputs(self, service: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
-        """What a service of the node returns; an activity, nothing, as soon as it runs. Raises ComponentError."""
-        answer = self._node.call_service(service, values)  # whoever waits, waits for this: there is nothing beside it
-        whole = answer.get("response")
-        return answer if whole is None else {name: getattr(whole, name) for name, _ in ROSAFE.service(service).outputs}
+        """Call a service of the node; an activity has no outputs, and is running then. Raises ComponentError."""
+        outputs = self._node.call_service(service, values)  # may block the event loop, which has no other task
+        message = outputs.get("response")
+        if message is None:
+            return outputs
+        return {name: getattr(message, name) for name, _ in ROSAFE.service(service).outputs}
 
     async def port_connected(self, port: str) -> str:
-        """The topic that an input port is connected to, or nothing."""
-        return self._heard()
+        """Return the topic to which an input port is connected, or ''."""
+        return self._audio_topic()
 
     async def published(self, topic: str) -> bool:
-        """Whether somebody publishes `topic`."""
+        """Return whether `topic` has a publisher."""
         try:
             return topic in master.published_topics(master.uri(), self._node.name)
         except master.MasterError as problem:

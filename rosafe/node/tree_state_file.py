@@ -1,4 +1,4 @@
-"""A node's tree in a file, so that a node that was killed comes back as it was: `rosAFE-ros --keep FILE`."""
+"""The file that contains the node's tree (`rosAFE-ros --keep FILE`), for its restoration after a restart."""
 
 from __future__ import annotations
 
@@ -15,24 +15,22 @@ from rosafe.tree.tree_planner import searched
 
 
 class TreeStateFile:
-    """Writes what `describe` tells into a file, whenever `save` is called and it has changed.
-
-    The file is a setup (docs/setups.md): whole at any moment, whatever kills the process or the machine.
+    """A setup file (docs/setups.md) that is complete at any time, even if the process is killed or the power fails.
 
     Parameters
     ----------
     path : Path
     describe : callable
-        The setup that is in force.
+        Returns the setup to save.
     report : callable
-        Gets one line for the log where the file cannot be written, once until it can.
+        Called with one line for the log if the file cannot be written; again only after a success.
 
     Attributes
     ----------
     problem : str
-        Why it could not be written the last time.
+        Why the file could not be written the last time.
     absent : str
-        Which of its processors cannot be built, because plugins are missing.
+        Which of the saved processors cannot be built because plugins are missing.
     """
 
     def __init__(self, path: Path, describe: Callable[[], Setup], report: Callable[[str], None]) -> None:
@@ -46,7 +44,7 @@ class TreeStateFile:
         self._lock = threading.Lock()
 
     def saved(self) -> Setup:
-        """What the file holds; an empty setup where there is none yet. ComponentError where it cannot be used."""
+        """Return the setup in the file; an empty one if the file does not exist. Raises ComponentError."""
         try:
             self._written = read_regular(self.path, 4 * MAX_SETUP + 1).decode()
             absent: list[str] = []
@@ -54,7 +52,7 @@ class TreeStateFile:
             if absent:
                 copy = self.path.with_name(f"{self.path.name}.complete")
                 write_whole(copy, self._written.encode())
-                self.absent = f"left out of the tree: {', '.join(absent)}; {searched()}; all of it is in {copy}"
+                self.absent = f"left out of the tree: {', '.join(absent)}; {searched()}; {copy} contains all of it"
             return setup
         except FileNotFoundError:
             return Setup()
@@ -64,8 +62,8 @@ class TreeStateFile:
             raise ROSAFE.error("e_badNewValue", what=printable(what)) from None
 
     def save(self) -> None:
-        """Have all changes up to now in the file once this returns; where that fails, life goes on."""
-        with self._lock:  # who has waited here finds, as a rule, that the one before has written his change, too
+        """Write all changes made so far to the file, if there are any. A failure is only reported."""
+        with self._lock:  # after waiting here, the change has usually been written by the previous thread
             text = "" if self._closed else write(self._describe(), full=True)
             if text in ("", self._written):
                 return
@@ -73,12 +71,12 @@ class TreeStateFile:
                 write_whole(self.path, text.encode())
                 self._written, self.problem = text, ""
             except OutputError as failure:
-                why = printable(failure)  # messages of ROS have no room for bytes that are not UTF-8
+                problem = printable(failure)  # ROS messages cannot contain bytes that are not UTF-8
                 if not self.problem:
-                    self._report(f"the tree is not kept: {why}")
-                self.problem = why
+                    self._report(f"the tree is not kept: {problem}")
+                self.problem = problem
 
     def close(self) -> None:
-        """Write nothing any more: the processors end now, and are to come back."""
+        """Ignore later calls of `save`."""
         with self._lock:
             self._closed = True

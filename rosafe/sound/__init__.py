@@ -1,1 +1,1 @@
-"""Sound itself: files of it, and how a head changes it. No ROS, no processors."""
+"""Sound files, audio in rosbags and messages, and a model of the head. Imports neither ROS nor the tree."""

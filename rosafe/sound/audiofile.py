@@ -1,4 +1,4 @@
-"""Audio files as int32 samples, scaled the same way wherever the project reads one (capture node, offline tools)."""
+"""Audio files as int32 samples, with the same scaling in the capture node and in the offline tools."""
 
 from __future__ import annotations
 
@@ -11,131 +11,156 @@ import soundfile
 
 from rosafe.input import open_descriptor
 
-FULL_SCALE = 2**31 - 1  # what 1.0 in a float file becomes
-MAX_CHANNELS = 1024  # that libsndfile opens
-_FLOAT_SUBTYPES = ("FLOAT", "DOUBLE", "VORBIS", "OPUS", "MPEG")  # the decoder's own numbers are floats
-_UNKNOWN_LENGTH = 0x7FFFF000  # a writer to a pipe leaves a data size from here up: it could not know the length
+FULL_SCALE = 2**31 - 1  # sample value of 1.0 in a float file
+MAX_CHANNELS = 1024  # limit of libsndfile
+_FLOAT_SUBTYPES = ("FLOAT", "DOUBLE", "VORBIS", "OPUS", "MPEG")  # the decoder computes in floating point
+_UNKNOWN_LENGTH = 0x7FFFF000  # a program that writes to a pipe sets a data size from here up, as the length is unknown
 
 
 class AudioFileError(Exception):
-    """The file cannot be read; the text is one line that says why."""
+    """The file cannot be read; the text is one line with the reason."""
 
 
 def to_int32(signal: np.ndarray) -> np.ndarray:
-    """Float samples, full scale 1.0, as int32: scaled by 2^31 - 1, rounded, clipped; NaN is silence."""
-    finite = np.nan_to_num(np.asarray(signal, dtype=np.float64), posinf=1.0, neginf=-1.0)
-    limited = np.clip(finite, -2.0, 2.0)  # else 1e308 overflows
-    return np.clip(np.rint(limited * FULL_SCALE), -(2**31), FULL_SCALE).astype(np.int32)
+    """Convert float samples (full scale 1.0) to int32: scaled by 2^31 - 1, rounded, clipped; NaN becomes 0."""
+    return _rounded(signal)[0]
 
 
-def channel_pair(text: str) -> tuple[int, int]:
-    """The two channels, from 1, that a text such as ``3,4`` names: left and right ear; ValueError for other texts."""
-    words = text.split(",")
-    if len(words) != 2 or not all(word.isascii() and word.isdigit() and len(word) <= 4 for word in words):
-        raise ValueError(f"two channel numbers from 1 to {MAX_CHANNELS}, such as 3,4")
-    left, right = (int(word) for word in words)
-    if not (1 <= left <= MAX_CHANNELS and 1 <= right <= MAX_CHANNELS):
-        raise ValueError(f"two channel numbers from 1 to {MAX_CHANNELS}, such as 3,4")
-    return left, right
+def _rounded(signal: np.ndarray) -> tuple[np.ndarray, int]:
+    """Return the samples as `to_int32`, and the number of finite samples that were clipped."""
+    limited = np.clip(_finite(np.asarray(signal, np.float64)), -2.0, 2.0)  # so that 1e308 does not overflow when scaled
+    rounded = np.rint(limited * FULL_SCALE)
+    clipped = int(np.count_nonzero((rounded > FULL_SCALE) | (rounded < -(2**31))))
+    return np.clip(rounded, -(2**31), FULL_SCALE).astype(np.int32), clipped
+
+
+def _finite(samples: np.ndarray) -> np.ndarray:
+    """Replace NaN by silence and infinity by full scale."""
+    return np.nan_to_num(samples, posinf=1.0, neginf=-1.0)
+
+
+def channel_pair(text: str, max_channel: int = MAX_CHANNELS) -> tuple[int, int]:
+    """Return the channels of the left and right ear (from 1) in a text such as ``3,4``. Raises ValueError."""
+    found = re.fullmatch(r"(\d{1,4}),(\d{1,4})", text, re.ASCII)
+    channels = (int(found[1]), int(found[2])) if found else (0, 0)
+    if not all(1 <= channel <= max_channel for channel in channels):
+        raise ValueError(f"expected two channel numbers from 1 to {max_channel}, such as 3,4, got {text!r}")
+    return channels
 
 
 class AudioFile:
-    """A sound file of any kind that libsndfile knows (WAV, FLAC, Ogg, AIFF, MP3...), read from disk bit by bit.
+    """A sound file in any format of libsndfile (WAV, FLAC, Ogg, AIFF, MP3...), read from disk in parts.
+
+    Parameters
+    ----------
+    path : path
+    clip : bool
+        Whether float samples are converted by `to_int32`; otherwise they are returned as float64.
 
     Attributes
     ----------
     sample_rate : int
         Hz.
     channels, frames : int
-        Size of what is read; at least 1 each.
+        Size of the array that `read` would return for the whole file; at least 1 each.
+    floats : bool
+        Whether `read` returns float64.
     not_finite : int
-        How many samples that were read so far were NaN or infinite.
+        Number of samples read so far that were NaN or infinite.
+    clipped : int
+        Number of samples read so far that were limited to full scale.
 
     Raises
     ------
     AudioFileError
-        The file is missing, unreadable, not a sound file, empty or cut off.
+        The file is missing, unreadable, not a sound file, empty or truncated.
     """
 
-    def __init__(self, path: str | Path) -> None:
+    def __init__(self, path: str | Path, clip: bool = True) -> None:
         self.path = Path(os.path.expanduser(path))
         try:
             descriptor = open_descriptor(self.path)
-        except (OSError, ValueError) as problem:  # ValueError: a path that no file can have
+        except (OSError, ValueError) as problem:  # ValueError: an invalid path
             raise AudioFileError(f"{self.path}: {getattr(problem, 'strerror', None) or problem}") from None
         if not os.fstat(descriptor).st_size:
             os.close(descriptor)
             raise AudioFileError(f"{self.path} is empty")
         try:
-            # Given the name, libsndfile would open resource forks too, and take any file as .gsm or .vox.
+            # If it got the name, libsndfile would also open resource forks, and accept any file as .gsm or .vox.
             self._file = soundfile.SoundFile(descriptor)
         except soundfile.LibsndfileError as problem:
             raise AudioFileError(
-                f"{self.path} is not a sound file: {problem.error_string}{self._replace_non_finite()}"
+                f"{self.path} is not a sound file: {problem.error_string}{self._mp3_advice()}"
             ) from None
-        self.not_finite = 0
+        self.not_finite = self.clipped = 0
         self.sample_rate = int(self._file.samplerate)
         self.channels = int(self._file.channels)
         self.frames = int(self._file.frames)
         self._float = self._file.subtype.startswith(_FLOAT_SUBTYPES)
-        self._ears: list[int] | None = None
+        self.floats = self._float and not clip
+        self._ears: list[int] | None = None  # channels to read, from 0; None for all
         try:
-            self._check_whole()
+            self._check_complete()
         except AudioFileError:
             self.close()
             raise
 
-    def _replace_non_finite(self) -> str:
-        """What to do where this libsndfile is too old for the file."""
+    def _mp3_advice(self) -> str:
+        """Return advice if the file is an MP3 and this version of libsndfile cannot read MP3; otherwise ''."""
         if self.path.suffix.lower() != ".mp3" or "MP3" in soundfile.available_formats():
             return ""
         version = soundfile.__libsndfile_version__
-        return f" (libsndfile {version} knows no MP3, 1.1 does; `ffmpeg -i IN.mp3 OUT.wav` makes a WAV of it)"
+        return f" (MP3 needs libsndfile 1.1, this is {version}; convert the file: `ffmpeg -i IN.mp3 OUT.wav`)"
 
-    def _check_whole(self) -> None:
+    def _check_complete(self) -> None:
         if self.frames == 0:
-            raise AudioFileError(f"{self.path} holds no samples")
-        # libsndfile shortens a WAV or AIFF that was cut off to what is there; only its log tells.
+            raise AudioFileError(f"{self.path} contains no samples")
+        # libsndfile silently shortens a truncated WAV or AIFF; only its log shows that bytes are missing.
         cut = re.search(r"^\s*(?:data|SSND)\s*:\s*(\d+) \(should be (\d+)\)", self._file.extra_info, re.MULTILINE)
         if cut and int(cut[2]) < int(cut[1]) < _UNKNOWN_LENGTH:
-            raise AudioFileError(f"{self.path} is cut off: {cut[2]} of {cut[1]} bytes of sound are there")
-        self.seek(self.frames - 1)  # compressed files show it where their end cannot be reached
+            raise AudioFileError(f"{self.path} is truncated: it contains {cut[2]} of {cut[1]} bytes of sound")
+        self.seek(self.frames - 1)  # fails for a truncated compressed file
         if self.read(1).shape[1] != 1:
-            raise AudioFileError(f"{self.path} is cut off before its {self.frames} frames")
+            raise AudioFileError(f"{self.path} is truncated: it contains fewer than {self.frames} frames")
         self.seek(0)
+        self.not_finite = self.clipped = 0  # the last frame was read above
 
     def pick(self, ears: tuple[int, int]) -> None:
-        """From now on read these two channels (from 1); one may be named twice. AudioFileError where one is missing."""
+        """Select two channels (from 1, may be equal) for `read`. Raises AudioFileError if one does not exist."""
         if max(ears) > self.channels:
-            there = "is mono" if self.channels == 1 else f"has {self.channels} channels"
-            raise AudioFileError(f"{self.path} {there}: there is no channel {max(ears)}")
+            size = "is mono" if self.channels == 1 else f"has {self.channels} channels"
+            raise AudioFileError(f"{self.path} {size}: there is no channel {max(ears)}")
         self._ears = [ear - 1 for ear in ears]
         self.channels = 2
 
     def seek(self, frame: int) -> None:
-        """Go on reading at `frame`, from 0 to `frames`."""
+        """Set the position for `read` to `frame`, from 0 to `frames`."""
         try:
             self._file.seek(frame)
         except soundfile.LibsndfileError as problem:
-            raise AudioFileError(f"{self.path} is cut off or damaged: {problem.error_string}") from None
+            raise AudioFileError(f"{self.path} is truncated or damaged: {problem.error_string}") from None
 
     def read(self, frames: int) -> np.ndarray:
-        """The next `frames` frames, fewer at the end of the file.
+        """Return the next `frames` frames, fewer at the end of the file.
 
         Returns
         -------
-        ndarray of int32, (channels, n)
-            Samples of 8, 16 or 24 bits fill the upper bits; float samples are converted by `to_int32`.
+        ndarray of int32 or float64, (channels, n)
+            Samples of 8, 16 or 24 bits fill the upper bits; float samples are converted by `to_int32` unless `floats`.
         """
         try:
             samples = self._file.read(frames, dtype="float64" if self._float else "int32", always_2d=True).T
         except soundfile.LibsndfileError as problem:
-            raise AudioFileError(f"{self.path} is cut off or damaged: {problem.error_string}") from None
+            raise AudioFileError(f"{self.path} is truncated or damaged: {problem.error_string}") from None
         if self._ears is not None:
             samples = samples[self._ears]
         if self._float:
             self.not_finite += samples.size - int(np.count_nonzero(np.isfinite(samples)))
-            return to_int32(samples)
+            if self.floats:
+                return _finite(samples)
+            samples, clipped = _rounded(samples)
+            self.clipped += clipped
+            return samples
         return np.asarray(samples)
 
     def close(self) -> None:

@@ -1,11 +1,11 @@
-"""Messages out of a bag file of ROS, format 2.0, as bytes, in memory that no bag can fill.
+"""Reader of rosbag files (format 2.0) that returns messages as bytes and needs limited memory for any file.
 
-rosbag's own reader believes every length in the file, keeps the whole index in memory, and makes Python code of the
-message definitions in the bag, which it runs. None of that is for files that somebody else may have made.
+The reader of rosbag trusts every length in the file, keeps the whole index in memory, and executes Python code that it
+generates from the message definitions in the bag. It is therefore not safe for files from an untrusted source.
 
-A bag is a line that names the format, and records of a header (fields `name=value`) and data: the bag's header, chunks
-of connections and messages, each chunk with its index behind it, and at the end all connections again. What is read
-here are the connections at the end, and the chunks one after the other: messages come as they were recorded.
+A bag starts with a line that names the format. Records follow, each with a header (fields `name=value`) and data: the
+header of the bag; chunks of connections and messages, each chunk followed by its index; finally all connections again.
+This module reads the connections at the end and then the chunks in order, so messages come in the order of recording.
 """
 
 from __future__ import annotations
@@ -13,11 +13,10 @@ from __future__ import annotations
 import bz2
 import importlib
 import os
-import struct
 import threading
 from collections.abc import Callable, Container, Iterator
 from pathlib import Path
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 from rosafe.input import open_descriptor
 
@@ -27,16 +26,16 @@ MAX_NAME = 1000  # characters of a topic or type
 _MAGIC = b"#ROSBAG V2.0\n"
 _MESSAGE, _BAG, _INDEX, _CHUNK, _CONNECTION = 2, 3, 4, 5, 7  # the field `op` of a record's header
 _INDEX_ENTRY = 12  # bytes
-_PIECE = 2**16  # bytes of a compressed chunk that are unpacked at a time,
-_UNPACKED_PIECE = 2**20  # and at most so many of what comes out
+_COMPRESSED_PIECE = 2**16  # bytes of a compressed chunk that are decompressed at a time
+_DECOMPRESSED_PIECE = 2**20  # maximum number of bytes that bz2 returns at a time
 
 
 class BagError(Exception):
-    """The bag cannot be read; the text, which follows the file's name, says why."""
+    """The bag cannot be read; the text is the reason and is to follow the file's name."""
 
 
 class NotClosedError(BagError):
-    """The bag has no index, since its recorder did not close it, or its end is missing."""
+    """The bag has no index because its recorder did not close it, or its end is missing."""
 
 
 class BagConnection(NamedTuple):
@@ -54,23 +53,23 @@ class BagReader:
     ----------
     path : Path
         The file.
-    largest : int
-        Bytes of a message that are read; longer ones count as damage.
+    max_message : int
+        Maximum size of a message in bytes; a longer one counts as damage.
     stopping : threading.Event
         Once set, `messages` ends.
 
     Attributes
     ----------
-    connections : dict of int to Connection
+    connections : dict of int to BagConnection
 
     Raises
     ------
     BagError, OSError
-        The file is no bag, or not a whole one, or cannot be read.
+        The file is not a bag, is incomplete, or cannot be read.
     """
 
-    def __init__(self, path: Path, largest: int, stopping: threading.Event) -> None:
-        self._largest = largest
+    def __init__(self, path: Path, max_message: int, stopping: threading.Event) -> None:
+        self._max_message = max_message
         self._stopping = stopping
         self._descriptor = open_descriptor(path)
         try:
@@ -82,14 +81,15 @@ class BagReader:
             raise
 
     def close(self) -> None:
-        """Close the file; once more is no harm."""
+        """Close the file; further calls have no effect."""
         if self._descriptor >= 0:
             os.close(self._descriptor)
             self._descriptor = -1
 
     def _read_bag_header(self) -> None:
         if os.pread(self._descriptor, len(_MAGIC), 0) != _MAGIC:
-            raise BagError("is not a bag of format 2.0")  # without a byte of it: who asks may not be allowed to read it
+            # The message contains no byte of the file, as the caller may lack the right to read it.
+            raise BagError("is not a bag of format 2.0")
         try:
             records = _FileSlice(self._descriptor, len(_MAGIC), self._size)
             header = _read_header(records, _BAG)
@@ -98,7 +98,7 @@ class BagReader:
             records.skip(_length(records))
         except BagError as problem:
             raise NotClosedError(str(problem)) from None
-        if not records.at <= self._index <= self._size:  # 0 before it is closed
+        if not records.at <= self._index <= self._size:  # 0 in a bag that was not closed
             raise NotClosedError("has no index")
         self._first = records.at
         if "encryptor" in header:
@@ -106,7 +106,7 @@ class BagReader:
 
     def _read_connections(self) -> dict[int, BagConnection]:
         if self._count > MAX_CONNECTIONS:
-            raise BagError(f"is not a whole bag: {self._count} connections, at most {MAX_CONNECTIONS} go")
+            raise BagError(f"is damaged: expected at most {MAX_CONNECTIONS} connections, got {self._count}")
         records = _FileSlice(self._descriptor, self._index, self._size)
         found = {}
         try:
@@ -120,9 +120,9 @@ class BagReader:
         return found
 
     def messages(self, connections: Container[int]) -> Iterator[tuple[int, bytes]]:
-        """The messages of these connections: number of the connection, and the message. May be called again.
+        """Yield the number of the connection and the bytes of each message of `connections`. Can be called repeatedly.
 
-        Raises BagError where the bag is damaged.
+        Raises BagError if the bag is damaged.
         """
         records = _FileSlice(self._descriptor, self._first, self._index)
         try:
@@ -132,28 +132,28 @@ class BagReader:
                 length = _length(records)
                 op = _number(header, "op", 1)
                 if op == _INDEX:
-                    length = _INDEX_ENTRY * _number(header, "count", 4)  # some recorders wrote another length
+                    length = _INDEX_ENTRY * _number(header, "count", 4)  # some recorders write a wrong length
                 elif op == _CHUNK:
                     yield from self._messages_in(self._chunk(header, records.part(length)), connections)
                 records.skip(length)
         except _StopReading:
             return
 
-    def _chunk(self, header: dict[str, bytes], packed: _FileSlice) -> _Bytes:
+    def _chunk(self, header: dict[str, bytes], data: _FileSlice) -> _ByteSource:
         compression = header.get("compression", b"").decode("ascii", "replace")
         if compression == "none":
-            return packed
-        if compression not in _UNPACK:
-            raise BagError(f"is damaged: compression {compression[:20]!r}")
-        return _DecompressedChunk(_UNPACK[compression](_pieces(packed)), _number(header, "size", 4), self._check_stop)
+            return data
+        if compression not in _DECOMPRESS:
+            raise BagError(f"is damaged: unknown compression {compression[:20]!r}")
+        return _DecompressedChunk(_DECOMPRESS[compression](_pieces(data)), _number(header, "size", 4), self._check_stop)
 
-    def _messages_in(self, chunk: _Bytes, connections: Container[int]) -> Iterator[tuple[int, bytes]]:
+    def _messages_in(self, chunk: _ByteSource, connections: Container[int]) -> Iterator[tuple[int, bytes]]:
         while chunk.left:
             self._check_stop()
             header = _read_header(chunk)
             connection = _number(header, "conn", 4)
             if _number(header, "op", 1) == _MESSAGE and connection in connections:
-                yield connection, _read(chunk, self._largest)
+                yield connection, _read(chunk, self._max_message)
             else:
                 chunk.skip(_length(chunk))
 
@@ -163,26 +163,14 @@ class BagReader:
 
 
 class _StopReading(Exception):
-    """It is told to stop."""
+    """Reading was stopped by the caller."""
 
 
 # --- bytes ------------------------------------------------------------------------------------------------------
 
 
-class _Bytes(Protocol):
-    """Bytes to be read in order."""
-
-    left: int
-
-    def read(self, count: int) -> bytes:
-        """The next `count` bytes; BagError where there are fewer."""
-
-    def skip(self, count: int) -> None:
-        """Leave out the next `count` bytes; BagError where there are fewer."""
-
-
 class _FileSlice:
-    """The bytes of a file from `at` to `end`."""
+    """The bytes of a file from `at` to `end`. Methods raise BagError if fewer than `count` bytes are `left`."""
 
     def __init__(self, descriptor: int, at: int, end: int) -> None:
         self._descriptor = descriptor
@@ -190,47 +178,47 @@ class _FileSlice:
         self.left = end - at
 
     def read(self, count: int) -> bytes:
-        """The next ones."""
+        """Return the next `count` bytes."""
         at = self.at
-        self.skip(count)  # before any memory is taken
+        self.skip(count)  # checks `count` before memory is allocated
         data = os.pread(self._descriptor, count, at)
         if len(data) != count:
-            raise BagError("is damaged: it has become shorter")
+            raise BagError("is damaged: it has been truncated while it was read")
         return data
 
     def skip(self, count: int) -> None:
-        """Go on behind them."""
+        """Skip the next `count` bytes."""
         if count > self.left:
-            raise BagError(f"is damaged: {count} bytes are announced where {self.left} are left")
+            raise BagError(f"is damaged: a record of {count} bytes, but only {self.left} remain")
         self.at += count
         self.left -= count
 
     def part(self, length: int) -> _FileSlice:
-        """The next `length` bytes as a stretch of their own."""
+        """Return the next `length` bytes as a slice of their own."""
         return _FileSlice(self._descriptor, self.at, self.at + min(length, self.left))
 
 
 class _DecompressedChunk:
-    """The `size` bytes of a compressed chunk, unpacked as they are needed."""
+    """The `size` bytes of a compressed chunk, decompressed on demand, with the methods of a `_FileSlice`."""
 
-    def __init__(self, unpacked: Iterator[bytes], size: int, check_stop: Callable[[], None]) -> None:
+    def __init__(self, decompressed: Iterator[bytes], size: int, check_stop: Callable[[], None]) -> None:
         self.left = size
-        self._unpacked = unpacked
+        self._decompressed = decompressed
         self._check_stop = check_stop
         self._ready = memoryview(b"")
 
     def read(self, count: int) -> bytes:
-        """The next ones."""
+        """Return the next `count` bytes."""
         return b"".join(self._take(count))
 
     def skip(self, count: int) -> None:
-        """Unpack and forget them."""
+        """Decompress and discard the next `count` bytes."""
         for _ in self._take(count):
             pass
 
     def _take(self, count: int) -> Iterator[memoryview]:
         if count > self.left:
-            raise BagError(f"is damaged: {count} bytes are announced where {self.left} are left of a chunk")
+            raise BagError(f"is damaged: a record of {count} bytes, but only {self.left} remain of its chunk")
         self.left -= count
         while count:
             if not self._ready:
@@ -243,56 +231,59 @@ class _DecompressedChunk:
 
     def _next(self) -> bytes:
         try:
-            return next(self._unpacked)
+            return next(self._decompressed)
         except (OSError, EOFError, ValueError) as problem:
             raise BagError(f"is damaged: a compressed chunk: {problem}") from None
         except StopIteration:
-            raise BagError("is damaged: a compressed chunk ends too early") from None
+            raise BagError("is damaged: a compressed chunk is truncated") from None
 
 
-def _pieces(packed: _FileSlice) -> Iterator[bytes]:
-    while packed.left:
-        yield packed.read(min(_PIECE, packed.left))
+_ByteSource = _FileSlice | _DecompressedChunk
 
 
-def _unpack_bz2(pieces: Iterator[bytes]) -> Iterator[bytes]:
-    """What they hold, in bounded pieces again: one of theirs may unpack to a gigabyte."""
-    unpacker = bz2.BZ2Decompressor()
+def _pieces(data: _FileSlice) -> Iterator[bytes]:
+    while data.left:
+        yield data.read(min(_COMPRESSED_PIECE, data.left))
+
+
+def _decompress_bz2(pieces: Iterator[bytes]) -> Iterator[bytes]:
+    """Decompress in pieces of limited size: a single input piece can expand to a gigabyte."""
+    decompressor = bz2.BZ2Decompressor()
     for piece in pieces:
-        yield unpacker.decompress(piece, _UNPACKED_PIECE)
-        while not (unpacker.needs_input or unpacker.eof):
-            yield unpacker.decompress(b"", _UNPACKED_PIECE)
+        yield decompressor.decompress(piece, _DECOMPRESSED_PIECE)
+        while not (decompressor.needs_input or decompressor.eof):
+            yield decompressor.decompress(b"", _DECOMPRESSED_PIECE)
 
 
-def _unpack_lz4(pieces: Iterator[bytes]) -> Iterator[bytes]:
-    """What they hold: at most 255 times as much."""
+def _decompress_lz4(pieces: Iterator[bytes]) -> Iterator[bytes]:
+    """Decompress; the output is at most 255 times as long."""
     try:
-        unpacker = importlib.import_module("roslz4").LZ4Decompressor()
+        decompressor = importlib.import_module("roslz4").LZ4Decompressor()
     except ImportError as problem:
-        raise BagError(f"is compressed by lz4, which needs Debian's python3-roslz4 ({problem})") from None
-    return map(unpacker.decompress, pieces)
+        raise BagError(f"is compressed with lz4; install Debian's python3-roslz4 ({problem})") from None
+    return map(decompressor.decompress, pieces)
 
 
-_UNPACK = {"bz2": _unpack_bz2, "lz4": _unpack_lz4}
+_DECOMPRESS = {"bz2": _decompress_bz2, "lz4": _decompress_lz4}
 
 
-def _length(source: _Bytes) -> int:
-    return int(struct.unpack("<I", source.read(4))[0])
+def _length(source: _ByteSource) -> int:
+    return int.from_bytes(source.read(4), "little")
 
 
-def _read(source: _Bytes, largest: int) -> bytes:
-    """Bytes with their number before them."""
+def _read(source: _ByteSource, max_length: int) -> bytes:
+    """Return the bytes of a field that starts with its length."""
     length = _length(source)
-    if length > largest:
-        raise BagError(f"is damaged: {length} bytes are announced, at most {largest} go there")
+    if length > max_length:
+        raise BagError(f"is damaged: expected a field of at most {max_length} bytes, got {length}")
     return source.read(length)
 
 
-def _read_header(source: _Bytes, op: int | None = None) -> dict[str, bytes]:
-    """A record's header; `source` is at the length of the data then."""
+def _read_header(source: _ByteSource, op: int | None = None) -> dict[str, bytes]:
+    """Return the header of a record and leave `source` at the length of the data."""
     header = _fields(_read(source, MAX_HEADER))
     if op is not None and _number(header, "op", 1) != op:
-        raise BagError(f"is damaged: a record of kind {_number(header, 'op', 1)} where {op} is wanted")
+        raise BagError(f"is damaged: expected a record of type {op}, got {_number(header, 'op', 1)}")
     return header
 
 
@@ -302,7 +293,7 @@ def _fields(data: bytes) -> dict[str, bytes]:
         end = at + 4 + int.from_bytes(data[at : at + 4], "little")
         name, equals, value = data[at + 4 : end].partition(b"=")
         if end > len(data) or not equals:
-            raise BagError("is damaged: a header's fields")
+            raise BagError("is damaged: malformed fields of a record header")
         fields[name.decode("utf-8", "replace")] = value
         at = end
     return fields
@@ -311,12 +302,12 @@ def _fields(data: bytes) -> dict[str, bytes]:
 def _number(header: dict[str, bytes], name: str, size: int) -> int:
     value = header.get(name, b"")
     if len(value) != size:
-        raise BagError(f"is damaged: a header without {name!r}")
+        raise BagError(f"is damaged: a record header without a valid {name!r}")
     return int.from_bytes(value, "little")
 
 
 def _text(header: dict[str, bytes], name: str) -> str:
     text = header.get(name, b"").decode("utf-8", "replace")
     if not 0 < len(text) <= MAX_NAME or not text.isprintable():
-        raise BagError(f"is damaged: the {name} of a connection")
+        raise BagError(f"is damaged: invalid {name} of a connection")
     return text

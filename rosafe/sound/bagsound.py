@@ -1,4 +1,4 @@
-"""The sound in a rosbag: the streams of one port Audio, every frame once. Needs nothing of ROS."""
+"""The audio in a rosbag: the streams of one port Audio, with each frame once. Does not need ROS."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from rosafe.sound.windows import MAX_WINDOW, WindowStream, window_error
 
 TYPE = "binaudio_portStruct"  # of the port Audio, in the package bass or another
 MD5SUM = "a3b73b6f3547870cf712571c1a85ea1d"
-MAX_MESSAGE = 2 * 4 * MAX_WINDOW + 1024  # bytes: both ears, and the rest
-MAX_LISTED = 20  # topics in a refusal
+MAX_MESSAGE = 2 * 4 * MAX_WINDOW + 1024  # bytes: the samples of both ears, and the other fields
+MAX_LISTED = 20  # topics in an error message
 _HEAD, _LENGTH, _STAMP = struct.Struct("<3IQ"), struct.Struct("<I"), 8
-Piece = tuple[int, np.ndarray]  # frames lost before it, and int32 (2, n)
+Piece = tuple[int, np.ndarray]  # number of frames lost before the samples, and the samples, int32 (2, n)
 
 
 class BagSoundError(Exception):
-    """The bag, or the port in it, cannot be read; the text is one line that names it and says why."""
+    """The bag, or the port in it, cannot be read; the text is one line with the file's name and the reason."""
 
 
 class _Message(NamedTuple):
-    """A message of the port Audio, as it is on the wire."""
+    """The fields of a message of the port Audio."""
 
     sampleRate: int
     nChunksOnPort: int
@@ -38,19 +38,19 @@ class _Message(NamedTuple):
     right: np.ndarray
 
 
-def _decoded(data: bytes) -> _Message:
-    """The message in these bytes; ValueError or struct.error where they hold none."""
+def _decode(data: bytes) -> _Message:
+    """Deserialize a message. Raises ValueError or struct.error."""
     numbers = _HEAD.unpack_from(data)
     at, ears = _HEAD.size, []
     for _ in range(2):
         (count,) = _LENGTH.unpack_from(data, at)
         at += _LENGTH.size
         if count > (len(data) - at) // 4:
-            raise ValueError(f"{count} samples are announced in a message of {len(data)} bytes")
+            raise ValueError(f"{count} samples do not fit into a message of {len(data)} bytes")
         ears.append(np.frombuffer(data, "<i4", count, at))
         at += 4 * count
     if at + _STAMP != len(data):
-        raise ValueError(f"a message of {len(data)} bytes holds {at + _STAMP}")
+        raise ValueError(f"expected a message of {at + _STAMP} bytes, got {len(data)}")
     return _Message(*numbers, *ears)
 
 
@@ -62,18 +62,18 @@ class Recording:
     path : path
         The bag; ``~`` is the user's home.
     topic : str, optional
-        Of the port; by default the only one, or `usual` of several.
+        Topic of the port. By default the only port in the bag, or `default` if there are several.
     stopping : threading.Event
-        Once set, what iterates ends.
-    usual : str
-        The topic to take where there are several and none is named.
-    several : str
-        What to do where there are several ports, for the refusal.
+        Once set, iterations end.
+    default : str
+        Topic to choose if there are several ports and `topic` is not given.
+    advice : str
+        What the user can do if there are several ports, for the error message.
 
     Raises
     ------
     BagSoundError
-        The file is not a whole bag, or does not hold that port.
+        The file is not a complete bag, or does not contain the port.
     """
 
     def __init__(
@@ -81,47 +81,52 @@ class Recording:
         path: str | Path,
         topic: str | None,
         stopping: threading.Event,
-        usual: str = "",
-        several: str = "pick one with ?topic=",
+        default: str = "",
+        advice: str = "choose one with ?topic=",
     ) -> None:
         self._path = Path(os.path.expanduser(path))
         try:
             self._bag = BagReader(self._path, MAX_MESSAGE, stopping)
-        except (OSError, ValueError) as problem:  # ValueError: a path that no file can have
+        except (OSError, ValueError) as problem:  # ValueError: an invalid path
             raise BagSoundError(f"{path}: {getattr(problem, 'strerror', None) or problem}") from None
         except NotClosedError:
             raise BagSoundError(
-                f"{path} was not closed by its recorder, or is cut off; `rosbag reindex {path}` repairs what is there"
+                f"{path} was not closed by its recorder, or is truncated; repair it with `rosbag reindex {path}`"
             ) from None
         except BagError as problem:
             raise BagSoundError(f"{path} {problem}") from None
         try:
-            self.topic = self._pick(topic, usual, several)
+            types = {connection.topic: connection.type for connection in self._bag.connections.values()}
+            ports = sorted(name for name, kind in types.items() if kind.endswith(f"/{TYPE}"))
+            self.topic = self._only_port(ports, default, advice) if topic is None else self._port(topic, ports, types)
         except BagSoundError:
             self.close()
             raise
 
-    def _pick(self, topic: str | None, usual: str, several: str) -> str:
-        found = {connection.topic: connection.type for connection in self._bag.connections.values()}
-        ports = sorted(name for name, kind in found.items() if kind.endswith(f"/{TYPE}"))
-        if topic is None and (len(ports) == 1 or usual in ports):
-            return ports[0] if len(ports) == 1 else usual
-        if topic is not None and topic in ports:
+    def _port(self, topic: str, ports: list[str], types: dict[str, str]) -> str:
+        """Return `topic`. Raises BagSoundError if it is not one of the `ports`."""
+        if topic in ports:
             return topic
-        if topic in found:
-            raise BagSoundError(f"{self._path}: {topic} is no port Audio, but of type {found[topic]}")
-        there = ", ".join((ports if ports or topic is None else sorted(found))[:MAX_LISTED]) or "none"
-        if topic is not None:
-            raise BagSoundError(f"{self._path}: no topic {topic} in there; there are: {there}")
+        if topic in types:
+            raise BagSoundError(f"{self._path}: expected {topic} to be a port Audio, got type {types[topic]}")
+        topics = ", ".join((ports or sorted(types))[:MAX_LISTED]) or "none"
+        raise BagSoundError(f"{self._path}: does not contain the topic {topic}; available: {topics}")
+
+    def _only_port(self, ports: list[str], default: str, advice: str) -> str:
+        """Return the only one of the `ports`, or `default` if it is one of several. Raises BagSoundError."""
+        if len(ports) == 1:
+            return ports[0]
+        if default in ports:
+            return default
         if not ports:
-            raise BagSoundError(f"{self._path} holds no port Audio (type bass/{TYPE})")
-        raise BagSoundError(f"{self._path} holds several ports Audio: {several}, of {there}")
+            raise BagSoundError(f"{self._path} contains no port Audio (type bass/{TYPE})")
+        raise BagSoundError(f"{self._path} contains several ports Audio; {advice}: {', '.join(ports[:MAX_LISTED])}")
 
     def streams(self) -> Iterator[tuple[int, Iterator[Piece]]]:
-        """Each stream: its sample rate (Hz) and its pieces, to be read before the next one is asked for.
+        """Yield the sample rate (Hz) and the pieces of each stream; read the pieces before the next stream.
 
-        A stream of a single message is what a latched port still showed from before; it counts only where there is
-        nothing else.
+        A stream of a single message is usually the last message of a latched port from before the recording. It is
+        used only if there is no other stream.
         """
         lone: list[tuple[int, Piece]] = []
         played = False
@@ -137,24 +142,24 @@ class Recording:
             yield lone[0][0], iter([lone[0][1]])
 
     def _numbered(self) -> Iterator[tuple[int, int, Piece]]:
-        """Number of the stream, its sample rate, and a piece of it."""
+        """Yield each piece with the number of its stream and the sample rate."""
         count, stream = 0, WindowStream(with_first=True)
         for message in self._messages():
             problem = window_error(message)
             if problem:
-                raise BagSoundError(f"{self._path}: a malformed message on {self.topic}: {problem}")
-            if stream.join_state(message):
+                raise BagSoundError(f"{self._path}: malformed message on {self.topic}: {problem}")
+            if stream.mismatch(message):
                 count, stream = count + 1, WindowStream(with_first=True)
-            yield count, message.sampleRate, stream.fresh(message)
+            yield count, message.sampleRate, stream.advance(message)
 
     def _messages(self) -> Iterator[_Message]:
-        connections = {number for number, one in self._bag.connections.items() if one.topic == self.topic}
+        connections = {number for number, found in self._bag.connections.items() if found.topic == self.topic}
         try:
             for number, data in self._bag.messages(connections):
                 md5sum = self._bag.connections[number].md5sum
                 if md5sum != MD5SUM:
-                    raise BagSoundError(f"{self._path}: {self.topic} is of another version of its type ({md5sum})")
-                yield _decoded(data)
+                    raise BagSoundError(f"{self._path}: {self.topic}: expected md5sum {MD5SUM}, got {md5sum}")
+                yield _decode(data)
         except BagError as problem:
             raise BagSoundError(f"{self._path} {problem}") from None
         except (struct.error, OSError, ValueError) as problem:
@@ -163,3 +168,15 @@ class Recording:
     def close(self) -> None:
         """Close the bag."""
         self._bag.close()
+
+
+def from_first_samples(pieces: Iterator[Piece], skip: int = 0) -> Iterator[Piece]:
+    """Skip the first `skip` frames of a stream, and frames that were lost before the first remaining samples."""
+    started = False
+    for lost, samples in pieces:
+        skipped = min(skip, lost + samples.shape[1])
+        skip -= skipped
+        rest = samples[:, max(0, skipped - lost) :]
+        if rest.shape[1]:
+            yield max(0, lost - skipped) * started, rest
+            started = True

@@ -1,4 +1,4 @@
-"""A serialized message as a list of buffers, which is sent without being joined."""
+"""A serialized message as a list of buffers, which are sent without being concatenated."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Any
 
 
 class BufferList:
-    """A serialized message in pieces, for one `sendmsg`. The buffers are not copied and must not change."""
+    """A serialized message as buffers for one `sendmsg`. The buffers are not copied and must not change."""
 
     def __init__(self) -> None:
         self.pieces: list[Any] = []

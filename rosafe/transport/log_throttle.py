@@ -1,4 +1,4 @@
-"""One line in the log for each event, and one line a second for a storm of them."""
+"""Log with a limited rate: the first event of a kind is logged at once, repetitions once per period."""
 
 from __future__ import annotations
 
@@ -8,66 +8,66 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 PERIOD = 1.0  # seconds in which a kind of event gets one line
-KINDS = 50  # at once; what goes beyond is of one kind
+MAX_KINDS = 50  # at a time; further kinds are counted as one
 
 _NUMBER = re.compile(r"\d+(\.\d+)?")
 
 
 @dataclass
 class _SuppressedEvent:
-    """What came of one kind since its last line."""
+    """The events of one kind since its last line."""
 
     count: int = 0
     last: str = ""
 
 
 class ThrottledLog:
-    """Writes lines about events, of each kind at once where it is the first in a second.
+    """A log that writes the first event of a kind immediately and counts the events that follow within `period`.
 
-    Those that follow within the second are counted, and the last of them is written with their number when the second
-    is over. Lines that differ in numbers alone are of one kind. Safe from any thread.
+    At the end of the period, the last of these is written with their number. Lines that differ only in numbers are of
+    one kind. Thread-safe.
 
     Parameters
     ----------
     write : callable
-        Takes one line, such as `rospy.logwarn`.
+        Function that writes one line, such as `rospy.logwarn`.
     period : float
-        The second.
+        Duration in s.
     """
 
     def __init__(self, write: Callable[[str], None], period: float = PERIOD) -> None:
         self._write = write
         self._period = period
-        self._held: dict[str, _SuppressedEvent] = {}
+        self._suppressed: dict[str, _SuppressedEvent] = {}
         self._lock = threading.Lock()
 
     def __call__(self, line: str, kind: str = "") -> None:
-        """Report one event, of a `kind` that need not be told by the line."""
+        """Report one event; `kind` is by default the line without its numbers."""
         kind = kind or _NUMBER.sub("#", line)
         with self._lock:
-            if kind not in self._held and len(self._held) >= KINDS:
+            if kind not in self._suppressed and len(self._suppressed) >= MAX_KINDS:
                 kind = ""
-            held = self._held.get(kind)
-            if held is not None:
-                held.count += 1
-                held.last = line
+            suppressed = self._suppressed.get(kind)
+            if suppressed is not None:
+                suppressed.count += 1
+                suppressed.last = line
                 return
-            self._hold(kind)
+            self._start_period(kind)
         self._write(line)
 
-    def _hold(self, kind: str) -> None:
-        self._held[kind] = _SuppressedEvent()
-        timer = threading.Timer(self._period, self._release, (kind,))
+    def _start_period(self, kind: str) -> None:
+        self._suppressed[kind] = _SuppressedEvent()
+        timer = threading.Timer(self._period, self._end_period, (kind,))
         timer.daemon = True
         try:
             timer.start()
-        except RuntimeError:  # no thread is left: the next one gets a line too
-            del self._held[kind]
+        except RuntimeError:  # no thread is available: the next event gets a line too
+            del self._suppressed[kind]
 
-    def _release(self, kind: str) -> None:
+    def _end_period(self, kind: str) -> None:
         with self._lock:
-            held = self._held.pop(kind)
-            if held.count:
-                self._hold(kind)
-        if held.count:
-            self._write(f"{held.last} ({held.count} like it in {self._period:g} s)")
+            suppressed = self._suppressed.pop(kind)
+            if suppressed.count:
+                self._start_period(kind)
+        if suppressed.count:
+            self._write(f"{suppressed.last} ({suppressed.count} like it in {self._period:g} s)")

@@ -1,7 +1,8 @@
-"""Finding the ROS master: local defaults for the environment, and a probe that never hangs. Imports no rospy."""
+"""Access to the ROS master: defaults for the environment, and calls with a time limit. Does not import rospy."""
 
 from __future__ import annotations
 
+import contextlib
 import http.client
 import os
 import socket
@@ -14,23 +15,23 @@ from urllib.parse import urlsplit
 
 DEFAULT_URI = "http://127.0.0.1:11311"
 PROBE_SECONDS = 3.0
-ANSWER_BYTES = 2**22  # to any call; the longest is the master's list of all topics
-RESOLVE_SECONDS = 5.0  # the whole probe; a name server that is silent is not bound by the socket's timeout
+ANSWER_BYTES = 2**22  # of the answer to any call; the longest is the master's list of all topics
+RESOLVE_SECONDS = 5.0  # for the whole probe: the socket's timeout does not include name resolution
 FAILURES = (OSError, xmlrpc.client.Error, http.client.HTTPException, ValueError, SyntaxError)  # of a call, see `reason`
 
 T = TypeVar("T")
 
 
 class MasterError(Exception):
-    """There is no master to work with; the text is one line that says what to do."""
+    """No master can be reached; the message is one line and ends with the next step for the user."""
 
 
 def set_local_defaults(environ: MutableMapping[str, str] = os.environ) -> None:
-    """Let ROS work on this machine alone where the environment says nothing else.
+    """Set ROS variables that are unset or empty, so that ROS works on this machine alone.
 
-    Numbers instead of `localhost`, which rospy waits for without end on a machine without /etc/hosts. ROS_IP is left
-    alone beside a master on another host, which could not call back to loopback. What is empty counts as not set;
-    rospy would complain of it again and again.
+    The address is 127.0.0.1 because rospy waits forever for `localhost` on a machine without /etc/hosts. ROS_IP is not
+    set if the master is on another host, which could not call back to loopback. Empty variables are removed because
+    rospy logs a warning about them repeatedly.
     """
     for variable in ("ROS_HOSTNAME", "ROS_IP"):
         if environ.get(variable) == "":
@@ -42,7 +43,7 @@ def set_local_defaults(environ: MutableMapping[str, str] = os.environ) -> None:
 
 
 def is_local(uri: str) -> bool:
-    """Whether `uri` names this machine by a loopback address."""
+    """Return whether the host of `uri` is a loopback address."""
     return _is_loopback(_host(uri))
 
 
@@ -58,9 +59,9 @@ def _is_loopback(host: str) -> bool:
 
 
 def unreachable(environ: Mapping[str, str] = os.environ) -> str:
-    """Why nobody could call a node that starts with this environment, and what to do; empty where all is well.
+    """Return why a node with this environment could not be called and how to correct it; empty if it can be called.
 
-    A node tells the master ROS_HOSTNAME, or else ROS_IP, as the address to call it at.
+    A node registers ROS_HOSTNAME, or ROS_IP if that is not set, as its address at the master.
     """
     variable = next((v for v in ("ROS_HOSTNAME", "ROS_IP") if environ.get(v)), "")
     if not variable:
@@ -68,20 +69,20 @@ def unreachable(environ: Mapping[str, str] = os.environ) -> str:
     host, uri = environ[variable], environ.get("ROS_MASTER_URI") or DEFAULT_URI
     found = _addresses(host)
     if not found:
-        wrong = "which is no address, and no name that is known here: nobody can call a node"
+        problem = "neither an address nor a name that is known on this machine: nodes cannot be called"
     elif {"0.0.0.0", "::"} & set(found):
-        wrong = "which is no address to call a node at"
+        problem = "which is not an address that nodes can be called at"
     elif not any(map(_is_own, found)):
-        wrong = "which is no address of this machine: nobody can call a node"
+        problem = "which is not an address of this machine: nodes cannot be called"
     elif _is_loopback(host) and not any(map(_is_own, _addresses(_host(uri) or host))):
-        wrong = f"where only this machine can call a node, but the master is at {uri}"
+        problem = f"at which only this machine can call nodes, but the master is at {uri}"
     else:
         return ""
-    return f"{variable} is {host}, {wrong}; unset it or set it to {_own_addresses(is_local(uri))}"
+    return f"{variable} is {host}, {problem}; unset it or set it to {_own_addresses(is_local(uri))}"
 
 
 def _addresses(host: str) -> list[str]:
-    """The addresses that `host` stands for; none where it stands for nothing, or the name server does not answer."""
+    """Return the addresses of `host`; none if the name is unknown or the name server does not answer."""
 
     def resolve() -> list[str]:
         try:
@@ -93,7 +94,7 @@ def _addresses(host: str) -> list[str]:
 
 
 def _is_own(address: str) -> bool:
-    """Whether an address belongs to this machine: others cannot be bound."""
+    """Return whether an address belongs to this machine: other addresses cannot be bound."""
     try:
         with socket.socket(socket.AF_INET6 if ":" in address else socket.AF_INET, socket.SOCK_STREAM) as sock:
             sock.bind((address, 0))
@@ -111,33 +112,33 @@ def _own_addresses(loopback: bool) -> str:
 
 
 def check_address(uri: str) -> None:
-    """Return if `uri` could be that of a ROS master, else raise MasterError."""
+    """Raise MasterError if `uri` is not a valid address of a ROS master."""
     try:
         parts = urlsplit(uri)
         usable = parts.scheme == "http" and parts.hostname and parts.port
     except ValueError:
         usable = None
     if not usable:
-        raise MasterError(f"ROS_MASTER_URI is {uri!r}, which is no address like {DEFAULT_URI}")
+        raise MasterError(f"ROS_MASTER_URI: expected an address such as {DEFAULT_URI}, got {uri!r}")
 
 
 def check_master(uri: str, give_up: Callable[[], bool] = lambda: False) -> None:
-    """Return if a ROS master answers at `uri` within a few seconds, else (or once `give_up()`) raise MasterError."""
+    """Raise MasterError if no ROS master answers at `uri` within a few seconds and before `give_up()` returns True."""
     check_address(uri)
     problem = _bounded(lambda: _ask(uri), "no answer", give_up)
     if problem:
         raise _error(uri, problem)
 
 
-def _bounded(ask: Callable[[], T], otherwise: T, give_up: Callable[[], bool] = lambda: False) -> T:
-    """What `ask()` returns within `RESOLVE_SECONDS`: name servers that are silent have no other bound."""
-    outcome: list[T] = []
-    asking = threading.Thread(target=lambda: outcome.append(ask()), daemon=True)
-    asking.start()
+def _bounded(call: Callable[[], T], default: T, give_up: Callable[[], bool] = lambda: False) -> T:
+    """Return `call()`, or `default` after `RESOLVE_SECONDS`: name resolution has no other time limit."""
+    results: list[T] = []
+    thread = threading.Thread(target=lambda: results.append(call()), daemon=True)
+    thread.start()
     deadline = time.monotonic() + RESOLVE_SECONDS
-    while asking.is_alive() and time.monotonic() < deadline and not give_up():
-        asking.join(0.1)
-    return outcome[0] if outcome else otherwise
+    while thread.is_alive() and time.monotonic() < deadline and not give_up():
+        thread.join(0.1)
+    return results[0] if results else default
 
 
 def _error(uri: str, problem: str) -> MasterError:
@@ -147,7 +148,7 @@ def _error(uri: str, problem: str) -> MasterError:
 
 
 def _ask(uri: str) -> str:
-    """What is wrong with the master at `uri`; empty where it answers."""
+    """Return why the master at `uri` cannot be used; empty if it answers."""
     try:
         with proxy(uri) as master:
             master.getPid("/rosafe_probe")
@@ -157,7 +158,7 @@ def _ask(uri: str) -> str:
 
 
 def published_topics(uri: str, caller: str) -> dict[str, str]:
-    """All topics that somebody publishes, with their types; MasterError where the master does not answer."""
+    """Return all published topics with their types; MasterError if the master does not answer."""
     check_master(uri)
     try:
         with proxy(uri) as master:
@@ -168,14 +169,14 @@ def published_topics(uri: str, caller: str) -> dict[str, str]:
 
 
 def node_address(uri: str, name: str) -> str | None:
-    """The address that the master at `uri` has for a node, None if it has none; raises `FAILURES`."""
+    """Return the address of a node at the master `uri`, None if it is not registered; raises `FAILURES`."""
     with proxy(uri) as master:
         code, _, address = cast(tuple[int, str, str], master.lookupNode(name, name))
     return address if code == 1 else None
 
 
 def reason(problem: Exception) -> str:
-    """In a few words, why a call of the master came to nothing."""
+    """Return in a few words why a call of the master failed."""
     if isinstance(problem, TimeoutError):
         return "no answer"
     if isinstance(problem, OSError):
@@ -184,19 +185,19 @@ def reason(problem: Exception) -> str:
 
 
 def uri() -> str:
-    """Where the master is, as the environment says."""
+    """Return the address of the master from the environment."""
     return os.environ.get("ROS_MASTER_URI") or DEFAULT_URI
 
 
 def proxy(uri: str, seconds: float = PROBE_SECONDS) -> xmlrpc.client.ServerProxy:
-    """The master at `uri`, or another XML-RPC server, with calls that end within `seconds` where nothing comes."""
+    """Return a proxy of the master or another XML-RPC server at `uri`; a call fails after `seconds` without data."""
     return xmlrpc.client.ServerProxy(uri, transport=Transport(seconds))
 
 
 class Transport(xmlrpc.client.Transport):
-    """HTTP that gives up: where nothing comes for some seconds, and where too much comes."""
+    """An HTTP transport whose calls are limited in time and in the length of the answer."""
 
-    accept_gzip_encoding = False  # packed, a short answer may be long
+    accept_gzip_encoding = False  # a short compressed answer may expand to a long one
 
     def __init__(self, seconds: float = PROBE_SECONDS) -> None:
         super().__init__()
@@ -210,22 +211,22 @@ class Transport(xmlrpc.client.Transport):
 
 
 class _Answer(http.client.HTTPResponse):
-    """One of bounded length; ValueError beyond it."""
+    """An answer of limited length; reading beyond the limit raises ValueError."""
 
-    _taken = 0
+    _received = 0
 
     def read(self, amt: int | None = None) -> bytes:
         data = super().read(ANSWER_BYTES + 1 if amt is None else amt)
-        self._taken += len(data)
-        if self._taken > ANSWER_BYTES:
+        self._received += len(data)
+        if self._received > ANSWER_BYTES:
             raise ValueError(f"an answer of more than {ANSWER_BYTES} bytes")
         return data
 
 
-class PrivateMaster:
-    """A master of this process' own on a free port of the loopback interface, up once made.
+class PrivateMaster(contextlib.AbstractContextManager["PrivateMaster"]):
+    """A ROS master in this process, on a free port of the loopback interface, started by the constructor.
 
-    Use it as a context manager, or `close` it. `uri` is its address.
+    Use it as a context manager, or call `close`. `uri` is its address.
     """
 
     def __init__(self) -> None:
@@ -237,11 +238,8 @@ class PrivateMaster:
         self.uri = f"http://127.0.0.1:{self._master.master_node.port}"
 
     def close(self) -> None:
-        """End the master; nodes that it knows notice at their next call."""
+        """End the master; its nodes notice at their next call."""
         self._master.stop()
-
-    def __enter__(self) -> PrivateMaster:
-        return self
 
     def __exit__(self, *exception: object) -> None:
         self.close()

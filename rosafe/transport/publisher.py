@@ -1,9 +1,9 @@
-"""Latched topics whose subscribers take messages at their own pace, while the publisher goes on.
+"""Latched topics with an independent queue and thread for each subscriber, so that publishing never blocks.
 
-rospy's own publisher copies every message into a buffer of its own, and its queue is one message for all topics alike.
-Here a message is gathered once for all subscribers, without copying samples, and only where there is a subscriber. Each
-subscriber has a thread that sends, straight from the processors' blocks into the socket. What waits for a subscriber
-is bounded: one that reads slowly or not at all misses old messages and holds up nobody.
+rospy's publisher copies every message into a buffer, and its queue has one message for any topic. Here a message is
+serialized once for all subscribers, without copying samples, and only if there is a subscriber. The thread of each
+subscriber sends directly from the processors' blocks to the socket. The queue of each subscriber is limited: a
+subscriber that reads slowly or not at all misses old messages and does not delay others.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import struct
 import threading
 from collections import deque
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import rospy
 from rospy import topics
@@ -23,11 +23,11 @@ from rospy.impl.registration import Registration, get_topic_manager
 
 from rosafe.transport.buffer_list import BufferList
 
-# What may wait for one subscriber besides what is on its way. Windows overlap, so that a message of a long port is made
-# up for by the next one, and the newest is enough; messages of short ports are small, and several can wait.
-MAX_WAITING = 32
-MAX_WAITING_BYTES = 16_000_000
-SHORT_BYTES = 512  # of a message that is sent without a detour
+# Limits of one subscriber's queue. Windows overlap: the next message of a long port replaces a lost one, and the newest
+# one suffices. Messages of short ports are small, and several can be queued.
+MAX_QUEUED = 32
+MAX_QUEUED_BYTES = 16_000_000
+DIRECT_BYTES = 2**16  # a message up to this length is sent directly, without the thread, if the system accepts it
 _LENGTH = struct.Struct("<I")
 _MAX_PIECES = os.sysconf("SC_IOV_MAX")  # of one sendmsg
 
@@ -38,36 +38,61 @@ class Publisher(rospy.Publisher):
     Parameters
     ----------
     name : str
-        The topic.
+        Name of the topic.
     data_class : type
         A message class of `rosafe.component.serialization`, or a generated one without Header.
     """
 
     def __init__(self, name: str, data_class: Any) -> None:
         manager, topic = get_topic_manager(), rospy.resolve_name(name)
-        with manager.lock:  # rospy makes its own kind of topic where it finds none
+        with manager.lock:  # otherwise rospy would create its own kind of topic
             if manager.get_publisher_impl(topic) is None:
                 manager._add(_Topic(topic, data_class), manager.pubs, Registration.PUB)
             super().__init__(name, data_class, latch=True, queue_size=1)
 
+    def publish_newest(self, newest: NewestMessage) -> None:
+        """Publish the message `newest.build()`. Without subscribers it is built when the first one connects."""
+        topic = self.impl
+        if topic is not None:
+            # A subscriber that connects now gets the latched message after it has been added to the connections.
+            if topic.latch is newest and not topic.connections:
+                return
+            topic.acquire()  # a new subscriber waits for this lock before it gets the latched message
+            try:
+                topic.latch = newest
+                if not topic.connections:
+                    return
+            finally:
+                topic.release()
+        self.publish(newest.build())
+
+
+class NewestMessage(NamedTuple):
+    """The newest message of a topic, which is built only if there is a subscriber.
+
+    `build` may be called at any time and from any thread.
+    """
+
+    build: Callable[[], Any]
+
 
 class _Topic(topics._PublisherImpl):
-    """What rospy has behind a Publisher, with senders for connections."""
+    """The implementation of a topic that rospy uses for a Publisher, with a `_Sender` for each connection."""
 
     connection_poll: topics.Poller
 
     def __init__(self, name: str, data_class: Any) -> None:
         super().__init__(name, data_class)
-        self.on_connection: Callable[[], None] = lambda: None  # there is one subscriber more
+        self.on_connection: Callable[[], None] = lambda: None  # called for each new subscriber
         self.connection_poll.poller.close()
         self.connection_poll = _Poller()
 
     def set_queue_size(self, queue_size: int) -> None:
-        """Have no queue of rospy's, with a thread of its own: the senders have theirs."""
+        """Do not create rospy's queue and its thread: each sender has its own."""
 
     def add_connection(self, connection: Any) -> bool:
-        """Take on a subscriber; it gets the latched message."""
-        # Messages are written whole, so nothing is gained by keeping back the last bytes of one.
+        """Add a subscriber and send it the latched message."""
+        # Complete messages are written at once, so delaying the last bytes (Nagle's algorithm) has no advantage.
         connection.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         sender = _Sender(connection)
         try:
@@ -78,19 +103,21 @@ class _Topic(topics._PublisherImpl):
             return False
         finally:
             self.on_connection()
-            if self.closed:  # in this very moment; rospy would leave the subscriber waiting
+            if self.closed:  # meanwhile; rospy would leave the subscriber waiting
                 sender.end()
 
     def remove_connection(self, connection: Any) -> None:
-        """Forget a subscriber; rospy would tell its listeners, which there are none of, and stumble at the end."""
+        """Remove a subscriber; rospy's method also notifies listeners, which are not used, and fails at shutdown."""
         topics._TopicImpl.remove_connection(self, connection)
 
     def publish(self, message: Any, connection_override: Any = None) -> None:
-        """Keep `message` for those who come later, and send it to those who are here (or to one connection)."""
+        """Keep `message` for later subscribers, and send it to the present ones (or to one connection)."""
         if self.closed:
             if rospy.is_shutdown():
                 return
             raise rospy.ROSException(f"publish() to {self.resolved_name}, which is closed")
+        if isinstance(message, NewestMessage):
+            message = message.build()
         self.latch = message
         senders = self.connections if connection_override is None else [connection_override]
         if senders:
@@ -102,22 +129,23 @@ class _Topic(topics._PublisherImpl):
             self._offer(written, senders)
 
     def send(self, written: BufferList) -> bool:
-        """Send a message to all subscribers, but do not keep it for later ones; return whether there are any."""
+        """Send a message to all subscribers without keeping it for later ones; return whether there are subscribers."""
         senders = self.connections
         if senders:
             self._offer(written, senders)
         return bool(senders)
 
     def _offer(self, written: BufferList, senders: list[Any]) -> None:
-        self.message_data_sent += _LENGTH.size + written.size  # for getBusStats; once, as rospy counts it
+        self.message_data_sent += _LENGTH.size + written.size  # for getBusStats; counted once, as in rospy
         for sender in senders:
             sender.offer(written)
 
 
 class _Poller(topics.Poller):
-    """Looks for connections that have ended. Its file is closed with the topic.
+    """Detects connections that have ended. Its file descriptor is closed with the topic.
 
-    rospy's own refers to itself, so that the files of topics that are gone pile up until garbage is collected.
+    rospy's poller is part of a reference cycle, so that descriptors of closed topics remain open until garbage
+    collection.
     """
 
     def __init__(self) -> None:
@@ -133,17 +161,17 @@ class _Sender:
 
     def __init__(self, connection: Any) -> None:
         self._connection = connection
-        self._turn = threading.Condition()
-        self._waiting: deque[BufferList] = deque(maxlen=MAX_WAITING)
-        self._rest = b""  # of a message that was sent in part
+        self._message_queued = threading.Condition()
+        self._queue: deque[BufferList] = deque(maxlen=MAX_QUEUED)
+        self._rest = b""  # of a partially sent message
         self._sending = False
         threading.Thread(target=self._run, name=f"to {connection.endpoint_id}", daemon=True).start()
 
     def __getattr__(self, name: str) -> Any:
-        return getattr(self._connection, name)  # to rospy it is the connection
+        return getattr(self._connection, name)  # rospy uses it as the connection
 
     def set_cleanup_callback(self, callback: Callable[[Any], None]) -> None:
-        """Let rospy know when the connection is closed."""
+        """Set the callback that notifies rospy when the connection is closed."""
 
         def closed(_: Any) -> None:
             try:
@@ -154,58 +182,60 @@ class _Sender:
         self._connection.set_cleanup_callback(closed)
 
     def end(self) -> None:
-        """Close the connection, whether rospy knows it or not."""
+        """Close the connection, whether or not it is registered in rospy."""
         self._connection.close()
         self._wake()
 
     def _wake(self) -> None:
-        with self._turn:
-            self._turn.notify()
+        with self._message_queued:
+            self._message_queued.notify()
 
     def offer(self, written: BufferList) -> None:
-        """Send a message when there is time, unless too many newer ones come before.
+        """Queue a message; it is dropped if too many newer ones follow before it is sent.
 
-        A short one is sent at once if nothing is ahead of it: to wake the thread takes ten times as long.
+        A short one is sent directly if the queue is empty: waking the thread takes more time than the call.
         """
-        with self._turn:
-            idle = not (self._waiting or self._rest or self._sending)
-            if idle and written.size <= SHORT_BYTES and self._send_at_once(written):
+        with self._message_queued:
+            idle = not (self._queue or self._rest or self._sending)
+            if idle and written.size <= DIRECT_BYTES and self._send_at_once(written):
                 return
-            self._waiting.append(written)
-            while len(self._waiting) > 1 and sum(w.size for w in self._waiting) > MAX_WAITING_BYTES:
-                self._waiting.popleft()
-            self._turn.notify()
+            self._queue.append(written)
+            while len(self._queue) > 1 and sum(w.size for w in self._queue) > MAX_QUEUED_BYTES:
+                self._queue.popleft()
+            self._message_queued.notify()
 
     def _send_at_once(self, written: BufferList) -> bool:
-        """Return whether the message was sent; False if the subscriber reads too slowly, or has left."""
-        sock, data = self._connection.socket, b"".join([_LENGTH.pack(written.size), *written.pieces])
-        try:
-            sent = sock.send(data, socket.MSG_DONTWAIT)
-        except (OSError, AttributeError):  # the thread finds out what it is
+        """Send a message and return True; return False if the subscriber reads too slowly or has disconnected."""
+        pieces = [_LENGTH.pack(written.size), *written.pieces]
+        if len(pieces) > _MAX_PIECES:
             return False
-        self._rest = data[sent:]
-        if self._rest:
-            self._turn.notify()
+        try:
+            sent = self._connection.socket.sendmsg(pieces, (), socket.MSG_DONTWAIT)
+        except (OSError, AttributeError):  # the thread handles the cause
+            return False
+        if sent < _LENGTH.size + written.size:
+            self._rest = b"".join(pieces)[sent:]
+            self._message_queued.notify()
         self._count(written)
         return True
 
     def _run(self) -> None:
         try:
             while True:
-                with self._turn:
+                with self._message_queued:
                     self._sending = False
-                    self._turn.wait_for(lambda: self._waiting or self._rest or self._connection.done)
+                    self._message_queued.wait_for(lambda: self._queue or self._rest or self._connection.done)
                     if self._connection.done:
                         return
                     rest, self._rest = self._rest, b""
-                    written = None if rest else self._waiting.popleft()
+                    written = None if rest else self._queue.popleft()
                     self._sending = True
                 self._send(rest, written)
-                del written  # it holds on to blocks
+                del written  # it references blocks
         except OSError as problem:
-            rospy.logdebug(f"{self._connection.name}: {self._connection.endpoint_id} has left: {problem}")
+            rospy.logdebug(f"{self._connection.name}: {self._connection.endpoint_id} has disconnected: {problem}")
         finally:
-            self._waiting.clear()
+            self._queue.clear()
             self._connection.close()
 
     def _send(self, rest: bytes, written: BufferList | None) -> None:
@@ -224,9 +254,9 @@ class _Sender:
 
 
 def send_pieces(sock: socket.socket, pieces: Sequence[Any]) -> None:
-    """Send contiguous buffers, one after the other; OSError where the other side has left."""
+    """Send contiguous buffers in order; OSError if the other side has disconnected."""
     for first in range(0, len(pieces), _MAX_PIECES):
         batch = pieces[first : first + _MAX_PIECES]
         sent = sock.sendmsg(batch)
-        if sent < sum(memoryview(piece).nbytes for piece in batch):  # a signal came in between, or the like
+        if sent < sum(memoryview(piece).nbytes for piece in batch):  # interrupted, for example by a signal
             sock.sendall(memoryview(b"".join(batch))[sent:])

@@ -1,4 +1,4 @@
-"""A node calls itself through its own TCP ports, and says in /diagnostics and to systemd whether it can be called."""
+"""Self-check: a node calls its own TCP ports and reports to /diagnostics and systemd whether it can be called."""
 
 from __future__ import annotations
 
@@ -18,33 +18,33 @@ from rospy.impl import tcpros_base
 
 from rosafe.transport import master, registration, server_limits, systemd
 
-PERIOD = 10.0  # seconds between two calls; a third of what systemd's watchdog allows where that is less
-CALL_SECONDS = 3.0  # for the answer on one port, but no more than a third of the period
-FAILURES = 2  # in a row that are more than a moment's trouble
+PERIOD = 10.0  # seconds between two calls, but at most a third of the interval of systemd's watchdog
+CALL_SECONDS = 3.0  # for the answer on one port, but at most a third of the period
+FAILURES = 2  # in a row before an error is reported
 
 
 class SelfCheck:
-    """Calls this node now and then, on a thread of its own, once `start` is called.
+    """Periodic calls of this node to itself, on a separate thread that `start` starts.
 
     Parameters
     ----------
     finished : threading.Event
-        Ends it.
+        Event that ends the thread.
     """
 
     def __init__(self, finished: threading.Event) -> None:
-        self.failures = 0  # in a row, up to now
+        self.failures = 0  # in a row
         self._problem = ""
-        self._seconds = 0.0  # that the last good call took
+        self._seconds = 0.0  # duration of the last successful call
         self._finished = finished
         self._watchdog = systemd.watchdog_seconds()
         self._period = PERIOD if self._watchdog is None else min(PERIOD, self._watchdog / 3)
 
     def start(self) -> None:
-        threading.Thread(target=self._run, name="pulse", daemon=True).start()
+        threading.Thread(target=self._run, name="self-check", daemon=True).start()
 
     def health(self, status: Any) -> Any:
-        """A task for diagnostic_updater."""
+        """Report the result; a task for diagnostic_updater."""
         if self.failures < FAILURES:
             status.summary(DiagnosticStatus.OK, "this node can be called")
         else:
@@ -76,17 +76,15 @@ class SelfCheck:
 
 
 def check_own_interfaces(seconds: float) -> str:
-    """Call this node on each of its two ports; what is wrong, such as silence of `seconds`, or nothing."""
-    everywhere = {"0.0.0.0": "127.0.0.1", "::": "::1"}
+    """Call this node on each of its two ports; return the problem, such as a timeout, or an empty string."""
     host = rosgraph.network.get_bind_address()
-    host = everywhere.get(host, host)
-    calls = {"XML-RPC": _call_api, "TCPROS": _call_service}
-    for port, call in calls.items():
+    host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(host, host)
+    for port, call in (("XML-RPC", _call_api), ("TCPROS", _call_service)):
         try:
             call(host, seconds)
         except TimeoutError:
             return f"{port}: no answer within {seconds:.3g} s"
-        except Exception as problem:  # whatever it is
+        except Exception as problem:  # any failure means that the node cannot be called
             return f"{port}: {getattr(problem, 'strerror', None) or f'{type(problem).__name__}: {problem}'}"
     return ""
 
@@ -98,7 +96,7 @@ def _call_api(host: str, seconds: float) -> None:
 
 
 def _call_service(host: str, seconds: float) -> None:
-    """Call the cheapest service that every node has, without asking the master for it."""
+    """Call a service that every node has and that does little work, without a lookup at the master."""
     _, port = tcpros_base.get_tcpros_server_address()
     name = f"{rospy.get_name()}/get_loggers"
     with socket.create_connection((host, port), seconds) as sock:
@@ -111,4 +109,4 @@ def _call_service(host: str, seconds: float) -> None:
         with sock.makefile("rb") as answer:
             good, size = struct.unpack("<BI", answer.read(5))
             if len(answer.read(size)) < size or not good:
-                raise ValueError("no whole answer")
+                raise ValueError("incomplete answer")

@@ -1,4 +1,4 @@
-"""What systemd is told by a service of Type=notify (sd_notify(3)): one datagram each. Elsewhere nothing happens."""
+"""Notifications to systemd from a service of Type=notify (sd_notify(3)); without systemd they do nothing."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ SEND_SECONDS = 1.0
 
 
 def notify(*assignments: str) -> None:
-    """Send assignments such as ``READY=1``; where nobody takes them, that is for systemd to notice."""
+    """Send assignments such as ``READY=1`` in one datagram; failures are ignored, systemd has its own time limits."""
     path = os.environ.get("NOTIFY_SOCKET", "")
     if path:
         with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sock:
@@ -20,9 +20,9 @@ def notify(*assignments: str) -> None:
 
 
 def watchdog_seconds() -> float | None:
-    """How often systemd wants to hear ``WATCHDOG=1`` of this process at least; None where it does not care."""
+    """Return the maximum interval of ``WATCHDOG=1`` that systemd expects; None without a watchdog."""
     microseconds = os.environ.get("WATCHDOG_USEC", "")
-    meant = os.environ.get("WATCHDOG_PID", "") in ("", str(os.getpid()))
-    if not (meant and microseconds.isascii() and microseconds.isdigit() and int(microseconds)):
+    for_us = os.environ.get("WATCHDOG_PID", "") in ("", str(os.getpid()))
+    if not (for_us and microseconds.isascii() and microseconds.isdigit() and int(microseconds)):
         return None
     return int(microseconds) / 1e6

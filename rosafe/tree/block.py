@@ -57,10 +57,16 @@ class Source(Protocol):
         In Hz.
     ended : bool
         Whether no further sound will arrive; blocks that have arrived may still be read.
+    waiting : bool
+        Whether it has no further block now, and will call `wake` for the next one, or at the end.
     """
 
     sample_rate: float
     ended: bool
+
+    @property
+    def waiting(self) -> bool:
+        """See the class."""
 
     def open(self, wake: Callable[[], None]) -> None:
         """Call `wake` from now on whenever there may be a block to read, or the end. `wake` returns immediately.

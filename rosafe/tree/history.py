@@ -1,4 +1,4 @@
-"""What a processor put out lately, for several readers: each gets what has come since it was there last."""
+"""The recent output of a processor, for its output port and for readers that get the output since their last call."""
 
 from __future__ import annotations
 
@@ -6,70 +6,89 @@ import threading
 from collections.abc import Sequence
 from typing import NamedTuple
 
-import numpy as np
-
 from rosafe.dsp.signal_format import SignalFormat
 from rosafe.tree.block import Block
-from rosafe.tree.sliding_window import RecentFrames, WindowView, frames_in
+from rosafe.tree.sliding_window import SlidingWindow, WindowView, frames_in
 
 
 class HistorySlice(NamedTuple):
-    """What a reader got."""
+    """A part of the history, one view for each part of the output."""
 
     parts: tuple[WindowView, ...]
-    next_index: int  # of the audio frame after the newest one that this knows of
+    next_index: int  # of the audio frame after the newest one that it depends on
     signal: SignalFormat
 
 
 class History:
-    """The newest `seconds` of a processor's output, and how far each reader has read. Safe from any thread.
+    """The newest output of a processor, and the position of each reader. Safe from any thread.
 
     Parameters
     ----------
-    part_rows : sequence of tuple of int
+    output_shapes : sequence of tuple of int
         Leading shape of each part.
-    signal : Signal
-        Its format.
+    signal : SignalFormat
+        The format of the output.
     seconds : float
-        Its length, which may be changed.
+        Maximum output for a reader, which may be changed.
+    port_seconds : float
+        Length of the window at the output port, which may be changed.
     """
 
-    def __init__(self, part_rows: Sequence[tuple[int, ...]], signal: SignalFormat, seconds: float) -> None:
+    def __init__(
+        self,
+        output_shapes: Sequence[tuple[int, ...]],
+        signal: SignalFormat,
+        seconds: float,
+        port_seconds: float = 0.0,
+    ) -> None:
         self.seconds = seconds
+        self.port_seconds = port_seconds
         self.next_index = 0
         self._lock = threading.Lock()
-        self._begin(tuple(part_rows), signal)
-
-    def _begin(self, part_rows: tuple[tuple[int, ...], ...], signal: SignalFormat) -> None:
-        """Forget what there was: frames of different shapes or rates do not go together."""
         self._signal = signal
-        self._parts = [RecentFrames(np.empty((*rows, 0)), 0) for rows in part_rows]
-        self._came = 0  # frames in all
-        self._read: dict[str, int] = {}  # how many of them had come when a reader was there
+        self._frames = (0.0, 0)  # seconds and frames of the windows
+        self._clear(output_shapes)
+
+    def _clear(self, output_shapes: Sequence[tuple[int, ...]]) -> None:
+        self._shapes = list(output_shapes)
+        self._windows = [SlidingWindow(shape, self._frames[1]) for shape in output_shapes]
+        self._appended = 0  # frames in total
+        self._read: dict[str, int] = {}  # how many of them each reader has read
 
     def append(self, block: Block) -> None:
-        """Remember a block."""
-        if not self.seconds:
+        """Append a block. One with another shape or frame rate than before clears the history first."""
+        seconds = max(self.seconds, self.port_seconds)
+        if not seconds:
             self.next_index = block.next_index
             return
         with self._lock:
-            rows = tuple(part.shape[:-1] for part in block.parts)
-            if block.signal is not self._signal:
-                if block.signal.rate != self._signal.rate:
-                    self._begin(rows, block.signal)
-                self._signal = block.signal
-            if rows != tuple(part.rows for part in self._parts):
-                self._begin(rows, block.signal)
+            shapes = [part.shape[:-1] for part in block.parts]
+            if block.signal is not self._signal or shapes != self._shapes or seconds != self._frames[0]:
+                self._resize(block.signal, shapes, seconds)
             self.next_index = block.next_index
-            capacity = frames_in(self.seconds, block.signal.rate)
-            for newest, part in zip(self._parts, block.parts, strict=True):
-                newest.capacity = capacity
-                newest.append(part)
-            self._came += block.data.shape[-1]
+            for window, part in zip(self._windows, block.parts, strict=True):
+                window.append(part)
+            self._appended += block.parts[0].shape[-1]
+
+    def _resize(self, signal: SignalFormat, shapes: list[tuple[int, ...]], seconds: float) -> None:
+        """Adapt the windows to the format of a block and to their length in seconds."""
+        self._frames = (seconds, frames_in(seconds, signal.rate))
+        if signal.rate != self._signal.rate or shapes != self._shapes:
+            self._clear(shapes)
+        self._signal = signal
+        for window in self._windows:
+            window.frames = self._frames[1]
 
     def read_new(self, reader: str) -> HistorySlice:
-        """What has come since `reader` was here last, or since the start, as far as it is remembered."""
+        """Return the output since the last call by `reader`, or since the beginning, at most the history."""
         with self._lock:
-            fresh = self._came - self._read.get(reader, 0)
-            self._read[reader] = self._came
-            return HistorySlice(tuple(part.view(fresh) for part in self._parts), self.next_index, self._signal)
+            new = min(self._appended - self._read.get(reader, 0), frames_in(self.seconds, self._signal.rate))
+            self._read[reader] = self._appended
+            return HistorySlice(tuple(window.view(new) for window in self._windows), self.next_index, self._signal)
+
+    def port_window(self) -> HistorySlice:
+        """Return the newest `port_seconds` of output, with zeros before the first block."""
+        with self._lock:
+            frames = frames_in(self.port_seconds, self._signal.rate)
+            views = tuple(window.padded_view(frames) for window in self._windows)
+            return HistorySlice(views, self.next_index, self._signal)

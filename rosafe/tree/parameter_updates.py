@@ -26,8 +26,8 @@ class ParameterUpdate(NamedTuple):
 class ParameterUpdates:
     """The active stage of a processor, and the stage after all pending updates.
 
-    An update is applied before the first block that the updated stage can process. A method that requires the parent's
-    envelope waits for a block that carries it; one that fits only the parent's coming format waits for that format.
+    An update is applied before the first block that the updated stage can process. An update that requires the parent's
+    envelope waits for a block that carries it; one that fits only the parent's next format waits for that format.
 
     Attributes
     ----------
@@ -47,15 +47,15 @@ class ParameterUpdates:
         stage.configure(**{name: value})
         return stage
 
-    def preview_input(self, given: SignalFormat) -> Stage:
+    def preview_input(self, input_format: SignalFormat) -> Stage:
         """Return the stage for another output format of the parent, or `final_stage` if it is the same.
 
         Raises ValueError if the stage rejects the format.
         """
-        if given == self.final_stage.input_format:
+        if input_format == self.final_stage.input_format:
             return self.final_stage
         stage = copy.copy(self.final_stage)
-        stage.set_input_format(given)
+        stage.set_input_format(input_format)
         return stage
 
     def enqueue(self, planned: Stage, name: str, value: Any, block: int = 0) -> None:
@@ -92,17 +92,17 @@ class ParameterUpdates:
         return list(itertools.takewhile(lambda change: change.block <= number, self._queue))
 
 
-def _changed(stage: Stage, given: SignalFormat, changes: Sequence[ParameterUpdate]) -> Stage | None:
-    """Return `stage` after `changes` for blocks of the format `given`, or None if that is not possible.
+def _changed(stage: Stage, input_format: SignalFormat, changes: Sequence[ParameterUpdate]) -> Stage | None:
+    """Return `stage` after `changes` for blocks of `input_format`, or None if that is not possible.
 
     The result shares the state of `stage`, which is not modified.
     """
-    if given == stage.input_format and not changes:
-        stage.set_input_format(given)
+    if input_format == stage.input_format and not changes:
+        stage.set_input_format(input_format)
         return stage
     changed = copy.copy(stage)
     try:
-        changed.reconfigure(given, [{change.name: change.value} for change in changes])
+        changed.reconfigure(input_format, [{change.name: change.value} for change in changes])
     except PluginError:
         raise
     except ValueError:

@@ -4,33 +4,42 @@ from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from time import monotonic
-from typing import TypeVar
+from typing import Any, TypeVar
 
+from rosafe.declarations.representation import Representation
 from rosafe.dsp.numeric_limits import FloatArray
 from rosafe.dsp.plugin_checks import PluginError
+from rosafe.dsp.signal_format import SignalFormat
 from rosafe.dsp.stage import Stage
 from rosafe.tree.block import Block, Source
 from rosafe.tree.context import TreeContext
-from rosafe.tree.member import Member
-from rosafe.tree.states import State
-from rosafe.tree.workers import WAKE_THRESHOLD_SECONDS
+from rosafe.tree.history import History
+from rosafe.tree.parameter_updates import ParameterUpdates
+from rosafe.tree.states import State, StateMachine
 
 T = TypeVar("T")
-NOTHING: frozenset[str] = frozenset()
+_NO_EXTRAS: frozenset[str] = frozenset()
+SLOW_LISTENER_SECONDS = 2.5e-4  # a listener that takes longer is called in a turn of its own
 ESTIMATE_GROWTH = 2.0  # the estimate is the recent minimum; it may grow by this factor per block
 
 
-class Processor(Member):
+class Processor(StateMachine):
     """A node of the tree, created and connected by `Tree`. The public members may be used from any thread.
 
     Locks are acquired in this order: tree's requests, `_publish_lock`, then the tree's or those of updates and history.
 
     Parameters
     ----------
-    name, stage, parent, history_seconds
-        As in `Member`.
+    name : str
+        The name given by the user.
+    stage : Stage
+        The computation.
+    parent : Processor or None
+        None for the input.
+    history_seconds, port_seconds : float
+        Length of the history of its output for readers and for its output port.
     context : TreeContext
         Shared by all processors of the tree.
     source : Source or None
@@ -38,6 +47,10 @@ class Processor(Member):
 
     Attributes
     ----------
+    error : BaseException or None
+        The reason for its failure.
+    blocks : int
+        Number of blocks processed.
     output_buffer_for : callable or None
         Called with the input block; returns the argument `out` of `Stage.process`, for stages that have one.
     """
@@ -51,48 +64,110 @@ class Processor(Member):
         stage: Stage,
         parent: Processor | None,
         history_seconds: float,
+        port_seconds: float,
         context: TreeContext,
         source: Source | None = None,
     ) -> None:
-        super().__init__(name, stage, parent, history_seconds)
-        # At most 30 attributes, with those of `Member` and `StateMachine`: with more, each access takes longer.
+        super().__init__(parent)
+        # At most 30 attributes, with those of `StateMachine`: with more, each access takes longer.
         self.observers = context.observers
+        self.name = name
+        self.error: BaseException | None = None
+        self.blocks = 0
+        self.changes = ParameterUpdates(stage)
+        self.history = History(self.output_shapes, stage.output_format, history_seconds, port_seconds)
         self.blocked_since = 0.0
         self.estimated_seconds = math.inf
         self.output_buffer_for: Callable[[Block], FloatArray | None] | None = None
         self._context = context
-        self._lock = context.workers.lock
         self._source = source
         self._started = False
         self._publish_seconds = 0.0  # duration of the last call of the listener
         self._publish_lock = threading.Lock()  # `on_released` and `on_removed` exclude each other
 
+    def __repr__(self) -> str:
+        return f"<{self.kind} {self.name!r} {self.state.value}>"
+
+    # --- properties ---
+
+    @property
+    def stage(self) -> Stage:
+        """The stage after all pending parameter updates, for queries only."""
+        return self.changes.final_stage
+
+    @property
+    def representation(self) -> Representation:
+        """The declaration of its representation."""
+        return self.stage.REPRESENTATION
+
+    @property
+    def kind(self) -> str:
+        """The kind of its representation."""
+        return self.stage.REPRESENTATION.kind
+
+    @property
+    def input_shape(self) -> tuple[int, ...]:
+        """Leading shape of its input."""
+        return (self.stage.input_format.ears,) if self.parent is None else self.parent.output_shape
+
+    @property
+    def output_shapes(self) -> tuple[tuple[int, ...], ...]:
+        """Leading shape of each part of its output, such as (2, channels)."""
+        return self.stage.part_rows(self.input_shape)
+
+    @property
+    def output_shape(self) -> tuple[int, ...]:
+        """Leading shape of the first part, which is the input of its children."""
+        return self.stage.output_rows(self.input_shape)
+
+    @property
+    def signal(self) -> SignalFormat:
+        """The format of its output."""
+        return self.stage.output_format
+
+    @property
+    def rate(self) -> float:
+        """Frames of output per second."""
+        return self.signal.rate
+
+    @property
+    def next_index(self) -> int:
+        """Index of the audio frame after the newest one that its output depends on."""
+        return self.history.next_index
+
+    def values(self) -> dict[str, Any]:
+        """Return parameters, in the order of the parameter structure, and derived values of the same moment."""
+        stage = self.stage
+        return {**stage.parameters, **stage.derived}
+
     # --- life ---
 
     def start(self) -> None:
         """Start to work, with the block that the parent released last."""
-        with self._lock:
-            self._context.workers.add_client()  # raises before anything is attached if no thread can be started
+        workers = self._context.workers
+        with workers.lock:
+            workers.add_client()  # raises before anything is attached if no thread can be started
             self._started = True
             self.attach()
-            self._context.workers.wake()
+            workers.wake()
         if self._source is not None:
             self._source.open(self._wake)
             self._wake()
 
     def _wake(self) -> None:
         """Check whether the source has a block."""
-        with self._lock:
+        with self._context.workers.lock:
             self.notify_input()
             self._context.workers.wake()
 
     def end(self) -> None:
         """Remove the processor immediately. The result of a computation still in progress is discarded."""
-        with self._lock:
+        workers = self._context.workers
+        with workers.lock:
             self.remove()
             if self._started:
-                self._context.workers.remove_client()
-            self._context.workers.wake()
+                workers.remove_client()
+            workers.wake()
         if self._source is not None:
             self._source.stop()
         with self._publish_lock:
@@ -100,7 +175,7 @@ class Processor(Member):
 
     def join(self, timeout: float | None = None) -> bool:
         """Wait until it is finished. Return False after `timeout` seconds."""
-        with self._lock:
+        with self._context.workers.lock:
             return bool(self._context.finished_condition.wait_for(lambda: self.finished, timeout))
 
     def ask(self, question: Callable[[Processor], T]) -> T | None:
@@ -132,7 +207,7 @@ class Processor(Member):
                 self._compute(self.current_block)
         except BaseException as problem:  # any failure must reach the tree, and no other processor may keep waiting
             self.error = problem
-            with self._lock:
+            with self._context.workers.lock:
                 self.end_of_stream()
             self.blocked_since = monotonic()  # requests may block the callback
             self._context.on_failure(self)
@@ -146,51 +221,47 @@ class Processor(Member):
             got = source.read()
             if got is not None or ended == source.ended:
                 break
+        more = not source.waiting
         self.blocked_since = 0.0
-        with self._lock:
+        with self._context.workers.lock:
             if got is not None:
-                self.accept_input_block(Block(self.blocks, (got[0],), got[1], self.stage.input_format))
+                self.accept_input_block(Block(self.blocks, (got[0],), got[1], self.stage.input_format), more)
             elif ended:
                 self.end_of_stream()
 
-    def _compute(self, taken: Block) -> None:
+    def _compute(self, block: Block) -> None:
         begun = monotonic()
-        private = self._process(taken)
+        output_block = self._process(block)
         ended = monotonic()
         seconds = ended - begun
         self.blocks += 1
         limit = ESTIMATE_GROWTH * self.estimated_seconds
         self.estimated_seconds = seconds if seconds < limit else limit
-        with self._lock:
-            self.finish_block(private)
+        with self._context.workers.lock:
+            self.finish_block(output_block)
         self._context.listener.on_executed(self, seconds)
         # A slow listener is called later, when no deeper processor is ready.
-        if self.unpublished_block is not None and self._publish_seconds < WAKE_THRESHOLD_SECONDS:
+        if self.unpublished_block is not None and self._publish_seconds < SLOW_LISTENER_SECONDS:
             self._publish(self.unpublished_block, ended)
 
-    def _process(self, taken: Block) -> Block | None:
+    def _process(self, block: Block) -> Block | None:
         """Compute the output for a block. Return None if no stage accepts it."""
-        stage = self.changes.stage_for_block(taken)
+        stage = self.changes.stage_for_block(block)
         if stage is None:
             return None
         if stage.EXTRAS:
-            stage.provide = self._requested_extras(stage, taken.number)
-        data, extras = taken.parts[0], taken.extras
+            stage.provide = _requested_extras(stage, self.children, block.number)
+        data, extras = block.parts[0], block.extras
         required = extras and stage.required_extra
         if self.output_buffer_for is not None:
-            output = stage.process(data, extras[required] if required else None, self.output_buffer_for(taken))
+            output = stage.process(data, extras[required] if required else None, self.output_buffer_for(block))
         else:
             output = stage.process(data, extras[required]) if required else stage.process(data)
         parts = output if isinstance(output, tuple) else (output,)
-        next_index = taken.next_index
+        next_index = block.next_index
         if look_ahead := stage.look_ahead:
             next_index = max(0, next_index - look_ahead * stage.input_format.hop)
-        return Block(taken.number, parts, next_index, stage.output_format, stage.provided)
-
-    def _requested_extras(self, stage: Stage, number: int) -> frozenset[str]:
-        """Return the extras that children need of block `number`."""
-        wanted = [needs for child in tuple(self.children) if (needs := child.changes.needs(number))]
-        return frozenset(stage.EXTRAS).intersection(wanted) if wanted else NOTHING
+        return Block(block.number, parts, next_index, stage.output_format, stage.provided)
 
     def _publish(self, block: Block, begun: float) -> None:
         """Add the last released block to the history and notify the listener."""
@@ -204,6 +275,12 @@ class Processor(Member):
                 self._context.listener.on_released(self, block)
         self.blocked_since = 0.0
         self._publish_seconds = monotonic() - begun
+
+
+def _requested_extras(stage: Stage, children: Sequence[Processor], number: int) -> frozenset[str]:
+    """Return the extras of `stage` that children need of block `number`."""
+    requested = [needs for child in tuple(children) if (needs := child.changes.needs(number))]
+    return frozenset(stage.EXTRAS).intersection(requested) if requested else _NO_EXTRAS
 
 
 def subtree(processor: Processor) -> Iterator[Processor]:

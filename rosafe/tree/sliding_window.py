@@ -1,11 +1,12 @@
-"""Sliding windows over released blocks: references to the blocks, no copies until somebody looks.
+"""Sliding windows over released blocks. A window refers to the blocks; frames are copied only when it is read.
 
-Released blocks are never written again, so a window is just the newest blocks. What it looked like at one moment is a
-`WindowView`, which stays valid whatever comes later.
+Released blocks are read-only. A `WindowView`, the content of a window at one moment, therefore stays valid when more
+blocks arrive.
 """
 
 from __future__ import annotations
 
+import functools
 import math
 from dataclasses import dataclass
 
@@ -13,31 +14,28 @@ import numpy as np
 
 from rosafe.dsp.numeric_limits import FloatArray
 
-MAX_PIECES = 128  # beyond that, the pieces of a window are joined, so that small blocks in long windows stay cheap
+MAX_PIECES = 256  # blocks are joined if the window would otherwise consist of more pieces, or
+MIN_PIECE_BYTES = 4096  # if they are smaller than this
 
 
 def frames_in(seconds: float, rate: float) -> int:
-    """Whole frames in so many seconds; a hair less than a whole number is that number (0.29 s at 100 Hz are 29)."""
+    """Return the number of whole frames in `seconds`, tolerating rounding errors: 0.29 s at 100 Hz are 29 frames."""
     return math.floor(seconds * rate + 1e-9)
 
 
 @dataclass(frozen=True)
 class WindowView:
-    """One moment of a window: pieces of equal leading shape, one after the other along the last axis.
+    """The content of a window at one moment: pieces of equal leading shape, in order along the last axis.
 
-    The first `skip` frames of the first piece lie outside.
+    The first `skip` frames of the first piece are not part of the window.
     """
 
     pieces: tuple[FloatArray, ...]
     skip: int = 0
 
-    @classmethod
-    def of(cls, array: FloatArray) -> WindowView:
-        """A view of one array of shape (..., frames)."""
-        return cls((array,))
-
-    @property
+    @functools.cached_property
     def frames(self) -> int:
+        """The number of frames."""
         return sum(piece.shape[-1] for piece in self.pieces) - self.skip
 
     @property
@@ -46,94 +44,81 @@ class WindowView:
         return (*self.pieces[0].shape[:-1], self.frames)
 
     def select(self, row: int) -> WindowView:
-        """The part at `row` of the first axis, such as one ear."""
+        """Return the part at index `row` of the first axis, such as one ear."""
         return WindowView(tuple(piece[row] for piece in self.pieces), self.skip)
 
     def swap_rows(self) -> WindowView:
-        """The first two axes exchanged, such as [channel][lag] to the port's [lag][channel]."""
+        """Return the view with its first two axes exchanged, such as [channel][lag] to the port's [lag][channel]."""
         return WindowView(tuple(piece.swapaxes(0, 1) for piece in self.pieces), self.skip)
 
     def trimmed(self) -> list[FloatArray]:
-        """The pieces without what lies outside, oldest first."""
+        """Return the pieces without the skipped frames, oldest first."""
         return [self.pieces[0][..., self.skip :], *self.pieces[1:]]
 
     def copy_to(self, target: FloatArray) -> None:
-        """Write all frames into `target`, whose shape is `shape`."""
+        """Write all frames to `target`, whose shape is `shape`."""
         at = 0
         for part in self.trimmed():
             target[..., at : at + part.shape[-1]] = part
             at += part.shape[-1]
 
     def array(self) -> FloatArray:
-        """All frames in one fresh array."""
+        """Return all frames in a new array."""
         joined = np.empty(self.shape)
         self.copy_to(joined)
         return joined
 
 
-class RecentFrames:
-    """The newest frames of a signal.
-
-    Parameters
-    ----------
-    first : ndarray (*rows, n)
-        What is there before anything comes.
-    capacity : int
-        How many frames are kept, at least 0.
-    """
-
-    def __init__(self, first: FloatArray, capacity: int) -> None:
-        self.capacity = capacity
-        self.frames = first.shape[-1]  # that there are, besides some in the first piece that nobody needs
-        self._pieces = [first]
-
-    @property
-    def rows(self) -> tuple[int, ...]:
-        """Leading shape of the blocks."""
-        return self._pieces[0].shape[:-1]
-
-    def append(self, block: FloatArray) -> None:
-        """Put `block`, of shape (*rows, n), at the end. The block must not be written again."""
-        if block.shape[-1] == 0:
-            return
-        self._pieces.append(block)
-        self.frames += block.shape[-1]
-        while len(self._pieces) > 1 and self.frames - self._pieces[0].shape[-1] >= self.capacity:
-            self.frames -= self._pieces.pop(0).shape[-1]
-        if len(self._pieces) > MAX_PIECES:
-            self._pieces = [self.view(self.capacity).array()]
-            self.frames = self._pieces[0].shape[-1]
-
-    def view(self, frames: int) -> WindowView:
-        """The newest `frames`, or as many as there are of these."""
-        skip, first = max(0, self.frames - min(frames, self.capacity)), 0
-        while first < len(self._pieces) - 1 and skip >= self._pieces[first].shape[-1]:
-            skip -= self._pieces[first].shape[-1]
-            first += 1
-        return WindowView(tuple(self._pieces[first:]), skip)
-
-
 class SlidingWindow:
-    """The newest `frames` frames of a signal; before there are so many, zeros come first (as on an output port).
+    """The newest `frames` frames of a signal. Each sample is copied at most once, when short blocks are joined.
 
     Parameters
     ----------
     rows : tuple of int
         Leading shape of the blocks, such as (2, channels).
     frames : int
-        Length of the window, at least 0.
+        Length of the window, at least 0. If it is increased later, the window is filled by the next blocks.
     """
 
     def __init__(self, rows: tuple[int, ...], frames: int) -> None:
         self.rows = rows
         self.frames = frames
-        # rows of one row, which is nowhere before somebody writes to it
-        self._newest = RecentFrames(np.broadcast_to(np.zeros(frames), (*rows, frames)), frames)
+        self._pieces: list[FloatArray] = [self._zeros(0)]
+        self._held = 0  # frames in all pieces; the window may begin within the first one
+        self._short = self._short_frames = 0  # blocks at the end that are not joined yet, and their frames
 
     def append(self, block: FloatArray) -> None:
-        """Shift left and put `block`, of shape (*rows, n), at the end. The block must not be written again."""
-        self._newest.append(block)
+        """Append `block` of shape (*rows, n). It must not be modified afterwards."""
+        count, pieces = block.shape[-1], self._pieces
+        if count == 0:
+            return
+        pieces.append(block)
+        self._held += count
+        while len(pieces) > 1 and self._held - pieces[0].shape[-1] >= self.frames:
+            self._held -= pieces.pop(0).shape[-1]
+        if block.nbytes >= MIN_PIECE_BYTES and count * MAX_PIECES >= self.frames:
+            self._short = self._short_frames = 0
+            return
+        self._short = min(self._short + 1, len(pieces))
+        self._short_frames += count
+        if self._short_frames**2 >= self.frames * count:  # balances the number of joined and of short pieces
+            pieces[-self._short :] = [np.concatenate(pieces[-self._short :], axis=-1)]
+            self._short = self._short_frames = 0
 
-    def view(self) -> WindowView:
-        """The window as it is now: `frames` frames, newest last."""
-        return self._newest.view(self.frames)
+    def view(self, frames: int | None = None) -> WindowView:
+        """Return the newest `frames` frames, newest last; by default, and at most, those that have arrived."""
+        length = self.frames if frames is None else min(frames, self.frames)
+        skip, first = max(0, self._held - length), 0
+        while first < len(self._pieces) - 1 and skip >= self._pieces[first].shape[-1]:
+            skip -= self._pieces[first].shape[-1]
+            first += 1
+        return WindowView(tuple(self._pieces[first:]), skip)
+
+    def padded_view(self, frames: int) -> WindowView:
+        """Return exactly `frames` frames, newest last: zeros before the first block, as on an output port."""
+        view = self.view(frames)
+        missing = frames - view.frames
+        return view if missing <= 0 else WindowView((self._zeros(missing), *view.trimmed()))
+
+    def _zeros(self, frames: int) -> FloatArray:
+        return np.broadcast_to(np.zeros(frames), (*self.rows, frames))  # one row in memory

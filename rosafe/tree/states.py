@@ -165,8 +165,8 @@ class StateMachine:
             return False
         state = self.state
         if state is WAIT_EXEC:
-            taken = self._next_block
-            if taken is None:
+            block = self._next_block
+            if block is None:
                 if not self.input_pending:
                     return False
                 self.input_pending = False
@@ -175,32 +175,33 @@ class StateMachine:
                 self._block_owner = self.parent
                 self.state = EXEC
                 if self.observers:
-                    self._tell_observers(taken.number)
-            self.current_block = taken
+                    self._tell_observers(block.number)
+            self.current_block = block
         elif state is not RELEASE:
             return False
         self.busy = True
         return True
 
-    def accept_input_block(self, block: Block) -> None:
-        """Process a block that the input has read."""
-        self.input_pending = True  # there may be more
+    def accept_input_block(self, block: Block, more: bool = True) -> None:
+        """Process a block that the input has read. `more` is False if the source will notify of the next one."""
+        if more:
+            self.input_pending = True
         self.current_block = block
         self._set_state(EXEC, block.number)
 
-    def finish_block(self, private: Block | None) -> None:
-        """Accept the computed block `private`, if any. It is released when no child holds the previous one."""
+    def finish_block(self, computed: Block | None) -> None:
+        """Accept the block `computed`, if any. It is released when no child holds the previous one."""
         if self.skipped:
             del self.skipped
         self.release_input()
-        if private is not None and self.state is not REMOVED:
+        if computed is not None and self.state is not REMOVED:
             self.state = WAIT_RELEASE
             if self.observers:
-                self._tell_observers(private.number)
+                self._tell_observers(computed.number)
             if self._readers:
-                self._pending_block = private
+                self._pending_block = computed
             else:
-                self._release(private)
+                self._release(computed)
 
     def skip(self) -> None:
         """Return the parent's block during a long computation: siblings continue, this processor misses blocks."""

@@ -1,170 +1,114 @@
-"""The tree of processors: who hangs on whom, by name, and every request that changes or asks something."""
+"""The tree of processors, and the requests that build, change and query it."""
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any, NamedTuple
+from typing import Any
 
-from rosafe.declarations.parameter import Parameter, short_repr
-from rosafe.declarations.text import did_you_mean, join_names
-from rosafe.dsp.plugin_checks import PluginError
-from rosafe.dsp.stage import Stage
+from rosafe.declarations.parameter import Parameter
+from rosafe.declarations.text import did_you_mean, join_names, short_repr
+from rosafe.dsp.signal_format import SignalFormat
 from rosafe.interface import KINDS, ROSAFE, ComponentError
 from rosafe.representations import STAGES
-from rosafe.tree import sizes
 from rosafe.tree.block import Source
 from rosafe.tree.context import Observer, TreeContext, TreeListener
-from rosafe.tree.member import EARS
 from rosafe.tree.processor import Processor, subtree
-from rosafe.tree.sizes import Rows
+from rosafe.tree.processor_registry import Failure, ProcessorRegistry, already_exists
 from rosafe.tree.states import State
+from rosafe.tree.subtree_preview import ProcessorPreview, check_memory, preview_subtree
 from rosafe.tree.workers import Workers, workers_to_use
 
 INPUT = next(kind for kind, representation in KINDS.items() if not representation.parent)
 
 
-MAX_FAILURES = 20  # processors whose failures are remembered
-
-
-class Failure(NamedTuple):
-    """Why a processor ended by itself.
-
-    `children` are the processors below it, which ended with it.
-    """
-
-    name: str
-    kind: str
-    reason: str
-    children: tuple[str, ...]
-
-    @classmethod
-    def of(cls, processor: Processor) -> Failure:
-        """The failure of a processor whose `error` is set; it is still in the tree."""
-        error = processor.error
-        reason = str(error) if isinstance(error, PluginError) else f"{type(error).__name__}: {error}"
-        below = tuple(one.name for one in subtree(processor) if one is not processor)
-        return cls(processor.name, processor.kind, " ".join(reason.split()), below)
-
-    def __str__(self) -> str:
-        below = f"; ended with it: {', '.join(self.children)}" if self.children else ""
-        return f"{self.name} ({self.kind}) failed: {self.reason}{below}"
-
-
-class Planned(NamedTuple):
-    """A processor as it would be after a request."""
-
-    processor: Processor
-    stage: Stage
-    rows: Rows  # that it would get
-
-
 class Tree:
     """All processors of one component.
 
-    Requests are atomic and may come from any thread. Errors are `ComponentError` with the original's names.
+    Requests are atomic and may be called from any thread. They raise `ComponentError` with the original's exceptions.
 
     Parameters
     ----------
-    listener : Listener
-        Hears of every block and every end.
+    listener : TreeListener
+        Is notified of every block and every removal.
     workers : int, optional
-        How many threads compute. By default as many as the environment variable ROSAFE_WORKERS says, or as there are
-        cores to use.
-
-    Raises
-    ------
-    ValueError
-        For another number of workers than 1 to 1024.
+        Number of threads that compute. By default the value of the environment variable ROSAFE_WORKERS, or the number
+        of available cores. Raises ValueError if it is not between 1 and 1024.
     """
 
     def __init__(self, listener: TreeListener, workers: int | None = None) -> None:
-        self._processors: dict[str, Processor] = {}  # in the order of creation, as getParameters reports them
+        self._registry = ProcessorRegistry()
         self._lock = threading.RLock()  # guards all tokens
-        self._requests = threading.RLock()  # one request at a time; taken before _lock
-        self._failures: dict[str, Failure] = {}  # by the processor's name
+        self._requests = threading.RLock()  # one request at a time; acquired before _lock
         self._workers = Workers(self._lock, workers_to_use(workers))
-        self._company = TreeContext(self._workers, listener, self.end, threading.Condition(self._lock))
+        self._context = TreeContext(self._workers, listener, self.end, threading.Condition(self._lock))
         self.sample_rate = 0.0
-        self.port_seconds = 1.0
-        self.history_seconds = 1.0
+        self.port_seconds = self.history_seconds = 1.0
 
-    # --- asking ---
+    # --- queries ---
 
     @property
     def workers(self) -> int:
-        """How many may compute at the same time."""
+        """The maximum number of processors that compute at the same time."""
         return self._workers.count
 
     @property
     def processors(self) -> list[Processor]:
         """All processors in the order of their creation."""
         with self._requests:
-            return list(self._processors.values())
+            return list(self._registry.by_name.values())
 
     @property
     def input(self) -> Processor | None:
         """The root, if there is one."""
         with self._requests:
-            return next((p for p in self._processors.values() if p.parent is None), None)
+            return self._registry.root
 
     @property
     def failures(self) -> list[Failure]:
-        """The processors that ended by themselves, oldest first; without those that were created again since."""
+        """The processors that failed, oldest first, without those that were created again."""
         with self._requests:
-            return list(self._failures.values())
+            return list(self._registry.failures.values())
 
     def find(self, name: str) -> Processor:
-        """The processor called `name`, or e_noSuchProcessor."""
+        """Return the processor called `name`. Raises e_noSuchProcessor."""
         with self._requests:
-            try:
-                return self._processors[name]
-            except KeyError:
-                raise ROSAFE.error("e_noSuchProcessor", self._no_processor(name)) from None
-
-    def _no_processor(self, name: str) -> str:
-        failure = self._failures.get(name)
-        reason = f": {failure}" if failure is not None else ""
-        return f"there is no processor {short_repr(name)}{reason}; there are: {join_names(self._processors)}"
+            return self._registry.find(name)
 
     def dependencies(self, name: str) -> list[str]:
-        """The names from the input down to `name`."""
+        """Return the names from the input down to `name`."""
         with self._requests:
-            chain = []
-            processor: Processor | None = self.find(name)
-            while processor is not None:
-                chain.append(processor.name)
-                processor = processor.parent
-            return chain[::-1]
+            chain = [self.find(name)]
+            while (parent := chain[-1].parent) is not None:
+                chain.append(parent)
+            return [processor.name for processor in reversed(chain)]
 
     def observe(self, observer: Observer) -> Callable[[], None]:
-        """Tell `observer` the state of every processor, and from now on each that one enters; returns what ends it."""
+        """Call `observer` with each processor's state, now and after each change; return a function that ends this."""
         with self._requests, self._lock:
-            for processor in self._processors.values():
+            for processor in self._registry.by_name.values():
                 observer(processor, processor.state, None)
-            self._company.observers.append(observer)
+            self._context.observers.append(observer)
 
         def end() -> None:
             with self._lock:
-                self._company.observers.remove(observer)
+                self._context.observers.remove(observer)
 
         return end
 
-    # --- building ---
+    # --- add processors ---
 
     def check_input(self, name: str, sample_rate: float) -> None:
-        """Whether an input could begin now (it may replace the one there is)."""
+        """Raise ComponentError if no input can start now. It may replace the present one."""
         with self._requests:
-            holder = self._processors.get(name)
+            holder = self._registry.by_name.get(name)
             if holder is not None and holder.parent is not None:
-                raise ROSAFE.error("e_existsAlready", f"{short_repr(name)} exists already, of kind {holder.kind}")
+                raise already_exists(holder)
             root = self.input
             if root is not None and root.children and sample_rate != self.sample_rate:
-                raise ROSAFE.error(
-                    "e_badNewValue",
-                    what=f"the tree runs at {self.sample_rate:g} Hz, Audio is at {sample_rate:g} Hz: call Stop first",
-                )
+                rates = f"the tree runs at {self.sample_rate:g} Hz, Audio is at {sample_rate:g} Hz"
+                raise ROSAFE.error("e_badNewValue", what=f"{rates}: call Stop first")
 
     def add_input(
         self,
@@ -174,162 +118,124 @@ class Tree:
         port_seconds: float,
         history_seconds: float,
         parameters: Mapping[str, Any] | None = None,
+        ears: int = 2,
     ) -> Processor:
-        """Add the input, which starts to read `source`; it takes over the children of the one it replaces.
+        """Add the input, which starts to read `source`. It takes over the children of an input that it replaces.
 
-        Histories are raised to two blocks, as the original meant to. A tree whose source has come to its end is
-        removed: its processors have ended. A source that is refused is stopped.
+        Histories are raised to two blocks, as the original intended. A tree whose source has ended is removed. If the
+        input is rejected, `source` is stopped. Plugins, and processors that compare ears, require `ears` to be 2.
         """
         with self._requests:
             history_seconds = max(history_seconds, 2 * frames_per_block / source.sample_rate)
             old = self.input
             try:
                 self.check_input(name, source.sample_rate)
-                with _as_value_error():
-                    stage = STAGES[INPUT](source.sample_rate, **(parameters or {}))
-                    new = Processor(name, stage, None, history_seconds, self._company, source)
+                with _bad_new_value():
+                    stage = STAGES[INPUT](SignalFormat.sound(source.sample_rate, ears), **(parameters or {}))
+                    new = Processor(name, stage, None, history_seconds, port_seconds, self._context, source)
                     heir = old if old is not None and old.state is not State.DONE else new
-                    self._check(_planned(heir, stage, EARS, None), max(port_seconds, history_seconds), old)
+                    self._check_memory(preview_subtree(heir, stage), old, max(port_seconds, history_seconds))
             except ComponentError:
                 source.stop()
                 raise
             self.sample_rate = source.sample_rate
-            self.port_seconds = port_seconds
-            self.history_seconds = history_seconds
+            self.port_seconds, self.history_seconds = port_seconds, history_seconds
             if old is not None:
                 self._replace(old, new)
             else:
-                self._failures.clear()
-            self._begin(new)
+                self._registry.failures.clear()
+            self._start(new)
             return new
 
     def _replace(self, old: Processor, new: Processor) -> None:
-        """Hang all that depends on input `old` on `new`, and remove `old`; if it has ended, remove it all."""
+        """Move the children of input `old` to `new` and remove `old`. If `old` has ended, remove its children too."""
         with self._lock:
             if old.state is not State.DONE:
                 for child in list(old.children):
                     child.move(new)
         self._remove(old)
-        for processor in self._processors.values():
-            processor.history.seconds = self.history_seconds
-        self._processors = {new.name: new, **self._processors}
+        for processor in self._registry.by_name.values():
+            processor.history.seconds, processor.history.port_seconds = self.history_seconds, self.port_seconds
+        self._registry.by_name = {new.name: new, **self._registry.by_name}
 
     def check(self, kind: str, name: str, parent_name: str) -> Processor:
-        """The parent of a processor that could be added now; the original's order of errors."""
+        """Return the parent of a processor that can be added now. Raises ComponentError in the original's order."""
         with self._requests:
-            wanted = KINDS[kind].parent
-            parent = self._processors.get(parent_name)
-            if parent is None:
-                raise ROSAFE.error(
-                    "e_noUpperDependencie", f"{self._no_processor(parent_name)}{self._descendants_of_kind(wanted)}"
-                )
-            if name in self._processors:
-                there = self._processors[name].kind
-                raise ROSAFE.error("e_existsAlready", f"{short_repr(name)} exists already, of kind {there}")
-            if parent.kind != wanted:
-                raise ROSAFE.error(
-                    "e_noUpperDependencie",
-                    f"{short_repr(parent_name)} is of kind {parent.kind}, wanted is {wanted}"
-                    f"{self._descendants_of_kind(wanted)}",
-                )
-            return parent
-
-    def _descendants_of_kind(self, kind: str) -> str:
-        names = [processor.name for processor in self._processors.values() if processor.kind == kind]
-        return f"; of kind {kind}: {join_names(names)}"
+            return self._registry.find_parent(kind, name, parent_name)
 
     def add(self, kind: str, name: str, parent_name: str, parameters: Mapping[str, Any] | None = None) -> Processor:
-        """Add a processor of `kind` under `parent_name`; it runs when this returns."""
+        """Add a processor of `kind` below `parent_name`. It is running when this returns."""
         with self._requests:
             parent = self.check(kind, name, parent_name)
-            with _as_value_error():
+            with _bad_new_value():
                 stage = STAGES[kind](parent.signal, **(parameters or {}))
-                processor = Processor(name, stage, parent, self.history_seconds, self._company)
-                self._check(_planned(processor, stage, parent.output_shape, parent.stage), self._longest)
-            self._begin(processor)
+                processor = Processor(name, stage, parent, self.history_seconds, self.port_seconds, self._context)
+                self._check_memory(preview_subtree(processor, stage))
+            self._start(processor)
             return processor
 
-    def _begin(self, processor: Processor) -> None:
-        self._processors[processor.name] = processor
-        self._failures.pop(processor.name, None)
+    def _start(self, processor: Processor) -> None:
+        self._registry.add(processor)
         try:
-            self._company.listener.on_added(processor)
+            self._context.listener.on_added(processor)
             processor.start()
         except BaseException:
             self._remove(processor)
             raise
 
-    @property
-    def _longest(self) -> float:
-        """Seconds of output that are kept, on a port or as history: these refer to the same blocks."""
-        return max(self.port_seconds, self.history_seconds)
+    def _check_memory(
+        self, previews: list[ProcessorPreview], replaced: Processor | None = None, seconds: float | None = None
+    ) -> None:
+        """Raise ValueError if the previewed processors, instead of the subtree of `replaced`, need too much memory."""
+        if seconds is None:
+            seconds = max(self.port_seconds, self.history_seconds)  # both refer to the same blocks
+        without = set(subtree(replaced)) if replaced is not None else set()
+        others = [processor for processor in self._registry.by_name.values() if processor not in without]
+        check_memory(previews, others, seconds)
 
-    def _check(self, planned: Iterable[Planned], seconds: float, instead_of: Processor | None = None) -> None:
-        """ValueError where what is `final_stage` would fill the memory.
-
-        That is with `seconds` of output or with the samples of one frame, or with the output of the whole tree as it
-        would be then: without `instead_of` and all below it.
-        """
-        coming = [(stage, rows) for _, stage, rows in planned]
-        for stage, rows in coming:
-            sizes.check_stage(stage, rows, seconds)
-        replaced = set(subtree(instead_of)) if instead_of is not None else set()
-        others = [p for p in self._processors.values() if p not in replaced]
-        sizes.check_all([*coming, *filter(None, [p.ask(_sized) for p in others])], seconds)
-
-    # --- changing ---
+    # --- change parameters ---
 
     def modify(
         self,
         name: str,
         parameter_name: str,
         text: str,
-        taken: Callable[[Parameter, Any], Any] = Parameter.resolve_choice,
+        resolve: Callable[[Parameter, Any], Any] = Parameter.resolve_choice,
     ) -> Processor:
         """modifyParameter: change one parameter, given as text, from the processor's next block on.
 
-        `taken(parameter, value)` is what is taken for a value that may be an unknown word.
+        `resolve(parameter, value)` returns the value to use for a value that may be an unknown choice.
         """
         with self._requests:
             processor = self.find(name)
-            try:
-                parameter = processor.representation.parameter(parameter_name)
-            except KeyError:
-                known = [p.name for p in processor.representation.parameters]
-                raise ROSAFE.error(
-                    "e_noSuchParameter",
-                    f"processors of kind {processor.kind} have no {short_repr(parameter_name)}, but: "
-                    f"{join_names(known)}"
-                    f"{did_you_mean(parameter_name, known)}",
-                ) from None
-            with _as_value_error():
-                self._change(processor, parameter.name, taken(parameter, parameter.parse(text, parameter_name)))
+            parameter = _find_parameter(processor, parameter_name)
+            with _bad_new_value():
+                self._change(processor, parameter.name, resolve(parameter, parameter.parse(text, parameter_name)))
             return processor
 
     def schedule(self, block: int, parameter_name: str, value: Any) -> None:
-        """Change a parameter, of every processor that has it, before block `block` of the input.
+        """Change a parameter of every processor that has it before block `block` of the input.
 
-        Several changes come in the order of their blocks: each is checked after all that were made before it.
+        The blocks of successive calls ascend: each change is checked after all previous ones.
         """
-        with self._requests, _as_value_error():
-            for processor in self._processors.values():
+        with self._requests, _bad_new_value():
+            for processor in self._registry.by_name.values():
                 if any(parameter_name == p.name for p in processor.representation.parameters):
                     self._change(processor, parameter_name, value, block)
 
     def _change(self, processor: Processor, name: str, value: Any, block: int = 0) -> None:
-        """Change a parameter if all processors below can go on then; else ValueError, and nothing has changed."""
+        """Change a parameter. If a descendant rejects the change, raise ValueError and change nothing."""
         changed = processor.changes.preview(name, value)
-        above = None if processor.parent is None else processor.parent.stage
-        planned = list(_planned(processor, changed, processor.input_shape, above))
-        self._check(planned, self._longest, processor)
-        for one, stage, _ in planned:
+        previews = preview_subtree(processor, changed)
+        self._check_memory(previews, replaced=processor)
+        for one, stage, _ in previews:
             one.changes.final_stage = stage
         processor.changes.enqueue(changed, name, value, block)
 
-    # --- removing ---
+    # --- remove processors ---
 
     def remove(self, name: str) -> list[Processor]:
-        """Remove a processor and all below it, leaves first; they are gone when this returns."""
+        """Remove a processor and its descendants, leaves first, and return them."""
         with self._requests:
             processor = self.find(name)
             if processor.parent is None:
@@ -337,71 +243,51 @@ class Tree:
             return self._remove(processor)
 
     def end(self, processor: Processor) -> None:
-        """Remove `processor` (the input too) and all below it, if it is still in the tree."""
+        """Remove `processor`, which may be the input, and its descendants, if it is still in the tree."""
         with self._requests:
-            if self._processors.get(processor.name) is processor:
+            if self._registry.by_name.get(processor.name) is processor:
                 if processor.error is not None:
-                    self._failures[processor.name] = Failure.of(processor)
-                    for name in list(self._failures)[:-MAX_FAILURES]:
-                        del self._failures[name]
+                    self._registry.record_failure(processor)
                 self._remove(processor)
 
     def skip(self, processor: Processor, block: int) -> None:
-        """Let all others continue while `processor` still computes its block number `block`: it misses blocks then."""
+        """Let all others continue while `processor` still computes block number `block`. It misses blocks then."""
         with self._lock:
             if processor.state is State.EXEC and processor.blocks == block and not processor.skipped:
                 processor.skip()
                 self._workers.wake()
 
     def stop(self) -> None:
-        """Remove everything. Workers may still be at a block each, of which nobody will hear."""
+        """Remove all processors. Each worker may still compute a block, whose result is discarded."""
         with self._requests:
-            root = self.input
-            if root is not None:
+            if (root := self.input) is not None:
                 self._remove(root)
 
     def join(self) -> None:
-        """After `stop`, wait until the workers have ended."""
+        """Wait until the workers have ended, after `stop`."""
         self._workers.join()
 
     def _remove(self, processor: Processor) -> list[Processor]:
-        # Their threads may still work on one long block; nobody waits for that, and nobody will see it.
-        going = list(subtree(processor))
-        for one in going:
+        removed = list(subtree(processor))
+        for one in removed:  # a worker may still compute a long block of it: this is not waited for
             one.end()
-            del self._processors[one.name]
-        return going
+            del self._registry.by_name[one.name]
+        return removed
+
+
+def _find_parameter(processor: Processor, name: str) -> Parameter:
+    try:
+        return processor.representation.parameter(name)
+    except KeyError:
+        known = [p.name for p in processor.representation.parameters]
+        text = f"processors of kind {processor.kind} have no {short_repr(name)}; they have: {join_names(known)}"
+        raise ROSAFE.error("e_noSuchParameter", f"{text}{did_you_mean(name, known)}") from None
 
 
 @contextmanager
-def _as_value_error() -> Iterator[None]:
-    """Make e_badNewValue of any ValueError."""
+def _bad_new_value() -> Iterator[None]:
+    """Raise e_badNewValue instead of ValueError."""
     try:
         yield
     except ValueError as problem:
         raise ROSAFE.error("e_badNewValue", what=str(problem)) from None
-
-
-def _planned(processor: Processor, stage: Stage, rows: Rows, above: Stage | None) -> Iterator[Planned]:
-    """`processor` with `stage`, and all below it as they would be then; ValueError where one could not go on.
-
-    `above` is the stage of its parent.
-    """
-    if above is not None and stage.required_extra and stage.required_extra not in above.EXTRAS:
-        raise ValueError(f"{processor.kind} needs the {stage.required_extra} of {above.REPRESENTATION}, which has none")
-    yield Planned(processor, stage, rows)
-    for child in list(processor.children):
-        below = child.ask(
-            lambda one: list(
-                _planned(one, one.changes.preview_input(stage.output_format), stage.output_rows(rows), stage)
-            )
-        )
-        yield from below or ()
-
-
-def _sized(processor: Processor) -> tuple[Stage, Rows]:
-    """The stage of a processor and the rows of its input, once the stage has answered what its sizes are."""
-    stage, rows = processor.stage, processor.input_shape
-    sizes.output_size(stage, rows, 0.0)
-    sizes.state_size(stage, rows)
-    return stage, rows

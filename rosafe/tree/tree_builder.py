@@ -1,4 +1,4 @@
-"""Makes whole trees of processors, as `rosafe.tree.tree_planner` plans them, with the services of a component."""
+"""Build whole trees of processors, planned by `rosafe.tree.tree_planner`, by the services of a component."""
 
 from __future__ import annotations
 
@@ -11,29 +11,29 @@ from typing import Any, Protocol, TypeVar
 
 from rosafe.interface import BLOCK_AND_BUFFERS, KINDS, REQUEST, ROSAFE, ComponentError
 from rosafe.representations import BUILTIN
-from rosafe.tree import tree_planner as request
+from rosafe.tree import tree_planner
 from rosafe.tree.tree_planner import ExistingProcessor, ServiceCall, TreePlan, TreeRequest
 
-MAX_ATTEMPTS = 20  # plans that others' changes of the tree may spoil before the error is told
-INPUT_SECONDS = 1.5  # longer than an InputProc waits for sound
+MAX_ATTEMPTS = 20  # plans that become invalid because other clients change the tree, before this is an error
+INPUT_SECONDS = 1.5  # longer than InputProc waits for sound
 POLL_SECONDS = 0.02
-LOOK_SECONDS = 0.1  # between two looks at the tree while many processors are removed
-BEGIN_BLOCKS, BEGIN_SECONDS = 2.5, 2.0  # how long plugins are watched after they were started: blocks, at most seconds
+LIST_SECONDS = 0.1  # between two requests for the list of processors while many are removed
+BEGIN_BLOCKS, BEGIN_SECONDS = 2.5, 2.0  # how long new plugins are observed: blocks, and at most seconds
 
 T = TypeVar("T")
 
 
 class Turns:
-    """Takes turns among the builds of one component, first come, first served.
+    """Queue of the builds of one component: one at a time, first come, first served.
 
-    A setup is long: it gives way to waiting builds between two of its steps, and then looks at the tree again.
+    Loading a setup takes long. It lets waiting builds run between two of its steps, and then lists the tree again.
 
     Attributes
     ----------
     reserved : frozenset of str
-        The names that a setup under way makes; other builds choose different ones.
+        The names of the processors that a setup in progress creates; other builds choose different names.
     kept : set of str
-        What other builds use of it; it stays also if the setup fails.
+        The processors of this setup that other builds use. They are kept even if the setup fails.
     """
 
     def __init__(self) -> None:
@@ -45,7 +45,7 @@ class Turns:
 
     @asynccontextmanager
     async def turn(self) -> AsyncIterator[None]:
-        """Have the turn inside the `async with` block."""
+        """Wait for the turn, and have it inside the `async with` block."""
         self._waiting += 1
         try:
             await self._lock.acquire()
@@ -58,7 +58,7 @@ class Turns:
 
     @asynccontextmanager
     async def setup(self, names: Iterable[str]) -> AsyncIterator[None]:
-        """Reserve the names of a setup inside the block. One setup at a time."""
+        """Reserve the names of a setup inside the block. One setup is loaded at a time."""
         async with self._setups:
             self.reserved, self.kept = frozenset(names), set()
             try:
@@ -67,12 +67,12 @@ class Turns:
                 self.reserved, self.kept = frozenset(), set()
 
     def keep(self, names: Iterable[str]) -> None:
-        """Note that a build uses the processors of these names: a setup under way does not remove them."""
+        """Record that a build uses the processors of these names, so that a setup in progress does not remove them."""
         if self.reserved:
             self.kept.update(names)
 
     async def give_way(self) -> bool:
-        """Let all waiting builds have their turn; return whether there were any. To be called by whose turn it is."""
+        """Give up the turn until all waiting builds have run. Return whether there were any."""
         if not self._waiting:
             return False
         self._lock.release()
@@ -81,96 +81,109 @@ class Turns:
 
 
 class Services(Protocol):
-    """A rosAFE, by its services."""
+    """The services of a rosAFE."""
 
     instance: str
     turns: Turns
 
     async def outputs(self, service: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
-        """What a service returns; an activity, nothing, as soon as it runs. Raises ComponentError."""
+        """Call a service and return its outputs, for an activity none when it is running. Raises ComponentError."""
 
     async def port_connected(self, port: str) -> str:
-        """The topic that an input port is connected to, or nothing."""
+        """Return the topic that an input port is connected to, or an empty string."""
 
     async def published(self, topic: str) -> bool:
-        """Whether somebody publishes `topic`."""
+        """Return whether `topic` is published."""
 
 
 async def build(component: Services, values: Mapping[str, Any]) -> dict[str, Any]:
-    """Make or find the processors that `values` ask for, those of REQUEST's parameters that are given; its outputs.
+    """Create or reuse the processors for `values`, which are parameters of REQUEST, and return its outputs.
 
-    Where anything fails, or the task is cancelled, what was made is removed again, as far as nothing of others hangs on
-    it. Others may change the tree meanwhile; a caller keeps his own requests apart, so that what one has found is not
-    removed by another that fails.
+    If a step fails or the task is cancelled, the created processors are removed again, except those with children of
+    other clients. Other clients may change the tree concurrently. The caller runs its own requests one at a time, so
+    that a failing request does not remove a processor that another one reuses.
 
     Raises
     ------
     ComponentError
-        The component's own.
+        An error of the component.
     """
-    wish = await _understood(values)
-    made: list[str] = []
+    request = await _parse(values)
+    created: list[str] = []
     try:
-        dependencies = await _carry_out(component, wish, made)
-        if set(wish.kinds) - BUILTIN and made:
-            await _watch_begin(component, made)
+        dependencies = await _execute(component, request, created)
+        if _has_plugins(request) and created:
+            await _watch_begin(component, created)
     except BaseException:
-        await shield_until_done(remove(component, made))
+        await shield_until_done(remove(component, created))
         raise
     component.turns.keep(dependencies)
-    return request.build_response(wish, dependencies, made, component.instance)
+    return tree_planner.build_response(request, dependencies, created, component.instance)
 
 
-async def _watch_begin(component: Services, made: list[str]) -> None:
-    """Raise ComponentError if a processor that was made fails with one of its first blocks, as plugins may."""
+def _has_plugins(request: TreeRequest) -> bool:
+    return bool(set(request.kinds) - BUILTIN)
+
+
+async def _check_all_exist(component: Services, names: Iterable[str]) -> None:
+    """Raise ComponentError, with the reason, if one of the processors has failed; a plugin would fail again."""
+    for name in names:
+        await component.outputs("getDependencies", {"nameProc": name})
+
+
+async def _watch_begin(component: Services, created: list[str]) -> None:
+    """Raise ComponentError if a created processor fails in one of its first blocks, as plugins may."""
     found = await list_processors(component)
     root = next((p for p in found if not p.parent), None)
     block = root.values["nFramesPerBlock"] / root.rate if root is not None and root.rate else 0.0
     deadline = asyncio.get_running_loop().time() + min(BEGIN_SECONDS, BEGIN_BLOCKS * block)
     while True:
-        for name in made:
-            await component.outputs("getDependencies", {"nameProc": name})
+        await _check_all_exist(component, created)
         if asyncio.get_running_loop().time() > deadline:
             return
         await asyncio.sleep(POLL_SECONDS)
 
 
 async def find(component: Services, values: Mapping[str, Any]) -> dict[str, Any]:
-    """What `build` would answer if all that it needs is there; ``::rosAFE::e_noSuchProcessor`` where it is not."""
-    wish = await _understood(values)
-    plan = request.plan(wish, await list_processors(component))
+    """Return the response of `build` if all processors exist. Raises ``::rosAFE::e_noSuchProcessor`` if not."""
+    request = await _parse(values)
+    plan = tree_planner.plan(request, await list_processors(component))
     if plan.steps:
-        missing = ", ".join(step.service for step in plan.steps if step.makes)
+        missing = ", ".join(step.service for step in plan.steps if step.creates)
         raise ROSAFE.error("e_noSuchProcessor", what=f"there is none with these parameters; missing: {missing}")
-    return request.build_response(wish, plan.dependencies, (), component.instance)
+    return tree_planner.build_response(request, plan.dependencies, (), component.instance)
 
 
-async def _understood(values: Mapping[str, Any]) -> TreeRequest:
-    given = dict(values)
-    kind = request.kind_of(given.pop("representation"))
-    return await asyncio.to_thread(request.parse_request, kind, given)  # numpy's and scipy's work, and their import
+async def _parse(values: Mapping[str, Any]) -> TreeRequest:
+    parameters = dict(values)
+    kind = tree_planner.kind_of(parameters.pop("representation"))
+    return await asyncio.to_thread(tree_planner.parse_request, kind, parameters)  # imports and uses numpy and scipy
 
 
-async def _carry_out(component: Services, wish: TreeRequest, made: list[str]) -> list[str]:
-    problem = ComponentError("::genom::mwerr", what="others change the tree all the time")
+async def _execute(component: Services, request: TreeRequest, created: list[str]) -> list[str]:
+    problem = ComponentError(
+        "::genom::mwerr", what=f"gave up after {MAX_ATTEMPTS} attempts: other clients kept changing the tree"
+    )
     for _ in range(MAX_ATTEMPTS):
-        plan = request.plan(wish, await list_processors(component), component.turns.reserved)
+        plan = tree_planner.plan(request, await list_processors(component), component.turns.reserved)
         try:
-            await _take_steps(component, wish, plan, made)
+            await _execute_plan(component, request, plan, created)
         except ComponentError as error:
-            if not request.is_race(error):
+            if not tree_planner.is_race(error):
                 raise
             problem = error
-            if error.ex == request.INTERRUPTED:
+            if error.ex == tree_planner.INTERRUPTED:
                 await wait_for_input(component)
         else:
-            if not plan.steps or request.chain_exists(plan.dependencies, await list_processors(component)):
+            if not plan.steps or tree_planner.chain_exists(plan.dependencies, await list_processors(component)):
                 return plan.dependencies
+            if _has_plugins(request):
+                await _check_all_exist(component, [step.creates for step in plan.steps if step.creates])
     raise problem
 
 
 async def wait_for_input(component: Services) -> None:
-    """Let another's InputProc, which has taken the place of ours, come to its end: it may be waiting for sound."""
+    """Wait until the InputProc of another client, which has interrupted ours, ends; it may wait for sound."""
     deadline = asyncio.get_running_loop().time() + INPUT_SECONDS
     while asyncio.get_running_loop().time() < deadline:
         if await list_processors(component):
@@ -178,33 +191,33 @@ async def wait_for_input(component: Services) -> None:
         await asyncio.sleep(POLL_SECONDS)
 
 
-async def _take_steps(component: Services, wish: TreeRequest, plan: TreePlan, made: list[str]) -> None:
-    if plan.steps and plan.steps[0].makes == plan.dependencies[0]:
-        await _connect(component, wish)
+async def _execute_plan(component: Services, request: TreeRequest, plan: TreePlan, created: list[str]) -> None:
+    if plan.steps and plan.steps[0].creates == plan.dependencies[0]:
+        await _connect(component, request)
     for step in plan.steps:
-        await shield_until_done(execute_step(component, step, made))
+        await shield_until_done(execute_step(component, step, created))
 
 
-async def execute_step(component: Services, step: ServiceCall, made: list[str]) -> None:
-    """Make one request, and note what it has made."""
+async def execute_step(component: Services, step: ServiceCall, created: list[str]) -> None:
+    """Call a service, and append the name of the processor that it has created to `created`."""
     await component.outputs(step.service, step.values)
-    if step.makes:
-        made.append(step.makes)
+    if step.creates:
+        created.append(step.creates)
 
 
 async def shield_until_done(work: Awaitable[T]) -> T:
-    """Do `work` to its end, also where the task is cancelled meanwhile: what a request made must be known."""
+    """Complete `work` even if the task is cancelled meanwhile: the processors that a call creates must be known."""
     task = asyncio.ensure_future(work)
     try:
         return await asyncio.shield(task)
     except asyncio.CancelledError:
-        await asyncio.gather(task, return_exceptions=True)  # how it ends is of no interest any more
+        await asyncio.gather(task, return_exceptions=True)  # its result is no longer needed
         raise
 
 
-async def _connect(component: Services, wish: TreeRequest) -> None:
-    """Connect the Audio port to the topic that the client named, or to bass where it is not connected yet."""
-    topic = wish.connect
+async def _connect(component: Services, request: TreeRequest) -> None:
+    """Connect the Audio port to the topic that the client named, or to bass if it is not connected yet."""
+    topic = str(request.explicit.get("connect", ""))
     if not topic and not await component.port_connected("Audio"):
         default = REQUEST.parameter("connect").default
         topic = default if await component.published(f"/{default}") else ""
@@ -213,7 +226,7 @@ async def _connect(component: Services, wish: TreeRequest) -> None:
 
 
 async def list_processors(component: Services) -> list[ExistingProcessor]:
-    """All processors of the kinds that are known here."""
+    """Return all processors whose kind is known here."""
     found = []
     for processor in (await component.outputs("getProcessors", {}))["processors"]:
         kind = KINDS.get(processor["kind"])
@@ -226,15 +239,15 @@ async def list_processors(component: Services) -> list[ExistingProcessor]:
     return found
 
 
-async def remove(component: Services, made: list[str]) -> None:
-    """Remove what was made, leaves first, but nothing that others have come to use. Errors are told by what failed."""
-    clock, looked = asyncio.get_running_loop().time, -math.inf
+async def remove(component: Services, created: list[str]) -> None:
+    """Remove the created processors, leaves first, except those that other clients use. Stops at the first error."""
+    clock, listed = asyncio.get_running_loop().time, -math.inf
     found: dict[str, ExistingProcessor] = {}
     children: Counter[str] = Counter()
     try:
-        for name in reversed(made):
-            if await component.turns.give_way() or clock() - looked > LOOK_SECONDS:
-                found, looked = {p.name: p for p in await list_processors(component)}, clock()
+        for name in reversed(created):
+            if await component.turns.give_way() or clock() - listed > LIST_SECONDS:
+                found, listed = {p.name: p for p in await list_processors(component)}, clock()
                 children = Counter(p.parent for p in found.values())
             if name not in found or children[name] or name in component.turns.kept:
                 continue

@@ -1,7 +1,6 @@
-"""One request for a whole tree: what a representation needs, which of it is there, and the requests for the rest.
+"""Plan of a request for a whole tree: the processors to reuse, and the service calls that create the others.
 
-Pure: `plan` goes from what getParameters and getDependencies tell to the requests to make. rosafe/tree/tree_builder.py
-makes them; docs/request.md has the rules.
+This module calls no service. rosafe/tree/tree_builder.py executes the plan; docs/request.md has the rules.
 """
 
 from __future__ import annotations
@@ -15,19 +14,18 @@ from typing import Any, NamedTuple
 
 from rosafe.declarations import plugins
 from rosafe.declarations.text import did_you_mean
-from rosafe.interface import BASS, KINDS, REQUEST, ROSAFE, ComponentError, Representation, format_value
+from rosafe.interface import KINDS, REQUEST, ROSAFE, ComponentError, Representation, format_value
 from rosafe.interface.arguments import check_parameter
 from rosafe.representations import PROBLEMS, STAGES
 
-HIGHEST_RATE = float(BASS.service("Acquire").parameter("sampleRate").maximum or 0)  # Hz; what is wrong there is at any
 INTERRUPTED = "::genom::interrupted"
 _RACES = {f"::rosAFE::{short}" for short in ("e_existsAlready", "e_noUpperDependencie", "e_noSuchProcessor")}
-# What only the making of an input needs: the topic, and InputProc's parameters without its name.
+# Parameters that only the creation of an input needs: the topic, and those of InputProc except its name.
 OF_THE_INPUT = ("connect", *(p.name for p in ROSAFE.service("InputProc").parameters[1:]))
 
 
 class ExistingProcessor(NamedTuple):
-    """A processor of the tree. `values` are those of getParameters; `parent` is empty for the input."""
+    """A processor of the tree. `values` are those that getParameters returns; `parent` is empty for the input."""
 
     name: str
     kind: str
@@ -37,15 +35,15 @@ class ExistingProcessor(NamedTuple):
 
 
 class ServiceCall(NamedTuple):
-    """One request to make, with all its values; `makes` is the name of the processor that it adds, if it does."""
+    """A service call with all its values. `creates` is the name of the processor that it creates, if any."""
 
     service: str
     values: dict[str, Any]
-    makes: str = ""
+    creates: str = ""
 
 
 class TreePlan(NamedTuple):
-    """The names from the input down to the wanted processor, and what to do for those that are not there."""
+    """The names from the input down to the requested processor, and the calls that create the missing ones."""
 
     dependencies: list[str]
     steps: list[ServiceCall]
@@ -53,57 +51,60 @@ class TreePlan(NamedTuple):
 
 @dataclass(frozen=True)
 class ProcessorSpec:
-    """One processor on the way from the input to the wanted one.
+    """A processor on the way from the input to the requested one.
 
-    `values` are all its parameters, as asked for; `in_force` what getParameters tells of a processor that was made
-    with them (of a filterbank, the channels that come of it); `given` those that the client named.
+    Attributes
+    ----------
+    kind : Representation
+    values : mapping
+        All its parameters, with defaults.
+    effective : mapping
+        The values that getParameters returns for a processor that was created with `values`; for a filterbank these
+        include the resulting channels.
+    explicit : mapping
+        The parameters that the client named.
     """
 
     kind: Representation
     values: Mapping[str, Any]
-    in_force: Mapping[str, Any]
-    given: Mapping[str, Any]
+    effective: Mapping[str, Any]
+    explicit: Mapping[str, Any]
 
     def matches(self, found: ExistingProcessor, sample_rate: float) -> bool:
-        """Whether `found`, at a sample rate (Hz), is what is wanted: each parameter the same, to the last digit.
+        """Return whether `found` has exactly these parameters at a sample rate in Hz.
 
-        A structure of getParameters fits the processor that it describes, though one that was made with all that
-        it names would tell otherwise of how its channels were chosen.
+        The values that getParameters returned for a processor match this processor too, although a processor created
+        with all of them would report another selection of its channels.
         """
-        told = {name: found.values[name] for name in self.in_force}
-        in_force = self.in_force
+        reported = {name: found.values[name] for name in self.effective}
+        effective = self.effective
         if sample_rate and any(p.follows_rate for p in self.kind.parameters):
             stage = STAGES[self.kind.kind]
-            in_force = stage.effective_values(stage.resolve_rate_defaults(self.values, self.given, sample_rate))
-        return told in (in_force, {**in_force, **self.given})
+            effective = stage.effective_values(stage.resolve_rate_defaults(self.values, self.explicit, sample_rate))
+        return reported in (effective, {**effective, **self.explicit})
 
 
 @dataclass(frozen=True)
 class TreeRequest:
-    """A checked request for a whole tree: `levels` from the input to the wanted processor, `given` by the client."""
+    """A checked request for a whole tree: the processors from the input to the requested one."""
 
-    levels: tuple[ProcessorSpec, ...]
-    input_values: Mapping[str, Any]  # of InputProc, less its name
-    given: Mapping[str, Any]
+    specs: tuple[ProcessorSpec, ...]
+    input_values: Mapping[str, Any]  # of InputProc, except its name
+    explicit: Mapping[str, Any]  # by the client
 
     @property
     def kinds(self) -> list[str]:
-        """The kinds of processors on the way, the input first."""
-        return [level.kind.kind for level in self.levels]
-
-    @property
-    def connect(self) -> str:
-        """The topic to connect the Audio port to, whatever it is connected to; empty where the client named none."""
-        return str(self.given.get("connect", ""))
+        """The kinds of the processors, the input first."""
+        return [spec.kind.kind for spec in self.specs]
 
 
-# --- what is wanted ---------------------------------------------------------------------------------------------
+# --- requests ---------------------------------------------------------------------------------------------------
 
 
 def kind_of(representation: str) -> Representation:
-    """The kind of processor that computes `representation`, by the original client's name or ours, in any case.
+    """Return the kind of processor called `representation`, by the original client's name or ours, in any case.
 
-    Raises ValueError for any other name.
+    Raises ValueError for an unknown name.
     """
     for kind in KINDS.values():
         if representation.lower() in map(str.lower, (kind.word, *kind.word_aliases, kind.kind)):
@@ -111,109 +112,108 @@ def kind_of(representation: str) -> Representation:
     parameter = REQUEST.parameter("representation")
     hint = did_you_mean(representation, parameter.choices)
     raise ValueError(
-        f"representation: {representation[:80]!r} is not {parameter.range_text}; plugins are loaded when a program "
-        f"starts: {searched()}{hint}"
+        f"representation: expected {parameter.range_text}, got {representation[:80]!r}; plugins are loaded when a "
+        f"program starts: {searched()}{hint}"
     )
 
 
 def searched() -> str:
-    """Where plugins were searched for, and which were left out."""
+    """Return where plugins were searched, and which were left out."""
     return "; left out: ".join((plugins.where(), *PROBLEMS))
 
 
 def ancestor_kinds(kind: Representation) -> list[Representation]:
-    """The kinds of processors from the input down to `kind`."""
+    """Return the kinds of processors from the input down to `kind`."""
     return [*(ancestor_kinds(KINDS[kind.parent]) if kind.parent else ()), kind]
 
 
-def parse_request(kind: Representation, given: Mapping[str, Any]) -> TreeRequest:
-    """The checked request for a processor of `kind`.
+def parse_request(kind: Representation, values: Mapping[str, Any]) -> TreeRequest:
+    """Check a request for a processor of `kind`.
 
     Parameters
     ----------
     kind : Representation
         From `kind_of`.
-    given : mapping
-        Parameters of `interface.REQUEST` by their own names, of the right Python types; taken literally, 0 too.
+    values : mapping
+        Parameters of `interface.REQUEST` by their own names, of the right Python types. 0 does not mean the default.
 
     Raises
     ------
     ComponentError
-        ``::rosAFE::e_badNewValue``, as the component itself would, for what no sample rate makes possible.
+        ``::rosAFE::e_badNewValue``, as from the component, for a value that is wrong at every sample rate.
     """
-    for above in ancestor_kinds(kind):
-        given = STAGES[above.kind].request_values(given)
+    for ancestor in ancestor_kinds(kind):
+        values = STAGES[ancestor.kind].request_values(values)
     try:
         for name in OF_THE_INPUT:
-            if name in given:
-                REQUEST.parameter(name).check(given[name])
-        # What belongs to none of them has no effect, and is checked all the same.
-        checked = dict(check_parameter(name, value) for name, value in given.items() if name not in OF_THE_INPUT)
-        levels = tuple(_level(above, checked) for above in ancestor_kinds(kind))
+            if name in values:
+                REQUEST.parameter(name).check(values[name])
+        # Parameters of none of the processors have no effect, but they are checked too.
+        checked = dict(check_parameter(name, value) for name, value in values.items() if name not in OF_THE_INPUT)
+        specs = tuple(_spec(ancestor, checked) for ancestor in ancestor_kinds(kind))
     except ValueError as problem:
         raise ROSAFE.error("e_badNewValue", what=str(problem)) from None
-    input_values = {p.name: given.get(p.name, p.default) for p in ROSAFE.service("InputProc").parameters[1:]}
-    return TreeRequest(levels, input_values, dict(given))
+    input_values = {p.name: values.get(p.name, p.default) for p in ROSAFE.service("InputProc").parameters[1:]}
+    return TreeRequest(specs, input_values, dict(values))
 
 
-def _level(kind: Representation, checked: Mapping[str, Any]) -> ProcessorSpec:
-    given = {p.name: checked[p.name] for p in kind.parameters if p.name in checked}
-    values = {p.name: p.check(p.default) for p in kind.parameters} | given
-    return ProcessorSpec(kind, values, STAGES[kind.kind].effective_values(values), given)
+def _spec(kind: Representation, checked: Mapping[str, Any]) -> ProcessorSpec:
+    explicit = {p.name: checked[p.name] for p in kind.parameters if p.name in checked}
+    values = {p.name: p.check(p.default) for p in kind.parameters} | explicit
+    return ProcessorSpec(kind, values, STAGES[kind.kind].effective_values(values), explicit)
 
 
-# --- what to do -------------------------------------------------------------------------------------------------
+# --- plans ------------------------------------------------------------------------------------------------------
 
 
-def plan(wish: TreeRequest, found: Sequence[ExistingProcessor], reserved: Collection[str] = ()) -> TreePlan:
-    """What to do for `wish` in a tree that consists of `found`; new processors get none of the names `reserved`.
+def plan(request: TreeRequest, found: Sequence[ExistingProcessor], reserved: Collection[str] = ()) -> TreePlan:
+    """Plan `request` in a tree that consists of `found`. New processors get none of the names `reserved`.
 
-    What is there and fits is used, as far down as possible; the rest is made below it, under new names.
+    The longest chain of existing processors that match is reused; the others are created below it under new names.
 
     Raises
     ------
     ComponentError
-        ``::rosAFE::e_existsAlready`` where the input, of which there is but one, has other parameters than given.
+        ``::rosAFE::e_existsAlready`` if the input, of which there is only one, has other parameters than requested.
     """
     root = next((p for p in found if not p.parent and p.kind == "input"), None)
     if root is not None:
-        _check_input(root, wish.levels[0])
-    reused = _deepest(wish.levels, found, root.rate if root is not None else 0.0)
+        _check_input(root, request.specs[0])
+    reused = _longest_match(request.specs, found, root.rate if root is not None else 0.0)
     names = {*reserved, *(p.name for p in found)}
     dependencies, steps = reused[:], []
-    for level in wish.levels[len(reused) :]:
-        name = free_name(level.kind, names)
+    for spec in request.specs[len(reused) :]:
+        name = free_name(spec.kind, names)
         names.add(name)
-        steps += creation_call(level, name, dependencies[-1] if dependencies else "", wish.input_values)
+        steps += creation_call(spec, name, dependencies[-1] if dependencies else "", request.input_values)
         dependencies.append(name)
     return TreePlan(dependencies, steps)
 
 
-def _check_input(root: ExistingProcessor, level: ProcessorSpec) -> None:
-    for name, value in level.given.items():
+def _check_input(root: ExistingProcessor, spec: ProcessorSpec) -> None:
+    for name, value in spec.explicit.items():
         if root.values[name] != value:
-            there = f"the input {root.name!r} has {name} {format_value(root.values[name])}"
-            what = f"{there}, which modifyParameter changes for all"
-            raise ROSAFE.error("e_existsAlready", what=what)
+            present = f"the input {root.name!r} has {name} {format_value(root.values[name])}"
+            raise ROSAFE.error("e_existsAlready", what=f"{present}, which modifyParameter changes for all")
 
 
-def _deepest(levels: Sequence[ProcessorSpec], found: Iterable[ExistingProcessor], sample_rate: float) -> list[str]:
-    """The names, from the input on, of the longest line of processors that fit."""
-    lines: dict[str, list[str]] = {"": []}  # that fit so far, by the name of their last processor
-    for level in levels:
+def _longest_match(specs: Sequence[ProcessorSpec], found: Iterable[ExistingProcessor], sample_rate: float) -> list[str]:
+    """Return the names, from the input on, of the longest chain of processors that match."""
+    chains: dict[str, list[str]] = {"": []}  # that match so far, by the name of their last processor
+    for spec in specs:
         longer = {
-            p.name: [*lines[p.parent], p.name]
+            p.name: [*chains[p.parent], p.name]
             for p in found
-            if p.kind == level.kind.kind and p.parent in lines and (not p.parent or level.matches(p, sample_rate))
+            if p.kind == spec.kind.kind and p.parent in chains and (not p.parent or spec.matches(p, sample_rate))
         }
         if not longer:
             break
-        lines = longer
-    return next(iter(lines.values()))
+        chains = longer
+    return next(iter(chains.values()))
 
 
 def free_name(kind: Representation, names: Collection[str]) -> str:
-    """A name for another processor of `kind` beside those called `names`: numbered after the highest of its sort."""
+    """Return a name for a new processor of `kind` that is not in `names`, numbered after the highest of its kind."""
     pattern = re.compile(rf"{kind.word}_([0-9]{{1,9}})")
     number = 1 + max((int(match[1]) for match in map(pattern.fullmatch, names) if match), default=-1)
     while f"{kind.word}_{number}" in names:
@@ -221,17 +221,19 @@ def free_name(kind: Representation, names: Collection[str]) -> str:
     return f"{kind.word}_{number}"
 
 
-def creation_call(level: ProcessorSpec, name: str, parent: str, input_values: Mapping[str, Any]) -> list[ServiceCall]:
-    """The requests for one processor. What that of an input cannot carry is set before anything hangs on it.
+def creation_call(spec: ProcessorSpec, name: str, parent: str, input_values: Mapping[str, Any]) -> list[ServiceCall]:
+    """Return the calls that create one processor.
 
-    `input_values` are those of InputProc less its name, of which only an input takes notice.
+    InputProc does not accept the parameters of the input's stage: modifyParameter sets them before the input has
+    children. `input_values` are the other parameters of InputProc except its name; only an input uses them.
     """
-    if level.kind.parent:
-        free = {p.name: math.nan for p in level.kind.parameters if p.follows_rate and p.name not in level.given}
-        return [ServiceCall(level.kind.request, {"name": name, "upperDepName": parent, **level.values, **free}, name)]
-    changed = {p.name: level.values[p.name] for p in level.kind.parameters if level.values[p.name] != p.default}
+    kind = spec.kind
+    if kind.parent:
+        free = {p.name: math.nan for p in kind.parameters if p.follows_rate and p.name not in spec.explicit}
+        return [ServiceCall(kind.request, {"name": name, "upperDepName": parent, **spec.values, **free}, name)]
+    changed = {p.name: spec.values[p.name] for p in kind.parameters if spec.values[p.name] != p.default}
     return [
-        ServiceCall(level.kind.request, {"name": name, **input_values}, name),
+        ServiceCall(kind.request, {"name": name, **input_values}, name),
         *(
             ServiceCall("modifyParameter", {"nameProc": name, "nameParam": parameter, "newValue": format_value(value)})
             for parameter, value in changed.items()
@@ -239,43 +241,44 @@ def creation_call(level: ProcessorSpec, name: str, parent: str, input_values: Ma
     ]
 
 
-# --- what has been done -----------------------------------------------------------------------------------------
+# --- responses --------------------------------------------------------------------------------------------------
 
 
 def build_response(
-    wish: TreeRequest, dependencies: Sequence[str], created: Collection[str], instance: str
+    request: TreeRequest, dependencies: Sequence[str], created: Collection[str], instance: str
 ) -> dict[str, Any]:
-    """The outputs of `interface.REQUEST`, once the processors `dependencies` are there."""
+    """Return the outputs of `interface.REQUEST` when the processors `dependencies` exist."""
+    kinds = [spec.kind for spec in request.specs]
     return {
         "name": dependencies[-1],
         "dependencies": list(dependencies),
         "created": [name for name in dependencies if name in created],
         "reused": [name for name in dependencies if name not in created],
-        "unused": unused((level.kind for level in wish.levels), wish.given, dependencies[0] in created),
-        "port": wish.levels[-1].kind.port,
-        "topic": topic(instance, wish.levels[-1].kind, dependencies[-1]),
+        "unused": unused(kinds, request.explicit, dependencies[0] in created),
+        "port": kinds[-1].port,
+        "topic": topic(instance, kinds[-1], dependencies[-1]),
     }
 
 
-def unused(kinds: Iterable[Representation], given: Iterable[str], new_input: bool) -> list[str]:
-    """Which of the parameters `given` have no effect on a processor with these kinds from the input down to it."""
+def unused(kinds: Iterable[Representation], names: Iterable[str], new_input: bool) -> list[str]:
+    """Return the parameters `names` that have no effect on a processor with these kinds from the input down to it."""
     own = {p.name for kind in kinds for p in kind.parameters} | {*(OF_THE_INPUT if new_input else ())}
-    return [name for name in given if name not in own]
+    return [name for name in names if name not in own]
 
 
 def topic(instance: str, kind: Representation, name: str) -> str:
-    """Where the processor `name` publishes."""
+    """Return the topic of the processor `name`."""
     return f"/{instance}/{kind.port}" + (f"/{name}" if ROSAFE.port(kind.port).multiple else "")
 
 
 def chain_exists(dependencies: Sequence[str], found: Iterable[ExistingProcessor]) -> bool:
-    """Whether processors of these names hang on each other, the first one being the input."""
+    """Return whether these names are a chain of parents and children that begins with the input."""
     parents = {p.name: p.parent for p in found}
     return all(parents.get(name) == parent for parent, name in itertools.pairwise(["", *dependencies]))
 
 
 def is_race(problem: ComponentError) -> bool:
-    """Whether somebody else changed the tree between the look at it and a step: to be planned anew."""
+    """Return whether another client changed the tree after it was listed, so that a new plan is needed."""
     if problem.ex == INTERRUPTED:
         return problem.detail.get("by") == "InputProc"
     return problem.ex in _RACES

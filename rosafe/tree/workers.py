@@ -3,7 +3,8 @@
 A worker that has finished a task continues with the deepest ready task, usually the one it has just made ready: the
 block is still in its cache. Among several it prefers one that it ran before, whose state is in its cache too. It wakes
 another worker only if a task remains, a worker is idle, and the tasks are long enough. With one core there is therefore
-no switching between threads; with several, siblings and successive blocks are processed concurrently.
+no switching between threads; with several, siblings and successive blocks are processed concurrently. The idle
+worker that worked last is woken, as its cache is the warmest.
 
 Only computing workers count towards the limit. A worker that is blocked by other code (a listener that does not return,
 a source that does not respond), or whose processor was removed, loses its slot to another worker after
@@ -24,19 +25,21 @@ from typing import Protocol
 VARIABLE = "ROSAFE_WORKERS"
 MAX_WORKERS = 1024
 BLOCKED_TIMEOUT_SECONDS = 0.05
-WAKE_THRESHOLD_SECONDS = 2.5e-4  # waking costs two workers some 10 us each, and they then compete for the GIL
+WAKE_THRESHOLD_SECONDS = 1e-3  # of waiting work: below, two workers lose more by competing for the GIL than they gain
+BUSY_THRESHOLD_SECONDS = 2.5e-4  # the same for a busy pool, whose tree may not keep up: its workers were not all idle
+BUSY_SECONDS = 0.1  # within this time
 WORKER = "rosafe worker"  # prefix of the threads' names
 
 
-def workers_to_use(wanted: int | str | None = None) -> int:
-    """Return the number of workers: `wanted`, or the value of ROSAFE_WORKERS, or the number of available cores."""
+def workers_to_use(count: int | str | None = None) -> int:
+    """Return the number of workers: `count`, or the value of ROSAFE_WORKERS, or the number of available cores."""
     text = os.environ.get(VARIABLE, "").strip()
-    name, given = ("workers", str(wanted)) if wanted is not None else (VARIABLE, text)
-    if not given:
+    name, value = ("workers", str(count)) if count is not None else (VARIABLE, text)
+    if not value:
         return len(os.sched_getaffinity(0))
-    if not (given.isascii() and given.isdigit()) or not 1 <= int(given[:20]) <= MAX_WORKERS:
-        raise ValueError(f"{name}: {given[:80]!r} is not a whole number from 1 to {MAX_WORKERS}")
-    return int(given)
+    if not (value.isascii() and value.isdigit()) or not 1 <= int(value[:20]) <= MAX_WORKERS:
+        raise ValueError(f"{name}: expected a whole number from 1 to {MAX_WORKERS}, got {value[:80]!r}")
+    return int(value)
 
 
 class Task(Protocol):
@@ -66,9 +69,10 @@ class Task(Protocol):
 class _Worker:
     """The task of one thread, and whether it occupies a slot."""
 
-    def __init__(self) -> None:
+    def __init__(self, lock: threading.RLock) -> None:
         self.task: Task | None = None
         self.has_slot = False  # counts towards the limit
+        self.woken = threading.Condition(lock)
 
 
 class Workers:
@@ -89,10 +93,10 @@ class Workers:
         self._ready: list[tuple[int, int, Task]] = []  # a heap: the deepest first, of these the newest
         self._sequence = itertools.count(0, -1)
         self._free_slots = count  # slots that no worker occupies
-        self._idle = 0  # threads that wait for a task or are about to start, and
-        self._woken = 0  # those of them that were notified already
+        self._idle: list[_Worker] = []  # those that wait for a task; the last one worked last
+        self._woken = 0  # those that were notified, or are about to start, and have not taken a task yet
+        self._busy_since = time.monotonic()  # when all workers were idle last
         self._last: dict[int, _Worker] = {}  # the worker that ran a task last, by its id
-        self._task_available = threading.Condition(lock)
         self._watch = threading.Condition(lock)
         self._workers: list[_Worker] = []
         self._threads: dict[str, threading.Thread] = {}
@@ -114,7 +118,8 @@ class Workers:
         self._clients -= 1
         if self._clients == 0:
             self._ready, self._last = [], {}
-            self._task_available.notify_all()
+            while self._idle:
+                self._notify_idle()
             self._watch.notify_all()
 
     def join(self) -> None:
@@ -133,23 +138,28 @@ class Workers:
     def wake(self) -> None:
         """Notify an idle worker, or start one, for each waiting task, within the free slots."""
         for _ in range(min(len(self._ready), self._free_slots) - self._woken):
-            if self._idle > self._woken:
-                self._woken += 1
-                self._task_available.notify()
+            if self._idle:
+                self._notify_idle()
                 continue
             try:
                 self._start_worker()
             except RuntimeError:  # no thread can be started: the existing ones continue
                 return
 
+    def _notify_idle(self) -> None:
+        self._woken += 1
+        self._idle.pop().woken.notify()
+
     def _should_wake_another(self, own: Task) -> bool:
         """Return whether the waiting tasks, and `own` before them, take one worker longer than the threshold."""
+        busy = time.monotonic() - self._busy_since > BUSY_SECONDS
+        threshold = min(BUSY_THRESHOLD_SECONDS, WAKE_THRESHOLD_SECONDS) if busy else WAKE_THRESHOLD_SECONDS
         seconds = own.estimated_seconds
         for _, _, task in self._ready:
-            if seconds > WAKE_THRESHOLD_SECONDS:
+            if seconds > threshold:
                 break
             seconds += task.estimated_seconds
-        return seconds > WAKE_THRESHOLD_SECONDS
+        return seconds > threshold
 
     def _pop_task(self, me: _Worker) -> Task:
         """Return the deepest task, preferably one that `me` ran last."""
@@ -170,10 +180,9 @@ class Workers:
     def _start_worker(self) -> None:
         names = (f"{WORKER} {number}" for number in itertools.count(1))
         name = next(name for name in names if name not in self._threads)
-        worker = _Worker()
+        worker = _Worker(self.lock)
         self._start(name, functools.partial(self._run, name, worker))
         self._workers.append(worker)
-        self._idle += 1
         self._woken += 1
 
     def _start(self, name: str, run: Callable[[], None]) -> None:
@@ -184,7 +193,6 @@ class Workers:
     def _run(self, name: str, me: _Worker) -> None:
         acquire, release = self.lock.acquire, self.lock.release
         with self.lock:
-            self._idle -= 1
             self._woken -= 1
             while (task := self._wait_for_task(me)) is not None:
                 release()
@@ -212,12 +220,13 @@ class Workers:
                         self.wake()
                     return task
             self._release_slot(me)
-            if self._idle >= self.count:  # others have replaced those that were blocked
+            if len(self._idle) + self._woken >= self.count:  # others have replaced those that were blocked
                 break
-            self._idle += 1
-            self._task_available.wait()
-            self._idle -= 1
-            self._woken = max(0, self._woken - 1)
+            self._idle.append(me)
+            me.woken.wait()
+            if len(self._idle) + self._woken == len(self._workers):
+                self._busy_since = time.monotonic()
+            self._woken -= 1
         self._release_slot(me)
         return None
 
