@@ -1,1 +1,1 @@
-"""The test suite: one folder per area, and the harness that the areas with ROS share."""
+"""The test suite: one folder per area, and a common harness for tests with ROS."""

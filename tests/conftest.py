@@ -1,7 +1,8 @@
-"""Fixtures of the whole suite; tests/harness.py is what stands behind them."""
+"""Fixtures of the whole suite, based on tests/harness.py."""
 
 from __future__ import annotations
 
+import re
 import subprocess
 from collections.abc import Iterator
 from pathlib import Path
@@ -10,51 +11,95 @@ import pytest
 
 from rosafe.component import generate
 from tests import harness
-from tests.bass.pulse import PulseServer
+from tests.bass.pulseaudio import PulseServer
+from tests.dsp.implementations import NUMPY, Choice, levels
 
 STARTING = ("cli", "demo", "live", "packaging", "setups")  # folders whose tests start commands, browsers, compilers
-ELSEWHERE = ("aarch64", "nehalem", "clang")  # kernels under qemu, or of the other compiler
+OF_THE_START = ("demo", "packaging", "soak", "startup")  # folders whose tests start programs as users do, not as forks
+STARTING_FILES = (  # the same for single files
+    "bass/test_calibration.py",
+    "bass/test_hostile_files.py",
+    "bass/test_record.py",
+    "eltclsh/test_script.py",
+    "eltclsh/test_terminal.py",
+    "genomix/test_decode.py",
+    "genomix/test_front_end.py",
+    "offline/test_damaged.py",
+    "offline/test_examples.py",
+    "plugins/test_documents.py",
+    "plugins/test_faults.py",
+    "plugins/test_loading.py",
+    "plugins/test_old_names.py",
+    "plugins/test_plugins.py",
+)
+LONG_FILES = (  # dozens of seconds of computation; scripts/test --fast has others for the same code
+    "dsp/test_accuracy.py",
+    "dsp/test_processors.py",
+    "localization/test_commands.py",
+    "localization/test_enhancement.py",
+    "localization/test_localize.py",
+    "localization/test_noise.py",
+    "offline/test_blocks.py",
+    "offline/test_results.py",
+    "offline/test_resynthesis.py",
+    "localization/test_tracker.py",
+    "localizer_node/test_calibration.py",
+    "view/test_figure.py",
+    "view/test_plot.py",
+)
+LONGEST_FILES = (  # they begin first, so that no process works on one of them while the others have nothing to do
+    "packaging/test_lint.py",
+    "packaging/test_catkin.py",
+    "packaging/test_wheel.py",
+    "packaging/test_kernels.py",
+    "dsp/test_sanitizers.py",
+    "tree/test_schedules.py",
+    "startup/test_startup.py",
+    "demo/test_readme.py",
+    "dsp/test_kernels.py",
+)
+ELSEWHERE = ("aarch64", "nehalem", "clang")  # kernels under qemu, or built by another compiler
 
 generate.ensure_messages()  # test modules import rosAFE.msg and bass.msg at their top
 
 
 @pytest.fixture(scope="session", autouse=True)
 def _default_signals() -> None:
-    """In every process that runs tests, before it starts anything; not in the one that only starts those."""
+    """Run in every process that runs tests, before it starts other processes; not in the coordinator of xdist."""
     harness.let_children_have_default_signals()
 
 
 @pytest.fixture(scope="session")
 def graph(tmp_path_factory: pytest.TempPathFactory) -> Iterator[harness.Graph]:
-    """The ROS graph that all tests of this process share: a master on a free port."""
+    """The ROS graph shared by all tests of this process: a master on a free port."""
     with harness.shared_graph(tmp_path_factory.mktemp("home")) as graph:
         yield graph
 
 
 @pytest.fixture
 def private_graph(tmp_path: Path) -> Iterator[tuple[harness.Graph, harness.MasterProcess]]:
-    """A ROS graph of the test's own, and its master, which may be killed and started again."""
+    """A separate ROS graph for the test, and its master, which may be killed and started again."""
     with harness.private_graph(tmp_path) as pair:
         yield pair
 
 
 @pytest.fixture
 def bass_node(graph: harness.Graph) -> Iterator[harness.Process]:
-    """A running bass-ros, new for the test."""
+    """A running bass-ros, started for the test."""
     with graph.node("bass-ros") as process:
         yield process
 
 
 @pytest.fixture
 def rosafe_node(graph: harness.Graph) -> Iterator[harness.Process]:
-    """A running rosAFE-ros, new for the test."""
+    """A running rosAFE-ros, started for the test."""
     with graph.node("rosAFE-ros") as process:
         yield process
 
 
 @pytest.fixture
 def pulse(tmp_path: Path) -> Iterator[PulseServer]:
-    """A sound card: a PulseAudio server of the test's own, which may be killed and started again."""
+    """A simulated sound card: a PulseAudio server for the test, which may be killed and started again."""
     server = PulseServer(tmp_path)
     server.start()
     yield server
@@ -63,28 +108,76 @@ def pulse(tmp_path: Path) -> Iterator[PulseServer]:
 
 @pytest.fixture
 def small_disk(tmp_path: Path) -> tuple[Path, list[str]]:
-    """A folder, and the beginning of a command line: for that command the folder is a file system of 4 MiB."""
+    """A folder and a command prefix: for commands with this prefix the folder is a file system of 4 MiB."""
     folder = tmp_path / "disk"
     folder.mkdir()
     mount = 'mount -t tmpfs -o size=4m none "$0" && exec "$@"'
-    before = ["unshare", "--mount", "sh", "-c", mount, str(folder)]
-    tried = subprocess.run([*before, "true"], capture_output=True, text=True, check=False)
+    prefix = ["unshare", "--mount", "sh", "-c", mount, str(folder)]
+    tried = subprocess.run([*prefix, "true"], capture_output=True, text=True, check=False)
     if tried.returncode != 0:
-        pytest.skip(f"no file system can be mounted here: {tried.stderr.strip()}")
-    return folder, before
+        pytest.skip(f"mounting a file system failed: {tried.stderr.strip()}")
+    return folder, prefix
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark what `scripts/test --fast` leaves out: tests on a ROS graph, and those that build, install or lint.
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Do not import the tests of whole folders that `scripts/test --fast` excludes."""
+    excluded = "not ros" in config.option.markexpr and collection_path.parent == harness.ROOT / "tests"
+    return True if excluded and collection_path.name in STARTING else None
 
-    Their files and the other long ones come first, so that none is left for one process alone at the end.
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    """Select how programs start, before the fixtures of the test are created."""
+    harness.forks = item.path.relative_to(harness.ROOT).parts[1] not in OF_THE_START
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Mark tests that `scripts/test --fast` excludes: those with a ROS graph, and those that build, install or lint.
+
+    Their files and other long ones run first, so that the last long file does not occupy a single process at the end.
     """
     for item in items:
-        uses_graph = {"graph", "private_graph"} & set(getattr(item, "fixturenames", ()))
-        if uses_graph or item.path.relative_to(harness.ROOT).parts[1] in STARTING:
+        file = item.path.relative_to(harness.ROOT / "tests")
+        uses_graph = {"graph", "private_graph", "world"} & set(getattr(item, "fixturenames", ()))
+        if uses_graph or file.parts[0] in STARTING or str(file) in STARTING_FILES:
             item.add_marker("ros")
-        call = getattr(item, "callspec", None)
-        if call is not None and call.params.get("level") in ELSEWHERE:
+        only_in_long_runs = item.get_closest_marker("soak") or item.get_closest_marker("exploration")
+        if only_in_long_runs or _implementation(item) in ELSEWHERE or str(file) in LONG_FILES:
             item.add_marker("long")
+        if _is_variant(item):
+            item.add_marker("variant")
+    _deselect_repetitions(items, config)
     slow = {item.path for item in items if item.get_closest_marker("ros") or item.get_closest_marker("long")}
-    items.sort(key=lambda item: item.path not in slow)
+    order = {harness.ROOT / "tests" / file: number - len(LONGEST_FILES) for number, file in enumerate(LONGEST_FILES)}
+    items.sort(key=lambda item: order.get(item.path, int(item.path not in slow)))
+
+
+def _implementation(item: pytest.Item) -> Choice | None:
+    """Return the implementation that a test selects by its argument `level`; levels of sound are floats."""
+    level = item.callspec.params.get("level") if hasattr(item, "callspec") else None
+    return level if isinstance(level, int | str) else None
+
+
+def _is_variant(item: pytest.Item) -> bool:
+    """Return whether a test repeats another one with numpy, or with kernels of an older set of instructions."""
+    level = _implementation(item)
+    older = isinstance(level, int) and level not in (NUMPY, max(levels(), default=NUMPY))
+    return older or (hasattr(item, "callspec") and item.callspec.params.get("implementation") == "numpy")
+
+
+def _deselect_repetitions(items: list[pytest.Item], config: pytest.Config) -> None:
+    """Deselect tests with numpy instead of kernels that do not depend on this fixture.
+
+    They check the declared limits of parameters, or select implementations themselves.
+    """
+
+    def repeated(item: pytest.Item) -> bool:
+        if not hasattr(item, "callspec") or item.callspec.params.get("implementation") != "numpy":
+            return False
+        name = item.name.partition("[")[0]
+        limits = re.search("invalid|bad_|rejected|wrong_|sample_rates", name)
+        return limits is not None or _implementation(item) is not None
+
+    kept = [item for item in items if not repeated(item)]
+    config.hook.pytest_deselected(items=[item for item in items if repeated(item)])
+    items[:] = kept

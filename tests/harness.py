@@ -1,12 +1,12 @@
-"""Real ROS graphs for tests: a private master, real nodes and commands as processes, waiting on conditions.
+"""Real ROS graphs for tests: a private master, nodes and commands as processes, and waiting for conditions.
 
     def test_scene(graph):
         with graph.node("bass-ros"):
             assert graph.call("/bass/Acquire", device="scene:").genom_success
             audio = graph.message("/bass/Audio", accept=lambda m: m.lastFrameIndex > 0)
 
-`graph` (fixture of conftest.py) is one master per test process, shared by all its tests; `private_graph` has a master
-of its own in a process of its own, for tests that kill it. Everything started dies with the test.
+The fixture `graph` (conftest.py) has one master per test process, shared by its tests. `private_graph` has a separate
+master process, for tests that kill it. All processes that a test starts end with the test.
 """
 
 from __future__ import annotations
@@ -34,19 +34,22 @@ import pytest
 from rosafe import interface
 from rosafe.component import generate
 from rosafe.transport.master import PrivateMaster
+from tests import fork_server
 
 ROOT = Path(__file__).resolve().parents[1]
 SCRIPTS = ROOT / "scripts"
 PYTHON = "/usr/bin/python3"
-PATIENCE = 60.0  # s; for whatever must happen, on a machine with much other work: no test asserts how long it takes
-END_SECONDS = 5.0  # s; the contract's: within them, a server that is told to has ended
-GRACE = 20.0  # s; from the wish that a process may end until it is killed
+PATIENCE = 60.0  # s; time limit for any event, also on a busy machine: tests do not check durations
+END_SECONDS = 5.0  # s; within this time a server ends after a request to do so
+GRACE = 20.0  # s; from the request to end until a process is killed
+
+forks = False  # tests/conftest.py sets it: programs are started as forks if possible, except in tests of the start
 
 T = TypeVar("T")
 
 
 def shared(*parts: str) -> Path:
-    """A file or folder of the shared material beside the checkout; the test is skipped where it is not there."""
+    """Return a path in the shared material beside the checkout; skip the test if it does not exist."""
     path = ROOT.parent.joinpath("shared", *parts)
     if not path.exists():
         pytest.skip(f"no {'/'.join(('../shared', *parts))} beside this checkout")
@@ -54,25 +57,31 @@ def shared(*parts: str) -> Path:
 
 
 def proc(*parts: object) -> Path:
-    """A file or folder of /proc, which knows all processes; the test is skipped where a bare chroot lacks it."""
+    """Return a path in /proc; skip the test if /proc is not mounted, as in a bare chroot."""
     if not Path("/proc/self").exists():
         pytest.skip("/proc is not mounted here")
     return Path("/proc", *map(str, parts))
 
 
-def let_children_have_default_signals() -> None:
-    """Whatever this process starts from now on has the system's default signals, also those that it ignores itself.
+def folder_of_run(factory: pytest.TempPathFactory) -> Path:
+    """Return the temporary folder that all processes of one run of the tests share."""
+    folder = factory.getbasetemp()
+    return folder.parent if "PYTEST_XDIST_WORKER" in os.environ else folder
 
-    Under `nohup`, and in a script behind `&`, a process ignores SIGHUP or SIGINT, and so would all that it starts: what
-    is ignored is inherited. What is handled is not, so here a handler ignores it.
+
+def let_children_have_default_signals() -> None:
+    """Give all child processes the default signal handlers, also for signals that this process ignores.
+
+    Under `nohup`, or in a script with `&`, a process ignores SIGHUP or SIGINT. Children inherit ignored signals, but
+    not handlers. Therefore ignored signals get a handler that does nothing.
     """
-    for number in signal.valid_signals() - {signal.SIGPIPE, signal.SIGXFSZ}:  # these two subprocess restores itself
+    for number in signal.valid_signals() - {signal.SIGPIPE, signal.SIGXFSZ}:  # subprocess restores these two
         if signal.getsignal(number) is signal.SIG_IGN:
             signal.signal(number, lambda number, frame: None)
 
 
 def wait_for(condition: Callable[[], T], timeout: float = PATIENCE, what: str | Callable[[], str] = "") -> T:
-    """The first true value of `condition()`, asked at first every 5 ms; AssertionError after `timeout` seconds."""
+    """Poll `condition()` every 5 to 50 ms and return its first true value; AssertionError after `timeout` s."""
     end = time.monotonic() + timeout
     pause = 0.005
     while True:
@@ -80,16 +89,16 @@ def wait_for(condition: Callable[[], T], timeout: float = PATIENCE, what: str | 
         if value:
             return value
         if time.monotonic() > end:
-            told = what() if callable(what) else what
-            raise AssertionError(f"not within {timeout:g} s: {told or condition}")
+            description = what() if callable(what) else what
+            raise AssertionError(f"not within {timeout:g} s: {description or condition}")
         time.sleep(pause)
-        pause = min(1.1 * pause, 0.05)  # what takes long is not to take longer because it is asked for
+        pause = min(1.1 * pause, 0.05)  # long waits poll less often, to leave processor time for the rest
 
 
 def free_port() -> int:
-    """A TCP port of the loopback interface that nobody uses at the moment.
+    """Return an unused TCP port of the loopback interface.
 
-    It is below those that Linux gives to connections, of which there are many meanwhile.
+    It is below the ports that Linux assigns to outgoing connections.
     """
     while True:
         port = random.SystemRandom().randrange(12_000, 32_000)
@@ -98,15 +107,33 @@ def free_port() -> int:
             return port
 
 
-class Process:
-    """A child process with its own process group; what it prints goes to files, so that it never waits for a reader."""
+def can_fork(command: list[str], env: dict[str, str]) -> bool:
+    """Return whether a program is started by the server of forks (tests/fork_server.py)."""
+    return forks and fork_server.can_fork(command, env, generate.environment()["PYTHONPATH"])
 
-    def __init__(self, command: list[str], env: dict[str, str], cwd: Path | None = None) -> None:
+
+class Process:
+    """A child process with its own process group. Its output goes to files, so that it never blocks on a pipe.
+
+    It is a fork of a process that has imported its modules, unless `fork` is false or `can_fork` is.
+    """
+
+    def __init__(self, command: list[str], env: dict[str, str], cwd: Path | None = None, fork: bool = True) -> None:
         self.command = command
-        self._out: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115  # open as long as the process is of interest
+        self._out: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115  # open as long as this object
         self._err: IO[bytes] = tempfile.TemporaryFile()  # noqa: SIM115
-        # setpriv: the kernel ends the child should this process be killed before it can clean up
-        self._popen = subprocess.Popen(
+        self._popen = self._start(command, env, cwd, fork and can_fork(command, env))
+        self.pid = self._popen.pid
+
+    def _start(
+        self, command: list[str], env: dict[str, str], cwd: Path | None, fork: bool
+    ) -> subprocess.Popen[bytes] | fork_server.ForkedProcess:
+        if fork:
+            with open(os.devnull) as nothing:
+                streams = [nothing.fileno(), self._out.fileno(), self._err.fileno()]
+                return fork_server.shared().start(command, env, cwd, streams)
+        # setpriv: the kernel kills the child if this process is killed before it can clean up
+        return subprocess.Popen(
             ["setpriv", "--pdeathsig", "KILL", "--", *command],
             env=env,
             cwd=cwd,
@@ -115,32 +142,31 @@ class Process:
             stderr=self._err,
             start_new_session=True,
         )
-        self.pid = self._popen.pid
 
     @property
     def out(self) -> str:
-        """What it has printed on stdout so far."""
+        """The standard output so far."""
         return _contents(self._out)
 
     @property
     def err(self) -> str:
-        """What it has printed on stderr so far."""
+        """The standard error so far."""
         return _contents(self._err)
 
     @property
     def complaints(self) -> str:
-        """`err` without the line in which a node tells that it is ready."""
+        """`err` without the line of a node that is ready."""
         return re.sub(r"^\w+-ros: ready as .*\n", "", self.err, flags=re.MULTILINE)
 
     @property
     def alive(self) -> bool:
-        """Whether it has not ended yet."""
+        """Whether the process is running."""
         return self._popen.poll() is None
 
     def wait(self, timeout: float = PATIENCE) -> int:
-        """Its exit code, negative for a signal; AssertionError where it does not end in time."""
+        """Return the exit code, negative for a signal; AssertionError if the process does not end in time."""
         wait_for(lambda: not self.alive, timeout, lambda: f"end of {self}")
-        return self._popen.returncode
+        return self._popen.wait()
 
     def stop(self, number: int = signal.SIGTERM, timeout: float = PATIENCE) -> int:
         """Send a signal and return the exit code."""
@@ -149,7 +175,7 @@ class Process:
         return self.wait(timeout)
 
     def close(self) -> None:
-        """End it and all its children, gently if they let themselves."""
+        """End the process and its children, with SIGKILL if SIGTERM has no effect."""
         if self.alive:
             self._signal_group(signal.SIGTERM)
             try:
@@ -176,7 +202,7 @@ class Process:
     ) -> None:
         self.close()
         if error is not None:
-            print(self)  # pytest shows it with the failure
+            print(self)  # pytest shows this with the failure
 
 
 def _contents(stream: IO[bytes]) -> str:
@@ -184,10 +210,10 @@ def _contents(stream: IO[bytes]) -> str:
 
 
 class Graph:
-    """One ROS graph: a master, the environment of its processes, and ways to look into it.
+    """A ROS graph: its master, the environment of its processes, and functions to inspect it.
 
-    `call`, `message` and `collect` use rospy in this process, which knows one master only: they are for the shared
-    graph. Commands and nodes work on any.
+    `call`, `message` and `collect` use rospy in this process, which supports one master only: they work for the shared
+    graph. Commands and nodes work for any graph.
     """
 
     def __init__(self, uri: str, home: Path) -> None:
@@ -196,7 +222,7 @@ class Graph:
         self.env = {k: v for k, v in os.environ.items() if not k.startswith("ROS_")}
         self.env.update(
             generate.environment(),
-            PATH=f"{SCRIPTS}:/usr/local/bin:/usr/bin:/bin",  # not the tester's: the commands run Debian's python3
+            PATH=f"{SCRIPTS}:/usr/local/bin:/usr/bin:/bin",  # the commands run Debian's python3
             HOME=str(home),
             ROS_HOME=str(home / ".ros"),
             ROS_IP="127.0.0.1",
@@ -206,12 +232,12 @@ class Graph:
     # --- processes ---
 
     def start(self, *command: str, cwd: Path | None = None, **env: str) -> Process:
-        """Start a command in this graph; close it, or use it in a `with`."""
+        """Start a command in this graph; the caller closes it, or uses it in a `with` statement."""
         return Process(list(command), {**self.env, **env}, cwd)
 
     @contextmanager
     def node(self, script: str, *arguments: str, cwd: Path | None = None, **env: str) -> Iterator[Process]:
-        """A node of scripts/ (``bass-ros``, ``rosAFE-ros``) that is up: all its services are there."""
+        """Run a node of scripts/ (``bass-ros``, ``rosAFE-ros``); yield when all its services are registered."""
         component = interface.COMPONENTS[Path(script).name.removesuffix("-ros")]
         name = component.name
         for option, value in itertools.pairwise(arguments):
@@ -226,15 +252,13 @@ class Graph:
     def run(
         self, *command: str, timeout: float = PATIENCE, check: bool = True, stdin: str = "", **env: str
     ) -> subprocess.CompletedProcess[str]:
-        """Run a command to its end; AssertionError where it fails (unless told not to check) or takes too long."""
-        done = subprocess.run(
-            ["timeout", "-k", "2", str(timeout), *command],
-            env={**self.env, **env},
-            input=stdin,
-            text=True,
-            capture_output=True,
-            check=False,
-        )
+        """Run a command to its end; AssertionError if it takes too long, or if it fails and `check` is true."""
+        env = {**self.env, **env}
+        if can_fork(list(command), env):
+            done = fork_server.shared().run(command, env, None, stdin, timeout)
+        else:
+            limited = ["timeout", "-k", "2", str(timeout), *command]
+            done = subprocess.run(limited, env=env, input=stdin, text=True, capture_output=True, check=False)
         if done.returncode == 124:
             raise AssertionError(f"{' '.join(command)}: not done after {timeout:g} s\n{done.stdout}\n{done.stderr}")
         if check and done.returncode != 0:
@@ -244,19 +268,19 @@ class Graph:
     # --- the master's view ---
 
     def services(self) -> set[str]:
-        """All services that the master knows."""
+        """Return all registered services."""
         return {name for name, _ in self._state()[2]}
 
     def topics(self) -> set[str]:
-        """All topics that somebody publishes."""
+        """Return all topics with a publisher."""
         return {name for name, _ in self._state()[0]}
 
     def readers(self) -> set[tuple[str, str]]:
-        """Which node subscribes to which topic: (topic, node)."""
+        """Return all subscriptions: (topic, node)."""
         return {(topic, node) for topic, nodes in self._state()[1] for node in nodes}
 
     def nodes(self) -> set[str]:
-        """All nodes that publish, subscribe or serve anything."""
+        """Return all nodes with a publisher, a subscriber or a service."""
         return {node for kind in self._state() for _, nodes in kind for node in nodes}
 
     def _state(self) -> Any:
@@ -266,20 +290,20 @@ class Graph:
 
     def _is_up(self, name: str, component: interface.ComponentSpec, process: Process) -> bool:
         if not process.alive:
-            raise AssertionError(f"ended at once: {process}")
+            raise AssertionError(f"ended during its start: {process}")
         _, subscribed, served = ({entry for entry, _ in kind} for kind in self._state())
         return {f"/{name}/{s.name}" for s in component.on_graph} <= served and {
             f"/{name}/{s.name}/cancel" for s in component.activities
         } <= subscribed
 
     def _forget(self, name: str) -> None:
-        """Unregister what a killed node of that name has left behind, as ``rosnode cleanup`` does."""
+        """Remove the registrations of a killed node of that name, like ``rosnode cleanup``."""
         import rosgraph
 
         try:
             if name not in self.nodes():
                 return
-        except OSError:  # the test has killed the master, and it knows nothing when it comes back
+        except OSError:  # the test has killed the master, which loses all registrations
             return
         master = rosgraph.Master(name, master_uri=self.uri)
         publishers, subscribers, services = master.getSystemState()
@@ -299,7 +323,7 @@ class Graph:
     def call(self, service: str, **fields: Any) -> Any:
         """Call a service and return its response, through rospy in this process (a millisecond).
 
-        `service` is a name like ``/bass/Acquire``; the types are those of the package that its node was made from.
+        `service` is a name such as ``/bass/Acquire``; its type is looked up on the graph.
         """
         import rospy
         import rosservice
@@ -314,17 +338,17 @@ class Graph:
         accept: Callable[[Any], bool] = lambda message: True,
         timeout: float = PATIENCE,
     ) -> Any:
-        """The first message on `topic` that `accept` takes (the latched one counts)."""
+        """Return the first message on `topic`, including a latched one, for which `accept` is true."""
         with self.collect(topic, message_class) as messages:
             return wait_for(
                 lambda: next((m for m in list(messages) if accept(m)), None),
                 timeout,
-                lambda: f"message on {topic} ({len(messages)} came, last: {str(messages[-1:])[:500]})",
+                lambda: f"message on {topic} ({len(messages)} received, last: {str(messages[-1:])[:500]})",
             )
 
     @contextmanager
     def collect(self, topic: str, message_class: Any = None) -> Iterator[list[Any]]:
-        """The list of all messages that come on `topic`, growing until the end of the ``with`` block."""
+        """Collect messages on `topic` in a list until the end of the ``with`` block."""
         import rospy
         import rostopic
 
@@ -339,7 +363,7 @@ class Graph:
             subscriber.unregister()
 
     def client(self) -> None:
-        """Make this process a node of the graph, once."""
+        """Initialise rospy in this process, once."""
         import rospy
 
         if os.environ.get("ROS_MASTER_URI") != self.uri:
@@ -349,26 +373,26 @@ class Graph:
 
 
 def python_path(graph: Graph) -> str:
-    """PYTHONPATH for programs of a test's own: this checkout, and the messages."""
+    """Return a PYTHONPATH for programs of a test: this checkout, and the messages."""
     return f"{ROOT}:{graph.env['PYTHONPATH']}"
 
 
 @contextmanager
 def shared_graph(home: Path) -> Iterator[Graph]:
-    """The graph of this test process: its master runs in it, and rospy here talks to that."""
+    """Run the graph of this test process: its master runs in this process, and rospy connects to it."""
     with PrivateMaster() as master:
         os.environ.update(ROS_MASTER_URI=master.uri, ROS_IP="127.0.0.1", ROS_HOME=str(home / ".ros"))
         yield Graph(master.uri, home)
         if "rospy" in sys.modules:
-            sys.modules["rospy"].signal_shutdown("end of the tests")  # while the master still listens
+            sys.modules["rospy"].signal_shutdown("end of the tests")  # before the master ends
 
 
 class PortTakenError(Exception):
-    """A port that was free a moment ago is not any more."""
+    """A port was taken between the check and its use."""
 
 
 class MasterProcess:
-    """A master in a process of its own, which can be killed and started again at the same address."""
+    """A master in a separate process, which can be killed and started again at the same address."""
 
     def __init__(self) -> None:
         self.port = free_port()
@@ -376,10 +400,10 @@ class MasterProcess:
         self.process: Process | None = None
 
     def start(self, env: dict[str, str]) -> None:
-        """Start it and wait until it answers."""
+        """Start the master and wait until it responds."""
         from rosafe.transport.master import MasterError, check_master
 
-        def answers() -> bool:
+        def responds() -> bool:
             assert self.process is not None
             if "already in use" in self.process.out:
                 self.kill()
@@ -391,10 +415,10 @@ class MasterProcess:
             return True
 
         self.process = Process(["rosmaster", "--core", "-p", str(self.port)], env)
-        wait_for(answers, what=lambda: f"master {self.process}")
+        wait_for(responds, what=lambda: f"master {self.process}")
 
     def kill(self) -> None:
-        """Kill it as a crash would."""
+        """Kill the master, like a crash."""
         if self.process is not None:
             self.process.stop(signal.SIGKILL)
             self.process.close()
@@ -403,14 +427,14 @@ class MasterProcess:
 
 @contextmanager
 def private_graph(home: Path) -> Iterator[tuple[Graph, MasterProcess]]:
-    """A graph with a master process of its own."""
+    """Run a graph with a separate master process."""
     for attempts_left in reversed(range(5)):
         master = MasterProcess()
         graph = Graph(master.uri, home)
         try:
             master.start(graph.env)
             break
-        except PortTakenError:  # somebody else was quicker
+        except PortTakenError:  # another process took the port
             if not attempts_left:
                 raise
     try:
@@ -420,7 +444,7 @@ def private_graph(home: Path) -> Iterator[tuple[Graph, MasterProcess]]:
 
 
 def run_together(count: int, work: Callable[[int], T]) -> list[T]:
-    """The results of `work(0)` to `work(count - 1)`, started at the same time in threads."""
+    """Run `work(0)` to `work(count - 1)` at the same time in threads, and return their results."""
     gate = threading.Barrier(count)
     results: dict[int, T] = {}
     errors: list[BaseException] = []
@@ -429,7 +453,7 @@ def run_together(count: int, work: Callable[[int], T]) -> list[T]:
         gate.wait()
         try:
             results[index] = work(index)
-        except BaseException as error:  # handed to the test below
+        except BaseException as error:  # raised below in the thread of the test
             errors.append(error)
 
     threads = [threading.Thread(target=go, args=(index,)) for index in range(count)]

@@ -1,4 +1,4 @@
-"""Network namespaces: hosts of a test's own, with cables between them."""
+"""Network namespaces: simulated hosts and cables for tests."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ import pytest
 
 @contextmanager
 def networks(commands: list[str], *names: str) -> Iterator[None]:
-    """Run commands of ``ip`` that make the namespaces of these names; the test is skipped where that is not allowed."""
+    """Run ``ip`` commands that create the namespaces `names`; skip the test if this is not permitted."""
     try:
         for command in commands:
             done = subprocess.run(["ip", *command.split()], capture_output=True, text=True, check=False)
             if done.returncode:
-                pytest.skip(f"no network namespaces here: ip {command}: {done.stderr.strip()}")
+                pytest.skip(f"network namespaces are not available: ip {command}: {done.stderr.strip()}")
         yield
     finally:
-        for name in names:  # the cables go with them
+        for name in names:  # this also removes the cables
             subprocess.run(["ip", "netns", "del", name], capture_output=True, check=False)

@@ -1,4 +1,4 @@
-"""A terminal in which a test types, and what a program shows on it."""
+"""A pseudoterminal: a test types on it and reads the output of a program."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ _ESCAPES = re.compile(r"\x1b\[[0-9;?]*[a-zA-Z]|\x1b[=>]|\x07|\r")
 
 
 class Terminal:
-    """A program on a terminal of its own; the test is skipped where a bare chroot has none."""
+    """A program on a separate terminal; the test is skipped without pseudoterminals, as in a bare chroot."""
 
     def __init__(self, command: list[str], env: dict[str, str], cwd: Path | None = None, columns: int = 200) -> None:
         try:
             self._master, slave = pty.openpty()
         except OSError as problem:
-            pytest.skip(f"no pseudoterminal here: {problem}")
+            pytest.skip(f"no pseudoterminal available: {problem}")
         fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", 50, columns, 0, 0))
         # setsid -c: the pty is the controlling terminal, so that Ctrl-C is a signal
         self._process = subprocess.Popen(
@@ -45,16 +45,16 @@ class Terminal:
 
     @property
     def sent(self) -> str:
-        """All that the program has sent to the terminal so far, as it is."""
+        """The output of the program so far, unchanged."""
         return self._raw.decode("utf-8", "replace")
 
     @property
     def shown(self) -> str:
-        """That without the escape sequences."""
+        """The output so far without escape sequences."""
         return _ESCAPES.sub("", self.sent)
 
     def expect(self, text: str, timeout: float = harness.PATIENCE) -> str:
-        """Wait until `text` is shown behind what was expected before; what was shown up to its end."""
+        """Wait for `text` after the previously expected text; return the output up to its end."""
         end = time.monotonic() + timeout
         while True:
             at = self.shown.find(text, self._seen)
@@ -66,11 +66,11 @@ class Terminal:
                 raise AssertionError(f"no {text!r} in {self.shown[self._seen :]!r}; before that: {self.shown!r}")
 
     def _read(self, end: float) -> bool:
-        """Take more of what is shown; False where nothing comes any more."""
+        """Read more output; return False if there is none before `end`."""
         ready, _, _ = select.select([self._master], [], [], max(0.0, end - time.monotonic()))
         try:
             more = os.read(self._master, 65536) if ready else b""
-        except OSError:  # EIO: nobody has the other side open
+        except OSError:  # EIO: the other side is closed
             more = b""
         self._raw += more
         return bool(more)
@@ -80,14 +80,14 @@ class Terminal:
         os.write(self._master, keys.encode())
 
     def run(self, command: str, prompt: str = "eltclsh > ") -> str:
-        """Type a command and Enter; what it shows until the next prompt."""
+        """Type a command and Enter; return its output up to the next prompt."""
         self.press(f"{command}\r")
         self.expect(command.rpartition("\n")[2])
         self.expect("\n")
         return self.expect(prompt).removesuffix(prompt).rstrip("\n")
 
     def end(self, timeout: float = harness.PATIENCE) -> int:
-        """The exit code; AssertionError where the program does not end."""
+        """Wait for the end and return the exit code; AssertionError if the program does not end."""
         limit = time.monotonic() + timeout
         while self._read(limit):
             continue

@@ -1,4 +1,4 @@
-"""The harness itself: what it starts is as if typed in a shell, however the suite was started."""
+"""The harness: child processes have default signals, however the suite was started; forks behave as new processes."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from tests import fork_server, harness
 from tests.harness import PYTHON, ROOT, Graph, Process, proc
 from tests.terminal import Terminal
 
@@ -17,7 +18,7 @@ SHOW = ["grep", "SigIgn", "/proc/self/status"]
 
 
 def ignored(shown: str) -> set[int]:
-    """The signals that a process ignores which has run SHOW."""
+    """Return the signals ignored by the process that ran SHOW."""
     found = re.search(r"SigIgn:\s*([0-9a-f]+)", shown)
     assert found, shown
     return {number for number in signal.valid_signals() if int(found[1], 16) >> (number - 1) & 1}
@@ -42,10 +43,60 @@ def test_children_have_default_signals(way: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("workers", ["-n0", "-n1"])
-def test_also_under_nohup_and_in_the_background_of_a_script(workers: str, tmp_path: Path) -> None:
-    """The suite within the suite: that of above, where the one who starts it ignores what can be ignored."""
+def test_suite_that_ignores_signals(workers: str, tmp_path: Path) -> None:
+    """Run the tests above in a process that ignores signals, as under nohup or in the background of a script."""
     pytest.importorskip("xdist")
     tests = f"{PYTHON} -m pytest {workers} -p no:cacheprovider {__file__} -k default"
     command = f"trap '' HUP INT QUIT TERM USR1; exec {tests}"
     done = subprocess.run(["bash", "-c", command], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0 and "4 passed" in done.stdout, done.stdout
+
+
+# --- forks ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["rosafe", "--version"],
+        ["rosafe", "nonsense"],
+        ["rosafe", "process", "missing.wav", "-o", "out.npz"],
+        ["rosAFE-ros", "-i", "1left"],
+        ["bass-ros", "-h"],
+        ["genomixd", "--frobnicate"],
+    ],
+    ids=" ".join,
+)
+def test_a_fork_behaves_like_a_new_process(tmp_path: Path, command: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    graph = Graph("http://127.0.0.1:1", tmp_path)
+    results = []
+    for forks in (True, False):
+        monkeypatch.setattr(harness, "forks", forks)
+        assert harness.can_fork(command, graph.env) == forks
+        done = graph.run(*command, check=False)
+        results.append((done.returncode, done.stdout, done.stderr))
+    assert results[0] == results[1]
+
+
+def test_signals_reach_a_fork(tmp_path: Path) -> None:
+    graph = Graph("http://127.0.0.1:1", tmp_path)
+    for number, code in ((signal.SIGTERM, 0), (signal.SIGKILL, -signal.SIGKILL)):
+        with graph.start("bass-ros", "--wait") as process:
+            assert isinstance(process._popen, fork_server.ForkedProcess)
+            harness.wait_for(lambda: "waiting for a ROS master" in process.err, what=lambda: str(process))
+            assert os.getsid(process.pid) == process.pid
+            assert process.stop(number) == code, process
+
+
+def test_programs_whose_imports_may_differ_are_not_forked(tmp_path: Path) -> None:
+    env = Graph("http://127.0.0.1:1", tmp_path).env
+    assert harness.can_fork(["bass-ros"], env)
+    for command, changes in (
+        (["bass-ros"], {"ROSAFE_PLUGINS": "/plugins"}),
+        (["bass-ros"], {"PYTHONPATH": "/elsewhere"}),
+        (["bass-ros", "__name:=left"], {}),
+        (["bass-ros", "-b"], {}),
+        (["/elsewhere/bass-ros"], {}),
+        (["cat"], {}),
+    ):
+        assert not harness.can_fork(command, {**env, **changes}), (command, changes)

@@ -1,4 +1,4 @@
-"""Only regular files are read: a FIFO, a socket or a device is refused by name, at once, wherever a file is named."""
+"""Only regular files are read: all readers of files reject a FIFO, a socket or a device by name, at once."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ READERS: dict[str, Callable[[Path], object]] = {
 
 
 @pytest.fixture(params=["FIFO", "socket", "character device"])
-def odd(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
-    path = tmp_path / "odd"
+def special_file(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
+    path = tmp_path / "special"
     if request.param == "FIFO":
         os.mkfifo(path)
     elif request.param == "socket":
@@ -53,10 +53,11 @@ def odd(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("reader", READERS)
-def test_refused(odd: Path, reader: str) -> None:
-    path = odd.with_name(reader if reader == "failed.csv" else f"odd{reader}" if reader in FORMATS else "odd")
-    if path != odd:
-        odd.rename(path)
+def test_special_file_is_rejected(special_file: Path, reader: str) -> None:
+    name = reader if reader == "failed.csv" else f"special{reader}" if reader in FORMATS else "special"
+    path = special_file.with_name(name)
+    if path != special_file:
+        special_file.rename(path)
     with pytest.raises(ERRORS) as refusal:
         READERS[reader](path)
     text = str(refusal.value)
@@ -77,8 +78,8 @@ def test_regular_files_are_read(tmp_path: Path) -> None:
         open_descriptor(tmp_path / "missing")
 
 
-def test_exchanged_meanwhile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A FIFO takes the place of the file between the first look and the opening."""
+def test_file_replaced_while_it_is_opened(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A FIFO replaces the file between the check and the opening."""
     path = tmp_path / "file"
     path.touch()
     check = inputs._check
@@ -96,8 +97,8 @@ def test_exchanged_meanwhile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
     assert len(os.listdir("/dev/fd")) == descriptors
 
 
-def test_a_sound_file_opens_no_other_file(tmp_path: Path) -> None:
-    """libsndfile, given a name, looks for a resource fork beside what it does not know, and waits for that FIFO."""
+def test_sound_file_opens_no_other_file(tmp_path: Path) -> None:
+    """Given a name, libsndfile opens the resource fork beside an unknown file, and would block on this FIFO."""
     path = tmp_path / "noise.wav"
     path.write_bytes(b"no sound " * 100)
     os.mkfifo(tmp_path / "._noise.wav")
@@ -106,8 +107,8 @@ def test_a_sound_file_opens_no_other_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("extension", [".vox", ".gsm"])
-def test_a_name_makes_no_sound(tmp_path: Path, extension: str) -> None:
-    """Formats without a header would turn any file into sound."""
+def test_extension_makes_no_sound_file(tmp_path: Path, extension: str) -> None:
+    """With formats without a header, any file would be sound."""
     path = tmp_path / f"secret{extension}"
     path.write_bytes(b"a secret " * 1000)
     with pytest.raises(AudioFileError, match="is not a sound file"):
@@ -115,7 +116,7 @@ def test_a_name_makes_no_sound(tmp_path: Path, extension: str) -> None:
 
 
 def test_commands(graph: Graph, tmp_path: Path) -> None:
-    """The commands end by themselves, with one line that names the file."""
+    """The commands exit with one line that names the file."""
     fifo = tmp_path / "fifo.yaml"
     os.mkfifo(fifo)
     kept = graph.run("rosAFE-ros", "--keep", str(fifo), check=False)
@@ -127,8 +128,8 @@ def test_commands(graph: Graph, tmp_path: Path) -> None:
         assert f"{fifo}: expected a regular file, got a FIFO" in lines[0]
 
 
-def test_standard_input_may_be_a_pipe(graph: Graph) -> None:
-    """`-` is read as it is; here it is no setup, which shows that it was."""
+def test_standard_input_can_be_a_pipe(graph: Graph) -> None:
+    """The error for invalid content shows that `-` is read from the pipe."""
     done = subprocess.run(
         [PYTHON, str(SCRIPTS / "rosafe"), "setup", "load", "-"],
         input="nothing: here\n",

@@ -1,4 +1,4 @@
-"""Bags for tests: what a port Audio shows of a stream, message by message, written by rosbag's own library."""
+"""Bags for tests: the messages of a port Audio, written by rosbag's own library."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from rosafe.component import serialization
 
 
 def stream(frames: int, seed: int = 0) -> np.ndarray:
-    """Noise, int32 (2, frames), in which no frame is zero."""
+    """Return noise, int32 (2, frames), in which no frame is zero."""
     return np.random.default_rng(seed).integers(1, 2**31, (2, frames)).astype(np.int32)
 
 
 def message(samples: np.ndarray, index: int, window: int, rate: int = 1000, chunk: int = 10) -> Any:
-    """The port when frame `index` is the newest of `samples`."""
+    """Return the message of the port whose newest frame is frame `index` of `samples`."""
     padded = np.concatenate((np.zeros((2, window), np.int32), samples[:, :index]), axis=1)[:, -window:]
     left, right = np.ascontiguousarray(padded)
     return serialization.message_class("bass", "::binaudio::portStruct")(
@@ -33,7 +33,7 @@ def message(samples: np.ndarray, index: int, window: int, rate: int = 1000, chun
 
 
 def write(path: Path, messages: Iterable[Any], topic: str = "/bass/Audio", **options: Any) -> Path:
-    """A bag of `messages`, 10 ms apart."""
+    """Write a bag of `messages`, 10 ms apart."""
     import genpy
     import rosbag
 
@@ -44,7 +44,7 @@ def write(path: Path, messages: Iterable[Any], topic: str = "/bass/Audio", **opt
 
 
 def record(op: int, data: bytes = b"", length: int | None = None, **fields: bytes) -> bytes:
-    """A record of a bag as it lies in the file; `length` is what it says of its data, if that is a lie."""
+    """Return the bytes of a record; `length` replaces the true length of its data."""
     header = b"".join(
         struct.pack("<I", len(name) + 1 + len(value)) + name.encode() + b"=" + value
         for name, value in {"op": bytes([op]), **fields}.items()
@@ -53,12 +53,12 @@ def record(op: int, data: bytes = b"", length: int | None = None, **fields: byte
 
 
 def number(value: int, size: int = 4) -> bytes:
-    """A field's value."""
+    """Return the bytes of a numeric field."""
     return value.to_bytes(size, "little")
 
 
 def forge(path: Path, chunks: bytes, hole: int = 0, connections: int = 1) -> Path:
-    """A bag of these chunks and a hole, with one connection of a port Audio, 0, at its end."""
+    """Write a bag of these chunks and a hole, and connection 0 of a port Audio at the end."""
     kind = serialization.message_class("bass", "::binaudio::portStruct")
 
     def head(index: int) -> bytes:
@@ -78,7 +78,7 @@ def forge(path: Path, chunks: bytes, hole: int = 0, connections: int = 1) -> Pat
 
 
 def read(path: Path, topic: str) -> list[Any]:
-    """The messages of a topic, as rosbag gives them."""
+    """Return the messages of a topic, read by rosbag."""
     import rosbag
 
     with rosbag.Bag(str(path)) as bag:

@@ -1,7 +1,7 @@
-"""A process that opens PCMs of libasound by name, in its own folder, and tells what came of each as a line of JSON.
+"""A process that opens PCMs by name with libasound, in its own folder, and prints each result as a line of JSON.
 
-It knows of every file that was written or opened for writing there (inotify), and of every process that was run.
-Reads lines of JSON, each a list of a name and whether it is to be checked first, as bass does.
+It detects each file that was written or opened for writing there (inotify), and each process that was started.
+Each input line is a JSON list of a name and of whether to check the name first, as bass does.
 """
 
 from __future__ import annotations
@@ -37,8 +37,8 @@ def main() -> None:
         before, outcome = children(), "opened"
         with captured_alsa_errors():
             try:
-                wanted = checked_name(name) if checked else name
-                alsa.PCM(type=alsa.PCM_CAPTURE, mode=alsa.PCM_NONBLOCK, device=wanted).close()
+                open_name = checked_name(name) if checked else name
+                alsa.PCM(type=alsa.PCM_CAPTURE, mode=alsa.PCM_NONBLOCK, device=open_name).close()
             except ComponentError as problem:
                 outcome = f"refused: {problem.reason}"
             except (alsa.ALSAAudioError, ValueError) as problem:

@@ -1,4 +1,4 @@
-"""The ALSA source: a scripted PCM for what hardware does at its worst, and the real libasound with plugins."""
+"""The ALSA source: with a scripted PCM for hardware failures, and with the real libasound and plugins."""
 
 from __future__ import annotations
 
@@ -17,7 +17,8 @@ import numpy as np
 import pytest
 
 from rosafe.bass.sources import alsa, libasound, open_source
-from rosafe.bass.sources.alsa import AlsaSource, DeviceBusyError
+from rosafe.bass.sources.alsa import AlsaSource
+from rosafe.bass.sources.pcm import DeviceBusyError
 from rosafe.interface import ComponentError
 from rosafe.transport import paths
 
@@ -26,9 +27,9 @@ XRUN = -errno.EPIPE
 
 
 class FakePcm:
-    """A PCM that follows `script`: a number of frames to give, XRUN, 0 (nothing yet) or an exception's text.
+    """A PCM that follows `script`: a number of frames to return, XRUN, 0 (no frames yet) or the text of an exception.
 
-    Frame k of channel c is 1000 * k + c, counted over all reads. `clock` moves by the frames that are given.
+    Frame k of channel c is 1000 * k + c, counted over all reads. `clock` advances by the duration of returned frames.
     """
 
     script: ClassVar[list[Any]] = []
@@ -39,16 +40,17 @@ class FakePcm:
     frame: ClassVar[int] = 0
     clock: ClassVar[float] = 100.0
 
-    def __init__(self, **wanted: Any) -> None:
+    def __init__(self, **settings: Any) -> None:
         if self.refusals:
-            raise FakeAlsa.ALSAAudioError(f"{self.refusals.pop(0)} [{wanted['device']}]")
-        channels = wanted["channels"] if wanted["channels"] in self.available_channels else self.available_channels[0]
+            raise FakeAlsa.ALSAAudioError(f"{self.refusals.pop(0)} [{settings['device']}]")
+        requested = settings["channels"]
+        channels = requested if requested in self.available_channels else self.available_channels[0]
         self.channels = channels
         self.settings = {
             "format_name": "S32_LE",
             "channels": channels,
-            "rate": wanted["rate"],
-            "period_size": wanted["periodsize"],
+            "rate": settings["rate"],
+            "period_size": settings["periodsize"],
             **self.info_changes,
         }
         self.closed = False
@@ -56,33 +58,33 @@ class FakePcm:
         self.opened.append(self)
 
     def info(self) -> dict[str, Any]:
-        """As pyalsaaudio gives it."""
+        """Return the settings in the form of pyalsaaudio."""
         return self.settings
 
     def getformats(self) -> dict[str, int]:
-        """Of a cheap microphone."""
+        """Return the formats of a cheap microphone."""
         return {"S16_LE": 2, "S24_3LE": 32}
 
     def getrates(self) -> list[int]:
-        """Of a cheap microphone."""
+        """Return the sample rates of a cheap microphone."""
         return [32000, 48000]
 
     def avail(self) -> int:
-        """Nothing more."""
+        """Return 0: no further frames are available."""
         return 0
 
     def polldescriptors(self) -> list[tuple[int, int]]:
-        """One that is ready at once."""
+        """Return a descriptor that is ready immediately."""
         os.write(self._pipe[1], b"x")
         return [(self._pipe[0], 1)]
 
     def polldescriptors_revents(self, ready: list[tuple[int, int]]) -> int:
-        """Takes note."""
+        """Read the byte that made the descriptor ready."""
         os.read(self._pipe[0], 1)
         return ready[0][1]
 
     def read(self) -> tuple[int, bytes]:
-        """The next step of the script; for ever what is asked for at its end."""
+        """Execute the next step of the script; after its end, return chunks."""
         step = FakePcm.script.pop(0) if FakePcm.script else CHUNK
         if isinstance(step, tuple):
             step, seconds = step
@@ -97,7 +99,7 @@ class FakePcm:
         return step, (1000 * numbers[:, None] + np.arange(self.channels)).astype("<i4").tobytes()
 
     def close(self) -> None:
-        """Close the pipe too."""
+        """Close the pipe."""
         if not self.closed:
             self.closed = True
             for end in self._pipe:
@@ -105,10 +107,10 @@ class FakePcm:
 
 
 class FakeAlsa:
-    """The module alsaaudio as far as the source uses it."""
+    """The parts of the module alsaaudio that the source uses."""
 
     class ALSAAudioError(Exception):
-        """As pyalsaaudio's."""
+        """The exception of pyalsaaudio."""
 
     PCM_CAPTURE, PCM_NONBLOCK, PCM_FORMAT_S32_LE = 1, 1, 10
     PCM = FakePcm
@@ -116,7 +118,7 @@ class FakeAlsa:
 
 @pytest.fixture
 def pcm(monkeypatch: pytest.MonkeyPatch) -> Iterator[type[FakePcm]]:
-    """The fake in place of pyalsaaudio, with its own clock and without pauses between attempts."""
+    """Replace pyalsaaudio by the fake, with its own clock and without pauses between attempts."""
     monkeypatch.setattr(alsa, "load_alsaaudio", lambda: FakeAlsa)
     monkeypatch.setattr(alsa, "time", types.SimpleNamespace(monotonic=lambda: FakePcm.clock))
     monkeypatch.setattr(alsa, "RETRY_SECONDS", 0.001)
@@ -142,13 +144,13 @@ def open_fake(device: str = "hw:9", stopping: threading.Event | None = None) -> 
 
 
 def left(source: AlsaSource) -> tuple[list[int], int]:
-    """Frame numbers of the left ear in the next chunk (-1 for zeros after frame 0), and the gap before it."""
+    """Return the left ear's frame numbers in the next chunk (-1 for zeros after frame 0), and the gap before it."""
     chunk = source.read()
     assert chunk is not None
     return [int(v) // 1000 if v else -1 for v in chunk.samples[0]], chunk.gap
 
 
-def test_short_reads_are_put_together(pcm: type[FakePcm]) -> None:
+def test_short_reads_are_joined_to_chunks(pcm: type[FakePcm]) -> None:
     pcm.frame = 1
     pcm.script[:] = [3, 0, 4, 2, 8, 3, 0, 0, 10]
     source = open_fake()
@@ -189,7 +191,7 @@ def test_overrun_within_a_chunk_is_zeros_and_then_a_gap(pcm: type[FakePcm]) -> N
     assert left(source) == ([1, 2, 3, 4, -1, -1, -1, 5, 6, 7], 0)
     pcm.script[:] = [XRUN]
     pcm.clock += 0.040
-    # 8 to 14 are still to come; the loss falls into the chunk that they begin, and the rest of it before the next.
+    # Frames 8 to 14 follow; the loss fills the rest of their chunk, and its remainder precedes the next chunk.
     chunk, gap = left(source)
     assert (chunk, gap) == ([8, 9, 10, 11, 12, 13, 14, -1, -1, -1], 0)
     chunk, gap = left(source)
@@ -197,15 +199,15 @@ def test_overrun_within_a_chunk_is_zeros_and_then_a_gap(pcm: type[FakePcm]) -> N
     assert source.lost_frames == 43
 
 
-def test_overruns_without_any_sound_end_as_a_broken_device(pcm: type[FakePcm]) -> None:
+def test_repeated_overruns_without_audio_are_a_device_error(pcm: type[FakePcm]) -> None:
     pcm.script[:] = [XRUN] * 1000
-    with pytest.raises(ComponentError, match="overrun after overrun") as caught:
+    with pytest.raises(ComponentError, match="repeated overruns") as caught:
         open_fake().read()
     assert caught.value.ex == "::bass::e_device"
 
 
-def test_overruns_with_sound_between_them_are_no_broken_device(pcm: type[FakePcm]) -> None:
-    """However many there are: the device is never opened again."""
+def test_overruns_with_audio_between_them_are_not_a_device_error(pcm: type[FakePcm]) -> None:
+    """The device is not reopened, whatever the number of overruns."""
     pcm.script[:] = [10, XRUN] * 50
     source = open_fake()
     for _ in range(50):
@@ -213,7 +215,7 @@ def test_overruns_with_sound_between_them_are_no_broken_device(pcm: type[FakePcm
     assert source.overruns >= 49 and len(pcm.opened) == 1
 
 
-def test_device_that_comes_back_goes_on(pcm: type[FakePcm]) -> None:
+def test_device_that_returns_is_reopened(pcm: type[FakePcm]) -> None:
     pcm.frame = 1
     pcm.script[:] = [10, ("Input/output error", 0.5), 10]
     source = open_fake()
@@ -225,8 +227,8 @@ def test_device_that_comes_back_goes_on(pcm: type[FakePcm]) -> None:
 
 
 @pytest.mark.parametrize("trouble", ["Input/output error", XRUN])
-def test_loss_lasts_until_there_is_sound_again(pcm: type[FakePcm], trouble: Any) -> None:
-    """A device that takes seconds to start anew, as PulseAudio does."""
+def test_loss_ends_with_the_next_audio(pcm: type[FakePcm], trouble: Any) -> None:
+    """A device that needs seconds to restart, such as PulseAudio."""
     pcm.frame = 1
     pcm.script[:] = [10, (trouble, 0.5), (0, 0.9), (0, 1.0), 10]
     source = open_fake()
@@ -235,7 +237,7 @@ def test_loss_lasts_until_there_is_sound_again(pcm: type[FakePcm], trouble: Any)
     assert (source.overruns, source.lost_frames) == (1, 2400)
 
 
-def test_nothing_is_lost_before_the_first_sound(pcm: type[FakePcm]) -> None:
+def test_no_frame_is_lost_before_the_first_audio(pcm: type[FakePcm]) -> None:
     pcm.frame = 1
     pcm.script[:] = [(0, 1.0), ("Input/output error", 0.5), (XRUN, 0.1), 10]
     source = open_fake()
@@ -244,8 +246,8 @@ def test_nothing_is_lost_before_the_first_sound(pcm: type[FakePcm]) -> None:
 
 
 @pytest.mark.parametrize(("kept", "lost"), [(400, 6000), (6400, 0)])
-def test_sound_that_is_dropped_in_a_standstill(pcm: type[FakePcm], kept: int, lost: int) -> None:
-    """A sound server keeps so many frames for a process that was stopped, and says nothing of the others."""
+def test_audio_that_is_dropped_in_a_standstill_is_counted(pcm: type[FakePcm], kept: int, lost: int) -> None:
+    """A sound server stores a limited number of frames for a stopped process, and drops the others without a report."""
     source = open_fake()
     begin = pcm.clock
     left(source)
@@ -253,7 +255,7 @@ def test_sound_that_is_dropped_in_a_standstill(pcm: type[FakePcm], kept: int, lo
     pcm.script[:] = [(kept, -kept / RATE)]  # at once
     frames = CHUNK
     frames += sum(CHUNK + left(source)[1] for _ in range(kept // CHUNK + 50))
-    pcm.clock += 1.5  # once more, before what there is to compare has come
+    pcm.clock += 1.5  # a second standstill before the comparison after the first one
     pcm.script[:] = [(1500, -1.5)]
     while pcm.clock < begin + 12:
         frames += CHUNK + left(source)[1]
@@ -262,8 +264,8 @@ def test_sound_that_is_dropped_in_a_standstill(pcm: type[FakePcm], kept: int, lo
 
 
 @pytest.mark.parametrize(("change", "lost"), [(0.2, 0), (-0.2, 0), (0.3, 300)])
-def test_delay_that_changes_in_a_standstill(pcm: type[FakePcm], change: float, lost: int) -> None:
-    """What a sound server has under way may be more or less than before; only much more is a loss."""
+def test_small_change_of_delay_in_a_standstill_is_not_a_loss(pcm: type[FakePcm], change: float, lost: int) -> None:
+    """The number of frames in a sound server can change; only a large increase is a loss."""
     source = open_fake()
     left(source)
     pcm.clock += 3.0
@@ -273,46 +275,46 @@ def test_delay_that_changes_in_a_standstill(pcm: type[FakePcm], change: float, l
     assert (source.lost_frames, source.overruns) == (lost, lost > 0)
 
 
-def test_plugins_see_what_the_poll_said(pcm: type[FakePcm], monkeypatch: pytest.MonkeyPatch) -> None:
-    """One whose descriptor is ready at once, and that has sound once it was told of that."""
-    told: list[list[tuple[int, int]]] = []
-    monkeypatch.setattr(pcm, "polldescriptors_revents", lambda self, ready: told.append(ready))
+def test_plugins_get_the_result_of_poll(pcm: type[FakePcm], monkeypatch: pytest.MonkeyPatch) -> None:
+    """A plugin whose descriptor is ready immediately, and that returns audio after it got the result of poll."""
+    poll_results: list[list[tuple[int, int]]] = []
+    monkeypatch.setattr(pcm, "polldescriptors_revents", lambda self, ready: poll_results.append(ready))
     read = pcm.read
 
-    def read_when_told(self: FakePcm) -> tuple[int, bytes]:
-        if told:
+    def read_after_poll(self: FakePcm) -> tuple[int, bytes]:
+        if poll_results:
             return read(self)
         pcm.clock += 0.1
         return 0, b""
 
-    monkeypatch.setattr(pcm, "read", read_when_told)
+    monkeypatch.setattr(pcm, "read", read_after_poll)
     source = open_fake()
     assert source.read() is not None
-    ((descriptor, events),) = told[0]
+    ((descriptor, events),) = poll_results[0]
     assert descriptor == pcm.opened[0]._pipe[0] and events & select.POLLIN
 
 
-def test_device_that_is_gone_ends_after_bounded_attempts(pcm: type[FakePcm]) -> None:
+def test_lost_device_is_an_error_after_bounded_attempts(pcm: type[FakePcm]) -> None:
     pcm.script[:] = [10, "No such device"]
     source = open_fake()
     left(source)
     pcm.refusals += ["No such device"] * 100
-    with pytest.raises(ComponentError, match="hw:9: No such device; given up after 5 attempts") as caught:
+    with pytest.raises(ComponentError, match="hw:9: No such device; gave up after 5 attempts") as caught:
         source.read()
     assert caught.value.ex == "::bass::e_device"
     assert len(pcm.refusals) == 95
     source.close()
 
 
-def test_device_that_opens_but_never_works_ends(pcm: type[FakePcm]) -> None:
+def test_device_that_opens_but_never_works_is_an_error(pcm: type[FakePcm]) -> None:
     pcm.script[:] = ["Input/output error"] * 100
-    with pytest.raises(ComponentError, match="given up after 5"):
+    with pytest.raises(ComponentError, match="gave up after 5"):
         open_fake().read()
 
 
-def test_mute_device_counts_as_gone(pcm: type[FakePcm]) -> None:
+def test_silent_device_counts_as_lost(pcm: type[FakePcm]) -> None:
     pcm.script[:] = [(0, 1.0)] * 1000
-    with pytest.raises(ComponentError, match="no sound comes any more"):
+    with pytest.raises(ComponentError, match="delivers no more audio"):
         open_fake().read()
 
 
@@ -324,8 +326,8 @@ def test_stop_ends_the_wait_for_sound(pcm: type[FakePcm]) -> None:
     assert source.read() is None
 
 
-def test_soak_the_index_never_leaves_the_clock(pcm: type[FakePcm]) -> None:
-    """Short reads, overruns and reopened devices: frames and losses together are the time that has passed."""
+def test_soak_the_frame_index_follows_the_clock(pcm: type[FakePcm]) -> None:
+    """With short reads, overruns and reopened devices, received and lost frames add up to the elapsed time."""
     random = np.random.default_rng(0)
     pcm.script[:] = [
         (XRUN, float(random.uniform(0.001, 0.5)))
@@ -343,7 +345,7 @@ def test_soak_the_index_never_leaves_the_clock(pcm: type[FakePcm]) -> None:
         last = chunk.time
         count += chunk.gap + 100
     assert source.overruns > 150
-    # Each loss is known to half a frame, and the newest frames are still to come.
+    # Each loss is exact to half a frame, and the newest frames are not read yet.
     assert count == pytest.approx((pcm.clock - 100) * RATE, abs=300 + source.overruns / 2)
     assert last == pytest.approx(pcm.clock, abs=0.3)
 
@@ -351,14 +353,16 @@ def test_soak_the_index_never_leaves_the_clock(pcm: type[FakePcm]) -> None:
 @pytest.mark.parametrize(
     ("changes", "why"),
     [
-        ({"format_name": "S16_LE"}, "no format S32_LE, it offers S16_LE, S24_3LE: plughw:9 converts"),
-        ({"rate": 48000}, "no sample rate of 1000 Hz, it offers 32000, 48000 Hz"),
-        ({"period_size": 16}, "no chunks of 10 frames, the nearest are of 16"),
-        ({"channels": 8}, "not 2 channels, it opens with 8: pick two with ?channels=1,2"),
+        ({"format_name": "S16_LE"}, "expected format S32_LE, got S16_LE, S24_3LE: use plughw:9"),
+        ({"rate": 48000}, "expected 1000 Hz, got 32000, 48000 Hz"),
+        ({"period_size": 16}, "expected chunks of 10 frames, got 16"),
+        ({"channels": 8}, "expected 2 channels, got 8: choose two with ?channels=1,2"),
         ({"channels": 1}, "1,1 for both ears"),
     ],
 )
-def test_inexact_device_is_refused_with_its_offer(pcm: type[FakePcm], changes: dict[str, Any], why: str) -> None:
+def test_inexact_device_is_rejected_with_its_capabilities(
+    pcm: type[FakePcm], changes: dict[str, Any], why: str
+) -> None:
     pcm.info_changes.update(changes)
     with pytest.raises(ComponentError) as caught:
         open_fake()
@@ -373,10 +377,10 @@ def test_inexact_device_is_refused_with_its_offer(pcm: type[FakePcm], changes: d
         ("No such file or directory", "e_device"),
         ("Permission denied", "e_device"),
         ("Device or resource busy", "e_device"),
-        ("Invalid argument", "e_hwparams"),  # libasound had nothing to say against the name
+        ("Invalid argument", "e_hwparams"),  # libasound has not reported an error about the name
     ],
 )
-def test_refusal_of_the_device(pcm: type[FakePcm], strerror: str, exception: str) -> None:
+def test_errors_when_opening_the_device(pcm: type[FakePcm], strerror: str, exception: str) -> None:
     pcm.refusals.append(strerror)
     with pytest.raises(ComponentError) as caught:
         open_fake()
@@ -384,7 +388,7 @@ def test_refusal_of_the_device(pcm: type[FakePcm], strerror: str, exception: str
     assert isinstance(caught.value, DeviceBusyError) == ("busy" in strerror)
 
 
-def test_two_channels_of_many(pcm: type[FakePcm]) -> None:
+def test_two_channels_of_many_can_be_selected(pcm: type[FakePcm]) -> None:
     pcm.available_channels = (6, 8)
     source = open_fake("hw:9?channels=4,3")
     assert pcm.opened[-1].channels == 6
@@ -393,25 +397,25 @@ def test_two_channels_of_many(pcm: type[FakePcm]) -> None:
     assert chunk is not None
     assert chunk.samples[:, 2].tolist() == [2003, 2002]
     pcm.available_channels = (2,)
-    with pytest.raises(ComponentError, match="has no 4 channels"):
+    with pytest.raises(ComponentError, match="expected at least 4 channels, got fewer"):
         open_fake("hw:9?channels=4,3")
 
 
 @pytest.mark.parametrize("options", ["channels=3", "channels=0,1", "channels=1,33", "channels=a,b", "rate=5"])
-def test_bad_options(pcm: type[FakePcm], options: str) -> None:
+def test_invalid_options_are_rejected(pcm: type[FakePcm], options: str) -> None:
     with pytest.raises(ComponentError) as caught:
         open_fake(f"hw:9?{options}")
     assert caught.value.ex == "::bass::e_device"
     assert not pcm.opened
 
 
-def test_debians_module_and_no_module_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_debians_module_and_a_missing_module_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
     broken = types.ModuleType("alsaaudio")
     broken.__file__ = "/usr/lib/python3/dist-packages/alsaaudio.so"
     monkeypatch.setitem(sys.modules, "alsaaudio", broken)
     with pytest.raises(ComponentError, match=r"Debian's python3-alsaaudio 0\.8.*scripts/install"):
         open_source("hw:0", 44100, 2205, threading.Event())
-    monkeypatch.setitem(sys.modules, "alsaaudio", None)  # type: ignore[misc]  # how Python marks what is not there
+    monkeypatch.setitem(sys.modules, "alsaaudio", None)  # type: ignore[misc]  # marks a module that cannot be imported
     with pytest.raises(ComponentError, match=r"need pyalsaaudio.*scripts/install"):
         open_source("hw:0", 44100, 2205, threading.Event())
 
@@ -434,7 +438,7 @@ def test_capture_devices_as_the_kernel_lists_them(tmp_path: Path) -> None:
         (2, 10, "Loop", "Loop Analog: x"),
         (10, 0, "Mic", "Mic Analog: x"),
     ]
-    (tmp_path / "card2" / "id").unlink()  # it is being unplugged
+    (tmp_path / "card2" / "id").unlink()  # a card that is being unplugged
     assert [card for card, *_ in libasound.capture_devices(tmp_path)] == [0, 10]
 
 
@@ -443,7 +447,7 @@ def test_capture_devices_as_the_kernel_lists_them(tmp_path: Path) -> None:
 
 @pytest.fixture
 def real_alsa(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A configuration with plugin PCMs that need no hardware; `samples.raw` is what `recorded` gives."""
+    """Create a configuration with plugin PCMs that need no hardware; `recorded` returns `samples.raw`."""
     paths.prefer_pypi_packages()
     try:
         importlib.import_module("alsaaudio")
@@ -506,20 +510,20 @@ def test_route_plugin_swaps_the_ears(real_alsa: Path) -> None:
         ("hw:7,0", "e_device", "hw:7,0: No such file or directory (Cannot get card index for 7;"),
         ("nosuch", "e_device", "Unknown PCM nosuch"),
         ("file", "e_device", "file is not defined"),
-        ("", "e_device", "no name of a PCM"),
-        ("two\nlines", "e_device", "in no device's name"),
-        ("floating", "e_hwparams", "no format S32_LE, it offers FLOAT64_BE, FLOAT64_LE, FLOAT_BE, FLOAT_LE: plug:f"),
-        ("sixteen", "e_hwparams", "sixteen: no format S32_LE, it offers S16_LE: plug:sixteen converts"),
-        ("microphone", "e_hwparams", "it opens with 1: pick two with ?channels=1,2, or 1,1 for both ears"),
+        ("", "e_device", "expected the name of a PCM"),
+        ("two\nlines", "e_device", "the name of a device"),
+        ("floating", "e_hwparams", "S32_LE, got FLOAT64_BE, FLOAT64_LE, FLOAT_BE, FLOAT_LE: use plug:f"),
+        ("sixteen", "e_hwparams", "sixteen: expected format S32_LE, got S16_LE: use plug:sixteen"),
+        ("microphone", "e_hwparams", "got 1: choose two with ?channels=1,2, or 1,1 for both ears"),
         ("nothing", "e_device", "Cannot open shared library libasound_module_pcm_nosuch.so"),
-        ("four", "e_hwparams", "not 2 channels, it opens with 4"),
+        ("four", "e_hwparams", "expected 2 channels, got 4"),
     ],
 )
-def test_real_refusals_are_one_line(
+def test_errors_of_the_real_libasound_are_one_line(
     real_alsa: Path, capfd: pytest.CaptureFixture[str], device: str, exception: str, why: str
 ) -> None:
     with pytest.raises(ComponentError) as caught:
         open_source(device, 44100, 2205, threading.Event())
     assert caught.value.ex == f"::bass::{exception}"
     assert why in caught.value.reason and "\n" not in caught.value.reason
-    assert capfd.readouterr().err == ""  # nothing of libasound's own
+    assert capfd.readouterr().err == ""  # no messages of libasound itself

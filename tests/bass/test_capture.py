@@ -17,7 +17,7 @@ from rosafe.interface import ComponentError
 
 @settings(max_examples=100, deadline=None)
 @given(st.integers(1, 50), st.lists(st.tuples(st.integers(0, 120), st.integers(0, 80)), max_size=30))
-def test_window_is_the_tail_of_the_stream(frames: int, steps: list[tuple[int, int]]) -> None:
+def test_window_contains_the_newest_frames_of_the_stream(frames: int, steps: list[tuple[int, int]]) -> None:
     window = AudioWindow(frames)
     stream = np.zeros((2, frames), np.int32)
     kept = []
@@ -27,13 +27,13 @@ def test_window_is_the_tail_of_the_stream(frames: int, steps: list[tuple[int, in
         window.append(block)
         stream = np.concatenate((stream, np.zeros((2, gap), np.int32), block), axis=1)
         kept.append((window.view(), stream[:, -frames:]))
-    for view, expected in kept:  # what was published stays as it was, whatever came later
+    for view, expected in kept:  # published views do not change
         assert np.array_equal(view, expected)
         assert not view.flags.writeable
 
 
 class ScriptedSource:
-    """Chunks of two frames, with gaps and times as told."""
+    """A source of chunks of two frames with given gaps and times."""
 
     name = "script"
     sample_rate = 1000
@@ -45,7 +45,7 @@ class ScriptedSource:
         self.next = 1
 
     def read(self) -> Chunk | None:
-        """The next chunk: consecutive numbers, the right ear negative."""
+        """Return the next chunk: consecutive numbers, negative for the right ear."""
         if not self.script:
             return None
         gap, age = self.script.pop(0)
@@ -57,7 +57,7 @@ class ScriptedSource:
         return Chunk(np.stack((numbers, -numbers)), gap, time.monotonic() - age)
 
     def close(self) -> None:
-        """Nothing to close."""
+        """Do nothing."""
 
 
 def run(script: list[tuple[int, float]], chunks: int = 3) -> tuple[list[Snapshot], list[str]]:
@@ -69,7 +69,7 @@ def run(script: list[tuple[int, float]], chunks: int = 3) -> tuple[list[Snapshot
     return published, reports
 
 
-def test_port_begins_with_zeros_and_slides() -> None:
+def test_port_starts_with_zeros_and_advances() -> None:
     published, reports = run([(0, 0.0), (0, 0.0), (0, 0.0), (0, 0.0)])
     assert [s.last_frame_index for s in published] == [0, 2, 4, 6, 8]
     assert [s.left.tolist() for s in published] == [
@@ -102,24 +102,24 @@ def test_stamp_is_the_time_of_acquisition() -> None:
     assert time.time_ns() - published[-1].time_ns == pytest.approx(5e9, abs=2e9)
 
 
-def test_late_chunks_are_published_together_but_none_is_missed() -> None:
+def test_late_chunks_are_published_together_without_a_loss() -> None:
     published, _ = run([(0, 10.0)] * 21, chunks=8)
     indexes = [s.last_frame_index for s in published]
     assert len(indexes) < 10 and indexes[-1] == 42
-    assert max(np.diff(indexes)) <= 16  # the window overlaps the one before
+    assert max(np.diff(indexes)) <= 16  # the window overlaps the previous one
     seen = {int(frame) for s in published for frame in s.left}
     assert seen == set(range(43))
 
 
-def test_absurd_windows_are_refused() -> None:
+def test_too_long_windows_are_rejected() -> None:
     check_window(2205, 200)
     check_window(MAX_WINDOW, 1)
-    with pytest.raises(ComponentError, match="are too many") as caught:
+    with pytest.raises(ComponentError, match="expected at most 16777216 frames") as caught:
         check_window(1_000_000, 100_000)
     assert caught.value.ex == "::bass::e_hwparams"
 
 
-def test_no_memory_has_a_name(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lack_of_memory_is_a_named_error(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object) -> None:
         raise MemoryError
 

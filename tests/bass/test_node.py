@@ -1,4 +1,4 @@
-"""The bass node on a real ROS graph: what users and rosAFE rely on."""
+"""The bass node on a real ROS graph."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def seconds(message: Any) -> float:
 
 @pytest.fixture
 def wav(tmp_path: Path) -> tuple[str, np.ndarray]:
-    """A file of half a second, as device name, and its samples as they come on the port, (2, frames)."""
+    """Write a file of half a second. Return its device name and the expected samples on the port, (2, frames)."""
     samples = np.random.default_rng(3).integers(-(2**15), 2**15, (2, 4100)).astype(np.int16)
     soundfile.write(tmp_path / "a.wav", samples.T, RATE, subtype="PCM_16")
     return f"file:{tmp_path / 'a.wav'}", samples.astype(np.int32) << 16
@@ -45,7 +45,7 @@ def acquire(graph: Graph, device: str, rate: int = 0, chunk: int = CHUNK, chunks
 
 
 def live(graph: Graph) -> list[str]:
-    """Names of the activities under way, as genom_state tells."""
+    """Return the names of the running activities according to genom_state."""
     state = graph.message("/bass/genom_state")
     return [activity.name for task in state.task for activity in task.activity]
 
@@ -66,7 +66,7 @@ def test_file_on_the_port(graph: Graph, bass_node: Process, wav: tuple[str, np.n
         assert np.array_equal(message.left, window[0]) and np.array_equal(message.right, window[1])
     indexes = [message.lastFrameIndex for message in messages]
     assert indexes == sorted(set(indexes)) and len(indexes) > 5
-    # Stamps are the times of acquisition: as far apart as the frames.
+    # Stamps are the times of acquisition; their differences correspond to those of the frame indices.
     stamps = np.array([seconds(message) for message in messages[1:]])
     assert np.allclose(np.diff(stamps), np.diff(indexes[1:]) / RATE, atol=5e-3)
     wait_for(lambda: "Acquire" not in live(graph), what="normal end at the end of the file")
@@ -77,7 +77,7 @@ def test_end_of_file_is_a_normal_end_of_the_action(
 ) -> None:
     import actionlib
 
-    messages = importlib.import_module("bass.msg")  # mypy takes the folder bass/ of this repository for it
+    messages = importlib.import_module("bass.msg")  # mypy confuses it with the folder bass/ of this repository
 
     graph.client()
     client = actionlib.SimpleActionClient("/bass/Acquire", messages.AcquireAction)
@@ -109,36 +109,36 @@ def test_defaults_and_scene_from_the_shell(graph: Graph, bass_node: Process) -> 
     assert "lastFrameIndex: " in graph.run("rostopic", "echo", "-n1", "/bass/Audio").stdout
 
 
-MISTAKES: list[tuple[dict[str, Any], str, str]] = [
+INVALID_REQUESTS: list[tuple[dict[str, Any], str, str]] = [
     ({"device": "hw:77,0"}, "e_device", "hw:77,0: "),
     ({"device": "no such device"}, "e_device", "no such device: "),
     ({"device": "file:/no/such/file.wav"}, "e_device", "/no/such/file.wav: No such file"),
-    ({"device": "WAV", "sampleRate": 44100}, "e_hwparams", "8000 Hz, asked for were 44100"),
-    ({"device": "WAV?loop=2"}, "e_device", "loop=2 is not 0 or 1"),
+    ({"device": "WAV", "sampleRate": 44100}, "e_hwparams", "expected 44100 Hz, got 8000 Hz"),
+    ({"device": "WAV?loop=2"}, "e_device", "loop: expected a whole number from 0 to 1, got '2'"),
     ({"device": "bag:/no/such.bag"}, "e_device", "/no/such.bag: No such file"),
-    ({"device": "scene:?x=1"}, "e_device", "no option 'x'"),
+    ({"device": "scene:?x=1"}, "e_device", "unknown option 'x'"),
     ({"device": "x" * 5000}, "e_hwparams", "4096 characters"),
     ({"device": "scene:", "sampleRate": 2**31}, "e_hwparams", "sampleRate"),
     ({"device": "scene:", "nFramesPerChunk": 2**32 - 1}, "e_hwparams", "nFramesPerChunk"),
-    ({"device": "scene:", "nFramesPerChunk": 10**6, "nChunksOnPort": 10**5}, "e_hwparams", "too many for the port"),
+    ({"device": "scene:", "nFramesPerChunk": 10**6, "nChunksOnPort": 10**5}, "e_hwparams", "frames on the port"),
 ]
 
 
-def test_mistakes_change_nothing(graph: Graph, bass_node: Process, wav: tuple[str, np.ndarray]) -> None:
+def test_invalid_requests_change_nothing(graph: Graph, bass_node: Process, wav: tuple[str, np.ndarray]) -> None:
     assert acquire(graph, "scene:", RATE).genom_success
     with graph.collect("/bass/Audio", audio_class()) as messages:
-        for mistake, exception, why in MISTAKES:
-            fields: dict[str, Any] = {"sampleRate": 0, "nFramesPerChunk": 0, "nChunksOnPort": 0, **mistake}
+        for request_values, exception, why in INVALID_REQUESTS:
+            fields: dict[str, Any] = {"sampleRate": 0, "nFramesPerChunk": 0, "nChunksOnPort": 0, **request_values}
             fields["device"] = fields["device"].replace("WAV", wav[0])
-            lines = len(bass_node.err.splitlines())
-            answer = graph.call("/bass/Acquire", **fields)
-            assert not answer.genom_success, mistake
-            refused = json.loads(answer.genom_exdetail)
-            assert refused["ex"] == f"::bass::{exception}" and why in refused["what"], mistake
-            told = bass_node.err.splitlines()[lines:]
-            assert len(told) == 1 and f"::bass::{exception}" in told[0] and why in told[0], (mistake, told)
+            logged = len(bass_node.err.splitlines())
+            response = graph.call("/bass/Acquire", **fields)
+            assert not response.genom_success, request_values
+            error = json.loads(response.genom_exdetail)
+            assert error["ex"] == f"::bass::{exception}" and why in error["what"], request_values
+            lines = bass_node.err.splitlines()[logged:]
+            assert len(lines) == 1 and f"::bass::{exception}" in lines[0] and why in lines[0], (request_values, lines)
         known = len(messages)
-        wait_for(lambda: len(messages) >= known + 3, what="more of the acquisition that was running")
+        wait_for(lambda: len(messages) >= known + 3, what="further messages of the running acquisition")
     indexes = [message.lastFrameIndex for message in messages]
     assert indexes == sorted(set(indexes))
     assert {message.nFramesPerChunk for message in messages} == {CHUNK}
@@ -146,7 +146,7 @@ def test_mistakes_change_nothing(graph: Graph, bass_node: Process, wav: tuple[st
 
 
 @pytest.mark.parametrize("kind", ["bag", "file"])
-def test_answers_and_log_hold_nothing_of_other_files(
+def test_responses_and_log_contain_nothing_of_other_files(
     graph: Graph, bass_node: Process, tmp_path: Path, kind: str
 ) -> None:
     path = tmp_path / "shadow"
@@ -168,7 +168,7 @@ def test_failed_acquisition_leaves_the_port_silent(graph: Graph, bass_node: Proc
 
 @pytest.mark.parametrize("window_seconds", [10, 250])
 def test_long_windows_lose_nothing(graph: Graph, bass_node: Process, window_seconds: int) -> None:
-    """Of 10 s all frames come; of much more (16 MB a message) the newest do, and windows overlap all the same."""
+    """With windows of 10 s all frames arrive; with longer ones (16 MB a message) the newest, in overlapping windows."""
     with graph.collect("/bass/Audio", audio_class()) as messages:
         assert acquire(graph, "scene:", RATE, chunks=window_seconds * RATE // CHUNK).genom_success
         wait_for(lambda: messages and messages[-1].lastFrameIndex >= RATE)
@@ -189,19 +189,21 @@ def test_acquire_replaces_and_stop_keeps_the_port(graph: Graph, bass_node: Proce
         wait_for(lambda: messages and messages[-1].sampleRate == 16000 and messages[-1].lastFrameIndex >= 1600)
         after = [m for m in messages if m.sampleRate == 16000]
         assert after[0].lastFrameIndex == 0 and not after[0].left.any()
-        assert messages[-len(after) :] == after  # nothing of the old one comes after the new one has begun
+        assert (
+            messages[-len(after) :] == after
+        )  # no frame of the old acquisition follows the first frame of the new one
         wait_for(lambda: live(graph) == ["Acquire"])
         assert graph.call("/bass/Stop").genom_success
         wait_for(lambda: live(graph) == [])
-    kept = graph.message("/bass/Audio", audio_class())  # latched, for those who come later
+    kept = graph.message("/bass/Audio", audio_class())  # latched, for later subscribers
     assert kept.lastFrameIndex == messages[-1].lastFrameIndex and np.array_equal(kept.left, messages[-1].left)
     assert kept.left.any()
-    assert graph.call("/bass/Stop").genom_success  # twice does no harm
+    assert graph.call("/bass/Stop").genom_success  # a second time has no effect
     assert acquire(graph, "scene:", RATE).genom_success
     graph.message("/bass/Audio", audio_class(), lambda m: m.sampleRate == RATE and m.lastFrameIndex > 0)
 
 
-def test_many_acquires_at_once_leave_one(graph: Graph, bass_node: Process) -> None:
+def test_of_many_simultaneous_acquires_one_remains(graph: Graph, bass_node: Process) -> None:
     answers = run_together(8, lambda index: acquire(graph, f"scene:?seed={index}", RATE))
     assert any(answer.genom_success for answer in answers)
     for answer in answers:
@@ -224,7 +226,7 @@ def test_list_devices_prints_on_stdout(graph: Graph, bass_node: Process) -> None
     assert (answer.genom_success, answer.genom_exdetail) == (not exdetail, exdetail)
     lines = bass_node.out.splitlines()
     assert [line for line in lines if line.startswith("hw:")] == expected
-    assert [line.split(" ")[0] for line in lines][:3] == ["file:PATH", "bag:PATH", "scene:"]
+    assert [line.split(" ")[0] for line in lines][:4] == ["file:PATH", "bag:PATH", "scene:FILE.yaml", "scene:"]
 
 
 def test_common_requests(graph: Graph, bass_node: Process) -> None:
@@ -264,7 +266,7 @@ def test_health(graph: Graph, bass_node: Process) -> None:
 
 def test_loss_in_the_window_the_log_and_diagnostics(graph: Graph, bass_node: Process, tmp_path: Path) -> None:
     samples = bags.stream(4000)
-    indexes = (0, 400, 800, 2400, 2800, 3200)  # the window of 2400 begins with frame 2001
+    indexes = (0, 400, 800, 2400, 2800, 3200)  # the window of frame 2400 starts with frame 2001
     bags.write(tmp_path / "a.bag", [bags.message(samples, index, 400, RATE, 400) for index in indexes])
     with graph.collect("/bass/Audio", audio_class()) as messages:
         assert acquire(graph, f"bag:{tmp_path / 'a.bag'}?loop=1", chunks=8).genom_success

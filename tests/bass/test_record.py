@@ -1,4 +1,4 @@
-"""`rosafe record` as a command: from devices without ROS, from a running bass, and how it ends."""
+"""`rosafe record` as a command: from devices without ROS, from a running bass, and its end."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def samples_of(path: Path) -> np.ndarray:
 
 
 def wait_for_sound(path: Path, recording: Process) -> None:
-    """Until some sound is on its way into the file."""
+    """Wait until samples are being written to the file."""
     part = path.with_name(f"{path.name}.part")
     wait_for(lambda: part.exists() and part.stat().st_size > 4000, what=lambda: str(recording))
 
@@ -45,14 +45,14 @@ def number(pattern: str, text: str) -> float:
 
 @pytest.fixture(scope="module")
 def wav(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A quarter of a second of full-range noise."""
+    """Write a quarter of a second of full-range noise."""
     path = tmp_path_factory.mktemp("in") / "in.wav"
     soundfile.write(path, bags.stream(2000).T, RATE, subtype="PCM_32")
     return path
 
 
 def test_through_a_bag_into_a_wav(wav: Path, tmp_path: Path) -> None:
-    """Whatever the chunks: the same samples, the last chunk filled up."""
+    """The samples do not depend on the chunk length; the last chunk is padded."""
     done = rosafe("record", "a.bag", "--device", f"file:{wav}", "--chunk", "300", cwd=tmp_path)
     assert done.returncode == 0 and done.stderr == "", done
     assert done.stdout.startswith("a.bag: 0.263 s at 8000 Hz, highest peaks left -0.0, right ")
@@ -61,7 +61,7 @@ def test_through_a_bag_into_a_wav(wav: Path, tmp_path: Path) -> None:
     assert np.array_equal(samples_of(tmp_path / "a.wav"), samples_of(wav))
 
 
-def test_loss_is_told_with_its_place(tmp_path: Path) -> None:
+def test_loss_is_reported_with_its_position(tmp_path: Path) -> None:
     samples = bags.stream(3000)
     messages = [bags.message(samples, index, 400, RATE, 200) for index in (0, 200, 400, 1600, 2000)]
     bags.write(tmp_path / "a.bag", messages)
@@ -80,12 +80,12 @@ def test_levels_without_output(tmp_path: Path) -> None:
     assert done.returncode == 0 and end == "file:a.wav has ended"
     clipped = 10 * np.log10(np.mean(np.clip(1.5 * tone, -1, 1) ** 2))
     assert re.sub(" +", " ", line) == f" 0:01 L peak -6.0 rms -9.0 R peak 0.0 rms {clipped:.1f} CLIP lost 0"
-    assert summary.startswith("heard: 1.000 s at 8000 Hz") and number(r"(\d+) samples clipped", summary) > 4000
+    assert summary.startswith("sound: 1.000 s at 8000 Hz") and number(r"(\d+) samples clipped", summary) > 4000
     assert os.listdir(tmp_path) == ["a.wav"]
 
 
-def told(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    """What the command answers, run in this process; for mistakes that show before any sound is asked for."""
+def direct_result(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    """Return the error of the command, run in this process, for errors that are detected before sound is read."""
     try:
         code = main(["record", *map(str, arguments)])
     except SystemExit as ended:
@@ -93,30 +93,33 @@ def told(capsys: pytest.CaptureFixture[str], *arguments: str | Path) -> subproce
     return subprocess.CompletedProcess(arguments, code, *capsys.readouterr())
 
 
-def test_mistakes_change_nothing(wav: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_invalid_arguments_change_nothing(wav: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     kept = tmp_path / "kept.wav"
     kept.write_text("precious")
     (tmp_path / "folder.wav").mkdir()
     device = ("--device", f"file:{wav}")
-    refused(told(capsys, kept, *device), "is there already; --force replaces it")
-    refused(told(capsys, kept, "--force", "--device", f"file:{kept}?loop=1"), "is the input itself")
+    refused(direct_result(capsys, kept, *device), "already exists; --force replaces it")
+    refused(direct_result(capsys, kept, "--force", "--device", f"file:{kept}?loop=1"), "is also the input")
     (tmp_path / "left.wav.part").write_text("precious")
     for_left = ("--force", "--device", f"file:{tmp_path}/left.wav.part")
-    refused(told(capsys, tmp_path / "left.wav", *for_left), "left.wav.part is the input itself")
+    refused(direct_result(capsys, tmp_path / "left.wav", *for_left), "left.wav.part is also the input")
     (tmp_path / "left.wav.part").unlink()
-    refused(told(capsys, tmp_path / "folder.wav", "--force", *device), "not a regular file")
-    refused(told(capsys, tmp_path / "no" / "a.wav", *device), "there is no folder")
-    refused(told(capsys, tmp_path / "a.mp3", *device), "ends in .wav or .bag", code=2)
-    refused(told(capsys, *device, "--seconds", "nan"), "'nan' is not a number of seconds", code=2)
-    refused(told(capsys, *device, "--rate", "-5"), "'-5' is not a whole number", code=2)
-    refused(told(capsys, *device, "--topic", "/x"), "not allowed with", code=2)
-    refused(told(capsys, "--socket", "nowhere"), "is not HOST:PORT", code=2)
-    refused(told(capsys, "--socket", "127.0.0.1:9"), "needs --rate", code=2)
+    refused(direct_result(capsys, tmp_path / "folder.wav", "--force", *device), "not a regular file")
+    refused(direct_result(capsys, tmp_path / "no" / "a.wav", *device), "does not exist")
+    refused(direct_result(capsys, tmp_path / "a.mp3", *device), "ends in .wav or .bag", code=2)
+    seconds = "expected a number of seconds from 1e-06 to 1e+07, got 'nan'"
+    refused(direct_result(capsys, *device, "--seconds", "nan"), seconds, code=2)
+    refused(
+        direct_result(capsys, *device, "--rate", "-5"), "expected a whole number from 1 to 768000, got '-5'", code=2
+    )
+    refused(direct_result(capsys, *device, "--topic", "/x"), "not allowed with", code=2)
+    refused(direct_result(capsys, "--socket", "nowhere"), "expected HOST:PORT", code=2)
+    refused(direct_result(capsys, "--socket", "127.0.0.1:9"), "needs --rate", code=2)
     refused(rosafe("record", kept, "--force", "--device", "file:missing.wav"), "missing.wav: No such file")
-    refused(rosafe("record", kept, "--force", *device, "--rate", "44100"), "8000 Hz, asked for were 44100")
+    refused(rosafe("record", kept, "--force", *device, "--rate", "44100"), "expected 44100 Hz, got 8000 Hz")
     refused(rosafe("record", "--socket", f"127.0.0.1:{free_port()}", "--rate", "8000"), "Connection refused")
     uri = f"http://127.0.0.1:{free_port()}"
-    refused(rosafe("record", ROS_MASTER_URI=uri), f"no ROS master at {uri}", "or record a --device without ROS")
+    refused(rosafe("record", ROS_MASTER_URI=uri), f"no ROS master at {uri}", "or record from a --device without ROS")
     assert kept.read_text() == "precious"
     assert sorted(os.listdir(tmp_path)) == ["folder.wav", "kept.wav"]
     done = rosafe("record", kept, "--force", "-q", *device)
@@ -126,17 +129,22 @@ def test_mistakes_change_nothing(wav: Path, tmp_path: Path, capsys: pytest.Captu
 def test_list(tmp_path: Path) -> None:
     done = rosafe("record", "--list")
     assert done.returncode == 0
-    assert [line.split()[0] for line in done.stdout.splitlines()][:3] == ["file:PATH", "bag:PATH", "scene:"]
+    assert [line.split()[0] for line in done.stdout.splitlines()][:4] == [
+        "file:PATH",
+        "bag:PATH",
+        "scene:FILE.yaml",
+        "scene:",
+    ]
 
 
 def test_signals_leave_a_complete_file(tmp_path: Path) -> None:
-    """Those that ask for the end, and the one that does not ask."""
+    """Signals that request the end, and SIGKILL."""
     numbers = (signal.SIGINT, signal.SIGHUP, signal.SIGKILL)
     options = ("--device", "scene:", "--rate", str(RATE), "--chunk", "400")
     with ExitStack() as stack:
         running = [stack.enter_context(start("record", f"{n}.wav", *options, cwd=tmp_path)) for n in numbers]
         for recording in running:
-            wait_for(lambda: "L peak" in recording.out, what=lambda: str(recording))  # noqa: B023  # called at once
+            wait_for(lambda: "L peak" in recording.out, what=lambda: str(recording))  # noqa: B023  # called immediately
         codes = [recording.stop(number) for number, recording in zip(numbers, running, strict=True)]
         assert codes == [0, 0, -signal.SIGKILL]
         for number, recording in zip(numbers[:2], running, strict=False):
@@ -148,7 +156,7 @@ def test_signals_leave_a_complete_file(tmp_path: Path) -> None:
 
 
 def test_full_disk(wav: Path, tmp_path: Path) -> None:
-    """As with a limit of the file's size; what fits is kept."""
+    """Simulated by a limit of the file size; the recording up to that point is kept."""
     done = subprocess.run(
         ["prlimit", "--fsize=10003", str(ROSAFE), "record", "a.wav", "--device", f"file:{wav}", "--chunk", "100"],
         cwd=tmp_path,
@@ -174,7 +182,7 @@ def test_live_line_on_a_terminal(tmp_path: Path) -> None:
     assert max(map(len, looks[:-1])) == 79 and looks[-1].startswith("a.wav: 0.600 s")
 
 
-def test_reader_of_the_meter_leaves(tmp_path: Path) -> None:
+def test_reader_of_the_meter_closes_the_pipe(tmp_path: Path) -> None:
     read, write = os.pipe()
     os.close(read)
     command = [str(ROSAFE), "record", "a.wav", "--device", "scene:", "--rate", str(RATE), "--chunk", "400"]
@@ -183,7 +191,7 @@ def test_reader_of_the_meter_leaves(tmp_path: Path) -> None:
     )
     os.close(write)
     assert done.returncode == 141 and done.stderr == b""
-    assert samples_of(tmp_path / "a.wav").shape[1] == RATE  # until the first line
+    assert samples_of(tmp_path / "a.wav").shape[1] == RATE  # wait for the first line
 
 
 # --- from a running bass ---
@@ -191,16 +199,16 @@ def test_reader_of_the_meter_leaves(tmp_path: Path) -> None:
 
 @pytest.fixture(scope="module")
 def capturing(graph: Graph) -> Iterator[Process]:
-    with graph.node("bass-ros", "-i", "heard") as bass:
+    with graph.node("bass-ros", "-i", "recorded") as bass:
         yield bass
 
 
 def acquire(graph: Graph, device: str = "scene:") -> None:
-    assert graph.call("/heard/Acquire", device=device, sampleRate=RATE, nFramesPerChunk=400).genom_success
+    assert graph.call("/recorded/Acquire", device=device, sampleRate=RATE, nFramesPerChunk=400).genom_success
 
 
 def find(samples: np.ndarray) -> int:
-    """Where the scene has these samples."""
+    """Return the position of these samples in the scene."""
     scene = Scene(RATE).frames(60 * RATE)
     (places,) = np.nonzero(scene[0, : -samples.shape[1]] == samples[0, 0])
     return next(int(at) for at in places if np.array_equal(scene[:, at : at + samples.shape[1]], samples))
@@ -208,16 +216,16 @@ def find(samples: np.ndarray) -> int:
 
 def test_topic_to_wav_and_bag(graph: Graph, capturing: Process, tmp_path: Path) -> None:
     acquire(graph)
-    to_wav = (str(ROSAFE), "record", "a.wav", "--topic", "/heard/Audio", "--seconds", "0.5")
-    to_bag = (str(ROSAFE), "record", "a.bag", "--topic", "heard/Audio", "--seconds", "0.5")
+    to_wav = (str(ROSAFE), "record", "a.wav", "--topic", "/recorded/Audio", "--seconds", "0.5")
+    to_bag = (str(ROSAFE), "record", "a.bag", "--topic", "recorded/Audio", "--seconds", "0.5")
     with graph.start(*to_wav, cwd=tmp_path) as wav, graph.start(*to_bag, cwd=tmp_path) as bag:
         assert wav.wait() == 0 and bag.wait() == 0, (wav, bag)
         assert "a.wav: 0.500 s at 8000 Hz" in wav.out and "0 frames lost" in wav.out and wav.err == ""
     assert find(samples_of(tmp_path / "a.wav")) % 400 == 0
-    messages = bags.read(tmp_path / "a.bag", "/heard/Audio")
+    messages = bags.read(tmp_path / "a.bag", "/recorded/Audio")
     newest = [int(message.lastFrameIndex) for message in messages]
     at = find(np.stack([messages[-1].left[-400:], messages[-1].right[-400:]]))
-    assert newest[-1] == at + 400 and np.all(np.diff(newest) == 400)  # the numbers are those of the stream
+    assert newest[-1] == at + 400 and np.all(np.diff(newest) == 400)  # frame indices of the stream
 
 
 def test_dedicated_socket_to_wav(graph: Graph, capturing: Process, tmp_path: Path) -> None:
@@ -225,36 +233,37 @@ def test_dedicated_socket_to_wav(graph: Graph, capturing: Process, tmp_path: Pat
 
     graph.client()
     port = free_port()
-    rospy.set_param("/heard/socket_port", port)
+    rospy.set_param("/recorded/socket_port", port)
     acquire(graph)
-    assert graph.call("/heard/DedicatedSocket").genom_success
+    assert graph.call("/recorded/DedicatedSocket").genom_success
     address = ("--socket", f"127.0.0.1:{port}", "--rate", str(RATE))
     done = rosafe("record", "a.wav", *address, "--seconds", "0.3", cwd=tmp_path)
     assert done.returncode == 0 and "0 frames lost" in done.stdout, done
     find(samples_of(tmp_path / "a.wav"))
     with start("record", "b.wav", *address, "-q", cwd=tmp_path) as recording:
         wait_for_sound(tmp_path / "b.wav", recording)
-        assert graph.call("/heard/CloseSocket").genom_success
+        assert graph.call("/recorded/CloseSocket").genom_success
         assert recording.wait() == 1
         assert recording.err == f"rosafe record: 127.0.0.1:{port}: bass has closed the connection\n"
     find(samples_of(tmp_path / "b.wav"))
 
 
 def test_new_acquisition_ends_the_recording(graph: Graph, capturing: Process, tmp_path: Path) -> None:
-    """Two streams are not spliced; what there was of the first is kept."""
+    """Two streams are not joined; the recording of the first one is kept."""
     acquire(graph)
-    with graph.start(str(ROSAFE), "record", "a.wav", "--topic", "/heard/Audio", "-q", cwd=tmp_path) as recording:
+    with graph.start(str(ROSAFE), "record", "a.wav", "--topic", "/recorded/Audio", "-q", cwd=tmp_path) as recording:
         wait_for_sound(tmp_path / "a.wav", recording)
         acquire(graph)
         assert recording.wait() == 1
-        assert recording.err.startswith("rosafe record: /heard/Audio: a new stream begins (its index falls from ")
+        assert recording.err.startswith("rosafe record: /recorded/Audio: a new stream begins (its index falls from ")
     find(samples_of(tmp_path / "a.wav"))
 
 
-def test_nothing_to_hear(graph: Graph, capturing: Process, tmp_path: Path) -> None:
+def test_topics_without_audio_are_rejected(graph: Graph, capturing: Process, tmp_path: Path) -> None:
     topics = {
-        "/heard/genom_state": "/heard/genom_state is no port Audio, but of type bass/genom_state_component",
-        "/nobody/Audio": "/nobody/Audio is published by nobody: start bass-ros",
+        "/recorded/genom_state": "expected /recorded/genom_state to be a port Audio, "
+        "got type bass/genom_state_component",
+        "/nobody/Audio": "/nobody/Audio: the topic has no publisher; start bass-ros",
     }
     with ExitStack() as stack:
         running = {

@@ -1,7 +1,8 @@
-"""The parts of recording: levels, WAV and bag files, losses, and disks that are full."""
+"""The parts of recording: levels, WAV and bag files, losses, and full disks."""
 
 from __future__ import annotations
 
+import io
 import itertools
 import math
 import os
@@ -20,6 +21,7 @@ from rosafe.bass.recording.outputs import BagWriter, WavFile
 from rosafe.bass.recording.recorder import SoundRecorder
 from rosafe.bass.sources import base, open_source
 from rosafe.bass.sources.base import Chunk
+from rosafe.commands._meter import PLAIN_SECONDS, Meter, clock
 from rosafe.sound.audiofile import AudioFile
 from tests.bass import bags
 
@@ -27,11 +29,29 @@ RATE = 1000
 
 
 def empty(path: Path) -> int:
-    """A descriptor of a new file."""
+    """Return a descriptor of a new file."""
     return os.open(path, os.O_RDWR | os.O_CREAT | os.O_TRUNC)
 
 
 # --- levels ---
+
+
+@pytest.mark.parametrize("clipped", [0, 1])
+def test_the_display_marks_the_ear_that_is_clipped(clipped: int) -> None:
+    stream = io.StringIO()
+    samples = np.full((2, round(PLAIN_SECONDS * RATE)), 2**20, np.int32)
+    samples[clipped, 5:9] = 2**31 - 1
+    Meter(stream, RATE, quiet=False).show(samples, lost=3)
+    left, right = stream.getvalue().split(" R peak ")
+    assert ["CLIP" in ear for ear in (left, right)] == [clipped == 0, clipped == 1]
+    assert right.endswith("lost 3\n")
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"), [(0.4, "0:00"), (6.6, "0:07"), (59.5, "1:00"), (754, "12:34"), (3722, "1:02:02")]
+)
+def test_durations(seconds: float, text: str) -> None:
+    assert clock(seconds) == text
 
 
 def test_levels_of_known_signals() -> None:
@@ -47,7 +67,7 @@ def test_levels_of_known_signals() -> None:
     assert levels.clipped == [0, RATE]
 
 
-def test_levels_of_silence_and_nothing() -> None:
+def test_levels_of_silence_and_of_no_samples() -> None:
     levels = LevelMeter()
     assert levels.peak(0) == levels.rms(1) == -math.inf
     levels.add(np.zeros((2, 0), np.int32))
@@ -58,7 +78,7 @@ def test_levels_of_silence_and_nothing() -> None:
 @pytest.mark.parametrize(
     ("sample", "clipped"), [(32767 << 16, 1), (-(2**31), 1), (-(32767 << 16), 1), (32766 << 16, 0)]
 )
-def test_the_end_of_16_bits_is_clipped_too(sample: int, clipped: int) -> None:
+def test_the_maximum_of_16_bits_counts_as_clipped(sample: int, clipped: int) -> None:
     levels = LevelMeter()
     levels.add(np.array([[0, sample], [0, 0]], np.int32))
     assert levels.clipped == [clipped, 0]
@@ -67,7 +87,7 @@ def test_the_end_of_16_bits_is_clipped_too(sample: int, clipped: int) -> None:
 # --- WAV ---
 
 
-def test_wav_is_exact_and_readable_by_everybody(tmp_path: Path) -> None:
+def test_wav_is_exact_and_readable_by_other_programs(tmp_path: Path) -> None:
     samples = bags.stream(2500)
     samples[:, :2] = [[-(2**31)], [2**31 - 1]]
     file = WavFile(empty(tmp_path / "a.wav"), RATE)
@@ -85,7 +105,7 @@ def test_wav_is_exact_and_readable_by_everybody(tmp_path: Path) -> None:
         assert plain.readframes(72_500) == expected.T.astype("<i4").tobytes()
 
 
-def test_wav_that_nobody_closed_holds_all_but_the_last_second(tmp_path: Path) -> None:
+def test_wav_that_was_not_closed_contains_all_except_the_last_second(tmp_path: Path) -> None:
     file = WavFile(empty(tmp_path / "a.wav"), RATE)
     samples = bags.stream(2300)
     for part in np.array_split(samples, 23, axis=1):
@@ -108,7 +128,7 @@ def test_long_wav_is_an_rf64(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_wav_beyond_4_gib(tmp_path: Path) -> None:
-    """A real one, of which most is a hole in the file."""
+    """A real file that consists mostly of a hole."""
     file = WavFile(empty(tmp_path / "a.wav"), RATE)
     hole = 2**29  # frames
     file.frames = hole
@@ -139,7 +159,7 @@ def no_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(base.Pacer, "wait", lambda pacer, frames: 0.0)
 
 
-def test_bag_holds_every_frame_under_its_number_and_time(tmp_path: Path, no_pauses: None) -> None:
+def test_bag_contains_each_frame_with_its_index_and_time(tmp_path: Path, no_pauses: None) -> None:
     import rosbag
 
     samples = bags.stream(500)
@@ -150,7 +170,7 @@ def test_bag_holds_every_frame_under_its_number_and_time(tmp_path: Path, no_paus
     file.close()
     samples[:, 35:50] = 0
     played, lost = play(tmp_path / "a.bag", "?topic=left/Audio")
-    assert lost == 0  # as in what bass publishes, the loss is zeros that have numbers
+    assert lost == 0  # the loss is zeros that count in the index, as published by bass
     assert np.array_equal(played, samples)
     with rosbag.Bag(str(tmp_path / "a.bag")) as bag:
         messages = [(message, time.to_nsec()) for _, message, time in bag.read_messages()]
@@ -168,14 +188,14 @@ def test_bag_of_less_than_a_window(tmp_path: Path, no_pauses: None) -> None:
     assert np.array_equal(play(tmp_path / "a.bag")[0][:, :25], samples)
 
 
-def test_bag_stops_while_there_is_room_for_its_index(
+def test_bag_stops_while_there_is_space_for_its_index(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, no_pauses: None
 ) -> None:
     samples = bags.stream(200)
     file = BagWriter(empty(tmp_path / "a.bag"), RATE, 10, "/bass/Audio")
     file.write(samples[:, :100], 10**9)
     monkeypatch.setattr(outputs, "BAG_RESERVE", 2**62)
-    with pytest.raises(OSError, match="the disk is full"):
+    with pytest.raises(OSError, match="free disk space"):
         file.write(samples[:, 100:], 2 * 10**9)
     file.close()
     assert np.array_equal(play(tmp_path / "a.bag")[0], samples[:, :100])
@@ -185,7 +205,7 @@ def test_bag_stops_while_there_is_room_for_its_index(
 
 
 class Scripted:
-    """A source of chunks of ten frames: (gap, frames of it that were lost within the chunk)."""
+    """A source of chunks of ten frames; each step is (gap, number of lost frames)."""
 
     name, sample_rate = "scripted", RATE
 
@@ -195,7 +215,7 @@ class Scripted:
         self.overruns = self.lost_frames = 0
 
     def read(self) -> Chunk | None:
-        """The next one."""
+        """Return the next chunk."""
         step = next(self._script, None)
         if step is None:
             return None
@@ -204,7 +224,7 @@ class Scripted:
         return Chunk(np.full((2, 10), next(self._numbers), np.int32), gap, 100.0)
 
     def close(self) -> None:
-        """Nothing."""
+        """Do nothing."""
 
 
 def record(path: Path | None, script: list[tuple[int, int]], frames: int | None = None) -> tuple[Any, list[str], bool]:
@@ -217,7 +237,7 @@ def record(path: Path | None, script: list[tuple[int, int]], frames: int | None 
     return recorder, reports, ended
 
 
-def test_losses_are_zeros_and_told_with_their_place(tmp_path: Path) -> None:
+def test_losses_are_zeros_and_reported_with_their_position(tmp_path: Path) -> None:
     recorder, reports, ended = record(tmp_path / "a.wav", [(0, 0), (25, 0), (0, 3), (0, 0)])
     assert ended and recorder.frames == 65 and recorder.lost == 28
     assert reports == [
@@ -229,14 +249,14 @@ def test_losses_are_zeros_and_told_with_their_place(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("frames", [1, 10, 17, 30, 36])
-def test_exactly_as_many_frames_as_wanted(tmp_path: Path, frames: int) -> None:
+def test_exactly_the_requested_number_of_frames_is_recorded(tmp_path: Path, frames: int) -> None:
     recorder, _, ended = record(tmp_path / "a.wav", [(0, 0), (25, 0), (0, 0)], frames)
     assert not ended and recorder.frames == frames
     left = soundfile.read(tmp_path / "a.wav", dtype="int32")[0][:, 0]
     assert left.tolist() == ([1] * 10 + [0] * 25 + [2] * 10)[:frames]
 
 
-def test_without_output_only_the_levels(tmp_path: Path) -> None:
+def test_without_output_only_levels_are_measured(tmp_path: Path) -> None:
     recorder, _, ended = record(None, [(0, 0)] * 5)
     assert ended and recorder.frames == 50 and recorder.levels.frames == 50
     assert not os.listdir(tmp_path)

@@ -1,4 +1,4 @@
-"""What `rosbag record` kept of a live run gives the same representations again: played by rosbag, and through bass."""
+"""A recording by `rosbag record` reproduces the representations of the live run, by `rosbag play` and by bass."""
 
 from __future__ import annotations
 
@@ -26,21 +26,21 @@ REQUESTS = [kind.request for kind in CORE_REPRESENTATIONS.values() if kind.paren
 
 
 class Recorded(NamedTuple):
-    """A live run."""
+    """The recording of a live run."""
 
     bag: Path
     sound: np.ndarray  # int32, (2, FRAMES)
-    result: Any  # of rosafe.process
+    result: Any  # computed by rosafe.process
 
 
 def prepare(node: Session, topic: str, *requests: str) -> None:
-    """Build a tree at leisure, on a stream of which nothing comes, and connect it with the one that is to come."""
+    """Build a tree on a silent stream, and connect it with the stream to come."""
     node.build(*requests, block=BLOCK, bufferSize_s_port=SECONDS, **VALUES)
     node.ok("connect_port", local="Audio", remote=topic)
 
 
 def assert_same(node: Session, recorded: Recorded) -> None:
-    """All ports hold, bit for bit, what comes of the whole signal, and under the same frame numbers."""
+    """Check that all ports are bit-identical to the result for the whole signal, with the same frame indices."""
     for kind in CORE_REPRESENTATIONS:
         rate = float(recorded.result.get(f"{kind}_frameRate", RATE))
         message = node.read(kind, index=FRAMES + 1)
@@ -60,7 +60,7 @@ def bass(graph: Graph) -> Iterator[Process]:
 
 @pytest.fixture(scope="module")
 def recorded(graph: Graph, bass: Process, tmp_path_factory: pytest.TempPathFactory) -> Recorded:
-    """A file through bass and rosAFE, while `rosbag record` listens."""
+    """Send a file through bass and rosAFE while `rosbag record` is running."""
     folder = tmp_path_factory.mktemp("replay")
     sound = noise(FRAMES)
     soundfile.write(folder / "a.wav", sound.T, RATE, subtype="PCM_32")
@@ -73,7 +73,7 @@ def recorded(graph: Graph, bass: Process, tmp_path_factory: pytest.TempPathFacto
         wait_for(lambda: ("/bass/Audio", "/recorder") in graph.readers(), what=lambda: str(recorder))
         acquire(graph, f"file:{folder / 'a.wav'}")
         assert_same(node, recorded)
-        # As `rosnode kill` does; a signal would end rosbag before its child has closed the bag.
+        # As by `rosnode kill`; a signal would end rosbag before its child has closed the bag.
         address = rosgraph.Master("/test", master_uri=graph.uri).lookupNode("/recorder")
         xmlrpc.client.ServerProxy(address).shutdown("/test", "")
         recorder.wait()
@@ -82,7 +82,7 @@ def recorded(graph: Graph, bass: Process, tmp_path_factory: pytest.TempPathFacto
 
 @contextmanager
 def replay(graph: Graph, bag: Path, name: str, requests: list[str], *options: str) -> Iterator[Session]:
-    """A new rosAFE, connected with what `rosbag play` plays; that waits for it, and comes to its end after the test."""
+    """Start a new rosAFE that is connected to `rosbag play`, which waits for it and ends after the test."""
     topic = f"/{name}/Audio"
     command = ("rosbag", "play", "--wait-for-subscribers", *options, str(bag), f"/bass/Audio:={topic}")
     with own_node(graph, name=name) as node, graph.start(*command) as player:
@@ -98,25 +98,25 @@ def test_played_by_rosbag_without_bass(graph: Graph, recorded: Recorded) -> None
 
 
 def test_played_from_the_middle_and_with_a_loss(graph: Graph, recorded: Recorded, tmp_path: Path) -> None:
-    """Frames keep their numbers; what no window shows is zeros."""
-    # The windows that would show frames 6001 to 9000 are not there, and the recording begins with frame 1001.
+    """Frame indices are preserved; frames that are in no window are zeros."""
+    # The windows with frames 6001 to 9000 are missing, and the recording starts with frame 1001.
     window = 4 * CHUNK
     indexes = [i for i in range(1000 + window, FRAMES + 1, CHUNK) if not 6000 < i < 9000 + window]
     messages = [bags.message(recorded.sound, i, window, RATE, CHUNK) for i in indexes]
-    end = FRAMES - (FRAMES - 1000) % BLOCK  # of the last whole block
+    end = FRAMES - (FRAMES - 1000) % BLOCK  # end of the last complete block
     gap = bags.write(tmp_path / "gap.bag", messages)
     with replay(graph, gap, "gap", []) as node:
         message = node.read("input", index=end + 1)
         entries = node.health(lambda entries: int(entries["lost"]) > 0)
     assert entries["lost"] == "3000" and entries["gaps"] == "1"
-    heard = recorded.sound.copy()
-    heard[:, 6000:9000] = 0
-    wanted = expected(heard[:, 1000:end], BLOCK, VALUES)["input"]
-    np.testing.assert_array_equal(np.stack((message.left, message.right))[:, -wanted.shape[1] :], wanted)
+    signal = recorded.sound.copy()
+    signal[:, 6000:9000] = 0
+    result = expected(signal[:, 1000:end], BLOCK, VALUES)["input"]
+    np.testing.assert_array_equal(np.stack((message.left, message.right))[:, -result.shape[1] :], result)
 
 
 def test_source_of_bass(graph: Graph, bass: Process, recorded: Recorded) -> None:
-    """`bag:` publishes the recorded frames under their numbers."""
+    """`bag:` publishes the recorded frames with their frame indices."""
     audio = serialization.message_class("bass", "::binaudio::portStruct")
     with graph.collect("/bass/Audio", audio) as messages:
         wait_for(lambda: messages, what="what the port shows of the live run")

@@ -1,4 +1,4 @@
-"""The built-in scene: physics of the walk, independence of the chunks, and what is refused."""
+"""The built-in scene: its physics, its independence of the chunk length, and rejected options."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy import signal
 
 from rosafe.bass.sources import open_source
-from rosafe.bass.sources.scene import Scene, scene_azimuth
+from rosafe.bass.sources.scene import Scene
 from rosafe.interface import ComponentError
 
 RATE = 44100
@@ -20,7 +20,7 @@ RATE = 44100
 
 @pytest.fixture(scope="module")
 def walk() -> np.ndarray:
-    """Ten seconds from left to right as float, (2, frames)."""
+    """Return ten seconds from left to right as float, (2, frames)."""
     return Scene(RATE).frames(10 * RATE) / 2.0**31
 
 
@@ -29,7 +29,7 @@ def band(samples: np.ndarray, low: float, high: float) -> np.ndarray:
 
 
 def itd(ears: np.ndarray) -> float:
-    """By how many seconds the right ear lags: the peak of the cross-correlation, with a parabola through it."""
+    """Return the delay (s) of the right ear: the interpolated peak of the cross-correlation."""
     left, right = ears
     reach = 60
     lags = np.arange(-reach, reach + 1)
@@ -40,28 +40,30 @@ def itd(ears: np.ndarray) -> float:
 
 
 def level_difference(ears: np.ndarray) -> float:
-    """Right over left, dB."""
+    """Return the level of the right ear relative to the left, dB."""
     left, right = np.sqrt(np.mean(ears**2, axis=1))
     return float(20 * np.log10(right / left))
 
 
-def test_azimuth_walks_from_left_to_right_and_back() -> None:
-    assert scene_azimuth(np.array([0, 2.5, 5, 10, 15, 20])).tolist() == [-90, -45, 0, 90, 0, -90]
-    assert scene_azimuth(4.0, walk=4.0) == 90
+def test_azimuth_moves_from_left_to_right_and_back() -> None:
+    assert Scene(RATE).azimuth(np.array([0, 2.5, 5, 10, 15, 20])).tolist() == [90, 45, 0, -90, 0, 90]
+    assert Scene(RATE, seconds=4.0).azimuth(4.0) == -90
 
 
 def test_itd_is_woodworths(walk: np.ndarray) -> None:
     pieces = band(walk, 3000, 8000).reshape(2, 20, -1)
-    azimuth = np.radians(scene_azimuth(np.arange(20) / 2 + 0.25))
+    azimuth = np.radians(Scene(RATE).azimuth(np.arange(20) / 2 + 0.25))
     measured = np.array([itd(pieces[:, k]) for k in range(20)])
-    expected = -0.0875 / 343 * (azimuth + np.sin(azimuth))  # a source on the right reaches the right ear first
-    assert np.abs(measured - expected).max() < 50e-6  # the shadow's filter adds a little even up here
+    expected = 0.0875 / 343 * (azimuth + np.sin(azimuth))  # a source on the left reaches the left ear first
+    assert (
+        np.abs(measured - expected).max() < 50e-6
+    )  # the filter of the shadow still adds a small delay at these frequencies
     assert (np.diff(measured) < 0).all()
     assert measured[0] > 600e-6 and measured[-1] < -600e-6
 
 
 def test_low_frequencies_have_more_itd_but_less_ild(walk: np.ndarray) -> None:
-    """As round a real head (Kuhn 1977): up to half as much again below 500 Hz."""
+    """As for a real head (Kuhn 1977): up to 50 % more below 500 Hz."""
     low, high = band(walk, 100, 600)[:, :RATE], band(walk, 3000, 8000)[:, :RATE]
     assert 1.1 < itd(low) / itd(high) < 1.5
     assert -6 < level_difference(low) < -1
@@ -71,7 +73,7 @@ def test_low_frequencies_have_more_itd_but_less_ild(walk: np.ndarray) -> None:
 def test_ild_follows_the_side(walk: np.ndarray) -> None:
     ild = np.array([level_difference(piece) for piece in band(walk, 4000, 8000).reshape(2, 20, -1).swapaxes(0, 1)])
     assert (ild[:10] < 0).all() and (ild[10:] > 0).all()
-    assert (np.diff(ild[2:18]) > 0).all()  # beyond, the bright spot behind a sphere brings some sound back
+    assert (np.diff(ild[2:18]) > 0).all()  # at larger angles the bright spot behind a sphere reduces the difference
     assert np.abs(ild + ild[::-1]).max() < 1.5  # the same on both sides
 
 
@@ -82,7 +84,7 @@ def test_level_is_that_of_the_source_and_nothing_clips(walk: np.ndarray) -> None
     assert np.allclose(softer, walk[:, :RATE] / 10, atol=2e-9)
 
 
-def test_sound_is_there_all_the_time_on_both_ears(walk: np.ndarray) -> None:
+def test_both_ears_always_have_sound(walk: np.ndarray) -> None:
     levels = np.sqrt(np.mean(walk.reshape(2, 500, -1) ** 2, axis=-1))  # 20 ms each
     assert levels[:, 1:].min() > 10 ** (-70 / 20)
 
@@ -117,14 +119,14 @@ def test_any_sample_rate(rate: int) -> None:
     ("device", "rate", "exception", "why"),
     [
         ("scene:seconds=5", 44100, "e_device", "question mark"),
-        ("scene:?speed=5", 44100, "e_device", "no option 'speed'; there are: seconds, level, seed"),
-        ("scene:?seconds=0", 44100, "e_device", "seconds=0 is not a number from 0.1"),
-        ("scene:?level=3", 44100, "e_device", "level=3 is not a number from -120 to 0"),
-        ("scene:?seed=-1", 44100, "e_device", "seed=-1 is not a whole number"),
-        ("scene:", 10, "e_hwparams", "from 1000 Hz"),
+        ("scene:?speed=5", 44100, "e_device", "unknown option 'speed'; expected one of seconds, level, seed"),
+        ("scene:?seconds=0", 44100, "e_device", "seconds: expected a number of seconds from 0.1"),
+        ("scene:?level=3", 44100, "e_device", "level: expected a number from -120 to 0"),
+        ("scene:?seed=-1", 44100, "e_device", "seed: expected a whole number"),
+        ("scene:", 10, "e_hwparams", "at least 1000 Hz"),
     ],
 )
-def test_refused(device: str, rate: int, exception: str, why: str) -> None:
+def test_invalid_options_are_rejected(device: str, rate: int, exception: str, why: str) -> None:
     with pytest.raises(ComponentError) as caught:
         open_source(device, rate, 100, threading.Event())
     assert caught.value.ex == f"::bass::{exception}"

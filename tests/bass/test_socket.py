@@ -26,7 +26,7 @@ from tests.harness import PATIENCE, ROOT, wait_for
 
 
 def port_content(last: int, length: int) -> Snapshot:
-    """A window in which frame k is k on the left and -k on the right, zeros before frame 1."""
+    """Return a window in which frame k is k on the left and -k on the right, with zeros before frame 1."""
     left = np.maximum(np.arange(last - length + 1, last + 1), 0).astype(np.int32)
     return Snapshot(44100, 1, length, last, left, -left, 0)
 
@@ -39,21 +39,21 @@ def parse(answer: bytes) -> tuple[int, int, int, list[int], list[int]]:
 
 
 def receive(connection: socket.socket) -> tuple[int, int, int, list[int], list[int]]:
-    """One whole answer."""
+    """Return one complete answer."""
     with connection.makefile("rb", buffering=0) as stream:
         answer = bytearray()
-        wanted = 16
-        while len(answer) < wanted:
-            part = stream.read(wanted - len(answer))
-            assert part, f"closed after {len(answer)} of {wanted} bytes"
+        size = 16
+        while len(answer) < size:
+            part = stream.read(size - len(answer))
+            assert part, f"closed after {len(answer)} of {size} bytes"
             answer += part
             if len(answer) >= 16:
-                wanted = 16 + 8 * struct.unpack_from("<i", answer)[0]
+                size = 16 + 8 * struct.unpack_from("<i", answer)[0]
     return parse(bytes(answer))
 
 
 class Server:
-    """A server in a thread; `content` is what it serves."""
+    """A server in a thread that serves `content`."""
 
     def __init__(self) -> None:
         self.content: Snapshot | None = port_content(100, 20)
@@ -86,10 +86,10 @@ def server() -> Iterator[Server]:
     ("count", "first", "expected"),
     [
         (5, 90, (5, 0, 95, [90, 91, 92, 93, 94])),
-        (50, 99, (2, 0, 101, [99, 100])),  # no more than there is
+        (50, 99, (2, 0, 101, [99, 100])),  # not more than available
         (3, 11, (3, 70, 84, [81, 82, 83])),  # 11 to 80 have left the window
-        (5, 101, (0, 0, 101, [])),  # nothing new yet
-        (5, 500, (0, 0, 500, [])),  # from before a restart, or nonsense: never a negative count
+        (5, 101, (0, 0, 101, [])),  # no new frames yet
+        (5, 500, (0, 0, 500, [])),  # from before a restart, or invalid: the count is never negative
         (5, 10**30, (0, 0, 2**63 - 1, [])),
         (0, 90, (0, 0, 90, [])),
         (10**30, 81, (20, 0, 101, list(range(81, 101)))),
@@ -109,7 +109,7 @@ def test_answer_before_and_at_the_start_of_an_acquisition() -> None:
 
 @settings(max_examples=200, deadline=None)
 @given(st.lists(st.tuples(st.integers(1, 60), st.integers(1, 60)), min_size=1, max_size=20), st.integers(1, 50))
-def test_a_reader_gets_every_frame_or_is_told_how_many_are_lost(steps: list[tuple[int, int]], length: int) -> None:
+def test_a_reader_gets_each_frame_or_the_number_of_lost_frames(steps: list[tuple[int, int]], length: int) -> None:
     last, following, seen, lost = 0, 1, [], 0
     for advance, count in steps:
         last += advance
@@ -123,7 +123,7 @@ def test_a_reader_gets_every_frame_or_is_told_how_many_are_lost(steps: list[tupl
 
 @settings(max_examples=100, deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 10**6), st.integers(0, 10**12)), max_size=6), st.data())
-def test_requests_may_be_cut_anywhere(requests: list[tuple[int, int]], data: st.DataObject) -> None:
+def test_requests_can_be_divided_anywhere(requests: list[tuple[int, int]], data: st.DataObject) -> None:
     text = b"".join(b"Read Port - N %d - nfr %d\n" % request for request in requests)
     inbox = bytearray()
     found: list[tuple[int, int]] = []
@@ -141,7 +141,7 @@ def test_requests_without_line_ends() -> None:
     assert list(take_requests(inbox, quiet=False)) == [(1, 2)]
     assert list(take_requests(inbox, quiet=True)) == [(3, 4)]
     assert not inbox
-    inbox += b"Read Port - N 5"  # the rest is on its way
+    inbox += b"Read Port - N 5"  # the rest follows
     assert list(take_requests(inbox, quiet=True)) == []
     inbox += b" - nfr 6"
     assert list(take_requests(inbox, quiet=True)) == [(5, 6)]
@@ -163,7 +163,7 @@ def test_odd_requests(text: bytes, request_: tuple[int, int]) -> None:
 
 @settings(max_examples=200, deadline=None)
 @given(st.binary(max_size=300), st.integers(-(2**70), 2**70), st.integers(-(2**70), 2**70))
-def test_whatever_comes_no_answer_is_negative(rubbish: bytes, count: int, first: int) -> None:
+def test_no_request_gets_a_negative_count(rubbish: bytes, count: int, first: int) -> None:
     inbox = bytearray(rubbish + b"Read Port - N %d - nfr %d\n" % (count, first))
     found = list(take_requests(inbox, quiet=True))
     assert found[-1] == (max(0, count), max(0, first))
@@ -175,11 +175,11 @@ def test_whatever_comes_no_answer_is_negative(rubbish: bytes, count: int, first:
 @pytest.mark.parametrize(
     "text", [b"Read Port\n", b"Read Port - N 5\n", b"Read Port - nfr 5\n", b"N 1 - nfr 1\n", b"Close\n", b"\n\0\r", b""]
 )
-def test_what_is_no_request_has_no_answer(text: bytes) -> None:
+def test_other_text_gets_no_answer(text: bytes) -> None:
     assert list(take_requests(bytearray(text), quiet=True)) == []
 
 
-def test_rubbish_is_not_kept() -> None:
+def test_invalid_input_is_not_stored() -> None:
     inbox = bytearray()
     for _ in range(100):
         inbox += b"x" * 1000
@@ -197,7 +197,7 @@ def test_conversation(server: Server) -> None:
         assert receive(connection)[0] == 0
         assert receive(connection)[3] == [100]
         server.content = port_content(103, 20)
-        connection.sendall(b"Read Port - N 3 - nfr 101")  # as a client that ends no lines
+        connection.sendall(b"Read Port - N 3 - nfr 101")  # without line ends
         assert receive(connection)[3] == [101, 102, 103]
         connection.sendall(b"Close")
         connection.sendall(b"\nRead Po")
@@ -205,14 +205,14 @@ def test_conversation(server: Server) -> None:
         assert receive(connection)[3] == [103]
 
 
-def test_as_many_clients_as_promised(server: Server) -> None:
+def test_the_documented_number_of_clients_is_served(server: Server) -> None:
     connections = [socket.create_connection(server.address, timeout=PATIENCE) for _ in range(socket_server.MAX_CLIENTS)]
     for index, connection in enumerate(connections):
         connection.sendall(b"Read Port - N 1 - nfr %d\n" % (81 + index % 20))
     assert [receive(c)[3] for c in connections] == [[81 + index % 20] for index in range(len(connections))]
     with server.client() as one_more:
-        assert one_more.recv(1) == b""  # turned away
-    assert "turned away" in server.reports[0]
+        assert one_more.recv(1) == b""  # rejected
+    assert "rejected" in server.reports[0]
     connections.pop().close()
     wait_for(lambda: server.clients() == socket_server.MAX_CLIENTS - 1)
     with server.client() as again:
@@ -224,19 +224,19 @@ def test_as_many_clients_as_promised(server: Server) -> None:
 
 
 def full(server: Server) -> list[socket.socket]:
-    """All places taken by clients that say nothing, the first of which came first."""
+    """Connect the maximum number of clients, in this order, which send nothing."""
     connections = [socket.create_connection(server.address, timeout=PATIENCE) for _ in range(socket_server.MAX_CLIENTS)]
     wait_for(lambda: server.clients() == socket_server.MAX_CLIENTS)
     return connections
 
 
 def let_in(server: Server) -> bool:
-    """Whether a new client gets an answer."""
+    """Return whether a new client gets an answer."""
     with server.client() as connection:
         try:
             connection.sendall(b"Read Port - N 1 - nfr 100\n")
             return receive(connection)[3] == [100]
-        except (AssertionError, ConnectionError):  # turned away
+        except (AssertionError, ConnectionError):  # rejected
             return False
 
 
@@ -249,26 +249,30 @@ def closed(connection: socket.socket) -> bool:
         return True
 
 
-def test_idle_clients_make_room(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_idle_clients_are_replaced(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
     connections = full(server)
-    assert not let_in(server) and not any(map(closed, connections)), "not at once"
+    assert not let_in(server) and not any(map(closed, connections)), "not immediately"
     monkeypatch.setattr(socket_server, "IDLE_SECONDS", 0.5)
     wait_for(lambda: let_in(server))
     assert [closed(connection) for connection in connections].count(True) == 1
-    assert closed(connections[0]), "the longest idle"
-    assert sum("asked for nothing for" in line for line in server.reports) == 1
+    assert closed(connections[0]), "the longest idle one"
+    assert sum("without a request for" in line for line in server.reports) == 1
     for _ in range(5):
-        wait_for(lambda: server.clients() == socket_server.MAX_CLIENTS - 1)  # the one before has left
+        wait_for(lambda: server.clients() == socket_server.MAX_CLIENTS - 1)  # the previous client has disconnected
         assert let_in(server)
-    assert [closed(connection) for connection in connections].count(True) == 1, "nobody goes where there is room"
+    assert [closed(connection) for connection in connections].count(True) == 1, (
+        "no client is disconnected below the limit"
+    )
     for connection in connections:
         connection.close()
 
 
-def test_who_asks_stays_and_who_only_sends_goes(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_client_with_requests_stays_and_one_with_other_text_is_replaced(
+    server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(socket_server, "IDLE_SECONDS", 0.5)
     asking, sending, *others = full(server)
-    others += [socket.create_connection(server.address, timeout=PATIENCE) for _ in range(3)]  # three too many
+    others += [socket.create_connection(server.address, timeout=PATIENCE) for _ in range(3)]  # three beyond the limit
 
     def all_served() -> bool:
         asking.sendall(b"Read Port - N 1 - nfr 90\n")
@@ -286,17 +290,17 @@ def test_who_asks_stays_and_who_only_sends_goes(server: Server, monkeypatch: pyt
         connection.close()
 
 
-def test_time_of_the_idle_is_as_documented() -> None:
+def test_idle_time_is_as_documented() -> None:
     text = (ROOT / "docs" / "capture.md").read_text("utf-8")
-    assert f"asked for nothing for {socket_server.IDLE_SECONDS:g} s" in " ".join(text.split())
+    assert f"no request for {socket_server.IDLE_SECONDS:g} s" in " ".join(text.split())
 
 
-def test_without_descriptors_it_waits_and_goes_on(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_descriptors_accepting_is_paused_and_resumed(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
     listener = server._socket._listener
     tries: list[float] = []
 
     class NoDescriptors:
-        """The listening socket of a process that has none left."""
+        """The listening socket of a process without free descriptors."""
 
         def __getattr__(self, name: str) -> Any:
             return getattr(listener, name)
@@ -314,7 +318,7 @@ def test_without_descriptors_it_waits_and_goes_on(server: Server, monkeypatch: p
             waiting.sendall(b"Read Port - N 1 - nfr 100\n")
             wait_for(lambda: len(tries) >= 2)
             before.sendall(b"Read Port - N 1 - nfr 99\n")
-            assert receive(before)[3] == [99], "those who are in go on"
+            assert receive(before)[3] == [99], "connected clients are still served"
             monkeypatch.setattr(NoDescriptors, "accept", lambda self: listener.accept())
             assert receive(waiting)[3] == [100]
     assert tries[1] - tries[0] >= socket_server.PAUSE_SECONDS
@@ -325,12 +329,12 @@ def test_slow_client_neither_hinders_others_nor_fills_memory(server: Server, mon
     server.content = port_content(2_000_000, 2_000_000)
     with server.client() as slow, server.client() as quick:
         for _ in range(20):
-            slow.sendall(b"Read Port - N 2000000 - nfr 1\n")  # 16 MB each, and it reads none
+            slow.sendall(b"Read Port - N 2000000 - nfr 1\n")  # 16 MB each, of which it reads none
         quick.sendall(b"Read Port - N 1 - nfr 1\n")
         assert receive(quick)[3] == [1]
         wait_for(lambda: any(client.outbox for client in server._socket._clients.values()))
         assert sum(len(client.outbox) for client in server._socket._clients.values()) <= 16_000_016
-        assert receive(slow)[0] == 2_000_000  # and it gets its answers when it wakes up
+        assert receive(slow)[0] == 2_000_000  # and it gets its answers when it reads again
         assert receive(slow)[4][-1] == -2_000_000
         monkeypatch.setattr(socket_server, "DEAD_SECONDS", 0.2)
         wait_for(lambda: server.clients() == 1, what="the end of the client that takes no answer")
@@ -350,7 +354,7 @@ def test_client_that_resets_its_connection(server: Server) -> None:
         assert receive(other)[3] == [7]
 
 
-def test_end_closes_connections_and_frees_the_port(server: Server) -> None:
+def test_end_closes_connections_and_releases_the_port(server: Server) -> None:
     with server.client() as connection:
         wait_for(lambda: server.clients() == 1)
         server.stopping.set()

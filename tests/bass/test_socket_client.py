@@ -1,4 +1,4 @@
-"""The reference client of the dedicated socket, against a server whose stream goes on, is lost, and begins anew."""
+"""The reference client of the dedicated socket, with a stream that continues, has losses, and is restarted."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_one_request(server: Server) -> None:
         assert client.newest() == 0
 
 
-def test_stream_in_order_with_its_losses_and_a_new_one(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stream_in_order_with_losses_and_a_restart(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(socket_client, "RESTART_SECONDS", 0.05)
     host, port = server.address
     stream = blocks(host, port, frames=6, first=95)
@@ -58,7 +58,7 @@ def test_stream_in_order_with_its_losses_and_a_new_one(server: Server, monkeypat
     stream.close()
 
 
-def test_begins_with_what_comes_and_ends_when_told(server: Server) -> None:
+def test_starts_with_the_next_frame_and_stops_on_request(server: Server) -> None:
     host, port = server.address
     stopping = threading.Event()
     stream = blocks(host, port, stopping=stopping)
@@ -82,10 +82,10 @@ def test_broken_connection_is_an_error(server: Server) -> None:
 
 
 @pytest.mark.parametrize("header", [(2**31 - 1, 0, 2**31), (-1, 0, 5), (6, 0, 100), (1, -1, 5), (5, 0, 2)])
-def test_whoever_is_no_bass_fills_no_memory(header: tuple[int, int, int]) -> None:
+def test_another_server_cannot_fill_the_memory(header: tuple[int, int, int]) -> None:
     with socket.create_server(("127.0.0.1", 0)) as listener:
         client = SocketClient(*listener.getsockname())
         connection, _ = listener.accept()
-        with connection, client, pytest.raises(OSError, match="what answers is no bass"):
+        with connection, client, pytest.raises(OSError, match="this is not a bass"):
             connection.sendall(struct.pack("<iiq", *header))
             client.read(5, 1)

@@ -1,4 +1,4 @@
-"""The command itself: help, version, usage, where it may lie, and how a command is added."""
+"""The command itself: help, version, usage, locations of the checkout, and adding a command."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_help_shows_the_commands_and_an_example() -> None:
     "arguments", [[], ["frobnicate"], ["--nonsense"], ["-x", "process"], ["doctor", "too", "much"]]
 )
 def test_usage(arguments: list[str]) -> None:
-    refused(rosafe(*arguments), "-h shows", code=2)
+    refused(rosafe(*arguments), "-h lists the options", code=2)
 
 
 def test_help_of_process_lists_every_parameter() -> None:
@@ -45,7 +45,7 @@ def test_help_of_process_lists_every_parameter() -> None:
             assert f" {parameter.name}=" in text
             assert parameter.doc in text
             assert parameter.range_text in text
-    for shown in ("fb_nERBs=1.0 (more than 0 to 100)", "in_doNormalize=true", "fb_cfHz={}", "ihc_method=dau"):
+    for shown in ("fb_nERBs=1.0 (above 0, at most 100)", "in_doNormalize=true", "fb_cfHz={}", "ihc_method=dau"):
         assert shown in text
     assert max(map(len, done.stdout.splitlines())) <= 120
 
@@ -62,7 +62,7 @@ def test_help_of_request_names_every_representation() -> None:
     assert {kind.word for kind in KINDS.values()} - set(told) == set()
 
 
-def test_help_into_a_pipe_that_closes() -> None:
+def test_help_into_a_closed_pipe() -> None:
     done = subprocess.run(
         ["/bin/bash", "-o", "pipefail", "-c", f"{ROSAFE} process -h | true"],
         env=environment(),
@@ -72,10 +72,10 @@ def test_help_into_a_pipe_that_closes() -> None:
         check=False,
     )
     assert done.stderr == ""
-    assert done.returncode in (0, 141)  # whoever comes first
+    assert done.returncode in (0, 141)  # depends on which process is first
 
 
-def test_through_a_link(tmp_path: Path) -> None:
+def test_symbolic_link_to_the_command(tmp_path: Path) -> None:
     (tmp_path / "there").symlink_to(ROSAFE)
     assert rosafe("--version", program=tmp_path / "there", cwd=tmp_path).stdout == f"rosafe {__version__}\n"
 
@@ -91,13 +91,13 @@ def test_in_an_install_space(tmp_path: Path, place: str) -> None:
     assert done.stdout == f"rosafe {__version__}\n", done
 
 
-def test_a_module_is_all_that_a_command_takes(tmp_path: Path) -> None:
+def test_a_module_adds_a_command(tmp_path: Path) -> None:
     (tmp_path / "say_hello.py").write_text(
-        '"""Say hello to somebody."""\n'
+        '"""Say hello to a person."""\n'
         "from rosafe.commands import CommandError\n"
         "def configure(parser):\n    parser.add_argument('name')\n"
         "def run(options):\n"
-        "    if options.name == 'nobody':\n        raise CommandError('there is nobody')\n"
+        "    if options.name == 'unknown':\n        raise CommandError('there is no person')\n"
         "    print('hello', options.name)\n    return 3\n"
     )
     (tmp_path / "_part.py").write_text("raise RuntimeError('not a command')\n")
@@ -119,17 +119,17 @@ def test_a_module_is_all_that_a_command_takes(tmp_path: Path) -> None:
             check=False,
         )
 
-    assert "say-hello Say hello to somebody" in " ".join(run("-h").stdout.split())
+    assert "say-hello Say hello to a person" in " ".join(run("-h").stdout.split())
     done = run("say-hello", "world")
     assert (done.returncode, done.stdout) == (3, "hello world\n")
-    done = run("say-hello", "nobody")
-    assert (done.returncode, done.stdout, done.stderr) == (1, "", "rosafe say-hello: there is nobody\n")
+    done = run("say-hello", "unknown")
+    assert (done.returncode, done.stdout, done.stderr) == (1, "", "rosafe say-hello: there is no person\n")
     refused(run("say-hello"), "rosafe say-hello", "name", code=2)
 
 
 def test_without_debians_packages() -> None:
-    """Each command (-S: none of them is there) says what to install; there is a list of them."""
+    """Each command names the missing packages (-S hides all of them), and the list of commands still works."""
     done = rosafe_alone("-h")
-    assert done.returncode == 0 and "Tell what is there of all that running needs" in done.stdout, done
+    assert done.returncode == 0 and "Check the installation and report" in done.stdout, done
     for arguments in (["-h"], ["sound.wav"]):
         refused(rosafe_alone("process", *arguments), "rosafe process", "numpy is not installed; run scripts/install")

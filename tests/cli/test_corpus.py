@@ -1,4 +1,4 @@
-"""`rosafe process` on folders: all of them, each in its place, whatever some are; killed and resumed; side by side."""
+"""`rosafe process` on folders: nested, linked and faulty ones, killed and resumed runs, concurrent runs."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ OPTIONS = (*SMALL, "--outputs", "ild")
 
 
 def corpus(folder: Path, count: int, frames: int = 3000) -> dict[str, np.ndarray]:
-    """Sounds in folders below `folder`, by their names there less .wav."""
+    """Write sounds in folders below `folder`; return them by their relative names without .wav."""
     made = {}
     for number in range(count):
         place = ("", "sub dir/", "sub dir/ünï/")[number % 3] + f"s{number}"
@@ -46,7 +46,7 @@ def corpus(folder: Path, count: int, frames: int = 3000) -> dict[str, np.ndarray
 
 
 def assert_results(folder: Path, sounds: dict[str, np.ndarray], extension: str = ".npz") -> None:
-    """In the folder are the right results of these sounds, and nothing else but failed.csv."""
+    """Assert that the folder contains the correct results of these sounds and, at most, failed.csv."""
     there = {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
     assert there - {"failed.csv"} == {f"{name}{extension}" for name in sounds}
     for name, sound in sounds.items():
@@ -61,7 +61,7 @@ def failed(folder: Path) -> dict[str, str]:
     return dict(rows)
 
 
-def test_folders_all_the_way_down(tmp_path: Path) -> None:
+def test_nested_folders(tmp_path: Path) -> None:
     sounds = corpus(tmp_path / "corpus", 7)
     (tmp_path / "corpus" / "notes.txt").write_text("no sound")
     (tmp_path / "corpus" / "._s0.wav").write_text("what some systems leave")
@@ -70,11 +70,11 @@ def test_folders_all_the_way_down(tmp_path: Path) -> None:
     assert done.stderr.count("\n") == 1
     assert_results(tmp_path / "out", sounds, ".h5")
     done = rosafe("process", "corpus", "-o", "out", *OPTIONS, "--format", "h5", "--resume", "-v", cwd=tmp_path)
-    assert done.returncode == 0 and done.stderr.endswith("\n7 files: 0 done, 7 complete already\n"), done
-    assert done.stderr.count(": complete already\n") == 7
+    assert done.returncode == 0 and done.stderr.endswith("\n7 files: 0 done, 7 already complete\n"), done
+    assert done.stderr.count(": already complete\n") == 7
 
 
-def test_one_name_for_several_sounds(tmp_path: Path) -> None:
+def test_several_sounds_with_one_name(tmp_path: Path) -> None:
     here = tmp_path / "corpus"
     sounds = corpus(here, 1)
     for name in ("a.wav", "a.flac", "a.wav.aiff", "failed.wav"):
@@ -92,10 +92,16 @@ def test_several_folders(tmp_path: Path) -> None:
     sounds = {f"{name}/{place}": sound for name in "ab" for place, sound in corpus(tmp_path / name, 2).items()}
     assert rosafe("process", "a", "b/", "-o", "out", *OPTIONS, cwd=tmp_path).returncode == 0
     assert_results(tmp_path / "out", sounds)
-    refused(rosafe("process", "a", tmp_path / "a", "-o", "other", *OPTIONS, cwd=tmp_path), "would both go to other/a/")
-    refused(rosafe("process", "a", *OPTIONS, cwd=tmp_path), "a is a folder: name one for its results with -o")
-    refused(rosafe("process", "a", "-o", "x.npz", *OPTIONS, cwd=tmp_path), "for several files, wanted is a folder")
-    refused(rosafe("process", "a", "-o", "x.v2", *OPTIONS, cwd=tmp_path), "for several files, wanted is a folder")
+    refused(
+        rosafe("process", "a", tmp_path / "a", "-o", "other", *OPTIONS, cwd=tmp_path), "would both be written to other"
+    )
+    refused(rosafe("process", "a", *OPTIONS, cwd=tmp_path), "a is a folder; name a folder for its results with -o")
+    refused(
+        rosafe("process", "a", "-o", "x.npz", *OPTIONS, cwd=tmp_path), "for several files, expected an existing folder"
+    )
+    refused(
+        rosafe("process", "a", "-o", "x.v2", *OPTIONS, cwd=tmp_path), "for several files, expected an existing folder"
+    )
 
 
 def test_results_within_the_corpus(tmp_path: Path) -> None:
@@ -103,13 +109,13 @@ def test_results_within_the_corpus(tmp_path: Path) -> None:
     for _ in range(2):
         done = rosafe("process", ".", "-o", "out", *OPTIONS, "--resume", cwd=tmp_path)
         assert done.returncode == 0 and done.stderr.startswith("3 files: "), done
-        (tmp_path / "out" / "heard.wav").write_bytes((tmp_path / "s0.wav").read_bytes())  # nobody's input
+        (tmp_path / "out" / "heard.wav").write_bytes((tmp_path / "s0.wav").read_bytes())  # not an input
     (tmp_path / "out" / "heard.wav").unlink()
     assert_results(tmp_path / "out", sounds)
 
 
 def test_links(tmp_path: Path) -> None:
-    """They are followed, but not to a folder that was searched already."""
+    """Links are followed, except to a folder that has been searched already."""
     sounds = corpus(tmp_path / "elsewhere", 2)
     here = tmp_path / "corpus"
     here.mkdir()
@@ -147,7 +153,7 @@ def test_folders_that_link_to_each_other(tmp_path: Path) -> None:
 
 
 def nest(folder: Path, name: str, levels: int, every: int) -> None:
-    """Folders in each other, and `s.wav` of the folder above in one of so many; paths are too long for the system."""
+    """Create nested folders with a copy of `s.wav` at each `every`-th level. The paths are too long for the system."""
     sound = (folder / "s.wav").read_bytes()
     at = os.open(folder, os.O_RDONLY)
     for level in range(1, levels + 1):
@@ -177,7 +183,7 @@ def test_very_deep_folders(tmp_path: Path) -> None:
 
 
 def test_folders_whose_paths_are_too_long(tmp_path: Path) -> None:
-    """That folder is named on one line; the others are processed. A result's name that is too long leaves nothing."""
+    """The folder is reported in one line, and the others are processed. A name that is too long leaves no file."""
     here = tmp_path / "corpus"
     here.mkdir()
     write(here / "s.wav", noise(3000))
@@ -200,7 +206,7 @@ def test_folders_whose_paths_are_too_long(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("extension", [".npz", ".h5", ".mat", ".zarr", ".csv"])
 def test_names_that_are_not_utf8(tmp_path: Path, extension: str) -> None:
-    """They are read, written, resumed and plotted. Results hold the name as text, the list of failures as bytes."""
+    """Such files are read, written, resumed and plotted. Results contain the name as text, failed.csv as bytes."""
     here = tmp_path / "corp\udcffus"
     here.mkdir()
     sound = noise(3000)
@@ -216,12 +222,12 @@ def test_names_that_are_not_utf8(tmp_path: Path, extension: str) -> None:
     assert load(result)["source"] == r"s\xfe.wav"
     assert list(failed(tmp_path / "out\udcff")) == ["corp\udcffus/bad\udcff.wav"]
     done = rosafe("process", here.name, *options, "--resume", "-v", cwd=tmp_path, PYTHONIOENCODING=STRICT)
-    assert r"s\xfe.wav -> " in done.stderr and done.stderr.count(": complete already\n") == 1, done
+    assert r"s\xfe.wav -> " in done.stderr and done.stderr.count(": already complete\n") == 1, done
     done = rosafe("plot", result, "-o", tmp_path / "p\udcff.png", PYTHONIOENCODING=STRICT)
     assert done.returncode == 0 and not done.stderr and (tmp_path / "p\udcff.png").stat().st_size, done
 
 
-def test_what_fails_is_named_and_does_not_keep_the_others(tmp_path: Path) -> None:
+def test_failures_are_listed_and_the_others_are_processed(tmp_path: Path) -> None:
     here = tmp_path / "corpus"
     sounds = corpus(here, 4)
     (here / "empty.wav").write_bytes(b"")
@@ -234,7 +240,7 @@ def test_what_fails_is_named_and_does_not_keep_the_others(tmp_path: Path) -> Non
     assert summary.startswith("8 files: 4 done, 4 failed; ")
     assert [line.split(" ", 4)[:3] for line in lines] == [["rosafe", "process:", line.split()[2]] for line in lines]
     assert lines[0] == "rosafe process: corpus/empty.wav is empty"
-    assert any("new\\nline.wav is mono" in line for line in lines) and "none.wav holds no samples" in done.stderr
+    assert any("new\\nline.wav is mono" in line for line in lines) and "none.wav contains no samples" in done.stderr
     assert len(failed(tmp_path / "out")) == 4 and "corpus/new\nline.wav" in failed(tmp_path / "out")
     assert_results(tmp_path / "out", sounds)
     for bad in ("none.wav", "new\nline.wav", os.fsdecode(b"\xff.wav")):
@@ -248,14 +254,14 @@ def test_what_fails_is_named_and_does_not_keep_the_others(tmp_path: Path) -> Non
     assert_results(tmp_path / "out", sounds)
 
 
-def test_empty_folders_and_a_list_of_somebody_else(tmp_path: Path) -> None:
+def test_empty_folders_and_a_foreign_list_of_failures(tmp_path: Path) -> None:
     (tmp_path / "nothing").mkdir()
     done = rosafe("process", "nothing", "-o", "out", *OPTIONS, cwd=tmp_path)
-    refused(done, "nothing: there is no sound file in this folder")
+    refused(done, "nothing: this folder contains no sound files")
     sounds = corpus(tmp_path / "corpus", 1)
     (tmp_path / "out" / "failed.csv").write_text("my own list\n")
     done = rosafe("process", "corpus", "nothing", "-o", "out", *OPTIONS, cwd=tmp_path)
-    assert done.returncode == 1 and "failed.csv is something else, and stays as it is" in done.stderr
+    assert done.returncode == 1 and "failed.csv is not a list of failures" in done.stderr
     assert (tmp_path / "out" / "failed.csv").read_text() == "my own list\n"
     (tmp_path / "out" / "failed.csv").unlink()
     os.mkfifo(tmp_path / "out" / "failed.csv")
@@ -266,7 +272,7 @@ def test_empty_folders_and_a_list_of_somebody_else(tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(os.getuid() == 0, reason="root may read everything")
-def test_what_nobody_may_read(tmp_path: Path) -> None:
+def test_unreadable_files(tmp_path: Path) -> None:
     sounds = corpus(tmp_path / "corpus", 3)
     (tmp_path / "corpus" / "sub dir").chmod(0)
     done = rosafe("process", "corpus", "-o", "out", *OPTIONS, cwd=tmp_path)
@@ -275,20 +281,20 @@ def test_what_nobody_may_read(tmp_path: Path) -> None:
     assert_results(tmp_path / "out", {"s0": sounds["s0"]})
 
 
-def test_what_is_there_stays_unless_it_is_to_go_on(tmp_path: Path) -> None:
+def test_existing_results_are_kept_unless_resume_is_given(tmp_path: Path) -> None:
     sounds = corpus(tmp_path / "corpus", 2)
     assert rosafe("process", "corpus", "-o", "out", *OPTIONS, cwd=tmp_path).returncode == 0
     done = rosafe("process", "corpus", "-o", "out", *OPTIONS, cwd=tmp_path)
-    assert done.returncode == 1 and done.stderr.count("is there already; --resume leaves it, --force replaces it") == 2
+    assert done.returncode == 1 and done.stderr.count("already exists; --resume keeps it, --force replaces it") == 2
     done = rosafe(
         "process", "corpus", "-o", "out", "--set", "fb_cfHz=500", "--outputs", "ild", "--resume", cwd=tmp_path
     )
-    assert done.returncode == 1 and done.stderr.count("was made with other parameters; take another -o") == 2
+    assert done.returncode == 1 and done.stderr.count("was computed with other parameters; choose another -o") == 2
     assert_results(tmp_path / "out", sounds)
 
 
 def test_killed_and_resumed(tmp_path: Path) -> None:
-    """Whenever it is killed, what is there is whole; and in the end all is."""
+    """All results are complete whenever the command is killed, and in the end none is missing."""
     sounds = corpus(tmp_path / "corpus", 60)
     out = tmp_path / "out"
     for wanted in (5, 20, 35):
@@ -299,18 +305,18 @@ def test_killed_and_resumed(tmp_path: Path) -> None:
         for path in out.rglob("*.npz"):
             assert load(path)["ild"].shape == (3, 17)
     done = rosafe("process", "corpus", "-o", "out", *OPTIONS, "--resume", cwd=tmp_path)
-    assert done.returncode == 0 and "complete already" in done.stderr, done
+    assert done.returncode == 0 and "already complete" in done.stderr, done
     assert_results(out, sounds)
 
 
 def test_two_runs_into_one_folder(tmp_path: Path) -> None:
-    """Halves go well together. For the same files, each is made by one; the other says so, or finds it complete."""
+    """Two runs on different files do not interact. On the same files, one run writes each result."""
     sounds = corpus(tmp_path / "corpus", 30)
     arguments = ("process", "corpus", "-o", "out", *OPTIONS, "--resume")
     with start(*arguments, cwd=tmp_path) as first, start(*arguments, cwd=tmp_path) as second:
         codes = [first.wait(), second.wait()]
     for code, run in zip(codes, (first, second), strict=True):
-        assert code == 0 or " is writing it" in run.err or "it has come into being meanwhile" in run.err, run
+        assert code == 0 or " is writing it" in run.err or "it was created meanwhile" in run.err, run
     done = rosafe(*arguments, cwd=tmp_path)
     assert done.returncode == 0 and not (tmp_path / "out" / "failed.csv").exists(), done
     assert_results(tmp_path / "out", sounds)
@@ -323,11 +329,11 @@ def test_interrupted(tmp_path: Path) -> None:
         wait_for(lambda: len(list(out.rglob("*.npz"))) >= 3, what=lambda: str(command))
         os.killpg(command.pid, signal.SIGINT)
         assert command.wait() == 130
-    assert command.err == "rosafe process: interrupted; what was not finished is removed; --resume goes on\n"
+    assert command.err == "rosafe process: interrupted; unfinished results were removed; continue with --resume\n"
     assert not list(out.rglob("*.part"))
 
 
-def test_the_bar_tells_files_and_how_long_it_takes(tmp_path: Path) -> None:
+def test_the_progress_bar_shows_files_and_the_remaining_time(tmp_path: Path) -> None:
     corpus(tmp_path / "corpus", 60)
     command = [str(ROSAFE), "process", "corpus", "-o", "out", *OPTIONS, "--jobs", "1"]
     with Terminal(command, environment(), cwd=tmp_path, columns=100) as terminal:
@@ -336,4 +342,4 @@ def test_the_bar_tells_files_and_how_long_it_takes(tmp_path: Path) -> None:
         terminal.press("\x03")
         terminal.end()
     line = text.split("\r")[-1]
-    assert "\n" not in text and line.startswith("\x1b[K[") and " of 60 files  " in line
+    assert "\n" not in text and line.startswith("[") and " of 60 files, " in line

@@ -1,4 +1,4 @@
-"""`rosafe process --dask`: the same numbers from workers of a scheduler, one of which is killed on the way."""
+"""`rosafe process --dask`: the same numbers from the workers of a scheduler, also if one of them is killed."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ distributed = pytest.importorskip("distributed")
 
 @pytest.fixture
 def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
-    """Two processes of one thread."""
+    """Two worker processes with one thread each."""
     with distributed.LocalCluster(
         n_workers=2,
         threads_per_worker=1,
@@ -32,7 +32,7 @@ def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
         yield cluster
 
 
-def test_a_worker_is_killed_on_the_way(tmp_path: Path, cluster: Any) -> None:
+def test_a_worker_is_killed_during_the_run(tmp_path: Path, cluster: Any) -> None:
     sounds = corpus(tmp_path / "corpus", 60)
     (tmp_path / "corpus" / "bad.wav").write_bytes(b"")
     out = tmp_path / "out"
@@ -50,25 +50,25 @@ def test_a_worker_is_killed_on_the_way(tmp_path: Path, cluster: Any) -> None:
     assert not proc(workers[0]).exists() and proc(workers[1]).exists()
 
 
-def test_workers_of_ones_own(tmp_path: Path) -> None:
-    """`local`: they go with the command, and resume what was there."""
+def test_local_workers(tmp_path: Path) -> None:
+    """Local workers end with the command, and resume an earlier run."""
     sounds = corpus(tmp_path / "corpus", 4)
     assert rosafe("process", "corpus/s0.wav", "-o", "out/", *OPTIONS, cwd=tmp_path).returncode == 0
     done = rosafe("process", "corpus", "-o", "out", *OPTIONS, "--dask", "local", "--resume", cwd=tmp_path)
     assert (done.returncode, done.stdout) == (0, ""), done
-    assert done.stderr.splitlines()[-1].startswith("4 files: 3 done, 1 complete already; "), done
+    assert done.stderr.splitlines()[-1].startswith("4 files: 3 done, 1 already complete; "), done
     assert_results(tmp_path / "out", sounds)
 
 
 def test_no_scheduler(tmp_path: Path) -> None:
     corpus(tmp_path / "corpus", 1)
     done = rosafe("process", "corpus", "-o", "out", *OPTIONS, "--dask", "tcp://127.0.0.1:1", cwd=tmp_path)
-    refused(done, "--dask tcp://127.0.0.1:1: no Dask scheduler answers there")
+    refused(done, "--dask tcp://127.0.0.1:1: no Dask scheduler answers")
     assert not (tmp_path / "out").exists()
 
 
 def test_workers_import_nothing_from_the_corpus(tmp_path: Path) -> None:
-    """A folder of sounds is data, even if it is the working directory and holds Python files."""
+    """A folder of sounds is data, even if it is the working directory and contains Python files."""
     sounds = corpus(tmp_path, 2)
     for name in ("struct", "random", "numpy", "rosafe", "sitecustomize"):
         (tmp_path / f"{name}.py").write_text(f"open({str(tmp_path / 'ran')!r}, 'a').write({name!r})\n")
@@ -80,7 +80,7 @@ def test_workers_import_nothing_from_the_corpus(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("restarts", [True, False], ids=["restarted by Dask", "not restarted by Dask"])
 def test_workers_that_die_at_their_start_end_the_run(tmp_path: Path, restarts: bool) -> None:
-    """Later versions of Dask do not restart them."""
+    """The parameter is False for later versions of Dask, which do not restart workers."""
     corpus(tmp_path / "corpus", 2)
     (tmp_path / "site").mkdir()
     (tmp_path / "site" / "sitecustomize.py").write_text(

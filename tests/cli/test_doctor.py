@@ -1,4 +1,4 @@
-"""`rosafe doctor`: what it finds on a machine that has everything, and on some that have not."""
+"""`rosafe doctor`: findings on a complete installation and on incomplete ones."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ EVERYTHING += ["alsaaudio", "sound devices", "HTTP server", "Tcl", "plots", "ext
 
 
 def findings(done: subprocess.CompletedProcess[str]) -> dict[str, dict[str, str]]:
-    """The checks by name; the exit code fits them."""
+    """Return the checks by name, and assert that the exit code fits them."""
     told: dict[str, Any] = json.loads(done.stdout)
     assert told["ok"] == (done.returncode == 0) == all(check["state"] != "MISSING" for check in told["checks"])
     return {check["name"]: check for check in told["checks"]}
@@ -36,7 +36,7 @@ def python(program: str, *options: str, **env: str) -> subprocess.CompletedProce
     )
 
 
-def test_all_is_there() -> None:
+def test_complete_installation() -> None:
     done = rosafe("doctor", "--json", ROS_MASTER_URI=f"http://127.0.0.1:{free_port()}")
     assert done.returncode == 0, done
     found = findings(done)
@@ -47,7 +47,7 @@ def test_all_is_there() -> None:
     assert found["master"]["state"] == "note" and "roscore" in found["master"]["detail"]
 
 
-def test_one_line_each() -> None:
+def test_one_line_per_check() -> None:
     done = rosafe("doctor", ROS_MASTER_URI=f"http://127.0.0.1:{free_port()}")
     lines = done.stdout.splitlines()
     assert (done.returncode, done.stderr, len(lines)) == (0, "", len(EVERYTHING))
@@ -57,7 +57,7 @@ def test_one_line_each() -> None:
         assert rest.startswith(name)
 
 
-def test_master_is_there(graph: Graph) -> None:
+def test_running_master(graph: Graph) -> None:
     found = findings(rosafe("doctor", "--json", ROS_MASTER_URI=graph.uri))
     assert (found["master"]["state"], found["master"]["detail"]) == ("ok", f"answers at {graph.uri}")
 
@@ -65,18 +65,18 @@ def test_master_is_there(graph: Graph) -> None:
 @pytest.mark.parametrize(
     ("ip", "hostname", "master", "why"),
     [
-        ("203.0.113.7", "", "", "ROS_IP is 203.0.113.7, which is no address of this machine"),
-        ("127.0.0.1", "nobody.invalid", "", "ROS_HOSTNAME is nobody.invalid, which is no address, and no name"),
-        ("http://127.0.0.1", "", "", "ROS_IP is http://127.0.0.1, which is no address"),
-        ("0.0.0.0", "", "", "ROS_IP is 0.0.0.0, which is no address to call"),
+        ("203.0.113.7", "", "", "ROS_IP is 203.0.113.7, which is not an address of this machine"),
+        ("127.0.0.1", "nobody.invalid", "", "ROS_HOSTNAME is nobody.invalid, neither an address nor a name"),
+        ("http://127.0.0.1", "", "", "ROS_IP is http://127.0.0.1, neither an address"),
+        ("0.0.0.0", "", "", "ROS_IP is 0.0.0.0, which is not an address that nodes"),
         ("127.0.0.1", "", "http://203.0.113.7:11311", "but the master is at http://203.0.113.7:11311"),
         ("127.0.0.1", "", "", ""),
         ("203.0.113.7", "127.0.0.1", "", ""),
         ("", "", "", ""),
     ],
 )
-def test_address_that_nobody_can_call(graph: Graph, ip: str, hostname: str, master: str, why: str) -> None:
-    """ROS_IP or ROS_HOSTNAME, which goes first, of another machine; or one that a master elsewhere cannot call."""
+def test_unreachable_address(graph: Graph, ip: str, hostname: str, master: str, why: str) -> None:
+    """ROS_HOSTNAME (which takes precedence) or ROS_IP is not of this machine, or not reachable from the master."""
     done = rosafe("doctor", "--json", ROS_MASTER_URI=master or graph.uri, ROS_IP=ip, ROS_HOSTNAME=hostname)
     found = findings(done)["address"]
     if why:
@@ -87,20 +87,20 @@ def test_address_that_nobody_can_call(graph: Graph, ip: str, hostname: str, mast
 
 
 def test_messages_of_this_shell(graph: Graph, tmp_path: Path) -> None:
-    """As env.sh sets it up, as a bare shell is, and as another checkout would set it up."""
+    """Three environments: after env.sh, without it, and after env.sh of another checkout."""
     paths_of_env = graph.env["PYTHONPATH"]
     found = findings(rosafe("doctor", "--json", PYTHONPATH=paths_of_env))["messages"]
-    assert found["state"] == "ok" and found["detail"].startswith("fresh")
+    assert found["state"] == "ok" and found["detail"].startswith("up to date")
     found = findings(rosafe("doctor", "--json"))["messages"]
     assert found["state"] == "note" and found["todo"] == f". {ROOT}/scripts/env.sh"
     (tmp_path / "rosAFE" / "msg").mkdir(parents=True)
     (tmp_path / "rosAFE" / "msg" / "__init__.py").touch()
     found = findings(rosafe("doctor", "--json", PYTHONPATH=f"{tmp_path}:{paths_of_env}"))["messages"]
-    assert found["state"] == "note" and f"this shell has others, in {tmp_path}" in found["detail"]
+    assert found["state"] == "note" and f"this shell uses others, in {tmp_path}" in found["detail"]
 
 
-def test_nothing_is_there() -> None:
-    """Python without Debian's packages, where also nothing can be generated."""
+def test_empty_installation() -> None:
+    """Python without Debian's packages; messages cannot be generated either."""
     done = rosafe_alone("doctor", "--json")
     assert done.returncode == 1, done
     found = findings(done)
@@ -133,7 +133,7 @@ def test_alsaaudio_of_debian_cannot_capture(tmp_path: Path) -> None:
 
 
 def test_plugins(tmp_path: Path) -> None:
-    """One that works beside one that does not."""
+    """A valid plugin and a faulty one."""
     page = (ROOT / "docs" / "own-representation.md").read_text("utf-8")
     (tmp_path / "zerocrossings.py").write_text(page.split("```python\n")[1].split("```")[0])
     found = findings(rosafe("doctor", "--json", ROSAFE_PLUGINS=str(tmp_path)))["plugins"]
@@ -144,7 +144,7 @@ def test_plugins(tmp_path: Path) -> None:
     assert "rosafe check" in found["todo"]
 
 
-def test_a_package_that_is_broken(tmp_path: Path) -> None:
+def test_broken_package(tmp_path: Path) -> None:
     (tmp_path / "soundfile.py").write_text("raise OSError('sndfile library\\nnot found')\n")
     done = rosafe("doctor", "--json", PYTHONPATH=str(tmp_path))
     assert done.returncode == 1, done

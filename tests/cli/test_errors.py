@@ -1,4 +1,4 @@
-"""What `rosafe process` refuses: one clear line, the right exit code, nothing left behind, nothing lost."""
+"""Refused inputs of `rosafe process`: one clear line, the right exit code, no leftover and no lost file."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.cli.command import ROSAFE, SMALL, environment, noise, refused, rosafe
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A folder with a sound file in.wav."""
+    """A folder with the sound file in.wav."""
     write(tmp_path / "in.wav", noise(3000))
     return tmp_path
 
@@ -34,7 +34,7 @@ def assert_untouched(folder: Path, *others: str) -> None:
         (b"RIFF\xff\xff\xff\xffWAVE", ["not a sound file"]),
     ],
 )
-def test_what_is_no_sound_file(folder: Path, content: bytes, words: list[str]) -> None:
+def test_other_files_than_sounds(folder: Path, content: bytes, words: list[str]) -> None:
     (folder / "bad.wav").write_bytes(content)
     refused(rosafe("process", "bad.wav", cwd=folder), "bad.wav", *words)
     assert_untouched(folder, "bad.wav")
@@ -43,26 +43,26 @@ def test_what_is_no_sound_file(folder: Path, content: bytes, words: list[str]) -
 @pytest.mark.parametrize("channels", [1, 3, 8])
 def test_other_than_two_channels(folder: Path, channels: int) -> None:
     write(folder / "bad.wav", np.zeros((channels, 500)))
-    refused(rosafe("process", "bad.wav", cwd=folder), "bad.wav", "two: left and right ear")
+    refused(rosafe("process", "bad.wav", cwd=folder), "bad.wav", "two, left and right ear")
     assert_untouched(folder, "bad.wav")
 
 
 def test_no_samples(folder: Path) -> None:
     write(folder / "bad.wav", np.zeros((2, 0)))
-    refused(rosafe("process", "bad.wav", cwd=folder), "bad.wav holds no samples")
+    refused(rosafe("process", "bad.wav", cwd=folder), "bad.wav contains no samples")
     assert_untouched(folder, "bad.wav")
 
 
 @pytest.mark.parametrize("name", ["bad.wav", "bad.flac", "bad.aiff"])
-def test_cut_off(folder: Path, name: str) -> None:
+def test_truncated_files(folder: Path, name: str) -> None:
     whole = write(folder / name, noise(50000)).read_bytes()
     (folder / name).write_bytes(whole[: len(whole) // 2])
-    refused(rosafe("process", name, cwd=folder), name, "cut off")
+    refused(rosafe("process", name, cwd=folder), name, "truncated")
     assert_untouched(folder, name)
 
 
 def test_damaged_in_the_middle(folder: Path) -> None:
-    """The damage shows when half of the output is written already."""
+    """The damage is detected after half of the output was written."""
     content = bytearray(write(folder / "bad.flac", noise(200000)).read_bytes())
     middle = len(content) // 2
     content[middle : middle + 30000] = bytes(30000)
@@ -90,7 +90,7 @@ def test_missing_folder_and_unreadable(folder: Path) -> None:
         ("fb_nChannels=2.5", ["fb_nChannels", "whole number"]),
         ("fb_nChannels=99999", ["fb_nChannels", "1024"]),
         ("fb_lowFreqHz=nan", ["fb_lowFreqHz", "number"]),
-        ("fb_lowFreqHz=0", ["fb_lowFreqHz", "out of range"]),
+        ("fb_lowFreqHz=0", ["fb_lowFreqHz: expected a number above 0"]),
         ("fb_highFreqHz=9000", ["fb_highFreqHz", "half the sample rate"]),  # the file is at 16 kHz
         ("fb_highFreqHz=50", ["fb_highFreqHz"]),  # below fb_lowFreqHz
         ("fb_cfHz=100,abc", ["fb_cfHz", "abc"]),
@@ -140,7 +140,7 @@ def test_outputs(folder: Path, outputs: str) -> None:
     ],
 )
 def test_usage(folder: Path, arguments: list[str]) -> None:
-    refused(rosafe("process", *arguments, cwd=folder), "rosafe process", "-h shows", code=2)
+    refused(rosafe("process", *arguments, cwd=folder), "rosafe process", "-h lists the options", code=2)
     assert_untouched(folder)
 
 
@@ -149,10 +149,10 @@ def test_usage(folder: Path, arguments: list[str]) -> None:
 
 def test_output_beside_the_input_is_not_replaced_unless_forced(folder: Path) -> None:
     (folder / "in.npz").write_text("precious")
-    refused(rosafe("process", "in.wav", *SMALL, cwd=folder), "in.npz is there already", "--force")
+    refused(rosafe("process", "in.wav", *SMALL, cwd=folder), "in.npz already exists", "--force")
     (folder / "results").mkdir()
     (folder / "results" / "in.npz").write_text("precious")
-    refused(rosafe("process", "in.wav", *SMALL, "-o", "results", cwd=folder), "in.npz is there already", "--force")
+    refused(rosafe("process", "in.wav", *SMALL, "-o", "results", cwd=folder), "in.npz already exists", "--force")
     assert (folder / "in.npz").read_text() == (folder / "results" / "in.npz").read_text() == "precious"
     assert rosafe("process", "in.wav", *SMALL, "--force", cwd=folder).returncode == 0
     with np.load(folder / "in.npz") as loaded:
@@ -167,18 +167,18 @@ def test_a_failure_leaves_the_old_output(folder: Path) -> None:
     assert_untouched(folder, "out.npz")
 
 
-def test_places_that_cannot_be_written(folder: Path) -> None:
+def test_unwritable_outputs(folder: Path) -> None:
     content = (folder / "in.wav").read_bytes()
     (folder / "link.npz").symlink_to("in.wav")
     for out, words in {
-        "nowhere/out.npz": ["nowhere/out.npz", "there is no folder"],
+        "nowhere/out.npz": ["nowhere/out.npz", "does not exist"],
         "in.wav/": ["-o in.wav: ", "File exists"],
         "in.wav/deep/": ["-o in.wav/deep: ", "Not a directory"],
-        "results": ["-o results: results end in .npz, .h5, .mat, .zarr, .csv", "/"],
-        "out.wav": ["-o out.wav: results end in .npz"],
+        "results": ["-o: expected a name ending in .npz, .h5, .mat, .zarr, .csv", "/"],
+        "out.wav": ["-o: expected a name ending in .npz"],
         "in.wav/out.npz": ["in.wav/out.npz", "Not a directory"],
-        "in.wav": ["-o in.wav: results end in .npz"],
-        "link.npz": ["link.npz is the input itself"],
+        "in.wav": ["-o: expected a name ending in .npz"],
+        "link.npz": ["link.npz is the input"],
         "x" * 300 + ".npz": ["File name too long"],
     }.items():
         refused(rosafe("process", "in.wav", *SMALL, "--force", "-o", out, cwd=folder), *words)
@@ -186,18 +186,23 @@ def test_places_that_cannot_be_written(folder: Path) -> None:
     assert_untouched(folder, "link.npz")
 
 
-def test_two_outputs_in_one_place(folder: Path) -> None:
+def test_two_outputs_with_one_name(folder: Path) -> None:
     write(folder / "in.flac", noise(100))
-    refused(rosafe("process", "in.wav", "in.wav", cwd=folder), "in.wav and in.wav would both go to in.wav.npz")
+    refused(rosafe("process", "in.wav", "in.wav", cwd=folder), "in.wav and in.wav would both be written to in.wav.npz")
     (folder / "link").symlink_to(folder)
-    refused(rosafe("process", "in.wav", "link/in.wav", cwd=folder), "in.wav and link/in.wav would both go to link/in.")
+    refused(
+        rosafe("process", "in.wav", "link/in.wav", cwd=folder),
+        "in.wav and link/in.wav would both be written to link/in.",
+    )
     (folder / "link").unlink()
-    refused(rosafe("process", "in.wav", "in.flac", "-o", "out.npz", cwd=folder), "-o out.npz", "folder")
+    refused(
+        rosafe("process", "in.wav", "in.flac", "-o", "out.npz", cwd=folder), "expected an existing folder", "'out.npz'"
+    )
     assert_untouched(folder, "in.flac")
 
 
-def test_no_room_is_told_before_the_work(folder: Path) -> None:
-    """2000 s at 192 kHz with 1000 channels: terabytes. The file itself is a hole."""
+def test_missing_disk_space_is_reported_before_processing(folder: Path) -> None:
+    """2000 s at 192 kHz with 1000 channels: terabytes. The file itself is sparse."""
     write(folder / "in.wav", np.zeros((2, 10)), 192000, "PCM_U8")
     head = (folder / "in.wav").read_bytes()[:-20]
     size = 2 * 192000 * 2000
@@ -212,17 +217,17 @@ def test_no_room_is_told_before_the_work(folder: Path) -> None:
 @pytest.mark.parametrize(
     "settings", [["cc_maxDelaySec=10", "--block", "3000"], ["fb_nChannels=1024", "fb_cfHz=" + "100," * 1024]]
 )
-def test_blocks_that_would_fill_the_memory(folder: Path, settings: list[str]) -> None:
+def test_blocks_that_exceed_the_memory(folder: Path, settings: list[str]) -> None:
     write(folder / "in.wav", np.zeros((2, 100_000)))
     done = rosafe(
         "process", "in.wav", "--block", "10000000", "--outputs", "crossCorrelation", "--set", *settings, cwd=folder
     )
-    refused(done, "in.wav: ", "one block of output would take", "allowed are 1.1 GB", "--block")
+    refused(done, "in.wav: ", "one block of output would take", "more than the limit of 1.1 GB", "--block")
     assert_untouched(folder)
 
 
 def test_full_disk(folder: Path) -> None:
-    """A limit on the size of files stands for a disk that fills up on the way."""
+    """A limit on the file size simulates a disk that becomes full during processing."""
     done = subprocess.run(
         ["/bin/bash", "-c", f"ulimit -f 100; exec {ROSAFE} process in.wav"],
         cwd=folder,

@@ -1,4 +1,4 @@
-"""Files of results: each format gives back what `rosafe.process` gave, and says where it comes from."""
+"""Files of results: each format returns the results of `rosafe.process` with their origin."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ import h5py
 import numpy as np
 import pytest
 import soundfile
-import xarray
 import zarr
 
 import rosafe
@@ -42,9 +41,9 @@ def assert_same(loaded: dict[str, Any], expected: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("extension", WHOLE)
-@pytest.mark.parametrize("frames", [9000, 100])  # one is too short for a frame
-@pytest.mark.parametrize("channels", [[500.0], [200.0, 800.0, 2000.0]])  # a single one has axes, too
-def test_all_outputs_come_back(tmp_path: Path, extension: str, frames: int, channels: list[float]) -> None:
+@pytest.mark.parametrize("frames", [9000, 100])  # the second is shorter than a frame
+@pytest.mark.parametrize("channels", [[500.0], [200.0, 800.0, 2000.0]])  # a single channel also has axes
+def test_all_outputs_are_loaded(tmp_path: Path, extension: str, frames: int, channels: list[float]) -> None:
     path = write(tmp_path / "sound.wav", noise(frames))
     target = tmp_path / f"result{extension}"
     parameters = {"fb_cfHz": channels}
@@ -63,8 +62,9 @@ def test_all_outputs_come_back(tmp_path: Path, extension: str, frames: int, chan
     np.testing.assert_array_equal(again["ild"], loaded["ild"])
 
 
-def test_zeros_are_no_missing_numbers_for_xarray(tmp_path: Path) -> None:
-    """It takes what equals an array's fill value for missing: silence, and the lag and the time 0."""
+def test_zeros_are_not_missing_values_for_xarray(tmp_path: Path) -> None:
+    """xarray regards values equal to the fill value as missing; here these would be silence, lag 0 and time 0."""
+    xarray = pytest.importorskip("xarray")
     target = tmp_path / "silence.zarr"
     process_file(write(tmp_path / "silence.wav", np.zeros((2, 2000))), target, SMALL_PARAMETERS, 700, list(KINDS))
     loaded = rosafe.load(target)
@@ -75,32 +75,33 @@ def test_zeros_are_no_missing_numbers_for_xarray(tmp_path: Path) -> None:
     assert not loaded["ratemap"].any() and 0.0 in loaded["cc_lags"]
 
 
-def test_parameters_are_those_in_force(tmp_path: Path, sound: Path) -> None:
-    """Also the highest channel, where the sample rate has decided."""
+def test_parameters_in_effect_are_stored(tmp_path: Path, sound: Path) -> None:
+    """This includes the highest channel, which may follow from the sample rate."""
     target = tmp_path / "result.npz"
     few: dict[str, Any] = {"fb_nChannels": 3}
     process_file(sound, target, few, outputs=["ild"])
     told = rosafe.load(target)["parameters"]
     assert told["fb_highFreqHz"] == rosafe.load(target)["fb_cfHz"][-1] == 7600.0
-    assert set(told) == {p.name for kind in KINDS.values() for p in kind.parameters}
+    every = {p.name for kind in KINDS.values() for p in kind.parameters}
+    assert every - set(told) == {"ams_highFreqHz"}  # follows the sample rate, and is not computed
     again = rosafe.process(as_int32(noise(9000)), RATE, parameters=told, outputs=["ild"])
     np.testing.assert_array_equal(again["ild"], rosafe.load(target)["ild"])
     for same in (few, {**few, "fb_highFreqHz": 7600.0}):
         assert process_file(sound, target, same, outputs=["ild"], resume=True).skipped
-    with pytest.raises(OutputError, match="was made with other parameters"):
+    with pytest.raises(OutputError, match="was computed with other parameters"):
         process_file(sound, target, {**few, "fb_highFreqHz": 7000.0}, outputs=["ild"], resume=True)
     process_file(sound, target, {**few, "fb_highFreqHz": 7000.0}, outputs=["ild"], replace=True)
-    with pytest.raises(OutputError, match="was made with other parameters"):
+    with pytest.raises(OutputError, match="was computed with other parameters"):
         process_file(sound, target, few, outputs=["ild"], resume=True)
 
 
 @pytest.mark.parametrize("extension", [".npz", ".zarr"])
-def test_a_result_older_than_its_input_is_made_anew(tmp_path: Path, sound: Path, extension: str) -> None:
+def test_a_result_older_than_its_input_is_replaced(tmp_path: Path, sound: Path, extension: str) -> None:
     target = tmp_path / f"result{extension}"
     process_file(sound, target, SMALL_PARAMETERS, outputs=["ild"])
     assert process_file(sound, target, SMALL_PARAMETERS, outputs=["ild"], resume=True).skipped
     write(sound, noise(5000, 9))
-    os.utime(sound, (2e9 + 2e9, 2e9 + 2e9))  # by a wrong clock: that would be made anew for ever
+    os.utime(sound, (2e9 + 2e9, 2e9 + 2e9))  # from a wrong clock: the result would be replaced each time
     assert process_file(sound, target, SMALL_PARAMETERS, outputs=["ild"], resume=True).skipped
     os.utime(sound)
     os.utime(target, (1e9, 1e9))
@@ -123,14 +124,14 @@ def test_csv(tmp_path: Path, sound: Path, output: str) -> None:
 
 
 @pytest.mark.parametrize("outputs", [["ratemap"], ["ild", "itd"], ["precedence"], None])
-def test_what_is_no_table_is_no_csv(tmp_path: Path, sound: Path, outputs: list[str] | None) -> None:
-    with pytest.raises(ValueError, match="one output of two axes: name one of input, preProc, ild"):
+def test_csv_accepts_tables_only(tmp_path: Path, sound: Path, outputs: list[str] | None) -> None:
+    with pytest.raises(ValueError, match="one output of two axes; name one of input, preProc, ild"):
         process_file(sound, tmp_path / "result.csv", outputs=outputs)
     assert not (tmp_path / "result.csv").exists()
 
 
 @pytest.mark.parametrize("extension", [".npz", ".mat"])
-def test_large_arrays_wait_on_the_disk(
+def test_large_arrays_are_buffered_on_disk(
     tmp_path: Path, sound: Path, extension: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     process_file(sound, tmp_path / f"a{extension}", SMALL_PARAMETERS, 1000, ["ihc", "ild"])
@@ -140,18 +141,18 @@ def test_large_arrays_wait_on_the_disk(
     assert len(list(tmp_path.iterdir())) == 3
 
 
-def test_how_little_room_there_is(tmp_path: Path, sound: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_free_disk_space(tmp_path: Path, sound: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(files.os, "statvfs", lambda path: SimpleNamespace(f_bavail=3, f_frsize=4096))
-    with pytest.raises(OutputError, match=r"would take 0\.432 MB, 0\.012 MB are free there; name fewer --outputs"):
+    with pytest.raises(OutputError, match=r"would take 0\.432 MB, but only 0\.012 MB are free; name fewer --outputs"):
         process_file(sound, tmp_path / "a.h5", SMALL_PARAMETERS, outputs=["ihc"])
     assert list(tmp_path.iterdir()) == [sound]
 
 
 def test_mat_beyond_version_5(tmp_path: Path, sound: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """MATLAB's 7.3: HDF5 with its types as attributes, and its axes in the opposite order."""
+    """Version 7.3 is HDF5 with MATLAB's types as attributes and reversed axes."""
     outputs = ["ihc", "ild", "spectralFeatures"]
     process_file(sound, tmp_path / "a.mat", SMALL_PARAMETERS, 1000, outputs)
-    monkeypatch.setattr(formats, "MAT5_MOST", 1000)
+    monkeypatch.setattr(formats, "MAX_MAT5", 1000)
     process_file(sound, tmp_path / "b.mat", SMALL_PARAMETERS, 1000, outputs)
     assert_same(rosafe.load(tmp_path / "b.mat"), rosafe.load(tmp_path / "a.mat"))
     content = (tmp_path / "b.mat").read_bytes()
@@ -174,8 +175,8 @@ def test_mat_in_octave(tmp_path: Path, sound: Path) -> None:
     assert done.stdout.split() == ["sound.wav", "3", "55", "3", f"{ild[1, 4]:.17g}", "2000"], done
 
 
-def test_others_find_their_way(tmp_path: Path, sound: Path) -> None:
-    """Labels of axes, units and the parameters are where readers of HDF5 and Zarr look for them."""
+def test_metadata_for_other_readers(tmp_path: Path, sound: Path) -> None:
+    """Axis labels, units and parameters have the names that readers of HDF5 and Zarr expect."""
     for extension in (".h5", ".zarr"):
         process_file(sound, tmp_path / f"a{extension}", SMALL_PARAMETERS)
     with h5py.File(tmp_path / "a.h5") as file:
@@ -187,60 +188,60 @@ def test_others_find_their_way(tmp_path: Path, sound: Path) -> None:
 
 
 @pytest.mark.parametrize("extension", [*WHOLE, ".csv"])
-def test_what_is_damaged_or_none(tmp_path: Path, sound: Path, extension: str) -> None:
+def test_damaged_files_and_other_files(tmp_path: Path, sound: Path, extension: str) -> None:
     target = tmp_path / f"a{extension}"
     with pytest.raises(FileNotFoundError):
         rosafe.load(target)
     if extension != ".zarr":
         for content in (b"", b"something else " * 100):
             target.write_bytes(content)
-            with pytest.raises(ValueError, match="is no result of rosafe process"):
+            with pytest.raises(ValueError, match="is not a result of rosafe process"):
                 rosafe.load(target)
         process_file(sound, target, SMALL_PARAMETERS, outputs=["ild"], replace=True)
         whole_file = target.read_bytes()
         target.write_bytes(whole_file[: len(whole_file) // 2])
-        with pytest.raises(ValueError, match="is no result of rosafe process, or damaged"):
+        with pytest.raises(ValueError, match="is not a result of rosafe process, or damaged"):
             rosafe.load(target)
     else:
         target.mkdir()
-        with pytest.raises(ValueError, match="is no result of rosafe process"):
+        with pytest.raises(ValueError, match="is not a result of rosafe process"):
             rosafe.load(target)
-    with pytest.raises(ValueError, match=r"a\.txt: results end in \.npz, \.h5"):
+    with pytest.raises(ValueError, match=r"a\.txt: expected a name that ends in \.npz, \.h5"):
         rosafe.load(tmp_path / "a.txt")
 
 
 @pytest.mark.parametrize("extension", [*WHOLE, ".csv"])
 def test_resume(tmp_path: Path, sound: Path, extension: str) -> None:
-    """What is complete stays; half a file is made anew; what was made otherwise, or is something else, is refused."""
+    """Complete results are kept, partial ones replaced; results with other parameters and other files are refused."""
     target = tmp_path / f"a{extension}"
 
-    def go(parameters: dict[str, Any], **options: Any) -> FileResult:
+    def resume(parameters: dict[str, Any], **options: Any) -> FileResult:
         return process_file(sound, target, parameters, outputs=["ild"], resume=True, **options)
 
-    assert not go(SMALL_PARAMETERS).skipped
+    assert not resume(SMALL_PARAMETERS).skipped
     before = rosafe.load(target)
-    assert go(SMALL_PARAMETERS).skipped
+    assert resume(SMALL_PARAMETERS).skipped
     changes: list[dict[str, Any]] = [{"parameters": {"fb_cfHz": [500.0]}}, {"block_frames": 100}, {"channels": (2, 1)}]
     for changed in changes:
-        with pytest.raises(OutputError, match=f"was made with other {next(iter(changed))}; .*--force"):
-            go(**{"parameters": SMALL_PARAMETERS, **changed})
+        with pytest.raises(OutputError, match=f"was computed with other {next(iter(changed))}; .*--force"):
+            resume(**{"parameters": SMALL_PARAMETERS, **changed})
     if extension == ".zarr":
         return
     content = target.read_bytes()
     target.write_bytes(content[: len(content) // 3])
-    assert not go(SMALL_PARAMETERS).skipped
+    assert not resume(SMALL_PARAMETERS).skipped
     assert_same(rosafe.load(target), before)
-    target.write_text("somebody's own")
-    with pytest.raises(OutputError, match="is no result of rosafe process; --force replaces it"):
-        go(SMALL_PARAMETERS)
-    assert target.read_text() == "somebody's own"
+    target.write_text("foreign text")
+    with pytest.raises(OutputError, match="is not a result of rosafe process; --force replaces it"):
+        resume(SMALL_PARAMETERS)
+    assert target.read_text() == "foreign text"
 
 
-def test_a_zarr_takes_the_place_of_a_zarr_only(tmp_path: Path, sound: Path) -> None:
+def test_a_zarr_replaces_only_a_zarr(tmp_path: Path, sound: Path) -> None:
     target = tmp_path / "a.zarr"
     target.mkdir()
     (target / "mine.txt").write_text("precious")
-    refused(command("process", sound, *SMALL, "-o", target), "a folder with other things in it, which stay")
+    refused(command("process", sound, *SMALL, "-o", target), "a folder with other contents; it is left unchanged")
     assert (target / "mine.txt").read_text() == "precious"
     (target / "mine.txt").unlink()
     (tmp_path / "a.zarr.part").mkdir()
@@ -251,11 +252,11 @@ def test_a_zarr_takes_the_place_of_a_zarr_only(tmp_path: Path, sound: Path) -> N
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.zarr", "sound.wav"]
 
 
-# --- what goes in ---------------------------------------------------------------------------------------------------
+# --- inputs ---------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", ["a.flac", "a.ogg", "A.WAV"])
-def test_kinds_of_sound(tmp_path: Path, name: str) -> None:
+def test_formats_of_sound_files(tmp_path: Path, name: str) -> None:
     signal = noise(20000) / 4
     soundfile.write(tmp_path / name, signal.T, RATE, format="WAV" if name.endswith("WAV") else None)
     done = command("process", name, *SMALL, "-o", "a.npz", "--outputs", "input,ild", cwd=tmp_path)
@@ -272,7 +273,7 @@ def test_kinds_of_sound(tmp_path: Path, name: str) -> None:
 
 
 def test_mp3(tmp_path: Path) -> None:
-    """Its decoder dithers: the same file is never read twice the same in the last of 24 bits."""
+    """The decoder adds dither, so that the last of 24 bits differs between two readings."""
     soundfile.write(tmp_path / "a.mp3", noise(20000).T / 4, RATE)
     done = command("process", "a.mp3", *SMALL, "--outputs", "input", cwd=tmp_path)
     assert done.returncode == 0, done
@@ -294,21 +295,24 @@ def test_channels(tmp_path: Path) -> None:
         assert_same(loaded, expected)
         assert loaded["channels"] == [left + 1, right + 1]
     refused(command("process", "mono.wav", "--channels", "1,2", cwd=tmp_path), "is mono: there is no channel 2")
-    refused(command("process", "five.wav", cwd=tmp_path), "has 5 channels", "--channels 1,2 takes those")
-    refused(command("process", "mono.wav", cwd=tmp_path), "is mono", "--channels 1,1 gives it to both")
+    refused(command("process", "five.wav", cwd=tmp_path), "has 5 channels", "--channels 1,2 takes the first two")
+    refused(command("process", "mono.wav", cwd=tmp_path), "is mono", "--channels 1,1 uses it for both")
 
 
-def test_no_numbers_are_told(tmp_path: Path) -> None:
+def test_nan_and_infinite_samples_are_reported(tmp_path: Path) -> None:
     signal = noise(3000)
     signal[0, 5:7] = np.nan
     write(tmp_path / "a.wav", signal, subtype="FLOAT")
     done = command("process", "a.wav", *SMALL, "--outputs", "input", cwd=tmp_path)
-    assert done.returncode == 0 and "; 2 samples that were NaN or infinite are silence or full scale" in done.stderr
+    assert (
+        done.returncode == 0
+        and "; 2 samples were NaN or infinite and were replaced by silence or full scale" in done.stderr
+    )
     assert rosafe.load(tmp_path / "a.npz")["input"][0, 5] == 0
 
 
 def test_bags(tmp_path: Path) -> None:
-    """Every frame once, from the first sound on; what was lost is silence in its place."""
+    """Each frame is read once, from the first sound on; lost frames are replaced by silence."""
     samples = bags.stream(9000)
     indexes = [*range(120, 6000, 100), *range(6500, 9001, 100)]  # windows of 120; between them, 380 frames are lost
     messages = [bags.message(samples, index, 120, RATE) for index in indexes]
@@ -323,16 +327,20 @@ def test_bags(tmp_path: Path) -> None:
     for name in ("a", "left"):
         assert_same(rosafe.load(tmp_path / f"{name}.npz"), expected)
     done = command("process", "left.bag", *options, "--topic", "/bass/Audio", "-o", "b.npz", cwd=tmp_path)
-    refused(done, "left.bag: no topic /bass/Audio in there; there are: /left/Audio")
+    refused(done, "left.bag: does not contain the topic /bass/Audio; available: /left/Audio")
     done = command("process", "a.bag", *options, "--channels", "2,1", "-o", "b.h5", cwd=tmp_path)
     assert done.returncode == 0
     np.testing.assert_array_equal(rosafe.load(tmp_path / "b.h5")["input"], expected["input"][::-1])
 
 
-def test_a_bag_of_several_streams(tmp_path: Path) -> None:
+def test_a_bag_with_several_streams(tmp_path: Path) -> None:
     samples = bags.stream(2000)
     both = [bags.message(samples, index, 120, RATE) for index in (*range(100, 2001, 100), *range(100, 501, 100))]
     bags.write(tmp_path / "a.bag", both)
-    refused(command("process", "a.bag", *SMALL, cwd=tmp_path), "a.bag holds several streams", "rosafe record OUT.wav")
+    refused(
+        command("process", "a.bag", *SMALL, cwd=tmp_path),
+        "a.bag contains several successive streams",
+        "rosafe record OUT.wav",
+    )
     (tmp_path / "cut.bag").write_bytes((tmp_path / "a.bag").read_bytes()[:3000])
     refused(command("process", "cut.bag", *SMALL, cwd=tmp_path), "cut.bag was not closed by its recorder")

@@ -1,4 +1,4 @@
-"""`rosafe process` on long files: memory that does not grow with them, progress, and the end in the middle."""
+"""`rosafe process` on long files: constant memory, progress, and interruptions."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ OUTPUTS = ("--outputs", "input,ihc,ild")  # of one channel: 32 bytes per frame
 
 
 def write_long(path: Path, seconds: int) -> Path:
-    """Noise that is the same every second."""
+    """Write noise that repeats every second."""
     second = np.int16(noise(RATE).T * 2**15)
     with soundfile.SoundFile(path, "w", RATE, 2, "PCM_16") as file:
         for _ in range(seconds):
@@ -34,7 +34,7 @@ def write_long(path: Path, seconds: int) -> Path:
 
 
 def peak_kilobytes(*arguments: str | Path) -> int:
-    """The most memory that the command or a child of it had at any time."""
+    """Return the peak memory of the command and its children."""
     program = (
         "import resource, subprocess, sys; subprocess.run(sys.argv[1:], check=True);"
         "print(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss)"
@@ -51,7 +51,7 @@ def peak_kilobytes(*arguments: str | Path) -> int:
 
 
 def test_memory_does_not_grow_with_the_file(tmp_path: Path) -> None:
-    """Ten minutes take what ten seconds take, though the output is 300 MB."""
+    """Ten minutes need as much memory as ten seconds, although the output has 300 MB."""
     short, long = (write_long(tmp_path / f"{seconds}.wav", seconds) for seconds in (10, 600))
     more = (*ONE_CHANNEL, *OUTPUTS, "--format", "h5")
     peaks = {path: peak_kilobytes("process", "-q", path, *more) for path in (short, long)}
@@ -59,7 +59,7 @@ def test_memory_does_not_grow_with_the_file(tmp_path: Path) -> None:
     assert peaks[long] < peaks[short] + 25_000, peaks
     assert peaks[long] < 350_000, peaks
 
-    # and the numbers are right at both ends of it, whatever came between
+    # and the numbers are right at the beginning and at the end
     mapped, loaded = load(long.with_suffix(".h5")), load(short.with_suffix(".h5"))
     assert mapped["ihc"].shape == (2, 1, 600 * RATE)
     assert mapped["ild"].shape == (1, 600 * 100 - 1)
@@ -67,7 +67,7 @@ def test_memory_does_not_grow_with_the_file(tmp_path: Path) -> None:
     np.testing.assert_array_equal(mapped["ild"][:, :999], loaded["ild"])
     second = soundfile.read(short, RATE, dtype="int32")[0].T
     np.testing.assert_array_equal(mapped["input"][:, -RATE:], second / (2**31 - 1))
-    # A filter that has run for ten minutes is where it was after ten seconds, if the signal repeats.
+    # For a periodic signal the filter has the same state after ten minutes as after ten seconds.
     np.testing.assert_allclose(mapped["ihc"][..., -RATE:], mapped["ihc"][..., 9 * RATE : 10 * RATE], rtol=0, atol=1e-12)
     expected = process(np.tile(second, 2), RATE, parameters={"fb_cfHz": [1000.0]}, outputs=["ihc"])["ihc"]
     np.testing.assert_array_equal(mapped["ihc"][..., : 2 * RATE], expected)
@@ -75,12 +75,12 @@ def test_memory_does_not_grow_with_the_file(tmp_path: Path) -> None:
         path.unlink()  # pytest keeps folders
 
 
-# --- the end in the middle ---
+# --- interruptions ---
 
 
 @pytest.fixture
 def long_file(tmp_path: Path) -> Path:
-    """Half an hour, most of it a hole: nobody waits for its end."""
+    """A sparse file of half an hour, whose processing is always interrupted."""
     path = write(tmp_path / "in.wav", noise(RATE))
     head = path.read_bytes()[:44]
     size = 4 * RATE * 1800
@@ -91,21 +91,21 @@ def long_file(tmp_path: Path) -> Path:
 
 
 def begun(part: Path) -> Callable[[], bool]:
-    """Whether an output is on its way."""
+    """Return a condition: the output has been started."""
     return part.exists
 
 
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
-def test_a_signal_to_the_command(long_file: Path, number: int, code: int) -> None:
+def test_signals(long_file: Path, number: int, code: int) -> None:
     with start("process", long_file.name, "--outputs", "ild", cwd=long_file.parent) as command:
         wait_for(begun(long_file.with_name("in.npz.part")), what=lambda: str(command))
         assert command.stop(number) == code
-        assert command.err == "rosafe process: interrupted; what was not finished is removed\n"
+        assert command.err == "rosafe process: interrupted; unfinished results were removed\n"
     assert [path.name for path in long_file.parent.iterdir()] == ["in.wav"]
 
 
 def test_ctrl_c_at_the_terminal(long_file: Path) -> None:
-    """The terminal sends it to the command and to all that it has started; several files; a key pressed twice."""
+    """The terminal sends the signal to the command and its children; several files; two key presses."""
     for name in ("b", "c"):
         os.link(long_file, long_file.with_name(f"{name}.wav"))
     here = long_file.parent
@@ -116,12 +116,12 @@ def test_ctrl_c_at_the_terminal(long_file: Path) -> None:
         for _ in range(2):
             os.killpg(command.pid, signal.SIGINT)
         assert command.wait() == 130
-        assert command.err == "rosafe process: interrupted; what was not finished is removed\n"
+        assert command.err == "rosafe process: interrupted; unfinished results were removed\n"
     assert {path.name for path in here.iterdir()} == {"in.wav", "b.wav", "c.wav"}
     assert not any(proc(child).exists() for child in children)
 
 
-def test_a_child_that_ends_first_of_the_same_signal_has_not_failed() -> None:
+def test_a_child_that_ends_first_by_the_same_signal_has_not_failed() -> None:
     program = """
 import os, signal
 from rosafe.commands._workers import Interrupted, Interrupts, run_parallel
@@ -130,7 +130,7 @@ def work(progress):
     os.kill(os.getppid(), signal.SIGINT)
     raise Interrupted(signal.SIGINT)
 
-run_parallel([work], 1, (), lambda index, told: print(told), Interrupts())
+run_parallel([work], 1, (), lambda index, task: print(task), Interrupts())
 """
     done = subprocess.run(
         ["/usr/bin/python3", "-c", program], env=environment(), cwd=ROOT, capture_output=True, text=True, timeout=120
@@ -139,7 +139,7 @@ run_parallel([work], 1, (), lambda index, told: print(told), Interrupts())
 
 
 def test_killed(long_file: Path) -> None:
-    """Whoever is left without the command ends too; what they leave is no hindrance."""
+    """The children end with the command, and their leftovers do not disturb the next run."""
     here, part = long_file.parent, long_file.with_name("in.npz.part")
     with start("process", "in.wav", "--outputs", "ild", cwd=here) as command:
         wait_for(begun(part), what=lambda: str(command))
@@ -154,23 +154,23 @@ def test_killed(long_file: Path) -> None:
     assert load(here / "in.npz")["ild"].shape == (1, 17)
 
 
-def test_a_killed_child_is_told(long_file: Path) -> None:
+def test_a_killed_child_is_reported(long_file: Path) -> None:
     here = long_file.parent
     with start("process", "in.wav", "--outputs", "ild", cwd=here) as command:
         wait_for(begun(here / "in.npz.part"), what=lambda: str(command))
         (child,) = _children(command.pid)
         os.kill(child, signal.SIGKILL)
         assert command.wait() == 1
-        assert command.err == "rosafe process: in.wav: ended too early, with signal 9\n"
+        assert command.err == "rosafe process: in.wav: the process ended too early, with signal 9\n"
     assert not (here / "in.npz").exists()
 
 
-def test_two_for_one_place(long_file: Path) -> None:
+def test_two_commands_for_one_output(long_file: Path) -> None:
     here, part = long_file.parent, long_file.with_name("in.npz.part")
     with start("process", "in.wav", "--outputs", "ild", cwd=here) as command:
         wait_for(begun(part), what=lambda: str(command))
         (child,) = _children(command.pid)
-        os.kill(child, signal.SIGSTOP)  # it has the file, and leaves the processor to others
+        os.kill(child, signal.SIGSTOP)  # it has opened the file and leaves the processor to others
         done = rosafe("process", "in.wav", "--outputs", "ild", cwd=here)
         os.kill(child, signal.SIGCONT)
         assert done.returncode == 1
@@ -197,11 +197,11 @@ def test_a_terminal_shows_one_live_line(long_file: Path) -> None:
         assert terminal.end() == 130
     assert "\n" not in text
     line = text.split("\r")[-1]
-    assert line.startswith("\x1b[K[") and " % " in line and "left" in line
+    assert line.startswith("[") and " % " in line and "left" in line
     assert max(len(line) for line in text.split("\r")) < 90
 
 
-def test_elsewhere_lines_are_few(tmp_path: Path) -> None:
+def test_few_lines_without_a_terminal(tmp_path: Path) -> None:
     path = write(tmp_path / "a.wav", noise(5 * RATE))
     done = rosafe("process", path, "--block", "100", *ONE_CHANNEL, "--outputs", "ild")
     assert done.returncode == 0
@@ -210,8 +210,8 @@ def test_elsewhere_lines_are_few(tmp_path: Path) -> None:
     assert done.stderr.count("\n") <= 3
 
 
-def test_reader_of_messages_leaves(long_file: Path) -> None:
-    """`rosafe process ... 2>&1 | head`: no traceback, no leftovers."""
+def test_the_reader_of_messages_ends(long_file: Path) -> None:
+    """`rosafe process ... 2>&1 | head`: no traceback and no leftovers."""
     read, write_end = os.pipe()
     os.close(read)
     short = write(long_file.with_name("short.wav"), noise(3000))

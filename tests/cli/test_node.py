@@ -1,4 +1,4 @@
-"""`rosafe process` and the running node: the same numbers from the same samples, bit for bit."""
+"""`rosafe process` and the running node return the same numbers for the same samples, bit for bit."""
 
 from __future__ import annotations
 
@@ -30,5 +30,5 @@ def test_same_numbers_as_the_node(graph: Graph, tmp_path: Path) -> None:
         microphone.play(signal)
         for kind in CORE_REPRESENTATIONS:
             rate = float(loaded[f"{kind}_frameRate"]) if f"{kind}_frameRate" in loaded else RATE
-            message = node.read(kind, index=BLOCK * BLOCKS + 1)  # of the frame after the last
+            message = node.read(kind, index=BLOCK * BLOCKS + 1)  # index of the frame after the last
             assert_holds(message, kind, windowed(loaded[kind], seconds, rate))

@@ -1,9 +1,8 @@
-"""What the product writes is complete or not there, and never two writers' mixture, whatever they and others do."""
+"""Output files are complete or absent, and never a mixture of two writers."""
 
 from __future__ import annotations
 
 import errno
-import multiprocessing
 import os
 import re
 import signal
@@ -17,8 +16,10 @@ import soundfile
 
 from rosafe import output
 from rosafe.bass.sources.scene import Scene
+from rosafe.commands.__main__ import main
 from rosafe.output import AtomicOutput, OutputError, new_file
 from tests.bass import bags
+from tests.cli import forked
 from tests.cli.command import refused, rosafe, start
 from tests.harness import Process, wait_for
 
@@ -27,7 +28,7 @@ SCENE = ("--device", "scene:", "--rate", str(RATE), "--chunk", "400")
 
 
 def written(path: Path) -> np.ndarray:
-    """The samples of a recording, (2, frames)."""
+    """Return the samples of a recording, (2, frames)."""
     if path.suffix == ".bag":
         windows = [np.stack((message.left, message.right)) for message in bags.read(path, "/bass/Audio")]
         return np.concatenate([windows[0], *(window[:, -400:] for window in windows[1:])], axis=1)
@@ -48,21 +49,21 @@ def content(folder: Path) -> dict[str, str]:
 
 @pytest.mark.parametrize("name", ["a.wav", "a.bag"])
 @pytest.mark.parametrize("force", [(), ("--force",)], ids=["", "force"])
-def test_the_second_recorder_is_told_who_has_the_file(tmp_path: Path, name: str, force: tuple[str, ...]) -> None:
+def test_the_second_recorder_names_the_first_one(tmp_path: Path, name: str, force: tuple[str, ...]) -> None:
     path = tmp_path / name
     if force:
-        path.write_text("of yesterday")
+        path.write_text("old recording")
     with start("record", name, *SCENE, *force, cwd=tmp_path) as first:
         begun(path, first)
-        for device in ("scene:?seed=1", "nosuch"):  # whatever it would listen to
+        for device in ("scene:?seed=1", "nosuch"):  # with any device
             second = rosafe("record", name, "--device", device, "--rate", str(RATE), *force, cwd=tmp_path)
             refused(second, f"cannot write {name}: process {first.pid} (", f"rosafe record {name} ", "is writing it")
         if force:
-            assert path.read_text() == "of yesterday"  # until the new one is complete
+            assert path.read_text() == "old recording"  # until the new one is complete
         else:
             assert not path.exists()
         assert first.stop(signal.SIGINT) == 0, first
-    assert os.listdir(tmp_path) == [name]
+    assert sorted(os.listdir(tmp_path)) == (["a.truth.csv", name] if name == "a.wav" else [name])
     samples = written(path)
     assert samples.shape[1] > 2000 and np.array_equal(samples, Scene(RATE).frames(samples.shape[1]))
 
@@ -70,25 +71,25 @@ def test_the_second_recorder_is_told_who_has_the_file(tmp_path: Path, name: str,
 @pytest.mark.parametrize("force", [(), ("--force",)], ids=["", "force"])
 def test_many_at_the_same_time(tmp_path: Path, force: tuple[str, ...]) -> None:
     commands = [
-        ("record", "a.wav", "--device", f"scene:?seed={seed}", *SCENE[2:], "--seconds", "1") for seed in range(5)
+        ("record", "a.wav", "--device", f"scene:?seconds={walk}", *SCENE[2:], "--seconds", "1") for walk in range(2, 7)
     ]
     with ExitStack() as stack:
         running = [stack.enter_context(start(*command, *force, cwd=tmp_path)) for command in commands]
         codes = [recording.wait(60) for recording in running]
         assert codes.count(0) >= 1 and (force or codes.count(0) == 1), running
         for code, recording in zip(codes, running, strict=True):
-            assert code == 0 or re.search(
-                r"a\.wav(: process \d+ \(.*\) is writing it| is there already)", recording.err
-            )
-    assert os.listdir(tmp_path) == ["a.wav"]
+            assert code == 0 or re.search(r"a\.wav(: process \d+ \(.*\) is writing it| already exists)", recording.err)
+    assert sorted(os.listdir(tmp_path)) == ["a.truth.csv", "a.wav"]
     samples = written(tmp_path / "a.wav")
-    own = [np.array_equal(samples, Scene(RATE, seed=seed).frames(RATE)) for seed in range(5)]
+    own = [np.array_equal(samples, Scene(RATE, seconds=walk).frames(RATE)) for walk in range(2, 7)]
     assert own.count(True) == 1 and codes[own.index(True)] == 0
+    last = (tmp_path / "a.truth.csv").read_text().splitlines()[-1]
+    assert last == f"0.99,0.000,talker,{float(Scene(RATE, seconds=2 + own.index(True)).azimuth(0.99)):.3f}"
 
 
 def test_killed_recorders_leave_nothing_under_the_name(tmp_path: Path) -> None:
-    """And their sound under another, which nobody overwrites unasked."""
-    (tmp_path / "old.wav").write_text("of yesterday")
+    """Their sound is in a file of another name, which is not overwritten without --force."""
+    (tmp_path / "old.wav").write_text("old recording")
     with ExitStack() as stack:
         running = {
             name: stack.enter_context(start("record", name, *SCENE, *options, cwd=tmp_path))
@@ -98,10 +99,10 @@ def test_killed_recorders_leave_nothing_under_the_name(tmp_path: Path) -> None:
             begun(tmp_path / name, recording)
             recording.stop(signal.SIGKILL)
     assert sorted(os.listdir(tmp_path)) == ["new.bag.part", "new.wav.part", "old.wav", "old.wav.part"]
-    assert (tmp_path / "old.wav").read_text() == "of yesterday"
+    assert (tmp_path / "old.wav").read_text() == "old recording"
     left = (tmp_path / "new.wav.part").read_bytes()
     done = rosafe("record", "new.wav", *SCENE, "--seconds", "1", cwd=tmp_path)
-    refused(done, "new.wav.part is what an interrupted recording has left: rename or remove it; --force replaces it")
+    refused(done, "new.wav.part was left by an interrupted recording; rename or remove it, or replace it with --force")
     refused(rosafe("record", "new.wav", "--force", "--device", "file:none.wav", cwd=tmp_path), "No such file")
     assert (tmp_path / "new.wav.part").read_bytes() == left
     (tmp_path / "new.wav.part").rename(tmp_path / "kept.wav")
@@ -112,20 +113,67 @@ def test_killed_recorders_leave_nothing_under_the_name(tmp_path: Path) -> None:
     assert not (tmp_path / "old.wav.part").exists()
 
 
-def test_a_file_that_comes_into_being_meanwhile_stays_and_so_does_the_recording(tmp_path: Path) -> None:
+def test_a_file_created_meanwhile_and_the_recording_are_both_kept(tmp_path: Path) -> None:
     with start("record", "a.wav", *SCENE, cwd=tmp_path) as recording:
         begun(tmp_path / "a.wav", recording)
-        (tmp_path / "a.wav").write_text("somebody else's")
+        (tmp_path / "a.wav").write_text("foreign text")
         assert recording.stop(signal.SIGINT) == 1
-        why = f"a.wav has come into being meanwhile; the recording is {tmp_path}/a.wav.part"
+        why = f"a.wav was created meanwhile; the recording is {tmp_path}/a.wav.part"
         assert recording.err == f"rosafe record: {why}\n"
-    assert (tmp_path / "a.wav").read_text() == "somebody else's"
+    assert (tmp_path / "a.wav").read_text() == "foreign text"
     (tmp_path / "a.wav.part").rename(tmp_path / "b.wav")
     samples = written(tmp_path / "b.wav")
     assert samples.shape[1] > 2000 and np.array_equal(samples, Scene(RATE).frames(samples.shape[1]))
 
 
-def test_nothing_recorded_leaves_nothing(tmp_path: Path) -> None:
+def test_a_truth_that_exists_is_kept(tmp_path: Path) -> None:
+    """A scene is recorded with its truth beside it, which replaces a file only with --force."""
+    (tmp_path / "a.truth.csv").write_text("foreign text")
+    refused(rosafe("record", "a.wav", *SCENE, "--seconds", "0.5", cwd=tmp_path), "a.truth.csv already exists; --force")
+    assert content(tmp_path) == {"a.truth.csv": "foreign text"}
+    assert rosafe("record", "a.wav", "--force", *SCENE, "--seconds", "0.5", cwd=tmp_path).returncode == 0
+    assert (tmp_path / "a.truth.csv").read_text().startswith("time_s,")
+
+
+def test_the_truth_of_a_replaced_recording_is_removed(tmp_path: Path) -> None:
+    """It would seem to be that of the new recording. A bag of the same name has no truth, and does not affect it."""
+    for name in ("in.wav", "a.wav"):
+        assert rosafe("record", name, *SCENE, "--seconds", "0.5", cwd=tmp_path).returncode == 0
+    assert rosafe("record", "a.bag", *SCENE, "--seconds", "0.5", cwd=tmp_path).returncode == 0
+    assert (tmp_path / "a.truth.csv").exists()
+    refused(rosafe("record", "a.wav", "--device", "file:in.wav", cwd=tmp_path), "a.wav already exists")
+    assert (tmp_path / "a.truth.csv").exists()
+    assert rosafe("record", "a.wav", "--force", "--device", "file:in.wav", cwd=tmp_path).returncode == 0
+    assert sorted(os.listdir(tmp_path)) == ["a.bag", "a.wav", "in.truth.csv", "in.wav"]
+    (tmp_path / "b.truth.csv").write_text("foreign text")
+    refused(rosafe("record", "b.wav", "--device", "file:in.wav", cwd=tmp_path), "b.truth.csv already exists")
+
+
+def test_the_truth_is_complete_before_the_lock_of_the_recording_ends(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Otherwise, it could belong to the recording of another process with the same name."""
+    monkeypatch.chdir(tmp_path)
+    seen: list[list[str]] = []
+    complete = AtomicOutput.complete
+
+    def observed(part: AtomicOutput) -> None:
+        if part.target.suffix == ".wav":
+            seen.append(sorted(os.listdir(tmp_path)))
+        complete(part)
+
+    monkeypatch.setattr(AtomicOutput, "complete", observed)
+    assert main(["record", "a.wav", *SCENE, "--seconds", "0.1", "--quiet"]) == 0
+    assert seen == [["a.truth.csv", "a.wav.part"]] and sorted(os.listdir(tmp_path)) == ["a.truth.csv", "a.wav"]
+    monkeypatch.setattr(
+        AtomicOutput, "complete", lambda part: complete(part) if part.target.suffix == ".csv" else 1 / 0
+    )
+    with pytest.raises(ZeroDivisionError):
+        main(["record", "b.wav", *SCENE, "--seconds", "0.1", "--quiet"])
+    assert not (tmp_path / "b.truth.csv").exists()
+
+
+def test_an_empty_recording_leaves_no_file(tmp_path: Path) -> None:
     refused(rosafe("record", "a.bag", "--device", "nosuch", cwd=tmp_path), "Unknown PCM nosuch")
     assert os.listdir(tmp_path) == []
 
@@ -133,22 +181,9 @@ def test_nothing_recorded_leaves_nothing(tmp_path: Path) -> None:
 # --- any file ---------------------------------------------------------------------------------------------------
 
 
-def _write_again_and_again(path: Path, letter: str, rounds: int) -> None:
-    for _ in range(rounds):
-        try:
-            with new_file(path, replace=True) as descriptor:
-                for _ in range(10):
-                    os.write(descriptor, letter.encode() * 1000)
-        except OutputError as problem:
-            assert "is writing it" in str(problem), problem
-
-
-def test_whoever_looks_sees_a_whole_file(tmp_path: Path) -> None:
+def test_readers_always_see_a_complete_file(tmp_path: Path) -> None:
     path = tmp_path / "a"
-    context = multiprocessing.get_context("fork")
-    writers = [context.Process(target=_write_again_and_again, args=(path, letter, 200)) for letter in "abc"]
-    for writer in writers:
-        writer.start()
+    writers = [forked.start(forked.write_again_and_again, path, letter, 200) for letter in "abc"]
     looks = set()
     while any(writer.is_alive() for writer in writers):
         if path.exists():
@@ -160,7 +195,7 @@ def test_whoever_looks_sees_a_whole_file(tmp_path: Path) -> None:
     assert os.listdir(tmp_path) == ["a"]
 
 
-def test_an_error_on_the_way_leaves_things_as_they_were(tmp_path: Path) -> None:
+def test_an_error_while_writing_changes_no_file(tmp_path: Path) -> None:
     (tmp_path / "old").write_text("old")
     for name, replace in (("old", True), ("new", False)):
         for problem, seen in ((KeyboardInterrupt(), KeyboardInterrupt), (OSError(28, "No space left"), OutputError)):
@@ -170,17 +205,17 @@ def test_an_error_on_the_way_leaves_things_as_they_were(tmp_path: Path) -> None:
     assert content(tmp_path) == {"old": "old"}
 
 
-def test_places_that_are_taken(tmp_path: Path) -> None:
+def test_existing_targets(tmp_path: Path) -> None:
     (tmp_path / "there").write_text("there")
     (tmp_path / "folder").mkdir()
     os.mkfifo(tmp_path / "fifo")
     (tmp_path / "link").symlink_to(tmp_path / "there")
     for name, replace, why in (
-        ("there", False, "is there already; --force replaces it"),
-        ("link", False, "is there already"),
+        ("there", False, "already exists; --force replaces it"),
+        ("link", False, "already exists"),
         ("folder", True, "not a regular file"),
         ("fifo", True, "not a regular file"),
-        ("no/such/folder", True, "there is no folder"),
+        ("no/such/folder", True, "does not exist"),
         ("there/file", True, "Not a directory"),
         ("x" * 300, True, "File name too long"),
         ("a\0b", True, "null"),
@@ -191,7 +226,7 @@ def test_places_that_are_taken(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("replace", [False, True])
-def test_the_part_is_never_somebody_elses_file(tmp_path: Path, replace: bool) -> None:
+def test_the_part_file_never_replaces_a_foreign_file(tmp_path: Path, replace: bool) -> None:
     (tmp_path / "precious").write_text("precious")
     os.mkfifo(tmp_path / "a.part")
     os.link(tmp_path / "precious", tmp_path / "b.part")
@@ -203,8 +238,8 @@ def test_the_part_is_never_somebody_elses_file(tmp_path: Path, replace: bool) ->
     assert (tmp_path / "precious").read_text() == "precious"
 
 
-def test_links_lead_to_the_file(tmp_path: Path) -> None:
-    """Two names of one place are one place."""
+def test_links_to_the_file(tmp_path: Path) -> None:
+    """Two names of one file are regarded as one target."""
     (tmp_path / "deep").mkdir()
     (tmp_path / "link").symlink_to(tmp_path / "deep" / "a")
     with new_file(tmp_path / "link", replace=False) as descriptor:
@@ -214,21 +249,21 @@ def test_links_lead_to_the_file(tmp_path: Path) -> None:
     assert (tmp_path / "link").is_symlink() and content(tmp_path / "deep") == {"a": "whole"}
 
 
-def test_a_part_that_is_taken_away(tmp_path: Path) -> None:
-    with pytest.raises(OutputError, match="is not there any more"), new_file(tmp_path / "a", replace=False):
+def test_a_part_file_that_is_removed(tmp_path: Path) -> None:
+    with pytest.raises(OutputError, match="has been removed"), new_file(tmp_path / "a", replace=False):
         (tmp_path / "a.part").rename(tmp_path / "b")
-        (tmp_path / "a.part").write_text("somebody else's")
-    assert content(tmp_path) == {"b": "", "a.part": "somebody else's"}
+        (tmp_path / "a.part").write_text("foreign text")
+    assert content(tmp_path) == {"b": "", "a.part": "foreign text"}
 
 
 @pytest.mark.parametrize("there", [False, True])
 @pytest.mark.parametrize("number", [errno.EINVAL, errno.ENOSYS, errno.EACCES])
-def test_file_systems_that_cannot_rename_to_nothing_only(
+def test_file_systems_without_exclusive_rename(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, number: int, there: bool
 ) -> None:
     def renameat2(*_: object) -> int:
         if there:
-            (tmp_path / "a").write_text("somebody else's")
+            (tmp_path / "a").write_text("foreign text")
         return -1
 
     library = SimpleNamespace(renameat2=renameat2)
@@ -238,14 +273,14 @@ def test_file_systems_that_cannot_rename_to_nothing_only(
         with new_file(tmp_path / "a", replace=False) as descriptor:
             os.write(descriptor, b"mine")
     except OutputError as problem:
-        expected = "Permission denied" if number == errno.EACCES else "it has come into being meanwhile"
+        expected = "Permission denied" if number == errno.EACCES else "it was created meanwhile"
         assert (there or number == errno.EACCES) and expected in str(problem)
     else:
         assert not there
-    assert content(tmp_path) == ({"a": "somebody else's"} if there else {} if number == errno.EACCES else {"a": "mine"})
+    assert content(tmp_path) == ({"a": "foreign text"} if there else {} if number == errno.EACCES else {"a": "mine"})
 
 
-def test_a_holder_of_whom_nothing_is_known(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(output.glob, "iglob", lambda pattern: iter(()))  # as where it is another user's
+def test_an_unknown_writer(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(output.glob, "iglob", lambda pattern: iter(()))  # as for a process of another user
     with new_file(tmp_path / "a", replace=False), pytest.raises(OutputError, match="another process is writing it"):
         AtomicOutput(tmp_path / "a", replace=False)

@@ -1,4 +1,4 @@
-"""Nothing that a file's name or another program says does anything to the terminal."""
+"""Names of files and texts of other programs cannot send control characters to the terminal."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_printable() -> None:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder with good and broken files of hostile names."""
+    """A folder with valid and damaged files that have hostile names."""
     here = tmp_path_factory.mktemp("names")
     write(here / "good.wav", noise(2000))
     shutil.copy(here / "good.wav", here / f"{EVIL}.wav")
@@ -46,7 +46,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def assert_harmless(done: subprocess.CompletedProcess[str], code: int) -> None:
-    """It has ended as it should; the name was shown, and escaped."""
+    """Assert the exit code, and that the name was printed in escaped form."""
     told = done.stdout + done.stderr
     assert done.returncode == code and "Traceback" not in told, done
     assert r"e\x1b[31m\x07\n\r\x9b1m\u202e" in told, told
@@ -104,7 +104,7 @@ def test_names_in_commands_that_take_signals(folder: Path, code: int, command: l
 
 
 def test_doctor(folder: Path) -> None:
-    evil = EVIL.replace("\n", "").replace("\r", "")  # it makes one line of several
+    evil = EVIL.replace("\n", "").replace("\r", "")  # doctor joins lines
     plugins = folder / f"plugins{evil}"
     plugins.mkdir()
     (plugins / f"bad{evil}.py").write_text("raise ValueError('\\x1b[31m')\n")
@@ -132,7 +132,7 @@ def test_names_in_programs_of_a_graph(graph: Graph, folder: Path, code: int, pro
     assert_harmless(done, code)
 
 
-def test_what_a_node_logs(graph: Graph) -> None:
+def test_logs_of_a_node(graph: Graph) -> None:
     script = (
         "import rospy; from rosafe.component import startup\n"
         "startup.become_node('teller'); rospy.logwarn('told: %s', 'a\\x1b[31m\\x9b\\udcff'); rospy.loginfo('\\x07')\n"
@@ -142,7 +142,7 @@ def test_what_a_node_logs(graph: Graph) -> None:
     assert all(line.isprintable() for line in done.stderr.split("\n")), done.stderr
 
 
-def test_what_the_keeper_of_a_tree_reports(tmp_path: Path) -> None:
+def test_errors_of_a_saved_tree(tmp_path: Path) -> None:
     reports: list[str] = []
     keeper = TreeStateFile(
         tmp_path / EVIL / "tree.yaml", lambda: Setup(AcquireSettings({"device": "scene:"})), reports.append

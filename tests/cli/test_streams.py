@@ -39,7 +39,7 @@ def test_output_that_cannot_be_written(tmp_path: Path, command: str, to: str, wh
 
 @pytest.mark.parametrize("to", ["2>&-", "2>/dev/full", ">&- 2>&-", ">&-"])
 def test_messages_that_cannot_be_written(tmp_path: Path, to: str) -> None:
-    """The work is done, and nothing else gets into the files that are opened meanwhile."""
+    """The result is complete, and messages are not written into files that are opened meanwhile."""
     write(tmp_path / "in.wav", noise(3000))
     done = shell(f"rosafe process in.wav {' '.join(SMALL)} --outputs ild -o out.h5 {to}", tmp_path)
     assert done.returncode == (1 if "2>" in to else 0) and "Traceback" not in done.stderr

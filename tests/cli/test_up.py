@@ -1,4 +1,4 @@
-"""`rosafe up`: one command starts everything, and Ctrl-C ends what it started and nothing else; roslaunch, systemd."""
+"""`rosafe up`: one command starts all processes, and Ctrl-C ends exactly these; roslaunch and systemd."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
+import yaml
 
 from rosafe.transport.master import MasterError, check_master
 from tests.harness import ROOT, SCRIPTS, Graph, MasterProcess, Process, free_port, wait_for
@@ -25,7 +26,7 @@ processors:
 
 @pytest.fixture
 def alone(tmp_path: Path) -> Graph:
-    """A graph whose master nobody has started."""
+    """A ROS graph without a running master."""
     return Graph(f"http://127.0.0.1:{free_port()}", tmp_path)
 
 
@@ -42,7 +43,7 @@ def wait_until(process: Process, text: str) -> None:
     assert re.search(text, process.out), process
 
 
-def test_everything_from_nothing_and_back(alone: Graph, tmp_path: Path) -> None:
+def test_start_and_end_of_all_processes(alone: Graph, tmp_path: Path) -> None:
     file = tmp_path / "tree.yaml"
     file.write_text(SETUP)
     keep = tmp_path / "kept.yaml"
@@ -50,9 +51,9 @@ def test_everything_from_nothing_and_back(alone: Graph, tmp_path: Path) -> None:
         port = free_port()
         command = ("rosafe", "up", str(file), "--port", str(port), "--keep", str(keep))
         with alone.start(*command) as up:
-            wait_until(up, "Ctrl-C ends")
+            wait_until(up, "Press Ctrl-C")
             wait_until(up, f"setup +loaded +{file}: {0 if again else 2} created")
-            wait_until(up, "rosAFE +runs +2 processors")  # the second time, they have come back
+            wait_until(up, "rosAFE +runs +2 processors")  # restored from the saved tree the second time
             wait_until(up, "bass +runs +acquires from scene:")
             assert f"http://127.0.0.1:{port}" in up.out
             assert {"/bass", "/rosAFE"} <= alone.nodes()
@@ -64,7 +65,7 @@ def test_everything_from_nothing_and_back(alone: Graph, tmp_path: Path) -> None:
             wait_for(lambda: not answers(alone.uri), what="the end of the master")
 
 
-def test_what_was_there_stays(tmp_path: Path) -> None:
+def test_running_processes_are_kept(tmp_path: Path) -> None:
     master = MasterProcess()
     graph = Graph(master.uri, tmp_path)
     file = tmp_path / "tree.yaml"
@@ -83,7 +84,35 @@ def test_what_was_there_stays(tmp_path: Path) -> None:
         master.kill()
 
 
-def test_a_file_that_is_wrong_starts_nothing(alone: Graph, tmp_path: Path) -> None:
+def test_the_localizer_of_a_setup(alone: Graph, tmp_path: Path) -> None:
+    """It gets the settings of the setup, and uses its input. Another file for the head is an option."""
+    file = tmp_path / "robot.yaml"
+    file.write_text(SETUP.partition("  preProc")[0] + "localizer: {seconds: 0.25, head_frame: ears, head: no.head}\n")
+    with alone.start("rosafe", "up", str(file), "--port", str(free_port())) as up:
+        wait_until(up, f"localizer +ended +exit code 1: .*{tmp_path}/no.head")
+        assert up.stop(signal.SIGINT) == 1
+    file.write_text(file.read_text("utf-8").replace("no.head", "sphere"))
+    with alone.start("rosafe", "up", str(file), "--port", str(free_port())) as up:
+        wait_until(up, "localizer +runs +head: sphere")
+        assert {"/bass", "/rosAFE", "/localizer"} <= alone.nodes()
+        assert yaml.safe_load(alone.run("rosparam", "get", "/localizer").stdout) == {
+            "head": "sphere",
+            "head_frame": "ears",
+            "seconds": 0.25,
+        }
+        assert up.stop(signal.SIGINT) == 0, up
+
+
+def test_one_command_for_a_robot(alone: Graph) -> None:
+    command = ("rosafe", "up", "--device", "scene:?seconds=3", "--localize", "--port", str(free_port()))
+    with alone.start(*command) as up:
+        wait_until(up, "localizer +runs +head: sphere")
+        wait_until(up, r"bass +runs +acquires from scene:\?seconds=3")
+        wait_until(up, "rosAFE +runs +[1-9][0-9]* processors")  # those of the localizer
+        assert up.stop(signal.SIGINT) == 0, up
+
+
+def test_a_faulty_setup_starts_no_process(alone: Graph, tmp_path: Path) -> None:
     file = tmp_path / "tree.yaml"
     file.write_text("processors:\n  a: {kind: nothing}\n")
     done = alone.run("rosafe", "up", str(file), check=False)
@@ -92,28 +121,40 @@ def test_a_file_that_is_wrong_starts_nothing(alone: Graph, tmp_path: Path) -> No
     assert not answers(alone.uri)
     far = alone.run("rosafe", "up", check=False, ROS_MASTER_URI="http://192.0.2.1:11311")
     assert far.returncode == 1
-    assert "it is for that machine to start it" in far.stderr
+    assert "start roscore on that machine" in far.stderr
 
 
-def test_one_that_is_killed_is_told(alone: Graph) -> None:
-    """On a terminal, which shows one screen; the page's address whole, although it is wider."""
+def test_a_killed_process_is_reported(alone: Graph) -> None:
+    """On a terminal, which shows one screen. The URL of the page is complete, although it is wider than the screen."""
     command = ["rosafe", "up", "--live", "--no-browser", "--port", str(free_port()), "--live-port", str(free_port())]
     with Terminal(command, alone.env, columns=80) as up:
-        up.expect("Ctrl-C ends")
+        up.expect("Press Ctrl-C")
         assert re.search(r"\?token=[\w-]{43}\r?\n", up.sent), up.sent
         done = alone.run("rosnode", "info", "/bass")
         os.kill(int(re.findall(r"Pid: (\d+)", done.stdout)[0]), signal.SIGKILL)
         up.expect("killed by signal 9\n")
         up.press("\x03")
-        up.expect("ending what was started")
+        up.expect("ending the processes")
         assert up.end() == 1
         *_, before, last = re.split(r"\x1b\[(?=\d+F)", up.sent)
         lines = before.partition("\x1b[J")[2].replace("\r", "").replace("^C", "").splitlines()
-        assert len(lines) == 6 and f"{len(lines) + 1}F" == last.partition("\x1b")[0], up.sent  # the address takes two
+        assert len(lines) == 6 and f"{len(lines) + 1}F" == last.partition("\x1b")[0], up.sent  # the URL takes two lines
+
+
+def test_roslaunch_starts_the_localizer(alone: Graph) -> None:
+    arguments = ("rosAFE", "rosafe.launch", "localize:=true", "head:=/tmp/robot.head", "seconds:=1")
+    assert "/localizer" in alone.run("roslaunch", "--nodes", *arguments).stdout.split()
+    assert "localize --wait __name:=localizer" in alone.run("roslaunch", "--args", "/localizer", *arguments).stdout
+    parameters = yaml.safe_load(alone.run("roslaunch", "--dump-params", *arguments).stdout)
+    assert {name: value for name, value in parameters.items() if name.startswith("/localizer/")} == {
+        "/localizer/head": "/tmp/robot.head",
+        "/localizer/seconds": 1.0,
+        "/localizer/world_frame": "",
+    }
 
 
 @pytest.mark.parametrize("live", ["true", "false"])
-def test_roslaunch_finds_everything(alone: Graph, live: str) -> None:
+def test_roslaunch_starts_all_processes(alone: Graph, live: str) -> None:
     arguments = ("rosAFE", "rosafe.launch", "setup:=/tmp/tree.yaml", "keep:=/tmp/kept.yaml", f"live:={live}", "port:=9")
     nodes = alone.run("roslaunch", "--nodes", *arguments).stdout.split()
     assert sorted(nodes) == sorted(
@@ -127,13 +168,13 @@ def test_roslaunch_finds_everything(alone: Graph, live: str) -> None:
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="there is no systemd-analyze here")
 @pytest.mark.parametrize("kind", ["system", "user"])
-def test_units_are_as_systemd_wants_them(kind: str, tmp_path: Path) -> None:
+def test_systemd_accepts_the_units(kind: str, tmp_path: Path) -> None:
     units = []
     for path in sorted((ROOT / "systemd" / kind).iterdir()):
         unit = tmp_path / path.name
         unit.write_text(path.read_text("utf-8").replace("/opt/rosafe/", f"{ROOT}/"))
         units.append(str(unit))
-    assert len(units) == 6
+    assert len(units) == 7
     done = subprocess.run(
         ["systemd-analyze", "verify", "--man=no", *(["--user"] if kind == "user" else []), *units],
         env={**os.environ, "XDG_RUNTIME_DIR": str(tmp_path)},

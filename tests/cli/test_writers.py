@@ -1,11 +1,10 @@
-"""Two writers of one result, and places that cannot take all of it: results are complete or not there."""
+"""Two writers of one result, and full disks: results are complete or absent."""
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import subprocess
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,34 +12,21 @@ import numpy as np
 import pytest
 
 import rosafe
-from rosafe.offline.files import process_file
-from rosafe.output import OutputError
+from tests.cli import forked
 from tests.cli.command import SMALL, SMALL_PARAMETERS, as_int32, noise, refused, write
 from tests.cli.command import rosafe as command
+from tests.cli.forked import process
 from tests.harness import PYTHON, ROOT, SCRIPTS
 
 EXTENSIONS = [".npz", ".h5", ".mat", ".zarr", ".csv"]
-FORK = multiprocessing.get_context("fork")
-
-
-def process(
-    source: Path, target: Path, replace: bool = False, progress: Callable[[int, int], None] = lambda done, frames: None
-) -> str:
-    """What came of it: "done", or the text of the OutputError."""
-    try:
-        process_file(source, target, SMALL_PARAMETERS, 500, ["ild"], replace, progress)
-    except OutputError as problem:
-        return str(problem)
-    return "done"
 
 
 class Other:
-    """`process` in another process."""
+    """`process` in a child process."""
 
     def __init__(self, source: Path, target: Path, replace: bool) -> None:
-        self._answer = FORK.SimpleQueue()
-        self._process = FORK.Process(target=lambda: self._answer.put(process(source, target, replace)))
-        self._process.start()
+        self._answer = forked.queue()
+        self._process = forked.start(forked.answer_of_process, self._answer, source, target, replace)
 
     def result(self) -> str:
         self._process.join(60)
@@ -49,7 +35,7 @@ class Other:
 
 
 def sounds(folder: Path, count: int) -> tuple[list[Path], list[np.ndarray]]:
-    """Files, and the ild of each."""
+    """Write sound files; return their paths and the ILD of each."""
     signals = [noise(4000, seed) for seed in range(count)]
     paths = [write(folder / f"{seed}.wav", signal) for seed, signal in enumerate(signals)]
     options: dict[str, Any] = {"parameters": SMALL_PARAMETERS, "outputs": ["ild"], "block_frames": 500}
@@ -61,9 +47,7 @@ def sounds(folder: Path, count: int) -> tuple[list[Path], list[np.ndarray]]:
 
 @pytest.mark.parametrize("replace", [False, True])
 @pytest.mark.parametrize("extension", EXTENSIONS)
-def test_the_second_writer_is_refused_as_long_as_the_first_one_writes(
-    tmp_path: Path, extension: str, replace: bool
-) -> None:
+def test_the_second_writer_is_refused_while_the_first_one_writes(tmp_path: Path, extension: str, replace: bool) -> None:
     (first, second), (expected, _) = sounds(tmp_path, 2)
     target = tmp_path / "out" / f"a{extension}"
     target.parent.mkdir()
@@ -82,16 +66,16 @@ def test_the_second_writer_is_refused_as_long_as_the_first_one_writes(
 
 
 @pytest.mark.parametrize("extension", EXTENSIONS)
-def test_many_at_any_time(tmp_path: Path, extension: str) -> None:
+def test_many_concurrent_writers(tmp_path: Path, extension: str) -> None:
     paths, expected = sounds(tmp_path, 3)
     out = tmp_path / "out"
     out.mkdir()
-    for turn in range(8):
+    for turn in range(4):
         replace = turn % 2 == 1
         target = out / (f"same{extension}" if replace else f"{turn}{extension}")
         others = [Other(path, target, replace) for path in paths]
         results = [other.result() for other in others]
-        endings = ("done", "is writing it", "is there already; --force replaces it", "has come into being meanwhile")
+        endings = ("done", "is writing it", "already exists; --force replaces it", "was created meanwhile")
         assert all(result.endswith(endings) for result in results), results
         assert "done" in results and (replace or results.count("done") == 1)
         own = [np.array_equal(rosafe.load(target)["ild"], one) for one in expected]
@@ -99,8 +83,8 @@ def test_many_at_any_time(tmp_path: Path, extension: str) -> None:
         assert not [name for name in os.listdir(out) if name.endswith(".part")]
 
 
-def test_a_zarr_that_is_replaced_is_nobodys_part(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The old folder has the name of the part for a moment."""
+def test_a_zarr_that_is_replaced_is_not_a_part_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The old folder has the name of the part file for a moment."""
     from rosafe import output
 
     paths, expected = sounds(tmp_path, 2)
@@ -120,7 +104,7 @@ def test_a_zarr_that_is_replaced_is_nobodys_part(tmp_path: Path, monkeypatch: py
     assert not (tmp_path / "a.zarr.part").exists()
 
 
-def test_things_put_into_a_place_meanwhile_stay(tmp_path: Path) -> None:
+def test_files_created_meanwhile_are_kept(tmp_path: Path) -> None:
     (path,), _ = sounds(tmp_path, 1)
     target = tmp_path / "a.zarr"
 
@@ -128,7 +112,7 @@ def test_things_put_into_a_place_meanwhile_stay(tmp_path: Path) -> None:
         target.mkdir(exist_ok=True)
         (target / "precious").write_text("precious")
 
-    assert process(path, target, True, meanwhile) == f"{target} is a folder with other things in it, which stay"
+    assert process(path, target, True, meanwhile) == f"{target} is a folder with other contents; it is left unchanged"
     assert os.listdir(target) == ["precious"] and not (tmp_path / "a.zarr.part").exists()
 
 
@@ -153,7 +137,7 @@ def test_one_output_named_by_two_inputs(tmp_path: Path) -> None:
     (tmp_path / "out").mkdir()
     (tmp_path / "out" / "link.zarr").symlink_to("0.zarr")
     done = command("process", "0.wav", "link.wav", "-o", "out", "--format", "zarr", *SMALL, cwd=tmp_path)
-    refused(done, "0.wav and link.wav would both go to out/")
+    refused(done, "0.wav and link.wav would both be written to out/")
 
 
 # --- full disks ---------------------------------------------------------------------------------------------------
@@ -166,7 +150,7 @@ from rosafe.output import OutputError
 
 source, room, how, *extensions = sys.argv[1:]
 room = Path(room)
-files._check_room = lambda path, size: None  # else it is refused before the work
+files._check_disk_space = lambda path, size: None  # otherwise the output is refused before the computation
 
 
 def fill(left=0):
@@ -206,7 +190,7 @@ for extension in extensions:
             assert not (limit == 0 and written)
         assert written
         continue
-    for at in (0.0, 0.5, 1.0):  # while it is written
+    for at in (0.0, 0.5, 1.0):  # while the output is written
         assert not run(extension, lambda done, frames: fill() if done >= at * frames else None), (extension, at)
         os.remove(room / "filler")
     lefts = [*range(0, 12 * 4096, 4096), 20 * 4096, 40 * 4096, 80 * 4096, 160 * 4096, 3_000_000]
@@ -234,7 +218,7 @@ def filled(tmp_path: Path, how: str, room: Path, extension: str, before: Sequenc
 
 
 @pytest.mark.parametrize("extension", EXTENSIONS)
-def test_disks_that_are_full_from_any_point_on(
+def test_disks_that_become_full_at_any_point(
     tmp_path: Path, small_disk: tuple[Path, list[str]], extension: str
 ) -> None:
     folder, before = small_disk
@@ -242,51 +226,17 @@ def test_disks_that_are_full_from_any_point_on(
 
 
 @pytest.mark.parametrize("extension", EXTENSIONS)
-def test_files_that_may_not_grow(tmp_path: Path, extension: str) -> None:
+def test_limited_file_size(tmp_path: Path, extension: str) -> None:
     (tmp_path / "room").mkdir()
     filled(tmp_path, "limit", tmp_path / "room", extension)
 
 
 @pytest.mark.parametrize("name", ["H5Writer", "Mat73Writer"])
 def test_hdf5_after_a_failure_at_any_write(tmp_path: Path, name: str) -> None:
-    """Each in a process of its own, which the library used to end."""
-    from rosafe.offline import streaming_formats
-    from rosafe.offline.result_metadata import Contents
-
-    def attempt(fail_at: float) -> int:
-        count, pwrite = 0, os.pwrite
-
-        def counted(*arguments: Any) -> int:
-            nonlocal count
-            count += 1
-            if count >= fail_at:
-                raise OSError(5, "Input/output error")
-            return pwrite(*arguments)
-
-        os.pwrite = counted
-        contents = Contents(
-            {"ild": (31, 2000)}, {"ild": ("channel", "time")}, {"ild": "dB"}, {}, {"parameters": {"x": "y" * 30000}}
-        )
-        (tmp_path / "a").write_bytes(b"")
-        writer = getattr(streaming_formats, name)(tmp_path / "a", contents)
-        try:
-            for _ in range(4):
-                writer.append("ild", np.zeros((31, 500)))
-            writer.finish()
-        finally:
-            writer.close()
-        return count
-
-    def child(fail_at: float) -> None:
-        try:
-            count = attempt(fail_at)
-        except OSError as problem:
-            os._exit(100 if problem.errno == 5 else 101)
-        os._exit(count)
+    """Each attempt runs in its own process, because the library used to end it."""
 
     def code(fail_at: float) -> int:
-        process = FORK.Process(target=child, args=(fail_at,))
-        process.start()
+        process = forked.start(forked.end_with_number_of_writes, tmp_path / "a", name, fail_at)
         process.join(60)
         return process.exitcode or 0
 

@@ -1,4 +1,4 @@
-"""The documents agree with the code that they describe."""
+"""Documents that must agree with the code."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from tests.harness import ROOT
 DOCS = ROOT / "docs"
 
 
-def test_counters_of_the_audio_are_explained() -> None:
+def test_the_audio_counters_are_documented() -> None:
     text = (DOCS / "audio-stream.md").read_text("utf-8")
     for counter in dataclasses.fields(Counters):
         if counter.name not in ("messages", "last_loss"):

@@ -1,4 +1,4 @@
-"""The README: every command that it shows works as it stands, and what it links to is there."""
+"""The README: all commands work as printed, and all links have a target."""
 
 from __future__ import annotations
 
@@ -8,95 +8,109 @@ import shlex
 import signal
 from pathlib import Path
 
+import numpy as np
 import pytest
+import soundfile
 
+import rosafe
+from rosafe import interface
+from rosafe.localization import model_cache, training
 from rosafe.transport.master import is_local
-from tests.demo.running import check_picture, check_walk, family, new_mark
+from tests.demo.running import check_picture, check_walk, marked_processes, new_mark
 from tests.genomix import world as worlds
 from tests.harness import PYTHON, ROOT, SCRIPTS, Process, free_port, wait_for
 
+RATE = 16000
 README = (ROOT / "README.md").read_text("utf-8")
-WHOLE_SUITE = "scripts/test"  # is what runs this; .ci/run runs it from a clean clone
-START_SECONDS = 120  # of both nodes, on such a machine
-SESSION_SECONDS = 500.0  # on a machine with much other work; a tenth of that elsewhere
+WHOLE_SUITE = "scripts/test"  # runs this test; .ci/run runs it from a clean clone
+START_SECONDS = 120  # of both nodes on a busy machine
+SESSION_SECONDS = 500.0  # on a busy machine; usually a tenth of it
 
 
 def blocks(language: str) -> list[str]:
-    """The code that README shows in one language, block by block."""
+    """Return the code blocks of the README in one language."""
     return re.findall(rf"^```{language}\n(.*?)^```$", README, re.MULTILINE | re.DOTALL)
 
 
-def place_like_the_checkout(folder: Path) -> dict[str, str]:
-    """Make `folder` look like the checkout, for commands that write beside it; the environment to run them in.
+def link_checkout(folder: Path) -> dict[str, str]:
+    """Fill `folder` with links to the checkout, and return an environment for the commands of the README.
 
-    roscore takes its port from the command line only, `rostopic hz` has no end of its own, and a person waits until the
-    nodes are up: that is what stands in for the person here. The commands themselves are those of the README.
+    The models of heads are those of the user: learning one takes half a minute.
+    Wrappers in its PATH do what a user does: they set the port of roscore, end `rostopic hz`, and wait for the nodes.
     """
     for entry in ROOT.iterdir():
         if entry.name not in ("rosafe-demo", ".git"):
             (folder / entry.name).symlink_to(entry)
     port = free_port()
-    tools = folder / "hands"
+    tools = folder / "wrappers"
     tools.mkdir()
-    stand_ins = {
+    services = [f"{c.name}/{service.name}" for c in interface.COMPONENTS.values() for service in c.on_graph]
+    wrappers = {
         "roscore": f"exec /usr/bin/roscore -p {port}",
         "rostopic": """[ "$1" = hz ] || exec /usr/bin/rostopic "$@"
-PYTHONUNBUFFERED=1 /usr/bin/rostopic "$@" | grep -m 3 rate
+PYTHONUNBUFFERED=1 /usr/bin/rostopic "$@" | grep -m 6 rate
 """,
         "rosservice": f"""cd {tools}
-up='until [ "$(/usr/bin/rosservice list 2>/dev/null | grep -c /kill)" = 2 ]; do :; done'
+count='/usr/bin/rosservice list 2>/dev/null | grep -cE "^/({"|".join(services)})$"'
+up="until [ \\$($count) = {len(services)} ]; do :; done"
 [ -e up ] || timeout {START_SECONDS} sh -c "$up" || exit 1
 touch up
 exec /usr/bin/rosservice "$@"
 """,
     }
-    for name, text in stand_ins.items():
+    for name, text in wrappers.items():
         (tools / name).write_text(f"#!/bin/sh\n{text}\n")
         (tools / name).chmod(0o755)
     env = {k: v for k, v in os.environ.items() if not k.startswith(("ROS_", "PYTHONPATH"))}
     uri = f"http://127.0.0.1:{port}"
     assert is_local(uri)
-    return {**env, "PATH": f"{tools}:/usr/local/bin:/usr/bin:/bin", "ROS_MASTER_URI": uri, "HOME": str(folder)}
+    return {
+        **env,
+        "PATH": f"{tools}:/usr/local/bin:/usr/bin:/bin",
+        "ROS_MASTER_URI": uri,
+        "HOME": str(folder),
+        "XDG_CACHE_HOME": str(model_cache.folder().parent),
+    }
 
 
-def test_every_command_of_the_shell(tmp_path: Path) -> None:
-    """The commands in their order, in one bash that stops at the first that fails."""
+def test_all_shell_commands(tmp_path: Path) -> None:
+    """Run the commands in one bash that stops at the first error."""
     commands = [line for block in blocks("sh") for line in block.splitlines() if line != WHOLE_SUITE]
     assert commands[0] == "scripts/demo" and WHOLE_SUITE in README
     assert ". scripts/env.sh" in commands and "roscore & bass-ros & rosAFE-ros &" in commands
     mark = new_mark()
-    env = {**place_like_the_checkout(tmp_path), mark: "1"}
+    env = {**link_checkout(tmp_path), mark: "1"}
     try:
-        with Process(["bash", "-c", "\n".join(["set -e", *map(_announced, commands), "wait"])], env, tmp_path) as shell:
-            code, said = shell.wait(SESSION_SECONDS), shell.out
-            last = said.rpartition("+ ")[2].splitlines()[0]
+        with Process(["bash", "-c", "\n".join(["set -e", *map(_with_echo, commands), "wait"])], env, tmp_path) as shell:
+            code, output = shell.wait(SESSION_SECONDS), shell.out
+            last = output.rpartition("+ ")[2].splitlines()[0]
             assert code == 0, f"exit {code} at or after {last!r}: {shell}"
-        wait_for(lambda: not family(mark), what=lambda: f"end of {family(mark)}")
+        wait_for(lambda: not marked_processes(mark), what=lambda: f"end of {marked_processes(mark)}")
     finally:
-        for pid in family(mark):  # a master has a session of its own
+        for pid in marked_processes(mark):  # the master has its own session
             os.kill(pid, signal.SIGKILL)
-    check_walk(said.partition("+ . scripts/env.sh")[0])
+    check_walk(output.partition("+ . scripts/env.sh")[0])
     assert [entry.name for entry in (tmp_path / "rosafe-demo").iterdir()] == ["rosafe-demo.png"]
     check_picture(tmp_path / "rosafe-demo" / "rosafe-demo.png")
     calls = [command for command in commands if command.startswith("rosservice call")]
-    by_hand = said.partition(f"+ {calls[0]}")[2]
-    assert by_hand.count("genom_success: True") == len(calls) >= 12
-    assert "genom_success: False" not in said
-    rates = re.findall(r"average rate: ([\d.]+)", said)
+    of_nodes = output.partition(f"+ {calls[0]}")[2]
+    assert of_nodes.count("genom_success: True") == len(calls) >= 12
+    assert "genom_success: False" not in output
+    rates = re.findall(r"average rate: ([\d.]+)", output)
     assert rates and float(rates[-1]) == pytest.approx(44100 / 12000, rel=0.25)
-    assert "/rosAFE/crossCorrelationPort/crosscorrelation" in said
+    assert "/rosAFE/crossCorrelationPort/crosscorrelation" in output
     for name in ("input", "preProc", "gammatone", "ihc", "ratemap"):
-        assert re.search(rf"^ *- {name}$", said, re.MULTILINE)
+        assert re.search(rf"^ *- {name}$", output, re.MULTILINE)
 
 
-def _announced(command: str) -> str:
-    """`command`, said before it runs."""
+def _with_echo(command: str) -> str:
+    """Print a command before it runs."""
     return f"echo + {shlex.quote(command)}\n{command.partition('    #')[0]}"
 
 
 @pytest.mark.parametrize("shell", ["dash", "bash"])
-def test_sourcing_line(shell: str, tmp_path: Path) -> None:
-    env = place_like_the_checkout(tmp_path)
+def test_the_command_that_sets_the_environment(shell: str, tmp_path: Path) -> None:
+    env = link_checkout(tmp_path)
     line = next(line for block in blocks("sh") for line in block.splitlines() if line.startswith(". "))
     with Process([shell, "-c", f"{line} && command -v rosAFE-ros && rossrv show rosAFE/Stop"], env, tmp_path) as done:
         assert done.wait() == 0, done
@@ -104,10 +118,10 @@ def test_sourcing_line(shell: str, tmp_path: Path) -> None:
         assert done.out.endswith("---\nbool genom_success\nstring genom_exdetail\n\n")
 
 
-def test_python(tmp_path: Path) -> None:
-    """The example runs in the shell that the README has set up, and prints what it promises."""
-    (code,) = blocks("python")
-    env = place_like_the_checkout(tmp_path)
+def test_the_python_example(tmp_path: Path) -> None:
+    """The example runs in the environment of the README and prints the documented output."""
+    (code,) = (block for block in blocks("python") if "rosafe.process" in block)
+    env = link_checkout(tmp_path)
     line = f". scripts/env.sh && exec {PYTHON} -c {shlex.quote(code)}"
     with Process(["bash", "-c", line], env, tmp_path) as done:
         assert done.wait() == 0, done
@@ -116,25 +130,43 @@ def test_python(tmp_path: Path) -> None:
     assert len(statements) == 5
 
 
-def test_tcl(tmp_path: Path) -> None:
-    """The example as a script, with a genomixd on a port that is free."""
+def test_three_lines_from_a_sound_to_a_direction(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With the model of the KEMAR head, learned from less sound than usual."""
+    (code,) = (block for block in blocks("python") if "rosafe.localize" in block)
+    head = re.findall(r'head="([^"]*)"', code)[0]
+    if not Path(head).exists():
+        pytest.skip("Debian's libmysofa1 is not installed")
+    assert len(code.splitlines()) == 3
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    monkeypatch.setattr(training, "SOUND_SECONDS", 150.0)
+    noise = 0.1 * np.random.default_rng(1).standard_normal(RATE)
+    soundfile.write("take.wav", rosafe.Head.from_sofa(head).render(noise, RATE, 40.0).T, RATE)
+    exec(code, {})
+    assert float(capsys.readouterr().out.split()[-1].rstrip("]")) == 40.0
+
+
+def test_the_tcl_example(tmp_path: Path) -> None:
+    """The example runs as a script, with a genomixd on a free port."""
     (script,) = blocks("tcl")
     with worlds.world(tmp_path) as world:
         printed = world.lines(f"set env(GENOMIXD) $address\n{script}")
         assert printed[-1] == "dependencies {0 input 1 preProc 2 gammatone}"
 
 
-def test_links_lead_somewhere() -> None:
+def test_links_have_a_target() -> None:
     for document in (ROOT / "README.md", *(ROOT / "docs").glob("*.md")):
         for target in re.findall(r"\]\(([^)#:]+)\)", document.read_text("utf-8")):
             assert (document.parent / target).exists(), f"{document.name}: {target}"
 
 
-def test_picture_is_small() -> None:
+def test_the_figure_is_small() -> None:
     assert 20_000 < (ROOT / "docs" / "demo.png").stat().st_size < 200_000
 
 
-def test_folders_are_those_that_there_are() -> None:
+def test_listed_folders_exist() -> None:
     named = re.findall(r"`(\w[\w/.]*)`", "".join(re.findall(r"^\| `.*?\|", README, re.MULTILINE)))
     named += re.findall(r"\b(msg|srv|action)/", README)
     assert len(named) > 10

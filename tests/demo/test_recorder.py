@@ -1,4 +1,4 @@
-"""Counting frames on a port whose messages overlap: nothing twice, nothing missed, losses seen."""
+"""Recording a port with overlapping windows: each frame is counted once, and losses are detected."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ HOP, WINDOW = 441, 882
 
 
 class Port:
-    """What a port of `kind` shows of a made-up signal that begins with audio frame `start`."""
+    """A simulated port of `kind` for a random signal that starts with audio frame `start`."""
 
     def __init__(self, kind: str, start: int = 1, seconds: float = 1.0) -> None:
         self.kind, self.start = kind, start
@@ -27,7 +27,7 @@ class Port:
         self.random = np.random.default_rng(start)
 
     def next(self) -> SimpleNamespace:
-        """The message after one more block."""
+        """Return the message after the next block."""
         self.index += BLOCK
         samples = self.index - self.start
         total = max(0, (samples - WINDOW) // HOP + 1) if self.framed else samples
@@ -44,10 +44,10 @@ def follower(kind: str) -> PortFollower:
 
 
 @pytest.mark.parametrize("start", [1, 2206, 100_000])
-def test_every_frame_is_taken_once(start: int) -> None:
+def test_each_frame_is_recorded_once(start: int) -> None:
     port, followed = Port("ild", start), follower("ild")
     for _ in range(40):
-        followed.take(port.next())
+        followed.receive(port.next())
     times, data = followed.series()
     np.testing.assert_array_equal(data, port.sent)
     assert (followed.row.frames, followed.row.lost, followed.row.frame_rate) == (port.sent.shape[1], 0, 100)
@@ -58,30 +58,32 @@ def test_every_frame_is_taken_once(start: int) -> None:
 def test_samples_are_counted_by_the_index() -> None:
     port, followed = Port("gammatone"), follower("gammatone")
     for _ in range(10):
-        followed.take(port.next())
+        followed.receive(port.next())
     assert (followed.row.frames, followed.row.lost) == (10 * BLOCK, 0)
 
 
 @pytest.mark.parametrize("kind", ["ild", "gammatone"])
-def test_a_message_that_did_not_come_is_no_loss_while_windows_overlap(kind: str) -> None:
+def test_a_lost_message_is_compensated_by_overlapping_windows(kind: str) -> None:
     port, followed = Port(kind), follower(kind)
     for number in range(12):
         message = port.next()
         if number % 3:
-            followed.take(message)
+            followed.receive(message)
     missed = 27 if kind == "ild" else BLOCK
     assert followed.row.lost == 0
-    assert followed.row.frames == pytest.approx(port.sent.shape[1] - missed, abs=1)  # number 0 came before the first
+    assert followed.row.frames == pytest.approx(
+        port.sent.shape[1] - missed, abs=1
+    )  # message 0 is before the first received one
 
 
 @pytest.mark.parametrize("kind", ["ild", "gammatone"])
-def test_frames_in_no_window_are_lost(kind: str) -> None:
+def test_frames_missing_in_all_windows_are_lost(kind: str) -> None:
     port, followed = Port(kind), follower(kind)
-    followed.take(port.next())
+    followed.receive(port.next())
     before = port.sent.shape[1]
     for _ in range(7):
         port.next()
-    followed.take(port.next())
+    followed.receive(port.next())
     gap = port.sent.shape[1] - before - port.window.shape[1]
     assert gap > 0
     assert followed.row.lost == pytest.approx(gap, abs=1)
@@ -93,33 +95,60 @@ def test_frames_in_no_window_are_lost(kind: str) -> None:
         assert not data[:, before : before + followed.row.lost].any()
 
 
-def test_sound_that_begins_anew_is_counted_anew() -> None:
+def test_a_restart_of_the_audio_restarts_the_recording() -> None:
     old, followed = Port("ild", 50_000), follower("ild")
     for _ in range(5):
-        followed.take(old.next())
-    assert followed.beginnings == 1
+        followed.receive(old.next())
+    assert followed.starts == 1
     new = Port("ild")
     for _ in range(5):
-        followed.take(new.next())
-    assert followed.beginnings == 2
+        followed.receive(new.next())
+    assert followed.starts == 2
     np.testing.assert_array_equal(followed.series()[1], new.sent)
     assert followed.row.lost == 0
 
 
-def test_zeros_of_a_new_processor_and_repetitions_count_for_nothing() -> None:
+def test_empty_and_repeated_messages_are_ignored() -> None:
     port, followed = Port("ild"), follower("ild")
     empty = SimpleNamespace(sampleRate=100, lastFrameIndex=0, framesOnPort=100, left=np.zeros((3, 100)))
-    followed.take(empty)
-    assert followed.beginnings == 0 and np.isnan(followed.row.message_rate)
+    followed.receive(empty)
+    assert followed.starts == 0 and np.isnan(followed.row.message_rate)
     message = port.next()
-    followed.take(message)
-    followed.take(message)
+    followed.receive(message)
+    followed.receive(message)
     assert followed.row.frames == 26
+    assert np.isnan(followed.row.message_rate), "the repetition counts as a message"
 
 
-def test_nothing_is_taken_after_stop() -> None:
+def test_messages_after_stop_are_ignored() -> None:
     port, followed = Port("ild"), follower("ild")
-    followed.take(port.next())
+    followed.receive(port.next())
     followed.stop()
-    followed.take(port.next())
+    followed.receive(port.next())
     assert followed.row.frames == 26
+
+
+def test_the_sound_of_the_input_is_taken_once() -> None:
+    random, followed = np.random.default_rng(0), follower("input")
+    sound = random.random((2, 6 * BLOCK))
+
+    def send(index: int) -> None:
+        window = np.concatenate((np.zeros((2, RATE)), sound[:, :index]), axis=1)[:, -RATE:]
+        followed.receive(
+            SimpleNamespace(sampleRate=RATE, lastFrameIndex=index, framesOnPort=RATE, left=window[0], right=window[1])
+        )
+
+    send(BLOCK)
+    send(2 * BLOCK)
+    position, taken = followed.take_sound()
+    assert position == (1, 0)
+    np.testing.assert_array_equal(taken, sound[:, : 2 * BLOCK])
+    assert followed.take_sound()[1].shape == (2, 0)
+    send(3 * BLOCK)
+    position, taken = followed.take_sound()
+    assert position == (1, 2 * BLOCK)
+    np.testing.assert_array_equal(taken, sound[:, 2 * BLOCK : 3 * BLOCK])
+    send(BLOCK)  # the audio has restarted
+    position, taken = followed.take_sound()
+    assert position == (2, 0)
+    np.testing.assert_array_equal(taken, sound[:, :BLOCK])

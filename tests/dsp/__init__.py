@@ -1,1 +1,1 @@
-"""Tests of the streaming numerics (rosafe/dsp)."""
+"""Tests of rosafe/dsp."""

@@ -1,4 +1,4 @@
-"""Bare stages joined by hand: block cutting and the default chain, without the processor tree."""
+"""Chains of stages without the processor tree: the default chain, and the division of a signal into blocks."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ KIND_OF = {p.name: kind.kind for kind in interface.CORE_REPRESENTATIONS.values()
 
 
 def cut(signal: NDArray[Any], sizes: int | Iterable[int]) -> list[NDArray[Any]]:
-    """`signal` in blocks of `sizes` along its last axis, used cyclically; the last block is what is left."""
+    """Split `signal` into blocks along its last axis. `sizes` are used cyclically; the last block is the remainder."""
     blocks: list[NDArray[Any]] = []
     position = 0
     for size in itertools.cycle([sizes] if isinstance(sizes, int) else sizes):
@@ -34,18 +34,18 @@ def cut(signal: NDArray[Any], sizes: int | Iterable[int]) -> list[NDArray[Any]]:
 
 
 def single(output: Output) -> FloatArray:
-    """The array that a stage of one part puts out."""
+    """Return the output of a stage with one part."""
     assert isinstance(output, np.ndarray)
     return output
 
 
 def run(stage: Stage, blocks: Iterable[NDArray[Any]]) -> FloatArray:
-    """What `stage` makes of `blocks`, joined."""
+    """Return the concatenated outputs of `stage` for `blocks`."""
     return np.concatenate([single(stage.process(block)) for block in blocks], axis=-1)
 
 
 class Chain:
-    """All seven stages, `ihc` feeding the last three."""
+    """All seven stages; `ihc` is the parent of the last three."""
 
     def __init__(self, sample_rate: float, parameters: Mapping[str, Any]) -> None:
         own: dict[str, dict[str, Any]] = {kind: {} for kind in CORE_KINDS}
@@ -54,7 +54,7 @@ class Chain:
         self.stages = {kind: STAGES[kind](sample_rate, **own[kind]) for kind in CORE_KINDS}
 
     def process(self, block: NDArray[Any]) -> dict[str, FloatArray]:
-        """The output of every stage for one block."""
+        """Return the output of each stage for one block."""
         filterbank, hair_cell = self.stages["gammatone"], self.stages["ihc"]
         assert isinstance(filterbank, Filterbank)
         assert isinstance(hair_cell, InnerHairCell)
@@ -70,7 +70,7 @@ class Chain:
     def run(
         self, blocks: Sequence[NDArray[Any]], changes: Iterable[tuple[int, str, Any]] = ()
     ) -> list[dict[str, FloatArray]]:
-        """Outputs block by block; `changes` are (block index, parameter, value), made before that block."""
+        """Return the outputs by block. `changes` are (block index, parameter, value), applied before that block."""
         changes = list(changes)
         outputs = []
         for index, block in enumerate(blocks):
@@ -81,5 +81,5 @@ class Chain:
 
 
 def joined(outputs: Sequence[Mapping[str, FloatArray]]) -> dict[str, FloatArray]:
-    """The outputs of all blocks as one array per stage."""
+    """Return the outputs of all blocks as one array per stage."""
     return {kind: np.concatenate([output[kind] for output in outputs], axis=-1) for kind in outputs[0]}

@@ -1,4 +1,4 @@
-"""All tests of the numerics run on the compiled kernels, and again on their twins."""
+"""All tests of stages run with compiled kernels, and again without."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ from collections.abc import Iterator
 
 import pytest
 
-from .implementations import TWINS, levels, using
+from .implementations import NUMPY, levels, using
 
 
-@pytest.fixture(params=["kernels", "twins"], scope="module", autouse=True)
+@pytest.fixture(params=["kernels", "numpy"], scope="module", autouse=True)
 def implementation(request: pytest.FixtureRequest) -> Iterator[None]:
-    """What the stages run on."""
+    """Select the implementation."""
     available = levels()
     if request.param == "kernels" and not available:
         pytest.skip("the kernels cannot be built here")
-    with using(available[-1] if request.param == "kernels" else TWINS):
+    with using(available[-1] if request.param == "kernels" else NUMPY):
         yield

@@ -1,8 +1,8 @@
-/* Calls functions of a library for another processor: reads calls with their arrays from its input, writes what came out.
+/* Calls functions of a library for another processor: reads calls with their arrays from its input, writes the results.
  *
  * It runs under qemu, with the library as its argument (tests/dsp/foreign.py writes the calls). All numbers are of 8 bytes.
  * A call: number of arrays, and of each its bytes and the contents; the function's name in 64 bytes; number of arguments, and
- * of each its kind and two numbers. The answer: what the function gave back, and the contents of all arrays. */
+ * of each its kind and two numbers. The answer: the return value, and the contents of all arrays. */
 #include <dlfcn.h>
 #include <stdint.h>
 #include <stdio.h>
@@ -14,8 +14,8 @@ enum { MAX_ARRAYS = 32, MAX_ARGUMENTS = 40, MAX_REALS = 8, MAX_MEMBERS = 16, PAG
 
 enum kind { INTEGER, REAL, ADDRESS /* number of the array, bytes from its beginning */, STRUCT /* number of members, which follow */ };
 
-/* Numbers go to registers of their own kind and, behind eight reals, the rest to the stack in order: so it is for aarch64 and
- * for x86-64, and a function takes what it has of each kind, wherever they stood among the arguments. */
+/* Numbers go to registers of their own kind and, behind eight reals, the rest to the stack in order. This is the
+ * calling convention of aarch64 and x86-64: arguments of each kind are numbered separately. */
 #define EIGHT(type) type, type, type, type, type, type, type, type
 typedef int64_t kernel(EIGHT(double), EIGHT(int64_t), EIGHT(int64_t), EIGHT(int64_t), EIGHT(int64_t), EIGHT(int64_t));
 #define FOUR_OF(x, n) x[n], x[n + 1], x[n + 2], x[n + 3]
@@ -31,7 +31,7 @@ static int64_t take_number(void) {
     return number;
 }
 
-/* Behind the last byte lies a page that must not be touched. */
+/* The last byte is followed by an inaccessible page. */
 static char *room(size_t bytes, char **begin, size_t *size) {
     size_t pages = (bytes + PAGE - 1) / PAGE * PAGE;
     *size = pages + PAGE;

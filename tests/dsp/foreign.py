@@ -1,4 +1,4 @@
-"""The kernels for another processor, under qemu: tests/dsp/driver.c gets calls with their arrays, and answers."""
+"""Kernels for another processor under qemu: tests/dsp/driver.c receives calls with their arrays and returns results."""
 
 from __future__ import annotations
 
@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
 import pytest
 from numpy.typing import NDArray
 
@@ -21,11 +20,11 @@ from rosafe.dsp import kernels
 from rosafe.dsp.kernels import build, loader
 
 INTEGER, REAL, ADDRESS, STRUCT = range(4)  # as in driver.c
-MAX_PINNED = 100  # arrays that the stages at work have
+MAX_PINNED = 100  # arrays of the stages in use
 
 
 class Machine(NamedTuple):
-    """A processor that is not this one."""
+    """Another processor."""
 
     compiler: str
     emulator: tuple[str, ...]
@@ -33,12 +32,12 @@ class Machine(NamedTuple):
     level: int
 
     @property
-    def lacking(self) -> list[str]:
-        """The programs that it takes and that are not here."""
+    def missing_programs(self) -> list[str]:
+        """Return the required programs that are not installed."""
         return [name for name in (self.compiler, self.emulator[0]) if shutil.which(name) is None]
 
     def library(self) -> Path:
-        """Its library, built if it is not there."""
+        """Return its library; build it if necessary."""
         if self.kind == platform.machine():
             return build.libraries()[self.level]
         with pytest.MonkeyPatch.context() as patch:
@@ -57,7 +56,7 @@ _pinned: dict[int, kernels.PinnedArray] = {}  # by address
 
 
 def pin(array: NDArray[Any]) -> kernels.PinnedArray:
-    """As `kernels.Pinned.of`; the array goes with each call that names it, whichever kernels were in use meanwhile."""
+    """Replace `kernels.PinnedArray.of`. The array is sent with each call that uses its address."""
     pinned = kernels.PinnedArray(array, array.ctypes.data)
     _pinned[pinned.address] = pinned
     if len(_pinned) > MAX_PINNED:
@@ -66,7 +65,7 @@ def pin(array: NDArray[Any]) -> kernels.PinnedArray:
 
 
 class Foreign:
-    """A library of kernels that runs elsewhere, in the place of a `ctypes.CDLL`."""
+    """A library of kernels in another process, with the interface of `ctypes.CDLL`."""
 
     def __init__(self, machine: Machine) -> None:
         folder = Path(tempfile.mkdtemp(prefix="foreign-kernels."))
@@ -76,12 +75,12 @@ class Foreign:
             command = [*machine.emulator, str(driver), str(machine.library())]
             self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE)
             self._arrays: list[NDArray[Any]] = []
-            self.rosafe_processor_level()  # answers: all is loaded
+            self.rosafe_processor_level()  # a response means that everything is loaded
         finally:
             shutil.rmtree(folder)
 
     def address(self, array: NDArray[Any]) -> int:
-        """As `kernels._address`; the array goes with the next call."""
+        """Replace `kernels._address`. The array is sent with the next call."""
         self._arrays.append(array)
         address: int = array.ctypes.data
         return address
@@ -92,9 +91,9 @@ class Foreign:
     def _call(self, name: str, *arguments: float | bytes | None) -> int:
         kinds = loader._ARGUMENTS.get(name, ())
         named = set(_addresses(kinds, arguments))
-        own = [np.byte_bounds(pinned.array) for pinned in _pinned.values()]
+        own = [_span(pinned.array) for pinned in _pinned.values()]
         own = [(low, high) for low, high in own if any(low <= address <= high for address in named)]
-        spans = _joined([*map(np.byte_bounds, self._arrays), *own])
+        spans = _joined([*map(_span, self._arrays), *own])
         message = [struct.pack("q", len(spans))]
         for low, high in spans:
             message += [struct.pack("q", high - low), ctypes.string_at(low, high - low)]
@@ -116,7 +115,7 @@ class Foreign:
         return int(struct.unpack_from("q", answer)[0])
 
     def close(self) -> None:
-        """End it."""
+        """End the process."""
         assert self._process.stdin is not None
         assert self._process.stdout is not None
         self._process.stdin.close()
@@ -124,8 +123,17 @@ class Foreign:
         self._process.stdout.close()
 
 
+def _span(array: NDArray[Any]) -> tuple[int, int]:
+    """Return the range of addresses of an array, as `byte_bounds`, which is in different places in numpy 1 and 2."""
+    if array.size == 0:
+        return array.ctypes.data, array.ctypes.data
+    extents = [(size - 1) * stride for size, stride in zip(array.shape, array.strides, strict=True)]
+    low = array.ctypes.data + sum(extent for extent in extents if extent < 0)
+    return low, low + sum(map(abs, extents)) + array.itemsize
+
+
 def _joined(spans: list[tuple[int, int]]) -> list[tuple[int, int]]:
-    """Ranges of addresses, those that overlap or touch made one: views of one store."""
+    """Merge overlapping and adjacent ranges of addresses, which are views of one array."""
     joined: list[tuple[int, int]] = []
     for low, high in sorted(spans):
         if joined and low <= joined[-1][1]:
@@ -144,7 +152,7 @@ def _addresses(kinds: Sequence[Any], values: Sequence[Any]) -> Iterator[int]:
 
 
 def _members(packed: bytes) -> tuple[Sequence[Any], Sequence[int]]:
-    """Kinds and values in a struct that a kernel is given."""
+    """Return the types and values of a struct argument."""
     kinds = {"P": ctypes.c_void_p, "q": ctypes.c_int64}
     return [kinds[letter] for letter in loader.FRAMES], struct.unpack(loader.FRAMES, packed)
 
@@ -167,10 +175,10 @@ _running: dict[str, Foreign] = {}
 
 
 def running(name: str) -> Foreign:
-    """One of `MACHINES`, started at the first call; a test for it is skipped where its tools are not here."""
+    """Return one of `MACHINES`, started at the first call; skip the test if its tools are not installed."""
     machine = MACHINES[name]
-    if machine.lacking:
-        pytest.skip(f"no {' and no '.join(machine.lacking)} here: scripts/install --tests brings them")
+    if machine.missing_programs:
+        pytest.skip(f"no {' and no '.join(machine.missing_programs)} here: scripts/install --tests brings them")
     if machine.kind == "x86_64" != platform.machine():
         pytest.skip("for x86-64")
     if name not in _running:
@@ -179,6 +187,6 @@ def running(name: str) -> Foreign:
 
 
 def close_all() -> None:
-    """End those that run."""
+    """End all running processes."""
     while _running:
         _running.popitem()[1].close()

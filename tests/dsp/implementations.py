@@ -1,4 +1,4 @@
-"""The kernels for each level of processor, other processors', clang's, and their twins, to be chosen by tests."""
+"""Implementations that tests can select: kernels for each instruction set, other processors and clang, and numpy."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from rosafe.dsp.kernels import build, loader, precedence
 
 from . import foreign
 
-TWINS = 0
-CLANG = "clang"  # its kernels for the highest level that runs here
+NUMPY = 0
+CLANG = "clang"  # its kernels for the highest level of this processor
 
 Choice = int | str  # a level, CLANG, or one of `foreign.MACHINES`
 
 
 def levels() -> list[int]:
-    """The levels of kernels that run here, ascending; none where they cannot be built."""
+    """Return the levels of kernels for this processor, ascending; none if they cannot be built."""
     try:
         paths = build.libraries()
     except build.BuildError:
@@ -46,8 +46,8 @@ def _by_clang() -> ctypes.CDLL:
 
 @contextmanager
 def using(choice: Choice) -> Iterator[None]:
-    """Within this, the stages run on these kernels, or on the twins."""
-    loaded: tuple[Any, loader.Status] = (None, loader.Status(False, "the twins, for a test"))
+    """Make the stages use these kernels, or numpy."""
+    loaded: tuple[Any, loader.Status] = (None, loader.Status(False, "numpy, for a test"))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(kernels.PinnedArray, "of", foreign.pin)
         if choice in foreign.MACHINES:
@@ -57,7 +57,7 @@ def using(choice: Choice) -> Iterator[None]:
                 patch.setattr(module, "_address", elsewhere.address)
         elif choice == CLANG:
             loaded = (_by_clang(), loader.Status(True, "clang's, for a test"))
-        elif isinstance(choice, int) and choice != TWINS:
+        elif isinstance(choice, int) and choice != NUMPY:
             if choice not in levels():
                 pytest.skip(f"no kernels of level {choice} here")
             loaded = (loader.load(build.libraries()[choice]), loader.Status(True, f"level {choice}, for a test"))

@@ -1,4 +1,4 @@
-"""A list of stages in every mode that matters, small enough for property tests, and blocks for them."""
+"""Stages in all relevant modes, small enough for property tests, and blocks for them."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def _framed(prefix: str, **more: Any) -> list[dict[str, Any]]:
     return [{f"{prefix}_{name}": value for name, value in modes.items()} | more for modes in _FRAMED.values()]
 
 
-# (kind, parameters) of every stage
+# (kind, parameters) of each stage
 MODES: list[tuple[str, dict[str, Any]]] = [
     ("input", {}),
     ("input", {"in_doNormalize": False}),
@@ -51,7 +51,7 @@ NAMES = [f"{kind}-{'-'.join(str(v) for v in parameters.values())}" for kind, par
 
 
 class WithEnvelope(Stage):
-    """A filterbank with the envelope behind its output, or a hair cell that is given an envelope made of its input."""
+    """A filterbank with its envelope appended to the output, or a hair cell with an envelope from its input."""
 
     def __init__(self, stage: Stage) -> None:
         self.stage = stage
@@ -67,18 +67,18 @@ class WithEnvelope(Stage):
 
 
 def make(kind: str, parameters: dict[str, Any], rate: float = RATE) -> Stage:
-    """The stage of this kind; filterbanks and hair cells as `WithEnvelope`."""
+    """Create a stage of this kind; filterbanks and hair cells as `WithEnvelope`."""
     stage = STAGES[kind](rate, **parameters)
     return WithEnvelope(stage) if kind in ("gammatone", "ihc") else stage
 
 
 def rows(kind: str, channels: int = CHANNELS) -> tuple[int, ...]:
-    """The shape of `kind`'s input without time."""
+    """Return the shape of the input of `kind` without the time axis."""
     return (2,) if kind in ("input", "preProc", "gammatone") else (2, channels)
 
 
 def noise(kind: str, samples: int, seed: int = 1, channels: int = CHANNELS) -> FloatArray:
-    """A block for a stage of this kind: noise, with the right ear quieter."""
+    """Return a block of noise for a stage of this kind, with the right ear quieter."""
     block = np.random.default_rng(seed).standard_normal((*rows(kind, channels), samples))
     block[1] *= 0.3
     return block * (2**31 - 1) / 8 if kind == "input" else block

@@ -1,4 +1,4 @@
-"""Parameters: the table of the interface, what is refused, changes between blocks and what they reset."""
+"""Parameters: the interface table, invalid values, changes between blocks and the states that they reset."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from .bare import run
 from .stages import MODES, NAMES, RATE, make, noise, rows
 
 
-def test_channels_in_force() -> None:
+def test_current_channels() -> None:
     default = Filterbank(44100).parameters
     assert (default["fb_nChannels"], default["fb_nERBs"], default["fb_highFreqHz"]) == (31, 1.0, 8000.0)
     assert default["fb_cfHz"][-1] == pytest.approx(7641.313909)
@@ -57,7 +57,7 @@ def test_a_range_of_whole_steps_excludes_its_end(low: float, steps: int, step: f
     assert made.parameters["fb_nChannels"] == steps
 
 
-# --- refusals ---------------------------------------------------------------------------------------------------
+# --- invalid values ---------------------------------------------------------------------------------------------------
 
 NAN, INF = math.nan, math.inf
 NOT_POSITIVE: list[Any] = [0.0, -1.0, NAN, INF, "1"]
@@ -99,23 +99,23 @@ REFUSED: list[tuple[str, dict[str, Any]]] = [
 
 
 @pytest.mark.parametrize(("kind", "changes"), REFUSED)
-def test_what_is_refused_changes_nothing(kind: str, changes: dict[str, Any]) -> None:
+def test_an_invalid_value_changes_nothing(kind: str, changes: dict[str, Any]) -> None:
     names = "|".join(changes) + "|fb_cfHz|fb_highFreqHz"
     with pytest.raises(ValueError, match=f"^({names}): ") as refusal:
         STAGES[kind](RATE, **changes)
     assert "\n" not in str(refusal.value)
     assert len(str(refusal.value)) < 200
 
-    stage, twin = (STAGES[kind](RATE) for _ in range(2))
-    for each in (stage, twin):
+    stage, reference_stage = (STAGES[kind](RATE) for _ in range(2))
+    for each in (stage, reference_stage):
         each.process(noise(kind, 500))
     other = {p.name: p.default for p in interface.KINDS[kind].parameters if p.name not in changes}
     with pytest.raises(ValueError, match=f"^({names}): "):
-        stage.configure(**other, **changes)  # the good ones first
-    assert stage.parameters == twin.parameters
+        stage.configure(**other, **changes)  # the valid ones first
+    assert stage.parameters == reference_stage.parameters
     block = noise(kind, 700, seed=2)
-    np.testing.assert_array_equal(stage.process(block), twin.process(block))
-    assert stage.output_format.rate == twin.output_format.rate
+    np.testing.assert_array_equal(stage.process(block), reference_stage.process(block))
+    assert stage.output_format.rate == reference_stage.output_format.rate
 
 
 @pytest.mark.parametrize("kind", CORE_KINDS)
@@ -138,7 +138,7 @@ def test_sample_rates_too_low_for_a_filter() -> None:
         InnerHairCell(2000)
     with pytest.raises(ValueError, match=r"^pp_middleEarModel: lopezpoveda"):
         PreProc(200, pp_bMiddleEarFiltering=True, pp_middleEarModel="lopezpoveda")
-    PreProc(30)  # what is switched off does not matter
+    PreProc(30)  # parameters of disabled steps are not checked
     assert PreProc(RATE, pp_middleEarModel="jespen").parameters["pp_middleEarModel"] == "jepsen"
 
 
@@ -148,7 +148,7 @@ PREPROC = {"pp_bRemoveDC": True, "pp_bPreEmphasis": True, "pp_bNormalizeRMS": Tr
 
 
 @pytest.mark.parametrize("name", [p.name for p in PreProc.REPRESENTATION.parameters])
-def test_any_preproc_parameter_starts_all_its_filters_anew(name: str) -> None:
+def test_any_preproc_parameter_resets_all_its_filters(name: str) -> None:
     stage = PreProc(RATE, **PREPROC)
     stage.process(noise("preProc", 500) + 0.5)
     changed = {**stage.parameters, name: {"pp_middleEarModel": "lopezpoveda", "pp_cutoffHzDC": 50.0}.get(name, 1)}
@@ -169,7 +169,7 @@ def test_input_changes_from_the_next_block() -> None:
 @pytest.mark.parametrize(
     "changes", [{"fb_bwERBs": 1.3}, {"fb_nGamma": 2}, {"fb_type": "drnl"}, {"fb_nChannels": 3}, {"fb_bwERBs": 1.018}]
 )
-def test_any_filterbank_parameter_starts_all_its_filters_anew(changes: dict[str, Any]) -> None:
+def test_any_filterbank_parameter_resets_all_its_filters(changes: dict[str, Any]) -> None:
     base: dict[str, Any] = {"fb_highFreqHz": 4000.0, "fb_nChannels": 4}
     stage = Filterbank(RATE, **base)
     stage.process(noise("gammatone", 500))
@@ -188,7 +188,7 @@ def test_which_channel_setting_decides() -> None:
     stage.configure(fb_bwERBs=1.2)
     assert channels() == [440, 880]
     stage.configure(fb_nChannels=0)
-    assert channels() == [440, 880]  # no number of channels: the list stays
+    assert channels() == [440, 880]  # no number of channels: the list is kept
     stage.configure(fb_nChannels=2)
     assert channels() == [80, 8000]
     stage.configure(fb_cfHz=[500.0])
@@ -212,7 +212,7 @@ def test_which_channel_setting_decides() -> None:
     assert len(channels()) == 5
 
 
-def test_hair_cell_method_starts_the_filter_anew() -> None:
+def test_hair_cell_method_resets_the_filter() -> None:
     stage = InnerHairCell(RATE)
     stage.process(noise("ihc", 500))
     stage.configure(ihc_method="joergensen")
@@ -228,7 +228,7 @@ def ild_of(frame: Any, name: str) -> Any:
 
 
 def test_window_and_hop_change_keep_the_buffer_and_the_grid() -> None:
-    """The next frame starts where it would have started, with the new window; its followers by the new hop."""
+    """The start of the next frame does not change; it has the new window, and later frames follow at the new hop."""
     x = noise("ild", 1000)
     stage = Ild(RATE, ild_wSizeSec=100 / RATE, ild_hSizeSec=40 / RATE)
     before = stage.process(x[..., :330])  # frames at 0, 40 ... 200; the next at 240
@@ -261,7 +261,7 @@ def test_hop_longer_than_window_then_shorter() -> None:
 
 
 @pytest.mark.parametrize("change", [{"rm_decaySec": 0.02}, {"rm_scaling": "power"}, {"rm_decaySec": 0.008}])
-def test_ratemap_integrator_starts_anew_and_the_buffer_stays(change: dict[str, Any]) -> None:
+def test_ratemap_integrator_is_reset_and_the_buffer_is_kept(change: dict[str, Any]) -> None:
     x = np.abs(noise("ratemap", 400))
     stage = Ratemap(RATE, rm_wSizeSec=100 / RATE, rm_hSizeSec=50 / RATE, rm_scaling="magnitude")
     stage.process(x[..., :130])  # one frame; the next at 50
@@ -283,7 +283,7 @@ def test_ratemap_integrator_starts_anew_and_the_buffer_stays(change: dict[str, A
     np.testing.assert_allclose(got, expected, rtol=1e-12, atol=0)
 
 
-def test_ratemap_window_change_leaves_the_integrator_running() -> None:
+def test_ratemap_window_change_keeps_the_integrator() -> None:
     x = np.abs(noise("ratemap", 400))
     framed = {"rm_wSizeSec": 50 / RATE, "rm_hSizeSec": 50 / RATE}
     whole = Ratemap(RATE, **framed, rm_wname="hamming").process(x)
@@ -306,10 +306,10 @@ def test_lag_and_frame_shapes_are_rebuilt() -> None:
 
 @pytest.mark.parametrize(("kind", "parameters"), MODES, ids=NAMES)
 def test_no_change_is_no_reset(kind: str, parameters: dict[str, Any]) -> None:
-    stage, twin = STAGES[kind](RATE, **parameters), make(kind, parameters)
+    stage, reference_stage = STAGES[kind](RATE, **parameters), make(kind, parameters)
 
     class Configured(Stage):
-        """`stage` with an empty change before every block."""
+        """A stage with an empty change before each block."""
 
         def __init__(self) -> None:
             pass
@@ -321,6 +321,6 @@ def test_no_change_is_no_reset(kind: str, parameters: dict[str, Any]) -> None:
             )
 
     blocks = [noise(kind, 200, seed) for seed in range(3)]
-    expected = run(twin, blocks)
+    expected = run(reference_stage, blocks)
     np.testing.assert_array_equal(run(Configured(), blocks), expected[:2] if kind == "gammatone" else expected)
     assert len(rows(kind)) + 1 == blocks[0].ndim

@@ -1,4 +1,4 @@
-"""Threads leave kernels one by one (gil_handoff.c); one that stays away blocks no other, and results are the same."""
+"""Threads leave kernels one by one (gil_handoff.c); a thread outside of kernels blocks no other; results are equal."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ THREADS, BLOCKS, PATIENCE = 6, 40, 60.0
 
 
 def ild(seed: int, blocks: int = BLOCKS) -> np.ndarray:
-    """Of noise, by a stage of its own: two kernels for each block."""
+    """Return the ILD of noise by a separate stage: two kernels for each block."""
     random, hair_cell, stage = np.random.default_rng(seed), InnerHairCell(44100.0), Ild(44100.0)
     levels = [stage.process(hair_cell.process(random.standard_normal((2, 3, 441)))) for _ in range(blocks)]
     return np.concatenate(levels, axis=-1)
@@ -30,7 +30,7 @@ def here() -> None:
         pytest.skip("no kernels here")
 
 
-def test_many_threads_at_once_get_what_each_gets_alone() -> None:
+def test_concurrent_threads_get_the_same_results_as_single_ones() -> None:
     with ThreadPoolExecutor(THREADS) as pool:
         together = list(pool.map(ild, range(THREADS)))
     for seed, levels in enumerate(together):
@@ -39,7 +39,7 @@ def test_many_threads_at_once_get_what_each_gets_alone() -> None:
 
 @pytest.fixture
 def away() -> Iterator[list[threading.Thread]]:
-    """Threads that have come out of a kernel and do something else for long; one that has ended there."""
+    """Start threads that have left a kernel and do something else for a long time; one of them has ended."""
     out, go = threading.Barrier(4), threading.Event()
 
     def leave(then: bool) -> None:
@@ -60,7 +60,7 @@ def away() -> Iterator[list[threading.Thread]]:
         assert not thread.is_alive()
 
 
-def test_nobody_waits_for_one_that_is_away(away: list[threading.Thread]) -> None:
+def test_no_thread_waits_for_one_that_is_away(away: list[threading.Thread]) -> None:
     expected = ild(5)
     with ThreadPoolExecutor(2) as pool:
         for levels in pool.map(ild, [5, 5, 5]):

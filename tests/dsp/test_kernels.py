@@ -1,7 +1,8 @@
-"""Each kernel against its twin, over all that can be configured; and one stream that goes through both."""
+"""Each kernel against its equivalent in numpy, for all parameters; and one stream processed by both."""
 
 from __future__ import annotations
 
+import os
 import subprocess
 import threading
 import time
@@ -22,6 +23,7 @@ from rosafe.dsp.numeric_limits import LIMIT
 from rosafe.dsp.signal_format import SignalFormat
 from rosafe.dsp.stage import Stage
 from rosafe.dsp.windows import NAMES
+from rosafe.localization import mixture
 from rosafe.representations import STAGES, precedence
 from rosafe.representations.amsfeatures import AmsFeatures
 from rosafe.representations.crosscorrelation import CrossCorrelation
@@ -32,23 +34,24 @@ from rosafe.representations.registry import CORE_KINDS
 from tests.harness import ROOT
 
 from .bare import FloatArray, cut, single
-from .implementations import TWINS, Choice, levels, using
+from .implementations import NUMPY, Choice, levels, using
 
 RATE = 16000.0
 
 each_level = pytest.mark.parametrize("level", [2, 3, 4, "aarch64"])
 each_native = pytest.mark.parametrize("level", [2, 3, 4])
-examples = settings(max_examples=20, deadline=None, database=None)
+EXAMPLES = "ROSAFE_TEST_EXAMPLES"  # environment variable: their number; the sanitizers need few, but each takes long
+examples = settings(max_examples=int(os.environ.get(EXAMPLES, "20")), deadline=None, database=None)
 block_sizes = st.lists(st.one_of(st.sampled_from([0, 1, 2, 3, 64]), st.integers(0, 400)), min_size=1, max_size=8)
 
 
 @pytest.fixture(scope="module", autouse=True)
 def implementation() -> None:
-    """Here, each test chooses for itself."""
+    """Each test of this module selects the implementation itself."""
 
 
 def signal(channels: int, samples: int, seed: int = 0) -> FloatArray:
-    """Noise with steps of level, some of it silent."""
+    """Return noise with steps of level and silent parts."""
     rng = np.random.default_rng(seed)
     levels = 10.0 ** rng.integers(-6, 3, samples // 100 + 1)
     levels[rng.random(len(levels)) < 0.2] = 0
@@ -56,7 +59,7 @@ def signal(channels: int, samples: int, seed: int = 0) -> FloatArray:
 
 
 def outputs(stage: Stage, blocks: Iterable[FloatArray], turns: Iterable[Choice]) -> list[FloatArray]:
-    """What `stage` makes of `blocks` on the implementations that have their turn."""
+    """Return the outputs of `stage` for `blocks` on alternating implementations."""
     made = []
     for block, level in zip(blocks, turns, strict=False):
         with using(level):
@@ -70,7 +73,7 @@ def outputs(stage: Stage, blocks: Iterable[FloatArray], turns: Iterable[Choice])
 def agree(
     got: Iterable[FloatArray], expected: Iterable[FloatArray], tolerance: float = 1e-11, least: float = 1e-140
 ) -> None:
-    """To `tolerance` of the largest number, or of `least`; below 1e-154, where 60 poles lead, squares are 0."""
+    """Compare to `tolerance` of the largest number, or of `least`. Squares of less than 1e-154 are 0."""
     got, expected = np.concatenate([*got], axis=-1), np.concatenate([*expected], axis=-1)
     assert got.shape == expected.shape
     largest = np.abs(expected).max(initial=least)
@@ -85,9 +88,9 @@ def check(
     given: SignalFormat | float = RATE,
     least: float = 1e-140,
 ) -> None:
-    """The kernels give what the twins give; so does a stage that goes back and forth between the two."""
-    expected = outputs(STAGES[kind](given, **parameters), blocks, [TWINS] * len(blocks))
-    rounds: list[list[Choice]] = [[level], [level, TWINS, TWINS, level]]
+    """Compare the kernels with numpy; also a stage that alternates between both."""
+    expected = outputs(STAGES[kind](given, **parameters), blocks, [NUMPY] * len(blocks))
+    rounds: list[list[Choice]] = [[level], [level, NUMPY, NUMPY, level]]
     for turns in rounds:
         got = outputs(STAGES[kind](given, **parameters), blocks, turns * len(blocks))
         agree(got, expected, least=least)
@@ -111,12 +114,15 @@ def test_gammatone(
     frequencies = np.geomspace(60.0, 7900.0, channels)
     blocks = [np.ascontiguousarray(block) for block in cut(signal(1, sum(sizes) + 50)[:, 0], [*sizes, 50])]
     made: dict[Choice, list[FloatArray]] = {}
-    for choice in (TWINS, level):
+    for choice in (NUMPY, level):
         bank = GammatoneBank(RATE, frequencies, order, width)
+        made[choice] = []
         with using(choice):
-            pairs = [bank.process(block, env) for block, env in zip(blocks, envelopes, strict=False)]
-        made[choice] = [array for pair in pairs for array in pair if array is not None]
-    agree(made[level], made[TWINS])
+            for block, with_envelope in zip(blocks, envelopes, strict=False):
+                output = np.empty((2, channels, block.shape[-1]))
+                envelope = bank.process(block, with_envelope, output)
+                made[choice] += [output] if envelope is None else [output, envelope]
+    agree(made[level], made[NUMPY])
 
 
 @each_level
@@ -128,12 +134,12 @@ def test_hair_cell(level: Choice, method: str, channels: int, sizes: list[int]) 
 
 @each_level
 @pytest.mark.parametrize("method", METHODS)
-def test_hair_cell_of_rows_that_are_whole_pages_apart(level: Choice, method: str) -> None:
+def test_hair_cell_of_rows_with_a_stride_of_whole_pages(level: Choice, method: str) -> None:
     check(level, "ihc", {"ihc_method": method}, cut(signal(11, 1600), [512, 1024, 64]))
 
 
 def framing(prefix: str) -> st.SearchStrategy[dict[str, Any]]:
-    """Windows of 2 to 300 samples, hops of 1 to 700."""
+    """Draw windows of 2 to 300 samples and hops of 1 to 700."""
     short, long = st.integers(1, 12), st.integers(1, 150)
     return st.fixed_dictionaries(
         {
@@ -185,7 +191,7 @@ def test_cross_correlation(
 @each_level
 @pytest.mark.parametrize(("size", "lag"), [(1024, 3), (1026, 100), (2050, 511), (3000, 400), (5002, 511), (1200, 512)])
 def test_cross_correlation_of_long_windows(level: Choice, size: int, lag: int) -> None:
-    """Windows that are taken in several spans, up to the most lags, and just beyond, where FFT takes over."""
+    """Windows of several spans, with up to the maximum number of lags, and just above, where FFT is used."""
     parameters = {"cc_wSizeSec": size / RATE, "cc_hSizeSec": size / 3 / RATE, "cc_maxDelaySec": (lag - 0.5) / RATE}
     check(level, "crossCorrelation", parameters, cut(signal(2, 12000), [5000, 100]))
 
@@ -216,16 +222,16 @@ def test_adaptation(
     )
     parameters = {"adpt_tau": tau, "adpt_lim": lim, "adpt_mindB": threshold, "adpt_model": model}
     blocks = cut(signal(channels, sum(sizes) + 50), [*sizes, 50])
-    check(level, "adaptation", parameters, blocks, given_signal, least=100.0)  # silence is 0 less its rounding
+    check(level, "adaptation", parameters, blocks, given_signal, least=100.0)  # silence is 0 except for rounding
 
 
 @each_level
 def test_adaptation_by_many_loops(level: Choice) -> None:
     tau = np.geomspace(0.001, 1.0, 32).tolist()
-    for lim in (0.0, 10.0):  # the output is the last loop's, times 5e9: 1e-11 is much to ask for
+    for lim in (0.0, 10.0):  # the output is multiplied by 5e9: 1e-11 would be a strict limit
         parameters = {"adpt_tau": tau, "adpt_lim": lim}
         blocks = cut(np.abs(signal(3, 600)), [100, 1, 33])
-        expected = outputs(STAGES["adaptation"](RATE, **parameters), blocks, [TWINS] * len(blocks))
+        expected = outputs(STAGES["adaptation"](RATE, **parameters), blocks, [NUMPY] * len(blocks))
         agree(outputs(STAGES["adaptation"](RATE, **parameters), blocks, [level] * len(blocks)), expected, 1e-6, 100.0)
 
 
@@ -248,7 +254,7 @@ def test_autocorrelation(
     channels: int,
     sizes: list[int],
 ) -> None:
-    if clipping == "sgn":  # whose spectra have zeros: what rounding makes of 0 must not be made larger
+    if clipping == "sgn":  # spectra with zeros: rounding errors of 0 must not be amplified
         exponent = max(exponent, 1.0)
     parameters = {**parameters, "ac_clipMethod": clipping, "ac_clipAlpha": alpha, "ac_K": exponent}
     check(level, "autocorrelation", parameters, cut(signal(channels, sum(sizes) + 500), [*sizes, 300]))
@@ -258,7 +264,7 @@ def test_autocorrelation(
 @pytest.mark.parametrize("size", [882, 960, 1024, 1026, 4096, 4098])
 @pytest.mark.parametrize("exponent", [2.0, 0.5])
 def test_autocorrelation_of_long_windows(level: Choice, size: int, exponent: float) -> None:
-    """Up to the longest one of the kernel, and just beyond, where scipy takes over."""
+    """Up to the maximum of the kernel, and just above, where scipy is used."""
     parameters = {"ac_wSizeSec": size / RATE, "ac_hSizeSec": size / 3 / RATE, "ac_K": exponent}
     check(level, "autocorrelation", parameters, cut(signal(2, 12000), [5000, 100]))
 
@@ -287,10 +293,10 @@ def test_modulation(
 def test_windowed_frames(
     level: Choice, parameters: dict[str, Any], channels: int, sizes: list[int], parts: int
 ) -> None:
-    """Of some frames after the other, those that lie in the history, in the block and in both."""
+    """Groups of frames in the history, in the block and in both."""
     window = np.random.default_rng(0).standard_normal(round(parameters["prec_wSizeSec"] * RATE))
     framing = FrameGrid(window, round(parameters["prec_hSizeSec"] * RATE))
-    with using(TWINS):  # which notes where arrays are
+    with using(NUMPY):  # records addresses of arrays
         buffer, rest = FrameBuffer(), FrameBuffer()
         for block in cut(signal(channels, sum(sizes) + 900), [*sizes, 300]):
             wanted = framing.frames(rest.append(block))
@@ -306,7 +312,7 @@ def test_windowed_frames(
             batch = max(1, count // parts)
             for first in range(0, count, batch):
                 number = min(batch, count - first)
-                got, expected = (by_kernel.Windowed.room(number, channels, len(window)) for _ in range(2))
+                got, expected = (by_kernel.Windowed.allocate(number, channels, len(window)) for _ in range(2))
                 with using(level):
                     by_kernel.windowed(frames.part(first, number), got)
                 precedence.windowed(wanted[:, :, first : first + number], window, expected)
@@ -319,16 +325,16 @@ def test_windowed_frames(
 @given(channels=st.integers(1, 11), frames=st.integers(1, 4), half=st.integers(1, 200), power=st.integers(2, 10))
 @examples
 def test_summed_spectra(level: Choice, channels: int, frames: int, half: int, power: int) -> None:
-    """Of any number of points that holds the samples, half of them or more; on goes what had been summed."""
+    """With any sufficient number of points, and half of the samples or more; previous sums are continued."""
     points = max(1 << power, 1 << (2 * half - 1).bit_length())
     rng = np.random.default_rng(half)
     gains, sums = rng.random(channels), {}
-    for choice in (TWINS, level):
+    for choice in (NUMPY, level):
         running = precedence.RunningSums()
         running.begin(np.full(channels, 500.0), points // 2 + 1, 1)
         rng, made = np.random.default_rng(half), []
         with using(choice):
-            add = precedence.add_spectra if choice == TWINS else by_kernel.add_spectra
+            add = precedence.add_spectra if choice == NUMPY else by_kernel.add_spectra
             for _ in range(2):
                 samples = rng.standard_normal((frames, 2, channels, 2 * half)) * 10 ** rng.uniform(-3, 3)
                 factors = np.where(rng.random((frames, 2, channels)) < 0.3, 0, rng.random((frames, 2, channels)))
@@ -336,7 +342,7 @@ def test_summed_spectra(level: Choice, channels: int, frames: int, half: int, po
         rows = np.arange(2 * channels)
         made.append(running.power[rows // by_kernel.INTERLEAVED_ROWS, :, rows % by_kernel.INTERLEAVED_ROWS].T)
         sums[choice] = made
-    for got, expected in zip(sums[level], sums[TWINS], strict=True):
+    for got, expected in zip(sums[level], sums[NUMPY], strict=True):
         agree([got], [expected])
 
 
@@ -353,7 +359,7 @@ def test_summed_spectra(level: Choice, channels: int, frames: int, half: int, po
 def test_correlations_of_filtered_frames(
     level: Choice, rows: int, frames: int, size: int, reach: int, alike: bool, seed: int
 ) -> None:
-    """Filters of both ways to clean, with delays up to more than a frame; some have no echo to take out."""
+    """Both kinds of filters, with delays up to more than a frame; some without an echo."""
     rng = np.random.default_rng(seed)
     ears: list[tuple[FloatArray, by_kernel.Taps]] = []
     made = {}
@@ -363,24 +369,24 @@ def test_correlations_of_filtered_frames(
         large = rng.random((*shape, 1)) < 0.5
         shifts = np.where(large, np.arange(6) - 6, np.arange(6)) * delays
         values = np.where(rng.random((*shape, 6)) < 0.2, 0.0, rng.standard_normal((*shape, 6)))
-        samples = rng.standard_normal((frames, 2, rows, size))[:, 0]  # rows that do not lie one behind the other
+        samples = rng.standard_normal((frames, 2, rows, size))[:, 0]  # rows that are not contiguous
         ears.append((samples, by_kernel.Taps(shifts, values)))
-    for choice in (TWINS, level):
+    for choice in (NUMPY, level):
         with using(choice):
-            correlate = precedence.correlate_filtered if choice == TWINS else by_kernel.correlate_filtered
+            correlate = precedence.correlate_filtered if choice == NUMPY else by_kernel.correlate_filtered
             made[choice] = correlate(*ears[0], *ears[1], reach)
-    for got, expected in zip(made[level], made[TWINS], strict=True):
-        agree([got], [expected], least=1.0)  # what the twin's rounding leaves of a 0 is of the size of energies
+    for got, expected in zip(made[level], made[NUMPY], strict=True):
+        agree([got], [expected], least=1.0)  # rounding errors of 0 in numpy are relative to the energies
 
 
 @each_level
 @pytest.mark.parametrize("parameters", [{}, {"prec_maxDelaySec": 0.1}, {"prec_wSizeSec": 0.7}], ids=str)
 def test_precedence(level: Choice, parameters: dict[str, Any]) -> None:
-    """Also with more lags, or more points of a transform, than the kernels have."""
+    """Also with more lags, or more points of a transform, than the kernels support."""
     x = np.random.default_rng(1).standard_normal((2, 9, 16000))
     x[1] += np.roll(x[0], 5, axis=-1)
     made = {}
-    rounds: list[list[Choice]] = [[TWINS], [level], [level, TWINS, TWINS, level]]
+    rounds: list[list[Choice]] = [[NUMPY], [level], [level, NUMPY, NUMPY, level]]
     for turns in rounds:
         stage, blocks = STAGES["precedence"](RATE, **parameters), cut(x, [3000, 1, 200])
         parts = []
@@ -388,7 +394,7 @@ def test_precedence(level: Choice, parameters: dict[str, Any]) -> None:
             with using(choice):
                 parts.append(stage.process(np.ascontiguousarray(block)))
         made[len(turns), turns[0]] = [np.concatenate(part, axis=-1) for part in zip(*parts, strict=True)]
-    expected = made.pop((1, TWINS))
+    expected = made.pop((1, NUMPY))
     assert expected[0].shape[-1] > 20
     for got in made.values():
         for mine, theirs in zip(got, expected, strict=True):
@@ -399,7 +405,7 @@ def test_precedence(level: Choice, parameters: dict[str, Any]) -> None:
 @given(channels=st.integers(1, 11), sizes=st.lists(st.integers(0, 40), min_size=1, max_size=6))
 @examples
 def test_gabor(level: Choice, channels: int, sizes: list[int]) -> None:
-    """The patterns; what is made of these is the same code. Values of a few standard deviations: see the levels."""
+    """The responses; the rest is the same code. Values of a few standard deviations: see the levels."""
     rng = np.random.default_rng(channels)
     rates = 10.0 ** rng.uniform(-3, 0, (2, channels, sum(sizes) + 60))
     check(level, "gabor", {}, cut(rates, [*sizes, 23]), SignalFormat(44100.0, 100.0, True, 441, 882))
@@ -412,35 +418,35 @@ def test_gabor(level: Choice, channels: int, sizes: list[int]) -> None:
 )
 @pytest.mark.parametrize("value", [1e300, LIMIT, 1e-160, 5e-324])
 def test_far_beyond_sound(level: Choice, kind: str, value: float) -> None:
-    """Huge samples are bounded alike. Of tiny ones the kernels may make 0, which differs by less than anything."""
+    """Huge samples are clamped in the same way. Kernels may set tiny ones to 0, a negligible difference."""
     sound = np.sign(signal(3, 2000)) * value
     blocks = cut(sound[:, 0] if kind == "gammatone" else sound, [700, 1, 600])
-    expected = outputs(STAGES[kind](RATE), blocks, [TWINS] * len(blocks))
+    expected = outputs(STAGES[kind](RATE), blocks, [NUMPY] * len(blocks))
     got = outputs(STAGES[kind](RATE), blocks, [level] * len(blocks))
     joined = np.concatenate(got, axis=-1)
     assert np.isfinite(joined).all()
-    twin = np.concatenate(expected, axis=-1)
-    size = 1.0 if kind == "autocorrelation" else max(min(value, 1.0), np.abs(twin).max())  # which tells no level
-    np.testing.assert_allclose(joined, twin, rtol=1e-11, atol=1e-11 * size)
+    expected_whole = np.concatenate(expected, axis=-1)
+    size = 1.0 if kind == "autocorrelation" else max(min(value, 1.0), np.abs(expected_whole).max())  # has no level
+    np.testing.assert_allclose(joined, expected_whole, rtol=1e-11, atol=1e-11 * size)
 
 
 @each_level
 def test_changes_between_blocks(level: Choice) -> None:
-    """A new window takes what was held."""
+    """A new window uses the buffered samples."""
     for stage_class, prefix in ((Ild, "ild"), (Ratemap, "rm"), (CrossCorrelation, "cc"), (AmsFeatures, "ams")):
         made = {}
-        for choice in (TWINS, level):
+        for choice in (NUMPY, level):
             stage = stage_class(RATE)
             parts = outputs(stage, cut(signal(3, 1000), 300), [choice] * 4)
             stage.configure(**{f"{prefix}_wSizeSec": 0.03, f"{prefix}_hSizeSec": 0.004, f"{prefix}_wname": "triang"})
             parts += outputs(stage, cut(signal(3, 1000, seed=1), 300), [choice] * 4)
             made[choice] = parts
-        agree(made[level], made[TWINS])
+        agree(made[level], made[NUMPY])
 
 
 @each_native
-def test_denormal_numbers_stay_a_matter_of_the_kernels(level: Choice) -> None:
-    """They are switched off inside; outside, arithmetic is as before."""
+def test_denormal_numbers_are_off_inside_kernels_only(level: Choice) -> None:
+    """They are off inside kernels; arithmetic outside is unchanged."""
     smallest = np.array([5e-324])
     with using(level):
         for kind in CORE_KINDS:
@@ -450,24 +456,24 @@ def test_denormal_numbers_stay_a_matter_of_the_kernels(level: Choice) -> None:
             assert (smallest * 1.0)[0] == 5e-324, kind
 
 
-@pytest.mark.parametrize("level", [TWINS, 2, 3, 4])
-def test_denormal_numbers_are_off_for_numpy_where_that_is_asked_for(level: Choice) -> None:
+@pytest.mark.parametrize("level", [NUMPY, 2, 3, 4])
+def test_denormal_numbers_are_off_for_numpy_on_request(level: Choice) -> None:
     smallest = np.array([5e-324])
     with using(level):
         with kernels.denormals_off():
-            assert (smallest * 1.0)[0] == (5e-324 if level == TWINS else 0.0)
+            assert (smallest * 1.0)[0] == (5e-324 if level == NUMPY else 0.0)
         with pytest.raises(ZeroDivisionError), kernels.denormals_off():
             raise ZeroDivisionError
         assert (smallest * 1.0)[0] == 5e-324
 
 
 @each_native
-def test_the_interpreter_goes_on_meanwhile(level: Choice) -> None:
+def test_kernels_release_the_gil(level: Choice) -> None:
     assert any(_steps_meanwhile(level) > 10 for _ in range(10)), "not one step in the middle of a call"
 
 
 def _steps_meanwhile(level: Choice) -> int:
-    """Steps of this thread in the middle of a call of another; few where the system lets others run then."""
+    """Return the steps of this thread during a call of another thread; few if the system runs other processes."""
     sound = signal(16, 100_000)
     span: list[float] = []
     ready = threading.Event()
@@ -514,8 +520,8 @@ def test_constants_are_those_of_the_sources() -> None:
     assert "{ NONE, HALF_WAVE, FULL_WAVE, SQUARE, COMPRESSED }" in sources["biquads.c"]
 
 
-def test_the_processor_is_asked_without_its_newer_instructions() -> None:
-    """Else the question itself would be an illegal instruction on a processor that must answer no."""
+def test_the_processor_check_uses_no_newer_instructions() -> None:
+    """Otherwise the check itself would be an illegal instruction on an older processor."""
     if not levels():
         pytest.skip("the kernels cannot be built here")
     path = build.libraries()[2]
@@ -528,3 +534,18 @@ def test_the_processor_is_asked_without_its_newer_instructions() -> None:
     assert len(instructions) > 3
     newer = {name for name in instructions if name.startswith("v") or name in ("andn", "bextr", "sarx", "shlx", "shrx")}
     assert not newer
+
+
+@each_level
+@pytest.mark.parametrize("units", [1, 60, 1550])
+def test_mixture(units: int, level: Choice) -> None:
+    rng = np.random.default_rng(units)
+    likelihood = np.exp(rng.normal(0, 2, (units, kernels.MIXTURE_COMPONENTS))).astype(np.float32)
+    start = rng.uniform(0.5, 1.0, kernels.MIXTURE_COMPONENTS + 1).astype(np.float32)
+    start /= start.sum()
+    got, expected = start.copy(), start.copy()
+    with using(level):
+        inverse = kernels.mixture(likelihood, 20, got)
+    np.testing.assert_allclose(inverse, mixture.fit_by_numpy(likelihood, 20, expected), rtol=1e-4)
+    np.testing.assert_allclose(got, expected, atol=1e-6)
+    assert np.abs(expected - start).max() > 5e-3  # it has moved

@@ -1,4 +1,4 @@
-"""Huge, tiny and broken numbers: finite in gives finite out, and nothing stays denormal."""
+"""Huge, tiny and invalid numbers: finite input gives finite output, and no state remains denormal."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from rosafe.representations.filterbank import Filterbank
 from rosafe.representations.input import Input
 from rosafe.representations.preproc import PreProc
 from rosafe.representations.ratemap import Ratemap
+from rosafe.representations.registry import CORE_KINDS
 
 from .bare import Chain, cut, run, single
 from .stages import MODES, NAMES, RATE, make, noise, rows
@@ -76,16 +77,16 @@ def test_finite_through_the_chain(pattern: str, method: str, fb_type: str) -> No
 @every_mode
 @pytest.mark.parametrize("size", [1e-160, 1e-203, 1e-305, 1e-310])
 def test_tiny_samples_make_no_denormal_numbers(kind: str, parameters: dict[str, Any], size: float) -> None:
-    """They would be many times slower; to what is heard, all this is 0."""
+    """They would be many times slower, and are inaudible."""
     stage = make(kind, parameters)
     for part in cut(size * noise(kind, 1000, seed=3), [300, 700]):
         output = np.abs(stage.process(part))
         if (kind, parameters) == ("preProc", {}):
-            return  # which does nothing at all
+            return  # does not change the samples
         assert not ((output > 0) & (output < np.finfo(np.float64).tiny)).any()
 
 
-def test_one_huge_sample_does_not_poison_the_rest() -> None:
+def test_one_huge_sample_does_not_affect_the_rest() -> None:
     bank = Filterbank(RATE, fb_nChannels=3, fb_highFreqHz=4000.0)
     block = noise("gammatone", 1000)
     block[:, 10] = BIGGEST
@@ -98,11 +99,11 @@ def test_one_huge_sample_does_not_poison_the_rest() -> None:
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_the_input_refuses_what_is_not_finite(bad: float) -> None:
+def test_the_input_rejects_samples_that_are_not_finite(bad: float) -> None:
     stage = Input(RATE, in_doNormalize=False)
     block = noise("input", 10)
     block[1, 3] = bad
-    with pytest.raises(ValueError, match=r"block: .*not finite"):
+    with pytest.raises(ValueError, match=r"block: expected finite samples"):
         stage.process(block)
 
 
@@ -112,11 +113,19 @@ def test_sample_types() -> None:
         np.testing.assert_array_equal(Input(RATE, in_doNormalize=False).process(whole.astype(kind)), whole)
 
 
+@pytest.mark.parametrize("kind", CORE_KINDS)
+@pytest.mark.parametrize("ears", [1, 3])
+def test_blocks_without_two_ears_are_rejected(kind: str, ears: int) -> None:
+    stage = STAGES[kind](RATE)
+    with pytest.raises(ValueError, match=r"block: expected numbers of shape \(2 ears, .*got float64 of shape"):
+        stage.process(np.zeros((ears, *rows(kind)[1:], 10)))
+
+
 # --- tiny states ------------------------------------------------------------------------------------------------
 
 
 def silence_after_burst(kind: str, parameters: dict[str, Any], blocks: int) -> Any:
-    """Output of the last of so many silent blocks after a loud one."""
+    """Return the output of the last of `blocks` silent blocks after a loud one."""
     stage = make(kind, parameters)
     stage.process(noise(kind, 1000))
     for _ in range(blocks):
@@ -135,8 +144,8 @@ def silence_after_burst(kind: str, parameters: dict[str, Any], blocks: int) -> A
         ("ratemap", {"rm_scaling": "magnitude"}, 110),
     ],
 )
-def test_silence_becomes_exactly_silent(kind: str, parameters: dict[str, Any], blocks: int) -> None:
-    """Unflushed, a decaying state ends at the smallest denormal and stays there."""
+def test_silence_becomes_exactly_0(kind: str, parameters: dict[str, Any], blocks: int) -> None:
+    """Without flushing, a decaying state would remain at the smallest denormal."""
     out = silence_after_burst(kind, parameters, blocks)
     assert out.size
     assert not out.any()
@@ -144,7 +153,7 @@ def test_silence_becomes_exactly_silent(kind: str, parameters: dict[str, Any], b
 
 @pytest.mark.parametrize("retention", [0.5, 0.99, 0.9999])
 def test_states_are_never_denormal_for_long(retention: float) -> None:
-    """They are looked at every 4096 samples, however these come."""
+    """States are flushed every 4096 samples, independent of block boundaries."""
     cascade = SosFilter(leaky_integrator(retention))
     cascade.process(np.ones((2, 96)))
     for _ in range(30):
@@ -166,10 +175,10 @@ def test_complex_states_are_flushed_too() -> None:
     assert not cascade.state.any()
 
 
-def test_tails_are_as_exact_in_many_blocks() -> None:
-    """The tail of a burst through many short blocks is that through one long block; to the last bit with kernels.
+def test_tails_are_as_accurate_in_many_blocks() -> None:
+    """The tail of a burst is the same in many short blocks and in one long block; bit-identical with kernels.
 
-    Twins round between two blocks: as exactly as the largest number nearby.
+    numpy rounds between two blocks: relative to the largest number nearby.
     """
     signal = np.zeros((2, 30000))
     signal[:, :100] = noise("gammatone", 100)
@@ -189,7 +198,7 @@ def test_all_zero_blocks_stay_exactly_zero() -> None:
 
 @pytest.mark.parametrize(("samples", "span"), [(2.4, 2), (2.5, 3), (3.5, 4), (0.2, 1)])
 def test_gain_control_starts_from_whole_samples(samples: float, span: int) -> None:
-    """As many as the time constant has, rounded half away from zero, and at least one."""
+    """The time constant in samples, rounded half away from zero, at least one."""
     sound = np.random.default_rng(4).standard_normal((2, 8))
     sound[1] = 0.0
     retention = np.exp(-1 / samples)

@@ -1,4 +1,4 @@
-"""Memory of very large blocks is used again, but never while somebody may still look at it."""
+"""Buffers of very large blocks are reused, but never while a view exists."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def place(array: np.ndarray) -> int:
     return int(array.__array_interface__["data"][0])
 
 
-def test_used_again_when_the_last_view_is_gone() -> None:
+def test_a_buffer_is_reused_after_its_last_view() -> None:
     block = buffer_pool.empty((*ROWS, LONG))
     assert (block.shape, block.dtype, block.flags.c_contiguous, block.flags.writeable) == (
         (2, 3, LONG),
@@ -34,10 +34,12 @@ def test_used_again_when_the_last_view_is_gone() -> None:
     other = buffer_pool.empty((*ROWS, LONG))
     assert place(other) != where
     del view
-    assert place(buffer_pool.empty((*ROWS[::-1], LONG))) == where
+    again = buffer_pool.empty((*ROWS[::-1], LONG))
+    assert place(again) == where
+    assert place(buffer_pool.empty((*ROWS, LONG))) != where, "two arrays have the same memory"
 
 
-def test_little_is_kept() -> None:
+def test_few_buffers_are_kept() -> None:
     blocks = [buffer_pool.empty((*ROWS, LONG + extra)) for extra in (0, 0, 0, 0, 1, 2, 3)]
     while blocks:
         blocks.pop(0)
@@ -50,7 +52,7 @@ def test_little_is_kept() -> None:
     }
     for shape in ((2, 100), (2**9, 2**17), (0,), ()):
         assert buffer_pool.empty(shape).shape == shape
-    assert len(buffer_pool._idle) == buffer_pool.SIZES
+    assert len(buffer_pool._idle) == buffer_pool.MAX_SIZES
 
 
 def test_many_threads() -> None:
@@ -76,5 +78,5 @@ def test_a_lack_of_memory_is_one_error(monkeypatch: pytest.MonkeyPatch, capfd: p
     monkeypatch.setattr(np, "empty", empty)
     with pytest.raises(MemoryError):
         buffer_pool.empty((*ROWS, LONG))
-    buffer_pool._PooledArray.__new__(buffer_pool._PooledArray)  # as if there were no memory for its attributes
+    buffer_pool._PooledArray.__new__(buffer_pool._PooledArray)  # simulates a lack of memory for its attributes
     assert capfd.readouterr().err == ""

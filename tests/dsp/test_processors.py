@@ -1,4 +1,4 @@
-"""The kernels on processors that are not this one, and by the other compiler; test_kernels.py has aarch64's inputs."""
+"""The kernels on other processors and with the other compiler; test_kernels.py has the inputs for aarch64."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rosafe.representations import STAGES
 
 from . import foreign
 from .bare import FloatArray, single
-from .implementations import CLANG, TWINS, Choice, using
+from .implementations import CLANG, NUMPY, Choice, using
 from .test_kernels import RATE, agree, signal
 
 CHANNELS = 9
@@ -22,13 +22,13 @@ each_processor = pytest.mark.parametrize("choice", [*foreign.MACHINES, CLANG])
 
 @pytest.fixture(scope="module", autouse=True)
 def implementation() -> Iterator[None]:
-    """Here, each test chooses for itself; what was started ends with the module."""
+    """Each test selects the implementation itself; started processes end with the module."""
     yield
     foreign.close_all()
 
 
 def representations(choice: Choice) -> dict[str, FloatArray]:
-    """Every representation that has a kernel, two blocks of it, one after the other from the filterbank on."""
+    """Return two blocks of each representation that has a kernel, from the filterbank on."""
     made: dict[str, list[FloatArray]] = {}
     bank, cell = STAGES["gammatone"](RATE, fb_nChannels=CHANNELS, fb_highFreqHz=7000.0), STAGES["ihc"](RATE)
     kinds = ("ild", "ratemap", "crossCorrelation", "adaptation", "autocorrelation", "amsFeatures", "precedence")
@@ -55,24 +55,22 @@ def representations(choice: Choice) -> dict[str, FloatArray]:
 
 @each_processor
 def test_every_kernel(choice: Choice) -> None:
-    got, expected = representations(choice), representations(TWINS)
+    got, expected = representations(choice), representations(NUMPY)
     assert got.keys() == expected.keys()
     assert min(array.shape[-1] for array in got.values()) > 20
     for kind, array in got.items():
-        if not kind.startswith(
-            "precedence"
-        ):  # which decides by differences of rounding: test_precedence has sound for that
+        if not kind.startswith("precedence"):  # depends on rounding of such input: test_precedence uses suitable sound
             agree([array], [expected[kind]])
 
 
 @pytest.mark.parametrize(("machine", "level"), [("aarch64", 8), ("nehalem", 2)])
-def test_the_library_says_what_it_is_for(machine: str, level: int) -> None:
-    """On a processor without AVX, too: the question is no illegal instruction."""
+def test_the_library_reports_its_level(machine: str, level: int) -> None:
+    """Also on a processor without AVX: the function has no illegal instruction."""
     assert foreign.running(machine).rosafe_processor_level() == level
 
 
 @pytest.mark.parametrize("machine", foreign.MACHINES)
-def test_denormal_numbers_are_off_until_they_are_given_back(machine: str) -> None:
+def test_denormal_numbers_are_off_until_they_are_restored(machine: str) -> None:
     elsewhere = foreign.running(machine)
     before = elsewhere.rosafe_denormals_off() & 0xFFFFFFFF
     off = elsewhere.rosafe_denormals_off() & 0xFFFFFFFF

@@ -1,4 +1,4 @@
-"""Numbers against what is known without this code: closed forms, published values, scipy's designs, direct sums."""
+"""Results against independent references: closed forms, published values, designs of scipy, direct sums."""
 
 from __future__ import annotations
 
@@ -111,8 +111,8 @@ def test_pre_emphasis_and_level() -> None:
     np.testing.assert_allclose(stage.process(x), expected, rtol=1e-14, atol=1e-15)
 
 
-def test_the_whole_order_of_pre_processing() -> None:
-    """Gain is measured on the high-passed, pre-emphasised signal; the middle ear comes last."""
+def test_the_order_of_pre_processing() -> None:
+    """Gain is measured on the high-passed, pre-emphasised signal; the middle ear filter is last."""
     x = noise("preProc", 2000) + 0.5
     first = PreProc(16000, pp_bRemoveDC=True, pp_bPreEmphasis=True).process(x)
     second = PreProc(16000, pp_bNormalizeRMS=True, pp_intTimeSecRMS=0.02).process(first)
@@ -155,7 +155,7 @@ def test_middle_ear_peaks_and_phases(model: str, rate: int, peak: float) -> None
         assert np.cumsum(fir**2)[100] > 0.99 * np.sum(fir**2)  # minimum phase: the energy comes first
 
 
-def test_middle_ear_is_that_convolution() -> None:
+def test_middle_ear_is_a_convolution() -> None:
     x = noise("preProc", 700)
     fir = middle_ear_fir("jepsen", 16000, unity=False)
     got = PreProc(16000, pp_bMiddleEarFiltering=True, pp_middleEarModel="jespen").process(x)
@@ -201,7 +201,7 @@ def test_gammatone_has_unit_gain_at_its_centre() -> None:
 
 
 def drnl_linear_response(frequency: float, rate: float, at: float) -> complex:
-    """The linear path as a formula, from the published numbers."""
+    """Return the response of the linear path by its formula, with the published numbers."""
     log = math.log10(frequency)
     z = np.exp(2j * np.pi * at / rate)
     centre, width = 10 ** (-0.06762 + 1.01679 * log), 10 ** (0.03728 + 0.75 * log)
@@ -228,13 +228,14 @@ def test_drnl_linear_path_by_its_formula(frequency: float) -> None:
         assert got == pytest.approx(drnl_linear_response(frequency, rate, at), rel=1e-9)
 
 
-def test_drnl_compresses_middle_levels_and_not_low_ones() -> None:
-    """The input-output curve of the model's 1 kHz channel: slope 1 at low levels, near 0.25 in the middle."""
+def test_drnl_compresses_middle_levels_only() -> None:
+    """The input-output curve of the 1 kHz channel: slope 1 at low levels, near 0.25 at middle levels."""
     rate, frequency = 44100.0, 1000.0
     tone = np.sin(2 * np.pi * frequency / rate * np.arange(8820)) * np.ones((2, 1))
     levels = []
     for velocity in (1e-9, 1e-8, 1e-5, 1e-4):
-        out = DrnlBank(rate, np.array([frequency])).process(tone * velocity, with_envelope=False)[0]
+        out = np.empty((2, 1, tone.shape[-1]))
+        DrnlBank(rate, np.array([frequency])).process(tone * velocity, with_envelope=False, output=out)
         levels.append(20 * math.log10(np.abs(out[0, 0, 4410:]).max()))
     assert levels[1] - levels[0] == pytest.approx(20, abs=0.5)
     assert levels[3] - levels[2] < 10
@@ -286,6 +287,7 @@ def test_hair_cell_methods() -> None:
         "hilbert": envelope,
         "joergensen": lowpass(1, 150, envelope),
         "dau": scipy_signal.lfilter(*DAU_44100, half),
+        "dau1996": lowpass(1, 1000, half),
         "breebart": breebart,
         "bernstein": lowpass(2, 425, np.maximum(envelope**-0.77 * x, 0) ** 2),
     }
@@ -293,6 +295,26 @@ def test_hair_cell_methods() -> None:
         stage = InnerHairCell(44100, ihc_method=method)
         got = stage.process(x, envelope if stage.required_extra else None)
         np.testing.assert_allclose(got, values, rtol=0, atol=1e-12 * np.abs(values).max(), err_msg=method)
+
+
+@pytest.mark.parametrize("rate", [16000, 44100, 48000])
+def test_dau1996_is_a_first_order_low_pass_in_closed_form(rate: int) -> None:
+    """Responses of max(x, 0) with the bilinear first-order Butterworth low-pass at 1 kHz, which AMT uses."""
+    stage = InnerHairCell(rate, ihc_method="dau1996")
+    k = np.tan(np.pi * 1000 / rate)
+    gain, pole = k / (1 + k), (1 - k) / (1 + k)
+    n = np.arange(rate // 10)
+    step = np.broadcast_to(1 - (1 - gain) * pole**n, (2, 1, len(n)))
+    np.testing.assert_allclose(stage.process(np.ones(step.shape)), step, rtol=0, atol=1e-13)
+    assert not InnerHairCell(rate, ihc_method="dau1996").process(-np.ones(step.shape)).any()
+    # fundamental of a rectified tone: half its amplitude, reduced by 1/sqrt(1 + (tan(pi f/rate) / k)**2)
+    for frequency in (500, 1000, 4000):
+        tone = np.exp(2j * np.pi * frequency * n / rate)
+        output = InnerHairCell(rate, ihc_method="dau1996").process(np.broadcast_to(tone.real, step.shape))[0, 0]
+        rectified = np.maximum(tone.real, 0)
+        measured = [abs(np.vdot(tone[len(n) // 2 :], x[len(n) // 2 :])) for x in (output, rectified)]
+        expected = 1 / np.sqrt(1 + (np.tan(np.pi * frequency / rate) / k) ** 2)
+        np.testing.assert_allclose(measured[0] / measured[1], expected, rtol=1e-9)
 
 
 def test_bernstein_without_envelope_is_silent() -> None:
@@ -307,7 +329,7 @@ RATE = 16000.0
 
 
 def frames_of(x: FloatArray, size: int, hop: int) -> FloatArray:
-    """(..., F, w), one by one."""
+    """Return the frames (..., F, w)."""
     starts = range(0, x.shape[-1] - size + 1, hop)
     return np.stack([x[..., s : s + size] for s in starts], axis=-2)
 
@@ -359,7 +381,7 @@ def test_lag_count_is_rounded_up_in_floating_point() -> None:
 
 
 def test_signs() -> None:
-    """A source on the right: the left ear is later and quieter, so lag and level difference are positive."""
+    """A source on the right: the left ear lags and is quieter, so lag and level difference are positive."""
     source = np.random.default_rng(3).standard_normal(2000)
     x = np.zeros((2, 1, 1900))
     x[0, 0], x[1, 0] = 0.5 * source[93:1993], source[100:2000]
@@ -380,5 +402,5 @@ def test_many_frames_go_in_batches(monkeypatch: pytest.MonkeyPatch) -> None:
     x = noise("crossCorrelation", 3000, channels=3)
     expected = CrossCorrelation(RATE).process(x)
     for batch in (1, 1000, 3000):
-        monkeypatch.setattr("rosafe.representations.crosscorrelation.BATCH", batch)
+        monkeypatch.setattr("rosafe.dsp.framing.BATCH", batch)
         np.testing.assert_allclose(CrossCorrelation(RATE).process(x), expected, rtol=0, atol=1e-14)

@@ -1,4 +1,4 @@
-"""The chain of bare stages against the reference vectors beside the checkout (../shared/vectors)."""
+"""The chain of stages against the reference vectors in ../shared/vectors."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def load(name: str) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
 
 
 def parameters(case: dict[str, Any]) -> dict[str, Any]:
-    """What the case was made with where it differs from the interface table's defaults."""
+    """Return the parameters of a case that differ from the defaults of the interface table."""
     return {"pp_bUnityComp": case["all_params"]["pp_bUnityComp"], **case["params"]}
 
 
@@ -58,7 +58,7 @@ def test_reference_vectors(name: str) -> None:
 def assert_reference(
     case: dict[str, Any], results: Mapping[str, NDArray[Any]], expected: Mapping[str, NDArray[Any]]
 ) -> None:
-    """Complete outputs of all stages, with `fb_cfHz` and `cc_lags`, agree with the reference's samples of them."""
+    """Compare complete outputs of all stages, `fb_cfHz` and `cc_lags` with the samples in the reference."""
     got = dict(results)
     times, channels = expected["time_idx"], expected["chan_idx"]
     got.update({kind: got[kind][:, times] for kind in ("input", "preProc")})
@@ -72,7 +72,7 @@ def assert_reference(
     np.testing.assert_allclose(got["fb_cfHz"], expected["cfHz"], rtol=0, atol=1e-9)
     np.testing.assert_allclose(got["cc_lags"], expected["lags"], rtol=1e-12, atol=1e-18)
 
-    # the reference's high-pass is the less exact one
+    # the high-pass of the reference is less accurate
     has_dc_filter = case["params"].get("pp_bRemoveDC", False)
     assert error("input").max() == 0
     assert error("preProc").max() <= (1e-5 if has_dc_filter else 1e-13) * np.abs(expected["preProc"]).max()
@@ -90,7 +90,7 @@ def assert_reference(
 
 
 def check_envelope_case(got: Mapping[str, FloatArray], expected: Mapping[str, NDArray[Any]]) -> None:
-    """The reference envelope is an FFT's over the whole signal: strong channels compare, away from the ends."""
+    """The envelope in the reference is from an FFT of the whole signal: compare strong channels, away from the ends."""
     inside = (expected["time_idx"] >= 1000) & (expected["time_idx"] < 17640 - 1000)
     error = np.abs(got["ihc"] - expected["ihc"])[..., inside] / expected["ihc"].max(axis=-1)[..., np.newaxis]
     level = 20 * np.log10(got["gammatone"].std(axis=-1))
@@ -99,7 +99,7 @@ def check_envelope_case(got: Mapping[str, FloatArray], expected: Mapping[str, ND
     assert error[level > -40].max() < 0.06
     assert (level > -20).sum() == 4
     assert error[level > -20].max() < 5e-4
-    strong = [1, 2, 3, 4]  # of all six channels: 20 dB within the strongest
+    strong = [1, 2, 3, 4]  # of all six channels: within 20 dB of the strongest
     assert np.abs(got["ild"] - expected["ild"])[strong, 3:-3].max() < 1e-3
     assert np.abs(got["crosscorrelation"] - expected["crosscorrelation"])[1:3, :, 3:-3].max() < 1e-5
     ratemap = np.abs(got["ratemap"] - expected["ratemap"])[:, strong, 3:-3]
@@ -107,7 +107,7 @@ def check_envelope_case(got: Mapping[str, FloatArray], expected: Mapping[str, ND
 
 
 def test_stage_by_stage() -> None:
-    """Fed with the reference's own input, a stage has nothing to blame on the ones before it."""
+    """With the input from the reference, errors of previous stages have no effect."""
     case, expected = load("P08_middleear_jepsen")
     fir = middle_ear_fir("jepsen", case["fs"], unity=False)
     np.testing.assert_allclose(fir, expected["me_fir"], rtol=0, atol=1e-14 * np.abs(fir).max())

@@ -1,4 +1,4 @@
-"""Fixtures: eltclsh as a command, and at a terminal, with a home folder of the test's own."""
+"""Fixtures: eltclsh as a command and on a terminal, with a temporary home folder."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Run = Callable[..., subprocess.CompletedProcess[str]]
 
 
 def environment(home: Path) -> dict[str, str]:
-    """What a user's shell without any set-up has."""
+    """Return the environment of a user without any set-up."""
     return {"PATH": "/usr/local/bin:/usr/bin:/bin", "HOME": str(home), "LANG": "C.UTF-8"} | {
         name: os.environ[name] for name in ("DISPLAY",) if name in os.environ
     }
@@ -24,7 +24,7 @@ def environment(home: Path) -> dict[str, str]:
 
 @pytest.fixture
 def home(tmp_path: Path) -> Path:
-    """A home folder."""
+    """Create a home folder."""
     folder = tmp_path / "home"
     folder.mkdir()
     return folder
@@ -32,7 +32,7 @@ def home(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def run(home: Path, tmp_path: Path) -> Run:
-    """Run a shell (eltclsh unless told another) with arguments to its end."""
+    """Return a function that runs a shell (eltclsh by default) and returns its result."""
 
     def run_shell(
         *arguments: str, shell: str = "eltclsh", stdin: str = "", **env: str
@@ -53,7 +53,7 @@ def run(home: Path, tmp_path: Path) -> Run:
 
 @pytest.fixture
 def terminal(home: Path) -> Iterator[Terminal]:
-    """eltclsh at its first prompt."""
-    with Terminal([str(harness.SCRIPTS / "eltclsh")], environment(home)) as this:
-        this.expect("eltclsh > ")
-        yield this
+    """Start eltclsh and wait for its prompt."""
+    with Terminal([str(harness.SCRIPTS / "eltclsh")], environment(home)) as started:
+        started.expect("eltclsh > ")
+        yield started

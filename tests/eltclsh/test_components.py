@@ -1,4 +1,4 @@
-"""The user's guide typed at the prompt of eltclsh, with real nodes: completion, questions, callbacks."""
+"""The user guide typed at the prompt of eltclsh, with real nodes: completion, questions, callbacks."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.ros
 
 @pytest.fixture
 def guide(tmp_path: Path) -> Iterator[Terminal]:
-    """eltclsh at its prompt, beside a genomixd with new nodes."""
+    """Start eltclsh and a genomixd with new nodes."""
     with worlds.world(tmp_path) as world:
         env = {**world.graph.env, "GENOMIXD": f"127.0.0.1:{world.port}"}
         with Terminal([str(harness.SCRIPTS / "eltclsh")], env) as terminal:
@@ -26,20 +26,21 @@ def guide(tmp_path: Path) -> Iterator[Terminal]:
 
 
 def test_the_guide_typed_at_the_prompt(guide: Terminal) -> None:
-    mistake = "::rosAFE::e_noSuchParameter\n"  # the input has no pp_bRemoveDC, as is told where nobody looks at it
-    shown = [guide.run(command).replace(f"rosAFE::modifyParameter &: {mistake}", "") for command in guide_commands()]
-    assert shown[:4] == ["1.8", "genomix1", "rosAFE", ""]
-    requests = shown[4:7] + shown[9:]
+    error = "::rosAFE::e_noSuchParameter\n"  # the input has no pp_bRemoveDC; printed because no command waits for it
+    outputs = [guide.run(command).replace(f"rosAFE::modifyParameter &: {error}", "") for command in guide_commands()]
+    assert outputs[:4] == ["1.8", "genomix1", "rosAFE", ""]
+    requests = outputs[4:7] + outputs[9:]
     assert requests == [f"::genomix::request{n}" for n in range(1, len(requests) + 1)]
-    assert shown[7:9] == ["", ""]
+    assert outputs[7:9] == ["", ""]
     assert guide.run("::genomix::request7 wait 10000").endswith("error")
-    assert guide.shown.count(mistake) <= 1
+    assert guide.shown.count(error) <= 1
     assert guide.run("::genomix::request8 wait 10000") == "done"
     assert guide.run("::genomix::request9 wait 10000") == "done"
     assert guide.run("::genomix::request8 result").startswith("parameters {input {0 {name input")
     assert guide.run("catch {::genomix::request7 result} e; dict get $e ex") == "::rosAFE::e_noSuchParameter"
     assert guide.run("::genomix::request9 result") == "dependencies {0 input 1 preProc 2 gammatone 3 ihc 4 ratemap}"
-    # removeProcessor takes the whole tree below preProc
+    # removeProcessor removes the whole tree below preProc
+    guide.run("::genomix::request10 wait 10000")  # there is no element dummyName; the error may be printed here
     guide.run("::genomix::request11 wait 10000")
     assert guide.run("rosAFE::getDependencies preProc") == (
         "ex ::rosAFE::e_noSuchProcessor what {there is no processor 'preProc'; there are: input}"
@@ -47,32 +48,32 @@ def test_the_guide_typed_at_the_prompt(guide: Terminal) -> None:
     assert guide.run("dict size [dict get [rosAFE::getParameters] parameters preProc]") == "0"
 
 
-def test_a_callback_comes_while_the_prompt_waits(guide: Terminal) -> None:
+def test_a_callback_runs_while_the_prompt_waits(guide: Terminal) -> None:
     guide.run("package require genomix; [genomix::connect] load bass")
-    guide.run('proc told {request} {puts "[$request status]: [catch {$request result} e] [dict get $e ex]"}')
-    guide.press("bass::Acquire {device none} & told\r")
+    guide.run('proc report {request} {puts "[$request status]: [catch {$request result} e] [dict get $e ex]"}')
+    guide.press("bass::Acquire {device none} & report\r")
     guide.expect("error: 1 ::bass::e_device\n")
 
 
-def test_an_error_in_the_background_is_told_once(guide: Terminal) -> None:
+def test_an_error_in_the_background_is_printed_once(guide: Terminal) -> None:
     guide.run("package require genomix; set g [genomix::connect]; $g load rosAFE; $g load bass")
-    guide.press("rosAFE::modifyParameter {nameProc nobody nameParam x newValue 1} &\r")
+    guide.press("rosAFE::modifyParameter {nameProc missing nameParam x newValue 1} &\r")
     guide.expect("\n::genomix::request1\n")
     guide.expect(
-        "rosAFE::modifyParameter &: ::rosAFE::e_noSuchProcessor: there is no processor 'nobody'; there are: none\n"
+        "rosAFE::modifyParameter &: ::rosAFE::e_noSuchProcessor: there is no processor 'missing'; there are: none\n"
     )
     guide.press("rosAFE::preProcPort dummyName &\r")
     guide.expect("preProcPort &: ::genom::no_such_outport: preProcPort has no element 'dummyName'; there are: none\n")
     assert guide.run("::genomix::request1 status") == "error"
-    guide.run("proc told {request} {puts told}")
-    assert guide.run("bass::Acquire {device none} & told") == "::genomix::request3"
-    guide.expect("told\n")
+    guide.run("proc report {request} {puts reported}")
+    assert guide.run("bass::Acquire {device none} & report") == "::genomix::request3"
+    guide.expect("reported\n")
     guide.run("set r [bass::Acquire {device none} &]; $r wait; catch {$r result}; after 1000 {set past 1}; vwait past")
     assert guide.shown.count(" &: ") == 2
     assert guide.shown.count("while executing") == 0
 
 
-def test_what_is_missing_is_asked_for(guide: Terminal) -> None:
+def test_missing_parameters_are_asked_for(guide: Terminal) -> None:
     guide.run("package require genomix; set g [genomix::connect]; $g load bass; $g load rosAFE")
     guide.press("rosAFE::connect_port\r")
     guide.expect("\nstring local: Name of this component's input port > ")
@@ -84,8 +85,8 @@ def test_what_is_missing_is_asked_for(guide: Terminal) -> None:
     guide.press("bass/Audio\r")
     guide.expect("eltclsh > ")
     guide.press("bass::Acquire &\r")
-    asked = guide.expect("(hw:1,0) > ")
-    assert "\nstring device: " in asked
+    question = guide.expect("(hw:1,0) > ")
+    assert "\nstring device: " in question
     guide.press("scene:\r")
     for name, answer in (("sampleRate", "22050"), ("nFramesPerChunk", ""), ("nChunksOnPort", "")):
         guide.expect(f"{name}: ")
@@ -93,9 +94,11 @@ def test_what_is_missing_is_asked_for(guide: Terminal) -> None:
         guide.press(f"{answer}\r")
     guide.expect("::genomix::request1\n")
     guide.expect("eltclsh > ")
-    guide.run("while {[dict get [bass::Audio] Audio sampleRate] == 0} {after 20}")  # it answers before it captures
+    guide.run(
+        "while {[dict get [bass::Audio] Audio sampleRate] == 0} {after 20}"
+    )  # Acquire returns before the capture starts
     assert guide.run("dict get [bass::Audio] Audio sampleRate") == "22050"
-    # Not asked: defaults by word, within a script or procedure, without parameters, or for help.
+    # No questions: with `--`, in a script or procedure, with an empty list, or for help.
     assert guide.run("rosAFE::InputProc --") == ""
     assert guide.run("proc f {} {rosAFE::PreProc}; f") == ""
     assert guide.run("rosAFE::GammatoneProc {}") == ""
@@ -103,8 +106,8 @@ def test_what_is_missing_is_asked_for(guide: Terminal) -> None:
     guide.run("set f [open ~/s.tcl w]; puts $f rosAFE::IhcProc; close $f")
     assert guide.run("source ~/s.tcl") == ""
     assert guide.run("dict size [dict get [rosAFE::getParameters] parameters ihc]") == "1"
-    guide.press("rosAFE::request\r")  # only for what has no default
-    guide.expect("\nstring representation: What is wanted, such as ild > ")
+    guide.press("rosAFE::request\r")  # asks only for parameters without a default
+    guide.expect("\nstring representation: The representation, such as ild > ")
     guide.press("ihc\r")
     assert "\nname ihc dependencies {0 input 1 preProc 2 gammatone 3 ihc} created {} " in guide.expect("eltclsh > ")
     guide.press("rosAFE::IldProc\r")
@@ -115,9 +118,9 @@ def test_what_is_missing_is_asked_for(guide: Terminal) -> None:
     assert guide.run("dict size [dict get [rosAFE::getParameters] parameters ild]") == "0"
 
 
-def test_tab_knows_what_a_component_takes(guide: Terminal) -> None:
+def test_tab_completes_the_parameters_of_components(guide: Terminal) -> None:
     guide.run("package require genomix; set g [genomix::connect]; $g load rosAFE")
-    for typed, shown in (
+    for typed, completed in (
         ("rosAFE::Gammat\tP", "rosAFE::Gammatone"),
         ("::rosAFE::getDep\t", "::rosAFE::getDependencies "),
         ("puts [rosAFE::getPar\t", "puts [rosAFE::getParameters "),
@@ -133,12 +136,12 @@ def test_tab_knows_what_a_component_takes(guide: Terminal) -> None:
         ("$g unl\t", "$g unload "),
     ):
         guide.press(typed)
-        guide.expect(shown)
+        guide.expect(completed)
         guide.press("\x15")
     guide.press("rosAFE::IhcProc \t\t")
-    shown = guide.expect("rosAFE::IhcProc {")
-    shown += guide.expect("rosAFE::IhcProc {")
-    assert "name" in shown and "upperDepName" in shown and "ihc_method" in shown
+    output = guide.expect("rosAFE::IhcProc {")
+    output += guide.expect("rosAFE::IhcProc {")
+    assert "name" in output and "upperDepName" in output and "ihc_method" in output
     guide.press("\x15rosAFE::IhcProc {name a \r upp\t")
     guide.expect("upperDepName ")
     guide.press("\x15}\r")

@@ -1,4 +1,4 @@
-"""elwish: eltclsh with Tk, on a display of the test's own."""
+"""elwish: eltclsh with Tk, on a virtual display."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.terminal import Terminal
 
 @pytest.fixture
 def display(home: Path) -> Iterator[str]:
-    """The name of a display that shows nothing to anybody."""
+    """Start a virtual display and return its name."""
     if shutil.which("Xvfb") is None:
         pytest.skip("Xvfb is not installed; scripts/install --tests brings it")
     command = ["Xvfb", "-displayfd", "1", "-nolisten", "tcp", "-screen", "0", "640x480x24"]
@@ -23,7 +23,7 @@ def display(home: Path) -> Iterator[str]:
         yield ":" + harness.wait_for(lambda: server.out.strip(), what=lambda: f"a display of {server}")
 
 
-def test_without_a_display_it_says_so(run: Run) -> None:
+def test_a_missing_display_is_reported(run: Run) -> None:
     done = run(shell="elwish", stdin="puts here\n", DISPLAY="")
     assert (done.returncode, done.stdout) == (1, "")
     assert done.stderr == 'elwish: couldn\'t connect to display ""\n'
@@ -43,7 +43,7 @@ def test_a_script_with_tk(run: Run, home: Path, tmp_path: Path, display: str) ->
     assert done.returncode == 3
 
 
-def test_windows_live_while_the_prompt_waits(home: Path, display: str) -> None:
+def test_window_events_are_processed_while_the_prompt_waits(home: Path, display: str) -> None:
     env = {**environment(home), "DISPLAY": display}
     with Terminal([str(harness.SCRIPTS / "elwish")], env) as terminal:
         terminal.expect("elwish > ")

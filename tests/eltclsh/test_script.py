@@ -1,4 +1,4 @@
-"""eltclsh without a terminal: a script runs as it does under tclsh, arguments and ends included."""
+"""eltclsh without a terminal: scripts run as with tclsh, including arguments and exit codes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests import harness
 from tests.eltclsh.conftest import Run, environment
 from tests.harness import PATIENCE
 
-# Each is run by both shells, which must print, fail and end alike.
+# Both shells run each of these; output, errors and exit code must be equal.
 SCRIPTS = {
     "arguments": "puts [list $argv $argc $argv0 $tcl_interactive [info script] [info level] [info frame]]",
     "levels": 'proc f {} {uplevel 1 {set x 1}; return [info level]}\nputs "[f] $x [info exists x]"',
@@ -44,7 +44,7 @@ SCRIPTS = {
 
 
 @pytest.mark.parametrize("name", SCRIPTS)
-def test_a_script_runs_as_under_tclsh(run: Run, tmp_path: Path, name: str) -> None:
+def test_a_script_runs_as_with_tclsh(run: Run, tmp_path: Path, name: str) -> None:
     script = tmp_path / "script.tcl"
     script.write_text(SCRIPTS[name] + "\n", "utf-8")
     results = []
@@ -68,7 +68,7 @@ def test_a_script_runs_as_under_tclsh(run: Run, tmp_path: Path, name: str) -> No
         "",
     ],
 )
-def test_piped_commands_run_as_under_tclsh(run: Run, typed: str) -> None:
+def test_piped_commands_run_as_with_tclsh(run: Run, typed: str) -> None:
     expected, done = (run(shell=shell, stdin=typed) for shell in ("tclsh", "eltclsh"))
     assert (done.stdout, done.stderr, done.returncode) == (expected.stdout, expected.stderr, expected.returncode)
 
@@ -108,7 +108,7 @@ def test_packages_are_found_without_any_set_up(run: Run, tmp_path: Path) -> None
     assert "ELTCLLIBPATH: unmatched open brace" in run("script.tcl", ELTCLLIBPATH="{").stderr
 
 
-def test_the_rc_file_is_run_first_also_for_scripts(run: Run, home: Path, tmp_path: Path) -> None:
+def test_the_rc_file_runs_before_scripts(run: Run, home: Path, tmp_path: Path) -> None:
     (home / ".eltclshrc").write_text("set greeting hello\n")
     (tmp_path / "script.tcl").write_text("puts $greeting")
     assert run("script.tcl").stdout == "hello\n"
@@ -170,20 +170,20 @@ red
     ]
 
 
-def test_interactive_in_a_script_reads_the_rest_from_stdin(run: Run, tmp_path: Path) -> None:
+def test_interactive_in_a_script_reads_commands_from_stdin(run: Run, tmp_path: Path) -> None:
     (tmp_path / "script.tcl").write_text("proc f {} {set hidden 1; interactive}\nset seen 1\nf\nputs after\n")
     done = run("script.tcl", stdin="puts [info exists seen][info exists hidden]\n")
     assert done.stdout == "10\nafter\n"
 
 
-def test_signals_in_a_script_that_is_busy(run: Run, tmp_path: Path) -> None:
+def test_signals_in_a_busy_script(run: Run, tmp_path: Path) -> None:
     (tmp_path / "script.tcl").write_text(
-        "set got {}\nsignal USR1 {lappend got [info level]; error told}\nexec kill -USR1 [pid]\n"
+        "set got {}\nsignal USR1 {lappend got [info level]; error reported}\nexec kill -USR1 [pid]\n"
         "while {![llength $got]} {}\nputs got:$got\nafter 1 {after idle {set end 1}}\nvwait end\n"
     )
     done = run("script.tcl")
     assert done.stdout == "got:0\n"
-    assert done.stderr.startswith("told\n    while executing")
+    assert done.stderr.startswith("reported\n    while executing")
 
 
 def test_ctrl_c_ends_a_script(home: Path, tmp_path: Path) -> None:

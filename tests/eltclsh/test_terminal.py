@@ -1,4 +1,4 @@
-"""A session at a terminal: what is typed, what is shown, and what the keys do."""
+"""Sessions on a terminal: input, output and keys."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def test_banner_prompt_results_and_errors(home: Path) -> None:
         assert terminal.run("list") == ""
         assert terminal.run("list $tcl_interactive $argc [file tail $argv0] [info level]") == "1 0 eltclsh 0"
         assert terminal.run("return done; error not") == "done"
-        assert terminal.run("!!") == "return done; error not\ndone"  # of Tcl's own history
+        assert terminal.run("!!") == "return done; error not\ndone"  # from the history of Tcl
         terminal.press("exit 3\r")
         assert terminal.end() == 3
 
@@ -36,7 +36,7 @@ def test_commands_of_several_lines(terminal: Terminal) -> None:
     terminal.expect("\n: ")
     terminal.run("}")
     assert terminal.run("f") == "5"
-    terminal.press("\x1b[A\x1b[A")  # the whole of it comes back with the arrow key
+    terminal.press("\x1b[A\x1b[A")  # the arrow key recalls all its lines
     terminal.expect("return 5")
     terminal.press("\x05\r")
     terminal.expect("eltclsh > ")
@@ -64,7 +64,7 @@ def test_events_are_served_while_the_prompt_waits(terminal: Terminal) -> None:
     terminal.expect("got it")
     terminal.press("\r")
     terminal.expect("eltclsh > ")
-    # A question in between, after which the line goes on that was being typed.
+    # A question interrupts the line that is being typed, which is continued afterwards.
     terminal.run("set pipe [open {|sh -c {read x; echo $x}} r+]; fconfigure $pipe -buffering line")
     terminal.run("fileevent $pipe readable {gets $pipe name; close $pipe; set answer [el::gets $name]}")
     terminal.run("after 300 {puts $pipe sure?}")
@@ -80,7 +80,7 @@ def test_events_are_served_while_the_prompt_waits(terminal: Terminal) -> None:
     assert terminal.end() == 6
 
 
-def test_history_is_kept_from_one_session_to_the_next(home: Path) -> None:
+def test_the_history_is_saved_between_sessions(home: Path) -> None:
     entries = ["set x {a\n\tb}", "puts {\\ \u00e9 # \u4e2d}", "last"]
     assert decode(encode(entries)) == entries
     assert decode("plain\nlines\n") == ["plain", "lines"]
@@ -98,6 +98,7 @@ def test_history_is_kept_from_one_session_to_the_next(home: Path) -> None:
         terminal.expect("2\neltclsh > ")
         terminal.press("\x04")
         assert terminal.end() == 0
+    assert (home / ".eltclhistory").stat().st_mode & 0o777 == 0o600
     kept = decode((home / ".eltclhistory").read_text())
     assert len(kept) == 800
     assert kept[-1] == "set new 2"
@@ -107,6 +108,9 @@ def test_history_is_kept_from_one_session_to_the_next(home: Path) -> None:
         terminal.run("el::history file /absent/file")
         assert terminal.run("el::history save") == "/absent/file: No such file or directory"
         assert terminal.run("set errorCode") == "POSIX 2 {No such file or directory}"
+        terminal.run("el::history file /dev/null")
+        assert terminal.run("el::history save") == "/dev/null: /dev/null is not a regular file"
+        terminal.run("el::history file /absent/file")
         terminal.press("exit\r")
         assert "the history is not saved" in terminal.expect("/absent/file'")
         assert terminal.end() == 0
@@ -119,7 +123,7 @@ def test_ctrl_c_while_a_command_runs(terminal: Terminal) -> None:
         terminal.expect("begun\n")
         terminal.press("\x03")
         terminal.expect(QUESTION)
-        terminal.press("x1")  # goes on
+        terminal.press("x1")  # continues
         terminal.expect("> 1\n")
         terminal.press("\x03")
         terminal.expect(QUESTION)
@@ -175,7 +179,7 @@ def test_signals_of_the_user(terminal: Terminal) -> None:
     terminal.expect("bad\n")
 
 
-def test_answers_typed_for_the_original_procedures(terminal: Terminal) -> None:
+def test_answers_for_the_procedures_of_the_original(terminal: Terminal) -> None:
     terminal.press("aska int number 4\r")
     terminal.expect("number [4]> ")
     terminal.press("x\r")
@@ -203,7 +207,7 @@ def test_tab_completes(terminal: Terminal, home: Path) -> None:
     (home / "some.tcl").write_text("")
     terminal.run("namespace eval deep::inner {proc command {} {}}; set deep::value 1; array set robots {first 1}")
     terminal.run("oo::class create Robot {method walk {} {}}; Robot create r2; set handle r2")
-    for typed, shown in (
+    for typed, completed in (
         ("lappe\t", "lappend "),
         ("dee\tin\tco\t", "deep::inner::command "),
         ("::dee\tin\tco\t", "::deep::inner::command "),
@@ -222,7 +226,7 @@ def test_tab_completes(terminal: Terminal, home: Path) -> None:
         ("flush std\te\t", "flush stderr "),
     ):
         terminal.press(typed)
-        terminal.expect(shown)
+        terminal.expect(completed)
         terminal.press("\x15")
     terminal.press("lre\t")
     shown = terminal.expect("eltclsh > lre")
@@ -233,9 +237,13 @@ def test_tab_completes(terminal: Terminal, home: Path) -> None:
     terminal.expect("Display all 3 possibilities? (y or n)")
     terminal.press("n\x15mine al\t")
     terminal.expect("mine alpha ")
+    terminal.press("\x15")
+    terminal.run("lappend el::completionPatterns {^part$ {C , {first second}}}; list")  # after the last match
+    terminal.press("part first,x,se\t")
+    terminal.expect("part first,x,second ")
 
 
-def test_the_terminal_is_given_back(home: Path) -> None:
+def test_the_terminal_is_restored(home: Path) -> None:
     with Terminal(["/bin/sh"], {**environment(home), "PS1": "sh$ "}) as terminal:
         terminal.expect("sh$ ")
         before = terminal.run("stty -a", "sh$ ")
@@ -249,7 +257,7 @@ def test_the_terminal_is_given_back(home: Path) -> None:
         terminal.run("close stdin", "sh$ ")
 
 
-def test_a_script_may_drop_to_the_prompt(home: Path, tmp_path: Path) -> None:
+def test_a_script_can_start_the_prompt(home: Path, tmp_path: Path) -> None:
     script = tmp_path / "script.tcl"
     script.write_text("set mine 1\nputs $tcl_interactive\nproc f {} {interactive}\nf\nputs after\nexit 2\n")
     with Terminal([ELTCLSH, str(script)], environment(home)) as terminal:

@@ -1,9 +1,9 @@
-"""What a hostile client can do to a genomixd by HTTP: recipes for tests and for the soak, each with a port to attack.
+"""Attacks of hostile HTTP clients on genomixd, for tests and the soak; each takes the port to attack.
 
     with attacks.half_requests(port):
-        ...  # genomixd must serve others now
+        ...  # genomixd must serve other clients now
 
-All that they open is closed at the end of the ``with`` block.
+All their connections are closed at the end of the ``with`` block.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ GET = "GET {} HTTP/1.1\r\nHost: localhost\r\n\r\n"
 
 @contextlib.contextmanager
 def crowd(port: int, count: int, sent: bytes = b"", host: str = "127.0.0.1") -> Iterator[list[socket.socket]]:
-    """`count` connections that each have `sent` something, and read nothing."""
+    """Open `count` connections that each have `sent` some bytes and read nothing."""
     _, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (hard, hard))
     with contextlib.ExitStack() as stack:
@@ -34,7 +34,7 @@ def crowd(port: int, count: int, sent: bytes = b"", host: str = "127.0.0.1") -> 
             connection.bind((host, 0))
             connection.settimeout(20)
             connection.connect(("127.0.0.1", port))
-            with contextlib.suppress(ConnectionError):  # thrown out already
+            with contextlib.suppress(ConnectionError):  # already disconnected
                 connection.sendall(sent)
             sockets.append(connection)
         yield sockets
@@ -62,17 +62,17 @@ def bodies(port: int, count: int = 100) -> contextlib.AbstractContextManager[lis
 
 
 def listeners(port: int, count: int = 2000) -> contextlib.AbstractContextManager[list[socket.socket]]:
-    """Connections that each listen to the events of a session of their own... of eight, as more may not be."""
+    """Connections that listen to events, eight for each session, which is the maximum."""
     return _one_by_one(port, [f"/session/listen?s=listener{number // 8}" for number in range(count)])
 
 
 def unread_answers(port: int, url: str, count: int = 200) -> contextlib.AbstractContextManager[list[socket.socket]]:
-    """Large answers that nobody takes."""
+    """Request large answers and do not read them."""
     return crowd(port, count, GET.format(url).encode())
 
 
 def absent_loads(port: int, count: int = 200) -> contextlib.AbstractContextManager[list[socket.socket]]:
-    """Loads of as many components that there are none of."""
+    """Request to load that number of components that do not exist."""
     return _one_by_one(port, [f"/load/absent{number}" for number in range(count)])
 
 
@@ -87,7 +87,7 @@ def _one_by_one(port: int, urls: list[str]) -> Iterator[list[socket.socket]]:
 
 @contextlib.contextmanager
 def pipelined(port: int, count: int = 1_000_000, seconds: float = 20.0) -> Iterator[int]:
-    """One connection that sends so many requests and reads no answer; how many requests it got rid of."""
+    """Send up to that number of requests on one connection without reading; return the number that was sent."""
     request = GET.format("/components").encode()
     block = memoryview(request * 1000)
     end = time.monotonic() + seconds
@@ -96,7 +96,7 @@ def pipelined(port: int, count: int = 1_000_000, seconds: float = 20.0) -> Itera
         sent = 0
         while sent < count * len(request) and time.monotonic() < end:
             if not select.select((), (connection,), (), 2.0)[1]:
-                break  # nobody reads any more
+                break  # the server has stopped reading
             try:
                 sent += connection.send(block[sent % len(request) :])
             except ConnectionError:
@@ -105,7 +105,7 @@ def pipelined(port: int, count: int = 1_000_000, seconds: float = 20.0) -> Itera
 
 
 def named_sessions(port: int, count: int = 999) -> None:
-    """Sessions that one client begins, each of another name, and leaves alone."""
+    """Start sessions with different names, and abandon them."""
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=90)
     for number in range(count):
         connection.request("GET", f"/session/start?s=attack{number}")
@@ -114,7 +114,7 @@ def named_sessions(port: int, count: int = 999) -> None:
 
 
 def surrogates(port: int) -> list[int]:
-    """Half a surrogate pair, and bytes that are no UTF-8, wherever there may be a text; the statuses of the answers."""
+    """Send unpaired surrogates and invalid UTF-8 in place of every text; return the statuses of the answers."""
     half, bad = quote('"\\ud800"'), "%ED%A0%80"
     urls = [
         f"/call/rosAFE/getDependencies?input=[{half}]",

@@ -1,4 +1,4 @@
-"""Fixtures: a world with nodes that the tests of a module share, and one of a test's own for those that break it."""
+"""Fixtures: a world with nodes that the tests of a module share, and private ones for tests that break theirs."""
 
 from __future__ import annotations
 
@@ -26,6 +26,6 @@ def world(shared_world: worlds.World) -> Iterator[worlds.World]:
 
 @pytest.fixture
 def empty_world(tmp_path: Path) -> Iterator[worlds.World]:
-    """A world of the test's own, without components."""
+    """A private world without components."""
     with worlds.world(tmp_path, nodes=False) as world:
         yield world

@@ -1,4 +1,4 @@
-"""Goals of activities where the graph is slow: when they are sent, and what becomes of those that nobody answers."""
+"""Goals of activities on a slow graph: the time of sending, and goals without an answer."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rosafe.interface import ComponentError
 
 
 class Topic:
-    """A publisher or subscriber of rospy, with as many connections as it is told."""
+    """A publisher or subscriber of rospy with a given number of connections."""
 
     def __init__(self) -> None:
         self.connections = 0
@@ -38,7 +38,7 @@ class Action:
         client._subscribers += topics[2:]
 
     def accept(self) -> None:
-        """Tell what an action server tells of a goal that runs."""
+        """Publish the status that an action server publishes for a running goal."""
         from actionlib_msgs.msg import GoalStatus, GoalStatusArray
 
         status = GoalStatus(status=GoalStatus.ACTIVE)
@@ -58,8 +58,8 @@ def run(test: Callable[[Action], Awaitable[None]]) -> None:
 
 
 @pytest.mark.parametrize("missing", ["goal", "result", "status"])
-def test_a_goal_is_sent_once_the_way_back_is_there(monkeypatch: pytest.MonkeyPatch, missing: str) -> None:
-    """A result is sent once: it would be lost on who is not connected to it yet."""
+def test_a_goal_is_sent_when_its_result_can_be_received(monkeypatch: pytest.MonkeyPatch, missing: str) -> None:
+    """A result is sent once: a client that is not connected yet would miss it."""
     monkeypatch.setattr(actions, "REPEAT_SECONDS", 0.01)
 
     async def check(action: Action) -> None:
@@ -82,7 +82,7 @@ def test_a_goal_is_sent_once_the_way_back_is_there(monkeypatch: pytest.MonkeyPat
     run(check)
 
 
-def test_a_goal_that_nobody_answers_is_cancelled(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_goal_without_an_answer_is_cancelled(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(actions, "ANSWER_SECONDS", 0.1)
 
     async def check(action: Action) -> None:
@@ -91,6 +91,6 @@ def test_a_goal_that_nobody_answers_is_cancelled(monkeypatch: pytest.MonkeyPatch
         with pytest.raises(ComponentError, match=r"bass did not answer /bass/Acquire within 0\.1 s"):
             await action.client.send({"device": "scene:"})
         assert action.cancel.sent[0].id == action.goal.sent[0].goal_id.id
-        assert action.client.goals() == []
+        assert action.client.goals == {}
 
     run(check)

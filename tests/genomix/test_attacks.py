@@ -1,4 +1,4 @@
-"""Attacks from another process on a live genomixd: others are served meanwhile, and afterwards all is as before."""
+"""Attacks on a running genomixd: other clients are served meanwhile, and its resources are released afterwards."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ pytestmark = pytest.mark.ros
 SOON = 10.0  # s; on a machine with nothing else to do it is well below 1 s
 MUCH = 150  # MB that an attack may take
 
-# genomixd with little patience and little memory.
+# genomixd with short time limits and little memory.
 HASTY = """
 import sys
 from dataclasses import replace
@@ -47,7 +47,7 @@ sys.exit(daemon.main(["-v", "-p", "0"]))
 
 
 def served(world: World) -> None:
-    """A client by HTTP and one in Tcl, both new, get what they ask for, and soon."""
+    """A new HTTP client and a new Tcl client are served quickly."""
     begin = time.monotonic()
     assert list(world.http.call("rosAFE/getParameters", s=f"fresh{begin}")) == ["parameters"]
     script = "set g [genomix::connect $address]; $g load rosAFE; show [dict keys [rosAFE::getParameters]]"
@@ -57,7 +57,7 @@ def served(world: World) -> None:
 
 @contextmanager
 def hasty(world: World) -> Iterator[World]:
-    """The world with a genomixd of little patience."""
+    """The world, with a genomixd that has short time limits."""
     code = f"import sys; sys.path.insert(0, {str(harness.ROOT)!r}){HASTY}"
     with world.graph.start(harness.PYTHON, "-c", code) as server:
         yield World(world.graph, world.master, server, worlds.port_of(server))
@@ -71,21 +71,21 @@ Crowd = Callable[[int], AbstractContextManager[list[socket.socket]]]
 @pytest.mark.parametrize(
     "crowd", [attacks.half_requests, attacks.silence, attacks.long_halves, attacks.bodies, attacks.listeners]
 )
-def test_a_crowd_keeps_nobody_out(world: World, crowd: Crowd) -> None:
+def test_a_crowd_does_not_lock_out_other_clients(world: World, crowd: Crowd) -> None:
     served(world)
     pid = world.server.pid
     files, memory = open_files(pid), resident(pid)
     with crowd(world.port):
         assert resident(pid) < memory + MUCH
-        harness.wait_for(lambda: world.http.raw("/components")[0] == 200, SOON)  # once the last of them is looked at
+        harness.wait_for(lambda: world.http.raw("/components")[0] == 200, SOON)  # when the last one is processed
         served(world)
     served(world)
     most = files + LINKS  # connections to the components, which it has loaded meanwhile
     harness.wait_for(lambda: open_files(pid) <= most, SOON, lambda: f"{open_files(pid)} files, {files} before")
 
 
-def test_a_client_that_was_idle_meanwhile_goes_on(world: World) -> None:
-    """Its connection goes for others, and it makes a new one; the one on which it hears of events stays."""
+def test_an_idle_client_continues_afterwards(world: World) -> None:
+    """Its connection is closed for other clients and it opens a new one; its event connection remains open."""
     go = world.graph.home / "go"
     script = world.graph.home / "idle.tcl"
     script.write_text(f"""
@@ -111,7 +111,7 @@ def test_a_client_that_was_idle_meanwhile_goes_on(world: World) -> None:
     assert 1 <= told < 10  # once a minute
 
 
-def test_answers_that_nobody_reads_stop_the_requests(world: World) -> None:
+def test_unread_answers_stop_the_requests(world: World) -> None:
     memory = resident(world.server.pid)
     with attacks.pipelined(world.port) as sent:
         assert sent < 500_000  # some wait in the kernel
@@ -121,7 +121,7 @@ def test_answers_that_nobody_reads_stop_the_requests(world: World) -> None:
 
 
 def test_pipelined_requests_are_answered_in_order(world: World) -> None:
-    """Those that wait are not forgotten, nor what comes in pieces; empty lines before a request do not count."""
+    """Queued and fragmented requests are answered; empty lines before a request are ignored."""
     names = [f"p{number}" for number in range(3000)]
     urls = [f"/session/start?s={name}" for name in names[:900]] + [f"/nothing/{name}" for name in names[900:]]
     sent = b"".join(b"\r\n" + attacks.GET.format(url).encode() for url in urls)
@@ -137,7 +137,7 @@ def test_pipelined_requests_are_answered_in_order(world: World) -> None:
 
 
 @pytest.mark.parametrize("sent", ["", "GET /components HTTP/1.1\r\nHo", "G"])
-def test_a_request_that_does_not_come_to_an_end(world: World, sent: str) -> None:
+def test_a_request_without_an_end(world: World, sent: str) -> None:
     with hasty(world) as other:
         # At once, and on a connection that was used before.
         with socket.create_connection(("127.0.0.1", other.port), timeout=90) as connection:
@@ -154,8 +154,8 @@ def test_a_request_that_does_not_come_to_an_end(world: World, sent: str) -> None
             assert used.sock.recv(1000).startswith(b"HTTP/1.1 408 ")
 
 
-def test_a_request_that_comes_drop_by_drop(world: World) -> None:
-    """It is the whole that has to come in time."""
+def test_a_request_that_arrives_byte_by_byte(world: World) -> None:
+    """The time limit applies to the complete request."""
     with hasty(world) as other, socket.create_connection(("127.0.0.1", other.port), timeout=90) as connection:
         connection.sendall(b"GET /components HTTP/1.1\r\nHost: localhost\r\nX: ")
         end = time.monotonic() + 20
@@ -191,8 +191,8 @@ def test_requests_have_no_body(world: World, sent: bytes, status: int) -> None:
 # --- answers ----------------------------------------------------------------------------------------------------
 
 
-def test_answers_that_nobody_takes_are_dropped(world: World) -> None:
-    """They make room for others at once where the memory is short, and go after a while in any case."""
+def test_unread_answers_are_dropped(world: World) -> None:
+    """They are dropped immediately if the memory is needed, and otherwise after a time limit."""
     start_tree(world.http)
     url = "/call/rosAFE/getSignals"
     harness.wait_for(lambda: len(world.http.raw(url)[1]) > 10_000)
@@ -200,16 +200,16 @@ def test_answers_that_nobody_takes_are_dropped(world: World) -> None:
         pid = other.server.pid
         files, memory = open_files(pid), resident(pid)
         port = "/call/rosAFE/gammatonePort/gammatone?syntax=packed"
-        with attacks.unread_answers(other.port, port, 100) as unread:  # they share what they get
+        with attacks.unread_answers(other.port, port, 100) as unread:  # they share one answer
             for connection in unread:
                 assert select.select((connection,), (), (), 30)[0]
             assert resident(pid) < memory + 2 * MUCH
             assert other.http.raw("/components")[0] == 200
-            # All of them go; those to the component stay.
+            # All of them are closed; the connections to the component remain.
             harness.wait_for(lambda: open_files(pid) < files + LINKS, SOON, lambda: f"{open_files(pid)} files")
 
 
-def test_answers_together_are_bounded() -> None:
+def test_the_total_size_of_answers_is_limited() -> None:
     every = connections_with(max_answers=100)
     one, two, three = (Fake(every) for _ in range(3))
     samples = object(), object(), object()
@@ -217,7 +217,7 @@ def test_answers_together_are_bounded() -> None:
     def taken(client: Fake, number: int, size: int) -> AbstractContextManager[None]:
         return every.reading_answer(client, samples[number], size)  # type: ignore[arg-type]
 
-    with taken(one, 0, 1000):  # one that is too large by itself is nobody's concern while it is alone
+    with taken(one, 0, 1000):  # a single answer may be too large while it is the only one
         with pytest.raises(HttpRefusal, match="clients are reading"), taken(two, 1, 1):
             pass
         with taken(two, 0, 1000):  # the same data
@@ -256,7 +256,7 @@ class Fake:
         self.every.forget(self)  # type: ignore[arg-type]
 
 
-# --- who goes ---------------------------------------------------------------------------------------------------
+# --- which connections are closed -------------------------------------------------------------------------------------
 
 
 class Room:
@@ -266,7 +266,7 @@ class Room:
         self.every = connections_with(max_connections=8)
 
     def come(self, address: str, busy: bool = False) -> Fake | None:
-        """A new connection, None where it is refused."""
+        """Return a new connection, None if it is rejected."""
         new = Fake(self.every)
         connection = cast(HttpConnection, new)
         account = self.every.admit(connection, address)
@@ -278,26 +278,26 @@ class Room:
         return new
 
     def authenticate(self, one: Fake | None) -> None:
-        """A connection has shown the token, and waits for its next request."""
+        """An authenticated connection waits for its next request."""
         assert one is not None
         connection = cast(HttpConnection, one)
         del one.account.silent[connection]
         one.account.idle[connection] = None
 
 
-def test_who_waits_longest_goes_first() -> None:
+def test_the_longest_idle_connection_is_closed_first() -> None:
     server = Room()
     mine = [server.come("me") for _ in range(2)]
     crowd = [server.come("crowd", busy=number == 0) for number in range(10)]
-    # Six of the crowd had to go, but not the one that is served, and nobody else.
+    # Six connections of the crowd were closed, but not the one in use, and none of other clients.
     assert [one.dropped for one in crowd if one] == [False] + [True] * 6 + [False] * 3
     others = [server.come("other") for _ in range(2)]  # now it is full
-    assert server.come("third") is not None  # for one of those who have most
+    assert server.come("third") is not None  # one of the client with most connections is closed
     assert [one.dropped for one in crowd[7:] if one] == [True, False, False]
     assert not any(one.dropped for one in (*mine, *others) if one)
 
 
-def test_who_is_served_stays() -> None:
+def test_a_connection_in_use_is_not_closed() -> None:
     server = Room()
     assert all(server.come("crowd", busy=True) for _ in range(4))
     assert server.come("crowd") is None
@@ -305,10 +305,10 @@ def test_who_is_served_stays() -> None:
     last = server.come("more")
     assert server.come("me") is not None
     assert last is not None and last.dropped
-    assert server.come("you") is not None  # for the one before, which waits
+    assert server.come("you") is not None  # of the previous one, which waits
 
 
-def test_authenticated_connections_go_last() -> None:
+def test_authenticated_connections_are_closed_last() -> None:
     server = Room()
     owner = [server.come("loopback") for _ in range(2)]
     for one in owner:
@@ -343,19 +343,19 @@ def test_addresses_of_one_client(one: str, other: str, same: bool) -> None:
 # --- sessions and loads -----------------------------------------------------------------------------------------
 
 
-def test_many_sessions_keep_nobody_out(world: World) -> None:
+def test_many_sessions_do_not_lock_out_other_clients(world: World) -> None:
     world.http.get("/load/bass", s="mine")
     with world.http.listening(s="mine") as events:
         number = world.http.send("bass/Acquire", {"device": "scene:"}, s="mine", ack=1)
         assert next(events)[0] == "request"
         attacks.named_sessions(world.port, 2000)
         served(world)
-        assert world.http.status(number, s="mine")["status"] == "sent"  # somebody listens there
+        assert world.http.status(number, s="mine")["status"] == "sent"  # it has a listener
     world.http.call("bass/Stop")
 
 
-def test_absent_components_hold_up_no_load(world: World) -> None:
-    """200 of them took 50 s."""
+def test_absent_components_do_not_delay_load(world: World) -> None:
+    """Before they were limited, 200 of them took 50 s."""
     with world.graph.node("bass-ros", "-i", "waited"), attacks.absent_loads(world.port) as waiting:
         begin = time.monotonic()
         assert world.http.get("/load/bass", i="waited")["instance"] == "waited"
@@ -366,7 +366,7 @@ def test_absent_components_hold_up_no_load(world: World) -> None:
 
 
 def test_many_names_for_one_component(world: World) -> None:
-    """A session's names for components go, the oldest first; an instance is found again by its own."""
+    """The oldest component names of a session are dropped; an instance is found again by its own name."""
     for number in range(70):
         world.http.get("/load/bass", s="names", **{"as": f"x{number}"})
     loaded = world.http.get("/components", s="names")
@@ -376,7 +376,7 @@ def test_many_names_for_one_component(world: World) -> None:
 
 
 def test_waiting_clients_that_vanish_are_forgotten(world: World) -> None:
-    """Their requests wait for an hour else, and take the place of others."""
+    """Their requests would otherwise wait for an hour and occupy connections."""
     number = world.http.send("bass/Acquire", {"device": "scene:"}, ack=1)
 
     async def wait_and_vanish() -> None:
@@ -395,7 +395,7 @@ def test_waiting_clients_that_vanish_are_forgotten(world: World) -> None:
     asyncio.run(wait_and_vanish())
 
     def listening() -> bool:
-        with suppress(AssertionError), world.http.listening(s="t"):  # refused while they take all places
+        with suppress(AssertionError), world.http.listening(s="t"):  # rejected while they occupy all connections
             return True
         return False
 
@@ -407,10 +407,10 @@ def test_waiting_clients_that_vanish_are_forgotten(world: World) -> None:
 # --- texts ------------------------------------------------------------------------------------------------------
 
 
-def test_half_a_surrogate_pair_is_refused_everywhere(world: World) -> None:
+def test_unpaired_surrogates_are_rejected_everywhere(world: World) -> None:
     assert set(attacks.surrogates(world.port)) == {400}
     assert "Traceback" not in world.server.err
-    told = "GENOM ::genom::serialization {what {the URL is not UTF-8}}"
+    told = "GENOM ::genom::serialization {what {URL: expected UTF-8}}"
     script = r"""
         set g [genomix::connect $address]
         $g load rosAFE
@@ -422,6 +422,6 @@ def test_half_a_surrogate_pair_is_refused_everywhere(world: World) -> None:
     command = ("sh", "-c", r"""rosafe request ild --connect "$(printf '\355\240\200')" """)
     done = world.graph.run(*command, check=False)
     assert done.returncode == 1 and "Traceback" not in done.stderr and done.stderr.count("\n") == 1
-    with pytest.raises(HttpError, match="half a surrogate pair is no character"):
+    with pytest.raises(HttpError, match="contains an unpaired UTF-16 surrogate"):
         world.http.call("bass/Acquire", ["\ud800"])
     served(world)

@@ -1,4 +1,4 @@
-"""Many clients, bad clients, and clients that vanish: genomixd serves the others and keeps nothing."""
+"""Many, invalid and disappearing clients: genomixd serves the others and releases all resources."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ pytestmark = pytest.mark.ros
     ],
     ids=str,
 )
-def test_no_web_page_drives_a_robot(world: World, headers: dict[str, str]) -> None:
+def test_requests_from_web_pages_are_rejected(world: World, headers: dict[str, str]) -> None:
     for url in ("/call/bass/Acquire?input=%5B%22scene:%22%5D", "/session/listen?s=x", "/session/stop?s=x", "/none"):
         status, body = world.http.raw(url, headers=headers)
         assert (status, json.loads(body)["ex"]) == (403, "::genomix::e_forbidden")
@@ -50,7 +50,7 @@ def test_no_web_page_drives_a_robot(world: World, headers: dict[str, str]) -> No
 @pytest.mark.parametrize(
     "host", ["localhost", "LOCALHOST:80", "127.0.0.1", "[::1]:8080", "10.1.2.3", socket.gethostname()]
 )
-def test_names_of_this_machine_are_fine(world: World, host: str) -> None:
+def test_names_of_this_machine_are_accepted(world: World, host: str) -> None:
     assert world.http.raw("/components", headers={"Host": host})[0] == 200
 
 
@@ -64,7 +64,7 @@ def test_only_get(world: World, method: str) -> None:
 # --- sizes and counts -------------------------------------------------------------------------------------------
 
 
-def test_the_longest_list_fits_and_larger_ones_are_refused(world: World) -> None:
+def test_the_longest_list_is_accepted_and_longer_ones_are_rejected(world: World) -> None:
     start_tree(world.http)
     longest = [100 + 0.123456789012 * i for i in range(1024)]
     world.http.call("rosAFE/GammatoneProc", {"name": "long", "fb_cfHz": [str(f) for f in longest]})
@@ -74,11 +74,11 @@ def test_the_longest_list_fits_and_larger_ones_are_refused(world: World) -> None
     assert world.http.raw("/components", headers={"X": "y" * 100_000})[0] == 400
 
 
-def test_requests_and_listeners_are_bounded(empty_world: World) -> None:
+def test_requests_and_listeners_are_limited(empty_world: World) -> None:
     http = empty_world.http
 
     async def get(client: aiohttp.ClientSession, url: str) -> str:
-        """The error's name, empty for none."""
+        """Return the error's name, empty for none."""
         async with client.get(f"http://127.0.0.1:{http.port}{url}") as response:
             return "" if response.status == 200 else str((await response.json(content_type=None))["ex"])
 
@@ -110,7 +110,7 @@ def test_requests_and_listeners_are_bounded(empty_world: World) -> None:
     ],
     ids=range(7),
 )
-def test_garbage_hurts_nobody(world: World, garbage: bytes) -> None:
+def test_invalid_data_does_not_affect_other_clients(world: World, garbage: bytes) -> None:
     with socket.create_connection(("127.0.0.1", world.port), timeout=harness.PATIENCE) as connection:
         try:
             connection.sendall(garbage)
@@ -118,14 +118,14 @@ def test_garbage_hurts_nobody(world: World, garbage: bytes) -> None:
             while connection.recv(65536):
                 continue
         except ConnectionError:
-            pass  # thrown out: as it should be
+            pass  # disconnected, as expected
     assert world.http.get("/components", s="fresh") == {}
 
 
 # --- many at once -----------------------------------------------------------------------------------------------
 
 
-def test_two_hundred_clients_at_once(world: World) -> None:
+def test_two_hundred_concurrent_clients(world: World) -> None:
     start_tree(world.http)
 
     async def client(number: int) -> list[str]:
@@ -144,8 +144,8 @@ def test_two_hundred_clients_at_once(world: World) -> None:
     assert asyncio.run(all_clients()) == [["gammatone"] * 3] * 200
 
 
-def test_a_large_download_stalls_nobody(world: World) -> None:
-    """A client that takes its getSignals slowly, or not at all, keeps no other waiting."""
+def test_a_large_download_does_not_delay_other_clients(world: World) -> None:
+    """A client that reads getSignals slowly, or not at all, does not delay others."""
     start_tree(world.http)
 
     def large() -> bool:
@@ -177,7 +177,7 @@ def threads(pid: int) -> int:
     return len(list(harness.proc(pid, "task").iterdir()))
 
 
-def test_vanished_clients_leave_nothing(world: World) -> None:
+def test_disappeared_clients_leave_no_resources(world: World) -> None:
     start_tree(world.http)
     world.http.call("rosAFE/getDependencies", ["input"], s="survivor")
     pid = world.server.pid
@@ -196,7 +196,7 @@ def test_vanished_clients_leave_nothing(world: World) -> None:
             connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, b"\1\0\0\0\0\0\0\0")  # a reset, as from a crash
             connection.close()
     harness.wait_for(lambda: open_files(pid) <= files + 8, what=lambda: f"{open_files(pid)} files, {files} before")
-    assert threads(pid) <= before + 20  # those of the pool stay
+    assert threads(pid) <= before + 20  # the threads of the pool remain
 
 
 def test_a_client_that_is_killed_takes_its_session_with_it(world: World) -> None:
@@ -213,5 +213,5 @@ def test_a_client_that_is_killed_takes_its_session_with_it(world: World) -> None
     with world.graph.start("tclsh", str(script)) as client:
         assert harness.wait_for(lambda: client.out.strip()).endswith("sent")
         client.stop(signal.SIGKILL)
-    # The activity is the component's, and goes on.
+    # The activity belongs to the component and continues.
     harness.wait_for(lambda: live_activities(world, "bass") == ["Acquire"])

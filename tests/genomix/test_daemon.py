@@ -34,14 +34,14 @@ def test_help_and_version(home_graph: harness.Graph) -> None:
 
 
 @pytest.mark.parametrize("arguments", [["-p", "x"], ["-p", "65536"], ["-p", "-1"], ["--port"], ["--what"], ["extra"]])
-def test_a_wrong_command_line_is_one_line(home_graph: harness.Graph, arguments: list[str]) -> None:
+def test_a_wrong_command_line_is_reported_in_one_line(home_graph: harness.Graph, arguments: list[str]) -> None:
     done = home_graph.run(GENOMIXD, *arguments, check=False)
     assert done.returncode == 2
     assert len(done.stderr.splitlines()) == 1
-    assert "genomixd -h shows what is possible" in done.stderr
+    assert "genomixd -h lists the options" in done.stderr
 
 
-def test_a_taken_port_is_one_line(home_graph: harness.Graph) -> None:
+def test_a_port_in_use_is_reported_in_one_line(home_graph: harness.Graph) -> None:
     with socket.create_server(("127.0.0.1", 0)) as other:
         port = other.getsockname()[1]
         backgrounds: tuple[list[str], ...] = ([], ["-b"])
@@ -49,17 +49,18 @@ def test_a_taken_port_is_one_line(home_graph: harness.Graph) -> None:
             done = home_graph.run(GENOMIXD, "-p", str(port), *background, check=False)
             assert done.returncode == 1
             assert done.stderr.splitlines() == [
-                f"genomixd: port {port} of 127.0.0.1 is taken, perhaps by another genomixd; -p chooses another"
+                f"genomixd: port {port} of 127.0.0.1 is in use, perhaps by another instance of this program; "
+                "choose another with --port"
             ]
 
 
-def test_an_address_that_is_not_ours_is_one_line(home_graph: harness.Graph) -> None:
+def test_a_foreign_address_is_reported_in_one_line(home_graph: harness.Graph) -> None:
     done = home_graph.run(GENOMIXD, "-p", "0", "--host", "192.0.2.1", check=False)
     assert done.returncode == 1
     assert len(done.stderr.splitlines()) == 1
 
 
-def test_it_listens_on_loopback_only_unless_told(home_graph: harness.Graph) -> None:
+def test_it_listens_on_loopback_by_default(home_graph: harness.Graph) -> None:
     with worlds.genomixd(home_graph) as (_, port):
         sockets = harness.proc("net", "tcp").read_text()
         assert f"0100007F:{port:04X} 00000000:0000 0A" in sockets
@@ -69,7 +70,7 @@ def test_it_listens_on_loopback_only_unless_told(home_graph: harness.Graph) -> N
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_it_whatever_clients_do(home_graph: harness.Graph, number: int) -> None:
+def test_a_signal_ends_it_regardless_of_clients(home_graph: harness.Graph, number: int) -> None:
     with worlds.genomixd(home_graph) as (process, port), Http(port).listening(s="x") as events:
         kept = socket.create_connection(("127.0.0.1", port))
         kept.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
@@ -90,7 +91,7 @@ def test_nohup_is_respected_and_a_script_may_start_it_in_the_background(home_gra
         assert process.stop(signal.SIGINT) == 0
 
 
-def test_background_returns_once_it_serves(home_graph: harness.Graph) -> None:
+def test_background_mode_returns_when_it_serves(home_graph: harness.Graph) -> None:
     port = str(harness.free_port())
 
     def servers() -> list[int]:
@@ -112,7 +113,7 @@ def test_background_returns_once_it_serves(home_graph: harness.Graph) -> None:
     harness.wait_for(lambda: not servers())
 
 
-def test_a_private_server_ends_with_its_starter(home_graph: harness.Graph) -> None:
+def test_a_private_server_ends_with_its_parent(home_graph: harness.Graph) -> None:
     process = subprocess.Popen(
         [GENOMIXD, "-p", "0", "--until-eof"],
         stdin=subprocess.PIPE,
@@ -134,7 +135,7 @@ def test_verbosity(home_graph: harness.Graph) -> None:
         harness.wait_for(lambda: re.search(r'"GET /components\?s=me HTTP/1.1" 200', process.err))
 
 
-def test_a_directory_for_logs_that_cannot_be_written_is_no_error(home_graph: harness.Graph) -> None:
+def test_a_read_only_log_directory_is_not_an_error(home_graph: harness.Graph) -> None:
     process = home_graph.start(GENOMIXD, "-v", "-p", "0", ROS_LOG_DIR="/dev/null/none", ROS_HOME="/dev/null/none")
     with process:
         assert Http(worlds.port_of(process)).raw("/")[0] == 200

@@ -1,4 +1,4 @@
-"""Octave's decoder on answers that are none: every one is told in an error, at once, whatever sizes it claims."""
+"""Octave's decoder on invalid answers: each causes an error immediately, whatever sizes it contains."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from rosafe import interface
 from rosafe.genomix import binary_format
 from tests.harness import ROOT
 
-LONG = int(os.environ.get("DECODE_FUZZ", "0"))  # so many more, in rounds of their own: DECODE_FUZZ=100000
+LONG = int(os.environ.get("DECODE_FUZZ", "0"))  # number of additional rounds, for example DECODE_FUZZ=100000
 SIZES = (1, 2, 255, 65_536, 1_000_000, 2**24, 2**30, 2**31 - 1, 2**31, 2**32 - 8, 2**32 - 1)
 
 
@@ -99,7 +99,7 @@ GOOD = [signal(("dataN", 31), ("data", 0)), signal(("dataNxN", 1000), ("dataN", 
 
 
 def mutants(seed: int, count: int) -> list[bytes]:
-    """Answers cut off anywhere, with other bytes and other counts in them, and heaps of bytes."""
+    """Truncated answers, answers with changed bytes and counts, and random bytes."""
     chance = random.Random(seed)
     made = [document[:at] for document in documents() for at in range(len(document))] if seed == 0 else []
     while len(made) < count:
@@ -149,7 +149,7 @@ printf('%g %s\n', slowest, regexp(status, 'VmHWM:\s*(\d+)', 'tokens'){1}{1});
 
 
 def decoded(folder: Path, answers: list[bytes]) -> tuple[list[str], float, float]:
-    """What Octave makes of each, as cells and as matrices: ``good`` or the error; longest time (s), memory (MB)."""
+    """Return Octave's result for each, as cells and matrices (``good`` or the error), maximum time (s), memory (MB)."""
     if shutil.which("octave-cli") is None:
         pytest.skip("octave-cli is not installed; scripts/install --tests brings it")
     with (folder / "documents").open("wb") as out:
@@ -171,12 +171,12 @@ def decoded(folder: Path, answers: list[bytes]) -> tuple[list[str], float, float
 
 
 def check(folder: Path, answers: list[bytes], wanted: Any) -> None:
-    """All are told as `wanted`, quickly and without much memory."""
+    """All have the results `wanted`, quickly and without much memory."""
     lines, seconds, megabytes = decoded(folder, answers)
     assert len(lines) == 2 * len(answers)
     for number, line in enumerate(lines):
         assert line in wanted, (line, answers[number // 2][:200])
-    assert seconds < 20  # of the processor
+    assert seconds < 20  # of CPU time
     assert megabytes < 500
 
 

@@ -1,4 +1,4 @@
-"""The curl lines of docs/genomixd.md, and the commands of docs/request.md, do what the pages say."""
+"""The curl lines of docs/genomixd.md and the commands of docs/request.md have the documented results."""
 
 from __future__ import annotations
 

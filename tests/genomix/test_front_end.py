@@ -1,4 +1,4 @@
-"""Pitch and modulations from nothing with one request, by every door: built, read, changed, seen."""
+"""Pitch and modulations with one request, through every interface: built, read, changed, plotted."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ CHAINS = {
 
 
 def picture(path: Path) -> np.ndarray:
-    """A picture with something in it."""
+    """Check that a picture is not empty."""
     pixels = matplotlib.image.imread(path)
     assert min(pixels.shape[:2]) > 200 and len(np.unique(pixels.reshape(-1, pixels.shape[-1]), axis=0)) > 50
     return pixels
@@ -73,7 +73,7 @@ def test_in_eltclsh(world: World) -> None:
     assert lines[0].split("|")[1:] == CHAINS["pitch"]
     assert lines[1] == "amsFeatures_0"
     assert lines[3] == "ear|feature|time"
-    assert lines[4] == "1" and lines[5].startswith("pi_confThres: 5 is out of range")
+    assert lines[4] == "1" and lines[5].startswith("pi_confThres: expected a number from 0 to 1, got 5")
     assert lines[2] == "9|31"
 
 

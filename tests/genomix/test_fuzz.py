@@ -1,6 +1,6 @@
-"""Nonsense of all kinds, thrown at a live genomixd: it names the mistake, crashes never and grows not.
+"""Random invalid requests to a running genomixd: it names the error, never crashes and does not grow.
 
-GENOMIX_FUZZ=SECONDS makes it long: ``GENOMIX_FUZZ=600 python3 -m pytest tests/genomix/test_fuzz.py --timeout=0``.
+GENOMIX_FUZZ=SECONDS sets the duration: ``GENOMIX_FUZZ=600 python3 -m pytest tests/genomix/test_fuzz.py --timeout=0``.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ queries = st.lists(
 
 
 @pytest.mark.timeout(int(LONG) + 600)
-def test_nonsense_is_told_to_be_nonsense(world: World) -> None:
+def test_random_text_is_rejected(world: World) -> None:
     connection = http.client.HTTPConnection("127.0.0.1", world.port, timeout=PATIENCE)
     end = time.monotonic() + LONG
     world.http.call("rosAFE/connect_port", ["Audio", "bass/Audio"])
@@ -103,12 +103,12 @@ def test_nonsense_is_told_to_be_nonsense(world: World) -> None:
 
 
 def open_files(pid: int) -> int:
-    """How many files and sockets a process has open."""
+    """Return the number of open files and sockets of a process."""
     return len(list(proc(pid, "fd").iterdir()))
 
 
 def resident(pid: int) -> int:
-    """Megabytes of memory of a process."""
+    """Return the memory of a process in MB."""
     for line in proc(pid, "status").read_text().splitlines():
         if line.startswith("VmRSS:"):
             return int(line.split()[1]) // 1024

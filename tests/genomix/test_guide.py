@@ -20,13 +20,13 @@ in_both_shells = pytest.mark.parametrize("shell", ["tclsh", "eltclsh"])
 
 @pytest.fixture
 def fresh_world(tmp_path: Path) -> Iterator[World]:
-    """Components that nobody has used yet."""
+    """Components that were not used yet."""
     with worlds.world(tmp_path) as world:
         yield world
 
 
 def guide_commands() -> list[str]:
-    """What the guide has its readers type into eltclsh, with a sound device that exists everywhere."""
+    """The guide's commands for eltclsh, with a sound device that exists everywhere."""
     text = harness.shared("spec", "original-user-guide.txt").read_text("utf-8")
     commands = re.findall(r"^.*eltclsh[ ]*>[ ]*(.*?)[ ]*$", text, re.MULTILINE)
     assert len(commands) == 18
@@ -36,7 +36,7 @@ def guide_commands() -> list[str]:
 def run_shell(world: World, shell: str, script: str) -> subprocess.CompletedProcess[str]:
     path = world.graph.home / "session.tcl"
     path.write_text(script, "utf-8")
-    # `genomix::connect` without an address, as in the guide, but not on the port that everybody uses.
+    # `genomix::connect` without an address, as in the guide, but not on the default port.
     return world.graph.run(shell, str(path), GENOMIXD=f"127.0.0.1:{world.port}")
 
 
@@ -45,13 +45,13 @@ def test_the_guide_runs_as_a_script(fresh_world: World, shell: str) -> None:
     done = run_shell(fresh_world, shell, "\n".join(guide_commands()) + "\n")
     assert (done.stdout, done.stderr) == ("", "")
     parameters = fresh_world.http.call("rosAFE/getParameters")["parameters"]
-    # The script's last requests are still on their way when it ends; removeProcessor is among them.
+    # The script's last requests, such as removeProcessor, are still in progress when it ends.
     harness.wait_for(lambda: not fresh_world.http.call("rosAFE/getParameters")["parameters"]["preProc"])
     assert [p["name"] for p in parameters["input"]] == ["input"]
 
 
 @in_both_shells
-def test_each_command_of_the_guide_does_what_it_says(fresh_world: World, shell: str) -> None:
+def test_each_command_of_the_guide_has_its_documented_result(fresh_world: World, shell: str) -> None:
     commands = guide_commands()
     script = ["set results {}", "proc note {result} {lappend ::results $result}"]
     for command in commands[:-2]:
@@ -73,7 +73,7 @@ def test_each_command_of_the_guide_does_what_it_says(fresh_world: World, shell: 
     lines = run_shell(fresh_world, shell, "\n".join(script)).stdout.splitlines()
     assert lines[0] == (
         "modify error 1 {ex ::rosAFE::e_noSuchParameter what "
-        "{processors of kind input have no 'pp_bRemoveDC', but: in_doNormalize, in_normalizeValue}}"
+        "{processors of kind input have no 'pp_bRemoveDC'; they have: in_doNormalize, in_normalizeValue}}"
     )
     for part in (
         "pp_refSPLdB 100.0",
@@ -241,7 +241,7 @@ PATTERNS = {
 @in_both_shells
 @pytest.mark.parametrize("pattern", PATTERNS)
 def test_usage_patterns_of_published_scripts(world: World, pattern: str, shell: str) -> None:
-    """Each shows an empty line where all went well."""
+    """Each shows an empty line on success."""
     if "left" in PATTERNS[pattern]:
         with world.graph.node("bass-ros", "-i", "left"):
             assert world.lines(PATTERNS[pattern], shell=shell) == [""]
@@ -251,7 +251,7 @@ def test_usage_patterns_of_published_scripts(world: World, pattern: str, shell: 
 
 @in_both_shells
 def test_pattern_24_a_shell_script_that_execs_a_tcl_shell(world: World, shell: str) -> None:
-    """OPT, LER: stop scripts are executables of their own."""
+    """OPT, LER: stop scripts are separate executables."""
     script = world.graph.home / "stop.tcl"
     script.write_text(
         f'#!/bin/sh\n# the next line restarts using {shell} \\\nexec {shell} "$0" ${{1+"$@"}}\n'

@@ -1,4 +1,4 @@
-"""What genomixd's clients say is what they get: zeros are zeros; unknown words are told, or refused where asked for."""
+"""Requests of genomixd's clients are literal: zeros are zeros; unknown choices cause a warning or are rejected."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ INPUT = """
     rosAFE::connect_port Audio bass/Audio
     rosAFE::InputProc
 """
-MISSPELT = "ihc: ihc_method: 'bernstien' is no known word, dau is taken; the nearest known one is bernstein"
+MISSPELT = "ihc: ihc_method: unknown word 'bernstien'; dau is used; the most similar known word is bernstein"
 
 
 def start(world: World, *processors: str) -> None:
@@ -42,7 +42,7 @@ def is_there(world: World, name: str) -> bool:
 # --- zeros ------------------------------------------------------------------------------------------------------
 
 
-def test_a_zero_is_a_zero_by_call_and_by_send(world: World) -> None:
+def test_a_zero_is_literal_with_call_and_send(world: World) -> None:
     start(world)
     world.http.call("rosAFE/PreProc", {"name": "called", "pp_coefPreEmphasis": 0, "pp_refSPLdB": 0})
     world.http.wait(world.http.send("rosAFE/PreProc", {"name": "sent", "pp_coefPreEmphasis": 0}), "sent")
@@ -57,16 +57,16 @@ def test_a_zero_is_a_zero_by_call_and_by_send(world: World) -> None:
 @pytest.mark.parametrize(
     ("request_name", "given", "why"),
     [
-        ("GammatoneProc", {"fb_lowFreqHz": 0}, "fb_lowFreqHz: 0 is out of range, allowed is more than 0 to 1000000"),
-        ("GammatoneProc", {"fb_nGamma": 0}, "fb_nGamma: 0 is out of range, allowed is from 1 to 128"),
-        ("GammatoneProc", {"fb_nERBs": 0}, "fb_nERBs: 0 is out of range"),
-        ("GammatoneProc", {"name": ""}, "name: '' names a topic too"),
-        ("InputProc", {"nFramesPerBlock": 0}, "nFramesPerBlock: 0 is out of range, allowed is from 1 to 10000000"),
-        ("InputProc", {"bufferSize_s_port": 0}, "bufferSize_s_port: 0 is out of range"),
-        ("InputProc", {"name": ""}, "name: '' is empty"),
+        ("GammatoneProc", {"fb_lowFreqHz": 0}, "fb_lowFreqHz: expected a number above 0, at most 1000000, got 0"),
+        ("GammatoneProc", {"fb_nGamma": 0}, "fb_nGamma: expected a number from 1 to 128, got 0"),
+        ("GammatoneProc", {"fb_nERBs": 0}, "fb_nERBs: expected a number above 0, at most 100, got 0"),
+        ("GammatoneProc", {"name": ""}, "name: '' also names a topic"),
+        ("InputProc", {"nFramesPerBlock": 0}, "nFramesPerBlock: expected a number from 1 to 10000000, got 0"),
+        ("InputProc", {"bufferSize_s_port": 0}, "bufferSize_s_port: expected a number above 0, at most 600, got 0"),
+        ("InputProc", {"name": ""}, "name: expected the name of a processor, got ''"),
     ],
 )
-def test_what_cannot_be_zero_or_nothing_is_refused(world: World, request_name: str, given: Any, why: str) -> None:
+def test_invalid_zeros_and_empty_values_are_rejected(world: World, request_name: str, given: Any, why: str) -> None:
     start(world, "PreProc")
     before = world.http.call("rosAFE/getProcessors")
     with pytest.raises(HttpError) as refused:
@@ -77,7 +77,7 @@ def test_what_cannot_be_zero_or_nothing_is_refused(world: World, request_name: s
     assert world.http.call("rosAFE/getProcessors") == before
 
 
-def test_of_what_is_nothing_the_reason_is_told(world: World) -> None:
+def test_the_error_of_an_empty_value_has_a_reason(world: World) -> None:
     start(world, "PreProc")
     with pytest.raises(HttpError) as refused:
         world.http.call("rosAFE/GammatoneProc", {"upperDepName": ""})
@@ -87,15 +87,15 @@ def test_of_what_is_nothing_the_reason_is_told(world: World) -> None:
     assert refused.value.ex == "::bass::e_hwparams"
 
 
-def test_plain_ros_clients_mean_the_defaults_still(world: World) -> None:
+def test_zeros_of_plain_ros_clients_stand_for_defaults(world: World) -> None:
     start(world)
     done = world.graph.run("rosservice", "call", "/rosAFE/PreProc", "{name: plain, pp_coefPreEmphasis: 0}")
     assert "genom_success: True" in done.stdout and "genom_exdetail: ''" in done.stdout
     assert told(world, "preProc", "plain")["pp_coefPreEmphasis"] == 0.97
 
 
-def test_what_get_parameters_tells_makes_another_one_like_it(world: World) -> None:
-    """A list of centre frequencies makes it tell of a spacing of 0."""
+def test_the_values_of_get_parameters_create_an_equal_processor(world: World) -> None:
+    """With a list of centre frequencies, it reports a spacing of 0."""
     start(world, "PreProc")
     world.http.call("rosAFE/GammatoneProc", {"name": "first", "fb_cfHz": [500, 900]})
     first = told(world, "gammatone", "first")
@@ -117,14 +117,14 @@ def test_zeros_of_tcl(world: World) -> None:
     assert world.lines(INPUT + script) == [
         "a|0.0",
         "b|0.0",
-        "fb_lowFreqHz: 0 is out of range, allowed is more than 0 to 1000000",
+        "fb_lowFreqHz: expected a number above 0, at most 1000000, got 0",
     ]
 
 
 # --- unknown words ----------------------------------------------------------------------------------------------
 
 
-# Prints the tree's entry in /diagnostics once its message has a text in it, or lacks it.
+# Prints the tree's entry in /diagnostics once its message contains a text, or does not.
 DIAGNOSED = """
 import sys, json, rospy
 from diagnostic_msgs.msg import DiagnosticArray
@@ -139,12 +139,12 @@ while True:
 
 
 def diagnosed(world: World, text: str, there: bool = True) -> list[Any]:
-    """Level, message and unknown words of the tree's health, once `text` is in the message, or is not any more."""
+    """Wait until `text` is (or is not) in the message; return level, message and unknown words of the tree's health."""
     done = world.graph.run("python3", "-c", DIAGNOSED, text, "in" if there else "out", timeout=90)
     return list(json.loads(done.stdout))
 
 
-def test_a_misspelt_word_is_told(world: World) -> None:
+def test_a_misspelt_choice_causes_a_warning(world: World) -> None:
     start(world, "PreProc", "GammatoneProc")
     assert world.http.call("rosAFE/IhcProc", {"ihc_method": "bernstien"}) == {"warning": MISSPELT}
     assert told(world, "ihc", "ihc")["ihc_method"] == "dau"
@@ -155,18 +155,18 @@ def test_a_misspelt_word_is_told(world: World) -> None:
     assert world.http.status(number) == {"id": number, "status": "sent", "warning": wanted}
     assert diagnosed(world, "more unknown") == [1, f"{MISSPELT} (and 1 more unknown words)", [MISSPELT, wanted]]
     change = {"nameProc": "two", "nameParam": "ihc_method", "newValue": "halfwav"}
-    change_told = "two: ihc_method: 'halfwav' is no known word, dau is taken; the nearest known one is halfwave"
+    change_told = "two: ihc_method: unknown word 'halfwav'; dau is used; the most similar known word is halfwave"
     assert world.http.call("rosAFE/modifyParameter", change) == {"warning": change_told}
     number = world.http.send("rosAFE/modifyParameter", change)
     assert world.http.wait(number, "done")["warning"] == change_told
-    # what is made good, or gone, is told no more
+    # corrected values and removed processors cause no further warnings
     world.http.call("rosAFE/modifyParameter", {**change, "newValue": "halfwave"})
     assert diagnosed(world, "more unknown", there=False) == [1, MISSPELT, [MISSPELT]]
     world.http.call("rosAFE/removeProcessor", ["ihc"])
     assert diagnosed(world, MISSPELT, there=False) == [0, "4 processors", []]
 
 
-def test_known_words_and_known_slips_are_nobody_s_business(world: World) -> None:
+def test_known_choices_and_accepted_misspellings_cause_no_warning(world: World) -> None:
     start(world)
     assert world.afe is not None
     said = len(world.afe.err)
@@ -174,11 +174,11 @@ def test_known_words_and_known_slips_are_nobody_s_business(world: World) -> None
     assert world.http.call("rosAFE/modifyParameter", ["slip", "pp_middleEarModel", "lopezpoveda"]) == {}
     done = world.graph.run("rosservice", "call", "/rosAFE/GammatoneProc", "{upperDepName: slip, fb_type: gamma}")
     assert "genom_success: True" in done.stdout and "genom_exdetail: ''" in done.stdout, "as in the original"
-    assert "gammatone: fb_type: 'gamma' is no known word, gammatone is taken" in world.afe.err[said:]
+    assert "gammatone: fb_type: unknown word 'gamma'; gammatone is used" in world.afe.err[said:]
     assert world.afe.err[said:].count("[WARN]") == 1
 
 
-def test_tcl_shows_it_where_somebody_looks(world: World) -> None:
+def test_tcl_shows_the_warning_on_a_terminal(world: World) -> None:
     script = """
         rosAFE::PreProc
         rosAFE::GammatoneProc
@@ -196,7 +196,7 @@ def test_tcl_shows_it_where_somebody_looks(world: World) -> None:
     assert done.stderr.splitlines() == [f"rosAFE::IhcProc &: warning: {second}"]
 
 
-def test_matlab_has_it_in_the_request(world: World) -> None:
+def test_matlab_has_the_warning_in_the_request(world: World) -> None:
     start(world, "PreProc", "GammatoneProc")
     script = """
         client = genomix.client();
@@ -221,20 +221,20 @@ def test_matlab_has_it_in_the_request(world: World) -> None:
     assert shown["sent"] == ["sent", MISSPELT.replace("ihc:", "two:", 1)]
     assert shown["known"] == ""
     assert shown["zero"] == 0
-    assert shown["refused"] == ["error", "fb_lowFreqHz: 0 is out of range, allowed is more than 0 to 1000000"]
+    assert shown["refused"] == ["error", "fb_lowFreqHz: expected a number above 0, at most 1000000, got 0"]
 
 
-def test_new_kinds_refuse_unknown_words(world: World) -> None:
+def test_new_kinds_reject_unknown_choices(world: World) -> None:
     start(world, "PreProc", "GammatoneProc", "IhcProc")
     with pytest.raises(HttpError) as refused:
         world.http.call("rosAFE/AutocorrelationProc", {"ac_wname": "han"})
     assert refused.value.ex == "::rosAFE::e_badNewValue"
-    assert refused.value.what.startswith("ac_wname: 'han' is not one of ")
+    assert refused.value.what.startswith("ac_wname: expected one of hamming, ")
     assert refused.value.what.endswith("; did you mean hann?")
 
 
 @pytest.mark.parametrize("by", ["option", "parameter"])
-def test_whoever_wants_it_strict_has_them_refused(world: World, by: str) -> None:
+def test_strict_mode_rejects_unknown_choices(world: World, by: str) -> None:
     name = f"strict_{by}"
     options = ("--strict",) if by == "option" else ("_strict_words:=true",)
     with world.graph.node("rosAFE-ros", "-i", name, *options):
@@ -250,18 +250,18 @@ def test_whoever_wants_it_strict_has_them_refused(world: World, by: str) -> None
             with pytest.raises(HttpError) as refused:
                 call(f"{name}/{request}", given)
             assert refused.value.ex == "::rosAFE::e_badNewValue"
-            assert refused.value.what.startswith("ihc_method: 'bernstien' is not one of ")
+            assert refused.value.what.startswith("ihc_method: expected one of none, halfwave")
             assert refused.value.what.endswith("; did you mean bernstein?")
         assert call(f"{name}/PreProc", {"name": "slip", "pp_middleEarModel": "jespen"}) == {}
-        if by == "parameter":  # which counts as it is now
+        if by == "parameter":  # whose present value counts
             world.graph.run("rosparam", "set", f"/{name}/strict_words", "false")
-            wait_for(lambda: _granted(world, name), what="unknown words that are taken")
+            wait_for(lambda: _granted(world, name), what="unknown choices that are replaced")
 
 
 def _granted(world: World, name: str) -> bool:
     change = {"nameProc": "ihc", "nameParam": "ihc_method", "newValue": "bernstien"}
     try:
-        return "dau is taken" in world.http.call(f"{name}/modifyParameter", change)["warning"]
+        return "dau is used" in world.http.call(f"{name}/modifyParameter", change)["warning"]
     except HttpError:
         return False
 
@@ -270,7 +270,7 @@ def _granted(world: World, name: str) -> bool:
     ("name", "meant"),
     [("getparameters", "getParameters"), ("PitchPort", "pitchPort"), ("amsfeaturesport", "amsFeaturesPort")],
 )
-def test_a_name_in_another_case_is_told(world: World, name: str, meant: str) -> None:
+def test_a_choice_in_another_case_causes_a_warning(world: World, name: str, meant: str) -> None:
     with pytest.raises(HttpError) as refused:
         world.http.call(f"rosAFE/{name}")
     assert refused.value.ex == "::genom::no_such_service" and refused.value.what.endswith(f"; did you mean {meant}?")

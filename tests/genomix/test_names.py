@@ -1,4 +1,4 @@
-"""By which names genomixd may be called, and what its clients are told otherwise."""
+"""Host names that genomixd accepts, and the errors for other names."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_names_that_are_given_and_those_of_the_machine(graph: Graph) -> None:
 def test_names_in_the_ros_parameter(
     graph: Graph, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """They count as soon as they are set, also while genomixd runs."""
+    """They take effect when they are set, also while genomixd runs."""
     monkeypatch.setattr(names, "READ_SECONDS", 0.0)
     monkeypatch.setattr(names.log, "propagate", True)
     master = xmlrpc.client.ServerProxy(graph.uri)
@@ -62,7 +62,7 @@ def test_names_in_the_ros_parameter(
                 "expected the name of a host, such as robot.lab, got 'a b'",
                 "expected the name of a host, such as robot.lab, got 7",
             ]
-            ours.uri = "http://127.0.0.1:1"  # the master is away: what it said last holds
+            ours.uri = "http://127.0.0.1:1"  # the master is unreachable: its last answer remains valid
             assert await known.from_parameter() == {"three"}
             ours.uri = graph.uri
             master.deleteParam("/test", "/test_names/names")
@@ -99,7 +99,7 @@ def test_the_parameter_of_a_genomixd_that_runs(graph: Graph) -> None:
 
 
 @pytest.mark.parametrize("name", ["", "a b", "http://robot", "robot/x", "*"])
-def test_a_name_that_is_none(graph: Graph, name: str) -> None:
+def test_an_invalid_name(graph: Graph, name: str) -> None:
     done = graph.run("genomixd", "--name", name, check=False)
     assert done.returncode == 2 and done.stderr.count("\n") == 1
     assert "--name: expected the name of a host" in done.stderr and repr(name) in done.stderr
@@ -117,13 +117,13 @@ sys.exit(daemon.main(["-v", "-p", "0", *sys.argv[1:]]))
 
 @pytest.fixture
 def nameless(graph: Graph) -> Iterator[int]:
-    """The port of a genomixd that does not know the name of this machine."""
+    """The port of a genomixd that does not have the name of this machine."""
     code = f"import sys; sys.path.insert(0, {str(harness.ROOT)!r}){NAMELESS}"
     with graph.start(harness.PYTHON, "-c", code) as server:
         yield port_of(server)
 
 
-def test_clients_are_told_at_once(graph: Graph, nameless: int, tmp_path: Path) -> None:
+def test_clients_get_the_error_immediately(graph: Graph, nameless: int, tmp_path: Path) -> None:
     name = socket.gethostname()
     script = tmp_path / "script.tcl"
     script.write_text(f"package require genomix\nputs [catch {{genomix::connect {name}:{nameless}}} told]$told")

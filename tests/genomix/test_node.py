@@ -1,4 +1,4 @@
-"""genomixd as a node of the graph: its name, from when to when it is there, and what it leaves behind."""
+"""genomixd as a node of the graph: its name, its registration, and its removal."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from tests.harness import END_SECONDS, Graph, free_port, private_graph, wait_for
 
 
 def registrations(graph: Graph, node: str) -> int:
-    """How many topics and services of `node` the master knows."""
+    """Return the number of topics and services of `node` that are registered at the master."""
     state: Any = rosgraph.Master("/test", master_uri=graph.uri).getSystemState()
     return sum(node in nodes for kind in state for _, nodes in kind)
 
 
 def known(graph: Graph, node: str) -> bool:
-    """Whether the master has an address for `node`."""
+    """Return whether `node` is registered at the master."""
     try:
         return bool(rosgraph.Master("/test", master_uri=graph.uri).lookupNode(node))
     except rosgraph.MasterError:
@@ -40,7 +40,7 @@ def test_it_leaves_the_graph_with_all_its_registrations(graph: Graph) -> None:
 
 
 def test_names(graph: Graph) -> None:
-    """By default genomixd, unless one of that name runs; what a killed one has left does not count."""
+    """The default is genomixd, unless a node of that name runs; a registration of a killed node is ignored."""
 
     def names() -> set[str]:
         return {node for node in graph.nodes() if "genomixd" in node or "ears" in node}
@@ -70,7 +70,7 @@ def test_servers_that_start_at_the_same_moment(graph: Graph) -> None:
         assert all(server.alive for server in servers)
 
 
-def test_a_master_that_comes_later(tmp_path: Path) -> None:
+def test_a_master_that_starts_later(tmp_path: Path) -> None:
     with private_graph(tmp_path) as (graph, master):
         master.kill()
         port = free_port()

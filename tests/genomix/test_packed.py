@@ -1,4 +1,4 @@
-"""The packed form: what is written reads back as the same value, here and in Octave."""
+"""The packed format: encoded values are decoded to equal values, in Python and in Octave."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ SPECTRUM = "::rosAFE::TimeFrequencySignalPortStruct"
 
 
 class Reader:
-    """Reads the packed form by what docs/genomixd.md says of it."""
+    """A decoder of the packed format, written according to docs/genomixd.md."""
 
     def __init__(self, data: bytes) -> None:
         self._data = data
@@ -50,7 +50,7 @@ class Reader:
         return np.frombuffer(self.take(8 * count), "<f8")
 
     def until_end(self) -> bool:
-        """Whether a sequence or structure goes on."""
+        """Return whether a sequence or structure continues."""
         if self._data[self._at : self._at + 1] == binary_format.END:
             self._at += 1
             return False
@@ -86,7 +86,7 @@ class Reader:
 
 
 def read(data: bytes) -> Any:
-    """The one value that `data` is, to its last byte."""
+    """Return the value of `data`, which must be complete."""
     reader = Reader(data)
     value = reader.value()
     assert reader.take(len(data) - reader._at) == b""
@@ -98,7 +98,7 @@ values = st.recursive(leaves, lambda inner: st.lists(inner) | st.dictionaries(st
 
 
 def same(found: Any, value: Any) -> bool:
-    """Whether a value reads back: sequences of numbers are arrays, booleans numbers."""
+    """Return whether values are equal: sequences of numbers are arrays, booleans are numbers."""
     if isinstance(value, dict):
         return list(found) == list(value) and all(same(found[k], v) for k, v in value.items())
     if isinstance(value, list):
@@ -115,7 +115,7 @@ def test_plain_values_read_back(value: Any) -> None:
 @settings(deadline=None)
 @given(st.lists(st.lists(st.floats(allow_nan=False), max_size=4), max_size=4), st.booleans())
 def test_signals_read_back(channels: list[list[float]], alike: bool) -> None:
-    """In one block where all channels have as many frames, level by level else."""
+    """One array if all channels have the same number of frames, otherwise nested structures."""
     if alike:
         channels = [(channel + [0.0] * 4)[:3] for channel in channels]
     arrays = [np.array(channel) for channel in channels]
@@ -143,7 +143,7 @@ def test_special_numbers_and_texts() -> None:
 
 
 def test_octave_reads_the_same(tmp_path: Path) -> None:
-    """The decoder of matlab/ gives cells, or matrices where it is told to."""
+    """The decoder of matlab/ returns cells, or matrices on request."""
     if shutil.which("octave-cli") is None:
         pytest.skip("octave-cli is not installed; scripts/install --tests brings it")
     lags = [[np.arange(3.0) + 10 * channel + 100 * lag for channel in range(2)] for lag in range(4)]
@@ -242,7 +242,7 @@ def test_the_server_answers_packed(world: World) -> None:
     assert audio["stamp"] == told["stamp"]
 
 
-def test_numbers_beyond_all_floats() -> None:
+def test_numbers_beyond_the_range_of_floats() -> None:
     """A component's error may hold any number that JSON has."""
     huge = 10**4000
     assert binary_format.plain(huge) == binary_format.plain(math.inf)

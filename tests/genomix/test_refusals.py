@@ -1,4 +1,4 @@
-"""Thirty refusals, made by hand from the documents: each tells its reason through every door that can ask for it."""
+"""Thirty rejected requests from the documents: each reports its reason through every interface."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from tests.matlab import octave
 
 
 class Refusal(NamedTuple):
-    """A request that cannot be granted, the exception, and words of the reason.
+    """A rejected request, its exception, and words of the reason.
 
-    `command` is the command line that wants the same, where there is one.
+    `command` is the equivalent command line, if there is one.
     """
 
     request: str
@@ -46,69 +46,69 @@ REFUSALS = (
         "rosAFE/IldProc",
         {"name": "i", "upperDepName": "gammatone"},
         "e_noUpperDependencie",
-        "'gammatone' is of kind gammatone, wanted is ihc; of kind ihc: ihc",
+        "'gammatone': expected a processor of kind ihc, got kind gammatone; of kind ihc: ihc",
     ),
     Refusal(
         "rosAFE/PreProc",
         {"name": "two words"},
         "e_badNewValue",
-        "name: 'two words' names a topic too: letters, digits and _ only",
+        "name: 'two words' also names a topic; use only letters, digits and _",
     ),
     # values
     Refusal(
         "rosAFE/GammatoneProc",
         {"name": "g", "fb_nERBs": -1},
         "e_badNewValue",
-        "fb_nERBs: -1 is out of range, allowed is more than 0 to 100",
+        "fb_nERBs: expected a number above 0, at most 100, got -1",
         ("request", "filterbank", "fb_nERBs=-1"),
     ),
     Refusal(
         "rosAFE/GammatoneProc",
         {"name": "g", "fb_lowFreqHz": 9000},
         "e_badNewValue",
-        "fb_lowFreqHz: 9000 Hz is not below fb_highFreqHz (8000 Hz)",
+        "fb_lowFreqHz: expected less than fb_highFreqHz (8000 Hz), got 9000 Hz",
         ("request", "filterbank", "fb_lowFreqHz=9000"),
     ),
     Refusal(
         "rosAFE/GammatoneProc",
         {"name": "g", "fb_highFreqHz": 30000},
         "e_badNewValue",
-        "is not below half the sample rate",
+        "expected channels below half the sample rate",
         ("request", "filterbank", "fb_highFreqHz=30000"),
     ),
     Refusal(
         "rosAFE/GammatoneProc",
         {"name": "g", "fb_nChannels": 5000},
         "e_badNewValue",
-        "fb_nChannels: 5000 is out of range, allowed is from 0 to 1024",
+        "fb_nChannels: expected a number from 0 to 1024, got 5000",
         ("request", "filterbank", "fb_nChannels=5000"),
     ),
     Refusal(
         "rosAFE/GammatoneProc",
         {"name": "g", "fb_cfHz": [500, -3]},
         "e_badNewValue",
-        "fb_cfHz: -3 is out of range",
+        "fb_cfHz: expected a number above 0, at most 1000000, got -3",
         ("request", "filterbank", "fb_cfHz=500,-3"),
     ),
     Refusal(
         "rosAFE/IldProc",
         {"name": "i", "ild_wSizeSec": -0.02},
         "e_badNewValue",
-        "ild_wSizeSec: -0.02 is out of range, allowed is more than 0 to ",
+        "ild_wSizeSec: expected a number above 0, at most ",
         ("request", "ild", "ild_wSizeSec=-0.02"),
     ),
     Refusal(
         "rosAFE/RatemapProc",
         {"name": "r", "rm_decaySec": -0.5},
         "e_badNewValue",
-        "rm_decaySec: -0.5 is out of range",
+        "rm_decaySec: expected a number above 0, at most 3600, got -0.5",
         ("request", "ratemap", "rm_decaySec=-0.5"),
     ),
     Refusal(
         "rosAFE/CrossCorrelationProc",
         {"name": "c", "cc_maxDelaySec": 100},
         "e_badNewValue",
-        "cc_maxDelaySec: 100 is out of range",
+        "cc_maxDelaySec: expected a number above 0, at most 10, got 100",
         ("request", "crosscorrelation", "cc_maxDelaySec=100"),
     ),
     Refusal(
@@ -122,7 +122,7 @@ REFUSALS = (
         "rosAFE/InputProc",
         {"name": "input", "nFramesPerBlock": 20_000_000},
         "e_badNewValue",
-        "nFramesPerBlock: 20000000 is out of range, allowed is from 1 to 10000000",
+        "nFramesPerBlock: expected a number from 1 to 10000000, got 20000000",
         ("request", "input", "nFramesPerBlock=20000000", "-i", "empty"),
     ),
     # changes
@@ -136,19 +136,19 @@ REFUSALS = (
         "rosAFE/modifyParameter",
         {"nameProc": "input", "nameParam": "pp_bRemoveDC", "newValue": "1"},
         "e_noSuchParameter",
-        "processors of kind input have no 'pp_bRemoveDC', but: in_doNormalize, in_normalizeValue",
+        "processors of kind input have no 'pp_bRemoveDC'; they have: in_doNormalize, in_normalizeValue",
     ),
     Refusal(
         "rosAFE/modifyParameter",
         {"nameProc": "preProc", "nameParam": "pp_bRemoveDC", "newValue": "on"},
         "e_badNewValue",
-        "pp_bRemoveDC: 'on' is not a boolean: 0, 1, true or false",
+        "pp_bRemoveDC: expected a boolean: 0, 1, true or false, got 'on'",
     ),
     Refusal(
         "rosAFE/modifyParameter",
         {"nameProc": "preProc", "nameParam": "pp_cutoffHzDC", "newValue": "0"},
         "e_badNewValue",
-        "pp_cutoffHzDC: 0 is out of range",
+        "pp_cutoffHzDC: expected a number above 0, at most 1000000, got 0",
     ),
     # connections and activities
     Refusal(
@@ -161,14 +161,14 @@ REFUSALS = (
         "rosAFE/connect_port",
         {"local": "Audio", "remote": "bas/Audio"},
         "::genom::no_such_outport",
-        "nobody publishes /bas/Audio",
+        "/bas/Audio is not published",
         ("request", "ild", "-i", "empty", "--connect", "bas/Audio"),
     ),
     Refusal(
         "rosAFE/connect_port",
         {"local": "Audio", "remote": "bass/genom_state"},
         "::genom::port_io",
-        "/bass/genom_state is a bass/genom_state_component, Audio takes binaudio_portStruct",
+        "/bass/genom_state: expected type binaudio_portStruct, got bass/genom_state_component",
     ),
     Refusal("rosAFE/abort_activity", {"activity": 4711}, "::genom::no_such_activity", "no activity 4711; there are: "),
     # sound
@@ -183,7 +183,7 @@ REFUSALS = (
         "bass/Acquire",
         {"device": "scene:?speed=2"},
         "e_device",
-        "scene:?speed=2: no option 'speed'; there are: ",
+        "scene:?speed=2: unknown option 'speed'; expected one of ",
         ("record", "--device", "scene:?speed=2"),
     ),
     Refusal(
@@ -197,7 +197,7 @@ REFUSALS = (
 NUMBERED = [pytest.param(k, id=f"{k + 1}-{r.request.partition('/')[2]}") for k, r in enumerate(REFUSALS)]
 WITH_COMMAND = [k for k, refusal in enumerate(REFUSALS) if refusal.command]
 
-# As `rosservice call NAME YAML` and `rosafe WORD ...` one after the other: to start Python thirty times takes long.
+# Run `rosservice call NAME YAML` and `rosafe WORD ...` in one process, because starting Python is slow.
 ROSSERVICE = """
 import json, sys, rosservice
 for name, text in json.load(sys.stdin):
@@ -228,12 +228,12 @@ def world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
 
 
 def full(refusal: Refusal) -> str:
-    """The exception's whole name."""
+    """Return the complete name of the exception."""
     return refusal.ex if refusal.ex.startswith("::") else f"::{refusal.request.partition('/')[0]}::{refusal.ex}"
 
 
 def check(refusal: Refusal, body: dict[str, Any]) -> None:
-    """The exception as a client got it is the one that was to come, with its reason at one of its two places."""
+    """Check that a client got the expected exception, with its reason in one of two places."""
     assert body["ex"] == full(refusal), body
     places = [body["what"]] if "what" in body else []
     places += [body["detail"]["what"]] if "what" in body.get("detail", {}) else []
@@ -308,7 +308,7 @@ def by_octave(world: World) -> dict[str, Any]:
         fields = ", ".join(f"'{name}', {_matlab(value)}" for name, value in refusal.given.items())
         component, request = refusal.request.split("/")
         lines.append(f"show('r{number}', {component}.{request}(struct({fields})).exception);")
-    return octave.shown(
+    return octave.run_and_parse(
         world,
         "client = genomix.client(); bass = client.load('bass'); rosAFE = client.load('rosAFE');\n" + "\n".join(lines),
     )

@@ -1,4 +1,4 @@
-"""Whole trees in one request, with real nodes: over HTTP, in tclsh, on the command line, and all of them at once."""
+"""Whole trees in one request, with real nodes: over HTTP, in tclsh, on the command line, and concurrently."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def names(world: World, component: str = "rosAFE") -> list[str]:
 
 
 def activities(world: World, component: str) -> list[str]:
-    """The names of a component's live activities, as it last told."""
+    """Return the names of a component's running activities from its latest state."""
     tasks = world.http.call(f"{component}/genom_state")["genom_state"]["task"]
     return [activity["name"] for task in tasks for activity in task["activity"]]
 
@@ -62,7 +62,7 @@ def command(world: World, *arguments: str) -> tuple[int, str, str]:
 
 
 def test_the_tree_and_its_numbers(sound: World) -> None:
-    """The port holds what `rosafe.process` makes of the input with the same parameters."""
+    """The port has the output of `rosafe.process` for the same input and parameters."""
     wanted = {"fb_nChannels": 5, "ild_wSizeSec": 0.04, "ild_hSizeSec": 0.02, "ihc_method": "halfwave"}
     told = sound.http.call("rosAFE/request", {"representation": "ild", **wanted, "nFramesPerBlock": 8820})
     assert told == {
@@ -94,13 +94,13 @@ def test_the_tree_and_its_numbers(sound: World) -> None:
 
 
 def _settled(world: World, first: str, second: str) -> dict[str, Any]:
-    """The second port, once it is as far as the first, which has come to rest; empty until then."""
+    """Return the second port when it has reached the first one, which has stopped; empty before."""
     one, two = (world.http.call(f"rosAFE/{port}")[port.partition("/")[0]] for port in (first, second))
     again = world.http.call(f"rosAFE/{first}")[first.partition("/")[0]]
     return two if one["lastFrameIndex"] == two["lastFrameIndex"] == again["lastFrameIndex"] else {}
 
 
-def test_what_fits_is_used_again(sound: World) -> None:
+def test_matching_processors_are_reused(sound: World) -> None:
     call = sound.http.call
     assert call("rosAFE/request", ["ild", {"fb_nChannels": 3}])["created"] == CHAIN
     assert call("rosAFE/request", ["ild", {"fb_nChannels": "3"}])["reused"] == CHAIN
@@ -113,16 +113,16 @@ def test_what_fits_is_used_again(sound: World) -> None:
     (_, second) = parameters(sound, "gammatone")
     assert call("rosAFE/request", {"representation": "ihc", "gammatone": second})["name"] == "innerhaircell_1"
     assert call("rosAFE/request", ["input"])["port"] == "inputProcPort"
-    # Changed by hand: no longer what a request means, and then again.
+    # After manual changes, the processor no longer matches the request, and then matches it again.
     changed = {"nameProc": "time_0", "nameParam": "pp_bRemoveDC", "newValue": "1"}
     call("rosAFE/modifyParameter", changed)
     assert call("rosAFE/request", ["time"])["created"] == ["time_1"]
     assert call("rosAFE/request", ["ild", {"fb_nChannels": 3, "pp_bRemoveDC": 1}])["reused"] == CHAIN
-    # The middle of the tree is gone.
+    # The middle of the tree was removed.
     call("rosAFE/removeProcessor", ["filterbank_0"])
     told = call("rosAFE/request", ["ild", {"fb_nChannels": 3, "pp_bRemoveDC": True}])
     assert told["dependencies"] == ["input_0", "time_0", "filterbank_2", "innerhaircell_2", "ild_0"]
-    # What was made by hand counts too.
+    # Manually created processors are used too.
     call("rosAFE/Stop")
     call("rosAFE/InputProc")
     call("rosAFE/PreProc", {"pp_coefPreEmphasis": 0.9})
@@ -134,11 +134,11 @@ def test_what_fits_is_used_again(sound: World) -> None:
     assert call("rosAFE/request", ["time", {"pp_coefPreEmphasis": 0}])["reused"] == ["input", "time_0"]
 
 
-def test_nothing_is_left_of_what_fails(sound: World) -> None:
+def test_a_failed_request_leaves_no_processor(sound: World) -> None:
     world, http = sound, sound.http
     refused = refusal(lambda: http.call("rosAFE/request", ["ild", {"fb_highFreqHz": 30000}]))
     assert (refused.status, refused.ex) == (422, "::rosAFE::e_badNewValue")
-    assert "is not below half the sample rate" in refused.what
+    assert "expected channels below half the sample rate" in refused.what
     assert names(world) == []
     harness.wait_for(lambda: activities(world, "rosAFE") == [])
     http.call("rosAFE/request", ["time"])
@@ -165,8 +165,8 @@ def test_in_the_background(sound: World) -> None:
     assert refusal(lambda: sound.http.send("rosAFE/request", ["ild", {"x": 1}])).ex == "::genom::serialization"
 
 
-def test_four_clients_at_once(sound: World) -> None:
-    """Two by HTTP, one of them in a session, and two commands: one tree, in which nothing is there twice."""
+def test_four_concurrent_clients(sound: World) -> None:
+    """Two HTTP clients, one of them in a session, and two commands: one tree without duplicates."""
     channels = ["fb_nChannels=2", "fb_nChannels=2", "fb_nChannels=3", "fb_nChannels=3"]
 
     def by_http(session: str, count: str) -> Any:
@@ -243,7 +243,7 @@ def test_tcl(sound: World) -> None:
     assert lines[5] == "callback|::genomix::request1"
     assert lines[6] == "ild_0"
     assert lines[7].startswith("request: representation is missing; one of input, time, filterbank")
-    assert lines[8] == 'request: after representation comes a dict of parameters, and not "fb_nChannels 16"'
+    assert lines[8] == 'request: expected a dict of parameters after representation, got "fb_nChannels 16"'
     assert lines[9:12] == ["::genom::serialization"] * 2 + ["::rosAFE::e_badNewValue"]
     assert lines[13] == "  rosAFE::request representation ?{parameter value ...}?"
     assert lines[14].startswith("  representation (string, no default, one of input, time")
@@ -263,13 +263,13 @@ def test_the_command(sound: World) -> None:
     assert (code, out.split()[::3]) == (0, ["reused", "reused"])
     assert err.splitlines() == [
         "rosafe request: cc_wname has no effect on this representation",
-        "rosafe request: nFramesPerBlock has no effect: the input is there already",
+        "rosafe request: nFramesPerBlock has no effect: the input exists already",
     ]
-    # before anything is made, or refused
+    # before a processor is created or rejected
     code, out, err = command(world, "ILD", "fb_highFreqHz=99999", "--connect", "foo/bar")
     assert (code, out) == (1, "")
     vain, refused = err.splitlines()
-    assert vain == "rosafe request: connect has no effect: the input is there already"
+    assert vain == "rosafe request: connect has no effect: the input exists already"
     assert refused.startswith("rosafe request: ::rosAFE::e_badNewValue: fb_highFreqHz: ")
     code, out, err = command(world, "--json", "ratemap", "rm_decaySec=0.01", "fb_cfHz=500,1000,2000")
     assert (code, err) == (0, "")
@@ -282,19 +282,19 @@ def test_the_command(sound: World) -> None:
     ("arguments", "code", "told"),
     [
         ([], 2, "the following arguments are required: REPRESENTATION;"),
-        (["spikes"], 1, "'spikes' is not one of input, time"),
-        (["ild", "fb_nChannels"], 1, "fb_nChannels: wanted is NAME=VALUE"),
+        (["spikes"], 1, "representation: expected one of input, time"),
+        (["ild", "fb_nChannels"], 1, "expected NAME=VALUE, got 'fb_nChannels'"),
         (["ild", "fb_nChannels=1", "fb_nChannels=2"], 1, "fb_nChannels is given twice"),
         (["ild", "fb_nERB=1"], 1, "unknown parameter 'fb_nERB'; there are: nFramesPerBlock"),
         (["ild", "fb_nchannels=1"], 1, "; did you mean fb_nChannels?\n"),
         (["rate_map"], 1, "; did you mean ratemap?\n"),
         (["ild", "representation=time"], 1, "unknown parameter 'representation'"),
-        (["ild", "fb_nChannels=-1"], 1, "fb_nChannels: -1 is not"),
-        (["ild", "ihc_method=hilbrt"], 1, "'hilbrt' is not one of none"),
-        (["ild", "nFramesPerBlock=0"], 1, "nFramesPerBlock: 0 is out of range"),
+        (["ild", "fb_nChannels=-1"], 1, "fb_nChannels: expected a number in the range of unsigned long, got -1"),
+        (["ild", "ihc_method=hilbrt"], 1, "ihc_method: expected one of none, halfwave"),
+        (["ild", "nFramesPerBlock=0"], 1, "nFramesPerBlock: expected a number from 1 to 10000000, got 0"),
         (["ild", "--wrong"], 2, "unrecognized arguments: --wrong"),
-        (["ild", "-i", "a b"], 1, "'a b' is no name"),
-        (["ild", "-i", "bass"], 1, "/bass is a bass, and no rosAFE"),
+        (["ild", "-i", "a b"], 1, "got 'a b'"),
+        (["ild", "-i", "bass"], 1, "/bass: expected the component rosAFE, got bass"),
         (["ild", "--connect", "no/Topic"], 1, "::genom::no_such_outport"),
     ],
 )
@@ -312,7 +312,7 @@ def test_no_master(world: World) -> None:
 
 
 def test_without_sound(world: World) -> None:
-    """What is refused or interrupted while there is none leaves nothing, and the command tells what to do."""
+    """Rejected and interrupted requests without audio leave no processor, and the command prints the next step."""
     with world.graph.node("bass-ros", "-i", "mute"), world.graph.node("rosAFE-ros", "-i", "deaf"):
         refused = refusal(lambda: world.http.call("deaf/request", ["ild", {"connect": "mute/Audio"}]))
         assert (refused.status, refused.ex) == (422, "::rosAFE::e_noData")

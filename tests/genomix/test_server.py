@@ -26,7 +26,7 @@ def start_tree(http: Http) -> None:
 # --- components -------------------------------------------------------------------------------------------------
 
 
-def test_load_tells_the_interface(world: World) -> None:
+def test_load_returns_the_interface(world: World) -> None:
     told = world.http.get("/load/rosAFE", s="load")
     assert (told["name"], told["component"], told["instance"]) == ("rosAFE", "rosAFE", "rosAFE")
     assert list(told["services"]) == [
@@ -61,9 +61,9 @@ def test_an_instance_has_names_of_its_own(world: World) -> None:
         assert (told["name"], told["component"]) == ("left", "bass")
         world.http.call("left/Acquire", {"device": "scene:", "nFramesPerChunk": 500})
         assert world.http.call("left/Audio")["Audio"]["nFramesPerChunk"] == 500
-        # An instance says itself what it is.
+        # An instance reports its component.
         assert world.http.get("/load/left", s="fresh")["component"] == "bass"
-        with pytest.raises(HttpError, match="/left is a bass, and no rosAFE"):
+        with pytest.raises(HttpError, match="/left: expected the component rosAFE, got bass"):
             world.http.get("/load/rosAFE", i="left")
 
 
@@ -98,7 +98,7 @@ def test_aliases_of_services_and_ports(world: World) -> None:
 
 
 def test_signals_are_those_of_the_ports(world: World) -> None:
-    """What getSignals returns through genomixd is, number for number, what the port published."""
+    """getSignals returns exactly the numbers that the port has published."""
     start_tree(world.http)
 
     def arrived() -> bool:
@@ -149,7 +149,7 @@ def test_exceptions_of_the_component(world: World) -> None:
     assert [p["name"] for p in world.http.call("rosAFE/getParameters")["parameters"]["gammatone"]] == ["gammatone"]
 
 
-def test_refused_arguments_reach_no_component(world: World) -> None:
+def test_rejected_arguments_are_not_sent_to_a_component(world: World) -> None:
     for given, told in (({"bogus": 1}, "unknown parameter 'bogus'"), ({"name": 7}, "name is a string")):
         for verb in ("call", "send"):
             with pytest.raises(HttpError, match=told) as caught:
@@ -181,7 +181,7 @@ def test_refused_arguments_reach_no_component(world: World) -> None:
         ("/call", 404, "::genomix::e_url"),
     ],
 )
-def test_mistakes_have_names(world: World, url: str, status: int, ex: str) -> None:
+def test_errors_have_names(world: World, url: str, status: int, ex: str) -> None:
     got, body = world.http.raw(url)
     assert (got, json.loads(body)["ex"]) == (status, ex)
     assert json.loads(body)["detail"]["what"]
@@ -196,7 +196,7 @@ def test_an_activity_is_sent_until_it_ends(world: World) -> None:
     assert world.http.status(number) == {"id": number, "status": "sent"}
     assert world.http.get("/requests", s="t")[number] == "sent"
     assert world.http.get("/request/wait", id=number, s="t", ms=50)["status"] == "sent"
-    with pytest.raises(HttpError, match="is not done yet"):
+    with pytest.raises(HttpError, match="has not finished yet"):
         world.http.get("/request/result", id=number, s="t")
     world.http.call("bass/Stop")
     assert world.http.wait(number, "done") == {"id": number, "status": "done", "output": {}}
@@ -215,8 +215,8 @@ def test_abort_ends_the_activity(world: World) -> None:
     harness.wait_for(lambda: not live_activities(world, "bass"), what=lambda: str(tasks))
 
 
-def test_abort_of_what_is_on_its_way(world: World) -> None:
-    """An activity may be aborted before the component has it."""
+def test_abort_of_a_request_in_progress(world: World) -> None:
+    """An activity can be aborted before the component has received it."""
     for _ in range(10):
         number = world.http.send("bass/Acquire", {"device": "scene:"}, s="order")
         world.http.get("/request/abort", id=number, s="order")
@@ -225,7 +225,7 @@ def test_abort_of_what_is_on_its_way(world: World) -> None:
     harness.wait_for(lambda: not live_activities(world, "bass"))
 
 
-def test_what_a_session_asked_for_is_done_after_its_end(world: World) -> None:
+def test_requests_of_a_session_are_completed_after_its_end(world: World) -> None:
     world.http.call("rosAFE/connect_port", ["Audio", "bass/Audio"])
     for target in ("bass/Acquire", "rosAFE/InputProc", "rosAFE/PreProc"):
         number = world.http.send(target, ["scene:"] if target == "bass/Acquire" else None, s="brief")
@@ -240,7 +240,7 @@ def live_activities(world: World, component: str) -> list[str]:
     return [activity["name"] for task in tasks for activity in task["activity"]]
 
 
-def test_clean_lets_the_activity_go_on(world: World) -> None:
+def test_the_activity_of_a_cleaned_request_continues(world: World) -> None:
     number = world.http.send("bass/Acquire", {"device": "scene:"}, ack=1)
     world.http.get("/request/clean", id=number, s="t")
     harness.wait_for(lambda: live_activities(world, "bass") == ["Acquire"])
@@ -254,8 +254,8 @@ def test_an_activity_that_fails(world: World) -> None:
     assert caught.value.ex == "::bass::e_device"
 
 
-def test_requests_in_one_breath_go_in_order(world: World) -> None:
-    """Each processor of the chain is asked for before its parent has answered."""
+def test_requests_without_pauses_are_sent_in_order(world: World) -> None:
+    """Each processor of the chain is requested before its parent has answered."""
     world.http.call("rosAFE/connect_port", ["Audio", "bass/Audio"])
     chain = ["bass/Acquire", "rosAFE/InputProc", "rosAFE/PreProc", "rosAFE/GammatoneProc", "rosAFE/IhcProc"]
     numbers = [world.http.send(chain[0], {"device": "scene:"}), *(world.http.send(name) for name in chain[1:])]
@@ -282,7 +282,7 @@ def test_functions_and_ports_in_the_background(world: World) -> None:
     assert caught.value.ex == "::rosAFE::e_noSuchProcessor"
 
 
-def test_oneway_leaves_nothing_to_ask_for(world: World) -> None:
+def test_a_oneway_request_has_no_status(world: World) -> None:
     start_tree(world.http)
     assert world.http.get("/send/rosAFE/removeProcessor", ["gammatone"], s="t1", oneway=1) == {}
     assert world.http.get("/requests", s="t1") == {}
@@ -300,7 +300,7 @@ def test_start_and_stop(world: World) -> None:
     assert world.http.raw("/session/stop?s=never-there") == (200, "")
 
 
-def test_listeners_are_told(world: World) -> None:
+def test_listeners_get_events(world: World) -> None:
     with world.http.listening(s="ears") as events:
         number = world.http.send("bass/Acquire", {"device": "scene:"}, s="ears")
         assert next(events) == ("request", json.dumps({"id": number, "status": "sent"}, separators=(",", ":")))
@@ -328,7 +328,7 @@ def test_listeners_may_have_tcl(world: World) -> None:
 # --- ports ------------------------------------------------------------------------------------------------------
 
 
-def test_ports_give_the_newest_sample(world: World) -> None:
+def test_ports_return_the_latest_message(world: World) -> None:
     start_tree(world.http)
     first = world.http.call("bass/Audio")["Audio"]["lastFrameIndex"]
     harness.wait_for(lambda: world.http.call("bass/Audio")["Audio"]["lastFrameIndex"] > first)
@@ -337,7 +337,7 @@ def test_ports_give_the_newest_sample(world: World) -> None:
     published = world.graph.run("rostopic", "echo", "-n1", "--noarr", "/bass/Audio").stdout
     assert f"lastFrameIndex: {audio['lastFrameIndex']}\n" in published
     assert len(audio["left"]) == audio["nChunksOnPort"] * audio["nFramesPerChunk"]
-    # A new processor of an old name: what is read is of the new one, at once.
+    # A new processor with an old name: the port has its data immediately.
     world.http.call("rosAFE/removeProcessor", ["gammatone"])
     world.http.call("rosAFE/GammatoneProc", {"fb_nChannels": 2})
     assert world.http.call("rosAFE/gammatonePort/gammatone")["gammatonePort"]["numberOfChannels"] == 2
@@ -347,8 +347,8 @@ def test_a_port_without_a_sample_is_zeros(world: World) -> None:
     assert world.http.call("rosAFE/dataObj")["dataObj"] == {kind: [] for kind in interface.CORE_REPRESENTATIONS}
 
 
-def test_what_is_not_there_makes_the_node_say_nothing(world: World) -> None:
-    """A node that is asked for a topic that it does not have names all that it has, in kilobytes."""
+def test_a_missing_element_is_not_logged_by_the_node(world: World) -> None:
+    """A node that gets a request for a missing topic would log kilobytes with all its topics."""
     with world.graph.node("rosAFE-ros", "-i", "quiet") as node:
         world.http.call("bass/Acquire", ["scene:"])
         world.http.call("quiet/request", ["filterbank", {"fb_nChannels": 2}])

@@ -1,4 +1,4 @@
-"""Sessions without a server and a graph: how long they live, who has how many, and what their requests occupy."""
+"""Sessions without a server and a graph: their duration, number and memory."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from rosafe.interface import BASS, ROSAFE, ComponentError, Service
 
 
 class Component(ComponentClient):
-    """A bass whose functions answer with as many bytes as they are told, once they may."""
+    """A bass whose functions return a given number of bytes when `may_answer` is set."""
 
     def __init__(self) -> None:
         super().__init__(Graph("http://127.0.0.1:9"), BASS, "bass")
@@ -31,7 +31,7 @@ class Component(ComponentClient):
         self.size = 0
         self.called: list[str] = []
 
-    def arguments(self, service: Service, given: Any) -> dict[str, Any]:
+    def arguments(self, service: Service, text_args: Any) -> dict[str, Any]:
         return {}
 
     async def call(self, service: Service, values: Mapping[str, Any]) -> Value:
@@ -47,18 +47,18 @@ def run(test: Callable[[Sessions, Component], Awaitable[None]]) -> None:
 
     async def checked() -> None:
         component = Component()
-        every = Sessions(component._graph)
+        every = Sessions(component.graph)
         await test(every, component)
         component.may_answer.set()
         await every.close()
-        await component._graph.close()
+        await component.graph.close()
 
     asyncio.run(checked())
 
 
 def send(session: Session, component: Component, keep: bool = True, size: int = 0) -> Request:
     """Send a function that takes `size` bytes of arguments."""
-    return session.send("bass", component, "ListDevices", {}, "", keep, size)
+    return session.send("bass", component.prepare_call("ListDevices", {}, ""), keep, size)
 
 
 async def wait_until(condition: Callable[[], bool]) -> None:
@@ -67,10 +67,10 @@ async def wait_until(condition: Callable[[], bool]) -> None:
             await asyncio.sleep(0.005)
 
 
-# --- how long they live -----------------------------------------------------------------------------------------
+# --- duration -----------------------------------------------------------------------------------------
 
 
-def test_sessions_end_when_their_clients_are_gone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sessions_end_after_their_clients_have_disconnected(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sessions, "SWEEP_SECONDS", 0.01)
     monkeypatch.setattr(sessions, "LINGER_SECONDS", 0.05)
     monkeypatch.setattr(sessions, "IDLE_SECONDS", 0.1)
@@ -95,7 +95,20 @@ def test_sessions_end_when_their_clients_are_gone(monkeypatch: pytest.MonkeyPatc
     run(check)
 
 
-def test_who_has_most_gives_up_what_is_idle_longest(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_session_without_listeners_expires_later_than_one_that_listened() -> None:
+    async def check(every: Sessions, component: Component) -> None:
+        polling, listened = every.get("polling"), every.get("listened")
+        listened.leave(listened.listen())
+        for session in (polling, listened):
+            session.used_at -= (sessions.LINGER_SECONDS + sessions.IDLE_SECONDS) / 2
+        assert (polling.expired, listened.expired) == (False, True)
+        polling.used_at -= sessions.IDLE_SECONDS
+        assert polling.expired
+
+    run(check)
+
+
+def test_the_longest_idle_session_of_the_largest_client_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sessions, "MAX_SESSIONS", 8)
 
     async def check(every: Sessions, component: Component) -> None:
@@ -119,7 +132,7 @@ def test_who_has_most_gives_up_what_is_idle_longest(monkeypatch: pytest.MonkeyPa
         for session in (every.get("c7", "crowd"), every.get("c1"), *others, shared, mine):
             session.busy += 1
         every.get("c8", "crowd")
-        assert "c0" not in every._sessions  # nothing better is left to give up
+        assert "c0" not in every._sessions  # no finished session is left
         every.get("c8").busy += 1
         send(every.get("c7"), component)
         with pytest.raises(ComponentError, match="sessions are open"):
@@ -130,11 +143,11 @@ def test_who_has_most_gives_up_what_is_idle_longest(monkeypatch: pytest.MonkeyPa
     run(check)
 
 
-# --- what requests occupy ---------------------------------------------------------------------------------------
+# --- memory of requests ---------------------------------------------------------------------------------------
 
 
-def test_results_that_nobody_fetches_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The oldest of whoever has most go; the newest of all stays, however large."""
+def test_unfetched_results_are_limited(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The oldest results of the largest session are dropped; the newest one remains, whatever its size."""
     monkeypatch.setattr(sessions, "MAX_KEPT", 100_000 + 7 * REQUEST_BYTES)
 
     async def check(every: Sessions, component: Component) -> None:
@@ -163,7 +176,7 @@ def test_results_that_nobody_fetches_are_bounded(monkeypatch: pytest.MonkeyPatch
 
 
 def test_events_keep_no_results(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A listener that does not read holds on to nothing large; it is told how large it was."""
+    """Large results are not kept for a listener that does not read; its events contain their size."""
 
     async def check(every: Sessions, component: Component) -> None:
         session = every.get("s")
@@ -182,8 +195,8 @@ def test_events_keep_no_results(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("keep", [True, False])
-def test_requests_under_way_are_bounded(monkeypatch: pytest.MonkeyPatch, keep: bool) -> None:
-    """Those that nobody follows, and those that were cleaned, count until they have ended."""
+def test_requests_in_progress_are_limited(monkeypatch: pytest.MonkeyPatch, keep: bool) -> None:
+    """Detached and cleaned requests count until they have ended."""
     monkeypatch.setattr(sessions, "MAX_REQUESTS", 10)
     monkeypatch.setattr(sessions, "MAX_KEPT", 17 * REQUEST_BYTES)
 
@@ -194,14 +207,14 @@ def test_requests_under_way_are_bounded(monkeypatch: pytest.MonkeyPatch, keep: b
             request = send(one, component, keep)
             if keep:
                 one.clean(request.id)
-        with pytest.raises(ComponentError, match="a session has at most 10 requests under way"):
+        with pytest.raises(ComponentError, match="a session has at most 10 requests in progress"):
             send(one, component, keep)
         for _ in range(6):
             send(other, component, keep)
-        with pytest.raises(ComponentError, match="requests under way take"):
+        with pytest.raises(ComponentError, match="requests in progress occupy"):
             send(other, component, keep, size=REQUEST_BYTES + 1)
         send(other, component, keep)
-        with pytest.raises(ComponentError, match="requests under way take"):
+        with pytest.raises(ComponentError, match="requests in progress occupy"):
             send(every.get("third"), component, keep)
         component.may_answer.set()
         await wait_until(lambda: len(component.called) == 17)
@@ -212,8 +225,8 @@ def test_requests_under_way_are_bounded(monkeypatch: pytest.MonkeyPatch, keep: b
     run(check)
 
 
-def test_what_has_not_ended_is_not_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
-    """For new requests those go that have ended, and only those."""
+def test_requests_in_progress_are_not_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only finished requests are forgotten for new ones."""
     monkeypatch.setattr(sessions, "MAX_REQUESTS", 4)
 
     async def check(every: Sessions, component: Component) -> None:
@@ -231,7 +244,7 @@ def test_what_has_not_ended_is_not_forgotten(monkeypatch: pytest.MonkeyPatch) ->
         await ended[-1].finished.wait()
         component.may_answer.clear()
         running.append(send(session, component))
-        with pytest.raises(ComponentError, match="a session has at most 4 requests under way"):
+        with pytest.raises(ComponentError, match="a session has at most 4 requests in progress"):
             send(session, component)
         assert list(session.requests.values()) == running
         for request in running:
@@ -243,7 +256,7 @@ def test_what_has_not_ended_is_not_forgotten(monkeypatch: pytest.MonkeyPatch) ->
 # --- in which order ---------------------------------------------------------------------------------------------
 
 
-def test_a_request_waits_for_the_one_before(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_request_waits_for_the_previous_one(monkeypatch: pytest.MonkeyPatch) -> None:
     async def check(every: Sessions, component: Component) -> None:
         for session, called in ((every.get(""), 2), (every.get("named"), 1)):
             component.called.clear()
@@ -251,7 +264,7 @@ def test_a_request_waits_for_the_one_before(monkeypatch: pytest.MonkeyPatch) -> 
             requests = [send(session, component) for _ in range(2)]
             for _ in range(50):
                 await asyncio.sleep(0)
-            assert len(component.called) == called  # those without a name wait for nobody
+            assert len(component.called) == called  # requests without a session name are not ordered
             component.may_answer.set()
             for request in requests:
                 await request.finished.wait()
@@ -259,7 +272,7 @@ def test_a_request_waits_for_the_one_before(monkeypatch: pytest.MonkeyPatch) -> 
     run(check)
 
 
-def test_a_request_waits_not_for_ever() -> None:
+def test_a_request_waits_for_a_limited_time() -> None:
     async def check(every: Sessions, component: Component) -> None:
         component.may_answer.clear()
         requests = [send(every.get("named"), component) for _ in range(2)]
@@ -269,7 +282,7 @@ def test_a_request_waits_not_for_ever() -> None:
     run(check)
 
 
-def test_what_ended_sessions_asked_for_is_forgotten() -> None:
+def test_requests_of_ended_sessions_are_forgotten() -> None:
     async def check(every: Sessions, component: Component) -> None:
         component.may_answer.clear()
         session = every.get("s")
@@ -284,7 +297,7 @@ def test_what_ended_sessions_asked_for_is_forgotten() -> None:
 
 
 def test_a_dead_component_without_a_session_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With all its connections, unless a session has it loaded, or it comes back in time."""
+    """Also its connections, unless a session has loaded it or it answers again in time."""
     monkeypatch.setattr(sessions, "CHECK_SECONDS", 0.005)
 
     async def check(every: Sessions, component: Component) -> None:
@@ -299,7 +312,7 @@ def test_a_dead_component_without_a_session_is_forgotten(monkeypatch: pytest.Mon
         monkeypatch.setattr(component, "is_reachable", is_reachable)
         monkeypatch.setattr(component, "close", close)
         shared, named = every.get(""), every.get("named")
-        every._proxies["bass"] = shared.components["ears"] = named.components["bass"] = component
+        every._clients["bass"] = shared.components["ears"] = named.components["bass"] = component
         queue = named.listen(), shared.listen()
         before = component.answered_at
         await wait_until(lambda: component.answered_at > before)
@@ -307,11 +320,11 @@ def test_a_dead_component_without_a_session_is_forgotten(monkeypatch: pytest.Mon
         monkeypatch.setattr(sessions, "DEAD_SECONDS", 0.02)
         await wait_until(lambda: not shared.components)
         assert queue[1].get_nowait() == ("unload", {"component": "ears"})
-        assert named.components and queue[0].empty() and not closed and every._proxies
+        assert named.components and queue[0].empty() and not closed and every._clients
         shared.components["ears"] = component
         await named.unload("bass")
         await wait_until(lambda: bool(closed))
-        assert not (shared.components or every._proxies)
+        assert not (shared.components or every._clients)
 
     run(check)
 
@@ -327,7 +340,7 @@ def test_a_listener_that_reads_nothing_is_dropped(monkeypatch: pytest.MonkeyPatc
         deaf, attentive = session.listen(), session.listen()
         heard = []
         for number in range(5):
-            session.tell("request", number)
+            session.notify("request", number)
             heard.append(attentive.get_nowait())
         assert [deaf.get_nowait() for _ in range(4)] == [("request", 0), ("request", 1), ("request", 2), ("quit", "")]
         assert deaf.empty()

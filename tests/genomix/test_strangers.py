@@ -1,4 +1,4 @@
-"""The Tcl and Octave clients before a server that is no genomixd, or one that lies: an error, at once."""
+"""The Tcl and Octave clients with a server that is not genomixd or sends invalid data: an immediate error."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.matlab import octave
 
 OK = b"HTTP/1.1 200 OK\r\n"
 CHUNKED = OK + b"Transfer-Encoding: chunked\r\n\r\n"
-ENDLESS = 64 * 2**20  # bytes that are sent where a client reads on and on
+ENDLESS = 64 * 2**20  # bytes that are sent if the client does not stop reading
 
 
 class Stranger:
@@ -27,7 +27,7 @@ class Stranger:
         self._answer, self._endless = answer, endless
         self._socket = socket.create_server(("127.0.0.1", 0))
         self.port = int(self._socket.getsockname()[1])
-        self.swallowed = 0  # bytes of what has no end that the client took
+        self.swallowed = 0  # bytes of endless data that the client has read
         self._thread = threading.Thread(target=self._serve, daemon=True)
         self._thread.start()
 
@@ -56,7 +56,7 @@ class Stranger:
 
 @contextlib.contextmanager
 def stranger(answer: bytes, endless: bytes = b"") -> Iterator[Stranger]:
-    """A server for the time of the block."""
+    """Run a server in the block."""
     server = Stranger(answer, endless)
     try:
         yield server
@@ -109,15 +109,15 @@ def test_tcl(lie: str, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("body", "told"),
     [
-        (b"unbalanced {", "describes no component"),
-        (b"name", "describes no component"),
-        (b"name x services y", "describes no component"),
-        (b"name x services {a {}} ports {b", "describes no component"),
-        (b"name {a b} services {} ports {}", "cannot be the name"),
-        (b"name ::oo services {} ports {}", "cannot be the name"),
+        (b"unbalanced {", "expected the description of a component"),
+        (b"name", "expected the description of a component"),
+        (b"name x services y", "expected the description of a component"),
+        (b"name x services {a {}} ports {b", "expected the description of a component"),
+        (b"name {a b} services {} ports {}", "is not allowed as a namespace"),
+        (b"name ::oo services {} ports {}", "is not allowed as a namespace"),
     ],
 )
-def test_tcl_is_told_nonsense(body: bytes, told: str, tmp_path: Path) -> None:
+def test_tcl_reports_invalid_answers(body: bytes, told: str, tmp_path: Path) -> None:
     with stranger(length(len(body), body)) as server:
         script = tmp_path / "script.tcl"
         script.write_text(f"""

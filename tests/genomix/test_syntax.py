@@ -1,4 +1,4 @@
-"""Values as JSON and as Tcl: what is written reads back the same, and Tcl reads words as they were."""
+"""Values as JSON and as Tcl: written values are read back unchanged, and so are words in Tcl."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ while {[gets stdin line] >= 0} {
 
 @pytest.fixture(scope="module")
 def split(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
-    """A function that has Tcl split a list into its words."""
+    """Return a function that splits a list with Tcl."""
     script = tmp_path_factory.mktemp("tcl") / "reader.tcl"
     script.write_text(READER)
     with subprocess.Popen(
@@ -101,7 +101,7 @@ def test_long_arrays_come_back_the_same(split: Any, length: int) -> None:
     assert [float(w) for w in words[1::2]] == numbers.tolist()
 
 
-def test_what_is_not_finite_is_null_but_nan_is_nan_in_tcl() -> None:
+def test_non_finite_numbers_are_null_but_nan_is_nan_in_tcl() -> None:
     values = np.array([1.5, math.nan, math.inf, -math.inf])
     assert text_of(JSON, "sequence<double>", values) == "[1.5,null,null,null]"
     assert text_of(TCL, "sequence<double>", values) == "{0 1.5 1 NaN 2 null 3 null}"

@@ -34,7 +34,7 @@ rosAFE::GammatoneProc {fb_nChannels 4}
 # --- connections and components ---------------------------------------------------------------------------------
 
 
-def test_the_package_says_its_version_and_does_nothing_at_load(world: World) -> None:
+def test_the_package_has_a_version_and_no_side_effects_at_load(world: World) -> None:
     script = """
         foreach name {byte character plain part root clients encoded} {set $name mine}
         set before ""
@@ -114,11 +114,11 @@ def test_mistakes_at_connecting_and_loading(world: World) -> None:
     what = f"no genomixd at 127.0.0.1:{port} (couldn't open socket: connection refused)"
     assert lines[0] == f"ex ::genom::mwerr detail {{what {{{what}}}}}|GENOM ::genom::mwerr {{what {{{what}}}}}"
     assert lines[1] == "::genom::serialization"
-    assert "GENOM ::genom::mwerr {what {nobody is not running: nobody serves /nobody/connect_port}}" in lines[2]
-    assert 'unknown option "-x"' in lines[3]
-    assert '"genomix" cannot be the name' in lines[4]
-    assert "as: letters, digits and _ only" in lines[5]
-    assert '"bass" is not loaded' in lines[6]
+    assert "GENOM ::genom::mwerr {what {nobody is not running: /nobody/connect_port is not registered}}" in lines[2]
+    assert 'got "-x"' in lines[3]
+    assert '"genomix" is not allowed as a namespace' in lines[4]
+    assert "as: expected a letter, followed by letters, digits and _" in lines[5]
+    assert 'got "bass"' in lines[6]
     assert "invalid command name" in lines[7]
 
 
@@ -200,21 +200,21 @@ def test_the_result_of_one_call_is_the_argument_of_another(world: World) -> None
         ("GammatoneProc {bogus 1}", "unknown parameter 'bogus'"),
         (
             "GammatoneProc {fb_nERBs abc}",
-            "fb_nERBs: 'abc' is not a finite number (fb_nERBs is a double; more than 0 to 100)",
+            "fb_nERBs: expected a finite number, got 'abc' (fb_nERBs is a double; above 0, at most 100)",
         ),
         ("GammatoneProc {fb_cfHz {1 x}}", "fb_cfHz is a sequence<double>"),
-        ("GammatoneProc {fb_nChannels 1.5}", "fb_nChannels: 1.5 is not a whole number"),
-        ("PreProc {pp_bRemoveDC 2}", "pp_bRemoveDC: '2' is not a boolean"),
-        ("GammatoneProc {name g fb_nERBs}", "fb_nERBs has no value in"),
-        ("getDependencies a b c", "3 arguments are too many; it takes nameProc"),
-        ("Stop now", "1 arguments are too many; it takes no parameters"),
+        ("GammatoneProc {fb_nChannels 1.5}", "fb_nChannels: expected a whole number, got 1.5"),
+        ("PreProc {pp_bRemoveDC 2}", "pp_bRemoveDC: expected a boolean, got '2'"),
+        ("GammatoneProc {name g fb_nERBs}", "expected a value for fb_nERBs"),
+        ("getDependencies a b c", "expected at most 1 arguments (nameProc), got 3"),
+        ("Stop now", "expected at most 0 arguments (no parameters), got 1"),
         ("connect_port", "local is missing; connect_port takes local (string), remote (string)"),
         ("connect_port Audio", "remote is missing"),
-        ("abort_activity -1x", 'unknown switch "-1x"; there are: -help, -send, -ack, -oneway, --'),
-        ("abort_activity -- -1", "activity: -1 is not in the range of unsigned long"),
-        ("abort_activity -1", "activity: -1 is not in the range of unsigned long"),
-        ("GammatoneProc -what g", 'unknown switch "-what"'),
-        ("ildPort a b", "takes one element, and not 2 arguments"),
+        ("abort_activity -1x", 'expected a switch (-help, -send, -ack, -oneway, --), got "-1x"'),
+        ("abort_activity -- -1", "activity: expected a number in the range of unsigned long, got -1"),
+        ("abort_activity -1", "activity: expected a number in the range of unsigned long, got -1"),
+        ("GammatoneProc -what g", 'got "-what"'),
+        ("ildPort a b", "expected at most one element, got 2 arguments"),
     ],
 )
 def test_refused_arguments_are_named(world: World, command: str, told: str) -> None:
@@ -236,7 +236,7 @@ def test_refused_arguments_are_named(world: World, command: str, told: str) -> N
     assert told in background
 
 
-def test_awkward_texts_arrive_as_they_are_and_nothing_is_evaluated(world: World) -> None:
+def test_special_characters_arrive_unchanged_and_are_not_evaluated(world: World) -> None:
     script = (
         LOAD
         + r"""
@@ -278,7 +278,7 @@ def test_results_are_dicts_with_indexed_sequences(world: World) -> None:
 
 
 def test_numbers_are_those_of_the_node(world: World) -> None:
-    """A port read in Tcl and one read with JSON hold the same numbers."""
+    """A port has the same numbers in Tcl and in JSON."""
     script = (
         TREE
         + """
@@ -311,13 +311,13 @@ def test_errors_of_the_component(world: World) -> None:
     assert world.lines(script) == [
         "ex ::rosAFE::e_noSuchProcessor what {there is no processor 'nobody'; there are: input, preProc, gammatone}"
         "|GENOM ::rosAFE::e_noSuchProcessor {}",
-        "::rosAFE::e_badNewValue|fb_nERBs: -1 is out of range, allowed is more than 0 to 100",
+        "::rosAFE::e_badNewValue|fb_nERBs: expected a number above 0, at most 100, got -1",
         "GENOM ::rosAFE::e_badNewValue",
         "trapped|ex ::rosAFE::e_existsAlready what {'preProc' exists already, of kind preProc}",
     ]
 
 
-def test_one_representation_is_there_at_once_and_all_of_them_are_not(world: World) -> None:
+def test_one_representation_is_faster_than_all_of_them(world: World) -> None:
     """A second of a full tree of 31 channels is 160 MB of text (here a quarter of that); of ILD or ratemap, little."""
     script = (
         LOAD
@@ -348,7 +348,7 @@ def test_one_representation_is_there_at_once_and_all_of_them_are_not(world: Worl
 # --- requests in the background ---------------------------------------------------------------------------------
 
 
-def test_a_request_lives_as_its_activity(world: World) -> None:
+def test_a_request_lasts_as_long_as_its_activity(world: World) -> None:
     script = (
         LOAD
         + """
@@ -398,6 +398,20 @@ def test_a_request_that_fails(world: World) -> None:
     ]
 
 
+def test_only_the_first_status_of_the_end_counts(world: World) -> None:
+    script = (
+        LOAD
+        + """
+        set r [rosAFE::getProcessors &]
+        show [$r wait]
+        set result [$r result]
+        show [$r update {status error exception {ex ::genom::late}}]
+        show [$r status] [expr {[$r result] eq $result}] [after info]
+    """
+    )
+    assert world.lines(script) == ["done", "0", "done|1|"]
+
+
 def test_callbacks_on_success_and_error_in_the_event_loop(world: World) -> None:
     script = (
         LOAD
@@ -441,7 +455,7 @@ def test_callbacks_on_success_and_error_in_the_event_loop(world: World) -> None:
     ]
 
 
-def test_background_everywhere(world: World) -> None:
+def test_requests_in_the_background(world: World) -> None:
     script = (
         TREE
         + """
@@ -477,7 +491,7 @@ def test_background_everywhere(world: World) -> None:
 
 
 def test_requests_go_in_order(world: World) -> None:
-    """A tree asked for in one breath, as scripts without pauses do."""
+    """A tree is requested without pauses, as in scripts."""
     script = (
         LOAD
         + """
@@ -501,7 +515,7 @@ def test_a_script_that_ends_does_not_hang(world: World) -> None:
     assert "ex ::bass::e_device" in done.stderr
 
 
-def test_a_server_that_goes_away_and_comes_back(world: World) -> None:
+def test_a_server_that_restarts(world: World) -> None:
     script = world.graph.home / "gone.tcl"
     script.write_text("""
         package require genomix
@@ -536,7 +550,7 @@ def test_a_server_that_goes_away_and_comes_back(world: World) -> None:
                 assert client.wait() == 0
 
 
-def test_localhost_is_a_private_server_that_dies_with_us(world: World) -> None:
+def test_localhost_starts_a_private_server_that_ends_with_the_shell(world: World) -> None:
     script = """
         set g [genomix::localhost]
         set h [genomix::localhost]
@@ -554,7 +568,7 @@ def test_localhost_is_a_private_server_that_dies_with_us(world: World) -> None:
 # --- help -------------------------------------------------------------------------------------------------------
 
 
-def test_help_tells_types_defaults_ranges_and_texts(world: World) -> None:
+def test_help_has_types_defaults_ranges_and_texts(world: World) -> None:
     script = (
         LOAD
         + """
@@ -582,7 +596,7 @@ def test_help_tells_types_defaults_ranges_and_texts(world: World) -> None:
 # --- the slips of the guide -------------------------------------------------------------------------------------
 
 
-def test_slips_of_the_guide_are_accepted(world: World) -> None:
+def test_errors_of_the_guide_are_accepted(world: World) -> None:
     script = (
         LOAD
         + """
@@ -615,18 +629,18 @@ def test_slips_of_the_guide_are_accepted(world: World) -> None:
     ]
 
 
-# --- what a person is told --------------------------------------------------------------------------------------
+# --- messages for users --------------------------------------------------------------------------------------
 
 
-def test_an_answer_that_takes_long_is_told_on_a_terminal(world: World) -> None:
-    """A line that comes and goes; in a pipe there is none."""
+def test_a_slow_answer_is_reported_on_a_terminal(world: World) -> None:
+    """A line that appears and disappears; in a pipe there is none."""
     script = world.graph.home / "long.tcl"
     script.write_text(
         f"""
         package require genomix
         set g [genomix::connect 127.0.0.1:{world.port}]
         $g load rosAFE
-        foreach ::genomix::http::patience {{0 100000}} {{
+        foreach ::genomix::http::progressDelay {{0 100000}} {{
             set port [rosAFE::gammatonePort gammatone]
             puts "got [dict get $port gammatonePort numberOfChannels]"
         }}
@@ -644,8 +658,8 @@ def test_an_answer_that_takes_long_is_told_on_a_terminal(world: World) -> None:
     assert (done.stdout.split(), done.stderr) == (["got", "4"] * 2, "")
 
 
-def test_errors_in_the_background_are_told_in_one_line(world: World) -> None:
-    """Those that nobody looks at, once; in the way that a script has for all errors in the background."""
+def test_background_errors_are_reported_in_one_line(world: World) -> None:
+    """Unread errors are reported once, by the background error handler of the script."""
     script = (
         LOAD
         + """
@@ -655,7 +669,7 @@ def test_errors_in_the_background_are_told_in_one_line(world: World) -> None:
         rosAFE::preProcPort dummyName &
         bass::Stop &
         pass 1500
-        # Who looks is told nothing more.
+        # A script that reads the error gets no second report.
         set r [rosAFE::modifyParameter $change &]
         show [$r wait]
         set r [rosAFE::modifyParameter $change &]
@@ -686,8 +700,8 @@ def test_errors_in_the_background_are_told_in_one_line(world: World) -> None:
     assert sorted(done.stderr.splitlines()) == [message, f"rosAFE::preProcPort &: ::genom::no_such_outport: {missing}"]
 
 
-def test_errors_in_the_background_are_told_at_the_prompt_of_tclsh(world: World) -> None:
-    """It serves no events while it waits for a line: they are told with the next request, and once."""
+def test_background_errors_are_reported_at_the_prompt_of_tclsh(world: World) -> None:
+    """tclsh handles no events while it waits for a line: errors are reported with the next request, and once."""
     with Terminal(["tclsh"], world.graph.env) as terminal:
 
         def types(line: str) -> str:
@@ -697,7 +711,7 @@ def test_errors_in_the_background_are_told_at_the_prompt_of_tclsh(world: World) 
         terminal.expect("% ")
         types("package require genomix")
         types(f"set g [genomix::connect 127.0.0.1:{world.port}]; $g load rosAFE")
-        types("set ::genomix::attention 0")
+        types("set ::genomix::reportDelay 0")
         types("rosAFE::modifyParameter nobody x 1 &")
         types("$g load rosAFE; after 100")
         told = types("set looked [rosAFE::removeProcessor nobody2 &]")
@@ -706,7 +720,7 @@ def test_errors_in_the_background_are_told_at_the_prompt_of_tclsh(world: World) 
         assert "&:" not in types("rosAFE::getProcessors") and "&:" not in types("rosAFE::getProcessors")
 
 
-def test_a_lost_server_is_told_once(world: World) -> None:
+def test_a_lost_server_is_reported_once(world: World) -> None:
     with worlds.genomixd(world.graph) as (server, port):
         script = world.graph.home / "lost.tcl"
         script.write_text(f"""
@@ -733,8 +747,8 @@ def test_a_lost_server_is_told_once(world: World) -> None:
             assert client.err == ""
 
 
-def test_the_highest_channel_follows_the_sample_rate_at_every_door(world: World) -> None:
-    """Where it is not given: Tcl, one request for the whole tree, which finds its own again, and plain services."""
+def test_the_default_of_the_highest_channel_depends_on_the_sample_rate_everywhere(world: World) -> None:
+    """Without it: Tcl, one request for the whole tree, which reuses its processors, and plain services."""
     script = (
         LOAD
         + """
@@ -745,7 +759,7 @@ def test_the_highest_channel_follows_the_sample_rate_at_every_door(world: World)
         show [dict get [rosAFE::request gammatone {fb_nChannels 6}] name]
         show [dict get [rosAFE::request gammatone {fb_nChannels 6}] name]
         catch {rosAFE::GammatoneProc {name other fb_nChannels 5 fb_highFreqHz 8000}} result
-        show [string match "*7600 Hz would do*" $result]
+        show [string match "*use at most 7600 Hz*" $result]
     """
     )
     assert world.lines(script) == ["filterbank_0", "filterbank_0", "1"]

@@ -1,4 +1,4 @@
-"""Components and masters that are not there, die, hang or come back: clear errors, and recovery without a restart."""
+"""Missing, killed, hanging and restarted components and masters: clear errors, and recovery without a restart."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def problem(world: World, target: str, given: object = None) -> str:
     return caught.value.what
 
 
-def test_a_component_that_comes_goes_and_comes_back(empty_world: World) -> None:
+def test_a_component_that_starts_ends_and_restarts(empty_world: World) -> None:
     world = empty_world
     assert "bass is not running" in problem(world, "bass/Stop")
     with world.graph.node("bass-ros") as bass:
@@ -62,10 +62,12 @@ def test_a_registration_that_a_killed_node_left(empty_world: World) -> None:
         world.http.call("bass/Stop")
         bass.stop(signal.SIGKILL)
         assert "/bass/Stop" in world.graph.services()
-        assert "bass is not running any more, though the master still lists it" in problem(world, "bass/Stop")
+        assert "bass is not running any more, though it is still registered at the master" in problem(
+            world, "bass/Stop"
+        )
 
 
-def test_a_component_that_hangs_keeps_others_out_of_it(empty_world: World) -> None:
+def test_a_component_that_hangs_does_not_delay_others(empty_world: World) -> None:
     world = empty_world
     with world.graph.node("bass-ros") as bass, world.graph.node("rosAFE-ros"):
         world.http.call("bass/Stop")
@@ -89,13 +91,13 @@ def bass_signal(process: harness.Process, number: int) -> None:
     os.kill(process.pid, number)
 
 
-def test_a_master_that_dies_and_comes_back(empty_world: World) -> None:
+def test_a_master_that_restarts(empty_world: World) -> None:
     world = empty_world
     with world.graph.node("bass-ros"):
         number = world.http.send("bass/Acquire", {"device": "scene:"}, ack=1)
         world.http.call("bass/Audio")
         world.master.kill()
-        # What is connected goes on without a master; what is new says what is missing.
+        # Connected clients continue without a master; new requests report that it is missing.
         assert world.http.call("bass/Audio")["Audio"]["sampleRate"] == 44100
         assert "no ROS master at" in problem(world, "rosAFE/Stop")
         world.http.get("/request/abort", id=number, s="t")
@@ -110,8 +112,8 @@ def test_a_master_that_dies_and_comes_back(empty_world: World) -> None:
 
 
 @pytest.mark.parametrize("how", ["killed", "hanging"])
-def test_known_components_go_on_without_a_master(tmp_path: Path, how: str) -> None:
-    """Services and activities that were not used before, new sessions, ports of what is new, by HTTP and in Tcl."""
+def test_known_components_continue_without_a_master(tmp_path: Path, how: str) -> None:
+    """New services, activities, sessions and ports, over HTTP and in Tcl."""
     with worlds.world(tmp_path) as world:
         http = world.http
         start_tree(http)
@@ -136,7 +138,7 @@ def away(master: harness.MasterProcess, how: str) -> Iterator[None]:
 
 
 def go_on(world: World) -> None:
-    """Use what is known, and some that is new, of both components."""
+    """Use known and new services of both components."""
     http = world.http
     assert http.call("rosAFE/getDependencies", ["gammatone"])["dependencies"][-1] == "gammatone"
     assert http.get("/load/rosAFE", s="new")["instance"] == "rosAFE"
@@ -182,7 +184,7 @@ def await_clients(world: World) -> None:
 
 
 def test_a_component_that_moves_is_found_again(empty_world: World) -> None:
-    """Where it was is asked first; another one that is there now says that it is another one."""
+    """The last known address is used first; another component there is recognised."""
     world = empty_world
     with world.graph.node("bass-ros") as bass:
         world.http.call("bass/Stop")
@@ -194,7 +196,7 @@ def test_a_component_that_moves_is_found_again(empty_world: World) -> None:
             assert world.http.call("bass/Audio")["Audio"]["left"] == []
 
 
-def test_a_master_that_is_not_there_yet(tmp_path: Path) -> None:
+def test_a_master_that_has_not_started_yet(tmp_path: Path) -> None:
     master = harness.MasterProcess()
     graph = harness.Graph(master.uri, tmp_path)
     with worlds.genomixd(graph) as (server, port):
@@ -211,7 +213,7 @@ def test_a_master_that_is_not_there_yet(tmp_path: Path) -> None:
             master.kill()
 
 
-# bass-ros on a machine on which opening a source takes until the file argv[1] is there, unless it is stopped before.
+# bass-ros that opens a source only when the file argv[1] exists, unless it is stopped before.
 SLOW_BASS = """
 import os, sys
 from rosafe.bass import node
@@ -225,7 +227,7 @@ sys.exit(node.main([]))
 """
 
 
-# genomixd with little patience.
+# genomixd with short time limits.
 HASTY_GENOMIXD = """
 import sys
 from rosafe.genomix import daemon, routes
@@ -235,7 +237,7 @@ sys.exit(daemon.main(["-v", "-p", "0"]))
 
 
 def code(script: str) -> str:
-    """`script` for an interpreter that does not know of the checkout."""
+    """Run `script` in an interpreter without the checkout in its path."""
     return f"import sys; sys.path.insert(0, {str(harness.ROOT)!r}){script}"
 
 
@@ -247,7 +249,7 @@ def slow_bass(world: World, opened: Path) -> Iterator[harness.Process]:
 
 
 def test_every_request_is_answered(empty_world: World, tmp_path: Path) -> None:
-    """Clients such as Octave wait for ever: for an activity that does not begin, and a component that hangs."""
+    """Clients such as Octave have no time limit: an activity that does not begin, and a component that hangs."""
     world = empty_world
     with (
         slow_bass(world, tmp_path / "opened") as bass,
@@ -267,8 +269,8 @@ def test_every_request_is_answered(empty_world: World, tmp_path: Path) -> None:
         assert hasty.http.wait(number, "error")["exception"]["ex"] == "::genom::interrupted"
 
 
-def test_what_is_acknowledged_runs(empty_world: World, tmp_path: Path) -> None:
-    """Also where that takes a while: to stop it then is a normal end."""
+def test_acknowledged_activities_run(empty_world: World, tmp_path: Path) -> None:
+    """A slow start that is stopped ends normally."""
     world, opened = empty_world, tmp_path / "opened"
     numbers: list[str] = []
     sender = threading.Thread(
@@ -285,7 +287,7 @@ def test_what_is_acknowledged_runs(empty_world: World, tmp_path: Path) -> None:
         assert world.http.wait(numbers[0], "done")["output"] == {}
 
 
-# genomixd that waits as long for a component as one takes to start on a busy machine.
+# genomixd that waits long enough for a component to start on a busy machine.
 PATIENT_GENOMIXD = """
 import sys
 from rosafe.client import component_client
@@ -308,7 +310,7 @@ def test_load_waits_for_a_component_that_is_starting(empty_world: World) -> None
             assert [load.result()["component"] for load in loads] == ["bass"] * 3
 
 
-def test_stop_everything_at_once(empty_world: World) -> None:
+def test_stop_everything_simultaneously(empty_world: World) -> None:
     """A component killed by its own request, with clients waiting."""
     world = empty_world
     with world.graph.node("bass-ros") as bass:

@@ -1,7 +1,8 @@
-"""Arguments of clients: completed from the interface table, converted, or refused in words that help."""
+"""Arguments of clients: completed from the interface table, converted, or rejected with a helpful message."""
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import tkinter
 from typing import Any
@@ -13,7 +14,7 @@ from hypothesis import strategies as st
 from rosafe import interface
 from rosafe.client.values import complete, parse_input, tcl_list
 from rosafe.declarations.idl import element
-from rosafe.interface import BASS, REQUIRED, ROSAFE, ComponentError, Service
+from rosafe.interface import BASS, REQUIRED, ROSAFE, ComponentError, Parameter, Service
 
 GAMMATONE = ROSAFE.service("GammatoneProc")
 INPUT = ROSAFE.service("InputProc")
@@ -28,7 +29,7 @@ def refusal(service: Service, given: Any) -> str:
 
 
 @pytest.mark.parametrize("service", [s for _, s in interface.all_services()], ids=lambda s: s.name)
-def test_nothing_given_is_all_defaults_or_a_refusal_that_names_the_first_missing(service: Service) -> None:
+def test_without_arguments_all_are_defaults_or_the_first_missing_one_is_named(service: Service) -> None:
     required = [p.name for p in service.parameters if p.default is REQUIRED]
     if required:
         assert f"{required[0]} is missing" in refusal(service, {})
@@ -50,6 +51,21 @@ def test_partial_arguments_in_any_order_are_completed() -> None:
 def test_positions() -> None:
     assert complete(INPUT, ["in", 4410])["nFramesPerBlock"] == 4410
     assert "5 arguments are too many; InputProc takes name (string)" in refusal(INPUT, [1, 2, 3, 4, 5])
+
+
+def test_only_parameters_of_other_components_are_checked_by_the_client() -> None:
+    """The component checks its own parameters; a component without declarations gets only values that it can take."""
+    speed = Parameter("speed", "string", REQUIRED, "", choices=("::arm::SLOW",), spellings={"SLOW": "::arm::SLOW"})
+    of_three = Parameter("joints", "sequence<double>", REQUIRED, "", least=3, most=3)
+    for checked in (True, False):
+        parameters = tuple(dataclasses.replace(p, checked_by_client=checked) for p in (speed, of_three))
+        service = Service("Move", "", parameters)
+        if checked:
+            assert complete(service, ["SLOW", [1, 2, 3]]) == {"speed": "::arm::SLOW", "joints": [1.0, 2.0, 3.0]}
+            assert "'FAST'" in refusal(service, ["FAST", [1, 2, 3]])
+            assert "joints" in refusal(service, ["SLOW", [1, 2]])
+        else:
+            assert complete(service, ["FAST", [1, 2]]) == {"speed": "FAST", "joints": [1.0, 2.0]}
 
 
 def test_aliases_of_the_guide() -> None:
@@ -99,7 +115,7 @@ def test_sequences(given: Any) -> None:
 
 
 @pytest.mark.parametrize("given", [[], {}, 0, [0], "", "0", None])
-def test_what_means_no_list(given: Any) -> None:
+def test_values_that_stand_for_an_empty_list(given: Any) -> None:
     assert complete(GAMMATONE, {"fb_cfHz": given})["fb_cfHz"] == []
 
 
@@ -112,42 +128,45 @@ def test_a_single_number_is_a_list_of_one() -> None:
     ("given", "told"),
     [
         ({"fb_nERB": 1}, "unknown parameter 'fb_nERB'; GammatoneProc takes name (string)"),
-        ({"fb_nERBs": "many"}, "fb_nERBs: 'many' is not a finite number (fb_nERBs is a double; more than 0 to 100)"),
+        (
+            {"fb_nERBs": "many"},
+            "fb_nERBs: expected a finite number, got 'many' (fb_nERBs is a double; above 0, at most 100)",
+        ),
         ({"fb_nERBs": None}, "fb_nERBs is a double"),
         ({"fb_nERBs": [1]}, "fb_nERBs is a double"),
         ({"fb_nERBs": {"a": 1}}, "fb_nERBs is a double"),
-        ({"fb_nERBs": float("nan")}, "fb_nERBs: nan is not a finite number"),
+        ({"fb_nERBs": float("nan")}, "fb_nERBs: expected a finite number, got nan"),
         ({"fb_nERBs": "1_0"}, "fb_nERBs is a double"),
-        ({"fb_nGamma": 1.5}, "fb_nGamma: 1.5 is not a whole number"),
-        ({"fb_nGamma": -1}, "fb_nGamma: -1 is not in the range of unsigned long"),
+        ({"fb_nGamma": 1.5}, "fb_nGamma: expected a whole number, got 1.5"),
+        ({"fb_nGamma": -1}, "fb_nGamma: expected a number in the range of unsigned long, got -1"),
         ({"fb_nGamma": 10**400}, "fb_nGamma"),
-        ({"name": 5}, "name: 5 is not a string (name is a string)"),
+        ({"name": 5}, "name: expected a string, got 5 (name is a string)"),
         ({"name": "x" * 5000}, "name"),
-        ({"fb_cfHz": {"0": 1, "2": 2}}, "the keys of a sequence"),
+        ({"fb_cfHz": {"0": 1, "2": 2}}, "expected the indexes from 0 on"),
         ({"fb_cfHz": [[1]]}, "fb_cfHz"),
         ({"fb_cfHz": ["a"]}, "fb_cfHz is a sequence<double>"),
-        ({"fb_cfHz": [100.0] * 2000}, "too many values, at most 1024"),
-        (5, "input is neither an object nor an array"),
-        ("text", "input is neither an object nor an array"),
-        (None, "input is neither an object nor an array"),
+        ({"fb_cfHz": [100.0] * 2000}, "fb_cfHz: expected at most 1024 values, got more"),
+        (5, "input: expected an object or an array"),
+        ("text", "input: expected an object or an array"),
+        (None, "input: expected an object or an array"),
     ],
 )
-def test_refusals_name_the_argument_and_say_what_is_allowed(given: Any, told: str) -> None:
+def test_errors_name_the_argument_and_the_allowed_values(given: Any, told: str) -> None:
     assert told in refusal(GAMMATONE, given)
 
 
-def test_ranges_are_for_the_component_to_judge() -> None:
+def test_ranges_are_checked_by_the_component() -> None:
     assert complete(GAMMATONE, {"fb_nERBs": -3})["fb_nERBs"] == -3
     assert complete(BASS.service("Acquire"), {"nFramesPerChunk": 0})["nFramesPerChunk"] == 0
 
 
 @pytest.mark.parametrize("text", ["{", "{'a':1}", "[1,", "nul", "[" * 100_000, "1" * 5000, '{"a":1}}'])
-def test_what_is_not_json_is_refused(text: str) -> None:
-    with pytest.raises(ComponentError, match="input is not JSON"):
+def test_invalid_json_is_rejected(text: str) -> None:
+    with pytest.raises(ComponentError, match="input: expected JSON"):
         parse_input(text)
 
 
-def test_no_input_is_no_arguments() -> None:
+def test_an_empty_input_has_no_arguments() -> None:
     assert parse_input("") == parse_input("  ") == {}
 
 
@@ -158,9 +177,9 @@ values = st.recursive(
 )
 
 
-@settings(deadline=None)
+@settings(deadline=None, max_examples=50)
 @given(st.data())
-def test_whatever_comes_is_of_the_right_types_or_refused(data: st.DataObject) -> None:
+def test_any_input_gets_the_right_types_or_is_rejected(data: st.DataObject) -> None:
     _, service = data.draw(st.sampled_from(list(interface.all_services())))
     names = [p.name for p in service.parameters] or ["none"]
     given = data.draw(st.dictionaries(st.sampled_from(names), values, max_size=3) | values)
@@ -182,7 +201,7 @@ def test_whatever_comes_is_of_the_right_types_or_refused(data: st.DataObject) ->
 @settings(deadline=None)
 @given(st.text(alphabet='ab {}"\\$[ ', max_size=12))
 def test_tcl_lists_are_split_as_tcl_does(text: str) -> None:
-    """Or not at all: quotes, backslashes and unbalanced braces."""
+    """Lists with quotes, backslashes or unbalanced braces are not split."""
     words = tcl_list(text)
     try:
         expected = list(tkinter.Tcl().splitlist(text))

@@ -1,6 +1,6 @@
-"""The guide's session, step by step: each does what the table of the original's behaviour wants of a robust one.
+"""The guide's session, step by step, compared with the table of the original's behaviour.
 
-The steps run once, in order, in one Tcl shell; each has a test of its own that looks at what it printed.
+The steps run once, in order, in one Tcl shell; each has a test of its output.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ def home(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def walked(home: Path) -> Iterator[tuple[World, dict[str, str]]]:
-    """The world after the session, and what each step printed."""
+    """The world after the session, and the output of each step."""
     with worlds.world(home) as world:
         script = PRELUDE + "\n".join(f"step {{{name}}} {{{text}}}" for name, text in STEPS.items())
         lines = world.lines(script)
@@ -100,14 +100,14 @@ def no_processor(name: str) -> str:
 WANTED = {
     "load": "genomix1 1 1",
     "connect before acquisition": "",
-    "input without sound": "error ex ::rosAFE::e_noData what {nothing has come from /bass/Audio: is bass acquiring?}",
+    "input without sound": "error ex ::rosAFE::e_noData what {no audio from /bass/Audio: is bass acquiring?}",
     "input": "sent",
     "preProc at once": "sent",
     "gammatone": "",
     "ihc": "",
     "leaves": "sent sent sent",
     "leaves have data": "100 frames",
-    "modify": "error ex ::rosAFE::e_noSuchParameter what {processors of kind input have no 'pp_bRemoveDC', but: "
+    "modify": "error ex ::rosAFE::e_noSuchParameter what {processors of kind input have no 'pp_bRemoveDC'; they have: "
     "in_doNormalize, in_normalizeValue}",
     "modify the right one": "",
     "dependencies": "dependencies {0 input 1 preProc 2 gammatone 3 ihc 4 ratemap}",
@@ -150,7 +150,7 @@ def test_steps_that_tell_more(walked: tuple[World, dict[str, str]], step: str, p
 
 
 def test_topics_of_the_graph(walked: tuple[World, dict[str, str]]) -> None:
-    """The input is left, and so is its port; those of removed processors are gone, and of others there were none."""
+    """The input and its port remain; the ports of removed processors are closed, and there are no others."""
     topics = walked[0].graph.topics()
     assert {"/rosAFE/inputProcPort", "/rosAFE/dataObj", "/bass/Audio"} <= topics
     wait_for(lambda: not [t for t in walked[0].graph.topics() if "Port/" in t])

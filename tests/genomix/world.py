@@ -17,7 +17,7 @@ from tests import harness
 
 
 class HttpError(Exception):
-    """An answer that is no 200. `ex` and `what` are those of its body."""
+    """An answer with another status than 200. `ex` and `what` are members of its body."""
 
     def __init__(self, status: int, body: dict[str, Any]) -> None:
         super().__init__(status, body)
@@ -28,13 +28,13 @@ class HttpError(Exception):
 
 
 class Http:
-    """GETs from one genomixd; every call is a connection of its own, as with curl."""
+    """GET requests to one genomixd; every call opens a new connection, like curl."""
 
     def __init__(self, port: int) -> None:
         self.port = port
 
     def raw(self, url: str, method: str = "GET", headers: dict[str, str] | None = None) -> tuple[int, str]:
-        """Status and body of any URL."""
+        """Return status and body of any URL."""
         connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=90)
         try:
             connection.request(method, url, headers=headers or {})
@@ -44,7 +44,7 @@ class Http:
             connection.close()
 
     def get(self, path: str, given: Any = None, **query: Any) -> Any:
-        """The value of the JSON answer; `given` are the arguments of a request. HttpError where it is no 200."""
+        """Return the value of the JSON answer; `given` are the arguments. HttpError for another status than 200."""
         if given is not None:
             query["input"] = json.dumps(given)
         status, body = self.raw(f"{quote(path)}?{urlencode(query)}")
@@ -54,7 +54,7 @@ class Http:
         return value
 
     def call(self, target: str, given: Any = None, **query: Any) -> Any:
-        """Make a request of `component/service` and wait for its result."""
+        """Call `component/service` and return its result."""
         return self.get(f"/call/{target}", given, **query)
 
     def send(self, target: str, given: Any = None, **query: Any) -> str:
@@ -62,11 +62,11 @@ class Http:
         return str(self.get(f"/send/{target}", given, **{"s": "t", **query})["id"])
 
     def status(self, number: str, **query: Any) -> dict[str, Any]:
-        """What has become of a request of the session ``t``."""
+        """Return the status of a request of the session ``t``."""
         return dict(self.get("/request/status", id=number, **{"s": "t", **query}))
 
     def wait(self, number: str, status: str, seconds: float = harness.PATIENCE, s: str = "t") -> dict[str, Any]:
-        """The status of a request of the session `s` once it is that."""
+        """Wait until a request of the session `s` has a status, and return all of it."""
         return harness.wait_for(
             lambda: (now := self.status(number, s=s))["status"] == status and now,
             seconds,
@@ -75,7 +75,7 @@ class Http:
 
     @contextmanager
     def listening(self, **query: Any) -> Iterator[Iterator[tuple[str, str]]]:
-        """The events of a session, as they come: (name, data)."""
+        """Yield the events of a session as they arrive: (name, data)."""
         connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=90)
         connection.request("GET", f"/session/listen?{urlencode(query)}")
         response = connection.getresponse()
@@ -111,7 +111,7 @@ class World:
         self.server = server
         self.port = port
         self.http = Http(port)
-        self.afe: harness.Process | None = None  # rosAFE-ros, where there are nodes
+        self.afe: harness.Process | None = None  # rosAFE-ros, if the world has nodes
 
     def tcl(
         self, script: str, timeout: float = 120.0, check: bool = True, shell: str = "tclsh"
@@ -131,17 +131,17 @@ class World:
         return self.graph.run(shell, str(path), timeout=timeout, check=check)
 
     def lines(self, script: str, timeout: float = 120.0, shell: str = "tclsh") -> list[str]:
-        """The lines that a script prints."""
+        """Return the lines that a script prints."""
         return self.tcl(script, timeout, shell=shell).stdout.splitlines()
 
     def reset(self) -> None:
-        """Stop what the components do, so that the next test finds them idle."""
+        """Stop all activities, so that the components are idle for the next test."""
         for component in ("rosAFE", "bass"):
             self.http.call(f"{component}/Stop")
 
 
 def port_of(process: harness.Process) -> int:
-    """The port on which a genomixd started with -v serves, once it does."""
+    """Wait until a genomixd started with -v serves, and return its port."""
 
     def said() -> str:
         assert process.alive, process
@@ -160,7 +160,7 @@ def genomixd(graph: harness.Graph, *arguments: str) -> Iterator[tuple[harness.Pr
 
 @contextmanager
 def world(home: Path, nodes: bool = True) -> Iterator[World]:
-    """A new graph with genomixd and, unless told not to, bass-ros and rosAFE-ros."""
+    """A new graph with genomixd and, by default, bass-ros and rosAFE-ros."""
     with harness.private_graph(home) as (graph, master), genomixd(graph) as (server, port):
         this = World(graph, master, server, port)
         if not nodes:

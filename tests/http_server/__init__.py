@@ -1,1 +1,1 @@
-"""What genomixd and the live page share: checks of headers, limits of connections."""
+"""The parts shared by genomixd and the live page: checks of headers, limits of connections."""

@@ -1,4 +1,4 @@
-"""Clients without a token: they neither fill the memory of genomixd and the live page nor keep others out."""
+"""Clients without a token neither fill the memory of genomixd and the live page nor lock out other clients."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from tests.live import world as live
 pytestmark = pytest.mark.ros
 
 MEMORY = 50  # MB above that of an idle server
-SENT = 30_000_000  # bytes, and
-OPENED = 600  # connections of an attack
+SENT = 30_000_000  # bytes of an attack, at most
+OPENED = 600  # connections of an attack, at most
 SECONDS = 2.0  # of an attack, at most
 
 
@@ -35,7 +35,7 @@ class Server(NamedTuple):
     page: live.Live | None
 
     def memory(self, which: str = "VmRSS") -> int:
-        """Megabytes now, or (VmHWM) the most since `reset`."""
+        """Return the megabytes now, or (VmHWM) the maximum since `reset`."""
         text = proc(self.process.pid, "status").read_text()
         found = re.search(rf"{which}:\s+(\d+)", text)
         assert found is not None
@@ -45,7 +45,7 @@ class Server(NamedTuple):
         proc(self.process.pid, "clear_refs").write_text("5")
 
     def serves(self) -> bool:
-        """Whether somebody else is served."""
+        """Return whether another client is served."""
         if self.page is not None:
             return asyncio.run(_page_opens(self.page))
         connection = http.client.HTTPConnection("127.0.0.1", self.port, timeout=harness.PATIENCE)
@@ -75,13 +75,13 @@ def api(graph: Graph) -> Iterator[Server]:
 
 @pytest.fixture(params=["page", "api"])
 def server(request: pytest.FixtureRequest) -> Server:
-    """One after the other."""
+    """Each of the two servers."""
     server: Server = request.getfixturevalue(request.param)
     return server
 
 
 def flood(port: int, sent: bytes, together: int, refill: bool = True) -> None:
-    """Send `sent` again and again on many connections, reading nothing; closed ones are replaced."""
+    """Send `sent` repeatedly on many connections and read nothing; closed connections are replaced."""
     end, total, opened = time.monotonic() + SECONDS, 0, 0
     done: dict[socket.socket, int] = {}  # bytes of `sent` that are sent
     try:
@@ -139,7 +139,7 @@ ATTACKS = {
 
 
 def test_memory_without_a_token(server: Server) -> None:
-    """Whatever is sent, and however often: the memory stays bounded, also over all attacks together."""
+    """The memory stays within its limit for each attack, and for all attacks together."""
     assert server.serves()
     idle = server.memory()
     for name, (sent, together) in ATTACKS.items():
@@ -151,12 +151,12 @@ def test_memory_without_a_token(server: Server) -> None:
 
 
 @pytest.mark.parametrize("sent", [b"", b"GET /?tok"], ids=["silent", "half"])
-def test_silent_connections_keep_nobody_out(server: Server, sent: bytes) -> None:
+def test_silent_connections_do_not_lock_out_other_clients(server: Server, sent: bytes) -> None:
     with attacks.crowd(server.port, 300, sent):
         assert [server.serves() for _ in range(10)] == [True] * 10
 
 
-def test_clients_that_do_not_read_a_file_keep_nobody_out(page: Server) -> None:
+def test_clients_that_do_not_read_a_file_do_not_lock_out_other_clients(page: Server) -> None:
     crowd = []
     try:
         for _ in range(300):
@@ -171,8 +171,8 @@ def test_clients_that_do_not_read_a_file_keep_nobody_out(page: Server) -> None:
             one.close()
 
 
-def test_connections_that_come_again_keep_nobody_out(page: Server, graph: Graph) -> None:
-    """A crowd that replaces each connection that had to make room."""
+def test_clients_that_reconnect_do_not_lock_out_other_clients(page: Server, graph: Graph) -> None:
+    """300 connections, each of which is replaced when the server closes it."""
     refill = (
         "import socket, selectors, sys\n"
         "selector, port = selectors.DefaultSelector(), int(sys.argv[1])\n"
@@ -208,18 +208,18 @@ def test_a_refusal_ends_the_connection(server: Server, request_: bytes) -> None:
 
 
 def exchange(port: int, sent: bytes) -> bytes:
-    """Everything that a server answers until it closes the connection."""
+    """Return everything that a server answers until it closes the connection."""
     answer = b""
     with socket.create_connection(("127.0.0.1", port), timeout=harness.PATIENCE) as connection:
         connection.sendall(sent)
-        with suppress(ConnectionResetError):  # it has not read all that was sent
+        with suppress(ConnectionResetError):  # the server has not read everything that was sent
             while part := connection.recv(65536):
                 answer += part
     return answer
 
 
-def test_a_long_request_gets_the_room_of_unfinished_ones(api: Server) -> None:
-    """The oldest of those that have not come to an end are closed for it."""
+def test_unfinished_long_requests_are_closed_for_a_complete_one(api: Server) -> None:
+    """The oldest unfinished requests are closed first."""
     with attacks.crowd(api.port, 100, b"GET /components?x=" + b"x" * 200_000):
         connection = http.client.HTTPConnection("127.0.0.1", api.port, timeout=harness.PATIENCE)
         connection.request("GET", "/components?x=" + "x" * 200_000)

@@ -1,4 +1,4 @@
-"""What comes from the table and must exist as files is as the table says, and one command makes it so."""
+"""The files derived from the interface table are up to date, and one command updates them."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from rosafe.representations import registry
 from tests.harness import PYTHON, ROOT
 
 
-def test_nothing_is_stale() -> None:
+def test_the_files_are_up_to_date() -> None:
     run = subprocess.run([PYTHON, "-m", "rosafe.interface", "--check"], cwd=ROOT, capture_output=True, text=True)
     assert (run.stdout, run.stderr, run.returncode) == ("", "", 0), "run: python3 -m rosafe.interface"
 
 
 def test_files_follow_the_table(tmp_path: Path) -> None:
-    """A representation that is gone takes its files with it, and comes back with them; nothing else is touched."""
+    """The files of a removed representation are deleted, and written again if it returns; others are not changed."""
     component = rosafe.derive({kind: stage.REPRESENTATION for kind, stage in registry.builtin_stages().items()})
     less = rosafe.derive({kind: r for kind, r in rosafe.KINDS.items() if kind not in ("ild", *children("ild"))})
     for folder in (tmp_path, tmp_path / "bass"):
@@ -42,6 +42,6 @@ def test_files_follow_the_table(tmp_path: Path) -> None:
 
 
 def children(kind: str) -> set[str]:
-    """All kinds below `kind`."""
+    """Return all descendants of `kind`."""
     own = {child for child, representation in rosafe.KINDS.items() if representation.parent == kind}
     return own.union(*map(children, own))

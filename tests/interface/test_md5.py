@@ -1,4 +1,4 @@
-"""Every message, service and action has its md5, the original's where there is one: clients and bags still fit."""
+"""The md5 sums of all messages, services and actions; clients and bags of the original remain compatible."""
 
 from __future__ import annotations
 
@@ -146,7 +146,7 @@ def test_action(package: str, action: str) -> None:
     assert {part: md5(package, "msg", action + part) for part in ACTION_COMMON} == ACTION_COMMON
 
 
-def test_nothing_of_the_interface_is_left_out() -> None:
+def test_all_services_and_actions_are_covered() -> None:
     functions = {c.name: {s.name for s in c.on_graph if not s.activity} for c in interface.COMPONENTS.values()}
     later = {kind.request for kind in interface.KINDS.values() if kind.kind not in interface.CORE_REPRESENTATIONS}
     activities = {(c.name, s.name) for c in interface.COMPONENTS.values() for s in c.activities if s.name not in later}

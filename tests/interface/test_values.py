@@ -1,4 +1,4 @@
-"""Values on their way in: from Python, from the texts of modifyParameter, from ROS requests that carry no defaults."""
+"""Checks of values from Python, from the texts of modifyParameter, and from ROS requests without defaults."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rosafe.interface import BASS, MAX_SEQUENCE, REQUIRED, ROSAFE, Parameter, format_value
+from rosafe.interface import BASS, MAX_SEQUENCE, REQUIRED, ROSAFE, Parameter, format_value, ros_type
 from rosafe.representations import STAGES
 
 BOOLEAN = Parameter("flag", "boolean", False, "")
@@ -26,8 +26,18 @@ WORD = Parameter("word", "string", "hann", "", choices=("hann", "triang"), fallb
 WORDS = Parameter("words", "sequence<string>", ("a",), "", choices=("a", "b"), least=1, most=4)
 
 
+def test_a_client_that_fills_in_defaults_marks_those_of_the_sample_rate_by_nan() -> None:
+    service = ROSAFE.service("GammatoneProc")
+    request = SimpleNamespace(**{p.name: math.nan if p.follows_rate else p.default for p in service.parameters})
+    free = {p.name for p in service.parameters if p.follows_rate}
+    assert "fb_highFreqHz" in free
+    assert service.from_ros(request, literal=True).keys() == {p.name for p in service.parameters} - free
+    request.fb_highFreqHz = 5000.0
+    assert service.from_ros(request, literal=True)["fb_highFreqHz"] == 5000.0
+
+
 @pytest.mark.parametrize(
-    ("parameter", "value", "wanted"),
+    ("parameter", "value", "expected"),
     [
         (BOOLEAN, 1, True),
         (BOOLEAN, 0.0, False),
@@ -62,9 +72,9 @@ WORDS = Parameter("words", "sequence<string>", ("a",), "", choices=("a", "b"), l
         (WORDS, ("b", "a", "b"), ["b", "a", "b"]),
     ],
 )
-def test_values_from_python(parameter: Parameter, value: Any, wanted: Any) -> None:
+def test_values_from_python(parameter: Parameter, value: Any, expected: Any) -> None:
     got = parameter.check(value)
-    assert got == wanted
+    assert got == expected
     python_types = {"boolean": bool, "double": float, "sequence<double>": list, "sequence<string>": list, "string": str}
     assert isinstance(got, python_types.get(parameter.idl, int))
 
@@ -88,7 +98,7 @@ def test_values_from_python(parameter: Parameter, value: Any, wanted: Any) -> No
         (LIST, [0, 0]),
         (LIST, [0.0, 5.0]),
         (LIST, np.ones((2, 2))),
-        (LIST, itertools.repeat(1.0)),  # it never ends
+        (LIST, itertools.repeat(1.0)),  # infinite
         (LIST, np.ones(MAX_SEQUENCE + 1)),
         (WORD, "x\0"),
         (WORD, "anything"),
@@ -98,14 +108,14 @@ def test_values_from_python(parameter: Parameter, value: Any, wanted: Any) -> No
         (WORDS, ["a"] * 5),
     ],
 )
-def test_values_that_are_refused(parameter: Parameter, value: Any) -> None:
+def test_values_that_are_rejected(parameter: Parameter, value: Any) -> None:
     with pytest.raises(ValueError, match=f"^{parameter.name}: ") as raised:
         parameter.check(value)
     assert len(str(raised.value)) < 200
 
 
 @given(st.one_of(st.none(), st.booleans(), st.integers(), st.floats(), st.complex_numbers(), st.text(), st.binary()))
-def test_a_value_passes_its_own_check_or_is_refused_with_a_reason(value: Any) -> None:
+def test_a_checked_value_passes_again_or_the_error_names_the_parameter(value: Any) -> None:
     for parameter in (BOOLEAN, UNSIGNED, LARGE, SIGNED, NUMBER, LIST, WORD):
         for given_value in (value, [value], [value, 1.0]):
             try:
@@ -117,7 +127,7 @@ def test_a_value_passes_its_own_check_or_is_refused_with_a_reason(value: Any) ->
 
 
 @given(st.integers(-(2**70), 2**70))
-def test_whole_numbers_are_exact_or_refused(value: int) -> None:
+def test_whole_numbers_are_exact_or_rejected(value: int) -> None:
     for parameter, low, high in ((UNSIGNED, 0, 2**32 - 1), (LARGE, 1, 2**64 - 1), (SIGNED, -(2**31), 2**31 - 1)):
         if low <= value <= high:
             assert parameter.check(value) == parameter.read(f" {value} ") == value
@@ -147,8 +157,8 @@ def test_lists_in_texts(values: list[float], between: str) -> None:
     ],
 )
 def test_texts(parameter: Parameter, texts: dict[str, Any]) -> None:
-    for text, wanted in texts.items():
-        assert parameter.read(text) == wanted
+    for text, expected in texts.items():
+        assert parameter.read(text) == expected
 
 
 @pytest.mark.parametrize(
@@ -195,7 +205,7 @@ def test_texts(parameter: Parameter, texts: dict[str, Any]) -> None:
         (WORDS, ["", "c", "a c"]),
     ],
 )
-def test_texts_that_are_refused(parameter: Parameter, texts: list[str]) -> None:
+def test_texts_that_are_rejected(parameter: Parameter, texts: list[str]) -> None:
     for text in texts:
         with pytest.raises(ValueError, match=f"^{parameter.name}: ") as raised:
             parameter.read(text)
@@ -205,23 +215,23 @@ def test_texts_that_are_refused(parameter: Parameter, texts: list[str]) -> None:
 @pytest.mark.parametrize(
     ("least", "given", "why"),
     [
-        (1, [0], "taus: 0 is out of range, allowed is more than 0 to 9"),
-        (1, 0, "taus: 0 is out of range, allowed is more than 0 to 9"),
-        (1, [], "taus: no values, wanted are 1"),
-        (2, [3], "taus: 1 value, wanted are 2"),
+        (1, [0], "taus: expected a number above 0, at most 9, got 0"),
+        (1, 0, "taus: expected a number above 0, at most 9, got 0"),
+        (1, [], "taus: expected at least 1 value, got none"),
+        (2, [3], "taus: expected at least 2 values, got 1"),
     ],
 )
-def test_a_zero_is_no_list_only_where_there_may_be_none(least: int, given: Any, why: str) -> None:
+def test_a_zero_stands_for_an_empty_list_only_if_the_list_may_be_empty(least: int, given: Any, why: str) -> None:
     taus = Parameter("taus", "sequence<double>", (1.0, 2.0), "", 0.0, 9.0, open_minimum=True, least=least)
     with pytest.raises(ValueError, match=f"^{why}$"):
         taus.check(given)
     assert dataclasses.replace(taus, least=0, default=()).check([0]) == []
 
 
-def test_words_that_nobody_knows() -> None:
+def test_unknown_choices_become_the_fallback() -> None:
     assert [WORD.resolve_choice(word) for word in ("triang", "Hann", "", "hann ")] == ["triang", "hann", "hann", "hann"]
-    assert WORDS.resolve_choice("x") == "x"  # nothing is taken for it
-    for text in ("x" * 4097, "nul\0"):  # nor for what is no word at all
+    assert WORDS.resolve_choice("x") == "x"  # it has no fallback
+    for text in ("x" * 4097, "nul\0"):  # rejected by `check`
         assert WORD.resolve_choice(text) == text
     for kind, word in (("PreProc", "jespen"), ("GammatoneProc", "string"), ("IhcProc", "meddis")):
         enumerated = next(p for p in ROSAFE.service(kind).parameters if p.choices)
@@ -242,9 +252,9 @@ def requests() -> list[Any]:
 
 @pytest.mark.parametrize(("component", "service"), requests(), ids=lambda x: x.name)
 def test_an_empty_ros_request_means_the_defaults(component: Any, service: Any) -> None:
-    """But booleans are always literal, and so is what has no default, or a meaning at zero."""
+    """Exceptions are booleans, parameters without a default, and parameters for which zero is a value."""
     empty = {"bool": False, "string": "", "float64[]": []}
-    request = SimpleNamespace(**{p.name: empty.get(p.ros, 0) for p in service.parameters})
+    request = SimpleNamespace(**{p.name: empty.get(ros_type(p.idl), 0) for p in service.parameters})
     values = service.from_ros(request)
     assert list(values) == [p.name for p in service.parameters if not p.follows_rate]
     for parameter in map(service.parameter, values):
@@ -259,19 +269,19 @@ def test_an_empty_ros_request_means_the_defaults(component: Any, service: Any) -
         assert service.check(values) == service.check(service.check(values))
 
 
-def test_what_a_ros_request_says_is_taken_as_it_is() -> None:
+def test_explicit_values_of_a_ros_request_are_kept() -> None:
     service = ROSAFE.service("PreProc")
     request = SimpleNamespace(**{p.name: p.default for p in service.parameters})
     request.pp_bRemoveDC, request.pp_refSPLdB, request.pp_cutoffHzDC, request.name = True, -3.0, math.nan, "x"
     values = service.from_ros(request)
     assert (values["pp_bRemoveDC"], values["pp_refSPLdB"], values["name"]) == (True, -3.0, "x")
-    with pytest.raises(ValueError, match=r"^pp_cutoffHzDC: nan is not a finite number"):
+    with pytest.raises(ValueError, match=r"^pp_cutoffHzDC: expected a finite number, got nan"):
         service.check(values)
     list_service = ROSAFE.service("GammatoneProc")
     request = SimpleNamespace(**{p.name: p.default for p in list_service.parameters})
-    for cf, wanted in (((), []), ((0.0,), []), (np.array([]), []), (np.array([500.0, 100.0]), [500.0, 100.0])):
+    for cf, expected in (((), []), ((0.0,), []), (np.array([]), []), (np.array([500.0, 100.0]), [500.0, 100.0])):
         request.fb_cfHz = cf
-        assert list_service.check(list_service.from_ros(request))["fb_cfHz"] == wanted
+        assert list_service.check(list_service.from_ros(request))["fb_cfHz"] == expected
 
 
 def test_names_and_their_aliases() -> None:
@@ -284,9 +294,9 @@ def test_names_and_their_aliases() -> None:
             lookup("none")
 
 
-def test_the_range_of_a_word_that_may_be_empty() -> None:
+def test_the_range_text_of_a_choice_that_may_be_empty() -> None:
     (model,) = [p for p in STAGES["adaptation"].REPRESENTATION.parameters if p.name == "adpt_model"]
     assert model.range_text == "one of adt_dau, adt_puschel, adt_breebaart, adt_vandorpschuitman, or empty"
     assert model.check("") == ""
-    with pytest.raises(ValueError, match=r"one of adt_dau, .*, or empty$"):
+    with pytest.raises(ValueError, match=r"expected one of adt_dau, .*, or empty, got 'dau'"):
         model.check("dau")

@@ -1,4 +1,4 @@
-"""Debian's chromium without a screen, driven by selenium."""
+"""The chromium of Debian without a display, controlled by selenium."""
 
 from __future__ import annotations
 
@@ -36,33 +36,33 @@ class Browser:
         self.driver = driver
 
     def run(self, script: str, *arguments: Any) -> Any:
-        """What a script returns in the page."""
+        """Return the result of a script in the page."""
         return self.driver.execute_script(script, *arguments)
 
     def until(self, script: str, *arguments: Any, what: str = "") -> Any:
-        """The first true value that a script returns."""
+        """Run a script until it returns a true value, and return this."""
         return wait_for(lambda: self.run(script, *arguments), what=lambda: f"{what or script}: {self.problems()}")
 
     def press(self, selector: str) -> None:
-        """Click an element once it is there."""
+        """Wait for an element and click it."""
         self.until("return Boolean(document.querySelector(arguments[0]))", selector)
         self.run("document.querySelector(arguments[0]).click()", selector)
 
     def resize(self, width: int, height: int, theme: str = "dark", scale: float = 1.0) -> None:
-        """The size of the window (CSS pixels), and what the user prefers."""
+        """Set the size of the window (CSS pixels) and the preferred colour scheme."""
         metrics = {"width": width, "height": height, "deviceScaleFactor": scale, "mobile": False}
         self.driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", metrics)
         features = [{"name": "prefers-color-scheme", "value": theme}]
         self.driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": features})
 
     def problems(self) -> list[str]:
-        """What the browser's console has to complain of."""
-        return [entry["message"] for entry in self.driver.get_log("browser") if entry["level"] == "SEVERE"]
+        """Return the errors on the console of the browser."""
+        return list(dict.fromkeys(e["message"] for e in self.driver.get_log("browser") if e["level"] == "SEVERE"))
 
 
 @contextmanager
 def browser(downloads: Path | None = None) -> Iterator[Browser]:
-    """A browser with a folder of its own, which goes with it; what it saves is in `downloads`."""
+    """Start a browser with a temporary profile; files are saved to `downloads`."""
     options = Options()
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         for argument in (*ARGUMENTS, f"--user-data-dir={folder}"):

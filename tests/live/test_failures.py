@@ -1,4 +1,4 @@
-"""What fails on the server is seen on the page, and in the log once; column numbers beyond 32 bits are shown."""
+"""Failures of the server are shown by the page and logged once; column numbers may exceed 32 bits."""
 
 from __future__ import annotations
 
@@ -17,12 +17,14 @@ from tests.live.world import Live, Page, page
 pytestmark = pytest.mark.ros
 
 LEVELS = {"what": "levels"}
-OFFSET = 2**40  # columns: 350 years of sound
+DEADLINE = 1.5  # s, for a complete request
+OFFSET = 2**40  # columns: 350 years of audio
 BROKEN = f"""
-import sys
+import dataclasses, sys
 sys.path.insert(0, {str(harness.ROOT)!r})
 from pathlib import Path
-from rosafe.live import components, views
+from rosafe.live import components, server, views
+server.LIMITS = dataclasses.replace(server.LIMITS, request_seconds={DEADLINE})
 append, piece = views.View.append, views.View.piece
 def late(view, first, columns, end):
     append(view, first if first >= {OFFSET} else first + {OFFSET}, columns, end + {OFFSET} / view.rate)
@@ -41,13 +43,13 @@ sys.exit(main(sys.argv[1:]))
 
 
 class World:
-    """A live page whose server fails if the file `broken` exists, or if it is asked for devices."""
+    """A live page whose server fails if the file `broken` exists, and at each request for devices."""
 
     def __init__(self, live: Live, broken: Path) -> None:
         self.live, self.broken = live, broken
 
-    def closed(self, count: int) -> str:
-        """What the log says of `count` closed connections, once it does."""
+    def log_of_closed(self, count: int) -> str:
+        """Wait until the log reports `count` closed connections, and return it."""
         log = self.live.process
         wait_for(lambda: log.err.count("a page's connection is closed") >= count, what=lambda: repr(log))
         return log.err
@@ -55,7 +57,7 @@ class World:
 
 @pytest.fixture(scope="module")
 def world(graph: Graph, tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
-    """With a bass that acquires."""
+    """Start bass with a capture, and the failing live page."""
     broken = tmp_path_factory.mktemp("live") / "broken"
     command = (harness.PYTHON, "-c", BROKEN, str(broken), "live", "--port", "0", "--no-browser")
     with graph.node("bass-ros"), graph.start(*command) as process:
@@ -63,8 +65,8 @@ def world(graph: Graph, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Wo
         yield World(Live(process), broken)
 
 
-async def end_of(client: Page) -> tuple[int | None, Any]:
-    """Code and reason with which the server closes a connection."""
+async def closing_frame(client: Page) -> tuple[int | None, Any]:
+    """Wait until the server closes the connection, and return its code and reason."""
     while True:
         message = await client.socket.receive(timeout=harness.PATIENCE)
         if message.type == aiohttp.WSMsgType.CLOSE:
@@ -74,39 +76,55 @@ async def end_of(client: Page) -> tuple[int | None, Any]:
 def test_an_exception_while_sending_closes_the_connection_with_its_reason(world: World) -> None:
     async def scenario() -> tuple[int | None, Any]:
         async with page(world.live) as client, page(world.live) as other:
-            (view,) = await client.look(LEVELS)
+            (view,) = await client.subscribe(LEVELS)
             while not client.pieces.get(view["number"]):
-                await client.hear()
+                await client.receive()
             assert all(first >= OFFSET for first, *_ in client.pieces[view["number"]])
             world.broken.touch()
             try:
-                ended = await end_of(client)
+                ended = await closing_frame(client)
             finally:
                 world.broken.unlink()
-            await other.until("status")  # which looks at nothing
+            await other.until("status")  # the page without views stays connected
             return ended
 
     before = world.live.process.err.count("the ring is broken")
     assert asyncio.run(scenario()) == (1011, "sending failed: RuntimeError: the ring is broken")
-    told = world.closed(1)
-    assert told.count("a page's connection is closed: sending failed: RuntimeError: the ring is broken") == 1
+    assert (
+        world.log_of_closed(1).count("a page's connection is closed: sending failed: RuntimeError: the ring is broken")
+        == 1
+    )
     assert before == 0
+
+
+def test_a_page_stays_open_beyond_the_deadline_of_its_request(world: World) -> None:
+    async def scenario() -> list[float]:
+        loop = asyncio.get_running_loop()
+        async with page(world.live) as client:
+            begin = loop.time()
+            while loop.time() < begin + 2 * DEADLINE:
+                client.latest.pop("status", None)
+                await client.until("status")
+            return [loop.time() - begin]
+
+    (seconds,) = asyncio.run(scenario())
+    assert seconds >= 2 * DEADLINE
 
 
 def test_an_exception_while_answering_closes_the_connection_with_its_reason(world: World) -> None:
     async def scenario() -> tuple[int | None, Any]:
         async with page(world.live) as client:
             await client.socket.send_json({"id": 1, "do": "devices"})
-            return await end_of(client)
+            return await closing_frame(client)
 
-    begun = world.live.process.err.count("no devices today")
+    before = world.live.process.err.count("no devices today")
     assert asyncio.run(scenario()) == (1011, "devices failed: RuntimeError: no devices today")
-    told = wait_for(lambda: world.live.process.err.count("devices failed: RuntimeError: no devices today"))
-    assert (begun, told) == (0, 1)
+    after = wait_for(lambda: world.live.process.err.count("devices failed: RuntimeError: no devices today"))
+    assert (before, after) == (0, 1)
 
 
 @pytest.mark.parametrize(
-    ("sent", "code", "reason"),
+    ("data", "code", "reason"),
     [
         ("nonsense", 1003, "expected a request with id and do"),
         (b"bytes", 1003, "expected a request as text, got bytes"),
@@ -114,21 +132,23 @@ def test_an_exception_while_answering_closes_the_connection_with_its_reason(worl
     ],
     ids=["text", "bytes", "encoding"],
 )
-def test_what_is_no_request_is_told_why(world: World, sent: str | bytes | None, code: int, reason: str) -> None:
+def test_a_malformed_request_closes_the_connection_with_a_reason(
+    world: World, data: str | bytes | None, code: int, reason: str
+) -> None:
     async def scenario() -> tuple[int | None, Any]:
         async with page(world.live) as client:
-            if isinstance(sent, str):
-                await client.socket.send_str(sent)
-            elif sent is not None:
-                await client.socket.send_bytes(sent)
+            if isinstance(data, str):
+                await client.socket.send_str(data)
+            elif data is not None:
+                await client.socket.send_bytes(data)
             else:
                 await client.socket._writer._send_frame(b"\xff", aiohttp.WSMsgType.TEXT)
-            return await end_of(client)
+            return await closing_frame(client)
 
     assert asyncio.run(scenario()) == (code, reason)
 
 
-# What link.js makes of a message with one column of the given number.
+# The result of link.js for a message with one column of the given number.
 READ = """
 const [low, high] = arguments;
 class Socket extends EventTarget { constructor() { super(); Socket.one = this; } }
@@ -151,7 +171,7 @@ return import("/link.js").then(({ Link }) => {
 """  # noqa: E501  # JavaScript
 
 
-def test_the_page_shows_late_columns_and_the_reason_of_an_end(world: World) -> None:
+def test_the_page_decodes_large_column_numbers_and_shows_why_it_was_closed(world: World) -> None:
     pytest.importorskip("selenium", reason="python3-selenium is not installed: scripts/install --tests")
     from tests.live.browser import browser
 
@@ -161,7 +181,7 @@ def test_the_page_shows_late_columns_and_the_reason_of_an_end(world: World) -> N
             read = one.run(READ, number % 2**32, number // 2**32)
             assert read == {"number": 7, "first": str(number), "count": 1, "size": 1, "stride": 3, "end": 12.5,
                             "values": [0.25]}  # fmt: skip
-        # The page asks for the devices when it opens.
+        # The page requests the devices when it opens.
         one.until("return document.getElementById('state').textContent.includes('no devices today')")
         text = one.run("return document.getElementById('state').textContent")
         assert "reload" in text

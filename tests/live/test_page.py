@@ -1,4 +1,4 @@
-"""The live page in a real browser: what is seen is what the robot hears, what is done reaches it."""
+"""The live page in a real browser: plots show the audio of the scene, and controls change the nodes."""
 
 from __future__ import annotations
 
@@ -14,34 +14,58 @@ import pytest
 
 pytest.importorskip("selenium", reason="python3-selenium is not installed: scripts/install --tests")
 
-from rosafe.bass.sources.scene import scene_azimuth
+from rosafe.bass.sources.scene import Scene
 from tests.harness import Graph, Process, wait_for
 from tests.live.browser import Browser, browser
-from tests.live.world import Live, build, live
+from tests.live.world import Live, build, live, localizer
 
-WALK = 5.0  # s
+SCENE = Scene(16000, seconds=5.0)
+# The circle of the directions while the true azimuth is in front: the azimuths of the page, and the mean positions of
+# the pixels with the colours of source 7 and of the truth near the rim, in units of the radius, right and downwards.
+CIRCLE = """
+const canvas = document.querySelector('canvas[data-kind=directions]');
+if (!canvas?.dataset.plot) return null;
+const { circle: { x, y, r }, present, truth } = JSON.parse(canvas.dataset.plot);
+if (present.length !== 1 || truth.length !== 1 || Math.abs(truth[0]) > 60) return null;
+const size = Math.round(2.2 * r);
+const [x0, y0] = [Math.round(x - size / 2), Math.round(y - size / 2)];
+const { data } = canvas.getContext("2d").getImageData(x0, y0, size, size);
+const centre = (colour) => {
+  let [sx, sy, count] = [0, 0, 0];
+  for (let at = 0; at < size * size; at += 1) {
+    const [dx, dy] = [(at % size) + 0.5 + x0 - x, Math.floor(at / size) + 0.5 + y0 - y];
+    const distance = Math.hypot(dx, dy) / r;
+    const far = [0, 1, 2].reduce((sum, one) => sum + Math.abs(data[4 * at + one] - colour[one]), 0);
+    if (distance > 0.78 && distance < 0.97 && far < 30) { sx += dx; sy += dy; count += 1; }
+  }
+  return count > 10 ? [sx / count / r, sy / count / r] : null;
+};
+const result = { present, truth, sourcePlace: centre([255, 180, 84]), truthPlace: centre([255, 255, 255]) };
+return result.sourcePlace && result.truthPlace ? result : null;
+"""
+READ = "document.querySelector('canvas[data-kind=directions]').closest('.panel').querySelector('.read').textContent"
 
-# Of each column of a picture: the row of the pixel that is nearest to a colour, and how near; and the plot's place.
+# For each column of a plot: the row of the pixel nearest to a colour, and its distance; and the position of the plot.
 TRACK = """
 const canvas = document.querySelector(`canvas[data-kind="${arguments[0]}"]`);
 if (!canvas?.dataset.plot) return null;
 const plot = JSON.parse(canvas.dataset.plot);
 const [x0, y0, w, h] = [plot.x, plot.y, plot.w, plot.h].map(Math.round);
 const { data } = canvas.getContext("2d").getImageData(x0, y0, w, h);
-const wanted = arguments[1];
+const colour = arguments[1];
 const rows = [], far = [];
 for (let x = 0; x < w; x += 1) {
   let best = Infinity, row = -1, count = 0;
   for (let y = 0; y < h; y += 1) {
     const at = 4 * (y * w + x);
-    const d = Math.abs(data[at] - wanted[0]) + Math.abs(data[at + 1] - wanted[1]) + Math.abs(data[at + 2] - wanted[2]);
+    const d = Math.abs(data[at] - colour[0]) + Math.abs(data[at + 1] - colour[1]) + Math.abs(data[at + 2] - colour[2]);
     if (d < best) { best = d; row = y; count = 1; } else if (d === best) { row += y; count += 1; }
   }
   rows.push(row / count); far.push(best);
 }
 return { plot, rows, far };
 """
-# The mean of the colours of a picture's upper third, column by column.
+# The mean colour of the upper third of a plot, for each column.
 TINT = """
 const canvas = document.querySelector(`canvas[data-kind="${arguments[0]}"]`);
 if (!canvas?.dataset.plot) return null;
@@ -62,13 +86,13 @@ END = "JSON.parse(document.querySelector('canvas[data-kind=ild]').dataset.plot).
 CHOOSE = "[...document.querySelectorAll('.node .name')].find((one) => one.textContent.startsWith(arguments[0])).click()"
 
 
-def moments(plot: dict[str, float], columns: int) -> np.ndarray:
-    """The time of the audio (s) that each column of pixels shows."""
+def column_times(plot: dict[str, float], columns: int) -> np.ndarray:
+    """Return the time of the audio (s) of each column of pixels."""
     return plot["from"] + (np.arange(columns) + 0.5) / columns * (plot["to"] - plot["from"])
 
 
 class World:
-    """The robot, its page, and a browser that shows it."""
+    """The nodes, the live page, and a browser that shows it."""
 
     def __init__(self, graph: Graph, live: Live, browser: Browser, stack: ExitStack) -> None:
         self.graph, self.live, self.browser = graph, live, browser
@@ -76,18 +100,18 @@ class World:
         self.bass: Process | None = None
 
     def start_bass(self) -> None:
-        """A bass-ros, in the place of one that was killed."""
+        """Start bass-ros, or start it again after it was killed."""
         self._bass.close()
         self.bass = self._bass.enter_context(self.graph.node("bass-ros"))
 
     def rate(self) -> int:
-        """Of the sound that the processors take."""
+        """Return the sample rate of the processors' input."""
         return int(self.graph.call("/rosAFE/getSignals").signals.input[0].sampleRate)
 
     def processors(self) -> dict[str, dict[str, str]]:
-        """Their parameters by name, as getProcessors tells."""
-        told = self.graph.call("/rosAFE/getProcessors").processors
-        return {one.name: {entry.name: entry.value for entry in one.parameters} for one in told}
+        """Return the parameters of each processor by name."""
+        answer = self.graph.call("/rosAFE/getProcessors").processors
+        return {one.name: {entry.name: entry.value for entry in one.parameters} for one in answer}
 
 
 @pytest.fixture(scope="module")
@@ -104,17 +128,17 @@ def world(graph: Graph) -> Iterator[World]:
 
 @pytest.fixture
 def shown(world: World) -> Browser:
-    """The page, with sound and pictures."""
+    """Open the page with audio and plots."""
     if not world.processors():
         build(world.graph, world.live)
     browser = world.browser
     browser.resize(1300, 900)
     browser.driver.get(world.live.url)
-    browser.until("return document.querySelectorAll('canvas[data-plot]').length >= 3", what="pictures")
+    browser.until("return document.querySelectorAll('canvas[data-plot]').length >= 3", what="plots")
     return browser
 
 
-def test_a_new_user_starts_everything_on_the_page(world: World) -> None:
+def test_capture_and_tree_are_started_on_the_page(world: World) -> None:
     browser = world.browser
     browser.resize(1300, 900)
     browser.driver.get(world.live.url)
@@ -122,51 +146,73 @@ def test_a_new_user_starts_everything_on_the_page(world: World) -> None:
     assert "token" not in browser.driver.current_url
     browser.run("document.querySelector('#source input').value = 'file:/none/there.wav'")
     browser.press("#source .primary")
-    refused = browser.until("return document.querySelector('#source .error').textContent")
-    assert refused == "e_device: /none/there.wav: No such file or directory"
+    error = browser.until("return document.querySelector('#source .error').textContent")
+    assert error == "e_device: /none/there.wav: No such file or directory"
     browser.run(
         "document.querySelector('#source input').value = 'scene:?seconds=5';"
         "const [rate, chunk] = document.querySelectorAll('#source input[type=number]');"
         "rate.value = 16000; chunk.value = 1600;"
     )
     browser.press("#source .primary")
-    browser.press("#pictures .empty .primary")
-    browser.until("return document.querySelectorAll('canvas[data-plot]').length >= 3", what="pictures")
+    browser.press("#plots .empty .primary")
+    browser.until("return document.querySelectorAll('canvas[data-plot]').length >= 3", what="plots")
     assert {"ratemap_0", "ild_0", "itd_0", "ic_0", "crosscorrelation_0"} <= world.processors().keys()
     assert browser.problems() == []
 
 
-def test_the_source_goes_from_left_to_right(world: World, shown: Browser) -> None:
-    """The direction's line is where the scene says; level differences have the colours of its side."""
-
-    def whole() -> Any:
-        found = shown.run(TRACK, "crossCorrelation", [255, 180, 84])
-        return found if found and np.mean(np.array(found["far"]) < 40) > 0.9 else None
-
-    found = wait_for(whole, what="a line across the picture")
-    plot, rows = found["plot"], np.array(found["rows"])
-    near = np.array(found["far"]) < 40
-    half = (plot["last"] - plot["first"]) / 2 / 32  # less than half the distance of two lags
-    lags = plot["last"] + half - (rows + 0.5) / plot["h"] * (plot["last"] - plot["first"] + 2 * half)
-    truth = scene_azimuth(moments(plot, len(rows)), WALK)
-    assert np.ptp(truth[near]) > 150
-    assert np.corrcoef(lags[near], np.sin(np.radians(truth[near])))[0, 1] > 0.95
-    tint = shown.run(TINT, "ild")
+def test_the_plots_follow_the_source(world: World, shown: Browser) -> None:
+    """Level differences have the colour of the side of the source."""
+    tint = wait_for(lambda: full_width(shown), what="colours across the plot")
     tints = np.array(tint["tints"])
-    when = tint["plot"]["from"] + (np.arange(len(tints)) + 0.5) / len(tints) * (
-        tint["plot"]["to"] - tint["plot"]["from"]
-    )
-    side = scene_azimuth(when, WALK)
-    assert np.mean(tints[side > 40]) > 40 and np.mean(tints[side < -40]) < -40  # red is right, blue is left
+    side = SCENE.azimuth(column_times(tint["plot"], len(tints)))
+    assert np.mean(tints[side < -40]) > 40 and np.mean(tints[side > 40]) < -40  # red is right, blue is left
     assert shown.problems() == []
 
 
-def test_pictures_move_and_a_frozen_one_does_not(shown: Browser) -> None:
+def full_width(shown: Browser) -> Any:
+    """Return the colours of the level differences if the plot is filled."""
+    tint = shown.run(TINT, "ild")
+    return tint if tint and tint["plot"]["from"] > 0.5 else None
+
+
+def test_directions_are_shown_with_the_truth(world: World, shown: Browser) -> None:
+    """The page says how to start the localizer. Then source, posterior and truth are at their azimuths."""
+    hint = "document.querySelector('canvas[data-kind=directions]').title"
+    shown.until(f"return {hint} === 'no localizer is running; start it with: rosafe localize'")
+    with localizer(world.graph, offset=40.0):
+        seen = wait_for(lambda: shown.run(CIRCLE), what="a source in the circle")
+        (azimuth,), (truth,) = seen["present"], seen["truth"]
+        assert azimuth - truth == pytest.approx(40, abs=1) and abs(truth) < 60
+        for place, angle in ((seen["sourcePlace"], azimuth), (seen["truthPlace"], truth)):
+            expected = -0.9 * np.sin(np.radians(angle)), -0.9 * np.cos(np.radians(angle))  # right and downwards
+            assert place == pytest.approx(expected, abs=0.06)
+        shown.until("return document.querySelector('#state').textContent.includes('live · source ')")
+        shown.until(f"return {READ}.startsWith('source 7: ') && {READ}.endsWith('± 3° (0.90)')")
+        found = wait_for(lambda: line_of_source(shown), what="a line of two seconds")
+    rows, near = np.array(found["rows"]), np.array(found["far"]) < 40
+    azimuths = found["plot"]["high"] - (rows + 0.5) / found["plot"]["h"] * 360
+    errors = np.abs(azimuths - SCENE.azimuth(column_times(found["plot"], len(rows))) - 40)[near]
+    assert np.median(errors) < 5 and np.ptp(azimuths[near]) > 50
+    shown.until(f"return {hint} !== ''")  # the localizer has ended
+    shown.press("#directions")
+    shown.until("return !document.querySelector('canvas[data-kind=directions]')")
+    shown.press("#directions")
+    shown.until("return Boolean(document.querySelector('canvas[data-kind=directions]'))")
+    assert shown.problems() == []
+
+
+def line_of_source(shown: Browser) -> Any:
+    """Return the line of source 7 over time if it is two seconds long."""
+    found = shown.run(TRACK, "directions", [255, 180, 84])
+    return found if found and np.sum(np.array(found["far"]) < 40) > len(found["far"]) / 5 else None
+
+
+def test_plots_scroll_until_they_are_frozen(shown: Browser) -> None:
     look = "return document.querySelector('canvas[data-kind=ild]').toDataURL()"
     first = shown.run(look)
     shown.until(f"return arguments[0] !== ({look.removeprefix('return ')})", first)
     shown.press("#freeze")
-    # Three turns of the drawing later nothing has moved.
+    # Nothing moves during the next 30 animation frames.
     still = """
     const done = arguments[arguments.length - 1];
     const canvas = document.querySelector('canvas[data-kind=ild]');
@@ -184,7 +230,7 @@ def test_pictures_move_and_a_frozen_one_does_not(shown: Browser) -> None:
     shown.until(f"return {END} > arguments[0] + 0.5", at)
 
 
-def test_the_cursor_reads_numbers_with_units(shown: Browser) -> None:
+def test_the_readout_has_units(shown: Browser) -> None:
     shown.run(
         "const canvas = document.querySelector('canvas[data-kind=ild]'); const box = canvas.getBoundingClientRect();"
         "const place = { clientX: box.left + box.width * 0.8, clientY: box.top + 40 };"
@@ -193,14 +239,14 @@ def test_the_cursor_reads_numbers_with_units(shown: Browser) -> None:
     read = "return document.querySelector('canvas[data-kind=ild]').closest('.panel').querySelector('.read').textContent"
 
     def numbers() -> list[str]:
-        words: list[str] = [word for word in shown.run(read).split(" · ") if " " in word]
-        return words if len(words) == 3 else []
+        parts: list[str] = [part for part in shown.run(read).split(" · ") if " " in part]
+        return parts if len(parts) == 3 else []
 
-    words = wait_for(numbers, what="a read-out")
-    assert [word.rsplit(" ", 1)[1] for word in words] == ["s", "kHz", "dB"], words
+    parts = wait_for(numbers, what="a readout")
+    assert [part.rsplit(" ", 1)[1] for part in parts] == ["s", "kHz", "dB"], parts
 
 
-def test_a_parameter_changed_on_the_page_reaches_the_node(world: World, shown: Browser) -> None:
+def test_a_parameter_is_changed_on_the_page(world: World, shown: Browser) -> None:
     shown.until("return document.querySelectorAll('.node .name').length > 4")
     shown.run(CHOOSE, "ratemap_0")
     write = (
@@ -212,13 +258,13 @@ def test_a_parameter_changed_on_the_page_reaches_the_node(world: World, shown: B
     wait_for(lambda: world.processors()["ratemap_0"]["rm_decaySec"] == "0.0125", what="the change")
     shown.run(write, "-3")
     error = "return [...document.querySelectorAll('#processor .error')].map((one) => one.textContent).join('')"
-    refused = shown.until(error)
-    assert "e_badNewValue" in refused and "rm_decaySec" in refused
+    message = shown.until(error)
+    assert "e_badNewValue" in message and "rm_decaySec" in message
     assert world.processors()["ratemap_0"]["rm_decaySec"] == "0.0125"
     assert shown.run("return document.querySelector('[data-parameter=rm_decaySec]').value") == "0.0125"
 
 
-def test_a_representation_is_added_shown_and_removed(world: World, shown: Browser) -> None:
+def test_a_representation_is_added_and_removed(world: World, shown: Browser) -> None:
     shown.press("#tree .more")
     shown.run(
         "const kind = document.querySelector('dialog select'); kind.value = 'onsetStrength';"
@@ -230,11 +276,11 @@ def test_a_representation_is_added_shown_and_removed(world: World, shown: Browse
     shown.run(CHOOSE, "onsetStrength_0")
     shown.press("#processor .more")
     shown.press("dialog .primary")
-    wait_for(lambda: "onsetStrength_0" not in world.processors(), what="its end")
+    wait_for(lambda: "onsetStrength_0" not in world.processors(), what="its removal")
     shown.until("return !document.querySelector('canvas[data-kind=onsetStrength]')")
 
 
-def test_one_picture_too_many_says_so(world: World, shown: Browser) -> None:
+def test_the_limit_of_open_plots_is_reported(world: World, shown: Browser) -> None:
     names = [f"ild_{number}" for number in range(90, 104)]
     for name in names:
         assert world.graph.call("/rosAFE/IldProc", name=name, upperDepName="innerhaircell_0").genom_success
@@ -259,7 +305,9 @@ def test_two_windows_and_a_reload(world: World, shown: Browser) -> None:
     driver.get(world.live.url)
     shown.until("return document.querySelectorAll('canvas[data-plot]').length >= 3", what="the second window")
     driver.refresh()
-    shown.until("return document.querySelectorAll('canvas[data-plot]').length >= 3", what="the second one again")
+    shown.until(
+        "return document.querySelectorAll('canvas[data-plot]').length >= 3", what="the second window after a reload"
+    )
     assert "token" not in driver.current_url and driver.get_cookies() == []
     driver.close()
     driver.switch_to.window(first)
@@ -267,13 +315,13 @@ def test_two_windows_and_a_reload(world: World, shown: Browser) -> None:
     shown.until(f"return {END} > arguments[0]", at)
 
 
-def test_the_token_goes_to_no_other_server(world: World, shown: Browser) -> None:
-    """To none of another port, and a window without it, or with an old one, is told what to do."""
-    driver, heard = shown.driver, []
+def test_the_token_is_not_sent_to_other_servers(world: World, shown: Browser) -> None:
+    """A server on another port does not get it; a window without it, or with an old one, shows what to do."""
+    driver, requests = shown.driver, []
 
     class Other(BaseHTTPRequestHandler):
         def do_GET(self) -> None:
-            heard.append(str(self.headers) + self.path)
+            requests.append(str(self.headers) + self.path)
             self.send_response(200)
             self.end_headers()
 
@@ -287,7 +335,7 @@ def test_the_token_goes_to_no_other_server(world: World, shown: Browser) -> None
         finally:
             other.shutdown()
             thread.join()
-    assert heard and not any(world.live.token in one or "cookie" in one.lower() for one in heard)
+    assert requests and not any(world.live.token in one or "cookie" in one.lower() for one in requests)
     driver.switch_to.new_window("window")
     state = "return document.querySelector('#state').textContent.includes('open the URL')"
     driver.get(world.live.root)
@@ -298,12 +346,12 @@ def test_the_token_goes_to_no_other_server(world: World, shown: Browser) -> None
     assert shown.run("return document.querySelectorAll('.node').length") == 0
     driver.close()
     driver.switch_to.window(first)
-    driver.get(world.live.root)  # the same window: it has the token still
-    shown.until("return document.querySelectorAll('canvas[data-plot]').length >= 3", what="pictures")
-    shown.problems()  # the refused sockets
+    driver.get(world.live.root)  # this window still has the token
+    shown.until("return document.querySelectorAll('canvas[data-plot]').length >= 3", what="plots")
+    shown.problems()  # discard the errors of the rejected sockets
 
 
-def test_malformed_sound_is_shown(world: World, shown: Browser) -> None:
+def test_malformed_audio_is_reported(world: World, shown: Browser) -> None:
     import rospy
 
     from bass.msg import binaudio_portStruct
@@ -312,12 +360,12 @@ def test_malformed_sound_is_shown(world: World, shown: Browser) -> None:
     message = binaudio_portStruct(sampleRate=16000, nChunksOnPort=1, nFramesPerChunk=2, left=[1, 2], right=[1])
     publisher = rospy.Publisher("/bass/Audio", binaudio_portStruct, queue_size=1)
 
-    def told() -> bool:
+    def reported() -> bool:
         publisher.publish(message)
         return "2 left and 1 right samples" in str(shown.run("return document.querySelector('#state').textContent"))
 
     try:
-        wait_for(told, what=lambda: str(world.live.process))
+        wait_for(reported, what=lambda: str(world.live.process))
     finally:
         publisher.unregister()
     shown.until("return document.querySelector('#state').dataset.state === 'live'")
@@ -325,23 +373,23 @@ def test_malformed_sound_is_shown(world: World, shown: Browser) -> None:
 
 
 @pytest.mark.parametrize("width", [380, 2560])
-def test_every_width_has_room(shown: Browser, width: int) -> None:
+def test_nothing_exceeds_the_width_of_the_window(shown: Browser, width: int) -> None:
     shown.resize(width, 800)
     shown.until("return innerWidth === arguments[0]", width)
     assert shown.run("return document.documentElement.scrollWidth") <= width
-    for tab in ("control", "pictures"):
+    for tab in ("control", "plots"):
         if width < 900:
             shown.press(f"button[data-tab={tab}]")
         edges = "[...document.querySelectorAll('.card, .panel')].map((one) => one.getBoundingClientRect().right)"
         assert shown.run(f"return Math.max(...{edges})") <= width
 
 
-def test_bass_killed_and_back(world: World, shown: Browser) -> None:
+def test_bass_is_killed_and_started_again(world: World, shown: Browser) -> None:
     assert world.bass is not None
     world.bass.stop(signal.SIGKILL)
     shown.until("return document.querySelector('#state').textContent.includes('bass is not running')")
     world.start_bass()
-    shown.until("return document.querySelector('#state').textContent.includes('nothing is acquired')")
+    shown.until("return document.querySelector('#state').textContent.includes('the capture is stopped')")
     shown.run(
         "document.querySelector('#source input').value = 'scene:?seconds=5';"
         "const [rate, chunk] = document.querySelectorAll('#source input[type=number]');"
@@ -350,4 +398,4 @@ def test_bass_killed_and_back(world: World, shown: Browser) -> None:
     shown.press("#source .primary")
     shown.until("return document.querySelector('#state').dataset.state === 'live'")
     at = shown.run(f"return {END}")
-    wait_for(lambda: shown.run(f"return {END}") != at, what="pictures that move again")
+    wait_for(lambda: shown.run(f"return {END}") != at, what="plots that scroll again")

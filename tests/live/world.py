@@ -1,4 +1,4 @@
-"""A robot with its live page, and clients of the page's protocol."""
+"""A running live page, and a client of its protocol."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import asyncio
 import json
 import re
 import struct
+from collections import deque
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager, contextmanager
 from typing import Any
@@ -15,8 +16,9 @@ import numpy as np
 
 from tests.harness import PATIENCE, Graph, Process, wait_for
 
-PIECE = struct.Struct("<IHHQdffBB6x")  # as docs/live.md has it
+PIECE = struct.Struct("<IHHQdffBB6x")  # as described in docs/live.md
 TREE = ("ratemap", "ild", "itd", "ic")
+GRID = np.radians(np.arange(-175, 181, 5))  # of a posterior
 
 
 class Live:
@@ -34,52 +36,52 @@ class Live:
 
 @contextmanager
 def live(graph: Graph, *arguments: str) -> Iterator[Live]:
-    """`rosafe live` on a free port, up."""
+    """Start `rosafe live` on a free port."""
     with graph.start("rosafe", "live", "--port", "0", "--no-browser", *arguments) as process:
         yield Live(process)
 
 
 def build(graph: Graph, live: Live) -> None:
-    """What the page shows, of the scene; built by the page."""
+    """Start the capture of the scene, and build the tree with requests of the page."""
     assert graph.call("/bass/Acquire", device="scene:?seconds=5", sampleRate=16000).genom_success
 
     async def build_all() -> None:
         async with page(live) as client:
             for kind in TREE:
-                answer = await client.ask("build", representation=kind, nFramesPerBlock=1600, fb_highFreqHz=6000)
+                answer = await client.request("build", representation=kind, nFramesPerBlock=1600, fb_highFreqHz=6000)
                 assert "ok" in answer, answer
 
     asyncio.run(build_all())
 
 
 class Page:
-    """A page, as far as the server sees it."""
+    """A client that behaves as a page."""
 
     def __init__(self, socket: aiohttp.ClientWebSocketResponse) -> None:
         self.socket = socket
-        self.said: dict[str, dict[str, Any]] = {}  # the newest message about each subject
+        self.latest: dict[str, dict[str, Any]] = {}  # message on each subject
         self.answers: dict[int, dict[str, Any]] = {}
         self.pieces: dict[int, list[tuple[int, int, float, np.ndarray]]] = {}  # first, stride, end, columns
-        self.pictures = self.bytes = 0
+        self.messages = self.bytes = 0  # with columns
         self._number = 0
 
-    async def hear(self) -> None:
-        """Take one message."""
+    async def receive(self) -> None:
+        """Receive one message."""
         message = await self.socket.receive(timeout=PATIENCE)
         if message.type == aiohttp.WSMsgType.TEXT:
-            said = json.loads(message.data)
-            if said["about"] == "answer":
-                self.answers[said["id"]] = said
+            content = json.loads(message.data)
+            if content["about"] == "answer":
+                self.answers[content["id"]] = content
             else:
-                self.said[said["about"]] = said
+                self.latest[content["about"]] = content
         elif message.type == aiohttp.WSMsgType.BINARY:
-            self.pictures += 1
+            self.messages += 1
             self.bytes += len(message.data)
-            self._take(message.data)
+            self._decode(message.data)
         else:
             raise ConnectionError(f"closed: {message}")
 
-    def _take(self, data: bytes) -> None:
+    def _decode(self, data: bytes) -> None:
         form, count, _ = struct.unpack_from("<HHI", data)
         assert form == 2
         at = 8
@@ -94,38 +96,75 @@ class Page:
             at += -(-steps.nbytes // 8) * 8
         assert at == len(data)
 
-    async def ask(self, what: str, **given: Any) -> dict[str, Any]:
-        """The answer to a request."""
+    async def request(self, action: str, **values: Any) -> dict[str, Any]:
+        """Send a request and return the answer."""
         self._number += 1
         number = self._number
-        await self.socket.send_json({"id": number, "do": what, "with": given})
+        await self.socket.send_json({"id": number, "do": action, "with": values})
         while number not in self.answers:
-            await self.hear()
+            await self.receive()
         return self.answers.pop(number)
 
-    async def look(self, *keys: dict[str, Any], anew: bool = False) -> list[dict[str, Any]]:
-        """Look at these; what the server says of the views."""
-        self.said.pop("views", None)
-        assert "ok" in await self.ask("look", keys=list(keys), anew=anew)
-        while not self._sees(len(keys)):
-            await self.hear()
-        return list(self.said.get("views", {"views": ()})["views"])
+    async def subscribe(self, *keys: dict[str, Any], resend: bool = False) -> list[dict[str, Any]]:
+        """Subscribe to these views and return their descriptions."""
+        self.latest.pop("views", None)
+        assert "ok" in await self.request("look", keys=list(keys), anew=resend)
+        while not self._has_views(len(keys)):
+            await self.receive()
+        return list(self.latest.get("views", {"views": ()})["views"])
 
-    def _sees(self, count: int) -> bool:
-        """Whether all that was asked for is there; the tree is looked at once a second, and may be an old one first."""
-        views = self.said.get("views", {"views": ()})["views"]
-        return len(views) == count and all("number" in view or view["key"]["name"] == "nobody" for view in views)
+    def _has_views(self, count: int) -> bool:
+        """Return whether all views are described; the server updates its tree once per second, which may be later."""
+        views = self.latest.get("views", {"views": ()})["views"]
+        return len(views) == count and all("number" in view or view["key"]["name"] == "missing" for view in views)
 
     async def until(self, subject: str) -> dict[str, Any]:
-        """The newest message about a subject, or the next one."""
-        while subject not in self.said:
-            await self.hear()
-        return self.said[subject]
+        """Return the newest message on a subject, or wait for the first one."""
+        while subject not in self.latest:
+            await self.receive()
+        return self.latest[subject]
+
+
+@contextmanager
+def localizer(graph: Graph, offset: float = 0.0) -> Iterator[None]:
+    """Publish the messages of a localizer in a running scene: source 7 at the true azimuth plus `offset` (degrees).
+
+    Source 8 is improbable. The posterior is a Gaussian around source 7.
+    """
+    import rospy
+    from rosAFE.msg import DirectionPosterior, SoundSource, SoundSources
+    from std_msgs.msg import Header
+
+    from bass.msg import SceneTruth
+
+    graph.client()
+    sources = rospy.Publisher("/localizer/sources", SoundSources, queue_size=10)
+    posterior = rospy.Publisher("/localizer/posterior", DirectionPosterior, queue_size=10)
+
+    delayed: deque[Any] = deque(maxlen=4)  # a localizer needs some time as well: 0.15 s
+
+    def publish(newest: Any) -> None:
+        delayed.append(newest)
+        truth = delayed[0]
+        header = Header(stamp=truth.stamp, frame_id="head")
+        azimuth = truth.azimuths[0] + np.radians(offset)
+        found = SoundSource(id=7, azimuth=azimuth, azimuth_std=0.05, probability=0.9)
+        improbable = SoundSource(id=8, azimuth=-2.0, azimuth_std=0.5, probability=0.2)
+        sources.publish(SoundSources(header, [improbable, found]))
+        shape = np.exp(-(((GRID - azimuth + np.pi) % (2 * np.pi) - np.pi) ** 2) / 0.02)
+        posterior.publish(DirectionPosterior(header, GRID, shape / shape.sum()))
+
+    scene = rospy.Subscriber("/bass/sceneTruth", SceneTruth, publish)
+    try:
+        yield
+    finally:
+        for topic in (scene, sources, posterior):
+            topic.unregister()
 
 
 @asynccontextmanager
 async def page(live: Live) -> AsyncIterator[Page]:
-    """One page that is open."""
+    """Open one page."""
     async with aiohttp.ClientSession() as session:
         headers = {"Origin": live.root.rstrip("/")}
         async with session.ws_connect(f"{live.root}socket?token={live.token}", headers=headers) as socket:

@@ -1,4 +1,4 @@
-"""Fixtures: a world with nodes that the tests of a module share, idle at the beginning of each test."""
+"""Fixtures: nodes shared by the tests of a module, idle at the start of each test."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from tests.matlab import octave
 
 @pytest.fixture(scope="module")
 def shared_world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[worlds.World]:
-    """One world for all tests of a module."""
-    octave.needed()
+    """Start the nodes for all tests of a module."""
+    octave.require_program()
     with worlds.world(tmp_path_factory.mktemp("world")) as world:
         yield world
 
 
 @pytest.fixture
 def world(shared_world: worlds.World) -> Iterator[worlds.World]:
-    """The module's world, with idle components."""
+    """Return the nodes of the module, and reset them after the test."""
     yield shared_world
     shared_world.reset()

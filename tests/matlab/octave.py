@@ -1,4 +1,4 @@
-"""Octave without a display, in the graph of a test: scripts run to their end, and what they show comes back."""
+"""Runs Octave scripts without a display in the graph of a test, and returns the values that they print."""
 
 from __future__ import annotations
 
@@ -30,23 +30,23 @@ end
 """
 
 
-def needed(program: str = "octave-cli") -> None:
-    """Skip the test where Octave, or what it draws with, is missing."""
+def require_program(program: str = "octave-cli") -> None:
+    """Skip the test if Octave, or a program for its plots, is not installed."""
     if shutil.which(program) is None:
         pytest.skip(f"{program} is not installed; scripts/install --tests brings it")
 
 
 def environment(world: World) -> dict[str, str]:
-    """What points Octave to the world's genomixd."""
+    """Return environment variables with the address of genomixd."""
     return {"GENOMIXD": f"127.0.0.1:{world.port}", "LANG": "C.UTF-8", "DISPLAY": ""}
 
 
 def command(folder: Path, script: str) -> tuple[str, ...]:
-    """The command that runs `script` in `folder`.
+    """Return the command that runs `script` in `folder`.
 
-    The script may call ``show(name, value)``, and ``message(@() ...)``: the identifier and message of an error, or ''.
+    The script may call ``show(name, value)``, and ``message(@() ...)``, which returns identifier and text of an error.
     """
-    needed()
+    require_program()
     (folder / "show.m").write_text(SHOW)
     (folder / "message.m").write_text(MESSAGE)
     path = folder / "script.m"
@@ -54,18 +54,18 @@ def command(folder: Path, script: str) -> tuple[str, ...]:
     return ("sh", "-c", 'cd "$1" && shift && exec "$@"', "sh", str(folder), *COMMAND, path.name)
 
 
-def values(printed: str) -> dict[str, Any]:
-    """The values that a script has shown, by name."""
-    lines = (line.partition("=") for line in printed.splitlines())
+def values(output: str) -> dict[str, Any]:
+    """Parse the values that a script has printed, by name."""
+    lines = (line.partition("=") for line in output.splitlines())
     return {name: json.loads(text) for name, equals, text in lines if equals}
 
 
 def run(world: World, script: str, timeout: float = 120.0, folder: Path | None = None) -> str:
-    """What `script` prints; AssertionError where it ends with an error."""
+    """Run `script` and return its output; raise AssertionError if it fails."""
     words = command(folder or world.graph.home, script)
     return world.graph.run(*words, timeout=timeout, check=True, stdin="", **environment(world)).stdout
 
 
-def shown(world: World, script: str, timeout: float = 120.0, folder: Path | None = None) -> dict[str, Any]:
-    """The values that `script` shows, by name."""
+def run_and_parse(world: World, script: str, timeout: float = 120.0, folder: Path | None = None) -> dict[str, Any]:
+    """Run `script` and return the values that it prints, by name."""
     return values(run(world, script, timeout, folder))

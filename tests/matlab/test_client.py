@@ -1,4 +1,4 @@
-"""The genomix client in Octave: components, requests, values, ports, refusals, and the questions at the prompt."""
+"""The genomix client in Octave: components, requests, values, ports, errors, and questions at the prompt."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ LOADED = """
 """
 
 
-def test_components_and_what_is_refused(world: World) -> None:
-    told = octave.shown(
+def test_components_and_errors(world: World) -> None:
+    results = octave.run_and_parse(
         world,
         LOADED
         + """
@@ -44,18 +44,18 @@ def test_components_and_what_is_refused(world: World) -> None:
         show('path', fieldnames(path){1});
         client.rpath('/nowhere');
 
-        % what raises errors, and what does not
+        % local errors, and errors in requests
         show('no service', message(@() rosAFE.Ratemapproc_()));
         show('no instance', message(@() client.load('rosAFE', '-i')));
         show('wrong instance', message(@() client.load('bass', '-i', 'rosAFE')));
         show('no text', message(@() genomix.client(7)));
         show('address', genomix.client([':' regexp(getenv('GENOMIXD'), '\\d+$', 'match'){1}]).address);
         show('no server', message(@() genomix.client('127.0.0.1:1')));
-        r = rosAFE.removeProcessor('nobody');
+        r = rosAFE.removeProcessor('missing');
         show('refused', {r.status, r.exception.ex, isempty(r.result)});
         r = rosAFE.InputProc('-a', 'input', -1);
         show('wrong', {r.status, r.exception.ex, r.exception.detail.what});
-        r = rosAFE.PreProc('-a', 'lonely', 'nobody');
+        r = rosAFE.PreProc('-a', 'lonely', 'missing');
         show('acknowledged', {r.status, r.exception.ex});
         r = rosAFE.InputProc(1, 2, 3, 4, 5);
         show('many', r.exception.detail.what);
@@ -63,7 +63,7 @@ def test_components_and_what_is_refused(world: World) -> None:
         show('kind', {r.status, r.exception.ex});
         r = rosAFE.GammatoneProc(struct('fb_nERB', 1));
         show('name', r.exception.detail.what);
-        p = rosAFE.ildPort('nobody');
+        p = rosAFE.ildPort('missing');
         show('port', {class(p), p.status, p.exception.ex, p.exception.detail.what});
         show('cells', {rosAFE.ildPort({'-a', 'b', 'c'}).status, rosAFE.getDependencies({1}).status});
         show('extra', fieldnames(bass.Audio({}, 3)));
@@ -81,41 +81,40 @@ def test_components_and_what_is_refused(world: World) -> None:
         """,
     )
     services, ports = (world.http.get("/describe/rosAFE")[kind] for kind in ("services", "ports"))
-    assert told["names"] == [*services, *ports]
-    assert told["properties"] == [len(told["names"]), True, False]
-    assert told["lines"] == len(told["names"]) and told["first"]
-    assert "unsigned long fb_nChannels: Number of channels; 0: as many as fb_nERBs gives (0)" in told["help"]
-    assert told["handle"] == ["function_handle", "done"]
-    assert told["alias"] == "done" and told["path"] == "InputProc"
-    assert told["no service"].startswith(
-        "genomix:component rosAFE has no service or port 'Ratemapproc_'; it has: Input"
-    )
-    assert "may be only: '-i', 'instance'" in told["no instance"]
-    assert "/rosAFE is a rosAFE, and no bass" in told["wrong instance"]
-    assert told["no text"].startswith("genomix:connection the address of genomixd is a text")
-    assert told["address"] == f"127.0.0.1:{world.port}"
-    assert told["no server"].startswith("genomix:connection no answer from genomixd at 127.0.0.1:1 (")
-    assert "genomixd &" in told["no server"]
-    assert told["refused"] == ["error", "::rosAFE::e_noSuchProcessor", True]
-    assert told["wrong"][:2] == ["error", "::genom::serialization"] and "nFramesPerBlock" in told["wrong"][2]
-    assert told["acknowledged"] == ["error", "::rosAFE::e_noUpperDependencie"]
-    assert told["many"].startswith("5 arguments are too many; InputProc takes name (string)")
-    assert told["kind"] == ["error", "::genom::serialization"]
-    assert told["name"].startswith("unknown parameter 'fb_nERB'")
-    assert told["port"][:3] == ["genomix.request", "error", "::genom::no_such_outport"]
-    assert told["port"][3] == "ildPort has no element 'nobody'; there are: none"
-    assert told["cells"] == ["error", "error"]
-    assert told["extra"] == ["Audio"]
-    assert told["long"][0] == "error" and "the arguments are too long" in told["long"][1]
-    assert told["pairs"].endswith("after representation come the parameters in one object, not 'fb_nChannels'")
-    assert told["device"] == ["error", "::bass::e_device"]
-    assert told["done"] == ["done", True, True, True]
-    assert "was deleted" in told["deleted"]
+    assert results["names"] == [*services, *ports]
+    assert results["properties"] == [len(results["names"]), True, False]
+    assert results["lines"] == len(results["names"]) and results["first"]
+    assert "unsigned long fb_nChannels: Number of channels; 0: as many as fb_nERBs gives (0)" in results["help"]
+    assert results["handle"] == ["function_handle", "done"]
+    assert results["alias"] == "done" and results["path"] == "InputProc"
+    assert results["no service"].startswith("genomix:component rosAFE: expected a service or port (Input")
+    assert results["no service"].endswith("), got 'Ratemapproc_'")
+    assert "expected '-i', 'instance'" in results["no instance"]
+    assert "/rosAFE: expected the component bass, got rosAFE" in results["wrong instance"]
+    assert results["no text"].startswith("genomix:connection address: expected a text")
+    assert results["address"] == f"127.0.0.1:{world.port}"
+    assert results["no server"].startswith("genomix:connection no answer from genomixd at 127.0.0.1:1 (")
+    assert "genomixd &" in results["no server"]
+    assert results["refused"] == ["error", "::rosAFE::e_noSuchProcessor", True]
+    assert results["wrong"][:2] == ["error", "::genom::serialization"] and "nFramesPerBlock" in results["wrong"][2]
+    assert results["acknowledged"] == ["error", "::rosAFE::e_noUpperDependencie"]
+    assert results["many"].startswith("5 arguments are too many; InputProc takes name (string)")
+    assert results["kind"] == ["error", "::genom::serialization"]
+    assert results["name"].startswith("unknown parameter 'fb_nERB'")
+    assert results["port"][:3] == ["genomix.request", "error", "::genom::no_such_outport"]
+    assert results["port"][3] == "ildPort has no element 'missing'; there are: none"
+    assert results["cells"] == ["error", "error"]
+    assert results["extra"] == ["Audio"]
+    assert results["long"][0] == "error" and "expected arguments of at most 80000 characters" in results["long"][1]
+    assert results["pairs"].endswith("expected the parameters in one object after representation, got 'fb_nChannels'")
+    assert results["device"] == ["error", "::bass::e_device"]
+    assert results["done"] == ["done", True, True, True]
+    assert "was deleted" in results["deleted"]
 
 
 def test_values(world: World) -> None:
-    """Arguments in all their spellings arrive, and results have the classes and shapes that scripts expect."""
-    told = octave.shown(
+    """All forms of arguments are accepted, and results have the classes and shapes that scripts expect."""
+    results = octave.run_and_parse(
         world,
         LOADED
         + """
@@ -150,7 +149,7 @@ def test_values(world: World) -> None:
         s = rosAFE.genom_state();
         show('state', {class(s.genom_state.task), class(s.genom_state.task{1}.name)});
 
-        % requests that go on, and end
+        % requests that are running, and that end
         show('sent', acquire.status);
         show('waited', acquire.wait(0.1));
         shown = evalc('disp(acquire)');
@@ -163,22 +162,22 @@ def test_values(world: World) -> None:
         show('function', {f.wait(60), fieldnames(f.result)});
         """,
     )
-    assert told["odd"] == "error"  # no name of a topic
-    assert told["shapes"] == [[1, 5], [1, 3], [1, 0], "cell"]
-    assert told["classes"] == ["cell", "cell", "char"]
-    assert all(told["equal"]) and told["cfHz"] and told["both"]
-    assert told["numbers"] == [5, 5, 3, 3, 3]
-    assert told["empty"][1] and 0 in told["empty"][0]
-    assert told["-m"] == ["double", [3, 1]]
-    assert told["names"] == [[1, 3], "input", "preProc", "scalar"] and told["last"]
-    assert told["no result"]
-    assert told["state"] == ["cell", "char"]
-    assert told["sent"] == told["waited"] == "sent"
-    assert told["aborted"][:3] == ["done", True, "done"]
+    assert results["odd"] == "error"  # not a valid name of a topic
+    assert results["shapes"] == [[1, 5], [1, 3], [1, 0], "cell"]
+    assert results["classes"] == ["cell", "cell", "char"]
+    assert all(results["equal"]) and results["cfHz"] and results["both"]
+    assert results["numbers"] == [5, 5, 3, 3, 3]
+    assert results["empty"][1] and 0 in results["empty"][0]
+    assert results["-m"] == ["double", [3, 1]]
+    assert results["names"] == [[1, 3], "input", "preProc", "scalar"] and results["last"]
+    assert results["no result"]
+    assert results["state"] == ["cell", "char"]
+    assert results["sent"] == results["waited"] == "sent"
+    assert results["aborted"][:3] == ["done", True, "done"]
     shown = "  request with properties:\n\n       status: 'sent'\n       result: []\n    exception: []\n"
-    assert told["aborted"][3] == shown
-    assert told["stopped"] == "done"
-    assert told["function"] == ["done", ["parameters"]]
+    assert results["aborted"][3] == shown
+    assert results["stopped"] == "done"
+    assert results["function"] == ["done", ["parameters"]]
 
 
 PORTS = {
@@ -192,8 +191,8 @@ PORTS = {
 }
 
 
-def test_numbers_are_those_of_the_ports(world: World, tmp_path: Path) -> None:
-    """Every sample of every port, as a matrix and in cells: exactly what the port holds."""
+def test_port_data_are_exact(world: World, tmp_path: Path) -> None:
+    """All samples of all ports, as matrices and in cells, are equal to those of the port."""
     octave.run(
         world,
         LOADED
@@ -209,7 +208,7 @@ def test_numbers_are_those_of_the_ports(world: World, tmp_path: Path) -> None:
         ports = {{{", ".join(f"'{port}', '{element}'" for port, element in PORTS.items())}}};
         ends = [1 2];
         before = [];
-        while any(ends ~= ends(1)) || ! isequal(ends, before) % until the last block has come through
+        while any(ends ~= ends(1)) || ! isequal(ends, before) % until all processors have finished
             pause(0.3);
             before = ends;
             for k = 1:2:numel(ports)
@@ -245,13 +244,13 @@ def test_numbers_are_those_of_the_ports(world: World, tmp_path: Path) -> None:
     )
     for port, element in PORTS.items():
         held = world.http.call(f"rosAFE/{port}/{element}")[port]
-        wanted = np.concatenate([_flat(held[ear]) for ear in ("left", "right") if ear in held])
-        assert np.std(wanted) > 0
-        np.testing.assert_array_equal(np.fromfile(tmp_path / port), wanted, err_msg=port)
+        expected = np.concatenate([_flat(held[ear]) for ear in ("left", "right") if ear in held])
+        assert np.std(expected) > 0
+        np.testing.assert_array_equal(np.fromfile(tmp_path / port), expected, err_msg=port)
 
 
 def _flat(signal: dict[str, Any]) -> np.ndarray:
-    """A signal of the JSON answer, frame after frame, channel after channel, lag after lag."""
+    """Return a signal of the JSON answer as a vector, ordered by lag, channel and frame."""
     (inner,) = signal.values()
     return (
         np.concatenate([np.empty(0), *map(_flat, inner)]) if inner and isinstance(inner[0], dict) else np.array(inner)
@@ -259,15 +258,15 @@ def _flat(signal: dict[str, Any]) -> np.ndarray:
 
 
 def test_questions_at_the_prompt(world: World) -> None:
-    """A person who calls a service without arguments is asked for them; a function in between, or a pipe, is not."""
-    octave.needed()
+    """A service that is called at the prompt without arguments asks for them; one called in a function does not."""
+    octave.require_program()
     command = [*octave.COMMAND, "--no-line-editing"]
     with Terminal(command, {**world.graph.env, **octave.environment(world)}) as terminal:
         terminal.expect("> ")
         terminal.press("client = genomix.client; bass = client.load('bass'); rosAFE = client.load('rosAFE');\r")
         terminal.press("r = bass.Acquire('-a');\r")
         terminal.expect(f"string device: {BASS.service('Acquire').parameter('device').doc} (hw:1,0) > ")
-        terminal.press("'scene:'\r")  # as people are used to; the quotes are not part of it
+        terminal.press("'scene:'\r")  # the quotes are removed
         terminal.expect("unsigned long sampleRate: ")
         terminal.expect("(44100) > ")
         terminal.press("22050\r")

@@ -1,4 +1,4 @@
-"""The m-code keeps to what MATLAB R2015a and Octave 7 have in common, as far as reading it tells."""
+"""The m-code uses only syntax and functions that MATLAB R2015a and Octave 7 have in common."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ FILES = sorted((ROOT / "matlab").rglob("*.m"))
 OCTAVE_ONLY = (
     r"\b(end(if|for|while|function|switch|_try_catch)|unwind_protect|printf|puts|until)\b",
     r"[+*/-]=|\+\+|!=|^\s*#|!\s*\w",
-    r'"',  # a class of its own since R2017a, and another kind of text in Octave
+    r'"',  # another class in MATLAB since R2017a, other escapes in Octave
 )
 SINCE_R2015B = (
     r"\b(jsondecode|jsonencode|contains|startsWith|endsWith|newline|isstring|strlength|erase|extractBefore|extractAfter"
@@ -23,12 +23,12 @@ TEXTS = r"(?<![\w\])}'.])'(?:[^'\n]|'')*'"
 
 
 def code(path: Path) -> list[str]:
-    """The lines without texts and comments."""
+    """Return the lines without texts and comments."""
     lines = path.read_text("utf-8").splitlines()
     return [re.sub(r"%.*", "", re.sub(TEXTS, "''", line)) for line in lines]
 
 
-def test_there_are_some() -> None:
+def test_files_are_found() -> None:
     assert len(FILES) > 20
 
 
@@ -41,8 +41,8 @@ def test_common_subset(path: Path) -> None:
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT / "matlab")))
-def test_looks(path: Path) -> None:
-    """`help` finds a text under the name of the file, and lines are not too long."""
+def test_layout(path: Path) -> None:
+    """The first comment starts with the name of the file, and lines are not too long."""
     lines = path.read_text("utf-8").splitlines()
     assert re.match(rf"(classdef|function) .*\b{path.stem}\b", lines[0])
     assert lines[1].startswith(f"%{path.stem.upper()}  ")

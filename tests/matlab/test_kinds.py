@@ -1,4 +1,4 @@
-"""All representations in Octave, by the names and parameters of the MATLAB front-end; one of a plugin is among them."""
+"""All representations in Octave, including a plugin, with names and parameters of the MATLAB Auditory Front-End."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ from tests.matlab import octave
 pytestmark = pytest.mark.ros
 
 RATE = 16000
-DELAY = 5  # samples by which the right ear is late
+DELAY = 5  # of the right ear, samples
 PITCH = 200.0  # Hz
 
 
 @pytest.fixture(scope="module")
 def shared_world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
-    """A world whose components know the plugin of the documents."""
-    octave.needed()
+    """Start nodes with the plugin of the documentation."""
+    octave.require_program()
     folder = tmp_path_factory.mktemp("plugins")
     document = (harness.ROOT / "docs" / "own-representation.md").read_text("utf-8")
     plugin = re.search(r"^```python\n(.*?)^```$", document, re.MULTILINE | re.DOTALL)
@@ -43,7 +43,7 @@ def shared_world(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
 
 @pytest.fixture
 def sound(tmp_path: Path) -> Path:
-    """A second of a harmonic tone from the left, and then one of silence."""
+    """Write a file with one second of a harmonic tone from the left and one second of silence."""
     t = np.arange(RATE) / RATE
     left = sum(np.cos(2 * np.pi * PITCH * k * t) for k in range(1, 15)) / 20
     ears = np.zeros((2 * RATE, 2))
@@ -57,7 +57,7 @@ def sound(tmp_path: Path) -> Path:
 
 
 def begin(sound: Path, port: float = 0.2) -> str:
-    """The beginning of a script: a manager that listens to the sound, with ports of so many seconds."""
+    """Return the start of a script: a manager for the sound file, with ports of `port` seconds."""
     return f"""
         startRosAFE;
         client = genomix.client;
@@ -79,8 +79,8 @@ CLASSES = {
 }
 
 
-def test_every_representation_comes_as_its_port_gives_it_out(world: World, sound: Path) -> None:
-    told = octave.shown(
+def test_all_representations_are_equal_to_their_ports(world: World, sound: Path) -> None:
+    results = octave.run_and_parse(
         world,
         begin(sound)
         + """
@@ -95,7 +95,7 @@ def test_every_representation_comes_as_its_port_gives_it_out(world: World, sound
         for word = words
             mObj.addProcessor(word{1}, par);
         end
-        show('counts', structfun(@numel, mObj.Processors)); % nothing is there twice
+        show('counts', structfun(@numel, mObj.Processors)); % there are no duplicates
         processors = rosAFE.getProcessors();
         processors = processors.result.processors(:).';
         full = @(processor) size(dObj.(processor.kind){1}.Data, 1) >= 0.3 * processor.rate;
@@ -105,7 +105,7 @@ def test_every_representation_comes_as_its_port_gives_it_out(world: World, sound
         end
         bass.Stop();
         left = processors;
-        while ! isempty(left) % until all is in the data object that is on the ports
+        while ! isempty(left) % until the data object contains all frames of the ports
             pause(0.1);
             mObj.processChunk();
             waiting = {};
@@ -137,10 +137,10 @@ def test_every_representation_comes_as_its_port_gives_it_out(world: World, sound
         """,
     )
     kinds = {kind.word: kind for kind in KINDS.values()}
-    assert told["words"] == [*kinds, "zeroCrossings"]
-    assert told["counts"] == [1] * (len(kinds) + 1)
+    assert results["words"] == [*kinds, "zeroCrossings"]
+    assert results["counts"] == [1] * (len(kinds) + 1)
     for word, kind in kinds.items():
-        label, classes, channels, names = told[f"of {word}"]
+        label, classes, channels, names = results[f"of {word}"]
         assert label == f"{word}_0"
         expected = []
         for part in kind.parts:
@@ -149,19 +149,19 @@ def test_every_representation_comes_as_its_port_gives_it_out(world: World, sound
             for channel in ("left", "right") if "ear" in part.axes else ("mono",):
                 expected.append((CLASSES[rows], channel, name))
         assert list(zip(classes, channels, names, strict=True)) == expected, word
-        assert told[kind.kind][0] == pytest.approx(0.2, abs=0.01), word
-        assert told[kind.kind][1:2] == [{"channel": 4}.get(rows[0], told[kind.kind][1])], word
-    assert told["zeroCrossings"][1:] == [4]
-    assert told["fList"][0] == ["pitch", "rawPitch", "confidence"]
-    assert len(told["fList"][1]) == 14 and told["fList"][1][:2] == ["centroid", "crest"]
-    assert told["alike"] and told["lags"] == [1 / RATE, -18 / RATE]
-    assert all(told["figures"])
-    assert told["clean"] == [1] + [0] * len(kinds)
+        assert results[kind.kind][0] == pytest.approx(0.2, abs=0.01), word
+        assert results[kind.kind][1:2] == [{"channel": 4}.get(rows[0], results[kind.kind][1])], word
+    assert results["zeroCrossings"][1:] == [4]
+    assert results["fList"][0] == ["pitch", "rawPitch", "confidence"]
+    assert len(results["fList"][1]) == 14 and results["fList"][1][:2] == ["centroid", "crest"]
+    assert results["alike"] and results["lags"] == [1 / RATE, -18 / RATE]
+    assert all(results["figures"])
+    assert results["clean"] == [1] + [0] * len(kinds)
 
 
-def test_pitch_and_times_of_a_tone_from_the_left_and_of_silence(world: World, sound: Path) -> None:
-    """NaN is NaN in MATLAB and Tcl, and null over HTTP."""
-    told = octave.shown(
+def test_pitch_and_time_differences_of_a_tone_and_of_silence(world: World, sound: Path) -> None:
+    """NaN is NaN in MATLAB and Tcl, and null in JSON."""
+    results = octave.run_and_parse(
         world,
         begin(sound, port=3)
         + """
@@ -180,9 +180,9 @@ def test_pitch_and_times_of_a_tone_from_the_left_and_of_silence(world: World, so
         show('itd', median(times(times != 0)));
         """,
     )
-    assert told["pitch"] == pytest.approx(PITCH, rel=0.01)
-    assert told["finite"]
-    assert abs(told["itd"]) == pytest.approx(DELAY / RATE, rel=0.1)
+    assert results["pitch"] == pytest.approx(PITCH, rel=0.01)
+    assert results["finite"]
+    assert abs(results["itd"]) == pytest.approx(DELAY / RATE, rel=0.1)
     (part,) = world.http.call("rosAFE/getRepresentation", {"name": "pitch_0"})["parts"]
     ears, features, frames = part["shape"]
     assert part["axes"] == ["ear", "feature", "time"] and (ears, features) == (2, 3)
@@ -236,7 +236,7 @@ SCRIPT = """
     mObj.deleteProcessor('onsetStrength', 1);
     show('none', {size(dObj.onsetStrength, 1), numel(mObj.Processors.onsetStrength)});
 
-    other = rosAFE.OffsetProc('mine', 'ratemap_0'); % not asked of the manager
+    other = rosAFE.OffsetProc('mine', 'ratemap_0'); % not created by the manager
     other = rosAFE.getRepresentation('mine');
     show('other', other.result.parts{1}.name);
     mObj.processChunk();
@@ -252,32 +252,32 @@ SCRIPT = """
 
 
 def test_names_and_parameters_of_the_matlab_front_end(world: World, sound: Path) -> None:
-    told = octave.shown(world, begin(sound) + SCRIPT)
-    assert told["features"] == ["flux", "centroid"]
-    assert told["aliases"] == [1000, 0.9, ["flux", "centroid"]]
-    assert told["model"] == "adt_breebaart"
-    assert told["has"] == [True, False, True, False, True, False]
-    assert told["range"] == [100, 300]
-    assert told["pitches"] == [1, 1]
-    frequencies, modulations, same = told["modulations"]
+    results = octave.run_and_parse(world, begin(sound) + SCRIPT)
+    assert results["features"] == ["flux", "centroid"]
+    assert results["aliases"] == [1000, 0.9, ["flux", "centroid"]]
+    assert results["model"] == "adt_breebaart"
+    assert results["has"] == [True, False, True, False, True, False]
+    assert results["range"] == [100, 300]
+    assert results["pitches"] == [1, 1]
+    frequencies, modulations, same = results["modulations"]
     assert len(frequencies) == 4 and len(modulations) == 3 and same and modulations[0] == 8
-    assert told["modulationProc"]
-    assert told["precedence"][0] == frequencies and told["precedence"][1] % 2 == 1 and told["precedence"][2]
-    assert told["gabor"][0] == int(told["gabor"][1]) > 1
-    assert told["changed"] == [["rolloff", "crest", "flux"], [90, 310.5]]
-    assert told["none"] == [0, 0]
-    assert told["other"] == "offsetStrength"
-    assert told["mine"] == ["mine", "mine"]
-    assert told["none of it"].startswith("manager_RosAFE:refused Error::rosAFE::e_badNewValue: pi_rangeHz")
-    assert "fb_nERB" in told["not there"]
-    assert "e_badNewValue: sf_requests" in told["bad word"]
-    assert told["no type"].startswith("manager_RosAFE:type there is no type of processors 'spikes'; there are: input, ")
-    assert "spikes" in told["no name"] and told["read only"]
+    assert results["modulationProc"]
+    assert results["precedence"][0] == frequencies and results["precedence"][1] % 2 == 1 and results["precedence"][2]
+    assert results["gabor"][0] == int(results["gabor"][1]) > 1
+    assert results["changed"] == [["rolloff", "crest", "flux"], [90, 310.5]]
+    assert results["none"] == [0, 0]
+    assert results["other"] == "offsetStrength"
+    assert results["mine"] == ["mine", "mine"]
+    assert results["none of it"].startswith("manager_RosAFE:refused Error::rosAFE::e_badNewValue: pi_rangeHz")
+    assert "fb_nERB" in results["not there"]
+    assert "e_badNewValue: sf_requests" in results["bad word"]
+    assert results["no type"].startswith("manager_RosAFE:type type: expected one of input, ")
+    assert "spikes" in results["no name"] and results["read only"]
 
 
-def test_pictures_of_features(world: World) -> None:
-    """The pitch lies over what it came from, in Hz; features of different units each fill their own range."""
-    told = octave.shown(
+def test_plots_of_features(world: World) -> None:
+    """The pitch is plotted over the raw pitch, in Hz; other features are scaled to their own range."""
+    results = octave.run_and_parse(
         world,
         """
         startRosAFE;
@@ -286,7 +286,7 @@ def test_pictures_of_features(world: World) -> None:
         pitch.appendChunk([NaN 0 0.1; 120 120 0.9; 125 125 0.8; NaN 300 0.2]);
         figure('visible', 'off');
         pitch.plot();
-        lines = get(gca(), 'children'); % the one on top comes first
+        lines = get(gca(), 'children'); % the top one is first
         show('pitch', {get(lines(1), 'ydata'), get(lines(2), 'ydata'), get(lines(1), 'xdata')});
         show('unit', get(get(gca(), 'ylabel'), 'string'));
         figure('visible', 'off');
@@ -294,7 +294,7 @@ def test_pictures_of_features(world: World) -> None:
         show('confidence', {get(get(gca(), 'children'), 'ydata'), get(get(gca(), 'ylabel'), 'string')});
         features = FeatureSignal(10, 10, 'spectralFeatures', 'spectralFeatures_0', {'flux', 'hfc', 'crest'}, 'left');
         figure('visible', 'off');
-        features.plot(); % nothing has come yet
+        features.plot(); % no frames yet
         features.appendChunk([0 1e6 5; 2 3e6 5; 1 2e6 5]);
         figure('visible', 'off');
         features.plot();
@@ -302,9 +302,9 @@ def test_pictures_of_features(world: World) -> None:
         show('features', get(gca(), 'yticklabel').');
         """,
     )
-    on_top, under, times = told["pitch"]
+    on_top, under, times = results["pitch"]
     assert on_top == [None, 120, 125, None] and under == [None, 120, 125, 300]
-    assert times == pytest.approx([0, 0.1, 0.2, 0.3]) and told["unit"] == "Hz"
-    assert told["confidence"] == [pytest.approx([0.1, 0.9, 0.8, 0.2]), "confidence"]
-    assert told["ranges"] == [[0, 1, 0.5], [0, 1, 0.5], [0, 0, 0]]
-    assert told["features"] == ["flux", "hfc", "crest"]
+    assert times == pytest.approx([0, 0.1, 0.2, 0.3]) and results["unit"] == "Hz"
+    assert results["confidence"] == [pytest.approx([0.1, 0.9, 0.8, 0.2]), "confidence"]
+    assert results["ranges"] == [[0, 1, 0.5], [0, 1, 0.5], [0, 0, 0]]
+    assert results["features"] == ["flux", "hfc", "crest"]

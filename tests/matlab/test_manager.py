@@ -1,4 +1,4 @@
-"""manager_RosAFE and dataObject_RosAFE in Octave: trees by one request, chunks without gaps, changes, refusals."""
+"""manager_RosAFE and dataObject_RosAFE in Octave: requests of trees, gapless chunks, changes, errors."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from tests.matlab import octave
 
 pytestmark = pytest.mark.ros
 
-# The manager's part of the original's rosAFEclient.m, in its order.
+# The part of the original's rosAFEclient.m that uses the manager.
 BEGIN = """
-    addpath(genpath('/home/somebody/TwoEars/AuditoryFrontEnd'));
+    addpath(genpath('/home/user/TwoEars/AuditoryFrontEnd'));
     startAuditoryFrontEnd;
     startRosAFE;
     client = genomix.client;
@@ -23,7 +23,7 @@ BEGIN = """
 
 
 def test_representations_and_their_data(world: World) -> None:
-    told = octave.shown(
+    results = octave.run_and_parse(
         world,
         BEGIN
         + """
@@ -41,7 +41,7 @@ def test_representations_and_their_data(world: World) -> None:
         acquire = dObj.acquire;
         show('acquire', acquire.status);
 
-        % new frames at the end of the old, none lost, none twice
+        % new frames are appended without losses and duplicates
         mObj.processChunk();
         while size(dObj.ild{1}.Data, 1) < 60
             pause(0.2);
@@ -50,7 +50,7 @@ def test_representations_and_their_data(world: World) -> None:
         bass.Stop();
         ends = [1 2];
         before = [];
-        while any(ends ~= ends(1)) || ! isequal(ends, before) % until the last block has come through
+        while any(ends ~= ends(1)) || ! isequal(ends, before) % until all processors have finished
             pause(0.3);
             before = ends;
             ends = [rosAFE.inputProcPort('-m').inputProcPort.lastFrameIndex, ...
@@ -81,10 +81,10 @@ def test_representations_and_their_data(world: World) -> None:
         show('reset', isempty(dObj.input{1}.Data));
         """,
     )
-    assert told["before"] == [[], 0]
-    assert told["signals"] == ["ild_0", [1, 2], "right", "crosscorrelation_0", 37]
-    assert told["cfHz"]
-    assert told["names"] == [
+    assert results["before"] == [[], 0]
+    assert results["signals"] == ["ild_0", [1, 2], "right", "crosscorrelation_0", 37]
+    assert results["cfHz"]
+    assert results["names"] == [
         "input_0",
         "time_0",
         "filterbank_0",
@@ -93,20 +93,20 @@ def test_representations_and_their_data(world: World) -> None:
         "ratemap_0",
         "crosscorrelation_0",
     ]
-    assert told["counts"] == [1] * 7 + [0] * (told["kinds"] - 7)
-    assert told["acquire"] == "sent"
-    assert told["input"] == [8000, True, True] or told["input"] == [8000, 1, 1]
-    assert told["ratemap"] and told["cc"]
-    *samples, frames = told["seconds"]
+    assert results["counts"] == [1] * 7 + [0] * (results["kinds"] - 7)
+    assert results["acquire"] == "sent"
+    assert results["input"] == [8000, True, True] or results["input"] == [8000, 1, 1]
+    assert results["ratemap"] and results["cc"]
+    *samples, frames = results["seconds"]
     assert min(samples) >= 0.6 and max(samples) - min(samples) <= 0.5
     assert abs(frames - samples[2]) <= 0.5
-    assert told["rates"] == [16000, 100, 100]
-    assert told["nothing new"] and told["cleared"][1] is False and told["reset"]
-    assert 0 in told["cleared"][0]
+    assert results["rates"] == [16000, 100, 100]
+    assert results["nothing new"] and results["cleared"][1] is False and results["reset"]
+    assert 0 in results["cleared"][0]
 
 
-def test_reuse_changes_and_refusals(world: World) -> None:
-    told = octave.shown(
+def test_reuse_changes_and_errors(world: World) -> None:
+    results = octave.run_and_parse(
         world,
         BEGIN
         + """
@@ -139,7 +139,7 @@ def test_reuse_changes_and_refusals(world: World) -> None:
         show('bad name', message(@() mObj.addProcessor('spikes')));
         show('bad member', message(@() mObj.addProcessor('ild', struct('fb_nERB', 1))));
         show('bad parameter', message(@() mObj.modifyParameter('ild_0', 'rm_scaling', 'power')));
-        show('bad processor', message(@() mObj.deleteProcessor('nobody')));
+        show('bad processor', message(@() mObj.deleteProcessor('missing')));
         show('bad type', message(@() mObj.hasProcessor('spikes')));
         show('bad number', message(@() mObj.deleteProcessor('ild', 99)));
         show('two', message(@() mObj.addProcessor('ild', struct('fb_nChannels', {1, 2}))));
@@ -160,7 +160,7 @@ def test_reuse_changes_and_refusals(world: World) -> None:
         mObj.deleteProcessor('time_0');
         show('root', {counts(), size(dObj.ratemap, 1)});
 
-        % signals follow what changes them
+        % signals are replaced when parameters change
         sOut = mObj.addProcessor('crosscorrelation', par);
         name = @(kind) mObj.Processors.(kind){end}.name;
         mObj.modifyParameter(name('gammatone'), 'fb_cfHz', [500 1000]);
@@ -176,31 +176,31 @@ def test_reuse_changes_and_refusals(world: World) -> None:
         show('clean', {counts(), mObj.Processors.input{1}.name, size(dObj.ild, 1), size(dObj.input, 1)});
         """,
     )
-    assert told["both"] == told["again"] == [1, 1, 1, 1]
-    assert told["wider"] == [[1, 1, 2, 1], "ild_1", [2, 1]]
-    assert told["has"] == [True, True, True, True, False, False]
-    assert told["found"] == "ild_1"
-    assert told["changed"] == [1, 0.005]
-    assert told["beside"] == [2, 2, 3, 1]
-    assert told["unity"] == [0, 0, 1]
-    assert told["bad value"].startswith("manager_RosAFE:refused Error::rosAFE::e_badNewValue: ild_wSizeSec: -1")
-    assert "::genom::serialization" in told["bad name"] and "'spikes' is not one of" in told["bad name"]
-    assert "fb_nERB" in told["bad member"]
-    assert told["bad parameter"].startswith("manager_RosAFE:refused Error::rosAFE::e_noSuchParameter: ")
-    assert "no 'rm_scaling', but: ild_wname, " in told["bad parameter"]
-    assert told["bad processor"].startswith("manager_RosAFE:refused Error::rosAFE::e_noSuchProcessor: ")
-    assert told["bad type"].startswith("manager_RosAFE:type")
-    assert told["bad number"] == "manager_RosAFE:number there is no processor 99 of type 'ild'"
-    assert told["two"].startswith("manager_RosAFE:arguments there are 2 structures")
-    assert told["none"].startswith("manager_RosAFE:arguments")
-    assert told["bad count"].startswith("manager_RosAFE:arguments")
-    assert told["bad device"].startswith("acquireAudio:refused Error::bass::e_device")
-    assert told["few"].startswith("dataObject_RosAFE:arguments")
-    assert told["after"][2:] == [3, 1]
-    before, left, size = told["deleted"]
+    assert results["both"] == results["again"] == [1, 1, 1, 1]
+    assert results["wider"] == [[1, 1, 2, 1], "ild_1", [2, 1]]
+    assert results["has"] == [True, True, True, True, False, False]
+    assert results["found"] == "ild_1"
+    assert results["changed"] == [1, 0.005]
+    assert results["beside"] == [2, 2, 3, 1]
+    assert results["unity"] == [0, 0, 1]
+    assert results["bad value"].startswith("manager_RosAFE:refused Error::rosAFE::e_badNewValue: ild_wSizeSec: exp")
+    assert "::genom::serialization" in results["bad name"] and "representation: expected one of" in results["bad name"]
+    assert "fb_nERB" in results["bad member"]
+    assert results["bad parameter"].startswith("manager_RosAFE:refused Error::rosAFE::e_noSuchParameter: ")
+    assert "no 'rm_scaling'; they have: ild_wname, " in results["bad parameter"]
+    assert results["bad processor"].startswith("manager_RosAFE:refused Error::rosAFE::e_noSuchProcessor: ")
+    assert results["bad type"].startswith("manager_RosAFE:type")
+    assert results["bad number"] == "manager_RosAFE:number number: expected 1 to 3 for type 'ild', got 99"
+    assert results["two"].startswith("manager_RosAFE:arguments p: expected one structure of parameters, got 2")
+    assert results["none"].startswith("manager_RosAFE:arguments")
+    assert results["bad count"].startswith("manager_RosAFE:arguments")
+    assert results["bad device"].startswith("acquireAudio:refused Error::bass::e_device")
+    assert results["few"].startswith("dataObject_RosAFE:arguments")
+    assert results["after"][2:] == [3, 1]
+    before, left, size = results["deleted"]
     assert before not in left and len(left) == 2 and size == [2, 1]
-    assert told["name"] not in left
-    assert told["middle"] == 2
-    assert told["root"][0] == [1, 1, 2, 0] and told["root"][1] == 0
-    assert told["follow"] == [50, [500, 1000], 17, [2, 17], True]
-    assert told["clean"] == [[0, 0, 0, 0], "input_0", 0, 1]
+    assert results["name"] not in left
+    assert results["middle"] == 2
+    assert results["root"][0] == [1, 1, 2, 0] and results["root"][1] == 0
+    assert results["follow"] == [50, [500, 1000], 17, [2, 17], True]
+    assert results["clean"] == [[0, 0, 0, 0], "input_0", 0, 1]

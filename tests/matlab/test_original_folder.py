@@ -1,4 +1,4 @@
-"""Scripts that run in the folder of the original's examples, whose functions come first on the path."""
+"""Scripts in the folder of the original's examples, whose functions are first on the path."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from tests.matlab import octave
 
 pytestmark = pytest.mark.ros
 
-# The files of the original's folder. As there, acquireAudio returns nothing, and initRosAFE puts the MATLAB Auditory
-# Front-End first on the path.
+# The files of the original's folder: acquireAudio returns nothing, and initRosAFE adds the MATLAB Auditory Front-End
+# at the front of the path.
 FUNCTIONS = {
     "initRosAFE": """
         function [bass, rosAFE, client] = initRosAFE(openRobotsMatlabPath, twoEarsPath, rosAFEPath)
@@ -33,7 +33,7 @@ FUNCTIONS = {
     "adaptTFS": "function adaptTFS(varargin)\nerror('folder:called', 'adaptTFS of the folder was called');\nend\n",
     "verifyParameters": "function verifyParameters(varargin)\nerror('folder:called', 'verifyParameters');\nend\n",
 }
-# Classes of the MATLAB Auditory Front-End take a processor where ours take a rate.
+# The constructors of the MATLAB Auditory Front-End have other arguments: a processor instead of a rate.
 SIGNALS = ("TimeDomainSignal", "TimeFrequencySignal", "FeatureSignal", "CorrelationSignal", "ModulationSignal")
 FRONT_END = """
 classdef NAME < handle
@@ -48,7 +48,7 @@ end
 """
 CLIENT = """
     clear all; close all; clc;
-    addpath(genpath('/home/somebody/genom_ws/rosAFE/examples'));
+    addpath(genpath('/home/user/genom_ws/rosAFE/examples'));
     [ bass, rosAFE, client ] = initRosAFE( );
     sampleRate = 16000;
     dObj = dataObject_RosAFE( bass, rosAFE, 'scene:', sampleRate, 1600, 1, 1, 1, 10 );
@@ -76,7 +76,7 @@ def _lines(text: str) -> str:
 
 
 @pytest.mark.parametrize("front_end", [False, True], ids=["alone", "MATLAB front-end first"])
-def test_the_clients_script_in_its_own_folder(world: World, tmp_path: Path, front_end: bool) -> None:
+def test_a_client_script_in_the_original_folder(world: World, tmp_path: Path, front_end: bool) -> None:
     for name, text in FUNCTIONS.items():
         (tmp_path / f"{name}.m").write_text(_lines(text), "utf-8")
     folder = tmp_path / "AuditoryFrontEnd"
@@ -85,9 +85,9 @@ def test_the_clients_script_in_its_own_folder(world: World, tmp_path: Path, fron
     if front_end:
         for name in SIGNALS:
             (folder / f"{name}.m").write_text(FRONT_END.replace("NAME", name).lstrip(), "utf-8")
-    # startRosAFE, which initRosAFE calls last, puts our folder first again
+    # startRosAFE, which initRosAFE calls last, moves our folder to the front of the path
     first = "initRosAFE( );" + (" addpath(fullfile(pwd, 'AuditoryFrontEnd'));" if front_end else "")
-    shown = octave.shown(world, CLIENT.replace("initRosAFE( );", first), folder=tmp_path)
+    shown = octave.run_and_parse(world, CLIENT.replace("initRosAFE( );", first), folder=tmp_path)
     assert shown["columns"] == [31, 3]
     assert shown["class"] == ("rosafe.FeatureSignal" if front_end else "FeatureSignal")
     assert shown["left"] == 0

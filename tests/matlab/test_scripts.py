@@ -1,4 +1,4 @@
-"""The MATLAB block of the user guide, the blocks of our documents, and scripts like the examples of the original."""
+"""The MATLAB code in the user guide and in the documentation, and a script like the examples of the original."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ REQUESTS = ("inputProc", "preProc", "gammatone", "ihc", "ild", "ratemap", "cross
 
 
 def blocks(document: Path) -> list[str]:
-    """The m-code that a document shows."""
+    """Return the blocks of m-code in a document."""
     found: list[str] = re.findall(r"^```matlab\n(.*?)^```$", document.read_text("utf-8"), re.MULTILINE | re.DOTALL)
     return found
 
 
 def test_the_block_of_the_guide(world: World) -> None:
-    """Verbatim, but for the device: this machine has none."""
+    """The code is unchanged except for the device."""
     guide = harness.shared("spec", "original-user-guide.txt").read_text("utf-8")
     block = guide.partition("\naddpath(genpath(")
     text = block[1] + block[2]
@@ -39,26 +39,26 @@ def test_the_block_of_the_guide(world: World) -> None:
     )
     checks += "show('types', fieldnames(getParameters.result.parameters))\n"
     checks += "show('frames', numel(getSignals.result.signals.ild))\n"
-    # what is given no name asks for a processor that nobody has
+    # without a name, these request a processor that does not exist
     checks += "show('refused', {getDependencies.exception.ex, removeProcessor.exception.ex})\n"
-    told = octave.shown(world, script + "\n" + checks)
-    assert {told[name] for name in ["inputProcRequest", *names]} == {"sent"}
-    assert told["ratemapProcOut"] == ["ratemapPort", 100]
-    assert told["gammatoneProcOut"] == ["gammatonePort", 44100]
-    assert told["types"] == ["input", "preProc", "gammatone", "ihc", "ild", "ratemap", "crossCorrelation"]
-    assert told["frames"] == 1
-    assert told["refused"] == ["::rosAFE::e_noSuchProcessor"] * 2
+    results = octave.run_and_parse(world, script + "\n" + checks)
+    assert {results[name] for name in ["inputProcRequest", *names]} == {"sent"}
+    assert results["ratemapProcOut"] == ["ratemapPort", 100]
+    assert results["gammatoneProcOut"] == ["gammatonePort", 44100]
+    assert results["types"] == ["input", "preProc", "gammatone", "ihc", "ild", "ratemap", "crossCorrelation"]
+    assert results["frames"] == 1
+    assert results["refused"] == ["::rosAFE::e_noSuchProcessor"] * 2
 
 
-def test_the_first_block_of_the_page(world: World) -> None:
-    told = octave.shown(world, blocks(DOCUMENT)[0] + "\nshow('cfHz', cfHz); show('rate', rate)")
-    assert len(told["cfHz"]) == 31 and told["cfHz"][0] == 80
-    assert told["rate"] == 100
+def test_the_first_block_of_the_document(world: World) -> None:
+    results = octave.run_and_parse(world, blocks(DOCUMENT)[0] + "\nshow('cfHz', cfHz); show('rate', rate)")
+    assert len(results["cfHz"]) == 31 and results["cfHz"][0] == 80
+    assert results["rate"] == 100
 
 
-def test_the_picture_of_the_page(world: World, tmp_path: Path) -> None:
-    octave.needed("gs")
-    octave.needed("gnuplot")
+def test_the_plot_of_the_document(world: World, tmp_path: Path) -> None:
+    octave.require_program("gs")
+    octave.require_program("gnuplot")
     script = blocks(DOCUMENT)[1]
     assert len(script.splitlines()) == 10
     for long, short in (("port', 8)", "port', 1)"), ("pause(9)", "pause(1.5)"), ("1:800", "1:100")):
@@ -70,16 +70,16 @@ def test_the_picture_of_the_page(world: World, tmp_path: Path) -> None:
     assert 10_000 < picture.stat().st_size < 100_000
 
 
-def test_the_manager_of_the_page(world: World) -> None:
+def test_the_manager_in_the_document(world: World) -> None:
     script = blocks(DOCUMENT)[2].replace("pause(0.5)", "pause(0.2)")
-    told = octave.shown(world, script + "\nshow('sizes', {size(levels), size(right)})")
-    (frames, channels), right = told["sizes"]
+    results = octave.run_and_parse(world, script + "\nshow('sizes', {size(levels), size(right)})")
+    (frames, channels), right = results["sizes"]
     assert channels == 16 and frames > 20 and right[1] == 16
     assert not world.http.call("rosAFE/getParameters")["parameters"]["preProc"]
 
 
-def test_pitch_and_modulations_of_the_page(world: World) -> None:
-    told = octave.shown(
+def test_pitch_and_modulations_in_the_document(world: World) -> None:
+    results = octave.run_and_parse(
         world,
         blocks(DOCUMENT)[3]
         + """
@@ -94,21 +94,23 @@ def test_pitch_and_modulations_of_the_page(world: World) -> None:
             r = rosAFE.getRepresentation('-m', 'pitch_0');
             part = r.result.parts{1};
         end
-        frames = reshape(part.data, flipud(part.shape).'); % as the page says: time first, then features, then ears
+        frames = reshape(part.data, flipud(part.shape).'); % as documented: time first, then features, then ears
         right = part.data(4 * part.shape(3) + 1:end); % row-major: the right ear's rawPitch and confidence
         show('frames', [size(frames) - flipud(part.shape).', isequaln(frames(:, 2:3, 2)(:), right)]);
         """,
     )
-    assert told["kinds"] == [1, True]
-    assert told["changed"] == [0.5, [80, 300]]
-    assert told["size"] == [31, 9]
-    assert told["frames"] == [0, 0, 0, 1]
+    assert results["kinds"] == [1, True]
+    assert results["changed"] == [0.5, [80, 300]]
+    assert results["size"] == [31, 9]
+    assert results["frames"] == [0, 0, 0, 1]
 
 
-def test_the_block_of_the_readme(world: World) -> None:
+def test_the_code_in_the_readme(world: World) -> None:
     (block,) = blocks(harness.ROOT / "README.md")
-    told = octave.shown(world, block.replace("pause(2)", "pause(0.5)") + "\nshow('size', size(out.ildPort.left))")
-    assert told["size"] == [100, 16]
+    results = octave.run_and_parse(
+        world, block.replace("pause(2)", "pause(0.5)") + "\nshow('size', size(out.ildPort.left))"
+    )
+    assert results["size"] == [100, 16]
 
 
 READER = """
@@ -181,17 +183,17 @@ READER = """
 """
 
 
-def test_a_reader_of_ports_in_the_manner_of_the_examples(shared_world: World) -> None:
-    """New frames by lastFrameIndex, `adaptTFS` in its old order, the shutdown: the last test of the module."""
-    told = octave.shown(shared_world, READER)
-    got, left, right, lost = told["frames"]
+def test_a_script_like_the_examples_reads_ports(shared_world: World) -> None:
+    """New frames by lastFrameIndex, `adaptTFS` in its old order, shutdown. It is the last test of the module."""
+    results = octave.run_and_parse(shared_world, READER)
+    got, left, right, lost = results["frames"]
     assert got == left == right > 0
     assert (got + lost) % 4410 == 0
-    assert told["same"] and told["alive"]
-    assert told["ratemap"][0] % 10 == 0 and told["ratemap"][1:] == [100, 8, 100, 8, 1]
-    assert told["input"] == [44100, 2, 1]
-    assert told["audio"] == [1, 44100, 1]
-    assert told["status"] == ["done", "done", "done"]
+    assert results["same"] and results["alive"]
+    assert results["ratemap"][0] % 10 == 0 and results["ratemap"][1:] == [100, 8, 100, 8, 1]
+    assert results["input"] == [44100, 2, 1]
+    assert results["audio"] == [1, 44100, 1]
+    assert results["status"] == ["done", "done", "done"]
     harness.wait_for(
         lambda: not {"/bass/kill", "/rosAFE/kill"} & shared_world.graph.services(), what="end of the nodes"
     )

@@ -1,4 +1,4 @@
-"""Octave scripts in the manner of what others wrote for the original's client: its arithmetic needs certain shapes."""
+"""Octave scripts like those of other users of the original's client, which depend on the shapes of values."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from tests.matlab import octave
 
 pytestmark = pytest.mark.ros
 
-# How the robot interfaces of Two!Ears get their ear signals.
+# The robot interfaces of Two!Ears read their ear signals like this.
 ROBOT = """
     1;
     function [signals, seconds] = getSignal(bass, duration)
         b = bass.Audio();
         signals = [cell2mat(b.Audio.left); cell2mat(b.Audio.right)]' ./ 2^31;
-        wanted = round(duration * b.Audio.sampleRate);
-        if wanted > size(signals, 1)
+        count = round(duration * b.Audio.sampleRate);
+        if count > size(signals, 1)
             error('the desired chunk is longer than the buffer');
         end
-        signals = signals(end - wanted + 1:end, :);
+        signals = signals(end - count + 1:end, :);
         seconds = length(signals) / b.Audio.sampleRate;
     end
     client = genomix.client;
@@ -37,7 +37,7 @@ ROBOT = """
     show('alive', all(std(whole) > 0));
     show('types', cellfun(@class, {b.Audio.left, b.Audio.left{1}}, 'UniformOutput', false));
 
-    % a tutorial of 2015 shows a client whose sequences are columns
+    % in a tutorial of 2015, sequences are columns
     old = genomix.client(client.address, '-columns');
     p = old.load('bass').Audio();
     show('old', {size(p.Audio.left), size([cell2mat(p.Audio.left) cell2mat(p.Audio.right)])});
@@ -49,25 +49,25 @@ ROBOT = """
 
 
 def test_a_robot_interface(world: World) -> None:
-    told = octave.shown(world, ROBOT)
-    assert told["sizes"] == [[1, 44100], [22050, 2], 0.5, [44100, 2]]
-    assert all(told["same"]) and told["alive"]
-    assert told["types"] == ["cell", "double"]
-    assert told["old"] == [[44100, 1], [44100, 2]]
-    assert told["fields"] == [[0, 1], "done"]
-    assert told["wrong"] == "genomix:connection after the address of genomixd there may be only: '-columns'"
+    results = octave.run_and_parse(world, ROBOT)
+    assert results["sizes"] == [[1, 44100], [22050, 2], 0.5, [44100, 2]]
+    assert all(results["same"]) and results["alive"]
+    assert results["types"] == ["cell", "double"]
+    assert results["old"] == [[44100, 1], [44100, 2]]
+    assert results["fields"] == [[0, 1], "done"]
+    assert results["wrong"] == "genomix:connection expected at most '-columns' after the address of genomixd"
 
 
-# A buffer that takes what Two!Ears' circVBuf takes, by an assignment of rows: time goes down.
+# A buffer that accepts the same chunks as circVBuf of Two!Ears: it assigns rows, one for each frame.
 SIGNALS = """
     1;
-    function data = held(data, chunk)
+    function data = appended(data, chunk)
         n = size(chunk, 1);
         old = size(data, 1);
         data(old + 1:old + n, :, :) = chunk(:, :, :);
     end
-    function taken(name, signal, buffer, chunk)
-        theirs = message(@() held(buffer, chunk));
+    function compare(name, signal, buffer, chunk)
+        theirs = message(@() appended(buffer, chunk));
         ours = message(@() signal.appendChunk(chunk));
         show(name, {isempty(theirs), isempty(ours), size(signal.Data)});
     end
@@ -87,10 +87,10 @@ SIGNALS = """
 
     time = TimeDomainSignal.construct(16000, 10, 'input', 'input_0', 'left');
     port = rosAFE.inputProcPort().inputProcPort;
-    taken('time', time, zeros(0, 1), cell2mat(port.left.data)');
+    compare('time', time, zeros(0, 1), cell2mat(port.left.data)');
     show('samples', isequal(time.Data', cell2mat(port.left.data)));
-    taken('time as it comes', time, zeros(0, 1), cell2mat(port.left.data));
-    taken('two ears', time, zeros(0, 1), [cell2mat(port.left.data); cell2mat(port.right.data)]');
+    compare('time as it comes', time, zeros(0, 1), cell2mat(port.left.data));
+    compare('two ears', time, zeros(0, 1), [cell2mat(port.left.data); cell2mat(port.right.data)]');
 
     bank = TimeFrequencySignal.construct(16000, 10, 'filterbank', 'filterbank_0', cfHz, 'left');
     port = rosAFE.gammatonePort('filterbank_0').gammatonePort;
@@ -98,42 +98,42 @@ SIGNALS = """
     for jj = 1:port.numberOfChannels
         chunk(:, jj) = cell2mat(port.left.dataN{jj}.data)';
     end
-    taken('bank', bank, zeros(0, 3), chunk);
+    compare('bank', bank, zeros(0, 3), chunk);
     show('channels', isequal(bank.Data, chunk));
     show('adapted', isequal(adaptTFS(port.framesOnPort, port.numberOfChannels, port.left, 0), chunk));
-    taken('bank on its side', bank, zeros(0, 3), chunk');
-    taken('one channel', bank, zeros(0, 3), chunk(:, 1));
-    taken('nothing new', bank, zeros(0, 3), chunk(end + 1:end, :));
+    compare('bank on its side', bank, zeros(0, 3), chunk');
+    compare('one channel', bank, zeros(0, 3), chunk(:, 1));
+    compare('nothing new', bank, zeros(0, 3), chunk(end + 1:end, :));
 
     cc = CorrelationSignal(100, 10, 'crosscorrelation', 'crosscorrelation_0', cfHz, lags, 'mono');
     chunk = rosAFE.crossCorrelationPort('-m', 'crosscorrelation_0').crossCorrelationPort.left;
-    taken('correlation', cc, zeros(0, 3, numel(lags)), chunk);
-    taken('other lags', cc, zeros(0, 3, numel(lags)), chunk(:, :, 2:end));
-    taken('lags first', cc, zeros(0, 3, numel(lags)), permute(chunk, [1 3 2]));
+    compare('correlation', cc, zeros(0, 3, numel(lags)), chunk);
+    compare('other lags', cc, zeros(0, 3, numel(lags)), chunk(:, :, 2:end));
+    compare('lags first', cc, zeros(0, 3, numel(lags)), permute(chunk, [1 3 2]));
 
     brief = TimeDomainSignal.construct(10, 1, 'input', 'input_0', 'left');
     brief.appendChunk((1:25)');
     show('newest', brief.Data');
-    show('told', message(@() brief.appendChunk(1:4410)));
-    show('told 3', message(@() cc.appendChunk(chunk(:, :, 1))));
+    show('error', message(@() brief.appendChunk(1:4410)));
+    show('error 3', message(@() cc.appendChunk(chunk(:, :, 1))));
 """
 
 
-def test_signals_take_what_the_front_ends_take(world: World) -> None:
-    told = octave.shown(world, SIGNALS)
+def test_signals_accept_the_same_chunks_as_the_front_end(world: World) -> None:
+    results = octave.run_and_parse(world, SIGNALS)
     samples, channels = [1600, 1], [1600, 3]
-    frames = told["correlation"][2]
-    assert told["time"] == [True, True, samples] and told["samples"]
-    assert told["bank"] == [True, True, channels] and told["channels"] and told["adapted"]
-    assert told["correlation"][:2] == [True, True] and frames == [10, 3, 37]
-    assert told["nothing new"] == [True, True, channels]
+    frames = results["correlation"][2]
+    assert results["time"] == [True, True, samples] and results["samples"]
+    assert results["bank"] == [True, True, channels] and results["channels"] and results["adapted"]
+    assert results["correlation"][:2] == [True, True] and frames == [10, 3, 37]
+    assert results["nothing new"] == [True, True, channels]
     for name in ("time as it comes", "two ears"):
-        assert told[name] == [False, False, samples]
+        assert results[name] == [False, False, samples]
     for name in ("bank on its side", "one channel"):
-        assert told[name] == [False, False, channels]
+        assert results[name] == [False, False, channels]
     for name in ("other lags", "lags first"):
-        assert told[name] == [False, False, frames]
-    assert told["newest"] == list(range(16, 26))
-    wanted = "takes chunks of N-by-1 (time goes down), and this one is 1-by-4410"
-    assert told["told"] == f"BufferedSignal:size input_0 {wanted}"
-    assert told["told 3"].endswith("takes chunks of N-by-3-by-37 (time goes down), and this one is 10-by-3")
+        assert results[name] == [False, False, frames]
+    assert results["newest"] == list(range(16, 26))
+    error = "expected a chunk of N-by-1 with one frame per row, got 1-by-4410"
+    assert results["error"] == f"BufferedSignal:size input_0: {error}"
+    assert results["error 3"].endswith("expected a chunk of N-by-3-by-37 with one frame per row, got 10-by-3")

@@ -1,4 +1,4 @@
-"""Octave's client when things go wrong: components and servers that end while it waits, and that come back."""
+"""The Octave client when components and genomixd end and are started again."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from tests.matlab import octave
 pytestmark = pytest.mark.ros
 
 SCRIPT = """
-    1; % a script, though it begins with functions
-    function say(name)
+    1; % a script that starts with functions
+    function signal_test(name)
         fclose(fopen(name, 'w'));
     end
     function await(name)
@@ -27,7 +27,7 @@ SCRIPT = """
     bass = client.load('bass');
     acquire = bass.Acquire('-a', 'scene:');
     show('sent', acquire.status);
-    say('1 kill the node');
+    signal_test('1 kill the node');
     status = acquire.wait(60);
     show('killed', {status, acquire.exception.ex, acquire.exception.detail.what});
     r = bass.ListDevices();
@@ -35,17 +35,17 @@ SCRIPT = """
     p = bass.Audio();
     show('dead port', {class(p), p.status});
     show('load', message(@() client.load('bass')));
-    say('2 start the node');
+    signal_test('2 start the node');
     await('3 the node is back');
     again = bass.Acquire('-a', 'scene:');
     show('back', again.status);
 
-    say('4 end the server');
+    signal_test('4 end the server');
     await('5 the server has ended');
     show('gone', message(@() bass.Stop()));
     show('gone status', message(@() again.status));
     delete(bass);
-    say('6 start the server');
+    signal_test('6 start the server');
     await('7 the server is back');
     bass = client.load('bass');
     show('forgotten', {again.status, again.exception.ex});
@@ -56,7 +56,7 @@ SCRIPT = """
 
 
 def test_components_and_servers_that_end(tmp_path: Path) -> None:
-    """One script from beginning to end; it and the test tell each other by files how far they are."""
+    """The script and the test synchronize with files."""
 
     def await_file(name: str) -> None:
         harness.wait_for(lambda: (tmp_path / name).exists() or not script.alive, what=lambda: f"{name}: {script}")
@@ -83,14 +83,14 @@ def test_components_and_servers_that_end(tmp_path: Path) -> None:
                 (tmp_path / "7 the server is back").touch()
                 with script:
                     assert script.wait() == 0
-            told = octave.values(script.out)
-    assert told["sent"] == told["back"] == "sent"
-    assert told["killed"] == ["error", "::genom::mwerr", "bass ended before its activity did"]
-    assert told["dead"] == ["error", "::genom::mwerr"]
-    assert told["dead port"] == ["genomix.request", "error"]
-    assert told["load"].startswith("genomix:load load bass: ::genom::mwerr: bass is not running")
+            results = octave.values(script.out)
+    assert results["sent"] == results["back"] == "sent"
+    assert results["killed"] == ["error", "::genom::mwerr", "bass ended before its activity did"]
+    assert results["dead"] == ["error", "::genom::mwerr"]
+    assert results["dead port"] == ["genomix.request", "error"]
+    assert results["load"].startswith("genomix:load load bass: ::genom::mwerr: bass is not running")
     for name in ("gone", "gone status"):
-        assert told[name].startswith(f"genomix:connection no answer from genomixd at 127.0.0.1:{port}")
-    assert told["forgotten"] == ["error", "::genomix::e_noSuchRequest"]
-    assert told["works"] == "done"
-    assert told["closed"] == "genomix:connection the client was deleted"
+        assert results[name].startswith(f"genomix:connection no answer from genomixd at 127.0.0.1:{port}")
+    assert results["forgotten"] == ["error", "::genomix::e_noSuchRequest"]
+    assert results["works"] == "done"
+    assert results["closed"] == "genomix:connection the client has been deleted"

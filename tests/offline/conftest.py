@@ -1,4 +1,4 @@
-"""No call of `rosafe.process` leaves a thread behind, whatever its end."""
+"""Check after each test that no thread of `rosafe.process` is left."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def no_thread_left() -> Iterator[None]:
 
 
 @pytest.fixture
-def blocks_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
-    """None are put together, and the tree has no branches."""
+def blocks_not_merged(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Blocks are not merged, and the tree has no branches."""
     monkeypatch.setattr(chain, "MAX_BYTES", 0)
     monkeypatch.setattr(chain, "MAX_FRAMES", 10**9)

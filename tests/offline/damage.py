@@ -1,4 +1,4 @@
-"""Damaged results: copies of good ones with seeded changes, read by a child process that is forked, which is fast."""
+"""Damaged results: copies with seeded changes, read by a forked child process, which starts quickly."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _WORDS += [b"axes", b"shape", b"sample_rate", b"frameRate", b"ild"]
 
 
 class Forked:
-    """As `subprocess.Popen` of `rosafe.offline.isolated`, without the time that an interpreter needs to start."""
+    """Replaces `subprocess.Popen` for `rosafe.offline.isolated` without the start of an interpreter."""
 
     def __init__(self, args: list[str], **options: Any) -> None:
         self.args = args
@@ -92,16 +92,16 @@ class Forked:
 
 @pytest.fixture
 def forked(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Children that read are forked."""
+    """Child processes that read are forked."""
     monkeypatch.setattr(containers, "subprocess", SimpleNamespace(**{**vars(subprocess), "Popen": Forked}))
 
 
 def change(content: bytes, draw: random.Random) -> bytes:
-    """A copy with one to four changes of bytes, lengths, numbers or texts."""
+    """Return a copy with one to four changes of bytes, lengths, numbers or texts."""
     data = bytearray(content)
     for _ in range(draw.choice((1, 1, 1, 2, 4))):
         at = draw.randrange(max(1, len(data)))
-        if draw.random() < 0.5:  # most of a file are the numbers of arrays, which may be anything
+        if draw.random() < 0.5:  # most of a file are array elements, for which any value is valid
             at = draw.choice(_interesting(bytes(data))) if data else 0
         way = draw.randrange(8)
         if way == 0:
@@ -126,7 +126,7 @@ def change(content: bytes, draw: random.Random) -> bytes:
 
 
 def _interesting(content: bytes) -> range | list[int]:
-    """Places near texts and signatures."""
+    """Return offsets near texts and signatures."""
     found = [at for word in _WORDS for at in _all(content, word)]
     return [min(len(content) - 1, at + step) for at in found for step in range(0, 40, 3)] or range(len(content))
 
@@ -139,7 +139,7 @@ def _all(content: bytes, word: bytes) -> Iterator[int]:
 
 
 def damaged(good: Path, target: Path, seed: int) -> Path:
-    """A changed copy of a file, or of a folder with one changed file, under the name `target`."""
+    """Create a changed copy of a file, or of a folder with one changed file, as `target`."""
     draw = random.Random(seed)
     if good.is_dir():
         shutil.rmtree(target, ignore_errors=True)

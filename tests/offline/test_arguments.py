@@ -1,4 +1,4 @@
-"""What `rosafe.process` refuses: a ValueError with a line that helps, before anything runs."""
+"""Invalid arguments of `rosafe.process`: a ValueError with a helpful line, before anything runs."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ RATE = 16000
 
 
 class Convertible:
-    """An object that numpy converts by its method."""
+    """An object with `__array__`."""
 
     def __init__(self, array: Any) -> None:
         self.array = array
@@ -35,7 +35,7 @@ class Convertible:
 
 @pytest.fixture(autouse=True)
 def nothing_runs(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    def run(self: Any, together: bool) -> None:
+    def run(self: Any, merge: bool) -> None:
         raise AssertionError("it went as far as that")
 
     monkeypatch.setattr(offline.Chain, "run", run)
@@ -53,22 +53,22 @@ def refused(match: str, *arguments: Any, **named: Any) -> None:
     [
         (
             np.zeros((3, 100)),
-            r"shape \(3, 100\); wanted is \(N,\) or \(1, N\) for one ear, \(2, N\) or \(N, 2\) for two",
+            r"expected shape \(N,\) or \(1, N\) for one ear, \(2, N\) or \(N, 2\) for two, got shape \(3, 100\)",
         ),
         (np.zeros((100, 1)), r"shape \(100, 1\)"),
         (np.zeros((0, 3)), r"shape \(0, 3\)"),
         (np.zeros((2, 2, 100)), "shape"),
-        (np.float64(0), "signal is no array, but float64"),
-        (None, "signal is no array, but NoneType"),
-        ("sound.wav", r"signal is no array, but str; wanted is \(N,\) or \(1, N\)"),
-        ([[1.0, 2.0], [3.0]], "signal is no array"),
-        (np.zeros((2, 10), np.int8), "type int8, wanted is a float type, int32 or int16"),
-        (np.zeros((2, 10), np.int64), "type int64"),
-        (np.zeros((2, 10), np.uint32), "type uint32"),
-        (np.zeros((2, 10), bool), "type bool"),
-        (np.zeros((2, 10), complex), "type complex128"),
-        (np.zeros((2, 10), object), "type object"),
-        (np.array([["a"], ["b"]]), "type <U1"),
+        (np.float64(0), "^signal: expected an array of shape .*, got float64"),
+        (None, "^signal: expected an array of shape .*, got NoneType"),
+        ("sound.wav", r"^signal: expected an array of shape \(N,\) or \(1, N\) .*, got str"),
+        ([[1.0, 2.0], [3.0]], "^signal: expected an array, got list: "),
+        (np.zeros((2, 10), np.int8), "expected a float type, int32 or int16, got int8"),
+        (np.zeros((2, 10), np.int64), "got int64"),
+        (np.zeros((2, 10), np.uint32), "got uint32"),
+        (np.zeros((2, 10), bool), "got bool"),
+        (np.zeros((2, 10), complex), "got complex128"),
+        (np.zeros((2, 10), object), "got object"),
+        (np.array([["a"], ["b"]]), "got <U1"),
         (np.array([[0.0, np.nan], [0.0, 0.0]]), "NaN or infinite"),
         (np.array([[0.0, 0.0], [0.0, -np.inf]]), "NaN or infinite"),
         (np.full((2, 1), np.finfo(np.longdouble).max), "NaN or infinite"),
@@ -89,7 +89,7 @@ def test_sample_rates(rate: Any) -> None:
 
 
 def test_a_sample_rate_that_is_too_low_for_the_channels() -> None:
-    what = "a channel at 8000 Hz is not below half the sample rate; 7600 Hz would do"
+    what = "expected channels below half the sample rate, got one at 8000 Hz; use at most 7600 Hz"
     cases: tuple[dict[str, Any], ...] = ({"fb_highFreqHz": 8000.0, "fb_nChannels": 16}, {"fb_cfHz": [8000.0]})
     for values in cases:
         refused(f"{next(iter(values))}: {what}", GOOD, RATE, parameters=values)
@@ -104,36 +104,39 @@ def test_a_sample_rate_that_is_too_low_for_the_channels() -> None:
         ({"name": "x"}, "unknown parameter 'name'"),
         ({"set_rm_scailing": "_power"}, "unknown parameter"),
         ({5: 1}, "unknown parameter 5"),
-        ([("fb_nERBs", 1)], "parameters: list is not a dict"),
-        ("fb_nERBs", "parameters: str is not a dict"),
-        ({"fb_nERBs": np.nan}, "fb_nERBs: nan is not a finite number"),
-        ({"fb_nERBs": "1"}, "fb_nERBs: '1' is not a finite number"),
-        ({"fb_nERBs": None}, "fb_nERBs: None is not"),
-        ({"fb_nERBs": True}, "fb_nERBs: True is not"),
-        ({"fb_nERBs": 0}, "fb_nERBs: 0 is out of range, allowed is more than 0 to 100"),
-        ({"fb_nERBs": 1e-3}, "fb_nERBs: .* too many channels"),
-        ({"fb_nChannels": 1.5}, "fb_nChannels: 1.5 is not a whole number"),
-        ({"fb_nChannels": -1}, "fb_nChannels: -1 is not in the range"),
-        ({"fb_lowFreqHz": 9000.0}, "fb_lowFreqHz: 9000 Hz is not below fb_highFreqHz"),
-        ({"fb_cfHz": [100.0, np.inf]}, "fb_cfHz: inf is not a finite number"),
-        ({"fb_cfHz": np.ma.masked}, "fb_cfHz: nan is not a finite number"),
-        ({"fb_lowFreqHz": np.ma.array(80.0, mask=True)}, "fb_lowFreqHz: nan is not a finite number"),
-        ({"fb_cfHz": [[100.0]]}, r"fb_cfHz: \[100.0\] is not"),
-        ({"fb_cfHz": "100"}, "fb_cfHz: '100' is not a list"),
-        ({"fb_cfHz": itertools.count(1)}, "fb_cfHz: too many values, at most 1024"),
-        ({"fb_cfHz": [8000.0]}, "fb_cfHz: a channel at 8000 Hz"),
-        ({"pp_bRemoveDC": "yes"}, "pp_bRemoveDC: 'yes' is not a boolean"),
-        ({"pp_bRemoveDC": 2}, "pp_bRemoveDC: 2 is not a boolean"),
-        ({"pp_bRemoveDC": True, "pp_cutoffHzDC": 8000}, "pp_cutoffHzDC: 8000 Hz is not below half the sample rate"),
-        ({"pp_middleEarModel": "human"}, "pp_middleEarModel: 'human' is not one of jepsen, lopezpoveda"),
-        ({"ihc_method": "Dau"}, "ihc_method: 'Dau' is not one of none, halfwave"),
-        ({"ihc_method": "jespen"}, "ihc_method: 'jespen' is not one of"),
-        ({"ild_wname": 5}, "ild_wname: 5 is not a string"),
-        ({"ild_wSizeSec": 1e-6}, "ild_wSizeSec: too short"),
-        ({"ild_wSizeSec": 1e6}, "ild_wSizeSec: 1000000 is out of range"),
-        ({"rm_decaySec": 0}, "rm_decaySec: 0 is out of range"),
-        ({"cc_maxDelaySec": -1e-3}, "cc_maxDelaySec: -0.001 is out of range"),
-        ({"in_normalizeValue": 0}, "in_normalizeValue: 0 is out of range"),
+        ([("fb_nERBs", 1)], "parameters: expected a dict of names and values, got list"),
+        ("fb_nERBs", "parameters: expected a dict of names and values, got str"),
+        ({"fb_nERBs": np.nan}, "fb_nERBs: expected a finite number, got nan"),
+        ({"fb_nERBs": "1"}, "fb_nERBs: expected a finite number, got '1'"),
+        ({"fb_nERBs": None}, "fb_nERBs: expected a finite number, got None"),
+        ({"fb_nERBs": True}, "fb_nERBs: expected a finite number, got True"),
+        ({"fb_nERBs": 0}, "fb_nERBs: expected a number above 0, at most 100, got 0"),
+        ({"fb_nERBs": 1e-3}, "fb_nERBs: expected a distance that gives at most 1024 channels, got 0.001"),
+        ({"fb_nChannels": 1.5}, "fb_nChannels: expected a whole number, got 1.5"),
+        ({"fb_nChannels": -1}, "fb_nChannels: expected a number in the range of unsigned long, got -1"),
+        ({"fb_lowFreqHz": 9000.0}, r"fb_lowFreqHz: expected less than fb_highFreqHz \(.* Hz\), got 9000 Hz"),
+        ({"fb_cfHz": [100.0, np.inf]}, "fb_cfHz: expected a finite number, got inf"),
+        ({"fb_cfHz": np.ma.masked}, "fb_cfHz: expected a finite number, got nan"),
+        ({"fb_lowFreqHz": np.ma.array(80.0, mask=True)}, "fb_lowFreqHz: expected a finite number, got nan"),
+        ({"fb_cfHz": [[100.0]]}, r"fb_cfHz: expected a finite number, got \[100.0\]"),
+        ({"fb_cfHz": "100"}, "fb_cfHz: expected a list of double, got '100'"),
+        ({"fb_cfHz": itertools.count(1)}, "fb_cfHz: expected at most 1024 values, got more"),
+        ({"fb_cfHz": [8000.0]}, "fb_cfHz: expected channels below half the sample rate, got one at 8000 Hz"),
+        ({"pp_bRemoveDC": "yes"}, "pp_bRemoveDC: expected a boolean, got 'yes'"),
+        ({"pp_bRemoveDC": 2}, "pp_bRemoveDC: expected a boolean, got 2"),
+        (
+            {"pp_bRemoveDC": True, "pp_cutoffHzDC": 8000},
+            "pp_cutoffHzDC: expected less than half .*, got 8000 Hz",
+        ),
+        ({"pp_middleEarModel": "human"}, "pp_middleEarModel: expected one of jepsen, lopezpoveda, got 'human'"),
+        ({"ihc_method": "Dau"}, "ihc_method: expected one of none, halfwave"),
+        ({"ihc_method": "jespen"}, "ihc_method: expected one of none, halfwave"),
+        ({"ild_wname": 5}, "ild_wname: expected a string, got 5"),
+        ({"ild_wSizeSec": 1e-6}, "ild_wSizeSec: expected at least one sample"),
+        ({"ild_wSizeSec": 1e6}, "ild_wSizeSec: expected a number above 0, at most 60, got 1000000"),
+        ({"rm_decaySec": 0}, "rm_decaySec: expected a number above 0, at most 3600, got 0"),
+        ({"cc_maxDelaySec": -1e-3}, "cc_maxDelaySec: expected a number above 0, at most 10, got -0.001"),
+        ({"in_normalizeValue": 0}, "in_normalizeValue: expected a number from 1 to 18446744073709551615, got 0"),
     ],
 )
 def test_parameters(parameters: Any, match: str) -> None:
@@ -149,7 +152,7 @@ def test_parameters(parameters: Any, match: str) -> None:
 )
 def test_block_sizes(block_frames: Any) -> None:
     refused(
-        "^block_frames: .* is not a positive whole number, or a sequence of such$",
+        "^block_frames: expected a positive integer or a sequence of these, got ",
         GOOD,
         RATE,
         block_frames=block_frames,
@@ -159,27 +162,30 @@ def test_block_sizes(block_frames: Any) -> None:
 @pytest.mark.parametrize(
     ("modifications", "match"),
     [
-        (5, "wanted is a sequence of"),
-        (None, "wanted is a sequence of"),
-        ("abc", "wanted is a sequence of"),
-        ([5], "wanted is a sequence of"),
-        ([()], "wanted is a sequence of"),
-        ([(0, "fb_nERBs")], "wanted is a sequence of"),
-        ((0, "fb_nERBs", 2), "wanted is a sequence of"),
-        ([(-1, "fb_nERBs", 2)], "-1 is not a block number"),
-        ([(1.0, "fb_nERBs", 2)], "1.0 is not a block number"),
-        ([(True, "fb_nERBs", 2)], "True is not a block number"),
-        ([("0", "fb_nERBs", 2)], "'0' is not a block number"),
+        (5, "expected a sequence of"),
+        (None, "expected a sequence of"),
+        ("abc", "expected a sequence of"),
+        ([5], "expected a sequence of"),
+        ([()], "expected a sequence of"),
+        ([(0, "fb_nERBs")], "expected a sequence of"),
+        ((0, "fb_nERBs", 2), "expected a sequence of"),
+        ([(-1, "fb_nERBs", 2)], "expected a block number, got -1"),
+        ([(1.0, "fb_nERBs", 2)], "expected a block number, got 1.0"),
+        ([(True, "fb_nERBs", 2)], "expected a block number, got True"),
+        ([("0", "fb_nERBs", 2)], "expected a block number, got '0'"),
         ([(0, "fb_nErbs", 2)], "unknown parameter 'fb_nErbs'"),
         ([(0, ["fb_nERBs"], 2)], r"unknown parameter \['fb_nERBs'\]"),
-        ([(0, "set_rm_scailing", "_log")], "rm_scaling: 'log' is not one of power, magnitude"),
-        ([(0, "set_rm_scailing", 1)], "rm_scaling: 1 is not a string"),
-        ([(0, "fb_nERBs", 0)], "fb_nERBs: 0 is out of range"),
-        ([(99, "fb_nERBs", 0)], "fb_nERBs: 0 is out of range"),
-        ([(0, "ihc_method", "none"), (0, "ihc_method", "nothing")], "ihc_method: 'nothing' is not one of"),
-        ([(9, "fb_highFreqHz", 9000.0)], "fb_highFreqHz: a channel at .* is not below half the sample rate"),
-        ([(3, "fb_highFreqHz", 100.0), (2, "fb_lowFreqHz", 200.0)], "fb_lowFreqHz: 200 Hz is not below"),
-        ([(0, "ild_wSizeSec", 1e-6)], "ild_wSizeSec: too short"),
+        ([(0, "set_rm_scailing", "_log")], "rm_scaling: expected one of power, magnitude, got 'log'"),
+        ([(0, "set_rm_scailing", 1)], "rm_scaling: expected a string, got 1"),
+        ([(0, "fb_nERBs", 0)], "fb_nERBs: expected a number above 0, at most 100, got 0"),
+        ([(99, "fb_nERBs", 0)], "fb_nERBs: expected a number above 0, at most 100, got 0"),
+        ([(0, "ihc_method", "none"), (0, "ihc_method", "nothing")], "ihc_method: expected one of none, halfwave"),
+        ([(9, "fb_highFreqHz", 9000.0)], "fb_highFreqHz: expected channels below half the sample rate, got one at"),
+        (
+            [(3, "fb_highFreqHz", 100.0), (2, "fb_lowFreqHz", 200.0)],
+            r"fb_lowFreqHz: expected less than fb_highFreqHz \(100 Hz\), got 200 Hz",
+        ),
+        ([(0, "ild_wSizeSec", 1e-6)], "ild_wSizeSec: expected at least one sample"),
     ],
 )
 def test_modifications(modifications: Any, match: str) -> None:
@@ -194,14 +200,14 @@ def test_modifications(modifications: Any, match: str) -> None:
         (["ild", "ILD"], "unknown output 'ILD'"),
         ([5], "unknown output 5"),
         ([["ild"]], "unknown output"),
-        (5, "outputs: 5 is not a sequence of names"),
+        (5, "outputs: expected a sequence of names, got 5"),
     ],
 )
 def test_outputs(outputs: Any, match: str) -> None:
     refused(match, GOOD, RATE, outputs=outputs)
 
 
-def test_what_there_is_is_told_once() -> None:
+def test_suggestions_list_each_name_once() -> None:
     with pytest.raises(ValueError, match="unknown parameter 'xyzzy'; there are: in_doNormalize, ") as raised:
         rosafe.process(GOOD, RATE, parameters={"xyzzy": 1})
     names = str(raised.value).partition("there are: ")[2].split(", ")
@@ -209,7 +215,7 @@ def test_what_there_is_is_told_once() -> None:
 
 
 @pytest.mark.parametrize("signal", [GOOD[0], GOOD[:1], list(GOOD[0])])
-def test_one_ear_has_no_differences(signal: Any) -> None:
+def test_binaural_outputs_of_one_ear_are_refused(signal: Any) -> None:
     refused(
         "outputs: ild, crossCorrelation compare two ears, and the signal has one",
         signal,
@@ -219,7 +225,7 @@ def test_one_ear_has_no_differences(signal: Any) -> None:
     refused("outputs: precedence compare two ears", signal, RATE, outputs="precedence")
 
 
-def test_a_signal_with_very_many_blocks_takes_no_memory() -> None:
+def test_many_blocks_take_no_memory() -> None:
     signal = np.lib.stride_tricks.as_strided(np.zeros(1, np.int16), (2, 10**9), (0, 0))
     tracemalloc.start()
     try:
@@ -229,34 +235,34 @@ def test_a_signal_with_very_many_blocks_takes_no_memory() -> None:
         tracemalloc.stop()
 
 
-def test_the_traceback_ends_where_the_user_called() -> None:
+def test_tracebacks_end_at_the_call() -> None:
     wrong: tuple[dict[str, Any], ...] = ({"parameters": {"volume": 1}}, {"parameters": {"fb_cfHz": [8000.0]}})
     for named in (*wrong, {"outputs": ["x"]}):
         with pytest.raises(ValueError) as raised:
             rosafe.process(GOOD, RATE, **named)
         assert [entry.name for entry in raised.traceback] == [
-            "test_the_traceback_ends_where_the_user_called",
+            "test_tracebacks_end_at_the_call",
             "process",
         ]
         assert raised.value.__suppress_context__
 
 
-def test_what_follows_the_sample_rate_has_a_name() -> None:
+def test_positional_options_are_deprecated() -> None:
     kinds = [p.kind.name for p in inspect.signature(rosafe.process).parameters.values()]
-    assert kinds == ["POSITIONAL_OR_KEYWORD"] * 2 + ["KEYWORD_ONLY"] * 4
+    assert kinds == ["POSITIONAL_OR_KEYWORD"] * 2 + ["KEYWORD_ONLY"] * 6
     with pytest.warns(DeprecationWarning, match="by name"), pytest.raises(ValueError, match="fb_nERBs"):
         rosafe.process(GOOD, RATE, {"fb_nERBs": 0})
-    with pytest.raises(TypeError, match="takes 2 positional arguments, and 7 were given"):
+    with pytest.raises(TypeError, match="expected 2 positional arguments, got 7"):
         rosafe.process(GOOD, RATE, {}, 1, (), None, 5)
 
 
-def test_sizes_that_fill_the_memory() -> None:
+def test_sizes_beyond_the_memory() -> None:
     refused("ild_wSizeSec: 60 s of .* MiB, more than 1024 MiB", GOOD, 96000, parameters={"ild_wSizeSec": 60.0})
     refused("more than 1024 MiB", GOOD, 96000, modifications=[(0, "ild_wSizeSec", 60.0)])
 
 
-def test_results_larger_than_the_memory_that_is_left(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """The rest of the machine's memory is in use: the kernel would end this process."""
+def test_results_larger_than_the_free_memory(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """If other processes use the memory, the kernel would end this process."""
     meminfo = tmp_path / "meminfo"
     meminfo.write_text("MemTotal:       24684196 kB\nMemFree: 1 kB\nMemAvailable:      12000 kB\n")
     monkeypatch.setattr(memory, "_MEMINFO", meminfo)
@@ -264,18 +270,18 @@ def test_results_larger_than_the_memory_that_is_left(monkeypatch: pytest.MonkeyP
     refused(r"outputs: they would take .* GB of memory, this machine has 0\.0 GB left", sound, RATE, parameters=large)
     with pytest.raises(ValueError, match=r"would take .* GB of memory, this machine has 0\.0 GB left"):
         rosafe.Stream(RATE, large).process(sound)
-    meminfo.unlink()  # nobody tells
+    meminfo.unlink()  # the free memory is unknown
     assert memory.available() == sizes.machine_memory()
 
 
-def test_a_file_that_is_too_large_is_refused_without_reading_it(tmp_path: Path) -> None:
-    """All sizes are checked before the samples are converted or looked at."""
+def test_large_files_are_refused_without_reading_them(tmp_path: Path) -> None:
+    """All sizes are checked before the samples are read."""
     path = tmp_path / "sound.int16"
     with open(path, "wb") as file:
         file.truncate(4 * 10**12)  # a sparse file, larger than any memory
     sound = np.memmap(path, np.int16, "r").reshape(-1, 2)
     refused("outputs: they would take .* GB of memory", sound, RATE)
-    with pytest.raises(ValueError, match=r"block: what comes of it would take .* GB of memory"):
+    with pytest.raises(ValueError, match=r"block: its outputs would take .* GB of memory"):
         rosafe.Stream(RATE).process(sound)
 
 
@@ -284,12 +290,12 @@ def test_results_larger_than_the_memory(monkeypatch: pytest.MonkeyPatch) -> None
     sound, lags = np.zeros((2, 4000)), {"cc_maxDelaySec": 1.0}
     refused("outputs: they would take .* GB of memory, this machine has", sound, RATE, parameters=lags)
     refused("outputs: they would take", sound, RATE, modifications=[(0, *change) for change in lags.items()])
-    at_the_end = [(3, "cc_maxDelaySec", 1e-3)]  # smaller again, but not before it was too large
+    at_the_end = [(3, "cc_maxDelaySec", 1e-3)]  # smaller again, but too large before
     refused("outputs: they would take", sound, RATE, parameters=lags, block_frames=1000, modifications=at_the_end)
     hidden = {
         "fb_nChannels": 500,
         "fb_highFreqHz": 4000.0,
-    }  # the filterbank is not kept, but all of it comes in one block
+    }  # the output of the filterbank is not stored, but computed as one block
     refused("outputs: they would take", sound, RATE, parameters=hidden, outputs=["ild"])
     with pytest.raises(AssertionError, match="it went as far as that"):
         rosafe.process(sound, RATE, parameters=hidden, block_frames=100, outputs=["ild"])

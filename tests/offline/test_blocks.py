@@ -1,4 +1,4 @@
-"""Neither blocks nor branches leave a trace in the numbers, not in the last bit; so both are chosen to be fast."""
+"""Numbers depend neither on blocks nor on branches, to the last bit; both are therefore chosen for speed."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from rosafe.representations import BUILTIN, STAGES
 from rosafe.representations.filterbank import Filterbank
 from rosafe.representations.input import Input
 from rosafe.representations.ratemap import Ratemap
-from tests.dsp.implementations import TWINS, levels, using
+from tests.dsp.implementations import NUMPY, levels, using
 
 RATE = 16000.0
 FEW = {"fb_nChannels": 5, "fb_highFreqHz": 6000.0}
-BYTES = 2 * 5 * 8  # that the filterbank puts out for a frame
+BYTES = 2 * 5 * 8  # bytes of output of the filterbank per frame
 SAMPLES = 3500
 SOUND = 0.1 * np.random.default_rng(0).standard_normal((2, SAMPLES))
 SOUND[1] = 0.7 * np.roll(SOUND[0], 5) + 0.3 * SOUND[1]
@@ -58,7 +58,7 @@ parameters = st.fixed_dictionaries(
 
 @contextmanager
 def at_most(size: int) -> Iterator[list[int]]:
-    """Of blocks that are put together, a processor puts out so many bytes at most; the lengths of those that come."""
+    """Limit merged blocks to `size` bytes of output, and record the lengths of the blocks that the input receives."""
     lengths: list[int] = []
     process = Input.process
 
@@ -80,8 +80,8 @@ def assert_same(got: dict[str, Any], wanted: dict[str, Any]) -> None:
 
 @with_kernels
 @given(sizes=sizes, given_parameters=parameters)
-@settings(deadline=None, max_examples=40)
-def test_no_trace_in_any_representation(sizes: list[int], given_parameters: dict[str, Any]) -> None:
+@settings(deadline=None, max_examples=10)
+def test_all_representations_are_independent_of_blocks(sizes: list[int], given_parameters: dict[str, Any]) -> None:
     options: dict[str, Any] = {"parameters": {**FEW, **given_parameters}, "outputs": sorted(BUILTIN)}
     with at_most(0) as lengths:
         whole = rosafe.process(SOUND, RATE, block_frames=SAMPLES, **options)
@@ -93,8 +93,8 @@ def test_no_trace_in_any_representation(sizes: list[int], given_parameters: dict
 
 @with_kernels
 @pytest.mark.parametrize(("channels", "block"), [(1, 100), (1, 2000), (2, 700)])
-def test_no_trace_in_sums_that_numpy_takes_in_pieces(channels: int, block: int) -> None:
-    """Over more than 8192 numbers; correlations over more than 1024 lags are by its FFT."""
+def test_long_sums_are_independent_of_blocks(channels: int, block: int) -> None:
+    """Sums over more than 8192 numbers; correlations over more than 1024 lags use the FFT."""
     sound = 0.1 * np.random.default_rng(1).standard_normal((2, 14_000))
     values = {"cc_wSizeSec": 0.6, "cc_maxDelaySec": 0.04, "cc_hSizeSec": 0.05, "ac_wSizeSec": 0.6, "prec_wSizeSec": 0.6}
     options: dict[str, Any] = {
@@ -108,7 +108,7 @@ def test_no_trace_in_sums_that_numpy_takes_in_pieces(channels: int, block: int) 
 
 
 @with_kernels
-def test_no_trace_in_blocks_of_one_frame_nor_in_long_tails() -> None:
+def test_blocks_of_one_frame_and_long_decays() -> None:
     sound = np.zeros((2, 9000))
     sound[:, :300], sound[:, 8000], sound[0, 8400:8410] = SOUND[:, :300], 1e-300, 1e80
     with at_most(0):
@@ -127,12 +127,12 @@ def test_no_trace_in_blocks_of_one_frame_nor_in_long_tails() -> None:
         (1099, 100, [1000, 1000, 1000, 500]),
         (199, 100, [100] * 35),
         (0, 1000, [1000, 1000, 1000, 500]),
-        (900, 1000, [1000, 1000, 1000, 500]),  # larger ones are left as they are
+        (900, 1000, [1000, 1000, 1000, 500]),  # larger blocks are not merged
         (1000, [600, 300, 200, 900], [900, 200, 900, 900, 600]),
     ],
 )
-def test_small_blocks_go_together(size: int, blocks: Any, lengths: list[int], tmp_path: Path) -> None:
-    """As many as there is room for."""
+def test_small_blocks_are_merged(size: int, blocks: Any, lengths: list[int], tmp_path: Path) -> None:
+    """Blocks are merged up to the limit."""
     options: dict[str, Any] = {"parameters": FEW, "block_frames": blocks}
     with at_most(0):
         alone = rosafe.process(SOUND, RATE, **options)
@@ -149,8 +149,8 @@ def test_small_blocks_go_together(size: int, blocks: Any, lengths: list[int], tm
 
 
 @with_kernels
-def test_as_many_frames_as_the_default_block_has_go_together() -> None:
-    """However few channels there are: processors are to work at the same time on short sounds, too."""
+def test_merged_blocks_have_at_most_the_default_length() -> None:
+    """This limit also holds with few channels, so that processors work concurrently on short sounds."""
     sound = np.zeros((2, 30_000))
     with at_most(2**22) as seen:
         rosafe.process(sound, RATE, parameters={"fb_nChannels": 1}, block_frames=1000, outputs=["ratemap"])
@@ -158,8 +158,8 @@ def test_as_many_frames_as_the_default_block_has_go_together() -> None:
 
 
 @with_kernels
-def test_who_is_to_end_reads_no_further() -> None:
-    """A block may take long to read."""
+def test_reading_stops_at_the_end() -> None:
+    """Reading a block may take long."""
     read: list[int] = []
 
     def blocks() -> Iterator[np.ndarray]:
@@ -170,19 +170,19 @@ def test_who_is_to_end_reads_no_further() -> None:
             yield np.zeros((2, 100))
 
     with chain.Chain(blocks(), RATE, FEW, ["ratemap"], lambda *_: None) as made:
-        made.run(together=True)
+        made.run(merge=True)
     assert len(read) <= 7
 
 
-def test_numpy_is_asked_to_write_over_nothing() -> None:
-    with using(TWINS):
+def test_numpy_overwrites_no_input() -> None:
+    with using(NUMPY):
         stream = rosafe.Stream(RATE, parameters=FEW, outputs=["ild"])
         stream.process(SOUND)
         assert not any(over for _, _, _, over, _ in stream._plan)
 
 
 @pytest.mark.parametrize("why", ["changes", "gain control", "a plugin", "twins"])
-def test_blocks_that_may_be_seen_stay_as_they_are(why: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_blocks_are_not_merged_if_the_numbers_could_change(why: str, monkeypatch: pytest.MonkeyPatch) -> None:
     options: dict[str, Any] = {"parameters": dict(FEW), "block_frames": 1000, "outputs": ["ratemap"]}
     if why == "changes":
         options["modifications"] = [(2, "rm_scaling", "magnitude")]
@@ -190,7 +190,7 @@ def test_blocks_that_may_be_seen_stay_as_they_are(why: str, monkeypatch: pytest.
         options["parameters"]["pp_bNormalizeRMS"] = True
     elif why == "a plugin":
         monkeypatch.setattr(chain, "BUILTIN", BUILTIN - {"ratemap"})
-    with at_most(2**22) as seen, using(TWINS if why == "twins" else [TWINS, *levels()][-1]):
+    with at_most(2**22) as seen, using(NUMPY if why == "twins" else [NUMPY, *levels()][-1]):
         rosafe.process(SOUND, RATE, **options)
     assert seen == [1000, 1000, 1000, 500]
 
@@ -200,7 +200,7 @@ def test_blocks_that_may_be_seen_stay_as_they_are(why: str, monkeypatch: pytest.
 
 @contextmanager
 def workers(count: int) -> Iterator[list[int]]:
-    """So many, for signals of any length; the number of channels of each filterbank that comes to work."""
+    """Set the number of workers for signals of any length; record the number of channels of each filterbank."""
     channels: list[int] = []
     process = Filterbank.process
 
@@ -226,7 +226,7 @@ APART = [kind for kind, stage in STAGES.items() if stage.CHANNEL_INDEPENDENT]
 )
 @pytest.mark.parametrize("ears", [2, 1])
 def test_a_branch_for_each_worker(count: int, channels: int, shares: list[int], ears: int) -> None:
-    """From the filterbank on, of whole groups of channels that a kernel takes together; and the same numbers."""
+    """Branches begin at the filterbank and have whole groups of lanes; the numbers are the same."""
     outputs = [kind for kind in APART if ears == 2 or kind not in ("ild", "crossCorrelation")]
     parameters = {**FEW, "fb_nChannels": channels, "cc_maxDelaySec": 0.0007, "ihc_method": "bernstein"}
     options: dict[str, Any] = {"parameters": parameters, "outputs": ["preProc", *outputs], "block_frames": 500}
@@ -247,7 +247,7 @@ def test_a_branch_for_each_worker(count: int, channels: int, shares: list[int], 
     channels=st.integers(9, 40),
 )
 @settings(deadline=None, max_examples=30)
-def test_branches_leave_no_trace(
+def test_numbers_are_independent_of_branches(
     given_parameters: dict[str, Any], outputs: set[str], count: int, channels: int
 ) -> None:
     options: dict[str, Any] = {"parameters": {**FEW, **given_parameters, "fb_nChannels": channels}}
@@ -260,7 +260,7 @@ def test_branches_leave_no_trace(
 
 
 @with_kernels
-def test_what_takes_several_channels_has_one_branch() -> None:
+def test_stages_across_channels_have_one_branch() -> None:
     for kind in sorted(BUILTIN - set(APART) - {"input", "preProc"}):
         with workers(2) as seen:
             rosafe.process(SOUND, RATE, parameters={**FEW, "fb_nChannels": 20}, outputs=["ratemap", kind])

@@ -1,4 +1,4 @@
-"""Every parameter of the interface table, changed on the way: what begins anew, what goes on, what does not notice."""
+"""Changes of every parameter during the sound: which processors are reset, which continue, which are unaffected."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ KIND_OF = {parameter.name: kind.kind for kind in CORE_REPRESENTATIONS.values() f
 
 
 def below(kind: str) -> set[str]:
-    """A processor and all that depend on it."""
+    """Return a kind and all kinds that depend on it."""
     return {kind}.union(*(below(child.kind) for child in CORE_REPRESENTATIONS.values() if child.parent == kind))
 
 
@@ -92,7 +92,7 @@ def test_a_change_of(name: str, unchanged: dict[str, Any]) -> None:
         after = np.concatenate([output[other] for output in outputs[AT:]], axis=-1)
         np.testing.assert_array_equal(inner(other, got[other], after.shape)[..., -after.shape[-1] :], after)
 
-    if kind in ("input", "preProc", "gammatone"):  # what begins anew is as if it were new
+    if kind in ("input", "preProc", "gammatone"):  # these are reset
         values = {key: value for key, value in {**BASE, name: CHANGES[name]}.items() if KIND_OF[key] == kind}
         stage = STAGES[kind](RATE, **values)
         taken = got[CORE_REPRESENTATIONS[kind].parent] if kind != "input" else SOUND
@@ -101,7 +101,7 @@ def test_a_change_of(name: str, unchanged: dict[str, Any]) -> None:
 
 
 def inner(kind: str, array: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any]:
-    """The part of an output where an array of this shape lies; the rest is for other numbers of channels and lags."""
+    """Return the part of an output for this shape; the rest belongs to other numbers of channels and lags."""
     place = [slice(0, size) for size in shape[:-1]]
     if kind == "crossCorrelation":
         first = (array.shape[1] - shape[1]) // 2
@@ -109,12 +109,12 @@ def inner(kind: str, array: NDArray[Any], shape: tuple[int, ...]) -> NDArray[Any
     return array[tuple(place)]
 
 
-def test_every_parameter_is_tried() -> None:
+def test_every_parameter_is_covered() -> None:
     assert CHANGES.keys() == KIND_OF.keys()
 
 
-def test_what_was_in_force_for_no_block_is_not_in_the_result() -> None:
-    """A change before the first block: the number of channels is the new one, not the larger one of before."""
+def test_values_that_apply_to_no_block_do_not_affect_the_result() -> None:
+    """After a change before the first block, the number of channels is the new one, although the old one was larger."""
     sound = np.random.default_rng(8).standard_normal((2, 500))
     changed = rosafe.process(sound, 44100, modifications=[(0, "fb_nChannels", 3)], outputs=["gammatone"])
     np.testing.assert_array_equal(

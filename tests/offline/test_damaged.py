@@ -1,4 +1,4 @@
-"""Results that are damaged or made to do harm: a mapping or a ValueError, whatever the file holds."""
+"""Damaged and malicious results: reading returns a mapping or raises ValueError for any content."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
     soundfile.write(folder / "sound.wav", sound, RATE)
     with pytest.MonkeyPatch.context() as patch:
         for name in NAMES:
-            patch.setattr(formats, "MAT5_MOST", 10 if name == "b.mat" else 2**30)
+            patch.setattr(formats, "MAX_MAT5", 10 if name == "b.mat" else 2**30)
             process_file(folder / "sound.wav", folder / name, PARAMETERS, outputs=_outputs(name))
     return folder
 
@@ -57,7 +57,7 @@ def _outputs(name: str) -> list[str]:
 
 
 def load(path: Path) -> dict[str, Any] | None:
-    """The result, or None; a text of one line that tells the name of the file."""
+    """Return the result, or None after a ValueError of one line with the name of the file."""
     try:
         return rosafe.load(path)
     except ValueError as problem:
@@ -78,7 +78,7 @@ def refused(path: Path, *words: str) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_random_changes(tmp_path: Path, good: Path, name: str, forked: None) -> None:
-    """`ROSAFE_FUZZ` sets how many."""
+    """`ROSAFE_FUZZ` is the number of changes."""
     for seed in range(int(os.environ.get("ROSAFE_FUZZ", "25"))):
         path = damaged(good / name, tmp_path / name, seed)
         loaded = load(path)
@@ -153,7 +153,7 @@ def test_a_damaged_result_is_computed_again(tmp_path: Path, good: Path, name: st
             assert load(path) or not (path / ".zattrs").exists()
 
 
-def test_numbers_that_cannot_be_drawn(tmp_path: Path, good: Path) -> None:
+def test_non_finite_coordinates(tmp_path: Path, good: Path) -> None:
     loaded = rosafe.load(good / "a.npz")
     for name, value in (("ild", 1e308), ("preProc", -1e200), ("ild_time", math.nan), ("fb_cfHz", math.inf)):
         result = {**loaded, name: np.full_like(loaded[name], value)}
@@ -165,7 +165,7 @@ def test_numbers_that_cannot_be_drawn(tmp_path: Path, good: Path) -> None:
 
 def test_a_list_of_failures_that_is_damaged(tmp_path: Path) -> None:
     (tmp_path / "failed.csv").write_text("input,why\n" + "x" * 200000)
-    with pytest.raises(OutputError, match="is something else, and stays as it is"):
+    with pytest.raises(OutputError, match="is not a list of failures"):
         write_failed(tmp_path, [], {"a": "b"})
 
 
@@ -201,7 +201,7 @@ def test_headers_of_npy(tmp_path: Path, good: Path, header: str) -> None:
 
 
 def test_zip_members(tmp_path: Path, good: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Methods that are not known, encrypted members, and many numbers in a small file."""
+    """Unknown compression methods, encrypted members, and large arrays in a small file."""
     content = bytearray((good / "a.npz").read_bytes())
     central = content.rindex(b"PK\x01\x02")
     for at, value in ((central + 10, 99), (central + 10, 12), (central + 8, 1)):
@@ -243,7 +243,7 @@ def test_mat5_as_scipy_reads_it(tmp_path: Path, compressed: bool) -> None:
 
 @pytest.mark.parametrize("option", ["-v6", "-v7"])
 def test_mat5_written_by_octave(tmp_path: Path, good: Path, option: str) -> None:
-    """It stores whole numbers as integers, and compresses."""
+    """Octave stores whole numbers as integers, and compresses."""
     program = f"r = load('{good}/a.mat'); save('{option}', '{tmp_path}/a.mat', '-struct', 'r')"
     subprocess.run(["octave-cli", "--no-init-file", "--eval", program], check=True, capture_output=True, timeout=120)
     loaded, expected = rosafe.load(tmp_path / "a.mat"), rosafe.load(good / "a.mat")
@@ -252,7 +252,19 @@ def test_mat5_written_by_octave(tmp_path: Path, good: Path, option: str) -> None
         np.testing.assert_array_equal(loaded[name], value, err_msg=name)
 
 
-def test_mat5_of_other_things(tmp_path: Path, good: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("change", [-1, 1, 2**31 - 1])
+def test_mat5_whose_length_does_not_fit_its_shape(tmp_path: Path, good: Path, change: int) -> None:
+    found = {k: v for k, v in scipy.io.loadmat(good / "a.mat").items() if not k.startswith("__")}
+    scipy.io.savemat(tmp_path / "a.mat", found, long_field_names=True)
+    content = bytearray((tmp_path / "a.mat").read_bytes())
+    at = content.index(struct.pack("<I", 3 << 16 | 1) + b"ild\0") - 4  # the last length precedes the name
+    assert struct.unpack_from("<I", content, at)[0] == found["ild"].shape[1]
+    struct.pack_into("<I", content, at, min(found["ild"].shape[1] + change, 2**31 - 1))
+    (tmp_path / "a.mat").write_bytes(content)
+    refused(tmp_path / "a.mat", "ild", "its length does not fit its shape")
+
+
+def test_mat5_with_other_contents(tmp_path: Path, good: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for value in ({"a": 1.0}, np.array([1 + 1j]), np.array([{}], object), scipy.sparse.eye(2)):
         found = {k: v for k, v in scipy.io.loadmat(good / "a.mat").items() if not k.startswith("__")}
         scipy.io.savemat(tmp_path / "a.mat", {**found, "ild": value})
@@ -330,12 +342,12 @@ _H5 = {
     "reference": _replace(lambda file, folder: file.__setitem__("ild", file["preProc"].ref)),
     "filter 32001": _replace(_filtered),
     "MiB of memory": _replace(_large),
-    "cut into more than": _replace(_cut),
+    "has more than": _replace(_cut),
 }
 
 
 @pytest.mark.parametrize("name", ["a.h5", "b.mat"])
-def test_hdf5_that_leads_elsewhere(tmp_path: Path, good: Path, name: str, forked: None) -> None:
+def test_hdf5_with_references_to_other_files(tmp_path: Path, good: Path, name: str, forked: None) -> None:
     (tmp_path / "secret").write_bytes(bytes(240))
     with h5py.File(tmp_path / "secret.h5", "w") as file:
         file["a"] = np.zeros((3, 10))
@@ -344,12 +356,12 @@ def test_hdf5_that_leads_elsewhere(tmp_path: Path, good: Path, name: str, forked
         with h5py.File(tmp_path / name, "a", locking=False) as file:
             change(file, tmp_path)
         expected = "" if words in ("named type", "compound", "reference", "'/' is a link") else words
-        refused(tmp_path / name, "no result of rosafe process, or damaged", expected)
+        refused(tmp_path / name, "not a result of rosafe process, or damaged", expected)
         with pytest.raises(ValueError, match="or damaged"):  # without the arrays, too
             formats.read(formats.format_of(name), tmp_path / name, arrays=False)
 
 
-def test_no_file_can_be_opened_beside_hdf5(good: Path) -> None:
+def test_hdf5_cannot_open_other_files(good: Path) -> None:
     program = (
         "import os; from rosafe.offline import isolated; kept = isolated.open_h5(os.environ['FILE'])\n"
         "try: open('/etc/hostname')\nexcept OSError as problem: print(problem.errno)"
@@ -362,7 +374,7 @@ def test_no_file_can_be_opened_beside_hdf5(good: Path) -> None:
 @pytest.mark.parametrize(
     "options", [{"compression": "gzip"}, {"compression": "lzf", "shuffle": True}, {"fletcher32": True}]
 )
-def test_hdf5_that_others_have_compressed(tmp_path: Path, good: Path, options: dict[str, Any], forked: None) -> None:
+def test_hdf5_compressed_by_other_programs(tmp_path: Path, good: Path, options: dict[str, Any], forked: None) -> None:
     shutil.copy(good / "a.h5", tmp_path)
     expected = rosafe.load(tmp_path / "a.h5")
     with h5py.File(tmp_path / "a.h5", "a", locking=False) as file:
@@ -525,7 +537,7 @@ def test_a_library_that_blocks_or_crashes(tmp_path: Path, good: Path, monkeypatc
 
 
 def test_memory_of_the_child(tmp_path: Path, good: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A chunk that says that it holds 2 GB."""
+    """A chunk with a header that claims 2 GB."""
     from numcodecs import LZ4
 
     shutil.copytree(good / "a.zarr", tmp_path / "a.zarr")
@@ -535,9 +547,11 @@ def test_memory_of_the_child(tmp_path: Path, good: Path, monkeypatch: pytest.Mon
     refused(tmp_path / "a.zarr")
 
 
-def test_from_programs_of_any_kind(tmp_path: Path, good: Path) -> None:
-    """Without a guard around the main program, in threads, and inside a program that is no interpreter; modules in the
-    current folder are not imported, and nothing remains of the child process."""
+def test_callers_of_any_kind(tmp_path: Path, good: Path) -> None:
+    """Programs without a main guard, threads, and embedded interpreters.
+
+    Modules in the current folder are not imported, and no child process remains.
+    """
     for name in ("struct", "json", "resource", "h5py", "numcodecs", "site", "sitecustomize"):
         (tmp_path / f"{name}.py").write_text(f"open({str(tmp_path / 'marker')!r}, 'w')\n")
     program = f"""

@@ -1,4 +1,4 @@
-"""Outputs of any kind: names, shapes, coordinates and rates come from the declaration alone."""
+"""Outputs of any kind: names, shapes, coordinates and rates follow from the declaration."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SOUND = 0.1 * np.random.default_rng(0).standard_normal((2, 3000))
 
 
 class Shells(FramedStage):
-    """Of each frame the ears' sums, and the same in shells around the middle: more of them where that is asked for."""
+    """Sums of both ears in each frame, and multiples of them along a centred axis of variable length."""
 
     REPRESENTATION = Representation(
         kind="shells",
@@ -79,7 +79,7 @@ def test_an_entry_for_each_part(shells: None) -> None:
 
 
 def test_parts_that_grow_on_the_way(shells: None, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Around the middle, as declared; nothing else changes."""
+    """Outputs are aligned at the middle of the declared axis; other parts do not change."""
     monkeypatch.setattr(
         "rosafe.interface.arguments._BY_NAME", {"sh_reach": Shells.REPRESENTATION.parameter("sh_reach")}
     )
@@ -101,8 +101,8 @@ def test_parts_that_grow_on_the_way(shells: None, monkeypatch: pytest.MonkeyPatc
     assert reaches == [[2, 4]] * 5 + [[0, 1, 2, 4, 5, 6]] * 6 + [[1, 2, 4, 5]] * 6
 
 
-def test_coordinates_are_those_that_were_in_force() -> None:
-    """Not those before a change that is made before the first block, nor those of one that comes too late."""
+def test_coordinates_are_those_in_effect() -> None:
+    """Coordinates before a change at the first block, and after one beyond the end, do not appear."""
     for changes, reach in (
         ([(0, "cc_maxDelaySec", 0.0005)], 8),
         ([(0, "cc_maxDelaySec", 0.003), (0, "cc_maxDelaySec", 0.0005)], 8),
@@ -119,7 +119,7 @@ def test_coordinates_are_those_that_were_in_force() -> None:
 
 
 def test_blocks_without_frames_have_rows_too() -> None:
-    """The first one is shorter than a window; it had more lags than there are from the second on."""
+    """The first block is shorter than a window, and has more lags than the following ones."""
     changes = [(1, "cc_maxDelaySec", 0.0005)]
     got = rosafe.process(
         SOUND, RATE, parameters=FEW, block_frames=[100, 2900], modifications=changes, outputs=["crossCorrelation"]
@@ -141,7 +141,7 @@ def test_blocks_without_frames_have_rows_too() -> None:
     ],
 )
 def test_later_kinds(kind: str, names: set[str], shape: tuple[int, ...]) -> None:
-    """What lies along the axes of all that is computed, and the rate of what is asked for."""
+    """Results contain the coordinates of all computed kinds, and the frame rate of the requested one."""
     got = rosafe.process(SOUND, RATE, parameters=FEW, block_frames=333, outputs=[kind])
     rate = set() if kind == "adaptation" else {f"{kind}_frameRate"}
     assert set(got) == {kind, f"{kind}_time"} | names | rate
@@ -150,7 +150,7 @@ def test_later_kinds(kind: str, names: set[str], shape: tuple[int, ...]) -> None
     np.testing.assert_allclose(got[kind], whole[kind], rtol=1e-9, atol=1e-9 * np.nanmax(np.abs(whole[kind])))
 
 
-def test_words_are_a_list() -> None:
+def test_names_are_a_list() -> None:
     got = rosafe.process(
         SOUND, RATE, parameters={**FEW, "sf_requests": ["flux", "centroid"]}, outputs=["spectralFeatures"]
     )
@@ -179,10 +179,12 @@ def test_lags_that_are_not_centred_are_aligned_at_the_first() -> None:
     assert at == got["autocorrelation"].shape[-1]
 
 
-def test_what_a_child_could_not_go_on_with_is_refused() -> None:
-    """Pitch needs three lags of its range; the change is the autocorrelation's."""
+def test_a_change_that_a_child_cannot_follow_is_refused() -> None:
+    """Pitch needs three lags in its range; a change of the autocorrelation would leave fewer."""
     changed: dict[str, Any] = {"parameters": FEW, "block_frames": 1000, "modifications": [(1, "ac_wSizeSec", 0.0005)]}
-    with pytest.raises(ValueError, match="pi_rangeHz: 80 to 400 Hz are 0 lags of the autocorrelation, wanted are 3"):
+    with pytest.raises(
+        ValueError, match="pi_rangeHz: expected at least 3 lags of the autocorrelation, got 0 from 80 to 400 Hz"
+    ):
         rosafe.process(SOUND, RATE, **changed, outputs=["pitch"])
     rosafe.process(SOUND, RATE, **changed, outputs=["autocorrelation"])
 

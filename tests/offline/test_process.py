@@ -1,4 +1,4 @@
-"""What `rosafe.process` computes: reference vectors, any cut into blocks, parts of the outputs, odd signals."""
+"""Results of `rosafe.process`: reference vectors, any blocks, parts of the outputs, unusual signals."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from rosafe.representations.haircell import InnerHairCell
 from rosafe.sound.audiofile import AudioFile
 from tests import harness
 from tests.dsp.bare import Chain, cut
-from tests.dsp.implementations import TWINS, levels, using
+from tests.dsp.implementations import NUMPY, levels, using
 from tests.dsp.test_vectors import CASES, assert_reference, load, parameters
 from tests.tree.support import tree_threads
 
@@ -47,7 +47,7 @@ def assert_same(got: dict[str, Any], wanted: dict[str, Any], tolerance: float = 
 
 @pytest.mark.parametrize("name", CASES)
 def test_reference_vectors(name: str) -> None:
-    """Through the tree, with the changes on the way."""
+    """Through the tree, with parameter changes."""
     case, expected = load(name)
     results = rosafe.process(
         expected["signal"],
@@ -60,7 +60,7 @@ def test_reference_vectors(name: str) -> None:
 
 
 def test_speech_comes_from_one_side() -> None:
-    """Level and time differences agree on it."""
+    """Level and time differences have the same sign."""
     file = AudioFile(harness.shared("audio", "speech_anechoic_16k.wav"))
     results = rosafe.process(file.read(2 * file.sample_rate), file.sample_rate, outputs=FRAMED)
     file.close()
@@ -73,7 +73,7 @@ def test_speech_comes_from_one_side() -> None:
     assert (level > 0) == (lag > 0)
 
 
-def test_what_is_returned() -> None:
+def test_keys_shapes_and_types() -> None:
     frames = 16000
     results = rosafe.process(noise(frames), RATE)
     channels = len(results["fb_cfHz"])
@@ -104,7 +104,7 @@ def test_what_is_returned() -> None:
     assert [results[f"{kind}_frameRate"] for kind in FRAMED] == [100.0] * 3
 
 
-def test_frame_rates_are_the_true_ones() -> None:
+def test_frame_rates_follow_from_the_rounded_hop() -> None:
     results = rosafe.process(
         noise(4410), 44100, parameters={"ild_hSizeSec": 0.0125, "rm_hSizeSec": 0.003, "cc_hSizeSec": 0.007}
     )
@@ -130,7 +130,7 @@ def test_integers_are_normalised_and_floats_are_not() -> None:
     np.testing.assert_array_equal(full_scale["input"], [[-1.0000000004656613], [1.0]])
 
 
-def test_the_slip_of_the_guide() -> None:
+def test_the_misspelling_of_the_guide_is_accepted() -> None:
     got, wanted = (
         rosafe.process(
             SOUND, RATE, parameters={"pp_bMiddleEarFiltering": True, "pp_middleEarModel": word}, outputs=["preProc"]
@@ -158,7 +158,7 @@ def test_any_memory_layout_and_lists() -> None:
         assert_same(rosafe.process(same, RATE, parameters=FEW), wanted, tolerance=0)
 
 
-def test_the_signal_stays_as_it_is_and_apart_from_the_results() -> None:
+def test_the_signal_is_unchanged_and_not_shared_with_results() -> None:
     signal = noise(600)
     before = signal.copy()
     results = rosafe.process(signal, RATE, parameters=FEW)
@@ -203,7 +203,7 @@ def test_silence() -> None:
 
 
 def test_two_ears_along_either_axis() -> None:
-    """As soundfile returns them; but (2, 2) is (2, N), and (1, 2) is one ear."""
+    """(N, 2) as soundfile returns it; (2, 2) is read as (2, N), and (1, 2) as one ear."""
     wanted = rosafe.process(SOUND, RATE, parameters=FEW)
     assert_same(rosafe.process(SOUND.T, RATE, parameters=FEW), wanted, tolerance=0)
     tiny = np.array([[1.0, 2.0], [3.0, 4.0]])
@@ -214,7 +214,7 @@ def test_two_ears_along_either_axis() -> None:
 
 @pytest.mark.parametrize("signal", [SOUND[0], SOUND[:1], SOUND[0].tolist()])
 def test_one_ear(signal: Any) -> None:
-    """Outputs per ear have one row, that of an ear of two that hear the same."""
+    """Outputs have one row for the ear, equal to that of two equal ears."""
     changes = [(1, "fb_nChannels", 3)]
     got = rosafe.process(signal, RATE, parameters=FEW, block_frames=1000, modifications=changes)
     both = rosafe.process(SOUND[[0, 0]], RATE, parameters=FEW, block_frames=1000, modifications=changes)
@@ -228,7 +228,7 @@ def test_one_ear(signal: Any) -> None:
     assert set(rows) == {1}
 
 
-def test_whole_numbers_are_scaled_as_files_are() -> None:
+def test_integers_are_scaled_as_in_files() -> None:
     short = (2**15 * 0.9 * np.random.default_rng(5).uniform(-1, 1, (2, 500))).astype(np.int16)
     long = short.astype(np.int32) * 2**16
     np.testing.assert_array_equal(*(rosafe.process(x, RATE, outputs="input")["input"] for x in (short, long)))
@@ -255,8 +255,8 @@ def test_the_middle_of_each_frame() -> None:
 
 
 @pytest.mark.parametrize("ratio", [1, 4, 5])
-def test_times_of_what_takes_every_so_manieth_sample(ratio: int) -> None:
-    """Each of these stands for all up to the next."""
+def test_times_of_decimated_outputs(ratio: int) -> None:
+    """Each sample covers the time until the next one."""
     values = {**FEW, "ams_dsRatio": ratio, "ams_wSizeSec": 0.032, "ams_hSizeSec": 0.008, "ams_cfHz": [50.0]}
     got = rosafe.process(SOUND, RATE, parameters=values, outputs="amsFeatures")
     window = 2 * round(0.016 * RATE / ratio) * ratio
@@ -267,7 +267,7 @@ def test_times_of_what_takes_every_so_manieth_sample(ratio: int) -> None:
 
 
 def test_times_after_a_change_of_the_hop() -> None:
-    """The next frame starts where it would have started anyway."""
+    """The change does not move the start of the next frame."""
     changes = [(1, "ild_hSizeSec", 0.02), (2, "ild_wSizeSec", 0.03)]
     got = rosafe.process(SOUND, RATE, parameters=FEW, block_frames=1000, modifications=changes, outputs=["ild"])
     # 320 samples each 160 up to sample 1000; each 320 up to 2000; then 480 samples each 320
@@ -281,7 +281,7 @@ def test_times_after_a_change_of_the_hop() -> None:
 
 
 @pytest.mark.parametrize("kind", CORE_REPRESENTATIONS)
-def test_what_nothing_depends_on_is_not_computed(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unneeded_kinds_are_not_computed(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
     whole = rosafe.process(SOUND, RATE, parameters=FEW)
     needed = [kind]
     while parent := CORE_REPRESENTATIONS[needed[-1]].parent:
@@ -306,12 +306,13 @@ def test_outputs_in_any_form() -> None:
     assert set(rosafe.process(SOUND, RATE, parameters=FEW, outputs="preProc")) == {"preProc", "preProc_time"}
     twice = rosafe.process(SOUND, RATE, parameters=FEW, outputs=("preProc", "input", "input"))
     assert set(twice) == {"preProc", "preProc_time", "input", "input_time"}
-    assert rosafe.process(SOUND, RATE, parameters=FEW, outputs=[]) == {}
+    with pytest.raises(ValueError, match="outputs: expected at least one name, got none"):
+        rosafe.process(SOUND, RATE, parameters=FEW, outputs=[])
 
 
-@pytest.mark.usefixtures("blocks_as_they_are")
-def test_what_is_not_asked_for_is_not_stored() -> None:
-    """Twice the signal takes no more memory, but for a few frames of ILD."""
+@pytest.mark.usefixtures("blocks_not_merged")
+def test_outputs_that_are_not_requested_are_not_stored() -> None:
+    """Twice the signal takes no more memory, except for a few frames of ILD."""
 
     def peak(frames: int) -> int:
         signal = noise(frames)
@@ -322,7 +323,7 @@ def test_what_is_not_asked_for_is_not_stored() -> None:
         finally:
             tracemalloc.stop()
 
-    peak(2000)  # what is imported and made once
+    peak(2000)  # imports and caches
     gammatone_bytes = 2 * 4 * 8 * 40_000
     assert peak(80_000) - peak(40_000) < 0.1 * gammatone_bytes
 
@@ -330,8 +331,8 @@ def test_what_is_not_asked_for_is_not_stored() -> None:
 # --- changes on the way ---
 
 
-def test_changes_before_their_blocks() -> None:
-    """Whatever order they come in, those for one block are made in turn; those for blocks that never come are not."""
+def test_changes_apply_before_their_blocks() -> None:
+    """Changes are ordered by block; those for one block keep their order; those beyond the end are ignored."""
     changes = [
         (5, "ihc_method", "dau"),
         (2, "fb_bwERBs", 1.3),
@@ -357,7 +358,7 @@ def test_changes_before_their_blocks() -> None:
 
 
 def test_misspelt_names_of_changes() -> None:
-    """What the original's modifyParameter calls them works too."""
+    """The misspelt names of the original's modifyParameter are accepted too."""
     for wrong, right in (
         (("set_rm_scailing", "_magnitude"), ("rm_scaling", "magnitude")),
         (("set_rm_scailing", "magnitude"), ("rm_scaling", "magnitude")),
@@ -381,7 +382,7 @@ def test_misspelt_names_of_changes() -> None:
         assert not np.array_equal(got["ratemap"], unchanged["ratemap"])
 
 
-def test_changes_of_what_is_not_computed_are_none() -> None:
+def test_changes_of_kinds_that_are_not_computed_have_no_effect() -> None:
     with_changes = rosafe.process(
         SOUND, RATE, parameters=FEW, modifications=[(0, "ild_wname", "hamming")], outputs=["preProc"]
     )
@@ -414,7 +415,7 @@ def test_lags_and_channels_that_change_leave_zeros_outside() -> None:
 
 
 def test_a_change_in_every_block() -> None:
-    """A thousand of them are checked in a moment."""
+    """A thousand changes are checked quickly."""
     changes = [(block, "rm_decaySec", 0.001 + 1e-5 * block) for block in range(1000)]
     results = rosafe.process(
         noise(1000), RATE, parameters=FEW, block_frames=1, modifications=changes, outputs=["ratemap"]
@@ -440,8 +441,8 @@ class Blown(Exception):
     pass
 
 
-@pytest.mark.usefixtures("blocks_as_they_are")
-def test_an_error_on_the_way_ends_it_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.usefixtures("blocks_not_merged")
+def test_an_error_during_the_run_ends_it_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     processed = []
 
     class Fuse(InnerHairCell):
@@ -463,12 +464,12 @@ def test_an_error_on_the_way_ends_it_at_once(monkeypatch: pytest.MonkeyPatch) ->
     with pytest.raises(Blown, match="third"):
         rosafe.process(noise(100_000), RATE, parameters=FEW, block_frames=10)
     assert len(processed) == 3
-    assert len(read) < 5000  # of 10000: the tree notices with a few blocks under way
+    assert len(read) < 5000  # of 10000: the tree notices after a few blocks
 
 
-@pytest.mark.usefixtures("blocks_as_they_are")
+@pytest.mark.usefixtures("blocks_not_merged")
 def test_an_interrupt_from_the_keyboard(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In the middle of the work, which ends with all its threads."""
+    """An interrupt during the computation ends it with all its threads."""
     processed: list[int] = []
     seen: list[int] = []
 
@@ -478,7 +479,7 @@ def test_an_interrupt_from_the_keyboard(monkeypatch: pytest.MonkeyPatch) -> None
         raise KeyboardInterrupt
 
     def sent() -> bool:
-        """Until it is seen: what comes just before the main thread falls asleep, that learns of when it wakes."""
+        """Repeat the signal until it is handled: the main thread may notice it only at its next wake-up."""
         if not seen:
             pthread_kill(threading.main_thread().ident or 0, SIGINT)
         return bool(seen)
@@ -502,10 +503,11 @@ def test_an_interrupt_from_the_keyboard(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 @pytest.mark.parametrize("outputs", [["gammatone"], ["ihc"], ["ild", "ratemap", "crossCorrelation"], ["input", "ihc"]])
-@pytest.mark.parametrize("frames", [3000, 30_000])
-@pytest.mark.parametrize("choice", [TWINS, *levels()[-1:]])
-def test_results_are_freed_with_their_last_name(outputs: list[str], frames: int, choice: int) -> None:
-    """And not when Python looks for what only holds itself: half a gigabyte may have to wait for that."""
+@pytest.mark.parametrize(
+    ("frames", "choice"), [(3000, NUMPY), *((n, level) for n in (3000, 30_000) for level in levels()[-1:])]
+)
+def test_results_are_freed_with_their_last_reference(outputs: list[str], frames: int, choice: int) -> None:
+    """Results are not part of reference cycles, which the garbage collector would free later."""
     gc.collect()
     gc.disable()
     try:

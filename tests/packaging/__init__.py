@@ -1,1 +1,1 @@
-"""Tests of what turns a clone into something that runs: generation, environment, installation, build, lint."""
+"""Tests of installation and builds (messages, kernels, catkin, pip), of the environment, and of linters."""

@@ -1,4 +1,4 @@
-"""A compiler that makes the same library once for all who build the kernels in a copy of the checkout."""
+"""A compiler that caches its results, for all tests that build the kernels in a copy of the checkout."""
 
 from __future__ import annotations
 
@@ -7,34 +7,33 @@ from collections.abc import Iterator
 
 import pytest
 
+from tests.harness import folder_of_run
 from tests.packaging.clone import ENVIRONMENT
 
-# gcc, but what it has made once of the same sources it does not make again.
+# Runs gcc, and caches the result for each set of options and preprocessed sources, which contain no comments.
 GCC = """#!/usr/bin/python3
 import hashlib, os, pathlib, shutil, subprocess, sys
 output = pathlib.Path(sys.argv[sys.argv.index("-o") + 1])
 sha = hashlib.sha256(repr([word for word in sys.argv[1:] if word.startswith("-")]).encode())
-for source in sorted(pathlib.Path(next(word for word in sys.argv if word.endswith(".c"))).parent.glob("*.[ch]")):
-    sha.update(source.read_bytes())
-kept = pathlib.Path(__file__).with_name(sha.hexdigest())
-if not kept.exists():
+words = [word for word in sys.argv[1:] if word not in ("-o", str(output), "-shared")]
+sha.update(subprocess.run(["/usr/bin/gcc", "-E", "-P", *words], check=True, stdout=subprocess.PIPE).stdout)
+cached = pathlib.Path(__file__).with_name(sha.hexdigest())
+if not cached.exists():
     subprocess.run(["/usr/bin/gcc", *sys.argv[1:]], check=True)
-    new = kept.with_suffix(f".{os.getpid()}")
+    new = cached.with_suffix(f".{os.getpid()}")
     shutil.copy(output, new)
-    new.rename(kept)
-shutil.copy(kept, output)
+    new.rename(cached)
+shutil.copy(cached, output)
 """
 
 
 @pytest.fixture(scope="session", autouse=True)
 def _gcc(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """The first compiler on the PATH of all that is run here, but where a test says otherwise.
+    """Put the caching compiler first on the PATH of all commands in these tests.
 
-    The processes of one run of the tests share what it has made.
+    The processes of one run of the tests share its cache.
     """
-    folder = tmp_path_factory.getbasetemp()
-    if "PYTEST_XDIST_WORKER" in os.environ:
-        folder = folder.parent
+    folder = folder_of_run(tmp_path_factory)
     program = folder / "gcc"
     new = folder / f"gcc.{os.getpid()}"
     new.write_text(GCC)

@@ -64,7 +64,8 @@ def _texts(path: Path) -> Iterator[str]:
     if path.suffix == ".py":
         yield from _python_texts(source)
     elif path.suffix == ".md":
-        yield re.sub(r"```.*?```|`[^`]*`|^ {4}.*$", " code ", source, flags=re.DOTALL | re.MULTILINE)
+        text = re.sub(r"```.*?```|`[^`]*`", " code ", source, flags=re.DOTALL)
+        yield re.sub(r"^ {4}.*$", " code ", text, flags=re.MULTILINE)
     else:
         comment = _COMMENTS[path.suffix]
         block: list[str] = []

@@ -1,4 +1,4 @@
-"""A catkin workspace with both packages: built, installed, and used from the install space alone."""
+"""A catkin workspace with both packages: built, installed, and used from the install space only."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ NEEDED = ("catkin_make", "cmake", "make", "cc")
 
 @pytest.fixture(scope="module")
 def workspace() -> Iterator[Path]:
-    """A workspace after ``catkin_make install``; the sources that it was built from are gone."""
+    """A workspace after ``catkin_make install``, whose sources have been moved away."""
     missing = [tool for tool in NEEDED if shutil.which(tool) is None]
     if missing or not Path("/usr/share/message_generation").exists():
-        pytest.skip(f"no catkin here ({missing or 'message_generation'}); scripts/install --tests brings it")
+        pytest.skip(f"no catkin here ({missing or 'message_generation'}); run scripts/install --tests")
     with fresh_copy() as copy:
         folder = copy.with_name("workspace")
         sources = folder / "src"
@@ -45,7 +45,7 @@ def workspace() -> Iterator[Path]:
 
 
 def sourced(workspace: Path, commands: str, shell: str = "bash", **env: str) -> subprocess.CompletedProcess[str]:
-    """Run commands after sourcing the install space's setup file, as a user in a new shell does."""
+    """Run commands in a new shell after sourcing the setup file of the install space."""
     return run(
         shell, "-c", f". {workspace}/install/setup.{shell.replace('dash', 'sh')} && {commands}", env=environment(**env)
     )
@@ -57,17 +57,17 @@ def printed(done: subprocess.CompletedProcess[str]) -> str:
 
 
 @pytest.mark.parametrize("package", ["rosAFE", "bass"])
-def test_messages_are_those_of_our_own_generator(workspace: Path, package: str) -> None:
-    """Byte for byte, the split actions included."""
+def test_messages_equal_those_of_our_generator(workspace: Path, package: str) -> None:
+    """Byte for byte, including the messages of actions."""
     generation = Path(generate.environment()["ROS_PACKAGE_PATH"].split(":")[0]).parent
     for kind in ("msg", "srv"):
-        for ours, catkins in (
+        for own, catkin in (
             (generation / "python" / package / kind, workspace / "install/lib/python3/dist-packages" / package / kind),
             (generation / "share" / package / kind, workspace / "install/share" / package / kind),
         ):
-            names = sorted(p.name for p in ours.iterdir() if p.is_file())
-            assert names == sorted(p.name for p in catkins.iterdir() if p.is_file())
-            assert filecmp.cmpfiles(ours, catkins, names, shallow=False) == (names, [], [])
+            names = sorted(p.name for p in own.iterdir() if p.is_file())
+            assert names == sorted(p.name for p in catkin.iterdir() if p.is_file())
+            assert filecmp.cmpfiles(own, catkin, names, shallow=False) == (names, [], [])
 
 
 def test_python(workspace: Path) -> None:
@@ -79,11 +79,11 @@ def test_python(workspace: Path) -> None:
 
 @pytest.mark.skipif(platform.machine() != "x86_64", reason="the kernels are for x86-64")
 def test_kernels(workspace: Path) -> None:
-    """Built with the workspace, and used where no compiler is found."""
+    """They are built with the workspace, and used without a compiler."""
     show = f"PATH=/nonexistent {PYTHON} -c 'from rosafe.dsp import kernels; print(kernels.status())'"
-    said = printed(sourced(workspace, show))
-    assert said.startswith("compiled for x86-64-v")
-    assert f"{workspace}/install/lib/python3/dist-packages/rosafe/dsp/kernels/" in said
+    status = printed(sourced(workspace, show))
+    assert status.startswith("compiled for x86-64-v")
+    assert f"{workspace}/install/lib/python3/dist-packages/rosafe/dsp/kernels/" in status
 
 
 @pytest.mark.parametrize("program", ["rosAFE-ros", "bass-ros"])
@@ -126,7 +126,7 @@ def test_environment_for_children(workspace: Path) -> None:
     assert exports["OCTAVE_PATH"] == exports["MATLABPATH"] == str(install / "lib" / "matlab")
 
 
-def test_setup_twice_is_once(workspace: Path) -> None:
+def test_second_setup_has_no_effect(workspace: Path) -> None:
     again = f". {workspace}/install/setup.bash && echo $TCLLIBPATH"
     assert printed(sourced(workspace, again)).strip() == str(workspace / "install" / "lib" / "tcltk")
 
@@ -146,8 +146,8 @@ def test_both_nodes_run_from_the_install_space(
             wait_for(lambda name=name: f"/{name}/Stop" in graph.services(), what=lambda node=node: str(node))  # type: ignore[misc]
         called = printed(sourced(workspace, "rosservice call /bass/Acquire \"{device: 'scene:'}\"", **ros))
         assert "genom_success: True" in called
-        heard = printed(sourced(workspace, "rostopic echo -n1 /bass/Audio/sampleRate", **ros))
-        assert heard.startswith("44100")
+        published = printed(sourced(workspace, "rostopic echo -n1 /bass/Audio/sampleRate", **ros))
+        assert published.startswith("44100")
         assert bass.stop() == 0 and rosafe.stop() == 0
     installed = workspace / "install" / "lib" / "python3" / "dist-packages"
     assert not any(installed.rglob(".generated")) and not (tmp_path / ".cache").exists()

@@ -1,4 +1,4 @@
-"""The documents and the library's reference are built by Sphinx without a warning, and the reference has everything."""
+"""Sphinx builds the documents and the API reference without a warning, and the reference is complete."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from rosafe.interface import KINDS
 from tests.harness import PYTHON, ROOT
 
 
-def test_sphinx_has_nothing_to_say(tmp_path: Path) -> None:
+def test_sphinx_reports_nothing(tmp_path: Path) -> None:
     for module in ("sphinx", "numpydoc", "myst_parser"):
-        pytest.importorskip(module, reason=f"{module} is not here: scripts/install --tests brings it")
+        pytest.importorskip(module, reason=f"{module} is not installed; run scripts/install --tests")
     command = [PYTHON, "-m", "sphinx", "-q", "-W", "--keep-going", "-b", "html", "-d", tmp_path / "trees"]
     done = subprocess.run(
         [*map(str, command), "docs", str(tmp_path / "html")],
@@ -34,14 +34,19 @@ def test_sphinx_has_nothing_to_say(tmp_path: Path) -> None:
     assert 'id="rosafe.Stream.process"' in library
 
 
-def test_every_page_is_in_the_contents() -> None:
+def test_index_lists_every_page() -> None:
     index = (ROOT / "docs" / "index.rst").read_text("utf-8").split()
     pages = {path.stem for path in (ROOT / "docs").glob("*.md")} - {"README"}
     assert pages - set(index) == set()
 
 
-def test_the_page_of_the_request_names_every_representation() -> None:
-    table = (ROOT / "docs" / "request.md").read_text("utf-8").split("## What is asked for")[1].split("\n## ")[0]
+def test_request_page_lists_every_representation() -> None:
+    table = (
+        (ROOT / "docs" / "request.md")
+        .read_text("utf-8")
+        .split("## Representations and parameters")[1]
+        .split("\n## ")[0]
+    )
     named = set(re.findall("`([^`]+)`", table))
     for kind in KINDS.values():
         assert {kind.word, kind.request, f"{kind.word}_0"} <= named, kind.kind

@@ -1,4 +1,4 @@
-"""scripts/env.sh in bash, dash and zsh: found from anywhere, the same twice, and harmless where it fails."""
+"""scripts/env.sh in bash, dash and zsh: it works from any folder and when called twice, and fails without effects."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ def sourced(
     shell: str, commands: str, cwd: Path = Path("/"), env: dict[str, str] | None = None, within: bool = False
 ) -> subprocess.CompletedProcess[str]:
     if shutil.which(shell) is None:
-        pytest.skip(f"{shell} is not installed; scripts/install --tests brings it")
+        pytest.skip(f"{shell} is not installed; run scripts/install --tests")
     if shell == "dash" and not within and not Path("/proc/self/fd").exists():
-        pytest.skip("without /proc, dash finds env.sh only from within the checkout")
+        pytest.skip("without /proc, dash finds env.sh only inside the checkout")
     return run(shell, "-c", commands, env=env or environment(), cwd=cwd)
 
 
 def variables(done: subprocess.CompletedProcess[str]) -> dict[str, str]:
-    """What SHOW printed, last."""
+    """Return the variables printed by SHOW, the last command."""
     assert done.returncode == 0 and done.stderr == "", done.stderr
     return dict(zip(VARIABLES, done.stdout.splitlines()[-len(VARIABLES) :], strict=True))
 
@@ -64,7 +64,7 @@ def test_sets_the_paths(copy: Path, shell: str) -> None:
 
 
 @SHELLS
-def test_twice_is_once(copy: Path, shell: str) -> None:
+def test_second_call_has_no_effect(copy: Path, shell: str) -> None:
     once = variables(sourced(shell, f"{source(copy)}; {SHOW}"))
     assert variables(sourced(shell, f"{source(copy)}; {source(copy)}; {source(copy)}; {SHOW}")) == once
 
@@ -81,7 +81,7 @@ def test_twice_is_once(copy: Path, shell: str) -> None:
         ("", "set -eu; . scripts/env.sh"),
     ],
 )
-def test_from_anywhere(copy: Path, shell: str, folder: str, command: str) -> None:
+def test_from_any_folder(copy: Path, shell: str, folder: str, command: str) -> None:
     commands = command.replace("{show}", SHOW) if "{show}" in command else f"{command}; {SHOW}"
     done = sourced(shell, commands, copy / folder, within=True)
     assert variables(done)["PATH"].split(":")[0] == f"{copy}/scripts"
@@ -95,8 +95,8 @@ def test_through_a_symbolic_link(copy: Path, shell: str, tmp_path: Path) -> None
 
 
 @SHELLS
-def test_not_taken_in_by_another_checkout_around(copy: Path, shell: str) -> None:
-    """The file that is sourced counts, not the folder in which one happens to be."""
+def test_surrounding_checkout_is_ignored(copy: Path, shell: str) -> None:
+    """The sourced file determines the checkout, not the working directory."""
     with fresh_copy() as other:
         found = variables(sourced(shell, f"{source(copy)}; {SHOW}", cwd=other))
         assert found["PYTHONPATH"].startswith(f"{copy}/.generated/")
@@ -106,27 +106,27 @@ def test_not_taken_in_by_another_checkout_around(copy: Path, shell: str) -> None
 
 
 @SHELLS
-def test_leaves_what_the_user_has_set(copy: Path, shell: str) -> None:
-    mine = {
+def test_keeps_variables_of_the_user(copy: Path, shell: str) -> None:
+    user = {
         "ROS_MASTER_URI": "http://robot:11311",
         "PYTHONPATH": "/mine/python",
         "ROS_PACKAGE_PATH": "/mine/ros",
         "TCLLIBPATH": "{/my tcl} /mine",
     }
-    found = variables(sourced(shell, f"{source(copy)}; {source(copy)}; {SHOW}", env=environment(**mine)))
+    found = variables(sourced(shell, f"{source(copy)}; {source(copy)}; {SHOW}", env=environment(**user)))
     assert found["ROS_MASTER_URI"] == "http://robot:11311"
     assert found["ROS_IP"] == "unset", "the robot could not call back to loopback"
     assert found["PYTHONPATH"].split(":")[-1] == "/mine/python"
     assert found["ROS_PACKAGE_PATH"].split(":")[-1] == "/mine/ros"
     assert found["TCLLIBPATH"].endswith("/tcl} {/my tcl} /mine")
-    for mine in ({"ROS_IP": "10.0.0.7"}, {"ROS_HOSTNAME": "desk"}):
-        found = variables(sourced(shell, f"{source(copy)}; {SHOW}", env=environment(**mine)))
-        assert {name: found[name] for name in mine} == mine
-        assert found["ROS_IP"] == mine.get("ROS_IP", "unset")
+    for user in ({"ROS_IP": "10.0.0.7"}, {"ROS_HOSTNAME": "desk"}):
+        found = variables(sourced(shell, f"{source(copy)}; {SHOW}", env=environment(**user)))
+        assert {name: found[name] for name in user} == user
+        assert found["ROS_IP"] == user.get("ROS_IP", "unset")
 
 
 @SHELLS
-def test_leaves_no_names_behind(copy: Path, shell: str) -> None:
+def test_defines_no_other_names(copy: Path, shell: str) -> None:
     done = sourced(shell, f"{source(copy)}; set | grep -c '^_rosafe'")
     assert done.stdout == "0\n"
 
@@ -140,7 +140,7 @@ def test_failure_is_one_line_and_changes_nothing(shell: str) -> None:
     assert done.stderr.startswith("rosafe: ") and done.stderr.count("\n") == 1
 
 
-@pytest.mark.skipif(os.getuid() != 0, reason="a mount namespace of its own takes root")
+@pytest.mark.skipif(os.getuid() != 0, reason="a separate mount namespace needs root")
 def test_dash_without_proc(copy: Path) -> None:
     def hidden(commands: str, cwd: Path) -> subprocess.CompletedProcess[str]:
         command = f"mount -t tmpfs none /proc && exec dash -c {shlex.quote(commands)}"

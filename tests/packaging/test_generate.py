@@ -1,4 +1,4 @@
-"""Message generation: complete, once however many start at the same time, fresh, and never half done."""
+"""Message generation: complete, once for concurrent starts, up to date, and never partial."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ IMPORT = (
 MD5_OF_INPUTPROC_ACTION = "2dc56590e981689aa1ab72a9e6db474e"
 
 
-REQUESTS = ("InputProc", "IhcProc", "Stop")  # of rosAFE in the copies; test_rosmsg_and_rossrv_know_everything has all
+REQUESTS = ("InputProc", "IhcProc", "Stop")  # of rosAFE in the copies; test_rosmsg_and_rossrv_list_all_types uses all
 
 
 @pytest.fixture
@@ -39,24 +39,24 @@ def generations(base: Path) -> list[str]:
 
 
 def imported(copy: Path, done: subprocess.CompletedProcess[str]) -> Path:
-    """Where a process that ran IMPORT has found the messages of rosAFE."""
+    """Return the path of the messages of rosAFE that a process running IMPORT has found."""
     assert done.returncode == 0, done.stderr
-    *place, action, _ = done.stdout.split()
+    *path, action, _ = done.stdout.split()
     assert action == MD5_OF_INPUTPROC_ACTION
-    return Path(" ".join(place))
+    return Path(" ".join(path))
 
 
-def test_ten_at_once_on_a_fresh_tree(copy: Path) -> None:
+def test_ten_concurrent_starts_in_a_new_tree(copy: Path) -> None:
     def start(index: int) -> subprocess.CompletedProcess[str]:
         return run(PYTHON, "-c", IMPORT, env=environment(PYTHONPATH=str(copy)))
 
-    places = {imported(copy, done) for done in run_together(10, start)}
-    assert len(places) == 1
-    assert places.pop().is_relative_to(copy / ".generated")
+    paths = {imported(copy, done) for done in run_together(10, start)}
+    assert len(paths) == 1
+    assert paths.pop().is_relative_to(copy / ".generated")
     assert len(generations(copy / ".generated")) == 1
 
 
-def test_generated_once_then_left_alone(copy: Path) -> None:
+def test_generated_once(copy: Path) -> None:
     assert run(*generate(copy), env=environment()).returncode == 0
     before = {p: p.stat().st_mtime_ns for p in (copy / ".generated").rglob("*")}
     assert run(*generate(copy), env=environment()).returncode == 0
@@ -74,10 +74,10 @@ def test_generated_again_when_a_message_changes(copy: Path) -> None:
     message.write_text(original)
     assert run(*show, env=environment(PYTHONPATH=str(copy))).stdout.endswith("['data']\n")
     assert (copy / ".generated" / "current").resolve() != current
-    assert len(generations(copy / ".generated")) == 2, "a node that runs may still need the other one"
+    assert len(generations(copy / ".generated")) == 2, "a running node may still need the other one"
 
 
-def test_old_generations_go(copy: Path) -> None:
+def test_old_generations_are_removed(copy: Path) -> None:
     message = copy / "msg" / "rosAFE_signalOneD.msg"
     for number in range(6):
         message.write_text(f"# version {number}\nfloat64[] data\n")
@@ -85,7 +85,7 @@ def test_old_generations_go(copy: Path) -> None:
     assert len(generations(copy / ".generated")) == 3
 
 
-def test_new_file_is_noticed(copy: Path) -> None:
+def test_new_file_is_detected(copy: Path) -> None:
     assert run(*generate(copy), env=environment()).returncode == 0
     (copy / "bass" / "srv" / "Extra.srv").write_text("uint8 a\n---\n")
     done = run(PYTHON, "-c", f"{IMPORT}; print(bass.srv.Extra)", env=environment(PYTHONPATH=str(copy)))
@@ -93,7 +93,7 @@ def test_new_file_is_noticed(copy: Path) -> None:
 
 
 def test_moved_tree_is_generated_again(copy: Path) -> None:
-    """rosrun's links hold the place of the tree."""
+    """The links for rosrun contain the path of the tree."""
     assert run(*generate(copy), env=environment()).returncode == 0
     moved = copy.rename(copy.with_name("moved"))
     assert run(*generate(moved), env=environment()).returncode == 0
@@ -102,7 +102,7 @@ def test_moved_tree_is_generated_again(copy: Path) -> None:
 
 
 @pytest.mark.parametrize("delay", [0.03, 0.08, 0.15, 0.3])
-def test_killed_half_way(copy: Path, delay: float) -> None:
+def test_killed_generator(copy: Path, delay: float) -> None:
     build = subprocess.Popen(list(map(str, generate(copy))), env=environment(), cwd="/")
     try:
         build.wait(delay)
@@ -110,11 +110,11 @@ def test_killed_half_way(copy: Path, delay: float) -> None:
         build.send_signal(signal.SIGKILL)
     build.wait()
     imported(copy, run(PYTHON, "-c", IMPORT, env=environment(PYTHONPATH=str(copy))))
-    assert len(generations(copy / ".generated")) == 1, "what the killed one left is gone"
+    assert len(generations(copy / ".generated")) == 1, "leftovers of the killed generator are removed"
 
 
-def test_another_waits_for_the_one_that_builds(copy: Path) -> None:
-    """Holding the lock as a generator does keeps others out, and its death lets them in."""
+def test_second_generator_waits_for_the_first(copy: Path) -> None:
+    """A process that holds the lock blocks other generators until it ends."""
     (copy / ".generated").mkdir()
     hold = (
         "import fcntl, sys, threading; f = open(sys.argv[1], 'w'); fcntl.flock(f, fcntl.LOCK_EX); print(flush=True); "
@@ -142,7 +142,7 @@ def test_another_waits_for_the_one_that_builds(copy: Path) -> None:
 
 @contextmanager
 def read_only(copy: Path) -> Iterator[None]:
-    """Within this, nobody but root can write in the copy."""
+    """Make the copy read-only for all users except root."""
     for path in [copy, *copy.rglob("*")]:
         if not path.is_symlink():
             path.chmod(path.stat().st_mode & ~0o222)
@@ -155,7 +155,7 @@ def read_only(copy: Path) -> Iterator[None]:
 
 
 def world_writable(path: Path, mode: int = 0o777) -> Path:
-    """A new folder for every user."""
+    """Create a folder in which every user can write."""
     path.mkdir()
     path.chmod(mode)
     return path
@@ -166,8 +166,8 @@ def test_read_only_tree_uses_the_users_cache(copy: Path) -> None:
     with read_only(copy):
         command = without_rights("env", f"PYTHONPATH={copy}", PYTHON, "-c", IMPORT)
         for _ in range(2):
-            place = imported(copy, run(*command, env=environment(HOME=str(home))))
-            assert place.is_relative_to(home / ".cache" / "rosafe" / "messages")
+            path = imported(copy, run(*command, env=environment(HOME=str(home))))
+            assert path.is_relative_to(home / ".cache" / "rosafe" / "messages")
         assert not (copy / ".generated").exists()
 
 
@@ -175,35 +175,35 @@ def test_read_only_tree_and_home_use_a_private_folder(copy: Path) -> None:
     temporary = world_writable(copy.with_name("tmp"), 0o1777)
     with read_only(copy):
         command = without_rights("env", f"PYTHONPATH={copy}", PYTHON, "-c", IMPORT)
-        places = {imported(copy, run(*command, env=environment(TMPDIR=str(temporary)))) for _ in range(2)}
-        assert len(places) == 1, "the same at every start"
+        paths = {imported(copy, run(*command, env=environment(TMPDIR=str(temporary)))) for _ in range(2)}
+        assert len(paths) == 1, "the same at every start"
         (private,) = temporary.iterdir()
-        assert places.pop().is_relative_to(private)
+        assert paths.pop().is_relative_to(private)
         assert private.stat().st_mode & 0o777 == 0o700
 
 
-@pytest.mark.skipif(os.getuid() != 0, reason="making another user's folder takes root")
+@pytest.mark.skipif(os.getuid() != 0, reason="creating another user's folder needs root")
 @pytest.mark.parametrize("outer", [0o700, 0o755])
-def test_messages_of_a_root_with_umask_077(copy: Path, outer: int) -> None:
-    """They can be read by all, unless the folder around them cannot: then other users generate their own."""
+def test_messages_generated_by_root_with_umask_077(copy: Path, outer: int) -> None:
+    """All users can read them, unless the surrounding folder forbids it: then other users generate their own."""
     (copy / ".generated").mkdir(mode=outer)
     assert run("sh", "-c", 'umask 077; exec "$@"', "-", *generate(copy), env=environment()).returncode == 0
     home = world_writable(copy.with_name("home"))
     command = without_rights("env", f"PYTHONPATH={copy}", PYTHON, "-c", IMPORT)
-    place = imported(copy, run(*command, env=environment(HOME=str(home))))
+    path = imported(copy, run(*command, env=environment(HOME=str(home))))
     own = home / ".cache" / "rosafe" / "messages"
-    assert place.is_relative_to(own if outer == 0o700 else copy / ".generated")
+    assert path.is_relative_to(own if outer == 0o700 else copy / ".generated")
 
 
-@pytest.mark.skipif(os.getuid() != 0, reason="making another user's folder takes root")
-def test_private_folder_that_somebody_else_made_is_refused(copy: Path) -> None:
+@pytest.mark.skipif(os.getuid() != 0, reason="creating another user's folder needs root")
+def test_private_folder_of_another_user_is_rejected(copy: Path) -> None:
     temporary = world_writable(copy.with_name("tmp"), 0o1777)
     (temporary / "rosafe-65534").mkdir(mode=0o777)
     with read_only(copy):
         command = without_rights(*generate(copy))
         done = run(*command, env=environment(TMPDIR=str(temporary)))
     assert done.returncode == 1
-    assert "not private" in done.stderr and done.stderr.count("\n") == 1
+    assert "private to this user" in done.stderr and done.stderr.count("\n") == 1
 
 
 @pytest.mark.parametrize(
@@ -212,10 +212,12 @@ def test_private_folder_that_somebody_else_made_is_refused(copy: Path) -> None:
         ("msg/rosAFE_signalOneD.msg", "nonsense data\n", "nonsense"),
         ("msg/rosAFE_signalOneD.msg", "float64[ data\n", "float64["),
         ("srv/Stop.srv", "string a\n---\nnowhere/Nothing b\n", "nowhere"),
-        ("action/IhcProc.action", "string a\n---\nbool b\n", "IhcProc.action has 2 parts"),
+        ("action/IhcProc.action", "string a\n---\nbool b\n", "expected goal, result and feedback, got 2 parts"),
     ],
 )
-def test_wrong_definition_is_one_line_and_keeps_what_was(copy: Path, path: str, text: str, reason: str) -> None:
+def test_invalid_definition_is_one_line_and_keeps_the_last_generation(
+    copy: Path, path: str, text: str, reason: str
+) -> None:
     assert run(*generate(copy), env=environment()).returncode == 0
     current = (copy / ".generated" / "current").resolve()
     (copy / path).write_text(text)
@@ -226,7 +228,7 @@ def test_wrong_definition_is_one_line_and_keeps_what_was(copy: Path, path: str, 
     assert generations(copy / ".generated") == [current.name]
 
 
-def test_rosmsg_and_rossrv_know_everything(graph: Graph) -> None:
+def test_rosmsg_and_rossrv_list_all_types(graph: Graph) -> None:
     for package, folder in (("rosAFE", ROOT), ("bass", ROOT / "bass")):
         listed = graph.run("rosmsg", "package", package).stdout.split()
         actions = [p.stem for p in (folder / "action").iterdir()]
@@ -246,8 +248,8 @@ def test_rosrun_finds_the_executables(graph: Graph) -> None:
         assert graph.run("rosrun", package, program, "--version").stdout.startswith(package)
 
 
-def test_quick_when_fresh(copy: Path) -> None:
-    """Nothing of genpy is imported: its import alone would take longer than the rest."""
+def test_quick_if_up_to_date(copy: Path) -> None:
+    """genpy is not imported: its import alone would take longer than the rest."""
     assert run(*generate(copy), env=environment()).returncode == 0
     ensure = "from rosafe.component import generate; generate.ensure_messages()"
     code = f"import sys; {ensure}; print('genpy' in sys.modules)"

@@ -1,4 +1,4 @@
-"""The kernels are built once, wherever that is possible; everywhere else numpy and scipy serve, and say why."""
+"""The kernels are built once if possible; otherwise numpy and scipy are used, and the status gives the reason."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def copy() -> Iterator[Path]:
 
 
 def shown(done: subprocess.CompletedProcess[str]) -> tuple[bool, str]:
-    """Whether a process that ran SHOW has used kernels, and its status."""
+    """Return whether a process running SHOW has used kernels, and its status."""
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""
     compiled, status, level = done.stdout.strip().split("|")
@@ -48,7 +48,7 @@ def folders(copy: Path) -> list[str]:
 
 
 def compiler(copy: Path, body: str, name: str = "gcc") -> str:
-    """A PATH on which a compiler is a script."""
+    """Return a PATH on which the compiler is a script."""
     folder = copy.with_name("bin")
     folder.mkdir()
     (folder / name).write_text(f"#!/bin/sh\n{body}\n")
@@ -56,7 +56,7 @@ def compiler(copy: Path, body: str, name: str = "gcc") -> str:
     return f"{folder}:/usr/bin:/bin"
 
 
-def test_ten_at_once_on_a_fresh_tree(copy: Path) -> None:
+def test_ten_concurrent_starts_in_a_new_tree(copy: Path) -> None:
     results = set(run_together(10, lambda index: show(copy)))
     assert len(results) == 1
     compiled, status = results.pop()
@@ -77,7 +77,7 @@ def test_built_once_and_again_when_a_source_changes(copy: Path) -> None:
     assert second != first
 
 
-def test_the_script_builds_where_it_is_told(copy: Path) -> None:
+def test_script_builds_in_the_given_folder(copy: Path) -> None:
     script, elsewhere = copy / "rosafe" / "dsp" / "kernels" / "build.py", copy.with_name("elsewhere")
     done = run(PYTHON, script, elsewhere, env=environment())
     paths = [Path(line) for line in done.stdout.splitlines()]
@@ -92,15 +92,15 @@ def test_no_compiler(copy: Path) -> None:
     empty.mkdir()
     compiled, status = show(copy, PATH=str(empty))
     assert not compiled
-    assert status == ("numpy and scipy: the kernels are not built, and there is no gcc to build them: install gcc")
+    assert status == ("numpy and scipy: the kernels are not built, and there is no compiler; install gcc")
     done = run(PYTHON, copy / "rosafe" / "dsp" / "kernels" / "build.py", env=environment(PATH=str(empty)))
     assert done.returncode == 1
     assert done.stderr.count("\n") == 1
-    assert show(copy)[0], "a compiler has come"
-    assert show(copy, PATH=str(empty))[0], "what is built needs no compiler"
+    assert show(copy)[0], "a compiler was installed"
+    assert show(copy, PATH=str(empty))[0], "built kernels need no compiler"
 
 
-def test_a_compiler_that_fails(copy: Path) -> None:
+def test_compiler_fails(copy: Path) -> None:
     path = compiler(copy, 'echo "In file included from x.c:1:" >&2; echo "x.c:3: error: broken" >&2; exit 1')
     compiled, status = show(copy, PATH=path)
     assert not compiled
@@ -108,8 +108,8 @@ def test_a_compiler_that_fails(copy: Path) -> None:
     assert folders(copy) == []
 
 
-def test_a_compiler_that_makes_nothing(copy: Path) -> None:
-    """Nor is a library missed for ever that was lost later."""
+def test_compiler_creates_no_library(copy: Path) -> None:
+    """A library that is deleted later is built again."""
     compiled, status = show(copy, PATH=compiler(copy, "exit 0"))
     assert not compiled
     assert status.startswith("numpy and scipy: gcc cannot build the kernels: ")
@@ -121,8 +121,8 @@ def test_a_compiler_that_makes_nothing(copy: Path) -> None:
 
 
 @pytest.mark.parametrize("damage", ["x86-64-v2.so", build.SUMS])
-def test_what_was_cut_off_is_built_again_or_not_loaded(copy: Path, damage: str) -> None:
-    """As after a power failure; the processor would end the process with a bus error."""
+def test_truncated_library_is_built_again_or_not_loaded(copy: Path, damage: str) -> None:
+    """As after a power failure. Loading it would end the process with a bus error."""
     empty = copy.with_name("bin")
     empty.mkdir()
     compiled, _ = show(copy)
@@ -135,8 +135,8 @@ def test_what_was_cut_off_is_built_again_or_not_loaded(copy: Path, damage: str) 
         assert show(copy)[0] is compiled
 
 
-@pytest.mark.skipif(os.getuid() != 0, reason="only root can give files to others")
-def test_what_other_users_could_have_written_is_not_loaded(copy: Path) -> None:
+@pytest.mark.skipif(os.getuid() != 0, reason="only root can change the owner of files")
+def test_library_writable_by_other_users_is_not_loaded(copy: Path) -> None:
     env = environment(PYTHONPATH=str(copy))
     old = os.umask(0)
     try:
@@ -165,20 +165,20 @@ def test_what_other_users_could_have_written_is_not_loaded(copy: Path) -> None:
     assert show(copy)[0]
 
 
-def test_killed_half_way(copy: Path) -> None:
+def test_killed_build(copy: Path) -> None:
     path = compiler(copy, "exec sleep 60")
     env = environment(PYTHONPATH=str(copy), PATH=path)
     with subprocess.Popen([PYTHON, "-c", SHOW], env=env, cwd="/", start_new_session=True) as killed:
-        wait_for(lambda: folders(copy), what="it has not begun")
+        wait_for(lambda: folders(copy), what="start of the build")
         os.killpg(killed.pid, signal.SIGKILL)
     assert len(folders(copy)) == 1
     assert show(copy)[0]
-    (left,) = folders(copy)
-    assert ".new-" not in left
+    (folder,) = folders(copy)
+    assert ".new-" not in folder
 
 
 def test_read_only_tree(copy: Path) -> None:
-    """Nothing is built there, and what is built is used, by whoever it may be, under any home."""
+    """No kernels are built in it. Kernels built before are used, by any user with any home folder."""
     command = without_rights("env", f"PYTHONPATH={copy}", PYTHON, "-c", SHOW)
     copy.chmod(0o555)
     try:
@@ -197,8 +197,8 @@ def test_read_only_tree(copy: Path) -> None:
         (copy / ".generated").chmod(0o755)
 
 
-def test_the_switch(copy: Path) -> None:
-    assert show(copy, ROSAFE_KERNELS="0") == (False, "numpy and scipy, as ROSAFE_KERNELS=0 says")
+def test_environment_variable(copy: Path) -> None:
+    assert show(copy, ROSAFE_KERNELS="0") == (False, "numpy and scipy, because ROSAFE_KERNELS is 0")
     assert not (copy / ".generated").exists()
     for level in (2, 3):
         compiled, status = show(copy, ROSAFE_KERNELS=str(level))
@@ -207,36 +207,36 @@ def test_the_switch(copy: Path) -> None:
         assert status.endswith(f"x86-64-v{level}.so")
     compiled, status = show(copy, ROSAFE_KERNELS="off")
     assert compiled
-    assert "(ROSAFE_KERNELS is 'off', which means nothing: 0, 2, 3 or 4 would)" in status
+    assert "(ROSAFE_KERNELS: expected 0, 2, 3 or 4, got 'off'; it is ignored)" in status
 
 
-def test_the_compiler_that_is_asked_for(copy: Path) -> None:
-    """It has a folder of its own: what another one has built stays."""
+def test_selected_compiler(copy: Path) -> None:
+    """It has a separate folder: the libraries of the other compiler remain."""
     if shutil.which("clang") is None:
-        pytest.skip("no clang here: scripts/install --tests brings it")
+        pytest.skip("clang is not installed; run scripts/install --tests")
     assert "by clang " in show(copy, ROSAFE_COMPILER="clang")[1]
     assert "by gcc " in show(copy)[1]
     assert len(folders(copy)) == 2
     compiled, status = show(copy, ROSAFE_COMPILER="clong")
     assert not compiled
-    assert status.endswith("the kernels are not built, and ROSAFE_COMPILER is 'clong', which is no program here")
+    assert status.endswith("the kernels are not built; ROSAFE_COMPILER: expected a program, got 'clong'")
 
 
-def test_clang_where_there_is_no_gcc(copy: Path) -> None:
+def test_clang_without_gcc(copy: Path) -> None:
     path = compiler(copy, 'echo "clang: error: found" >&2; exit 1', "clang")
     assert show(copy, PATH=path.partition(":")[0])[1].endswith("clang cannot build the kernels: clang: error: found")
 
 
 def test_other_machines(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(platform, "machine", lambda: "riscv64")
-    with pytest.raises(build.BuildError, match="for x86_64 and aarch64, and this machine is riscv64"):
+    with pytest.raises(build.BuildError, match="for x86_64 and aarch64, but this machine is riscv64"):
         build.libraries(tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("level", [0, 2, 3, 4])
-def test_no_more_than_the_processor_can(monkeypatch: pytest.MonkeyPatch, level: int) -> None:
-    """What is not for this processor is not even opened, but for the one that is asked."""
+def test_only_levels_of_the_processor_are_loaded(monkeypatch: pytest.MonkeyPatch, level: int) -> None:
+    """Libraries for other processors are not opened, except the one that reports the level of the processor."""
     opened = []
 
     class Library:

@@ -1,4 +1,4 @@
-"""The tools that check the code have nothing to say. A tool that is not here is brought by scripts/install --tests."""
+"""Linters report nothing. `scripts/install --tests` installs them."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import pytest
 
 from tests.harness import PYTHON, ROOT
 
-TOOLS = Path("/usr/local/lib/rosafe/tools")  # where scripts/install puts what is from PyPI
+TOOLS = Path("/usr/local/lib/rosafe/tools")  # folder of packages that scripts/install installs from PyPI
 
 
 def tracked() -> list[Path]:
-    """The files of the project as git knows them, or all where this is no clone."""
+    """Return the files tracked by git, or all files if this is not a clone."""
     if (ROOT / ".git").exists() and shutil.which("git"):
         listed = subprocess.run(
             ["git", "-c", f"safe.directory={ROOT}", "ls-files", "-z"],
@@ -36,7 +36,7 @@ def first_line(path: Path) -> str:
 
 def check(*command: str | Path) -> None:
     if shutil.which(str(command[0])) is None:
-        pytest.skip(f"{command[0]} is not installed; scripts/install --tests brings it")
+        pytest.skip(f"{command[0]} is not installed; run scripts/install --tests")
     done = subprocess.run(["timeout", "550", *map(str, command)], cwd=ROOT, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout + done.stderr
 
@@ -47,9 +47,9 @@ def test_ruff() -> None:
 
 
 def test_mypy() -> None:
-    """Debian's takes five times as long."""
+    """With mypy from PyPI: Debian's version takes five times as long."""
     if not (TOOLS / "mypy").is_dir():
-        pytest.skip("mypy is not installed; scripts/install --tests brings it")
+        pytest.skip("mypy is not installed; run scripts/install --tests")
     check("env", f"PYTHONPATH={TOOLS}", PYTHON, "-m", "mypy")
 
 
@@ -57,6 +57,16 @@ def test_shellcheck() -> None:
     shells = [p for p in tracked() if p.suffix == ".sh" or first_line(p) in ("#!/bin/sh", "#!/bin/bash")]
     assert ROOT / "scripts" / "env.sh" in shells and ROOT / "scripts" / "install" in shells
     check("shellcheck", *shells)
+
+
+def test_cppcheck() -> None:
+    """Justified exceptions are in cppcheck.txt."""
+    exceptions = ROOT / "tests" / "packaging" / "cppcheck.txt"
+    sources = [path for path in tracked() if path.suffix in (".c", ".cpp")]
+    assert ROOT / "rosafe" / "dsp" / "kernels" / "gammatone.c" in sources
+    enabled = "--enable=warning,performance,portability"
+    paths = [path.relative_to(ROOT) for path in sources]
+    check("cppcheck", "-q", "--error-exitcode=1", enabled, f"--suppressions-list={exceptions}", *paths)
 
 
 def test_catkin_lint() -> None:
@@ -72,13 +82,13 @@ def test_programs_are_executable_and_use_debians_python() -> None:
 
 
 def test_catkin_installs_every_program() -> None:
-    """All of scripts/ but what is for a checkout, which is written for the shell; links too."""
+    """All Python programs and links in scripts/. Shell scripts are for a checkout only."""
     programs = {f"scripts/{p.name}" for p in (ROOT / "scripts").iterdir() if "python3" in first_line(p)}
     listed = (ROOT / "CMakeLists.txt").read_text("utf-8").split("set(EXECUTABLES")[1].split(")")[0].split()
     assert set(listed) == programs
 
 
-def test_every_python_file_says_what_lives_there() -> None:
+def test_every_python_file_begins_with_a_docstring() -> None:
     for path in tracked():
         if path.suffix == ".py":
             assert first_line(path).startswith('"""'), path

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import importlib
 import re
 from collections import Counter, defaultdict
@@ -16,7 +17,6 @@ from tests.packaging.prose import SUFFIXES, markers, sentences
 from tests.packaging.test_lint import tracked
 
 PACKAGE = ROOT / "rosafe"
-MODULES = {path: ast.parse(path.read_text("utf-8")) for path in sorted(PACKAGE.rglob("*.py"))}
 Function = ast.FunctionDef | ast.AsyncFunctionDef
 
 # --- size and complexity ----------------------------------------------------------------------------------------
@@ -24,57 +24,17 @@ Function = ast.FunctionDef | ast.AsyncFunctionDef
 MAX_CLASS_LINES = 250
 MAX_ATTRIBUTES = 15  # names assigned on `self`
 MAX_COMPLEXITY = 14
-# Classes and functions beyond the limits, with lines and attributes, or complexity. A figure may only fall.
-TOO_LARGE: dict[str, tuple[int, int]] = {
-    "rosafe/bass/recording/topic_source.py:TopicSource": (124, 18),
-    "rosafe/bass/sources/alsa.py:AlsaSource": (224, 21),
-    "rosafe/client/component_client.py:ComponentClient": (279, 11),
-    "rosafe/component/audio.py:AudioRing": (252, 14),
-    "rosafe/component/component.py:ComponentNode": (330, 23),
-    "rosafe/declarations/parameter.py:Parameter": (255, 0),
-    "rosafe/demo/recorder.py:PortFollower": (93, 16),
-    "rosafe/dsp/stage.py:Stage": (258, 4),
-    "rosafe/eltclsh/shell.py:Shell": (274, 6),
-    "rosafe/genomix/routes.py:HttpApi": (267, 5),
-    "rosafe/genomix/sessions.py:Session": (251, 12),
-    "rosafe/http_server/connections.py:HttpConnection": (218, 16),
-    "rosafe/live/client.py:BrowserConnection": (254, 14),
-    "rosafe/live/plot_data.py:PlotLayout": (116, 16),
-    "rosafe/node/node.py:RosafeNode": (345, 21),
-    "rosafe/offline/stream.py:Stream": (254, 12),
-    "rosafe/tree/tree.py:Tree": (311, 9),
-}
-TOO_COMPLEX: dict[str, int] = {
-    "rosafe/commands/check.py:run": 17,
-    "rosafe/commands/process.py:_output_path": 15,
-    "rosafe/commands/process.py:run": 15,
-    "rosafe/commands/record.py:_check": 15,
-    "rosafe/declarations/parameter.py:_bad_words": 18,
-    "rosafe/declarations/parameter.py:_check_sequence": 16,
-    "rosafe/declarations/representation.py:_bad_parts": 21,
-    "rosafe/declarations/representation.py:_bad_values": 18,
-    "rosafe/declarations/signals.py:layout": 16,
-    "rosafe/dsp/old_names.py:used": 20,
-    "rosafe/dsp/plugin_checks.py:_part": 15,
-    "rosafe/dsp/plugin_checks.py:process": 18,
-    "rosafe/eltclsh/words.py:scan": 24,
-    "rosafe/live/client.py:_keys": 15,
-    "rosafe/live/plot_data.py:__init__": 19,
-    "rosafe/offline/formats.py:_check_kind": 17,
-    "rosafe/offline/isolated.py:_checked": 19,
-    "rosafe/offline/signals.py:ears_view": 16,
-    "rosafe/offline/stream.py:_checked": 15,
-    "rosafe/representations/checks.py:_of_class": 27,
-    "rosafe/sound/bagsound.py:_pick": 15,
-    "rosafe/tree/trace.py:summary": 16,
-    "rosafe/view/dataset.py:to_xarray": 15,
-    "rosafe/view/plot.py:_plane": 16,
-}
 _BRANCHES = (ast.If, ast.For, ast.AsyncFor, ast.While, ast.IfExp, ast.ExceptHandler, ast.comprehension)
 
 
+@functools.cache
+def modules() -> dict[Path, ast.Module]:
+    """Return all modules of the package, parsed."""
+    return {path: ast.parse(path.read_text("utf-8")) for path in sorted(PACKAGE.rglob("*.py"))}
+
+
 def classes() -> Iterator[tuple[Path, ast.ClassDef]]:
-    for path, module in MODULES.items():
+    for path, module in modules().items():
         for node in ast.walk(module):
             if isinstance(node, ast.ClassDef):
                 yield path, node
@@ -108,18 +68,16 @@ def test_the_size_of_classes_is_limited() -> None:
         lines, attributes = (node.end_lineno or 0) - node.lineno + 1, len(assigned_on_self(node))
         if lines > MAX_CLASS_LINES or attributes > MAX_ATTRIBUTES:
             found[f"{path.relative_to(ROOT)}:{node.name}"] = (lines, attributes)
-    assert found.keys() == TOO_LARGE.keys()
-    assert not {name for name, size in found.items() if size[0] > TOO_LARGE[name][0] or size[1] > TOO_LARGE[name][1]}
+    assert not found
 
 
 def test_the_complexity_of_functions_is_limited() -> None:
     found = {}
-    for path, module in MODULES.items():
+    for path, module in modules().items():
         for node in ast.walk(module):
             if isinstance(node, Function) and complexity(node) > MAX_COMPLEXITY:
                 found[f"{path.relative_to(ROOT)}:{node.name}"] = complexity(node)
-    assert found.keys() == TOO_COMPLEX.keys(), found
-    assert not {name for name, figure in found.items() if figure > TOO_COMPLEX[name]}
+    assert not found
 
 
 def test_complexity_counts_each_branch_once() -> None:
@@ -141,38 +99,43 @@ def test_each_class_has_a_name_of_its_own() -> None:
 
 # Marked sentences for each folder, in per cent. A figure may only fall: lower it when the text has become better.
 MAX_MARKED_PERCENT: dict[str, float] = {
-    "benchmarks": 15.0,
+    "benchmarks": 0.2,
     "cmake": 0.0,
-    "docs": 19.5,
-    "examples": 25.0,
-    "matlab": 21.7,
-    "rosafe": 20.8,
-    "rosafe/bass": 23.8,
-    "rosafe/client": 23.0,
-    "rosafe/commands": 23.5,
-    "rosafe/component": 24.3,
-    "rosafe/declarations": 16.5,
-    "rosafe/demo": 25.3,
-    "rosafe/dsp": 16.6,
-    "rosafe/eltclsh": 23.6,
-    "rosafe/genomix": 24.2,
-    "rosafe/http_server": 10.8,
-    "rosafe/interface": 18.1,
-    "rosafe/live": 28.7,
-    "rosafe/node": 27.3,
-    "rosafe/offline": 23.6,
-    "rosafe/representations": 15.4,
-    "rosafe/setups": 27.3,
-    "rosafe/sound": 21.0,
-    "rosafe/transport": 29.7,
-    "rosafe/tree": 16.0,
-    "rosafe/view": 28.8,
+    "debian": 0.0,
+    "docs": 0.9,
+    "examples": 0.0,
+    "matlab": 2.0,
+    "paper": 0.0,
+    "rosafe": 0.8,
+    "rosafe/bass": 0.9,
+    "rosafe/client": 2.9,
+    "rosafe/commands": 1.5,
+    "rosafe/component": 0.6,
+    "rosafe/declarations": 2.0,
+    "rosafe/demo": 1.5,
+    "rosafe/dsp": 2.0,
+    "rosafe/eltclsh": 1.6,
+    "rosafe/genomix": 0.5,
+    "rosafe/http_server": 0.8,
+    "rosafe/interface": 2.9,
+    "rosafe/live": 1.0,
+    "rosafe/localization": 1.5,
+    "rosafe/localizer_node": 0.7,
+    "rosafe/node": 1.0,
+    "rosafe/offline": 1.0,
+    "rosafe/representations": 1.0,
+    "rosafe/setups": 1.4,
+    "rosafe/sound": 2.4,
+    "rosafe/transport": 1.6,
+    "rosafe/tree": 1.2,
+    "rosafe/validation": 0.0,
+    "rosafe/view": 2.3,
     "rosafe/vocabulary": 0.0,
-    "scripts": 37.5,
-    "systemd": 30.8,
-    "tcl": 28.8,
-    "tests": 17.6,
-    "top": 19.8,
+    "scripts": 0.0,
+    "systemd": 0.0,
+    "tcl": 2.3,
+    "tests": 1.9,
+    "top": 1.7,
 }
 SLACK_PERCENT = 1.0  # how far the text may be better than its figure
 

@@ -1,14 +1,16 @@
-"""pip: a wheel and an sdist are built, and the library works in an environment that has neither ROS nor the rest.
+"""pip: a wheel and an sdist are built, and the library works in an environment without ROS and optional packages.
 
-The environment holds what the wheel says that it depends on, taken from Debian's packages rather than from PyPI: a
-folder of links. So there is no network in this, and what is not linked is really absent.
+The environment has only the dependencies of the wheel: links to Debian's packages instead of downloads from PyPI. The
+tests need no network, and all other packages are absent.
 """
 
 from __future__ import annotations
 
 import email
+import filecmp
 import json
 import os
+import re
 import shutil
 import subprocess
 import tarfile
@@ -24,14 +26,14 @@ from tests.harness import PYTHON, ROOT
 from tests.packaging.clone import environment, fresh_copy, run
 
 DEBIAN = Path("/usr/lib/python3/dist-packages")
-NEEDED = ["numpy", "scipy", "soundfile.py", "_soundfile.py", "cffi", "_cffi_backend*.so", "pycparser", "ply"]
+NEEDED = ["numpy", "scipy", "tqdm", "soundfile.py", "_soundfile.py", "cffi", "_cffi_backend*.so", "pycparser", "ply"]
 FOR_TESTS = ["pytest", "_pytest", "py", "py.py", "pluggy", "iniconfig", "packaging", "attr", "attrs", "hypothesis"]
 FOR_TESTS += ["sortedcontainers"]
 BUILD = "import setuptools.build_meta as backend, sys; getattr(backend, sys.argv[1])(sys.argv[2])"
 
 
 class Venv:
-    """An environment with the wheel in it."""
+    """A virtual environment with the wheel."""
 
     def __init__(self, folder: Path, wheel: Path) -> None:
         self.folder = folder
@@ -44,14 +46,14 @@ class Venv:
         subprocess.run([*map(str, pip)], check=True, capture_output=True, env=environment())
 
     def run(self, *command: str | Path, cwd: Path | None = None, **env: str) -> subprocess.CompletedProcess[str]:
-        """A program of the environment, without anything of this checkout."""
+        """Run a program of the environment, without access to this checkout."""
         name, *arguments = command
         path = f"{self.folder / 'bin'}:/usr/bin:/bin"
         variables = environment(**{"PATH": path, **env})
         return run(self.folder / "bin" / name, *arguments, env=variables, cwd=cwd or self.folder)
 
     def python(self, program: str, **env: str) -> str:
-        """What a program in Python prints."""
+        """Run Python code and return its output."""
         done = self.run("python", "-c", program, cwd=None, **env)
         assert (done.returncode, done.stderr) == (0, ""), done
         return done.stdout.strip()
@@ -59,15 +61,17 @@ class Venv:
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Path]]:
-    """The wheel, and the sdist, of a fresh copy of this checkout, with Debian's setuptools."""
-    folder = tmp_path_factory.mktemp("built")
-    made = {}
+    """The sdist of a new copy of this checkout, and the wheel that is built from it, with Debian's setuptools."""
+    yield build_both(tmp_path_factory.mktemp("built"))
+
+
+def build_both(folder: Path) -> dict[str, Path]:
     with fresh_copy() as copy:
-        for kind in ("wheel", "sdist"):
-            done = run(PYTHON, "-c", BUILD, f"build_{kind}", folder / kind, env=environment(), cwd=copy)
-            assert done.returncode == 0, done.stderr
-            (made[kind],) = (folder / kind).iterdir()
-    yield made
+        done = run(copy / "scripts" / "make-wheel", folder, env=environment(SOURCE_DATE_EPOCH="1700000000"))
+    assert done.returncode == 0, done.stdout + done.stderr
+    sdist, wheel = map(Path, done.stdout.splitlines())
+    assert sorted(folder.iterdir()) == sorted([sdist, wheel])
+    return {"sdist": sdist, "wheel": wheel}
 
 
 @pytest.fixture(scope="module")
@@ -83,37 +87,49 @@ def files_of_the_package() -> set[str]:
     }
 
 
-def test_all_files_are_in_the_wheel_and_in_the_sdist(built: dict[str, Path]) -> None:
-    """Whoever adds a folder or a kind of file is told here."""
+def test_wheel_and_sdist_have_all_files(built: dict[str, Path]) -> None:
+    """This fails for a new folder or type of file that is missing in them."""
     with zipfile.ZipFile(built["wheel"]) as wheel:
-        names = {name for name in wheel.namelist() if name.startswith("rosafe/")}
+        names = {name for name in wheel.namelist() if name.startswith("rosafe/") and not name.endswith("/")}
         metadata = email.message_from_bytes(wheel.read(f"rosafe-{VERSION}.dist-info/METADATA"))
     libraries = {name for name in names if name.endswith(".so")}
     sums = {name for name in names if name.endswith(f"/{build.SUMS}")}
     assert names - libraries - sums == files_of_the_package() and len(sums) == bool(libraries)
     if shutil.which("gcc") and os.uname().machine == "x86_64":
         assert {Path(name).stem for name in libraries} == set(build.ISA_LEVELS["x86_64"].values())
-        assert built["wheel"].name == f"rosafe-{VERSION}-py3-none-linux_x86_64.whl"
+        # auditwheel determines the manylinux tag from the symbols that the libraries need of the C library.
+        assert re.fullmatch(rf"rosafe-{re.escape(VERSION)}-py3-none-manylinux_2_\d+_x86_64.whl", built["wheel"].name)
     assert (metadata["Name"], metadata["Version"]) == ("rosafe", VERSION)
     assert metadata["Requires-Python"] == ">=3.10" and metadata["Summary"] and metadata["Author-email"]
-    assert set(metadata.get_all("Provides-Extra", [])) == {"plot", "files", "dask", "all"}
+    assert set(metadata.get_all("Provides-Extra", [])) == {"plot", "files", "dask", "notebook", "all"}
     with tarfile.open(built["sdist"]) as sdist:
         sources = {name.partition("/")[2] for name in sdist.getnames()}
     assert files_of_the_package() | {"pyproject.toml", "README.md", "LICENSE", "CHANGELOG.md"} <= sources
-    assert not any(name.endswith(".so") for name in sources)
+    for folder in ("docs", "examples"):
+        own = {path.relative_to(ROOT).as_posix() for path in (ROOT / folder).rglob("*") if path.is_file()}
+        assert {name for name in own if "__pycache__" not in name} <= sources
+    assert not any(name.endswith((".so", ".pyc")) or name.startswith(("tests", "build")) for name in sources)
 
 
-def test_the_version_stands_once() -> None:
+@pytest.mark.exploration
+def test_two_builds_are_equal(built: dict[str, Path], tmp_path: Path) -> None:
+    for kind, path in build_both(tmp_path).items():
+        assert filecmp.cmp(path, built[kind], shallow=False), path.name
+
+
+def test_version_is_defined_once() -> None:
     assert VERSION not in (ROOT / "pyproject.toml").read_text("utf-8")
 
 
 def test_library_tests_in_the_environment(venv: Venv, tmp_path: Path) -> None:
-    """Some of this suite, beside no checkout: files, arguments, changes, and the same numbers as everywhere."""
+    """A part of this suite without a checkout: files, arguments, changes, and the reference numbers."""
     (tmp_path / "tests").mkdir()
-    for name in ("__init__.py", "harness.py", "offline", "dsp", "representations", "tree", "vectors"):
-        there = ROOT / "tests" / name
-        copy = shutil.copytree if there.is_dir() else shutil.copy
-        copy(there, tmp_path / "tests" / name)
+    modules = ("__init__.py", "harness.py", "fork_server.py")
+    for source in (
+        ROOT / "tests" / name for name in (*modules, "offline", "dsp", "representations", "tree", "vectors")
+    ):
+        copy = shutil.copytree if source.is_dir() else shutil.copy
+        copy(source, tmp_path / "tests" / source.name)
     (tmp_path / "pytest.ini").write_text(
         "[pytest]\naddopts = --import-mode=importlib -p no:cacheprovider\npythonpath=.\n"
     )
@@ -124,50 +140,50 @@ def test_library_tests_in_the_environment(venv: Venv, tmp_path: Path) -> None:
     assert not (tmp_path / "rosafe").exists()
 
 
-def test_it_is_the_wheel_that_works(venv: Venv) -> None:
-    """With its kernels, with the twins, and with the numbers of the checkout."""
+def test_results_of_the_wheel(venv: Venv) -> None:
+    """With its kernels and with numpy, the numbers are those of the checkout."""
     program = (
         "import json, numpy, rosafe; from rosafe.dsp import kernels; "
         "x = numpy.random.default_rng(1).standard_normal((2, 4000)); "
         "r = rosafe.process(x, 16000, parameters={'fb_cfHz': [200.0, 1000.0]}, outputs=['ild', 'ratemap']); "
         "print(json.dumps([rosafe.__file__, kernels.compiled(), float(r['ild'].sum()), float(r['ratemap'].sum())]))"
     )
-    here = json.loads(run(PYTHON, "-c", program, env=environment(PYTHONPATH=str(ROOT))).stdout)
-    there, twins = json.loads(venv.python(program)), json.loads(venv.python(program, ROSAFE_KERNELS="0"))
-    assert Path(there[0]).is_relative_to(venv.packages)
-    assert there[1:] == here[1:]
-    assert not twins[1] and twins[2:] == pytest.approx(here[2:], rel=1e-9)
+    expected = json.loads(run(PYTHON, "-c", program, env=environment(PYTHONPATH=str(ROOT))).stdout)
+    kernels, numpy = json.loads(venv.python(program)), json.loads(venv.python(program, ROSAFE_KERNELS="0"))
+    assert Path(kernels[0]).is_relative_to(venv.packages)
+    assert kernels[1:] == expected[1:]
+    assert not numpy[1] and numpy[2:] == pytest.approx(expected[2:], rel=1e-9)
 
 
-def test_the_command_and_what_it_says_of_what_is_absent(venv: Venv, tmp_path: Path) -> None:
+def test_command_reports_missing_packages(venv: Venv, tmp_path: Path) -> None:
     assert venv.run("rosafe", "--version").stdout == f"rosafe {VERSION}\n"
     sound = tmp_path / "x.wav"
     assert venv.run("rosafe", "record", sound, "--device", "scene:", "--seconds", "0.2", "-q").returncode == 0
     done = venv.run("rosafe", "process", sound, "-o", tmp_path / "x.npz", "--outputs", "ild")
     assert done.returncode == 0 and (tmp_path / "x.npz").stat().st_size > 0, done
     doctor = venv.run("rosafe", "doctor", "--json")
-    told = json.loads(doctor.stdout)
-    assert doctor.returncode == 0 and told["ok"], doctor
-    state = {check["name"]: check for check in told["checks"]}
+    report = json.loads(doctor.stdout)
+    assert doctor.returncode == 0 and report["ok"], doctor
+    state = {check["name"]: check for check in report["checks"]}
     assert (state["python"]["state"], state["ROS"]["state"], state["plots"]["state"]) == ("ok", "note", "note")
     assert "x86-64" in state["kernels"]["detail"] or "numpy and scipy: " in state["kernels"]["detail"]
     cases: list[tuple[list[str | Path], str]] = [
-        (["plot", sound], "matplotlib is not installed; pip install 'rosafe[plot]'"),
-        (["record", "--seconds", "1"], "is not installed; pip does not bring it: run scripts/install of a checkout"),
-        (["trace"], "is not installed; pip does not bring it"),
-        (["request", "ratemap"], "genpy is not installed; pip does not bring it: run scripts/install of a checkout"),
-        (["live"], "genpy is not installed; pip does not bring it"),
-        (["up"], "yaml is not installed; pip does not bring it"),
-        (["setup", "save", "x.yaml"], "yaml is not installed; pip does not bring it"),
+        (["plot", sound], "matplotlib is not installed; pip install '.[plot]' in a checkout"),
+        (["record", "--seconds", "1"], "is not installed; pip does not install it: run scripts/install of a checkout"),
+        (["trace"], "is not installed; pip does not install it"),
+        (["request", "ratemap"], "genpy is not installed; pip does not install it: run scripts/install of a checkout"),
+        (["live"], "genpy is not installed; pip does not install it"),
+        (["up"], "yaml is not installed; pip does not install it"),
+        (["setup", "save", "x.yaml"], "yaml is not installed; pip does not install it"),
     ]
-    for arguments, words in cases:
+    for arguments, message in cases:
         done = venv.run("rosafe", *arguments)
         assert (done.returncode, done.stdout, done.stderr.count("\n")) == (1, "", 1), done
-        assert words in done.stderr
+        assert message in done.stderr
 
 
 def test_without_a_compiler(tmp_path: Path) -> None:
-    """The wheel is there all the same, for any machine, and says that the twins serve."""
+    """The wheel is built for any machine, and the status reports that numpy and scipy are used."""
     programs = tmp_path / "bin"
     programs.mkdir()
     env = environment(PATH=str(programs))

@@ -1,1 +1,1 @@
-"""Tests of representations of somebody else's."""
+"""Tests of plugins."""

@@ -1,4 +1,4 @@
-"""Plugins for tests: nine good ones, and one with each kind of fault at run time."""
+"""Plugins for tests: nine valid ones, and one with each kind of fault at run time."""
 
 from __future__ import annotations
 
@@ -55,17 +55,17 @@ DERIVED = 'derived=(Derived("my_count", "unsigned long", "Number"),)'
 
 
 class Fault(NamedTuple):
-    """A plugin with a fault: what it overrides, what is said of it, and what else is declared."""
+    """A plugin with a fault: the overriding code, the expected error, and further declarations."""
 
     text: str
     body: str
-    told: str
+    expected_text: str
     declared: str = ""
-    at_run_time: bool = True  # else only the author's check finds it
+    at_run_time: bool = True  # otherwise only the check command finds it
 
 
 def process(*lines: str) -> str:
-    """A method `process`."""
+    """Return the source of a method `process`."""
     return "\n".join(["    def process(self, block, extra=None):", *(f"        {line}" for line in lines)])
 
 
@@ -164,7 +164,7 @@ FAULTS: Mapping[str, Fault] = {
         + "\n    def build(self, values, changed):"
         + "\n        self.factor = getattr(self, 'factor', [2.0])"
         + "\n        self.factor[0] += 1",
-        "build must make new objects",
+        "build must create new objects",
         at_run_time=False,
     ),
     "no reset": Fault(
@@ -205,7 +205,7 @@ FAULTS: Mapping[str, Fault] = {
     "derived no dict": Fault(PLAIN, _property("derived", "return [3]"), "derived: expected a dict", DERIVED),
     "parameters raise": Fault(PLAIN, _property("parameters", "raise RuntimeError('never')"), "RuntimeError: never"),
     "built wrongly": Fault(PLAIN, "    def build(self, values, changed):\n        values['other']", "KeyError"),
-    "no format": Fault(PLAIN, _property("output_format", "return 100.0"), "output_format: expected a Signal"),
+    "no format": Fault(PLAIN, _property("output_format", "return 100.0"), "output_format: expected a SignalFormat"),
     "refuses without a name": Fault(
         PLAIN,
         "    def build(self, values, changed):\n        if values['my_factor'] > 3:\n"
@@ -217,7 +217,7 @@ FAULTS: Mapping[str, Fault] = {
 
 
 def text_of(fault: Fault) -> str:
-    """The plugin's file."""
+    """Return the source of the plugin."""
     plugin = fault.text.format(parameters=FACTOR, declared=fault.declared)
     if fault.declared.startswith("parts"):
         plugin = plugin.replace('axes=("ear", "channel", "time"),', "")
@@ -225,7 +225,7 @@ def text_of(fault: Fault) -> str:
 
 
 def loaded(path: Path, name: str = "mine_for_tests") -> type[Stage]:
-    """The representation of a file."""
+    """Load the representation in a file."""
     spec = importlib.util.spec_from_file_location(name, path)
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)

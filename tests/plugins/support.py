@@ -10,7 +10,7 @@ from tests.harness import PATIENCE, PYTHON, ROOT
 
 
 def python(code: str, folder: Path, **env: str) -> subprocess.CompletedProcess[str]:
-    """What `code` does in a process of its own whose plugins are in `folder`."""
+    """Run `code` in a new process whose plugins are in `folder`."""
     return subprocess.run(
         [PYTHON, "-c", code],
         env={**os.environ, "PYTHONPATH": str(ROOT), "ROSAFE_PLUGINS": str(folder), **env},

@@ -1,4 +1,4 @@
-"""Broken declarations: each is left out alone, with its file, its kind and the reason."""
+"""Invalid declarations: only the affected plugin is left out, and reported with file, kind and reason."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import pytest
 
+from rosafe.declarations.representation import Derived
 from rosafe.declarations.signals import layout
 from rosafe.interface import KINDS, ROSAFE
 from rosafe.representations import checks
@@ -31,7 +32,7 @@ TWO_PARTS = 'parts=(Part("one", ("channel", "time")), Part("two", ("channel", "t
 
 
 class Case(NamedTuple):
-    """What is replaced in the good plugin by what, and what is said of it."""
+    """A replacement in the valid plugin, and the expected reason."""
 
     old: str
     new: str
@@ -43,7 +44,7 @@ PARAMETER = 'Parameter("{kind}_gain", "double", 1.0, "Gain", minimum=0.0, maximu
 
 
 def _field(name: str, value: str, reason: str) -> Case:
-    """Another field of Representation."""
+    """Return a case with a further field of Representation."""
     return Case('doc="What', f'{name}={value}, doc="What', reason)
 
 
@@ -79,8 +80,8 @@ CASES = [
     # parent
     Case('parent="ihc"', 'parent=""', "parent: expected a kind of processor"),
     Case('parent="ihc"', "parent=None", "parent: expected a string"),
-    Case('parent="ihc"', 'parent="nobody"', "parent: 'nobody' is not a known kind"),
-    Case('parent="ihc"', 'parent="{kind}"', "is not a known kind"),
+    Case('parent="ihc"', 'parent="nobody"', "got 'nobody'"),
+    Case('parent="ihc"', 'parent="{kind}"', "parent: expected one of "),
     # axes and parts
     *(
         Case(AXES, f"axes={axes}", reason)
@@ -149,8 +150,8 @@ CASES = [
         _field("derived", f"(Derived({text}),)", reason)
         for text, reason in (
             ('"{kind}_x", "double", "Doc"', "the property derived is missing"),
-            ('"{kind}_x", "quaternion", "Doc"', "type: expected a type of parameters"),
-            ('"{kind}_x", None, "Doc"', "type: expected a type of parameters"),
+            ('"{kind}_x", "quaternion", "Doc"', "type: expected one of"),
+            ('"{kind}_x", None, "Doc"', "type: expected one of"),
             ('"", "double", "Doc"', "expected a name"),
             ('"{kind}_x", "double", 5', "expected one line of text"),
             ('"{kind}_gain", "double", "Doc"', "or a derived value, are called"),
@@ -204,7 +205,7 @@ CASES = [
             ('"double", 1.0, "Doc", minimum=True', "minimum: expected a finite number"),
             ('"double", 1.0, "Doc", open_minimum=1', "open_minimum: expected True or False"),
             ('"double", 1.0, "Doc", unit=5', "unit: expected one line"),
-            ('"double", 1.0, "Doc", choices=("1",)', "choices: only a string has any"),
+            ('"double", 1.0, "Doc", choices=("1",)', "choices: expected none for the type double"),
             ('"unsigned long", -1, "Doc"', "default: "),
             ('"unsigned long", 1.5, "Doc"', "default: "),
             ('"boolean", "yes", "Doc"', "default: "),
@@ -249,7 +250,7 @@ CASES = [
     Case(
         "class Mine(Stage):",
         'class Mine(FramedStage):\n    prefix = "other"',
-        "prefix: there is no parameter other_wname",
+        "prefix: expected frame_parameters('other'), which declare other_wname",
     ),
     # the module
     Case("import numpy as np", "import nothing_like_this", "ModuleNotFoundError"),
@@ -265,7 +266,7 @@ CASES = [
 
 @pytest.fixture(scope="module")
 def loaded(tmp_path_factory: pytest.TempPathFactory) -> dict[str, list[str]]:
-    """What a process with all of these, and a good one, says of each, after everything has been used."""
+    """Return the problems in a process with all of these plugins and a valid one, which is used."""
     folder = tmp_path_factory.mktemp("plugins")
     (folder / "good.py").write_text(GOOD.format(kind="good"))
     for number, case in enumerate(CASES):
@@ -284,18 +285,18 @@ print(json.dumps({"problems": PROBLEMS, "kinds": sorted(set(STAGES) - BUILTIN)})
 """
     done = python(code, folder)
     assert done.returncode == 0, done.stderr
-    told: dict[str, list[str]] = json.loads(done.stdout)
-    return told
+    reported: dict[str, list[str]] = json.loads(done.stdout)
+    return reported
 
 
-def test_only_the_good_one_is_left(loaded: dict[str, list[str]]) -> None:
+def test_only_the_valid_plugin_is_loaded(loaded: dict[str, list[str]]) -> None:
     assert loaded["kinds"] == ["good"]
     assert len(loaded["problems"]) == len(CASES)
     assert len(CASES) >= 60
 
 
 @pytest.mark.parametrize("number", range(len(CASES)), ids=lambda number: f"{number}-{CASES[number].reason[:40]}")
-def test_it_is_named_with_the_reason(loaded: dict[str, list[str]], number: int) -> None:
+def test_the_problem_contains_the_reason(loaded: dict[str, list[str]], number: int) -> None:
     (line,) = [line for line in loaded["problems"] if f"/case{number}.py: " in line]
     assert CASES[number].reason in line
     assert "\n" not in line
@@ -303,6 +304,10 @@ def test_it_is_named_with_the_reason(loaded: dict[str, list[str]], number: int) 
     kind_itself = "kind=" in CASES[number].new or "Parameter(" in CASES[number].new or "Part(" in CASES[number].new
     if not (fails_first or kind_itself or "Derived(" in CASES[number].new or "{{" in CASES[number].new):
         assert f"kind{number}" in line
+
+
+def test_a_derived_value_needs_no_description() -> None:
+    assert Derived("own_x", "double", "").doc == ""
 
 
 def test_the_reserved_names_are_those_of_the_component() -> None:

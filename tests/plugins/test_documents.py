@@ -1,4 +1,4 @@
-"""Each example of docs/own-representation.md works as it stands, and its plugins pass the author's check."""
+"""The examples of docs/own-representation.md work unchanged, and their plugins pass the check command."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ NAME = re.compile(r"ave (?:this|it) as\s+`(\w+\.py)`")
 
 
 def plugins() -> dict[str, str]:
-    """The plugin files, by the names that they are to be saved under."""
+    """Return the plugin files by name."""
     found = {}
     for block in BLOCK.finditer(TEXT):
         if "rosafe.plugin import" in block[1]:
@@ -27,13 +27,13 @@ def plugins() -> dict[str, str]:
 
 
 def scripts() -> list[str]:
-    """All other examples in Python."""
+    """Return all other examples in Python."""
     return [block[1] for block in BLOCK.finditer(TEXT) if "rosafe.plugin import" not in block[1]]
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """All plugins of the page; without numba, the one that needs it is left out."""
+    """Return a folder with all plugins of the page, except the one for numba if it is not installed."""
     path = tmp_path_factory.mktemp("plugins")
     for name, text in plugins().items():
         if "numba" not in text or importlib.util.find_spec("numba"):

@@ -1,4 +1,4 @@
-"""Stages that fail, or do not return, in the tree: they are named, and the others continue."""
+"""Stages that fail or do not return in the tree: they are reported, and the others continue."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Use = Callable[[Fault], Path]
 
 @pytest.fixture
 def use(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Use:
-    """Make a plugin known to this process, as the registry does, and one below it."""
+    """Register a plugin and a child of it in this process, as the registry does."""
 
     def install(fault: Fault) -> Path:
         for kind, text in (
@@ -43,7 +43,7 @@ def use(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Use:
 
 @pytest.fixture
 def tree() -> Iterator[tuple[Tree, Recorder, Feed]]:
-    """The tree of the guide."""
+    """Return the tree of the guide."""
     listener, feed = Recorder(), Feed(frames=1600)
     tree = Tree(listener, workers=2)
     grow(tree, feed)
@@ -52,7 +52,7 @@ def tree() -> Iterator[tuple[Tree, Recorder, Feed]]:
 
 
 def feed_sound(frames: int) -> np.ndarray:
-    """What `Feed.put` makes."""
+    """Put sound into the tree."""
     return np.broadcast_to(np.arange(frames, dtype=float), (2, frames))
 
 
@@ -71,13 +71,13 @@ def test_a_failure_names_the_place_and_the_children(use: Use, tree: tuple[Tree, 
     assert str(failure).endswith("; ended with it: second")
     with pytest.raises(ComponentError, match=r"no processor 'first': first \(mine\) failed"):
         this.find("first")
-    # The parent's numbers are those of a tree without the plugin, and the others continue.
+    # The output of the parent equals that of a tree without the plugin, and the others continue.
     feed.put(count=2)
     ratemap = this.find("ratemap")
     listener.wait_blocks(ratemap, 4)
     expected = rosafe.process(feed_sound(6400), RATE, parameters=CHANNELS, outputs=["ratemap"], block_frames=1600)
     np.testing.assert_array_equal(listener.data(ratemap), expected["ratemap"])
-    # A new processor of that name is a new beginning.
+    # A new processor with that name has a new state.
     this.add("mine", "first", "ratemap")
     assert this.failures == []
 
@@ -89,13 +89,13 @@ def test_values_that_cannot_be_reported_end_their_processor(use: Use, tree: tupl
     use(fault._replace(body=f"    late = False\n{body}"))
     mine = this.add("mine", "first", "ratemap")
     type(mine.stage).PLUGIN.late = True  # type: ignore[attr-defined]
-    this.modify("gammatone", "fb_nChannels", "6")  # which concerns all below it
+    this.modify("gammatone", "fb_nChannels", "6")  # affects all processors below it
     assert mine in listener.ends
     assert "derived: ZeroDivisionError" in str(this.failures[0])
     assert this.find("ratemap").output_shape == (2, 6)
 
 
-def test_a_stage_that_does_not_return_stops_nobody_else(use: Use, tree: tuple[Tree, Recorder, Feed]) -> None:
+def test_a_stage_that_does_not_return_blocks_no_other(use: Use, tree: tuple[Tree, Recorder, Feed]) -> None:
     this, listener, feed = tree
     released = threading.Event()
     use(Fault(PLAIN, "    waits = None\n" + process("self.waits.wait()", "return block * 2"), ""))
@@ -109,7 +109,7 @@ def test_a_stage_that_does_not_return_stops_nobody_else(use: Use, tree: tuple[Tr
     listener.wait_blocks(this.find("ratemap"), 6)
     assert mine.state is State.EXEC
     assert listener.blocks[mine] == []
-    # It takes part again once it returns.
+    # It continues after it returns.
     released.set()
     listener.wait_blocks(mine, 1)
     feed.put(count=2)

@@ -1,4 +1,4 @@
-"""Plugins with faults: found by the author's check, and at run time they end with one error that names their place."""
+"""Plugins with faults: the check command finds them, and at run time they end with one error with file and line."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def test_the_check_finds_each_fault(tmp_path: Path, name: str) -> None:
     path.write_text(text_of(FAULTS[name]))
     with pytest.raises(AssertionError) as caught:
         check_representation(loaded(path), seconds=0.06)
-    assert FAULTS[name].told in str(caught.value)
+    assert FAULTS[name].expected_text in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
@@ -44,7 +44,7 @@ def test_good_ones_pass(tmp_path: Path, text: str) -> None:
 
 @pytest.fixture
 def use(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Path]:
-    """Make a plugin with a fault known to this process, as the registry does."""
+    """Register a plugin with a fault in this process, as the registry does."""
 
     def install(name: str) -> Path:
         path = tmp_path / "mine.py"
@@ -70,28 +70,28 @@ def test_python_raises_an_error_with_kind_and_place(use: Callable[[str], Path], 
     for run in (process, stream):
         with pytest.raises(ValueError, match=f"plugin mine .{re.escape(str(path))}:[0-9]+") as caught:
             run()
-        assert FAULTS[name].told in str(caught.value)
+        assert FAULTS[name].expected_text in str(caught.value)
 
 
 def test_the_command_tries_the_stage(tmp_path: Path) -> None:
-    """One that passes, with its cost; one that depends on blocks; and one that ends the process."""
+    """A plugin that passes, with its running time; one that depends on block boundaries; one that ends the process."""
     good, bad, ends = (tmp_path / f"{name}.py" for name in ("good", "bad", "ends"))
     good.write_text(text_of(Fault(PLAIN, "", "")))
     bad.write_text(text_of(FAULTS["depends on blocks"]))
     ends.write_text(text_of(Fault(PLAIN, process("import os", "os._exit(7)"), "")))
-    for path, code, told in (
+    for path, code, expected_text in (
         (good, 0, "mine takes "),
         (bad, 1, f"{bad}: mine: the output depends on blocks"),
-        (ends, 1, f"{ends}: mine: the process that tried it ended with exit status 7"),
+        (ends, 1, f"{ends}: mine: the process that tested it ended with exit status 7"),
     ):
         command = ["-m", "rosafe.commands", "check", str(path)]
         done = subprocess.run([PYTHON, *command], cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE)
         assert (done.returncode, "Traceback" in done.stderr) == (code, False), done
-        assert told in done.stdout
+        assert expected_text in done.stdout
 
 
 def test_a_variant_of_the_pitch_has_no_pitch_for_silence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its numbers are those of the pitch: NaN for none."""
+    """Its output is that of the pitch: NaN if there is none."""
     path = tmp_path / "mine.py"
     path.write_text(
         "from rosafe.plugin import variant\nfrom rosafe.representations import pitch\n"

@@ -1,4 +1,4 @@
-"""Nine plugins work through every interface: Python, ROS, HTTP, Tcl, setups and the live page."""
+"""Nine plugins work in all interfaces: Python, ROS, HTTP, Tcl, setups and the live page."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ NAMES = {kind: f"{'nth' if kind == 'everyNth' else kind}_0" for kind in KINDS}  
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The nine plugins."""
+    """Return a folder with the nine plugins."""
     path = tmp_path_factory.mktemp("plugins")
     for name in ("zerocrossings.py", "bands.py", "slowratemap.py"):
         (path / name).write_text(plugins()[name])
@@ -55,8 +55,8 @@ print(json.dumps({{name: bool(np.allclose(joined[name], result[name]) and result
 """
     done = python(code, folder)
     assert done.returncode == 0, done.stderr
-    told = json.loads(done.stdout)
-    assert all(told.values()) and len(told) == len(KINDS) + 2
+    reported = json.loads(done.stdout)
+    assert all(reported.values()) and len(reported) == len(KINDS) + 2
 
 
 @pytest.mark.ros
@@ -65,17 +65,17 @@ def test_in_a_running_node(folder: Path) -> None:
         world.http.send("bass/Acquire", ["scene:"])
         world.http.call("rosAFE/connect_port", ["Audio", "bass/Audio"])
 
-        # the live page builds them, and shows a picture of each
+        # the live page creates and plots each of them
         async def scenario(address: Any) -> None:
             async with page(address) as client:
                 for kind in KINDS:
                     answer: dict[str, Any] = {}
-                    while "ok" not in answer:  # until there is sound
-                        answer = await client.ask("build", representation=kind, nFramesPerBlock=4410)
+                    while "ok" not in answer:  # until sound has arrived
+                        answer = await client.request("build", representation=kind, nFramesPerBlock=4410)
                         assert "ok" in answer or "e_noData" in answer["error"], answer
-                views = await client.look(*({"what": "picture", "name": name} for name in NAMES.values()))
+                views = await client.subscribe(*({"what": "picture", "name": name} for name in NAMES.values()))
                 while not all(client.pieces.get(view["number"]) for view in views):
-                    await client.hear()
+                    await client.receive()
 
         with live(world.graph) as shown:
             asyncio.run(asyncio.wait_for(scenario(shown), 120))

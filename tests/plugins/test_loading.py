@@ -1,4 +1,4 @@
-"""What plugins do at import does not reach others; where they are searched for; which files are not plugins."""
+"""Isolation of the import of plugins, the search path, and files that are not plugins."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ print(json.dumps([sorted(set(STAGES) - BUILTIN), PROBLEMS, WARNINGS, os.getcwd()
 
 
 def good(kind: str, first: str = "") -> str:
-    """A plugin that does something else first."""
+    """Return a plugin with further code at the top."""
     return f"{first}\n{GOOD.format(kind=kind)}"
 
 
@@ -36,8 +36,8 @@ def rosafe(*words: str, folder: Path, **env: str) -> subprocess.CompletedProcess
     )
 
 
-def test_what_it_does_at_import_stays_there(tmp_path: Path) -> None:
-    """Output, working directory, environment, search path and error state; the next one of the folder sees none."""
+def test_side_effects_of_an_import_are_undone(tmp_path: Path) -> None:
+    """Output, working directory, environment, search path and error handling do not affect the next plugin."""
     mischief = (
         "import os, sys, numpy\nprint('PRINTED')\nos.system('echo PRINTED')\nos.write(1, b'PRINTED')\n"
         "os.chdir('/')\nos.environ['PATH'] = ''\nsys.path.insert(0, '/nowhere')\nnumpy.seterr(all='raise')\n"
@@ -53,7 +53,7 @@ def test_what_it_does_at_import_stays_there(tmp_path: Path) -> None:
     assert done.stderr.count("PRINTED") == 3
 
 
-def test_the_shell_evaluates_nothing_that_it_prints(tmp_path: Path) -> None:
+def test_output_of_plugins_is_not_evaluated_by_the_shell(tmp_path: Path) -> None:
     touched = [tmp_path / name for name in ("one", "two", "three")]
     first = (
         f"import os, atexit\nprint('touch {touched[0]}')\nos.system('echo touch {touched[1]}')\n"
@@ -74,7 +74,7 @@ def test_the_shell_evaluates_nothing_that_it_prints(tmp_path: Path) -> None:
 
 
 def test_files_that_are_not_plugins(tmp_path: Path) -> None:
-    """Helper modules are found, last on the path, and not reported; dataclasses find their module; two of one name."""
+    """Helper modules are found, last on the path, and not reported; dataclasses find their module; two equal names."""
     (tmp_path / "helper.py").write_text("VALUE = 3\n")
     (tmp_path / "json.py").write_text("raise RuntimeError('it replaced a module of Python')\n")
     for name in (".hidden", "_private", "test_it"):
@@ -110,7 +110,7 @@ def test_entry_points_name_modules_or_classes(tmp_path: Path) -> None:
         assert reason in line
 
 
-def test_folders_that_others_can_write_are_named(tmp_path: Path) -> None:
+def test_folders_that_others_can_write_are_reported(tmp_path: Path) -> None:
     (tmp_path / "mine.py").write_text(good("mine"))
     tmp_path.chmod(0o755)
     assert json.loads(python(SHOW, tmp_path).stdout)[2] == []
@@ -124,18 +124,18 @@ def test_folders_that_others_can_write_are_named(tmp_path: Path) -> None:
     ]
 
 
-def test_a_folder_that_cannot_be_read_is_named(tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_read_is_reported(tmp_path: Path) -> None:
     loop = tmp_path / "loop"
     loop.symlink_to(loop)
     _, problems, *_ = json.loads(python(SHOW, loop).stdout)
-    assert problems[0].startswith(f"{loop}: named in ROSAFE_PLUGINS, and not a folder that can be read: ")
+    assert problems[0].startswith(f"{loop}: ROSAFE_PLUGINS: expected a readable folder, got: ")
     file = tmp_path / "file"
     file.write_text("")
     _, problems, *_ = json.loads(python(SHOW, file).stdout)
     assert "Not a directory" in problems[0]
 
 
-def test_a_boolean_that_is_true_by_default_is_warned_of(tmp_path: Path) -> None:
+def test_a_boolean_with_the_default_true_gives_a_warning(tmp_path: Path) -> None:
     text = good("flagged").replace('"double", 1.0, "Gain", minimum=0.0, maximum=2.0', '"boolean", True, "Flag"')
     (tmp_path / "flagged.py").write_text(text)
     _, problems, (warning,), *_ = json.loads(python(SHOW, tmp_path).stdout)
@@ -148,7 +148,7 @@ def test_a_boolean_that_is_true_by_default_is_warned_of(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("words", [["--help"], ["--version"], ["nonsense"], ["record", "--help"], ["trace", "--help"]])
-def test_commands_that_compute_nothing_import_none(tmp_path: Path, words: list[str]) -> None:
+def test_commands_without_computation_import_no_plugins(tmp_path: Path, words: list[str]) -> None:
     seen = tmp_path / "seen"
     (tmp_path / "mine.py").write_text(good("mine", f"open({str(seen)!r}, 'w')"))
     rosafe(*words, folder=tmp_path)
@@ -163,18 +163,18 @@ def test_commands_that_compute_nothing_import_none(tmp_path: Path, words: list[s
         ("import signal; signal.pause()", "did not end within 10 s"),
     ],
 )
-def test_doctor_and_check_outlive_the_import(tmp_path: Path, first: str, reason: str) -> None:
+def test_doctor_and_check_survive_the_import(tmp_path: Path, first: str, reason: str) -> None:
     file = tmp_path / "ends.py"
     file.write_text(good("ends", first))
     done = rosafe("check", str(file), folder=Path())
     assert done.returncode == 1
     assert f"{file}: " in done.stdout and reason in done.stdout
     if "7" in first:
-        told = rosafe("doctor", folder=tmp_path).stdout
-        assert f"{file}: " in told and reason in told and "Traceback" not in told
+        reported = rosafe("doctor", folder=tmp_path).stdout
+        assert f"{file}: " in reported and reason in reported and "Traceback" not in reported
 
 
-def test_check_says_what_is_wrong_and_what_is_right(tmp_path: Path) -> None:
+def test_check_reports_failures_and_successes(tmp_path: Path) -> None:
     file = tmp_path / "mine.py"
     empty = tmp_path / "empty"
     empty.mkdir()
@@ -187,6 +187,6 @@ def test_check_says_what_is_wrong_and_what_is_right(tmp_path: Path) -> None:
     assert done.stdout.startswith(f"ERROR   {file}: ild: ")
     file.write_text("")
     done = rosafe("check", str(file), folder=empty)
-    assert done.returncode == 1 and "it defines no representation" in done.stdout
+    assert done.returncode == 1 and "expected a class with a REPRESENTATION" in done.stdout
     done = rosafe("check", str(tmp_path / "none.py"), folder=empty)
     assert done.returncode == 1 and "expected a Python file" in done.stderr

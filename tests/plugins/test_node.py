@@ -23,9 +23,9 @@ pytestmark = pytest.mark.ros
 BELOW = Fault(PLAIN.replace('"ratemap"', '"breaks"'), "", "")
 
 
-def gated(what: str, *lines: str) -> str:
-    """A method that does something else once the file `what` is there."""
-    return f"    import os\n\n    gate = os.path.join(os.path.dirname(__file__), '{what}')\n\n" + process(*lines)
+def gated(name: str, *lines: str) -> str:
+    """Return a method with another behaviour after the file `name` exists."""
+    return f"    import os\n\n    gate = os.path.join(os.path.dirname(__file__), '{name}')\n\n" + process(*lines)
 
 
 PLUGINS = {
@@ -51,7 +51,7 @@ PLUGINS = {
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The plugins, and the files that they look for."""
+    """Return a folder with the plugins and their control files."""
     path = tmp_path_factory.mktemp("plugins")
     for kind, fault in PLUGINS.items():
         text = text_of(fault).replace('kind="mine"', f'kind="{kind}"').replace("my_", f"{kind}_")
@@ -61,7 +61,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def world(folder: Path) -> Iterator[worlds.World]:
-    """Nodes that hear a scene, with a tree down to the ratemap."""
+    """Return nodes with sound of a scene and a tree down to the ratemap."""
     with mock.patch.dict(os.environ, ROSAFE_PLUGINS=str(folder)), worlds.world(folder.parent) as this:
         this.http.call("rosAFE/connect_port", ["Audio", "bass/Audio"])
         this.http.send("bass/Acquire", ["scene:"])
@@ -71,7 +71,7 @@ def world(folder: Path) -> Iterator[worlds.World]:
 
 
 def started(world: worlds.World) -> bool:
-    """Build the ratemap's tree; False if there is no sound yet."""
+    """Create the tree down to the ratemap; return False before sound has arrived."""
     try:
         world.http.call("rosAFE/request", {"representation": "ratemap", "nFramesPerBlock": 4410})
     except worlds.HttpError as problem:
@@ -81,7 +81,7 @@ def started(world: worlds.World) -> bool:
 
 
 def health(world: worlds.World) -> DiagnosticStatus:
-    """The processors' status of the next message."""
+    """Return the status of the processors in the next message."""
     for text in world.graph.run("rostopic", "echo", "-n", "3", "/diagnostics").stdout.split("---\n"):
         for status in (yaml.safe_load(text) or {}).get("status", ()):
             if status["name"] == "rosAFE: processors":
@@ -91,27 +91,27 @@ def health(world: worlds.World) -> DiagnosticStatus:
 
 
 def log(world: worlds.World) -> str:
-    """What the nodes have logged."""
+    """Return the logs of the nodes."""
     return "".join(path.read_text("utf-8", "replace") for path in (world.graph.home / ".ros").rglob("rosAFE*.log"))
 
 
 def make(world: worlds.World, kind: str, name: str, parent: str) -> None:
-    """A processor of `kind`."""
+    """Create a processor of `kind`."""
     world.http.send(f"rosAFE/{kind.capitalize()}Proc", {"name": name, "upperDepName": parent})
     wait_for(lambda: name in names(world))
 
 
 def names(world: worlds.World) -> list[str]:
-    """Of all processors."""
+    """Return the names of all processors."""
     return [p["name"] for p in world.http.call("rosAFE/getProcessors")["processors"]]
 
 
 def newest(world: worlds.World, name: str) -> Any:
-    """Index of the newest frame that a processor's output knows of."""
+    """Return the index of the newest frame of a processor."""
     return world.http.call("rosAFE/getRepresentation", [name])["parts"][0]["lastFrameIndex"]
 
 
-def test_a_request_for_a_plugin_that_fails_says_why(world: worlds.World, folder: Path) -> None:
+def test_a_request_for_a_plugin_that_fails_gives_the_reason(world: worlds.World, folder: Path) -> None:
     (folder / "broken").touch()
     done = world.graph.run("rosafe", "request", "breaks", check=False)
     assert done.returncode == 1
@@ -122,32 +122,32 @@ def test_a_request_for_a_plugin_that_fails_says_why(world: worlds.World, folder:
     (folder / "broken").unlink()
 
 
-def test_a_failure_is_an_error_that_names_the_children(world: worlds.World, folder: Path) -> None:
+def test_a_failure_is_an_error_with_the_names_of_the_children(world: worlds.World, folder: Path) -> None:
     make(world, "breaks", "first", "ratemap_0")
     make(world, "below", "second", "first")
     before = log(world).count("Traceback")
     (folder / "broken").touch()
     status = wait_for(lambda: (now := health(world)).level == DiagnosticStatus.ERROR and now)
     (folder / "broken").unlink()
-    told = next(v.value for v in status.values if v.key == "failed first")
+    reported = next(v.value for v in status.values if v.key == "failed first")
     assert re.match(
-        rf"first \(breaks\) failed: plugin breaks \({folder}/breaks.py:\d+\): process: OSError: no more", told
+        rf"first \(breaks\) failed: plugin breaks \({folder}/breaks.py:\d+\): process: OSError: no more", reported
     )
-    assert "; ended with it: second" in told
+    assert "; ended with it: second" in reported
     assert {"first", "second"}.isdisjoint(names(world))
     text = log(world)
     assert text.count("Traceback") - before == 1
     assert len(re.findall(r"\[ERROR\].*first \(breaks\) failed", text)) == 1
     page = Health("rosAFE", "bass")
     page._subscriber = object()
-    page._take(DiagnosticArray(status=[status]))
-    assert told in page.status()["failures"]
+    page._receive(DiagnosticArray(status=[status]))
+    assert reported in page.status()["failures"]
     make(world, "breaks", "first", "ratemap_0")
     wait_for(lambda: not any(v.key == "failed first" for v in health(world).values))
     world.http.call("rosAFE/removeProcessor", ["first"])
 
 
-def test_a_stage_that_does_not_return_is_named_and_stops_nobody(world: worlds.World, folder: Path) -> None:
+def test_a_stage_that_does_not_return_is_reported_and_blocks_no_other(world: worlds.World, folder: Path) -> None:
     make(world, "hangs", "stuck", "ratemap_0")
     text = wait_for(lambda: next((v.value for v in health(world).values if v.key == "slow stuck"), ""))
     assert text.startswith(f"stuck (plugin hangs ({folder}/hangs.py)) is slow: one call has been running for")
@@ -159,7 +159,7 @@ def test_a_stage_that_does_not_return_is_named_and_stops_nobody(world: worlds.Wo
     (folder / "free").touch()
 
 
-def test_values_that_cannot_be_reported_break_nothing_else(world: worlds.World, folder: Path) -> None:
+def test_values_that_cannot_be_reported_affect_no_other_processor(world: worlds.World, folder: Path) -> None:
     make(world, "moody", "other", "ratemap_0")
     (folder / "moody").touch()
     assert "ratemap_0" in names(world)

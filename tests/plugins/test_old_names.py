@@ -13,7 +13,7 @@ PLUGINS = Path(__file__).with_name("plugins_0_2")
 
 
 @pytest.mark.parametrize("kind", ["zeroCrossings", "everyNth", "meanSquare", "fineIld"])
-def test_what_the_tree_relies_on(kind: str) -> None:
+def test_members_that_the_tree_uses(kind: str) -> None:
     code = f"""
 from rosafe.representations import PROBLEMS, STAGES
 from rosafe.testing import check_representation
@@ -24,8 +24,8 @@ check_representation(STAGES[{kind!r}])
     assert done.returncode == 0, done.stderr
 
 
-def test_their_numbers() -> None:
-    """Of rosafe.process and of Stream, with a change of each hook's parameter on the way."""
+def test_their_results() -> None:
+    """The results of rosafe.process and of Stream, with changes of the parameters of all methods."""
     code = """
 import json, numpy as np, rosafe
 sound = 0.1 * np.random.default_rng(1).standard_normal((2, 8000))

@@ -1,4 +1,4 @@
-"""The representation of docs/own-representation.md, through every door; broken ones are named and left out."""
+"""The representation of docs/own-representation.md in all interfaces; broken plugins are reported and left out."""
 
 from __future__ import annotations
 
@@ -45,14 +45,14 @@ class Taken(Stage):
 CLASHES = {
     "same_kind.py": (("ild", "ihc", "mine_x"), "ild has 'ild' already"),
     "same_word.py": (("Ratemap", "ihc", "mine_x"), "ratemap has 'Ratemap' already"),
-    "orphan.py": (("mine", "nobody", "mine_x"), "'nobody' is not a known kind"),
+    "orphan.py": (("mine", "nobody", "mine_x"), "got 'nobody'"),
     "same_parameter.py": (("mine", "ihc", "fb_nERBs"), "'fb_nERBs'"),
 }
 
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A folder with the representation of the document, as its reader saves it."""
+    """Return a folder with the representation of the document."""
     path = tmp_path / "my representations"
     path.mkdir()
     (path / "zerocrossings.py").write_text(PYTHON_BLOCKS[0])
@@ -68,7 +68,7 @@ def test_its_output(folder: Path) -> None:
     assert shown.startswith("(2, 31, 96) 100")
 
 
-def test_its_numbers(folder: Path) -> None:
+def test_its_results(folder: Path) -> None:
     """A sine crosses zero twice a period."""
     code = """
 import json, numpy as np, rosafe
@@ -85,8 +85,8 @@ print(json.dumps([result["zeroCrossings"][:, 0, k].tolist() for k in (10, 90)]))
     assert right == no_left == 0
 
 
-def test_a_stage_that_breaks_the_rules_is_found(folder: Path) -> None:
-    """What the author's one call finds: state over frames that depends on blocks, and a late refusal."""
+def test_a_stage_that_violates_the_rules_is_detected(folder: Path) -> None:
+    """The check finds state across frames that depends on block boundaries, and a late error."""
     broken = PYTHON_BLOCKS[0].replace("crossing.sum(axis=-1)", "frames.shape[-2] + 0 * crossing.sum(axis=-1)")
     (folder / "zerocrossings.py").write_text(broken)
     done = python(next(code for code in PYTHON_BLOCKS if "check_representation" in code), folder)
@@ -94,7 +94,7 @@ def test_a_stage_that_breaks_the_rules_is_found(folder: Path) -> None:
     assert "AssertionError: the output depends on blocks" in done.stderr
 
 
-def test_broken_ones_are_named_and_left_out(folder: Path) -> None:
+def test_broken_plugins_are_reported_and_left_out(folder: Path) -> None:
     for name, (text, _) in BROKEN.items():
         (folder / name).write_text(text)
     for name, (words, _) in CLASHES.items():
@@ -111,9 +111,9 @@ def test_broken_ones_are_named_and_left_out(folder: Path) -> None:
         assert "\n" not in line
 
 
-def test_a_folder_that_is_not_there_is_named(tmp_path: Path) -> None:
+def test_a_missing_folder_is_reported(tmp_path: Path) -> None:
     done = python("from rosafe.representations import PROBLEMS; print(PROBLEMS)", tmp_path / "none")
-    assert "not a folder that can be read: No such file" in done.stdout
+    assert "expected a readable folder, got: No such file" in done.stdout
 
 
 def test_an_installed_package(folder: Path, tmp_path: Path) -> None:
@@ -133,7 +133,7 @@ def test_an_installed_package(folder: Path, tmp_path: Path) -> None:
 
 @pytest.fixture
 def world(folder: Path) -> Iterator[worlds.World]:
-    """Nodes and genomixd in an environment with the plugin, and one that is broken."""
+    """Return nodes and genomixd in an environment with the plugin and a broken one."""
     (folder / "broken.py").write_text("import nothing_like_this")
     with mock.patch.dict(os.environ, ROSAFE_PLUGINS=str(folder)), worlds.world(folder.parent) as this:
         this.http.call("rosAFE/connect_port", ["Audio", "bass/Audio"])
@@ -143,18 +143,18 @@ def world(folder: Path) -> Iterator[worlds.World]:
 
 
 @pytest.mark.ros
-def test_every_door(world: worlds.World) -> None:
+def test_all_interfaces(world: worlds.World) -> None:
     def shell(command: str) -> str:
         return world.graph.run("bash", "-c", f". {ROOT}/scripts/env.sh && {command}").stdout
 
     changing = "rosservice call /rosAFE/modifyParameter \"{{nameProc: zc2, nameParam: zc_threshold, newValue: '{}'}}\""
 
-    # one request for all that it needs, from the shell
-    told = json.loads(shell("rosafe request zeroCrossings zc_wSizeSec=0.05 fb_nChannels=4 --json"))
-    assert told["created"][-1] == "zeroCrossings_0"
-    parent = told["dependencies"][-2]
+    # one request for the whole chain, from the shell
+    reported = json.loads(shell("rosafe request zeroCrossings zc_wSizeSec=0.05 fb_nChannels=4 --json"))
+    assert reported["created"][-1] == "zeroCrossings_0"
+    parent = reported["dependencies"][-2]
 
-    # service, topic and modifyParameter by the commands of ROS
+    # service, topic and modifyParameter with the commands of ROS
     assert "genom_success: True" in shell(
         f"rosservice call /rosAFE/ZeroCrossingsProc '{{name: zc2, upperDepName: {parent}, zc_hSizeSec: 0.02}}'"
     )
@@ -164,7 +164,7 @@ def test_every_door(world: worlds.World) -> None:
     assert "e_badNewValue" in refused
     assert "genom_success: True" in shell(changing.format("0.5"))
 
-    # HTTP: all processors, what they put out, help
+    # HTTP: processors, outputs, help
     (found,) = [p for p in world.http.call("rosAFE/getProcessors")["processors"] if p["name"] == "zc2"]
     assert (found["kind"], found["upperDepName"], found["rate"]) == ("zeroCrossings", parent, 50.0)
     assert (found["shape"], found["axes"]) == ([2, 4], ["ear", "channel"])
@@ -197,8 +197,8 @@ def test_every_door(world: worlds.World) -> None:
 
 @pytest.mark.ros
 def test_a_broken_one_is_in_the_log_and_in_doctor(world: worlds.World) -> None:
-    """The node lives; who looks finds the file and the error."""
+    """The node continues; log and doctor contain the file and the error."""
     log = "".join(path.read_text("utf-8", "replace") for path in (world.graph.home / ".ros").rglob("*.log"))
     assert "broken.py: ModuleNotFoundError" in log
-    told = world.graph.run("rosafe", "doctor", check=False)
-    assert "broken.py: ModuleNotFoundError" in told.stdout
+    reported = world.graph.run("rosafe", "doctor", check=False)
+    assert "broken.py: ModuleNotFoundError" in reported.stdout

@@ -1,4 +1,4 @@
-"""A client and a node with different plugins: both say so, and nothing ends in a traceback."""
+"""A client and a node with different plugins: both report it, without a traceback."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ pytestmark = pytest.mark.ros
 
 @pytest.fixture
 def folders(tmp_path: Path) -> tuple[Path, Path, Path]:
-    """Folders with no plugin, with one, and with another version of it."""
+    """Return folders without a plugin, with one, and with another version of it."""
     made = tuple(tmp_path / name for name in ("none", "first", "second"))
     for folder in made:
         folder.mkdir()
@@ -34,7 +34,7 @@ def folders(tmp_path: Path) -> tuple[Path, Path, Path]:
         (2, "was started with another version of the plugin mine than this program"),
     ],
 )
-def test_a_client_that_knows_another_plugin(
+def test_a_client_with_another_plugin(
     bass_node: object, graph: Graph, folders: tuple[Path, Path, Path], number: int, reason: str
 ) -> None:
     with graph.node("rosAFE-ros", "-i", "versions", ROSAFE_PLUGINS=str(folders[number])):
@@ -55,10 +55,8 @@ def test_a_client_that_knows_another_plugin(
         (2, "started with another version of the plugin mine"),
     ],
 )
-def test_genomixd_knows_another_plugin(
-    graph: Graph, folders: tuple[Path, Path, Path], number: int, reason: str
-) -> None:
-    """Called, sent, from Tcl, and as a whole tree; requests for other kinds are not concerned."""
+def test_genomixd_with_another_plugin(graph: Graph, folders: tuple[Path, Path, Path], number: int, reason: str) -> None:
+    """Synchronous, asynchronous, from Tcl, and as a whole tree; requests for other kinds are not affected."""
     command = (str(SCRIPTS / "genomixd"), "-v", "-p", "0")
     with (
         graph.node("rosAFE-ros", "-i", "versions", ROSAFE_PLUGINS=str(folders[number])),
@@ -87,8 +85,8 @@ def test_genomixd_knows_another_plugin(
         assert "Traceback" not in server.err
 
 
-def test_a_kept_tree_without_its_plugin(graph: Graph, folders: tuple[Path, Path, Path], tmp_path: Path) -> None:
-    """The rest comes back; log and /diagnostics say what is missing and where it was searched; a copy has all of it."""
+def test_a_saved_tree_without_its_plugin(graph: Graph, folders: tuple[Path, Path, Path], tmp_path: Path) -> None:
+    """The rest is restored; log and /diagnostics report the missing plugin and the search path; a copy is complete."""
     file = tmp_path / "tree.yaml"
     text = (
         "connections: {Audio: /bass/Audio}\nprocessors:\n  input: {kind: input}\n  preProc: {kind: preProc}\n"
@@ -100,8 +98,8 @@ def test_a_kept_tree_without_its_plugin(graph: Graph, folders: tuple[Path, Path,
         wait_for(lambda: "left out of the tree" in process.err)
         said = next(line for line in process.err.splitlines() if "left out of the tree" in line)
         wait_for(lambda: "waiting for sound" in graph.run("rostopic", "echo", "-n", "1", "/diagnostics").stdout)
-    assert "one (there is no plugin 'mine')" in said
-    assert "two (there is no plugin 'grandchild')" in said
+    assert "one (plugin 'mine' not found)" in said
+    assert "two (plugin 'grandchild' not found)" in said
     assert f"ROSAFE_PLUGINS is {folders[0]}" in said
     assert Path(f"{file}.complete").read_text() == text
 
@@ -113,4 +111,4 @@ def test_what_is_below_a_missing_one_is_left_out_too() -> None:
         absent,
     )
     assert [one.name for one in setup.processors] == ["input"]
-    assert absent == ["a (there is no plugin 'nothing')", "preProc (it is below a)"]
+    assert absent == ["a (plugin 'nothing' not found)", "preProc (descendant of a)"]

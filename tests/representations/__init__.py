@@ -1,1 +1,1 @@
-"""Tests of each representation beyond the original's seven: numbers, changes, refusals."""
+"""Tests of the representations that the original does not have: results, changes, errors."""

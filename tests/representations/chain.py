@@ -1,4 +1,4 @@
-"""Stages of any kinds joined by hand, without the processor tree; and the reference vectors of the later kinds."""
+"""Chains of stages without the processor tree, and the reference vectors of later kinds."""
 
 from __future__ import annotations
 
@@ -19,15 +19,15 @@ from tests.dsp.bare import FloatArray, cut, single
 
 
 def kinds_of(name: str) -> list[str]:
-    """The kinds that have a parameter of this name, or of this alias: both maps have the same ones."""
+    """Return the kinds with a parameter of this name or alias: both maps have the same ones."""
     found = [k.kind for k in KINDS.values() if any(name in (p.name, *p.aliases, *p.former) for p in k.parameters)]
     if not found:
         raise KeyError(name)
     return found
 
 
-def needed(outputs: Iterable[str]) -> list[str]:
-    """The kinds `outputs` and all that they hang on, parents first."""
+def with_ancestors(outputs: Iterable[str]) -> list[str]:
+    """Return the kinds `outputs` and all their ancestors, parents first."""
     wanted: set[str] = set()
     for kind in outputs:
         while kind and kind not in wanted:
@@ -36,24 +36,22 @@ def needed(outputs: Iterable[str]) -> list[str]:
     return [kind for kind in STAGES if kind in wanted]
 
 
-def check_new_beginnings(
-    fresh: Callable[[int], Stage], given: SignalFormat, x: FloatArray, *others: FloatArray
-) -> None:
-    """A stage of `given`, after a reset, and for other channels, is as a new one, which `fresh` makes for so many."""
+def check_resets(fresh: Callable[[int], Stage], given: SignalFormat, x: FloatArray, *others: FloatArray) -> None:
+    """Compare a stage after a reset, and after a change of the channels, with a new one from `fresh`."""
     stage = fresh(x.shape[1])
     expected = single(stage.process(x))
     assert expected.shape[-1] > 2
     stage.reset()
     np.testing.assert_array_equal(stage.process(x), expected)
     names = tuple(float(number) for number in range(1, x.shape[1] + 1))
-    stage.set_input_format(replace(given, center_frequencies=names))  # as many, but others
+    stage.set_input_format(replace(given, center_frequencies=names))  # the same number of other channels
     np.testing.assert_array_equal(stage.process(x), expected)
     for other in others:
         np.testing.assert_array_equal(stage.process(other), fresh(other.shape[1]).process(other))
 
 
 def check_fresh_output(stage: Stage, x: FloatArray) -> None:
-    """What comes out is an array of its own, which may be written, and is not written again; `x` may not be."""
+    """Check that the output is a new, writable array that is not modified later; `x` is read-only."""
     x.setflags(write=False)
     made = single(stage.process(x))
     assert made.flags.c_contiguous and made.flags.writeable and made.dtype == np.float64
@@ -66,18 +64,18 @@ def check_fresh_output(stage: Stage, x: FloatArray) -> None:
 
 
 class Chain:
-    """The stages of `outputs` and of all that they hang on, one of each kind.
+    """The stages of `outputs` and of all their ancestors, one of each kind.
 
     Parameters
     ----------
-    given : Signal or float
-        The sample rate (Hz); or, with `root`, the format of what the root's parent would put out.
+    given : SignalFormat or float
+        The sample rate (Hz); with `root`, the output format of the parent of the root.
     outputs : iterable of str
         Kinds.
     parameters : mapping, optional
-        Of any of them, by name or alias.
+        Parameters of any stage, by name or alias.
     root : str, optional
-        Begin with this kind instead of the input: blocks are what its parent would put out.
+        Begin with this kind instead of the input: blocks are outputs of its parent.
     """
 
     def __init__(
@@ -88,9 +86,9 @@ class Chain:
         root: str = "",
     ) -> None:
         self.outputs = list(outputs)
-        kinds = needed(self.outputs)
+        kinds = with_ancestors(self.outputs)
         if root:
-            kinds = [kind for kind in kinds if root in needed([kind])]
+            kinds = [kind for kind in kinds if root in with_ancestors([kind])]
         own: dict[str, dict[str, Any]] = {kind: {} for kind in kinds}
         for name, value in (parameters or {}).items():
             for kind in set(kinds_of(name)) & own.keys():
@@ -105,9 +103,9 @@ class Chain:
         return self.given if parent is None else parent.output_format
 
     def modify(self, name: str, value: Any) -> None:
-        """Change one parameter between blocks; what hangs on it hears of it. A ValueError changes nothing.
+        """Change one parameter between blocks, and update the stages below. A ValueError changes nothing.
 
-        As in the tree, the change is tried on shallow copies first, while the stages stand by.
+        As in the tree, the change is first tried on shallow copies of the stages.
         """
         tried = {kind: copy.copy(stage) for kind, stage in self.stages.items()}
         for kind in set(kinds_of(name)) & tried.keys():
@@ -119,7 +117,7 @@ class Chain:
         self.stages = tried
 
     def process(self, block: NDArray[Any], extra: NDArray[Any] | None = None) -> dict[str, Output]:
-        """What every stage makes of one block. `extra` is what the root needs of a parent that is not there."""
+        """Return the output of each stage for one block. `extra` is for the root, whose parent does not exist."""
         for stage in self.stages.values():
             stage.provide = frozenset()
         for kind, stage in self.stages.items():
@@ -143,11 +141,11 @@ class Chain:
         sizes: int | Sequence[int] | None = None,
         changes: Iterable[Sequence[Any]] = (),
     ) -> dict[str, FloatArray]:
-        """`outputs` of a signal (..., N) cut into blocks of `sizes`, joined, by the names of `rosafe.process`.
+        """Return `outputs` for a signal (..., N) in blocks of `sizes`, concatenated, by the names of `rosafe.process`.
 
-        `changes` are (block index, parameter, value), made before that block. A kind of several parts comes as
-        `<kind>_<part>`. Where a change alters what lies before the time axis, the largest rules, and what lies outside
-        is 0; the axis `centred` keeps its middle.
+        `changes` are (block index, parameter, value), applied before that block. The parts of a kind are named
+        `<kind>_<part>`. If a change alters the leading shape, the result has the largest one, filled with 0; the axis
+        `centred` is aligned at its middle.
         """
         changes = list(changes)
         gathered: dict[str, list[FloatArray]] = {}
@@ -162,7 +160,7 @@ class Chain:
         return {name: _joined(name, parts) for name, parts in gathered.items()}
 
     def coordinates(self) -> dict[str, Any]:
-        """The coordinates of `outputs`, and of framed ones `<kind>_frameRate`."""
+        """Return the coordinates of `outputs`, and `<kind>_frameRate` of framed ones."""
         found: dict[str, Any] = {}
         for kind in self.outputs:
             stage = self.stages[kind]
@@ -174,7 +172,7 @@ class Chain:
 
 
 def part_names(kind: str) -> list[str]:
-    """What the parts of a kind are called in the results of `rosafe.process`."""
+    """Return the names of the parts of a kind in the results of `rosafe.process`."""
     parts = KINDS[kind].parts
     return [kind] if len(parts) == 1 else [f"{kind}_{part.name}" for part in parts]
 
@@ -207,7 +205,7 @@ def process(
     sizes: int | Sequence[int] | None = None,
     changes: Iterable[Sequence[Any]] = (),
 ) -> dict[str, Any]:
-    """As `rosafe.process`, on bare stages: `outputs` of a signal (2, N), with their coordinates and rates."""
+    """Do the same as `rosafe.process` without the tree: `outputs` of a signal (2, N), with coordinates and rates."""
     values = {"in_doNormalize": signal.dtype.kind == "i", **(parameters or {})}
     chain = Chain(sample_rate, outputs, values)
     return {**chain.run(signal, sizes, changes), **chain.coordinates()}
@@ -217,9 +215,9 @@ def process(
 
 
 def reference(name: str) -> tuple[dict[str, Any], dict[str, FloatArray], dict[str, Any]]:
-    """One of ../shared/vectors/more: its case of the manifest, what is expected, and what the stages make of it.
+    """Return the case of the manifest for a file of ../shared/vectors/more, the expected results and the computed ones.
 
-    The latter is thinned out as what is expected is; rates and coordinates are compared already.
+    Computed results are decimated as the expected ones; rates and coordinates have been compared.
     """
     cases = json.loads(harness.shared("vectors", "more", "manifest.json").read_text())
     (case,) = (case for case in cases if case["name"] == name)
@@ -233,7 +231,7 @@ def reference(name: str) -> tuple[dict[str, Any], dict[str, FloatArray], dict[st
             got[output] = np.take(got[output], stored[f"{output}.idx{axis}"], axis)
     for coordinate, expected in case["axes"].items():
         if coordinate not in got:
-            continue  # fb_cfHz, where the filterbank is no output
+            continue  # fb_cfHz, if the filterbank is not an output
         found = got[coordinate]
         if coordinate in ("ac_lags", "prec_lags"):
             found = [len(found), found[-1] if coordinate == "ac_lags" else found[0]]

@@ -1,4 +1,4 @@
-"""All tests of the representations run on the compiled kernels, and again on their twins."""
+"""All tests of representations run with compiled kernels, and again without."""
 
 from __future__ import annotations
 

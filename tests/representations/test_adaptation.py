@@ -24,7 +24,7 @@ DRNL = replace(SOUND, filterbank="drnl")
 
 
 def sound(samples: int, seed: int = 0, channels: int = 3) -> FloatArray:
-    """Half-wave rectified noise whose level steps about, from silence to 120 dB; some of it is below 0."""
+    """Return half-wave rectified noise with steps of level, from silence to 120 dB; some samples are below 0."""
     rng = np.random.default_rng(seed)
     levels = 10.0 ** rng.uniform(-6, 1, samples // 50 + 1)
     levels[rng.random(len(levels)) < 0.2] = 0
@@ -33,7 +33,7 @@ def sound(samples: int, seed: int = 0, channels: int = 3) -> FloatArray:
 
 
 def by_the_book(x: FloatArray, threshold_db: float, tau: list[float], lim: float, drnl: bool = False) -> list[float]:
-    """One channel (N,), one number after the other, with the limit as papers write it."""
+    """Compute one channel (N,) sample by sample, with the limit in the form of the papers."""
     least = 10 ** ((threshold_db - 100) / 20)
     rest = [least ** (2.0**-j) for j in range(1, len(tau) + 1)]
     states, made = list(rest), []
@@ -64,7 +64,7 @@ def test_reference_vectors() -> None:
         {"adpt_lim": 0.0},
         {"adpt_lim": 1.0, "adpt_mindB": 40.0},
         {"adpt_lim": 1.4, "adpt_mindB": 99.0},  # all m below 0
-        {"adpt_lim": 1.2},  # those of the last loops
+        {"adpt_lim": 1.2},  # of the last loops
         {"adpt_lim": 1e6, "adpt_mindB": -300.0},
         {"adpt_lim": 5.0, "adpt_tau": [0.001]},
         {"adpt_lim": 3.0, "adpt_tau": [3600.0, 1e-3, 0.02, 1e-3, 0.1, 0.5, 2.0, 1e-4, 1e-5]},
@@ -91,28 +91,28 @@ def test_the_constants() -> None:
 
 
 @pytest.mark.parametrize("level", [-20.0, 0.0, 35.0, 60.0, 100.0, 110.0])
-def test_what_steady_sound_settles_at(level: float) -> None:
-    """Each loop takes the root: 0 at the threshold and below, 100 at 100 dB."""
+def test_the_output_for_steady_sound(level: float) -> None:
+    """Each loop computes the square root: 0 at the threshold and below, 100 at 100 dB."""
     x = np.full((2, 1, 3000), 10 ** ((level - 100) / 20))
-    stage = Adaptation(RATE, adpt_tau=[0.001, 0.002, 0.003], adpt_lim=0)  # limits hold above 100 dB for ever
+    stage = Adaptation(RATE, adpt_tau=[0.001, 0.002, 0.003], adpt_lim=0)  # limits have a permanent effect above 100 dB
     least = 1e-5 ** (1 / 8)
     expected = 100 * (max(x[0, 0, 0], 1e-5) ** (1 / 8) - least) / (1 - least)
     assert stage.process(x)[1, 0, -1] == pytest.approx(expected, abs=1e-6 * max(expected, 1e-4))
 
 
 def test_the_limit_of_an_onset() -> None:
-    """An onset that is loud beyond all measure comes to 1 + m = lim (1 - s**2)."""
+    """An extremely loud onset reaches 1 + m = lim (1 - s**2)."""
     onset = Adaptation(RATE, adpt_tau=[0.05]).process(np.full((2, 1, 1), 1e20))
     rest = 1e-5**0.5
     assert onset[0, 0, 0] == pytest.approx(100 * (10 * (1 - rest**2) - rest) / (1 - rest), rel=1e-12)
-    # and one just above 1 is not limited yet
+    # an onset just above 1 is not limited
     x = 1e-5**0.5 * (1 + 1e-5)
     onset = Adaptation(RATE, adpt_tau=[0.05]).process(np.full((2, 1, 1), x))
     assert onset[0, 0, 0] == pytest.approx(100 * (1 + 1e-5 - rest) / (1 - rest), rel=1e-12)
 
 
-def test_no_room_above_one() -> None:
-    """lim = 1 / (1 - s**2) makes m 0: nothing comes out beyond 1, which is 100."""
+def test_a_limit_of_one() -> None:
+    """lim = 1 / (1 - s**2) makes m 0: the maximum is 1, which is 100."""
     rest = 10 ** (-100 / 40)
     stage = Adaptation(RATE, adpt_tau=[0.05], adpt_lim=1 / (1 - rest**2))
     x = np.geomspace(1e-4, 1e3, 500) * np.ones((2, 2, 1))
@@ -150,7 +150,7 @@ sizes = st.lists(st.one_of(st.sampled_from([0, 1, 2, 31, 32, 33]), st.integers(0
 @each_mode
 @given(sizes=sizes)
 @settings(max_examples=10, deadline=None, database=None)
-def test_cuts_and_prefixes(signal: SignalFormat, parameters: dict[str, Any], sizes: list[int]) -> None:
+def test_block_boundaries_and_prefixes(signal: SignalFormat, parameters: dict[str, Any], sizes: list[int]) -> None:
     x = sound(400)
     whole = Adaptation(signal, **parameters).process(x)
     stage = Adaptation(signal, **parameters)
@@ -161,7 +161,7 @@ def test_cuts_and_prefixes(signal: SignalFormat, parameters: dict[str, Any], siz
 
 
 @each_mode
-def test_reset_and_other_channels_are_a_new_beginning(signal: SignalFormat, parameters: dict[str, Any]) -> None:
+def test_reset_and_other_channels_reset_the_state(signal: SignalFormat, parameters: dict[str, Any]) -> None:
     stage = Adaptation(signal, **parameters)
     expected = stage.process(sound(100))
     stage.reset()
@@ -175,15 +175,15 @@ def test_reset_and_other_channels_are_a_new_beginning(signal: SignalFormat, para
     expected = Adaptation(replace(other, filterbank="drnl"), **parameters).process(x)
     np.testing.assert_array_equal(stage.process(x), expected)
     if "adpt_model" in parameters:
-        with pytest.raises(ValueError, match=r"^block: 3 channels"):
+        with pytest.raises(ValueError, match=r"^block: expected 2 channels, got 3"):
             stage.process(sound(10))
-    else:  # nobody has told
+    else:  # without notification
         fresh = Adaptation(replace(signal, filterbank="drnl"), **parameters)
         np.testing.assert_array_equal(stage.process(sound(100)), fresh.process(sound(100)))
 
 
 @each_mode
-def test_copies_may_be_changed_and_thrown_away(signal: SignalFormat, parameters: dict[str, Any]) -> None:
+def test_copies_may_be_changed_and_discarded(signal: SignalFormat, parameters: dict[str, Any]) -> None:
     expected = Adaptation(signal, **parameters).process(sound(300))
     stage, made = Adaptation(signal, **parameters), []
     for block in cut(sound(300), 100):
@@ -197,8 +197,8 @@ def test_copies_may_be_changed_and_thrown_away(signal: SignalFormat, parameters:
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("lim", [0.0, 1.2, 10.0])
 @pytest.mark.parametrize("tau", [TAU, (3600.0, 1e-3, 1e-3), (5e-324, 1e-300), (1e-3,) * 32])
-def test_finite_whatever_comes(tau: tuple[float, ...], lim: float) -> None:
-    """Even where nothing is left of a loop's memory, or sound of 1500 dB is followed by silence."""
+def test_the_output_is_always_finite(tau: tuple[float, ...], lim: float) -> None:
+    """Even if a loop has almost no memory, or if silence follows sound of 1500 dB."""
     rng = np.random.default_rng(0)
     x = 10.0 ** rng.choice([-300.0, -4.0, 0.0, 70.0, 300.0], (2, 3, 600)) * rng.choice([-1, 1, 1], (2, 3, 600))
     x[..., 100:300] = 0
@@ -222,14 +222,14 @@ def test_finite_whatever_comes(tau: tuple[float, ...], lim: float) -> None:
     ],
     ids=str,
 )
-def test_any_change_begins_anew(change: dict[str, Any]) -> None:
+def test_any_change_resets_the_loops(change: dict[str, Any]) -> None:
     stage = Adaptation(SOUND)
     stage.process(sound(200))
     stage.configure(**change)
     np.testing.assert_array_equal(stage.process(sound(200, 1)), Adaptation(SOUND, **change).process(sound(200, 1)))
 
 
-def test_models_and_what_is_in_force() -> None:
+def test_models_and_effective_values() -> None:
     assert Adaptation(SOUND).parameters == {
         "adpt_lim": 10.0,
         "adpt_mindB": 0.0,
@@ -254,7 +254,7 @@ def test_models_and_what_is_in_force() -> None:
     stage.configure(adpt_lim=3.0)  # overridden
     assert stage.parameters["adpt_lim"] == 0.0
     stage.configure(adpt_model="")
-    assert stage.parameters["adpt_tau"] == list(EVEN_TAU)  # as they are
+    assert stage.parameters["adpt_tau"] == list(EVEN_TAU)  # unchanged
     stage.configure(adpt_lim=3.0)
     assert stage.parameters["adpt_lim"] == 3.0
     expected = Adaptation(SOUND, **stage.parameters).process(sound(100))
@@ -271,7 +271,7 @@ def test_the_threshold_of_hearing() -> None:
 
 
 def test_behind_drnl_in_a_chain() -> None:
-    """The hair cells between hand on which filterbank there is."""
+    """The hair cell stage passes on the type of the filterbank."""
     chain = Chain(RATE, ["ihc", "adaptation"], {"fb_type": "drnl", "fb_cfHz": [500.0, 1000.0], "in_doNormalize": False})
     x = np.random.default_rng(0).standard_normal((2, 900))
     made = chain.run(x, 300, [(2, "fb_type", "gammatone")])
@@ -302,24 +302,24 @@ def test_behind_drnl_in_a_chain() -> None:
         {"adpt_model": "adt_jepsen"},
         {"adpt_model": "dau"},
         {"adpt_model": 3},
-        {"adpt_model": "adt_vandorpschuitman"},  # of channels that have no frequencies
+        {"adpt_model": "adt_vandorpschuitman"},  # channels without frequencies
     ],
     ids=str,
 )
-def test_refusals(changes: dict[str, Any]) -> None:
+def test_invalid_values(changes: dict[str, Any]) -> None:
     (name,) = changes
     with pytest.raises(ValueError, match=f"^{name}: "):
         Adaptation(RATE, **changes)
-    stage, twin = Adaptation(RATE), Adaptation(RATE)
-    for each in (stage, twin):
+    stage, reference_stage = Adaptation(RATE), Adaptation(RATE)
+    for each in (stage, reference_stage):
         each.process(sound(50))
     with pytest.raises(ValueError, match=f"^{name}: "):
         stage.configure(adpt_lim=5, **changes) if name != "adpt_lim" else stage.configure(adpt_mindB=5, **changes)
-    assert stage.parameters == twin.parameters
-    np.testing.assert_array_equal(stage.process(sound(50)), twin.process(sound(50)))
+    assert stage.parameters == reference_stage.parameters
+    np.testing.assert_array_equal(stage.process(sound(50)), reference_stage.process(sound(50)))
 
 
-def test_other_blocks_are_refused() -> None:
+def test_invalid_blocks_raise() -> None:
     stage = Adaptation(SOUND)
     for block in (np.zeros((2, 5)), np.zeros((3, 3, 5)), np.zeros((1, 3, 5)), np.zeros((2, 3, 5), complex)):
         with pytest.raises(ValueError, match=r"^block: "):

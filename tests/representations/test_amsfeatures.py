@@ -1,4 +1,4 @@
-"""Amplitude modulation spectrograms: the reference vector, scipy's filters, Fourier transforms written out, sines."""
+"""Amplitude modulation spectrograms: the reference vector, filters of scipy, Fourier transforms as sums, sines."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from rosafe.dsp.signal_format import SignalFormat
 from rosafe.dsp.windows import ALL_NAMES, window
 from rosafe.representations.amsfeatures import AmsFeatures, design_sections
 
-from .chain import Chain, FloatArray, check_fresh_output, check_new_beginnings, cut, reference
+from .chain import Chain, FloatArray, check_fresh_output, check_resets, cut, reference
 
 RATE = 16000.0
 SOUND = SignalFormat(RATE, RATE, center_frequencies=(100.0, 1000.0, 3000.0), filterbank="gammatone")
@@ -25,19 +25,19 @@ GOLDEN = (1 + math.sqrt(5)) / 2
 
 
 def framed(size: int, hop: int, ratio: int = 4, **more: Any) -> dict[str, Any]:
-    """Windows and hops in samples that are left."""
+    """Return parameters for windows and hops in decimated samples."""
     rate = RATE / ratio
     return {"ams_wSizeSec": size / rate, "ams_hSizeSec": hop / rate, "ams_dsRatio": ratio, **more}
 
 
 def sound(samples: int, seed: int = 0, channels: int = 3) -> FloatArray:
-    """Half-wave rectified noise of a level that changes."""
+    """Return half-wave rectified noise with a varying level."""
     x = np.maximum(np.random.default_rng(seed).standard_normal((2, channels, samples)), 0)
     return x * (1.1 + np.sin(np.arange(samples) / 150)) * [[[1.0]], [[0.3]]]
 
 
 def by_scipy(x: FloatArray, centres: list[float], ratio: int, size: int, hop: int, name: str) -> FloatArray:
-    """The log form of (..., N), each filter on its own."""
+    """Compute the log form of (..., N), each filter separately."""
     rate, taken, made = RATE / ratio, x[..., ::ratio], []
     for index, centre in enumerate(centres):
         if index == 0:
@@ -92,8 +92,8 @@ def test_centres(values: dict[str, Any], centres: list[float]) -> None:
 
 @pytest.mark.parametrize("name", ALL_NAMES)
 @pytest.mark.parametrize(("size", "hop", "ratio"), [(64, 32, 4), (50, 71, 1), (130, 11, 7)])
-def test_log_is_scipys_filters(size: int, hop: int, ratio: int, name: str) -> None:
-    centres = [40.0, 4.0, 30.0, 200.0, 3.0] + [25.0 * 1.2**i for i in range(14)]  # the first is a low-pass, wherever
+def test_log_equals_filters_of_scipy(size: int, hop: int, ratio: int, name: str) -> None:
+    centres = [40.0, 4.0, 30.0, 200.0, 3.0] + [25.0 * 1.2**i for i in range(14)]  # the first is always a low-pass
     x = sound(3001)
     stage = AmsFeatures(SOUND, ams_cfHz=centres, **framed(size, hop, ratio), ams_wname=name)
     got, expected = stage.process(x), by_scipy(x, centres, ratio, size, hop, name)
@@ -101,21 +101,21 @@ def test_log_is_scipys_filters(size: int, hop: int, ratio: int, name: str) -> No
     np.testing.assert_allclose(got, expected, rtol=0, atol=1e-10 * expected.max())
 
 
-def test_sections_are_scipys() -> None:
+def test_sections_equal_those_of_scipy() -> None:
     frequencies = np.array([5.0, 1e-3, 0.7, 4.0, 64.0, 1024.0, 2400.0])
     made = design_sections(frequencies, 8000.0)
     expected = [scipy.signal.butter(1, 5.0, fs=8000.0, output="sos")[0]]
     for f in frequencies[1:]:
         expected.append(scipy.signal.butter(1, [f / GOLDEN, f * GOLDEN], "bandpass", fs=8000.0, output="sos")[0])
     np.testing.assert_allclose(made, expected, rtol=1e-9, atol=1e-12)
-    for section, f in zip(made[3:], frequencies[3:], strict=True):  # the quality is 1: 3 dB down at edges f apart
+    for section, f in zip(made[3:], frequencies[3:], strict=True):  # Q is 1: 3 dB down at edges with a distance of f
         _, gains = scipy.signal.sosfreqz(section[np.newaxis], [f / GOLDEN, f * GOLDEN], fs=8000.0)
         np.testing.assert_allclose(np.abs(gains), math.sqrt(0.5), rtol=1e-9)
         assert f * GOLDEN - f / GOLDEN == pytest.approx(f)
 
 
-def test_a_sine_is_found_where_it_is() -> None:
-    """A rectified sine has a mean of 2 / pi; the filter at its frequency lets it through."""
+def test_a_sine_has_its_maximum_at_its_frequency() -> None:
+    """A rectified sine has a mean of 2 / pi; the filter at its frequency passes it."""
     time = np.arange(32000) / RATE
     for centre in (16.0, 64.0, 256.0):
         x = np.ones((2, 1, 1)) * (1 + np.sin(2 * np.pi * centre * time))
@@ -160,9 +160,9 @@ def test_lin_is_the_formula(size: int, hop: int, ratio: int, low: float, high: f
     [
         (0.032, 0.016, 4, 128, 64),
         (0.0331, 0.016, 4, 132, 64),  # 132.4 samples
-        (0.0328, 0.016, 4, 132, 64),  # 131.2 samples are odd: the even number from half of it
+        (0.0328, 0.016, 4, 132, 64),  # 131.2 samples: rounded to an even number
         (0.0327, 0.016, 4, 130, 64),  # of 130, not of 130.8 samples: 63.6
-        (0.0003, 0.001, 4, 2, 7),  # of 2 samples, not of 1.2: 6.67, where 0.001 s are 4
+        (0.0003, 0.001, 4, 2, 7),  # of 2 samples, not of 1.2: 6.67, although 0.001 s are 4
         (0.01, 1e-6, 4, 40, 1),  # at least 1
         (0.001, 0.3, 1, 16, 4800),
     ],
@@ -175,7 +175,7 @@ def test_the_step_follows_from_the_window(
     assert (len(stage.window), stage.output_format.hop) == (size, hop * ratio)
     assert stage.output_format.rate == RATE / ratio / hop
     assert stage.output_format.framed and stage.output_format.window == size * ratio
-    samples = (size + 2 * hop - 1) * ratio + 1  # the last one that frame 2 takes in
+    samples = (size + 2 * hop - 1) * ratio + 1  # the last sample of frame 2
     assert stage.output_count(samples) == 3 and stage.output_count(samples - 1) == 2
     assert stage.process(sound(samples - 1)).shape[-1] == 2
     assert stage.process(sound(1)).shape[-1] == 1
@@ -195,7 +195,7 @@ sizes = st.lists(st.one_of(st.sampled_from([0, 1, 2, 3, 5]), st.integers(0, 500)
 @each_mode
 @given(sizes=sizes)
 @settings(max_examples=15, deadline=None, database=None)
-def test_cuts_and_prefixes(parameters: dict[str, Any], sizes: list[int]) -> None:
+def test_block_boundaries_and_prefixes(parameters: dict[str, Any], sizes: list[int]) -> None:
     x = sound(1200)
     whole = AmsFeatures(SOUND, **parameters).process(x)
     stage = AmsFeatures(SOUND, **parameters)
@@ -216,15 +216,15 @@ def test_blocks_longer_than_spans() -> None:
 
 
 @each_mode
-def test_reset_and_other_channels_are_a_new_beginning(parameters: dict[str, Any]) -> None:
+def test_reset_and_other_channels_reset_the_state(parameters: dict[str, Any]) -> None:
     def fresh(channels: int) -> AmsFeatures:
         return AmsFeatures(SOUND if channels == 3 else RATE, **parameters)
 
-    check_new_beginnings(fresh, SOUND, sound(1001), sound(999, 2, 5), sound(999, 2, 2))
+    check_resets(fresh, SOUND, sound(1001), sound(999, 2, 5), sound(999, 2, 2))
 
 
 @each_mode
-def test_what_comes_out_is_fresh(parameters: dict[str, Any]) -> None:
+def test_the_output_is_a_new_array(parameters: dict[str, Any]) -> None:
     stage = AmsFeatures(SOUND, **parameters)
     check_fresh_output(stage, sound(1000))
     assert stage.process(sound(0)).shape == (*stage.output_rows((2, 3)), 0)
@@ -232,7 +232,7 @@ def test_what_comes_out_is_fresh(parameters: dict[str, Any]) -> None:
 
 @pytest.mark.filterwarnings("error")
 @each_mode
-def test_silence_and_what_is_hardly_sound(parameters: dict[str, Any]) -> None:
+def test_silence_and_almost_silence(parameters: dict[str, Any]) -> None:
     assert not AmsFeatures(SOUND, **parameters).process(np.zeros((2, 3, 1000))).any()
     one_ear = sound(1000)
     one_ear[0] = 0
@@ -244,7 +244,7 @@ def test_silence_and_what_is_hardly_sound(parameters: dict[str, Any]) -> None:
         assert np.isfinite(AmsFeatures(SOUND, **parameters).process(x)).all()
     stage = AmsFeatures(SOUND, **parameters)
     stage.process(sound(1000))
-    for _ in range(50):  # filters ring for long
+    for _ in range(50):  # filters ring for a long time
         assert np.isfinite(stage.process(np.zeros((2, 3, 20_000)))).all()
     assert stage.process(np.zeros((2, 3, 1000))).max() < 1e-9
 
@@ -287,8 +287,8 @@ def test_the_defaults() -> None:
     ],
     ids=str,
 )
-def test_a_change_of_frames_keeps_filters_buffer_and_grid(fb_type: str, change: dict[str, Any]) -> None:
-    """The next frame starts where it would have started; filters and decimation run on."""
+def test_a_change_of_frames_keeps_filters_and_buffer(fb_type: str, change: dict[str, Any]) -> None:
+    """The start of the next frame does not change; filters and decimation keep their state."""
     x = sound(9001)
     before: dict[str, Any] = {**framed(128, 48), "ams_fbType": fb_type}
     stage = AmsFeatures(SOUND, **before)
@@ -296,7 +296,7 @@ def test_a_change_of_frames_keeps_filters_buffer_and_grid(fb_type: str, change: 
     assert count == (834 - 128) // 48 + 1
     stage.configure(**change)
     got = np.concatenate([stage.process(block) for block in cut(x[..., 3333:], 777)], axis=-1)
-    # of the filtered samples from there on, which a step of 1 shows all
+    # filtered samples from there on, all visible with a step of 1
     fine = AmsFeatures(SOUND, **{**before, **change, "ams_hSizeSec": 1e-9}).process(x)
     expected = fine[..., count * 48 :: stage.output_format.hop // 4]
     np.testing.assert_allclose(got, expected[..., : got.shape[-1]], rtol=0, atol=1e-12)
@@ -307,7 +307,7 @@ def test_a_change_of_frames_keeps_filters_buffer_and_grid(fb_type: str, change: 
     "change",
     [
         {"ams_fbType": "lin"},
-        {"ams_nFilters": 15},  # what is set counts as changed
+        {"ams_nFilters": 15},  # a parameter that is set counts as changed
         {"ams_lowFreqHz": 5.0},
         {"ams_highFreqHz": 900.0},
         {"ams_cfHz": [10.0, 20.0]},
@@ -317,15 +317,15 @@ def test_a_change_of_frames_keeps_filters_buffer_and_grid(fb_type: str, change: 
     ],
     ids=str,
 )
-def test_any_other_change_begins_anew(change: dict[str, Any]) -> None:
+def test_any_other_change_resets_the_state(change: dict[str, Any]) -> None:
     x = sound(4000)
     stage = AmsFeatures(SOUND)
-    stage.process(x[..., :2001])  # the next sample would be left out
+    stage.process(x[..., :2001])  # the next sample would be skipped
     stage.configure(**change)
     np.testing.assert_array_equal(stage.process(x[..., 2001:]), AmsFeatures(SOUND, **change).process(x[..., 2001:]))
 
 
-def test_a_list_gives_way_only_to_another_list() -> None:
+def test_a_list_is_replaced_only_by_another_list() -> None:
     stage = AmsFeatures(RATE, ams_cfHz=[10.0, 20.0])
     stage.configure(ams_nFilters=4)
     assert stage.parameters["ams_cfHz"] == [10.0, 20.0]
@@ -337,8 +337,8 @@ def test_a_list_gives_way_only_to_another_list() -> None:
     assert len(stage.parameters["ams_cfHz"]) == 4
 
 
-def test_changes_on_the_way_by_the_chain() -> None:
-    """Filters are aligned at the first one; what was not computed is 0."""
+def test_changes_in_a_chain() -> None:
+    """Results are aligned at the first filter; missing values are 0."""
     x = np.random.default_rng(0).standard_normal((2, 9000))
     chain = Chain(RATE, ["amsFeatures"], {"fb_cfHz": [300.0, 900.0], "in_doNormalize": False, "ams_nFilters": 3})
     changes = [(1, "ams_nFilter", 5), (2, "ams_wname", "hann"), (2, "fb_cfHz", [500.0, 600.0, 700.0])]
@@ -349,7 +349,7 @@ def test_changes_on_the_way_by_the_chain() -> None:
     assert len(chain.coordinates()["ams_cfHz"]) == 5
 
 
-def test_copies_may_be_changed_and_thrown_away() -> None:
+def test_copies_may_be_changed_and_discarded() -> None:
     for parameters in (framed(64, 32), framed(64, 32, ams_fbType="lin")):
         expected = AmsFeatures(SOUND, **parameters).process(sound(1500))
         stage, made = AmsFeatures(SOUND, **parameters), []
@@ -375,7 +375,7 @@ def test_copies_may_be_changed_and_thrown_away() -> None:
         ("ams_highFreqHz", {"ams_highFreqHz": 2000 / GOLDEN + 1e-6}),  # at half of the rate
         ("ams_highFreqHz", {"ams_highFreqHz": 1300, "ams_nFilters": 0, "ams_lowFreqHz": 1250}),
         ("ams_highFreqHz", {"ams_highFreqHz": 2000.1, "ams_fbType": "lin"}),
-        ("ams_highFreqHz", {"ams_dsRatio": 8}),
+        ("ams_highFreqHz", {"ams_dsRatio": 8, "ams_highFreqHz": 1024.0}),
         ("ams_highFreqHz", {"ams_lowFreqHz": 700, "ams_highFreqHz": 600, "ams_fbType": "lin"}),
         *(("ams_cfHz", {"ams_cfHz": value}) for value in ([0.0, 4.0], [-1.0], [10.0, 1300.0], "log", [math.nan])),
         ("ams_cfHz", {"ams_cfHz": [10.0], "ams_fbType": "lin"}),
@@ -387,41 +387,52 @@ def test_copies_may_be_changed_and_thrown_away() -> None:
     ],
     ids=str,
 )
-def test_refusals(name: str, changes: dict[str, Any]) -> None:
+def test_invalid_values(name: str, changes: dict[str, Any]) -> None:
     with pytest.raises(ValueError, match=f"^{name}: "):
         AmsFeatures(RATE, **changes)
-    stage, twin = AmsFeatures(RATE), AmsFeatures(RATE)
-    for each in (stage, twin):
+    stage, reference_stage = AmsFeatures(RATE), AmsFeatures(RATE)
+    for each in (stage, reference_stage):
         each.process(sound(900))
     with pytest.raises(ValueError, match=f"^{name}: "):
         stage.configure(**changes)
-    assert stage.parameters == twin.parameters
-    np.testing.assert_array_equal(stage.process(sound(900)), twin.process(sound(900)))
+    assert stage.parameters == reference_stage.parameters
+    np.testing.assert_array_equal(stage.process(sound(900)), reference_stage.process(sound(900)))
     parameter = AmsFeatures.REPRESENTATION.parameter(name)
-    assert parameter.resolve_choice("nonsense") == "nonsense"  # there are no old scripts: nothing is taken for it
+    assert parameter.resolve_choice("nonsense") == "nonsense"  # there are no old scripts: no replacement
 
 
 def test_the_highest_filter_depends_on_the_rate() -> None:
+    """The default follows the sample rate if it must; a given value does not."""
+    for kind, edge in (("log", GOLDEN), ("lin", 1.0)):
+        low = AmsFeatures(1000.0 * 4, ams_fbType=kind)
+        assert low.parameters["ams_highFreqHz"] == pytest.approx(0.475 * 1000 / edge)
+        assert low.parameters["ams_cfHz"][-1] <= 0.475 * 1000 / edge
+        with pytest.raises(ValueError, match=r"^ams_highFreqHz: "):
+            AmsFeatures(1000.0 * 4, ams_fbType=kind, ams_highFreqHz=1024.0)
+    assert AmsFeatures(8000.0).parameters["ams_highFreqHz"] == pytest.approx(0.475 * 2000 / GOLDEN)
+    assert AmsFeatures(8000.0, ams_dsRatio=2).parameters["ams_highFreqHz"] == 1024.0
     with pytest.raises(ValueError, match=r"^ams_highFreqHz: "):
-        AmsFeatures(8000.0)
-    AmsFeatures(8000.0, ams_dsRatio=2)
+        AmsFeatures(8000.0, ams_highFreqHz=1024.0)
     AmsFeatures(RATE, ams_highFreqHz=2000 / GOLDEN - 1e-6)
     AmsFeatures(RATE, ams_highFreqHz=2000.0, ams_fbType="lin")
-    stage = AmsFeatures(SOUND)
+    stage = AmsFeatures(SOUND, ams_highFreqHz=1024.0)
     with pytest.raises(ValueError, match=r"^ams_highFreqHz: "):
         stage.set_input_format(replace(SOUND, sample_rate=8000.0, rate=8000.0))
     assert stage.input_format is SOUND
+    stage = AmsFeatures(SOUND)
+    stage.set_input_format(replace(SOUND, sample_rate=8000.0, rate=8000.0))
+    assert stage.parameters["ams_highFreqHz"] == pytest.approx(0.475 * 2000 / GOLDEN)
 
 
 @pytest.mark.filterwarnings("error")
-def test_frequencies_next_to_nothing() -> None:
+def test_frequencies_close_to_0() -> None:
     for low in (5e-324, 1e-300, 1e-9):
         for count in (0, 3):
             stage = AmsFeatures(RATE, ams_lowFreqHz=low, ams_nFilters=count)
             assert np.isfinite(stage.process(sound(2000))).all()
 
 
-def test_other_blocks_are_refused() -> None:
+def test_invalid_blocks_raise() -> None:
     for block in (np.zeros((2, 5)), np.zeros((3, 3, 5)), np.zeros((1, 3, 5)), np.zeros((2, 3, 5), complex)):
         with pytest.raises(ValueError, match=r"^block: "):
             AmsFeatures(SOUND).process(block)

@@ -1,4 +1,4 @@
-"""Autocorrelation: the reference vectors, sums and Fourier transforms written out, and signals that are known."""
+"""Autocorrelation: the reference vectors, sums and Fourier transforms as matrices, and signals with known results."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from rosafe.dsp.signal_format import SignalFormat
 from rosafe.dsp.windows import ALL_NAMES, window
 from rosafe.representations.autocorrelation import Autocorrelation
 
-from .chain import Chain, FloatArray, check_fresh_output, check_new_beginnings, cut, reference
+from .chain import Chain, FloatArray, check_fresh_output, check_resets, cut, reference
 
 RATE = 8000.0
 SOUND = SignalFormat(RATE, RATE, center_frequencies=(100.0, 1000.0, 3000.0), filterbank="gammatone")
@@ -27,7 +27,7 @@ def framed(size: int, hop: int, **more: Any) -> dict[str, Any]:
 
 
 def sound(samples: int, seed: int = 0, channels: int = 3) -> FloatArray:
-    """Noise with a period, half-wave rectified in the left ear, with some silence."""
+    """Return periodic noise, half-wave rectified in the left ear, with some silence."""
     rng = np.random.default_rng(seed)
     x = 0.3 * rng.standard_normal((2, channels, samples)) + np.sin(2 * np.pi * np.arange(samples) / 17)
     x[0] = np.maximum(x[0], 0)
@@ -49,7 +49,7 @@ def clipped_by_the_book(x: list[float], method: str, alpha: float) -> list[float
 
 
 def by_the_book(frame: FloatArray, method: str, alpha: float, exponent: float) -> FloatArray:
-    """Of a windowed frame (w,): sums of products, or Fourier transforms as matrices."""
+    """Compute the result for a windowed frame (w,) by sums of products, or by Fourier transforms as matrices."""
     size = len(frame)
     y = np.array(clipped_by_the_book(frame.tolist(), method, alpha))
     if exponent == 2:
@@ -71,9 +71,15 @@ def test_reference_vectors() -> None:
     np.testing.assert_allclose(got["autocorrelation"], expected["autocorrelation"], rtol=0, atol=1e-12)
 
 
-@pytest.mark.parametrize("exponent", [2.0, 2 / 3, 1.0, 7.0])
-@pytest.mark.parametrize("alpha", [0.0, 0.3, 0.6, 1.0])
-@pytest.mark.parametrize("method", ["clp", "clc", "sgn"])
+@pytest.mark.parametrize(
+    ("method", "alpha", "exponent"),
+    [  # all pairs of two values
+        *(("clp", 0.0, 2.0), ("clc", 0.0, 2 / 3), ("sgn", 0.0, 1.0), ("clp", 0.0, 7.0)),
+        *(("clc", 0.3, 2.0), ("sgn", 0.3, 2 / 3), ("clp", 0.3, 1.0), ("clc", 0.3, 7.0)),
+        *(("sgn", 0.6, 2.0), ("clp", 0.6, 2 / 3), ("clc", 0.6, 1.0), ("sgn", 0.6, 7.0)),
+        *(("clp", 1.0, 2.0), ("clc", 1.0, 2 / 3), ("sgn", 1.0, 1.0), ("clp", 1.0, 7.0)),
+    ],
+)
 def test_it_is_the_formula(method: str, alpha: float, exponent: float) -> None:
     x = sound(400)
     stage = Autocorrelation(
@@ -84,7 +90,7 @@ def test_it_is_the_formula(method: str, alpha: float, exponent: float) -> None:
     for ear, channel, frame in np.ndindex(2, 3, 12):
         windowed = window("hamming", 50) * x[ear, channel, 31 * frame : 31 * frame + 50]
         expected = by_the_book(windowed, method, alpha, exponent)
-        # signs have spectra with zeros, and what rounding makes of 0 is not small after an exponent below 1
+        # signs have spectra with zeros, whose rounding errors are large after an exponent below 1
         tolerance = 1e-9 if method == "sgn" and exponent < 1 else 1e-12
         np.testing.assert_allclose(got[ear, channel, :, frame], expected, rtol=0, atol=tolerance)
 
@@ -92,7 +98,7 @@ def test_it_is_the_formula(method: str, alpha: float, exponent: float) -> None:
 @pytest.mark.parametrize("size", [2, 4, 6, 16, 32, 34, 64, 66, 130])
 @pytest.mark.parametrize("name", ALL_NAMES)
 def test_sizes_and_windows(size: int, name: str) -> None:
-    """Up to the lag before the last but one, however long the transform must be."""
+    """All lags up to the last, with any length of the transform."""
     x = np.random.default_rng(size).standard_normal((2, 1, size + 3))
     stage = Autocorrelation(RATE, **framed(size, 3, ac_wname=name, ac_clipAlpha=0.2))
     got = stage.process(x)
@@ -103,7 +109,7 @@ def test_sizes_and_windows(size: int, name: str) -> None:
 
 
 def test_the_means_are_not_biased() -> None:
-    """A constant correlates with itself alike at all lags; so do pulses, at all multiples of their period."""
+    """The correlation of a constant is equal at all lags, that of pulses at all multiples of their period."""
     plain: dict[str, Any] = {"ac_wname": "rectwin", "ac_clipAlpha": 0.0}
     constant = Autocorrelation(RATE, **framed(100, 50, **plain)).process(np.full((2, 2, 350), 0.3))
     assert constant.shape == (2, 2, 99, 6)
@@ -127,7 +133,7 @@ def test_a_sine() -> None:
 
 
 def test_the_level_makes_no_difference() -> None:
-    """From the quietest to what no sound is, and whatever the exponent."""
+    """From the quietest level to far above sound, with any exponent."""
     for method in ("clp", "clc", "sgn"):
         for exponent in (2.0, 10.0, 0.1):
             parameters = framed(100, 50, ac_clipMethod=method, ac_K=exponent)
@@ -140,7 +146,7 @@ def test_the_level_makes_no_difference() -> None:
 @pytest.mark.filterwarnings("error")
 @pytest.mark.parametrize("exponent", [2.0, 0.01, 10.0])
 @pytest.mark.parametrize("method", ["clp", "clc", "sgn"])
-def test_silence_and_what_is_hardly_sound(method: str, exponent: float) -> None:
+def test_silence_and_almost_silence(method: str, exponent: float) -> None:
     def made(x: FloatArray, alpha: float = 0.6) -> FloatArray:
         parameters = framed(40, 20, ac_clipMethod=method, ac_K=exponent, ac_clipAlpha=alpha)
         return Autocorrelation(RATE, **parameters).process(x)
@@ -183,7 +189,7 @@ sizes = st.lists(st.one_of(st.sampled_from([0, 1, 2]), st.integers(0, 300)), min
 @each_mode
 @given(sizes=sizes)
 @settings(max_examples=15, deadline=None, database=None)
-def test_cuts_and_prefixes(parameters: dict[str, Any], sizes: list[int]) -> None:
+def test_block_boundaries_and_prefixes(parameters: dict[str, Any], sizes: list[int]) -> None:
     x = sound(700)
     whole = Autocorrelation(SOUND, **parameters).process(x)
     stage = Autocorrelation(SOUND, **parameters)
@@ -203,15 +209,15 @@ def test_first_blocks_that_complete_no_frame() -> None:
 
 
 @each_mode
-def test_reset_and_other_channels_are_a_new_beginning(parameters: dict[str, Any]) -> None:
+def test_reset_and_other_channels_reset_the_state(parameters: dict[str, Any]) -> None:
     def fresh(channels: int) -> Autocorrelation:
         return Autocorrelation(SOUND if channels == 3 else RATE, **parameters)
 
-    check_new_beginnings(fresh, SOUND, sound(333), sound(400, 2, 5), sound(400, 2, 2))
+    check_resets(fresh, SOUND, sound(333), sound(400, 2, 5), sound(400, 2, 2))
 
 
 @each_mode
-def test_what_comes_out_is_fresh(parameters: dict[str, Any]) -> None:
+def test_the_output_is_a_new_array(parameters: dict[str, Any]) -> None:
     check_fresh_output(Autocorrelation(SOUND, **parameters), sound(500))
 
 
@@ -253,20 +259,20 @@ def test_the_defaults() -> None:
     ],
     ids=str,
 )
-def test_a_change_keeps_the_buffer_and_the_grid(change: dict[str, Any]) -> None:
-    """The next frame starts where it would have started; all of it is made in the new way."""
+def test_a_change_keeps_the_buffer(change: dict[str, Any]) -> None:
+    """The start of the next frame does not change; the new parameters apply to the whole frame."""
     x = sound(900)
     before, after = framed(100, 40), {**framed(100, 40), **change}
     stage = Autocorrelation(SOUND, **before)
-    assert stage.process(x[..., :430]).shape[-1] == 9  # those at 0 ... 320; the next one at 360
+    assert stage.process(x[..., :430]).shape[-1] == 9  # frames at 0 ... 320; the next one at 360
     stage.configure(**change)
     np.testing.assert_allclose(
         stage.process(x[..., 430:]), Autocorrelation(SOUND, **after).process(x[..., 360:]), rtol=0, atol=1e-12
     )
 
 
-def test_changes_on_the_way_by_the_chain() -> None:
-    """Lags are aligned at 0; what was not computed is 0."""
+def test_changes_in_a_chain() -> None:
+    """Results are aligned at lag 0; missing values are 0."""
     x = np.random.default_rng(0).standard_normal((2, 3000))
     chain = Chain(RATE, ["autocorrelation"], {"fb_cfHz": [300.0, 900.0], "in_doNormalize": False, "ac_wSizeSec": 0.01})
     changes = [(1, "ac_wSizeSec", 0.02), (2, "ac_clipMethod", "clc"), (2, "fb_cfHz", [500.0, 600.0, 700.0])]
@@ -276,7 +282,7 @@ def test_changes_on_the_way_by_the_chain() -> None:
     np.testing.assert_allclose(made[:, :2, 0], 1.0, rtol=1e-14)
 
 
-def test_copies_may_be_changed_and_thrown_away() -> None:
+def test_copies_may_be_changed_and_discarded() -> None:
     expected = Autocorrelation(SOUND).process(sound(700))
     stage, made = Autocorrelation(SOUND), []
     for block in cut(sound(700), 100):
@@ -303,23 +309,23 @@ def test_copies_may_be_changed_and_thrown_away() -> None:
     ],
     ids=str,
 )
-def test_refusals(changes: dict[str, Any]) -> None:
+def test_invalid_values(changes: dict[str, Any]) -> None:
     (name,) = changes
     with pytest.raises(ValueError, match=f"^{name}: "):
         Autocorrelation(RATE, **changes)
-    stage, twin = Autocorrelation(RATE), Autocorrelation(RATE)
-    for each in (stage, twin):
+    stage, reference_stage = Autocorrelation(RATE), Autocorrelation(RATE)
+    for each in (stage, reference_stage):
         each.process(sound(200))
     other = {"ac_clipAlpha": 0.5} if name != "ac_clipAlpha" else {"ac_K": 1.5}
     with pytest.raises(ValueError, match=f"^{name}: "):
         stage.configure(**other, **changes)
-    assert stage.parameters == twin.parameters
-    np.testing.assert_array_equal(stage.process(sound(200)), twin.process(sound(200)))
+    assert stage.parameters == reference_stage.parameters
+    np.testing.assert_array_equal(stage.process(sound(200)), reference_stage.process(sound(200)))
     parameter = Autocorrelation.REPRESENTATION.parameter(name)
-    assert parameter.resolve_choice("nonsense") == "nonsense"  # there are no old scripts: nothing is taken for it
+    assert parameter.resolve_choice("nonsense") == "nonsense"  # there are no old scripts: no replacement
 
 
-def test_other_blocks_are_refused() -> None:
+def test_invalid_blocks_raise() -> None:
     for block in (np.zeros((2, 5)), np.zeros((3, 3, 5)), np.zeros((1, 3, 5)), np.zeros((2, 3, 5), complex)):
         with pytest.raises(ValueError, match=r"^block: "):
             Autocorrelation(SOUND).process(block)

@@ -1,4 +1,4 @@
-"""The helper that joins stages by hand gives what the chain of the original's seven gives."""
+"""The helper for chains gives the same results as the chain of the seven original stages."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def test_the_originals_chain() -> None:
     assert got["fb_cfHz"] == chain.stages["gammatone"].parameters["fb_cfHz"]
 
 
-def test_what_is_refused_anywhere_changes_nothing() -> None:
+def test_an_error_in_any_stage_changes_nothing() -> None:
     chain = Chain(RATE, ["ihc"], PARAMETERS)
     with pytest.raises(ValueError, match=r"^fb_cfHz: "):
         chain.modify("fb_cfHz", [9000.0])

@@ -1,4 +1,4 @@
-"""Gabor features: the reference vector, the definition written out, and ratemaps whose features are known."""
+"""Gabor features: the reference vector, a direct implementation of the definition, and ratemaps with known features."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from hypothesis import strategies as st
 from rosafe.dsp.signal_format import SignalFormat
 from rosafe.representations.gabor import Gabor, RunningZScore, filters, patterns
 
-from .chain import Chain, FloatArray, check_fresh_output, check_new_beginnings, cut, reference
+from .chain import Chain, FloatArray, check_fresh_output, check_resets, cut, reference
 
 REACH = 19
 
 
 def given_signal(channels: int, rate: float = 3.0) -> SignalFormat:
-    """Of ratemaps: at 3 frames a second, 5 s are 15 frames."""
+    """Return the format of ratemaps with 3 frames per second: 5 s are 15 frames."""
     frequencies = tuple(np.geomspace(100.0, 5000.0, channels))
     return SignalFormat(12000.0, rate, True, round(12000 / rate), 8000, frequencies, "gammatone")
 
 
 def rates(frames: int, channels: int = 5, seed: int = 0) -> FloatArray:
-    """Rates that go up and down by 60 dB, some of them 0."""
+    """Return rates that vary by 60 dB, some of them 0."""
     rng = np.random.default_rng(seed)
     x = rng.exponential(size=(2, channels, frames)) * 10.0 ** rng.uniform(-6, 0, (2, 1, frames))
     x[rng.random(x.shape) < 0.1] = 0.0
@@ -44,8 +44,8 @@ def axis(size: int, delta: float) -> list[float]:
     return found
 
 
-def spelt_out_weights(channels: int) -> FloatArray:
-    """W (G, C, 39), the frame u at u + 19, element by element."""
+def weights_by_definition(channels: int) -> FloatArray:
+    """Compute W (G, C, 39) element by element; frame u is at index u + 19."""
     made = []
     for omega in [0.0, *sorted(axis(40, 0.2))]:
         along = axis(3 * channels, 0.3)
@@ -81,10 +81,10 @@ def spelt_out_weights(channels: int) -> FloatArray:
     return np.array(made)
 
 
-def spelt_out(x: FloatArray, dynamic_range: float, remembered: int) -> FloatArray:
-    """z (2, G, F - 19) of rates (2, C, F)."""
+def by_definition(x: FloatArray, dynamic_range: float, remembered: int) -> FloatArray:
+    """Compute z (2, G, F - 19) of rates (2, C, F)."""
     channels, frames = x.shape[1:]
-    w, x = spelt_out_weights(channels), np.maximum(x, 0)
+    w, x = weights_by_definition(channels), np.maximum(x, 0)
     s = np.empty(x.shape)
     for ear, k in np.ndindex(2, frames):
         most = x[ear, :, max(0, k - remembered + 1) : k + 1].max()
@@ -113,8 +113,8 @@ def test_the_number_of_features(channels: int, count: int) -> None:
 
 
 @pytest.mark.parametrize("channels", [1, 2, 3, 5, 8, 17])
-def test_weights_are_the_definition(channels: int) -> None:
-    made, expected = patterns(channels), spelt_out_weights(channels)
+def test_weights_follow_the_definition(channels: int) -> None:
+    made, expected = patterns(channels), weights_by_definition(channels)
     assert len(made.places) == len(expected)
     for (first, number, reach, begin), wanted in zip(made.places.tolist(), expected, strict=True):
         dense = np.zeros((channels, 39))
@@ -124,7 +124,7 @@ def test_weights_are_the_definition(channels: int) -> None:
 
 
 def test_filters() -> None:
-    """Without a mean, but for one; the largest gain is 1."""
+    """Filters have zero mean, except one; the maximum gain is 1."""
     omegas = axis(40, 0.2)[::-1]
     np.testing.assert_allclose(omegas, [0.38887, 0.61931, 0.98631, 1.57080], atol=5e-6)
     made = list(filters(23))
@@ -137,12 +137,12 @@ def test_filters() -> None:
 
 @pytest.mark.parametrize("dynamic_range", [80.0, 20.0, 1000.0])
 @pytest.mark.parametrize(("channels", "rate"), [(5, 3.0), (1, 0.01), (8, 0.5), (3, 100.0)])
-def test_it_is_the_definition(channels: int, rate: float, dynamic_range: float) -> None:
-    """With 15 frames of memory, 1, 3 and more than there are; rounding is to the even number's other side: 2.5 is 3."""
+def test_the_result_follows_the_definition(channels: int, rate: float, dynamic_range: float) -> None:
+    """With windows of 15, 1 and 3 frames, and longer than the signal; 2.5 is rounded to 3."""
     x = rates(70, channels)
     stage = Gabor(given_signal(channels, rate), gb_maxDynamicRangeDB=dynamic_range)
     remembered = {3.0: 15, 0.01: 1, 0.5: 3, 100.0: 500}[rate]
-    got, expected = stage.process(x), spelt_out(x, dynamic_range, remembered)
+    got, expected = stage.process(x), by_definition(x, dynamic_range, remembered)
     assert got.shape == expected.shape
     np.testing.assert_allclose(got, expected, rtol=0, atol=1e-8)
     assert not got[..., 0].any()
@@ -154,7 +154,7 @@ def test_negative_rates_count_as_0() -> None:
 
 
 def test_a_ripple_is_found_by_its_filter() -> None:
-    """Levels that go up and down at the frequency of one filter: it varies most, around the middle channel."""
+    """Levels that vary at the frequency of one filter: its feature varies most, around the middle channel."""
     channels, (omega, kappa) = 23, (axis(40, 0.2)[1], axis(69, 0.3)[1])
     time, place = np.arange(400), np.arange(channels)[:, np.newaxis]
     level = 10 * np.cos(omega * time + kappa * place)
@@ -175,7 +175,7 @@ def test_a_ripple_is_found_by_its_filter() -> None:
     order = [(0.0, k) for k in [0.0, *sorted(along)]]
     order += [(w, k) for w in sorted(axis(40, 0.2)) for k in sorted([-k for k in along] + [0.0] + along)]
     assert order[which] == (omega, kappa)
-    # and the ripple runs down where kappa and omega have the same sign, as in the filter: not its mirror image
+    # the ripple moves down if kappa and omega have the same sign, as the filter does: not its mirror image
     assert features[best] > 3 * features[best - sum(counts[:which]) + sum(counts[: order.index((omega, -kappa))])]
 
 
@@ -184,10 +184,10 @@ def test_a_ripple_is_found_by_its_filter() -> None:
 
 @pytest.mark.parametrize("length", [1, 2, 3, 7, 50, 500])
 def test_deviations_are_those_of_the_window(length: int) -> None:
-    """Whatever the mean; nothing drifts, and each window is on its own."""
+    """With any mean; errors do not accumulate, and windows are independent."""
     rng = np.random.default_rng(length)
     values = rng.standard_normal((1300, 9)) * 10.0 ** rng.integers(-3, 4, 9) + rng.choice([0.0, 1e3], 9)
-    values[400:700] *= 1e6  # what leaves the window leaves no trace
+    values[400:700] *= 1e6  # values outside the window have no effect
     values[900:, 2] = 7.0
     values[900:, 3] = 7.0 + 1e-12 * rng.standard_normal(400)
     made = RunningZScore(length, np.empty((0, 9)))
@@ -204,19 +204,19 @@ def test_deviations_are_those_of_the_window(length: int) -> None:
 
 @pytest.mark.parametrize("after", [1, 5, 20, 33, 100])
 @pytest.mark.parametrize("come", [0, 3, 20, 47, 60])
-def test_another_window_goes_on_with_what_is_remembered(come: int, after: int) -> None:
+def test_another_window_keeps_past_values(come: int, after: int) -> None:
     values = np.random.default_rng(come).standard_normal((200, 4))
     before = RunningZScore(20, np.empty((0, 4)))
     before.process(values[:come])
     made = before.resized(after)
     got, wide = made.process(values[come:]), before.process(values[come:])
-    first = max(0, come - 20)  # what had been forgotten is forgotten
+    first = max(0, come - 20)  # older values are not restored
     for k in range(come, 200):
         past = values[max(first, k - after + 1) : k + 1]
         expected = (values[k] - past.mean(axis=0)) / np.where(past.std(axis=0) > 0, past.std(axis=0), 1)
         np.testing.assert_allclose(got[k - come], expected, rtol=0, atol=1e-11)
     expected = RunningZScore(20, np.empty((0, 4))).process(values)[come:]
-    np.testing.assert_array_equal(wide, expected)  # the one before does not notice
+    np.testing.assert_array_equal(wide, expected)  # the original is not affected
 
 
 # --- streams ------------------------------------------------------------------------------------------------------
@@ -226,7 +226,7 @@ sizes = st.lists(st.one_of(st.sampled_from([0, 1, 2]), st.integers(0, 60)), min_
 
 @given(sizes=sizes)
 @settings(max_examples=25, deadline=None, database=None)
-def test_cuts_and_prefixes(sizes: list[int]) -> None:
+def test_block_boundaries_and_prefixes(sizes: list[int]) -> None:
     x = rates(100)
     whole = Gabor(given_signal(5)).process(x)
     assert whole.shape[-1] == 81
@@ -241,7 +241,7 @@ def test_cuts_and_prefixes(sizes: list[int]) -> None:
     np.testing.assert_allclose(first, whole[..., : first.shape[-1]], rtol=0, atol=1e-9)
 
 
-def test_frames_are_held_back() -> None:
+def test_the_output_is_19_frames_late() -> None:
     stage = Gabor(given_signal(5))
     assert stage.look_ahead == 19
     assert [stage.output_count(count) for count in (0, 1, 19, 20, 100)] == [0, 0, 0, 1, 81]
@@ -252,19 +252,19 @@ def test_frames_are_held_back() -> None:
     assert stage.process(rates(7)).shape[-1] == 7
 
 
-def test_reset_and_other_channels_are_a_new_beginning() -> None:
-    check_new_beginnings(lambda n: Gabor(given_signal(n)), given_signal(5), rates(60), rates(60, 6), rates(60, 2))
+def test_reset_and_other_channels_reset_the_state() -> None:
+    check_resets(lambda n: Gabor(given_signal(n)), given_signal(5), rates(60), rates(60, 6), rates(60, 2))
     stage = Gabor(given_signal(5))
     stage.set_input_format(given_signal(7))
-    assert stage.derived["gb_nFeatures"] == len(spelt_out_weights(7))
+    assert stage.derived["gb_nFeatures"] == len(weights_by_definition(7))
 
 
-def test_what_comes_out_is_fresh() -> None:
+def test_the_output_is_a_new_array() -> None:
     check_fresh_output(Gabor(given_signal(5)), rates(60))
 
 
 @pytest.mark.filterwarnings("error")
-def test_silence_and_what_is_steady() -> None:
+def test_silence_and_steady_sound() -> None:
     for level in (0.0, 1e-300, 1e-9, 1.0, 1e100):
         stage = Gabor(given_signal(5))
         for frames in (1, 2, 40, 30):
@@ -295,8 +295,8 @@ def test_the_declaration() -> None:
     assert stage.output_format == stage.input_format
 
 
-def test_a_change_of_the_range_keeps_everything() -> None:
-    """Levels that were made stay as they are."""
+def test_a_change_of_the_range_keeps_the_state() -> None:
+    """Levels computed before are kept."""
     x = rates(100)
     stage = Gabor(given_signal(5))
     first = stage.process(x[..., :50])
@@ -305,13 +305,13 @@ def test_a_change_of_the_range_keeps_everything() -> None:
     wide, narrow = (Gabor(given_signal(5), gb_maxDynamicRangeDB=value).process(x) for value in (80.0, 15.0))
     np.testing.assert_array_equal(first, wide[..., :31])
     assert second.shape[-1] == 50
-    later = 50 + REACH  # from here on, all levels that count are of the new range; the window of 15 frames, too, later
+    later = 50 + REACH  # from here on, all levels have the new range; the window of 15 frames follows later
     assert np.abs(second[..., :3] - narrow[..., 31:34]).max() > 0.1
     np.testing.assert_allclose(second[..., later + 14 - 31 :], narrow[..., later + 14 :], rtol=0, atol=1e-9)
 
 
-def test_another_step_of_the_parent_goes_on_with_what_is_remembered() -> None:
-    """5 s are another number of frames then; those that have come count as they are."""
+def test_another_step_of_the_parent_keeps_past_values() -> None:
+    """5 s are then another number of frames; past frames are kept."""
     x = rates(120)
     stage = Gabor(given_signal(5, 3.0))
     first = stage.process(x[..., :50])
@@ -320,24 +320,24 @@ def test_another_step_of_the_parent_goes_on_with_what_is_remembered() -> None:
     assert (stage.look_ahead, stage.output_format.rate) == (19, 1.0)
     np.testing.assert_array_equal(first, Gabor(given_signal(5, 3.0)).process(x)[..., :31])
     # a maximum 5 frames ago counts for 15 frames before the change, and for 5 after it
-    expected = spelt_out(x, 80.0, 5)
+    expected = by_definition(x, 80.0, 5)
     np.testing.assert_allclose(second[..., 50 + REACH + 4 - 31 :], expected[..., 50 + REACH + 4 :], rtol=0, atol=1e-8)
 
 
-def test_changes_on_the_way_by_the_chain() -> None:
+def test_changes_in_a_chain() -> None:
     x = np.random.default_rng(0).standard_normal((2, 24000))
     values = {"fb_nChannels": 4, "fb_highFreqHz": 3000.0, "in_doNormalize": False}
     chain = Chain(8000.0, ["gabor"], values)
     changes = [(1, "gb_maxDynamicRangeDB", 40.0), (1, "rm_hSizeSec", 0.02), (2, "fb_nChannels", 6)]
     made = chain.run(x, 8000, changes)["gabor"]
-    before, after = len(spelt_out_weights(4)), len(spelt_out_weights(6))
-    frames = [99 - 19, 50, 50 - 19]  # after the change of channels, 19 frames are never put out
+    before, after = len(weights_by_definition(4)), len(weights_by_definition(6))
+    frames = [99 - 19, 50, 50 - 19]  # after the change of channels, 19 frames are dropped
     assert made.shape == (2, after, sum(frames))
     assert not made[:, before:, : sum(frames[:2])].any()
     assert np.isfinite(made).all()
 
 
-def test_copies_may_be_changed_and_thrown_away() -> None:
+def test_copies_may_be_changed_and_discarded() -> None:
     expected = Gabor(given_signal(5)).process(rates(100))
     stage, made = Gabor(given_signal(5)), []
     for block in cut(rates(100), 13):
@@ -350,7 +350,7 @@ def test_copies_may_be_changed_and_thrown_away() -> None:
 
 
 @pytest.mark.parametrize("value", [0, -1, 1000.1, math.nan, math.inf, "x", [1.0, 2.0], None])
-def test_refusals(value: Any) -> None:
+def test_invalid_values(value: Any) -> None:
     with pytest.raises(ValueError, match=r"^gb_maxDynamicRangeDB: "):
         Gabor(given_signal(5), gb_maxDynamicRangeDB=value)
     stage = Gabor(given_signal(5))
@@ -359,7 +359,7 @@ def test_refusals(value: Any) -> None:
     np.testing.assert_array_equal(stage.process(rates(40)), Gabor(given_signal(5)).process(rates(40)))
 
 
-def test_other_blocks_are_refused() -> None:
+def test_invalid_blocks_raise() -> None:
     for block in (np.zeros((2, 5)), np.zeros((3, 3, 5)), np.zeros((1, 3, 5)), np.zeros((2, 3, 5), complex)):
         with pytest.raises(ValueError, match=r"^block: "):
             Gabor(given_signal(5)).process(block)

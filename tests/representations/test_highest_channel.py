@@ -1,4 +1,4 @@
-"""The highest channel where nobody has given it: 8000 Hz, or what the sample rate allows."""
+"""The highest channel if it is not given: 8000 Hz, or a fraction of the sample rate."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from rosafe.representations.filterbank import Filterbank
         (16000, {"fb_nChannels": 16}, 7600.0),
         (16000, {"fb_nChannels": 16, "fb_type": "drnl"}, 7600.0),
         (16000, {"fb_nChannels": 16, "fb_highFreqHz": 7000.0}, 7000.0),
-        (16000, {}, 8000.0),  # the default's channels end below it
+        (16000, {}, 8000.0),  # the default channels end below it
         (8000, {}, 3800.0),
         (8000, {"fb_nERBs": 0.5, "fb_lowFreqHz": 200.0}, 3800.0),
         (44100, {"fb_nChannels": 16}, 8000.0),
@@ -32,15 +32,15 @@ def test_it_follows_the_sample_rate(rate: float, values: dict[str, Any], highest
     assert max(told["fb_cfHz"]) < rate / 2
 
 
-def test_a_list_rules() -> None:
+def test_a_list_takes_precedence() -> None:
     assert Filterbank(16000, fb_cfHz=[100.0, 7900.0]).parameters["fb_highFreqHz"] == 7900.0
 
 
-def test_it_follows_changes_until_it_is_given() -> None:
+def test_it_follows_updates_until_it_is_given() -> None:
     stage = Filterbank(16000)
     stage.configure(fb_nChannels=5)
     assert stage.parameters["fb_highFreqHz"] == 7600.0
-    with pytest.raises(ValueError, match=r"fb_highFreqHz: a channel at 8000 Hz .* 7600 Hz would do"):
+    with pytest.raises(ValueError, match=r"fb_highFreqHz: expected .* got one at 8000 Hz; use at most 7600 Hz"):
         stage.configure(fb_highFreqHz=8000.0)
     stage.configure(fb_nERBs=1.0)
     assert stage.parameters["fb_highFreqHz"] == 8000.0
@@ -49,9 +49,9 @@ def test_it_follows_changes_until_it_is_given() -> None:
     assert stage.parameters["fb_highFreqHz"] == stage.parameters["fb_cfHz"][-1] == 7999.0
 
 
-def test_what_is_refused_is_not_given() -> None:
+def test_a_rejected_value_does_not_count_as_given() -> None:
     stage = Filterbank(8000)
-    with pytest.raises(ValueError, match="3800 Hz would do"):
+    with pytest.raises(ValueError, match="use at most 3800 Hz"):
         stage.configure(fb_highFreqHz=5000.0)
     stage.configure(fb_nChannels=5)
     assert stage.parameters["fb_highFreqHz"] == 3800.0
@@ -60,6 +60,6 @@ def test_what_is_refused_is_not_given() -> None:
 def test_all_kinds_at_the_rates_of_speech() -> None:
     sound = 0.1 * np.random.default_rng(3).standard_normal((2, 2000))
     for rate in (8000, 16000):
-        kinds = [kind for kind in STAGES if kind != "amsFeatures" or rate > 8000]  # modulations need more
+        kinds = [kind for kind in STAGES if kind != "amsFeatures" or rate > 8000]  # modulation filters require more
         got = rosafe.process(sound, rate, parameters={"fb_nChannels": 12}, outputs=kinds)
         assert got["fb_cfHz"][-1] == 0.475 * rate

@@ -1,4 +1,4 @@
-"""Time difference and coherence: the reference vectors, parabolas, delays and mixtures that are known."""
+"""ITD and interaural coherence: the reference vectors, parabolas, known delays and mixtures."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ import pytest
 
 from rosafe.dsp.signal_format import SignalFormat
 from rosafe.representations import KINDS
-from rosafe.representations.interaural import Ic, Itd
+from rosafe.representations.ic import Ic
+from rosafe.representations.itd import Itd
 
 from .chain import Chain, FloatArray, process, reference
 
@@ -20,7 +21,7 @@ GIVEN = SignalFormat(RATE, 100.0, True, 160, 320, (500.0,), "gammatone", lags=4)
 
 
 def of(correlations: list[float] | FloatArray) -> tuple[float, float]:
-    """ITD in samples and coherence of one frame of one channel."""
+    """Return ITD in samples and coherence of one frame of one channel."""
     block = np.array(correlations, float)[np.newaxis, :, np.newaxis]
     return Itd(GIVEN).process(block).item() * RATE, Ic(GIVEN).process(block).item()
 
@@ -40,8 +41,8 @@ def test_the_top_of_a_parabola(top: float, height: float) -> None:
     assert ic == pytest.approx(height, rel=1e-13)
 
 
-def test_it_is_the_formula() -> None:
-    """In rational numbers, for every place that the peak can have."""
+def test_the_result_follows_the_formula() -> None:
+    """In rational numbers, for all positions of the peak."""
     rng = np.random.default_rng(5)
     block = np.round(rng.standard_normal((40, 9, 50)), 1)  # with ties
     itd, ic = Itd(GIVEN).process(block) * RATE, Ic(GIVEN).process(block)
@@ -70,7 +71,7 @@ def test_equal_values() -> None:
 
 @pytest.mark.filterwarnings("error")
 def test_a_peak_that_rounding_flattens() -> None:
-    """1 less its neighbours is 0 for floating point if 2 c[i] is subtracted first."""
+    """The curvature would be rounded to 0 if 2 c[i] were subtracted first."""
     below = np.nextafter(1.0, 0.0)
     assert of([0, 0, 0, 0, below, 1, 1, 0, 0]) == (1.5, 1.0)
     itd, ic = of([0, 0, 5e-324, 1e-323, 5e-324, 0, 0, 0, 0])
@@ -80,7 +81,7 @@ def test_a_peak_that_rounding_flattens() -> None:
 
 @pytest.mark.parametrize("delay", [-9, -4, 0, 3, 8])
 def test_the_delay_between_the_ears(delay: int) -> None:
-    """Positive where the left ear hears it later; the filters ring, so that the peak lies between samples."""
+    """Positive if the left ear lags; the filters ring, so that the peak is between samples."""
     sound = np.random.default_rng(2).standard_normal(6400)
     ears = np.stack([np.roll(sound, delay), sound])
     values = {"fb_cfHz": CHANNELS, "ihc_method": "none", "cc_maxDelaySec": 0.001}
@@ -92,7 +93,7 @@ def test_the_delay_between_the_ears(delay: int) -> None:
 
 
 def test_coherence_of_a_mixture() -> None:
-    """Noise of which the part p is common to the ears, in power: the coherence is near p."""
+    """Noise with a fraction p of its power common to both ears: the coherence is about p."""
     rng = np.random.default_rng(4)
     common, own = rng.standard_normal(48000), rng.standard_normal((2, 48000))
     values = {"fb_cfHz": [4000.0], "ihc_method": "none", "cc_wSizeSec": 0.5, "cc_hSizeSec": 0.5}
@@ -108,7 +109,7 @@ def test_one_silent_ear() -> None:
     assert not made["ic"].any()
 
 
-def test_lags_may_change_on_the_way() -> None:
+def test_lags_may_change() -> None:
     sound = np.random.default_rng(2).standard_normal((2, 4800))
     chain = Chain(RATE, ["itd", "ic"], {"in_doNormalize": False, "fb_cfHz": CHANNELS})
     made = chain.run(sound, 1600, [(1, "cc_maxDelaySec", 0.0001), (2, "cc_maxDelaySec", 0.02)])

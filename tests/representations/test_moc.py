@@ -1,4 +1,4 @@
-"""Medial olivocochlear attenuation: the reference vectors, the cubic and where it is cut off, and what is refused."""
+"""Medial olivocochlear attenuation: the reference vectors, the cubic and its limits, invalid values."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ FACTORS = [Fraction(x) for x in ("-0.00012411", "-0.051322", "-6.3528", "-206.11
 
 
 def attenuation(levels: Any, **parameters: float) -> FloatArray:
-    """Of the levels (F,) 20 log10 R in dB."""
+    """Return the attenuation for levels (F,) 20 log10 R in dB."""
     rates = np.broadcast_to(10 ** (np.array(levels, float) / 20), (2, 1, len(levels)))
     return Moc(GIVEN, **parameters).process(rates)[1, 0]
 
 
 def cubic(level: float) -> float:
-    """P(y), in rational numbers."""
+    """Compute P(y) in rational numbers."""
     y, a, b, c, d = Fraction(level), *FACTORS
     return float(a * y**3 + b * y**2 + c * y + d)
 
@@ -46,7 +46,7 @@ def test_the_cubic_between_its_turning_points() -> None:
 
 
 def test_it_saturates() -> None:
-    """The cubic alone would say 37 dB at -80 dB, 0 at -40 dB, and ever more below -182 dB."""
+    """The cubic itself would give 37 dB at -80 dB, 0 at -40 dB, and increase below -182 dB."""
     top, bottom = cubic(-93.821837), max(0.0, cubic(-181.858339))
     free = {"moc_thresholdRatedB": -1000.0, "moc_maxAttenuationdB": 200.0}
     np.testing.assert_allclose(attenuation([-93, -80, -40, 0, 100], **free), top, rtol=1e-12)
@@ -58,7 +58,7 @@ def test_it_saturates() -> None:
 
 
 def test_the_threshold() -> None:
-    """Below it the attenuation is that of the threshold; 0 dB makes every sound as loud as can be."""
+    """Below it the attenuation is that at the threshold; 0 dB gives the maximum for any sound."""
     got = attenuation([-300, -150, -140.5, -120], moc_thresholdRatedB=-140.0)
     np.testing.assert_allclose(got, [cubic(-140.0)] * 3 + [cubic(-120.0)], rtol=1e-11)
     np.testing.assert_array_equal(attenuation([-300, -150, -93], moc_thresholdRatedB=0.0), 40.0)
@@ -89,7 +89,7 @@ def test_changes_take_effect_at_once() -> None:
         *(("moc_maxAttenuationdB", value) for value in (-1e-9, 200.1, math.inf)),
     ],
 )
-def test_values_that_are_refused(name: str, value: Any) -> None:
+def test_invalid_values(name: str, value: Any) -> None:
     with pytest.raises(ValueError, match=f"^{name}: "):
         Moc(GIVEN, **{name: value})
     stage = Moc(GIVEN)

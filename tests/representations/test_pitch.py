@@ -1,4 +1,4 @@
-"""Pitch: the reference vectors, a model written out frame by frame, its memory and its look-ahead, and a glide."""
+"""Pitch: the reference vectors, a direct implementation frame by frame, memory and look-ahead, and a glide."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from rosafe.representations.pitch import Pitch
 from .chain import Chain, FloatArray, cut, process, reference
 
 FS = 1000.0
-# 10 frames a second, so that 5 s are 50 of them; lags from 0 to 30 ms
+# 10 frames per second: 5 s are 50 frames; lags from 0 to 30 ms
 GIVEN = SignalFormat(FS, 10.0, True, 100, 31, (200.0, 300.0), "gammatone", lags=30)
 WIDE: dict[str, Any] = {"pi_rangeHz": [40.0, 400.0]}  # lags 3 to 25
 
 
 def correlations(frames: int, seed: int = 0, channels: int = 2, lags: int = 31) -> FloatArray:
-    """Numbers with few different values, so that there are plateaus and ties; some frames are silent, some negative."""
+    """Return numbers with few different values, for plateaus and ties; some frames are silent, some negative."""
     rng = np.random.default_rng(seed)
     made = rng.integers(-3, 6, (2, channels, lags, frames)) / 8
     made[..., rng.random(frames) < 0.1] = 0.0
@@ -36,7 +36,7 @@ def correlations(frames: int, seed: int = 0, channels: int = 2, lags: int = 31) 
 
 
 def peaks_at(lags: list[int], heights: list[float]) -> FloatArray:
-    """Frames of both ears whose only peak lies at these lags; none where the height is 0."""
+    """Return frames of both ears whose only peak is at these lags; none if the height is 0."""
     made = np.zeros((2, 2, 31, len(lags)))
     for frame, (lag, height) in enumerate(zip(lags, heights, strict=True)):
         made[:, :, lag, frame] = height
@@ -46,7 +46,7 @@ def peaks_at(lags: list[int], heights: list[float]) -> FloatArray:
 def by_the_book(
     frames: FloatArray, limits: list[float], threshold: float, order: int, rate: float = 10.0
 ) -> tuple[list[float], list[float], list[float]]:
-    """One ear (C, L, F) to pitch, rawPitch and confidence, those that can be told."""
+    """Compute pitch, rawPitch and confidence of one ear (C, L, F), without pending frames."""
     raw: list[float] = []
     confidence: list[float] = []
     chosen: list[float] = []
@@ -78,7 +78,7 @@ def test_reference_vectors() -> None:
 @pytest.mark.parametrize("channels", [1, 2, 5])
 @pytest.mark.parametrize("order", [1, 2, 3, 4, 7, 8, 99])
 @pytest.mark.parametrize("threshold", [0.0, 0.5, 0.7, 1.0])
-def test_it_is_the_formula(threshold: float, order: int, channels: int) -> None:
+def test_the_result_follows_the_formula(threshold: float, order: int, channels: int) -> None:
     x = correlations(170, order, channels)
     parameters = {**WIDE, "pi_confThres": threshold, "pi_medianOrder": order}
     got = Pitch(GIVEN, **parameters).process(x)
@@ -93,13 +93,13 @@ def test_it_is_the_formula(threshold: float, order: int, channels: int) -> None:
     ("curve", "lag", "height"),
     [
         ([0, 0, 1, 0, 0, 0], 2, 1),
-        ([0, 0, 1, 1, 0, 0], 2, 1),  # a plateau, at the floor of its middle
+        ([0, 0, 1, 1, 0, 0], 2, 1),  # a plateau: its middle, rounded down
         ([0, 1, 1, 1, 0, 0], 2, 1),
         ([0, 1, 1, 1, 1, 0], 2, 1),
-        ([0, 1, 0, 2, 0, 2], 3, 2),  # the last one is the range's end
-        ([3, 1, 2, 1, 0, 4], 2, 2),  # nor is the first one a peak
+        ([0, 1, 0, 2, 0, 2], 3, 2),  # the last value is the end of the range
+        ([3, 1, 2, 1, 0, 4], 2, 2),  # the first value is not a peak
         ([0, 1, 0, 1, 0, 0], 1, 1),  # the first of equals
-        ([0, 1, 1, 2, 2, 0], 3, 2),  # a step on the way up is none
+        ([0, 1, 1, 2, 2, 0], 3, 2),  # a step in a rise is not a peak
         ([2, 2, 1, 1, 1, 2], 0, 0),
         ([0, 1, 2, 3, 3, 3], 0, 0),  # a plateau at the end
         ([0, 0, 0, 0, 0, 0], 0, 0),
@@ -120,14 +120,16 @@ def test_peaks(curve: list[float], lag: int, height: float) -> None:
 @pytest.mark.parametrize("limits", [[80.0, 400.0], [100.0, 300.0], [0.1, 7.0], [49.0, 1e9], [90.0, 110.0]])
 @pytest.mark.parametrize("rate", [8000.0, 16000.0, 44100.0, 48000.0, 11025.0])
 def test_the_range(rate: float, limits: list[float]) -> None:
-    """In any order; both ends belong to it, as the quotients say."""
+    """Both ends are included, by the quotients; the lowest pitch comes first."""
     format_ = SignalFormat(rate, 100.0, True, round(rate / 100), 2, (), "", lags=round(rate / 50))
     lags = [lag for lag in range(format_.lags + 1) if 1 / limits[1] <= lag / rate <= 1 / limits[0]]
     if len(lags) < 3:
         with pytest.raises(ValueError, match=r"^pi_rangeHz: .* lags"):
             Pitch(format_, pi_rangeHz=limits)
         return
-    for given_limits in (limits, limits[::-1]):
+    with pytest.raises(ValueError, match=r"^pi_rangeHz: expected the lowest and the highest pitch, got "):
+        Pitch(format_, pi_rangeHz=limits[::-1])
+    for given_limits in (limits,):
         stage = Pitch(format_, pi_rangeHz=given_limits, pi_medianOrder=1)
         assert stage._range == slice(lags[0], lags[-1] + 1)
         x = np.zeros((2, 1, format_.lags + 1, 3))
@@ -138,7 +140,7 @@ def test_the_range(rate: float, limits: list[float]) -> None:
 
 @pytest.mark.parametrize(("rate", "reach"), [(10.0, 50), (1.3, 7), (0.01, 1), (0.3, 2), (0.29, 1)])
 def test_five_seconds_of_confidences(rate: float, reach: int) -> None:
-    """A clear frame silences less clear ones for as long as it is remembered, and none before it."""
+    """A clear frame suppresses less clear ones for 5 s, and none before it."""
     lags = [9] * (2 * reach + 5)
     heights = [0.5] * len(lags)
     heights[2] = 1.0
@@ -159,7 +161,7 @@ sizes = st.lists(st.one_of(st.sampled_from([0, 1, 2]), st.integers(0, 90)), min_
 
 @given(sizes=sizes, order=st.sampled_from([1, 2, 3, 6, 41, 99]), rate=st.sampled_from([0.4, 10.0]))
 @settings(max_examples=40, deadline=None, database=None)
-def test_cuts_and_prefixes(sizes: list[int], order: int, rate: float) -> None:
+def test_block_boundaries_and_prefixes(sizes: list[int], order: int, rate: float) -> None:
     def stage() -> Pitch:
         return Pitch(replace(GIVEN, rate=rate), **WIDE, pi_medianOrder=order)
 
@@ -189,8 +191,8 @@ def test_silence_has_no_pitch() -> None:
         assert not made[:, 1:].any()
 
 
-def test_reset_and_other_channels_are_a_new_beginning() -> None:
-    """Frames that were held back are dropped then."""
+def test_reset_and_other_channels_reset_the_state() -> None:
+    """Pending frames are dropped."""
     for order in (3, 8):
         stage = Pitch(GIVEN, **WIDE, pi_medianOrder=order)
         expected = stage.process(correlations(40))
@@ -201,10 +203,10 @@ def test_reset_and_other_channels_are_a_new_beginning() -> None:
         stage.set_input_format(replace(GIVEN, center_frequencies=(1.0, 2.0), filterbank="drnl"))
         np.testing.assert_array_equal(stage.process(correlations(40)), expected)
         fresh = Pitch(GIVEN, **WIDE, pi_medianOrder=order).process(correlations(40, channels=3))
-        np.testing.assert_array_equal(stage.process(correlations(40, channels=3)), fresh)  # nobody has told
+        np.testing.assert_array_equal(stage.process(correlations(40, channels=3)), fresh)  # without notification
 
 
-def test_what_comes_out() -> None:
+def test_the_output() -> None:
     stage = Pitch(GIVEN, **WIDE)
     x = correlations(30)
     x.setflags(write=False)
@@ -234,7 +236,7 @@ def test_the_defaults_and_the_documentations_names() -> None:
 
 @pytest.mark.parametrize("orders", [(3, 9), (9, 3), (1, 99), (99, 1), (4, 5), (5, 4), (2, 1)])
 def test_another_order_of_the_median(orders: tuple[int, int]) -> None:
-    """The next frame is the first that has not come out; each is as if its order had always been in force."""
+    """The next output frame follows the previous one; each is computed as if its order had always been set."""
     x = correlations(150)
     stage = Pitch(GIVEN, **WIDE, pi_medianOrder=orders[0])
     made = [stage.process(x[..., :70])]
@@ -247,8 +249,8 @@ def test_another_order_of_the_median(orders: tuple[int, int]) -> None:
     np.testing.assert_array_equal(np.concatenate(made, axis=-1), expected)
 
 
-def test_thresholds_and_ranges_hold_for_what_comes() -> None:
-    """What is held back stays as it was; greatest confidences are remembered."""
+def test_thresholds_and_ranges_apply_to_later_frames() -> None:
+    """Pending frames do not change; past confidences are kept."""
     x = peaks_at([9, 9, 20, 20, 20, 20], [1.0, 0.5, 0.5, 0.5, 0.9, 0.6])
     stage = Pitch(GIVEN, **WIDE, pi_medianOrder=1, pi_confThres=0.8)
     made = [stage.process(x[..., :3])]
@@ -270,7 +272,7 @@ def test_thresholds_and_ranges_hold_for_what_comes() -> None:
 
 
 def test_another_step_of_the_parent() -> None:
-    """5 s are as many frames as they are now; the frames that are remembered stay."""
+    """5 s are another number of frames; past frames are kept."""
     stage = Pitch(GIVEN, **WIDE, pi_medianOrder=1)
     assert not np.isnan(stage.process(peaks_at([9] * 20, [0.9] * 19 + [1.0]))[0, 0]).any()
     stage.set_input_format(replace(GIVEN, rate=4.0, hop=250))  # 20 frames
@@ -285,17 +287,17 @@ def test_another_window_of_the_parent() -> None:
     stage.process(correlations(10))
     stage.set_input_format(replace(GIVEN, lags=12))
     assert stage._range == slice(3, 13)
-    assert stage.process(correlations(10, lags=13)).shape == (2, 3, 10)  # with the one that was held back
-    with pytest.raises(ValueError, match=r"^pi_rangeHz: .* 2 lags"):
+    assert stage.process(correlations(10, lags=13)).shape == (2, 3, 10)  # with the pending frame
+    with pytest.raises(ValueError, match=r"^pi_rangeHz: .* got 2 from"):
         stage.set_input_format(replace(GIVEN, lags=4))
     assert stage.input_format.lags == 12
     assert stage.process(correlations(10, lags=13)).shape == (2, 3, 10)
-    with pytest.raises(ValueError, match=r"^block: 31 lags"):
+    with pytest.raises(ValueError, match=r"^block: expected 13 lags, got 31"):
         stage.process(correlations(10))
 
 
 def test_in_a_chain() -> None:
-    """A window of the autocorrelation that leaves too few lags is refused; new channels begin anew."""
+    """A window of the autocorrelation with too few lags is an error; new channels reset the state."""
     x = np.random.default_rng(0).standard_normal((2, 6000))
     values = {"fb_cfHz": [300.0, 900.0], "in_doNormalize": False}
     chain = Chain(8000.0, ["autocorrelation", "pitch"], values)
@@ -304,12 +306,12 @@ def test_in_a_chain() -> None:
     made = chain.run(x, 2000, [(1, "ac_wSizeSec", 0.03), (2, "fb_cfHz", [300.0, 901.0])])
     frames = made["autocorrelation"].shape[-1]
     assert frames == 24 + 24 + 23
-    assert made["pitch"].shape[-1] == 23 + 24 + 22  # one is held back, then dropped
+    assert made["pitch"].shape[-1] == 23 + 24 + 22  # one is pending, then dropped
     begun = Pitch(chain.stages["autocorrelation"].output_format).process(made["autocorrelation"][..., -23:])
     np.testing.assert_allclose(made["pitch"][..., -22:], begun, rtol=1e-14)
 
 
-def test_copies_may_be_changed_and_thrown_away() -> None:
+def test_copies_may_be_changed_and_discarded() -> None:
     expected = Pitch(GIVEN, **WIDE).process(correlations(60))
     stage, made = Pitch(GIVEN, **WIDE), []
     for block in cut(correlations(60), 7):
@@ -344,21 +346,21 @@ def test_copies_may_be_changed_and_thrown_away() -> None:
     ],
     ids=str,
 )
-def test_refusals(changes: dict[str, Any]) -> None:
+def test_invalid_values(changes: dict[str, Any]) -> None:
     (name,) = changes
     with pytest.raises(ValueError, match=f"^{name}: "):
         Pitch(GIVEN, **changes)
-    stage, twin = Pitch(GIVEN, **WIDE), Pitch(GIVEN, **WIDE)
-    for each in (stage, twin):
+    stage, reference_stage = Pitch(GIVEN, **WIDE), Pitch(GIVEN, **WIDE)
+    for each in (stage, reference_stage):
         each.process(correlations(20))
     other = {"pi_confThres": 0.1} if name != "pi_confThres" else {"pi_medianOrder": 9}
     with pytest.raises(ValueError, match=f"^{name}: "):
         stage.configure(**other, **changes)
-    assert stage.parameters == twin.parameters
-    np.testing.assert_array_equal(stage.process(correlations(20)), twin.process(correlations(20)))
+    assert stage.parameters == reference_stage.parameters
+    np.testing.assert_array_equal(stage.process(correlations(20)), reference_stage.process(correlations(20)))
 
 
-def test_other_blocks_are_refused() -> None:
+def test_invalid_blocks_raise() -> None:
     for block in (np.zeros((2, 3, 5)), np.zeros((3, 3, 31, 5)), np.zeros((2, 3, 31, 5), complex)):
         with pytest.raises(ValueError, match=r"^block: "):
             Pitch(GIVEN).process(block)
@@ -368,7 +370,7 @@ def test_other_blocks_are_refused() -> None:
 
 
 def test_a_glide() -> None:
-    """Within 2 % where it is voiced, and it is voiced nearly everywhere; windows of several periods are needed."""
+    """Within 2 % in voiced frames, which are almost all; windows of several periods are required."""
     rate, seconds, window = 16000.0, 1.5, 0.04
     time = np.arange(int(rate * seconds)) / rate
     phase = np.cumsum(110.0 * 2 ** (time / seconds)) / rate  # one octave up
@@ -386,8 +388,8 @@ def test_a_glide() -> None:
 
 
 @pytest.mark.parametrize("steps", [2, 3, 5, 1000])
-def test_without_plateaus_the_short_way_finds_the_same_peaks(steps: int) -> None:
-    """Few steps make plateaus, many make none."""
+def test_the_fast_path_finds_the_same_peaks(steps: int) -> None:
+    """Values with few levels have plateaus, those with many have none."""
     rng = np.random.default_rng(steps)
     for size in (3, 4, 17, 100):
         curves = rng.integers(-1, steps, (2, 5, size)) / 10

@@ -1,4 +1,4 @@
-"""Precedence: the reference vector, the definition written out sum by sum, and sounds with a known direction."""
+"""Precedence: the reference vector, a direct implementation of the definition, and sounds with a known direction."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def framed(size: int, hop: int, rate: float = RATE, **more: Any) -> dict[str, An
 def sound(
     samples: int, channels: int = 3, seed: int = 0, echo: int = 7, gain: float = 0.6, shift: int = 1
 ) -> FloatArray:
-    """Noise in each channel with an echo, later and quieter in the right ear, and some noise of each ear's own."""
+    """Return noise with an echo in each channel, later and quieter in the right ear, and independent noise."""
     rng = np.random.default_rng(seed)
     dry = rng.standard_normal((channels, samples + 50))
     wet = dry + gain * np.roll(dry, echo, axis=-1)
@@ -46,7 +46,7 @@ def sound(
 
 
 def xc(a: FloatArray, b: FloatArray, reach: int) -> FloatArray:
-    """sum a[n + m] b[n] for m = -reach ... reach."""
+    """Return sum a[n + m] b[n] for m = -reach ... reach."""
     made = []
     for m in range(-reach, reach + 1):
         length = max(0, min(len(a) - max(0, m), len(b) + min(0, m)))
@@ -54,8 +54,8 @@ def xc(a: FloatArray, b: FloatArray, reach: int) -> FloatArray:
     return np.array(made)
 
 
-def spelt_out(x: FloatArray, signal: SignalFormat, size: int, hop: int, delay: float) -> tuple[Any, ...]:
-    """itd, ild, cc of (2, C, N) as the specification's steps say, and which pair, delays and gains there were."""
+def by_definition(x: FloatArray, signal: SignalFormat, size: int, hop: int, delay: float) -> tuple[Any, ...]:
+    """Compute itd, ild and cc of (2, C, N) by the steps of the specification, and the pairs, delays and gains."""
     rate, frequencies = signal.sample_rate, signal.center_frequencies
     most, last, reach = math.ceil(delay * rate), math.floor(0.01 * rate + 0.5), math.ceil(rate / 1000)
     first, unit = math.floor(0.75 * rate / 1000), math.floor(rate / 1000 + 0.5)
@@ -118,14 +118,14 @@ def spelt_out(x: FloatArray, signal: SignalFormat, size: int, hop: int, delay: f
 
 
 def sines(seed: int, samples: int = 300) -> FloatArray:
-    """Different periods in both ears, and noise: echoes that are none make any of the pairs the best one."""
+    """Return different periods in both ears, and noise: without real echoes, each pair is the best one at times."""
     time, rng = np.arange(samples), np.random.default_rng(seed)
     tones = np.stack([np.sin(2 * np.pi * time / (8 + seed % 5)), np.sin(2 * np.pi * time / (9 + seed % 7) + seed)])
     return 0.3 * rng.standard_normal((2, 3, samples)) + tones[:, np.newaxis]
 
 
 def some_loud(seed: int = 0) -> FloatArray:
-    """Twelve channels, of which eight, four, and again eight are active, and one is next to nothing."""
+    """Return twelve channels, of which eight, four, and again eight are active, and one is almost silent."""
     x = sound(500, 12, seed)
     x[:, 5] *= 1e-4
     x[:, 8:] *= 0.05
@@ -134,7 +134,7 @@ def some_loud(seed: int = 0) -> FloatArray:
 
 
 def clicks() -> FloatArray:
-    """So far apart that nothing correlates with anything later."""
+    """Return clicks so far apart that they do not correlate."""
     x = np.zeros((2, 3, 400))
     x[0, :, 50::100], x[1, :, 52::100] = 1.0, -0.5
     return x
@@ -162,7 +162,7 @@ def made_and_spelt_out(name: str) -> tuple[tuple[FloatArray, ...], tuple[Any, ..
     signal = given_signal(x.shape[1])
     seconds = size / RATE + 1e-6  # a window of 0.01 s is not allowed
     stage = Precedence(signal, prec_wSizeSec=seconds, prec_hSizeSec=hop / RATE, prec_maxDelaySec=delay)
-    return stage.process(x), spelt_out(x, signal, size, hop, delay)
+    return stage.process(x), by_definition(x, signal, size, hop, delay)
 
 
 def test_reference_vector() -> None:
@@ -173,15 +173,15 @@ def test_reference_vector() -> None:
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_it_is_the_definition(name: str) -> None:
+def test_the_result_follows_the_definition(name: str) -> None:
     got, expected = made_and_spelt_out(name)
     for part, mine, theirs, tolerance in zip(PARTS, got, expected[:3], (1e-15, 1e-10, 1e-11), strict=True):
         assert mine.shape == theirs.shape
         np.testing.assert_allclose(mine, theirs, rtol=0, atol=tolerance, err_msg=part)
 
 
-def test_the_cases_reach_everything() -> None:
-    """Each pair of ways to clean, echoes that count and that fade, few channels and many, gains up to the limit."""
+def test_the_cases_cover_all_branches() -> None:
+    """Each pair of filters, echoes with and without fading, few and many channels, gains up to the limit."""
     pairs: set[int] = set()
     delays: set[tuple[bool, bool]] = set()
     gains: set[float] = set()
@@ -221,13 +221,13 @@ def test_the_gain_makes_no_difference() -> None:
             got = Precedence(given_signal(x.shape[1]), **framed(60, 30)).process(scale * x)
             np.testing.assert_array_equal(got[0], itd)
             np.testing.assert_allclose(got[1], ild, rtol=0, atol=1e-11)
-            if scale > 1:  # elsewhere, eps makes correlations less
+            if scale > 1:  # for quieter sound, eps reduces correlations
                 np.testing.assert_allclose(got[2], cc, rtol=0, atol=1e-11)
 
 
 @pytest.mark.parametrize("side", [1, -1])
-def test_the_first_wave_front_rules(side: int) -> None:
-    """Noise from one side, and 3 ms later, hardly quieter, from the other: the lead is found, which plain ITDs miss."""
+def test_the_first_wave_front_dominates(side: int) -> None:
+    """Noise from one side and, 3 ms later and hardly quieter, from the other: the first one dominates."""
     rate, lead = 16000, 6
     dry = 0.05 * np.random.default_rng(1).standard_normal(32000)
     later, sooner = np.roll(dry, lead) + 0.8 * np.roll(dry, 48), dry + 0.8 * np.roll(dry, 48 + lead)
@@ -240,12 +240,12 @@ def test_the_first_wave_front_rules(side: int) -> None:
 
 
 def test_level_differences() -> None:
-    """Of sums, without an echo: the ears' ratio exactly; positive where the right ear is louder."""
+    """Without an echo: exactly the ratio of the ears; positive if the right ear is louder."""
     x = np.random.default_rng(0).standard_normal((1, 3, 400)) * [[[1.0]], [[2.0]]]
     itd, ild, cc = Precedence(given_signal(3), **framed(60, 30)).process(x)
     np.testing.assert_allclose(ild, 20 * math.log10(2), rtol=1e-12)
     assert not itd.any()
-    middle = cc[:, cc.shape[1] // 2]  # energies of samples that are 1 on average: eps is nothing
+    middle = cc[:, cc.shape[1] // 2]  # samples of 1 on average: eps is negligible
     np.testing.assert_allclose(
         middle, np.repeat(weights(np.geomspace(60.0, 900.0, 3))[:, np.newaxis], 12, 1), rtol=1e-9
     )
@@ -277,7 +277,7 @@ def test_silence() -> None:
 
 
 @pytest.mark.filterwarnings("error")
-def test_what_is_hardly_sound() -> None:
+def test_almost_silence() -> None:
     rng = np.random.default_rng(0)
     for scale in (5e-324, 1e-310, 1e-160, 1e-146, 1e-144, 1e-100, 1e70, 1e300):
         stage = Precedence(given_signal(3), **framed(60, 30))
@@ -290,7 +290,7 @@ def test_what_is_hardly_sound() -> None:
         for made in Precedence(given_signal(3), **framed(60, 30)).process(x):
             assert np.isfinite(made).all()
     single = np.zeros((2, 3, 300))
-    single[..., 100] = 1.0  # nothing to correlate with but itself: no echo
+    single[..., 100] = 1.0  # one click: no echo
     itd, _, cc = Precedence(given_signal(3), **framed(60, 30)).process(single)
     assert not itd.any()
     assert set(np.flatnonzero(cc.any(axis=(0, 2)))) == {cc.shape[1] // 2}
@@ -314,7 +314,7 @@ def joined(blocks: list[tuple[FloatArray, ...]]) -> list[FloatArray]:
 @each_mode
 @given(sizes=sizes)
 @settings(max_examples=15, deadline=None, database=None)
-def test_cuts_and_prefixes(parameters: dict[str, Any], sizes: list[int]) -> None:
+def test_block_boundaries_and_prefixes(parameters: dict[str, Any], sizes: list[int]) -> None:
     x, signal = sound(700, 9), given_signal(9)
     whole = Precedence(signal, **parameters).process(x)
     stage = Precedence(signal, **parameters)
@@ -327,7 +327,7 @@ def test_cuts_and_prefixes(parameters: dict[str, Any], sizes: list[int]) -> None
 
 
 def test_many_frames_in_a_block(monkeypatch: pytest.MonkeyPatch) -> None:
-    """However many are worked on at a time."""
+    """With any number of frames at a time."""
     whole = Precedence(given_signal(3), **framed(60, 3)).process(sound(3000))
     monkeypatch.setattr("rosafe.representations.precedence.BATCH", 1000)
     for got, expected in zip(Precedence(given_signal(3), **framed(60, 3)).process(sound(3000)), whole, strict=True):
@@ -343,7 +343,7 @@ def test_first_blocks_that_complete_no_frame() -> None:
 
 
 @each_mode
-def test_reset_and_other_channels_are_a_new_beginning(parameters: dict[str, Any]) -> None:
+def test_reset_and_other_channels_reset_the_state(parameters: dict[str, Any]) -> None:
     stage = Precedence(given_signal(3), **parameters)
     expected = stage.process(sound(433))
 
@@ -353,7 +353,7 @@ def test_reset_and_other_channels_are_a_new_beginning(parameters: dict[str, Any]
     stage.process(sound(200, seed=3))
     stage.reset()
     assert same(stage.process(sound(433)), expected)
-    others = replace(given_signal(3), center_frequencies=(500.0, 600.0, 700.0))  # as many, but others
+    others = replace(given_signal(3), center_frequencies=(500.0, 600.0, 700.0))  # the same number of other channels
     stage.set_input_format(others)
     assert same(stage.process(sound(433)), Precedence(others, **parameters).process(sound(433)))
     assert stage.output_format.center_frequencies == (500.0, 600.0, 700.0)
@@ -362,7 +362,7 @@ def test_reset_and_other_channels_are_a_new_beginning(parameters: dict[str, Any]
         assert same(stage.process(x), Precedence(RATE, **parameters).process(x))
 
 
-def test_what_comes_out_is_fresh() -> None:
+def test_the_output_is_a_new_array() -> None:
     stage = Precedence(given_signal(3), **framed(60, 30))
     x = sound(500)
     x.setflags(write=False)
@@ -402,24 +402,24 @@ def test_the_defaults() -> None:
         {"prec_wSizeSec": 40 / RATE},
         {"prec_hSizeSec": 20 / RATE},
         {"prec_maxDelaySec": 0.003},
-        {"prec_maxDelaySec": 0.001},  # what is set counts as changed
+        {"prec_maxDelaySec": 0.001},  # a parameter that is set counts as changed
     ],
     ids=str,
 )
-def test_a_change_begins_sums_anew_and_keeps_the_buffer(change: dict[str, Any]) -> None:
-    """The next frame starts where it would have started, and is as the first one ever."""
+def test_a_change_resets_sums_and_keeps_the_buffer(change: dict[str, Any]) -> None:
+    """The start of the next frame does not change; its sums are those of a first frame."""
     x = sound(900)
     before = framed(80, 40)
     stage = Precedence(given_signal(3), **before)
-    assert stage.process(x[..., :410])[0].shape[-1] == 9  # those at 0 ... 320; the next one at 360
+    assert stage.process(x[..., :410])[0].shape[-1] == 9  # frames at 0 ... 320; the next one at 360
     stage.configure(**change)
     expected = Precedence(given_signal(3), **{**before, **change}).process(x[..., 360:])
     for got, wanted in zip(stage.process(x[..., 410:]), expected, strict=True):
         np.testing.assert_allclose(got, wanted, rtol=0, atol=1e-11)
 
 
-def test_changes_on_the_way_by_the_chain() -> None:
-    """Lags are aligned in the middle; what was not computed is 0."""
+def test_changes_in_a_chain() -> None:
+    """Results are aligned at lag 0; missing values are 0."""
     x = np.random.default_rng(0).standard_normal((2, 4800))
     values = {"fb_cfHz": [300.0, 900.0], "in_doNormalize": False}
     chain = Chain(16000.0, ["precedence"], values)
@@ -433,7 +433,7 @@ def test_changes_on_the_way_by_the_chain() -> None:
     assert chain.coordinates()["precedence_frameRate"] == 100.0
 
 
-def test_copies_may_be_changed_and_thrown_away() -> None:
+def test_copies_may_be_changed_and_discarded() -> None:
     expected = Precedence(given_signal(3), **framed(60, 30)).process(sound(700))
     stage, made = Precedence(given_signal(3), **framed(60, 30)), []
     for block in cut(sound(700), 100):
@@ -454,18 +454,18 @@ def test_copies_may_be_changed_and_thrown_away() -> None:
     ],
     ids=str,
 )
-def test_refusals(changes: dict[str, Any]) -> None:
+def test_invalid_values(changes: dict[str, Any]) -> None:
     (name,) = changes
     with pytest.raises(ValueError, match=f"^{name}: "):
         Precedence(RATE, **changes)
-    stage, twin = Precedence(RATE), Precedence(RATE)
-    for each in (stage, twin):
+    stage, reference_stage = Precedence(RATE), Precedence(RATE)
+    for each in (stage, reference_stage):
         each.process(sound(200))
     other = {"prec_wSizeSec": 0.03} if name != "prec_wSizeSec" else {"prec_hSizeSec": 0.02}
     with pytest.raises(ValueError, match=f"^{name}: "):
         stage.configure(**other, **changes)
-    assert stage.parameters == twin.parameters
-    for got, wanted in zip(stage.process(sound(200)), twin.process(sound(200)), strict=True):
+    assert stage.parameters == reference_stage.parameters
+    for got, wanted in zip(stage.process(sound(200)), reference_stage.process(sound(200)), strict=True):
         np.testing.assert_array_equal(got, wanted)
 
 
@@ -474,11 +474,11 @@ def test_rates_that_are_too_low() -> None:
         with pytest.raises(ValueError, match=r"^sample_rate: .*precedence"):
             Precedence(rate)
     assert Precedence(1334.0).process(np.ones((2, 1, 100)))[0].shape == (1, 6)
-    with pytest.raises(ValueError, match=r"^prec_maxDelaySec: too long"):
+    with pytest.raises(ValueError, match=r"^prec_maxDelaySec: expected at most 2147483647 samples, got "):
         Precedence(1e9, prec_maxDelaySec=10.0)
 
 
-def test_other_blocks_are_refused() -> None:
+def test_invalid_blocks_raise() -> None:
     for block in (np.zeros((2, 5)), np.zeros((3, 3, 5)), np.zeros((1, 3, 5)), np.zeros((2, 3, 5), complex)):
         with pytest.raises(ValueError, match=r"^block: "):
             Precedence(given_signal(3)).process(block)

@@ -1,4 +1,4 @@
-"""Spectral features: the reference vectors, definitions elsewhere (scipy's statistics), and spectra that are known."""
+"""Spectral features: the reference vectors, other implementations (statistics of scipy), and known spectra."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from rosafe.dsp.signal_format import SignalFormat
 from rosafe.representations import KINDS
 from rosafe.representations.spectralfeatures import FEATURES, SpectralFeatures
-from tests.dsp.implementations import TWINS, Choice, using
+from tests.dsp.implementations import NUMPY, Choice, using
 
 from .chain import Chain, FloatArray, reference
 
@@ -33,7 +33,7 @@ def signal(frequencies: tuple[float, ...] = FREQUENCIES) -> SignalFormat:
 def features(
     spectra: Any, frequencies: tuple[float, ...] = FREQUENCIES, words: Any = "all", **parameters: Any
 ) -> dict[str, FloatArray]:
-    """Of spectra (C, F), by word: (F,)."""
+    """Return the features (F,) of spectra (C, F) by name."""
     block = np.stack([np.array(spectra, float)] * 2)
     block[1] *= 3.0
     stage = SpectralFeatures(signal(frequencies), sf_requests=words, **parameters)
@@ -54,7 +54,7 @@ def test_reference_vectors() -> None:
 
 
 def test_against_other_definitions() -> None:
-    """With energies far above E, these are well-known numbers."""
+    """With energies far above E, these are standard statistics."""
     x, f = spectra(30), np.array(FREQUENCIES)[:, np.newaxis]
     got = features(x)
     share = x / x.sum(axis=0)
@@ -120,7 +120,7 @@ def test_one_channel() -> None:
         np.testing.assert_allclose(got[word], values, rtol=1e-12, atol=1e-12, err_msg=word)
 
 
-def test_rolloff_is_where_the_energy_reaches_its_part() -> None:
+def test_rolloff() -> None:
     x = [[0.5, 0.9, 1, 0], [0.1, 0, 0, 0], [0.2, 0, 0, 0], [0.2, 0.1, 0, 1]]
     got = features(x, (100.0, 200.0, 400.0, 800.0), sf_roPerc=0.7)["rolloff"] * 800
     np.testing.assert_allclose(got, [200 + 0.5 * 200, 100, 100, 400 + 0.7 * 400], rtol=1e-12)
@@ -133,8 +133,8 @@ def test_rolloff_is_where_the_energy_reaches_its_part() -> None:
 
 
 @pytest.mark.parametrize("level", [1e-150, 1e-20, 1e-8, 1.0, 1e20, 1e130])
-def test_what_the_level_does_not_change(level: float) -> None:
-    """Roll-off and variation, down to energies where the original's hang on what it adds to them."""
+def test_features_independent_of_the_level(level: float) -> None:
+    """Roll-off and variation, down to energies at which E has an effect in the original."""
     words = ["rolloff", "variation"] if level > 1e-10 else ["rolloff"]
     expected, got = features(spectra(20), words=words), features(level * spectra(20), words=words)
     for word in words:
@@ -164,7 +164,7 @@ def test_requests_in_order_with_repetitions() -> None:
 
 
 def test_changes_keep_the_last_frame() -> None:
-    """Flux and variation see the frame before, also where they were not asked for then."""
+    """Flux and variation use the previous frame, even if they were not requested for it."""
     x = spectra(8)
     whole = SpectralFeatures(signal(), sf_requests=["flux", "variation", "brightness"], sf_brCF=500.0)
     expected = whole.process(np.stack([x, x]))
@@ -200,7 +200,7 @@ REFUSED: list[tuple[str, list[Any]]] = [
 
 
 @pytest.mark.parametrize(("name", "value"), [(name, value) for name, values in REFUSED for value in values])
-def test_values_that_are_refused(name: str, value: Any) -> None:
+def test_invalid_values(name: str, value: Any) -> None:
     with pytest.raises(ValueError, match=f"^{name}: "):
         SpectralFeatures(signal(), **{name: value})
     stage = SpectralFeatures(signal())
@@ -210,7 +210,7 @@ def test_values_that_are_refused(name: str, value: Any) -> None:
 
 
 @pytest.mark.parametrize("channels", [3, 5])
-def test_channels_whose_frequencies_are_not_known(channels: int) -> None:
+def test_channels_without_known_frequencies(channels: int) -> None:
     with pytest.raises(ValueError, match=r"^block: "):
         SpectralFeatures(signal()).process(np.zeros((2, channels, 3)))
     with pytest.raises(ValueError, match=r"^block: "):
@@ -235,14 +235,14 @@ def test_declaration() -> None:
 @pytest.mark.parametrize("level", [2, 3, 4, "aarch64"])
 @settings(deadline=None, max_examples=40)
 @given(st.integers(1, 9), st.integers(0, 12), st.integers(0, 99), st.floats(1e-3, 1.0), st.sampled_from([0, 40, 140]))
-def test_the_kernel_gives_what_its_twin_gives(
+def test_the_kernel_equals_the_numpy_implementation(
     level: Choice, channels: int, frames: int, seed: int, part: float, wide: int
 ) -> None:
     rng = np.random.default_rng(seed)
     given_signal = signal(tuple(rng.uniform(50, 7000, channels).tolist()))
     block = 10 ** rng.uniform(-wide, wide + 1, (2, channels, frames)) * (rng.random((2, channels, frames)) < 0.9)
     made = []
-    for implementation in (TWINS, level):
+    for implementation in (NUMPY, level):
         stage = SpectralFeatures(given_signal, sf_roPerc=part)
         with using(implementation):
             made.append(np.concatenate([stage.process(block[..., :3]), stage.process(block[..., 3:])], axis=-1))

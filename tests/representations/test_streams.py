@@ -1,4 +1,4 @@
-"""What holds for every stage of frames: cuts, prefixes, silence, new channels, copies, and blocks that are refused."""
+"""Properties of all framed stages: block boundaries, prefixes, silence, new channels, copies, invalid blocks."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from .chain import Chain, FloatArray
 RATEMAP = SignalFormat(16000.0, 100.0, True, 160, 320, (200.0, 500.0, 1200.0, 3000.0, 2500.0), "gammatone")
 CORRELATIONS = replace(RATEMAP, lags=3)
 MAP = {"trm_fuseWithinSec": 0.03, "trm_minSpread": 2, "trm_minStrengthdB": 1.0}
-# (kind, the kind that the blocks are given to, parameters)
+# (kind, the kind that receives the blocks, parameters)
 CASES: list[tuple[str, str, dict[str, Any]]] = [
     ("itd", "itd", {}),
     ("ic", "ic", {}),
@@ -43,7 +43,7 @@ def chain(kind: str, root: str, parameters: dict[str, Any]) -> Chain:
 
 
 def frames(root: str, number: int, seed: int = 0, channels: int = 5) -> FloatArray:
-    """What comes to `root`: correlations of any shape, or rates whose levels wander over 200 dB; some are silent."""
+    """Return input of `root`: correlations of any shape, or rates with a range of 200 dB; some are silent."""
     rng = np.random.default_rng(seed)
     if root in ("itd", "ic"):
         made = rng.standard_normal((channels, 7, number))
@@ -58,7 +58,9 @@ def frames(root: str, number: int, seed: int = 0, channels: int = 5) -> FloatArr
 @every
 @settings(deadline=None, max_examples=30)
 @given(sizes=block_sizes, seed=st.integers(0, 5))
-def test_cuts_make_no_difference(kind: str, root: str, parameters: dict[str, Any], sizes: list[int], seed: int) -> None:
+def test_block_boundaries_have_no_effect(
+    kind: str, root: str, parameters: dict[str, Any], sizes: list[int], seed: int
+) -> None:
     given_frames = frames(root, 60, seed)
     whole = chain(kind, root, parameters).run(given_frames)[kind]
     in_parts = chain(kind, root, parameters).run(given_frames, sizes)[kind]
@@ -78,7 +80,7 @@ def test_a_prefix_gives_a_prefix(kind: str, root: str, parameters: dict[str, Any
 
 
 @every
-def test_rows_and_the_type_of_what_comes_out(kind: str, root: str, parameters: dict[str, Any]) -> None:
+def test_shape_and_type_of_the_output(kind: str, root: str, parameters: dict[str, Any]) -> None:
     one = chain(kind, root, parameters)
     given_frames = frames(root, 50)
     kept = given_frames.copy()
@@ -90,7 +92,7 @@ def test_rows_and_the_type_of_what_comes_out(kind: str, root: str, parameters: d
         assert made.shape[:-1] == one.stages[kind].output_rows(block.shape[:-1])
         assert made.ndim == len(KINDS[kind].parts[0].axes)
         assert not np.shares_memory(made, block)
-        made[...] = np.nan  # whoever gets it may do what he likes with it
+        made[...] = np.nan  # the caller may modify it
     np.testing.assert_array_equal(given_frames, kept)
     again = one.process(given_frames)[kind]
     assert np.isfinite(again).all()
@@ -99,7 +101,7 @@ def test_rows_and_the_type_of_what_comes_out(kind: str, root: str, parameters: d
 @every
 @pytest.mark.filterwarnings("error")
 def test_silence(kind: str, root: str, parameters: dict[str, Any]) -> None:
-    """From the start, after sound, and in one ear: every number is finite, and nobody complains."""
+    """At the start, after sound, and in one ear: all numbers are finite, without warnings."""
     silence = np.zeros((5, 7, 40) if root in ("itd", "ic") else (2, 5, 40))
     silent = chain(kind, root, parameters).run(silence, 7)[kind]
     if kind != "spectralFeatures":
@@ -123,8 +125,8 @@ def test_reset(kind: str, root: str, parameters: dict[str, Any]) -> None:
 
 
 @every
-def test_other_channels_are_a_new_beginning(kind: str, root: str, parameters: dict[str, Any]) -> None:
-    """Told of or not; frames that were held back are dropped."""
+def test_other_channels_reset_the_state(kind: str, root: str, parameters: dict[str, Any]) -> None:
+    """With or without notification; pending frames are dropped."""
     for channels in (5, 3):
         one = chain(kind, root, parameters)
         one.process(frames(root, 37))
@@ -138,8 +140,8 @@ def test_other_channels_are_a_new_beginning(kind: str, root: str, parameters: di
 
 
 @pytest.mark.parametrize(("kind", "root", "parameters"), [case for case in CASES if case[0] != "spectralFeatures"])
-def test_blocks_of_other_rows_are_a_new_beginning(kind: str, root: str, parameters: dict[str, Any]) -> None:
-    """But for spectral features, whose channels have frequencies."""
+def test_blocks_of_another_shape_reset_the_state(kind: str, root: str, parameters: dict[str, Any]) -> None:
+    """Except for spectral features, whose channels have frequencies."""
     one = chain(kind, root, parameters)
     one.process(frames(root, 37))
     later = frames(root, 40, 3, 2)
@@ -148,7 +150,7 @@ def test_blocks_of_other_rows_are_a_new_beginning(kind: str, root: str, paramete
 
 
 @every
-def test_copies_may_be_changed_and_thrown_away(kind: str, root: str, parameters: dict[str, Any]) -> None:
+def test_copies_may_be_changed_and_discarded(kind: str, root: str, parameters: dict[str, Any]) -> None:
     expected = chain(kind, root, parameters).run(frames(root, 60), 10)[kind]
     one = chain(kind, root, parameters)
     made = []
@@ -166,7 +168,7 @@ def test_copies_may_be_changed_and_thrown_away(kind: str, root: str, parameters:
 
 
 @every
-def test_other_blocks_are_refused(kind: str, root: str, parameters: dict[str, Any]) -> None:
+def test_invalid_blocks_raise(kind: str, root: str, parameters: dict[str, Any]) -> None:
     stage = chain(kind, root, parameters).stages[kind]
     axes = len(STAGES[kind].INPUT)
     for block in (np.zeros((2,) * (axes + 1)), np.zeros(5), np.zeros((2,) * axes, complex)):

@@ -1,4 +1,4 @@
-"""Onset and offset strength: the reference vectors, levels that are known, and what silence does."""
+"""Onset and offset strength: the reference vectors, known levels, and silence."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ both = pytest.mark.parametrize(("kind", "limit", "sign"), KINDS_AND_LIMITS)
 
 
 def rates(levels: Any) -> FloatArray:
-    """Rates (2, 2, F) of which all have these levels (F,) in dB."""
+    """Return rates (2, 2, F) with these levels (F,) in dB."""
     return np.broadcast_to(10 ** (np.array(levels, float) / 10), (2, 2, len(levels))).copy()
 
 
 def made_by(stage: Stage, block: FloatArray) -> FloatArray:
-    """What the stage makes of one block."""
+    """Return the output of the stage for one block."""
     made = stage.process(block)
     assert isinstance(made, np.ndarray)
     return made
@@ -52,7 +52,7 @@ def test_steps(kind: type[Stage], limit: str, sign: int) -> None:
 
 
 @both
-def test_each_ear_and_channel_is_on_its_own(kind: type[Stage], limit: str, sign: int) -> None:
+def test_ears_and_channels_are_independent(kind: type[Stage], limit: str, sign: int) -> None:
     levels = np.random.default_rng(3).uniform(-300, 100, (2, 2, 20))
     made = made_by(kind(GIVEN, **{limit: 1000.0}), 10 ** (levels / 10))
     for ear, channel, frame in np.ndindex(2, 2, 20):
@@ -63,7 +63,7 @@ def test_each_ear_and_channel_is_on_its_own(kind: type[Stage], limit: str, sign:
 @both
 @pytest.mark.filterwarnings("error")
 def test_silence_is_2000_db_below_1(kind: type[Stage], limit: str, sign: int) -> None:
-    """Also what is below 0, which no ratemap is."""
+    """Also values below 0, which ratemaps do not contain."""
     block = rates([0] * 8)
     block[:] = [0.0, -3.0, 1e-200, 5e-324, 1.0, 0.0, -1e300, 1e100]
     made = made_by(kind(GIVEN, **{limit: 1000.0}), block)[0, 0]
@@ -87,7 +87,7 @@ def test_the_level_for_the_maps(kind: type[Stage], limit: str, sign: int) -> Non
 @both
 @pytest.mark.parametrize(("scaling", "per_frame"), [("power", 10.857362), ("magnitude", 5.428681)])
 def test_the_decay_after_sound(kind: type[Stage], limit: str, sign: int, scaling: str, per_frame: float) -> None:
-    """What the integrator loses from frame to frame, until -2000 dB; then nothing is left."""
+    """The decay of the integrator per frame, until -2000 dB; then 0."""
     name = kind.REPRESENTATION.kind
     ihc = SignalFormat(RATE, RATE, center_frequencies=(500.0, 900.0), filterbank="gammatone")
     chain = Chain(ihc, [name], {"rm_scaling": scaling, limit: 30.0}, root="ratemap")
@@ -96,7 +96,7 @@ def test_the_decay_after_sound(kind: type[Stage], limit: str, sign: int, scaling
     if sign > 0:
         assert not made[..., 6:].any()
         return
-    falls = 2000 / per_frame - 15  # the level of the sound is some -10 to -150 dB
+    falls = 2000 / per_frame - 15  # the level of the sound is about -10 to -150 dB
     np.testing.assert_allclose(made[..., 6 : int(falls)], per_frame, rtol=0, atol=1e-6)
     assert not made[..., int(2000 / per_frame) + 8 :].any()
 
@@ -122,7 +122,7 @@ def test_other_steps_of_the_ratemap_keep_the_last_level(kind: type[Stage], limit
 
 @both
 @pytest.mark.parametrize("value", [0, -30.0, 1000.5, math.nan, math.inf, "much", None, [3.0]])
-def test_limits_that_are_refused(kind: type[Stage], limit: str, sign: int, value: Any) -> None:
+def test_invalid_limits(kind: type[Stage], limit: str, sign: int, value: Any) -> None:
     with pytest.raises(ValueError, match=f"^{limit}: "):
         kind(GIVEN, **{limit: value})
     stage = kind(GIVEN)

@@ -28,7 +28,7 @@ class Processor:
 
 
 class Model:
-    """The processors by name, and what was asked for. `fail` makes the call of that number fail."""
+    """A component with its processors by name and the calls it got; the call number `fail` fails."""
 
     def __init__(self, audio: bool = True, sample_rate: float = RATE) -> None:
         self.instance = "rosAFE"
@@ -45,7 +45,7 @@ class Model:
     # --- as a component ---
 
     async def outputs(self, service: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
-        # What a component has been asked for it does, also where nobody waits for its answer any more.
+        # A component completes a request even if the caller no longer waits for the answer.
         call = asyncio.create_task(self._answer(len(self.calls), service, values))
         self.calls.append(service)
         self.answers.append(call)
@@ -54,7 +54,7 @@ class Model:
     async def _answer(self, number: int, service: str, values: Mapping[str, Any]) -> Mapping[str, Any]:
         if number in self.cancel:
             self.cancel[number].cancel()
-        await asyncio.sleep(0)  # others have their turn
+        await asyncio.sleep(0)  # other clients run
         if number in self.fail:
             raise self.fail[number]
         if service == "InputProc" and "InputProc" in self.calls[number + 1 :]:
@@ -97,7 +97,7 @@ class Model:
         return {}
 
     def _replace_input(self, name: str) -> None:
-        """What hangs on the input that there is, if there is one, will hang on the new one."""
+        """The children of an existing input become children of the new one."""
         for old in [other for other, processor in self.processors.items() if not processor.parent]:
             del self.processors[old]
             for processor in self.processors.values():
@@ -148,11 +148,11 @@ class Model:
         return self.processors[name]
 
     def line(self, name: str) -> Iterator[str]:
-        """The names from a processor up to the input."""
+        """Return the names from a processor up to the input."""
         while name:
             yield name
             name = self._find(name).parent
 
     def state(self) -> dict[str, tuple[str, str, dict[str, Any]]]:
-        """All there is, to be compared."""
+        """The complete state, for comparison."""
         return {name: (p.kind, p.parent, p.stage.parameters) for name, p in self.processors.items()}

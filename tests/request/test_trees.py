@@ -1,4 +1,4 @@
-"""What a request for a tree makes, reuses and removes, on a tree in this process that others change too."""
+"""Requests for trees create, reuse and remove processors of an in-process tree that other clients change."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from rosafe import interface
 from rosafe.client.values import partial
 from rosafe.dsp.stage import Stage
 from rosafe.interface import KINDS, ROSAFE, ComponentError
-from rosafe.representations import STAGES
+from rosafe.representations import BUILTIN, STAGES
 from rosafe.tree import tree_builder
 from rosafe.tree import tree_planner as request
 from tests.request.model import RATE, Model
@@ -46,24 +46,24 @@ def build(model: Model, representation: str, **parameters: Any) -> dict[str, Any
 
 
 def find(model: Model, representation: str, **parameters: Any) -> dict[str, Any]:
-    """What there is of it."""
+    """Return the matching processors that exist."""
     return asyncio.run(tree_builder.find(model, {"representation": representation, **parameters}))
 
 
 def in_force(kind: str, parameters: Mapping[str, Any]) -> dict[str, Any]:
-    """What a processor made with these tells of itself."""
+    """Return the description of a processor with these parameters."""
     return stage(kind, parameters).parameters
 
 
 def stage(kind: str, parameters: Mapping[str, Any]) -> Stage:
-    """A stage of this kind on all that it needs."""
+    """Return a stage of this kind with its ancestors."""
     own = {p.name: parameters[p.name] for p in KINDS[kind].parameters if p.name in parameters}
     parent = KINDS[kind].parent
     return STAGES[kind](stage(parent, parameters).output_format if parent else RATE, **own)
 
 
 def check(model: Model, before: Mapping[str, Any], wanted: tuple[str, Mapping[str, Any]], told: dict[str, Any]) -> None:
-    """The tree is what was asked for, and no more was made than what was not there."""
+    """The tree is as requested, and only missing processors were created."""
     representation, parameters = wanted
     names, state = told["dependencies"], model.state()
     assert names == list(model.line(told["name"]))[::-1]
@@ -83,7 +83,7 @@ def check(model: Model, before: Mapping[str, Any], wanted: tuple[str, Mapping[st
 
 
 def disturb(model: Model, number: int, what: str) -> None:
-    """What others do: remove or change one of the processors, or all."""
+    """Changes by other clients: remove or change one processor, or all."""
     names = [name for name, processor in model.processors.items() if processor.parent]
     if what == "stop":
         model.processors.clear()
@@ -112,8 +112,8 @@ def test_any_sequence_of_requests_and_changes(acts: list[tuple[Any, Any]]) -> No
 
 @settings(max_examples=40, deadline=None)
 @given(st.lists(REQUESTS, min_size=2, max_size=5))
-def test_clients_that_do_not_know_of_each_other(wanted: list[tuple[str, dict[str, Any]]]) -> None:
-    """All at once, and no lock: everybody gets what he asked for, and nothing is there twice."""
+def test_independent_clients(wanted: list[tuple[str, dict[str, Any]]]) -> None:
+    """Concurrent requests without a lock: each gets its processors, and there are no duplicates."""
     model = Model()
 
     async def all_at_once() -> list[dict[str, Any]]:
@@ -133,10 +133,10 @@ def test_clients_that_do_not_know_of_each_other(wanted: list[tuple[str, dict[str
 
 @settings(max_examples=60, deadline=None)
 @given(REQUESTS, REQUESTS, st.integers(0, 20), st.booleans(), st.integers(1, 10))
-def test_nothing_is_left_of_what_fails(
+def test_a_failed_request_leaves_no_processor(
     first: tuple[str, dict[str, Any]], wanted: tuple[str, dict[str, Any]], at: int, cancelled: bool, again: int
 ) -> None:
-    """Of what the component refuses, and of what is cancelled, also where the clearing up is cancelled again."""
+    """Rejected and cancelled requests, also if the cleanup is cancelled again."""
     model = Model()
     build(model, first[0], **first[1])
     before, number = model.state(), len(model.calls) + at
@@ -183,8 +183,8 @@ def test_names_are_those_of_the_original_client() -> None:
 
 
 @pytest.mark.parametrize("word", REPRESENTATIONS)
-def test_what_is_there_is_used_again_and_found(word: str) -> None:
-    """Also where the processor tells of other values in force than it was asked for."""
+def test_existing_processors_are_reused_and_found(word: str) -> None:
+    """Also if the effective values of the processor differ from the requested ones."""
     model = Model()
     with pytest.raises(ComponentError, match="missing: InputProc") as missing:
         find(model, word)
@@ -207,8 +207,8 @@ def test_every_name_of_a_representation() -> None:
             assert request.kind_of(name) is kind
 
 
-def test_a_number_is_not_given_twice_after_a_removal() -> None:
-    """The original counted what was there, and came to a name that was there."""
+def test_a_number_is_not_reused_after_a_removal() -> None:
+    """The original counted the processors and chose a name that existed."""
     model = Model()
     for hop in (0.01, 0.02, 0.03):
         build(model, "ild", ild_hSizeSec=hop)
@@ -217,7 +217,7 @@ def test_a_number_is_not_given_twice_after_a_removal() -> None:
     assert build(model, "ild", ild_hSizeSec=0.01)["name"] == "ild_4"
 
 
-def test_names_that_others_have_taken() -> None:
+def test_names_in_use_by_other_clients() -> None:
     free = request.free_name
     ild = KINDS["ild"]
     assert free(ild, ["ild", "ild_x", "ild_-1", "child_7", "ild_7a"]) == "ild_0"
@@ -227,7 +227,7 @@ def test_names_that_others_have_taken() -> None:
 
 
 def test_the_tree_of_a_user_is_used() -> None:
-    """Also where a shorter line would fit as well: nothing is made that is there."""
+    """Also if a shorter chain matches as well: existing processors are not created again."""
     model = Model()
     build(model, "input")
     mine: list[tuple[str, dict[str, Any]]] = [
@@ -270,7 +270,7 @@ def test_after_modify_parameter() -> None:
     assert build(model, "ild", pp_bRemoveDC=True)["created"] == []
 
 
-def test_zeros_are_part_of_the_request_and_what_an_input_cannot_carry_is_set_before_anything_hangs_on_it() -> None:
+def test_zeros_are_literal_and_other_input_parameters_are_set_before_it_has_children() -> None:
     model = Model()
     build(model, "filterbank", pp_coefPreEmphasis=0.0, pp_refSPLdB=0.0, in_doNormalize=False)
     made = [call for call in model.calls if not call.startswith("get")]
@@ -317,21 +317,19 @@ def test_the_sound() -> None:
 @pytest.mark.parametrize(
     ("values", "what"),
     [
-        ({"fb_nChannels": 5000}, "fb_nChannels: 5000 is out of range"),
-        ({"fb_lowFreqHz": 9000.0}, "is not below fb_highFreqHz"),
-        ({"fb_nERBs": 0.001}, "too many channels"),
-        ({"fb_highFreqHz": 0.0}, "fb_highFreqHz: 0 is out of range"),
-        ({"ihc_method": "hilbrt"}, "ihc_method: 'hilbrt' is not one of none"),
-        ({"ild_wSizeSec": 61.0}, "ild_wSizeSec: 61 is out of range"),
-        ({"fb_lowFreqHz": 600.0, "fb_highFreqHz": 500.0}, "is not below fb_highFreqHz"),
-        ({"rm_decaySec": -1.0}, "rm_decaySec: -1 is out of range"),
-        ({"nFramesPerBlock": 0}, "nFramesPerBlock: 0 is out of range"),
+        ({"fb_nChannels": 5000}, "fb_nChannels: expected a number from 0 to 1024, got 5000"),
+        ({"fb_lowFreqHz": 9000.0}, "fb_lowFreqHz: expected less than fb_highFreqHz"),
+        ({"fb_nERBs": 0.001}, "fb_nERBs: expected a distance that gives at most"),
+        ({"fb_highFreqHz": 0.0}, "fb_highFreqHz: expected a number above 0, at most 1000000, got 0"),
+        ({"ihc_method": "hilbrt"}, "ihc_method: expected one of none, halfwave"),
+        ({"ild_wSizeSec": 61.0}, "ild_wSizeSec: expected a number above 0, at most 60, got 61"),
+        ({"fb_lowFreqHz": 600.0, "fb_highFreqHz": 500.0}, "fb_lowFreqHz: expected less than fb_highFreqHz"),
+        ({"rm_decaySec": -1.0}, "rm_decaySec: expected a number above 0, at most 3600, got -1"),
+        ({"nFramesPerBlock": 0}, "nFramesPerBlock: expected a number from 1 to 10000000, got 0"),
         ({"bufferSize_s_port": 1e9}, "bufferSize_s_port"),
     ],
 )
-def test_what_no_sample_rate_makes_possible_is_refused_before_anything_is_asked(
-    values: dict[str, Any], what: str
-) -> None:
+def test_values_impossible_at_any_sample_rate_are_rejected_without_a_call(values: dict[str, Any], what: str) -> None:
     model = Model()
     with pytest.raises(ComponentError, match=what) as refused:
         build(model, "ild", **values)
@@ -340,23 +338,23 @@ def test_what_no_sample_rate_makes_possible_is_refused_before_anything_is_asked(
     assert model.calls == []
 
 
-def test_what_this_sample_rate_makes_impossible_leaves_nothing() -> None:
+def test_values_impossible_at_this_sample_rate_leave_no_processor() -> None:
     model = Model()
     for values, what in (
-        ({"fb_highFreqHz": 30000.0}, "not below half the sample rate"),
-        ({"ild_wSizeSec": 1e-9}, "ild_wSizeSec: too short"),
+        ({"fb_highFreqHz": 30000.0}, "below half the sample rate"),
+        ({"ild_wSizeSec": 1e-9}, "ild_wSizeSec: expected at least one sample"),
     ):
         with pytest.raises(ComponentError, match=what):
             build(model, "ild", **values)
         assert len(model.calls) > 3 and not model.processors
     build(model, "time")
     before = model.state()
-    with pytest.raises(ComponentError, match="not below half the sample rate"):
+    with pytest.raises(ComponentError, match="below half the sample rate"):
         build(model, "ild", fb_highFreqHz=30000.0, pp_bRemoveDC=True)
     assert model.state() == before
 
 
-def test_what_others_have_come_to_use_stays() -> None:
+def test_processors_that_other_clients_use_remain() -> None:
     model = Model()
 
     async def go() -> None:
@@ -372,6 +370,28 @@ def test_what_others_have_come_to_use_stays() -> None:
     assert list(model.processors) == ["input_0", "time_0", "mine"]
 
 
+def test_a_plugin_that_fails_before_it_is_listed_is_created_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(tree_builder, "BUILTIN", BUILTIN - {"ild"})
+    reason = "there is no processor 'ild_0': ild_0 (ild) failed: plugin ild: process: OSError"
+
+    class Failing(Model):
+        def _IldProc(self, service: str, values: Mapping[str, Any]) -> dict[str, Any]:
+            self._make(service, values)
+            del self.processors[values["name"]]
+            return {}
+
+        def _getDependencies(self, _: str, values: Mapping[str, Any]) -> dict[str, Any]:
+            if values["nameProc"] not in self.processors:
+                raise ROSAFE.error("e_noSuchProcessor", reason)
+            return {}
+
+    model = Failing()
+    with pytest.raises(ComponentError, match="OSError") as caught:
+        build(model, "ild")
+    assert reason in str(caught.value)
+    assert model.calls.count("IldProc") == 1 and not model.processors
+
+
 def test_words_that_the_guide_misspells() -> None:
     model = Model()
     assert build(model, "time", pp_middleEarModel="jespen")["created"] == ["input_0", "time_0"]
@@ -379,7 +399,7 @@ def test_words_that_the_guide_misspells() -> None:
 
 
 def test_a_long_window_costs_nothing() -> None:
-    """It is the node's to make, or to refuse."""
+    """The node creates or rejects it."""
     tracemalloc.start()
     try:
         request.parse_request(KINDS["ild"], {"ild_wSizeSec": 60.0})
@@ -406,7 +426,7 @@ def test_arguments_by_name_and_structure() -> None:
     assert partial({"representation": "IHC", "pp_refSPLdBS": 90}) == {"representation": "IHC", "pp_refSPLdB": 90.0}
 
 
-def test_the_table_knows_every_parameter_of_a_chain_once() -> None:
+def test_the_table_has_every_parameter_of_a_chain_once() -> None:
     names = [p.name for p in interface.REQUEST.parameters]
     inputs = [p.name for p in ROSAFE.service("InputProc").parameters if p.name != "name"]
     own = list(dict.fromkeys(p.name for kind in KINDS.values() for p in kind.parameters))
@@ -421,21 +441,21 @@ def test_the_table_knows_every_parameter_of_a_chain_once() -> None:
         ({}, "representation is missing; one of input, time"),
         ([], "representation is missing"),
         ([{}], "representation is missing"),
-        ("ild", "neither an object nor an array"),
+        ("ild", "expected an object or an array"),
         (["ild", {"fb_nERB": 1}], "unknown parameter 'fb_nERB'; request takes representation, connect"),
         (["ild", {"name": "x"}], "unknown parameter 'name'"),
         (["ild", {"fb_nChannels": [1]}], "fb_nChannels"),
         (["ild", {"fb_nChannels": float("nan")}], "fb_nChannels"),
         (["ild", {"fb_nChannels": 1, "gammatone": {"fb_nChannels": 1}}], "fb_nChannels is given twice"),
-        (["ild", {"gammatone": [{}, {}]}], "gammatone: wanted is an object"),
-        (["ild", {"gammatone": 1}], "gammatone: wanted is an object"),
+        (["ild", {"gammatone": [{}, {}]}], "gammatone: expected an object"),
+        (["ild", {"gammatone": 1}], "gammatone: expected an object"),
         ([7], "representation"),
-        (["spikes"], "'spikes' is not one of input, time, filterbank"),
-        (["ild", "fb_nChannels", 16], "after representation come the parameters in one object, not 'fb_nChannels'"),
-        (["ild", 16], "in one object, not '16'"),
+        (["spikes"], "representation: expected one of input, time, filterbank"),
+        (["ild", "fb_nChannels", 16], "expected the parameters in one object after representation, got 'fb_nChannels'"),
+        (["ild", 16], "in one object after representation, got '16'"),
     ],
 )
-def test_arguments_that_are_refused(given: Any, what: str) -> None:
+def test_arguments_that_are_rejected(given: Any, what: str) -> None:
     with pytest.raises(ComponentError, match=what) as refused:
         partial(given)
     assert refused.value.ex == "::genom::serialization"
@@ -463,7 +483,7 @@ _JSON = st.recursive(
 
 @settings(max_examples=60, deadline=None)
 @given(st.one_of(_JSON, st.dictionaries(_NAMES, _SCALARS).map(lambda form: {**form, "representation": "ild"})))
-def test_whatever_comes_is_understood_or_refused(form: Any) -> None:
+def test_any_input_is_accepted_or_rejected(form: Any) -> None:
     try:
         values = partial(form)
         wish = request.parse_request(request.kind_of(values.pop("representation")), values)

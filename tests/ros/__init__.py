@@ -1,1 +1,1 @@
-"""Tests of the rosAFE node and of what it is made of: wire format, audio ring, activities, requests, ports, faults."""
+"""Tests of the rosAFE node and its parts: wire format, audio ring, activities, requests, ports, faults."""

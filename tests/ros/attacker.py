@@ -1,4 +1,4 @@
-"""What a hostile or broken peer does to a node, from outside, and whether the node is well afterwards."""
+"""Attacks of a hostile or broken peer on a node, and checks of the node afterwards."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from rosgraph.network import encode_ros_handshake_header, read_ros_handshake_hea
 
 from tests.harness import Graph, Process, proc, wait_for
 
-WELL_SECONDS = 2.0  # for any call of a node that is well
+WELL_SECONDS = 2.0  # for any call of a healthy node
 HUGE = 0xFFFFFFFF
 
 
@@ -44,19 +44,19 @@ class Target:
 
     # --- attacks ---
 
-    def connect(self, port: str, said: bytes = b"") -> socket.socket:
-        """A connection on which something was said."""
+    def connect(self, port: str, data: bytes = b"") -> socket.socket:
+        """Open a connection and send data."""
         sock = socket.create_connection(self.ports[port], 20)
-        sock.sendall(said)
+        sock.sendall(data)
         return sock
 
     def subscribe(self, topic: str, caller: str = "/attacker", wait: bool = True) -> socket.socket:
-        """A subscriber that never reads; where it does not `wait`, its header is not answered yet."""
+        """Connect a subscriber that never reads; without `wait`, its header is not answered yet."""
         fields = {"topic": f"/{self.name}/{topic}", "md5sum": "*", "type": "*", "callerid": caller}
         return self._greet(fields, wait)
 
     def client(self, service: str, **fields: str) -> socket.socket:
-        """A service client that has not asked for anything yet."""
+        """Connect a service client that has not sent a request yet."""
         return self._greet({"service": f"/{self.name}/{service}", "md5sum": "*", "callerid": "/attacker", **fields})
 
     def _greet(self, fields: dict[str, str], wait: bool = True) -> socket.socket:
@@ -65,12 +65,12 @@ class Target:
             read_ros_handshake_header(sock, io.BytesIO(), 4096)
         return sock
 
-    # --- how it is ---
+    # --- checks ---
 
-    def assert_well(self) -> None:
-        """Whoever comes now is served at once: a service call, the master or a tool, and a subscriber.
+    def assert_healthy(self) -> None:
+        """Check that new clients are served immediately: a service call, the master or a tool, and a subscriber.
 
-        Up to three tries, for the machine may be busy just now.
+        Makes up to three attempts, as the machine may be busy.
         """
         for _ in range(3):
             took = self._ask()
@@ -102,17 +102,17 @@ class Target:
 
     @property
     def _all_imported(self) -> bool:
-        """Whether rosAFE, which imports `scipy.signal` after it has reported that it is ready, has done so."""
+        """Return whether rosAFE has imported `scipy.signal`, which it does after it has reported that it is ready."""
         return "bass" in self.name or "scipy/signal/_peak_finding" in proc(self.process.pid, "maps").read_text()
 
     @contextmanager
-    def costs_nothing(self, megabytes: float = 30.0) -> Iterator[None]:
-        """What was done within is over: soon as many descriptors as before, no more memory, and the node is well."""
-        self.assert_well()
+    def needs_no_resources(self, megabytes: float = 30.0) -> Iterator[None]:
+        """Check after the block that the node is healthy and has the same number of descriptors and no more memory."""
+        self.assert_healthy()
         wait_for(lambda: self._all_imported, what="the end of imports after start-up")
         descriptors, before = self.descriptors, self.megabytes
         yield
-        self.assert_well()
+        self.assert_healthy()
         wait_for(
             lambda: self.descriptors <= descriptors + 2,
             what=lambda: f"{descriptors} descriptors, there are {self.descriptors}",
@@ -120,19 +120,19 @@ class Target:
         assert self.megabytes < before + megabytes
         assert self.process.alive and "Traceback" not in self.process.err, self.process
 
-    def said(self, pattern: str) -> int:
-        """How many lines the log has of an event, those that only sum up left out."""
+    def logged(self, pattern: str) -> int:
+        """Return the number of log lines about an event, without summaries."""
         lines = self.process.err.splitlines()
         return sum(bool(re.search(pattern, line)) and " like it in " not in line for line in lines)
 
     @contextmanager
-    def says_once(self, *patterns: str) -> Iterator[None]:
-        """What is done within makes one line of each kind, or none where there was one already a moment ago."""
-        before = {pattern: self.said(pattern) for pattern in patterns}
+    def logs_once(self, *patterns: str) -> Iterator[None]:
+        """Check that the block logs one line of each kind, or none if there was one less than a second before."""
+        before = {pattern: self.logged(pattern) for pattern in patterns}
         yield
         for pattern in patterns:
-            wait_for(lambda: self.said(pattern), what=lambda: f"{pattern} in {self.process}")  # noqa: B023
-            assert self.said(pattern) <= before[pattern] + 1
+            wait_for(lambda: self.logged(pattern), what=lambda: f"{pattern} in {self.process}")  # noqa: B023
+            assert self.logged(pattern) <= before[pattern] + 1
 
 
 def _address(uri: str) -> tuple[str, int]:
@@ -142,7 +142,7 @@ def _address(uri: str) -> tuple[str, int]:
 
 
 def closed(sock: socket.socket) -> bool:
-    """Whether the node has closed a connection, once it has or 20 s are over."""
+    """Wait up to 20 s for the node to close a connection. Return whether it has."""
     sock.settimeout(20)
     try:
         while sock.recv(65536):
@@ -154,8 +154,8 @@ def closed(sock: socket.socket) -> bool:
     return True
 
 
-def pour(sock: socket.socket, data: bytes, most: int = 200_000_000) -> int:
-    """Send `data` again and again until the node does not take it any more; how many bytes went."""
+def flood(sock: socket.socket, data: bytes, most: int = 200_000_000) -> int:
+    """Send `data` repeatedly until the node does not read it any more. Return the number of bytes sent."""
     sent = 0
     sock.settimeout(20)
     with contextlib.suppress(ConnectionError):
@@ -165,14 +165,14 @@ def pour(sock: socket.socket, data: bytes, most: int = 200_000_000) -> int:
 
 
 class FakePublisher:
-    """A publisher of a topic as the master and a subscriber see it, which then sends what it likes.
+    """A publisher that looks valid to the master and to subscribers, and then sends any data.
 
     Parameters
     ----------
     behave : callable
-        Takes each connection of a subscriber whose header has been read.
+        Called with each connection of a subscriber whose header has been read.
     asked : callable, optional
-        The answer to requestTopic, from the port; by default a right one.
+        Returns the response of requestTopic for the port; by default a valid one.
     """
 
     def __init__(
@@ -226,7 +226,7 @@ class FakePublisher:
 
 
 def publisher_header(kind: Any, topic: str) -> bytes:
-    """The header with which a right publisher answers."""
+    """Return the header that a valid publisher sends."""
     return bytes(
         encode_ros_handshake_header(
             {"topic": topic, "type": kind._type, "md5sum": kind._md5sum, "callerid": "/evil", "latching": "0"}
@@ -235,5 +235,5 @@ def publisher_header(kind: Any, topic: str) -> bytes:
 
 
 def length(size: int) -> bytes:
-    """A length as TCPROS has them."""
+    """Return a length in the format of TCPROS."""
     return struct.pack("<I", size)

@@ -1,4 +1,4 @@
-"""Fixtures of the node's tests: one node for all tests of a module, emptied between them."""
+"""Fixtures of the node's tests: one node for all tests of a module, without processors at the start of each."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ def _node(graph: Graph) -> Iterator[Session]:
 
 @pytest.fixture
 def afe(_node: Session) -> Iterator[Session]:
-    """A node without processors. It must still live, and must not have stumbled, when the test is over."""
-    said = len(_node.process.err)
+    """Provide a node without processors. After the test it must be alive, and must have logged no traceback."""
+    logged = len(_node.process.err)
     yield _node
     if _node.microphone is not None:
         _node.microphone.close()
         _node.microphone = None
     _node.ok("Stop")
     assert _node.processors() == {}
-    assert "Traceback" not in _node.process.err[said:], _node.process.err[said:]
+    assert "Traceback" not in _node.process.err[logged:], _node.process.err[logged:]

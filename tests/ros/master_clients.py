@@ -1,4 +1,4 @@
-"""Client processes of a node whose master is lost and comes back; they print what they see. Run by test_master.py."""
+"""Client processes of a node whose master is lost and returns; they print their results. Run by test_master.py."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ BLOCK = 2000
 REQUESTS = ("connect_port", "InputProc", "PreProc", "GammatoneProc", "getParameters", "removeProcessor", "Stop")
 
 
-class LonelyGraph:
-    """What Microphone needs of a graph."""
+class MinimalGraph:
+    """The part of a graph that Microphone needs."""
 
     def client(self) -> None:
-        """This process is a node already."""
+        """Do nothing: this process is a node already."""
 
 
 def calls(node: str) -> dict[str, Any]:
-    """Proxies with connections of their own, which need no master any more once they have been used."""
+    """Return proxies with persistent connections, which need no master after the first call."""
     proxies = {}
     for name in REQUESTS:
         proxies[name] = rospy.ServiceProxy(f"{node}/{name}", getattr(rosAFE.srv, name), persistent=True)
@@ -42,14 +42,14 @@ def calls(node: str) -> dict[str, Any]:
 
 
 def names(call: dict[str, Any]) -> list[str]:
-    """The names of all processors of the kinds that are used here."""
+    """Return the names of all processors of the kinds that are used here."""
     parameters = call["getParameters"]().parameters
     return [p.name for p in (*parameters.input, *parameters.preProc, *parameters.gammatone)]
 
 
 def stay(node: str, master_is_lost: Path) -> None:
-    """Build a tree, wait until the file says that the master is lost, and go on with what is connected."""
-    microphone = Microphone(LonelyGraph())  # type: ignore[arg-type]
+    """Build a tree, wait until the file reports that the master is lost, and continue with the open connections."""
+    microphone = Microphone(MinimalGraph())  # type: ignore[arg-type]
     acquire = rospy.ServiceProxy("/bass/Acquire", bass.srv.Acquire)
     assert acquire(device="scene:", sampleRate=microphone.sample_rate, nFramesPerChunk=1000).genom_success
     rospy.set_param("/bass/socket_port", 0)
@@ -62,7 +62,7 @@ def stay(node: str, master_is_lost: Path) -> None:
     assert call["GammatoneProc"](fb_nChannels=2, name="first").genom_success
     assert call["removeProcessor"](name="first").genom_success
     assert names(call) == ["input", "preProc"]
-    assert call["Stop"]().genom_success  # every connection has been used
+    assert call["Stop"]().genom_success  # all connections have been used
     assert call["InputProc"](nFramesPerBlock=BLOCK).genom_success
     assert call["PreProc"]().genom_success
     assert call["PreProc"](name="other").genom_success
@@ -82,14 +82,14 @@ def stay(node: str, master_is_lost: Path) -> None:
     requests: list[Callable[[], Any]] = [
         lambda: call["GammatoneProc"](fb_nChannels=2, name="late"),
         lambda: call["connect_port"](local="Audio", remote="bass/Audio"),
-        lambda: dedicated_socket(),  # its parameters are with the master
+        lambda: dedicated_socket(),  # its parameters are stored by the master
     ]
     added, *refused = run_together(len(requests), lambda number: requests[number]())
     seen: dict[str, Any] = {"GammatoneProc": added.genom_success}
     seen["connect_port"], seen["DedicatedSocket"] = (json.loads(answer.genom_exdetail)["ex"] for answer in refused)
     seen["processors"] = names(call)
-    told = len(states)
-    wait_for(lambda: len(states) >= told + 2, what="genom_state")
+    count = len(states)
+    wait_for(lambda: len(states) >= count + 2, what="genom_state")
     seen["removed"] = call["removeProcessor"](name="other").genom_success
     seen["left"] = names(call)
     microphone.play(noise(BLOCK))
@@ -98,7 +98,7 @@ def stay(node: str, master_is_lost: Path) -> None:
 
 
 def come(node: str) -> None:
-    """Use everything anew, through the master that is back."""
+    """Use everything again, through the new master."""
     call = calls(node)
     seen: dict[str, Any] = {"processors": names(call)}
     assert call["connect_port"](local="Audio", remote="bass/Audio").genom_success

@@ -1,4 +1,4 @@
-"""What the tests of the node share: a microphone of their own, requests, goals, ports and what these must hold."""
+"""Shared code of the node's tests: a microphone, requests, goals, ports and their expected content."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ from rosafe.component import serialization
 from rosafe.interface import CORE_REPRESENTATIONS, ROSAFE
 from tests.harness import PATIENCE, PYTHON, Graph, Process, wait_for
 
-RATE = 20000  # Hz; cheap, and all default channels lie below half of it
+RATE = 20000  # Hz; low, but twice the frequency of all default channels
 _topics = itertools.count(1)
 
 
 def noise(frames: int, seed: int = 1) -> np.ndarray:
-    """A binaural int32 signal, (2, frames)."""
+    """Return a binaural int32 signal, (2, frames)."""
     return np.random.default_rng(seed).integers(-(2**30), 2**30, (2, frames)).astype(np.int32)
 
 
 class Microphone:
-    """Publishes what bass would: a window that slides over a signal, chunk by chunk, beginning full of zeros."""
+    """Publishes like bass: a window that moves over a signal, chunk by chunk, and starts with zeros."""
 
     def __init__(
         self, graph: Graph, sample_rate: int = RATE, chunk: int = 400, chunks: int = 10, topic: str = ""
@@ -40,14 +40,14 @@ class Microphone:
         graph.client()
         self.topic = topic or f"/microphone{next(_topics)}/Audio"
         self.sample_rate, self.chunk, self.chunks = sample_rate, chunk, chunks
-        self.index = 0  # of the newest frame
+        self.index = 0  # index of the newest frame
         self._message = serialization.message_class("bass", "::binaudio::portStruct")
         self.window = np.zeros((2, chunk * chunks), np.int32)
         self._publisher = rospy.Publisher(self.topic, self._message, latch=True, queue_size=0, tcp_nodelay=True)
         self.publish()
 
     def publish(self) -> None:
-        """Send the window as it is."""
+        """Send the current window."""
         self._publisher.publish(
             self._message(
                 sampleRate=self.sample_rate,
@@ -61,29 +61,29 @@ class Microphone:
         )
 
     def stamp(self) -> dict[str, int]:
-        """The time of the window; of a bass that knows none, 0."""
+        """Return the time of the window; 0, as from a bass without stamps."""
         return {"sec": 0, "nsec": 0}
 
     def publish_bytes(self, data: bytes) -> None:
-        """Send anything at all in place of a message."""
+        """Send any bytes in place of a message."""
         message = self._message()
         message.serialize = lambda out: out.write(data)
         self._publisher.publish(message)
 
     def play(self, signal: np.ndarray) -> None:
-        """Go on with `signal`, (2, n), in chunks; the last one may be shorter."""
+        """Append `signal`, (2, n), in chunks; the last one can be shorter."""
         for start in range(0, signal.shape[1], self.chunk):
             self.lose(signal[:, start : start + self.chunk])
             self.publish()
 
     def lose(self, signal: np.ndarray) -> None:
-        """Go on with `signal` and do not tell; what the window still holds comes with the next message."""
+        """Append `signal` without a message; the next message contains the part that is still in the window."""
         joined = np.concatenate((self.window, signal), axis=1)
         self.window = joined[:, -self.window.shape[1] :]
         self.index += signal.shape[1]
 
     def resize(self, chunks: int) -> None:
-        """Let the window hold so many chunks from now on; what is older than the window so far is zeros."""
+        """Set the length of the window to `chunks`; frames before the current window are zeros."""
         self.chunks = chunks
         longer = np.zeros((2, chunks * self.chunk), np.int32)
         kept = self.window[:, -longer.shape[1] :]
@@ -91,17 +91,17 @@ class Microphone:
         self.window = longer
 
     @property
-    def heard(self) -> bool:
-        """Whether anybody is connected."""
+    def subscribed(self) -> bool:
+        """Return whether there is a subscriber."""
         return self._publisher.get_num_connections() > 0
 
     def close(self) -> None:
-        """End as a publisher that leaves."""
+        """Close the topic."""
         self._publisher.unregister()
 
 
 class Session:
-    """One node under test, with a microphone; most tests get it from the fixture `afe`."""
+    """A node under test, with a microphone; most tests get it from the fixture `afe`."""
 
     def __init__(self, graph: Graph, process: Process, name: str = "rosAFE") -> None:
         self.graph = graph
@@ -113,26 +113,26 @@ class Session:
     # --- requests ---
 
     def call(self, service: str, **fields: Any) -> Any:
-        """The response of a plain service."""
+        """Return the response of a plain service."""
         return self.graph.call(f"/{self.name}/{service}", **fields)
 
     def ok(self, service: str, **fields: Any) -> Any:
-        """The response of a request that succeeds."""
+        """Return the response of a request that succeeds."""
         response = self.call(service, **fields)
         assert response.genom_success, response.genom_exdetail
         assert response.genom_exdetail == ""
         return response
 
     def refused(self, service: str, **fields: Any) -> tuple[str, Mapping[str, Any]]:
-        """Exception and detail of a request that fails."""
+        """Return exception and detail of a request that fails."""
         response = self.call(service, **fields)
         assert not response.genom_success
-        return told(response)
+        return error_of(response)
 
     # --- audio and processors ---
 
     def listen(self, **options: Any) -> Microphone:
-        """A new microphone, connected to the Audio port."""
+        """Connect a new microphone to the Audio port."""
         if self.microphone is not None:
             self.microphone.close()
         self.microphone = Microphone(self.graph, **options)
@@ -140,7 +140,7 @@ class Session:
         return self.microphone
 
     def build(self, *requests: str, block: int = 1600, **values: Any) -> Microphone:
-        """A microphone and an input, and then `requests` with `values` where they have such a parameter."""
+        """Create a microphone, an input, and the processors of `requests` with those of the `values` that they have."""
         microphone = self.microphone if self.microphone is not None else self.listen()
         for request in ("InputProc", *requests):
             names = {p.name for p in ROSAFE.service(request).parameters}
@@ -149,7 +149,7 @@ class Session:
         return microphone
 
     def processors(self) -> dict[str, list[str]]:
-        """The names of all processors by kind, as getParameters tells them."""
+        """Return the names of all processors by kind, from getParameters."""
         parameters = self.ok("getParameters").parameters
         return {
             kind: [p.name for p in getattr(parameters, kind)]
@@ -160,13 +160,13 @@ class Session:
     # --- ports ---
 
     def topic(self, kind: str, name: str = "") -> str:
-        """The topic of a processor; `name` by default as the request's."""
+        """Return the topic of a processor; the default of `name` is that of the request."""
         port = ROSAFE.port(CORE_REPRESENTATIONS[kind].port)
         element = name or ROSAFE.service(CORE_REPRESENTATIONS[kind].request).parameter("name").default
         return f"/{self.name}/{port.name}" + (f"/{element}" if port.multiple else "")
 
     def read(self, kind: str, index: int | None = None, name: str = "", timeout: float = PATIENCE) -> Any:
-        """The newest message of a port, with arrays; the one with lastFrameIndex `index` where that is given."""
+        """Return the newest message of a port, with arrays, or the one with lastFrameIndex `index`."""
         return self.graph.message(
             self.topic(kind, name),
             serialization.message_class("rosAFE", ROSAFE.port(CORE_REPRESENTATIONS[kind].port).idl),
@@ -176,14 +176,14 @@ class Session:
 
     @contextmanager
     def follow(self, kind: str, name: str = "") -> Iterator[list[Any]]:
-        """All messages of a port, from the latched one on."""
+        """Collect all messages of a port, starting with the latched one."""
         message_class = serialization.message_class("rosAFE", ROSAFE.port(CORE_REPRESENTATIONS[kind].port).idl)
         with self.graph.collect(self.topic(kind, name), message_class) as messages:
             wait_for(lambda: messages, what=f"a message on {self.topic(kind, name)}")
             yield messages
 
     def connections(self, topic: str) -> int:
-        """How many subscribers of one of its topics the node knows."""
+        """Return the node's number of subscribers of a topic."""
         address = rosgraph.Master("/test", master_uri=self.graph.uri).lookupNode(f"/{self.name}")
         answer: Any = xmlrpc.client.ServerProxy(address).getBusInfo("/test")
         return sum(entry[4] == topic for entry in answer[2])
@@ -191,12 +191,12 @@ class Session:
     # --- state ---
 
     def activities(self) -> dict[int, str]:
-        """Id and name of all live activities, from a fresh genom_state."""
+        """Return id and name of all live activities, from a new genom_state."""
         state = self.graph.message(f"/{self.name}/genom_state", rosAFE.msg.genom_state_component)
         return {activity.id: activity.name for task in state.task for activity in task.activity}
 
     def wait_activities(self, names: list[str]) -> dict[int, str]:
-        """The live activities once their names are those of `names`."""
+        """Wait until the names of the live activities are `names`. Return the activities."""
         with self.graph.collect(f"/{self.name}/genom_state", rosAFE.msg.genom_state_component) as messages:
 
             def live() -> dict[int, str]:
@@ -206,7 +206,7 @@ class Session:
             return live()
 
     def health(self, accept: Callable[[dict[str, str]], bool], part: str = "audio") -> dict[str, str]:
-        """The entries of /diagnostics once `accept` takes them; level and message are among them."""
+        """Return the entries of /diagnostics, with level and message, as soon as `accept` is true for them."""
         from diagnostic_msgs.msg import DiagnosticArray
 
         with self.graph.collect("/diagnostics", DiagnosticArray) as messages:
@@ -227,7 +227,7 @@ class Session:
     # --- goals ---
 
     def goal(self, service: str, **fields: Any) -> Goal:
-        """Send a goal to the action of that name."""
+        """Send a goal to the action `name`."""
         client = self._clients.get(service)
         if client is None:
             action = getattr(rosAFE.msg, f"{service}Action")
@@ -236,7 +236,7 @@ class Session:
         return Goal(client, getattr(rosAFE.msg, f"{service}Goal")(**fields))
 
     def close(self) -> None:
-        """Leave all topics."""
+        """End all subscriptions."""
         for client in self._clients.values():
             client.stop()
         if self.microphone is not None:
@@ -245,7 +245,7 @@ class Session:
 
 @contextmanager
 def own_node(graph: Graph, *arguments: str, name: str = "own") -> Iterator[Session]:
-    """A node of the test's own, for what must not happen to the one that the module shares."""
+    """Start a node for one test, if the shared node of the module must not be affected."""
     with graph.node("rosAFE-ros", "-i", name, *arguments) as process:
         session = Session(graph, process, name)
         yield session
@@ -253,7 +253,7 @@ def own_node(graph: Graph, *arguments: str, name: str = "own") -> Iterator[Sessi
 
 
 class Goal:
-    """A goal that was sent, and what the client saw of it."""
+    """A goal with its transitions as seen by the client."""
 
     def __init__(self, client: actionlib.ActionClient, goal: Any) -> None:
         self.states: list[int] = []
@@ -283,12 +283,12 @@ class Goal:
         return self.handle.get_result()
 
     def status(self) -> int:
-        """The terminal state (actionlib_msgs/GoalStatus)."""
+        """Return the terminal state (actionlib_msgs/GoalStatus)."""
         return int(self.handle.get_goal_status())
 
 
-def told(response: Any) -> tuple[str, Mapping[str, Any]]:
-    """Exception and detail of a failed response or result, from its JSON text."""
+def error_of(response: Any) -> tuple[str, Mapping[str, Any]]:
+    """Return exception and detail of a failed response or result, from its JSON text."""
     body = json.loads(response.genom_exdetail)
     assert set(body) <= {"ex", "detail", "what"}
     assert body.get("what") or {"what", "by"} & set(body.get("detail", {})), "there is always a reason"
@@ -296,9 +296,9 @@ def told(response: Any) -> tuple[str, Mapping[str, Any]]:
     return body["ex"], body.get("detail", {})
 
 
-# --- another process that reads ---------------------------------------------------------------------------------
+# --- a subscriber in another process ---------------------------------------------------------------------------------
 
-# Prints the index of each message that comes.
+# Prints the index of each message.
 SUBSCRIBER = """
 import sys, rospy
 from rosAFE.msg import rosAFE_TimeFrequencySignalPortStruct as Message
@@ -309,29 +309,29 @@ rospy.spin()
 
 
 def reader(graph: Graph, topic: str) -> Process:
-    """A process that subscribes to a topic and prints the index of each message; it has got the first one."""
+    """Start a process that subscribes to a topic and prints the index of each message; wait for the first one."""
     process = graph.start(PYTHON, "-c", SUBSCRIBER, topic)
     wait_for(lambda: process.out, what=lambda: str(process))
     return process
 
 
-# --- what a port must hold ---------------------------------------------------------------------------------------
+# --- expected content of ports ---------------------------------------------------------------------------------------
 
 
 def expected(signal: np.ndarray, block: int, parameters: Mapping[str, Any] | None = None, rate: int = RATE) -> Any:
-    """`rosafe.process` of `signal` on the same blocks."""
+    """Return the result of `rosafe.process` for `signal` with the same blocks."""
     return process(signal, rate, parameters=parameters, block_frames=block)
 
 
 def windowed(values: np.ndarray, seconds: float, rate: float) -> np.ndarray:
-    """The newest `seconds` of (..., frames), zeros before the beginning."""
+    """Return the newest `seconds` of (..., frames), with zeros before the beginning."""
     frames = int(np.floor(seconds * rate + 1e-9))
     padded = np.concatenate((np.zeros((*values.shape[:-1], frames)), values), axis=-1)
     return padded[..., padded.shape[-1] - frames :]
 
 
 def ears(kind: str, values: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
-    """`left` and `right` of a message, from an output of `rosafe.process`; None where there is no `right`."""
+    """Return `left` and `right` of a message from an output of `rosafe.process`; None for a missing `right`."""
     if kind == "ild":
         return values, np.zeros((0, 0))
     if kind == "crossCorrelation":
@@ -340,7 +340,7 @@ def ears(kind: str, values: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
 
 
 def assert_holds(message: Any, kind: str, values: np.ndarray) -> None:
-    """The samples of a message are bit for bit `values`, an output of `rosafe.process` cut to length."""
+    """Check that the samples of a message are bit-identical to `values`, an output of `rosafe.process`."""
     left, right = ears(kind, values)
     assert message.framesOnPort == values.shape[-1]
     np.testing.assert_array_equal(message.left, left)

@@ -16,13 +16,13 @@ from actionlib_msgs.msg import GoalStatus
 
 from rosafe.interface import CORE_REPRESENTATIONS, ROSAFE
 from tests.harness import Graph, wait_for
-from tests.ros.session import Goal, Session, noise, own_node, told
+from tests.ros.session import Goal, Session, error_of, noise, own_node
 
 REQUESTS = [kind.request for kind in CORE_REPRESENTATIONS.values()]
 
 
 def build(afe: Session, *requests: str) -> dict[str, Goal]:
-    """Goals for an input and `requests`, each made as soon as the one before is accepted."""
+    """Send goals for an input and `requests`, each as soon as the previous one is accepted."""
     afe.listen()
     goals = {}
     for request in ("InputProc", *requests):
@@ -32,23 +32,23 @@ def build(afe: Session, *requests: str) -> dict[str, Goal]:
 
 
 def succeeded(goal: Goal) -> None:
-    """The goal ended as every goal does, and normally."""
+    """Check that the goal has ended normally."""
     result = goal.result()
     assert (result.genom_success, result.genom_exdetail) == (True, "")
     assert goal.status() == GoalStatus.SUCCEEDED
 
 
 def failed(goal: Goal) -> tuple[str, Any]:
-    """Exception and detail of a goal that failed; for actionlib it succeeded all the same."""
+    """Return exception and detail of a goal that failed; its actionlib state is succeeded, too."""
     result = goal.result()
     assert not result.genom_success
     assert goal.status() == GoalStatus.SUCCEEDED
-    assert {CommState.ACTIVE, CommState.PREEMPTING} & set(goal.states), "failures are told after acceptance"
-    return told(result)
+    assert {CommState.ACTIVE, CommState.PREEMPTING} & set(goal.states), "failures are reported after acceptance"
+    return error_of(result)
 
 
 def test_a_whole_tree_of_goals(afe: Session) -> None:
-    """Accepted means running, so that each can follow at once; the results come when the activities end."""
+    """An accepted goal is running, so that the next one can follow; results arrive when the activities end."""
     goals = build(afe, *REQUESTS[1:])
     assert afe.processors() == {
         kind: [ROSAFE.service(k.request).parameter("name").default] for kind, k in CORE_REPRESENTATIONS.items()
@@ -65,7 +65,7 @@ def test_a_whole_tree_of_goals(afe: Session) -> None:
     succeeded(goals["PreProc"])
 
 
-def test_failures_come_as_results(afe: Session) -> None:
+def test_failures_are_results(afe: Session) -> None:
     build(afe, "PreProc")
     assert failed(afe.goal("IhcProc")) == ("::rosAFE::e_noUpperDependencie", {})
     assert failed(afe.goal("PreProc")) == ("::rosAFE::e_existsAlready", {})
@@ -82,14 +82,14 @@ def test_an_input_without_audio_fails(afe: Session) -> None:
 
 
 def waiting_input(afe: Session) -> Goal:
-    """An InputProc that waits for sound."""
+    """Start an InputProc that waits for audio."""
     goal = afe.goal("InputProc")
     afe.wait_activities(["InputProc"])
     return goal
 
 
 def silent_port(afe: Session) -> Any:
-    """An Audio port that is connected and gets nothing."""
+    """Connect the Audio port to a topic without messages."""
     import bass.msg
 
     publisher = rospy.Publisher("/silent/Audio", bass.msg.binaudio_portStruct, queue_size=1)
@@ -98,7 +98,7 @@ def silent_port(afe: Session) -> Any:
 
 
 @pytest.mark.parametrize("by", ["client", "abort_activity", "Stop", "InputProc"])
-def test_an_input_that_still_waits_is_interrupted(afe: Session, by: str) -> None:
+def test_a_waiting_input_is_interrupted(afe: Session, by: str) -> None:
     silent = silent_port(afe)
     goal = waiting_input(afe)
     if by == "client":
@@ -119,7 +119,7 @@ def test_an_input_that_still_waits_is_interrupted(afe: Session, by: str) -> None
 
 def test_many_goals_of_one_kind_at_once(afe: Session) -> None:
     build(afe, "PreProc", "GammatoneProc", "IhcProc")
-    names = [f"ild{number}" for number in range(8)]  # actionlib's client queues no more than ten
+    names = [f"ild{number}" for number in range(8)]  # the queue of actionlib's client has ten entries
     goals = [afe.goal("IldProc", name=name) for name in names]
     for goal in goals:
         goal.active()
@@ -136,7 +136,7 @@ def test_many_goals_of_one_kind_at_once(afe: Session) -> None:
             succeeded(goal)
 
 
-def test_cancel_is_a_normal_end_and_takes_what_hangs_below(afe: Session) -> None:
+def test_cancel_is_a_normal_end_also_of_the_descendants(afe: Session) -> None:
     goals = build(afe, "PreProc", "GammatoneProc", "IhcProc")
     goals["GammatoneProc"].handle.cancel()
     succeeded(goals["GammatoneProc"])
@@ -145,8 +145,8 @@ def test_cancel_is_a_normal_end_and_takes_what_hangs_below(afe: Session) -> None
     assert afe.topic("gammatone") not in afe.graph.topics()
 
 
-def test_a_goal_of_long_ago_can_be_cancelled(afe: Session) -> None:
-    """However many goals of its kind have come and gone since."""
+def test_an_old_goal_can_be_cancelled(afe: Session) -> None:
+    """Also after many other goals of its kind."""
     goals = build(afe, "PreProc")
     for _ in range(40):
         failed(afe.goal("PreProc"))
@@ -194,8 +194,8 @@ def test_a_new_input_that_fails_leaves_the_old_one(afe: Session) -> None:
     assert goals["InputProc"].running
 
 
-def test_kill_ends_everything_and_the_node(graph: Graph) -> None:
-    """Every goal has its result; the process ends with 0, and nothing of it is left on the graph."""
+def test_kill_ends_all_activities_and_the_node(graph: Graph) -> None:
+    """Each goal has its result; the exit code is 0, and the node leaves nothing on the graph."""
     with own_node(graph) as afe:
         goals = build(afe, "PreProc", "GammatoneProc", "IhcProc", "IldProc")
         assert afe.microphone is not None
@@ -210,7 +210,7 @@ def test_kill_ends_everything_and_the_node(graph: Graph) -> None:
 
 
 def test_a_waiting_input_is_interrupted_by_kill(graph: Graph) -> None:
-    """Three tries: on a busy machine the wait for sound (2 s) may be over before the signal arrives."""
+    """Three attempts: on a busy machine the wait for audio (2 s) may end before the signal arrives."""
     for _ in range(3):
         with own_node(graph) as afe:
             silent = silent_port(afe)
@@ -226,7 +226,7 @@ def test_a_waiting_input_is_interrupted_by_kill(graph: Graph) -> None:
 # --- genom_state ------------------------------------------------------------------------------------------------
 
 
-def test_genom_state_tells_what_is(afe: Session) -> None:
+def test_genom_state_describes_all_activities(afe: Session) -> None:
     microphone = afe.build("PreProc", block=800)
     blocks = 5
     microphone.play(noise(800 * blocks))
@@ -248,15 +248,15 @@ def test_genom_state_tells_what_is(afe: Session) -> None:
     assert (idle.cycles, idle.timings.max, idle.load.max) == (0, 0.0, 0.0)
 
 
-def test_genom_state_comes_each_second_and_at_every_change(afe: Session) -> None:
+def test_genom_state_is_published_each_second_and_at_each_change(afe: Session) -> None:
     afe.build()
     with afe.graph.collect("/rosAFE/genom_state", rosAFE.msg.genom_state_component) as messages:
         moments = []
-        for count in range(1, 7):  # the latched one comes first
+        for count in range(1, 7):  # the latched message is the first one
             wait_for(lambda: len(messages) >= count)  # noqa: B023
             moments.append(time.monotonic())
         periods = [after - before for before, after in itertools.pairwise(moments[1:])]
-        assert statistics.median(periods) < 1.1, "one a second, but where the machine has other work for a moment"
+        assert statistics.median(periods) < 1.1, "one each second, except for delays on a busy machine"
         afe.ok("PreProc")
         wait_for(lambda: "PreProc" in {a.name for t in messages[-1].task for a in t.activity})
         afe.ok("removeProcessor", name="preProc")

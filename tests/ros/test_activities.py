@@ -1,4 +1,4 @@
-"""Activities without ROS: ids, slots, beginnings, ends, interruptions; what a task measures of itself."""
+"""Activities without ROS: ids, slots, start, end, interruption; statistics of a task."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ IHC = ROSAFE.service("IhcProc")
 
 
 class Board:
-    """Activities, and what they reported."""
+    """Activities and their reports."""
 
     def __init__(self) -> None:
         self.crashes: list[BaseException] = []
@@ -53,10 +53,11 @@ def raising(problem: BaseException) -> Any:
 def board() -> Any:
     board = Board()
     yield board
-    board.activities.interrupt(board.activities.live(), "the test's end")
+    for activity in board.activities.live():
+        activity.interrupt("the test's end")
 
 
-def test_ids_grow_over_all_kinds_and_the_ended_leave(board: Board) -> None:
+def test_ids_grow_over_all_kinds_and_ended_activities_are_removed(board: Board) -> None:
     first, second, third = board.start(), board.start(INPUT), board.start()
     assert [first.id, second.id, third.id] == [1, 2, 3]
     assert board.activities.live() == [first, second, third]
@@ -71,11 +72,11 @@ def test_ids_grow_over_all_kinds_and_the_ended_leave(board: Board) -> None:
     assert board.changes >= 5
 
 
-def test_a_task_takes_so_many_activities_and_no_more(board: Board) -> None:
+def test_the_number_of_activities_of_a_task_is_limited(board: Board) -> None:
     for _ in range(MAX_ACTIVITIES - 1):
         board.start()
     assert board.activities.full(IHC) and not board.activities.full(INPUT)
-    with pytest.raises(ComponentError, match="ihcProc has 255 activities, as many as it takes"):
+    with pytest.raises(ComponentError, match="ihcProc has 255 activities, which is the limit"):
         board.start()
     board.start(INPUT)
     leaving = board.activities.find(5)
@@ -99,7 +100,7 @@ def test_a_task_takes_so_many_activities_and_no_more(board: Board) -> None:
         (KeyError("lost"), '{"ex":"::genom::unkex","detail":{"what":"KeyError: \'lost\'"}}', 1),
     ],
 )
-def test_failures_have_a_name(board: Board, problem: BaseException, exdetail: str, crashes: int) -> None:
+def test_failures_are_named_errors(board: Board, problem: BaseException, exdetail: str, crashes: int) -> None:
     activity = board.start(handler=raising(problem))
     assert activity.begun.wait(PATIENCE) and activity.ended.wait(PATIENCE)
     assert activity.error is not None and activity.error.exdetail == exdetail
@@ -107,7 +108,7 @@ def test_failures_have_a_name(board: Board, problem: BaseException, exdetail: st
     assert board.activities.live() == []
 
 
-def test_no_thread_left(board: Board, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lack_of_threads_is_a_named_error(board: Board, monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch:
         patch.setattr(threading.Thread, "start", raising_start)
         with pytest.raises(ComponentError) as caught:
@@ -121,7 +122,7 @@ def raising_start(thread: threading.Thread) -> None:
     raise RuntimeError("can't start new thread")
 
 
-def test_the_requester_is_told_before_anybody_who_waits(board: Board) -> None:
+def test_the_requesting_client_is_notified_first(board: Board) -> None:
     seen: list[Any] = []
     activity = board.start(on_end=lambda a: seen.append((a.begun.is_set(), a.ended.is_set(), board.activities.live())))
     activity.begun.wait(PATIENCE)
@@ -129,7 +130,7 @@ def test_the_requester_is_told_before_anybody_who_waits(board: Board) -> None:
     assert seen == [(True, False, [])]
 
 
-def test_an_end_that_cannot_be_told_is_an_end(board: Board, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_end_is_complete_if_its_report_fails(board: Board, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(threading, "excepthook", lambda arguments: None)
     activity = board.start(handler=raising(ROSAFE.error("e_noData")), on_end=raising_end)
     assert activity.ended.wait(PATIENCE)
@@ -156,7 +157,7 @@ def test_interrupted_before_it_ran(board: Board) -> None:
     assert activity.error.exdetail == '{"ex":"::genom::interrupted","detail":{"by":"client"}}', "the first one counts"
 
 
-def test_a_newcomer_waits_for_those_that_it_replaces(board: Board) -> None:
+def test_a_new_activity_waits_for_the_ones_that_it_replaces(board: Board) -> None:
     release = threading.Event()
 
     def reluctant(activity: Activity, values: dict[str, Any]) -> None:
@@ -187,7 +188,7 @@ def test_stopping_by_name_is_bounded(board: Board) -> None:
     assert activity.ended.wait(PATIENCE)
 
 
-def test_the_table_names_activities_that_exist() -> None:
+def test_the_interface_table_names_existing_activities() -> None:
     for component in (ROSAFE, BASS):
         names = {service.name for service in component.activities}
         assert all(set(service.interrupts) <= names for service in component.services)
@@ -209,7 +210,7 @@ def test_a_task_measures_its_cycles(monkeypatch: pytest.MonkeyPatch) -> None:
     usage = meter.snapshot()
     assert usage["cycles"] == 3
     assert usage["timings"] == pytest.approx({"last": 0.25, "max": 0.4, "avg": 0.25})
-    assert usage["load"]["last"] == 0.0, "not yet: half a second tells nothing"
+    assert usage["load"]["last"] == 0.0, "not yet: half a second is too short"
     now = 103.0
     assert meter.snapshot()["load"] == pytest.approx({"last": 0.25, "max": 0.25, "avg": 0.25})
     now = 105.0

@@ -1,4 +1,4 @@
-"""The audio ring against a simple model of its rules, and the threads that meet at it."""
+"""The audio ring compared with a simple model of its rules, and its threads."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from rosafe.component.audio import RING_SECONDS, AudioReader, AudioRing
 from rosafe.sound.windows import MAX_RATE
 from tests.harness import PATIENCE
 
-RATE = 8  # Hz: the ring holds 80 frames
+RATE = 8  # Hz: the ring contains 80 frames
 CAPACITY = int(RING_SECONDS * RATE)
 
 
 @dataclass
 class Source:
-    """A stream whose samples tell which stream and which frame they are."""
+    """A stream whose samples identify the stream and the frame."""
 
     rate: int = RATE
     window: int = 12
@@ -59,7 +59,7 @@ def opened(ring: AudioRing, block: int) -> AudioReader:
 
 
 class Model:
-    """The rules at the head of rosafe/component/audio.py, on a dict from frame number to sample."""
+    """The rules in the docstring of rosafe/component/audio.py, with a dict from frame index to sample."""
 
     def __init__(self) -> None:
         self.rate = self.window = self.newest = 0
@@ -120,7 +120,7 @@ class Model:
 
 
 class RingMachine(RuleBasedStateMachine):
-    """Whatever comes in, the ring and the model tell the same."""
+    """For any input, the ring and the model agree."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -217,7 +217,7 @@ TestRing = RingMachine.TestCase
     late=st.integers(0, 50),
     repeats=st.integers(1, 2),
 )
-def test_any_chunks_give_the_same_blocks(chunks: list[int], block: int, late: int, repeats: int) -> None:
+def test_blocks_do_not_depend_on_the_chunk_length(chunks: list[int], block: int, late: int, repeats: int) -> None:
     ring = AudioRing(lambda line: pytest.fail(line))
     feed = ring.connect()
     source = Source(rate=1000, index=late)
@@ -241,18 +241,18 @@ def test_any_chunks_give_the_same_blocks(chunks: list[int], block: int, late: in
     ("bad", "why"),
     [
         (message(RATE, 5, np.zeros(3, np.int32), np.zeros(2, np.int32)), "3 left and 2 right"),
-        (message(RATE, 5, np.zeros(0, np.int32)), "0 samples"),
-        (message(0, 5, np.zeros(3, np.int32)), "0 Hz"),
-        (message(MAX_RATE + 1, 5, np.zeros(3, np.int32)), f"{MAX_RATE + 1} Hz"),
-        (message(2**32 - 1, 5, np.zeros(3, np.int32)), "4294967295 Hz"),
-        (message(RATE, 5, np.zeros(3, np.int32), nChunksOnPort=2), "3 samples per ear, where there should be 2 x 3"),
+        (message(RATE, 5, np.zeros(0, np.int32)), "samples per ear, got 0"),
+        (message(0, 5, np.zeros(3, np.int32)), "Hz, got 0"),
+        (message(MAX_RATE + 1, 5, np.zeros(3, np.int32)), f"Hz, got {MAX_RATE + 1}"),
+        (message(2**32 - 1, 5, np.zeros(3, np.int32)), "Hz, got 4294967295"),
+        (message(RATE, 5, np.zeros(3, np.int32), nChunksOnPort=2), "expected 2 x 3 samples per ear, got 3"),
         (message(RATE, 5, np.zeros(3, np.int32), nChunksOnPort=0), "0 x 3"),
         (message(RATE, 5, np.zeros(3, np.int32), nFramesPerChunk=2**32 - 1), "1 x 4294967295"),
         (message(RATE, 2**63, np.zeros(3, np.int32)), "9223372036854775808"),
         (message(RATE, 2**64 - 1, np.zeros(3, np.int32)), "18446744073709551615"),
     ],
 )
-def test_malformed_messages_change_nothing_and_are_told_once(bad: Any, why: str) -> None:
+def test_malformed_messages_change_nothing_and_are_reported_once(bad: Any, why: str) -> None:
     lines: list[str] = []
     ring = AudioRing(lines.append)
     feed = ring.connect()
@@ -268,15 +268,15 @@ def test_malformed_messages_change_nothing_and_are_told_once(bad: Any, why: str)
     assert reader.read() is not None
     assert ring.counters.lost == ring.counters.dropped == 0
     feed(bad)
-    assert len(lines) == 2, "another event, told again"
+    assert len(lines) == 2, "another event, reported again"
 
 
-def test_a_window_beyond_all_reason_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_too_long_window_is_rejected(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("rosafe.sound.windows.MAX_WINDOW", 100)
     lines: list[str] = []
     feed = AudioRing(lines.append).connect()
     feed(message(RATE, 5, np.zeros(101, np.int32)))
-    assert "101 samples" in lines[0]
+    assert "got 101" in lines[0]
 
 
 def test_losses_are_located_and_timed() -> None:
@@ -286,13 +286,13 @@ def test_losses_are_located_and_timed() -> None:
     source = Source(index=100)
     feed(source.message())
     opened(ring, 4)
-    source.index += 20  # of which the window holds 12
+    source.index += 20  # of which the window contains 12
     feed(source.message())
     assert ring.counters.last_loss == "8 frames from frame 101 on"
     assert lines == ["Audio: lost 8 frames from frame 101 on (1.000 s)"]
 
 
-def test_events_are_told_in_words() -> None:
+def test_events_are_reported_as_text() -> None:
     lines: list[str] = []
     ring = AudioRing(lines.append)
     feed = ring.connect()
@@ -311,17 +311,17 @@ def test_events_are_told_in_words() -> None:
     feed(Source(index=8, number=3).message())
     feed(Source(index=8, number=2).message())
     feed(Source(index=9, number=3).message())
-    assert len(lines) == 1 and "another stream began" in lines[0], "once, as long as it does not fit"
+    assert len(lines) == 1 and "another stream began" in lines[0], "once, while it does not fit"
     lines.clear()
     feed(Source(rate=16, index=9).message())
     assert "8 unread frames" not in lines[0]
     assert lines[-2:] == [
         "Audio: a new stream at 16 Hz, frame 9 (it was at 8 Hz)",
-        "Audio: the tree runs at 8 Hz and takes nothing of this stream; call Stop",
+        "Audio: the tree runs at 8 Hz and does not read this stream; call Stop",
     ]
 
 
-def test_a_new_connection_begins_anew_and_the_old_one_is_deaf() -> None:
+def test_a_new_connection_starts_a_stream_and_the_old_one_is_ignored() -> None:
     lines: list[str] = []
     ring = AudioRing(lines.append)
     old = ring.connect()
@@ -330,7 +330,7 @@ def test_a_new_connection_begins_anew_and_the_old_one_is_deaf() -> None:
     old(Source(index=53).message())
     new = ring.connect()
     assert ring.counters.dropped == 3 and ring.behind == 0
-    assert ring.open_reader(4, 0.0, lambda: False) is None, "nothing has come on the new connection"
+    assert ring.open_reader(4, 0.0, lambda: False) is None, "no message on the new connection yet"
     old(Source(index=60).message())
     assert ring.sample_rate == 0
     new(Source(index=5, number=2).message())
@@ -343,7 +343,7 @@ def test_waiting_for_the_first_message() -> None:
     ring = AudioRing(lambda line: None)
     feed = ring.connect()
     assert ring.open_reader(4, 0.0, lambda: False) is None
-    assert ring.open_reader(4, 60.0, lambda: True) is None, "told to give up"
+    assert ring.open_reader(4, 60.0, lambda: True) is None, "interrupted"
     found: list[Any] = []
     waiting = threading.Thread(target=lambda: found.append(ring.open_reader(4, 60.0, lambda: False)))
     waiting.start()
@@ -352,7 +352,7 @@ def test_waiting_for_the_first_message() -> None:
     assert found[0].position == 8 and found[0].sample_rate == RATE
 
 
-def test_a_reader_is_woken_for_all_that_comes_until_it_is_stopped() -> None:
+def test_a_reader_is_notified_of_each_complete_block_until_it_is_stopped() -> None:
     ring = AudioRing(lambda line: None)
     feed = ring.connect()
     source = Source()
@@ -361,7 +361,7 @@ def test_a_reader_is_woken_for_all_that_comes_until_it_is_stopped() -> None:
     came: list[int] = []
     calls = []
 
-    def wake() -> None:  # as the tree does, but on the feeding thread; the ring must be free then
+    def wake() -> None:  # as by the tree, but on the thread that feeds the ring, which must not be locked
         calls.append(1)
         while (block := reader.read()) is not None:
             came.append(block[1])
@@ -371,11 +371,11 @@ def test_a_reader_is_woken_for_all_that_comes_until_it_is_stopped() -> None:
         source.index += 1
         feed(source.message())
     assert came == [7, 13]
-    assert len(calls) == 12
+    assert len(calls) == 2
     reader.stop()
     source.index += 12
     feed(source.message())
-    assert len(calls) == 12
+    assert len(calls) == 2
     assert reader.ended
     assert reader.read() is None
 
@@ -391,7 +391,7 @@ def test_two_readers_at_a_replacement() -> None:
     new = opened(ring, 5)
     source.index += 6
     feed(source.message())
-    assert ring.behind == 12, "of the one that is farthest behind"
+    assert ring.behind == 12, "of the slowest reader"
     first, second = old.read(), new.read()
     assert first is not None and list(first[0][0]) == [source.sample(f) for f in (1, 2, 3, 4)]
     assert second is not None and list(second[0][0]) == [source.sample(f) for f in (7, 8, 9, 10, 11)]
@@ -399,7 +399,7 @@ def test_two_readers_at_a_replacement() -> None:
     assert ring.behind == 1
 
 
-def test_a_block_longer_than_the_ring_makes_room() -> None:
+def test_a_block_longer_than_the_ring_enlarges_it() -> None:
     ring = AudioRing(lambda line: pytest.fail(line))
     feed = ring.connect()
     source = Source(index=40)
@@ -412,7 +412,7 @@ def test_a_block_longer_than_the_ring_makes_room() -> None:
     assert read is not None and list(read[0][0]) == [source.sample(f) for f in range(41, 41 + 3 * CAPACITY)]
 
 
-def test_plain_messages_with_lists_do_as_well() -> None:
+def test_generated_messages_with_lists_are_accepted() -> None:
     ring = AudioRing(lambda line: pytest.fail(line))
     feed = ring.connect()
     feed(message(RATE, 4, (1, 2, 3, 4), (5, 6, 7, 8)))  # type: ignore[arg-type]
@@ -423,8 +423,8 @@ def test_plain_messages_with_lists_do_as_well() -> None:
 
 
 @pytest.mark.parametrize("first", [0, 1, 50, 2**63 - 40])
-def test_indexes_that_move_by_anything(first: int) -> None:
-    """By less than a chunk, by nothing, by more than a window, and back: frames keep their numbers throughout."""
+def test_any_changes_of_the_index(first: int) -> None:
+    """By less than a chunk, by 0, by more than a window, and backwards: frames always keep their index."""
     lines: list[str] = []
     ring = AudioRing(lines.append)
     feed = ring.connect()
@@ -432,21 +432,21 @@ def test_indexes_that_move_by_anything(first: int) -> None:
     feed(source.message())
     reader = opened(ring, 1)
 
-    def heard() -> list[tuple[int, int]]:
-        """Number and sample of every frame that can be read."""
+    def readable() -> list[tuple[int, int]]:
+        """Return index and sample of each frame that can be read."""
         return [(read[1] - 1, int(read[0][0, 0])) for read in iter(lambda: ring.behind and reader.read(), 0) if read]
 
     for step in (1, 0, 2, 0, 12):
         before = source.index
         source.index += step
         feed(source.message())
-        assert heard() == [(f, source.sample(f)) for f in range(before + 1, source.index + 1)]
-    before, source.index = source.index, source.index + 15  # three more than the window holds
+        assert readable() == [(f, source.sample(f)) for f in range(before + 1, source.index + 1)]
+    before, source.index = source.index, source.index + 15  # three more than the length of the window
     feed(source.message())
-    assert heard() == [(f, 0 if f <= before + 3 else source.sample(f)) for f in range(before + 1, source.index + 1)]
+    assert readable() == [(f, 0 if f <= before + 3 else source.sample(f)) for f in range(before + 1, source.index + 1)]
     assert (ring.counters.lost, ring.counters.gaps, ring.counters.streams) == (3, 1, 1)
-    source.index -= 1  # out of order: nobody but a newcomer says that
+    source.index -= 1  # out of order: this is a new stream
     feed(source.message())
     assert ring.counters.streams == 2 and "its index fell" in lines[-1]
     oldest = max(1, source.index - 11)
-    assert heard() == [(f, source.sample(f)) for f in range(oldest, source.index + 1)]
+    assert readable() == [(f, source.sample(f)) for f in range(oldest, source.index + 1)]

@@ -1,4 +1,4 @@
-"""ROS' own commands on the node, as a user types them: rosservice, rostopic, rosnode, rosmsg; bass plays its scene."""
+"""The commands of ROS with the node, as typed by a user: rosservice, rostopic, rosnode, rosmsg."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ PORTS = {
 
 @pytest.fixture(scope="module")
 def session(graph: Graph) -> Iterator[Graph]:
-    """The guide's session, made with `rosservice call`: bass plays its scene, and all seven kinds of processors run."""
+    """Build the session of the guide with `rosservice call`: bass plays its scene, and all seven kinds run."""
     with graph.node("bass-ros"), graph.node("rosAFE-ros") as process:
         call(graph, "/rosAFE/connect_port", "{local: Audio, remote: bass/Audio}")
         call(graph, "/bass/Acquire", "{device: 'scene:', sampleRate: 20000, nFramesPerChunk: 1000}")
@@ -37,14 +37,14 @@ def session(graph: Graph) -> Iterator[Graph]:
 
 
 def call(graph: Graph, service: str, values: str) -> str:
-    """What `rosservice call` prints for a request that succeeds."""
-    said = graph.run("rosservice", "call", service, values).stdout
-    assert "genom_success: True" in said, said
-    return said
+    """Return the output of `rosservice call` for a request that succeeds."""
+    output = graph.run("rosservice", "call", service, values).stdout
+    assert "genom_success: True" in output, output
+    return output
 
 
 def follow(graph: Graph, pattern: str, *command: str) -> str:
-    """The first line of an endless command that fits `pattern`; then it is interrupted, as with Ctrl-C."""
+    """Return the first line of an endless command that matches `pattern`, and interrupt it as with Ctrl-C."""
     with graph.start(*command, PYTHONUNBUFFERED="1") as process:
 
         def found() -> re.Match[str] | None:
@@ -70,17 +70,17 @@ def test_rosservice_list_type_info_find_args(session: Graph) -> None:
     assert "Args: name upperDepName ild_wname ild_wSizeSec ild_hSizeSec" in information
 
 
-def test_rosservice_call_shows_parameters_and_refusals(session: Graph) -> None:
-    said = call(session, "/rosAFE/getParameters", "{}")
-    assert "fb_nChannels: 4" in said and 'pp_middleEarModel: "jepsen"' in said
-    said = call(session, "/rosAFE/getDependencies", "{nameProc: ratemap}")
-    assert re.findall(r"- (\w+)", said.replace('"', "")) == ["input", "preProc", "gammatone", "ihc", "ratemap"]
+def test_rosservice_call_shows_parameters_and_errors(session: Graph) -> None:
+    output = call(session, "/rosAFE/getParameters", "{}")
+    assert "fb_nChannels: 4" in output and 'pp_middleEarModel: "jepsen"' in output
+    output = call(session, "/rosAFE/getDependencies", "{nameProc: ratemap}")
+    assert re.findall(r"- (\w+)", output.replace('"', "")) == ["input", "preProc", "gammatone", "ihc", "ratemap"]
     for values, ex in (
         ("{name: again, upperDepName: nobody}", "e_noUpperDependencie"),
         ("{}", "e_existsAlready"),
     ):
-        said = session.run("rosservice", "call", "/rosAFE/IldProc", values).stdout
-        assert "genom_success: False" in said and f"::rosAFE::{ex}" in said
+        output = session.run("rosservice", "call", "/rosAFE/IldProc", values).stdout
+        assert "genom_success: False" in output and f"::rosAFE::{ex}" in output
 
 
 def test_rostopic_list_type_info_find(session: Graph) -> None:
@@ -92,21 +92,21 @@ def test_rostopic_list_type_info_find(session: Graph) -> None:
     information = session.run("rostopic", "info", "/rosAFE/ildPort/ild").stdout
     assert "Type: rosAFE/rosAFE_TimeFrequencySignalPortStruct" in information and "/rosAFE (http" in information
     found = session.run("rostopic", "find", "rosAFE/rosAFE_CrossCorrelationSignalPortStruct").stdout.split()
-    assert "/rosAFE/crossCorrelationPort/crosscorrelation" in found  # the master never forgets a topic's type
+    assert "/rosAFE/crossCorrelationPort/crosscorrelation" in found  # the master keeps the type of a topic for ever
     assert "/rosAFE/ildPort/ild" not in found
 
 
 def test_rostopic_echo(session: Graph) -> None:
-    said = session.run("rostopic", "echo", "-n", "1", "--noarr", "/rosAFE/ildPort/ild").stdout
-    assert "sampleRate: 100\n" in said and "framesOnPort: 100\n" in said and "numberOfChannels: 4\n" in said
+    output = session.run("rostopic", "echo", "-n", "1", "--noarr", "/rosAFE/ildPort/ild").stdout
+    assert "sampleRate: 100\n" in output and "framesOnPort: 100\n" in output and "numberOfChannels: 4\n" in output
     index = session.run("rostopic", "echo", "-n", "1", "/rosAFE/inputProcPort/lastFrameIndex").stdout
     assert int(index.split()[0]) % 1000 == 1
     whole = session.run("rostopic", "echo", "-n", "1", "/rosAFE/ildPort/ild/left/dataN[0]/data").stdout
     assert whole.count(",") == 99
 
 
-def test_rostopic_hz_and_bw_on_every_port(session: Graph) -> None:
-    """Ten blocks a second: hz must have seen about that; bw must have seen whole messages."""
+def test_rostopic_hz_and_bw_on_each_port(session: Graph) -> None:
+    """With ten blocks per second, hz reports about this rate, and bw complete messages."""
 
     def watch(index: int) -> tuple[str, str]:
         topic = list(PORTS)[index]
@@ -146,7 +146,7 @@ def test_rosmsg_and_rossrv_know_the_types(session: Graph) -> None:
 
 
 def test_goals_from_the_shell(session: Graph) -> None:
-    """A goal is a message like any other: rostopic pub starts a processor, and another one cancels it."""
+    """A goal is an ordinary message: one rostopic pub starts a processor, and another one cancels it."""
     goal = "{goal_id: {id: shell}, goal: {name: from_shell, upperDepName: ihc}}"
     with session.start("rostopic", "pub", "-l", "/rosAFE/IldProc/goal", "rosAFE/IldProcActionGoal", goal):
         wait_for(lambda: "/rosAFE/ildPort/from_shell" in session.topics())
@@ -155,15 +155,15 @@ def test_goals_from_the_shell(session: Graph) -> None:
 
 
 def test_rosnode_kill(graph: Graph) -> None:
-    with graph.node("rosAFE-ros", "-i", "victim") as process:
-        wait_for(lambda: "ready as /victim" in process.err)  # a node that is ended before has not started
-        graph.run("rosnode", "kill", "/victim")
+    with graph.node("rosAFE-ros", "-i", "ended") as process:
+        wait_for(lambda: "ready as /ended" in process.err)  # not before the node has started
+        graph.run("rosnode", "kill", "/ended")
         assert process.wait() == 0
         assert "Traceback" not in process.err
-        assert "/victim" not in graph.nodes()
+        assert "/ended" not in graph.nodes()
 
 
 def test_the_kill_request(graph: Graph) -> None:
-    with graph.node("rosAFE-ros", "-i", "victim") as process:
-        call(graph, "/victim/kill", "{}")
+    with graph.node("rosAFE-ros", "-i", "ended") as process:
+        call(graph, "/ended/kill", "{}")
         assert process.wait() == 0

@@ -1,4 +1,4 @@
-"""Others that fail: subscribers that stop or die, a source that is killed, a master that is gone; endless cycles."""
+"""Failures of other processes: stopped or killed subscribers, a killed source, a lost master; many cycles."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from actionlib_msgs.msg import GoalStatus
 
 from rosafe.interface import CORE_REPRESENTATIONS, MAX_ACTIVITIES
 from tests.harness import Graph, Process, proc, run_together, wait_for
-from tests.ros.session import Session, noise, own_node, reader, told
+from tests.ros.session import Session, error_of, noise, own_node, reader
 
 BLOCK = 2000
 
 
 def reads(process: Process, index: int) -> None:
-    """Wait until a reader has got the message with that index."""
+    """Wait until a reader has received the message with `index`."""
     wait_for(lambda: str(index) in process.out.split(), what=lambda: f"{index} in {process.out}")
 
 
-def test_a_subscriber_that_stops_reading_holds_nobody_up(afe: Session) -> None:
-    """It is stopped amid messages of 5 MB; the tree, another subscriber and all requests go on; then it is killed."""
+def test_a_subscriber_that_stops_reading_does_not_block_others(afe: Session) -> None:
+    """It stops during messages of 5 MB; the tree, another subscriber and all requests continue; then it is killed."""
     microphone = afe.build("PreProc", "GammatoneProc", block=BLOCK, fb_nChannels=16)
     topic = afe.topic("gammatone")
     with reader(afe.graph, topic) as stuck, reader(afe.graph, topic) as well:
@@ -46,11 +46,11 @@ def test_a_subscriber_that_stops_reading_holds_nobody_up(afe: Session) -> None:
         reads(well, 14 * BLOCK + 1)
 
 
-def test_a_subscriber_that_is_killed_is_forgotten(afe: Session) -> None:
+def test_a_killed_subscriber_is_removed(afe: Session) -> None:
     microphone = afe.build("PreProc", "GammatoneProc", block=BLOCK, fb_nChannels=16)
 
     def connections() -> int:
-        """TCP connections to this topic, as the node itself tells."""
+        """Return the number of TCP connections to this topic according to the node."""
         node: Any = xmlrpc.client.ServerProxy(rosgraph.Master("/harness").lookupNode("/rosAFE"))
         return sum(entry[4] == afe.topic("gammatone") for entry in node.getBusInfo("/harness")[2])
 
@@ -63,13 +63,13 @@ def test_a_subscriber_that_is_killed_is_forgotten(afe: Session) -> None:
         wait_for(lambda: connections() == 0)
 
 
-def test_bass_is_killed_and_comes_back(graph: Graph) -> None:
-    """Nothing but a new Acquire is needed; the index begins anew, and so do the blocks."""
+def test_bass_is_killed_and_restarted(graph: Graph) -> None:
+    """Only a new Acquire is needed; frame index and blocks start again."""
     with own_node(graph) as afe:
         with graph.node("bass-ros") as bass:
             with graph.collect("/bass/Audio") as audio, graph.collect("/own/inputProcPort") as blocks:
                 afe.wait_activities([])
-            assert (audio, blocks) == ([], []), "advertised, and silent until somebody asks"
+            assert (audio, blocks) == ([], []), "advertised, and silent until a request"
             assert graph.call("/bass/Acquire", device="scene:", sampleRate=20000, nFramesPerChunk=1000).genom_success
             afe.ok("connect_port", local="Audio", remote="bass/Audio")
             afe.ok("InputProc", nFramesPerBlock=BLOCK)
@@ -87,17 +87,17 @@ def test_bass_is_killed_and_comes_back(graph: Graph) -> None:
 
 
 def threads_and_memory(pid: int) -> tuple[int, int]:
-    """Threads and resident bytes of a process."""
+    """Return the number of threads and resident bytes of a process."""
     status = dict(line.split(":", 1) for line in proc(pid, "status").read_text().splitlines())
     return int(status["Threads"]), int(status["VmRSS"].split()[0]) * 1024
 
 
 def open_files(pid: int) -> int:
-    """How many files and sockets a process has open."""
+    """Return the number of open files and sockets of a process."""
     return len(list(proc(pid, "fd").iterdir()))
 
 
-def test_cycles_of_creation_and_removal_leave_nothing(afe: Session) -> None:
+def test_cycles_of_creation_and_removal_leak_nothing(afe: Session) -> None:
     microphone = afe.build("PreProc", block=BLOCK)
 
     def cycle(number: int) -> None:
@@ -121,8 +121,8 @@ def test_cycles_of_creation_and_removal_leave_nothing(afe: Session) -> None:
     afe.read("preProc", 2 * BLOCK + 1)
 
 
-def test_anything_at_all_from_eight_clients(afe: Session) -> None:
-    """Random requests at the same time; in the end, processors, activities and ports still tell the same."""
+def test_random_requests_of_eight_clients(afe: Session) -> None:
+    """After simultaneous random requests, processors, activities and ports still agree."""
     microphone = afe.listen()
     names = [f"n{number}" for number in range(6)]
     changes = [("ihc_method", "hilbert"), ("ild_hSizeSec", "0.005"), ("fb_nChannels", "3"), ("pp_bRemoveDC", "1")]
@@ -147,7 +147,7 @@ def test_anything_at_all_from_eight_clients(afe: Session) -> None:
             request, fields = chance.choice(requests)
             response = afe.call(request, **fields)
             if not response.genom_success:
-                told(response)
+                error_of(response)
         microphone.play(noise(500, number))
 
     run_together(8, work)
@@ -161,21 +161,21 @@ def test_anything_at_all_from_eight_clients(afe: Session) -> None:
             assert chain[-1] == name and chain[0] == there["input"][0]
 
 
-def test_many_clients_may_connect_at_once(afe: Session) -> None:
-    """While the node is too busy to accept them (here: stopped), the system completes their connections."""
+def test_many_clients_can_connect_at_the_same_time(afe: Session) -> None:
+    """While the node cannot accept them (here: stopped), the system completes their connections."""
     address = urlsplit(rosservice.get_service_uri("/rosAFE/getParameters"))
     os.kill(afe.process.pid, signal.SIGSTOP)
     try:
         with ExitStack() as stack:
-            for _ in range(40):  # the sixth would have to try again after a second, with rospy's own backlog
+            for _ in range(40):  # with rospy's own backlog, the sixth would have to retry after a second
                 stack.enter_context(socket.create_connection((address.hostname, address.port), timeout=0.9))
     finally:
         os.kill(afe.process.pid, signal.SIGCONT)
     afe.build("PreProc")
 
 
-def test_all_slots_of_a_task_are_full_and_empty_again(afe: Session) -> None:
-    """As many processors of one kind as there are activities; all work, one more is refused, none stays."""
+def test_all_slots_of_a_task_are_used_and_freed(afe: Session) -> None:
+    """With the maximum number of processors of one kind all work, one more is rejected, and none stays."""
     microphone = afe.build("PreProc", "GammatoneProc", "IhcProc", block=BLOCK, fb_nChannels=2)
     afe.wait_activities(["InputProc", "PreProc", "GammatoneProc", "IhcProc"])
     threads, memory = threads_and_memory(afe.process.pid)

@@ -1,4 +1,4 @@
-"""The times of frames: a line that knows them better than the stamps do, and clients that read it."""
+"""Times of frames: the fitted line is more exact than the stamps; clients that use it."""
 
 from __future__ import annotations
 
@@ -25,11 +25,11 @@ BEGIN = 1_700_000_000.0
 
 
 def delays(kind: str, count: int, random: np.random.Generator) -> np.ndarray:
-    """How late stamps are (s)."""
+    """Return delays of stamps (s)."""
     late = random.exponential(0.002, count)
     if kind == "spikes":
         late[random.random(count) < 0.1] += 0.04
-    if kind == "bursts":  # a busy machine, for seconds
+    if kind == "bursts":  # a machine that is busy for seconds
         late += 0.015 * (np.sin(np.arange(count) / 60) > 0.7)
     return late if kind != "none" else np.zeros(count)
 
@@ -44,31 +44,31 @@ def delays(kind: str, count: int, random: np.random.Generator) -> np.ndarray:
         ("spikes", 80e-6, 441, 2),
     ],
 )
-def test_delays_are_not_seen(kind: str, skew: float, chunk: int, per_block: int) -> None:
+def test_delays_of_stamps_do_not_affect_the_line(kind: str, skew: float, chunk: int, per_block: int) -> None:
     random = np.random.default_rng(3)
     rate = 44100 * (1 + skew)
     times = FrameTime()
     times.begin(44100)
     count = 150 * 44100 // chunk
-    told, true, line = [], [], None
+    estimated, true, line = [], [], None
     for k, late in enumerate(delays(kind, count, random), 1):
         times.add(k * chunk, BEGIN + k * chunk / rate + late)
         if k % per_block == 0:
             line = times.line(k * chunk)
             assert line is not None
-            told.append(line.time - BEGIN)
+            estimated.append(line.time - BEGIN)
             true.append(k * chunk / rate)
-    errors = np.array(told) - true
+    errors = np.array(estimated) - true
     seconds = np.array(true)
-    assert (np.diff(told) > 0).all()
+    assert (np.diff(estimated) > 0).all()
     steps = np.diff(errors)[seconds[1:] > 2]
-    assert np.abs(steps).max() < 2e-4, "from one answer to the next"
-    assert np.abs(errors[seconds > 30]).max() < 2e-4, "off the truth"
+    assert np.abs(steps).max() < 2e-4, "between two results"
+    assert np.abs(errors[seconds > 30]).max() < 2e-4, "deviation from the true time"
     assert line is not None
     assert abs(line.rate / rate - 1) < 5e-6
 
 
-def test_a_clock_that_is_set_and_a_stream_that_begins_anew() -> None:
+def test_a_clock_that_is_set_and_a_restarted_stream() -> None:
     times = FrameTime()
     times.begin(1000)
     for step in (0.0, -3.0, 7.0):
@@ -92,7 +92,7 @@ def test_a_clock_that_is_set_and_a_stream_that_begins_anew() -> None:
 )
 @example(steps=[500, 2**62, 40, 1], late=[0.0])
 def test_any_index_has_a_time(steps: list[int], late: list[float]) -> None:
-    """Whatever a stream's index does, up to the largest there is, as much of it as messages can say."""
+    """For any sequence of indices, up to the maximum in a message."""
     times, frame = FrameTime(), 0
     times.begin(8)
     for k, step in enumerate(steps):
@@ -105,7 +105,7 @@ def test_any_index_has_a_time(steps: list[int], late: list[float]) -> None:
 
 
 class Stamped(Microphone):
-    """A microphone that knows when it has heard what."""
+    """A microphone with exact stamps."""
 
     def stamp(self) -> dict[str, int]:
         if self.index == 0:
@@ -114,7 +114,7 @@ class Stamped(Microphone):
         return {"sec": seconds, "nsec": nanoseconds}
 
     def nanoseconds(self, index: float) -> int:
-        """When a frame was captured."""
+        """Return when a frame was captured."""
         return int(1.7e18) + round(index * 1e9 / self.sample_rate)
 
 
@@ -126,7 +126,7 @@ def stamped(afe: Session) -> Iterator[Stamped]:
     yield microphone
 
 
-def test_with_each_block(afe: Session, stamped: Stamped) -> None:
+def test_a_time_is_published_with_each_block(afe: Session, stamped: Stamped) -> None:
     afe.build("PreProc", block=1000)
     with afe.graph.collect("/rosAFE/frameTime", rosAFE_frameTime) as messages:
         wait_for(lambda: afe.connections("/rosAFE/frameTime"), what="the connection")
@@ -139,11 +139,11 @@ def test_with_each_block(afe: Session, stamped: Stamped) -> None:
         assert message.sampleRate == pytest.approx(20_000)
 
 
-def test_a_client_asks_for_a_frame_of_any_port(afe: Session, stamped: Stamped) -> None:
+def test_a_client_computes_the_time_of_a_frame_of_any_port(afe: Session, stamped: Stamped) -> None:
     clock = FrameClock()
     with pytest.raises(LookupError, match="frameTime"):
         clock.time(3)
-    afe.build("PreProc", "GammatoneProc", "IhcProc", "IldProc", block=1600)  # a hop has 200 frames, a window 400
+    afe.build("PreProc", "GammatoneProc", "IhcProc", "IldProc", block=1600)  # hop of 200 frames, window of 400
     stamped.play(noise(8000))
     assert clock.wait()
     ild = afe.graph.message(
@@ -153,17 +153,17 @@ def test_a_client_asks_for_a_frame_of_any_port(afe: Session, stamped: Stamped) -
     sound = SimpleNamespace(lastFrameIndex=8001, framesOnPort=20_000)
     for frame, index in ((-1, 8000), (-20, 7981), (19_999, 8000)):
         assert clock.of(sound, frame).wall == pytest.approx(1.7e9 + index / 20_000, abs=1e-5)
-    for frame, middle in ((-1, 7800), (-3, 7400)):  # the newest covers 7601 to 8000
+    for frame, middle in ((-1, 7800), (-3, 7400)):  # the newest frame covers 7601 to 8000
         moment = clock.of(ild, frame, window=0.02, hop=0.01)
         assert moment.wall == pytest.approx(1.7e9 + (middle + 1) / 20_000, abs=6e-5)
         wall_now = rospy.get_time()
         assert abs(moment.ros.to_sec() - moment.wall) < abs(wall_now - moment.wall)
-    with pytest.raises(LookupError, match="no frame"):
+    with pytest.raises(LookupError, match="frame: expected"):
         clock.of(ild, 100_000)
     clock.close()
 
 
-def test_tcl_and_matlab_read_it(afe: Session, stamped: Stamped) -> None:
+def test_tcl_and_matlab_read_the_time(afe: Session, stamped: Stamped) -> None:
     port = free_port()
     afe.build(block=1000)
     stamped.play(noise(2000))
@@ -181,17 +181,21 @@ def test_tcl_and_matlab_read_it(afe: Session, stamped: Stamped) -> None:
             except OSError:
                 return None
 
-        told = wait_for(answered)["frameTime"]
-        assert told == {"stamp": {"sec": 1_700_000_000, "nsec": told["stamp"]["nsec"]}, "frameIndex": 2000,
-                        "sampleRate": pytest.approx(20_000)}  # fmt: skip
-        assert told["stamp"]["nsec"] == pytest.approx(1e8, abs=2000)
-        nsec = told["stamp"]["nsec"]
-        text = f"frameTime {{stamp {{sec 1700000000 nsec {nsec}}} frameIndex 2000 sampleRate {told['sampleRate']!r}}}"
+        frame_time = wait_for(answered)["frameTime"]
+        assert frame_time == {
+            "stamp": {"sec": 1_700_000_000, "nsec": frame_time["stamp"]["nsec"]},
+            "frameIndex": 2000,
+            "sampleRate": pytest.approx(20_000),
+        }
+        assert frame_time["stamp"]["nsec"] == pytest.approx(1e8, abs=2000)
+        nsec = frame_time["stamp"]["nsec"]
+        rate = frame_time["sampleRate"]
+        text = f"frameTime {{stamp {{sec 1700000000 nsec {nsec}}} frameIndex 2000 sampleRate {rate!r}}}"
         assert ask("tcl").decode() == text
         assert b"stamp" in ask("packed")
 
 
-def test_the_array_class_has_the_bytes_of_the_generated_one(graph: Graph) -> None:
+def test_the_array_class_serializes_like_the_generated_one(graph: Graph) -> None:
     import io
 
     both = []

@@ -1,4 +1,4 @@
-"""docs/hosts.md: two instances on one machine, as typed there; and two machines, here two network namespaces."""
+"""docs/hosts.md: two instances on one machine with the documented commands; two machines as network namespaces."""
 
 from __future__ import annotations
 
@@ -27,25 +27,25 @@ call(bass, "/bass/Acquire", device="scene:", nChunksOnPort=4)
 call(rosAFE, "/far/connect_port", local="Audio", remote="/bass/Audio")
 call(rosAFE, "/far/InputProc", nFramesPerBlock=2205)
 call(rosAFE, "/far/PreProc")
-heard = queue.Queue()
-rospy.Subscriber("/far/preProcPort/preProc", Message, heard.put)
-while not (index := heard.get(timeout=60).lastFrameIndex):
+received = queue.Queue()
+rospy.Subscriber("/far/preProcPort/preProc", Message, received.put)
+while not (index := received.get(timeout=60).lastFrameIndex):
     pass
-print("heard", index)
+print("received", index)
 """
 
 
 def test_two_instances_as_in_the_document(graph: Graph) -> None:
     text = (ROOT / "docs" / "hosts.md").read_text("utf-8")
     (block,) = re.findall(r"```sh\n(.*?)```", text, re.DOTALL)
-    script = f"set -e\n{block}".replace("roscore & ", "")  # there is a master, and not where everybody's is
+    script = f"set -e\n{block}".replace("roscore & ", "")  # there is a master, at another than the default address
     with graph.start("bash", "-c", f"{script}\nwait", cwd=ROOT) as shell:
         try:
             wait_for(lambda: "/right/preProcPort/preProc" in shell.out or not shell.alive, what=lambda: str(shell))
             assert {"/left/preProcPort/preProc", "/right/preProcPort/preProc"} == set(shell.out.split()[-2:])
             assert shell.out.count("genom_success: True") == 7
         finally:
-            for name in ("left", "right", "bass"):  # those in the background are in sessions of their own
+            for name in ("left", "right", "bass"):  # background processes have sessions of their own
                 assert graph.call(f"/{name}/kill").genom_success
         assert shell.wait() == 0
     wait_for(lambda: not {"/left", "/right", "/bass"} & graph.nodes())
@@ -53,7 +53,7 @@ def test_two_instances_as_in_the_document(graph: Graph) -> None:
 
 @dataclass
 class Net:
-    """A second host: a network namespace, and an address on either side."""
+    """A second host: a network namespace, with an address on each side."""
 
     name: str
     near: str
@@ -62,7 +62,7 @@ class Net:
 
 @pytest.fixture
 def net() -> Iterator[Net]:
-    """Two hosts with a cable between them; skipped where that is not allowed."""
+    """Create two connected hosts; skip the test without permission."""
     if shutil.which("ip") is None or os.geteuid() != 0:
         pytest.skip("network namespaces need root and the command ip")
     number = os.getpid() % 250
@@ -83,7 +83,7 @@ def net() -> Iterator[Net]:
 
 @pytest.mark.ros
 def test_two_machines(net: Net, tmp_path: Path) -> None:
-    """The master and bass are near, rosAFE is far; a client is near, and hears what is computed far."""
+    """Master, bass and a client run on one host and rosAFE on the other; the client receives its results."""
     master = MasterProcess()
     graph = Graph(f"http://{net.near}:{master.port}", tmp_path)
     graph.env["ROS_IP"] = net.near
@@ -92,8 +92,8 @@ def test_two_machines(net: Net, tmp_path: Path) -> None:
         far = ["ip", "netns", "exec", net.name, str(SCRIPTS / "rosAFE-ros"), "-i", "far"]
         with graph.node("bass-ros"), graph.start(*far, ROS_IP=net.far) as process:
             wait_for(lambda: "/far/kill" in graph.services() or not process.alive, what=lambda: str(process))
-            heard = graph.run(PYTHON, "-c", CLIENT).stdout.split()
-            assert heard[0] == "heard" and (int(heard[1]) - 1) % 2205 == 0
+            received = graph.run(PYTHON, "-c", CLIENT).stdout.split()
+            assert received[0] == "received" and (int(received[1]) - 1) % 2205 == 0
             assert process.stop(signal.SIGTERM) == 0
     finally:
         master.kill()

@@ -1,4 +1,4 @@
-"""Several nodes on one master, and names that are mapped to others."""
+"""Several nodes with one master, and remapped names."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ BLOCK = 2000
 
 
 def test_two_instances_share_one_source(graph: Graph) -> None:
-    """Each has a tree, ports and activities of its own, and its types are those of rosAFE."""
+    """Each has its own tree, ports and activities, and the types of rosAFE."""
     with own_node(graph, name="left") as left, own_node(graph, name="right") as right:
         microphone = left.listen()
         right.microphone = microphone
@@ -35,8 +35,8 @@ def test_two_instances_share_one_source(graph: Graph) -> None:
         right.read("gammatone", 3 * BLOCK + 1)
 
 
-def test_a_name_that_is_taken_ends_the_older_node(graph: Graph) -> None:
-    """As ROS has it: the newcomer takes over, the older one ends cleanly."""
+def test_a_second_node_of_a_name_ends_the_first(graph: Graph) -> None:
+    """As in ROS: the new node takes over, the old one ends cleanly."""
     with own_node(graph, name="twice") as older, graph.start(str(SCRIPTS / "rosAFE-ros"), "-i", "twice") as process:
         assert older.process.wait() == 0
         newer = Session(graph, process, "twice")
@@ -53,14 +53,14 @@ def test_remapped_topics(graph: Graph) -> None:
         microphone = afe.listen(topic="/elsewhere/Audio")
         afe.ok("connect_port", local="Audio", remote="bass/Audio")
         afe.build("PreProc", block=BLOCK)
-        wait_for(lambda: microphone.heard)
+        wait_for(lambda: microphone.subscribed)
         microphone.play(noise(BLOCK))
         message = graph.message("/shown/here", accept=lambda m: m.lastFrameIndex == BLOCK + 1)
         assert message.framesOnPort == 20000
         assert afe.topic("preProc") not in graph.topics()
 
 
-def test_a_namespace_comes_before_all_names(graph: Graph) -> None:
+def test_a_namespace_precedes_all_names(graph: Graph) -> None:
     with graph.start(str(SCRIPTS / "rosAFE-ros"), "__ns:=/robot") as process:
         wait_for(lambda: "/robot/rosAFE/kill" in graph.services(), what=lambda: str(process))
         afe = Session(graph, process, "robot/rosAFE")

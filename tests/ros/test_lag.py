@@ -1,4 +1,4 @@
-"""A tree that does not keep up with the stream is reported, with a block size that does."""
+"""A tree that is slower than the stream is reported, with a block size that is sufficient."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ RATE = 44100.0
 
 
 def run(block: int, block_seconds: float, seconds: float) -> list[tuple[float, str]]:
-    """What is reported, and when, of a tree that takes `block_seconds` for each block while a stream comes in."""
+    """Return the reports, with their times, about a tree that needs `block_seconds` for each block of a stream."""
     now = 0.0
     lines: list[tuple[float, str]] = []
     monitor = LagMonitor(RATE, block, lambda line: lines.append((now, line)))
     arrived = read = 0
-    free_at = 0.0  # when the tree takes the next block
+    free_at = 0.0  # when the tree reads the next block
     while now < seconds:
         arrived += MESSAGE
         monitor.update(arrived - read, now)
@@ -38,31 +38,31 @@ def run(block: int, block_seconds: float, seconds: float) -> list[tuple[float, s
     return lines
 
 
-def proposed(line: str) -> int:
+def proposed_size(line: str) -> int:
     found = re.search(r"nFramesPerBlock (\d+)", line)
     assert found is not None, line
     return int(found[1])
 
 
-def test_a_tree_that_keeps_up_is_not_reported() -> None:
+def test_a_fast_enough_tree_is_not_reported() -> None:
     assert run(220, 0.9 * 220 / RATE, 5.0) == []
     assert run(44100, 0.9, 20.0) == []
 
 
 @settings(deadline=None)
 @given(st.sampled_from([1, 10, 100, 220]), st.floats(1.1, 12.0))
-def test_a_short_block_is_reported_in_time_with_a_size_that_keeps_up(block: int, load: float) -> None:
-    """The cost of a block does not depend on its length here."""
+def test_a_too_short_block_is_reported_in_time_with_a_sufficient_size(block: int, load: float) -> None:
+    """Here the time for a block does not depend on its length."""
     cost = load * block / RATE
     (when, line), *more = run(block, cost, 3.0)
     assert when <= LAG_SECONDS + 0.5 and not more
     assert "does not keep up" in line
-    size = proposed(line)
+    size = proposed_size(line)
     assert size in BLOCK_SIZES
     assert run(size, cost, 3.0) == []
 
 
-def test_no_block_size_is_proposed_that_is_too_long() -> None:
+def test_no_too_long_block_size_is_proposed() -> None:
     ((_, line),) = run(12000, 2 * 12000 / RATE, 20.0)
     assert "longer blocks do not help" in line and "channels" in line
 
@@ -85,8 +85,8 @@ def test_the_end_of_a_lag_is_reported() -> None:
 
 
 @pytest.mark.ros
-def test_the_node_reports_blocks_that_are_too_short(graph: Graph, bass_node: Process) -> None:
-    """In log and /diagnostics; the size that is named removes the problem."""
+def test_the_node_reports_too_short_blocks(graph: Graph, bass_node: Process) -> None:
+    """In log and /diagnostics; the proposed size solves the problem."""
     with own_node(graph) as own:
         assert graph.call("/bass/Acquire", device="scene:").genom_success
         own.ok("connect_port", local="Audio", remote="bass/Audio")
@@ -97,8 +97,8 @@ def test_the_node_reports_blocks_that_are_too_short(graph: Graph, bass_node: Pro
         assert status["level"] == "1"
         line = wait_for(lambda: re.search(r"Audio: the tree does not keep up.*", own.process.err))
         assert line is not None
-        size = proposed(line[0])
-        assert size == proposed(status["message"]) > 10
+        size = proposed_size(line[0])
+        assert size == proposed_size(status["message"]) > 10
         own.ok("Stop")
         own.ok("InputProc", nFramesPerBlock=max(size, 2205))
         own.health(lambda entries: "keep up" not in entries["message"] and int(entries["frames waiting"]) < 44100)

@@ -1,4 +1,4 @@
-"""A master that is killed and started anew, or hangs and goes on: the nodes serve meanwhile, and are found again."""
+"""A master that is restarted, or hangs for a while: the nodes still serve clients, and register again."""
 
 from __future__ import annotations
 
@@ -7,29 +7,34 @@ import os
 import signal
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
+import rosgraph
+from rospy.impl.registration import Registration
 
+from rosafe.transport import registration
+from rosafe.transport.succession import Succession
 from tests.harness import PYTHON, ROOT, Graph, MasterProcess, wait_for
 
 
 def kill(graph: Graph, master: MasterProcess) -> Callable[[], None]:
-    """Take the master away as a crash does; what it returns starts another one at the same address."""
+    """Kill the master. Return a function that starts another one at the same address."""
     master.kill()
     return lambda: master.start(graph.env)
 
 
 def hang(graph: Graph, master: MasterProcess) -> Callable[[], None]:
-    """Stop the master: who connects waits for an answer. What it returns lets it go on."""
+    """Stop the master, so that clients wait for an answer. Return a function that continues it."""
     assert master.process is not None
     pid = master.process.pid
     os.kill(pid, signal.SIGSTOP)
     return lambda: os.kill(pid, signal.SIGCONT)
 
 
-def assert_all_is_there(graph: Graph, clients: list[str], path: str) -> None:
-    """A client that comes now finds services, topics and parameters, and audio from bass."""
+def assert_all_is_registered(graph: Graph, clients: list[str], path: str) -> None:
+    """Check that a new client finds services, topics and parameters, and receives audio from bass."""
     done = graph.run(*clients, "come", "/rosAFE", PYTHONPATH=path)
     assert json.loads(done.stdout.splitlines()[-1]) == {
         "processors": ["input", "preProc", "late"],
@@ -40,10 +45,10 @@ def assert_all_is_there(graph: Graph, clients: list[str], path: str) -> None:
 
 
 @pytest.mark.parametrize("lose", [kill, hang])
-def test_a_master_is_lost_and_comes_back(
+def test_a_master_is_lost_and_returns(
     private_graph: tuple[Graph, MasterProcess], tmp_path: Path, lose: Callable[..., Callable[[], None]]
 ) -> None:
-    """Only what needs the master is refused while it is away; afterwards all is known to it that is there."""
+    """Without a master, only requests that need it are rejected; afterwards everything is registered again."""
     graph, master = private_graph
     lost = tmp_path / "lost"
     clients = [PYTHON, "-m", "tests.ros.master_clients"]
@@ -73,13 +78,43 @@ def test_a_master_is_lost_and_comes_back(
         wait_for(lambda: before <= graph.services(), what=lambda: f"{before - graph.services()} {afe} {bass}")
         wait_for(lambda: "/rosAFE/gammatonePort/late" in graph.topics())
         wait_for(lambda: "/rosAFE/preProcPort/other" not in graph.topics())
-        if lose is kill:  # another master knows nothing but what it was told
-            assert_all_is_there(graph, clients, path)
-        assert readers <= graph.readers(), "actions are back too"
+        if lose is kill:  # a new master has only the registrations that it received
+            assert_all_is_registered(graph, clients, path)
+        assert readers <= graph.readers(), "actions are registered, too"
         for node in (afe, bass):
             assert node.stop(signal.SIGTERM) == 0
             assert "Traceback" not in node.err, node.err
         assert not {"/rosAFE", "/bass"} & graph.nodes()
+
+
+@pytest.mark.parametrize("in_time", [True, False])
+def test_the_end_waits_a_limited_time_for_a_registration_in_progress(graph: Graph, in_time: bool) -> None:
+    """Also if the master did not answer before: it could carry it out after the node has unregistered everything."""
+    limits: list[float] = []
+
+    class Lock:
+        """The lock that the registering thread holds during a call."""
+
+        def acquire(self, timeout: float) -> bool:
+            limits.append(timeout)
+            return in_time
+
+        def release(self) -> None:
+            assert in_time
+
+    succession = Succession("/ending", graph.uri)
+    manager = SimpleNamespace(handler=SimpleNamespace(succession=succession), master_uri=graph.uri, uri="http://a:1/")
+    registrar = registration.Registrar(manager)
+    registrar._name, registrar._master_lost = "/ending", True
+    registrar.reg_added("/ending/topic", "std_msgs/String", Registration.PUB)
+    registrar._update_master(dict(registrar._offered))
+    registrar.reg_removed("/ending/topic", "std_msgs/String", Registration.PUB)
+    assert "/ending/topic" in graph.topics()
+    setattr(succession, "registration_lock", Lock())  # noqa: B010  # of another type
+    registrar.end()
+    assert limits == [registration.SETTLE_SECONDS]
+    assert ("/ending/topic" in graph.topics()) == (not in_time)
+    rosgraph.Master("/ending", master_uri=graph.uri).unregisterPublisher("/ending/topic", "http://a:1/")
 
 
 def test_the_end_does_not_wait_for_a_master(private_graph: tuple[Graph, MasterProcess]) -> None:

@@ -1,10 +1,10 @@
-"""What the C library is told about memory is taken, and a process that has had much gives it back."""
+"""The settings of the C library's allocator are accepted, and a process releases unused memory."""
 
 from __future__ import annotations
 
 from tests.harness import PYTHON, ROOT, Graph, proc
 
-# Fills memory from many threads with pieces of all sizes, frees all but a few, and prints the MiB that stay resident.
+# Allocates memory of all sizes in many threads, frees almost all, and prints the resident MiB.
 SPREAD = """
 import random, threading
 from rosafe.component import malloc_tuning
@@ -24,7 +24,7 @@ print(resident() - before)
 """
 
 
-def test_memory_that_is_freed_goes_back(graph: Graph) -> None:
+def test_freed_memory_is_returned_to_the_system(graph: Graph) -> None:
     proc()
     done = graph.run(PYTHON, "-c", SPREAD, PYTHONPATH=str(ROOT))
     assert int(done.stdout) < 60, "of some 500 MiB"

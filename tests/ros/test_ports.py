@@ -1,4 +1,4 @@
-"""What stands on the ports: shapes, indexes and numbers, bit for bit those of rosafe.process."""
+"""The content of the ports: shapes, indices and values are bit-identical to rosafe.process."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.ros.session import RATE, Session, assert_holds, ears, expected, noise
 
 CHAIN = ("PreProc", "GammatoneProc", "IhcProc", "IldProc", "RatemapProc", "CrossCorrelationProc")
 FRAMED = ("ild", "ratemap", "crossCorrelation")
-BLOCK = 1500  # frames, which is no whole number of hops
+BLOCK = 1500  # frames, not a multiple of the hop
 
 
 def rate_of(kind: str, values: Any) -> float:
@@ -27,8 +27,8 @@ def rate_of(kind: str, values: Any) -> float:
 
 
 @pytest.mark.parametrize("seconds", [0.5, 0.013, 0.001])
-def test_every_port_holds_what_process_computes(afe: Session, seconds: float) -> None:
-    """For windows of many blocks, of less than a block, and of less than a frame of the framed ones."""
+def test_each_port_contains_the_result_of_process(afe: Session, seconds: float) -> None:
+    """For windows of many blocks, of less than a block, and of less than a frame of framed representations."""
     afe.build(*CHAIN, block=BLOCK, bufferSize_s_port=seconds, fb_nChannels=3)
     signal = noise(4 * BLOCK)
     parameters = {"fb_nChannels": 3}
@@ -54,7 +54,7 @@ def test_every_port_holds_what_process_computes(afe: Session, seconds: float) ->
 
 
 def test_the_default_tree_at_44100(afe: Session) -> None:
-    """31 channels, one-second windows, blocks of 12000, as a user begins."""
+    """31 channels, windows of 1 s, and blocks of 12000 frames: the defaults."""
     rate, blocks = 44100, 2
     microphone = afe.listen(sample_rate=rate, chunk=2205, chunks=20)
     for request in ("InputProc", *CHAIN):
@@ -70,11 +70,11 @@ def test_the_default_tree_at_44100(afe: Session) -> None:
     assert afe.read("crossCorrelation").left.shape == (99, 31, 100)
 
 
-def test_every_block_is_published_in_order_and_slides_the_window(afe: Session) -> None:
+def test_each_block_is_published_in_order_and_advances_the_window(afe: Session) -> None:
     microphone = afe.build("PreProc", block=BLOCK, bufferSize_s_port=0.3)
     signal = noise(6 * BLOCK)
     with afe.follow("preProc") as messages:
-        assert messages[0].lastFrameIndex == 0, "zeros come first"
+        assert messages[0].lastFrameIndex == 0, "the first message has zeros"
         for start in range(0, signal.shape[1], BLOCK):
             microphone.play(signal[:, start : start + BLOCK])
             wait_for(lambda: messages[-1].lastFrameIndex == microphone.index + 1)
@@ -84,7 +84,7 @@ def test_every_block_is_published_in_order_and_slides_the_window(afe: Session) -
             assert_holds(message, "preProc", windowed(signal[:, :end] / (2**31 - 1), 0.3, RATE))
 
 
-def test_a_late_subscriber_gets_the_newest(afe: Session) -> None:
+def test_a_late_subscriber_gets_the_newest_message(afe: Session) -> None:
     microphone = afe.build("PreProc", block=BLOCK)
     microphone.play(noise(3 * BLOCK))
     afe.read("preProc", 3 * BLOCK + 1)
@@ -93,7 +93,7 @@ def test_a_late_subscriber_gets_the_newest(afe: Session) -> None:
 
 
 @pytest.mark.parametrize("kind", ["preProc", "ihc", "ild", "crossCorrelation"])
-def test_bytes_on_the_wire_are_those_of_the_generated_class(afe: Session, kind: str) -> None:
+def test_serialized_bytes_are_those_of_the_generated_class(afe: Session, kind: str) -> None:
     requests = CHAIN[: CHAIN.index(CORE_REPRESENTATIONS[kind].request) + 1]
     microphone = afe.build(*requests, block=BLOCK, fb_nChannels=3, bufferSize_s_port=0.1)
     microphone.play(noise(BLOCK))
@@ -115,7 +115,7 @@ def test_bytes_on_the_wire_are_those_of_the_generated_class(afe: Session, kind: 
         assert len(plain.left.dataNxN[0].dataN[0].data) == plain.framesOnPort
 
 
-def test_a_hop_that_changes_while_it_runs_changes_the_port(afe: Session) -> None:
+def test_a_change_of_the_hop_changes_the_port(afe: Session) -> None:
     microphone = afe.build(*CHAIN[:4], block=BLOCK, fb_nChannels=2, bufferSize_s_port=0.5)
     signal = noise(4 * BLOCK)
     microphone.play(signal[:, : 2 * BLOCK])
@@ -128,7 +128,7 @@ def test_a_hop_that_changes_while_it_runs_changes_the_port(afe: Session) -> None
     assert np.all(message.left[:, :50] == 0.0), "and zeros before"
 
 
-def test_channels_that_change_while_it_runs_change_the_ports_below(afe: Session) -> None:
+def test_a_change_of_channels_changes_the_ports_of_descendants(afe: Session) -> None:
     microphone = afe.build(*CHAIN[:4], block=BLOCK, fb_nChannels=2)
     microphone.play(noise(BLOCK))
     afe.read("ild", BLOCK + 1)
@@ -149,9 +149,9 @@ def test_the_true_frame_rate_is_rounded(afe: Session) -> None:
         assert message.framesOnPort == int(true)
 
 
-def test_ports_come_and_go_with_their_processors(afe: Session) -> None:
+def test_ports_exist_as_long_as_their_processors(afe: Session) -> None:
     before = afe.graph.topics()
-    assert {"/rosAFE/inputProcPort", "/rosAFE/dataObj"} <= before, "simple ports are there from the start"
+    assert {"/rosAFE/inputProcPort", "/rosAFE/dataObj"} <= before, "simple ports exist from the start"
     afe.build("PreProc")
     with afe.follow("preProc") as messages:
         first = len(messages)
@@ -176,7 +176,7 @@ def test_two_of_a_kind_and_names_with_a_slash(afe: Session) -> None:
     assert afe.read("gammatone", BLOCK + 1).numberOfChannels == 3
 
 
-def test_a_child_begins_with_the_block_that_was_released_last(afe: Session) -> None:
+def test_a_child_starts_with_the_last_released_block(afe: Session) -> None:
     microphone = afe.build("PreProc", block=BLOCK)
     signal = noise(2 * BLOCK)
     microphone.play(signal)
@@ -200,7 +200,7 @@ def test_the_data_object_is_advertised_and_silent(afe: Session) -> None:
 
 
 def arrays(signals: Any, kind: str) -> tuple[np.ndarray, np.ndarray]:
-    """`left` and `right` (empty where there is none) of the only processor of a kind, from the generated class."""
+    """Return `left` and `right` (may be empty) of the only processor of a kind, from the generated class."""
     (message,) = getattr(signals, kind)
     if kind in ("input", "preProc"):
         return np.array(message.left.data), np.array(message.right.data)
@@ -209,7 +209,7 @@ def arrays(signals: Any, kind: str) -> tuple[np.ndarray, np.ndarray]:
     return np.array([c.data for c in message.left.dataN]), np.array([c.data for c in message.right.dataN])
 
 
-def test_signals_are_what_is_new(afe: Session) -> None:
+def test_signals_are_the_new_frames(afe: Session) -> None:
     parameters = {"fb_nChannels": 2}
     microphone = afe.build(*CHAIN, block=BLOCK, bufferSize_s_getSignal=0.5, **parameters)
     signal = noise(5 * BLOCK)
@@ -243,13 +243,13 @@ def test_signals_are_what_is_new(afe: Session) -> None:
     again = afe.ok("getSignals").signals
     for kind in CORE_REPRESENTATIONS:
         (message,) = getattr(again, kind)
-        assert (message.lastFrameIndex, message.framesOnPort) == (5 * BLOCK + 1, 0), "nothing is new"
+        assert (message.lastFrameIndex, message.framesOnPort) == (5 * BLOCK + 1, 0), "no new frames"
         assert arrays(again, kind)[0].size == 0
     assert len(again.gammatone[0].left.dataN) == 2, "channels without frames"
 
 
-def test_many_calls_at_any_moment_get_every_frame_once(afe: Session) -> None:
-    """Called while the tree works; what all calls got together is what `rosafe.process` computes, frame by frame."""
+def test_repeated_calls_get_each_frame_once(afe: Session) -> None:
+    """Called while the tree computes; the joined responses are the result of `rosafe.process`."""
     parameters = {"fb_nChannels": 2}
     microphone = afe.build(*CHAIN, block=BLOCK, bufferSize_s_getSignal=2.0, **parameters)
     blocks = 14
@@ -277,11 +277,11 @@ def test_many_calls_at_any_moment_get_every_frame_once(afe: Session) -> None:
             seen += piece.shape[-1]
             assert index in range(BLOCK + 1, blocks * BLOCK + 2, BLOCK) or (index, seen) == (0, 0)
             if kind not in FRAMED:
-                assert seen == max(0, index - 1), "the index is that of the frame after the newest one"
+                assert seen == max(0, index - 1), "the index of the frame after the newest one"
 
 
-def test_signals_are_kept_for_so_long(afe: Session) -> None:
-    """Only the newest stay, for as long as was asked for, and for two blocks at least."""
+def test_signals_are_kept_for_the_length_of_the_buffer(afe: Session) -> None:
+    """Only the newest frames are kept: for the requested time, and at least two blocks."""
     for seconds, frames in ((0.25, 5000), (0.001, 2 * BLOCK)):
         afe.ok("Stop")
         microphone = afe.listen()
@@ -319,7 +319,7 @@ def test_signals_as_arrays(afe: Session) -> None:
             array_srv(wrong)
 
 
-def test_two_clients_share_what_is_new(afe: Session) -> None:
+def test_two_clients_share_the_new_frames(afe: Session) -> None:
     microphone = afe.build(block=BLOCK)
     microphone.play(noise(2 * BLOCK))
     afe.read("input", 2 * BLOCK + 1)

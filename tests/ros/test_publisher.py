@@ -1,4 +1,4 @@
-"""How messages leave the node: complete, newest last, to each subscriber at its own pace, and bounded in memory."""
+"""Sending of messages: complete, newest last, to each subscriber at its own pace, and with bounded memory."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import socket
 import threading
 import xmlrpc.client
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,7 @@ from rosafe.interface import CORE_REPRESENTATIONS
 from rosafe.ros import array_msg
 from rosafe.transport import publisher
 from rosafe.transport.buffer_list import BufferList
-from rosafe.transport.publisher import MAX_WAITING, MAX_WAITING_BYTES, Publisher, send_pieces
+from rosafe.transport.publisher import MAX_QUEUED, MAX_QUEUED_BYTES, NewestMessage, Publisher, send_pieces
 from tests.harness import PATIENCE, PYTHON, ROOT, Graph, Process, proc, wait_for
 from tests.ros.session import Session, noise, own_node
 
@@ -40,26 +40,26 @@ BLOCK = 12000
 
 
 @pytest.mark.parametrize("count", [1, 5, 3000])
-def test_pieces_arrive_as_one_whatever_the_socket_takes_at_once(count: int) -> None:
-    """More pieces than one call may have, of all sizes, through a socket whose buffer is smaller than many of them."""
+def test_pieces_arrive_as_one_message_for_any_socket_buffer(count: int) -> None:
+    """More pieces than a call can have, of all sizes, with a socket buffer that is smaller than many of them."""
     rng = np.random.default_rng(count)
     pieces: list[Any] = [rng.normal(size=rng.integers(1, 40)) for _ in range(count - 1)] + [rng.normal(size=200_000)]
     pieces[0:0] = [b"head", memoryview(b"view")]
-    wanted = b"".join(bytes(memoryview(piece).cast("B")) for piece in pieces)
+    data = b"".join(bytes(memoryview(piece).cast("B")) for piece in pieces)
     ours, theirs = socket.socketpair()
     ours.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 10_000)
     sending = threading.Thread(target=send_pieces, args=(ours, pieces))
     sending.start()
-    came = bytearray()
-    while len(came) < len(wanted):
-        came += theirs.recv(70_000)
+    received = bytearray()
+    while len(received) < len(data):
+        received += theirs.recv(70_000)
     sending.join()
     ours.close()
     theirs.close()
-    assert came == wanted
+    assert received == data
 
 
-def test_what_the_system_left_over_is_sent_after_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_rest_of_a_partial_write_is_sent(monkeypatch: pytest.MonkeyPatch) -> None:
     taken = bytearray()
 
     class Slow:
@@ -78,7 +78,7 @@ def test_what_the_system_left_over_is_sent_after_it(monkeypatch: pytest.MonkeyPa
     assert taken == b"".join(pieces)
 
 
-def test_gathered_pieces_are_counted_and_empty_ones_left_out() -> None:
+def test_gathered_pieces_are_counted_and_empty_ones_skipped() -> None:
     out = BufferList()
     for piece in (b"abc", b"", np.zeros(0), np.zeros(2), memoryview(b"1234")):
         out.write(piece)
@@ -89,14 +89,14 @@ def test_gathered_pieces_are_counted_and_empty_ones_left_out() -> None:
 
 
 def message(index: int, frames: int = 3) -> Any:
-    """A message whose samples are its index."""
+    """Return a message whose samples are its index."""
     samples = np.full(frames, float(index))
     return array_msg(TIME_DOMAIN)(lastFrameIndex=index, framesOnPort=frames, left=samples, right=samples)
 
 
 @contextmanager
 def stalled(graph: Graph, topic: str) -> Iterator[socket.socket]:
-    """A subscriber that makes itself known and then reads nothing, until the test reads for it."""
+    """Connect a subscriber that reads nothing after the handshake, until the test reads for it."""
     master = rosgraph.Master("/stalled", master_uri=graph.uri)
     publisher_uri = master.lookupNode(rospy.get_name())
     answer: Any = xmlrpc.client.ServerProxy(publisher_uri).requestTopic("/stalled", topic, [["TCPROS"]])
@@ -119,10 +119,72 @@ def read_message(sock: socket.socket) -> Any:
     return array_msg(TIME_DOMAIN)().deserialize(read_exactly(sock, int.from_bytes(read_exactly(sock, 4), "little")))
 
 
-def test_what_waits_is_bounded_and_ends_with_the_newest(graph: Graph) -> None:
-    """Small messages wait up to a number, large ones up to so many bytes; who reads in time gets every one."""
+class WatchedLock:
+    """A lock that records whether another thread has waited for it, or has had it."""
+
+    def __init__(self) -> None:
+        self.reached = False
+        self._lock = threading.RLock()
+        self._thread = threading.current_thread()
+
+    def acquire(self) -> None:
+        if not self._lock.acquire(blocking=False):
+            self.reached = True
+            self._lock.acquire()
+
+    def release(self) -> None:
+        self._lock.release()
+        self.reached |= threading.current_thread() is not self._thread
+
+    def __enter__(self) -> None:
+        self.acquire()
+
+    def __exit__(self, *exception: object) -> None:
+        self.release()
+
+
+@pytest.mark.parametrize("same", [True, False])
+def test_a_subscriber_that_connects_during_publish_newest_gets_the_message(
+    graph: Graph, monkeypatch: pytest.MonkeyPatch, same: bool
+) -> None:
+    """It connects just after the publisher has found no subscribers."""
     graph.client()
-    for frames, count, together in ((2000, 400, MAX_WAITING // 2), (MAX_WAITING_BYTES // 32, 8, 1)):
+    port = Publisher(f"/of_the_test/newest{same}", array_msg(TIME_DOMAIN))
+    index = [1]
+    newest = NewestMessage(lambda: message(index[0]))
+    port.publish_newest(newest)
+    index[0] = 2
+    subscribers: list[socket.socket] = []
+    publishing = threading.current_thread()
+    lock = WatchedLock()
+
+    def connections(topic: Any) -> list[Any]:
+        found: list[Any] = topic.__dict__["connections"]
+        if threading.current_thread() is publishing and not subscribers:
+            subscribers.append(stack.enter_context(stalled(graph, port.resolved_name)))
+            wait_for(lambda: lock.reached, what="the thread that sends the latched message")
+        return found
+
+    with ExitStack() as stack:
+        with monkeypatch.context() as patch:
+            patch.setattr(
+                publisher._Topic,
+                "connections",
+                property(connections, lambda topic, new: topic.__dict__.update(connections=new)),
+                raising=False,
+            )
+            patch.setattr(port.impl, "publock", lock)
+            port.publish_newest(newest if same else NewestMessage(lambda: message(2)))
+        (subscriber,) = subscribers
+        subscriber.settimeout(PATIENCE)
+        while read_message(subscriber).lastFrameIndex < 2:
+            pass
+
+
+def test_the_queue_is_bounded_and_ends_with_the_newest_message(graph: Graph) -> None:
+    """The queue is limited in messages and in bytes; a subscriber that reads in time gets each message."""
+    graph.client()
+    for frames, count, together in ((2000, 400, MAX_QUEUED // 2), (MAX_QUEUED_BYTES // 32, 8, 1)):
         port = Publisher(f"/of_the_test/bounded{frames}", array_msg(TIME_DOMAIN))
         with stalled(graph, port.resolved_name) as sock, graph.collect(port.resolved_name) as quick:
             wait_for(lambda: port.get_num_connections() == 2)  # noqa: B023
@@ -130,26 +192,28 @@ def test_what_waits_is_bounded_and_ends_with_the_newest(graph: Graph) -> None:
                 for index in range(first, first + together):
                     port.publish(message(index, frames))
                 wait_for(lambda: quick and quick[-1].lastFrameIndex == index)  # noqa: B023
-            assert [m.lastFrameIndex for m in quick] == list(range(1, count + 1)), "the stalled one holds up nobody"
+            assert [m.lastFrameIndex for m in quick] == list(range(1, count + 1)), (
+                "the stalled subscriber does not block others"
+            )
             got = [1]
             while got[-1] < count:
-                came = read_message(sock)
-                assert np.all(came.left == came.lastFrameIndex) and len(came.left) == frames
-                got.append(came.lastFrameIndex)
+                received = read_message(sock)
+                assert np.all(received.left == received.lastFrameIndex) and len(received.left) == frames
+                got.append(received.lastFrameIndex)
             assert got == sorted(got) and got[-1] == count
-            waited = [index for index in got if index > count - MAX_WAITING]
-            assert len(got) < count, "old ones were given up"
+            waited = [index for index in got if index > count - MAX_QUEUED]
+            assert len(got) < count, "old messages were dropped"
             assert waited[-1] == count
             if frames == 2000:
-                assert waited == list(range(count - MAX_WAITING + 1, count + 1))
+                assert waited == list(range(count - MAX_QUEUED + 1, count + 1))
         port.unregister()
 
 
 def test_statistics_of_the_topic_and_of_each_connection(graph: Graph) -> None:
-    """As `getBusStats` gives them: bytes published, and for each connection its number, bytes, messages, whether up."""
+    """As in `getBusStats`: bytes published, and for each connection its number, bytes, messages and state."""
     graph.client()
     port = Publisher("/of_the_test/counted", array_msg(TIME_DOMAIN))
-    port.publish(message(1))  # for nobody, yet
+    port.publish(message(1))  # without a subscriber so far
     size = 4 + 4 + 8 + 8 + 2 * (4 + 3 * 8)
     with stalled(graph, port.resolved_name), graph.collect(port.resolved_name):
         wait_for(lambda: port.get_num_connections() == 2)
@@ -160,12 +224,12 @@ def test_statistics_of_the_topic_and_of_each_connection(graph: Graph) -> None:
             return next(entry for entry in node.getBusStats("/test")[2][0] if entry[0] == port.resolved_name)
 
         wait_for(lambda: [entry[2] for entry in statistics()[2]] == [2, 2], what=lambda: str(statistics()))
-        assert statistics()[1] == 3 * size, "the latched one for each, the other once"
+        assert statistics()[1] == 3 * size, "the latched message for each, the other one once"
         assert all(entry[1] >= 2 * size and entry[3] for entry in statistics()[2])
     port.unregister()
 
 
-def test_a_subscriber_that_left_is_forgotten(graph: Graph) -> None:
+def test_a_disconnected_subscriber_is_removed(graph: Graph) -> None:
     graph.client()
     port = Publisher("/of_the_test/left", array_msg(TIME_DOMAIN))
     with stalled(graph, port.resolved_name):
@@ -176,10 +240,10 @@ def test_a_subscriber_that_left_is_forgotten(graph: Graph) -> None:
 
 
 @pytest.mark.parametrize("moment", ["before", "amid"])
-def test_a_subscriber_of_a_topic_that_is_closed_in_that_very_moment(
+def test_a_subscriber_that_connects_while_the_topic_is_closed(
     graph: Graph, monkeypatch: pytest.MonkeyPatch, moment: str
 ) -> None:
-    """Its connection ends, and so does the thread that was to send to it."""
+    """Its connection and its sending thread end."""
     graph.client()
     port = Publisher(f"/of_the_test/closing_{moment}", array_msg(TIME_DOMAIN))
     port.publish(message(1))
@@ -205,7 +269,7 @@ def test_a_subscriber_of_a_topic_that_is_closed_in_that_very_moment(
         wait_for(lambda: not [t for t in threading.enumerate() if t.name == "to /closing"], what="end of its sender")
 
 
-def test_late_subscribers_get_the_newest_and_withdrawal_ends_everything(graph: Graph) -> None:
+def test_late_subscribers_get_the_newest_message_and_closing_ends_all(graph: Graph) -> None:
     graph.client()
     port = Publisher("/of_the_test/late", array_msg(TIME_DOMAIN))
     for index in (1, 2):
@@ -221,16 +285,16 @@ def test_late_subscribers_get_the_newest_and_withdrawal_ends_everything(graph: G
         port.publish(message(3))
 
 
-def test_a_message_that_cannot_be_written_is_refused_where_somebody_listens(graph: Graph) -> None:
+def test_an_invalid_message_is_rejected_if_there_is_a_subscriber(graph: Graph) -> None:
     graph.client()
     port = Publisher("/of_the_test/bad", array_msg(TIME_DOMAIN))
-    with graph.collect("/of_the_test/bad", array_msg(TIME_DOMAIN)) as came:
+    with graph.collect("/of_the_test/bad", array_msg(TIME_DOMAIN)) as received:
         wait_for(lambda: port.get_num_connections() == 1)
         with pytest.raises(rospy.ROSException, match="left"):
             port.publish(array_msg(TIME_DOMAIN)(left=np.ones((2, 2))))
         port.publish(message(5))
-        wait_for(lambda: came)
-        assert came[0].lastFrameIndex == 5
+        wait_for(lambda: received)
+        assert received[0].lastFrameIndex == 5
     port.unregister()
 
 
@@ -239,7 +303,7 @@ def test_a_message_that_cannot_be_written_is_refused_where_somebody_listens(grap
 
 @pytest.fixture(scope="module")
 def tree(graph: Graph) -> Iterator[Session]:
-    """The default tree at 44.1 kHz with ports of one second, in a node of its own."""
+    """Start the default tree at 44.1 kHz with ports of 1 s, in a node of its own."""
     with own_node(graph, name="large") as session:
         session.listen(sample_rate=44100, chunk=BLOCK // 4, chunks=20)
         session.ok("InputProc", nFramesPerBlock=BLOCK)
@@ -250,7 +314,7 @@ def tree(graph: Graph) -> Iterator[Session]:
 
 
 def play(session: Session, blocks: int) -> int:
-    """So many blocks more, one after the other; the index of the last one."""
+    """Play `count` further blocks, one at a time. Return the index of the last one."""
     assert session.microphone is not None
     with session.follow("ild") as messages:
         for seed in range(blocks):
@@ -274,8 +338,8 @@ rospy.spin()
 """
 
 
-def test_a_stopped_subscriber_of_22_megabytes_costs_nobody_anything(tree: Session) -> None:
-    """No memory, and no block of another port; when it goes on it soon has the newest, and killed it is forgotten."""
+def test_a_stopped_subscriber_of_22_megabytes_affects_no_other(tree: Session) -> None:
+    """It needs no memory, and no other port loses a block. Continued, it gets the newest message."""
     large = tree.topic("gammatone")
     with (
         tree.graph.start(PYTHON, "-u", "-c", LISTENER, "going", large) as going,
@@ -288,19 +352,19 @@ def test_a_stopped_subscriber_of_22_megabytes_costs_nobody_anything(tree: Sessio
             os.kill(subscriber.pid, signal.SIGSTOP)
         play(tree, 3)
         before = resident(tree.process.pid)
-        index = play(tree, 20)  # follows every block of ILD
+        index = play(tree, 20)  # receives each block of ILD
         assert resident(tree.process.pid) - before < 60, "20 messages of 22 MB, to two subscribers"
         os.kill(killed.pid, signal.SIGKILL)
         os.kill(going.pid, signal.SIGCONT)
         wait_for(lambda: going.out.split()[-1] == str(index), what=lambda: f"{index} in {going}")
         wait_for(lambda: tree.connections(large) == 1)
-        came = [int(line) for line in going.out.split()]
-        assert came == sorted(came) and len(came) < 15, "it did not get what came meanwhile"
+        received = [int(line) for line in going.out.split()]
+        assert received == sorted(received) and len(received) < 15, "it did not get the messages in between"
         assert tree.read("gammatone").lastFrameIndex == index
 
 
 def test_the_example_of_the_document(tree: Session, tmp_path: Path) -> None:
-    """docs/subscribers.md: ten lines that work as they stand, but for the name of this test's node."""
+    """docs/subscribers.md: the ten lines work unchanged, except for the name of this test's node."""
     text = (ROOT / "docs" / "subscribers.md").read_text("utf-8")
     (code,) = re.findall(r"^```python\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
     assert len([line for line in code.splitlines() if line]) <= 10
@@ -316,12 +380,12 @@ def test_the_table_of_the_document(tree: Session) -> None:
     text = (ROOT / "docs" / "subscribers.md").read_text("utf-8")
     for name in re.findall(r"`((?:rosAFE|binaudio)_\w+)`", text):
         assert array_msg(getattr(rosAFE.msg, name)), name
-    assert f"{MAX_WAITING} messages and {MAX_WAITING_BYTES // 10**6} MB" in text
+    assert f"{MAX_QUEUED} messages and {MAX_QUEUED_BYTES // 10**6} MB" in text
 
 
 @pytest.mark.ros
 def test_all_ports_for_a_while(tmp_path: Path) -> None:
-    """The short form of the benchmark that runs for minutes: nothing lost, no growth."""
+    """A short run of the benchmark that takes minutes: no loss, no growth."""
     proc()
     env = {k: v for k, v in os.environ.items() if not k.startswith("ROS_")}
     command = [PYTHON, str(ROOT / "benchmarks" / "ports.py"), "--quick", "--loaded", "--seconds", "3"]
@@ -329,5 +393,5 @@ def test_all_ports_for_a_while(tmp_path: Path) -> None:
         assert done.wait(200) == 0, done
         rows = re.findall(r"^\| (/rosAFE/\S+) \| (\d+) \| (\d+) \| (\d+) \|$", done.out, re.MULTILINE)
     assert len(rows) == 2 * len(CORE_REPRESENTATIONS)
-    for topic, came, expected, lost in rows:
-        assert 2 < int(came) <= int(expected) and int(lost) == 0, topic
+    for topic, received, expected, lost in rows:
+        assert 2 < int(received) <= int(expected) and int(lost) == 0, topic

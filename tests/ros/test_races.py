@@ -1,4 +1,4 @@
-"""Things that happen in the one moment in which they hurt: made to happen there, on real nodes."""
+"""Race conditions, provoked on real nodes."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ import rosgraph
 
 from rosafe.transport import master
 from tests.harness import PYTHON, Graph, MasterProcess, python_path, run_together, wait_for
-from tests.ros.session import Session, told
+from tests.ros.session import Session, error_of
 
-# --- two inputs at a time ---------------------------------------------------------------------------------------
+# --- two simultaneous inputs ---------------------------------------------------------------------------------------
 
-# A node whose first InputProc stops for a while at one place, and tells by files what happens.
+# A node whose first InputProc pauses at one point, and signals its progress by files.
 STALLING = """
 import sys, threading
 from pathlib import Path
 from rosafe.component import audio
-from rosafe.node import node
+from rosafe.node import node, published_tree
 where, folder = sys.argv.pop(1), Path(sys.argv.pop(1))
 
 def stall():
@@ -43,7 +43,7 @@ def stall_reading(ring, frames, *rest):
     return reader
 audio.AudioRing.open_reader = stall_reading
 
-add_input = node.Tree.add_input
+add_input = published_tree.Tree.add_input
 def stall_adding(tree, name, *rest):
     if where == "adding" and name == "first":
         stall()
@@ -51,9 +51,9 @@ def stall_adding(tree, name, *rest):
     if name == "second":
         (folder / "second").touch()
     return added
-node.Tree.add_input = stall_adding
+published_tree.Tree.add_input = stall_adding
 
-class Lock:  # tells when somebody has to wait for it
+class Lock:  # signals that a thread has to wait
     def __init__(self):
         self.lock = threading.Lock()
     def __enter__(self):
@@ -65,7 +65,7 @@ class Lock:  # tells when somebody has to wait for it
 
 start = node.ComponentNode.start
 def with_lock(component):
-    for owner in component._handlers["InputProc"].__self__,:
+    for owner in component._dispatcher._registered["InputProc"].handler.__self__,:
         owner._starting = Lock()
     start(component)
 node.ComponentNode.start = with_lock
@@ -74,8 +74,8 @@ sys.exit(node.main())
 
 
 @pytest.mark.parametrize("where", ["reader", "adding"])
-def test_the_newer_of_two_inputs_stays_wherever_the_older_one_is(graph: Graph, tmp_path: Path, where: str) -> None:
-    """The older one has its audio but no processor yet, or is about to get that."""
+def test_the_newer_of_two_inputs_remains_at_any_point_of_the_older(graph: Graph, tmp_path: Path, where: str) -> None:
+    """The older one has its audio but no processor yet, or is just creating it."""
     program = tmp_path / "stalling.py"
     program.write_text(STALLING)
     name = f"stalling_{where}"
@@ -99,7 +99,7 @@ def test_the_newer_of_two_inputs_stays_wherever_the_older_one_is(graph: Graph, t
         older, newer, _ = run_together(3, lambda number: steps[number]())
         assert newer.genom_success, newer.genom_exdetail
         if where == "reader":
-            assert told(older)[0] == "::genom::interrupted"
+            assert error_of(older)[0] == "::genom::interrupted"
         session.wait_activities(["InputProc"])
         assert session.processors() == {"input": ["second"]}
         session.close()
@@ -108,8 +108,8 @@ def test_the_newer_of_two_inputs_stays_wherever_the_older_one_is(graph: Graph, t
 # --- the master -------------------------------------------------------------------------------------------------
 
 
-def test_another_master_that_knows_a_little_is_told_all(private_graph: tuple[Graph, MasterProcess]) -> None:
-    """It came so quickly that the node missed nothing, and knows the node by one topic."""
+def test_a_new_master_with_one_registration_gets_all_others(private_graph: tuple[Graph, MasterProcess]) -> None:
+    """It was started so quickly that the node did not notice, and one topic of the node is registered."""
     graph, master_process = private_graph
     with graph.node("bass-ros") as process:
         services = graph.services()
@@ -126,7 +126,7 @@ def test_another_master_that_knows_a_little_is_told_all(private_graph: tuple[Gra
 
 
 class SlowMaster(ThreadingMixIn, xmlrpc.server.SimpleXMLRPCServer):
-    """Between a node and its master: one call gets no answer, and takes effect late, after another one.
+    """A proxy between a node and its master: one call gets no answer, and takes effect late, after another call.
 
     Parameters
     ----------
@@ -140,7 +140,7 @@ class SlowMaster(ThreadingMixIn, xmlrpc.server.SimpleXMLRPCServer):
     def __init__(self, uri: str) -> None:
         super().__init__(("127.0.0.1", 0), logRequests=False, allow_none=True)
         self.uri = f"http://127.0.0.1:{self.server_address[1]}"
-        self.held = ""  # the topic whose next unregisterPublisher is held
+        self.held = ""  # the topic whose next unregisterPublisher is delayed
         self.late = threading.Event()  # it has taken effect
         self._waiting: list[tuple[Any, ...]] = []
         self._end = threading.Event()
@@ -154,7 +154,7 @@ class SlowMaster(ThreadingMixIn, xmlrpc.server.SimpleXMLRPCServer):
         if self.held and (method, *params[1:2]) == ("unregisterPublisher", self.held):
             self.held = ""
             self._waiting.append(params)
-            self._end.wait()  # the node gives up before
+            self._end.wait()  # the node's timeout is shorter
         result = call(method, params)
         if self._waiting and method == "registerPublisher" and params[1] == self._waiting[0][1]:
             call("unregisterPublisher", self._waiting.pop())
@@ -177,8 +177,8 @@ def slow_master(uri: str) -> Iterator[SlowMaster]:
         server.close()
 
 
-def test_a_call_that_takes_effect_when_it_was_given_up_is_made_good(graph: Graph) -> None:
-    """A topic is withdrawn and offered again; the master hears of that the wrong way round, and knows it in the end."""
+def test_a_call_that_takes_effect_after_its_timeout_is_corrected(graph: Graph) -> None:
+    """A topic is closed and advertised again; the master gets the calls in the wrong order, and is then corrected."""
     with slow_master(graph.uri) as server, graph.node("rosAFE-ros", "-i", "late", ROS_MASTER_URI=server.uri) as process:
         session = Session(graph, process, "late")
         session.build("PreProc")

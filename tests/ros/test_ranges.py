@@ -1,4 +1,4 @@
-"""Every value of every request, from the interface table: out of its range it is refused, whichever way it comes."""
+"""All values of all requests in the interface table are rejected outside their range, by each interface."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 
 from rosafe.interface import CORE_REPRESENTATIONS, KINDS, ROSAFE, Parameter, Representation, Service
-from tests.ros.session import Session, told
+from tests.ros.session import Session, error_of
 from tests.ros.test_requests import NAMES, snapshot
 
 PARENTS = ("PreProc", "GammatoneProc", "IhcProc")
@@ -18,14 +18,14 @@ NUMBERS = ("double", "unsigned long", "unsigned long long")
 
 
 def parents(kind: Representation) -> Iterator[Representation]:
-    """The kinds that `kind` hangs on, the input first."""
+    """Return the ancestors of `kind`, the input first."""
     if kind.parent:
         yield from parents(KINDS[kind.parent])
         yield KINDS[kind.parent]
 
 
 def element(parameter: Parameter) -> str:
-    """The IDL type of a parameter, or of the elements of a list."""
+    """Return the IDL type of a parameter, or of the elements of a list."""
     return parameter.idl.removeprefix("sequence<").removesuffix(">")
 
 
@@ -34,7 +34,7 @@ def numeric(parameters: tuple[Parameter, ...]) -> Iterator[Parameter]:
 
 
 def outside(parameter: Parameter) -> list[float]:
-    """Values that the parameter's type holds and its range does not; 0 is among them where it is not allowed."""
+    """Return values of the parameter's type outside its range, with 0 if that is not allowed."""
     low, high = parameter.minimum, parameter.maximum
     assert low is not None, f"{parameter.name} has no range"
     if element(parameter) == "double":
@@ -47,20 +47,20 @@ def outside(parameter: Parameter) -> list[float]:
 
 
 def in_request(parameter: Parameter) -> Iterator[Any]:
-    """The values of `outside` as a field of a request, in which zero is the default."""
+    """Return the values of `outside` for a request, in which zero is the default."""
     for value in outside(parameter):
         if value != 0:
             yield value if parameter.idl == element(parameter) else [100.0, value]
 
 
 def refused(response: Any, parameter: Parameter, value: Any) -> None:
-    ex, detail = told(response)
+    ex, detail = error_of(response)
     assert ex == "::rosAFE::e_badNewValue", (parameter.name, value)
     assert parameter.name in detail["what"], (parameter.name, value, detail)
 
 
 @pytest.mark.parametrize("service", ROSAFE.activities, ids=lambda service: service.name)
-def test_values_outside_are_refused_by_service_and_action(afe: Session, service: Service) -> None:
+def test_values_outside_are_rejected_by_service_and_action(afe: Session, service: Service) -> None:
     served = [kind for kind in KINDS.values() if kind.request == service.name]
     above = [kind for one in served for kind in parents(one)]
     afe.build(*(kind.request for kind in above if kind.parent), fb_nChannels=2)
@@ -78,14 +78,14 @@ def test_values_outside_are_refused_by_service_and_action(afe: Session, service:
 
 
 @pytest.mark.parametrize("kind", CORE_REPRESENTATIONS)
-def test_values_outside_are_refused_by_modify_parameter(afe: Session, kind: str) -> None:
-    """There, zero is zero."""
+def test_values_outside_are_rejected_by_modify_parameter(afe: Session, kind: str) -> None:
+    """In modifyParameter, zero is not the default."""
     afe.build(*(k.request for k in CORE_REPRESENTATIONS.values() if k.parent), fb_nChannels=2)
     before = snapshot(afe)
     for parameter in numeric(CORE_REPRESENTATIONS[kind].parameters):
         for value in outside(parameter):
             if value == 0 and parameter.idl != element(parameter):
-                continue  # a list of one zero is none
+                continue  # a list of one zero is the default
             response = afe.call(
                 "modifyParameter", nameProc=NAMES[kind][0], nameParam=parameter.name, newValue=repr(value)
             )
@@ -94,7 +94,7 @@ def test_values_outside_are_refused_by_modify_parameter(afe: Session, kind: str)
 
 
 @pytest.mark.parametrize("kind", [kind for kind in CORE_REPRESENTATIONS if CORE_REPRESENTATIONS[kind].parent])
-def test_unknown_words_become_the_default_by_service_and_by_modify_parameter(afe: Session, kind: str) -> None:
+def test_unknown_choices_become_the_default(afe: Session, kind: str) -> None:
     afe.build(*PARENTS, fb_nChannels=2)
     numbers = itertools.count(1)
     for parameter in CORE_REPRESENTATIONS[kind].parameters:
@@ -115,7 +115,7 @@ def test_unknown_words_become_the_default_by_service_and_by_modify_parameter(afe
             afe.ok("removeProcessor", name=name)
 
 
-def test_texts_that_are_too_long_or_no_texts(afe: Session) -> None:
+def test_too_long_or_invalid_texts(afe: Session) -> None:
     afe.build("PreProc")
     before = snapshot(afe)
     for text in ("x" * 4097, "nul\0"):
@@ -123,7 +123,7 @@ def test_texts_that_are_too_long_or_no_texts(afe: Session) -> None:
     assert snapshot(afe) == before
 
 
-def test_lists_that_are_too_long(afe: Session) -> None:
+def test_too_long_lists(afe: Session) -> None:
     afe.build("PreProc")
     for length in (1025, 100_000):
         ex, detail = afe.refused("GammatoneProc", fb_cfHz=[100.0] * length)

@@ -1,4 +1,4 @@
-"""Requests as plain services: what is refused, in which order, and that nothing changes then; defaults; removal."""
+"""Requests as plain services: order of checks, rejected requests change nothing, defaults, removal."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ NAMES = {kind: [ROSAFE.service(k.request).parameter("name").default] for kind, k
 
 
 def snapshot(afe: Session) -> tuple[Any, set[str]]:
-    """What a refused request must leave as it was."""
+    """Return the state that a rejected request must not change."""
     return afe.ok("getParameters").parameters, {t for t in afe.graph.topics() if re.match(f"/{afe.name}/\\w+Port", t)}
 
 
 # --- InputProc --------------------------------------------------------------------------------------------------
 
 
-def test_input_without_a_connection_is_no_data(graph: harness.Graph) -> None:
+def test_input_without_a_connection_is_an_error(graph: harness.Graph) -> None:
     with own_node(graph) as afe:
         assert afe.refused("InputProc") == ("::rosAFE::e_noData", {})
-        assert "connect_port" in afe.process.err, "the log says what to do"
+        assert "connect_port" in afe.process.err, "the log contains the next step"
 
 
 def test_input_waits_for_a_first_message(afe: Session) -> None:
@@ -65,7 +65,7 @@ def test_a_second_input_replaces_the_first_and_keeps_the_tree(afe: Session) -> N
     afe.ok("InputProc", name="other", nFramesPerBlock=400)
     assert afe.processors() == {"input": ["other"], "preProc": ["preProc"]}
     later = afe.wait_activities(["InputProc", "PreProc"])
-    assert len(set(ids) & set(later)) == 1, "the pre-processor goes on, the old input has ended"
+    assert len(set(ids) & set(later)) == 1, "the pre-processor continues, the old input has ended"
     second = noise(400, 2)
     microphone.play(second)
     message = afe.read("preProc", 1201)
@@ -80,7 +80,7 @@ def test_an_input_cannot_take_the_name_of_another_processor(afe: Session) -> Non
     assert snapshot(afe) == before
 
 
-def test_a_replacing_input_that_is_refused_leaves_the_first(afe: Session) -> None:
+def test_a_rejected_second_input_does_not_affect_the_first(afe: Session) -> None:
     microphone = afe.build(block=800)
     ex, detail = afe.refused("InputProc", bufferSize_s_port=math.nan)
     assert ex == "::rosAFE::e_badNewValue" and "bufferSize_s_port" in detail["what"]
@@ -92,12 +92,12 @@ def test_a_replacing_input_that_is_refused_leaves_the_first(afe: Session) -> Non
     assert microphone.topic != afe.topic("input")
 
 
-# --- the others: order of the refusals --------------------------------------------------------------------------
+# --- other requests: order of checks --------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("request_name", CHAIN)
-def test_the_order_of_refusals(afe: Session, request_name: str) -> None:
-    """Parent unknown, name taken, parent of another type, values: the first that applies is told."""
+def test_the_order_of_checks(afe: Session, request_name: str) -> None:
+    """Unknown parent, used name, parent of another kind, values: the first one that applies is reported."""
     afe.build("PreProc", "GammatoneProc", "IhcProc", fb_nChannels=2)
     before = snapshot(afe)
     wrong = {"PreProc": "preProc", "GammatoneProc": "input"}.get(request_name, "preProc")
@@ -151,7 +151,7 @@ def test_the_order_of_refusals(afe: Session, request_name: str) -> None:
         ("InputProc", {"nFramesPerBlock": 2**32 - 1}, "nFramesPerBlock"),
     ],
 )
-def test_values_out_of_range_are_refused_with_the_reason(
+def test_values_out_of_range_are_rejected_with_the_reason(
     afe: Session, request_name: str, values: dict[str, Any], named: str
 ) -> None:
     parents = list(CHAIN[: CHAIN.index(request_name)] if request_name in CHAIN else ())
@@ -167,21 +167,21 @@ def test_values_out_of_range_are_refused_with_the_reason(
 
 
 def test_zeros_are_defaults(afe: Session) -> None:
-    """ROS requests carry no defaults: a request full of zeros is one full of defaults."""
+    """ROS requests have no defaults: zeros stand for the defaults."""
     afe.listen()
     for request in ("InputProc", *CHAIN):
         afe.ok(request)
     assert afe.processors() == NAMES
     parameters = afe.ok("getParameters").parameters
     for kind, table in CORE_REPRESENTATIONS.items():
-        (told,) = getattr(parameters, kind)
+        (struct,) = getattr(parameters, kind)
         for parameter in table.parameters:
             if parameter.name not in ("fb_cfHz", "fb_nChannels"):
-                assert getattr(told, parameter.name) == parameter.default, parameter.name
+                assert getattr(struct, parameter.name) == parameter.default, parameter.name
     assert parameters.gammatone[0].fb_nChannels == 31
 
 
-def test_enumerated_words_are_permissive(afe: Session) -> None:
+def test_unknown_choices_are_replaced(afe: Session) -> None:
     afe.build(
         "PreProc",
         "GammatoneProc",
@@ -203,13 +203,13 @@ def test_enumerated_words_are_permissive(afe: Session) -> None:
     assert parameters.ratemap[0].rm_scaling == "power"
 
 
-def test_a_list_of_zero_is_no_list(afe: Session) -> None:
+def test_a_list_of_one_zero_is_the_default(afe: Session) -> None:
     afe.build("PreProc")
     afe.ok("GammatoneProc", fb_cfHz=[0.0], fb_nChannels=3)
     assert afe.ok("getParameters").parameters.gammatone[0].fb_nChannels == 3
 
 
-def test_parameters_come_back_exactly(afe: Session) -> None:
+def test_parameters_are_returned_exactly(afe: Session) -> None:
     afe.build("PreProc")
     given: dict[str, dict[str, Any]] = {
         "PreProc": {
@@ -226,7 +226,7 @@ def test_parameters_come_back_exactly(afe: Session) -> None:
             "pp_bUnityComp": True,
         },
         "GammatoneProc": {"fb_cfHz": [100.1, 1000 / 3, 5e3], "fb_nGamma": 3, "fb_bwERBs": 1.0179999999999998},
-        "IhcProc": {"ihc_method": "halfwave"},
+        "IhcProc": {"ihc_method": "dau1996"},
         "IldProc": {"ild_wname": "blackman", "ild_wSizeSec": 0.02 + 1e-17, "ild_hSizeSec": 0.1 / 7},
         "RatemapProc": {"rm_wname": "hamming", "rm_scaling": "magnitude", "rm_decaySec": 0.1 / 3, "rm_wSizeSec": 0.03},
         "CrossCorrelationProc": {"cc_maxDelaySec": 0.0011, "cc_wname": "triang", "cc_hSizeSec": 0.005},
@@ -240,10 +240,10 @@ def test_parameters_come_back_exactly(afe: Session) -> None:
     assert [p.name for p in parameters.preProc] == ["preProc", "my_PreProc"], "in the order of creation"
     for kind, table in CORE_REPRESENTATIONS.items():
         if table.parent:
-            told = getattr(parameters, kind)[-1]
-            assert told.name == f"my_{table.request}"
+            struct = getattr(parameters, kind)[-1]
+            assert struct.name == f"my_{table.request}"
             for name, value in given[table.request].items():
-                got = getattr(told, name)
+                got = getattr(struct, name)
                 assert (list(got) if isinstance(value, list) else got) == value, name
     flat = {name: value for values in given.values() for name, value in values.items()}
     truth = process(noise(2000), RATE, parameters=flat)
@@ -257,7 +257,7 @@ def test_parameters_come_back_exactly(afe: Session) -> None:
 # --- dependencies, modification, removal ------------------------------------------------------------------------
 
 
-def test_dependencies_begin_at_the_root(afe: Session) -> None:
+def test_dependencies_start_at_the_root(afe: Session) -> None:
     afe.build(*CHAIN, fb_nChannels=2)
     for name, expected in (
         ("input", ["input"]),
@@ -281,7 +281,7 @@ def test_dependencies_begin_at_the_root(afe: Session) -> None:
         ("preProc", "pp_middleEarModel", "jespen", "jepsen"),
         ("gammatone", "fb_nGamma", "3", 3),
         ("gammatone", "fb_bwERBs", "20E-1", 2.0),
-        ("ihc", "ihc_method", "halfwave", "halfwave"),
+        ("ihc", "ihc_method", "dau1996", "dau1996"),
         ("ihc", "ihc_method", "unheard of", "dau"),
         ("ild", "ild_wname", "hamming", "hamming"),
         ("ratemap", "set_rm_scailing", "_magnitude", "magnitude"),
@@ -293,11 +293,11 @@ def test_modify_parameter(afe: Session, name: str, parameter: str, text: str, va
     afe.build(*CHAIN, fb_nChannels=2)
     afe.ok("modifyParameter", nameProc=name, nameParam=parameter, newValue=text)
     parameters = afe.ok("getParameters").parameters
-    told = {p.name: p for kind in CORE_REPRESENTATIONS for p in getattr(parameters, kind)}[name]
+    struct = {p.name: p for kind in CORE_REPRESENTATIONS for p in getattr(parameters, kind)}[name]
     real = {"pp_refSPLdBS": "pp_refSPLdB", "set_rm_scailing": "rm_scaling"}.get(parameter, parameter)
-    assert getattr(told, real) == value
+    assert getattr(struct, real) == value
     if parameter == "cc_maxDelaySec":
-        assert len(told.cc_lags) == 2 * math.ceil(0.0005 * RATE) + 1
+        assert len(struct.cc_lags) == 2 * math.ceil(0.0005 * RATE) + 1
 
 
 @pytest.mark.parametrize(
@@ -331,16 +331,16 @@ def test_modify_parameter(afe: Session, name: str, parameter: str, text: str, va
         ("crosscorrelation", "cc_maxDelaySec", "10.5", "e_badNewValue"),
     ],
 )
-def test_modifications_that_are_refused(afe: Session, name: str, parameter: str, text: str, ex: str) -> None:
+def test_rejected_modifications(afe: Session, name: str, parameter: str, text: str, ex: str) -> None:
     afe.build(*CHAIN, fb_nChannels=2, pp_bRemoveDC=True)
     before = snapshot(afe)
-    told, detail = afe.refused("modifyParameter", nameProc=name, nameParam=parameter, newValue=text)
-    assert told == f"::rosAFE::{ex}"
+    exception, detail = afe.refused("modifyParameter", nameProc=name, nameParam=parameter, newValue=text)
+    assert exception == f"::rosAFE::{ex}"
     assert (parameter in detail["what"]) if ex == "e_badNewValue" else detail == {}
     assert snapshot(afe) == before
 
 
-def test_removal_takes_all_below_and_frees_the_names(afe: Session) -> None:
+def test_removal_includes_descendants_and_frees_the_names(afe: Session) -> None:
     afe.build(*CHAIN, fb_nChannels=2)
     afe.ok("IldProc", name="second")
     afe.ok("GammatoneProc", name="sibling", fb_nChannels=2)
@@ -348,14 +348,14 @@ def test_removal_takes_all_below_and_frees_the_names(afe: Session) -> None:
     assert afe.processors() == {"input": ["input"], "preProc": ["preProc"], "gammatone": ["sibling"]}
     afe.wait_activities(["InputProc", "PreProc", "GammatoneProc"])
     gone = [afe.topic(kind) for kind in ("gammatone", "ihc", "ild", "ratemap", "crossCorrelation")]
-    assert not set(gone) & afe.graph.topics(), "withdrawn when the call returns"
+    assert not set(gone) & afe.graph.topics(), "closed when the call returns"
     for request in CHAIN[1:]:
         afe.ok(request)
     assert set(gone) <= afe.graph.topics()
 
 
 @pytest.mark.parametrize("name", ["input", "nobody", "", "name", "Preproc"])
-def test_removals_that_are_refused(afe: Session, name: str) -> None:
+def test_rejected_removals(afe: Session, name: str) -> None:
     afe.build("PreProc", "GammatoneProc", fb_nChannels=2)
     before = snapshot(afe)
     assert afe.refused("removeProcessor", name=name) == ("::rosAFE::e_noSuchProcessor", {})
@@ -373,7 +373,7 @@ def test_stop_and_start_again(afe: Session) -> None:
         assert afe.ok("getSignals").signals.input == []
         afe.wait_activities([])
         assert afe.refused("PreProc")[0] == "::rosAFE::e_noUpperDependencie"
-    assert microphone.heard, "the connection stays"
+    assert microphone.subscribed, "the connection is kept"
     for request in ("InputProc", *CHAIN):
         afe.ok(request, **({"nFramesPerBlock": 800} if request == "InputProc" else {}))
     microphone.play(noise(800, 3))
@@ -384,7 +384,7 @@ def test_stop_and_start_again(afe: Session) -> None:
 # --- connect_port and the rest ----------------------------------------------------------------------------------
 
 
-def test_connections_that_are_refused(afe: Session) -> None:
+def test_rejected_connections(afe: Session) -> None:
     microphone = afe.build(block=400)
     for local, remote, ex in (
         ("audio", microphone.topic, "no_such_inport"),
@@ -398,28 +398,28 @@ def test_connections_that_are_refused(afe: Session) -> None:
         assert afe.refused("connect_port", local=local, remote=remote) == (f"::genom::{ex}", {}), (local, remote)
     signal = noise(400)
     microphone.play(signal)
-    assert afe.read("input", 401).left[-1] == signal[0, -1] / (2**31 - 1), "the old connection stands"
+    assert afe.read("input", 401).left[-1] == signal[0, -1] / (2**31 - 1), "the old connection is kept"
 
 
-def test_names_resolve_as_those_of_ros(afe: Session) -> None:
+def test_names_are_resolved_as_in_ros(afe: Session) -> None:
     microphone = afe.listen()
     relative = microphone.topic[1:]
     for remote in (relative, microphone.topic, f"/{relative}/"):
         afe.ok("connect_port", local="Audio", remote=remote)
-    wait_for(lambda: microphone.heard)
+    wait_for(lambda: microphone.subscribed)
 
 
 def test_there_are_no_remote_services(afe: Session) -> None:
     assert afe.refused("connect_service", local="any", remote="thing") == ("::genom::no_such_remote", {})
 
 
-def test_activities_that_do_not_exist_cannot_be_aborted(afe: Session) -> None:
+def test_missing_activities_cannot_be_aborted(afe: Session) -> None:
     for number in (0, 99999, 2**32 - 1):
         assert afe.refused("abort_activity", activity=number) == ("::genom::no_such_activity", {})
 
 
-def test_what_goes_wrong_is_valid_json_whatever_the_name(afe: Session) -> None:
-    """Quotes, backslashes, line ends and other alphabets in what the user sent come back in the reason."""
+def test_errors_are_valid_json_for_any_name(afe: Session) -> None:
+    """Quotes, backslashes, line ends and other alphabets of the request are part of the reason."""
     afe.build("PreProc")
     for name in ('say "hi"', "back\\slash", "two\nlines", "日本語", "tab\t"):
         response = afe.call("GammatoneProc", name=name)
@@ -427,8 +427,8 @@ def test_what_goes_wrong_is_valid_json_whatever_the_name(afe: Session) -> None:
         assert body["ex"] == "::rosAFE::e_badNewValue" and repr(name) in body["detail"]["what"]
 
 
-def test_eight_clients_at_once(afe: Session) -> None:
-    """Each builds, asks, modifies and removes a branch of its own; the tree is whole in the end."""
+def test_eight_simultaneous_clients(afe: Session) -> None:
+    """Each builds, queries, modifies and removes its own branch; the tree is consistent in the end."""
     microphone = afe.build("PreProc", block=400)
 
     def work(number: int) -> None:
@@ -453,7 +453,7 @@ def test_eight_clients_at_once(afe: Session) -> None:
     afe.read("preProc", 401)
 
 
-def test_the_same_name_at_once_is_given_once(afe: Session) -> None:
+def test_simultaneous_requests_for_one_name_create_one_processor(afe: Session) -> None:
     afe.build("PreProc")
     responses = harness.run_together(8, lambda _: afe.call("GammatoneProc", fb_nChannels=2))
     failed = [json.loads(r.genom_exdetail) for r in responses if not r.genom_success]

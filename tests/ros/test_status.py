@@ -1,4 +1,4 @@
-"""The status of action servers: periodic, so that any client finds the server at any time, and cheap."""
+"""The status of action servers: periodic, so that clients find the server at any time, and cheap."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ HEADER = Path("/usr/include/actionlib/client/simple_action_client.h")
 
 
 def periods(graph: Graph, topic: str, count: int = 8) -> list[float]:
-    """Seconds between messages of a topic, the latched one left out."""
+    """Return the seconds between messages of a topic, without the latched one."""
     with graph.collect(topic, GoalStatusArray) as messages:
         moments = []
         for number in range(1, count + 2):
@@ -37,7 +37,7 @@ def periods(graph: Graph, topic: str, count: int = 8) -> list[float]:
     return [after - before for before, after in itertools.pairwise(moments[1:])]
 
 
-def test_the_status_comes_five_times_a_second(graph: Graph, bass_node: Any) -> None:
+def test_the_status_is_published_five_times_a_second(graph: Graph, bass_node: Any) -> None:
     assert statistics.median(periods(graph, "/bass/Acquire/status")) == pytest.approx(0.2, abs=0.06)
 
 
@@ -54,7 +54,7 @@ def test_the_parameter(graph: Graph, given: Any, frequency: float) -> None:
 
 @pytest.mark.parametrize("frequency", [0, 1e-12])
 def test_no_status_in_periods(graph: Graph, frequency: float) -> None:
-    """0, as in every action server: only the latched one, and those that tell of changes."""
+    """0, as in any action server: only the latched message, and one for each change."""
     graph.client()
     rospy.set_param("/other/actionlib_status_frequency", frequency)
     with graph.node("bass-ros", "-i", "other") as node:
@@ -93,7 +93,7 @@ def test_two_roscpp_clients_in_one_process(graph: Graph, bass_node: Any, tmp_pat
 
 
 class Counted:
-    """An action server that counts how often it is asked to publish."""
+    """An action server that counts the calls to publish its status."""
 
     frequency = 1000.0
 
@@ -106,8 +106,8 @@ class Counted:
         return self.in_use
 
 
-def test_what_nobody_uses_costs_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The thread sleeps until a server has a goal or a subscriber, and again when none has any more."""
+def test_unused_servers_need_no_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The thread sleeps while no server has a goal or a subscriber."""
     monkeypatch.setattr(action_server, "MAX_FREQUENCY", 1000.0)
     monkeypatch.setattr(rospy.Time, "now", lambda: rospy.Time(1))
     finished = threading.Event()

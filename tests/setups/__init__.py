@@ -1,1 +1,1 @@
-"""Tests of setups: reading, writing, loading, and what starts them."""
+"""Tests of setups: reading, writing, loading, and the commands for them."""

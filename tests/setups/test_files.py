@@ -1,4 +1,4 @@
-"""Setups as files: what is written reads back the same, what is wrong is told with its line, bombs are refused."""
+"""Setup files: writing and reading are inverse, errors name the line, hostile texts are rejected."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rosafe.interface import KINDS, MAX_SETUP, Parameter
+from rosafe.interface.remarks import PRESETS
 from rosafe.representations import STAGES
-from rosafe.setups import AcquireSettings, Setup, SetupError, SetupProcessor, read, wanted, write
+from rosafe.setups import AcquireSettings, Setup, SetupError, SetupProcessor, read, setup_processor, write
 from rosafe.setups.setup import parameters_of
 from rosafe.tree.tree_planner import ExistingProcessor
 
@@ -32,11 +33,11 @@ processors:
 """
 
 
-def test_what_a_person_writes() -> None:
+def test_a_setup_written_by_hand() -> None:
     setup = read(TREE)
     assert setup.sound == AcquireSettings({"device": "scene:"})
     assert setup.connections == {"Audio": "/bass/Audio"}
-    assert [(w.name, w.kind, w.parent, dict(w.given)) for w in setup.processors] == [
+    assert [(w.name, w.kind, w.parent, dict(w.explicit)) for w in setup.processors] == [
         ("input", "input", "", {"nFramesPerBlock": 4410}),
         ("time", "preProc", "input", {}),
         ("bank", "gammatone", "time", {"fb_cfHz": [500.0, 1000.0, 2000.25]}),
@@ -47,11 +48,37 @@ def test_what_a_person_writes() -> None:
     assert read(write(setup, full=True)) == setup
 
 
-def test_parents_may_come_later_and_defaults_go_without_saying() -> None:
+def test_the_settings_of_a_localizer() -> None:
+    setup = read(TREE + "localizer: {head: robot.head, seconds: 1}\n")
+    assert setup.localizer == {"head": "robot.head", "seconds": 1.0}
+    assert read(write(setup)) == setup == read(write(setup, full=True))
+    assert read("localizer: {}").localizer == {} and read(write(read("localizer: {}"))).localizer == {}
+    assert read(TREE).localizer is None
+    for text, reason in (
+        ("localizer: {haed: x}", "line 1: localizer: unknown 'haed'; expected one of head, .*; did you mean head?"),
+        ("localizer: {seconds: 0}", "line 1: localizer: seconds: "),
+        ("localizer: [1]", "line 1: localizer"),
+    ):
+        with pytest.raises(SetupError, match=reason):
+            read(text)
+
+
+def test_a_preset_applies_to_all_processors() -> None:
+    """Values of a processor take precedence."""
+    text = "preset: speech\nprocessors:\n  input: {kind: input}\n  time: {kind: time, parent: input}\n"
+    text += "  bank: {kind: filterbank, parent: time}\n  ihc: {kind: ihc, parent: bank}\n"
+    text += "  ac: {kind: autocorrelation, parent: ihc}\n  pitch: {kind: pitch, parent: ac, pi_confThres: 0.5}\n"
+    explicit = {processor.name: processor.explicit for processor in read(text).processors}
+    assert explicit["ac"] == {"ac_wSizeSec": PRESETS["speech"]["ac_wSizeSec"]} and not explicit["bank"]
+    assert explicit["pitch"]["pi_confThres"] == 0.5
+    assert explicit["pitch"]["pi_medianOrder"] == PRESETS["speech"]["pi_medianOrder"]
+
+
+def test_parents_can_follow_and_defaults_can_be_omitted() -> None:
     setup = read("processors:\n  ild: {kind: ILD}\n  ihc: {kind: ihc}\n  gammatone: {kind: gammatone}\n"
                  "  preProc: {kind: preProc, pp_bRemoveDC: yes}\n  input: {kind: input}\n")  # fmt: skip
     assert [w.name for w in setup.processors] == ["input", "preProc", "gammatone", "ihc", "ild"]
-    assert setup.processors[1].given == {"pp_bRemoveDC": True}
+    assert setup.processors[1].explicit == {"pp_bRemoveDC": True}
 
 
 @pytest.mark.parametrize("text", ["", "# nothing\n", "processors:\n", "---\n...\n", "sound: ~\n"])
@@ -81,7 +108,7 @@ _SIMPLE = [
 
 @settings(max_examples=60, deadline=None)
 @given(st.data())
-def test_every_parameter_to_the_last_digit(data: st.DataObject) -> None:
+def test_each_parameter_is_preserved_to_the_last_digit(data: st.DataObject) -> None:
     kind = data.draw(st.sampled_from(_SIMPLE))
     given = {p.name: data.draw(_values(p)) for p in parameters_of(kind) if "sequence<double>" not in p.idl}
     line = [kind]
@@ -106,34 +133,39 @@ def test_every_parameter_to_the_last_digit(data: st.DataObject) -> None:
         {"fb_type": "drnl", "fb_nChannels": 5},
     ],
 )
-def test_a_filterbank_is_told_as_it_was_asked_for(values: dict[str, Any]) -> None:
+def test_a_filterbank_is_described_as_it_was_requested(values: dict[str, Any]) -> None:
     kind = KINDS["gammatone"]
     stage = STAGES["gammatone"](44100.0, **values)
-    found = wanted(ExistingProcessor("bank", "gammatone", "preProc", stage.parameters))
-    assert found.given == {name: value for name, value in values.items() if value != kind.parameter(name).default}
+    found = setup_processor(ExistingProcessor("bank", "gammatone", "preProc", stage.parameters))
+    assert found.explicit == {name: value for name, value in values.items() if value != kind.parameter(name).default}
     assert STAGES["gammatone"](44100.0, **found.values).parameters == stage.parameters
 
 
 WRONG = {
     "processors:\n  a: {kind: input}\n  b: {kind: preProc, parent: a, pp_cutoffHzDC: -3}": (3, "pp_cutoffHzDC"),
     "processors:\n  a: {kind: input}\n  b:\n    kind: preProc\n    parent: a\n    fb_nERBs: 3": (6, "'fb_nERBs'"),
-    "processors:\n  a: {kind: input}\n  b: {kind: preProcessor, parent: a}": (3, "'preProcessor' is no kind"),
-    "processors:\n  a: {kind: input}\n  b:\n    kind: preProc\n    parent: c": (5, "'c' is not in the setup"),
-    "processors:\n  a: {kind: input}\n  b: {kind: ihc, parent: a}": (3, "is of kind input, wanted is gammatone"),
+    "processors:\n  a: {kind: input}\n  b: {kind: preProcessor, parent: a}": (3, "unknown kind 'preProcessor'"),
+    "processors:\n  a: {kind: input}\n  b:\n    kind: preProc\n    parent: c": (5, "got 'c', which is not in"),
+    "processors:\n  a: {kind: input}\n  b: {kind: ihc, parent: a}": (3, "kind gammatone, got 'a' of kind input"),
     "processors:\n  a: {kind: input}\n  b: {kind: input}": (3, "two inputs"),
     "processors:\n  a: {kind: input}\n  a: {kind: input}": (3, "twice, first in line 2"),
     "processors:\n  a: {parent: b}": (2, "kind is missing"),
+    "processors:\n  a: {kind: input}\n  b: {kind: preProc, parent: a, pp_refSPLdB: 90, pp_refSPLdBS: 80}": (
+        3,
+        "occurs twice",
+    ),
     "processors: [input]": (1, "NAME: VALUE"),
     "processors:\n  a: {kind: input, nFramesPerBlock: 0}": (2, "nFramesPerBlock"),
     "processors:\n  a: {kind: input, nFramesPerBlock: 1.5}": (2, "whole number"),
-    "processors:\n  a: {kind: input, nFramesPerBlock: }": (2, "nFramesPerBlock: wanted is one value"),
+    "processors:\n  a: {kind: input, nFramesPerBlock: }": (2, "nFramesPerBlock: expected one value"),
     "processors:\n  a: {kind: input, in_doNormalize: perhaps}": (2, "boolean"),
-    "processors:\n  a: {kind: input}\n  'b c': {kind: preProc, parent: a}": (3, "names a topic"),
+    "processors:\n  a: {kind: input}\n  'b c': {kind: preProc, parent: a}": (3, "also names a topic"),
     "sound: {device: 3, rate: 4}": (1, "'rate'"),
     "sound:\n  sampleRate: .nan": (2, "sampleRate"),
-    "connections:\n  audio: bass/Audio": (2, "there are: Audio"),
-    "connections:\n  Audio: bass Audio": (2, "no name of a topic"),
-    "sounds: {}": (1, "there are: sound, connections, processors"),
+    "connections:\n  audio: bass/Audio": (2, "expected one of Audio"),
+    "connections:\n  Audio: bass Audio": (2, "expected the name of a topic"),
+    "sounds: {}": (1, "expected one of sound, connections, processors, preset"),
+    "preset: music": (1, "preset: expected one of speech, got 'music'"),
     "processors:\n\t- a": (2, "not YAML"),
     "a: b: c": (1, "not YAML"),
     "a\n---\nb": (3, "a second document"),
@@ -142,7 +174,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("text", WRONG)
-def test_what_is_wrong_is_told_with_its_line(text: str) -> None:
+def test_errors_name_the_line(text: str) -> None:
     line, what = WRONG[text]
     with pytest.raises(SetupError) as error:
         read(text)
@@ -175,7 +207,7 @@ HOSTILE = [
 
 
 @pytest.mark.parametrize("text", HOSTILE, ids=range(len(HOSTILE)))
-def test_hostile_texts_are_refused_quickly(text: str) -> None:
+def test_hostile_texts_are_rejected_quickly(text: str) -> None:
     begun = time.process_time()
     with pytest.raises(SetupError) as error:
         read(text)

@@ -1,4 +1,4 @@
-"""Loading a setup is one transaction, on components in this process: wholly, or nothing is changed."""
+"""Loading a setup is a transaction, here on components in this process: it is complete, or nothing changes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import pytest
 from rosafe.client import setup_transaction
 from rosafe.interface import BASS, ROSAFE, ComponentError
 from rosafe.representations import STAGES
-from rosafe.setups import read, write
+from rosafe.setups import dry_run, read, write
 from tests.request.model import Model, Processor
 
 SETUP = """
@@ -30,7 +30,7 @@ processors:
 
 
 class Bass:
-    """A bass, as setups see one."""
+    """The services of bass that setups use."""
 
     component = BASS
     instance = "bass"
@@ -50,7 +50,7 @@ class Bass:
 
 
 class Graph(Model):
-    """A rosAFE beside a bass."""
+    """The services of a rosAFE and of a bass."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -62,8 +62,8 @@ class Graph(Model):
             raise ComponentError("::genom::mwerr", what="not running")
         yield self.bass
 
-    def everything(self) -> Any:
-        """All that there is, to be compared."""
+    def full_state(self) -> Any:
+        """Return the whole state, for comparison."""
         return self.state(), dict(self.bass.acquired)
 
 
@@ -75,17 +75,17 @@ def saved(graph: Graph, full: bool = False) -> str:
     return str(asyncio.run(setup_transaction.save(graph, {"full": full}))["setup"])
 
 
-def refused(graph: Graph, text: str) -> ComponentError:
-    """The exception of a setup that is refused, which has changed nothing."""
-    before = graph.everything()
+def rejected(graph: Graph, text: str) -> ComponentError:
+    """Return the exception of a setup that is rejected, and check that nothing has changed."""
+    before = graph.full_state()
     with pytest.raises(ComponentError) as error:
         load(graph, text)
-    assert graph.everything() == before
+    assert graph.full_state() == before
     return error.value
 
 
 @pytest.mark.parametrize("full", [False, True])
-def test_what_is_saved_is_what_is_loaded(full: bool) -> None:
+def test_a_saved_setup_is_loaded_identically(full: bool) -> None:
     first, second = Graph(), Graph()
     answer = load(first, SETUP)
     assert answer == {
@@ -94,25 +94,25 @@ def test_what_is_saved_is_what_is_loaded(full: bool) -> None:
         "sound": "started",
     }
     load(second, saved(first, full))
-    assert second.everything() == first.everything()
+    assert second.full_state() == first.full_state()
     assert list(second.processors) == list(first.processors)
     assert first.processors["preProc"].stage.parameters["pp_coefPreEmphasis"] == 0.0
     assert saved(second, full) == saved(first, full)
     assert read(saved(first)) == read(write(read(SETUP)))
 
 
-def test_what_is_there_is_used() -> None:
+def test_existing_processors_are_reused() -> None:
     graph = Graph()
     load(graph, SETUP)
-    before = graph.everything()
+    before = graph.full_state()
     answer = load(graph, SETUP)
     assert (answer["created"], answer["sound"], len(answer["reused"])) == ([], "reused", 7)
     graph._removeProcessor("", {"name": "ihc"})
     assert load(graph, SETUP)["created"] == ["ihc", "ild", "ratemap"]
-    assert graph.everything() == before
+    assert graph.full_state() == before
 
 
-def test_an_input_is_used_under_whatever_name() -> None:
+def test_an_input_of_another_name_is_reused() -> None:
     graph = Graph()
     load(graph, SETUP.replace("input: {kind", "ears: {kind").replace("parent: input", "parent: ears"))
     graph._removeProcessor("", {"name": "wide"})
@@ -122,28 +122,28 @@ def test_an_input_is_used_under_whatever_name() -> None:
 @pytest.mark.parametrize(
     ("change", "what"),
     [
-        (("fb_nChannels: 4", "fb_nChannels: 5"), "'wide' is there already and has fb_nChannels 4, in the setup 5"),
-        (("parent: ihc, ild_hSizeSec: 0.007", "parent: ihc"), "'ild' is there already and has ild_hSizeSec 0.007"),
-        (("ihc: {kind: ihc, parent: wide}", "ihc: {kind: ihc, parent: narrow}"), "hangs on 'wide'"),
+        (("fb_nChannels: 4", "fb_nChannels: 5"), "'wide' exists already and has fb_nChannels 4, in the setup 5"),
+        (("parent: ihc, ild_hSizeSec: 0.007", "parent: ihc"), "'ild' exists already and has ild_hSizeSec 0.007"),
+        (("ihc: {kind: ihc, parent: wide}", "ihc: {kind: ihc, parent: narrow}"), "is a child of 'wide'"),
         (("ild: {kind: ild", "ild: {kind: ratemap"), "of kind ild"),
         (("ratemap: {kind: ratemap", "wide: {kind: ratemap"), "twice"),
         (("nFramesPerChunk: 441", "nFramesPerChunk: 882"), "bass acquires with nFramesPerChunk 441"),
-        (("bass/Audio", "left/Audio"), "the tree hears /bass/Audio"),
-        (("{kind: input}", "{kind: input, in_doNormalize: no}"), "'input' is there already and has in_doNormalize 1"),
+        (("bass/Audio", "left/Audio"), "the tree is connected to /bass/Audio"),
+        (("{kind: input}", "{kind: input, in_doNormalize: no}"), "'input' exists already and has in_doNormalize 1"),
         (("kind: ratemap, parent: ihc", "kind: ratemap, parent: ihc, rm_wSizeSec: 1e-9"), "rm_wSizeSec"),
         (("fb_cfHz: [500, 1000]", "fb_cfHz: [500, 30000]"), "fb_cfHz"),
     ],
 )
-def test_what_does_not_go_with_what_is_there_changes_nothing(change: tuple[str, str], what: str) -> None:
+def test_a_conflict_with_existing_processors_changes_nothing(change: tuple[str, str], what: str) -> None:
     graph = Graph()
     load(graph, SETUP)
     changed = SETUP.replace(*change)
     if "ild: {kind: ratemap" in changed:
         changed = changed.replace(", ild_hSizeSec: 0.007", "")
-    assert what in str(refused(graph, changed))
+    assert what in str(rejected(graph, changed))
 
 
-def test_whatever_step_fails_nothing_is_left() -> None:
+def test_a_failure_of_any_step_leaves_nothing() -> None:
     whole = Graph()
     load(whole, SETUP)
     steps = [number for number, call in enumerate(whole.calls) if call not in ("getProcessors", "connect_port")]
@@ -151,27 +151,27 @@ def test_whatever_step_fails_nothing_is_left() -> None:
     for number in steps:
         graph = Graph()
         graph.fail[number] = ROSAFE.error("e_noMemory")
-        assert refused(graph, SETUP).ex == "::rosAFE::e_noMemory"
-        assert load(graph, SETUP)["created"] == list(whole.processors)  # nothing is in the way
+        assert rejected(graph, SETUP).ex == "::rosAFE::e_noMemory"
+        assert load(graph, SETUP)["created"] == list(whole.processors)  # there is no conflict
 
 
-def test_what_others_have_made_stays() -> None:
+def test_processors_of_other_clients_stay() -> None:
     graph = Graph()
     load(graph, SETUP)
     for name in ("ild", "ratemap"):
         graph._removeProcessor("", {"name": name})
-    before = graph.everything()
-    graph.fail[len(graph.calls) + 3] = ROSAFE.error("e_noMemory")  # two looks, one processor, and then
-    assert refused(graph, SETUP).ex == "::rosAFE::e_noMemory"
-    assert graph.everything() == before
+    before = graph.full_state()
+    graph.fail[len(graph.calls) + 3] = ROSAFE.error("e_noMemory")  # after two queries and one creation
+    assert rejected(graph, SETUP).ex == "::rosAFE::e_noMemory"
+    assert graph.full_state() == before
 
 
-def test_a_bass_that_refuses() -> None:
+def test_a_bass_that_rejects_acquire() -> None:
     graph = Graph()
     graph.bass.broken = True
-    assert refused(graph, SETUP).ex == "::bass::e_device"
+    assert rejected(graph, SETUP).ex == "::bass::e_device"
     assert "connect_port" not in graph.calls
-    assert "start it with: bass-ros" in str(refused(graph, SETUP.replace("bass/Audio", "left/Audio")))
+    assert "start it with: bass-ros" in str(rejected(graph, SETUP.replace("bass/Audio", "left/Audio")))
 
 
 def test_a_cancelled_load_leaves_nothing() -> None:
@@ -185,24 +185,32 @@ def test_a_cancelled_load_leaves_nothing() -> None:
 
     for number in range(2, 10):
         graph = asyncio.run(cancelled(number))
-        assert graph.everything() == ({}, {}), number
+        assert graph.full_state() == ({}, {}), number
 
 
-def test_a_kind_that_is_not_known_here_is_not_left_out() -> None:
+def test_an_unknown_kind_is_an_error_and_not_omitted() -> None:
     class Elsewhere(Graph):
         def _getProcessors(self, service: str, values: Mapping[str, Any]) -> dict[str, Any]:
-            told = super()._getProcessors(service, values)
-            told["processors"][-1]["kind"] = "loudness"
-            return told
+            outputs = super()._getProcessors(service, values)
+            outputs["processors"][-1]["kind"] = "loudness"
+            return outputs
 
     graph = Elsewhere()
     graph.connected = "bass/Audio"
     graph.processors["loud"] = Processor("input", "", STAGES["input"](44100.0))
-    with pytest.raises(ComponentError, match="'loud' is of kind loudness, which is not known here"):
+    with pytest.raises(ComponentError, match="'loud' is of kind loudness, which is not available here"):
         saved(graph)
 
 
-def test_a_text_that_is_no_setup() -> None:
-    error = refused(Graph(), "processors:\n  a: {kind: nothing}\n")
+def test_a_text_that_is_not_a_setup() -> None:
+    error = rejected(Graph(), "processors:\n  a: {kind: nothing}\n")
     assert error.ex == "::rosAFE::e_badNewValue"
     assert "line 2" in error.detail["what"]
+
+
+def test_an_extra_that_the_parent_does_not_provide_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    setup = read(SETUP.replace("ihc: {kind: ihc, parent: wide}", "ihc: {kind: ihc, parent: wide, ihc_method: hilbert}"))
+    dry_run(setup, 44100.0)
+    monkeypatch.setattr(STAGES["gammatone"], "EXTRAS", ())
+    with pytest.raises(ComponentError, match="'ihc' at 44100 Hz: requires the envelope, which 'wide' does not provide"):
+        dry_run(setup, 44100.0)

@@ -1,4 +1,4 @@
-"""The time of parsing grows linearly with the length of a text, whatever is in it, and has a bound."""
+"""The time for parsing is bounded, and grows linearly with the length of any text."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rosafe.interface import KINDS, MAX_ACTIVITIES, MAX_SETUP
 from rosafe.interface.rosafe import MAX_PARAMETERS
 from rosafe.setups import SetupError, markup, read, read_parameters
 
-SECONDS = 4.0  # of processor time for a text as long as may be; a quiet machine needs less than one
+SECONDS = 4.0  # of processor time for a text of maximum length; an idle machine needs less than 1 s
 
 
 def filled(unit: str, size: int, before: str = "", after: str = "") -> str:
@@ -25,7 +25,7 @@ def numbered(unit: str, size: int, before: str = "", after: str = "") -> str:
 
 
 def growing(line: str, size: int) -> str:
-    """Lines with deeper and deeper indents."""
+    """Return lines with increasing indents."""
     lines = (" " * indent + line for indent in range(int((2 * size) ** 0.5) - len(line)))
     return "".join(lines)
 
@@ -85,7 +85,7 @@ def seconds(work: Callable[[str], object], text: str) -> float:
 
 @pytest.mark.parametrize("name", WORST)
 def test_time_is_linear(name: str) -> None:
-    """Eight times the text takes eight times as long, not 64 times."""
+    """A text of eight times the length takes eight times as long, not 64 times."""
     make = WORST[name]
     part = min(seconds(read, make(2**14)) for _ in range(2))
     assert seconds(read, make(2**17)) < 32 * max(part, 0.002)
@@ -98,7 +98,7 @@ def test_time_is_bounded(name: str) -> None:
 
 
 def test_values_are_bounded() -> None:
-    """A setup may have as many processors as a node takes, with all of their parameters."""
+    """A setup can contain as many processors as a node can run, with all their parameters."""
     with pytest.raises(SetupError, match=f"expected at most {markup.MAX_VALUES} values"):
         read(filled("- a\n", MAX_SETUP))
     with pytest.raises(SetupError, match="expected at most"):
@@ -111,14 +111,14 @@ def test_values_are_bounded() -> None:
 @pytest.mark.parametrize("version", ["%YAML 1.1", "%YAML 1.2", "%YAML  1.2 # the newest", "# first\n%YAML 1.1"])
 def test_a_version_is_allowed_once(version: str) -> None:
     assert read(f"{version}\n---\nconnections: {{Audio: a}}\n").connections == {"Audio": "/a"}
-    with pytest.raises(SetupError, match="expected no directive but one"):
+    with pytest.raises(SetupError, match="expected no directive except one"):
         read(f"{version}\n%YAML 1.1\n---\na: b\n")
 
 
 @pytest.mark.parametrize("directive", ["%TAG ! tag:x", "%YAML 1.3", "%YAML 2.0", "%YAML", "%foo bar", "%"])
 @pytest.mark.parametrize("before", ["", "\ufeff", "# c\n", "\n\r\n", "a: 1\n...\n", "a: 1\r", "a: 1\x85", "a: 1\u2028"])
-def test_other_directives_are_refused(directive: str, before: str) -> None:
-    with pytest.raises(SetupError, match="expected no directive but one"):
+def test_other_directives_are_rejected(directive: str, before: str) -> None:
+    with pytest.raises(SetupError, match="expected no directive except one"):
         read(f"{before}{directive}\n---\nb: 1\n")
 
 

@@ -1,4 +1,4 @@
-"""Setups on a running graph: the command, HTTP and Tcl; wholly or not at all; the same tree after all was killed."""
+"""Setups on a running graph: by command, HTTP and Tcl; as transactions; the same tree after all nodes were killed."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
 from rosafe.setups import SetupError, read
 from tests.harness import ROOT, SCRIPTS, Graph, free_port, wait_for
@@ -45,7 +46,7 @@ def test_saved_killed_and_loaded_again(graph: Graph, file: Path, tmp_path: Path)
             "rosafe", "setup", "load", "-", check=False, stdin=file.read_text().replace("0.005", "0.006")
         )
         assert refused.returncode == 1
-        assert "'ild' is there already and has ild_hSizeSec 0.005" in refused.stderr
+        assert "'ild' exists already and has ild_hSizeSec 0.005" in refused.stderr
         assert processors(graph) == before
         for process in (bass, afe):
             process.stop(signal.SIGKILL)
@@ -53,6 +54,21 @@ def test_saved_killed_and_loaded_again(graph: Graph, file: Path, tmp_path: Path)
         graph.run("rosafe", "setup", "load", str(saved))
         assert processors(graph) == before
         assert graph.call("/bass/getAcquisition").device == "scene:"
+
+
+def test_the_settings_of_the_localizer_become_its_parameters(graph: Graph, tmp_path: Path) -> None:
+    """Files are relative to the setup. Settings that are not given are removed from the parameter server."""
+    file = tmp_path / "robot.yaml"
+    with graph.node("rosAFE-ros"):
+        for settings, expected in (
+            ("{head: robot.head, audio_delay: 0.02}", {"head": str(tmp_path / "robot.head"), "audio_delay": 0.02}),
+            ("{head: sphere}", {"head": "sphere"}),
+        ):
+            file.write_text(f"localizer: {settings}\n")
+            done = graph.run("rosafe", "setup", "load", str(file))
+            assert done.stdout == "set      parameters of the localizer; start it with: rosafe localize\n"
+            assert yaml.safe_load(graph.run("rosparam", "get", "/localizer").stdout) == expected
+        graph.run("rosparam", "delete", "/localizer")
 
 
 def test_by_http_and_tcl(graph: Graph, file: Path, tmp_path: Path) -> None:
@@ -77,9 +93,9 @@ def test_by_http_and_tcl(graph: Graph, file: Path, tmp_path: Path) -> None:
         wait_for(serves, what="genomixd")
         with pytest.raises(urllib.error.HTTPError) as error:
             ask("loadSetup", setup=text.replace("kind: ild", "kind: idl"))
-        told = json.load(error.value)
-        assert told["ex"] == "::rosAFE::e_badNewValue"
-        assert "line 12: 'ild': 'idl' is no kind" in told["detail"]["what"]
+        response = json.load(error.value)
+        assert response["ex"] == "::rosAFE::e_badNewValue"
+        assert "line 12: 'ild': unknown kind 'idl'" in response["detail"]["what"]
         assert processors(graph) == []
         assert not graph.call("/bass/getAcquisition").running
         answer = ask("loadSetup", setup=text)
@@ -107,10 +123,10 @@ def test_by_http_and_tcl(graph: Graph, file: Path, tmp_path: Path) -> None:
         (("save", "FILE", "--keep", "x"), 2, "--keep is for load"),
         (("show", "FILE"), 2, "invalid choice"),
         (("save", "FILE", "-i", "nobody"), 1, "start it with: rosAFE-ros -i nobody"),
-        (("load", "FILE", "--wait", "nan"), 2, "is no time"),
+        (("load", "FILE", "--wait", "nan"), 2, "expected a number of seconds from 0 to 3600"),
     ],
 )
-def test_what_is_typed_wrong(graph: Graph, file: Path, arguments: tuple[str, ...], code: int, what: str) -> None:
+def test_invalid_command_lines(graph: Graph, file: Path, arguments: tuple[str, ...], code: int, what: str) -> None:
     before = file.read_bytes()
     words = [str(file) if word == "FILE" else word for word in arguments]
     done = graph.run("rosafe", "setup", *words, check=False)
@@ -120,7 +136,7 @@ def test_what_is_typed_wrong(graph: Graph, file: Path, arguments: tuple[str, ...
     assert file.read_bytes() == before
 
 
-def test_every_setup_that_is_shown_or_shipped_can_be_read() -> None:
+def test_all_setups_in_documents_and_examples_can_be_read() -> None:
     shown = re.findall(r"^```yaml\n(.*?)^```$", (ROOT / "docs" / "setups.md").read_text("utf-8"), re.M | re.S)
     shipped = [path.read_text("utf-8") for path in sorted((ROOT / "setups").glob("*.yaml"))]
     assert shown
@@ -128,5 +144,5 @@ def test_every_setup_that_is_shown_or_shipped_can_be_read() -> None:
     for text in (*shown, *shipped):
         assert read(text).processors
     wrong = shown[0].replace("ild_hSizeSec: 0.005", "ild_hSizeSec: -1")
-    with pytest.raises(SetupError, match="'ild': ild_hSizeSec: -1 is out of range, allowed is more than 0 to 60"):
+    with pytest.raises(SetupError, match="'ild': ild_hSizeSec: expected a number above 0, at most 60, got -1"):
         read(wrong)

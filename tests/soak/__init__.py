@@ -1,4 +1,4 @@
-"""The soak: real nodes under load and faults for as long as one likes. `scripts/soak` runs it, the suite one round."""
+"""The soak: real nodes under load and faults for any time. `scripts/soak` runs it; the test suite runs one round."""
 
 from rosafe.component import generate
 

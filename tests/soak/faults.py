@@ -1,4 +1,4 @@
-"""What is done to the nodes in a round of the soak: one function for each, which raises AssertionError."""
+"""Faults of the nodes in a round of the soak: one function for each, which raises AssertionError."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import rospy
 
 from rosafe.component import serialization
 from tests.harness import run_together, wait_for
-from tests.ros.session import reader, told
+from tests.ros.session import error_of, reader
 from tests.soak.world import NAMES, World, following, wait_out
 
 CHANGES = [
@@ -28,7 +28,7 @@ CHANGES = [
 
 
 def subscriber_dies(world: World, chance: random.Random) -> None:
-    """A subscriber stops amid the largest messages, and is killed then."""
+    """A subscriber of the largest messages is stopped and then killed."""
     with reader(world.graph, world.afe.topic("gammatone")) as process:
         os.kill(process.pid, signal.SIGSTOP)
         index = world.afe.read("input").lastFrameIndex
@@ -37,7 +37,7 @@ def subscriber_dies(world: World, chance: random.Random) -> None:
 
 
 def garbage(world: World, chance: random.Random) -> None:
-    """A second publisher of Audio sends what nobody can use, amid the messages of bass."""
+    """A second publisher of Audio sends malformed messages between those of bass."""
     message_class = serialization.message_class("bass", "::binaudio::portStruct")
     publisher = rospy.Publisher("/bass/Audio", message_class, queue_size=100, tcp_nodelay=True)
     try:
@@ -65,7 +65,7 @@ def garbage(world: World, chance: random.Random) -> None:
 
 
 def crowd(world: World, chance: random.Random) -> None:
-    """Hundreds of processors at once; all get a block, all go."""
+    """Hundreds of processors are added, get a block and are removed."""
     count = world.size.crowd
 
     def each(client: int, request: str, field: str, **more: Any) -> None:
@@ -80,7 +80,7 @@ def crowd(world: World, chance: random.Random) -> None:
 
 
 def cycles(world: World, chance: random.Random) -> None:
-    """Branches come and go."""
+    """Branches of the tree are added and removed."""
     for number in range(world.size.cycles):
         world.afe.ok("GammatoneProc", name="come", fb_nChannels=2)
         world.afe.ok("IhcProc", name="and", upperDepName="come")
@@ -89,7 +89,7 @@ def cycles(world: World, chance: random.Random) -> None:
 
 
 def clients(world: World, chance: random.Random) -> None:
-    """Eight clients do what comes to their minds, on branches of their own and on each other's."""
+    """Eight clients send random requests for their own and each other's branches."""
     seed = chance.random()
 
     def work(client: int) -> None:
@@ -110,7 +110,7 @@ def clients(world: World, chance: random.Random) -> None:
             request, fields = mine.choice(requests)
             response = world.afe.call(request, **fields)
             if not response.genom_success:
-                told(response)
+                error_of(response)
 
     run_together(8, work)
     for name in [n for n in world.afe.processors()["gammatone"] if n.startswith("client")]:
@@ -118,7 +118,7 @@ def clients(world: World, chance: random.Random) -> None:
 
 
 def changes(world: World, chance: random.Random) -> None:
-    """Parameters change while the processor runs, to good values and bad ones."""
+    """Parameters of a running processor are changed to valid and invalid values."""
     world.afe.ok("GammatoneProc", name="changing", fb_nChannels=2)
     for name, value in chance.sample(CHANGES, len(CHANGES)):
         response = world.afe.call("modifyParameter", nameProc="changing", nameParam=name, newValue=value)
@@ -129,19 +129,19 @@ def changes(world: World, chance: random.Random) -> None:
 
 
 def master_dies(world: World, chance: random.Random) -> None:
-    """The master is killed, and another one comes at the same address."""
+    """The master is killed, and another one is started at the same address."""
     world.master.kill()
     world.bring_master()
 
 
-def bass_hiccups(world: World, chance: random.Random) -> None:
-    """bass is held for less than its window is long: nothing is lost."""
+def bass_is_stopped_briefly(world: World, chance: random.Random) -> None:
+    """bass is stopped for less than the length of its window: no frame is lost."""
     with world.held(world.bass):
         wait_out(0.5)
 
 
-def genomix_asks(world: World, chance: random.Random) -> None:
-    """Everything that genomixd passes on."""
+def genomix_requests(world: World, chance: random.Random) -> None:
+    """Requests by genomixd."""
     port = world.http.call(f"rosAFE/ildPort/{NAMES['ild']}")["ildPort"]
     assert port["framesOnPort"] == 100 and port["right"] == {"dataN": []}
     assert world.http.call("rosAFE/getDependencies", [NAMES["ild"]])["dependencies"][0] == NAMES["input"]
@@ -156,16 +156,16 @@ DURING = (
     clients,
     changes,
     master_dies,
-    bass_hiccups,
-    genomix_asks,
+    bass_is_stopped_briefly,
+    genomix_requests,
 )
 
 
 def the_source_dies_and_the_node_is_held(world: World) -> None:
-    """bass is killed and comes back, and is heard without help; then rosAFE is held for longer than a window lasts.
+    """bass is killed and restarted, and rosAFE reconnects. Then rosAFE is stopped for longer than a window.
 
-    Whatever happens, a frame on the input's port is the one that its number tells, or was lost, counted, and is zero.
-    (How much is lost is up to the system, which keeps some messages for a process that does not read.)
+    Each frame on the input's port is the one with its number, or it is zero and counted as lost. The number of lost
+    frames depends on the system, which buffers some messages for a process that does not read.
     """
     blocks = 3 * world.size.block
     world.acquire()

@@ -1,4 +1,4 @@
-"""Peers of the nodes that keep to no rule: connections that say nothing, or lie about what is to come."""
+"""Misbehaving peers of the nodes: connections that send nothing, or announce wrong lengths."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from rosgraph.network import decode_ros_handshake_header, encode_ros_handshake_h
 from tests.harness import PATIENCE, Graph
 
 Address = tuple[str, int]
-MOST = b"\xff\xff\xff\xff"  # the length word of a message of 4 GiB
+MAX_LENGTH = b"\xff\xff\xff\xff"  # the length word of a message of 4 GiB
 
 
-def doors(graph: Graph, node: str) -> dict[str, Address]:
-    """Where a node listens: its TCPROS and its XML-RPC port."""
+def node_addresses(graph: Graph, node: str) -> dict[str, Address]:
+    """Return the addresses of a node's TCPROS and XML-RPC ports."""
     master = rosgraph.Master("/peer", master_uri=graph.uri)
     found = {"TCPROS": master.lookupService(f"/{node}/kill"), "XML-RPC": master.lookupNode(f"/{node}")}
     return {name: _address(uri) for name, uri in found.items()}
@@ -34,7 +34,7 @@ def _address(uri: str) -> Address:
 
 
 def connect(address: Address, text: bytes = b"") -> socket.socket:
-    """A connection on which `text` was sent; the other side may have closed it already."""
+    """Return a connection on which `text` was sent. The peer may have closed it already."""
     connection = socket.create_connection(address, timeout=PATIENCE)
     with suppress(ConnectionError):
         connection.sendall(text)
@@ -43,19 +43,19 @@ def connect(address: Address, text: bytes = b"") -> socket.socket:
 
 @contextmanager
 def crowd(address: Address, count: int, text: bytes = b"") -> Iterator[list[socket.socket]]:
-    """So many connections at the same time, each of which says `text`, as many as are taken."""
+    """Open up to `count` connections and send `text` on each of them. Fewer are opened if the peer rejects them."""
     with ExitStack() as stack:
         connections = []
         for _ in range(count):
             try:
                 connections.append(stack.enter_context(connect(address, text)))
-            except OSError:  # turned away, or nobody takes any more
+            except OSError:  # rejected
                 break
         yield connections
 
 
 def closed(connection: socket.socket) -> bool:
-    """Whether the other side has closed it; what it sent before is thrown away."""
+    """Return whether the peer has closed the connection. Received data is discarded."""
     connection.setblocking(False)
     try:
         while connection.recv(2**20):
@@ -67,12 +67,12 @@ def closed(connection: socket.socket) -> bool:
     return True
 
 
-def pour(connection: socket.socket, most: int, text: bytes = bytes(2**20)) -> int:
-    """Send `text` again and again until the other side closes or takes no more, but `most` bytes; how many went."""
+def flood(connection: socket.socket, limit: int, text: bytes = bytes(2**20)) -> int:
+    """Send `text` repeatedly until the peer closes or stops reading, up to `limit` bytes. Return the sent bytes."""
     connection.settimeout(2.0)
     sent = 0
     with suppress(OSError):
-        while sent < most:
+        while sent < limit:
             sent += connection.send(text)
     return sent
 
@@ -81,14 +81,14 @@ def pour(connection: socket.socket, most: int, text: bytes = bytes(2**20)) -> in
 
 
 def call_header(service: str) -> bytes:
-    """How a client of a service begins."""
+    """Return the connection header of a client of a service."""
     fields = {"service": service, "md5sum": "*", "callerid": "/peer", "persistent": "1"}
     return bytes(encode_ros_handshake_header(fields))
 
 
 @contextmanager
 def deaf_subscriber(graph: Graph, node: str, topic: str, message_class: Any) -> Iterator[socket.socket]:
-    """A subscriber that makes itself known and then reads nothing."""
+    """A subscriber that connects and then reads nothing."""
     api = ServerProxy(rosgraph.Master("/peer", master_uri=graph.uri).lookupNode(f"/{node}"))
     answer: Any = api.requestTopic("/peer", topic, [["TCPROS"]])
     _, host, port = answer[2]
@@ -103,12 +103,12 @@ def deaf_subscriber(graph: Graph, node: str, topic: str, message_class: Any) -> 
 
 
 class LyingPublisher:
-    """A publisher whose first message is said to have 4 GiB, and who sends until nobody takes any more."""
+    """A publisher that announces a message of 4 GiB and sends data until the peer stops reading."""
 
-    def __init__(self, topic: str, message_class: Any, most: int) -> None:
+    def __init__(self, topic: str, message_class: Any, limit: int) -> None:
         self.sent = 0  # bytes, on all connections
-        self.closed = threading.Event()  # by the other side
-        self._topic, self._class, self._most = topic, message_class, most
+        self.closed = threading.Event()  # by the peer
+        self._topic, self._class, self._limit = topic, message_class, limit
         self._listener = socket.create_server(("127.0.0.1", 0))
         self._api = SimpleXMLRPCServer(("127.0.0.1", 0), logRequests=False, allow_none=True)
         self._api.register_function(self._request_topic, "requestTopic")
@@ -131,8 +131,8 @@ class LyingPublisher:
         connection.settimeout(PATIENCE)
         stream = connection.makefile("rb")
         header = stream.read(int.from_bytes(stream.read(4), "little"))
-        asked = decode_ros_handshake_header(len(header).to_bytes(4, "little") + header)
-        assert asked["topic"] == self._topic
+        subscribed = decode_ros_handshake_header(len(header).to_bytes(4, "little") + header)
+        assert subscribed["topic"] == self._topic
         fields = {
             "topic": self._topic,
             "md5sum": self._class._md5sum,
@@ -140,10 +140,10 @@ class LyingPublisher:
             "callerid": "/peer",
             "message_definition": "",
         }
-        connection.sendall(bytes(encode_ros_handshake_header(fields)) + MOST)
-        sent = pour(connection, self._most)
+        connection.sendall(bytes(encode_ros_handshake_header(fields)) + MAX_LENGTH)
+        sent = flood(connection, self._limit)
         self.sent += sent
-        if sent < self._most:
+        if sent < self._limit:
             self.closed.set()
 
     def close(self) -> None:
@@ -152,8 +152,8 @@ class LyingPublisher:
         self._listener.close()
 
     @contextmanager
-    def known(self, graph: Graph) -> Iterator[None]:
-        """The master knows it, and has told its subscribers."""
+    def registered(self, graph: Graph) -> Iterator[None]:
+        """Register it at the master, which notifies the subscribers."""
         master = rosgraph.Master("/peer", master_uri=graph.uri)
         master.registerPublisher(self._topic, self._class._type, self.uri)
         try:

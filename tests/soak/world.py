@@ -1,4 +1,4 @@
-"""The nodes that are soaked, the sound that they hear, and what must hold whatever is done to them."""
+"""The nodes of the soak, their audio, and the checks that must pass during and after every fault."""
 
 from __future__ import annotations
 
@@ -31,48 +31,48 @@ from tests.ros.session import Session, assert_holds
 NAMES = {kind: ROSAFE.service(entry.request).parameter("name").default for kind, entry in CORE_REPRESENTATIONS.items()}
 TREE = {kind: [name] for kind, name in NAMES.items()}
 CHUNKS = 20  # on bass' port, as by default
-DRIFT = 0.15  # seconds that bass' frames may be off the clock: a chunk more or less, and a busy machine
-SLOWER = 3.0  # or so many times what it took before, where the machine has much other work
-PEAK_MEMORY = 160 * 2**20  # bytes that a process may take for a moment, for what others say is to come
-MORE_MEMORY = 64 * 2**20  # bytes that a process may have more once all is over
-MORE_THREADS, MORE_FILES = 8, 16  # and threads and files: clients that are just leaving
+DRIFT = 0.15  # s, maximum deviation of bass' frames from the clock: one chunk, and a busy machine
+SLOWER = 3.0  # an answer may take this many times the first one's time, if the machine is busy
+PEAK_MEMORY = 160 * 2**20  # bytes, maximum temporary increase for announced messages
+MORE_MEMORY = 64 * 2**20  # bytes, maximum increase after an attack
+MORE_THREADS, MORE_FILES = 8, 16  # likewise: clients that are disconnecting
 T = TypeVar("T")
 
 
 @dataclass(frozen=True)
 class Size:
-    """How much is asked of the machine."""
+    """The load of a soak."""
 
     rate: int
     chunk: int
     block: int
-    channels: int  # 0: as by default
-    crowd: int  # processors at once, besides the tree
+    channels: int  # 0: the default
+    crowd: int  # processors that are added together
     cycles: int  # of creation and removal in a round
-    connections: int  # of those who mean ill, to one port
-    mixed_seconds: float  # of all of it at once
-    answer_seconds: float  # for a fresh client to be answered, whatever others do
+    connections: int  # of an attack on one port
+    mixed_seconds: float  # of all attacks together
+    answer_seconds: float  # maximum time until a new client is answered
 
 
 DEFAULT = Size(44100, 2205, 12000, 0, 200, 100, 2100, 60.0, 2.0)
-LIGHT = Size(20000, 800, 4000, 3, 48, 10, 300, 3.0, 6.0)  # beside other tests
+LIGHT = Size(20000, 800, 4000, 3, 48, 10, 300, 3.0, 6.0)  # while other tests run
 
 
 @dataclass
-class Use:
-    """What one process takes of the machine."""
+class ResourceUse:
+    """The resources of a process."""
 
     threads: int
     files: int
     memory: int  # resident bytes
 
     @classmethod
-    def of(cls, pid: int) -> Use:
+    def of(cls, pid: int) -> ResourceUse:
         status = dict(line.split(":", 1) for line in proc(pid, "status").read_text().splitlines())
         return cls(int(status["Threads"]), len(list(proc(pid, "fd").iterdir())), int(status["VmRSS"].split()[0]) * 1024)
 
-    def exceeds(self, other: Use) -> str:
-        """What is more than in `other`, if it is much."""
+    def exceeds(self, other: ResourceUse) -> str:
+        """Return the resource that exceeds `other` by more than the limit, or an empty string."""
         if self.memory > other.memory + MORE_MEMORY:
             return "memory"
         if self.threads > other.threads + MORE_THREADS:
@@ -84,16 +84,16 @@ class Use:
 
 
 class World:
-    """A master, bass, rosAFE and genomixd. bass plays noise in a loop, so that a frame's number tells its samples."""
+    """A master, bass, rosAFE and genomixd. bass plays noise in a loop, so that a frame's number determines it."""
 
     def __init__(self, size: Size, graph: harness.Graph, master: harness.MasterProcess, stack: ExitStack) -> None:
         self.size = size
         self.graph = graph
         self.master = master
         self.refused = 0  # messages that were garbage
-        self.slowest = (0.0, "")  # of the answers to fresh clients
-        self._turn = False
-        self._usual: dict[str, float] = {}  # seconds that such an answer took at first
+        self.slowest = (0.0, "")  # answer to a new client: seconds, request
+        self._second_service = False
+        self._first_seconds: dict[str, float] = {}  # time of the first answer, by request
         self._bass = ExitStack()
         self.sound = self._noise(int(7.3 * size.rate))
         self._file = graph.home / "noise.wav"
@@ -115,12 +115,12 @@ class World:
         return (chance.integers(2**10, 2**30, (2, frames)) * chance.choice([-1, 1], (2, frames))).astype(np.int32)
 
     def frames(self, first: int, count: int) -> np.ndarray:
-        """What bass plays from frame number `first` (the first one is 1) on, (2, count)."""
+        """Return `count` frames that bass plays from number `first` on (the first one is 1), (2, count)."""
         return self.sound[:, (np.arange(first - 1, first - 1 + count)) % self.sound.shape[1]]
 
     @property
     def window_seconds(self) -> float:
-        """How long bass' window is."""
+        """Length of bass' window."""
         return CHUNKS * self.size.chunk / self.size.rate
 
     # --- bass ---
@@ -134,7 +134,7 @@ class World:
         assert self.graph.call("/bass/DedicatedSocket").genom_success
 
     def acquire(self) -> None:
-        """Let bass begin anew with frame 1."""
+        """Restart the stream of bass with frame 1."""
         answer = self.graph.call(
             "/bass/Acquire",
             device=f"file:{self._file}?loop=1",
@@ -144,7 +144,7 @@ class World:
         assert answer.genom_success, answer.genom_exdetail
 
     def audio(self) -> tuple[int, float]:
-        """Index and time of bass' newest frame."""
+        """Return index and time of bass' newest frame."""
         message = self.graph.message("/bass/Audio", accept=lambda m: m.lastFrameIndex > 0)
         return message.lastFrameIndex, message.stamp.sec + message.stamp.nsec / 1e9
 
@@ -152,9 +152,9 @@ class World:
 
     @contextmanager
     def stream(self) -> Iterator[None]:
-        """The whole tree on a stream that begins with frame 1; at its end, all that came of it is looked at.
+        """Build the whole tree on a stream that begins with frame 1, and check all its output at the end.
 
-        Nothing may be lost in it, and bass must keep time.
+        No frame may be lost, and bass must keep time.
         """
         assert self.graph.call("/bass/Stop").genom_success
         self.afe.ok("Stop")
@@ -173,19 +173,19 @@ class World:
         assert self.graph.call("/bass/Stop").genom_success
         self.verify()
         after = self.counters()
-        for what in ("lost", "breaks"):
-            assert after[what] == before[what], f"{what}: {after[what] - before[what]} more; {after['last loss']}"
+        for name in ("lost", "breaks"):
+            assert after[name] == before[name], f"{name}: {after[name] - before[name]} more; {after['last loss']}"
         assert after["refused"] == self.refused, f"{after['refused']} messages refused, {self.refused} were garbage"
 
     def verify(self) -> None:
-        """All ports hold, bit for bit, what `rosafe.process` makes of the same frames, by their absolute numbers."""
+        """Check that all ports contain exactly the output of `rosafe.process` for the same frames."""
         end = self.graph.message("/bass/Audio").lastFrameIndex // self.size.block * self.size.block
-        truth = {}
+        expected = {}
 
         def keep(kind: str, branch: int, block: Any) -> None:
-            if kind not in truth:
-                truth[kind] = SlidingWindow(block.data.shape[:-1], frames_in(1.0, block.rate))
-            truth[kind].append(block.data)
+            if kind not in expected:
+                expected[kind] = SlidingWindow(block.data.shape[:-1], frames_in(1.0, block.rate))
+            expected[kind].append(block.data)
 
         parameters = check_parameters({"fb_nChannels": self.size.channels} if self.size.channels else {})
         blocks = (self.frames(first, self.size.block) for first in range(1, end, self.size.block))
@@ -194,98 +194,100 @@ class World:
         ) as chain:
             chain.run()
         for kind in CORE_REPRESENTATIONS:
-            assert_holds(self.afe.read(kind, end + 1), kind, truth[kind].view().array())
+            assert_holds(self.afe.read(kind, end + 1), kind, expected[kind].padded_view(expected[kind].frames).array())
 
     def counters(self) -> dict[str, Any]:
-        """What rosAFE counts of the audio, from /diagnostics."""
+        """Return the counters of the audio, from /diagnostics."""
         entries = self.afe.health(lambda _: True, "audio")
         return {key: int(value) if value.isdigit() else value for key, value in entries.items()}
 
-    def alive(self) -> None:
-        """All processes are, and none has stumbled."""
+    def check_alive(self) -> None:
+        """Check that all processes are running, and that none has logged a traceback."""
         for process in (self.afe.process, self.bass, self.genomixd):
             assert process.alive, f"it has ended: {process}"
             assert "Traceback" not in process.err, process
         assert self.http.call("rosAFE/getParameters")["parameters"]["input"][0]["name"] == "input"
 
-    def use(self) -> dict[str, Use]:
-        """What the processes take."""
+    def use(self) -> dict[str, ResourceUse]:
+        """Return the resources of the processes."""
         processes = {"rosAFE": self.afe.process, "bass": self.bass, "genomixd": self.genomixd}
-        return {name: Use.of(process.pid) for name, process in processes.items()}
+        return {name: ResourceUse.of(process.pid) for name, process in processes.items()}
 
     # --- attacks ---
 
-    def unharmed(self, when: str = "") -> None:
-        """Whoever comes anew is answered in time: rosservice by one node, rostopic by the other, in turn, and HTTP."""
+    def check_responsive(self, when: str = "") -> None:
+        """Check that new clients are answered in time: rosservice and rostopic by the nodes in turn, and HTTP."""
         services = [("/rosAFE/getDependencies", "{nameProc: input}"), ("/bass/abort_activity", "{activity: 0}")]
         topics = ["/bass/Audio", self.afe.topic("ild")]
         service, topic = services[0], topics[0]
-        if self._turn:
+        if self._second_service:
             service, topic = services[1], topics[1]
-        self._turn = not self._turn
+        self._second_service = not self._second_service
         commands = [("rosservice", "call", *service), ("rostopic", "echo", "-n", "1", "--noarr", topic)]
 
         def run(number: int) -> str:
             return self.quick(commands[number][0], lambda: self.graph.run(*commands[number]).stdout)
 
-        called, heard = run_together(len(commands), run)
+        called, echoed = run_together(len(commands), run)
         assert "genom_success: True" in called or "no_such_activity" in called, f"{when}: {called}"
-        assert "lastFrameIndex" in heard, f"{when}: {heard}"
-        for node in ("rosAFE", "bass"):  # connections of a client that does not have to start first
+        assert "lastFrameIndex" in echoed, f"{when}: {echoed}"
+        for node in ("rosAFE", "bass"):  # clients in this process, without the time to start one
             answer = self.quick("a new client", lambda: self.graph.call(f"/{node}/abort_activity", activity=0))  # noqa: B023
             assert "no_such_activity" in answer.genom_exdetail, f"{when}: {answer}"
         answer = self.quick("HTTP", lambda: self.http.call("rosAFE/getDependencies", ["input"]))
         assert answer == {"dependencies": ["input"]}, f"{when}: {answer}"
         assert self.quick("HTTP", lambda: self.http.call("bass/genom_state"))["genom_state"], when
 
-    def quick(self, what: str, work: Callable[[], T]) -> T:
-        """The result of what takes no longer than it may; how long is kept in `slowest`."""
+    def quick(self, request: str, work: Callable[[], T]) -> T:
+        """Return the result of `work`, and check its time, which is recorded in `slowest`."""
         begin = time.monotonic()
         result = work()
-        took = time.monotonic() - begin
-        self.slowest = max(self.slowest, (took, what))
-        limit = max(self.size.answer_seconds, SLOWER * self._usual.setdefault(what, took))
-        assert took <= limit, f"{what} took {took:.2f} s, {limit:.2f} go"
+        seconds = time.monotonic() - begin
+        self.slowest = max(self.slowest, (seconds, request))
+        limit = max(self.size.answer_seconds, SLOWER * self._first_seconds.setdefault(request, seconds))
+        assert seconds <= limit, f"{request} took {seconds:.2f} s, the limit is {limit:.2f}"
         return result
 
-    def recovers(self, before: dict[str, Use]) -> None:
-        """Memory, threads and descriptors come back to what they were."""
+    def recovers(self, before: dict[str, ResourceUse]) -> None:
+        """Wait until memory, threads and descriptors are down to the previous values."""
 
         def more() -> list[str]:
             return [
                 f"{name}: {use}, before {before[name]}" for name, use in self.use().items() if use.exceeds(before[name])
             ]
 
-        wait_for(lambda: not more(), what=lambda: f"an end of what was taken; {more()}")
+        wait_for(lambda: not more(), what=lambda: f"resources are freed; {more()}")
 
     @contextmanager
     def bounded_memory(self) -> Iterator[None]:
-        """No process takes much memory meanwhile, not for a moment."""
+        """Check that no process needs much memory in the meantime."""
         before = self.use()
         processes = (self.afe.process, self.bass, self.genomixd)
         for process in processes:
-            proc(process.pid, "clear_refs").write_text("5")  # what it had at most is what it has
+            proc(process.pid, "clear_refs").write_text("5")  # reset the peak
         yield
         for process, (name, use) in zip(processes, before.items(), strict=True):
             status = dict(line.split(":", 1) for line in proc(process.pid, "status").read_text().splitlines())
             peak = int(status["VmHWM"].split()[0]) * 1024
-            assert peak < use.memory + PEAK_MEMORY, f"{name}: {peak / 2**20:.0f} MiB at most, before {use}"
+            assert peak < use.memory + PEAK_MEMORY, f"{name}: {peak / 2**20:.0f} MiB at peak, before {use}"
 
     def refuses(self, device: str) -> None:
-        """bass does not take a device, says so by name, and what it plays goes on."""
+        """Check that bass rejects a device with the named error."""
         answer = self.graph.call("/bass/Acquire", device=device)
         assert not answer.genom_success and "::bass::e_device" in answer.genom_exdetail, (device, answer)
 
     def bring_master(self) -> None:
-        """A master comes at the address of the one that was killed, and is told of everything that is there."""
+        """Start a master at the address of the one that was killed, and wait until all nodes are registered there."""
         self.master.start(self.graph.env)
-        wanted = {f"/{component.name}/{service.name}" for component in (ROSAFE, BASS) for service in component.services}
-        wait_for(lambda: wanted <= self.graph.services(), what=lambda: str(wanted - self.graph.services()))
+        expected = {
+            f"/{component.name}/{service.name}" for component in (ROSAFE, BASS) for service in component.services
+        }
+        wait_for(lambda: expected <= self.graph.services(), what=lambda: str(expected - self.graph.services()))
         wait_for(lambda: {self.afe.topic("ild"), "/bass/Audio"} <= self.graph.topics())
 
     @contextmanager
     def held(self, process: harness.Process) -> Iterator[None]:
-        """Stop a process for as long as the `with` lasts."""
+        """Stop a process inside the `with` block."""
         os.kill(process.pid, signal.SIGSTOP)
         try:
             yield
@@ -294,7 +296,7 @@ class World:
 
 
 class Follower:
-    """Looks at every message of the input's port: each frame is the one that its number tells, or lost and zero."""
+    """Checks every message of the input's port: each frame is the one with its number, or it is lost and zero."""
 
     def __init__(self, world: World) -> None:
         self.lost = 0
@@ -305,7 +307,7 @@ class Follower:
         self._lock = threading.Lock()
 
     def append(self, message: Any) -> None:
-        """Take one message."""
+        """Check a message."""
         with self._lock:
             if message.lastFrameIndex < self.index:
                 self.begun, self.index = self.begun + 1, 1
@@ -319,7 +321,7 @@ class Follower:
                 if not self.wrong and not np.array_equal(held[:, ~lost], truth[:, ~lost]):
                     self.wrong = f"wrong samples before index {message.lastFrameIndex}"
 
-    def goes_on(self) -> None:
+    def wait_for_block(self) -> None:
         """Wait for another block."""
         wait_for(lambda: self.begun)
         index = self.index
@@ -328,7 +330,7 @@ class Follower:
 
 @contextmanager
 def following(world: World) -> Iterator[Follower]:
-    """A follower of the input's port, from the next block on."""
+    """Follow the input's port from the next block on."""
     follower = Follower(world)
     message_class = serialization.message_class("rosAFE", ROSAFE.port("inputProcPort").idl)
     subscriber = rospy.Subscriber(world.afe.topic("input"), message_class, follower.append, buff_size=2**22)
@@ -340,17 +342,17 @@ def following(world: World) -> Iterator[Follower]:
 
 @contextmanager
 def world(size: Size, home: Path) -> Iterator[World]:
-    """A world that is up. rospy in this process belongs to it."""
+    """Start a world. rospy in this process is part of it."""
     with harness.private_graph(home) as (graph, master), ExitStack() as stack:
         os.environ.update(ROS_MASTER_URI=graph.uri, ROS_IP="127.0.0.1", ROS_HOME=str(home / ".ros"))
-        registrar = registration.init_node("soak", ["soak"])  # which finds its way to a master that was restarted
-        genpy.Message.longest_sequence = 2**26  # here, what the nodes send is no attack, however long
+        registrar = registration.init_node("soak", ["soak"])  # it registers at a restarted master too
+        genpy.Message.longest_sequence = 2**26  # in this process, long messages of the nodes are accepted
         stack.callback(registrar.end)
         yield World(size, graph, master, stack)
 
 
 def recorded(world: World, path: Path) -> int:
-    """How many frames a recording has, each of which is the one that follows in what bass plays."""
+    """Return the number of frames of a recording, and check that they are successive frames of bass."""
     samples = soundfile.read(path, dtype="int32")[0].T
     begin = np.flatnonzero((world.sound == samples[:, :1]).all(axis=0))
     assert len(begin) == 1, f"{path} begins with {samples[:, :1]}"
@@ -359,14 +361,14 @@ def recorded(world: World, path: Path) -> int:
 
 
 def later(seconds: float) -> Callable[[], bool]:
-    """Whether so much time has gone by since this was called."""
-    over = threading.Event()
-    timer = threading.Timer(seconds, over.set)
+    """Return a function that returns whether `seconds` have elapsed since this call."""
+    elapsed = threading.Event()
+    timer = threading.Timer(seconds, elapsed.set)
     timer.daemon = True
     timer.start()
-    return over.is_set
+    return elapsed.is_set
 
 
 def wait_out(seconds: float) -> None:
-    """Let so much time go by."""
+    """Wait for `seconds`."""
     wait_for(later(seconds), seconds + 10)

@@ -1,4 +1,4 @@
-"""docs/security.md: what the page says listens is what listens, and its firewall lets in whom it should."""
+"""docs/security.md: the listed ports are those that listen, and the firewall admits only the partner."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from rosafe.genomix import routes as api
 from rosafe.http_server import connections
 from rosafe.interface import MAX_SETUP
 from rosafe.interface.rosafe import MAX_PARAMETERS
-from rosafe.live import client, server, views
+from rosafe.live import client, server, subscriptions, views
 from rosafe.setups import markup, reading
 from rosafe.transport import handshake_server, self_check, server_limits
 from tests.genomix.world import Http, genomixd
@@ -34,29 +34,29 @@ LOOPBACK, EVERYWHERE = "127.0.0.1", "0.0.0.0"
 
 
 def rows(heading: str) -> list[list[str]]:
-    """The rows of the table under a heading of the page."""
+    """Return the rows of the table under a heading of the page."""
     section = PAGE.partition(f"## {heading}\n")[2].partition("\n## ")[0]
     lines = [line for line in section.splitlines() if line.startswith("|")][2:]
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in lines]
 
 
-def promised(ros_address: str) -> dict[str, Counter[tuple[str, str]]]:
-    """What each program listens on, as the page says: how often (port or `any`, address)."""
+def documented(ros_address: str) -> dict[str, Counter[tuple[str, str]]]:
+    """Return the documented sockets of each program, as counts by (port or `any`, address)."""
     found: dict[str, Counter[tuple[str, str]]] = {}
-    for programs, _, port, address in rows("What listens where"):
-        where = ros_address if address == "as `ROS_IP` says" else address.split()[0]
+    for programs, _, port, address in rows("Listening ports"):
+        where = ros_address if address == "by `ROS_IP`" else address.split()[0]
         for program in re.findall("`(.*?)`", programs):
             found.setdefault(program, Counter())[port.split()[0], where] += 1
     return found
 
 
 def listening(pid: int, ports: dict[int, str]) -> Counter[tuple[str, str]]:
-    """What a process listens on; `ports` are those that are not any, and what the page calls them."""
+    """Return the sockets on which a process listens. `ports` are the names of fixed ports in the page."""
     inodes = set()
     for path in proc(pid, "fd").iterdir():
         try:
             inodes.add(path.readlink().name)
-        except OSError:  # closed meanwhile
+        except OSError:  # closed in the meantime
             continue
     found: Counter[tuple[str, str]] = Counter()
     for table in ("tcp", "tcp6", "udp", "udp6"):
@@ -71,7 +71,7 @@ def listening(pid: int, ports: dict[int, str]) -> Counter[tuple[str, str]]:
 
 
 def own_address() -> str:
-    """An address of this machine that is no loopback address; the test is skipped where there is none."""
+    """Return an address of this machine other than loopback. Without one, the test is skipped."""
     if shutil.which("ip") is None:
         pytest.skip("no command ip")
     shown = subprocess.run(["ip", "-4", "-o", "address"], capture_output=True, text=True, check=True).stdout
@@ -83,8 +83,8 @@ def own_address() -> str:
 
 @pytest.mark.ros
 @pytest.mark.parametrize("setting", ["loopback", "unset", "an address"])
-def test_what_the_page_says_listens(setting: str, tmp_path: Path) -> None:
-    """Master, nodes, genomixd, the live page and the dedicated socket, beside each other as on a robot."""
+def test_the_documented_sockets_listen(setting: str, tmp_path: Path) -> None:
+    """Master, nodes, genomixd, the live page and the dedicated socket run together, as on a robot."""
     address = own_address() if setting == "an address" else LOOPBACK
     socket_port = free_port()
     master = MasterProcess()
@@ -93,7 +93,7 @@ def test_what_the_page_says_listens(setting: str, tmp_path: Path) -> None:
     with ExitStack() as stack:
         stack.callback(master.kill)
         master.start(graph.env)
-        if setting == "unset":  # what our commands make of it; the master is roscore's, and was told
+        if setting == "unset":  # with the defaults of our commands; the master is that of roscore
             del graph.env["ROS_IP"]
         nodes = {name: stack.enter_context(graph.node(name)) for name in ("bass-ros", "rosAFE-ros")}
         graph.run("rosparam", "set", "/bass/socket_port", str(socket_port))
@@ -104,7 +104,7 @@ def test_what_the_page_says_listens(setting: str, tmp_path: Path) -> None:
         nodes["rosafe live"] = page.process
         assert master.process is not None
         nodes["roscore"] = master.process
-        expected = promised(LOOPBACK if address == LOOPBACK else EVERYWHERE)
+        expected = documented(LOOPBACK if address == LOOPBACK else EVERYWHERE)
         assert expected.keys() == nodes.keys()
         ports = {master.port: "11311", socket_port: "8081", http_port: "8080", page.port: "8090"}
         for name, process in nodes.items():
@@ -113,14 +113,14 @@ def test_what_the_page_says_listens(setting: str, tmp_path: Path) -> None:
     assert (str(socket_server.DEFAULT_PORT), socket_server.DEFAULT_HOST) in expected["bass-ros"]
 
 
-def test_the_bounds_of_the_page() -> None:
-    wanted = [
+def test_the_documented_limits() -> None:
+    limits = [
         handshake_server.OPENING_SECONDS,
         handshake_server.MAX_PENDING,
         server_limits.HEADER_BYTES,
         server_limits.BODY_BYTES,
         (handshake_server.DESCRIPTORS, handshake_server.RESERVE),
-        "what the longest that makes sense has",
+        "the longest valid one",
         self_check.PERIOD,
         (socket_server.MAX_CLIENTS, socket_server.IDLE_SECONDS),
         (api.LIMITS.max_connections, api.LIMITS.max_connections // 2),
@@ -132,14 +132,14 @@ def test_the_bounds_of_the_page() -> None:
         (MAX_PARAMETERS, reading.MAX_PARAMETER_VALUES),
         (server.MAX_CLIENTS, server.LIMITS.max_connections, server.LIMITS.max_connections // 2),
         (server.LIMITS.request_seconds, server.LIMITS.max_header_bytes // 2**20, MEMORY),
-        (f"{client.MAX_MESSAGE >> 20} MiB", client.MAX_PENDING, client.MAX_VIEWS, views.MAX_VIEWS),
-        (client.BYTES_PER_SECOND, 1 / client.PERIOD, client.STALL_SECONDS),
+        (f"{client.MAX_MESSAGE >> 20} MiB", client.MAX_PENDING, subscriptions.MAX_VIEWS, views.MAX_VIEWS),
+        (subscriptions.BYTES_PER_SECOND, 1 / client.PERIOD, client.STALL_SECONDS),
     ]
     shown = [
         "; ".join(f"{number:.0f}" if not isinstance(number, str) else number for number in numbers)
-        for numbers in (entry if isinstance(entry, tuple) else (entry,) for entry in wanted)
+        for numbers in (entry if isinstance(entry, tuple) else (entry,) for entry in limits)
     ]
-    assert [bound for *_, bound in rows("Bounds")] == shown
+    assert [bound for *_, bound in rows("Limits")] == shown
     assert self_check.FAILURES == 2
     assert connections.BUFFER == 4 * 1024
 
@@ -167,7 +167,7 @@ except TimeoutError:
 
 @pytest.fixture
 def robot() -> Iterator[str]:
-    """The name of a host, a network namespace, with the page's address; behind its cable are the partner and others."""
+    """A host in a network namespace with the address in the page, connected to the partner and other hosts."""
     if shutil.which("ip") is None or shutil.which("nft") is None:
         pytest.skip("network namespaces and firewalls need the commands ip and nft")
     number = free_port()
@@ -184,7 +184,7 @@ def robot() -> Iterator[str]:
         yield robot
 
 
-def test_the_firewall_lets_in_the_partner_and_nobody_else(robot: str) -> None:
+def test_the_firewall_admits_only_the_partner(robot: str) -> None:
     (rules,) = re.findall(r"^```nft\n(.*?)^```$", PAGE, re.MULTILINE | re.DOTALL)
     inside, outside = (["ip", "netns", "exec", name] for name in (robot, robot.replace("robot", "others")))
     done = subprocess.run([*inside, "nft", "-f", "-"], input=rules, capture_output=True, text=True, check=False)

@@ -1,4 +1,4 @@
-"""Both nodes from the shell and back: options, names, signals, background, a missing or silent master, takeover."""
+"""Start and end of both nodes: options, names, signals, background, a missing or silent master, takeover."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ PROGRAMS = pytest.mark.parametrize("program", ["rosAFE-ros", "bass-ros"])
 
 @contextmanager
 def silent_port() -> Iterator[int]:
-    """A port that takes connections and never answers."""
+    """A port that accepts connections and never answers."""
     with socket.socket() as listener:
         listener.bind(("127.0.0.1", 0))
         listener.listen(8)
@@ -34,7 +34,7 @@ def silent_port() -> Iterator[int]:
 
 @contextmanager
 def web_server() -> Iterator[int]:
-    """A port where something else than a ROS master answers."""
+    """A port at which a web server answers instead of a ROS master."""
     server = HTTPServer(("127.0.0.1", 0), type("Quiet", (BaseHTTPRequestHandler,), {"log_message": lambda *a: None}))
     thread = threading.Thread(target=server.serve_forever)
     thread.start()
@@ -76,29 +76,29 @@ def test_wrong_instance_name(graph: Graph, name: str) -> None:
     for arguments in (["-i", name], [f"__name:={name}"]):
         done = graph.run("bass-ros", *arguments, check=False)
         assert (done.returncode, done.stdout) == (1, "")
-        assert "no instance name" in done.stderr and done.stderr.count("\n") == 1
+        assert "instance name: expected" in done.stderr and done.stderr.count("\n") == 1
 
 
 # --- workers ---------------------------------------------------------------------------------------------------
 
 
 def test_number_of_workers(graph: Graph) -> None:
-    """The node's own parameter counts more than the environment."""
+    """The node's own parameter has priority over the environment."""
     with (
         graph.node("rosAFE-ros", "-i", "few", "_workers:=3", ROSAFE_WORKERS="2"),
         graph.collect("/diagnostics", DiagnosticArray) as messages,
     ):
-        wait_for(lambda: ("few", "3") in told_workers(messages), what=lambda: str(messages))
+        wait_for(lambda: ("few", "3") in reported_workers(messages), what=lambda: str(messages))
     graph.run("rosparam", "delete", "/few/workers")
     with (
         graph.node("rosAFE-ros", "-i", "few", ROSAFE_WORKERS="2"),
         graph.collect("/diagnostics", DiagnosticArray) as messages,
     ):
-        wait_for(lambda: ("few", "2") in told_workers(messages), what=lambda: str(messages))
+        wait_for(lambda: ("few", "2") in reported_workers(messages), what=lambda: str(messages))
 
 
-def told_workers(messages: list[Any]) -> set[tuple[str, str]]:
-    """Instance and number of workers of all that was told."""
+def reported_workers(messages: list[Any]) -> set[tuple[str, str]]:
+    """Return instance and number of workers in all messages."""
     return {
         (status.name.split(":")[0].strip("/ "), value.value)
         for message in messages
@@ -121,7 +121,7 @@ def test_wrong_number_of_workers(graph: Graph, number: str) -> None:
 
 @pytest.fixture(scope="module")
 def masterless(graph: Graph) -> Iterator[dict[str, Process]]:
-    """Nodes that find no master, each for another reason; started at once, for all wait a while for one."""
+    """Nodes without a master, for different reasons; started together, because each waits for a while."""
     with silent_port() as silent, web_server() as web, ExitStack() as stack:
 
         def start(program: str, port: int, *options: str) -> Process:
@@ -137,8 +137,8 @@ def masterless(graph: Graph) -> Iterator[dict[str, Process]]:
         }
 
 
-def refusal(node: Process) -> str:
-    """The one line that a node ends with which cannot start."""
+def error_line(node: Process) -> str:
+    """Return the single line of a node that cannot start."""
     assert node.wait() == 1
     assert node.out == ""
     assert re.fullmatch(r"(rosAFE|bass)-ros: .*\n", node.err), node
@@ -147,27 +147,27 @@ def refusal(node: Process) -> str:
 
 @pytest.mark.parametrize("which", ["rosAFE", "bass", "background"])
 def test_no_master(masterless: dict[str, Process], which: str) -> None:
-    assert re.search(r"no ROS master at http://127\.0\.0\.1:\d+ .*start roscore first", refusal(masterless[which]))
+    assert re.search(r"no ROS master at http://127\.0\.0\.1:\d+ .*start roscore first", error_line(masterless[which]))
 
 
 def test_silent_master(masterless: dict[str, Process]) -> None:
-    assert "no answer" in refusal(masterless["silent"])
+    assert "no answer" in error_line(masterless["silent"])
 
 
-def test_something_else_at_the_masters_port(masterless: dict[str, Process]) -> None:
-    assert "not a ROS master" in refusal(masterless["web"])
+def test_a_web_server_at_the_masters_port(masterless: dict[str, Process]) -> None:
+    assert "not a ROS master" in error_line(masterless["web"])
 
 
 @pytest.mark.parametrize(
     "uri", ["nonsense", "http://127.0.0.1", "http://127.0.0.1:99999", "ftp://127.0.0.1:1", "http://[::1"]
 )
-def test_address_that_is_none(graph: Graph, uri: str) -> None:
+def test_invalid_master_address(graph: Graph, uri: str) -> None:
     with graph.start("bass-ros", ROS_MASTER_URI=uri) as node:
-        assert "ROS_MASTER_URI" in refusal(node)
+        assert "ROS_MASTER_URI" in error_line(node)
 
 
 def test_waiting_for_a_master(private_graph: tuple[Graph, MasterProcess]) -> None:
-    """As services at boot do: longer than by default, and then all is as usual; without --wait nothing has changed."""
+    """Nodes with --wait wait longer than the default and then start; without it they do not."""
     graph, master = private_graph
     master.kill()
     with (
@@ -176,7 +176,7 @@ def test_waiting_for_a_master(private_graph: tuple[Graph, MasterProcess]) -> Non
         graph.start("bass-ros", "-i", "hasty") as hasty,
         graph.start("bass-ros", "-i", "stopped", "--wait") as stopped,
     ):
-        assert "start roscore first" in refusal(hasty), "the patient ones have waited as long by now"
+        assert "start roscore first" in error_line(hasty), "the nodes with --wait have waited for the same time"
         line = f"waiting for a ROS master at {graph.uri}"
         for node in (afe, bass, stopped):
             wait_for(lambda: line in node.err, 20, lambda: str(node))  # noqa: B023
@@ -184,38 +184,38 @@ def test_waiting_for_a_master(private_graph: tuple[Graph, MasterProcess]) -> Non
         assert stopped.stop(signal.SIGTERM, timeout=5) == 0
         master.start(graph.env)
         wait_for(lambda: {"/rosAFE/Stop", "/bass/Stop"} <= graph.services(), 30, lambda: f"{afe} {bass}")
-        assert bass.wait() == 0, "the shell goes on once the node is up"
+        assert bass.wait() == 0, "the command returns when the node has started"
         assert "Traceback" not in afe.err + bass.err
         done = graph.run("rosservice", "call", "/bass/kill")
         assert "genom_success: True" in done.stdout
 
 
-def test_waiting_for_a_master_that_answers_nothing_can_be_ended(graph: Graph) -> None:
+def test_waiting_for_a_silent_master_can_be_interrupted(graph: Graph) -> None:
     with silent_port() as port, graph.start("bass-ros", "--wait", ROS_MASTER_URI=f"http://127.0.0.1:{port}") as node:
         wait_for(lambda: "waiting" in node.err, 20, lambda: str(node))
         assert node.stop(signal.SIGINT, timeout=5) == 0
         assert node.err.count("\n") == 1, node
 
 
-# --- an address that nobody can call -----------------------------------------------------------------------------
+# --- an unreachable address --------------------------------------------------------------------------------------
 
 
 @PROGRAMS
 @pytest.mark.parametrize(
     ("ip", "hostname", "remapping", "why"),
     [
-        ("203.0.113.7", "", "", "ROS_IP is 203.0.113.7, which is no address of this machine"),
-        ("127.0.0.1", "nobody.invalid", "", "ROS_HOSTNAME is nobody.invalid, which is no address, and no name"),
-        ("127.0.0.1", "", "__ip:=203.0.113.8", "ROS_IP is 203.0.113.8, which is no address of this machine"),
+        ("203.0.113.7", "", "", "ROS_IP is 203.0.113.7, which is not an address of this machine"),
+        ("127.0.0.1", "unknown.invalid", "", "ROS_HOSTNAME is unknown.invalid, neither an address nor a name"),
+        ("127.0.0.1", "", "__ip:=203.0.113.8", "ROS_IP is 203.0.113.8, which is not an address of this machine"),
         ("127.0.0.1", "", "", ""),
         ("127.3.2.1", "", "", ""),
         ("203.0.113.7", "localhost", "", ""),
     ],
 )
-def test_an_address_that_nobody_can_call_is_said(
+def test_an_unreachable_address_is_reported(
     graph: Graph, program: str, ip: str, hostname: str, remapping: str, why: str
 ) -> None:
-    """In one line; the node starts all the same."""
+    """In one line; the node starts nevertheless."""
     name = f"at_{program.partition('-')[0]}"
     with graph.node(program, "-i", name, *filter(None, [remapping]), ROS_IP=ip, ROS_HOSTNAME=hostname) as node:
         if why:
@@ -231,7 +231,7 @@ def test_an_address_that_nobody_can_call_is_said(
 
 @PROGRAMS
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
-def test_signal_ends_it_and_leaves_nothing(graph: Graph, program: str, number: int) -> None:
+def test_a_signal_ends_a_node_cleanly(graph: Graph, program: str, number: int) -> None:
     name = f"/{program.removesuffix('-ros')}"
     with graph.node(program) as node:
         assert node.stop(number, timeout=END_SECONDS) == 0
@@ -240,7 +240,7 @@ def test_signal_ends_it_and_leaves_nothing(graph: Graph, program: str, number: i
 
 
 @PROGRAMS
-def test_kill_request_ends_it(graph: Graph, program: str) -> None:
+def test_a_kill_request_ends_a_node(graph: Graph, program: str) -> None:
     name = program.removesuffix("-ros")
     with graph.node(program) as node:
         assert "genom_success: True" in graph.run("rosservice", "call", f"/{name}/kill", "{}").stdout
@@ -248,7 +248,7 @@ def test_kill_request_ends_it(graph: Graph, program: str) -> None:
         assert f"/{name}" not in graph.nodes()
 
 
-def test_rosnode_kill_ends_it(graph: Graph) -> None:
+def test_rosnode_kill_ends_a_node(graph: Graph) -> None:
     with graph.node("bass-ros") as node:
         graph.run("rosnode", "kill", "/bass")
         assert node.wait(END_SECONDS) == 0
@@ -265,8 +265,8 @@ def test_nohup_is_respected(graph: Graph) -> None:
 
 
 @PROGRAMS
-def test_a_script_may_start_it_in_the_background(graph: Graph, program: str) -> None:
-    """There `&` lets it ignore SIGINT."""
+def test_a_script_may_start_a_node_in_the_background(graph: Graph, program: str) -> None:
+    """In a script, a command with `&` ignores SIGINT."""
     name = program.removesuffix("-ros")
     with graph.start("sh", "-c", f"trap '' INT QUIT; exec {program}") as node:
         wait_for(lambda: f"/{name}/kill" in graph.services(), what=lambda: str(node))
@@ -285,7 +285,7 @@ def test_ends_without_the_master(private_graph: tuple[Graph, MasterProcess]) -> 
         assert node.stop(signal.SIGTERM, timeout=6) == 0
 
 
-def test_stdout_is_left_to_the_requests(graph: Graph) -> None:
+def test_stdout_is_for_the_output_of_requests(graph: Graph) -> None:
     with graph.node("bass-ros") as node:
         node.stop()
         assert node.out == ""
@@ -312,13 +312,13 @@ def test_instance(graph: Graph, arguments: list[str], name: str) -> None:
         assert node.stop() == 0
 
 
-def test_two_instances_at_once(graph: Graph) -> None:
+def test_two_instances(graph: Graph) -> None:
     with graph.node("bass-ros", "-i", "left") as left, graph.node("bass-ros", "-i", "right") as right:
         assert left.stop() == 0
         assert right.alive and "/right/Acquire" in graph.services()
 
 
-def test_a_second_one_of_the_same_name_takes_over(graph: Graph) -> None:
+def test_a_second_node_of_the_same_name_takes_over(graph: Graph) -> None:
     with graph.node("bass-ros") as old, graph.start("bass-ros") as new:
         assert old.wait() == 0
         assert "new node registered with same name" in old.out
@@ -337,7 +337,7 @@ def test_master_and_address_by_remapping(graph: Graph) -> None:
 # --- background -------------------------------------------------------------------------------------------------
 
 
-def test_background_is_up_when_the_shell_goes_on(graph: Graph) -> None:
+def test_a_background_node_has_started_when_the_command_returns(graph: Graph) -> None:
     done = graph.run("bass-ros", "-b", "-i", "behind")  # returns although stdout is a pipe that the node could hold
     try:
         assert (done.stdout, done.returncode) == ("", 0)
@@ -360,7 +360,7 @@ def test_background_keeps_writing_to_a_file(graph: Graph, tmp_path: Path) -> Non
 # --- surroundings -----------------------------------------------------------------------------------------------
 
 
-def test_a_package_that_is_missing_is_named(graph: Graph, tmp_path: Path) -> None:
+def test_a_missing_package_is_named(graph: Graph, tmp_path: Path) -> None:
     (tmp_path / "rospy.py").write_text("raise ModuleNotFoundError('none', name='rospy')")
     done = graph.run("bass-ros", check=False, PYTHONPATH=str(tmp_path))
     assert done.returncode == 1
@@ -383,7 +383,7 @@ def test_starts_without_any_environment(graph: Graph) -> None:
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="becoming another user takes root")
-def test_home_that_cannot_be_written(graph: Graph) -> None:
+def test_home_that_is_not_writable(graph: Graph) -> None:
     with fresh_copy() as copy:
         temporary = copy.with_name("tmp")
         temporary.mkdir()
@@ -396,7 +396,7 @@ def test_home_that_cannot_be_written(graph: Graph) -> None:
             assert node.stop() == 0
 
 
-def test_end_is_bounded_when_threads_hang(graph: Graph, tmp_path: Path) -> None:
+def test_the_time_to_end_is_limited_when_threads_hang(graph: Graph, tmp_path: Path) -> None:
     program = tmp_path / "stuck"
     program.write_text(
         f"""#!/usr/bin/python3

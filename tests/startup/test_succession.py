@@ -1,4 +1,4 @@
-"""A second node of the same name: the new one goes on, the old one ends with a message, whatever it was doing."""
+"""A second node of the same name: the new node runs, and the old one ends with a message, whatever it was doing."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from tests.harness import SCRIPTS, Graph, Process, free_port, wait_for
 
 
 def owner(graph: Graph, name: str) -> str:
-    """The address that the master has for a node; empty if it has none."""
+    """Return the address of a node that is registered at the master, or an empty string."""
     try:
         return str(rosgraph.Master("/test", master_uri=graph.uri).lookupNode(name))
     except rosgraph.MasterError:
@@ -27,7 +27,7 @@ def owner(graph: Graph, name: str) -> str:
 
 
 def pid(graph: Graph, name: str) -> int:
-    """The process that answers at the address that the master has for a node; 0 if none does."""
+    """Return the process that answers at the registered address of a node, or 0."""
     address = owner(graph, name)
     try:
         answer: Any = xmlrpc.client.ServerProxy(address).getPid("/test") if address else (0, "", 0)
@@ -37,7 +37,7 @@ def pid(graph: Graph, name: str) -> int:
 
 
 def taken_over(graph: Graph, component: interface.ComponentSpec, old: Process, new: Process) -> None:
-    """Check that `new` has the place of `old` for good: its name, its services, its actions."""
+    """Check that `new` has replaced `old`: its name, its services, its actions."""
     name = f"/{component.name}"
     assert old.wait() == 0
     assert old.out.count(REASON) == 1 and "Traceback" not in old.err
@@ -67,8 +67,8 @@ def test_bass_that_acquires(graph: Graph, tmp_path: Path, recording: bool) -> No
             recorder.close()
 
 
-def test_rosafe_with_a_tree_that_changes_all_the_time(graph: Graph) -> None:
-    """It registers new ports at the moment at which the new node registers itself."""
+def test_rosafe_with_a_tree_that_changes_permanently(graph: Graph) -> None:
+    """It registers new ports while the new node registers itself."""
     ended = threading.Event()
 
     def change() -> None:
@@ -76,7 +76,7 @@ def test_rosafe_with_a_tree_that_changes_all_the_time(graph: Graph) -> None:
             try:
                 graph.call("/rosAFE/RatemapProc", name="again", upperDepName="innerhaircell_0")
                 graph.call("/rosAFE/removeProcessor", nameProc="again")
-            except Exception:  # between the two nodes
+            except Exception:  # neither node is available
                 ended.wait(0.02)
 
     with graph.node("bass-ros"), graph.node("rosAFE-ros") as old:
@@ -94,8 +94,8 @@ def test_rosafe_with_a_tree_that_changes_all_the_time(graph: Graph) -> None:
             changing.join()
 
 
-def test_three_at_once_leave_one(graph: Graph) -> None:
-    """Those that start at the same time interrupt each other; the others say so and end with 1, or with 0 once up."""
+def test_one_of_three_concurrent_nodes_remains(graph: Graph) -> None:
+    """Concurrent nodes interrupt each other. The others report this and end with 1, or with 0 after their start."""
     processes = [graph.start("bass-ros", "-i", "crowd") for _ in range(3)]
     try:
         wait_for(lambda: sum(process.alive for process in processes) == 1, what=lambda: str(processes))
@@ -145,16 +145,16 @@ def failing(graph: Graph, tmp_path: Path, script: str) -> Process:
 @pytest.mark.parametrize(
     ("script", "message"),
     [
-        (  # rospy forgets its listeners in the middle of its start
+        (  # rospy is shut down during its start
             """
 import rospy
 import rospy.impl.simtime as simtime
 real = simtime.init_simtime
-simtime.init_simtime = lambda: rospy.signal_shutdown("told to") or real()
+simtime.init_simtime = lambda: rospy.signal_shutdown("on request") or real()
 """,
-            "cannot start the node: it was told to end",
+            "cannot start the node: it was asked to end",
         ),
-        (  # a newer node while this one builds its services
+        (  # a newer node is registered while this one creates its services
             """
 import xmlrpc.client, os
 import rosafe.component.component as component
@@ -198,15 +198,15 @@ def registered(graph: Graph, address: str) -> Iterator[None]:
 @pytest.mark.parametrize(
     ("address", "up", "ignores"),
     [
-        (OLD, False, True),  # the old one's last registration came late
+        (OLD, False, True),  # the last registration of the old node was late
         (OLD, True, True),
-        (MINE, False, True),  # of two that start, this one came last
-        (MINE, True, False),  # the new one has still to register
+        (MINE, False, True),  # two nodes start, and this one was registered last
+        (MINE, True, False),  # the new node has not registered yet
         (NEW, False, False),
         (NEW, True, False),
     ],
 )
-def test_who_ignores_that_it_is_told_to_end(graph: Graph, address: str, up: bool, ignores: bool) -> None:
+def test_a_request_to_end_that_is_ignored(graph: Graph, address: str, up: bool, ignores: bool) -> None:
     with registered(graph, OLD):
         succession = Succession("/contested", graph.uri)
     contests: list[bool] = []
@@ -218,7 +218,7 @@ def test_who_ignores_that_it_is_told_to_end(graph: Graph, address: str, up: bool
 
 
 def test_the_log_registers_nothing(graph: Graph, monkeypatch: pytest.MonkeyPatch) -> None:
-    """rospy would subscribe to a parameter with each line."""
+    """rospy would subscribe to a parameter for each line."""
     subscribed: list[Any] = []
     real: Callable[..., Any] = rosmaster.master_api.ROSMasterHandler.subscribeParam
 

@@ -1,4 +1,4 @@
-"""A tree under test: its listener, its source, and an end that leaves no thread behind."""
+"""Fixtures: a tree, its listener and its source. The tree is stopped after the test."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from .support import Feed, Recorder, end
 
 @pytest.fixture(scope="session", autouse=True)
 def built() -> None:
-    """No test waits for gcc."""
+    """Compile the kernels before the first test."""
     kernels.compiled()
 
 
@@ -30,7 +30,7 @@ def feed() -> Feed:
 
 @pytest.fixture
 def workers() -> int | None:
-    """How many; None for one on each core."""
+    """Number of workers; None for one on each core."""
     return None
 
 

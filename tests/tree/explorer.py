@@ -1,9 +1,9 @@
-"""A scheduler of its own for threads: one runs at a time, and every place where another could go on is a decision.
+"""A deterministic scheduler for threads: one runs at a time, and every possible switch between threads is a decision.
 
-`explore` runs a scenario under very many schedules. The code under test is the real one; only its locks, conditions and
-threads are this module's. Few deviations from a plain schedule find nearly all faults that orders of events can cause:
-it tries all schedules with so many delays (Emmi, Qadeer and Rakamaric, POPL 2011), and beyond that some of the many
-with random priorities (Burckhardt et al., ASPLOS 2010).
+`explore` runs a scenario under many schedules. The code under test is the real one; only locks, conditions and threads
+are replaced. A few deviations from a simple schedule find nearly all faults that depend on the order of events. All
+schedules with a limited number of delays are run (Emmi, Qadeer and Rakamaric, POPL 2011), and some schedules with
+random priorities (Burckhardt et al., ASPLOS 2010).
 """
 
 from __future__ import annotations
@@ -16,28 +16,28 @@ from contextlib import contextmanager
 from types import SimpleNamespace, TracebackType
 from typing import Any
 
-HANG_SECONDS = 30.0  # no thread gets its turn for so long: the scheduler itself has failed
-MAX_PASSES = 10  # of time, one after the other, in which nothing happens: nothing ever will
+HANG_SECONDS = 30.0  # if no thread runs for this time, the scheduler itself has failed
+MAX_PASSES = 10  # successive timeouts without progress: there will be none
 
 
 class Abandoned(BaseException):
-    """Ends the threads of a run that cannot go on."""
+    """Raised in the threads of a run that cannot continue."""
 
 
 class Task:
-    """One thread under the scheduler's control."""
+    """A thread that the scheduler controls."""
 
     def __init__(self, name: str) -> None:
         self.name = name
         self.ready: Callable[[], bool] = lambda: True
-        self.in_time: Callable[[], bool] | None = None  # ready as soon as time passes, and this holds
+        self.in_time: Callable[[], bool] | None = None  # ready after a timeout if this holds
         self.finished = False
-        self.go = threading.Lock()  # released to give it its turn
+        self.go = threading.Lock()  # released to let the thread run
         self.go.acquire()
 
 
 class Delays:
-    """The running thread goes on until it cannot, then the next one in turn; at the decisions `at`, the one after."""
+    """Run a thread until it blocks, then the next one; at the decisions `at`, run the one after that."""
 
     def __init__(self, at: tuple[int, ...]) -> None:
         self.at = at
@@ -52,15 +52,15 @@ class Delays:
 
 
 class Priorities:
-    """Threads have random priorities; the one that would run falls behind all others at some random decisions."""
+    """Give threads random priorities; at some random decisions, the running thread gets the lowest one."""
 
     FALLS = 3
-    SPAN = 150  # decisions among which the falls are
+    MAX_FALL = 150  # number of the last decision at which a priority may fall
 
     def __init__(self, seed: int) -> None:
         self.seed = seed
         self._random = random.Random(seed)
-        self._falls = [self._random.randrange(self.SPAN) for _ in range(self.FALLS)]
+        self._falls = [self._random.randrange(self.MAX_FALL) for _ in range(self.FALLS)]
         self._priorities: dict[Task, float] = {}
         self._decisions = 0
 
@@ -79,9 +79,9 @@ class Priorities:
 
 
 class Scheduler:
-    """Lets one thread run at a time; `strategy` decides which where there is a choice.
+    """Lets one thread run at a time; `strategy` chooses one if several are ready.
 
-    Time stands still, and passes where nobody can go on otherwise.
+    Timeouts expire only if no thread can run otherwise.
     """
 
     def __init__(self, strategy: Delays | Priorities) -> None:
@@ -100,9 +100,9 @@ class Scheduler:
         )
 
     def until(self, ready: Callable[[], bool], in_time: Callable[[], bool] | None = None) -> None:
-        """Let others run as the schedule says, until `ready()` holds and it is this thread's turn.
+        """Let other threads run until `ready()` holds and this thread is chosen.
 
-        Or until `in_time()` holds, and time has passed.
+        Or until `in_time()` holds after a timeout.
         """
         me = self._current
         me.ready, me.in_time = ready, in_time
@@ -131,7 +131,7 @@ class Scheduler:
             chosen.go.release()
         if not me.finished:
             if not me.go.acquire(timeout=HANG_SECONDS):
-                raise RuntimeError(f"{me.name} never got its turn")
+                raise RuntimeError(f"{me.name} was never scheduled")
             if self.deadlock:
                 raise Abandoned
 
@@ -141,14 +141,14 @@ class Scheduler:
                 task.go.release()
 
     def finish(self, task: Task) -> None:
-        """`task` has come to its end."""
+        """Mark `task` as finished."""
         task.finished = True
         if not self.deadlock:
             self._switch(task)
 
 
 class Lock:
-    """`threading.RLock`, and `threading.Lock` as well: nobody takes one of those twice."""
+    """`threading.RLock`, also used for `threading.Lock`, which no thread acquires twice."""
 
     def __init__(self, scheduler: Scheduler) -> None:
         self._scheduler = scheduler
@@ -178,7 +178,7 @@ class Lock:
 
 
 class Condition(Lock):
-    """`threading.Condition` on a lock that others share."""
+    """`threading.Condition` on a shared lock."""
 
     def __init__(self, scheduler: Scheduler, lock: Lock) -> None:
         super().__init__(scheduler)
@@ -250,7 +250,7 @@ class Thread:
 
 
 def delay_bounded(bound: int) -> Iterator[Delays]:
-    """All strategies with up to `bound` delays. Each must have run before the next one is asked for."""
+    """Yield all strategies with up to `bound` delays. Each must be run before the next one is requested."""
     unexplored: list[tuple[int, ...]] = [()]
     while unexplored:
         strategy = Delays(unexplored.pop())
@@ -263,9 +263,9 @@ def delay_bounded(bound: int) -> Iterator[Delays]:
 def explore(
     scenario: Callable[[Scheduler], Callable[[], None]], use: Callable[[Any], None], delays: int, walks: int
 ) -> int:
-    """Run `scenario(scheduler)` and then what it returns, its check, under all `delays` and `walks` random priorities.
+    """Run `scenario(scheduler)`, and the check that it returns, with all delays and with `walks` random priorities.
 
-    `use` puts a replacement of the module `threading` into the code under test. Returns the number of schedules.
+    `use` replaces the module `threading` in the code under test. Return the number of schedules.
     """
     count = 0
     with _one_processor():
@@ -296,7 +296,7 @@ def _run(
 
 @contextmanager
 def _one_processor() -> Iterator[None]:
-    """Keep all threads on one processor of the machine, between which handing over takes twice as long."""
+    """Run all threads on one CPU; switching between threads takes twice as long across CPUs."""
     processors = os.sched_getaffinity(0)
     os.sched_setaffinity(0, {min(processors)})
     try:

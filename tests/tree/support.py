@@ -1,4 +1,4 @@
-"""Sources, listeners and stages for tests of the tree: everything that comes out can be told from what went in."""
+"""Sources, listeners and stages for tests of the tree, with outputs that identify their inputs."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ RATE = 16000.0
 
 
 class Feed:
-    """A source that gives what the test puts in. Without data, frame n of a block holds n in both ears."""
+    """A source of the blocks that the test puts in. By default, frame n has the value n in both ears."""
 
     def __init__(self, rate: float = RATE, frames: int = 160) -> None:
         self.sample_rate = rate
@@ -41,7 +41,7 @@ class Feed:
         self._wake()
 
     def end(self) -> None:
-        """Nothing more will come."""
+        """Mark the end of the source."""
         self.ended = True
         self._wake()
 
@@ -54,22 +54,26 @@ class Feed:
         block = self._blocks.popleft()
         return block, int(block[0, -1]) + 1 if block.size else 0
 
+    @property
+    def waiting(self) -> bool:
+        return not (self._blocks or self.ended)
+
     def stop(self) -> None:
         self.ended = self.stopped = True
 
 
 class Recorder:
-    """A listener that remembers everything and lets the test wait for it."""
+    """A listener that records all calls, and for which the test can wait."""
 
     def __init__(self) -> None:
         self.processors: list[Processor] = []
         self.blocks: dict[Processor, list[Block]] = {}
         self.ends: list[Processor] = []
-        self.late: list[Processor] = []  # released something after their end
-        self._turn = threading.Condition()
+        self.late: list[Processor] = []  # that released a block after their end
+        self._called = threading.Condition()
 
     def on_added(self, processor: Processor) -> None:
-        with self._turn:
+        with self._called:
             self.processors.append(processor)
             self.blocks[processor] = []
 
@@ -77,40 +81,40 @@ class Recorder:
         pass
 
     def on_released(self, processor: Processor, block: Block) -> None:
-        with self._turn:
+        with self._called:
             if processor in self.ends:
                 self.late.append(processor)
             self.blocks[processor].append(block)
-            self._turn.notify_all()
+            self._called.notify_all()
 
     def on_removed(self, processor: Processor) -> None:
-        with self._turn:
+        with self._called:
             self.ends.append(processor)
-            self._turn.notify_all()
+            self._called.notify_all()
 
     def forget(self) -> None:
-        """Remember nothing but those that have not ended."""
-        with self._turn:
+        """Drop all records except the processors that have not ended."""
+        with self._called:
             self.processors = [processor for processor in self.processors if processor not in self.ends]
             self.blocks = {processor: [] for processor in self.processors}
             self.ends.clear()
 
     def wait(self, condition: Callable[[], Any]) -> None:
-        """Wait until `condition()` holds after something that a processor did."""
-        with self._turn:
-            assert self._turn.wait_for(condition, PATIENCE), f"not within {PATIENCE:g} s"
+        """Wait until `condition()` holds after a call."""
+        with self._called:
+            assert self._called.wait_for(condition, PATIENCE), f"not within {PATIENCE:g} s"
 
     def wait_blocks(self, processor: Processor, count: int) -> None:
-        """Wait until `processor` has released `count` blocks in all."""
+        """Wait until `processor` has released `count` blocks in total."""
         self.wait(lambda: len(self.blocks[processor]) >= count)
 
     def data(self, processor: Processor) -> np.ndarray:
-        """All that it released, joined."""
+        """Return all released blocks, joined."""
         return np.concatenate([block.data for block in self.blocks[processor]], axis=-1)
 
 
 class Plain(Stage):
-    """A stage of any kind, with any parameters, that hands its blocks on as they are."""
+    """A stage of any kind, with any parameters, that returns its input."""
 
     work: Callable[[np.ndarray], None] = staticmethod(lambda block: None)
 
@@ -123,12 +127,12 @@ class Plain(Stage):
 
 
 def tree_threads() -> set[threading.Thread]:
-    """The threads of all trees, and of nobody else."""
+    """Return the threads of all trees."""
     return {thread for thread in threading.enumerate() if thread.name.startswith("rosafe ")}
 
 
 def use_plain_stages(patch: pytest.MonkeyPatch, **stages: type[Plain]) -> None:
-    """Let the tree make `Plain` stages, or those given, of all kinds."""
+    """Let the tree create `Plain` stages, or the given ones, for all kinds."""
     for kind, representation in KINDS.items():
         base = stages.get(kind, Plain)
         patch.setitem(STAGES, kind, type(base.__name__, (base,), {"REPRESENTATION": representation}))
@@ -146,14 +150,14 @@ CHANNELS = {"fb_highFreqHz": 4000.0, "fb_nChannels": 5}
 
 
 def grow(tree: Tree, feed: Feed) -> None:
-    """Make the tree of the guide: one processor of each kind, called as its kind. Samples are taken as they are."""
+    """Build the tree of the guide: one processor of each kind, named after it. Samples are not scaled."""
     tree.add_input("input", feed, feed.frames, 1.0, 1.0, {"in_doNormalize": False})
     for kind, parent in DEFAULT_TREE:
         tree.add(kind, kind, parent, CHANNELS if kind == "gammatone" else {})
 
 
 def end(tree: Tree, listener: Recorder) -> None:
-    """Stop the tree and see to it that no thread is left."""
+    """Stop the tree and check that all threads have ended."""
     tree.stop()
     for processor in listener.processors:
         assert processor.join(PATIENCE), f"{processor!r} is still running"

@@ -1,4 +1,4 @@
-"""modifyParameter on a running tree: what it accepts, when it takes effect, and what it leaves alone."""
+"""modifyParameter on a running tree: accepted values, and the blocks and processors that are affected."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from .support import CHANNELS, RATE, Feed, Plain, Recorder, grow, use_plain_stag
 
 LEAVES = ("ild", "ratemap", "crossCorrelation")
 NOISE = np.random.default_rng(7).standard_normal((20, 2, 400))
-# A value of every parameter that is not the one in force, as text and as what getParameters then says
+# For every parameter a value that differs from the present one, as text and as getParameters then returns it
 CHANGES: dict[str, tuple[str, Any]] = {
     "in_doNormalize": ("1", True),
     "in_normalizeValue": ("32768", 32768),
@@ -61,15 +61,15 @@ OWNER = {
 }  # later kinds: tests/representations
 
 
-def test_every_parameter_has_a_change_here() -> None:
+def test_the_table_of_changes_is_complete() -> None:
     assert list(CHANGES) == list(OWNER)
 
 
 def settle(tree: Tree, feed: Feed, listener: Recorder, *blocks: np.ndarray) -> None:
-    """Feed `blocks` and wait until all processors have released what they make of them."""
-    wanted = {p: len(listener.blocks[p]) + len(blocks) for p in tree.processors}
+    """Feed `blocks` and wait until all processors have released their output."""
+    expected = {p: len(listener.blocks[p]) + len(blocks) for p in tree.processors}
     feed.put(*blocks)
-    for processor, count in wanted.items():
+    for processor, count in expected.items():
         listener.wait_blocks(processor, count)
 
 
@@ -78,7 +78,7 @@ def chain(**parameters: Any) -> Chain:
 
 
 def assert_as(listener: Recorder, tree: Tree, kind: str, outputs: list[dict[str, np.ndarray]]) -> None:
-    """The processor called `kind` released, block by block, what the bare stages make."""
+    """Check that the processor `kind` released, block by block, the output of the bare stages."""
     released = listener.blocks[tree.find(kind)]
     assert len(released) == len(outputs)
     for block, output in zip(released, outputs, strict=True):
@@ -86,29 +86,29 @@ def assert_as(listener: Recorder, tree: Tree, kind: str, outputs: list[dict[str,
         np.testing.assert_allclose(block.data, output[kind], rtol=1e-12, atol=1e-12)
 
 
-# --- what it takes ---
+# --- values ---
 
 
 @pytest.mark.parametrize("name", CHANGES)
 def test_a_change_of_each_parameter(tree: Tree, feed: Feed, listener: Recorder, name: str) -> None:
-    """It is in force from the next block on, for that processor alone; the bare stages say what that means."""
+    """It applies from the next block on, to this processor alone. The bare stages are the reference."""
     text, value = CHANGES[name]
     grow(tree, feed)
     processor = tree.find(OWNER[name])
-    assert processor.parameters()[name] != value
-    others = {p.name: p.parameters() for p in tree.processors if p is not processor}
+    assert processor.stage.parameters[name] != value
+    others = {p.name: p.stage.parameters for p in tree.processors if p is not processor}
     settle(tree, feed, listener, *NOISE[:3])
     tree.modify(OWNER[name], name, text)
-    assert processor.parameters()[name] == value
-    assert {p.name: p.parameters() for p in tree.processors if p is not processor} == others
+    assert processor.stage.parameters[name] == value
+    assert {p.name: p.stage.parameters for p in tree.processors if p is not processor} == others
     settle(tree, feed, listener, *NOISE[3:6])
     outputs = chain().run(list(NOISE[:6]), [(3, name, value)])
     for kind in ("preProc", "gammatone", "ihc", *LEAVES):
         assert_as(listener, tree, kind, outputs)
-    assert processor.parameters()[name] == value
+    assert processor.stage.parameters[name] == value
 
 
-def test_values_that_are_refused(tree: Tree, feed: Feed) -> None:
+def test_values_that_are_rejected(tree: Tree, feed: Feed) -> None:
     grow(tree, feed)
     refusals = {
         "pp_bRemoveDC": ("2", "10", "TRUE", "True", "1.0", "yes", "", "0 1"),
@@ -140,13 +140,13 @@ def test_values_that_are_refused(tree: Tree, feed: Feed) -> None:
     }
     for name, texts in refusals.items():
         processor = tree.find(OWNER[name])
-        before = processor.parameters()
+        before = processor.stage.parameters
         for text in texts:
             with pytest.raises(ComponentError) as raised:
                 tree.modify(OWNER[name], name, text)
             assert raised.value.ex == "::rosAFE::e_badNewValue", text
             assert raised.value.detail["what"].startswith("fb_" if name.startswith("fb_") else name)
-            assert processor.parameters() == before
+            assert processor.stage.parameters == before
 
 
 def test_the_order_of_errors(tree: Tree, feed: Feed) -> None:
@@ -164,7 +164,7 @@ def test_the_order_of_errors(tree: Tree, feed: Feed) -> None:
 
 
 def test_names_and_words_of_the_original(tree: Tree, feed: Feed) -> None:
-    """Its misspelt names work, and unknown words become the default, which getParameters then reports."""
+    """Its misspelt names work, and unknown choices become the default, which getParameters reports."""
     grow(tree, feed)
     for processor, parameter, text, name, value in (
         ("ratemap", "set_rm_scailing", "_magnitude", "rm_scaling", "magnitude"),
@@ -189,13 +189,13 @@ def test_names_and_words_of_the_original(tree: Tree, feed: Feed) -> None:
         assert tree.find(processor).values()[name] == value, (parameter, text)
 
 
-# --- when and how ---
+# --- effect ---
 
 
-def test_a_refused_change_does_not_touch_the_numbers(
+def test_a_rejected_change_has_no_effect_on_the_numbers(
     tree: Tree, feed: Feed, listener: Recorder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Not even one that a stage has made of itself already when the tree refuses it."""
+    """Even if a stage has applied it to its copy before the tree rejects it."""
 
     def refuse(*_: Any) -> None:
         raise ValueError("refused")
@@ -212,21 +212,21 @@ def test_a_refused_change_does_not_touch_the_numbers(
         assert_as(listener, tree, kind, outputs)
 
 
-def test_changes_pile_up_until_the_next_block(tree: Tree, feed: Feed, listener: Recorder) -> None:
+def test_changes_accumulate_until_the_next_block(tree: Tree, feed: Feed, listener: Recorder) -> None:
     grow(tree, feed)
     settle(tree, feed, listener, *NOISE[:2])
     changes = [("fb_nERBs", "3"), ("fb_bwERBs", "1.5"), ("fb_nChannels", "4"), ("fb_highFreqHz", "3000")]
     for name, text in changes:
         tree.modify("gammatone", name, text)
     with pytest.raises(ComponentError):
-        tree.modify("gammatone", "fb_lowFreqHz", "3500")  # refused for a change that no block has seen yet
+        tree.modify("gammatone", "fb_lowFreqHz", "3500")  # rejected because of a change that waits for the next block
     settle(tree, feed, listener, *NOISE[2:4])
     outputs = chain().run(list(NOISE[:4]), [(2, name, float(text)) for name, text in changes])
     assert_as(listener, tree, "gammatone", outputs)
     assert_as(listener, tree, "crossCorrelation", outputs)
 
 
-def test_a_change_waits_for_no_block_and_never_meets_one_half_way(
+def test_a_change_does_not_wait_for_a_block_and_does_not_affect_it(
     tree: Tree, feed: Feed, listener: Recorder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     working, go_on = threading.Event(), threading.Event()
@@ -249,13 +249,13 @@ def test_a_change_waits_for_no_block_and_never_meets_one_half_way(
     tree.modify("ratemap", "rm_decaySec", "2")
     ratemap = tree.find("ratemap")
     assert ratemap.state is State.EXEC
-    assert ratemap.parameters()["rm_decaySec"] == 2.0
+    assert ratemap.stage.parameters["rm_decaySec"] == 2.0
     go_on.set()
     listener.wait_blocks(ratemap, 2)
     assert [block.data[0, 0] for block in listener.blocks[ratemap]] == [1.0, 2.0]
 
 
-def test_what_is_asked_while_others_change_it_fits_together(tree: Tree, feed: Feed) -> None:
+def test_values_read_during_changes_are_consistent(tree: Tree, feed: Feed) -> None:
     grow(tree, feed)
     correlation = tree.find("crossCorrelation")
 

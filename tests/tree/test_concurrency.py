@@ -1,4 +1,4 @@
-"""The tree on real threads: who works at the same time as whom, and blocks that arrive whole and in order."""
+"""The tree with real threads: processors that compute concurrently, and complete blocks in order."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ def feed() -> Feed:
 
 @pytest.fixture
 def workers() -> int:
-    """So that whoever may work at the same time can, on any machine."""
+    """Enough workers for all concurrent processors, on any machine."""
     return 4
 
 
 def test_siblings_work_at_the_same_time(
     tree: Tree, listener: Recorder, feed: Feed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Each waits, in the middle of its work, until the other two are in the middle of theirs."""
+    """Each waits during its computation until the other two are computing."""
     meeting = threading.Barrier(3)
 
     class Meeting(Plain):
@@ -58,25 +58,25 @@ def test_a_parent_works_on_the_next_block_while_its_child_works_on_the_last(
     """The child finishes block n only after the parent has computed n + 1; the parent releases only after that."""
     computed: list[int] = []
     last = 6
-    turn = threading.Condition()
+    was_computed = threading.Condition()
 
     class Parent(Plain):
         def process(
             self, block: np.ndarray, extra: np.ndarray | None = None, out: np.ndarray | None = None
         ) -> np.ndarray:
-            with turn:
+            with was_computed:
                 computed.append(int(block[0, 0]))
-                turn.notify_all()
+                was_computed.notify_all()
             return block
 
     class Child(Plain):
         def process(
             self, block: np.ndarray, extra: np.ndarray | None = None, out: np.ndarray | None = None
         ) -> np.ndarray:
-            with turn:
+            with was_computed:
                 number = int(block[0, 0])
-                assert turn.wait_for(lambda: number == last or number + 1 in computed, PATIENCE)
-                assert number + 2 not in computed, "the parent went on without the child's token"
+                assert was_computed.wait_for(lambda: number == last or number + 1 in computed, PATIENCE)
+                assert number + 2 not in computed, "the parent continued without the child's token"
             return block
 
     use_plain_stages(monkeypatch, preProc=Parent, gammatone=Child)
@@ -100,18 +100,18 @@ def test_children_read_the_parents_memory(
         assert listener.blocks[child][0].data is block
 
 
-def test_a_block_that_nobody_hears_of_is_gone_once_the_children_have_done_with_it(
+def test_a_block_without_consumers_is_freed_when_the_children_are_finished(
     tree: Tree, listener: Recorder, feed: Feed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its memory, which is still in the cache, takes the next block. Of another one the last block stays."""
-    made: list[weakref.ref[np.ndarray]] = []
+    """Its memory is reused for the next block while it is in the cache. With consumers, the last block is kept."""
+    created: list[weakref.ref[np.ndarray]] = []
 
     class Parent(Plain):
         def process(
             self, block: np.ndarray, extra: np.ndarray | None = None, out: np.ndarray | None = None
         ) -> np.ndarray:
             output = block.copy()
-            made.append(weakref.ref(output))
+            created.append(weakref.ref(output))
             return output
 
     class Child(Plain):
@@ -124,14 +124,14 @@ def test_a_block_that_nobody_hears_of_is_gone_once_the_children_have_done_with_i
     tree.add_input("input", feed, 1, 1.0, 1.0)
     parent = tree.add("preProc", "parent", "input")
     children = [tree.add("gammatone", name, "parent") for name in ("one", "other")]
-    for count, heard in ((2, False), (4, True)):
-        parent.has_consumers = heard
+    for count, consumed in ((2, False), (4, True)):
+        parent.has_consumers = consumed
         feed.put(count=2)
         for child in children:
             listener.wait_blocks(child, count)
-        if not heard:
-            wait_for(lambda: [block() for block in made] == [None, None], what="all gone")
-    last = made[-1]()
+        if not consumed:
+            wait_for(lambda: all(block() is None for block in created), what="all blocks freed")
+    last = created[-1]()
     assert last is not None
     np.testing.assert_array_equal(last, [[3.0], [3.0]])
     latest = tree.add("gammatone", "latest", "parent")
@@ -170,10 +170,10 @@ def test_the_four_states(tree: Tree, listener: Recorder, feed: Feed, monkeypatch
     assert [p.state for p in (root, parent, child)] == [State.REMOVED] * 3
 
 
-def test_nobody_waits_for_a_removed_child(
+def test_no_processor_waits_for_a_removed_child(
     tree: Tree, listener: Recorder, feed: Feed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It goes while it is in the middle of its work; the call does not wait for it, its name is free at once."""
+    """It is removed during its computation. The request does not wait for it, and its name is free immediately."""
     working, go_on = threading.Event(), threading.Event()
 
     class Slow(Plain):
@@ -198,7 +198,7 @@ def test_nobody_waits_for_a_removed_child(
     assert tree.remove("slow") == [below, slow]
     assert listener.ends == [below, slow]
     listener.wait_blocks(other, 5)
-    listener.wait_blocks(root, 5)  # which may tell of its block after a child that was quick
+    listener.wait_blocks(root, 5)  # whose block may be published after that of a fast child
     again = tree.add("preProc", "slow", "input")
     feed.put(count=1)
     listener.wait_blocks(again, 2)
@@ -208,10 +208,10 @@ def test_nobody_waits_for_a_removed_child(
     assert listener.blocks[slow] == listener.blocks[below] == []
 
 
-def test_blocks_arrive_whole_and_in_order_whoever_comes_and_goes(
+def test_blocks_are_complete_and_in_order_while_processors_are_added_and_removed(
     tree: Tree, listener: Recorder, feed: Feed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Work of random length, threads that are switched often, and two users who add and remove all the time."""
+    """Computations of random length, frequent thread switches, and two clients that add and remove processors."""
     dice = random.Random(1)
 
     class Erratic(Plain):
@@ -234,16 +234,16 @@ def test_blocks_arrive_whole_and_in_order_whoever_comes_and_goes(
             for step in range(150):
                 names = [p.name for p in tree.processors if p.name.startswith(f"{seed}-")]
                 if names and mine.random() < 0.4:
-                    with contextlib.suppress(ComponentError):  # the other user has removed its parent
+                    with contextlib.suppress(ComponentError):  # the other client has removed its parent
                         tree.remove(mine.choice(names))
                     continue
                 parent = mine.choice([p for p in tree.processors if p.kind != "ild"])
                 kind = levels[0] if parent.kind == "input" else levels[levels.index(parent.kind) + 1]
                 try:
                     tree.add(kind, f"{seed}-{step}", parent.name)
-                except ComponentError as problem:  # the other user was faster
+                except ComponentError as problem:  # the other client was faster
                     assert problem.ex.endswith("e_noUpperDependencie")
-        except BaseException as problem:  # told to the test below
+        except BaseException as problem:  # checked below
             errors.append(problem)
 
     interval = sys.getswitchinterval()

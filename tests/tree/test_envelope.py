@@ -1,4 +1,4 @@
-"""The filterbank's envelope: computed only while a hair cell wants it, and never missing where one works with it."""
+"""The envelope of the filterbank: computed only while a hair cell requires it, and never missing for that one."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ from .test_changes import LEAVES, NOISE, assert_as, chain, settle
 
 @pytest.fixture
 def workers() -> int:
-    """A parent is to compute its next block while a child is held up."""
+    """Enough workers for a parent to compute its next block while a child is blocked."""
     return 2
 
 
 @pytest.fixture
-def asked(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
-    """Whether the filterbank computed the envelope, block by block."""
+def provided(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
+    """Record for each block whether the filterbank computed the envelope."""
     answers: list[bool] = []
     original = STAGES["gammatone"].process
 
@@ -42,7 +42,7 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
 
 
 def suffix(listener: Recorder, processor: Processor, whole: np.ndarray) -> int:
-    """The processor released the end of `whole`; the number of blocks of 400 that are missing before."""
+    """Check that the processor released the end of `whole`. Return the number of missing blocks of 400 before it."""
     released = listener.data(processor)
     start = whole.shape[-1] - released.shape[-1]
     np.testing.assert_allclose(released, whole[..., start:], rtol=0, atol=1e-12)
@@ -50,27 +50,29 @@ def suffix(listener: Recorder, processor: Processor, whole: np.ndarray) -> int:
     return start // 400
 
 
-def test_the_envelope_is_computed_only_while_somebody_wants_it(
-    tree: Tree, feed: Feed, listener: Recorder, asked: list[bool]
+def test_the_envelope_is_computed_only_while_a_child_requires_it(
+    tree: Tree, feed: Feed, listener: Recorder, provided: list[bool]
 ) -> None:
     grow(tree, feed)
     settle(tree, feed, listener, *NOISE[:3])
     late = tree.add("ihc", "late", "gammatone", {"ihc_method": "hilbert"})
-    wait_for(lambda: late.blocks == 1)  # it has seen the last block, which had none
+    wait_for(lambda: late.blocks == 1)  # it has got the last block, without an envelope
     assert listener.blocks[late] == []
     settle(tree, feed, listener, NOISE[3])
     settle(tree, feed, listener, *NOISE[4:6])
     tree.remove("late")
     settle(tree, feed, listener, *NOISE[6:8])
-    assert asked == [False] * 3 + [True] * 3 + [False] * 2
+    assert provided == [False] * 3 + [True] * 3 + [False] * 2
     outputs = joined(chain(ihc_method="hilbert").run(list(NOISE[:6])))
     assert suffix(listener, late, outputs["ihc"]) == 3
     assert_as(listener, tree, "ihc", chain().run(list(NOISE[:8])))
 
 
 @pytest.mark.parametrize("method", ["hilbert", "joergensen", "bernstein"])
-def test_a_late_child_never_works_without_the_envelope(tree: Tree, feed: Feed, listener: Recorder, method: str) -> None:
-    """While blocks flow, it begins one to three blocks later and then misses none."""
+def test_a_late_child_never_computes_without_the_envelope(
+    tree: Tree, feed: Feed, listener: Recorder, method: str
+) -> None:
+    """It begins one to three blocks later, and then misses none."""
     grow(tree, feed)
     feed.put(*NOISE[:8])
     listener.wait_blocks(tree.find("gammatone"), 2)
@@ -82,7 +84,7 @@ def test_a_late_child_never_works_without_the_envelope(tree: Tree, feed: Feed, l
     numbers = [block.number for block in listener.blocks[late]]
     assert numbers == list(range(numbers[0], 20))
     assert [block.number for block in listener.blocks[below]][-3:] == [17, 18, 19]
-    # from where it began, the filter after the envelope begins at rest
+    # the filter after the envelope begins with zeros
     filterbank = chain().stages["gammatone"]
     hair_cell = STAGES["ihc"](RATE, ihc_method=method)
     for number, block in enumerate(NOISE):
@@ -95,26 +97,26 @@ def test_a_late_child_never_works_without_the_envelope(tree: Tree, feed: Feed, l
 
 
 def test_a_live_switch_to_the_envelope_and_back_loses_no_block(
-    tree: Tree, feed: Feed, listener: Recorder, asked: list[bool]
+    tree: Tree, feed: Feed, listener: Recorder, provided: list[bool]
 ) -> None:
     grow(tree, feed)
     settle(tree, feed, listener, *NOISE[:3])
     tree.modify("ihc", "ihc_method", "hilbert")
-    assert tree.find("ihc").parameters() == {"ihc_method": "hilbert"}
+    assert tree.find("ihc").stage.parameters == {"ihc_method": "hilbert"}
     settle(tree, feed, listener, *NOISE[3:6])
     tree.modify("ihc", "ihc_method", "fullwave")
     settle(tree, feed, listener, *NOISE[6:8])
-    assert asked == [False] * 3 + [True] * 3 + [False] * 2
+    assert provided == [False] * 3 + [True] * 3 + [False] * 2
     changes = [(3, "ihc_method", "hilbert"), (6, "ihc_method", "fullwave")]
     outputs = chain().run(list(NOISE[:8]), changes)
     for kind in ("ihc", *LEAVES):
         assert_as(listener, tree, kind, outputs)
 
 
-def test_a_block_that_is_on_its_way_without_the_envelope_goes_the_old_way(
+def test_a_released_block_without_the_envelope_is_processed_by_the_old_method(
     tree: Tree, feed: Feed, listener: Recorder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The filterbank has computed the next block already when the method changes."""
+    """The filterbank has already computed the next block when the method changes."""
     working, go_on = threading.Event(), threading.Event()
     original = InnerHairCell.process
 
@@ -136,10 +138,10 @@ def test_a_block_that_is_on_its_way_without_the_envelope_goes_the_old_way(
     assert_as(listener, tree, "ihc", chain().run(list(NOISE[:4]), [(2, "ihc_method", "hilbert")]))
 
 
-def test_a_block_without_the_envelope_after_all_is_no_gap(
+def test_a_block_without_the_envelope_is_not_lost(
     tree: Tree, feed: Feed, listener: Recorder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The filterbank has computed it for a method that then was not to be."""
+    """The filterbank has computed it for a method that is changed again."""
     working, go_on = threading.Event(), threading.Event()
     original = InnerHairCell.process
 
@@ -167,8 +169,8 @@ def test_a_block_without_the_envelope_after_all_is_no_gap(
     assert_as(listener, tree, "ihc", chain().run(list(NOISE[:3]), changes))
 
 
-def test_a_switch_while_blocks_are_on_their_way(tree: Tree, feed: Feed, listener: Recorder) -> None:
-    """Every block is either wholly the old method's or the new one's, none is missing, and the last word counts."""
+def test_a_switch_while_blocks_are_processed(tree: Tree, feed: Feed, listener: Recorder) -> None:
+    """Every block is processed by the old or the new method, none is missing, and the last method is kept."""
     grow(tree, feed)
     ihc = tree.find("ihc")
     feed.put(*NOISE[:15])
@@ -188,19 +190,19 @@ def test_a_switch_while_blocks_are_on_their_way(tree: Tree, feed: Feed, listener
     assert len(names) == 20
 
 
-def test_a_switch_there_and_back_before_any_block_is_none(
-    tree: Tree, feed: Feed, listener: Recorder, asked: list[bool]
+def test_a_switch_and_its_reversal_before_a_block_have_no_effect(
+    tree: Tree, feed: Feed, listener: Recorder, provided: list[bool]
 ) -> None:
     grow(tree, feed)
     settle(tree, feed, listener, *NOISE[:2])
     tree.modify("ihc", "ihc_method", "hilbert")
     tree.modify("ihc", "ihc_method", "fullwave")
     settle(tree, feed, listener, *NOISE[2:5])
-    assert asked == [False] * 5
+    assert provided == [False] * 5
     assert_as(listener, tree, "ihc", chain().run(list(NOISE[:5]), [(2, "ihc_method", "fullwave")]))
 
 
-def test_two_hair_cells_of_which_one_wants_the_envelope(tree: Tree, feed: Feed, listener: Recorder) -> None:
+def test_two_hair_cells_of_which_one_requires_the_envelope(tree: Tree, feed: Feed, listener: Recorder) -> None:
     grow(tree, feed)
     other = tree.add("ihc", "other", "gammatone", {"ihc_method": "hilbert"})
     settle(tree, feed, listener, *NOISE[:3])

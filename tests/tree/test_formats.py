@@ -1,4 +1,4 @@
-"""What flows beside the samples: several parts, frames held back, by-products, and formats that change from above."""
+"""Blocks with several parts, delayed frames, extras, and formats that change above a processor."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ from .support import RATE, Feed, Recorder, use_plain_stages
 
 
 def declared(kind: str, **differs: Any) -> Representation:
-    """A representation in the place of one that there is."""
+    """Return a representation that replaces an existing one."""
     there = KINDS[kind]
     settings: dict[str, Any] = {"parent": there.parent, "axes": ("ear", "time"), **differs}
     return Representation(kind=kind, doc="A test's own", **settings)
 
 
 class Coarser(Stage):
-    """Every so-manieth sample as a frame, and a number of lags for its children; squares for who needs them."""
+    """Every n-th sample as a frame, and a number of lags for its children; squares as an extra."""
 
     REPRESENTATION = declared(
         "preProc",
@@ -45,7 +45,7 @@ class Coarser(Stage):
     )
     INPUT = ("ear", "time")
     EXTRAS = ("squares",)
-    computed: list[frozenset[str]]  # what was to be provided with each block
+    computed: list[frozenset[str]]  # the extras that were requested with each block
 
     def process(self, block: FloatArray, extra: FloatArray | None = None, out: FloatArray | None = None) -> Output:
         self.computed.append(self.provide)
@@ -66,7 +66,7 @@ class Coarser(Stage):
 
 
 class Picky(Stage):
-    """Holds frames back, has two parts, and works only where there are so many lags; perhaps on squares."""
+    """Delays frames, has two parts, and requires a number of lags and optionally the squares."""
 
     REPRESENTATION = declared(
         "gammatone",
@@ -110,7 +110,7 @@ class Picky(Stage):
 
     def _check(self, values: dict[str, Any]) -> None:
         if self.input_format.lags < values["fb_least"]:
-            raise ValueError(f"fb_least: {values['fb_least']} lags are wanted, there are {self.input_format.lags}")
+            raise ValueError(f"fb_least: {values['fb_least']} lags are required, got {self.input_format.lags}")
 
 
 @pytest.fixture(autouse=True)
@@ -138,27 +138,27 @@ def grow(tree: Tree, feed: Feed, **parameters: Any) -> None:
     tree.add("ihc", "below", "picky")
 
 
-def refused(tree: Tree, text: str, name: str, parameter: str, value: str) -> None:
-    before = {p: (p.parameters(), p.signal, p.stage) for p in tree.processors}
+def assert_rejected(tree: Tree, text: str, name: str, parameter: str, value: str) -> None:
+    before = {p: (p.stage.parameters, p.signal, p.stage) for p in tree.processors}
     with pytest.raises(ComponentError, match=text) as raised:
         tree.modify(name, parameter, value)
     assert raised.value.ex == "::rosAFE::e_badNewValue"
-    assert {p: (p.parameters(), p.signal, p.stage) for p in tree.processors} == before
+    assert {p: (p.stage.parameters, p.signal, p.stage) for p in tree.processors} == before
 
 
-def test_what_a_processor_tells_of_itself(tree: Tree, feed: Feed) -> None:
+def test_properties_of_a_processor(tree: Tree, feed: Feed) -> None:
     grow(tree, feed)
     coarser, picky, below = (tree.find(name) for name in ("coarser", "picky", "below"))
     assert (coarser.kind, picky.representation) == ("preProc", Picky.REPRESENTATION)
     assert (coarser.signal.hop, coarser.rate, picky.rate) == (2, RATE / 2, RATE / 2)
     assert (picky.output_shape, picky.output_shapes, below.output_shape) == ((2,), ((2,), ()), (2,))
-    assert picky.axes == (("ear", "time"), ("time",))
-    assert coarser.parameters() == {"pp_step": 2, "pp_lags": 10}
-    assert coarser.derived() == {}
+    assert [part.axes for part in picky.representation.parts] == [("ear", "time"), ("time",)]
+    assert coarser.stage.parameters == {"pp_step": 2, "pp_lags": 10}
+    assert coarser.stage.derived == {}
 
 
-def test_parts_and_frames_that_are_held_back(tree: Tree, feed: Feed, listener: Recorder) -> None:
-    """Children take the first part; histories hold all; the index is that of the newest frame that is out."""
+def test_parts_and_delayed_frames(tree: Tree, feed: Feed, listener: Recorder) -> None:
+    """Children get the first part, histories contain all; the index is that of the newest released frame."""
     grow(tree, feed)
     picky, below = tree.find("picky"), tree.find("below")
     feed.put(count=3)
@@ -170,27 +170,27 @@ def test_parts_and_frames_that_are_held_back(tree: Tree, feed: Feed, listener: R
     assert [block.next_index for block in listener.blocks[picky]] == [8 - 6, 16 - 6, 24 - 6]
     assert [block.next_index for block in listener.blocks[below]] == [8 - 6, 16 - 6, 24 - 6]
     for reader in ("one", "another"):
-        (values, sums), index, signal = picky.take(reader)
+        (values, sums), index, signal = picky.history.read_new(reader)
         np.testing.assert_array_equal(values.array(), [frames, frames])
         np.testing.assert_array_equal(sums.array(), 2 * frames)
         assert (index, signal) == (18, picky.signal)
     assert picky.blocks == 3
 
 
-def test_the_index_of_what_is_held_back_is_never_negative(tree: Tree, feed: Feed, listener: Recorder) -> None:
+def test_the_index_of_delayed_frames_is_never_negative(tree: Tree, feed: Feed, listener: Recorder) -> None:
     grow(tree, feed, fb_held=100)
     feed.put(count=2)
     listener.wait_blocks(tree.find("below"), 2)
     assert [block.next_index for block in listener.blocks[tree.find("below")]] == [0, 0]
 
 
-def test_a_format_goes_down_with_its_block(tree: Tree, feed: Feed, listener: Recorder) -> None:
+def test_a_format_changes_with_its_block(tree: Tree, feed: Feed, listener: Recorder) -> None:
     grow(tree, feed)
     coarser, picky, below = (tree.find(name) for name in ("coarser", "picky", "below"))
     feed.put(count=1)
     listener.wait_blocks(below, 1)
     tree.modify("coarser", "pp_step", "4")
-    assert (picky.rate, below.rate) == (RATE / 4, RATE / 4), "what is told is what will be"
+    assert (picky.rate, below.rate) == (RATE / 4, RATE / 4), "the reported rates are those of the next block"
     assert listener.blocks[below][0].rate == RATE / 2
     feed.put(count=1)
     listener.wait_blocks(below, 2)
@@ -202,20 +202,20 @@ def test_a_format_goes_down_with_its_block(tree: Tree, feed: Feed, listener: Rec
     assert first != second
 
 
-def test_a_child_refuses_what_its_parent_would_put_out(tree: Tree, feed: Feed, listener: Recorder) -> None:
-    """Also where it is two levels below; then nothing has changed anywhere."""
+def test_a_child_rejects_the_output_format_of_its_parent(tree: Tree, feed: Feed, listener: Recorder) -> None:
+    """Also from two levels below; then no processor has changed."""
     grow(tree, feed, fb_least=5)
-    refused(tree, "fb_least: 5 lags are wanted, there are 4", "coarser", "pp_lags", "4")
-    refused(tree, "fb_least: 11 lags are wanted, there are 10", "picky", "fb_least", "11")
+    assert_rejected(tree, "fb_least: 5 lags are required, got 4", "coarser", "pp_lags", "4")
+    assert_rejected(tree, "fb_least: 11 lags are required, got 10", "picky", "fb_least", "11")
     tree.modify("coarser", "pp_lags", "5")
     tree.modify("coarser", "pp_lags", "20")
     tree.modify("picky", "fb_least", "20")
-    refused(tree, "fb_least: 20 lags are wanted", "coarser", "pp_lags", "5")
+    assert_rejected(tree, "fb_least: 20 lags are required", "coarser", "pp_lags", "5")
     with pytest.raises(ComponentError, match="fb_least: 21"):
         tree.add("gammatone", "second", "coarser", {"fb_least": 21})
     tree.add("gammatone", "second", "coarser", {"fb_least": 3})
     tree.modify("picky", "fb_least", "1")
-    refused(tree, "fb_least: 3 lags are wanted", "coarser", "pp_lags", "2")
+    assert_rejected(tree, "fb_least: 3 lags are required", "coarser", "pp_lags", "2")
     tree.remove("second")
     tree.modify("coarser", "pp_lags", "2")
     feed.put(count=2)
@@ -223,10 +223,10 @@ def test_a_child_refuses_what_its_parent_would_put_out(tree: Tree, feed: Feed, l
     assert all(p.error is None for p in tree.processors)
 
 
-def test_a_change_waits_for_the_format_that_it_goes_with(
+def test_a_change_waits_for_the_format_that_it_fits(
     tree: Tree, feed: Feed, listener: Recorder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The parent has computed a block already when both change: that one goes the old way, and none is lost."""
+    """The parent has already computed a block when both change. That block is processed as before, none is lost."""
     working, go_on = threading.Event(), threading.Event()
     original = Picky.process
 
@@ -242,7 +242,7 @@ def test_a_change_waits_for_the_format_that_it_goes_with(
     assert working.wait(PATIENCE)
     wait_for(lambda: coarser.state is State.WAIT_RELEASE)
     tree.modify("coarser", "pp_lags", "50")
-    tree.modify("picky", "fb_least", "30")  # goes only with the new format
+    tree.modify("picky", "fb_least", "30")  # fits only the new format
     tree.modify("picky", "fb_held", "1")
     tree.modify("coarser", "pp_lags", "30")
     go_on.set()
@@ -250,11 +250,11 @@ def test_a_change_waits_for_the_format_that_it_goes_with(
     listener.wait_blocks(picky, 4)
     assert [block.signal.lags for block in listener.blocks[picky]] == [10, 10, 30, 30]
     assert [block.data.shape[-1] for block in listener.blocks[picky]] == [4, 4, 3, 4]
-    assert picky.parameters() == {"fb_least": 30, "fb_held": 1, "fb_squares": False}
+    assert picky.stage.parameters == {"fb_least": 30, "fb_held": 1, "fb_squares": False}
 
 
-def test_changes_in_an_order_that_only_goes_with_a_format_in_between() -> None:
-    """The new format needs a change, and another change needs the new format."""
+def test_changes_that_fit_only_with_a_format_between_them() -> None:
+    """The new format requires a change, and another change requires the new format."""
     few, many = (replace(SignalFormat.sound(RATE), lags=lags) for lags in (5, 20))
     changes = ParameterUpdates(Picky(many, fb_least=20))
     for name, value in (("fb_least", 3), ("fb_held", 1)):
@@ -269,8 +269,8 @@ def test_changes_in_an_order_that_only_goes_with_a_format_in_between() -> None:
     assert changes.stage_for_block(Block(1, (np.zeros((2, 4)),), 8, few)) is stage
 
 
-def test_a_format_that_nobody_can_use_yet_is_skipped() -> None:
-    """A stage that was made for the coming format, before a block of the last one."""
+def test_a_block_of_an_unusable_format_is_skipped() -> None:
+    """A stage was created for the next format, and gets a block of the previous one."""
     few, many = (replace(SignalFormat.sound(RATE), lags=lags) for lags in (5, 20))
     changes = ParameterUpdates(Picky(many, fb_least=20))
     planned = changes.final_stage
@@ -279,7 +279,7 @@ def test_a_format_that_nobody_can_use_yet_is_skipped() -> None:
     assert changes.stage_for_block(Block(1, (np.zeros((2, 4)),), 8, many)) is planned
 
 
-def test_what_is_planned_is_not_changed_by_a_block_of_the_last_format() -> None:
+def test_the_final_stage_is_not_changed_by_a_block_of_the_previous_format() -> None:
     few, many = (replace(SignalFormat.sound(RATE), lags=lags) for lags in (5, 20))
     changes = ParameterUpdates(Picky(many, fb_least=1))
     stage = changes.stage_for_block(Block(0, (np.zeros((2, 4)),), 4, few))
@@ -287,7 +287,7 @@ def test_what_is_planned_is_not_changed_by_a_block_of_the_last_format() -> None:
     assert (stage.output_format.lags, changes.final_stage.output_format.lags) == (5, 20)
 
 
-def test_by_products_go_to_those_that_need_them(tree: Tree, feed: Feed, listener: Recorder) -> None:
+def test_extras_are_provided_to_the_children_that_require_them(tree: Tree, feed: Feed, listener: Recorder) -> None:
     grow(tree, feed, fb_held=0)
     picky = tree.find("picky")
     feed.put(count=1)
@@ -305,21 +305,21 @@ def test_by_products_go_to_those_that_need_them(tree: Tree, feed: Feed, listener
     assert [set(block.extras) for block in listener.blocks[tree.find("coarser")]] == [set(), {"squares"}, set()]
 
 
-def test_a_by_product_that_the_parent_does_not_have_is_refused(
+def test_an_extra_that_the_parent_does_not_have_is_rejected(
     tree: Tree, feed: Feed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     grow(tree, feed)
     monkeypatch.setattr(Coarser, "EXTRAS", ())
-    refused(tree, "gammatone needs the squares of preProc, which has none", "picky", "fb_squares", "1")
+    assert_rejected(tree, "gammatone needs the squares of preProc, which has none", "picky", "fb_squares", "1")
     with pytest.raises(ComponentError, match="needs the squares"):
         tree.add("gammatone", "second", "coarser", {"fb_squares": True})
 
 
-def test_memory_counts_all_parts_and_all_below(tree: Tree, feed: Feed, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A change of the rate above makes the output of all below larger."""
+def test_memory_includes_all_parts_and_all_descendants(tree: Tree, feed: Feed, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A change of the rate above a processor increases the output of all descendants."""
     grow(tree, feed, pp_step=100)
     before = tree.processors
     monkeypatch.setattr("rosafe.tree.sizes.machine_memory", lambda: 2 * int(8 * RATE * (2 + 0.02 + 0.03 + 0.02 + 0.1)))
-    refused(tree, "1 s of output of 4 processors, and their states, take", "coarser", "pp_step", "1")
+    assert_rejected(tree, "1 s of output of 4 processors, and their states, take", "coarser", "pp_step", "1")
     tree.modify("coarser", "pp_step", "99")
     assert tree.processors == before

@@ -1,4 +1,4 @@
-"""The real tree under every order of events with a few deviations: no block lost, doubled or reordered, no deadlock."""
+"""The tree under many schedules of its threads: no block is lost, repeated or reordered, and there is no deadlock."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ Scenario = Callable[[Scheduler, int], Check]
 
 
 class Numbers:
-    """A source of blocks that hold their number. It ends with them, or never."""
+    """A source of blocks that contain their number. It ends after them, or never."""
 
     sample_rate = 1000.0
 
@@ -50,12 +50,16 @@ class Numbers:
         self.ended = self.ended or self._ends
         return None
 
+    @property
+    def waiting(self) -> bool:
+        return not (self.numbers or self._ends or self.ended)
+
     def stop(self) -> None:
         self.stopped = self.ended = True
 
 
 class Log:
-    """A listener that writes down what was released by whom. Only one thread runs at a time, so it needs no lock."""
+    """A listener that records the blocks of each processor. Only one thread runs at a time: it needs no lock."""
 
     def __init__(self) -> None:
         self.numbers: dict[Processor, list[int]] = {}
@@ -75,7 +79,7 @@ class Log:
         self.ends.append(processor)
 
     def assert_run(self, processor: Processor, first: int | None, last: int | None) -> None:
-        """It released blocks one after the other, from `first` to `last` (None: from or to any)."""
+        """Check that it released consecutive blocks from `first` to `last` (None: from or to any)."""
         numbers = self.numbers[processor]
         assert processor.error is None, f"{processor!r}: {processor.error!r}"
         if numbers:
@@ -87,13 +91,13 @@ class Log:
 
 
 def use(patch: pytest.MonkeyPatch, threading: Any) -> None:
-    """Let the tree's code take locks and threads from there."""
+    """Let the code of the tree use the locks and threads of `threading`."""
     for module in (parameter_updates, history, processor, tree, workers):
         patch.setattr(module, "threading", threading)
 
 
 def run_to_the_end(tree: Tree) -> None:
-    """Wait until all processors have come to their end, then until no thread is left."""
+    """Wait until all processors are finished, then until all threads have ended."""
     for one in tree.processors:
         one.join()
     end(tree)
@@ -108,7 +112,7 @@ def end(tree: Tree) -> None:
 
 
 def grow(scheduler: Scheduler, count: int) -> Check:
-    """Processors come while blocks flow: siblings, and a child's child."""
+    """Processors are added while blocks are processed: siblings, and a grandchild."""
     log = Log()
     tree = Tree(log, count)
     root = tree.add_input("input", Numbers(range(3)), 1, 0.0, 0.0)
@@ -125,8 +129,8 @@ def grow(scheduler: Scheduler, count: int) -> Check:
     return check
 
 
-def hear(scheduler: Scheduler, count: int) -> Check:
-    """Blocks come one by one from a thread of their own, which wakes the tree each time."""
+def wake(scheduler: Scheduler, count: int) -> Check:
+    """A thread adds blocks one by one, and wakes the tree each time."""
     log = Log()
     tree = Tree(log, count)
     source = Numbers(range(0), ends=False)
@@ -152,8 +156,8 @@ def hear(scheduler: Scheduler, count: int) -> Check:
     return check
 
 
-def pass_on(scheduler: Scheduler, count: int) -> Check:
-    """Nobody hears of the input and of one below it; what hangs on them misses nothing."""
+def without_consumers(scheduler: Scheduler, count: int) -> Check:
+    """The input and its child have no consumers. The grandchild gets all blocks."""
     log = Log()
     tree = Tree(log, count)
     source = Numbers(range(0), ends=False)
@@ -175,7 +179,7 @@ def pass_on(scheduler: Scheduler, count: int) -> Check:
 
 
 def shrink(scheduler: Scheduler, count: int) -> Check:
-    """One of two siblings goes with what is below it; its name is used again at once."""
+    """One of two siblings is removed with its child, and its name is used again immediately."""
     log = Log()
     tree = Tree(log, count)
     root = tree.add_input("input", Numbers(range(2)), 1, 0.0, 0.0)
@@ -199,8 +203,8 @@ def shrink(scheduler: Scheduler, count: int) -> Check:
     return check
 
 
-def leave(scheduler: Scheduler, count: int) -> Check:
-    """The only child goes: the input does not wait for it."""
+def remove_child(scheduler: Scheduler, count: int) -> Check:
+    """The only child is removed: the input does not wait for it."""
     log = Log()
     tree = Tree(log, count)
     root = tree.add_input("input", Numbers(range(3)), 1, 0.0, 0.0)
@@ -217,7 +221,7 @@ def leave(scheduler: Scheduler, count: int) -> Check:
 
 
 def replace_input(scheduler: Scheduler, count: int) -> Check:
-    """A new input takes over the tree: the child misses nothing of it, whatever it did for the old one."""
+    """A new input takes over the tree. Its child gets all its blocks, whatever it did for the old one."""
     log = Log()
     tree = Tree(log, count)
     old_source, new_source = Numbers(range(2), ends=False), Numbers(range(10, 13))
@@ -243,7 +247,7 @@ def replace_input(scheduler: Scheduler, count: int) -> Check:
 
 
 def stop(scheduler: Scheduler, count: int) -> Check:
-    """Everything ends at any moment, and the tree begins anew."""
+    """The tree is stopped at any moment and built again."""
     log = Log()
     tree = Tree(log, count)
     tree.add_input("input", Numbers(range(9), ends=False), 1, 0.0, 0.0)
@@ -262,7 +266,7 @@ def stop(scheduler: Scheduler, count: int) -> Check:
 
 
 def fail(scheduler: Scheduler, count: int) -> Check:
-    """A processor fails in its second block: it goes with what is below it, the others do not notice."""
+    """A processor fails in its second block. Its sibling and its parent are not affected."""
     log = Log()
     tree = Tree(log, count)
     root = tree.add_input("input", Numbers(range(2)), 1, 0.0, 0.0)
@@ -283,7 +287,7 @@ def fail(scheduler: Scheduler, count: int) -> Check:
 
 
 class Failing(Plain):
-    """Fails in its second block, where it is asked to."""
+    """A stage that fails in its second block if `fails` is set."""
 
     def process(self, block: np.ndarray, extra: np.ndarray | None = None, out: np.ndarray | None = None) -> np.ndarray:
         if self.parameters.get("fails") and block[0, 0] == 1.0:
@@ -291,11 +295,11 @@ class Failing(Plain):
         return block
 
 
-# --- they hold ---
+# --- correct code ---
 
 
 @pytest.fixture(autouse=True)
-def plain(monkeypatch: pytest.MonkeyPatch) -> None:
+def plain_stages(monkeypatch: pytest.MonkeyPatch) -> None:
     use_plain_stages(monkeypatch, preProc=Failing)
     monkeypatch.setattr(workers, "WAKE_THRESHOLD_SECONDS", 0.0)
 
@@ -307,52 +311,75 @@ def go(patch: pytest.MonkeyPatch, scenario: Scenario, count: int, delays: int, w
     return explore(run, partial(use, patch), delays, walks)
 
 
-@pytest.mark.parametrize("telling", [0.0, math.inf])
-@pytest.mark.parametrize("count", [1, 2, 3])
-@pytest.mark.parametrize(
+scenarios = pytest.mark.parametrize(
     ("scenario", "delays"),
-    [(grow, 1), (hear, 1), (pass_on, 1), (shrink, 2), (leave, 2), (replace_input, 1), (stop, 2), (fail, 2)],
+    [
+        (grow, 1),
+        (wake, 1),
+        (without_consumers, 1),
+        (shrink, 2),
+        (remove_child, 2),
+        (replace_input, 1),
+        (stop, 2),
+        (fail, 2),
+    ],
 )
+
+
+@pytest.mark.parametrize(("count", "threshold"), [(1, 0.0), (2, math.inf), (3, 0.0)])
+@scenarios
 def test_any_order_of_events(
-    scenario: Scenario, delays: int, count: int, telling: float, monkeypatch: pytest.MonkeyPatch
+    scenario: Scenario, delays: int, count: int, threshold: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Other workers are called whenever there is something to do; the world is told at once, or later."""
-    monkeypatch.setattr(processor, "WAKE_THRESHOLD_SECONDS", telling)
+    """Other workers are woken for every task; blocks are published immediately or later."""
+    monkeypatch.setattr(processor, "SLOW_LISTENER_SECONDS", threshold)
     assert go(monkeypatch, scenario, count, delays, WALKS) > WALKS + 15
 
 
-@pytest.mark.parametrize("scenario", [grow, hear, shrink, replace_input])
-def test_any_order_of_events_where_calls_are_rare(scenario: Scenario, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(workers, "WAKE_THRESHOLD_SECONDS", math.inf)
+@pytest.mark.exploration
+@pytest.mark.parametrize("threshold", [0.0, math.inf])
+@pytest.mark.parametrize("count", [1, 2, 3])
+@scenarios
+def test_any_order_of_events_in_all_combinations(
+    scenario: Scenario, delays: int, count: int, threshold: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(processor, "SLOW_LISTENER_SECONDS", threshold)
+    assert go(monkeypatch, scenario, count, delays, WALKS) > WALKS + 15
+
+
+@pytest.mark.parametrize("scenario", [grow, wake, shrink, replace_input])
+def test_any_order_of_events_with_few_wake_ups(scenario: Scenario, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name in ("WAKE_THRESHOLD_SECONDS", "BUSY_THRESHOLD_SECONDS"):
+        monkeypatch.setattr(workers, name, math.inf)
     assert go(monkeypatch, scenario, 2, 1, WALKS) > WALKS + 15
 
 
-# --- and it is found where they do not ---
+# --- faults that must be found ---
 
 
 def test_the_exploration_finds_a_parent_that_does_not_wait(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It releases while a child holds the last block, or has not taken it."""
-    done = StateMachine.finish_block
+    """The parent releases a block while a child holds the last block, or has not read it yet."""
+    finish_block = StateMachine.finish_block
 
-    def release_anyway(self: StateMachine, private: Block | None) -> None:
+    def release_anyway(self: StateMachine, computed: Block | None) -> None:
         self._readers.clear()
-        done(self, private)
+        finish_block(self, computed)
 
     monkeypatch.setattr(StateMachine, "finish_block", release_anyway)
     with pytest.raises(AssertionError, match="released"):
         go(monkeypatch, grow, 2, 1, WALKS)
 
 
-def test_the_exploration_finds_a_look_at_tokens_that_is_out_of_date(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A child that looks whether there is a token, and takes it later: there may be another one meanwhile."""
+def test_the_exploration_finds_an_outdated_check_for_tokens(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A child checks for a token and takes it later, when there may be another one."""
 
     def take_later(self: Processor) -> bool:
         if not self.ready:
             return False
         self.busy = True
         self.current_block = self._next_block
-        self._lock.release()
-        self._lock.acquire()
+        self._context.workers.lock.release()
+        self._context.workers.lock.acquire()
         self.input_pending, self._next_block, self._block_owner = False, None, self.parent
         if self.current_block is not None:
             self._set_state(State.EXEC, self.current_block.number)
@@ -363,52 +390,52 @@ def test_the_exploration_finds_a_look_at_tokens_that_is_out_of_date(monkeypatch:
         go(monkeypatch, replace_input, 2, 2, WALKS)
 
 
-def test_the_exploration_finds_a_token_for_the_wrong_zone(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A child that gives its block back to the parent that it has now."""
+def test_the_exploration_finds_a_token_returned_to_the_wrong_parent(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A child returns its block to its present parent, not to the owner of the block."""
 
-    def give_back_to_the_present_parent(self: StateMachine) -> None:
+    def return_to_the_present_parent(self: StateMachine) -> None:
         if self.parent is not None:
             self.parent._reader_done(self)
 
-    monkeypatch.setattr(StateMachine, "release_input", give_back_to_the_present_parent)
+    monkeypatch.setattr(StateMachine, "release_input", return_to_the_present_parent)
     with pytest.raises(AssertionError, match="released"):
         go(monkeypatch, replace_input, 2, 0, WALKS)
 
 
 def test_the_exploration_finds_a_deadlock(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A child that does not say that it is done."""
+    """A child does not report that it is finished with a block."""
     monkeypatch.setattr(StateMachine, "_reader_done", lambda self, child: self._readers.discard(child))
     with pytest.raises(AssertionError, match="deadlock"):
         go(monkeypatch, grow, 2, 0, WALKS)
 
 
-def test_the_exploration_finds_a_task_that_two_work_on(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An input that was called twice, and is taken up twice."""
+def test_the_exploration_finds_a_task_with_two_workers(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An input is notified twice, and run by two workers."""
     begin = StateMachine.begin_work
 
-    def begin_though_at_work(self: StateMachine) -> bool:
+    def begin_while_busy(self: StateMachine) -> bool:
         self.busy = False
         return begin(self)
 
-    monkeypatch.setattr(StateMachine, "begin_work", begin_though_at_work)
+    monkeypatch.setattr(StateMachine, "begin_work", begin_while_busy)
     with pytest.raises(AssertionError):
-        go(monkeypatch, hear, 2, 1, WALKS)
+        go(monkeypatch, wake, 2, 1, WALKS)
 
 
-def test_the_exploration_finds_a_call_that_is_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An input that forgets, after it has looked for sound in vain, that it was called meanwhile."""
-    rest = Processor.end_work
+def test_the_exploration_finds_a_lost_notification(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An input has read no block, and loses a notification that arrived meanwhile."""
+    end_work = Processor.end_work
 
     def forget(self: Processor) -> None:
         self.input_pending = self.input_pending and self.state is not State.WAIT_EXEC
-        rest(self)
+        end_work(self)
 
     monkeypatch.setattr(Processor, "end_work", forget)
     with pytest.raises(AssertionError, match="deadlock"):
-        go(monkeypatch, hear, 2, 1, WALKS)
+        go(monkeypatch, wake, 2, 1, WALKS)
 
 
-def test_the_exploration_finds_a_worker_that_is_not_called(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_exploration_finds_a_worker_that_is_not_woken(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Workers, "wake", lambda self: None)
     with pytest.raises(AssertionError, match="deadlock"):
-        go(monkeypatch, hear, 2, 1, WALKS)
+        go(monkeypatch, wake, 2, 1, WALKS)

@@ -1,4 +1,4 @@
-"""What stages keep between blocks counts as what they put out does, and is refused before it is made."""
+"""The memory of states counts like that of outputs, and is checked before it is allocated."""
 
 from __future__ import annotations
 
@@ -35,11 +35,13 @@ SOUND = SignalFormat(RATE, RATE, False, 1, 1, FREQUENCIES)
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
-def test_what_a_stage_keeps_is_what_it_says(
+def test_a_stage_keeps_the_memory_that_it_declares(
     kind: str, given: SignalFormat, parameters: dict[str, Any], blocks: list[int]
 ) -> None:
     rng = np.random.default_rng(0)
-    STAGES[kind](given, **parameters).process(*arguments(kind, rng, 50))  # tables that all of its kind share
+    STAGES[kind](given, **parameters).process(
+        *arguments(kind, rng, 50)
+    )  # allocate tables that all stages of this kind share
     tracemalloc.start()
     try:
         stage = STAGES[kind](given, **parameters)
@@ -48,12 +50,10 @@ def test_what_a_stage_keeps_is_what_it_says(
         kept = tracemalloc.get_traced_memory()[0]
     finally:
         tracemalloc.stop()
-    told = sizes.state_size(stage, (2, CHANNELS))
-    window = (
-        2 * 8.0 * 2 * CHANNELS * (stage.output_format.window - given.window) / given.hop
-    )  # of the input, in its store
-    assert kept <= 1.05 * (told + window) + 200_000
-    assert told <= 6 * kept
+    declared = sizes.state_size(stage, (2, CHANNELS))
+    window = 2 * 8.0 * 2 * CHANNELS * (stage.output_format.window - given.window) / given.hop  # buffered input
+    assert kept <= 1.05 * (declared + window) + 200_000
+    assert declared <= 6 * kept
 
 
 def arguments(kind: str, rng: np.random.Generator, number: int) -> list[Any]:
@@ -73,10 +73,10 @@ MANY = {"fb_nChannels": 1000, "fb_highFreqHz": 7000.0}
     ],
 )
 def test_states_that_are_too_large(kind: str, parameters: dict[str, Any]) -> None:
-    """Nothing of that size has been made by then."""
+    """They are rejected before they are allocated."""
     tracemalloc.start()
     try:
-        text = f"{kind}: what it keeps of 2x1000 values takes [0-9]+ MiB, more than 1024 MiB"
+        text = f"{kind}: the state for 2x1000 values takes [0-9]+ MiB, more than 1024 MiB"
         with pytest.raises(ValueError, match=text):
             rosafe.process(np.zeros((2, 1600)), RATE, parameters={**MANY, **parameters}, outputs=[kind])
         assert tracemalloc.get_traced_memory()[1] < 2**26
@@ -85,7 +85,7 @@ def test_states_that_are_too_large(kind: str, parameters: dict[str, Any]) -> Non
 
 
 def test_the_autocorrelation_of_many_channels(tree: Tree, feed: Feed) -> None:
-    """In a tree that runs, what it puts out in ten seconds; offline there is no more than the sound is long."""
+    """In a running tree, ten seconds of its output are limited. Offline, the output is as long as the sound."""
     tree.add_input("input", feed, 160, 1.0, 10.0)
     for kind, parent in (("preProc", "input"), ("gammatone", "preProc"), ("ihc", "gammatone")):
         tree.add(kind, kind, parent, {"fb_nChannels": 256, "fb_highFreqHz": 7000.0} if kind == "gammatone" else {})
@@ -96,7 +96,7 @@ def test_the_autocorrelation_of_many_channels(tree: Tree, feed: Feed) -> None:
 
 
 def test_states_have_their_share_of_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each of them would do, and all together not."""
+    """Each state alone is accepted, all together are not."""
     stages = [(STAGES["gabor"](FRAMES), (2, CHANNELS)) for _ in range(4)]
     one = sizes.state_size(*stages[0]) + sizes.output_size(*stages[0], 1.0)
     monkeypatch.setattr(sizes, "machine_memory", lambda: int(one * 3.5 / sizes.MAX_MEMORY_FRACTION))

@@ -1,4 +1,4 @@
-"""The state machine that runs, without threads: every state that a small tree can get into, by every order of steps."""
+"""The state machine without threads: all states that a small tree can reach by any order of steps."""
 
 from __future__ import annotations
 
@@ -13,31 +13,31 @@ from rosafe.tree.states import FINAL_STATES, State, StateMachine
 
 SIGNAL = SignalFormat.sound(1.0)
 Saved = tuple[list[dict[str, Any]], dict[str, tuple[int, ...]]]
-STEPS = {"": (), "compute": ("compute", "skip"), "tell": ("tell", "rest"), "rest": ("rest",)}  # of a worker
+STEPS = {"": (), "compute": ("compute", "skip"), "publish": ("publish", "end_work"), "end_work": ("end_work",)}
 
 
 def block(number: int) -> Block:
     return Block(number, (np.zeros((2, 0)),), 0, SIGNAL)
 
 
-def note_release(one: Machine, state: State, number: int | None) -> None:
+def record_release(one: Machine, state: State, number: int | None) -> None:
     if state is State.RELEASE and number is not None:
         one.released += (number,)
 
 
 class Machine(StateMachine):
-    """A processor without numerics; what a worker is about to do with it is `then`."""
+    """A processor without computation; `then` is the next step of its worker."""
 
     def __init__(self, name: str, parent: Machine | None) -> None:
         super().__init__(parent)
         self.name = name
-        self.attached = self.roused = self.settled = False
-        self.observers = (note_release,)
+        self.attached = self.woken = self.has_ended = False
+        self.observers = (record_release,)
         self.then = ""
         self.seen: tuple[int, ...] = ()
         self.released: tuple[int, ...] = ()
-        self.told: tuple[int, ...] = ()
-        self.begins: int | None = None  # the first block that it should see; None: any
+        self.published: tuple[int, ...] = ()
+        self.begins: int | None = None  # the first block that it should process; None: any
 
     def __str__(self) -> str:
         return self.name
@@ -51,15 +51,15 @@ class Machine(StateMachine):
 
     def on_ready(self) -> None:
         assert self.ready
-        self.roused = True
+        self.woken = True
 
     def on_finished(self) -> None:
         assert self.finished
-        self.settled = True
+        self.has_ended = True
 
     def fingerprint(self) -> tuple[Any, ...]:
-        """All that `save` keeps and that changes; of a block only its number."""
-        taken, shared, untold, private, token = (
+        """Return all variables that `save` stores; a block is represented by its number."""
+        current, last, unpublished, pending, following = (
             self.current_block,
             self.last_block,
             self.unpublished_block,
@@ -67,27 +67,27 @@ class Machine(StateMachine):
             self._next_block,
         )
         return (
-            *(self.state, self.busy, self.input_pending, self.attached, self.roused, self.settled, self.then),
-            *(taken and taken.number, shared and shared.number, untold and untold.number),
-            *(private and private.number, token and token.number),
+            *(self.state, self.busy, self.input_pending, self.attached, self.woken, self.has_ended, self.then),
+            *(current and current.number, last and last.number, unpublished and unpublished.number),
+            *(pending and pending.number, following and following.number),
             *(self.parent, self._block_owner, frozenset(self.children), frozenset(self._readers)),
-            *(self.seen, self.released, self.told),
+            *(self.seen, self.released, self.published),
         )
 
 
 class World:
-    """An input, what may hang on it, and perhaps one that takes its place.
+    """An input, its possible descendants, and optionally a second input that replaces it.
 
     Parameters
     ----------
     parents : dict of str to str
-        The parent of each name; of the inputs an empty one.
+        The parent of each name; empty for inputs.
     blocks : int
-        That an input reads until it ends; the numbers of the second one's begin at 10.
+        Number of blocks of an input. The numbers of the second input begin at 10.
     called_once : bool
-        All are there from the start, and the input is called then and never again.
+        Whether all blocks are available at the start, and the input is notified only then.
     fails : bool
-        Each may fail.
+        Whether every processor may fail.
     """
 
     def __init__(self, parents: dict[str, str], blocks: int, called_once: bool = False, fails: bool = False) -> None:
@@ -96,7 +96,7 @@ class World:
             self.machines[name] = Machine(name, self.machines.get(parent))
         self.coming = {name: tuple(range(first, first + blocks)) for name, first in (("root", 0), ("new", 10))}
         self.called_once, self.fails = called_once, fails
-        self.numbers: dict[tuple[Any, ...], int] = {}  # of the fingerprints of machines
+        self.numbers: dict[tuple[Any, ...], int] = {}  # by fingerprint of a machine
         self.attach(self.machines["root"])
         if called_once:
             self.call(self.machines["root"])
@@ -108,7 +108,7 @@ class World:
         machine.attach()
 
     def steps(self) -> list[tuple[str, str]]:
-        """All that can happen next, each as a name and a step."""
+        """Return all possible next steps, each as a name and a step."""
         return [(name, step) for name, one in self.machines.items() for step in self.possible(one)]
 
     def possible(self, one: Machine) -> list[str]:
@@ -118,18 +118,18 @@ class World:
                 return ["replace"] if self.machines["root"].state is not State.DONE else []
             return ["come"] if above.attached and not above.removed else []  # type: ignore[attr-defined]
         steps = [*STEPS[one.then]]
-        if self.fails and one.then in ("compute", "tell"):
+        if self.fails and one.then in ("compute", "publish"):
             steps.append("fail")
         if above is not None and not one.removed:
             steps.append("go")
         if above is None and not self.called_once and not one.input_pending and one.state not in FINAL_STATES:
             steps.append("call")
-        if one.roused and one.ready:
+        if one.woken and one.ready:
             steps.append("begin")
         return steps
 
     def save(self) -> Saved:
-        """What `load` brings back: no machine is copied, so that all go on knowing each other."""
+        """Return the state for `load`. Machines are not copied, so that their references stay valid."""
         return [machine.save() for machine in self.machines.values()], dict(self.coming)
 
     def load(self, saved: Saved) -> None:
@@ -142,7 +142,7 @@ class World:
         getattr(self, step)(self.machines[name])
 
     def fingerprint(self) -> tuple[int, ...]:
-        """What two worlds have in common that go on alike: a number for each machine's, of which there are few."""
+        """Return a key that equal states share: the number of each machine's fingerprint."""
         numbers = self.numbers
         return tuple([numbers.setdefault(one.fingerprint(), len(numbers)) for one in self.machines.values()])
 
@@ -170,14 +170,14 @@ class World:
     def call(self, one: Machine) -> None:
         one.notify_input()
 
-    # what a worker does, each step with the lock held
+    # the steps of a worker, each with the lock held
 
     def begin(self, one: Machine) -> None:
-        one.roused = False
-        telling = one.state is State.RELEASE
+        one.woken = False
+        publishing = one.state is State.RELEASE
         assert one.begin_work()
-        if telling:
-            one.then = "tell"
+        if publishing:
+            one.then = "publish"
             return
         if one.parent is None and self.coming[one.name]:
             first, *rest = self.coming[one.name]
@@ -185,7 +185,7 @@ class World:
             one.accept_input_block(block(first))
         elif one.parent is None:
             one.end_of_stream()
-            one.then = "rest"
+            one.then = "end_work"
             return
         assert one.current_block is not None
         assert one.seen or one.begins in (one.current_block.number, None)
@@ -195,63 +195,69 @@ class World:
     def compute(self, one: Machine) -> None:
         assert one.current_block is not None
         one.finish_block(block(one.current_block.number))
-        one.then = "rest" if one.unpublished_block is None else "tell"
+        one.then = "end_work" if one.unpublished_block is None else "publish"
 
     def skip(self, one: Machine) -> None:
-        """A block that it cannot use."""
+        """Discard a block that the stage cannot process."""
         one.finish_block(None)
-        one.then = "rest"
+        one.then = "end_work"
 
     def fail(self, one: Machine) -> None:
-        """Also one that has computed, and cannot tell of it."""
+        """Fail, possibly after the computation, when the block cannot be published."""
         one.end_of_stream()
-        one.then = "rest"
+        one.then = "end_work"
 
-    def tell(self, one: Machine) -> None:
+    def publish(self, one: Machine) -> None:
         if one.unpublished_block is not None:
             if not one.removed:
-                one.told += (one.unpublished_block.number,)
+                one.published += (one.unpublished_block.number,)
             one.unpublished_block = None
-        one.then = "rest"
+        one.then = "end_work"
 
-    def rest(self, one: Machine) -> None:
-        """Also before it has told: somebody else may do that."""
+    def end_work(self, one: Machine) -> None:
+        """End the work, possibly before the block is published, which another worker may do."""
         one.then = ""
         one.end_work()
 
-    # what holds
+    # invariants
 
     def check(self) -> None:
-        """At any moment."""
+        """Check the invariants of every state."""
         for one in self.machines.values():
             for first in (0, 10) if one.parent is not None else ():
-                came = self.released(one, range(first, first + 10))
+                released = self.released(one, range(first, first + 10))
                 seen = [n for n in one.seen if n in range(first, first + 10)]
-                assert not seen or seen == came[came.index(seen[0]) :][: len(seen)], f"{one.name} saw {one.seen}"
-            assert one.told == one.released[: len(one.told)], f"{one.name} told {one.told} of {one.released}"
+                assert not seen or seen == released[released.index(seen[0]) :][: len(seen)], (
+                    f"{one.name} saw {one.seen}"
+                )
+            assert one.published == one.released[: len(one.published)], (
+                f"{one.name} published {one.published} of {one.released}"
+            )
             if one.ready:
-                assert one.roused, f"{one.name} is ready, and nobody knows"
+                assert one.woken, f"{one.name} is ready without a call of on_ready"
             reading = one._block_owner
             if reading is not None and not reading.removed and not one.removed:
                 assert one.current_block is reading.last_block, "a block changed under its reader"
-            assert one.settled == (one.attached and one.finished), f"{one.name} is over, and nobody knows"
+            assert one.has_ended == (one.attached and one.finished), (
+                f"{one.name} is finished without a call of on_finished"
+            )
             assert (one.parent is None) or (one in one.parent.children) == (
                 one.attached and not one.removed and not one.parent.removed
             )
 
     def released(self, child: Machine, numbers: range) -> list[int]:
-        """Which of these its parent has released, or the input before that."""
+        """Return which of these numbers its parent, or a previous input, has released."""
         parents = {child.parent}
         if child.parent is self.machines.get("new"):
             parents.add(self.machines["root"])
         return sorted(n for parent in parents for n in parent.released if n in numbers)  # type: ignore[union-attr]
 
     def check_end(self) -> None:
-        """Where nothing can happen any more but that somebody comes or goes."""
+        """Check a state in which only requests to add or remove processors are possible."""
         replaced = self.machines["root"].removed
         for one in self.machines.values():
             if one.attached and not one.removed:
-                assert one.finished and one.state is State.DONE, f"{one.name} waits for ever"
+                assert one.finished and one.state is State.DONE, f"{one.name} waits forever"
                 assert not one._readers
                 assert one.unpublished_block is None or self.fails
                 if one.parent is not None and one.begins is not None and not replaced:
@@ -260,7 +266,7 @@ class World:
 
 
 def explore(world: World) -> tuple[int, int]:
-    """Go through all states; their number, and that of those in which only requests are left."""
+    """Visit all states. Return their number, and the number of those in which only requests are possible."""
     known = {world.fingerprint()}
     unexplored = [world.save()]
     ends = 0
@@ -289,34 +295,34 @@ ANOTHER_INPUT = {"root": "", "new": "", "a": "root"}
 
 
 @pytest.mark.parametrize(
-    ("parents", "blocks", "least"),
+    ("parents", "blocks", "min_states"),
     [
         (CHILD, 3, 4_000),
         (ANOTHER_INPUT, 1, 6_000),
         pytest.param(GRANDCHILD, 2, 14_000, marks=pytest.mark.long),
-        pytest.param(SIBLINGS, 2, 50_000, marks=pytest.mark.long),
+        pytest.param(SIBLINGS, 2, 50_000, marks=pytest.mark.exploration),
         pytest.param({**SIBLINGS, "c": "a"}, 1, 30_000, marks=pytest.mark.long),
-        pytest.param(ANOTHER_INPUT, 2, 150_000, marks=(pytest.mark.long, pytest.mark.timeout(900))),
+        pytest.param(ANOTHER_INPUT, 2, 150_000, marks=(pytest.mark.exploration, pytest.mark.timeout(900))),
     ],
 )
-def test_every_order_of_steps(parents: dict[str, str], blocks: int, least: int) -> None:
-    """Each sees a contiguous run of what its parent releases, nobody waits in vain, and who is ready is known to be."""
+def test_every_order_of_steps(parents: dict[str, str], blocks: int, min_states: int) -> None:
+    """Each processor gets consecutive blocks of its parent, none waits forever, and each ready one was reported."""
     states, ends = explore(World(parents, blocks))
-    assert states > least
+    assert states > min_states
     assert ends > 50
 
 
-def test_all_blocks_may_be_there_before_the_first_look() -> None:
+def test_all_blocks_may_be_available_at_the_start() -> None:
     explore(World(CHILD, 3, called_once=True))
 
 
-def test_each_may_fail() -> None:
-    """Then it is over at once, and so is, after its last block, what hangs on it."""
+def test_each_processor_may_fail() -> None:
+    """A failed processor ends immediately, and its children end after their last block."""
     explore(World(CHILD, 2, fails=True))
     explore(World(GRANDCHILD, 1, called_once=True, fails=True))
 
 
-def test_a_call_that_is_forgotten_while_it_tells_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_notification_lost_during_publishing_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
     begin = StateMachine.begin_work
 
     def forget(self: StateMachine) -> bool:
@@ -325,21 +331,21 @@ def test_a_call_that_is_forgotten_while_it_tells_is_found(monkeypatch: pytest.Mo
         return begun
 
     monkeypatch.setattr(StateMachine, "begin_work", forget)
-    with pytest.raises(AssertionError, match="waits for ever"):
+    with pytest.raises(AssertionError, match="waits forever"):
         explore(World(CHILD, 3, called_once=True))
 
 
 @pytest.mark.parametrize(
     ("name", "mutant", "fault"),
     [
-        ("_reader_done", lambda self, child: self._readers.discard(child), "waits for ever"),
+        ("_reader_done", lambda self, child: self._readers.discard(child), "waits forever"),
         (
             "release_input",
             lambda self: self.parent and self.parent._reader_done(self),
-            "changed under its reader|waits for ever|saw",
+            "changed under its reader|waits forever|saw",
         ),
-        ("_end_if_exhausted", lambda self: None, "waits for ever"),
-        ("_detach", lambda self: self.parent and self.parent.children.remove(self), "waits for ever|changed|assert"),
+        ("_end_if_exhausted", lambda self: None, "waits forever"),
+        ("_detach", lambda self: self.parent and self.parent.children.remove(self), "waits forever|changed|assert"),
     ],
 )
 def test_faults_are_found(name: str, mutant: Any, fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -353,7 +359,7 @@ def test_faults_are_found(name: str, mutant: Any, fault: str, monkeypatch: pytes
 
 
 def machine(name: str, parent: Machine | None = None, *released: int) -> Machine:
-    """One that is attached, and has released these blocks."""
+    """Return an attached machine that has released these blocks."""
     one = Machine(name, parent)
     one.attach()
     for number in released:

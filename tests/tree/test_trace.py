@@ -1,4 +1,4 @@
-"""The trace: every step of every processor, in a form that viewers take, and numbers that are right."""
+"""Traces: every transition of every processor, the format for viewers, and the figures of the summary."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def workers() -> int:
 def test_overlap_of_parent_and_child_and_of_siblings(
     tree: Tree, listener: Recorder, feed: Feed, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Stages that insist on it: the siblings meet in mid-work, and then the parent in the middle of its next block."""
+    """Barriers in the stages enforce it: the siblings meet, and then the parent meets them in its next block."""
     last = 5
     siblings_meet, all_meet = threading.Barrier(2), threading.Barrier(3)
 
@@ -70,17 +70,17 @@ def test_overlap_of_parent_and_child_and_of_siblings(
         ("a", "b", "siblings"),
     }
     for name in trace.processors:
-        assert [span.block for span in trace.of(name, State.EXEC)] == list(range(last + 1))
-        assert [span.block for span in trace.of(name, State.RELEASE)] == list(range(last + 1))
+        assert [interval.block for interval in trace.of(name, State.EXEC)] == list(range(last + 1))
+        assert [interval.block for interval in trace.of(name, State.RELEASE)] == list(range(last + 1))
     assert trace.workers == ["worker 1", "worker 2", "worker 3"]
-    assert all(span.worker in trace.workers for span in trace.spans if span.state == State.EXEC.value)
+    assert all(interval.worker in trace.workers for interval in trace.intervals if interval.state == State.EXEC.value)
     for name in ("a", "b"):
-        together = {(one.block, other.block) for one, other in trace.overlap("parent", name)}
-        assert {(n + 1, n) for n in range(last)} <= together, "the parent at block n + 1, the child at block n"
+        overlapping = {(one.block, other.block) for one, other in trace.overlap("parent", name)}
+        assert {(n + 1, n) for n in range(last)} <= overlapping, "the parent at block n + 1, the child at block n"
     assert {(n, n) for n in range(last + 1)} <= {(a.block, b.block) for a, b in trace.overlap("a", "b")}
 
 
-def test_nothing_is_noted_after_the_end(tree: Tree, listener: Recorder, feed: Feed) -> None:
+def test_no_event_is_recorded_after_the_end(tree: Tree, listener: Recorder, feed: Feed) -> None:
     tracer = Tracer()
     stop = tree.observe(tracer)
     tree.add_input("input", feed, 1, 1.0, 1.0)
@@ -93,7 +93,7 @@ def test_nothing_is_noted_after_the_end(tree: Tree, listener: Recorder, feed: Fe
     assert tracer.take() == []
 
 
-def test_who_comes_and_goes_while_it_is_traced(tree: Tree, listener: Recorder, feed: Feed) -> None:
+def test_processors_that_are_added_and_removed_during_a_trace(tree: Tree, listener: Recorder, feed: Feed) -> None:
     tracer = Tracer()
     tree.observe(tracer)
     tree.add_input("input", feed, 1, 1.0, 1.0)
@@ -105,10 +105,11 @@ def test_who_comes_and_goes_while_it_is_traced(tree: Tree, listener: Recorder, f
     assert {event.name: event.parent for event in events} == {"input": "", "p": "input"}
     assert [e.state for e in events if e.name == "p"][-1] == "removed"
     trace = Trace(events)
-    assert max(span.end for span in trace.spans if span.name == "p") == [e.time for e in events if e.name == "p"][-1]
+    ends = [interval.end for interval in trace.intervals if interval.name == "p"]
+    assert max(ends) == [e.time for e in events if e.name == "p"][-1]
 
 
-# --- numbers ----------------------------------------------------------------------------------------------------
+# --- figures ----------------------------------------------------------------------------------------------------
 
 EVENTS = [
     Event(0, "child", "preProc", "root", "waitExec", None),
@@ -123,14 +124,15 @@ EVENTS = [
 ]
 
 
-def test_spans_overlap_and_shares() -> None:
+def test_intervals_overlap_and_shares() -> None:
     trace = Trace(EVENTS)
     assert (trace.begin, trace.end) == (0, 1000)
     assert [(s.begin, s.end, s.block) for s in trace.of("root", State.EXEC)] == [(0, 400, 7), (600, 1000, 8)]
     assert [(a.block, b.block) for a, b in trace.overlap("root", "child")] == [(8, 7)]
     assert trace.concurrency() == {0: 100, 1: 600, 2: 300}
     summary = "\n".join(trace.summary())
-    assert "somebody computes in 90.0% of the time; of that, two or more at once in 33%, 1.33 on average" in summary
+    assert "at least one processor computes in 90.0% of the time; during this time, two or more compute in " in summary
+    assert "33%, and 1.33 on average" in summary
     assert "root and child           0.3 ms  (parent and child)" in summary
     (row,) = (line.split() for line in summary.splitlines() if line.startswith("child"))
     assert row == ["child", "1", "0.40", "0.40", "50.0%", "40.0%", "10.0%", "0.0%"]
@@ -140,9 +142,9 @@ def test_chrome_format() -> None:
     shown = json.loads(json.dumps(Trace(EVENTS).chrome("/rosAFE")))["traceEvents"]
     names = {e["tid"]: e["args"]["name"] for e in shown if e["name"] == "thread_name"}
     assert names == {1: "root (input)", 2: "child (preProc)"}, "a row for each, parents first"
-    spans = [e for e in shown if e["ph"] == "X"]
-    assert {"name", "cat", "ph", "ts", "dur", "pid", "tid", "args"} == set(spans[0])
-    assert [(e["name"], e["ts"], e["dur"], e["args"]) for e in spans if e["tid"] == 2] == [
+    intervals = [e for e in shown if e["ph"] == "X"]
+    assert {"name", "cat", "ph", "ts", "dur", "pid", "tid", "args"} == set(intervals[0])
+    assert [(e["name"], e["ts"], e["dur"], e["args"]) for e in intervals if e["tid"] == 2] == [
         ("waitExec", 0, 500, {}),
         ("exec 7", 500, 400, {"block": 7}),
         ("waitRelease 7", 900, 100, {"block": 7}),
@@ -150,15 +152,15 @@ def test_chrome_format() -> None:
 
 
 def test_workers_have_a_row_each_and_their_share() -> None:
-    """What they computed, whoever it was for; a release is often another's work."""
+    """A row shows the computations of its worker. A release is often done by another worker."""
     events = [event._replace(worker=f"worker {1 + (event.name == 'child')}") for event in EVENTS]
     trace = Trace(events)
     shown = trace.chrome("/rosAFE")["traceEvents"]
     processes = {e["pid"]: e["args"]["name"] for e in shown if e["name"] == "process_name"}
     assert processes == {1: "/rosAFE", 2: "workers"}
     rows = {e["tid"]: e["args"]["name"] for e in shown if e["name"] == "thread_name" and e["pid"] == 2}
-    spans = [(rows[e["tid"]], e["name"], e["ts"], e["dur"]) for e in shown if e["ph"] == "X" and e["pid"] == 2]
-    assert spans == [
+    intervals = [(rows[e["tid"]], e["name"], e["ts"], e["dur"]) for e in shown if e["ph"] == "X" and e["pid"] == 2]
+    assert intervals == [
         ("worker 1", "root 7", 0, 400),
         ("worker 2", "child 7", 500, 400),
         ("worker 1", "root 8", 600, 400),
@@ -168,13 +170,13 @@ def test_workers_have_a_row_each_and_their_share() -> None:
     assert [(line[1], line[2], line[-4]) for line in lines] == [("1", "2", "80.0%"), ("2", "1", "40.0%")]
 
 
-def test_nothing_is_a_trace_too() -> None:
+def test_an_empty_trace() -> None:
     trace = Trace([])
-    assert trace.spans == [] and trace.chrome("x")["traceEvents"]
-    assert "somebody computes in 0.0% of the time" in "\n".join(trace.summary())
+    assert trace.intervals == [] and trace.chrome("x")["traceEvents"]
+    assert "at least one processor computes in 0.0% of the time" in "\n".join(trace.summary())
 
 
-def test_parents_that_nobody_knows_and_circles_do_no_harm() -> None:
+def test_unknown_parents_and_circles_are_accepted() -> None:
     """A parent that was replaced while it was traced, or a name that came back elsewhere in the tree."""
     events = [
         Event(0, "a", "x", "b", "exec", 0),

@@ -1,4 +1,4 @@
-"""Windows and histories against plain concatenation, for blocks of any size."""
+"""Sliding windows and histories, compared with concatenation, for blocks of any size."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SIZES = st.lists(st.one_of(st.integers(0, 5), st.integers(0, 60)), max_size=3 * 
 
 
 def numbered(rows: tuple[int, ...], sizes: list[int]) -> list[NDArray[np.float64]]:
-    """Blocks of these lengths, in which no two numbers are alike."""
+    """Return blocks of these lengths, in which all numbers differ."""
     count = sum(sizes) * int(np.prod(rows))
     whole = np.arange(1.0, count + 1.0).reshape(*rows, sum(sizes))
     return np.split(whole, np.cumsum(sizes)[:-1], axis=-1) if sizes else []
@@ -28,15 +28,16 @@ def numbered(rows: tuple[int, ...], sizes: list[int]) -> list[NDArray[np.float64
 @given(ROWS, st.integers(0, 80), SIZES)
 @example((2,), 2 * MAX_PIECES + 50, [1] * (3 * MAX_PIECES))
 @example((2, 3), 2 * MAX_PIECES + 7, [2, 1, 0] * MAX_PIECES)
+@example((2, 3), 50, [1, 1, 1, 200, 1] * 40)
 def test_a_window_is_the_newest_frames_after_zeros(rows: tuple[int, ...], frames: int, sizes: list[int]) -> None:
     window = SlidingWindow(rows, frames)
     model = np.zeros((*rows, frames))
-    seen: list[tuple[WindowView, NDArray[np.float64]]] = [(window.view(), model)]
+    seen: list[tuple[WindowView, NDArray[np.float64]]] = [(window.padded_view(frames), model)]
     for block in numbered(rows, sizes):
         window.append(block)
         model = np.concatenate((model, block), axis=-1)[..., block.shape[-1] :]
-        seen.append((window.view(), model))
-    for view, expected in seen:  # what a view showed at its time it still shows
+        seen.append((window.padded_view(frames), model))
+    for view, expected in seen:  # the content of a view has not changed
         assert view.shape == expected.shape == (*rows, frames)
         assert view.frames == frames
         assert len(view.pieces) <= MAX_PIECES
@@ -46,29 +47,29 @@ def test_a_window_is_the_newest_frames_after_zeros(rows: tuple[int, ...], frames
 @settings(deadline=None)
 @given(ROWS, st.integers(0, 80), st.lists(st.one_of(st.sampled_from("ab"), st.integers(0, 40)), max_size=40))
 @example((2,), 2 * MAX_PIECES + 50, ["a", *[1] * (2 * MAX_PIECES), "a", *[1] * MAX_PIECES, "b", *[1] * 30])
-def test_a_history_is_what_came_since_it_was_taken(
+def test_a_history_returns_the_output_since_the_last_call(
     rows: tuple[int, ...], capacity: int, steps: list[int | str]
 ) -> None:
-    """Each reader (a word) has a memory of its own, and the second part goes with the first."""
+    """Each reader (a string) has its own position, which is the same for both parts."""
     signal = SignalFormat.sound(100.0)
     history = History([rows, (7,)], signal, capacity / 100)
     sizes = [step for step in steps if isinstance(step, int)]
     blocks = zip(numbered(rows, sizes), numbered((7,), sizes), strict=True)
-    came = [np.zeros((*rows, 0)), np.zeros((7, 0))]
+    appended = [np.zeros((*rows, 0)), np.zeros((7, 0))]
     read: dict[str, int] = {}
-    taken = []
+    slices = []
     for step in [*steps, "a", "b"]:
         if isinstance(step, str):
-            end = came[0].shape[-1]
+            end = appended[0].shape[-1]
             first = max(read.get(step, 0), end - capacity)
-            taken.append((history.read_new(step), [part[..., first:] for part in came], end))
+            slices.append((history.read_new(step), [part[..., first:] for part in appended], end))
             read[step] = end
         else:
             parts = next(blocks)
-            end = came[0].shape[-1] + step
+            end = appended[0].shape[-1] + step
             history.append(Block(0, parts, end, signal))
-            came = [np.concatenate(pair, axis=-1) for pair in zip(came, parts, strict=True)]
-    for (views, next_index, its_signal), expected, end in taken:
+            appended = [np.concatenate(pair, axis=-1) for pair in zip(appended, parts, strict=True)]
+    for (views, next_index, its_signal), expected, end in slices:
         assert (next_index, its_signal) == (end, signal)
         for view, part in zip(views, expected, strict=True):
             assert view.shape == part.shape
@@ -88,16 +89,16 @@ def test_a_history_grows_and_shrinks_with_its_seconds() -> None:
     np.testing.assert_array_equal(view.array(), whole[:, [18, 19, 18]])
 
 
-def test_a_history_begins_anew_with_other_rows_or_another_rate() -> None:
+def test_a_history_is_cleared_by_another_shape_or_another_rate() -> None:
     signal = SignalFormat.sound(10.0)
     history = History([(2,)], signal, 1.0)
-    for rows, of in (
+    for rows, signal_format in (
         ((2,), signal),
         ((3,), signal),
         ((3,), SignalFormat.sound(20.0)),
         ((3,), SignalFormat(10.0, 20.0, lags=5)),
     ):
-        history.append(Block(0, (np.ones((*rows, 2)),), 0, of))
+        history.append(Block(0, (np.ones((*rows, 2)),), 0, signal_format))
     (view,), _, last = history.read_new("x")
     assert (view.shape, last.lags) == ((3, 4), 5)
 
@@ -108,7 +109,7 @@ def test_views_of_a_part_and_of_exchanged_rows(frames: int, sizes: list[int]) ->
     window = SlidingWindow((2, 3), frames)
     for block in numbered((2, 3), sizes):
         window.append(block)
-    view = window.view()
+    view = window.padded_view(frames)
     whole = view.array()
     for row in (0, 1):
         np.testing.assert_array_equal(view.select(row).array(), whole[row])
@@ -119,7 +120,7 @@ def test_views_of_a_part_and_of_exchanged_rows(frames: int, sizes: list[int]) ->
     np.testing.assert_array_equal(target, whole)
 
 
-def test_blocks_are_referred_to_and_not_copied() -> None:
+def test_blocks_are_not_copied() -> None:
     block = np.ones((2, 10))
     signal = SignalFormat.sound(100.0)
     window, history = SlidingWindow((2,), 25), History([(2,)], signal, 0.25)
@@ -129,11 +130,50 @@ def test_blocks_are_referred_to_and_not_copied() -> None:
     assert history.read_new("x").parts[0].pieces[-1] is block
 
 
+@settings(deadline=None)
+@given(ROWS, st.integers(1, 3000), SIZES)
+@example((2,), 2000, [1] * 600)
+@example((64,), 44100, [220] * 400)  # 1 s of sound in blocks of 5 ms
+@example((2, 32), 100, [1, 0] * 300)  # level differences of such blocks
+def test_each_sample_is_copied_at_most_once(rows: tuple[int, ...], frames: int, sizes: list[int]) -> None:
+    """Short blocks are joined once, for history and port together, so that a window has few pieces."""
+    history = History([rows], SignalFormat.sound(float(frames)), 0.5, port_seconds=1.0)
+    known: dict[int, NDArray[np.float64]] = {}
+    copied = arrived = 0
+    for block in numbered(rows, sizes):
+        known[id(block)] = block
+        arrived += block.nbytes
+        history.append(Block(0, (block,), 0, SignalFormat.sound(float(frames))))
+        (view,) = history.port_window().parts
+        for piece in view.pieces:
+            if id(piece) not in known and piece.base is None:  # neither a view nor padding
+                known[id(piece)] = piece
+                copied += piece.nbytes
+    assert copied <= arrived
+    assert len(view.pieces if sizes else ()) <= 2 * MAX_PIECES
+
+
+def test_the_port_and_readers_share_the_blocks() -> None:
+    signal = SignalFormat.sound(100.0)
+    history = History([(2,)], signal, 0.1, port_seconds=0.3)
+    blocks = numbered((2,), [10] * 5)
+    for number, block in enumerate(blocks):
+        history.append(Block(number, (block,), 10 * (number + 1), signal))
+    (port,), index, _ = history.port_window()
+    (new,), _, _ = history.read_new("reader")
+    np.testing.assert_array_equal(port.array(), np.concatenate(blocks[-3:], axis=-1))
+    np.testing.assert_array_equal(new.array(), blocks[-1])
+    assert index == 50
+
+
 def test_an_empty_window_costs_no_memory() -> None:
     """A port of ten minutes exists before the first block."""
-    view = SlidingWindow((2, 31), 600 * 44100).view()
+    view = SlidingWindow((2, 31), 0).padded_view(600 * 44100)
     assert view.shape == (2, 31, 26_460_000)
-    assert view.pieces[0].strides[:-1] == (0, 0), "all rows are one, of zeros that the system has not handed out yet"
+    padding = next(piece for piece in view.pieces if piece.shape[-1])
+    assert padding.strides[:-1] == (0, 0), (
+        "all rows share one row of zeros, whose pages the system has not allocated yet"
+    )
 
 
 @pytest.mark.parametrize(
@@ -149,5 +189,5 @@ def test_an_empty_window_costs_no_memory() -> None:
         (600.0, 100.0, 60000),
     ],
 )
-def test_frames_in_so_many_seconds(seconds: float, rate: float, frames: int) -> None:
+def test_frames_in_seconds(seconds: float, rate: float, frames: int) -> None:
     assert frames_in(seconds, rate) == frames

@@ -1,4 +1,4 @@
-"""The pool: in what order, how many at a time, and that nobody who is held up holds up others."""
+"""The pool of workers: order of tasks, number of workers, and workers that are blocked."""
 
 from __future__ import annotations
 
@@ -37,37 +37,37 @@ def computing() -> int:
     return sum(thread.name.startswith(pool.WORKER) for thread in tree_threads())
 
 
-# --- how many ---
+# --- number ---
 
 
-def test_how_many_there_are(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_number_of_workers(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv(VARIABLE, raising=False)
     assert workers_to_use() == len(os.sched_getaffinity(0))
     assert workers_to_use(3) == 3
     for text, count in (("5", 5), (" 2 ", 2), ("", workers_to_use()), (str(MAX_WORKERS), MAX_WORKERS)):
         monkeypatch.setenv(VARIABLE, text)
         assert workers_to_use() == count
-        assert workers_to_use(4) == 4, "what a program says counts more than the environment"
+        assert workers_to_use(4) == 4, "the argument has priority over the environment"
 
 
 @pytest.mark.parametrize(
     "text", ["0", "-1", "1.5", "two", str(MAX_WORKERS + 1), "9" * 5000, "\N{ARABIC-INDIC DIGIT FIVE}"]
 )
-def test_numbers_that_are_none(text: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_invalid_numbers(text: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(VARIABLE, text)
-    with pytest.raises(ValueError, match=f"^{VARIABLE}: .* is not a whole number from 1 to {MAX_WORKERS}$"):
+    with pytest.raises(ValueError, match=f"^{VARIABLE}: expected a whole number from 1 to {MAX_WORKERS}, got '"):
         Tree(Recorder())
     with pytest.raises(ValueError, match=r"^workers: "):
         Tree(Recorder(), 0)
 
 
 @pytest.mark.parametrize("workers", [1, 2, 3], indirect=True)
-def test_no_more_compute_than_there_are_workers(
+def test_the_number_of_concurrent_computations_is_that_of_the_workers(
     tree: Tree, feed: Feed, listener: Recorder, workers: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of six siblings as many are at work at the same time as may be, and never more."""
+    """Six siblings: as many compute at the same time as there are workers, and never more."""
     lock = threading.Lock()
-    at_once: list[int] = []
+    concurrent: list[int] = []
     now = 0
 
     class Counted(Plain):
@@ -77,7 +77,7 @@ def test_no_more_compute_than_there_are_workers(
             nonlocal now
             with lock:
                 now += 1
-                at_once.append(now)
+                concurrent.append(now)
             meeting.wait(PATIENCE)
             with lock:
                 now -= 1
@@ -90,27 +90,27 @@ def test_no_more_compute_than_there_are_workers(
     feed.put(count=3)
     for one in siblings:
         listener.wait_blocks(one, 3)
-    assert max(at_once) == workers
+    assert max(concurrent) == workers
     assert computing() <= workers
 
 
-# --- in what order ---
+# --- order ---
 
 
-def test_one_worker_takes_a_block_through_the_tree_before_the_next(
+def test_one_worker_completes_a_block_before_the_next(
     tree: Tree, feed: Feed, listener: Recorder, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """While it is in the cache; and the deepest first."""
+    """The block is still in the cache. The deepest task is run first."""
     order: list[tuple[str, int]] = []
 
-    class Noted(Plain):
+    class Recorded(Plain):
         def process(
             self, block: np.ndarray, extra: np.ndarray | None = None, out: np.ndarray | None = None
         ) -> np.ndarray:
             order.append((self.parameters["name"], int(block[0, 0])))
             return block
 
-    use_plain_stages(monkeypatch, **dict.fromkeys(("preProc", "gammatone", "ihc"), Noted))
+    use_plain_stages(monkeypatch, **dict.fromkeys(("preProc", "gammatone", "ihc"), Recorded))
     tree.add_input("input", feed, 1, 1.0, 1.0)
     for kind, name, parent in (
         ("preProc", "a", "input"),
@@ -132,15 +132,15 @@ def test_one_worker_takes_a_block_through_the_tree_before_the_next(
     assert computing() == 1
 
 
-class Short:
-    """A task that takes so many seconds, as it says; it never does."""
+class EstimatedTask:
+    """A task with an estimated duration, which does nothing."""
 
     depth = 0
     blocked_since = 0.0
     removed = False
 
-    def __init__(self, usual: float) -> None:
-        self.estimated_seconds = usual
+    def __init__(self, seconds: float) -> None:
+        self.estimated_seconds = seconds
 
     def begin_work(self) -> bool:
         return True
@@ -153,50 +153,103 @@ class Short:
 
 
 @pytest.mark.parametrize(
-    ("seconds", "worth"),
+    ("seconds", "expected"),
     [
         ([1e-5, 1e-5], False),
         ([1e-3, 1e-5], True),
         ([1e-5, 1e-3], True),
         ([math.inf, 1e-5], True),
         ([1e-5, math.inf], True),
+        ([2e-4, 2e-4], False),
         ([1e-5] * 10, False),
         ([1e-5] * 100, True),
     ],
 )
-def test_short_work_is_not_worth_a_call(seconds: list[float], worth: bool) -> None:
-    """Neither what one does oneself is long to wait for, nor all that is left over together."""
-    own, *waiting = map(Short, seconds)
+def test_another_worker_is_woken_only_for_long_tasks(seconds: list[float], expected: bool) -> None:
+    """No other worker is woken if the own task and all waiting ones together are short."""
+    own, *waiting = map(EstimatedTask, seconds)
     workers = pool.Workers(threading.RLock(), 2)
     for task in waiting:
         workers.push(task)
-    assert workers._should_wake_another(own) == worth
+    assert workers._should_wake_another(own) == expected
+    workers._busy_since -= 2 * pool.BUSY_SECONDS
+    assert workers._should_wake_another(own) == (sum(seconds) > pool.BUSY_THRESHOLD_SECONDS)
 
 
-def test_a_worker_goes_on_with_what_it_did_the_last_time() -> None:
-    """Of the deepest ones; else with the deepest that came last, as the only worker does."""
+def test_the_pool_is_busy_only_until_all_workers_are_idle() -> None:
+    """The next tasks are run by the worker that worked last."""
+
+    class Waiting(EstimatedTask):
+        thread: threading.Thread
+
+        def __init__(self) -> None:
+            super().__init__(1.0)
+            self.released = threading.Event()
+
+        def work(self) -> None:
+            self.thread = threading.current_thread()
+            self.released.wait(PATIENCE)
+
+    lock = threading.RLock()
+    workers = pool.Workers(lock, 2)
+
+    def run(*tasks: EstimatedTask) -> None:
+        with lock:
+            for task in tasks:
+                workers.push(task)
+            workers.wake()
+
+    def wait_idle(count: int) -> None:
+        def idle() -> bool:
+            with lock:
+                return len(workers._idle) == count
+
+        wait_for(idle)
+
+    with lock:
+        workers.add_client()
+    first, second = Waiting(), Waiting()
+    run(first, second)
+    for number, task in enumerate((first, second), 1):
+        task.released.set()
+        wait_idle(number)
+    for _ in range(2):
+        workers._busy_since = 0.0
+        task = Waiting()
+        task.released.set()
+        run(task)
+        wait_for(lambda: workers._busy_since)
+        wait_idle(2)
+        assert task.thread is second.thread is not first.thread
+    with lock:
+        workers.remove_client()
+    workers.join()
+
+
+def test_a_worker_prefers_the_tasks_that_it_ran_before() -> None:
+    """Among the deepest tasks. Without such a task it takes the newest of the deepest, as a single worker does."""
     workers = pool.Workers(threading.RLock(), 2)
-    one, other = pool._Worker(), pool._Worker()
-    first, second, deep = (Short(1e-5) for _ in range(3))
+    one, other = pool._Worker(workers.lock), pool._Worker(workers.lock)
+    first, second, deep = (EstimatedTask(1e-5) for _ in range(3))
     deep.depth = 1
 
-    def taken(worker: Any, *tasks: Short) -> list[Short]:
+    def pop(worker: Any, *tasks: EstimatedTask) -> list[EstimatedTask]:
         for task in tasks:
             workers.push(task)
         return [workers._pop_task(worker) for _ in tasks]  # type: ignore[misc]
 
-    assert taken(one, first) == [first]
-    assert taken(other, second) == [second]
-    assert taken(one, first, second) == [first, second]
-    assert taken(other, second) == [second]
-    assert taken(one, second, first) == [first, second]
-    assert taken(other, second) == [second]
-    assert taken(other, first, second, deep) == [deep, second, first]
+    assert pop(one, first) == [first]
+    assert pop(other, second) == [second]
+    assert pop(one, first, second) == [first, second]
+    assert pop(other, second) == [second]
+    assert pop(one, second, first) == [first, second]
+    assert pop(other, second) == [second]
+    assert pop(other, first, second, deep) == [deep, second, first]
     assert not workers._ready
 
 
-def test_what_a_processor_usually_takes(tree: Tree, feed: Feed, listener: Recorder) -> None:
-    """Unknown at first, so that nobody waits for it in vain; then the least of late."""
+def test_the_estimated_duration_of_a_processor(tree: Tree, feed: Feed, listener: Recorder) -> None:
+    """Infinite at first, so that no task waits for it; then the recent minimum."""
     one = tree.add_input("input", feed, 1, 1.0, 1.0)
     assert one.estimated_seconds == math.inf
     for number in range(1, 4):
@@ -206,51 +259,51 @@ def test_what_a_processor_usually_takes(tree: Tree, feed: Feed, listener: Record
         assert 0 < one.estimated_seconds <= ESTIMATE_GROWTH * before
 
 
-# --- who is held up ---
+# --- blocked workers ---
 
 
-class Stubborn(Recorder):
-    """A listener that does not come back from those in `holds` until it is let `go`."""
+class Blocking(Recorder):
+    """A listener that blocks for the processors in `blocked_names` until `go` is set."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.holds: set[str] = set()
-        self.held: set[str] = set()
+        self.blocked_names: set[str] = set()
+        self.blocked: set[str] = set()
         self.go = threading.Event()
 
     def on_released(self, processor: Processor, block: Block) -> None:
-        if processor.name in self.holds and not self.go.is_set():
-            self.held.add(processor.name)
+        if processor.name in self.blocked_names and not self.go.is_set():
+            self.blocked.add(processor.name)
             assert self.go.wait(PATIENCE)
         super().on_released(processor, block)
 
 
 @pytest.fixture
-def listener() -> Iterator[Stubborn]:
-    stubborn = Stubborn()
-    yield stubborn
-    stubborn.go.set()
+def listener() -> Iterator[Blocking]:
+    blocking = Blocking()
+    yield blocking
+    blocking.go.set()
 
 
 @pytest.mark.parametrize("workers", [1, 2], indirect=True)
-def test_a_listener_that_does_not_come_back(
-    tree: Tree, feed: Feed, listener: Stubborn, workers: int, monkeypatch: pytest.MonkeyPatch
+def test_a_listener_that_blocks(
+    tree: Tree, feed: Feed, listener: Blocking, workers: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """For three processors, of which one has a child: that goes on, and so do the others, until all wait for those."""
+    """It blocks for three siblings. A child of one of them and the other siblings continue until they need those."""
     use_plain_stages(monkeypatch)
-    listener.holds = {"a", "b", "c"}
+    listener.blocked_names = {"a", "b", "c"}
     root = tree.add_input("input", feed, 1, 1.0, 1.0)
-    held = [tree.add("preProc", name, "input") for name in "abc"]
+    blocked = [tree.add("preProc", name, "input") for name in "abc"]
     others = [tree.add("preProc", name, "input") for name in "xyz"]
     child = tree.add("gammatone", "child", "a")
     feed.put(count=5)
     for one in (*others, child):
         listener.wait_blocks(one, 1)
-    wait_for(lambda: listener.held == {"a", "b", "c"})
-    for one in (root, *others):  # the second block is kept by those that are held up before they take it
+    wait_for(lambda: listener.blocked == {"a", "b", "c"})
+    for one in (root, *others):  # the blocked processors have not read the second block
         listener.wait_blocks(one, 2)
-    assert [len(listener.blocks[one]) for one in held] == [0, 0, 0]
-    assert tree.find("x").parameters() == others[0].parameters()
+    assert [len(listener.blocks[one]) for one in blocked] == [0, 0, 0]
+    assert tree.find("x").stage.parameters == others[0].stage.parameters
     tree.modify("x", "pp_bRemoveDC", "1")
     late = tree.add("gammatone", "late", "x")
     listener.wait_blocks(late, 1)
@@ -258,13 +311,13 @@ def test_a_listener_that_does_not_come_back(
     for one in tree.processors:
         listener.wait_blocks(one, 5 if one is not late else 4)
         assert [block.number for block in listener.blocks[one]][-4:] == [1, 2, 3, 4]
-    wait_for(lambda: computing() <= workers + 1, what="those that came in the place of others to end")
+    wait_for(lambda: computing() <= workers + 1, what="the end of the replacing workers")
 
 
-def test_a_block_that_takes_long_stops_no_request(
-    tree: Tree, feed: Feed, listener: Stubborn, monkeypatch: pytest.MonkeyPatch
+def test_a_long_computation_does_not_block_requests(
+    tree: Tree, feed: Feed, listener: Blocking, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As many are at one as there are workers. Who is removed in the middle of it holds up nobody any more."""
+    """All workers compute long blocks. After its removal, such a processor no longer blocks others."""
     working, go_on = threading.Event(), threading.Event()
 
     class Long(Plain):
@@ -285,7 +338,7 @@ def test_a_block_that_takes_long_stops_no_request(
     other = tree.add("preProc", "other", "input")
     tree.modify("long", "pp_bRemoveDC", "1")
     assert tree.dependencies("other") == ["input", "other"]
-    assert [(view.frames, index) for (view,), index, _ in [root.take("x")]] in ([(0, 0)], [(1, 1)])
+    assert [(view.frames, index) for (view,), index, _ in [root.history.read_new("reader")]] in ([(0, 0)], [(1, 1)])
     assert tree.remove("long") == [long]
     assert time.monotonic() - begun < PATIENCE / 4
     listener.wait_blocks(other, 3)
@@ -296,15 +349,36 @@ def test_a_block_that_takes_long_stops_no_request(
     wait_for(lambda: computing() == 1)
 
 
-def test_a_source_that_does_not_answer(tree: Tree, listener: Stubborn, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A file on a disk that sleeps: what was read before goes through the tree, and it can be stopped."""
-    asked, answer = threading.Event(), threading.Event()
+def test_a_source_that_waits_is_not_read_again(tree: Tree, listener: Blocking) -> None:
+    """It is read once at the start and once for each block; with `waiting` False, also after the last block."""
+    reads: list[int] = []
+
+    class Counted(Feed):
+        def read(self) -> tuple[np.ndarray, int] | None:
+            reads.append(1)
+            return super().read()
+
+    source = Counted()
+    root = tree.add_input("input", source, 1, 1.0, 1.0)
+    wait_for(lambda: len(reads) == 1 and root.state is State.WAIT_EXEC)
+    for number in range(1, 6):
+        source.put(count=1)
+        listener.wait_blocks(root, number)
+        wait_for(lambda: not root.busy and not root.ready)
+        assert len(reads) == 1 + number
+
+
+def test_a_source_that_blocks(tree: Tree, listener: Blocking, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Such as a file on a sleeping disk. Blocks that were read before are processed, and the tree can be stopped."""
+    read_called, answer = threading.Event(), threading.Event()
 
     class Asleep(Feed):
+        waiting = False
+
         def read(self) -> tuple[np.ndarray, int] | None:
             got = super().read()
             if got is None and not self.ended:
-                asked.set()
+                read_called.set()
                 assert answer.wait(PATIENCE)
             return got
 
@@ -313,7 +387,7 @@ def test_a_source_that_does_not_answer(tree: Tree, listener: Stubborn, monkeypat
     source.put(count=1)
     root = tree.add_input("input", source, 1, 1.0, 1.0)
     child = tree.add("preProc", "child", "input")
-    assert asked.wait(PATIENCE)
+    assert read_called.wait(PATIENCE)
     listener.wait_blocks(child, 1)
     tree.stop()
     assert listener.ends == [child, root]
@@ -322,20 +396,20 @@ def test_a_source_that_does_not_answer(tree: Tree, listener: Stubborn, monkeypat
     assert root.join(PATIENCE)
 
 
-def test_a_listener_that_is_slow_is_told_last(
-    tree: Tree, feed: Feed, listener: Stubborn, monkeypatch: pytest.MonkeyPatch
+def test_a_slow_listener_is_called_last(
+    tree: Tree, feed: Feed, listener: Blocking, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What hangs on the processor does not wait for it."""
-    told: list[str] = []
+    """The children of the processor do not wait for it."""
+    called: list[str] = []
 
-    def released(self: Stubborn, processor: Processor, block: Block) -> None:
-        told.append(processor.name)
+    def released(self: Blocking, processor: Processor, block: Block) -> None:
+        called.append(processor.name)
         if processor.name == "slow":
             processor._publish_seconds = 1.0
         Recorder.on_released(self, processor, block)
 
     use_plain_stages(monkeypatch)
-    monkeypatch.setattr(Stubborn, "on_released", released)
+    monkeypatch.setattr(Blocking, "on_released", released)
     tree.add_input("input", feed, 1, 1.0, 1.0)
     slow = tree.add("preProc", "slow", "input")
     below = tree.add("gammatone", "below", "slow")
@@ -343,13 +417,13 @@ def test_a_listener_that_is_slow_is_told_last(
     feed.put(count=1)
     listener.wait_blocks(slow, 1)
     listener.wait_blocks(below, 1)
-    assert told == ["input", "below", "slow"]
+    assert called == ["input", "below", "slow"]
 
 
 # --- threads ---
 
 
-def test_threads_come_with_the_first_processor_and_go_with_the_last(tree: Tree, listener: Stubborn) -> None:
+def test_threads_exist_from_the_first_to_the_last_processor(tree: Tree, listener: Blocking) -> None:
     assert tree_threads() == set()
     for _ in range(20):
         feed = Feed(frames=1)
@@ -364,8 +438,8 @@ def test_threads_come_with_the_first_processor_and_go_with_the_last(tree: Tree, 
     assert child.state is State.REMOVED
 
 
-def test_a_stop_and_a_new_beginning_at_the_same_time(listener: Stubborn, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The threads of the old tree may not have ended yet when they are wanted again."""
+def test_a_stop_followed_immediately_by_a_new_tree(listener: Blocking, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The threads of the old tree may not have ended yet when they are needed again."""
     use_plain_stages(monkeypatch)
     tree = Tree(listener, 2)
     for _ in range(200):
@@ -381,14 +455,16 @@ def test_a_stop_and_a_new_beginning_at_the_same_time(listener: Stubborn, monkeyp
     assert tree_threads() == set()
 
 
-def test_a_listener_asks_the_tree(tree: Tree, feed: Feed, listener: Stubborn, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A listener may not wait for the tree; but it may ask it."""
+def test_a_listener_queries_the_tree(
+    tree: Tree, feed: Feed, listener: Blocking, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A listener must not wait for the tree, but it may query it."""
     answers: list[Any] = []
 
-    def executed(self: Stubborn, processor: Processor, seconds: float) -> None:
+    def executed(self: Blocking, processor: Processor, seconds: float) -> None:
         answers.append(tree.dependencies(processor.name))
 
-    monkeypatch.setattr(Stubborn, "on_executed", executed)
+    monkeypatch.setattr(Blocking, "on_executed", executed)
     tree.add_input("input", feed, 1, 1.0, 1.0)
     child = tree.add("preProc", "child", "input")
     feed.put(count=1)

@@ -1,1 +1,1 @@
-"""Reference vectors of the project's own, and the script that made them."""
+"""Reference vectors of this project, and the script that generates them."""

@@ -1,7 +1,7 @@
-"""Makes the reference vectors: `python3 -m tests.vectors.make`. Nothing of rosafe is used, only numpy and scipy.
+"""Generate the reference vectors: `python3 -m tests.vectors.make`. This uses numpy and scipy, and nothing of rosafe.
 
-Each formula is written out in the form that is the farthest from how rosafe computes it: filters as convolutions with
-their impulse responses in closed form or as sums over all samples, frames one by one, correlations as plain sums.
+Each formula is implemented as differently from rosafe as possible: filters as convolutions with closed-form impulse
+responses or as sums over all samples, frames one by one, correlations as plain sums.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import scipy.special
 
 HERE = Path(__file__).parent
 EPSILON = 2.2204e-16
-THIN = 13  # of what comes at the audio rate, every so-manieth sample is kept
+THIN = 13  # every 13th sample of signals at the audio rate is kept
 
 Case = dict[str, Any]
 CASES: dict[str, Case] = {
@@ -58,7 +58,7 @@ DEFAULTS: Case = {
 
 
 def sound(case: Case) -> np.ndarray:
-    """Int32 samples (2, N): gliding harmonics with pauses and some noise, later and softer in the right ear."""
+    """Return int32 samples (2, N): gliding harmonics with pauses and noise, later and softer in the right ear."""
     rate, count = case["rate"], int(case["rate"] * case["seconds"])
     rng = np.random.default_rng(case["seed"])
     t = np.arange(count) / rate
@@ -83,7 +83,7 @@ def preproc(x: np.ndarray, rate: float, p: Case) -> np.ndarray:
 
 
 def by_partial_fractions(zeros: np.ndarray, poles: np.ndarray, gain: float, x: np.ndarray) -> np.ndarray:
-    """Convolution with the impulse response, a sum of one exponential for each pole."""
+    """Convolve with the impulse response, a sum of one exponential for each pole."""
     k = np.arange(x.shape[1])
     response = np.zeros(len(k), complex)
     for i, pole in enumerate(poles):
@@ -94,7 +94,7 @@ def by_partial_fractions(zeros: np.ndarray, poles: np.ndarray, gain: float, x: n
 
 
 def gammatone(x: np.ndarray, rate: float, f: float, order: int, width: float) -> np.ndarray:
-    """Convolution with 2 g**n binomial(k + n - 1, n - 1) exp(-beta k) cos(theta k)."""
+    """Convolve with 2 g**n binomial(k + n - 1, n - 1) exp(-beta k) cos(theta k)."""
     k = np.arange(x.shape[1])
     beta = 2 * np.pi * width * (24.7 + 0.108 * f) / rate
     response = scipy.special.binom(k + order - 1, order - 1) * np.exp(-beta * k) * np.cos(2 * np.pi * f / rate * k)
@@ -119,7 +119,7 @@ def frames(count: int, size: int, hop: int) -> list[slice]:
 
 
 def compute(case: Case) -> dict[str, np.ndarray]:
-    """All outputs of one case, whole."""
+    """Compute all outputs of a case, for the whole signal."""
     rate, p = case["rate"], {**DEFAULTS, **case.get("parameters", {})}
     samples = sound(case)
     out = {"signal": samples, "input": samples / (2**31 - 1)}
@@ -164,7 +164,7 @@ def compute(case: Case) -> dict[str, np.ndarray]:
 
 
 def peaks(correlations: np.ndarray, reach: int, rate: float) -> tuple[np.ndarray, np.ndarray]:
-    """Time (s) and height of the parabola through the largest of the correlations and its neighbours."""
+    """Return time (s) and height of the parabola through the maximum of the correlation and its neighbours."""
     times = np.zeros((correlations.shape[0], correlations.shape[2]))
     heights = np.zeros_like(times)
     for c, k in np.ndindex(times.shape):
@@ -180,7 +180,7 @@ def peaks(correlations: np.ndarray, reach: int, rate: float) -> tuple[np.ndarray
 
 
 def kept(name: str, data: np.ndarray) -> np.ndarray:
-    """What the file holds of an output."""
+    """Return the part of an output that is stored in the file."""
     return data[..., ::THIN] if name in ("input", "preProc", "gammatone", "ihc") else data
 
 

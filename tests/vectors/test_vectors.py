@@ -1,4 +1,4 @@
-"""`rosafe.process` gives the reference vectors, however the signal is cut into blocks."""
+"""`rosafe.process` reproduces the reference vectors for any block sizes."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ def test_vectors(name: str, block_frames: int | list[int]) -> None:
         assert error <= TOLERANCES.get(output, 1e-10), (output, error)
 
 
-def test_the_files_are_those_of_the_script() -> None:
-    """The smaller case is made anew."""
+def test_the_script_reproduces_the_files() -> None:
+    """The smaller case is generated again."""
     name = "noise_conditioned"
     made = make.compute(make.CASES[name])
     with np.load(make.HERE / f"{name}.npz") as stored:

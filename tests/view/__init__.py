@@ -1,1 +1,1 @@
-"""Tests of what a person gets to see."""
+"""Tests of plots, tables and datasets."""

@@ -1,4 +1,4 @@
-"""The picture: a real image with all four parts in it, whole or not there at all."""
+"""The figure of a binaural signal: content of its four parts, and saving it completely or not at all."""
 
 from __future__ import annotations
 
@@ -12,39 +12,49 @@ import pytest
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from rosafe.bass.sources.scene import scene_azimuth
 from rosafe.output import OutputError
-from rosafe.view import estimates, figure
+from rosafe.view import figure
 from rosafe.view.axes import save
 from rosafe.view.representations import Representations
-from tests.view.conftest import WALK, represented
+from tests.view.conftest import represented
 
 
 def pixels(path: Path) -> np.ndarray:
-    """The image in a PNG file, (height, width, 3), from 0 to 1."""
+    """Return the image of a PNG file, (height, width, 3), from 0 to 1."""
     return matplotlib.image.imread(path)[..., :3]
 
 
-def axes_with(drawing: Figure, words: str) -> Axes:
-    """The part of the picture with these words in its title."""
-    return next(axes for axes in drawing.axes if words in axes.get_title("left"))
+def axes_with(drawing: Figure, text: str) -> Axes:
+    """Return the axes whose title contains `text`."""
+    return next(axes for axes in drawing.axes if text in axes.get_title("left"))
 
 
-def test_picture_of_the_scene(walk: Representations, tmp_path: Path) -> None:
-    drawing = figure.draw(walk, "A walk", "three seconds", lambda times: scene_azimuth(times, WALK))
+TRUTH = np.linspace(85.0, -85.0, 250)
+
+
+def directions() -> dict[str, np.ndarray]:
+    """Return directions as of `rosafe.localize`: the posterior has one direction at each time."""
+    grid = np.arange(-175.0, 181.0, 5.0)
+    nearest = np.abs(grid - TRUTH[:, np.newaxis]).argmin(axis=1)
+    times = 0.25 + np.arange(len(TRUTH)) / 100
+    return {"time": times, "azimuth": grid[nearest], "azimuths": grid, "posterior": np.eye(len(grid))[nearest]}
+
+
+def test_the_figure_of_the_scene(walk: Representations, tmp_path: Path) -> None:
+    drawing = figure.draw(walk, "A walk", "three seconds", directions(), {"talker": TRUTH})
     path = tmp_path / "walk.png"
     save(drawing, path)
     image = pixels(path)
     assert image.shape[0] > 800 and image.shape[1] > 1000
     assert len(np.unique((image * 255).astype(np.uint8).reshape(-1, 3), axis=0)) > 500
-    texts = {text.get_text() for text in drawing.texts}
+    texts = {label.get_text() for label in drawing.texts}
     assert {"A walk", "three seconds"} <= texts
 
 
-def test_axes_say_real_centre_frequencies(walk: Representations) -> None:
+def test_axes_are_labelled_with_centre_frequencies(walk: Representations) -> None:
     drawing = figure.draw(walk, "")
-    for words in ("Left ear", "Right ear", "level difference"):
-        axes = axes_with(drawing, words)
+    for text in ("Left ear", "Right ear", "level difference"):
+        axes = axes_with(drawing, text)
         labels = [label.get_text() for label in axes.get_yticklabels()]
         assert labels[0] == "80" and labels[-1] == "7641"
         for tick, label in zip(axes.get_yticks(), labels, strict=True):
@@ -61,23 +71,28 @@ def test_images_show_the_data(walk: Representations) -> None:
     np.testing.assert_allclose(left.get_array(), np.maximum(level[0], -60), atol=1e-9)
     np.testing.assert_allclose(right.get_array(), np.maximum(level[1], -60), atol=1e-9)
     assert left.get_clim() == right.get_clim()
-    begin, end, *_ = ild.get_extent()
-    assert (begin, end) == pytest.approx((walk.times[0] - 0.005, walk.times[-1] + 0.005), abs=1e-9)
+    start, end, *_ = ild.get_extent()
+    assert (start, end) == pytest.approx((walk.times[0] - 0.005, walk.times[-1] + 0.005), abs=1e-9)
 
 
-def test_lines_lie_at_the_estimated_lags(walk: Representations) -> None:
-    drawing = figure.draw(walk, "", "", lambda times: scene_azimuth(times, WALK))
-    axes = axes_with(drawing, "cross-correlation")
+def test_posterior_estimate_and_truth_are_drawn(walk: Representations) -> None:
+    axes = axes_with(figure.draw(walk, "", "", directions(), {"talker": TRUTH}), "Direction")
     lines = {line.get_label(): line.get_ydata() for line in axes.get_lines()}
-    truth = estimates.lag_of_azimuth(walk.center_frequencies, scene_azimuth(walk.times, WALK))
-    np.testing.assert_allclose(lines["true path"], 1e3 * truth)
-    inside = np.abs(estimates.azimuth_from_correlation(walk)) < 89
-    peak = 1e3 * estimates.time_difference(walk)
-    np.testing.assert_allclose(lines["from the correlation's peak"][inside], peak[inside], atol=0.005)
-    assert np.abs(lines["from level differences"] - lines["true path"]).mean() < 0.03
+    np.testing.assert_array_equal(lines["true direction: talker"], TRUTH)
+    np.testing.assert_array_equal(lines["estimate"], directions()["azimuth"])
+    posterior = axes.get_images()[0].get_array()
+    assert posterior is not None and posterior.shape == (72, len(TRUTH)) and posterior.max() == 0.0
+    assert axes.get_ylim() == (-90, 90) and axes.get_yticklabels()[-1].get_text() == "90° left"
+    labels = [label.get_text() for label in axes.get_yticklabels()]
+    assert labels == ["90° right", "45° right", "ahead", "45° left", "90° left"]
 
 
-def test_silence_makes_a_picture_too(tmp_path: Path) -> None:
+def test_sources_behind_the_head_are_drawn(walk: Representations) -> None:
+    axes = axes_with(figure.draw(walk, "", "", directions(), {"behind": TRUTH + 100}), "Direction")
+    assert axes.get_ylim() == (-180, 180)
+
+
+def test_a_figure_of_silence(tmp_path: Path) -> None:
     save(figure.draw(represented(np.zeros((2, 16000)), 16000), "nothing"), tmp_path / "silence.png")
     assert pixels(tmp_path / "silence.png").shape[2] == 3
 
@@ -96,12 +111,12 @@ def test_any_number_of_channels(channels: int, tmp_path: Path) -> None:
     save(figure.draw(shown, "x"), tmp_path / "x.png")
 
 
-def test_too_few_frames_are_refused(walk: Representations) -> None:
-    with pytest.raises(ValueError, match="1 frames are too few"):
+def test_too_few_frames_are_rejected(walk: Representations) -> None:
+    with pytest.raises(ValueError, match="expected at least 2 frames, got 1"):
         figure.draw(walk.tail(0.0), "")
 
 
-def test_failed_save_leaves_the_old_picture(
+def test_a_failed_save_keeps_the_old_file(
     walk: Representations, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     drawing = figure.draw(walk.tail(0.5), "")
@@ -117,13 +132,13 @@ def test_failed_save_leaves_the_old_picture(
     assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
 
 
-def test_saved_picture_has_the_rights_of_any_new_file(walk: Representations, tmp_path: Path) -> None:
+def test_a_saved_file_has_default_permissions(walk: Representations, tmp_path: Path) -> None:
     save(figure.draw(walk.tail(0.5), ""), tmp_path / "a.png")
     (tmp_path / "b").touch()
     assert (tmp_path / "a.png").stat().st_mode == (tmp_path / "b").stat().st_mode
 
 
-def test_users_settings_of_matplotlib_do_not_change_it(walk: Representations, tmp_path: Path) -> None:
+def test_matplotlib_settings_of_the_user_have_no_effect(walk: Representations, tmp_path: Path) -> None:
     def png() -> bytes:
         save(figure.draw(walk.tail(0.5), "x"), tmp_path / "x.png")
         return (tmp_path / "x.png").read_bytes()

@@ -1,4 +1,4 @@
-"""Results as text."""
+"""Tables and texts of results."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 from rosafe.view import report
 
 
-def test_table_says_what_was_counted() -> None:
+def test_the_table_of_ports() -> None:
     rows = [
         report.PortRow("/rosAFE/inputProcPort", "rosAFE_TimeDomainSignalPortStruct", 3.675, 441000, 44100, 0),
         report.PortRow("/rosAFE/ildPort/ild", "rosAFE_TimeFrequencySignalPortStruct", float("nan"), 26, 100, 17),
@@ -28,41 +28,39 @@ def test_table_says_what_was_counted() -> None:
 
 
 @pytest.mark.parametrize(
-    "azimuth, words",
-    [(-84.6, "85 deg left"), (0.4, "ahead"), (-0.4, "ahead"), (12.0, "12 deg right"), (np.nan, "nobody")],
+    "azimuth, text",
+    [(84.6, "85 deg left"), (0.4, "ahead"), (-0.4, "ahead"), (-12.0, "12 deg right"), (np.nan, "no source")],
 )
-def test_sides_in_words(azimuth: float, words: str) -> None:
-    assert report.side(azimuth) == words.rjust(12)
+def test_directions_as_text(azimuth: float, text: str) -> None:
+    assert report.side(azimuth) == text.rjust(12)
 
 
 def test_ruler_goes_from_left_to_right() -> None:
-    assert report.ruler({"I": -90.0, "C": 90.0}).startswith("|I") and report.ruler({"C": 200.0}).endswith("C|")
-    middle = report.ruler({"I": 1.0})
-    assert middle[len(middle) // 2] == "I"
-    assert report.ruler({"I": 40.0, "C": 40.0}).count("X") == 1
-    assert report.ruler({"I": np.nan}).count("-") == report.RULER - 1
+    assert report.ruler({"E": 90.0, "T": -90.0}).startswith("|E") and report.ruler({"T": -120.0}).endswith("T|")
+    middle = report.ruler({"E": 1.0})
+    assert middle[len(middle) // 2] == "E"
+    assert report.ruler({"E": 40.0, "T": 40.0}).count("X") == 1
+    assert report.ruler({"E": np.nan}).count("-") == report.RULER - 1
 
 
-def test_path_has_a_line_per_step() -> None:
+def test_the_path_has_one_line_per_step() -> None:
     times = np.arange(200) / 100
-    azimuth = np.where(times < 1, -45.0, 45.0)
+    azimuth = np.where(times < 1, 45.0, -45.0)
     gone = np.where(times < 0.5, np.nan, azimuth)
-    lines = report.path_table(times, azimuth, gone, azimuth, every=0.5).splitlines()
+    lines = report.path_table(times, {"estimate": gone, "truth": azimuth}, every=0.5).splitlines()
     assert len(lines) == 5
-    assert lines[0].split()[-3:] == ["levels", "correlation", "truth"]
+    assert lines[0].split()[-2:] == ["estimate", "truth"]
     assert lines[1].split() == [
         "0.00",
         "s",
-        report.ruler({"I": -45.0}),
-        "45",
-        "deg",
-        "left",
-        "nobody",
+        report.ruler({"T": 45.0}),
+        "no",
+        "source",
         "45",
         "deg",
         "left",
     ]
-    assert lines[3].endswith("45 deg right  45 deg right  45 deg right")
+    assert lines[3].endswith("45 deg right  45 deg right") and "X" in lines[3]
 
 
 def test_level() -> None:

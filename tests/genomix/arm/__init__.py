@@ -1,1 +1,1 @@
-"""A small GenoM component that is not ours: its ROS package `arm`, generated as catkin would, and its server."""
+"""A small GenoM component of another project: its ROS package `arm`, generated like by catkin, and its server."""

@@ -1,4 +1,4 @@
-"""Generates the ROS package of the component `arm`, in the form that genom3 gives it."""
+"""Generates the ROS package of the component `arm`, in the format of genom3."""
 
 from __future__ import annotations
 

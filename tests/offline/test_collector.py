@@ -1,4 +1,4 @@
-"""Results that stages write into their place themselves: the same numbers, and no second copy."""
+"""Stages that write into the result array: the same numbers without a copy."""
 
 from __future__ import annotations
 
@@ -9,33 +9,34 @@ import pytest
 
 import rosafe
 from rosafe.dsp import kernels
-from rosafe.offline.process import _OutputCollector
+from rosafe.offline.collector import OutputCollector
 from rosafe.representations import STAGES
 from rosafe.representations.haircell import METHODS, InnerHairCell
 from tests.dsp.bare import Chain, cut
 
 pytestmark = [
     pytest.mark.skipif(not kernels.compiled(), reason="numpy's twin of the hair cell's kernel returns its own"),
-    pytest.mark.usefixtures("blocks_as_they_are"),
+    pytest.mark.usefixtures("blocks_not_merged"),
 ]
 
 RATE = 16000.0
+BLOCKS = ([3000], [512], [1], [700, 1, 333])
 FEW = {"fb_nChannels": 5, "fb_highFreqHz": 4000.0}
 SOUND = 0.1 * np.random.default_rng(2).standard_normal((2, 3000))
 
 
 @pytest.fixture
 def copied(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Frames of the blocks that were copied into a result."""
+    """Record the lengths of the blocks that were copied into a result."""
     counts: list[int] = []
-    add = _OutputCollector.add
+    add = OutputCollector.add
 
-    def count(self: _OutputCollector, block: np.ndarray) -> None:
+    def count(self: OutputCollector, block: np.ndarray) -> None:
         if block is not self._output_slice:
             counts.append(block.shape[-1])
         add(self, block)
 
-    monkeypatch.setattr(_OutputCollector, "add", count)
+    monkeypatch.setattr(OutputCollector, "add", count)
     return counts
 
 
@@ -62,8 +63,8 @@ def test_the_same_numbers_without_a_copy(
     np.testing.assert_array_equal(got, np.concatenate([output[kind] for output in outputs], axis=-1))
 
 
-def test_who_has_children_is_copied(copied: list[int]) -> None:
-    """They take blocks in one piece."""
+def test_outputs_with_children_are_copied(copied: list[int]) -> None:
+    """Children need contiguous blocks."""
     alone = rosafe.process(SOUND, RATE, parameters=FEW, block_frames=1000, outputs=["gammatone"])
     assert copied == []
     both = rosafe.process(SOUND, RATE, parameters=FEW, block_frames=1000, outputs=["gammatone", "ihc"])
@@ -71,7 +72,7 @@ def test_who_has_children_is_copied(copied: list[int]) -> None:
     np.testing.assert_array_equal(both["gammatone"], alone["gammatone"])
 
 
-def test_from_a_change_of_the_rows_on_nothing_is_written_there(copied: list[int]) -> None:
+def test_a_change_of_the_rows_ends_writing_in_place(copied: list[int]) -> None:
     changes = [(2, "fb_nChannels", 3), (3, "fb_nChannels", 5)]
     options: dict[str, Any] = {"block_frames": 600, "modifications": changes, "outputs": ["gammatone"]}
     got = rosafe.process(SOUND, RATE, parameters=FEW, **options)["gammatone"]
@@ -86,8 +87,8 @@ def test_from_a_change_of_the_rows_on_nothing_is_written_there(copied: list[int]
 
 @pytest.mark.parametrize("kind", ["gammatone", "ihc"])
 @pytest.mark.parametrize("frames", [1, 40, 512, 700])
-def test_a_place_is_used_only_where_it_fits(kind: str, frames: int) -> None:
-    """Rows evenly apart, each in one piece, of the right shape and type; and for one block."""
+def test_a_place_is_used_only_if_it_fits(kind: str, frames: int) -> None:
+    """A place is used for one block if its rows are evenly spaced and contiguous, with the right shape and type."""
     block = np.random.default_rng(frames).standard_normal((2, frames) if kind == "gammatone" else (2, 5, frames))
     parameters = FEW if kind == "gammatone" else {}
     plain = STAGES[kind](RATE, **parameters).process(block)
@@ -116,7 +117,7 @@ def test_a_place_is_used_only_where_it_fits(kind: str, frames: int) -> None:
 
 @pytest.fixture
 def overwritten(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
-    """Whether the hair cell wrote over what it took, block by block."""
+    """Record for each block whether the hair cell has overwritten its input."""
     seen: list[bool] = []
     process = InnerHairCell.process
 
@@ -131,13 +132,19 @@ def overwritten(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
     return seen
 
 
-@pytest.mark.parametrize("block", [[3000], [512], [1], [700, 1, 333]], ids=str)
-@pytest.mark.parametrize("kind", ["gammatone", "drnl"])
-@pytest.mark.parametrize("method", METHODS)
-def test_what_nobody_else_wants_is_written_over(
+@pytest.mark.parametrize(
+    ("method", "kind", "block"),
+    [  # each kind of filterbank with all methods and with all blocks
+        (method, kind, BLOCKS[number % len(BLOCKS)])
+        for kind in ("gammatone", "drnl")
+        for number, method in enumerate(METHODS)
+    ],
+    ids=str,
+)
+def test_inputs_without_other_consumers_are_overwritten(
     method: str, kind: str, block: list[int], overwritten: list[bool]
 ) -> None:
-    """The same numbers, of the array and of the stream, and the sound that was given stays as it is."""
+    """`process` and `Stream` return the same numbers, and the signal remains unchanged."""
     sound, parameters = SOUND[:, :200] if block == [1] else SOUND, {**FEW, "fb_type": kind, "ihc_method": method}
     given, parts = sound.copy(), cut(sound, block)
     outputs = Chain(RATE, {"in_doNormalize": False, **parameters}).run(parts)
@@ -156,7 +163,7 @@ def test_what_nobody_else_wants_is_written_over(
 
 
 @pytest.mark.parametrize("other", ["gammatone", "precedence"])
-def test_what_somebody_else_wants_is_not_written_over(other: str, overwritten: list[bool]) -> None:
+def test_inputs_with_other_consumers_are_not_overwritten(other: str, overwritten: list[bool]) -> None:
     options: dict[str, Any] = {"parameters": FEW, "outputs": ["ratemap", other]}
     got = rosafe.process(SOUND, RATE, block_frames=1000, **options)
     rosafe.Stream(RATE, **options).process(SOUND)
@@ -168,7 +175,7 @@ def test_what_somebody_else_wants_is_not_written_over(other: str, overwritten: l
 
 
 @pytest.mark.parametrize("lengths", [[0], [1] * 64, [9, 8, 9, 31, 32, 33], [0, 700, 0, 1]], ids=str)
-def test_joined_as_numpy_does(lengths: list[int]) -> None:
+def test_concatenate_matches_numpy(lengths: list[int]) -> None:
     rng = np.random.default_rng(len(lengths))
     whole = np.full((3, 7, 1000), np.nan)
     end = 20 + sum(lengths)

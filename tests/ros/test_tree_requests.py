@@ -1,4 +1,4 @@
-"""The service `request`: a whole tree by `rosservice`, or nothing."""
+"""The service `request`: builds a whole tree, or nothing."""
 
 from __future__ import annotations
 
@@ -17,25 +17,25 @@ PITCH = ["input_0", "time_0", "filterbank_0", "innerhaircell_0", "autocorrelatio
 
 
 def tree(afe: Session) -> dict[str, str]:
-    """Which processor hangs on which."""
+    """Return the parent of each processor."""
     return {p.name: p.upperDepName for p in afe.ok("getProcessors").processors}
 
 
 def parameters(afe: Session, name: str) -> dict[str, str]:
-    """The parameters of a processor, as texts."""
+    """Return the parameters of a processor, as texts."""
     (found,) = (p for p in afe.ok("getProcessors").processors if p.name == name)
     return {p.name: p.value for p in found.parameters}
 
 
 def sounding(afe: Session) -> Microphone:
-    """A microphone that has something to hear, which the node is connected to."""
+    """Connect the node to a microphone that publishes audio."""
     microphone = afe.listen()
     microphone.play(noise(400))
     return microphone
 
 
 def why(afe: Session, **fields: Any) -> tuple[str, str]:
-    """Exception and reason of a request that is refused, and has changed nothing."""
+    """Return exception and reason of a rejected request, and check that nothing has changed."""
     before = tree(afe)
     ex, detail = afe.refused("request", **fields)
     assert tree(afe) == before
@@ -43,17 +43,17 @@ def why(afe: Session, **fields: Any) -> tuple[str, str]:
 
 
 def rosservice(graph: Graph, text: str) -> Any:
-    """What `rosservice call` prints."""
+    """Return the output of `rosservice call`."""
     return yaml.safe_load(graph.run("rosservice", "call", "/rosAFE/request", text).stdout)
 
 
-def test_from_nothing_by_rosservice_while_only_bass_plays(graph: Graph) -> None:
+def test_a_tree_by_rosservice_while_only_bass_runs(graph: Graph) -> None:
     with graph.node("bass-ros"), graph.node("rosAFE-ros") as process:
         afe = Session(graph, process)
         acquire = "{device: 'scene:', sampleRate: 44100, nFramesPerChunk: 2205}"
         assert "genom_success: True" in graph.run("rosservice", "call", "/bass/Acquire", acquire).stdout
-        wanted = "{representation: pitch, parameters: 'fb_nChannels: 16, pi_rangeHz: [80, 300]', connect: bass/Audio}"
-        assert rosservice(graph, wanted) == {
+        values = "{representation: pitch, parameters: 'fb_nChannels: 16, pi_rangeHz: [80, 300]', connect: bass/Audio}"
+        assert rosservice(graph, values) == {
             "genom_success": True,
             "genom_exdetail": "",
             "name": "pitch_0",
@@ -75,15 +75,15 @@ def test_from_nothing_by_rosservice_while_only_bass_plays(graph: Graph) -> None:
         assert modulation["dependencies"] == modulation["reused"] + modulation["created"]
         assert graph.message(modulation["topic"], accept=lambda m: m.lastFrameIndex > 0).framesOnPort > 0
 
-        again = rosservice(graph, wanted)
+        again = rosservice(graph, values)
         assert (again["dependencies"], again["created"], again["reused"]) == (PITCH, [], PITCH)
         known = graph.run("rosafe", "request", "pitch", "fb_nChannels=16", "pi_rangeHz=80,300", "--json").stdout
-        assert json.loads(known)["reused"] == PITCH  # genomixd's takes the same ones
+        assert json.loads(known)["reused"] == PITCH  # genomixd accepts the same parameters
         assert "Traceback" not in process.err
         afe.close()
 
 
-def test_what_is_there_is_used_and_the_input_is_not_changed(afe: Session) -> None:
+def test_existing_processors_are_used_and_the_input_is_not_changed(afe: Session) -> None:
     sounding(afe)
     first = afe.ok("request", representation="ild", parameters=f"{{{BLOCK}, fb_cfHz: [200, 400], rm_wSizeSec: 0.03}}")
     assert first.unused == ["rm_wSizeSec"] and first.topic == f"/{afe.name}/ildPort/ild_0"
@@ -99,10 +99,10 @@ def test_what_is_there_is_used_and_the_input_is_not_changed(afe: Session) -> Non
     assert ex == "::rosAFE::e_existsAlready" and "'input_0' has in_doNormalize" in what and "modifyParameter" in what
 
 
-def test_all_or_nothing_where_it_fails_half_way(afe: Session) -> None:
+def test_a_request_that_fails_half_way_leaves_nothing(afe: Session) -> None:
     sounding(afe)
     beyond = f"{BLOCK}, fb_nChannels: 4, fb_highFreqHz: {RATE * 0.75}"
-    ex, what = why(afe, representation="ild", parameters=beyond)  # input and time come first
+    ex, what = why(afe, representation="ild", parameters=beyond)  # input and time are created first
     assert ex == "::rosAFE::e_badNewValue" and "fb_highFreqHz" in what
     assert tree(afe) == {}
     afe.ok("request", representation="time", parameters=BLOCK)
@@ -111,7 +111,7 @@ def test_all_or_nothing_where_it_fails_half_way(afe: Session) -> None:
     afe.wait_activities(["InputProc", "PreProc"])
 
 
-def test_without_sound_nothing_is_made(graph: Graph) -> None:
+def test_without_audio_nothing_is_created(graph: Graph) -> None:
     with own_node(graph, name="deaf") as afe:
         assert why(afe, representation="ild", connect="nobody/Audio")[0] == "::genom::no_such_outport"
         assert why(afe, representation="ild", connect="no topic")[0] == "::genom::no_such_outport"
@@ -144,7 +144,7 @@ HOSTILE = {
     "fb_nChannels: .inf": "fb_nChannels",
     "fb_nChannels: 4; pi_rangeHz: [1]": "not YAML",
     "fb_lowFreqHz: __import__('os').getpid()": "fb_lowFreqHz",
-    "fb_cfHz: [" + "100," * 2000 + "]": "too many",
+    "fb_cfHz: [" + "100," * 2000 + "]": "expected at most",
     "x" * 300_000: "characters",
     "representation: ild": "unknown 'representation'",
     "fb_nChannel: 4": "did you mean fb_nChannels?",
@@ -154,7 +154,7 @@ HOSTILE = {
 
 
 @pytest.mark.parametrize(("text", "reason"), HOSTILE.items(), ids=[text[:30] for text in HOSTILE])
-def test_texts_that_are_no_parameters(afe: Session, tmp_path: Path, text: str, reason: str) -> None:
+def test_texts_that_are_not_parameters(afe: Session, tmp_path: Path, text: str, reason: str) -> None:
     mark = tmp_path / "mark"
     ex, what = why(afe, representation="ratemap", parameters=text.replace("MARK", str(mark)))
     assert ex == "::rosAFE::e_badNewValue" and reason in what and "\n" not in what

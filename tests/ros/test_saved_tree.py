@@ -1,4 +1,4 @@
-"""`rosAFE-ros --keep FILE`: a node that was killed comes back as it was, once there is sound.
+"""`rosAFE-ros --keep FILE`: the tree of a killed node is restored as soon as there is sound.
 
 ROSAFE_KILLS=20 in the environment kills twenty times.
 """
@@ -11,11 +11,18 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import rospy
+from diagnostic_updater import DiagnosticStatusWrapper
 
+from rosafe.component.activities import Activities
+from rosafe.interface import ComponentError, Service
+from rosafe.node.audio_input import AudioInput
+from rosafe.node.saved_tree import SavedTree
 from rosafe.setups import read
+from rosafe.tree.tree import Tree
 from tests.harness import PATIENCE, Graph, wait_for
 from tests.ros.session import Microphone, Session, noise, own_node
 
@@ -26,7 +33,7 @@ NAME = "kept"
 
 @contextmanager
 def playing(microphone: Microphone) -> Iterator[None]:
-    """Sound that goes on."""
+    """Publish audio continuously."""
     over = threading.Event()
 
     def play() -> None:
@@ -46,13 +53,13 @@ def tree(node: Session) -> list[Any]:
     return list(node.ok("getProcessors").processors)
 
 
-def back(node: Session, before: list[Any]) -> bool:
-    """Whether all is as it was."""
+def is_restored(node: Session, before: list[Any]) -> bool:
+    """Return whether the tree is restored."""
     wait_for(lambda: len(tree(node)) >= len(before), what=lambda: f"{before}, there is {tree(node)}")
     return tree(node) == before
 
 
-def test_killed_under_load_again_and_again(graph: Graph, tmp_path: Path) -> None:
+def test_killed_repeatedly_under_load(graph: Graph, tmp_path: Path) -> None:
     microphone = Microphone(graph)
     file = tmp_path / "tree.yaml"
     with playing(microphone):
@@ -69,7 +76,7 @@ def test_killed_under_load_again_and_again(graph: Graph, tmp_path: Path) -> None
             node.process.stop(signal.SIGKILL)
         for number in range(KILLS):
             with own_node(graph, "--keep", str(file), name=NAME) as node:
-                assert back(node, before), number
+                assert is_restored(node, before), number
                 value = 0.006 + 0.001 * (number % 3) + 1e-17 * number
                 node.ok("modifyParameter", nameProc="ild", nameParam="ild_hSizeSec", newValue=repr(value))
                 before = tree(node)
@@ -79,15 +86,13 @@ def test_killed_under_load_again_and_again(graph: Graph, tmp_path: Path) -> None
     microphone.close()
 
 
-def test_a_clean_end_keeps_a_stop_does_not_and_whoever_asks_for_an_input_begins_anew(
-    graph: Graph, tmp_path: Path
-) -> None:
+def test_the_tree_survives_a_clean_end_but_not_stop_or_a_new_input(graph: Graph, tmp_path: Path) -> None:
     microphone = Microphone(graph)
     file = tmp_path / "tree.yaml"
     file.write_text("sound: {device: 'scene:'}\n")
     rospy.set_param(f"/{NAME}/keep", str(file))
     try:
-        with own_node(graph, name=NAME) as node:  # the ROS parameter will do
+        with own_node(graph, name=NAME) as node:  # the ROS parameter suffices
             node.ok("connect_port", local="Audio", remote=microphone.topic)
             microphone.play(noise(400))
             node.ok("InputProc")
@@ -95,16 +100,16 @@ def test_a_clean_end_keeps_a_stop_does_not_and_whoever_asks_for_an_input_begins_
             before = tree(node)
             node.process.stop(signal.SIGTERM)
         assert [one.name for one in read(file.read_text()).processors] == ["input", "preProc"]
-        assert read(file.read_text()).sound is not None  # not the node's, and so left alone
+        assert read(file.read_text()).sound is not None  # not used by the node, and preserved
         microphone.close()
-        with own_node(graph, name=NAME) as node:  # there is no sound
+        with own_node(graph, name=NAME) as node:  # no audio
             assert node.health(lambda entries: "waiting for sound" in entries["message"], "keep")["level"] == "1"
             assert tree(node) == []
             node.process.stop(signal.SIGKILL)
         again = Microphone(graph, topic=microphone.topic)
         with own_node(graph, name=NAME) as node:
             again.play(noise(400))
-            assert back(node, before)
+            assert is_restored(node, before)
             node.ok("Stop")
             node.process.stop(signal.SIGKILL)
         assert read(file.read_text()).processors == ()
@@ -121,8 +126,41 @@ def test_a_clean_end_keeps_a_stop_does_not_and_whoever_asks_for_an_input_begins_
         rospy.delete_param(f"/{NAME}/keep")
 
 
-def test_the_parameter_names_setups_only(graph: Graph, tmp_path: Path) -> None:
-    """Others can set it: it must not make a start-up file of the user's shell, say."""
+def test_a_tree_that_cannot_be_restored_completely_is_removed(tmp_path: Path) -> None:
+    """The second processor is refused although the check before accepted it, as if the memory were used meanwhile."""
+    file = tmp_path / "tree.yaml"
+    file.write_text("processors:\n  input: {kind: input}\n  preProc: {kind: preProc, parent: input}\n")
+    begun = threading.Event()
+    begun.set()
+    started: list[str] = []
+    stopped = threading.Event()
+
+    def start(service: Service, *_: Any) -> SimpleNamespace:
+        started.append(service.name)
+        error = ComponentError("::rosAFE::e_memory") if service.name == "PreProc" else None
+        return SimpleNamespace(begun=begun, error=error)
+
+    saved = SavedTree(
+        file,
+        cast(AudioInput, SimpleNamespace(topic="", ring=SimpleNamespace(sample_rate=44100))),
+        cast(Tree, SimpleNamespace(stop=stopped.set)),
+        tuple,
+        cast(Activities, SimpleNamespace(live=tuple, start=start)),
+        cast(Any, lambda kind: None),
+    )
+    finished = threading.Event()
+    saved.restore(finished)
+    try:
+        assert stopped.wait(PATIENCE)
+        wait_for(lambda: "e_memory" in saved.report(DiagnosticStatusWrapper()).message)
+        assert started == ["InputProc", "PreProc"]
+        assert [one.name for one in read(file.read_text()).processors] == ["input", "preProc"]
+    finally:
+        finished.set()
+
+
+def test_the_parameter_can_only_name_setups(graph: Graph, tmp_path: Path) -> None:
+    """Any client can set it: it must not overwrite a start-up file of the user's shell, for example."""
     file = tmp_path / ".bash_profile"
     rospy.set_param(f"/{NAME}/keep", str(file))
     try:
@@ -134,7 +172,7 @@ def test_the_parameter_names_setups_only(graph: Graph, tmp_path: Path) -> None:
     assert not file.exists()
 
 
-def test_what_cannot_be_read_is_told_and_left_alone(graph: Graph, tmp_path: Path) -> None:
+def test_an_unreadable_file_is_reported_and_not_changed(graph: Graph, tmp_path: Path) -> None:
     file = tmp_path / "tree.yaml"
     for text, what in (("processors:\n  a: {nothing: x}\n", "line 2"), ("\x00", "not YAML")):
         file.write_text(text)
@@ -146,7 +184,7 @@ def test_what_cannot_be_read_is_told_and_left_alone(graph: Graph, tmp_path: Path
         assert "Traceback" not in done.stderr
 
 
-def test_what_cannot_be_written_is_told_and_the_node_goes_on(graph: Graph, tmp_path: Path) -> None:
+def test_a_failure_to_write_is_reported_and_the_node_continues(graph: Graph, tmp_path: Path) -> None:
     folder = tmp_path / "folder"
     folder.mkdir()
     with own_node(graph, "--keep", str(folder / "tree.yaml"), name=NAME) as node:
@@ -154,7 +192,7 @@ def test_what_cannot_be_written_is_told_and_the_node_goes_on(graph: Graph, tmp_p
         microphone = node.listen()
         microphone.play(noise(400))
         node.ok("InputProc")
-        assert "no folder" in node.health(lambda entries: entries["level"] == "1", "keep")["message"]
+        assert "does not exist" in node.health(lambda entries: entries["level"] == "1", "keep")["message"]
         folder.mkdir()
         node.ok("PreProc")
         assert len(read((folder / "tree.yaml").read_text()).processors) == 2

@@ -1,4 +1,4 @@
-"""A node knows whether it can be called, and tells /diagnostics, the log and systemd."""
+"""Self-check: a node detects whether it can be called, and reports it to /diagnostics, the log and systemd."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from tests.ros.attacker import Target
 
 
 class Systemd:
-    """What takes the datagrams of a service."""
+    """A socket that receives the datagrams of a service."""
 
     def __init__(self, address: str) -> None:
-        self.told: list[tuple[float, str]] = []
+        self.messages: list[tuple[float, str]] = []
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         self._socket.bind(address)
         self._thread = threading.Thread(target=self._run)
@@ -32,11 +32,11 @@ class Systemd:
 
     def _run(self) -> None:
         while (data := self._socket.recv(4096)) != b"end":
-            self.told.append((time.monotonic(), data.decode()))
+            self.messages.append((time.monotonic(), data.decode()))
 
     def count(self, what: str) -> int:
-        """How often it was told so."""
-        return sum(told == what for _, told in self.told)
+        """Return the number of datagrams with this text."""
+        return sum(message == what for _, message in self.messages)
 
     def close(self) -> None:
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sock:
@@ -47,19 +47,19 @@ class Systemd:
 
 @contextmanager
 def listening(address: str) -> Iterator[Systemd]:
-    told = Systemd(address)
+    systemd = Systemd(address)
     try:
-        yield told
+        yield systemd
     finally:
-        told.close()
+        systemd.close()
 
 
 @pytest.mark.parametrize("component", ["rosAFE", "bass"])
-def test_a_node_that_cannot_be_called_says_so_until_it_can(graph: Graph, tmp_path: Path, component: str) -> None:
-    """Subscribers that never read take all descriptors; systemd's watchdog is fed before and after, not meanwhile."""
+def test_a_node_reports_that_it_cannot_be_called(graph: Graph, tmp_path: Path, component: str) -> None:
+    """While subscribers that never read use all descriptors, systemd's watchdog is not notified."""
     name = f"{component}_watched"
     with (
-        listening(str(tmp_path / "notify")) as told,
+        listening(str(tmp_path / "notify")) as systemd,
         graph.node(
             f"{component}-ros", "-i", name, NOTIFY_SOCKET=str(tmp_path / "notify"), WATCHDOG_USEC="6000000"
         ) as process,
@@ -72,8 +72,8 @@ def test_a_node_that_cannot_be_called_says_so_until_it_can(graph: Graph, tmp_pat
             return statuses[-1] if statuses else DiagnosticStatus(level=DiagnosticStatus.STALE)
 
         target = Target(graph, process, name)
-        wait_for(lambda: told.count("WATCHDOG=1") > 1, 20, lambda: f"{told.told} {process}")
-        assert told.told[0][1] in ("READY=1", "WATCHDOG=1") and told.count("READY=1") == 1
+        wait_for(lambda: systemd.count("WATCHDOG=1") > 1, 20, lambda: f"{systemd.messages} {process}")
+        assert systemd.messages[0][1] in ("READY=1", "WATCHDOG=1") and systemd.count("READY=1") == 1
         wait_for(lambda: (health().level, health().message) == (DiagnosticStatus.OK, "this node can be called"), 20)
 
         limits = resource.prlimit(process.pid, resource.RLIMIT_NOFILE)
@@ -83,32 +83,32 @@ def test_a_node_that_cannot_be_called_says_so_until_it_can(graph: Graph, tmp_pat
             stack.enter_context(target.subscribe("genom_state", f"/deaf{number}", wait=False))
         wait_for(lambda: "this node cannot be called: " in health().message, 40, lambda: str(process))
         assert health().level == DiagnosticStatus.ERROR and "no answer within" in health().message
-        fed = told.count("WATCHDOG=1")
+        fed = systemd.count("WATCHDOG=1")
         wait_for(lambda: {v.key: v.value for v in health().values}["failed calls in a row"] > "3", 40)
-        assert told.count("WATCHDOG=1") == fed, "systemd may end it"
+        assert systemd.count("WATCHDOG=1") == fed, "systemd can end it"
         assert process.err.count("this node cannot be called: ") == 1
 
         stack.close()
         wait_for(lambda: health().message == "this node can be called", 40, lambda: str(process))
-        wait_for(lambda: told.count("WATCHDOG=1") > fed + 1, 20, lambda: f"{told.told}")
+        wait_for(lambda: systemd.count("WATCHDOG=1") > fed + 1, 20, lambda: f"{systemd.messages}")
         wait_for(lambda: process.err.count("this node can be called again") == 1, what=lambda: str(process))
-        target.assert_well()
+        target.assert_healthy()
         assert process.stop(signal.SIGTERM) == 0
-        assert told.told[-1][1] == "STOPPING=1" and told.count("READY=1") == 1
+        assert systemd.messages[-1][1] == "STOPPING=1" and systemd.count("READY=1") == 1
 
 
-def test_what_takes_the_news_may_have_an_abstract_address_or_none(graph: Graph) -> None:
-    """And a watchdog that is meant for another process, or makes no sense, is none of ours."""
+def test_abstract_and_missing_notification_addresses(graph: Graph) -> None:
+    """A watchdog for another process, or with an invalid interval, is ignored."""
     address = f"rosafe-test-{os.getpid()}"
-    with listening(f"\0{address}") as told:
+    with listening(f"\0{address}") as systemd:
         for microseconds, pid in (("3000000", "1"), ("nonsense", ""), ("0", ""), ("", "")):
             with graph.node(
                 "bass-ros", "-i", "unwatched", NOTIFY_SOCKET=f"@{address}", WATCHDOG_USEC=microseconds, WATCHDOG_PID=pid
             ) as process:
-                wait_for(lambda: told.count("READY=1"), 20)
+                wait_for(lambda: systemd.count("READY=1"), 20)
                 assert process.stop(signal.SIGTERM) == 0
-            assert [what for _, what in told.told] == ["READY=1", "STOPPING=1"]
-            told.told.clear()
+            assert [what for _, what in systemd.messages] == ["READY=1", "STOPPING=1"]
+            systemd.messages.clear()
     with graph.node("bass-ros", "-i", "unwatched", NOTIFY_SOCKET="/nowhere/at/all", WATCHDOG_USEC="3000000") as process:
         assert process.stop(signal.SIGTERM) == 0 and process.complaints == ""
 
@@ -124,29 +124,28 @@ def test_the_watchdog_of_this_process(monkeypatch: pytest.MonkeyPatch) -> None:
         assert systemd.watchdog_seconds() == seconds
 
 
-def test_while_a_node_waits_for_a_master_systemd_is_patient(
-    private_graph: tuple[Graph, MasterProcess], tmp_path: Path
-) -> None:
+def test_systemd_allows_a_node_to_wait_for_a_master(private_graph: tuple[Graph, MasterProcess], tmp_path: Path) -> None:
     graph, master = private_graph
     master.kill()
     address = str(tmp_path / "notify")
-    with listening(address) as told, graph.start("bass-ros", "--wait", NOTIFY_SOCKET=address) as process:
-        wait_for(lambda: len(told.told) > 2, 20, lambda: str(process))
-        assert told.told[-1][1] == f"STATUS=waiting for a ROS master at {graph.uri}\nEXTEND_TIMEOUT_USEC=30000000"
+    with listening(address) as systemd, graph.start("bass-ros", "--wait", NOTIFY_SOCKET=address) as process:
+        wait_for(lambda: len(systemd.messages) > 2, 20, lambda: str(process))
+        status = f"STATUS=waiting for a ROS master at {graph.uri}\nEXTEND_TIMEOUT_USEC=30000000"
+        assert systemd.messages[-1][1] == status
         master.start(graph.env)
-        wait_for(lambda: told.told[-1][1] == "READY=1", 30, lambda: f"{told.told} {process}")
+        wait_for(lambda: systemd.messages[-1][1] == "READY=1", 30, lambda: f"{systemd.messages} {process}")
 
 
-def test_the_master_has_no_part_in_it(private_graph: tuple[Graph, MasterProcess], tmp_path: Path) -> None:
-    """A node whose master is gone can be called by those who know it, and is left alone by systemd."""
+def test_the_self_check_does_not_need_the_master(private_graph: tuple[Graph, MasterProcess], tmp_path: Path) -> None:
+    """A node without a master can be called by connected clients, and is not ended by systemd."""
     graph, master = private_graph
     address = str(tmp_path / "notify")
     with (
-        listening(address) as told,
+        listening(address) as systemd,
         graph.node("bass-ros", NOTIFY_SOCKET=address, WATCHDOG_USEC="3000000") as process,
     ):
         master.kill()
         wait_for(lambda: "no answer from the ROS master" in process.err, 20)
-        fed = told.count("WATCHDOG=1")
-        wait_for(lambda: told.count("WATCHDOG=1") > fed + 3, 20, lambda: f"{told.told} {process}")
+        fed = systemd.count("WATCHDOG=1")
+        wait_for(lambda: systemd.count("WATCHDOG=1") > fed + 3, 20, lambda: f"{systemd.messages} {process}")
         assert "cannot be called" not in process.err

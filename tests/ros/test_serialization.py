@@ -53,7 +53,7 @@ def serialized(message: Any) -> bytes:
 
 
 def _nested(values: Any, depth: int) -> Any:
-    """The generated classes' form of nested lists."""
+    """Return nested lists in the form of the generated classes."""
     if depth == 1:
         return rosAFE.msg.rosAFE_signalOneD(data=values)
     if depth == 2:
@@ -62,7 +62,7 @@ def _nested(values: Any, depth: int) -> Any:
 
 
 def ours_and_plain(idl: str, left: np.ndarray, right: np.ndarray | None = None) -> tuple[Any, Any]:
-    """The same message in our class and in the generated one."""
+    """Return the same message in our class and in the generated one."""
     signals = {"left": left} if idl == CROSS_CORRELATION else {"left": left, "right": left if right is None else right}
     lists = {name: _nested(array.tolist(), LEVELS[idl]) for name, array in signals.items()}
     return (
@@ -84,7 +84,7 @@ def test_bytes_are_those_of_the_generated_class(data: st.DataObject, idl: str) -
     assert back.left.shape == shape
     assert {name: getattr(back, name) for name in HEADS[idl]} == HEADS[idl]
     assert serialized(plain_class(idl)().deserialize(serialized(ours))) == sent
-    assert serialized(back) == sent, "what was received can be sent on"
+    assert serialized(back) == sent, "a received message can be sent again"
 
 
 @pytest.mark.parametrize("idl", sorted(LEVELS))
@@ -96,7 +96,7 @@ def test_types_are_those_of_the_generated_class(idl: str) -> None:
 
 
 @pytest.mark.parametrize("idl", sorted(LEVELS))
-def test_a_message_made_without_arrays_can_be_sent(idl: str) -> None:
+def test_a_message_created_without_arrays_can_be_sent(idl: str) -> None:
     assert serialized(serialization.message_class("rosAFE", idl)()) == serialized(plain_class(idl)())
 
 
@@ -120,13 +120,13 @@ def test_the_pieces_of_a_window_are_sent_as_one() -> None:
     frames=st.integers(1, 60),
     row_bytes=st.sampled_from([1, 100, 10**9]),
 )
-def test_rows_as_they_lie_and_rows_copied_together(idl: str, blocks: list[int], frames: int, row_bytes: int) -> None:
-    """Whichever way a window is written, into memory or gathered, from zeros or full of blocks: the same bytes."""
+def test_contiguous_and_copied_rows(idl: str, blocks: list[int], frames: int, row_bytes: int) -> None:
+    """The bytes of a window do not depend on the way of writing it: into memory or gathered, with zeros or blocks."""
     rows = (2, 3)[: LEVELS[idl] - 1] if idl == CROSS_CORRELATION else (2, 3)[: LEVELS[idl]]
     window = SlidingWindow(rows, frames)
     for size in blocks:
         window.append(np.random.default_rng(size).normal(size=(*rows, size)))
-    view = window.view()
+    view = window.padded_view(frames)
     if idl == CROSS_CORRELATION:
         ours, plain = ours_and_plain(idl, view.array().swapaxes(0, 1))
         ours.left = view.swap_rows()
@@ -142,24 +142,24 @@ def test_rows_as_they_lie_and_rows_copied_together(idl: str, blocks: list[int], 
     assert gathered.size == len(serialized(plain))
 
 
-def test_array_msg_is_the_class_that_belongs_to_a_generated_one() -> None:
+def test_array_msg_is_the_class_of_a_generated_one() -> None:
     for package, classes in (("rosAFE", rosAFE.msg), ("bass", bass.msg)):
         for idl in interface.COMPONENTS[package].structs:
             generated = getattr(classes, interface.ros_type(idl))
             assert array_msg(generated) is serialization.message_class(package, idl)
             assert array_msg(array_msg(generated)) is array_msg(generated)
     for wrong in (None, int, "rosAFE/rosAFE_signalND", rosAFE.msg.InputProcGoal, genpy.Message):
-        with pytest.raises(TypeError, match="no message class"):
+        with pytest.raises(TypeError, match="expected a message class"):
             array_msg(wrong)
 
 
-def test_another_build_of_a_class_is_refused() -> None:
+def test_another_build_of_a_class_is_rejected() -> None:
     other = type("binaudio_portStruct", (bass.msg.binaudio_portStruct,), {"_md5sum": "0" * 32})
     with pytest.raises(TypeError):
         array_msg(other)
 
 
-def test_bags_keep_such_messages_and_give_them_back(tmp_path: Path) -> None:
+def test_bags_can_store_such_messages(tmp_path: Path) -> None:
     ours, plain = ours_and_plain(TIME_FREQUENCY, np.arange(12.0).reshape(3, 4))
     with rosbag.Bag(str(tmp_path / "a.bag"), "w") as bag:
         bag.write("/ours", ours)
@@ -240,7 +240,7 @@ def test_signals_of_all_processors_in_one_response() -> None:
     assert received.signals["input"][0]["lastFrameIndex"] == 2**40
 
 
-# --- what cannot be read ----------------------------------------------------------------------------------------
+# --- unreadable messages ----------------------------------------------------------------------------------------
 
 
 def audio_bytes() -> bytes:
@@ -248,7 +248,7 @@ def audio_bytes() -> bytes:
 
 
 @pytest.mark.parametrize("idl", [*sorted(LEVELS), AUDIO])
-def test_truncated_messages_are_refused_wherever_they_end(idl: str) -> None:
+def test_messages_truncated_anywhere_are_rejected(idl: str) -> None:
     whole = audio_bytes() if idl == AUDIO else serialized(ours_and_plain(idl, np.ones((2, 3, 4)[3 - LEVELS[idl] :]))[1])
     for length in range(len(whole)):
         with pytest.raises(genpy.DeserializationError):
@@ -257,7 +257,7 @@ def test_truncated_messages_are_refused_wherever_they_end(idl: str) -> None:
 
 @settings(deadline=None, max_examples=200)
 @given(idl=st.sampled_from([*sorted(LEVELS), AUDIO]), data=st.binary(max_size=120))
-def test_garbage_is_refused_or_read_and_nothing_else(idl: str, data: bytes) -> None:
+def test_garbage_is_rejected_or_read(idl: str, data: bytes) -> None:
     lenient = serialization.tolerant_message_class("rosAFE", idl, 100)().deserialize(data)
     try:
         serialization.message_class("rosAFE", idl)().deserialize(data)
@@ -267,8 +267,8 @@ def test_garbage_is_refused_or_read_and_nothing_else(idl: str, data: bytes) -> N
         assert lenient.problem == ""
 
 
-def test_a_signal_beyond_what_numpy_can_lay_out_is_read_all_the_same() -> None:
-    """More than 2 GB in one piece; zeros that nobody looks at, so that they are not in memory."""
+def test_a_signal_that_numpy_cannot_reshape_is_read() -> None:
+    """More than 2 GB in one piece, of zeros that are never accessed and therefore need no memory."""
     head = serialized(plain_class(TIME_DOMAIN)())[:20]
     count = 2**28 + 1
     data = np.zeros(len(head) + 4 + 8 * count + 4, np.uint8)
@@ -280,7 +280,7 @@ def test_a_signal_beyond_what_numpy_can_lay_out_is_read_all_the_same() -> None:
 
 
 @pytest.mark.parametrize("idl", sorted(LEVELS))
-def test_counts_beyond_the_message_cost_nothing(idl: str) -> None:
+def test_counts_beyond_the_message_need_no_memory(idl: str) -> None:
     message_class = serialization.message_class("rosAFE", idl)
     head = serialized(plain_class(idl)())[: {TIME_DOMAIN: 20, TIME_FREQUENCY: 24, CROSS_CORRELATION: 32}[idl]]
     huge = (2**32 - 1).to_bytes(4, "little")
@@ -291,7 +291,7 @@ def test_counts_beyond_the_message_cost_nothing(idl: str) -> None:
         message_class().deserialize(head + huge + bytes(1000))
 
 
-# --- what cannot be written -------------------------------------------------------------------------------------
+# --- unwritable messages -------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -310,13 +310,13 @@ def test_counts_beyond_the_message_cost_nothing(idl: str) -> None:
         ("stamp", 5),
     ],
 )
-def test_what_does_not_fit_is_refused_and_named(field: str, value: Any) -> None:
+def test_values_that_do_not_fit_are_rejected_by_name(field: str, value: Any) -> None:
     message = serialization.message_class("bass", AUDIO)(**{field: value})
     with pytest.raises(genpy.SerializationError, match=field):
         serialized(message)
 
 
-def test_signals_of_the_wrong_shape_are_refused() -> None:
+def test_signals_of_the_wrong_shape_are_rejected() -> None:
     for idl, levels in LEVELS.items():
         for shape in {1: (2, 2), 2: (3,), 3: (2, 2)}[levels], (1, 1, 1, 1):
             with pytest.raises(genpy.SerializationError, match="left"):
@@ -329,7 +329,7 @@ def test_signals_of_the_wrong_shape_are_refused() -> None:
 
 
 def test_a_port_of_22_megabytes(record_property: Any) -> None:
-    """How long it takes is on record (pytest --junitxml), not asserted: machines differ."""
+    """The time is recorded (pytest --junitxml) and not checked, as machines differ."""
     values = np.random.default_rng(1).normal(size=(2, 31, 44100))
     pieces = tuple(values[..., start : start + 12000] for start in range(0, 44100, 12000))
     view = WindowView(pieces)
@@ -346,4 +346,4 @@ def test_a_port_of_22_megabytes(record_property: Any) -> None:
     assert len(data) == 24 + 2 * (4 + 31 * (4 + 44100 * 8))
     np.testing.assert_array_equal(received.left, values[0])
     np.testing.assert_array_equal(received.right, values[1])
-    assert np.shares_memory(received.left, np.frombuffer(data, np.uint8)), "a view of what was received, no copy"
+    assert np.shares_memory(received.left, np.frombuffer(data, np.uint8)), "a view of the received bytes, not a copy"

@@ -14,7 +14,7 @@ from tests.harness import PATIENCE, Process, wait_for
 
 
 class PulseServer:
-    """What is played into the null sink, ALSA's PCM `pulse` captures. Start it as often as it was killed."""
+    """A server whose null sink ALSA's PCM `pulse` captures. It can be started again after it was killed."""
 
     def __init__(self, folder: Path) -> None:
         if shutil.which("pulseaudio") is None:
@@ -34,7 +34,7 @@ class PulseServer:
         self._process: Process | None = None
 
     def start(self) -> None:
-        """Start the server and wait until it takes connections."""
+        """Start the server and wait until it accepts connections."""
         self._process = Process(
             [
                 *("pulseaudio", "-n", "--exit-idle-time=-1", "--daemonize=no", "--use-pid-file=no"),
@@ -50,11 +50,11 @@ class PulseServer:
         return done.returncode == 0
 
     def play(self, path: Path) -> Process:
-        """Begin to play a WAV into the sink."""
+        """Start to play a WAV file into the sink."""
         return Process(["paplay", "--latency-msec=500", str(path)], self.env)
 
     def kill(self) -> None:
-        """Pull the plug."""
+        """Kill the server."""
         if self._process is not None:
             self._process.stop(9)
             self._process.close()

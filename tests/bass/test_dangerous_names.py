@@ -1,4 +1,4 @@
-"""A device name that would run a command, through every door that leads to bass: refused, and nothing has run."""
+"""A device name that would run a command is rejected by each interface that leads to bass, and nothing is run."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ ATTACKS = (
     "plug:SLAVE='file:FILE=|touch MARK'",
     "file1:a/b",
 )
-WHY = "no name of a PCM"
+WHY = "expected the name of a PCM"
 ACTION = """
 import sys, actionlib, rospy
 from bass.msg import AcquireAction, AcquireGoal
@@ -37,7 +37,7 @@ print(client.get_result().genom_exdetail)
 
 @pytest.fixture(scope="module")
 def doors(tmp_path_factory: pytest.TempPathFactory) -> Iterator[World]:
-    """A world with a bass that works in a folder of its own."""
+    """Start a graph with a bass that has a working directory of its own."""
     with worlds.world(tmp_path_factory.mktemp("world"), nodes=False) as world:
         work = world.graph.home / "work"
         work.mkdir()
@@ -78,7 +78,7 @@ def in_octave(world: World, name: str) -> str:
         r = bass.Acquire(char({characters}));
         show('told', {{r.status, r.exception.ex}});
     """
-    return str(octave.shown(world, script)["told"])
+    return str(octave.run_and_parse(world, script)["told"])
 
 
 @pytest.mark.parametrize("door", [service, action, http, tcl, in_octave], ids=lambda door: door.__name__)
@@ -95,19 +95,19 @@ def test_through_the_command(tmp_path: Path, name: str) -> None:
     assert os.listdir(tmp_path) == []
 
 
-def test_the_reason_is_told_and_the_acquisition_goes_on(graph: Graph, bass_node: Process) -> None:
+def test_the_reason_is_returned_and_the_acquisition_continues(graph: Graph, bass_node: Process) -> None:
     assert graph.call("/bass/Acquire", device="scene:", sampleRate=8000, nFramesPerChunk=400).genom_success
     answer = graph.call("/bass/Acquire", device=ATTACKS[0])
-    told = json.loads(answer.genom_exdetail)
-    assert told["ex"] == "::bass::e_device"
+    error = json.loads(answer.genom_exdetail)
+    assert error["ex"] == "::bass::e_device"
     audio = serialization.message_class("bass", "::binaudio::portStruct")
     newest = graph.message("/bass/Audio", audio).lastFrameIndex
     graph.message("/bass/Audio", audio, accept=lambda message: message.lastFrameIndex > newest + 800)
     assert WHY in bass_node.err and bass_node.err.count("tee:null") == 1
 
 
-def test_names_that_are_almost_right(graph: Graph, bass_node: Process) -> None:
-    listed = "see ListDevices and `arecord -L` for what there is)"
+def test_almost_correct_names_get_a_hint(graph: Graph, bass_node: Process) -> None:
+    listed = "see ListDevices and `arecord -L` for the available devices)"
     for name, hint in {
         "scen:": "; did you mean scene:?",
         "Scene:?seconds=3": "; did you mean scene:?",
@@ -118,5 +118,5 @@ def test_names_that_are_almost_right(graph: Graph, bass_node: Process) -> None:
         "hw:1.0": listed,
         "no_such_pcm": listed,
     }.items():
-        told = json.loads(graph.call("/bass/Acquire", device=name).genom_exdetail)
-        assert told["ex"] == "::bass::e_device" and told["what"].endswith(hint), (name, told)
+        error = json.loads(graph.call("/bass/Acquire", device=name).genom_exdetail)
+        assert error["ex"] == "::bass::e_device" and error["what"].endswith(hint), (name, error)

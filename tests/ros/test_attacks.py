@@ -1,4 +1,4 @@
-"""Attacks on the ports of running nodes: silence, garbage, floods and lies about lengths cost nobody anything."""
+"""Attacks on the ports of running nodes: silence, garbage, floods and wrong lengths do not affect other clients."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from std_msgs.msg import Header, String
 
 import bass.msg
 from rosafe.sound.windows import MAX_WINDOW
-from rosafe.transport import handshake_server
+from rosafe.transport import handshake_server, server_limits
 from tests.harness import PATIENCE, PYTHON, Graph, proc, python_path, wait_for
-from tests.ros.attacker import HUGE, FakePublisher, Target, closed, length, pour, publisher_header
+from tests.ros.attacker import HUGE, FakePublisher, Target, closed, flood, length, publisher_header
 from tests.ros.session import Session, noise, own_node
 
 PORTS = ("TCPROS", "XML-RPC")
@@ -38,7 +38,7 @@ def node(graph: Graph, component: str, name: str) -> Iterator[Target]:
 
 @pytest.fixture(scope="module", params=["rosAFE", "bass"])
 def target(graph: Graph, request: pytest.FixtureRequest) -> Iterator[Target]:
-    """Each of the two nodes; it must be as well after a test as before."""
+    """Provide each of the two nodes, which must be healthy after the test."""
     with node(graph, request.param, f"{request.param}_attacked") as target:
         yield target
 
@@ -58,42 +58,57 @@ OPENINGS = {
 }
 
 
-def test_one_that_says_too_little_or_garbage_holds_nobody_up(target: Target) -> None:
-    """Nor do all of them together; the node closes them within some seconds, and says so in the log."""
-    lines = "TCPROS: 127.0.0.1: said nothing for 5 s", r"TCPROS: 127.0.0.1: a header of \d+ bytes, which is not ROS"
-    with target.says_once(*lines), target.costs_nothing(), ExitStack() as stack:
+def test_incomplete_or_invalid_headers_do_not_block_other_clients(target: Target) -> None:
+    """Also all of them at once; the node closes them within some seconds, and logs it."""
+    lines = (
+        "TCPROS: 127.0.0.1: sent nothing for 5 s",
+        r"TCPROS: 127.0.0.1: header: expected at most 65536 bytes, got \d+; this is not ROS",
+    )
+    with target.logs_once(*lines), target.needs_no_resources(), ExitStack() as stack:
         open_ones = []
         for port in PORTS:
-            for said in OPENINGS.values():
-                open_ones.append(stack.enter_context(target.connect(port, said)))
-                target.assert_well()
+            for opening in OPENINGS.values():
+                open_ones.append(stack.enter_context(target.connect(port, opening)))
+                target.assert_healthy()
         for sock in open_ones:
             assert closed(sock)
 
 
-def test_many_that_are_silent_or_slow_hold_nobody_up(target: Target) -> None:
-    """More than rospy could have open at all; some of them say a byte now and then."""
-    line = "TCPROS: too many connections that say nothing"
-    with target.says_once(line), target.costs_nothing(), ExitStack() as stack:
+def test_many_silent_or_slow_connections_do_not_block_other_clients(target: Target) -> None:
+    """More than rospy could have open; some of them send single bytes."""
+    line = "TCPROS: too many silent connections"
+    with target.logs_once(line), target.needs_no_resources(), ExitStack() as stack:
         for port in PORTS:
-            crowd = [stack.enter_context(target.connect(port)) for _ in range(1200)]
-            target.assert_well()
+            connections = [stack.enter_context(target.connect(port)) for _ in range(1200)]
+            target.assert_healthy()
             for byte in (b"\x10", b"\0", b"\0"):
-                for sock in crowd[-200:]:
+                for sock in connections[-200:]:
                     with contextlib.suppress(ConnectionError):
                         sock.sendall(byte)
-                target.assert_well()
-        assert target.descriptors < 2 * handshake_server.MAX_PENDING + 200, "no more wait than that"
+                target.assert_healthy()
+        assert target.descriptors < 2 * handshake_server.MAX_PENDING + 200, "the maximum number of waiting connections"
 
 
-def test_one_who_says_its_piece_byte_by_byte_is_understood(target: Target) -> None:
+def test_the_longest_header_is_accepted(target: Target) -> None:
+    fields = {"service": f"/{target.name}/connect_service", "md5sum": "*", "callerid": "/long", "padding": ""}
+    fields["padding"] = "x" * (server_limits.HEADER_BYTES - len(encode_ros_handshake_header(fields)) + 4)
+    header = encode_ros_handshake_header(fields)
+    assert header[:4] == length(server_limits.HEADER_BYTES)
+    with target.connect("TCPROS", header) as sock:
+        assert "error" not in read_ros_handshake_header(sock, io.BytesIO(), 65536)
+    longer = encode_ros_handshake_header({**fields, "padding": fields["padding"] + "x"})
+    with target.connect("TCPROS", longer) as sock, contextlib.suppress(ConnectionResetError):
+        assert sock.recv(100) == b""
+
+
+def test_a_header_sent_byte_by_byte_is_accepted(target: Target) -> None:
     header = encode_ros_handshake_header(
         {"service": f"/{target.name}/connect_service", "md5sum": "*", "callerid": "/slow"}
     )
     request = length(8) + bytes(8)
     with target.connect("TCPROS") as sock:
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        for byte in header + request:  # the request does not wait for the answer to the header
+        for byte in header + request:  # the request is sent before the header is answered
             sock.sendall(bytes([byte]))
         answer = b""
         while b"no_such_remote" not in answer and (part := sock.recv(4096)):
@@ -105,7 +120,7 @@ def test_one_who_says_its_piece_byte_by_byte_is_understood(target: Target) -> No
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         for byte in call:
             sock.sendall(bytes([byte]))
-        sock.sendall(call + call)  # two more at once, on the same connection
+        sock.sendall(call + call)  # two more at the same time, on the same connection
         answers = b""
         while answers.count(b"</methodResponse>") < 3:
             part = sock.recv(4096)
@@ -117,60 +132,62 @@ def test_one_who_says_its_piece_byte_by_byte_is_understood(target: Target) -> No
 # --- lengths ----------------------------------------------------------------------------------------------------
 
 
-def test_lengths_beyond_all_reason_are_not_believed(target: Target) -> None:
-    """Of headers, requests, HTTP bodies and HTTP headers; each is one line in the log however often it comes."""
+def test_excessive_lengths_are_rejected(target: Target) -> None:
+    """Of headers, requests, HTTP bodies and HTTP headers; repetitions of each are one line in the log."""
     bomb = b"<value><i4>1</i4></value>" * 10
     lines = (
-        r"TCPROS: 127.0.0.1: a header of \d+ bytes",
-        rf"/{target.name}/Stop: 127.0.0.1: a request of \d+ bytes",
-        r"XML-RPC: 127.0.0.1: an HTTP request of \d+ bytes",
-        "XML-RPC: 127.0.0.1: an HTTP request whose headers have no end",
+        r"TCPROS: 127.0.0.1: header: expected at most 65536 bytes, got \d+",
+        rf"/{target.name}/Stop: 127.0.0.1: request: expected at most \d+ bytes, got \d+",
+        r"XML-RPC: 127.0.0.1: HTTP request: expected at most 262144 bytes, got \d+",
+        "XML-RPC: 127.0.0.1: HTTP headers: expected at most 16384 bytes",
     )
-    with target.says_once(*lines), target.costs_nothing():
+    with target.logs_once(*lines), target.needs_no_resources():
         for _ in range(3):
             with target.connect("TCPROS", length(HUGE)) as sock:
-                assert pour(sock, bytes(10**6)) < 20e6
+                assert flood(sock, bytes(10**6)) < 20e6
             for service in ("connect_port", "Stop", "get_loggers"):
                 for size in (HUGE, 2**21):
                     with target.client(service) as sock:
                         sock.sendall(length(size))
-                        assert pour(sock, bytes(10**6)) < 20e6
+                        assert flood(sock, bytes(10**6)) < 20e6
             with target.connect("XML-RPC", b"POST / HTTP/1.1\r\nContent-Length: 4000000000\r\n\r\n") as sock:
-                assert pour(sock, bytes(10**6)) < 20e6
+                assert flood(sock, bytes(10**6)) < 20e6
             with target.connect("XML-RPC", b"POST / HTTP/1.1\r\n") as sock:
-                assert pour(sock, b"x: y\r\n" * 10**5) < 20e6
+                assert flood(sock, b"x: y\r\n" * 10**5) < 20e6
             with target.connect("XML-RPC") as sock:
-                assert pour(sock, b"x" * 10**6) < 20e6
+                assert flood(sock, b"x" * 10**6) < 20e6
             packed = b"POST / HTTP/1.1\r\nContent-Encoding: gzip\r\nContent-Length: %d\r\n\r\n" % len(bomb)
             with target.connect("XML-RPC", packed + bomb) as sock:
                 assert sock.recv(100).startswith(b"HTTP/1.1 501")
 
 
-def test_requests_that_are_not_finished_or_not_begun(target: Target) -> None:
-    """A client has some seconds for its request; only a persistent one may keep silent, and not amid a request."""
+def test_incomplete_or_missing_requests(target: Target) -> None:
+    """A client has some seconds for its request; only a persistent one may be silent, and only between requests."""
     lines = [
-        f"/{target.name}/{name}: 127.0.0.1: no whole request within" for name in ("connect_port", "connect_service")
+        f"/{target.name}/{name}: 127.0.0.1: no complete request within" for name in ("connect_port", "connect_service")
     ]
-    with target.says_once(*lines), target.costs_nothing(), ExitStack() as stack:
+    with target.logs_once(*lines), target.needs_no_resources(), ExitStack() as stack:
         hanging = [stack.enter_context(target.client("connect_port")) for _ in range(20)]
         for sock in hanging[10:]:
             sock.sendall(length(16384) + b"x")
         patient = stack.enter_context(target.client("connect_service", persistent="1"))
         amid = stack.enter_context(target.client("connect_service", persistent="1"))
         amid.sendall(length(8))
-        target.assert_well()
+        target.assert_healthy()
         body = xmlrpc.client.dumps(("/hasty",), "getPid").encode()
         call = b"POST / HTTP/1.1\r\nHost: node\r\nContent-Length: %d\r\n\r\n%s" % (len(body), body)
         unread = stack.enter_context(target.connect("XML-RPC"))
-        assert pour(unread, call * 1000) < 50e6, "who does not read the answers is not asked for more"
+        assert flood(unread, call * 1000) < 50e6, (
+            "no further request is read from a client that does not read its answers"
+        )
         for sock in (*hanging, amid):
             assert closed(sock)
         patient.sendall(length(8) + bytes(8))
         assert b"no_such_remote" in patient.recv(4096)
 
 
-def test_requests_that_are_garbage_get_an_answer(target: Target) -> None:
-    with target.costs_nothing():
+def test_invalid_requests_get_an_answer(target: Target) -> None:
+    with target.needs_no_resources():
         for garbage in (b"", b"x", length(HUGE) + b"x", b"\xff" * 5000):
             with target.client("connect_port") as sock:
                 sock.sendall(length(len(garbage)) + garbage)
@@ -188,12 +205,12 @@ def test_requests_that_are_garbage_get_an_answer(target: Target) -> None:
             assert b"<fault>" in answer
 
 
-def test_a_name_that_would_break_those_who_read_it_is_refused(target: Target) -> None:
-    """`rosnode info` gets the names of all subscribers in XML, where such characters cannot stand."""
+def test_a_name_with_invalid_xml_characters_is_rejected(target: Target) -> None:
+    """`rosnode info` gets the names of all subscribers in XML, which cannot contain such characters."""
     for caller in ("/evil\x01name", "/" + "x" * 5000):
         fields = {"topic": f"/{target.name}/genom_state", "md5sum": "*", "callerid": caller}
         with target.connect("TCPROS", encode_ros_handshake_header(fields)) as sock:
-            assert read_ros_handshake_header(sock, io.BytesIO(), 4096)["error"] == "callerid is no name"
+            assert read_ros_handshake_header(sock, io.BytesIO(), 4096)["error"] == "callerid: expected a name"
             assert closed(sock)
 
 
@@ -206,32 +223,32 @@ def test_the_soft_limit_is_raised(target: Target) -> None:
     assert int(soft) == min(handshake_server.DESCRIPTORS, int(hard)) or int(soft) > handshake_server.DESCRIPTORS
 
 
-def test_when_descriptors_run_out_the_node_waits_and_goes_on(target: Target) -> None:
-    """Subscribers that never read take all there are; once they are gone, all who waited are served."""
+def test_without_descriptors_the_node_waits_and_continues(target: Target) -> None:
+    """Subscribers that never read use all descriptors; after their end all waiting clients are served."""
     pid = target.process.pid
     usual = resource.prlimit(pid, resource.RLIMIT_NOFILE)
     try:
-        with target.costs_nothing(), ExitStack() as stack:
+        with target.needs_no_resources(), ExitStack() as stack:
             limit = target.descriptors + 60
             resource.prlimit(pid, resource.RLIMIT_NOFILE, (limit, usual[1]))
             for number in range(limit + 50):
                 stack.enter_context(target.subscribe("genom_state", f"/deaf{number}", wait=False))
-            wait_for(lambda: target.said("TCPROS: of"), what=lambda: str(target.process))
-            assert target.descriptors < limit, "some are left to the node itself"
+            wait_for(lambda: target.logged("TCPROS: all"), what=lambda: str(target.process))
+            assert target.descriptors < limit, "some are reserved for the node itself"
             stack.close()
-            target.assert_well()
+            target.assert_healthy()
     finally:
         resource.prlimit(pid, resource.RLIMIT_NOFILE, usual)
-    line = f"TCPROS: of {limit} file descriptors none is left for connections: new ones wait"
-    assert target.said(line) == target.said("TCPROS: there are file descriptors for connections again") == 1
+    line = f"TCPROS: all {limit} file descriptors are in use: new connections wait"
+    assert target.logged(line) == target.logged("TCPROS: file descriptors for connections are available again") == 1
 
 
 def test_1100_subscribers_that_never_read(target: Target) -> None:
-    """More than fitted into Debian's usual limit; the one after them is served as the first."""
-    with target.costs_nothing(megabytes=60), ExitStack() as stack:
+    """More than the default limit of Debian; the next client is served as usual."""
+    with target.needs_no_resources(megabytes=60), ExitStack() as stack:
         for number in range(1100):
             stack.enter_context(target.subscribe("genom_state", f"/deaf{number}"))
-        target.assert_well()
+        target.assert_healthy()
         stack.close()
         wait_for(lambda: target.threads < 100, what=lambda: f"end of {target.threads} threads")
 
@@ -248,8 +265,10 @@ def afe(graph: Graph) -> Iterator[tuple[Session, Target]]:
 
 
 @pytest.mark.parametrize("behaviour", ["header", "message", "answer"])
-def test_a_publisher_that_lies_about_lengths_is_left(afe: tuple[Session, Target], graph: Graph, behaviour: str) -> None:
-    """Of its header, of a message, of its answer to the question where it is; sound from others comes as before."""
+def test_a_publisher_with_wrong_lengths_is_disconnected(
+    afe: tuple[Session, Target], graph: Graph, behaviour: str
+) -> None:
+    """Lengths of its header, of a message, of its response to requestTopic; audio of other publishers still arrives."""
     session, target = afe
     poured: list[int] = []
 
@@ -257,33 +276,36 @@ def test_a_publisher_that_lies_about_lengths_is_left(afe: tuple[Session, Target]
         if behaviour == "message":
             sock.sendall(publisher_header(AUDIO, "/evil/Audio"))
         sock.sendall(length(HUGE if behaviour == "header" else 2**28))
-        poured.append(pour(sock, bytes(10**6)))
+        poured.append(flood(sock, bytes(10**6)))
 
     def answer(port: int) -> Any:
         return 1, "", ["TCPROS", "x" * 40_000_000 if behaviour == "answer" else "127.0.0.1", port]
 
-    session.build("PreProc")  # the first one takes memory that stays
+    session.build("PreProc")  # the first one allocates memory that is kept
     session.ok("Stop")
-    with target.costs_nothing(megabytes=60), FakePublisher(graph, "/evil/Audio", AUDIO._type, behave, answer) as evil:
+    with (
+        target.needs_no_resources(megabytes=60),
+        FakePublisher(graph, "/evil/Audio", AUDIO._type, behave, answer) as evil,
+    ):
         session.ok("connect_port", local="Audio", remote="/evil/Audio")
         if behaviour == "answer":
             wait_for(lambda: evil.calls)
         else:
             wait_for(lambda: poured, what=lambda: str(target.process))
             assert poured[0] < 40e6
-        target.assert_well()
+        target.assert_healthy()
     session.listen()
     session.build("PreProc")
     line = {
-        "header": "TCPROS: 127.0.0.1: a header of 4294967295",
-        "message": "/evil/Audio: 127.0.0.1: a message of 268435456",
+        "header": "TCPROS: 127.0.0.1: header: expected at most 65536 bytes, got 4294967295",
+        "message": "/evil/Audio: 127.0.0.1: message: expected at most \\d+ bytes, got 268435456",
     }
     if behaviour in line:
-        assert target.said(line[behaviour]) == 1, target.process
+        assert target.logged(line[behaviour]) == 1, target.process
 
 
-def test_goals_are_bounded_in_all_their_texts(afe: tuple[Session, Target], graph: Graph) -> None:
-    """`frame_id`, the goal's id and the request's own names; the topics go on for others."""
+def test_all_texts_of_goals_are_bounded(afe: tuple[Session, Target], graph: Graph) -> None:
+    """`frame_id`, the goal's id and the names in the request; the topics still work for other clients."""
     session, target = afe
     goal = rosAFE.msg.PreProcActionGoal
     long = "x" * 200_000
@@ -309,16 +331,14 @@ def test_goals_are_bounded_in_all_their_texts(afe: tuple[Session, Target], graph
 
             with FakePublisher(graph, name, message._type, behave):
                 assert behaved.wait(PATIENCE), target.process
-            assert target.said(f"{name}: 127.0.0.1: a message of") == 1
+            assert target.logged(f"{name}: 127.0.0.1: message: expected at most") == 1
     session.listen()
     goal_of_mine = session.goal("InputProc", nFramesPerBlock=1600).active()
     session.ok("Stop")
     assert goal_of_mine.result().genom_success
 
 
-def test_a_publisher_of_garbage_goals_does_not_keep_others_from_theirs(
-    afe: tuple[Session, Target], graph: Graph
-) -> None:
+def test_a_publisher_of_invalid_goals_does_not_affect_other_clients(afe: tuple[Session, Target], graph: Graph) -> None:
     session, target = afe
     goal = rosAFE.msg.InputProcActionGoal
     name = f"/{session.name}/InputProc/goal"
@@ -330,17 +350,17 @@ def test_a_publisher_of_garbage_goals_does_not_keep_others_from_theirs(
         closed(sock)
 
     with FakePublisher(graph, name, goal._type, behave):
-        for _ in range(2):  # it is tried again
+        for _ in range(2):  # the node connects again
             assert came.acquire(timeout=PATIENCE)
         session.listen()
         mine = session.goal("InputProc", nFramesPerBlock=1600).active()
         session.ok("Stop")
         assert mine.result().genom_success
-        target.assert_well()
+        target.assert_healthy()
 
 
-def test_lists_of_publishers_that_are_not_there_cost_little(afe: tuple[Session, Target], graph: Graph) -> None:
-    """Thousands of addresses where nobody answers, sent by anybody; the one that is there is found all the same."""
+def test_lists_of_unreachable_publishers_need_few_resources(afe: tuple[Session, Target], graph: Graph) -> None:
+    """Thousands of addresses without a server, sent by any client; the one existing publisher is still found."""
     session, target = afe
     session.listen()
     topic = session.microphone.topic if session.microphone else ""
@@ -349,25 +369,25 @@ def test_lists_of_publishers_that_are_not_there_cost_little(afe: tuple[Session, 
         threads = target.threads
         api: Any = xmlrpc.client.ServerProxy(target.api_uri)
         for turn in range(3):
-            crowd = [f"http://127.0.0.1:{where}/{turn}/{number}" for number in range(1500)]
-            assert api.publisherUpdate("/evil", topic, crowd)[0] == 1
+            addresses = [f"http://127.0.0.1:{where}/{turn}/{number}" for number in range(1500)]
+            assert api.publisherUpdate("/evil", topic, addresses)[0] == 1
         assert target.threads < threads + 20
-        target.assert_well()
+        target.assert_healthy()
         another = session.listen()
-        wait_for(lambda: another.heard)
+        wait_for(lambda: another.subscribed)
         assert target.threads < threads + 20
 
 
-def test_a_window_that_is_a_little_too_long_is_refused_and_the_stream_goes_on(afe: tuple[Session, Target]) -> None:
+def test_a_slightly_too_long_window_is_rejected_and_the_stream_continues(afe: tuple[Session, Target]) -> None:
     session, _ = afe
     microphone = session.listen()
-    wait_for(lambda: microphone.heard, 20)
+    wait_for(lambda: microphone.subscribed, 20)
     before = int(session.health(lambda entries: int(entries["messages"]) > 0)["messages"])
     microphone.publish_bytes(bytes(20) + 2 * (length(MAX_WINDOW + 1) + bytes(4 * (MAX_WINDOW + 1))) + bytes(8))
     wait_for(lambda: session.health(lambda entries: entries["refused"] == "1"), 30)
     microphone.play(noise(400))
     health = session.health(lambda entries: int(entries["messages"]) >= before + 2)
-    assert health["refused"] == "1" and microphone.heard
+    assert health["refused"] == "1" and microphone.subscribed
 
 
 LISTENING = """
@@ -382,8 +402,8 @@ rospy.spin()
 """
 
 
-def test_who_listens_to_data_gets_it_whatever_its_length(graph: Graph) -> None:
-    """The bounds of requests are not those of sound or of a trace, taken with the classes as they are generated."""
+def test_subscribers_get_data_of_any_length(graph: Graph) -> None:
+    """The limits of requests do not apply to audio or traces received with the generated classes."""
     graph.client()
     audio = rospy.Publisher("/long/audio", bass.msg.binaudio_portStruct, latch=True, queue_size=1)
     text = rospy.Publisher("/long/text", String, latch=True, queue_size=1)
@@ -397,18 +417,18 @@ def test_who_listens_to_data_gets_it_whatever_its_length(graph: Graph) -> None:
     text.unregister()
 
 
-# --- all at once ------------------------------------------------------------------------------------------------
+# --- combined ------------------------------------------------------------------------------------------------
 
 
-def test_a_mixed_load_loses_no_frame(graph: Graph) -> None:
-    """30 subscribers that never read, clients that die, garbage on all ports, while sound is worked on."""
+def test_a_mixed_load_causes_no_loss(graph: Graph) -> None:
+    """30 subscribers that never read, clients that are killed, garbage on all ports, while audio is processed."""
     with node(graph, "bass", "bass_mixed") as bass, own_node(graph, name="mixed") as session:
         target = Target(graph, session.process, "mixed")
         target.graph.call(
             "/bass_mixed/Acquire", device="scene:", sampleRate=44100, nFramesPerChunk=2205, nChunksOnPort=20
         )
         session.ok("connect_port", local="Audio", remote="/bass_mixed/Audio")
-        session.ok("InputProc", nFramesPerBlock=4410, bufferSize_s_port=0.1)  # several messages may wait for a reader
+        session.ok("InputProc", nFramesPerBlock=4410, bufferSize_s_port=0.1)  # several messages can wait for a reader
         for request in ("PreProc", "GammatoneProc"):
             session.ok(request)
         with ExitStack() as stack, session.follow("gammatone") as messages:
@@ -416,18 +436,18 @@ def test_a_mixed_load_loses_no_frame(graph: Graph) -> None:
                 topic = ("gammatonePort/gammatone", "genom_state")[number % 2]
                 stack.enter_context(target.subscribe(topic, f"/deaf{number}"))
             for turn in range(15):
-                for victim in (target, bass):
-                    victim.client("connect_port").close()
-                    victim.subscribe("genom_state", f"/dying{turn}").close()
+                for attacked in (target, bass):
+                    attacked.client("connect_port").close()
+                    attacked.subscribe("genom_state", f"/dying{turn}").close()
                     for port in PORTS:
-                        stack.enter_context(victim.connect(port, list(OPENINGS.values())[turn % len(OPENINGS)]))
+                        stack.enter_context(attacked.connect(port, list(OPENINGS.values())[turn % len(OPENINGS)]))
                 seen = len(messages)
                 wait_for(lambda: len(messages) > seen + 1)  # noqa: B023
-            for victim in (target, bass):
-                victim.assert_well()
-                done = graph.run("rosservice", "call", f"/{victim.name}/connect_service", "{local: a, remote: b}")
+            for attacked in (target, bass):
+                attacked.assert_healthy()
+                done = graph.run("rosservice", "call", f"/{attacked.name}/connect_service", "{local: a, remote: b}")
                 assert "no_such_remote" in done.stdout
-                done = graph.run("rostopic", "echo", "-n1", f"/{victim.name}/genom_state")
+                done = graph.run("rostopic", "echo", "-n1", f"/{attacked.name}/genom_state")
                 assert "task" in done.stdout
         indices = [m.lastFrameIndex for m in messages if m.lastFrameIndex]
         assert indices == list(range(indices[0], indices[-1] + 1, 4410)), "no block is missing"

@@ -1,4 +1,4 @@
-"""A long setup gives way: other builds of the same component come between two of its steps."""
+"""Other tree requests to the same component run between two steps of a long setup."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ SETUP = (
 NAMES = ["input", "preProc", *(f"filterbank_{i}" for i in range(COUNT))]
 
 
-async def among(graph: Graph, text: str, **values: Any) -> tuple[Any, dict[str, Any], int]:
-    """Load `text`, and once it is under way `request` something else.
+async def load_during(graph: Graph, text: str, **values: Any) -> tuple[Any, dict[str, Any], int]:
+    """Load `text`, and during this `request` a tree.
 
-    Returns the answer to the first (or its exception), that to the second, and how many processors the setup made from
-    the second's beginning to its end.
+    Returns the response of the first (or its exception), that of the second, and the number of processors that the
+    setup created during the second.
     """
     first = asyncio.create_task(setup_transaction.load(graph, {"setup": text}))
     while len(graph.processors) < 10:
@@ -40,18 +40,18 @@ async def among(graph: Graph, text: str, **values: Any) -> tuple[Any, dict[str, 
         return problem, second, between
 
 
-def test_another_build_waits_for_one_step() -> None:
+def test_another_request_waits_for_one_step() -> None:
     graph = Graph()
-    loaded, built, between = asyncio.run(among(graph, SETUP, representation="gammatone", fb_nChannels=3))
+    loaded, built, between = asyncio.run(load_during(graph, SETUP, representation="gammatone", fb_nChannels=3))
     assert between <= 2
     assert built["reused"] == ["input", "preProc"]
-    assert built["created"] == [f"filterbank_{COUNT}"]  # none of the names that the setup is going to make
+    assert built["created"] == [f"filterbank_{COUNT}"]  # none of the names in the setup
     assert loaded == {"created": NAMES, "reused": [], "sound": "started"}
     assert set(graph.processors) == {*NAMES, f"filterbank_{COUNT}"}
     assert graph.turns.reserved == frozenset()
 
 
-def test_what_another_build_uses_stays_if_the_setup_fails() -> None:
+def test_processors_used_by_another_request_stay_if_the_setup_fails() -> None:
     graph = Graph()
     bad = SETUP + "  last: {kind: gammatone, parent: preProc, fb_cfHz: [21000, 22049]}\n"
     fail = ComponentError("::rosAFE::e_badNewValue", what="no")
@@ -63,24 +63,24 @@ def test_what_another_build_uses_stays_if_the_setup_fails() -> None:
         return real(service, values)
 
     graph._make = make  # type: ignore[method-assign]
-    problem, built, _ = asyncio.run(among(graph, bad, representation="gammatone", fb_nChannels=2))
+    problem, built, _ = asyncio.run(load_during(graph, bad, representation="gammatone", fb_nChannels=2))
     assert problem is fail
     assert built["created"] == []
-    assert list(graph.processors) == built["dependencies"]  # also a leaf, on which nothing depends
+    assert list(graph.processors) == built["dependencies"]  # also a leaf
 
 
-def test_a_setup_alone_gives_way_to_nobody_and_two_follow_each_other() -> None:
+def test_two_setups_run_one_after_the_other() -> None:
     graph = Graph()
 
     async def both() -> list[dict[str, Any]]:
         return list(await asyncio.gather(*(setup_transaction.load(graph, {"setup": SETUP}) for _ in range(2))))
 
-    first, second = sorted(asyncio.run(both()), key=lambda answer: len(answer["reused"]))  # whichever began
+    first, second = sorted(asyncio.run(both()), key=lambda answer: len(answer["reused"]))  # whichever was first
     assert (first["created"], second["created"]) == (NAMES, [])
     assert second["reused"] == NAMES
 
 
-def test_a_cancelled_setup_leaves_the_turn_to_others() -> None:
+def test_a_cancelled_setup_releases_the_lock() -> None:
     graph = Graph()
 
     async def cancel() -> dict[str, Any]:
@@ -98,8 +98,8 @@ def test_a_cancelled_setup_leaves_the_turn_to_others() -> None:
     assert list(graph.processors) == built["dependencies"]
 
 
-def test_what_an_earlier_build_used_does_not_stay_for_ever() -> None:
-    """The names of its processors may be those of a later build, of which nothing is left if it fails."""
+def test_use_by_an_earlier_request_does_not_persist() -> None:
+    """A later request can use the same names, and none of its processors stays if it fails."""
     graph = Graph()
     asyncio.run(tree_builder.build(graph, {"representation": "time"}))
     graph.processors.clear()

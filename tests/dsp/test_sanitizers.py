@@ -1,0 +1,147 @@
+"""Built with sanitizers for addresses and undefined behaviour, the kernels pass their tests and process random blocks.
+
+The usual run has the kernels of one instruction set; `scripts/test --long` those of all, and more random blocks.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import NamedTuple
+
+import pytest
+
+from rosafe.dsp.kernels import build
+from tests.harness import ROOT
+
+from .implementations import levels
+
+# -O1 halves the time of the compiler. Options of the kernels' own flags come first in the command, and are overridden.
+COMPILER = """#!/bin/sh
+exec gcc "$@" -O1 -g1 -fsanitize=address,undefined -fno-sanitize-recover=undefined -fno-omit-frame-pointer
+"""
+TIMEOUT_SECONDS = 500
+# Tests for another level than those of a library are skipped; tests marked `long` run in an emulator or need clang.
+PYTEST = (
+    "pytest",
+    "-n0",
+    "-q",
+    "--durations=9",
+    "-p",
+    "no:cacheprovider",
+    "tests/dsp/test_kernels.py",
+    "-m",
+    "not long",
+)
+# one test or two of each kernel; the others repeat the same loops for other parameters
+SELECTED = (
+    "not release and not denormal and not constants and not newer and not long_windows and not many_loops and "
+    "not test_precedence and not changes"
+)
+
+
+pytestmark = pytest.mark.long
+
+
+@pytest.fixture(scope="module", autouse=True)
+def implementation() -> None:
+    """Replace the fixture of this folder: the processes select their implementation."""
+
+
+class Sanitized(NamedTuple):
+    """Kernels with sanitizers, for these levels of instruction sets."""
+
+    folder: Path
+    levels: list[int]
+
+    def run(self, *arguments: str, examples: int = 6) -> subprocess.CompletedProcess[str]:
+        """Run tests.dsp.sanitized with these kernels; `examples` is the number of random ones of each test."""
+        runtime = [_runtime(f"lib{name}.so") for name in ("asan", "ubsan")]
+        environment = {
+            **os.environ,
+            build.COMPILER: str(self.folder / "compiler"),
+            "LD_PRELOAD": ":".join(runtime),
+            "ASAN_OPTIONS": "detect_leaks=0:quarantine_size_mb=16",
+            "UBSAN_OPTIONS": "print_stacktrace=1",
+            "ROSAFE_KERNELS": "",
+            "ROSAFE_TEST_EXAMPLES": str(examples),
+        }
+        command = [sys.executable, "-m", "tests.dsp.sanitized", str(self.folder), ",".join(map(str, self.levels))]
+        return subprocess.run(
+            [*command, *arguments],
+            cwd=ROOT,
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=TIMEOUT_SECONDS,
+            check=False,
+        )
+
+
+def _runtime(name: str) -> str:
+    """Return the path of a library of gcc."""
+    found = subprocess.run(["gcc", f"-print-file-name={name}"], capture_output=True, text=True, check=True)
+    return found.stdout.strip()
+
+
+def _built(folder: Path, chosen: list[int]) -> Sanitized:
+    if shutil.which("gcc") is None or "/" not in _runtime("libasan.so") or "/" not in _runtime("libubsan.so"):
+        pytest.skip("no gcc with sanitizers here")
+    compiler = folder / "compiler"
+    compiler.write_text(COMPILER, "ascii")
+    compiler.chmod(0o755)
+    names = build.ISA_LEVELS[platform.machine()]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv(build.COMPILER, str(compiler))
+        patch.setattr(build, "ISA_LEVELS", {platform.machine(): {level: names[level] for level in chosen}})
+        patch.setattr(build, "COMPILE_TIMEOUT_SECONDS", TIMEOUT_SECONDS)
+        build.libraries(folder)
+    return Sanitized(folder, chosen)
+
+
+@pytest.fixture(scope="module")
+def newest(tmp_path_factory: pytest.TempPathFactory) -> Sanitized:
+    """Kernels for the newest instruction set of this processor."""
+    if not levels():
+        pytest.skip("the kernels cannot be built here")
+    return _built(tmp_path_factory.mktemp("sanitized"), levels()[-1:])
+
+
+@pytest.fixture(scope="module")
+def every(tmp_path_factory: pytest.TempPathFactory) -> Sanitized:
+    """Kernels for all instruction sets of this processor."""
+    if not levels():
+        pytest.skip("the kernels cannot be built here")
+    return _built(tmp_path_factory.mktemp("sanitized"), levels())
+
+
+def passed(done: subprocess.CompletedProcess[str]) -> None:
+    assert done.returncode == 0, done.stdout[-5000:] + done.stderr[-5000:]
+
+
+def test_an_overflow_is_reported(newest: Sanitized) -> None:
+    done = newest.run("overflow")
+    assert done.returncode != 0
+    assert "heap-buffer-overflow" in done.stderr and "rosafe_concatenate" in done.stderr, done.stderr[-3000:]
+
+
+def test_kernels_pass_their_tests(newest: Sanitized) -> None:
+    passed(newest.run(*PYTEST, "-k", SELECTED))
+
+
+def test_random_blocks(newest: Sanitized) -> None:
+    passed(newest.run("fuzz", "400"))
+
+
+@pytest.mark.exploration
+def test_kernels_of_all_instruction_sets_pass_all_tests(every: Sanitized) -> None:
+    passed(every.run(*PYTEST, examples=20))
+
+
+@pytest.mark.soak
+def test_many_random_blocks(newest: Sanitized) -> None:
+    passed(newest.run("fuzz", "10000"))

@@ -1,0 +1,1 @@
+"""Tests of heads, scenes, direction models, localization and tracking."""

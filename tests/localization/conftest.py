@@ -1,0 +1,62 @@
+"""A small direction model of the sphere at 16 kHz, and a cache of models of its own."""
+
+from __future__ import annotations
+
+import fcntl
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rosafe.localization import training
+from rosafe.localization.direction_model import DirectionModel
+from rosafe.localization.head import Head
+from tests import harness
+
+RATE = 16000
+KEMAR = Path("/usr/share/libmysofa/MIT_KEMAR_normal_pinna.sofa")
+
+
+@pytest.fixture(scope="session")
+def sphere_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the file of a model of the sphere, learned from less sound than usual."""
+    return _learned_once(tmp_path_factory, "sphere.head", 250.0, Head.sphere)
+
+
+@pytest.fixture(scope="session")
+def kemar_model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the file of a model of the MIT KEMAR head, learned from less sound than usual."""
+    if not KEMAR.exists():
+        pytest.skip("Debian's libmysofa1 is not installed")
+    return _learned_once(tmp_path_factory, "kemar.head", 400.0, lambda: Head.from_sofa(KEMAR))
+
+
+def _learned_once(factory: pytest.TempPathFactory, name: str, seconds: float, head: Callable[[], Head]) -> Path:
+    """Return the file of a model; the first process of a run of the tests that needs it learns it."""
+    path = harness.folder_of_run(factory) / name
+    with open(path.with_suffix(".lock"), "w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not path.exists():
+            with pytest.MonkeyPatch.context() as patch:
+                patch.setattr(training, "SOUND_SECONDS", seconds)
+                training.learn_head(head(), RATE).save(path)
+    return path
+
+
+@pytest.fixture(scope="session")
+def kemar() -> Head:
+    """Return the MIT KEMAR head."""
+    if not KEMAR.exists():
+        pytest.skip("Debian's libmysofa1 is not installed")
+    return Head.from_sofa(KEMAR)
+
+
+def modulated(seconds: float, seed: int, rate: int = RATE) -> np.ndarray:
+    """Return noise whose level changes as in speech, with an RMS of about -26 dB."""
+    random = np.random.default_rng(seed)
+    levels = np.repeat(10 ** (random.uniform(-20, 0, int(seconds * 10) + 1) / 20), rate // 10)
+    return 0.1 * levels[: round(seconds * rate)] * random.standard_normal(round(seconds * rate))
+
+
+__all__ = ["KEMAR", "RATE", "DirectionModel", "modulated"]

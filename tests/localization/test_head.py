@@ -1,0 +1,199 @@
+"""Heads: rendering, interaural cues, SOFA files that are suitable or not."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import rosafe
+from rosafe.localization import angles
+from tests.localization.conftest import KEMAR
+
+h5py = pytest.importorskip("h5py")
+RATE = 44100
+
+
+def write_sofa(path: Path, change: Callable[[dict[str, Any]], None] = lambda values: None) -> Path:
+    """Write a SOFA file with 36 directions, each ear an impulse; `change` modifies its contents."""
+    azimuths = np.arange(0, 360, 10.0)
+    responses = np.zeros((36, 2, 64))
+    delays = np.round(10 - 10 * np.stack((np.sin(np.radians(azimuths)), -np.sin(np.radians(azimuths))), 1)).astype(int)
+    for row, pair in enumerate(delays):
+        responses[row, [0, 1], pair + 4] = 1.0
+    values = {
+        "convention": "SimpleFreeFieldHRIR",
+        "Data.IR": responses,
+        "Data.SamplingRate": np.array([44100.0]),
+        "Data.Delay": np.zeros((1, 2)),
+        "SourcePosition": np.stack((azimuths, np.zeros(36), np.full(36, 1.4)), 1),
+        "ReceiverPosition": np.array([[0, 0.09, 0], [0, -0.09, 0]])[..., np.newaxis],
+    }
+    change(values)
+    with h5py.File(path, "w") as file:
+        file.attrs["SOFAConventions"] = values.pop("convention")
+        for name, value in values.items():
+            if value is not None:
+                file[name] = value
+        if "SourcePosition" in file:
+            file["SourcePosition"].attrs["Type"] = "spherical"
+    return path
+
+
+def test_sphere_follows_woodworth_and_brown_and_duda() -> None:
+    head = rosafe.Head.sphere()
+    azimuths = [-90.0, -45.0, 0.0, 45.0, 90.0]
+    itd = head.itd([4000.0], azimuths)[:, 0]
+    angle = np.radians(azimuths)
+    expected = -0.0875 / 343 * (angle + np.sin(angle))  # positive on the right: the left ear hears later
+    assert np.abs(itd - expected).max() < 60e-6
+    ild = head.ild([200.0, 4000.0], azimuths)
+    assert (np.diff(ild[:, 1]) < 0).all() and 10 < ild[0, 1] < 25
+    assert np.abs(ild[:, 0]).max() < 2
+    assert np.allclose(ild, -ild[::-1], atol=1e-9)
+
+
+def test_rendering_at_a_measured_direction_is_the_convolution(kemar: rosafe.Head) -> None:
+    with h5py.File(KEMAR) as file:
+        position = file["SourcePosition"][()]
+        row = int(np.flatnonzero((np.abs(position[:, 1]) < 0.1) & (position[:, 0] == 30))[0])
+        response = file["Data.IR"][row]
+    signal = np.random.default_rng(1).standard_normal(3000)
+    ears = kemar.render(signal, RATE, 30)
+    for ear in range(2):
+        assert np.allclose(ears[ear], np.convolve(signal, response[ear])[:3000], atol=1e-12)
+    assert np.allclose(kemar.render(signal, RATE, np.full(3000, 30.0)), ears, atol=1e-12)
+    assert np.allclose(kemar.render(signal, RATE, 390), ears, atol=1e-12)
+
+
+def test_left_is_positive(kemar: rosafe.Head) -> None:
+    signal = np.random.default_rng(1).standard_normal(RATE)
+    for head in (rosafe.Head.sphere(), kemar):
+        left, right = head.render(signal, RATE, 70).std(axis=1)
+        assert left > 1.5 * right
+        assert head.itd([500.0], [70.0])[0, 0] < -400e-6 and head.ild([4000.0], [70.0])[0, 0] < -5
+
+
+def test_moving_sources_have_no_clicks(kemar: rosafe.Head) -> None:
+    """A tone stays a tone: no energy away from its frequency, beyond the Doppler shift."""
+    time = np.arange(2 * RATE) / RATE
+    tone = np.sin(2 * np.pi * 1000 * time)
+    ears = kemar.render(tone, RATE, np.linspace(-90, 90, len(tone)))
+    spectrum = np.abs(np.fft.rfft(ears[:, RATE // 4 :] * np.hanning(len(tone) - RATE // 4), axis=1)) ** 2
+    frequency = np.fft.rfftfreq(len(tone) - RATE // 4, 1 / RATE)
+    away = np.abs(frequency - 1000) > 100
+    assert (10 * np.log10(spectrum[:, away].sum(axis=1) / spectrum.sum(axis=1)) < -60).all()
+
+
+def test_directions_between_measured_ones_are_interpolated(kemar: rosafe.Head) -> None:
+    frequencies = [300.0, 500.0, 1000.0]
+    fine = kemar.itd(frequencies, np.arange(-30, 31, 1.0))
+    assert (np.diff(fine, axis=0) < 1e-9).all()
+    middle = kemar.itd(frequencies, [12.5])[0]
+    around = kemar.itd(frequencies, [10.0, 15.0])
+    assert np.allclose(middle, around.mean(axis=0), atol=5e-6)
+
+
+@pytest.mark.parametrize("rate", [16000, 48000, 96000])
+def test_a_head_is_resampled(kemar: rosafe.Head, rate: int) -> None:
+    """Level and delay at low frequencies do not depend on the sample rate."""
+    reference = kemar.filters(44100).response(60.0)
+    response = kemar.filters(rate).response(60.0)
+    for frequency in (300.0, 1000.0, 3000.0):
+        gains = [
+            (r * np.exp(-2j * np.pi * frequency * np.arange(r.shape[1]) / fs)).sum(axis=1)
+            for r, fs in ((reference, 44100), (response, rate))
+        ]
+        assert np.abs(gains[1] - gains[0]).max() < 5e-3 * np.abs(gains[0]).max()
+
+
+def test_ears_follow_the_receiver_positions(tmp_path: Path) -> None:
+    def swap(values: dict[str, Any]) -> None:
+        values["ReceiverPosition"] = values["ReceiverPosition"][::-1]
+        values["Data.IR"] = values["Data.IR"][:, ::-1]
+
+    plain = rosafe.Head.from_sofa(write_sofa(tmp_path / "a.sofa"))
+    swapped = rosafe.Head.from_sofa(write_sofa(tmp_path / "b.sofa", swap))
+    assert np.array_equal(plain.filters(RATE).responses, swapped.filters(RATE).responses)
+    assert plain.itd([1000.0], [90.0])[0, 0] < -400e-6
+    assert plain.is_symmetric() and plain.key == swapped.key
+
+
+def test_delays_of_the_file_are_applied(tmp_path: Path) -> None:
+    def delay(values: dict[str, Any]) -> None:
+        values["Data.Delay"] = np.array([[0.0, 8.0]])
+
+    head = rosafe.Head.from_sofa(write_sofa(tmp_path / "a.sofa", delay))
+    assert head.itd([1000.0], [0.0])[0, 0] == pytest.approx(-8 / 44100, abs=2e-6)
+
+
+def _set(name: str, value: Any) -> Callable[[dict[str, Any]], None]:
+    def change(values: dict[str, Any]) -> None:
+        values[name] = value(values[name]) if callable(value) else value
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (_set("convention", "GeneralFIR"), "expected the SOFA convention SimpleFreeFieldHRIR, got 'GeneralFIR'"),
+        (_set("Data.IR", lambda ir: ir[:, :1]), "Data.IR of shape"),
+        (_set("Data.IR", None), "Data.IR of shape"),
+        (_set("Data.IR", lambda ir: ir * np.nan), "finite numbers"),
+        (_set("Data.IR", lambda ir: ir * 0), "not all zero"),
+        (_set("Data.SamplingRate", np.array([10.0])), "sample rate"),
+        (_set("SourcePosition", lambda p: p + np.array([0, 45, 0])), "horizontal plane"),
+        (_set("SourcePosition", lambda p: p * np.array([0.4, 1, 1])), "a gap of"),
+        (_set("SourcePosition", lambda p: p[:5]), "36 rows in SourcePosition"),
+        (_set("ReceiverPosition", np.zeros((2, 3, 1))), "one receiver on the left"),
+        (_set("Data.Delay", np.array([[0.0, 1e9]])), "delays of at most"),
+    ],
+)
+def test_unsuitable_files_are_rejected(tmp_path: Path, change: Callable[[dict[str, Any]], None], message: str) -> None:
+    path = write_sofa(tmp_path / "bad.sofa", change)
+    with pytest.raises(ValueError) as caught:
+        rosafe.Head.from_sofa(path)
+    text = str(caught.value)
+    assert text.startswith(f"{path}: ") and message in text and "\n" not in text
+
+
+def test_other_files_are_rejected(tmp_path: Path) -> None:
+    text = tmp_path / "text.sofa"
+    text.write_text("no SOFA file")
+    cut = tmp_path / "cut.sofa"
+    cut.write_bytes(write_sofa(tmp_path / "whole.sofa").read_bytes()[:3000])
+    for path in (text, cut, tmp_path, tmp_path / "none.sofa"):
+        with pytest.raises(ValueError) as caught:
+            rosafe.Head.from_sofa(path)
+        assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("signal", "rate", "azimuth", "message"),
+    [
+        (np.zeros((2, 5)), RATE, 0, "signal: expected"),
+        (np.array([0, np.nan]), RATE, 0, "signal: expected finite"),
+        (np.zeros(5), 0, 0, "sample_rate: expected"),
+        (np.zeros(5), RATE, [0, 1], "azimuth: expected"),
+        (np.zeros(5), RATE, np.nan, "azimuth: expected"),
+    ],
+)
+def test_arguments_of_render_are_checked(signal: np.ndarray, rate: float, azimuth: Any, message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        rosafe.Head.sphere().render(signal, rate, azimuth)
+
+
+def test_rendering_nothing() -> None:
+    for azimuth in (np.array(30.0), np.zeros(0)):
+        assert rosafe.Head.sphere().render(np.zeros(0), RATE, azimuth).shape == (2, 0)
+
+
+def test_angles() -> None:
+    assert angles.wrap([190, -180, 180, 540, 0]).tolist() == [-170, 180, 180, 180, 0]
+    assert angles.lateral([0, 30, 90, 150, 180, -150, -90]).tolist() == [0, 30, 90, 30, 0, -30, -90]
+    assert angles.unwrap(np.array([170.0, -170.0, -150.0])).tolist() == [170, 190, 210]
+    assert len(angles.grid()) == 72 and angles.grid()[-1] == 180

@@ -1,0 +1,70 @@
+"""The tracker and the mixture: birth, death, crossing, images."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+import rosafe
+from rosafe.localization.mixture import Candidate
+from rosafe.localization.tracker import Tracker
+from tests.localization.conftest import RATE, modulated
+
+
+def run(azimuths: list[list[float]], share: float = 0.5) -> Tracker:
+    """Return a tracker after updates every 0.1 s with candidates at these azimuths."""
+    tracker = Tracker()
+    for number, now in enumerate(azimuths):
+        tracker.update([Candidate(azimuth, share) for azimuth in now], 0.1 * number)
+    return tracker
+
+
+def test_birth_and_death() -> None:
+    tracker = run([[30.0]] * 20 + [[]] * 20)
+    (track,) = tracker.histories()
+    present = track["time"][track["probability"] > 0.5]
+    assert present[0] <= 0.31 and 1.9 <= present[-1] <= 2.6
+    assert track["last_time"] == 0.1 * 19 and np.allclose(track["azimuth"][:20], 30, atol=0.1)
+    assert not tracker.tracks
+
+
+def test_a_pause_does_not_end_a_source() -> None:
+    tracker = run([[30.0]] * 10 + [[]] * 2 + [[30.0]] * 10)
+    assert len(tracker.histories()) == 1 and len(tracker.present()) == 1
+
+
+def test_single_candidates_are_not_present() -> None:
+    assert not run([[30.0], [], [], [-60.0], [], [], [110.0], []], share=0.25).histories()
+
+
+def test_a_moving_source_is_one_track() -> None:
+    tracker = run([[-170.0 - 2 * k] for k in range(30)])  # across 180 degrees
+    (track,) = tracker.histories()
+    assert abs((track["azimuth"][-1] - 132 + 180) % 360 - 180) < 3
+
+
+def test_crossing_sources_keep_their_numbers() -> None:
+    first, second = np.linspace(-40, 40, 80), np.linspace(40, -40, 80)
+    azimuths = [
+        [a, b] if abs(a - b) > 15 else [(a + b) / 2] for a, b in zip(first.tolist(), second.tolist(), strict=True)
+    ]
+    tracks = run(azimuths).histories()
+    assert len(tracks) == 2
+    for track in tracks:
+        assert np.sign(track["azimuth"][0]) != np.sign(track["azimuth"][-1])
+        assert abs(track["azimuth"][-1]) > 30
+
+
+def test_two_talkers(kemar_model: Path, kemar: rosafe.Head) -> None:
+    sound = kemar.render(modulated(4.0, 1), RATE, 40) + kemar.render(modulated(4.0, 2), RATE, -20)
+    tracks = rosafe.localize(sound, RATE, kemar_model)["tracks"]
+    azimuths = sorted(float(np.median(track["azimuth"])) for track in tracks if len(track["time"]) > 20)
+    assert len(azimuths) == 2 and np.allclose(azimuths, [-20, 40], atol=10)
+
+
+def test_a_source_that_stops_is_forgotten(kemar_model: Path, kemar: rosafe.Head) -> None:
+    source = modulated(4.0, 1)
+    source[2 * RATE :] = 0
+    (track,) = rosafe.localize(kemar.render(source, RATE, 60), RATE, kemar_model)["tracks"]
+    assert track["time"][track["probability"] > 0.5][-1] < 3.0

@@ -1,0 +1,1 @@
+"""Tests of the localizer node: real masters and nodes, scenes with known truth."""

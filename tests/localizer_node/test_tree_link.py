@@ -1,0 +1,50 @@
+"""The link to rosAFE when the master does not know the node."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from rosafe.client.graph import NotRegisteredError
+from rosafe.localizer_node import tree_link
+from rosafe.localizer_node.status import WARN, NodeStatus
+from tests.harness import wait_for
+
+
+def test_a_node_that_the_master_does_not_know(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its services answer at their known address; the link waits, closes its client, and tries again."""
+    closed: list[None] = []
+
+    class Client:
+        @classmethod
+        async def load(cls, *_: Any) -> Client:
+            return cls()
+
+        async def close(self) -> None:
+            closed.append(None)
+
+    class Graph:
+        def __init__(self, *_: Any) -> None:
+            pass
+
+        async def node_uri(self, instance: str) -> str:
+            raise NotRegisteredError(f"unknown node [/{instance}]")
+
+        async def close(self) -> None:
+            pass
+
+    monkeypatch.setenv("ROS_MASTER_URI", "http://127.0.0.1:1")
+    monkeypatch.setattr(tree_link, "Graph", Graph)
+    monkeypatch.setattr(tree_link, "ComponentClient", Client)
+    monkeypatch.setattr(tree_link, "POLL_SECONDS", 0.01)
+    monkeypatch.setattr("rospy.resolve_name", lambda name: name)
+    status = NodeStatus(lambda: None)
+    unused: Any = None
+    link = tree_link.TreeLink("/rosAFE", "", unused, unused, status)
+    link.start()
+    try:
+        wait_for(lambda: len(closed) > 2)
+        assert status.state() == (WARN, "waiting for rosAFE: /rosAFE is not registered at the master")
+    finally:
+        link.close()

@@ -1,0 +1,824 @@
+"""Named mutations, small faults that tests must detect: `scripts/test --mutations [NAME...]`.
+
+Each is applied to a temporary copy of the tree, in which the tests named with it run. A mutation survives if they pass,
+or if they fail without it, too.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+ROOT = Path(__file__).resolve().parents[1]
+PYTHON = "/usr/bin/python3"
+TIMEOUT_SECONDS = 600  # for the tests of one mutation; a test that does not end detects it, too
+PYTEST_FAILED = 1  # exit codes
+TIMED_OUT = 124
+
+
+class Mutation(NamedTuple):
+    """A change of one place in a file, and arguments for pytest that select tests which detect it."""
+
+    name: str
+    path: str
+    old: str
+    new: str
+    tests: str
+
+
+def _of(folder: str) -> Callable[[str, str, str, str, str], Mutation]:
+    return lambda name, path, old, new, tests: Mutation(name, f"{folder}/{path}", old, new, tests)
+
+
+_bass, _client, _commands, _component, _declarations, _demo, _dsp, _eltclsh, _genomix, _http, _interface, _live = (
+    _of(f"rosafe/{package}")
+    for package in (
+        *("bass", "client", "commands", "component", "declarations", "demo", "dsp", "eltclsh", "genomix"),
+        *("http_server", "interface", "live"),
+    )
+)
+(
+    _localization,
+    _localizer_node,
+    _node,
+    _offline,
+    _representations,
+    _setups,
+    _sound,
+    _transport,
+    _tree,
+    _validation,
+    _view,
+) = (
+    _of(f"rosafe/{package}")
+    for package in (
+        *(
+            "localization",
+            "localizer_node",
+            "node",
+            "offline",
+            "representations",
+            "setups",
+            "sound",
+            "transport",
+            "tree",
+        ),
+        *("validation", "view"),
+    )
+)
+
+MUTATIONS = (
+    # --- bass: capture
+    _bass(
+        "bass-lost-frames-not-counted",
+        "capture.py",
+        "new = chunk.gap + chunk.samples.shape[1]",
+        "new = chunk.samples.shape[1]",
+        "tests/bass/test_capture.py",
+    ),
+    _bass("bass-writable-view", "capture.py", "view.flags.writeable = False", "pass", "tests/bass/test_capture.py"),
+    _bass(
+        "bass-oldest-frame-off-by-one",
+        "socket_server.py",
+        "oldest = max(0, last - length + 1)",
+        "oldest = max(0, last - length)",
+        "tests/bass/test_socket.py",
+    ),
+    _bass(
+        "bass-inbox-unlimited",
+        "socket_server.py",
+        "    del inbox[: max(0, len(inbox) - _MAX_REQUEST)]\n",
+        "",
+        "tests/bass/test_socket.py",
+    ),
+    _bass(
+        "bass-always-defers-publishing",
+        "capture.py",
+        "late * sample_rate > LATE_CHUNKS * frames_per_chunk and self._unpublished * 2 <= self._window.frames",
+        "late * sample_rate > LATE_CHUNKS * frames_per_chunk",
+        "tests/bass/test_capture.py",
+    ),
+    # --- client: requests of genomixd, the live page and Tcl
+    _client(
+        "client-parameter-given-twice",
+        "values.py",
+        "        if parameter.name in values:\n",
+        "        if False:\n",
+        "tests/genomix/test_values.py",
+    ),
+    _client(
+        "client-missing-parameter",
+        "values.py",
+        "    if missing is not None:\n",
+        "    if False:\n",
+        "tests/genomix/test_values.py",
+    ),
+    _client(
+        "client-range-not-checked",
+        "values.py",
+        "    if not parameter.checked_by_client:",
+        "    if True:",
+        "tests/genomix/test_values.py tests/request",
+    ),
+    _client(
+        "client-too-many-arguments",
+        "values.py",
+        "    if len(text_args) > len(service.parameters):\n",
+        "    if len(text_args) > len(service.parameters) + 1:\n",
+        "tests/genomix/test_values.py",
+    ),
+    # --- commands
+    _commands(
+        "clock-rounds-down",
+        "_meter.py",
+        "divmod(round(seconds), 60)",
+        "divmod(int(seconds), 60)",
+        "tests/bass/test_recording.py",
+    ),
+    _commands(
+        "meter-mark-of-wrong-ear",
+        "_meter.py",
+        "any(part.clipped[ear] for part in parts)",
+        "any(part.clipped[0] for part in parts)",
+        "tests/bass/test_recording.py",
+    ),
+    # --- component
+    _component(
+        "clock-step-without-limit",
+        "frame_clock.py",
+        "step = min(STEP_SECONDS, SLEW * (frame - self._last_output.frame) / self._nominal)",
+        "step = SLEW * (frame - self._last_output.frame) / self._nominal",
+        "tests/ros/test_frame_time.py",
+    ),
+    _component(
+        "clock-set-not-noticed",
+        "frame_clock.py",
+        "        if time < line.at(frame) - SET_SECONDS:\n            return True\n",
+        "",
+        "tests/ros/test_frame_time.py",
+    ),
+    _component(
+        "audio-of-old-connection",
+        "audio.py",
+        "            if connection is not self._connection:\n                return\n",
+        "",
+        "tests/ros/test_audio_ring.py",
+    ),
+    _component(
+        "audio-gap-closed",
+        "audio.py",
+        "                self._frames.append(np.zeros((2, lost), np.int32))\n",
+        "                pass\n",
+        "tests/ros/test_audio_ring.py",
+    ),
+    _component(
+        "audio-dropped-not-counted",
+        "audio.py",
+        "            self.counters.dropped += unread\n",
+        "",
+        "tests/ros/test_audio_ring.py",
+    ),
+    _component(
+        "audio-read-without-lock",
+        "audio.py",
+        "        with self._arrived:\n            if connection is not self._connection:",
+        "        if True:\n            if connection is not self._connection:",
+        "tests/ros/test_audio_ring.py tests/ros/test_races.py",
+    ),
+    _component(
+        "activities-one-too-many",
+        "activities.py",
+        ">= MAX_ACTIVITIES - 1",
+        ">= MAX_ACTIVITIES",
+        "tests/ros/test_activities.py",
+    ),
+    _component(
+        "activity-stays-after-failed-start",
+        "activities.py",
+        "                del self._live[activity.id]\n            raise ComponentError(",
+        "                pass\n            raise ComponentError(",
+        "tests/ros/test_activities.py",
+    ),
+    _component(
+        "load-never-reset",
+        "activities.py",
+        "                self._busy, self._since = 0.0, now\n",
+        "                self._since = now\n",
+        "tests/ros/test_activities.py",
+    ),
+    # --- declarations
+    _declarations(
+        "parameter-open-minimum-allowed",
+        "parameter.py",
+        "or (self.open_minimum and number == low)",
+        "or False",
+        "tests/interface",
+    ),
+    _declarations(
+        "parameter-maximum-not-checked",
+        "parameter.py",
+        "if below or (high is not None and number > high):",
+        "if below:",
+        "tests/interface",
+    ),
+    _declarations(
+        "parameter-list-too-long",
+        "parameter.py",
+        "        if len(items) > self.most:\n",
+        "        if False:\n",
+        "tests/interface",
+    ),
+    _declarations("parameter-nan", "checks.py", "math.isfinite", "not math.isinf", "tests/interface"),
+    # --- demo
+    _demo(
+        "demo-losses-not-counted",
+        "recorder.py",
+        "            recording.lost += lost\n",
+        "",
+        "tests/demo/test_recorder.py",
+    ),
+    _demo(
+        "demo-same-message-twice",
+        "recorder.py",
+        "message.lastFrameIndex in (0, self._recording.index)",
+        "message.lastFrameIndex == 0",
+        "tests/demo/test_recorder.py",
+    ),
+    # --- dsp
+    _dsp(
+        "frames-one-too-few",
+        "framing.py",
+        "return max(0, (samples - len(self.window)) // self.hop + 1)",
+        "return max(0, (samples - len(self.window)) // self.hop)",
+        "tests/dsp/test_blocks.py -k ild",
+    ),
+    _dsp(
+        "hop-longer-than-window",
+        "framing.py",
+        "self.skip = 0 if kept > 0 else -kept",
+        "self.skip = 0",
+        "tests/dsp/test_blocks.py -k ild",
+    ),
+    _dsp(
+        "framing-position-not-reset",
+        "framing.py",
+        "self._start = self._stop = self.skip = self.position = 0\n\n    def advance",
+        "self._start = self._stop = self.skip = 0\n\n    def advance",
+        "tests/dsp/test_blocks.py tests/dsp/test_changes.py tests/dsp/test_kernels.py -k 'not aarch64 and not nehalem'",
+    ),
+    _dsp(
+        "stage-change-not-atomic",
+        "stage.py",
+        "        tried = copy.copy(self)\n",
+        "        tried = self\n",
+        "tests/dsp/test_changes.py",
+    ),
+    _dsp(
+        "stage-one-ear",
+        "stage.py",
+        'axes[0] != "ear" or len(array) == ears)',
+        'axes[0] != "ear" or len(array) >= 1)',
+        "tests/dsp/test_limits.py",
+    ),
+    _dsp(
+        "pool-array-in-use",
+        "buffer_pool.py",
+        "memory = _idle[count].pop()",
+        "memory = _idle[count][-1]",
+        "tests/dsp/test_memory.py",
+    ),
+    _dsp(
+        "kernel-ild-swapped-ears",
+        "kernels/ild.c",
+        "(right[i] + epsilon) / (left[i] + epsilon)",
+        "(left[i] + epsilon) / (right[i] + epsilon)",
+        "tests/dsp/test_kernels.py -k 'test_ild and not aarch64'",
+    ),
+    _dsp(
+        "kernel-correlation-of-one-energy",
+        "kernels/correlation.c",
+        "root(energy[0] * energy[1] + all(epsilon))",
+        "root(energy[0] * energy[0] + all(epsilon))",
+        "tests/dsp/test_kernels.py -k 'test_cross_correlation and not aarch64'",
+    ),
+    _dsp(
+        "kernel-reads-beyond-frame",
+        "kernels/ild.c",
+        "load_first(weights + t, n - t), sum[0]);",
+        "load(weights + t), sum[0]);",
+        "tests/dsp/test_sanitizers.py -m 'not soak and not exploration'",
+    ),
+    # --- eltclsh
+    _eltclsh(
+        "history-newest-lost",
+        "history.py",
+        "entries[max(0, len(entries) - self.size) :]",
+        "entries[: self.size]",
+        "tests/eltclsh/test_terminal.py -k history",
+    ),
+    _eltclsh("history-readable-by-all", "history.py", "0o600", "0o644", "tests/eltclsh/test_terminal.py -k history"),
+    _eltclsh(
+        "completion-after-first-match",
+        "complete.py",
+        'return matches[-1].end() if kind == "C" else 0',
+        'return matches[0].end() if kind == "C" else 0',
+        "tests/eltclsh/test_terminal.py -k tab_completes",
+    ),
+    # --- genomix
+    _genomix(
+        "session-not-in-order",
+        "sessions.py",
+        "if self.name and call.service is not None:",
+        "if False:",
+        "tests/genomix/test_sessions.py",
+    ),
+    _genomix("session-events-unlimited", "sessions.py", "if queue.qsize() < MAX_EVENTS:", "if True:", "tests/genomix"),
+    _genomix(
+        "session-expires-at-once",
+        "sessions.py",
+        "LINGER_SECONDS if self._listened else IDLE_SECONDS",
+        "LINGER_SECONDS",
+        "tests/genomix/test_sessions.py",
+    ),
+    _genomix(
+        "packed-number-too-large",
+        "binary_format.py",
+        "return math.inf if value > 0 else -math.inf",
+        "return math.inf",
+        "tests/genomix/test_packed.py tests/genomix/test_decode.py",
+    ),
+    _genomix(
+        "packed-ragged-signal",
+        "binary_format.py",
+        "if len(shapes) > 1 or None in shapes:",
+        "if None in shapes:",
+        "tests/genomix/test_packed.py tests/genomix/test_decode.py",
+    ),
+    # --- http_server
+    _http(
+        "http-long-polls-unlimited",
+        "connections.py",
+        "        if len(polls) >= limit:\n",
+        "        if False:\n",
+        "tests/http_server/test_connections.py",
+    ),
+    _http(
+        "http-authenticated-closed-first",
+        "connections.py",
+        "return self.account.idle if self._authenticated else self.account.silent",
+        "return self.account.silent",
+        "tests/http_server/test_connections.py",
+    ),
+    _http(
+        "http-answers-unlimited",
+        "connections.py",
+        "        if not self._fits(data, size):\n",
+        "        if False:\n",
+        "tests/http_server/test_connections.py",
+    ),
+    # --- interface
+    _interface(
+        "interface-nan-default", "service.py", "math.isnan(values[p.name])}", "False}", "tests/interface/test_values.py"
+    ),
+    _interface(
+        "interface-zero-not-default",
+        "service.py",
+        "if not _is_unset(p, values[p.name])})",
+        "})",
+        "tests/interface/test_values.py",
+    ),
+    # --- live
+    _live(
+        "live-page-keeps-deadline",
+        "server.py",
+        "        connection_of(request).request_parsed()\n",
+        "",
+        "tests/live/test_failures.py -k deadline",
+    ),
+    _live(
+        "live-any-token",
+        "access.py",
+        "if not hmac.compare_digest(token, self.token.encode()):",
+        "if not token:",
+        "tests/live/test_server.py",
+    ),
+    _live("live-other-origin", "access.py", "        check_same_origin(headers)\n", "", "tests/live/test_server.py"),
+    _live(
+        "live-pages-unlimited",
+        "server.py",
+        "if len(self._clients) >= MAX_CLIENTS:",
+        "if False:",
+        "tests/live/test_server.py -k limit",
+    ),
+    _live(
+        "live-columns-too-fast",
+        "plot_data.py",
+        "math.ceil(processor.rate / MAX_COLUMN_RATE - 1e-9)",
+        "math.floor(processor.rate / MAX_COLUMN_RATE)",
+        "tests/live/test_plots.py",
+    ),
+    # --- localization
+    _localization(
+        "tracker-never-forgets",
+        "tracker.py",
+        "        self.log_odds -= _LOSS\n",
+        "        pass\n",
+        "tests/localization/test_tracker.py",
+    ),
+    _localization(
+        "tracker-gate-open",
+        "tracker.py",
+        "if distance[row, column] <= GATE\n",
+        "\n",
+        "tests/localization/test_tracker.py",
+    ),
+    _localization(
+        "azimuth-difference-not-wrapped",
+        "angles.py",
+        "return wrap(np.asarray(first, np.float64) - np.asarray(second, np.float64))",
+        "return np.asarray(first, np.float64) - np.asarray(second, np.float64)",
+        "tests/localization/test_tracker.py tests/localization/test_head.py",
+    ),
+    _localization(
+        "head-ild-swapped-ears",
+        "head.py",
+        "10 * np.log10(energies[1] / energies[0])",
+        "10 * np.log10(energies[0] / energies[1])",
+        "tests/localization/test_head.py",
+    ),
+    # --- node
+    _node(
+        "node-half-restored-tree-stays",
+        "saved_tree.py",
+        "            if self._pending is setup:\n                self._tree.stop()\n",
+        "",
+        "tests/ros/test_saved_tree.py",
+    ),
+    _node(
+        "node-slow-call-blocks-others",
+        "processor_health.py",
+        "                self._tree.skip(processor, block)\n",
+        "",
+        "tests/plugins/test_node.py tests/ros/test_lag.py",
+    ),
+    # --- offline
+    _offline(
+        "offline-last-frame-lost",
+        "chain.py",
+        "-((start - self._frames) // hop)",
+        "(self._frames - start) // hop",
+        "tests/offline/test_results.py -k padd",
+    ),
+    _offline(
+        "offline-mat-length",
+        "mat5.py",
+        "if data.end > source.end or data.end - data.start != count * dtype.itemsize:",
+        "if data.end > source.end:",
+        "tests/offline/test_damaged.py -k mat5",
+    ),
+    _offline(
+        "offline-lags-not-aligned",
+        "collector.py",
+        "first = (shape[middle] - block.shape[middle]) // 2",
+        "first = 0",
+        "tests/offline/test_collector.py tests/offline/test_changes.py",
+    ),
+    _offline(
+        "offline-error-ignored",
+        "chain.py",
+        "            raise self._listener.error\n",
+        "            return\n",
+        "tests/offline/test_process.py tests/offline/test_stream.py",
+    ),
+    # --- representations
+    _representations(
+        "ild-swapped-ears",
+        "ild.py",
+        "energies[1] / energies[0]",
+        "energies[0] / energies[1]",
+        "tests/dsp/test_kernels.py -k 'test_ild and not aarch64'",
+    ),
+    _representations(
+        "ratemap-integrator-not-reset",
+        "ratemap.py",
+        "        self._integrator.reset()\n",
+        "",
+        "tests/dsp/test_changes.py tests/dsp/test_blocks.py -k ratemap",
+    ),
+    _representations(
+        "pitch-plateau",
+        "pitch.py",
+        "return ((begin + 1 + end) // 2)[..., 0]",
+        "return (begin + 1)[..., 0]",
+        "tests/representations/test_pitch.py",
+    ),
+    _representations(
+        "pitch-median-edge",
+        "pitch.py",
+        'return (self.values["pi_medianOrder"] - 1) // 2',
+        'return self.values["pi_medianOrder"] // 2',
+        "tests/representations/test_pitch.py",
+    ),
+    _representations(
+        "correlation-lag-sign",
+        "crosscorrelation.py",
+        "scipy.fft.rfft(left, transform), np.conj(scipy.fft.rfft(right, transform))",
+        "np.conj(scipy.fft.rfft(left, transform)), scipy.fft.rfft(right, transform)",
+        "tests/dsp/test_kernels.py -k 'test_cross_correlation and not aarch64'",
+    ),
+    # --- setups
+    _setups(
+        "setup-extra-not-checked",
+        "plan.py",
+        "if stage.required_extra and stage.required_extra not in extras[processor.parent]:",
+        "if False:",
+        "tests/setups/test_loading.py",
+    ),
+    _setups(
+        "setup-other-parent",
+        "plan.py",
+        "    if existing.parent != parent:\n",
+        "    if False:\n",
+        "tests/setups/test_loading.py",
+    ),
+    _setups(
+        "setup-parameter-twice",
+        "reading.py",
+        "        if parameter.name in values:\n",
+        "        if False:\n",
+        "tests/setups/test_files.py",
+    ),
+    # --- sound
+    _sound(
+        "sound-jump-without-limit",
+        "windows.py",
+        "MAX_JUMP_SECONDS = 3600.0",
+        "MAX_JUMP_SECONDS = 1e9",
+        "tests/bass/test_windows.py",
+    ),
+    _sound(
+        "sound-infinity-swapped",
+        "audiofile.py",
+        "posinf=1.0, neginf=-1.0",
+        "posinf=-1.0, neginf=1.0",
+        "tests/bass/test_file_source.py tests/cli/test_streams.py",
+    ),
+    _sound(
+        "sound-truncated-file",
+        "audiofile.py",
+        "        if cut and int(cut[2]) < int(cut[1]) < _UNKNOWN_LENGTH:\n",
+        "        if False:\n",
+        "tests/bass/test_hostile_files.py tests/bass/test_file_source.py",
+    ),
+    # --- transport
+    _transport(
+        "request-size-unlimited",
+        "server_limits.py",
+        "        if size > self._limit:\n",
+        "        if False:\n",
+        "tests/ros/test_attacks.py",
+    ),
+    _transport(
+        "header-size-off-by-one",
+        "server_limits.py",
+        "if size > HEADER_BYTES:",
+        "if size >= HEADER_BYTES:",
+        "tests/ros/test_attacks.py tests/ros/test_handshake_server.py",
+    ),
+    _transport(
+        "newest-connection-closed",
+        "handshake_server.py",
+        "pending = next(iter(self._pending.values()), None)",
+        "pending = next(reversed(self._pending.values()), None)",
+        "tests/ros/test_handshake_server.py",
+    ),
+    _transport(
+        "listener-stays-paused",
+        "handshake_server.py",
+        "                self._paused_until = 0.0\n                self._selector.register",
+        "                self._selector.register",
+        "tests/ros/test_handshake_server.py",
+    ),
+    # --- tree
+    _tree(
+        "released-while-read",
+        "states.py",
+        "            if self._readers:\n",
+        "            if False:\n",
+        "tests/tree/test_states.py -m 'not long'",
+    ),
+    _tree(
+        "skipped-flag-stays",
+        "states.py",
+        "            del self.skipped\n",
+        "            pass\n",
+        "tests/plugins/test_failures.py -k not_return",
+    ),
+    _tree(
+        "slot-returned-twice",
+        "workers.py",
+        "me.task, me.has_slot = None, False",
+        "me.task = None",
+        "tests/tree/test_workers.py",
+    ),
+    _tree(
+        "blocked-worker-keeps-slot",
+        "workers.py",
+        "                        self._free_slots += 1\n",
+        "                        pass\n",
+        "tests/tree/test_workers.py",
+    ),
+    _tree(
+        "window-one-frame-late",
+        "sliding_window.py",
+        "max(0, self._held - length), 0",
+        "max(0, self._held - length - 1), 0",
+        "tests/tree/test_window.py",
+    ),
+    _tree(
+        "change-not-previewed",
+        "tree.py",
+        "        self._check_memory(previews, replaced=processor)\n",
+        "",
+        "tests/tree/test_sizes.py tests/tree/test_requests.py",
+    ),
+    # --- validation and citations
+    _representations(
+        "ihc-order-of-dau1996",
+        "haircell.py",
+        '"dau1996": (1, 1000.0, 1)',
+        '"dau1996": (2, 1000.0, 1)',
+        "tests/dsp/test_truths.py",
+    ),
+    _declarations(
+        "citation-applies-if-any-condition-does",
+        "reference.py",
+        "return all(_matches",
+        "return any(_matches",
+        "tests/interface/test_references.py",
+    ),
+    _interface(
+        "citing-ignores-parameters",
+        "citing.py",
+        "for c in applicable(kind.references, parameters)}",
+        "for c in applicable(kind.references, {})}",
+        "tests/cli/test_cite.py",
+    ),
+    _validation(
+        "validation-tolerance-ignored",
+        "report.py",
+        "return self.deviation <= self.comparison.tolerance",
+        "return self.deviation >= 0",
+        "tests/validation/test_validate.py",
+    ),
+    _validation(
+        "validation-self-test-without-disturbance",
+        "report.py",
+        "comparison.disturbance.change(compute) if disturbed else compute",
+        "compute",
+        "tests/validation/test_validate.py",
+    ),
+    # --- localizer node
+    _localizer_node(
+        "localizer-sources-stay",
+        "localization_loop.py",
+        "if self._newest and (self._queue.muted or now - self._used_at > limit):",
+        "if False:",
+        "tests/localizer_node/test_node.py -k end_of_the_sound",
+    ),
+    _localizer_node(
+        "localizer-processors-left-behind",
+        "tree_link.py",
+        "            try:\n                await tree_builder.remove(client, self._created)\n",
+        "            try:\n                pass\n",
+        "tests/localizer_node/test_recovery.py -k own_processors",
+    ),
+    _localizer_node(
+        "localizer-muted-frames-used",
+        "frame_queue.py",
+        "kept = known & ~self._mute.muted(now.middles)",
+        "kept = known",
+        "tests/localizer_node/test_frame_queue.py",
+    ),
+    # --- view
+    _view(
+        "plot-wrong-ear",
+        "plot.py",
+        "_Panel(result, names[0], **options).draw(ax, EARS.index(ear or EARS[0]))",
+        "_Panel(result, names[0], **options).draw(ax, 0)",
+        "tests/view/test_plot.py",
+    ),
+    _view(
+        "plot-of-several-outputs",
+        "plot.py",
+        "    if len(names) != 1:\n",
+        "    if not names:\n",
+        "tests/view/test_plot.py",
+    ),
+    # --- Tcl and MATLAB
+    Mutation(
+        "tcl-second-status",
+        "tcl/genomix/request.tcl",
+        'if {$Status ne "sent" || [dict get $new status] eq "sent"} {',
+        'if {[dict get $new status] eq "sent"} {',
+        "tests/genomix/test_tcl.py",
+    ),
+    Mutation(
+        "tcl-error-reported-though-read",
+        "tcl/genomix/request.tcl",
+        "        if {$Seen} {\n            return\n        }\n",
+        "",
+        "tests/genomix/test_tcl.py",
+    ),
+)
+
+
+def _copy(folder: Path) -> Path:
+    """Copy the tracked files and the generated ones; `../shared` is a link."""
+    copy = folder / "tree"
+    listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    for name in filter(None, listed.split("\0")):
+        if (ROOT / name).exists():
+            (copy / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(ROOT / name, copy / name, follow_symlinks=False)
+    if (ROOT / ".generated").is_dir():
+        shutil.copytree(ROOT / ".generated", copy / ".generated", symlinks=True)
+    if (ROOT.parent / "shared").exists():
+        (folder / "shared").symlink_to(ROOT.parent / "shared")
+    return copy
+
+
+def detected_by(mutation: Mutation, copy: Path) -> str:
+    """Return the first line with a failed test, or an empty string if the mutation survives."""
+    path = copy / mutation.path
+    original = path.read_text("utf-8")
+    if original.count(mutation.old) != 1:
+        raise ValueError(f"{mutation.name}: expected its old text once in {mutation.path}")
+    path.write_text(original.replace(mutation.old, mutation.new), "utf-8")
+    try:
+        return first_failure(mutation.tests, copy)
+    finally:
+        path.write_text(original, "utf-8")
+
+
+def first_failure(tests: str, copy: Path) -> str:
+    """Run tests; return the first line with a failed one, or an empty string."""
+    command = f"exec timeout -k 5 {TIMEOUT_SECONDS} {PYTHON} -m pytest -n0 -x -q -p no:cacheprovider {tests}"
+    done = subprocess.run(
+        ["sh", "-c", command],
+        cwd=copy,
+        env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1"},  # compiled files are found by size and second
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if done.returncode == TIMED_OUT:
+        return f"no end within {TIMEOUT_SECONDS} s"
+    if done.returncode not in (0, PYTEST_FAILED):  # no test has run: the mutation, or the tests named, are wrong
+        raise ValueError(f"{tests}: pytest returned {done.returncode}\n{done.stdout[-2000:]}{done.stderr[-2000:]}")
+    failed = [line for line in done.stdout.splitlines() if line.startswith(("FAILED tests", "ERROR tests"))]
+    return failed[0].split(" - ")[0].partition(" ")[2] if failed else ""
+
+
+def main(arguments: list[str]) -> int:
+    """Apply the named mutations, or all; print a table; return 1 if one survives."""
+    parser = argparse.ArgumentParser(prog="scripts/test --mutations", description=__doc__)
+    parser.add_argument("names", nargs="*", metavar="NAME", help="names or their beginnings; all by default")
+    names = parser.parse_args(arguments).names
+    chosen = [m for m in MUTATIONS if not names or m.name.startswith(tuple(names))]
+    if not chosen:
+        parser.error(f"expected a beginning of one of {', '.join(m.name for m in MUTATIONS)}")
+    survivors = 0
+    unmodified: dict[str, str] = {}  # the first failure of some tests without a mutation
+    print("| mutation | file | result | s |\n|---|---|---|---|", flush=True)
+    with tempfile.TemporaryDirectory(prefix="rosafe-mutations.") as folder:
+        copy = _copy(Path(folder))
+        for mutation in chosen:
+            begin = time.monotonic()
+            try:
+                test = detected_by(mutation, copy)
+                result = test or "**survives**"
+                if test and mutation.tests not in unmodified:
+                    unmodified[mutation.tests] = first_failure(mutation.tests, copy)
+                if test and unmodified[mutation.tests]:
+                    test, result = "", f"**{unmodified[mutation.tests]} fails without the mutation, too**"
+            except ValueError as problem:
+                test, result = "", "**no test has run**"
+                print(problem, file=sys.stderr)
+            survivors += not test
+            seconds = time.monotonic() - begin
+            print(f"| {mutation.name} | {mutation.path} | {result} | {seconds:.0f} |", flush=True)
+    print(f"\n{len(chosen) - survivors} of {len(chosen)} mutations are detected")
+    return 1 if survivors else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

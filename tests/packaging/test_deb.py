@@ -1,0 +1,191 @@
+"""Debian packages: built by scripts/make-deb, checked by lintian, and used from an unpacked copy without the checkout.
+
+tests/packaging/fresh_packages installs, upgrades and purges them on minimal machines.
+"""
+
+from __future__ import annotations
+
+import filecmp
+import os
+import re
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from rosafe.component import generate
+from rosafe.version import VERSION
+from tests.harness import PYTHON, ROOT, Graph, MasterProcess, wait_for
+from tests.packaging.clone import environment, fresh_copy, run
+
+NAMES = ("python3-rosafe", "rosafe")
+DATE = "1700000000"  # seconds; the packages do not depend on the time of the build
+NOT_AT_RUN_TIME = {"gcc", "libc6-dev", "python3-dev", "libasound2-dev", "ca-certificates"}  # of scripts/install
+NOT_AT_RUN_TIME |= {"python3-pip", "python3-setuptools", "python3-wheel"}
+
+
+def build(folder: Path) -> dict[str, Path]:
+    """Build the packages of a new copy of this checkout in `folder`."""
+    missing = [tool for tool in ("dpkg-buildpackage", "dh", "dh_python3") if shutil.which(tool) is None]
+    if missing:
+        pytest.skip(f"not installed: {missing}; run scripts/install --tests")
+    with fresh_copy() as copy:
+        done = run(copy / "scripts" / "make-deb", folder, env=environment(SOURCE_DATE_EPOCH=DATE), seconds=500)
+    if "cannot download" in done.stderr:
+        pytest.skip(done.stderr)
+    assert done.returncode == 0, done.stdout + done.stderr
+    files = {path.name.partition("_")[0]: path for path in folder.iterdir()}
+    assert set(files) == set(NAMES)
+    assert {str(path) for path in files.values()} <= set(done.stdout.splitlines())
+    return files
+
+
+@pytest.fixture(scope="module")
+def packages(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
+    return build(tmp_path_factory.mktemp("packages"))
+
+
+@pytest.fixture(scope="module")
+def root(packages: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+    """A folder with the content of both packages, which is read-only."""
+    folder = tmp_path_factory.mktemp("root")
+    for path in packages.values():
+        assert run("dpkg-deb", "-x", path, folder, env=environment()).returncode == 0
+    folders = [path for path in (folder, *folder.rglob("*")) if path.is_dir() and not path.is_symlink()]
+    for path in folders:
+        path.chmod(0o555)
+    yield folder
+    for path in folders:
+        path.chmod(0o755)
+
+
+def content(folder: Path) -> list[Path]:
+    """Return all paths, without those of compiled modules: root may write them, and dpkg does when it installs."""
+    return sorted(path for path in folder.rglob("*") if "__pycache__" not in path.parts)
+
+
+def field(package: Path, name: str) -> str:
+    done = run("dpkg-deb", "-f", package, name, env=environment())
+    assert done.returncode == 0, done.stderr
+    return done.stdout.strip()
+
+
+def array(text: str, name: str) -> set[str]:
+    """Return the words of the arrays `name` in a shell script, without comments."""
+    found = re.findall(rf"^{name}\+?=\((.*?)\)", text, re.MULTILINE | re.DOTALL)
+    assert found
+    return set(re.sub(r"#.*", "", " ".join(f"{part}\n" for part in found)).split())
+
+
+def test_versions_and_dependencies(packages: dict[str, Path]) -> None:
+    """All packages of scripts/install are dependencies, except those that only builds need."""
+    depends = {name: field(path, "Depends") for name, path in packages.items()}
+    for path in packages.values():
+        assert re.fullmatch(re.escape(VERSION) + r"~[a-z]+[0-9.]*", field(path, "Version"))
+    assert f"python3-rosafe (= {field(packages['rosafe'], 'Version')})" in depends["rosafe"]
+    names = {re.split(r"[ :]", part.strip())[0] for text in depends.values() for part in re.split("[,|]", text)}
+    needed = array((ROOT / "scripts" / "install").read_text("utf-8"), "run") - NOT_AT_RUN_TIME
+    assert needed <= names
+    assert not {name for name in names if name.startswith(("ros-", "python3-ros"))} - needed - {"python3-rosafe"}
+
+
+def test_maintainer_scripts_remove_what_programs_create(packages: dict[str, Path], tmp_path: Path) -> None:
+    for name, path in packages.items():
+        assert run("dpkg-deb", "-e", path, tmp_path / name, env=environment()).returncode == 0
+        assert f"py3clean -p {name}" in (tmp_path / name / "prerm").read_text("utf-8")
+    assert "/var/lib/private/rosafe" in (tmp_path / "rosafe" / "postrm").read_text("utf-8")
+
+
+def test_lintian_finds_no_error(packages: dict[str, Path]) -> None:
+    if shutil.which("lintian") is None:
+        pytest.skip("lintian is not installed; run scripts/install --tests")
+    done = run("lintian", "--fail-on", "error", *packages.values(), env=environment(LC_ALL="C.UTF-8"))
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_files(root: Path) -> None:
+    """No file depends on the checkout or its place, and all links end in the packages or in the packages of ROS."""
+    assert [path.name for path in root.iterdir()] == ["usr"]
+    programs = {path.name for path in (root / "usr" / "bin").iterdir()}
+    assert programs == {"bass-ros", "eltclsh", "elwish", "genomixd", "rosAFE-ros", "rosafe"}
+    for path in root.rglob("*"):
+        assert path.name not in ("__pycache__", ".generated", "kernels.lock")
+        if path.is_symlink():
+            target = Path(os.path.normpath(path.parent / path.readlink()))
+            assert target.is_relative_to(root / "usr")
+            assert target.exists() or Path("/", target.relative_to(root)).exists(), path
+    units = [path for kind in ("system", "user") for path in (root / "usr" / "lib" / "systemd" / kind).iterdir()]
+    assert len(units) == len(list((ROOT / "systemd" / "system").iterdir())) * 2
+    for unit in units:
+        text = unit.read_text("utf-8")
+        assert "/opt" not in text
+        for program in re.findall(r"^ExecStart=/(\S+)", text, re.MULTILINE):
+            assert (root / program).exists() or program == "usr/bin/roscore"
+        for document in re.findall(r"^Documentation=file:/(\S+)", text, re.MULTILINE):
+            assert (root / document).is_file()
+
+
+@pytest.mark.parametrize("package", ["rosAFE", "bass"])
+def test_messages_equal_those_of_the_checkout(root: Path, package: str) -> None:
+    generation = Path(generate.environment()["ROS_PACKAGE_PATH"].split(":")[0]).parent
+    for kind in ("msg", "srv"):
+        for own, installed in (
+            (generation / "python" / package / kind, root / "usr/lib/python3/dist-packages" / package / kind),
+            (generation / "share" / package / kind, root / "usr/share" / package / kind),
+        ):
+            names = sorted(path.name for path in own.iterdir() if path.is_file())
+            assert names and names == sorted(path.name for path in installed.iterdir())
+            assert filecmp.cmpfiles(own, installed, names, shallow=False) == (names, [], [])
+
+
+def test_doctor_finds_the_prebuilt_parts(root: Path, tmp_path: Path) -> None:
+    done = run(root / "usr/bin/rosafe", "doctor", env=environment(HOME=str(tmp_path), PATH="/usr/bin"))
+    lines = {line[8:].split("  ")[0].strip(): line for line in done.stdout.splitlines()}
+    assert done.returncode == 0, done
+    assert str(root / "usr/lib/python3/dist-packages/rosafe/dsp/kernels") in lines["kernels"]
+    assert lines["messages"].endswith(f"up to date, in {root}/usr/lib/python3/dist-packages")
+    assert str(root / "usr/lib/rosafe/python/alsaaudio") in lines["alsaaudio"]
+
+
+def test_nodes_run_from_the_packages(root: Path, private_graph: tuple[Graph, MasterProcess], tmp_path: Path) -> None:
+    """They write nothing into their packages or into the home folder."""
+    graph, _ = private_graph
+    ros = {
+        "ROS_MASTER_URI": graph.uri,
+        "ROS_IP": "127.0.0.1",
+        "HOME": str(tmp_path),
+        "ROS_LOG_DIR": str(tmp_path / "log"),
+    }
+    plain = ["env", "-i", *(f"{name}={value}" for name, value in {**environment(), **ros}.items())]
+    before = content(root)
+    with (
+        graph.start(*plain, str(root / "usr/bin/bass-ros")) as bass,
+        graph.start(*plain, str(root / "usr/lib/rosAFE/rosAFE-ros")) as rosafe,
+    ):
+        for name, node in (("bass", bass), ("rosAFE", rosafe)):
+            wait_for(lambda name=name: f"/{name}/Stop" in graph.services(), what=lambda node=node: str(node))  # type: ignore[misc]
+        exports = run(
+            *(PYTHON, "-P", "-m", "rosafe.component.generate", "--shell"),
+            env=environment(PYTHONPATH=str(root / "usr/lib/python3/dist-packages"), **ros),
+        ).stdout
+        request = "rosservice call /bass/Acquire \"{device: 'scene:'}\" && rosafe request ild"
+        done = run("sh", "-c", f"{exports}\n{request} && rosmsg show rosAFE/rosAFE_dataObjSt", env=environment(**ros))
+        assert done.returncode == 0, done
+        assert "genom_success: True" in done.stdout and "float64[] data" in done.stdout
+        assert bass.stop() == 0 and rosafe.stop() == 0
+    assert content(root) == before
+    assert {path.name for path in tmp_path.iterdir()} <= {"log"}
+
+
+@pytest.mark.exploration
+def test_two_builds_are_equal(packages: dict[str, Path], tmp_path: Path) -> None:
+    for name, path in build(tmp_path).items():
+        assert filecmp.cmp(path, packages[name], shallow=False), name
+
+
+@pytest.mark.parametrize("arguments", [["-x"], ["--folder"], ["a", "b"]])
+def test_wrong_arguments(arguments: list[str]) -> None:
+    done = run(ROOT / "scripts" / "make-deb", *arguments, env=environment())
+    assert (done.returncode, done.stdout) == (2, "")
+    assert done.stderr.startswith("usage: scripts/make-deb [FOLDER]")

@@ -1,0 +1,80 @@
+"""The paper: structure as JOSS expects it, references that exist, and figures that agree with the measurements."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import pytest
+import yaml
+
+from rosafe.declarations import literature
+from rosafe.declarations.reference import Reference
+from tests.harness import ROOT
+
+PAPER = (ROOT / "paper" / "paper.md").read_text("utf-8")
+BIB = (ROOT / "paper" / "paper.bib").read_text("utf-8")
+_, HEADER, BODY = PAPER.split("---\n", 2)
+
+
+def test_the_header() -> None:
+    header = yaml.safe_load(HEADER)
+    assert {"title", "tags", "authors", "affiliations", "date", "bibliography"} <= header.keys()
+    assert header["bibliography"] == "paper.bib" and len(header["tags"]) >= 3
+    known = {affiliation["index"] for affiliation in header["affiliations"]}
+    assert all(author["affiliation"] in known and author["name"] for author in header["authors"])
+
+
+def test_sections_and_length() -> None:
+    sections = re.findall(r"^# (.*)$", BODY, re.MULTILINE)
+    wanted = ["Summary", "Statement of need", "State of the field", "Validation", "Acknowledgements", "References"]
+    assert sections == wanted
+    assert 250 <= len(BODY.split()) <= 1100
+
+
+def test_cited_keys_exist_and_are_used() -> None:
+    cited = set(re.findall(r"@([A-Za-z][\w-]*)", BODY))
+    entries = re.findall(r"^@\w+\{([\w-]+),$", BIB, re.MULTILINE)
+    assert len(entries) == len(set(entries)) and cited == set(entries)
+    assert BIB.count("{") == BIB.count("}")
+
+
+def test_publications_of_representations_are_those_of_the_declarations() -> None:
+    declared = {one.key: one for one in vars(literature).values() if isinstance(one, Reference)}
+    shared = [key for key in re.findall(r"^@\w+\{([\w-]+),$", BIB, re.MULTILINE) if key in declared]
+    assert len(shared) >= 6 and all(declared[key].bibtex in BIB for key in shared)
+
+
+def test_only_names_are_placeholders() -> None:
+    assert not re.search(r"TODO|FIXME|XXX|MEASURED|RESTORED|CAUSAL|ESTIMATED|IDEAL", BODY)
+    assert set(re.findall(r"\b[A-Z]{6,}(?: [A-Z]+)?\b", HEADER)) == {"AUTHOR NAME", "AFFILIATION"}
+
+
+def test_pictures_exist() -> None:
+    pictures = re.findall(r"!\[[^\]]*\]\(([^)]*)\)", BODY)
+    assert pictures and all((ROOT / "paper" / picture).is_file() for picture in pictures)
+
+
+def test_figures_are_those_of_the_measurements() -> None:
+    validation = (ROOT / "docs" / "validation.md").read_text("utf-8")
+    passed = re.search(r"(\d+) of \1 comparisons passed", validation)
+    assert passed and f"All {passed[1]} comparisons pass" in BODY
+    table = re.findall(r"^\| [^|]* \| [^|]* \| ([^|]*) \|$", BODY, re.MULTILINE)[1:]
+    assert len(table) == 7
+    for value in table:
+        number = re.search(r"[\d.]+(?:e-\d+)?$", value.split(" ")[-1]) or re.search(r"[\d.]+(?:e-\d+)?", value)
+        assert number and f"| {number[0].replace('e-7', 'e-07')}" in validation, value
+    known = json.loads((ROOT / "benchmarks" / "results" / "resynthesis.json").read_text("utf-8"))
+    talkers = known["talkers"]["figures"]
+    for mask in ("estimated, matched head", "ideal ratio mask"):
+        assert f"{talkers[f'{mask}, 0 and 60']:.1f} dB" in " ".join(BODY.split())
+    assert f"{known['error']['figures']['1 ERB (default), 44100 Hz']:.0f} dB" in BODY
+
+
+@pytest.mark.parametrize("text", ["within 5 degrees in all of 360 trials", "the share is 0.886 at 0 dB"])
+def test_localization_figures(text: str) -> None:
+    assert text in " ".join(BODY.split())
+    measured = (ROOT / "benchmarks" / "results" / "localization.md").read_text("utf-8")
+    (row,) = re.findall(r"^\| within 5 degrees \| (.*) \|$", measured.split("## Head turns")[0], re.MULTILINE)
+    values = dict(zip(("60", "20", "10", "5", "0", "-5"), row.split(" | "), strict=True))
+    assert values["20"] == "1.000" and values["0"] == "0.886"

@@ -1,0 +1,24 @@
+"""The mutations of `scripts/test --mutations` fit the sources."""
+
+from __future__ import annotations
+
+import shlex
+
+from tests.harness import ROOT
+from tests.mutations import MUTATIONS
+
+
+def test_each_old_text_occurs_once_and_the_tests_exist() -> None:
+    for mutation in MUTATIONS:
+        count = (ROOT / mutation.path).read_text("utf-8").count(mutation.old)
+        assert count == 1, f"{mutation.name}: expected its old text once in {mutation.path}, got it {count} times"
+        assert mutation.new != mutation.old, mutation.name
+        paths = [word for word in shlex.split(mutation.tests) if word.startswith("tests")]
+        assert paths and all((ROOT / path).exists() for path in paths), f"{mutation.name}: {mutation.tests}"
+
+
+def test_there_are_mutations_of_every_package() -> None:
+    assert len({mutation.name for mutation in MUTATIONS}) == len(MUTATIONS) >= 60
+    packages = {path.parent.name for path in ROOT.glob("rosafe/*/__init__.py")} - {"vocabulary"}  # re-exports names
+    mutated = {mutation.path.split("/")[1] for mutation in MUTATIONS}
+    assert packages <= mutated, f"no mutation of {sorted(packages - mutated)}"
