@@ -1,9 +1,9 @@
-"""How exact the numbers are: every representation against formulas that share nothing with this code.
+"""Accuracy: errors of every representation relative to independent references.
 
 ``/usr/bin/python3 benchmarks/accuracy.py`` prints a table of the largest errors and writes it to benchmarks/results and
-into docs/accuracy.md. The bounds in it are what tests/dsp/test_accuracy.py holds the code to. Truths are closed forms
-in 50 digits (mpmath), the formulas of truth.py in 80-bit arithmetic, and, where they lie beside the checkout, reference
-outputs of the original, whose own errors then count too.
+to docs/accuracy.md. tests/dsp/test_accuracy.py checks the limits in it. References are closed forms in 50 digits
+(mpmath) and the formulas of truth.py in 80-bit arithmetic. If they exist beside the checkout, recorded outputs of the
+original are compared as well; these include the errors of the original.
 """
 
 from __future__ import annotations
@@ -51,46 +51,41 @@ Array = NDArray[Any]
 
 
 class Row(NamedTuple):
-    """The largest error of one thing."""
+    """The largest error of one quantity."""
 
-    what: str
-    truth: str
-    unit: str  # what the error is relative to, or its unit
+    quantity: str
+    reference: str
+    unit: str  # the reference value of a relative error, or the unit of an absolute one
     bound: float
     error: float
 
 
 def noise(samples: int, seed: int = 1, rows: tuple[int, ...] = (2,)) -> Array:
-    """Noise with the right ear quieter, (*rows, samples)."""
+    """Return noise with the right ear quieter, (*rows, samples)."""
     x = np.random.default_rng(seed).standard_normal((*rows, samples))
     x[1] *= 0.3
     return x
 
 
-def absolute(got: Any, wanted: Any) -> float:
-    """The largest difference."""
-    if np.shape(got) != np.shape(wanted):
-        raise ValueError(f"{np.shape(got)} are not {np.shape(wanted)}")
-    return float(np.abs(np.asarray(got) - wanted).max())
+def absolute(got: Any, expected: Any) -> float:
+    """Return the largest difference."""
+    if np.shape(got) != np.shape(expected):
+        raise ValueError(f"shape: expected {np.shape(expected)}, got {np.shape(got)}")
+    return float(np.abs(np.asarray(got) - expected).max())
 
 
-def of_peak(got: Any, wanted: Any) -> float:
-    """The largest difference over the largest number of the same row (channel and ear)."""
-    absolute(got, wanted)
-    error, peak = (np.abs(array).max(axis=-1) for array in (np.asarray(got) - wanted, np.asarray(wanted)))
+def of_peak(got: Any, expected: Any) -> float:
+    """Return the largest difference relative to the largest number of the same row (channel and ear)."""
+    absolute(got, expected)
+    error, peak = (np.abs(array).max(axis=-1) for array in (np.asarray(got) - expected, np.asarray(expected)))
     return float((error / peak).max())
-
-
-def of_itself(got: Any, wanted: Any) -> float:
-    """The largest difference over the number itself."""
-    return float(np.abs((np.asarray(got) - wanted) / wanted).max())
 
 
 # --- against closed forms in 50 digits --------------------------------------------------------------------------
 
 
 def scales() -> Iterator[Row]:
-    """ERB rate, centre frequencies, input."""
+    """Measure ERB rate, centre frequencies and input."""
     mp = mpmath.mp.clone()
     mp.dps = 50
     q, width = mp.mpf("9.265"), mp.mpf("24.7")
@@ -119,7 +114,7 @@ def scales() -> Iterator[Row]:
 
 
 class Response(NamedTuple):
-    """Of a gammatone filter to an impulse: its peak, and (k, h[k], envelope) at some 200 of its samples."""
+    """Impulse response of a gammatone filter: its peak, and (k, h[k], envelope) at about 200 of its samples."""
 
     peak: Any
     points: list[tuple[int, Any, Any]]
@@ -128,7 +123,7 @@ class Response(NamedTuple):
 
 @functools.cache
 def exact_response(rate: int, frequency: float, order: int, width: float) -> Response:
-    """By the closed form."""
+    """Return the impulse response from the closed form."""
     mp = mpmath.mp.clone()
     mp.dps = 50
     beta = 2 * mp.pi * mp.mpf(width) * (mp.mpf("24.7") + mp.mpf("0.108") * frequency) / rate
@@ -146,7 +141,7 @@ def exact_response(rate: int, frequency: float, order: int, width: float) -> Res
 
 
 def impulse_response(rate: int, frequency: float, order: int, width: float) -> float:
-    """Error of the gammatone filter's response to an impulse, over its peak."""
+    """Return the error of a gammatone filter's impulse response, relative to its peak."""
     exact = exact_response(rate, frequency, order, width)
     block = np.zeros((2, exact.samples))
     block[:, 0] = 1.0, -0.5
@@ -162,11 +157,11 @@ def impulse_response(rate: int, frequency: float, order: int, width: float) -> f
 
 
 def gammatone_impulses() -> Iterator[Row]:
-    """The closed form of the impulse response."""
+    """Measure impulse responses of gammatone filters."""
     plain = [(rate, f, 4, 1.018) for rate in RATES for f in (20.0, 80.0, 1000.0, 0.49 * rate)]
     yield from (
-        Row(f"gammatone, impulse: {what}", "50 digits", "peak", 1e-12, max(impulse_response(*case) for case in cases))
-        for what, cases in {
+        Row(f"gammatone, impulse: {varied}", "50 digits", "peak", 1e-12, max(impulse_response(*case) for case in cases))
+        for varied, cases in {
             "8 to 192 kHz, from 20 Hz on": plain,
             "fb_nGamma 1 to 128": [(rate, 80.0, n, 1.018) for rate in (16000, 192000) for n in (1, 2, 7, 33, 64, 128)],
             "fb_bwERBs 0.1 to 100": [(rate, 80.0, 4, b) for rate in (16000, 44100) for b in (0.1, 0.3, 3.0, 100.0)],
@@ -178,10 +173,10 @@ def gammatone_impulses() -> Iterator[Row]:
 
 
 def preprocessing() -> Iterator[Row]:
-    """Each element of the pre-processing."""
+    """Measure each step of the pre-processing."""
 
-    def row(what: str, bound: float, pairs: list[tuple[Array, Array]]) -> Row:
-        return Row(f"preProc: {what}", "80 bits", "peak", bound, max(of_peak(*pair) for pair in pairs))
+    def row(step: str, bound: float, pairs: list[tuple[Array, Array]]) -> Row:
+        return Row(f"preProc: {step}", "80 bits", "peak", bound, max(of_peak(*pair) for pair in pairs))
 
     x = noise(4000) + 0.5
     exact = x.astype(truth.Long)
@@ -220,7 +215,7 @@ def preprocessing() -> Iterator[Row]:
 
 
 def filterbanks() -> Iterator[Row]:
-    """Noise through both kinds of filterbank."""
+    """Measure the response of both types of filterbank to noise."""
     frequencies = [80.0, 440.0, 3000.0]
     for name, bound in (("output", 1e-12), ("envelope", 1e-12)):
         error = 0.0
@@ -230,8 +225,8 @@ def filterbanks() -> Iterator[Row]:
             bank.provide = frozenset({"envelope"})
             got = bank.process(x)
             exact = truth.gammatone(x.astype(truth.Long), rate, frequencies, order, width)
-            found, wanted = (got, exact[0]) if name == "output" else (bank.provided["envelope"], exact[1])
-            error = max(error, of_peak(found, wanted))
+            found, expected = (got, exact[0]) if name == "output" else (bank.provided["envelope"], exact[1])
+            error = max(error, of_peak(found, expected))
         yield Row(f"gammatone, noise: {name}", "80 bits", "peak", bound, error)
     error = 0.0
     for rate, frequency, velocity in ((16000, 300.0, 1e-10), (44100, 1000.0, 1e-6), (44100, 4000.0, 1e-3)):
@@ -242,7 +237,7 @@ def filterbanks() -> Iterator[Row]:
 
 
 def hair_cells() -> Iterator[Row]:
-    """Each method, on noise and its envelope."""
+    """Measure each method, with noise and its envelope."""
     for method in METHODS:
         error = 0.0
         for rate in (8000, 44100):
@@ -256,7 +251,7 @@ def hair_cells() -> Iterator[Row]:
 
 
 def framed() -> Iterator[Row]:
-    """Windows; the three framed stages, on what a hair cell puts out, with windows and hops of all kinds."""
+    """Measure windows, and the three framed stages on the output of a hair cell, with various windows and hops."""
     error = max(absolute(window(name, size), truth.window(name, size)) for name in NAMES for size in (2, 7, 882))
     yield Row("windows", "80 bits", "absolute", 1e-15, error)
     rate, x = 16000, np.maximum(noise(2000, rows=(2, 2)), 0)
@@ -273,8 +268,8 @@ def framed() -> Iterator[Row]:
         errors["ild"].append(absolute(got, truth.level_difference(exact, shape, hop)))
         for scaling in ("power", "magnitude"):
             got = Ratemap(rate, rm_scaling=scaling, **parameters("rm")).process(x)
-            wanted = truth.ratemap(exact, shape, hop, rate, 0.008, scaling == "power")
-            errors[scaling].append(of_peak(got, wanted))
+            expected = truth.ratemap(exact, shape, hop, rate, 0.008, scaling == "power")
+            errors[scaling].append(of_peak(got, expected))
         for reach in (17, 150):
             got = CrossCorrelation(rate, cc_maxDelaySec=reach / rate, **parameters("cc")).process(x)
             errors["correlation"].append(absolute(got, truth.correlation(exact, shape, hop, reach)))
@@ -288,10 +283,10 @@ def framed() -> Iterator[Row]:
 
 
 def whole_chain() -> Iterator[Row]:
-    """`rosafe.process` with its defaults at 16 kHz, all in one block and in many."""
-    rate, few = 16000, {"fb_nERBs": 4.0}
+    """Measure `rosafe.process` with its defaults at 16 kHz, in one block and in many."""
+    rate, parameters = 16000, {"fb_nERBs": 4.0}
     signal = 0.1 * noise(1800)
-    got = rosafe.process(signal, rate, parameters=few)
+    got = rosafe.process(signal, rate, parameters=parameters)
     shape = truth.window("hann", 320)
     banded = truth.gammatone(signal.astype(truth.Long), rate, got["fb_cfHz"], 4, 1.018)
     ihc = truth.hair_cell("dau", *banded, rate)
@@ -301,11 +296,11 @@ def whole_chain() -> Iterator[Row]:
         "ratemap": (of_peak, "peak", 1e-12, truth.ratemap(ihc, shape, 160, rate, 0.008, power=True)),
         "crossCorrelation": (absolute, "absolute", 1e-11, truth.correlation(ihc, shape, 160, 18)),
     }
-    for kind, (error, unit, bound, wanted) in exact.items():
-        yield Row(f"chain: {kind}", "80 bits", unit, bound, error(got[kind], wanted))
+    for kind, (error, unit, bound, expected) in exact.items():
+        yield Row(f"chain: {kind}", "80 bits", unit, bound, error(got[kind], expected))
     worst = 0.0
     for sizes in ([1], [7, 500, 1, 33], [159, 161]):
-        pieces = rosafe.process(signal, rate, parameters=few, block_frames=sizes)
+        pieces = rosafe.process(signal, rate, parameters=parameters, block_frames=sizes)
         worst = max(worst, *(absolute(pieces[kind], got[kind]) for kind in exact))
     yield Row("chain in blocks of 1 to 500 samples", "in one block", "absolute", 1e-12, worst)
 
@@ -314,7 +309,7 @@ def whole_chain() -> Iterator[Row]:
 
 
 def reference_vectors() -> Iterator[Row]:
-    """Outputs of the original; for `hilbert` and its kin it works otherwise, so that case is left out."""
+    """Compare with the original, except for `joergensen`, for which the original computes envelopes in another way."""
     tolerances = {"preProc": 1e-13, "preProc with DC removal": 1e-5, "gammatone": 2e-6, "ihc": 5e-6}
     tolerances |= {"ratemap": 1e-6, "ild": 1e-3, "crossCorrelation": 1e-4}
     errors = dict.fromkeys(tolerances, 0.0)
@@ -331,7 +326,7 @@ def reference_vectors() -> Iterator[Row]:
         pre = "preProc" if without_dc else "preProc with DC removal"
         error = absolute(got["preProc"][:, times], expected["preProc"]) / np.abs(expected["preProc"]).max()
         errors[pre] = max(errors[pre], error)
-        if not without_dc:  # its error goes through the whole chain
+        if not without_dc:  # its error affects the whole chain
             continue
         for kind in ("gammatone", "ihc"):
             errors[kind] = max(errors[kind], of_peak(got[kind][:, channels][..., times], expected[kind]))
@@ -340,9 +335,9 @@ def reference_vectors() -> Iterator[Row]:
         errors["ild"] = max(errors["ild"], absolute(got["ild"], expected["ild"]))
         error = absolute(got["crossCorrelation"][channels], expected["crosscorrelation"])
         errors["crossCorrelation"] = max(errors["crossCorrelation"], error)
-    for what, error in errors.items():
-        unit = {"ild": "dB", "crossCorrelation": "absolute"}.get(what, "peak")
-        yield Row(f"{what}", "the original", unit, tolerances[what], error)
+    for quantity, error in errors.items():
+        unit = {"ild": "dB", "crossCorrelation": "absolute"}.get(quantity, "peak")
+        yield Row(quantity, "the original", unit, tolerances[quantity], error)
 
 
 # --- the table --------------------------------------------------------------------------------------------------
@@ -359,18 +354,18 @@ MEASUREMENTS: tuple[Callable[[], Iterator[Row]], ...] = (
 
 
 def table(rows: list[Row]) -> str:
-    """The rows in Markdown."""
-    lines = ["| | truth | error relative to | largest | at most |", "|---|---|---|--:|--:|"]
+    """Return the rows in Markdown."""
+    lines = ["| | reference | error relative to | largest | at most |", "|---|---|---|--:|--:|"]
     for row in rows:
         unit = {"dB": "(in dB)", "absolute": "1"}.get(row.unit, row.unit)
-        lines.append(f"| {row.what} | {row.truth} | {unit} | {row.error:.1e} | {row.bound:.1e} |")
+        lines.append(f"| {row.quantity} | {row.reference} | {unit} | {row.error:.1e} | {row.bound:.1e} |")
     return "\n".join(lines) + "\n"
 
 
 def main() -> int:
-    """Measure, print, write; 1 where an error is beyond its bound."""
-    parser = argparse.ArgumentParser(description="Measure the errors of all representations against the truth.")
-    parser.add_argument("--print", action="store_true", help="only print, write nothing")
+    """Measure, print and write. Return 1 if an error exceeds its limit."""
+    parser = argparse.ArgumentParser(description="Measure the errors of all representations.")
+    parser.add_argument("--print", action="store_true", help="print only, without writing files")
     options = parser.parse_args()
     print(kernels.status().detail, file=sys.stderr)
     measurements = [*MEASUREMENTS, *([reference_vectors] if VECTORS.is_dir() else [])]
@@ -379,11 +374,16 @@ def main() -> int:
     print(text, end="")
     if not options.print:
         RESULTS.parent.mkdir(parents=True, exist_ok=True)
-        RESULTS.write_text(f"# Errors, measured\n\nBy benchmarks/accuracy.py; docs/accuracy.md explains.\n\n{text}")
+        RESULTS.write_text(f"# Measured errors\n\nWritten by benchmarks/accuracy.py; see docs/accuracy.md.\n\n{text}")
         before, _, rest = DOCUMENT.read_text().partition(MARKS[0])
         DOCUMENT.write_text(before + MARKS[0] + text + MARKS[1] + rest.partition(MARKS[1])[2])
-    beyond = [row.what for row in rows if not math.isfinite(row.error) or row.error > row.bound]
-    print(*(f"beyond its bound: {what}" for what in beyond), sep="\n", end="\n" if beyond else "", file=sys.stderr)
+    beyond = [row.quantity for row in rows if not math.isfinite(row.error) or row.error > row.bound]
+    print(
+        *(f"error exceeds its limit: {quantity}" for quantity in beyond),
+        sep="\n",
+        end="\n" if beyond else "",
+        file=sys.stderr,
+    )
     return 1 if beyond else 0
 
 

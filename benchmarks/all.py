@@ -1,7 +1,7 @@
-"""Write all tables in benchmarks/results, one benchmark after the other: some fifteen minutes on a quiet machine.
+"""Run all benchmarks and write all tables in benchmarks/results, in about fifteen minutes on an idle machine.
 
-``/usr/bin/python3 benchmarks/all.py`` refuses a busy machine as each of them does; what counts is the load before the
-first one. The exit code is 1 where one of them has failed.
+``/usr/bin/python3 benchmarks/all.py`` stops on a busy machine, like each benchmark. The load is that before the first
+benchmark. The exit code is 1 if a benchmark has failed.
 """
 
 from __future__ import annotations
@@ -20,13 +20,14 @@ RUNS = (
     ("everything.py",),
     ("ports.py", "--seconds", "30"),
     ("latency.py", "--messages", "400"),
+    ("blocks.py",),
 )
 
 
 def main() -> int:
-    """Run them all."""
+    """Run all benchmarks."""
     parser = report.arguments("Write all tables in benchmarks/results.")
-    parser.add_argument("--list", action="store_true", help="only say what would run")
+    parser.add_argument("--list", action="store_true", help="only list the commands")
     options = parser.parse_args()
     commands = [[str(report.HERE / name), *rest, "--results", str(options.results)] for name, *rest in RUNS]
     if options.list:
@@ -34,12 +35,14 @@ def main() -> int:
             print(sys.executable, *command)
         return 0
     report.Report(options, "All benchmarks")
-    load = os.environ.get(report.BEFORE) or f"{os.getloadavg()[0]:.2f}"
+    load = os.environ.get(report.LOAD_VARIABLE) or f"{os.getloadavg()[0]:.2f}"
     failed = []
     for command in commands:
         begin = time.monotonic()
         loaded = ["--loaded"] if options.loaded else []
-        done = subprocess.run([sys.executable, *command, *loaded], env={**os.environ, report.BEFORE: load}, check=False)
+        done = subprocess.run(
+            [sys.executable, *command, *loaded], env={**os.environ, report.LOAD_VARIABLE: load}, check=False
+        )
         print(f"== {os.path.basename(command[0])}: {time.monotonic() - begin:.0f} s\n", flush=True)
         if done.returncode:
             failed.append(os.path.basename(command[0]))

@@ -1,9 +1,9 @@
-"""What capture costs and how regular it is: ``/usr/bin/python3 benchmarks/capture.py`` prints a table.
+"""Cost and regularity of capture: ``/usr/bin/python3 benchmarks/capture.py`` prints a table.
 
-A master, bass-ros and one subscriber, this process, on the loopback interface; chunks of 50 ms at 44100 Hz from a file.
-For each length of the window: the share of a core that bass takes; how far the stamps are from the even grid of the
-chunks, and how long after its stamp a message is here (median / 99th percentile); the messages that came, and the
-frames that no window showed.
+It runs a master, bass-ros and one subscriber (this process) on the loopback interface, with chunks of 50 ms at 44100 Hz
+from a file. For each length of the window it measures: the share of a core used by bass; the deviation of the stamps
+from a regular grid, and the delay of messages after their stamps (median / 99th percentile); the number of received
+messages, and of frames that were in no window.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ RATE, CHUNK = 44100, 2205
 WINDOWS = (0.2, 1.0, 10.0, 60.0)  # s
 
 
-class Heard(NamedTuple):
-    """One message, as it came."""
+class Received(NamedTuple):
+    """A received message."""
 
     index: int
     frames: int  # in its window
@@ -39,41 +39,41 @@ class Heard(NamedTuple):
 
 
 def cpu_seconds(pid: int) -> float:
-    """The processor time that a process has used so far."""
+    """Return the processor time that a process has used so far."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
-def measure(call: Any, device: str, window: float, seconds: float, pid: int, heard: list[Heard]) -> list[str]:
-    """A row of the table."""
+def measure(call: Any, device: str, window: float, seconds: float, pid: int, received: list[Received]) -> list[str]:
+    """Measure one length of the window and return a row of the table."""
     chunks = round(window * RATE / CHUNK)
     call("Acquire", device=device, sampleRate=RATE, nFramesPerChunk=CHUNK, nChunksOnPort=chunks)
-    time.sleep(2.0)  # until all is warm
-    heard.clear()
+    time.sleep(2.0)  # warm-up
+    received.clear()
     begun, used = time.monotonic(), cpu_seconds(pid)
     time.sleep(seconds)
     share = (cpu_seconds(pid) - used) / (time.monotonic() - begun)
-    came = list(heard)
+    messages = list(received)
     call("Stop")
-    index = np.array([item.index for item in came])
-    stamp = np.array([item.stamp for item in came])
+    index = np.array([item.index for item in messages])
+    stamp = np.array([item.stamp for item in messages])
     grid = stamp[0] + (index - index[0]) / RATE
     jitter = np.abs(stamp - grid - np.median(stamp - grid)) * 1e3
-    delay = np.array([item.arrival - item.stamp for item in came]) * 1e3
-    lost = np.maximum(0, np.diff(index) - came[0].frames).sum()
+    delay = np.array([item.arrival - item.stamp for item in messages]) * 1e3
+    lost = np.maximum(0, np.diff(index) - messages[0].frames).sum()
     return [
         f"{window:g} s",
         f"{100 * share:.1f} %",
         f"{np.median(jitter):.3f} / {np.percentile(jitter, 99):.3f}",
         f"{np.median(delay):.1f} / {np.percentile(delay, 99):.1f}",
-        f"{len(came)} of {round((index[-1] - index[0]) / CHUNK) + 1}",
+        f"{len(messages)} of {round((index[-1] - index[0]) / CHUNK) + 1}",
         f"{lost}",
     ]
 
 
 def main() -> None:
-    """Measure all windows."""
-    parser = report.arguments("What capture costs and how regular it is.")
+    """Measure all lengths of the window."""
+    parser = report.arguments("Measure the cost and the regularity of capture.")
     parser.add_argument("--seconds", type=float, default=10.0, help="for each window (default: %(default)s)")
     options = parser.parse_args()
     page = report.Report(options, "Capture")
@@ -91,11 +91,11 @@ def main() -> None:
         with subprocess.Popen([str(ROOT / "scripts" / "bass-ros")], stderr=subprocess.DEVNULL) as bass:
             try:
                 rospy.init_node("benchmark", disable_signals=True)
-                heard: list[Heard] = []
+                received: list[Received] = []
 
-                def hear(message: Any) -> None:
+                def receive(message: Any) -> None:
                     stamp = message.stamp["sec"] + message.stamp["nsec"] * 1e-9
-                    heard.append(Heard(message.lastFrameIndex, len(message.left), stamp, time.time()))
+                    received.append(Received(message.lastFrameIndex, len(message.left), stamp, time.time()))
 
                 def call(service: str, **fields: Any) -> None:
                     rospy.wait_for_service(f"/bass/{service}", 20)
@@ -105,9 +105,9 @@ def main() -> None:
                         sys.exit(f"{service}: {answer.genom_exdetail}")
 
                 audio = serialization.message_class("bass", "::binaudio::portStruct")
-                rospy.Subscriber("/bass/Audio", audio, hear, queue_size=1, buff_size=2**26, tcp_nodelay=True)
+                rospy.Subscriber("/bass/Audio", audio, receive, queue_size=1, buff_size=2**26, tcp_nodelay=True)
                 device = f"file:{folder}/noise.wav?loop=1"
-                rows = [measure(call, device, window, options.seconds, bass.pid, heard) for window in WINDOWS]
+                rows = [measure(call, device, window, options.seconds, bass.pid, received) for window in WINDOWS]
                 page.table(["window", "of a core", "stamps off (ms)", "delay (ms)", "messages", "lost"], rows)
                 page.write("capture.md")
                 rospy.signal_shutdown("done")

@@ -1,9 +1,9 @@
-"""How fast the chain is: by hand, through the tree, on a file; against plain numpy and scipy; in other configurations.
+"""Speed of the chain: by hand, through the tree, on a file; compared with numpy and scipy; in other configurations.
 
 ``/usr/bin/python3 benchmarks/chain.py`` prints tables and writes them to benchmarks/results. Times are milliseconds of
-computing per second of sound, medians of warm blocks. On one core it is processor time that counts, which other
-programs on the machine hardly touch, and all sides take turns. On two cores it is the clock on the wall: it wants a
-quiet machine.
+computing per second of sound, medians of warm blocks. On one core they are processor time, which is nearly independent
+of other programs, and all implementations take turns. On two cores they are wall-clock time, which needs an idle
+machine.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
-for library in ("OMP", "OPENBLAS", "MKL"):  # before numpy is imported: one core is one core
+for library in ("OMP", "OPENBLAS", "MKL"):  # before the import of numpy, so that it uses one core
     os.environ[f"{library}_NUM_THREADS"] = "1"
 HERE = Path(__file__).resolve().parent
 sys.path[:0] = [str(HERE.parent), str(HERE)]
@@ -42,45 +42,45 @@ from rosafe.representations.registry import CORE_KINDS  # noqa: E402
 
 RATE = 44100
 BLOCKS = (12000, 882, 220)
-FEEDERS = ("input", "preProc", "gammatone", "ihc")  # the chain goes on from these; the other three all take ihc
+FEEDERS = ("input", "preProc", "gammatone", "ihc")  # each is the input of the next stage; ihc that of all others
 LEAVES = ("ild", "ratemap", "crossCorrelation")
-SECONDS = 20  # of sound in each turn through the tree
+SECONDS = 20  # length of the sound in each run through the tree
 FILE_SECONDS = 60
 Steps = dict[str, Callable[[Any], Any]]
 Cost = tuple[float, float]  # wall clock and processor time, ms per second of sound
 
 
 def sound(samples: int, seed: int = 0) -> np.ndarray:
-    """Noise of a tenth of full scale, (2, samples) int32."""
+    """Return noise at a tenth of full scale, (2, samples) int32."""
     return (np.random.default_rng(seed).standard_normal((2, samples)) * 2e8).astype(np.int32)
 
 
-def ours() -> Steps:
-    """A step for each stage of `rosafe`."""
+def rosafe_steps() -> Steps:
+    """Return the stages of `rosafe`."""
     return {kind: STAGES[kind](RATE).process for kind in CORE_KINDS}
 
 
-def plain() -> Steps:
-    """The same of the yardstick."""
+def reference_steps() -> Steps:
+    """Return the same stages of the reference in plain numpy and scipy."""
     frequencies = np.array(Filterbank(RATE).parameters["fb_cfHz"])
     return yardstick.chain(RATE, frequencies, window("hann", 2 * round(RATE / 100)))
 
 
 def run(steps: Steps, block: np.ndarray, kept: dict[str, Any], spent: dict[str, list[float]] | None = None) -> None:
-    """One block through the chain; `kept` holds the outputs until the next ones come, as the tree does."""
-    taken: Any = block
+    """Compute one block of the chain; `kept` holds the outputs until the next block, as the tree does."""
+    data: Any = block
     for kind, step in steps.items():
         begin = time.thread_time()
-        kept[kind] = step(taken)
+        kept[kind] = step(data)
         if spent is not None:
             spent.setdefault(kind, []).append(time.thread_time() - begin)
         if kind in FEEDERS:
-            taken = kept[kind]
+            data = kept[kind]
 
 
 def one_core(block: int, rounds: int) -> dict[str, Any]:
-    """Each stage and the whole chain, of both sides in turn: ms per second of sound, and how many times as fast."""
-    sides = {"yardstick": plain(), "rosafe": ours()}
+    """Measure each stage and the chain of both implementations in turn: ms per second of sound, and their ratio."""
+    sides = {"reference": reference_steps(), "rosafe": rosafe_steps()}
     stages: dict[str, dict[str, list[float]]] = {side: {} for side in sides}
     chains: dict[str, list[float]] = {side: [] for side in sides}
     kept: dict[str, dict[str, Any]] = {side: {} for side in sides}
@@ -99,12 +99,12 @@ def one_core(block: int, rounds: int) -> dict[str, Any]:
     for kind in (*CORE_KINDS, "chain"):
         times = [chains[side] if kind == "chain" else stages[side][kind] for side in sides]
         slow, fast = (_typical(spent) * per_second for spent in times)
-        result[kind] = {"yardstick": slow, "rosafe": fast, "ratio": slow / fast}
+        result[kind] = {"reference": slow, "rosafe": fast, "ratio": slow / fast}
     return result
 
 
 def _typical(times: list[float]) -> float:
-    """The median; the mean where most blocks complete no frame, so that a few of them take all the time."""
+    """Return the median, or the mean if a few blocks take most of the time because the others complete no frame."""
     return float(np.median(times) if np.percentile(times, 90) < 2 * np.median(times) else np.mean(times))
 
 
@@ -119,19 +119,19 @@ def _by_hand(steps: Steps, block: int, seconds: int) -> Cost:
     return 1000 * (time.perf_counter() - wall) / seconds, 1000 * (time.process_time() - spent) / seconds
 
 
-def by_yardstick(block: int) -> Cost:
-    """The chain of plain numpy and scipy, on two seconds of sound."""
-    return _by_hand(plain(), block, 2)
+def by_reference(block: int) -> Cost:
+    """Measure the reference in plain numpy and scipy, on two seconds of sound."""
+    return _by_hand(reference_steps(), block, 2)
 
 
 def by_hand(block: int) -> Cost:
-    """The stages called one after the other."""
-    return _by_hand(ours(), block, SECONDS)
+    """Measure the stages in sequence, without the tree."""
+    return _by_hand(rosafe_steps(), block, SECONDS)
 
 
-def through_tree(block: int, outputs: tuple[str, ...] = LEAVES, together: int = chain.MAX_BYTES) -> Cost:
-    """What `rosafe.process` takes, with small blocks put `together` to so many bytes."""
-    chain.MAX_BYTES = together
+def through_tree(block: int, outputs: tuple[str, ...] = LEAVES, max_bytes: int = chain.MAX_BYTES) -> Cost:
+    """Measure `rosafe.process`, which combines small blocks up to `max_bytes`."""
+    chain.MAX_BYTES = max_bytes
     signal = sound(SECONDS * RATE)
     wall, spent = time.perf_counter(), time.process_time()
     rosafe.process(signal, RATE, block_frames=block, outputs=outputs)
@@ -139,20 +139,20 @@ def through_tree(block: int, outputs: tuple[str, ...] = LEAVES, together: int = 
 
 
 def one_by_one(block: int) -> Cost:
-    """The same where each block goes through the tree alone, as in the node."""
-    return through_tree(block, together=0)
+    """Measure the tree without combining blocks, as in the node."""
+    return through_tree(block, max_bytes=0)
 
 
 def gammatone_alone(block: int) -> Cost:
-    """The same for the filterbank's output alone, the second time: memory that is new costs the system far more."""
+    """Measure the output of the filterbank only, in the second run: new memory would cost far more in the first one."""
     through_tree(block, ("gammatone",))
     return through_tree(block, ("gammatone",))
 
 
 def _settle(cores: Collection[int] = ()) -> None:
-    """In a new process: bind it to these cores, if any, and keep memory that was used once.
+    """Initialise a new process: bind it to `cores`, if any, and make it keep memory after use.
 
-    What the C library gives back, a virtual machine gives back to its host; new pages cost more than the filters do.
+    A virtual machine returns memory that the C library frees to its host; new pages cost more than the filters.
     """
     if cores:
         os.sched_setaffinity(0, cores)
@@ -161,29 +161,32 @@ def _settle(cores: Collection[int] = ()) -> None:
     library.mallopt(trim_threshold, 2**31 - 1)
 
 
-class Place:
+class BoundProcess:
     """A process that is bound to some cores."""
 
     def __init__(self, cores: list[int]) -> None:
         self.executor = ProcessPoolExecutor(1, mp_context=get_context("spawn"), initializer=_settle, initargs=(cores,))
 
     def run(self, function: Callable[..., Cost], *arguments: Any) -> Cost:
-        """What `function` gives there."""
+        """Return the result of `function` in this process."""
         return self.executor.submit(function, *arguments).result()
 
 
 def through(block: int, rounds: int, cores: list[int]) -> dict[str, float]:
-    """Medians of rounds in which all take their turn: ms per second of sound.
+    """Return medians over rounds in which all variants take turns: ms per second of sound.
 
-    Two independent runs, on a core each at the same time, are the limit of two cores: each second of either counts.
+    The limit of two cores is the speed of two simultaneous independent runs, on one core each.
     """
-    places = [Place([core]) for core in cores]
-    both, alone = Place(cores), Place([cores[0]])  # what is large comes where the same was before
+    processes = [BoundProcess([core]) for core in cores]
+    both, alone = (
+        BoundProcess(cores),
+        BoundProcess([cores[0]]),
+    )  # a separate process reuses its memory for large outputs
     found: dict[str, list[float]] = {}
     for turn in range(rounds + 1):
-        one = places[0]
+        one = processes[0]
         now = {
-            "yardstick": one.run(by_yardstick, block)[1],
+            "reference": one.run(by_reference, block)[1],
             "by hand": one.run(by_hand, block)[1],
             "tree, one core": one.run(through_tree, block)[1],
             "block by block": one.run(one_by_one, block)[1],
@@ -191,32 +194,32 @@ def through(block: int, rounds: int, cores: list[int]) -> dict[str, float]:
         }
         if len(cores) > 1:
             for name, function in (("tree", through_tree), ("block by block", one_by_one)):
-                running = [place.executor.submit(function, block) for place in places]
+                running = [process.executor.submit(function, block) for process in processes]
                 limit = float(np.mean([each.result()[0] for each in running])) / len(cores)
                 now[f"{name}, limit of two cores"] = limit
                 now[f"{name}, two cores"], now[f"{name}, processor time there"] = both.run(function, block)
         for name, cost in now.items():
             if turn:  # the first turn warms up
                 found.setdefault(name, []).append(cost)
-    for place in (*places, both, alone):
-        place.executor.shutdown()
+    for process in (*processes, both, alone):
+        process.executor.shutdown()
     medians = {name: float(np.median(costs)) for name, costs in found.items()}
     ratios = {
-        "times as fast": ("yardstick", "tree, one core"),
+        "times as fast": ("reference", "tree, one core"),
         "tree over hand": ("tree, one core", "by hand"),
         "block by block over hand": ("block by block", "by hand"),
     }
     if len(cores) > 1:
-        ratios["times as fast, two cores"] = ("yardstick", "tree, two cores")
+        ratios["times as fast, two cores"] = ("reference", "tree, two cores")
         for name in ("tree", "block by block"):
             ratios[f"{name}, of the limit"] = (f"{name}, limit of two cores", f"{name}, two cores")
-    for name, (over, under) in ratios.items():  # of the same minute
+    for name, (over, under) in ratios.items():  # ratios of times measured in the same round
         medians[name] = float(np.median(np.divide(found[over], found[under])))
     return medians
 
 
 def offline(rounds: int) -> dict[str, float]:
-    """Seconds of `rosafe process` on a file of a minute, from its start to its end: reads a WAV file, writes NPZ."""
+    """Measure `rosafe process` on a file of a minute, from start to end: it reads a WAV file and writes NPZ."""
     walls = []
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "minute.wav"
@@ -231,8 +234,8 @@ def offline(rounds: int) -> dict[str, float]:
     return {"seconds": float(np.median(walls)), "MB": size}
 
 
-def apart(function: Callable[..., Any], *arguments: Any) -> Any:
-    """The result of a function in a process of its own: memory that one measurement leaves speeds up the next one."""
+def in_new_process(function: Callable[..., Any], *arguments: Any) -> Any:
+    """Run a function in a new process, because memory left by one measurement speeds up the next one."""
     with ProcessPoolExecutor(1, mp_context=get_context("spawn"), initializer=_settle) as executor:
         return executor.submit(function, *arguments).result()
 
@@ -244,21 +247,21 @@ def _say_stages(page: report.Report, rounds: int) -> None:
     for block in BLOCKS:
         page.say(f"## Stage by stage on one core, blocks of {block}")
         page.say()
-        found = apart(one_core, block, rounds)
-        rows = [[k, f"{t['yardstick']:.2f}", f"{t['rosafe']:.2f}", f"{t['ratio']:.1f}"] for k, t in found.items()]
-        page.table(["stage", "yardstick", "rosafe", "times as fast"], rows)
+        found = in_new_process(one_core, block, rounds)
+        rows = [[k, f"{t['reference']:.2f}", f"{t['rosafe']:.2f}", f"{t['ratio']:.1f}"] for k, t in found.items()]
+        page.table(["stage", "reference", "rosafe", "times as fast"], rows)
 
 
 def _say_tree(page: report.Report, rounds: int) -> None:
     cores = sorted(os.sched_getaffinity(0))[:2]
     page.say("## Through the tree: `rosafe.process`")
     page.say()
-    page.say(f"{SECONDS} s of sound to {', '.join(LEAVES)}; on one core processor time, on two the clock on the wall.")
-    page.say("The limit is what two runs on one core each do at the same time. All took turns in the same minutes.")
+    page.say(f"{SECONDS} s of sound to {', '.join(LEAVES)}; processor time on one core, wall-clock time on two.")
+    page.say("The limit is the speed of two simultaneous runs on one core each. All variants took turns.")
     page.say(
-        f"Small blocks go through together, up to {chain.MAX_BYTES >> 20} MiB of a processor's output, as the numbers"
+        f"Small blocks are combined, up to {chain.MAX_BYTES >> 20} MiB of a processor's output; the numbers do not"
     )
-    page.say("are the same to the last bit. Block by block is what the tree of the node does, which cannot wait.")
+    page.say("change. Block by block: without combining blocks, as in the node.")
     page.say()
     found = {block: through(block, rounds, cores) for block in BLOCKS}
     names = list(found[BLOCKS[0]])
@@ -271,26 +274,26 @@ def _say_offline(page: report.Report) -> None:
     page.say("## A file of a minute")
     page.say()
     ratio = FILE_SECONDS / found["seconds"]
-    page.say(f"* `rosafe process` from start to end, with reading WAV and writing {found['MB']:.0f} MB of NPZ:")
+    page.say(f"* `rosafe process` from start to end, including reading WAV and writing {found['MB']:.0f} MB of NPZ:")
     page.say(f"  {found['seconds']:.2f} s, {1000 / ratio:.1f} ms per second of sound, {ratio:.0f} times real time")
     page.say()
 
 
 def _say_kinds(page: report.Report, rounds: int) -> None:
-    page.say("## The other representations, each beside plain numpy and scipy")
+    page.say("## The other representations, compared with plain numpy and scipy")
     page.say()
-    page.say("On one core; plain is benchmarks/plain.py on the whole signal at once. Parents are not counted.")
-    page.say("`differ` is the largest difference over the largest number, or the share of decisions that differ.")
+    page.say("On one core, without parents; plain is benchmarks/plain.py on the whole signal at once.")
+    page.say("`differ` is the largest difference relative to the largest number, or the share of different decisions.")
     page.say()
-    head, *rows = kinds.table(apart(kinds.measure, rounds))
+    head, *rows = kinds.table(in_new_process(kinds.measure, rounds))
     page.table(head, rows)
 
 
 def _say_configurations(page: report.Report) -> None:
-    measured = apart(configurations.measure)
+    measured = in_new_process(configurations.measure)
     page.say("## Other configurations")
     page.say()
-    page.say("Cost per unit of work is for one of the default's.")
+    page.say("Cost per unit of work is relative to the default configuration.")
     page.say()
     for kind, found in measured.items():
         page.say(f"{kind}: a unit of work is {configurations.UNITS[kind]}.")
@@ -300,43 +303,47 @@ def _say_configurations(page: report.Report) -> None:
             [[text, f"{cost['ms']:.2f}", f"{cost['per unit']:.2f}"] for text, cost in found.items()],
         )
     worst = max(cost["per unit"] for found in measured.values() for cost in found.values())
-    page.say(f"The dearest unit of work costs {worst:.2f} times what the default's costs.")
+    page.say(f"The most expensive unit of work costs {worst:.2f} times as much as that of the default configuration.")
     page.say()
 
 
 def _say_rest(page: report.Report) -> None:
-    small = apart(configurations.small_blocks)
+    small = in_new_process(configurations.small_blocks)
     page.say("## Small blocks")
     page.say()
-    page.say("Microseconds that one block of so many samples takes, 31 channels.")
+    page.say("Microseconds for one block of the given number of samples, 31 channels.")
     page.say()
     rows = [[kind, *(f"{cost:.0f}" for cost in found.values())] for kind, found in small.items()]
     page.table(["stage", *map(str, configurations.SMALL_BLOCKS)], rows)
-    first, memory = configurations.first_block(), apart(configurations.memory)
-    page.say("## What else")
+    first, memory = configurations.first_block(), in_new_process(configurations.memory)
+    page.say("## Start-up, memory, silence")
     page.say()
     page.say(f"* a new process loads in {first['load']:.2f} s; its first block takes {first['first block']:.3f} s")
-    page.say(f"* between blocks the default chain holds {memory['state']:.1f} MB; a stage takes up to")
-    page.say(f"  {memory['scratch']:.1f} MB more while it works, besides its output")
+    page.say(f"* between blocks the default chain holds {memory['state']:.1f} MB; a stage uses up to")
+    page.say(f"  {memory['scratch']:.1f} MB more while it computes, in addition to its output")
     page.say()
-    page.say("What silence after sound costs, for what sound costs (the whole chain):")
+    page.say("Cost of silence after sound relative to the cost of sound (the whole chain):")
     page.say()
-    silence = apart(configurations.silence, "kernels")
-    twins = apart(configurations.silence, "twins", ("default",))
+    silence = in_new_process(configurations.silence, "kernels")
+    numpy_ratios = in_new_process(configurations.silence, "numpy", ("default",))
     rows = [[name, f"{ratio:.2f}"] for name, ratio in silence.items()]
-    rows += [[f"{name}, the twins", f"{ratio:.2f}"] for name, ratio in twins.items()]
+    rows += [[f"{name}, numpy and scipy", f"{ratio:.2f}"] for name, ratio in numpy_ratios.items()]
     page.table(["chain", "silence / sound"], rows)
 
 
 def main() -> int:
-    """Measure, print, write."""
-    parser = report.arguments("Time the chain: by hand, through the tree, on a file, against plain numpy and scipy.")
-    parser.add_argument("--rounds", type=int, default=5, help="how often all sides take their turn (default 5)")
+    """Measure, print and write."""
+    parser = report.arguments(
+        "Time the chain: by hand, through the tree, on a file, compared with plain numpy and scipy."
+    )
+    parser.add_argument("--rounds", type=int, default=5, help="number of turns of all variants (default 5)")
     parser.add_argument(
-        "--quick", action="store_true", help="only the default chain, by hand and through the tree; writes nothing"
+        "--quick",
+        action="store_true",
+        help="only the default chain, by hand and through the tree, without writing files",
     )
     options = parser.parse_args()
-    page = report.Report(options, "The chain, timed")
+    page = report.Report(options, "Times of the chain")
     page.say(f"* kernels: {kernels.status().detail.partition(';')[0]}")
     page.say(f"* numpy {np.__version__}, scipy {scipy.__version__}; ms of computing per second of sound, medians")
     page.say()

@@ -1,4 +1,4 @@
-"""What other configurations cost per unit of work, and what else there is to know: first block, memory, silence."""
+"""Cost per unit of work in other configurations; cost of the first block, memory, cost of silence."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ BLOCK = 12000
 
 
 class Case(NamedTuple):
-    """One stage in one configuration."""
+    """A stage in a configuration."""
 
     kind: str
     text: str
@@ -33,15 +33,15 @@ class Case(NamedTuple):
     channels: int = 31
     rate: int = RATE
     block: int = BLOCK
-    times: float = 1.0  # units of work for one of the default configuration: what it should cost in proportion
+    times: float = 1.0  # units of work relative to the default configuration; the expected relative cost
 
 
-# What a unit of work is; times are in proportion to it.
+# The unit of work of each stage, to which the time should be proportional.
 UNITS = {
-    "gammatone": "a sample of eight channels of an ear (so many are filtered at a time) through four poles",
-    "ihc": "a sample of eight rows (an ear's channel each); with a power (bernstein), four of them",
-    "ild": "a sample, or its product with a window where there are more than two of them",
-    "ratemap": "a sample, or its product with a window where there are more than two of them",
+    "gammatone": "a sample of eight channels of an ear (which are filtered at a time) through four poles",
+    "ihc": "a sample of eight rows (channels of an ear); four samples for bernstein, which needs a power",
+    "ild": "a sample, or its product with a window if there are more than two products per sample",
+    "ratemap": "a sample, or its product with a window if there are more than two products per sample",
     "crossCorrelation": "a product of two samples of a frame; a sample's window costs as much as sixty",
 }
 ROWS_AT_ONCE = 8
@@ -49,7 +49,7 @@ WINDOWING = 60
 
 
 def cases() -> list[Case]:
-    """What is measured; the first of each kind is the default."""
+    """Return all cases to measure; the first of each kind is the default."""
     found = []
     for kind in UNITS:
         found.append(Case(kind, "default", {}))
@@ -85,7 +85,7 @@ def _rate(kind: str, rate: int) -> dict[str, Any]:
 
 
 def _rows(kind: str, channels: int) -> float:
-    """Rows for those of the default; where rows are in the lanes, whole registers."""
+    """Return rows relative to the default; for kernels with one row per lane, whole registers."""
     if kind not in ("gammatone", "ihc", "ratemap"):
         return channels / 31
     ears_at_once = 1 if kind == "gammatone" else 2
@@ -102,12 +102,12 @@ def _products(delay: float, rate: int) -> float:
 
 
 def _work(kind: str, rate: int) -> float:
-    """Samples per second; for the correlation, with all their products."""
+    """Return samples per second relative to the default; for the correlation, products."""
     return rate / RATE * (_products(1.1, rate) if kind == "crossCorrelation" else 1)
 
 
 def measure() -> dict[str, Any]:
-    """ms per second of sound of each case, and what a unit of work costs for one of the default configuration."""
+    """Measure ms per second of sound of each case, and the cost per unit of work relative to the default."""
     result: dict[str, Any] = {}
     for case in cases():
         found = result.setdefault(case.kind, {})
@@ -141,13 +141,13 @@ SMALL_BLOCKS = (1, 20, 50, 100, 200, 400, 800)
 
 
 def small_blocks() -> dict[str, dict[str, float]]:
-    """Microseconds of a block of so many samples, for each stage: a fixed part, and one that grows as they do."""
+    """Measure microseconds per block of each stage for each of `SMALL_BLOCKS`: fixed and proportional cost."""
     result: dict[str, dict[str, float]] = {}
     for kind in UNITS:
         found = result.setdefault(kind, {})
         for size in SMALL_BLOCKS:
             step, block = _prepared(Case(kind, "", {}, block=size))
-            blocks = max(200, 40 * 441 // size)  # a mean over many frames: most small blocks complete none
+            blocks = max(200, 40 * 441 // size)  # many blocks: most small blocks complete no frame
             means = []
             for _ in range(5):
                 begin = time.thread_time()
@@ -158,7 +158,7 @@ def small_blocks() -> dict[str, dict[str, float]]:
     return result
 
 
-# --- the rest ---
+# --- start-up, memory, silence ---
 
 _FIRST = """
 import sys, time
@@ -169,17 +169,17 @@ from rosafe.representations import STAGES
 from rosafe.representations.registry import CORE_KINDS
 kernels.compiled()
 loaded = time.perf_counter()
-taken = np.ones((2, 12000), np.int32)
+data = np.ones((2, 12000), np.int32)
 for kind in CORE_KINDS:
-    out = STAGES[kind](44100).process(taken)
+    out = STAGES[kind](44100).process(data)
     if kind in ("input", "preProc", "gammatone", "ihc"):
-        taken = out
+        data = out
 print(loaded - begin, time.perf_counter() - loaded)
 """
 
 
 def first_block() -> dict[str, float]:
-    """Seconds of a new process: to load everything, and then to set up the chain and compute a block of 12000."""
+    """Measure a new process: seconds to import everything, and to set up the chain and compute a block of 12000."""
     root = Path(__file__).resolve().parents[1]
     runs = []
     for _ in range(5):
@@ -194,19 +194,19 @@ def _chain() -> dict[str, Stage]:
 
 
 def _through(stages: dict[str, Stage], block: Any) -> None:
-    taken = block
+    data = block
     hair_cell, filterbank = stages["ihc"], stages["gammatone"]
     assert isinstance(hair_cell, InnerHairCell) and isinstance(filterbank, Filterbank)
     filterbank.provide = frozenset({hair_cell.required_extra} - {""})
     for kind, stage in stages.items():
         envelope = filterbank.provided.get(hair_cell.required_extra)
-        out: Any = hair_cell.process(taken, envelope) if stage is hair_cell else stage.process(taken)
+        out: Any = hair_cell.process(data, envelope) if stage is hair_cell else stage.process(data)
         if kind in ("input", "preProc", "gammatone", "ihc"):
-            taken = out
+            data = out
 
 
 def memory() -> dict[str, float]:
-    """Of the default chain: what it holds between blocks, and the most at any time less the block in and out."""
+    """Measure memory of the default chain between blocks, and its peak without the input and output blocks, in MB."""
     tracemalloc.start()
     stages = _chain()
     block = np.ones((2, BLOCK), np.int32)
@@ -214,19 +214,19 @@ def memory() -> dict[str, float]:
         _through(stages, block)
     held = tracemalloc.get_traced_memory()[0]
     peaks = []
-    taken: Any = block
+    data: Any = block
     for kind, stage in stages.items():
         before = tracemalloc.get_traced_memory()[0]
         tracemalloc.reset_peak()
-        out = stage.process(taken)
+        out = stage.process(data)
         peaks.append(tracemalloc.get_traced_memory()[1] - before - out.nbytes)
         if kind in ("input", "preProc", "gammatone", "ihc"):
-            taken = out
+            data = out
     tracemalloc.stop()
     return {"state": held / 1e6, "scratch": max(peaks) / 1e6}
 
 
-# Chains whose filters have tails: everything that can be chosen in a filter's place.
+# Chains whose filters have tails: all alternatives for each filter.
 TAILS: dict[str, dict[str, dict[str, Any]]] = {
     "default": {},
     **{f"ihc_method {method}": {"ihc": {"ihc_method": method}} for method in METHODS},
@@ -238,8 +238,8 @@ TAILS: dict[str, dict[str, dict[str, Any]]] = {
 
 
 def silence(implementation: str, names: Sequence[str] = tuple(TAILS)) -> dict[str, float]:
-    """What silence after sound costs, for what sound costs; the first blocks, in which the filters decay, count."""
-    os.environ["ROSAFE_KERNELS"] = "0" if implementation == "twins" else "4"
+    """Measure the cost of silence after sound relative to sound, including the blocks in which the filters decay."""
+    os.environ["ROSAFE_KERNELS"] = "0" if implementation == "numpy" else "4"
     noise = (np.random.default_rng(0).standard_normal((2, BLOCK)) * 2e8).astype(np.int32)
     result = {}
     for name in names:

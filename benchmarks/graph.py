@@ -1,15 +1,16 @@
-"""A real graph for benchmarks: a private master, both nodes, the default tree, and subscribers in other processes."""
+"""A ROS graph for benchmarks: a private master, both nodes, the default tree, and subscribers in other processes."""
 
 from __future__ import annotations
 
 import json
+import multiprocessing
 import os
 import sys
 import tempfile
 import time
 import xmlrpc.client
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -27,28 +28,28 @@ UP_SECONDS = 20.0
 
 
 def topic(kind: str) -> str:
-    """The topic of the default tree's processor of a kind."""
+    """Return the topic of the default processor of a kind."""
     port = ROSAFE.port(KINDS[kind].port)
     return f"/rosAFE/{port.name}" + (f"/{KINDS[kind].name}" if port.multiple else "")
 
 
 class Subscriber:
-    """A process that subscribes to some topics with the zero-copy classes; `close` tells what came."""
+    """A process that subscribes to some topics with the zero-copy classes; `close` returns the received messages."""
 
     def __init__(self, children: ProcessGroup, folder: str, topics: Iterable[str]) -> None:
         self._result = Path(tempfile.mkdtemp(dir=folder)) / "result.json"
         self.child: Child = children.start(PYTHON, str(HERE / "subscriber.py"), str(self._result), *topics)
 
     def close(self) -> dict[str, Any]:
-        """End it; what came, by topic: a list of [lastFrameIndex, monotonic seconds, ...]."""
+        """End the process; return a list of [lastFrameIndex, monotonic seconds, ...] for each topic."""
         self.child.process.terminate()
         if self.child.process.wait(UP_SECONDS) != 0:
-            raise RuntimeError(f"the subscriber has failed: {self.child.err}")
+            raise RuntimeError(f"the subscriber failed: {self.child.err}")
         return json.loads(self._result.read_text())
 
 
 class Bench:
-    """The running nodes; `bench` makes one."""
+    """The running nodes; created by `bench`."""
 
     def __init__(self, session: DemoSession, children: ProcessGroup, folder: str) -> None:
         self.session = session
@@ -64,23 +65,33 @@ class Bench:
         if not answer.genom_success:
             raise RuntimeError(f"{service}: {answer.genom_exdetail}")
 
-    def build(self, block: int, port_seconds: float, chunk: int, device: str = "scene:") -> None:
-        """Start the sound, in chunks of so many frames, and all seven processors on blocks of so many."""
+    def start_sound(self, chunk: int, device: str = "scene:") -> None:
+        """Start the sound in chunks of `chunk` frames and connect rosAFE to it."""
         self.call("/rosAFE/connect_port", local="Audio", remote=AUDIO)
         self.call("/bass/Acquire", device=device, sampleRate=RATE, nFramesPerChunk=chunk, nChunksOnPort=20)
+
+    def build(self, block: int, port_seconds: float, chunk: int, device: str = "scene:") -> None:
+        """Start the sound in chunks of `chunk` frames, and all seven processors on blocks of `block` frames."""
+        self.start_sound(chunk, device)
         self.call("/rosAFE/InputProc", nFramesPerBlock=block, bufferSize_s_port=port_seconds)
         for kind in CORE_REPRESENTATIONS.values():
             if kind.parent:
                 self.call(f"/rosAFE/{kind.request}", name=NAMES[kind.kind], upperDepName=NAMES[kind.parent])
 
     def subscribe(self, topics: Iterable[str]) -> Subscriber:
-        """Subscribe from another process; something has come on every topic when this returns."""
+        """Subscribe from another process; return after the first message on every topic."""
         subscriber = Subscriber(self._children, self._folder, topics)
-        self.session.wait(lambda: "ready" in subscriber.child.out, UP_SECONDS, "the subscriber hears nothing")
+        self.session.wait(
+            lambda: "ready" in subscriber.child.out, UP_SECONDS, "the subscriber received no message on some topic"
+        )
         return subscriber
 
+    def start(self, *command: str) -> Child:
+        """Start a command in the graph."""
+        return self._children.start(*command)
+
     def health(self) -> str:
-        """What the node says of its sound on /diagnostics."""
+        """Return the status of the node's audio on /diagnostics."""
         import rospy
         from diagnostic_msgs.msg import DiagnosticArray
 
@@ -89,28 +100,33 @@ class Bench:
             for status in rospy.wait_for_message("/diagnostics", DiagnosticArray, UP_SECONDS).status:
                 if "rosAFE" in status.name and status.name.endswith("audio"):
                     return str(status.message)
-        raise RuntimeError("the node tells nothing on /diagnostics")
+        raise RuntimeError("no status of the audio on /diagnostics")
 
-    @property
-    def node(self) -> int:
-        """Process id of the rosAFE node."""
+    def pid(self, node: str) -> int:
+        """Return the process id of a node, such as `/rosAFE`."""
         import rosgraph
 
-        address = rosgraph.Master("/benchmark").lookupNode("/rosAFE")
+        address = rosgraph.Master("/benchmark").lookupNode(node)
         return int(xmlrpc.client.ServerProxy(address).getPid("/benchmark")[2])
 
 
 def resident(pid: int) -> float:
-    """Resident memory of a process in MB."""
+    """Return the resident memory of a process in MB."""
     pages = int(Path(f"/proc/{pid}/statm").read_text().split()[1])
     return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
 
 
+def in_child(function: Callable[..., Any], *arguments: Any) -> Any:
+    """Call a function in a process of its own, because rospy joins one graph per process."""
+    with multiprocessing.get_context("spawn").Pool(1) as pool:
+        return pool.apply(function, arguments)
+
+
 @contextmanager
 def bench() -> Iterator[Bench]:
-    """Both nodes on a private master; everything ends with it."""
-    with tempfile.TemporaryDirectory() as folder, DemoSession(folder, lambda: None) as session:
+    """Run both nodes with a private master; all processes end with the context."""
+    with tempfile.TemporaryDirectory() as folder, closing(DemoSession(folder, lambda: None)) as session:
         session.start_nodes()
         session.join()
-        with ProcessGroup(os.environ) as children:
+        with closing(ProcessGroup(os.environ)) as children:
             yield Bench(session, children, folder)

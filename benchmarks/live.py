@@ -1,8 +1,8 @@
-"""What the live page costs: processor time of `rosafe live` and bytes for each page, with one page and with twenty.
+"""Cost of the live page: processor time of `rosafe live` and bytes per page, with one page and with twenty.
 
     /usr/bin/python3 benchmarks/live.py [--seconds 20]
 
-Starts a master, both nodes and the page on free ports; the scene, at 44100 Hz, with the tree that the page shows.
+Starts a master, both nodes and the page on free ports, with the scene at 44100 Hz and the default tree.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ KEYS = (
     {"what": "picture", "name": "ratemap_0"},
     {"what": "picture", "name": "ild_0"},
     {"what": "picture", "name": "crosscorrelation_0"},
-    {"what": "direction", "name": "crosscorrelation_0"},
+    {"what": "directions"},
 )
 
 
@@ -44,37 +44,41 @@ def main() -> None:
         for kind in ("ratemap", "ild", "crossCorrelation"):  # the default tree
             graph.run("rosafe", "request", kind)
         one = stack.enter_context(live(graph))
-        print("pages  % of a core  kB/s a page  pictures/s a page")
+        print("pages  % of a core  kB/s per page  messages/s per page")
         for pages in (1, 20):
-            share, rate, pictures = asyncio.run(measure(one, pages, seconds))
-            print(f"{pages:5}  {100 * share:11.1f}  {rate / 1e3:11.1f}  {pictures:17.1f}")
+            share, rate, messages = asyncio.run(measure(one, pages, seconds))
+            print(f"{pages:5}  {100 * share:11.1f}  {rate / 1e3:13.1f}  {messages:19.1f}")
 
 
 async def measure(one: Live, pages: int, seconds: float) -> tuple[float, float, float]:
-    """Share of a core, and bytes and messages per second of a page."""
+    """Measure the share of a core, and bytes and messages per second of a page."""
 
     async def follow() -> tuple[int, int]:
         async with page(one) as client:
-            await client.look(*KEYS)
+            await client.subscribe(*KEYS)
             await asyncio.sleep(0)
             end = time.monotonic() + 3
-            while time.monotonic() < end:  # what is kept for a new page is not what it costs
-                await client.hear()
-            begun, before = client.bytes, client.pictures
-            spent.append(_spent(one))
+            while time.monotonic() < end:  # exclude the retained frames that a new page gets first
+                await client.receive()
+            begun, before = client.bytes, client.messages
+            spent.append(_processor_seconds(one))
             while time.monotonic() < end + seconds:
-                await client.hear()
-            spent.append(_spent(one))
-            return client.bytes - begun, client.pictures - before
+                await client.receive()
+            spent.append(_processor_seconds(one))
+            return client.bytes - begun, client.messages - before
 
     spent: list[float] = []
-    told = await asyncio.gather(*(follow() for _ in range(pages)))
+    received = await asyncio.gather(*(follow() for _ in range(pages)))
     share = (max(spent) - min(spent)) / seconds
-    return share, sum(size for size, _ in told) / pages / seconds, sum(count for _, count in told) / pages / seconds
+    return (
+        share,
+        sum(size for size, _ in received) / pages / seconds,
+        sum(count for _, count in received) / pages / seconds,
+    )
 
 
-def _spent(one: Live) -> float:
-    """Seconds of processor time."""
+def _processor_seconds(one: Live) -> float:
+    """Return the processor time of the server in seconds."""
     fields = Path(f"/proc/{one.process.pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 

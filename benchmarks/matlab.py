@@ -1,7 +1,8 @@
-"""How long Octave takes to read ports through genomixd: one second of ILD, ratemap, cross-correlation and gammatone.
+"""Time to read ports in Octave through genomixd: one second of ILD, ratemap, cross-correlation and gammatone.
 
-``/usr/bin/python3 benchmarks/matlab.py`` starts real nodes on a master of its own, a genomixd, and Octave, and prints
-median ms for cell arrays (the form of the original's scripts) and for matrices (``'-m'``). benchmarks/ports.m measures.
+``/usr/bin/python3 benchmarks/matlab.py`` starts real nodes with a private master, a genomixd, and Octave, which runs
+benchmarks/ports.m. It prints median ms for cell arrays (the form of the original's scripts) and for matrices
+(``'-m'``).
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ import socket
 import subprocess
 import sys
 import time
+from contextlib import closing
 
 import graph
 import report
@@ -19,24 +21,24 @@ import report
 from rosafe.component import generate
 from rosafe.demo.processes import ProcessGroup
 
-FULL_SECONDS = 2.0  # until the ports hold a second
+FILL_SECONDS = 2.0  # until the ports hold one second
 UP_SECONDS = 20.0
 
 
 def main() -> int:
     """Measure and print."""
-    report.Report(report.arguments("How long reading ports takes in Octave.").parse_args(), "Octave")
+    report.Report(report.arguments("Measure the time to read ports in Octave.").parse_args(), "Octave")
     if shutil.which("octave-cli") is None:
-        print("benchmarks/matlab.py: octave-cli is not installed; scripts/install --tests brings it", file=sys.stderr)
+        print("benchmarks/matlab.py: octave-cli is not installed; run scripts/install --tests", file=sys.stderr)
         return 1
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         address = f"127.0.0.1:{probe.getsockname()[1]}"
-    with graph.bench() as bench, ProcessGroup(os.environ) as children:
+    with graph.bench() as bench, closing(ProcessGroup(os.environ)) as children:
         children.start(graph.PYTHON, str(graph.HERE.parent / "scripts" / "genomixd"), "-p", address.rpartition(":")[2])
         bench.build(12000, 1.0, 2205)
         _await(address)
-        time.sleep(FULL_SECONDS)
+        time.sleep(FILL_SECONDS)
         env = {**os.environ, **generate.environment(), "GENOMIXD": address}
         octave = ["octave-cli", "--norc", "--quiet", "--no-history", str(graph.HERE / "ports.m")]
         return subprocess.run(octave, env=env, check=False).returncode

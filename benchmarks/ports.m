@@ -1,4 +1,4 @@
-% Prints, for ports of one second, the median ms of reading one in cells and as matrices. By benchmarks/matlab.py.
+% Prints the median ms to read ports of one second as cell arrays and as matrices. Run by benchmarks/matlab.py.
 client = genomix.client;
 rosAFE = client.load('rosAFE');
 ports = {'ildPort', 'ild'; 'ratemapPort', 'ratemap'; 'crossCorrelationPort', 'crosscorrelation'; ...

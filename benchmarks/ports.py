@@ -1,10 +1,10 @@
-"""What the output ports can carry: serialising and reading the large message, and all ports subscribed for a while.
+"""Throughput of the output ports: serialising and reading a large message, and all ports subscribed for a while.
 
-``/usr/bin/python3 benchmarks/ports.py`` prints the times for the message of the gammatone port, one second of 31
-channels for two ears, which is 22 MB. Then it starts real nodes on a master of its own and subscribes to all seven
+``/usr/bin/python3 benchmarks/ports.py`` prints the times for the message of the gammatone port: one second of 31
+channels for two ears, which is 22 MB. Then it starts real nodes with a private master, and subscribes to all seven
 ports of the default tree from another process: blocks of 12000 with ports of one second, and blocks of 882 with short
-ones. It counts what came on every port against what the audio says there must be, and the memory of both processes.
-The exit code is 1 where frames were lost, or where a process has grown.
+ports. It compares the messages on every port with the number expected from the audio, and measures the memory of both
+processes. The exit code is 1 if frames were lost, or if a process has grown.
 """
 
 from __future__ import annotations
@@ -26,15 +26,15 @@ from rosafe.component import generate
 from rosafe.interface import CORE_REPRESENTATIONS
 from rosafe.transport.buffer_list import BufferList
 
-SETTLED = 5.0  # seconds until memory counts: windows and buffers are full by then
-GROWTH = 64.0  # MB; a leak of one window in the time would be as much as that
+SETTLE_SECONDS = 5.0  # after this time windows and buffers are full, and memory is measured
+MAX_GROWTH = 64.0  # MB; the leak of one window would exceed this
 
 
 # --- one large message ------------------------------------------------------------------------------------------
 
 
 def times(count: int = 20) -> dict[str, float]:
-    """Median ms of each step in the life of a 22 MB message, on this machine."""
+    """Measure the median ms of each step in the processing of a 22 MB message."""
     generate.ensure_messages()
     from rosAFE.msg import rosAFE_TimeFrequencySignalPortStruct
 
@@ -45,7 +45,7 @@ def times(count: int = 20) -> dict[str, float]:
     window = SlidingWindow((2, 31), graph.RATE)
     for seed in range(6):
         window.append(np.random.default_rng(seed).normal(size=(2, 31, 12000)))
-    view = window.view()
+    view = window.padded_view(window.frames)
     data_class = array_msg(rosAFE_TimeFrequencySignalPortStruct)
     message = data_class(numberOfChannels=31, framesOnPort=graph.RATE, left=view.select(0), right=view.select(1))
 
@@ -58,25 +58,25 @@ def times(count: int = 20) -> dict[str, float]:
     out = io.BytesIO()
     message.serialize(out)
     data = out.getvalue()
-    ours, theirs = socket.socketpair()
-    drain = threading.Thread(target=_drain, args=(theirs,))
+    sender, receiver = socket.socketpair()
+    drain = threading.Thread(target=_drain, args=(receiver,))
     drain.start()
 
     def through_a_socket() -> None:
         out = BufferList()
         message.serialize(out)
-        send_pieces(ours, out.pieces)
+        send_pieces(sender, out.pieces)
 
     found = {
-        "serialise into memory (rospy's way)": _median(into_memory, count),
-        "serialise for the socket (the node's way)": _median(for_the_socket, count),
+        "serialise into memory (as rospy)": _median(into_memory, count),
+        "serialise for the socket (as the node)": _median(for_the_socket, count),
         "serialise and send to another thread": _median(through_a_socket, count),
         "read": _median(lambda: data_class().deserialize(data), count),
         "for comparison: copy the bytes": _median(lambda: bytearray(data), count),
     }
-    ours.close()
+    sender.close()
     drain.join()
-    theirs.close()
+    receiver.close()
     return found
 
 
@@ -99,18 +99,18 @@ def _median(function: Callable[[], Any], count: int) -> float:
 
 
 class Port(NamedTuple):
-    """What came on one port."""
+    """The messages received on a port."""
 
     topic: str
-    came: int  # messages
+    received: int  # messages
     expected: int
-    lost: int  # audio frames that no window showed
+    lost: int  # audio frames that were in no window
 
 
 def count(topic: str, indexes: list[int], block: int, window: int) -> Port:
-    """Messages against blocks: on every port `lastFrameIndex` goes on by one block per message.
+    """Compare messages with blocks: on every port `lastFrameIndex` increases by one block per message.
 
-    A message that was skipped costs frames only where the next window does not reach back so far.
+    The frames of a skipped message are lost only if they are not in the next window.
     """
     seen = sorted({index for index in indexes if index})
     expected = (seen[-1] - seen[0]) // block + 1 if seen else 0
@@ -119,7 +119,7 @@ def count(topic: str, indexes: list[int], block: int, window: int) -> Port:
 
 
 class Run(NamedTuple):
-    """The result of one run; memory in MB, from when it had settled to the end."""
+    """The result of one run; memory in MB, after `SETTLE_SECONDS` and at the end."""
 
     ports: list[Port]
     node: tuple[float, float]
@@ -127,50 +127,50 @@ class Run(NamedTuple):
 
     @property
     def lost(self) -> int:
-        """Frames lost on all ports; a port on which nothing came counts as one."""
-        return sum(port.lost for port in self.ports) + sum(port.came == 0 for port in self.ports)
+        """Frames lost on all ports; a port without messages counts as one."""
+        return sum(port.lost for port in self.ports) + sum(port.received == 0 for port in self.ports)
 
     @property
     def growth(self) -> float:
-        """MB by which a process has grown, the one that grew more."""
+        """Growth in MB of the process that has grown more."""
         return max(last - first for first, last in (self.node, self.subscriber))
 
 
 def run(bench: graph.Bench, block: int, port_seconds: float, seconds: float) -> Run:
-    """Subscribe to all ports from another process for so long; the tree is there and runs on blocks of `block`."""
+    """Subscribe to all ports of the running tree from another process for `seconds`."""
     topics = [graph.topic(kind) for kind in CORE_REPRESENTATIONS]
-    taker = bench.subscribe(topics)
-    pids = bench.node, taker.child.process.pid
-    settling = min(SETTLED, seconds / 2)
+    reader = bench.subscribe(topics)
+    pids = bench.pid("/rosAFE"), reader.child.process.pid
+    settling = min(SETTLE_SECONDS, seconds / 2)
     time.sleep(settling)
     before = [graph.resident(pid) for pid in pids]
     time.sleep(seconds - settling)
     node, subscriber = zip(before, [graph.resident(pid) for pid in pids], strict=True)
-    came = taker.close()
+    received = reader.close()
     window = round(port_seconds * graph.RATE)
-    return Run([count(t, [int(index) for index, _ in came[t]], block, window) for t in topics], node, subscriber)
+    return Run([count(t, [int(index) for index, _ in received[t]], block, window) for t in topics], node, subscriber)
 
 
 def report(page: Report, result: Run) -> None:
     """Print one run."""
     page.table(
-        ["port", "came", "expected", "frames lost"],
-        [[port.topic, str(port.came), str(port.expected), str(port.lost)] for port in result.ports],
+        ["port", "received", "expected", "frames lost"],
+        [[port.topic, str(port.received), str(port.expected), str(port.lost)] for port in result.ports],
     )
     for name, (first, last) in (("node", result.node), ("subscriber", result.subscriber)):
-        page.say(f"* memory of the {name}: {first:.0f} MB at first, {last:.0f} MB at the end")
+        page.say(f"* memory of the {name}: {first:.0f} MB at the beginning, {last:.0f} MB at the end")
     page.say()
 
 
 def main() -> int:
-    """Measure, print, write."""
-    parser = arguments("Serialisation of large ports, and all ports subscribed for a while.")
-    parser.add_argument("--seconds", type=float, default=60.0, help="of each run (default %(default)s)")
-    parser.add_argument("--quick", action="store_true", help="leave out the times of a single message; writes nothing")
+    """Measure, print and write."""
+    parser = arguments("Measure the serialisation of a large message, and all ports subscribed for a while.")
+    parser.add_argument("--seconds", type=float, default=60.0, help="duration of each run (default %(default)s)")
+    parser.add_argument("--quick", action="store_true", help="omit the times of a single message, and write no files")
     options = parser.parse_args()
-    page = Report(options, "What the ports carry")
+    page = Report(options, "Throughput of the ports")
     if not options.quick:
-        page.table(["22 MB message", "median ms"], [[what, f"{spent:.2f}"] for what, spent in times().items()])
+        page.table(["22 MB message", "median ms"], [[step, f"{spent:.2f}"] for step, spent in times().items()])
     lost = 0
     with graph.bench() as bench:
         for block, port_seconds, chunk in ((12000, 1.0, 2205), (882, 0.02, 882)):
@@ -180,8 +180,8 @@ def main() -> int:
             result = run(bench, block, port_seconds, options.seconds)
             report(page, result)
             lost += result.lost
-            if result.growth > GROWTH:
-                page.say(f"* grown by {result.growth:.0f} MB")
+            if result.growth > MAX_GROWTH:
+                page.say(f"* a process has grown by {result.growth:.0f} MB")
                 lost += 1
             bench.call("/rosAFE/Stop")
     if not options.quick:

@@ -1,4 +1,4 @@
-"""What all benchmarks have in common: the load that they begin with, tables, and the files that they write."""
+"""Reports of benchmarks: the initial load of the machine, tables, and result files."""
 
 from __future__ import annotations
 
@@ -11,57 +11,61 @@ from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
 RESULTS = HERE / "results"
-BUSY = 0.5  # processes on average that want a core; a machine that has more to do is not quiet
-BEFORE = "ROSAFE_BENCHMARK_LOAD"  # environment variable: the load before benchmarks/all.py began, whose own work counts
+MAX_LOAD = 0.5  # load average; above it, the machine is busy
+LOAD_VARIABLE = "ROSAFE_BENCHMARK_LOAD"  # set by benchmarks/all.py to the load before its first benchmark
 
 
 def arguments(description: str) -> argparse.ArgumentParser:
-    """A parser with what every benchmark takes."""
+    """Return a parser with the options of every benchmark."""
     parser = argparse.ArgumentParser(description=description)
-    parser.add_argument("--loaded", action="store_true", help=f"measure although the load is above {BUSY}")
+    parser.add_argument("--loaded", action="store_true", help=f"measure even if the load is above {MAX_LOAD}")
     parser.add_argument(
-        "--results", type=Path, default=RESULTS, metavar="FOLDER", help="where to write (default %(default)s)"
+        "--results",
+        type=Path,
+        default=RESULTS,
+        metavar="FOLDER",
+        help="folder of the result files (default %(default)s)",
     )
     return parser
 
 
 class Report:
-    """Prints lines and keeps them for a file. The first one tells the load; on a busy machine it ends the program.
+    """A report that is printed and written to a file. It begins with the load; on a busy machine it ends the program.
 
     Parameters
     ----------
     options : Namespace
-        Of a parser that `arguments` has made.
+        Options of a parser created by `arguments`.
     title : str
-        Of the file.
+        Title of the file.
     """
 
     def __init__(self, options: argparse.Namespace, title: str) -> None:
         name = Path(sys.argv[0]).name
         try:
-            load = float(os.environ.get(BEFORE, ""))
+            load = float(os.environ.get(LOAD_VARIABLE, ""))
         except ValueError:
             load = os.getloadavg()[0]
-        if load > BUSY and not options.loaded:
+        if load > MAX_LOAD and not options.loaded:
             print(
-                f"{name}: the load is {load:.2f}, above {BUSY}: wait until it is quiet, or give --loaded",
+                f"{name}: the load is {load:.2f}, above {MAX_LOAD}: wait until the machine is idle, or use --loaded",
                 file=sys.stderr,
             )
             sys.exit(1)
         self._folder: Path = options.results
         self._lines = [f"# {title}", "", f"By benchmarks/{name}.", ""]
-        loud = f", above {BUSY}: measured with --loaded, so take the numbers with care" if load > BUSY else ""
-        self.say(f"* load before: {load:.2f}{loud}")
+        warning = f", above {MAX_LOAD}: measured with --loaded, the numbers are unreliable" if load > MAX_LOAD else ""
+        self.say(f"* load before: {load:.2f}{warning}")
         self.say(f"* machine: {processor()}, {len(os.sched_getaffinity(0))} cores, Python {platform.python_version()}")
         self.say()
 
     def say(self, line: str = "") -> None:
-        """A line for both."""
+        """Add a line."""
         print(line, flush=True)
         self._lines.append(line)
 
     def table(self, head: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
-        """In Markdown; numbers to the right."""
+        """Add a table in Markdown; numbers are right-aligned."""
         self.say("| " + " | ".join(head) + " |")
         self.say("|" + "|".join(["---"] + ["--:"] * (len(head) - 1)) + "|")
         for row in rows:
@@ -69,13 +73,13 @@ class Report:
         self.say()
 
     def write(self, file: str) -> None:
-        """All of it into this file of the results."""
+        """Write the report to a file in the folder of results."""
         self._folder.mkdir(parents=True, exist_ok=True)
         (self._folder / file).write_text("\n".join(self._lines).rstrip() + "\n", "utf-8")
 
 
 def processor() -> str:
-    """What it runs on."""
+    """Return the name of the processor."""
     try:
         for line in Path("/proc/cpuinfo").read_text("utf-8").splitlines():
             if line.startswith("model name"):

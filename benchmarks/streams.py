@@ -1,10 +1,10 @@
-"""How many default trees two cores hold in real time without a lost frame, in one process and in several.
+"""Number of default trees that two cores run in real time without a lost frame, in one process and in several.
 
-``/usr/bin/python3 benchmarks/streams.py`` plays sound in real time into the ring that a rosAFE node reads, with so many
-default trees under one input: filterbank to cross-correlation, 44.1 kHz. It looks for the largest number with short
-trials, holds that for a minute, and tells how latency grows with the number and what a tree costs on one core. ROS
-takes no part: what ports and subscribers cost more is for benchmarks/ports.py. About four minutes; `--seconds` and
-`--trial` make it shorter.
+``/usr/bin/python3 benchmarks/streams.py`` plays sound in real time into the ring that a rosAFE node reads, with several
+default trees (filterbank to cross-correlation, 44.1 kHz) below one input. It searches for the largest number of trees
+with short trials, and runs that number for a minute. It prints the latency for each number of trees, and the cost of a
+tree on one core. ROS is not involved: benchmarks/ports.py measures ports and subscribers. It takes about four minutes;
+`--seconds` and `--trial` make it shorter.
 """
 
 from __future__ import annotations
@@ -36,31 +36,31 @@ PARENTS = {
     "ratemap": "ihc",
     "crossCorrelation": "ihc",
 }
-LATE = 2.0  # blocks that the end of a trial may be behind: more, and it does not keep up
+MAX_LATE_BLOCKS = 2.0  # delay of the last result, in blocks; with more, the trees do not keep up
 GOAL = 60
-LENGTHS = (1, 5, 10, 20)  # numbers of trees whose cost on one core is told
-SETTLE = 1.0  # seconds that do not count
+TREE_COUNTS = (1, 5, 10, 20)  # numbers of trees for which the cost on one core is measured
+SETTLE_SECONDS = 1.0  # at the beginning; these results are ignored
 
 
 class Played(NamedTuple):
-    """What came of playing; seconds, but for the counts."""
+    """The result of a trial; times in seconds."""
 
     trees: int
     lost: int  # frames
-    late: float  # blocks that the last result was late
-    median: float  # of the latency: from the last sample of a block to its ILD
-    worst: float  # 99 % are faster
-    busy: float  # cores that were at work, of all processes
-    cost: float  # processor time of a tree for a second of sound
+    late: float  # delay of the last result in blocks
+    median: float  # latency from the last sample of a block to its ILD
+    worst: float  # 99th percentile of the latency
+    busy: float  # cores used by all processes
+    cost: float  # processor time of a tree per second of sound
 
     @property
     def held(self) -> bool:
-        """Whether it kept up."""
-        return self.lost == 0 and self.late < LATE
+        """Whether the trees kept up."""
+        return self.lost == 0 and self.late < MAX_LATE_BLOCKS
 
 
 class Clock:
-    """A listener that notes how late each ILD block is."""
+    """A listener that records the latency of each ILD block."""
 
     def __init__(self, block: int) -> None:
         self.begun = 0.0
@@ -86,18 +86,18 @@ class Clock:
 
 
 def play(trees: int, block: int, seconds: float, cores: list[int], begin: float) -> tuple[int, list[float], float]:
-    """Play from `begin` (monotonic) on; frames lost, all latencies after `SETTLE` in order, processor time."""
+    """Play from `begin` (monotonic time); return lost frames, latencies after `SETTLE_SECONDS`, and processor time."""
     os.sched_setaffinity(0, cores)
     from rosafe.component.audio import AudioRing
     from rosafe.tree.tree import Tree
 
     noise = (np.random.default_rng(0).standard_normal((2, block)) * 2e8).astype(np.int32)
     ring, clock = AudioRing(lambda line: print(line, file=sys.stderr)), Clock(block)
-    take, tree = ring.connect(), Tree(clock)
+    receive, tree = ring.connect(), Tree(clock)
 
     def feed(number: int) -> None:
         last = number * block
-        take(
+        receive(
             SimpleNamespace(
                 sampleRate=RATE,
                 lastFrameIndex=last,
@@ -119,52 +119,52 @@ def play(trees: int, block: int, seconds: float, cores: list[int], begin: float)
             tree.add(kind, names[kind], names[parent])
     blocks = int(seconds * RATE / block)
     time.sleep(max(0.0, begin - time.monotonic()))
-    clock.begun = time.monotonic() - block / RATE  # the first block has been there for long
+    clock.begun = time.monotonic() - block / RATE  # the first block is already in the ring
     clock.lateness.clear()
     spent = time.process_time()
     for number in range(2, blocks + 2):
         time.sleep(max(0.0, clock.begun + number * block / RATE - time.monotonic()))
         feed(number)
-    time.sleep(LATE * block / RATE)
+    time.sleep(MAX_LATE_BLOCKS * block / RATE)
     spent = time.process_time() - spent
     lost, lateness = ring.counters.lost + ring.behind, list(clock.lateness)
     tree.stop()
-    return lost, lateness[int(SETTLE * RATE / block) * trees :], spent
+    return lost, lateness[int(SETTLE_SECONDS * RATE / block) * trees :], spent
 
 
 def trial(trees: int, processes: int, block: int, seconds: float, cores: list[int]) -> Played:
-    """So many trees in so many processes."""
+    """Run `trees` trees, distributed over `processes` processes."""
     shares = [trees // processes + (number < trees % processes) for number in range(processes)]
     shares = [share for share in shares if share]
     with ProcessPoolExecutor(len(shares), mp_context=get_context("spawn")) as pool:
-        begin = time.monotonic() + 2.0 + 0.1 * max(shares)  # until when all stand
+        begin = time.monotonic() + 2.0 + 0.1 * max(shares)  # time for all processes to build their trees
         runs = [pool.submit(play, share, block, seconds, cores, begin) for share in shares]
         results = [run.result() for run in runs]
     lateness = np.concatenate([np.array(late) for _, late, _ in results])
     spent = sum(spent for _, _, spent in results)
-    expected = sum(shares) * int((seconds - SETTLE) * RATE / block)
+    expected = sum(shares) * int((seconds - SETTLE_SECONDS) * RATE / block)
     last = max(max(late[-share:], default=np.inf) for (_, late, _), share in zip(results, shares, strict=True))
     missing = max(0, expected - len(lateness)) if len(lateness) < 0.98 * expected else 0
     median, worst = np.percentile(lateness, [50, 99]) if len(lateness) else (np.inf, np.inf)
-    lost = sum(lost for lost, _, _ in results) if max(lost for lost, _, _ in results) > LATE * block else 0
+    lost = sum(lost for lost, _, _ in results) if max(lost for lost, _, _ in results) > MAX_LATE_BLOCKS * block else 0
     return Played(
         trees, lost + missing * block, last * RATE / block, median, worst, spent / seconds, spent / seconds / trees
     )
 
 
 def search(page: report.Report, processes: int, block: int, options: Any, cores: list[int]) -> Played:
-    """The largest number that short trials hold, and then a minute of it; fewer, where a minute is too long for it."""
-    least, most, found = 0, options.most + 1, {}
+    """Find the largest number of trees in short trials, and confirm it, or a smaller number, in a long one."""
+    held, failed, found = 0, options.most + 1, {}
     guess = min(options.most, GOAL)
-    while most - least > max(1, least // 16):
+    while failed - held > max(1, held // 16):
         found[guess] = trial(guess, processes, block, options.trial, cores)
-        least, most = (guess, most) if found[guess].held else (least, guess)
-        guess = min(options.most, 2 * least) if most > options.most and least else (least + most) // 2
-        if guess in (least, most, 0):
+        held, failed = (guess, failed) if found[guess].held else (held, guess)
+        guess = min(options.most, 2 * held) if failed > options.most and held else (held + failed) // 2
+        if guess in (held, failed, 0):
             break
     rows = [_row(played) for _, played in sorted(found.items())]
     page.table(["trees, short trials", "median ms", "p99 ms", "blocks late", "cores busy", "held"], rows)
-    count = least
+    count = held
     while count:
         played = trial(count, processes, block, options.seconds, cores)
         if played.held:
@@ -186,18 +186,23 @@ def _row(played: Played) -> list[str]:
 
 
 def main() -> int:
-    """Measure, print, write."""
-    parser = report.arguments("How many default trees two cores hold in real time, and how latency grows with them.")
+    """Measure, print and write."""
+    parser = report.arguments("Measure the number of default trees that two cores run in real time, and their latency.")
     parser.add_argument("--block", type=int, default=2205, help="frames per block (default %(default)s)")
-    parser.add_argument("--seconds", type=float, default=60.0, help="that the number found must hold (default 60)")
-    parser.add_argument("--trial", type=float, default=5.0, help="seconds of each short trial (default 5)")
-    parser.add_argument("--processes", type=int, nargs="+", default=[1, 2], help="how many at once (default 1 2)")
-    parser.add_argument("--most", type=int, default=120, help="trees to try at most (default 120)")
+    parser.add_argument("--seconds", type=float, default=60.0, help="duration of the final trial (default 60)")
+    parser.add_argument("--trial", type=float, default=5.0, help="duration of each short trial (default 5)")
+    parser.add_argument("--processes", type=int, nargs="+", default=[1, 2], help="numbers of processes (default 1 2)")
+    parser.add_argument("--most", type=int, default=120, help="largest number of trees (default 120)")
     options = parser.parse_args()
-    if options.seconds <= SETTLE or options.trial <= SETTLE or options.block < 1 or min(options.processes) < 1:
-        parser.error(f"--seconds and --trial are more than {SETTLE:g}, the others at least 1")
+    if (
+        options.seconds <= SETTLE_SECONDS
+        or options.trial <= SETTLE_SECONDS
+        or options.block < 1
+        or min(options.processes) < 1
+    ):
+        parser.error(f"--seconds, --trial: expected more than {SETTLE_SECONDS:g}; all others: expected at least 1")
     if not 1 <= options.most <= 200:
-        parser.error("--most: 1 to 200")
+        parser.error("--most: expected 1 to 200")
     page = report.Report(options, "Many trees at once")
     cores = sorted(os.sched_getaffinity(0))[:2]
     page.say(
@@ -205,26 +210,24 @@ def main() -> int:
     )
     page.say("is from the last sample of a block to its ILD.")
     page.say()
-    page.say("## One core, one process: what each tree costs")
+    page.say("## One core, one process: cost of a tree")
     page.say()
     rows = []
-    for trees in (count for count in LENGTHS if count <= options.most):
+    for trees in (count for count in TREE_COUNTS if count <= options.most):
         played = trial(trees, 1, options.block, options.trial, cores[:1])
         rows.append([*_row(played), f"{1000 * played.cost:.1f}"])
-    page.table(
-        ["trees", "median ms", "p99 ms", "blocks late", "cores busy", "held", "ms of a core for a tree's second"], rows
-    )
+    page.table(["trees", "median ms", "p99 ms", "blocks late", "cores busy", "held", "ms per tree and second"], rows)
     for processes in options.processes:
         page.say(f"## Two cores, {'one process' if processes == 1 else f'{processes} processes'}")
         page.say()
         played = search(page, processes, options.block, options, cores)
         page.say(
-            f"{played.trees} trees (goal {GOAL}) held for {options.seconds:g} s without a lost frame: latency median"
+            f"{played.trees} trees (goal {GOAL}) ran for {options.seconds:g} s without a lost frame: latency median"
             f" {1000 * played.median:.1f} ms, p99 {1000 * played.worst:.1f} ms; {played.busy:.2f} of {len(cores)} cores"
-            f" were at work, {1000 * played.cost:.1f} ms for a tree's second."
+            f" used, {1000 * played.cost:.1f} ms per tree and second."
         )
         full = played.busy > 0.9 * len(cores)
-        page.say("What bounds it: " + ("processor time." if full else "waiting: for the interpreter, or others' work."))
+        page.say("Limited by " + ("processor time." if full else "waiting for the GIL or for other workers."))
         page.say()
     page.write("streams.md")
     return 0

@@ -1,13 +1,13 @@
-# How fast the Tcl package is: round trips of a synchronous call, of a port read and of a background request, and the
-# throughput of a large result. Needs roscore, rosAFE-ros and bass-ros; starts a genomixd of its own.
+# Speed of the Tcl package: round trips of a synchronous call, of reading a port and of a background request, and the
+# throughput of a large result. Needs roscore, rosAFE-ros and bass-ros; starts its own genomixd.
 #
 #   . scripts/env.sh; roscore & bass-ros & rosAFE-ros & tclsh benchmarks/tcl.tcl
 
 package require genomix
 
-# The median and the 99th percentile of the milliseconds that a script takes.
-proc measure {what count script} {
-    uplevel #0 $script ;# connections are made by the first call
+# Print the median and the 99th percentile of the duration of a script in milliseconds.
+proc measure {label count script} {
+    uplevel #0 $script ;# the first call opens connections
     set times {}
     for {set i 0} {$i < $count} {incr i} {
         set start [clock microseconds]
@@ -15,7 +15,7 @@ proc measure {what count script} {
         lappend times [expr {([clock microseconds] - $start) / 1000.0}]
     }
     set times [lsort -real $times]
-    puts [format "%-32s median %7.2f ms   p99 %7.2f ms   (%d)" $what \
+    puts [format "%-32s median %7.2f ms   p99 %7.2f ms   (%d)" $label \
         [lindex $times [expr {$count / 2}]] [lindex $times [expr {$count * 99 / 100}]] $count]
 }
 

@@ -1,10 +1,10 @@
-"""What each trick in the kernels brings: the kernels once with it and once without, in turn.
+"""Effect of each optimisation in the kernels: the kernels with and without it, in turn.
 
-``/usr/bin/python3 benchmarks/tricks.py`` prints the table and writes it to benchmarks/results/tricks.md, in some
-minutes. A trick is taken out of a copy of the sources by replacing text, and the copy is compiled as the kernels are.
-What runs is the default chain from the filterbank on (44.1 kHz, two ears, 31 channels), or a stage that is not in it,
-on one core; the processor time of the thread counts, and where two cores work the clock on the wall. Each turn with a
-trick stands beside one without it: the median of these ratios is what the table has.
+``/usr/bin/python3 benchmarks/tricks.py`` prints a table and writes it to benchmarks/results/tricks.md, in a few
+minutes. An optimisation is removed from a copy of the sources by replacing text, and the copy is compiled like the
+kernels. The workload is the default chain from the filterbank on (44.1 kHz, two ears, 31 channels), or a stage that is
+not part of the chain, on one core, in processor time of the thread; on two cores in wall-clock time. Runs with and
+without an optimisation alternate. The table has the median of their ratios.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
-for threads in ("OMP", "OPENBLAS", "MKL"):  # before numpy is imported: one core is one core
+for threads in ("OMP", "OPENBLAS", "MKL"):  # before the import of numpy, so that it uses one core
     os.environ[f"{threads}_NUM_THREADS"] = "1"
 HERE = Path(__file__).resolve().parent
 sys.path[:0] = [str(HERE.parent), str(HERE)]
@@ -37,18 +37,18 @@ from rosafe.dsp.signal_format import SignalFormat  # noqa: E402
 from rosafe.representations import STAGES  # noqa: E402
 
 RATE = 44100.0
-CHAIN = ("ild", "ratemap", "crossCorrelation")  # behind the hair cell
+CHAIN = ("ild", "ratemap", "crossCorrelation")  # the stages after the hair cell
 CHAIN_ON = {1: "the chain", 2: "the chain, through the tree on two cores"}
 
 
-class Trick(NamedTuple):
-    """A trick, where it is, and the texts that go when it goes."""
+class Optimisation(NamedTuple):
+    """An optimisation: a description, its source file, and the replacements that remove it."""
 
     text: str
     source: str
     without: tuple[tuple[str, str], ...]
     blocks: int = 882
-    stage: str = ""  # by default the chain
+    stage: str = ""  # empty for the chain
     cores: int = 1
 
 
@@ -70,24 +70,24 @@ SPLIT_ONCE = """
     }
     return;
 """
-TRICKS = (
-    Trick(
-        "25 products for 81 of every ninth sample (Toom's way, twice)",
+OPTIMISATIONS = (
+    Optimisation(
+        "25 instead of 81 products for every ninth sample (Toom's method, twice)",
         "correlation_blocks.c",
         (("    put_zeros(l, n + lags", "    direct(l, r, n, lags, c);\n    return;\n    put_zeros(l, n + lags"),),
     ),
-    Trick(
-        "the same, instead of five products for nine of every third sample",
+    Optimisation(
+        "the same, compared with five instead of nine products for every third sample",
         "correlation_blocks.c",
         (("    put_zeros(l, n + lags", SPLIT_ONCE + "    put_zeros(l, n + lags"),),
     ),
-    Trick(
-        "the barrier that keeps sums of lags in registers",
+    Optimisation(
+        "a compiler barrier that keeps sums of lags in registers",
         "correlation_blocks.c",
         (('if (LANES < 8) __asm__ volatile("");', ""),),
     ),
-    Trick(
-        "several samples of all rows at a time from and to memory, instead of one",
+    Optimisation(
+        "loading and storing several samples of all rows at a time instead of one",
         "vector.h",
         (
             (
@@ -102,30 +102,30 @@ TRICKS = (
             ),
         ),
     ),
-    Trick(
+    Optimisation(
         "filterbank: four poles at a time in registers, instead of one",
         "gammatone.c",
         (("TOGETHER = 4,", "TOGETHER = 1,"), ("if (p > 0) {", "if (p > 0 && p % 4 == 0) {")),
     ),
-    Trick(
-        "ILD and ratemap: four sums that do not wait for one another",
+    Optimisation(
+        "ILD and ratemap: four independent sums",
         "framed.h",
         (("CHAINS = 4 }", "CHAINS = 1 }"), ("(sum[0] + sum[1]) + (sum[2] + sum[3])", "sum[0]")),
     ),
-    Trick(
-        "who comes out of a kernel waits awake for the interpreter",
+    Optimisation(
+        "active waiting for the GIL after a kernel",
         "gil_handoff.c",
         (("if (replaced(0, mine)) return;", "return;"),),
         cores=2,
     ),
-    Trick(
+    Optimisation(
         "adaptation: sixteen rows at a time",
         "adaptation.c",
         (("ROWS = 16", "ROWS = LANES"),),
         stage="adaptation",
     ),
-    Trick(
-        "autocorrelation: the upper half of the input is known to be 0",
+    Optimisation(
+        "autocorrelation: no computation for the upper half of the input, which is 0",
         "autocorrelation.c",
         (
             ("there_from_half(x, n, twiddles);", "there(x, n, twiddles);"),
@@ -133,25 +133,25 @@ TRICKS = (
         ),
         stage="autocorrelation",
     ),
-    Trick(
-        "autocorrelation: squares without the general power",
+    Optimisation(
+        "autocorrelation: squares without calls of pow",
         "autocorrelation.c",
         (("if (exponent == 1)", "if (0)"),),
         stage="autocorrelation",
     ),
-    Trick(
+    Optimisation(
         "modulation: sixteen filters at a time",
         "modulation.c",
         (("FILTERS = 16 ", "FILTERS = LANES "),),
         stage="amsFeatures",
     ),
-    Trick(
-        "precedence: the upper half of the input is known to be 0",
+    Optimisation(
+        "precedence: no computation for the upper half of the input, which is 0",
         "precedence.c",
         (("size <= points && points >= 4;", "0;"),),
         stage="precedence",
     ),
-    Trick(
+    Optimisation(
         "gabor: two registers of frames share a weight",
         "gabor.c",
         (("TOGETHER = 2", "TOGETHER = 1"),),
@@ -161,8 +161,8 @@ TRICKS = (
 )
 
 
-class Workshop(NamedTuple):
-    """Where libraries are compiled, and how."""
+class Compilation(NamedTuple):
+    """The folder, compiler and level for compiling libraries."""
 
     folder: Path
     compiler: str
@@ -170,46 +170,46 @@ class Workshop(NamedTuple):
 
     @property
     def options(self) -> tuple[str, ...]:
-        """Of the compiler, beside `build.FLAGS`; what a trick leaves behind may be of no use."""
+        """Compiler options in addition to `build.FLAGS`. A removed optimisation may leave unused code."""
         return ("-Wno-unused", f"-march={build.ISA_LEVELS[platform.machine()][self.level]}")
 
-    def libraries(self, tricks: list[Trick]) -> list[Any]:
-        """The library with all tricks, and without each of these."""
+    def libraries(self, optimisations: list[Optimisation]) -> list[Any]:
+        """Return the library with all optimisations, and the libraries without each of `optimisations`."""
         objects = self.objects()
         with ThreadPoolExecutor(os.cpu_count()) as executor:
-            return list(executor.map(lambda trick: self.library(trick, objects), (None, *tricks)))
+            return list(executor.map(lambda optimisation: self.library(optimisation, objects), (None, *optimisations)))
 
     def objects(self) -> dict[str, Path]:
-        """Each source with all tricks, compiled."""
+        """Compile each source with all optimisations."""
         for path in sorted(build.HERE.glob("*.c")):
             command = [self.compiler, *build.FLAGS, *self.options, "-c", path, "-o", self.folder / f"{path.stem}.o"]
             subprocess.run([word for word in command if word != "-shared"], check=True)
         return {path.stem: path for path in self.folder.glob("*.o")}
 
-    def library(self, trick: Trick | None, objects: dict[str, Path]) -> Any:
-        """The library with or without a trick.
+    def library(self, optimisation: Optimisation | None, objects: dict[str, Path]) -> Any:
+        """Return the library without `optimisation`, or with all if it is None.
 
         Raises
         ------
         ValueError
-            Where the sources are no longer what the trick says.
+            If the text to be replaced is not in the source file.
         """
         folder = Path(tempfile.mkdtemp(dir=self.folder))
         for path in build.HERE.glob("*.[ch]"):
             if path.suffix == ".h" or (
-                trick and (path.name == trick.source or f'"{trick.source}"' in path.read_text())
+                optimisation and (path.name == optimisation.source or f'"{optimisation.source}"' in path.read_text())
             ):
                 shutil.copy(path, folder)
-        if trick is not None:
-            path = folder / trick.source
+        if optimisation is not None:
+            path = folder / optimisation.source
             text = path.read_text()
-            for old, new in trick.without:
+            for old, new in optimisation.without:
                 if old not in text:
-                    raise ValueError(f"{trick.source} has no {old!r}, which {trick.text!r} is about")
+                    raise ValueError(f"{optimisation.source}: expected {old!r} for {optimisation.text!r}")
                 text = text.replace(old, new)
             path.write_text(text)
         unchanged = [str(path) for name, path in objects.items() if not (folder / f"{name}.c").exists()]
-        if trick is not None and trick.source == "vector.h":
+        if optimisation is not None and optimisation.source == "vector.h":
             unchanged = []
             for path in build.HERE.glob("*.c"):
                 shutil.copy(path, folder)
@@ -220,7 +220,7 @@ class Workshop(NamedTuple):
 
 @contextmanager
 def using(loaded: Any) -> Iterator[None]:
-    """Within this, the stages call this library."""
+    """Make the stages call this library within the context."""
     before = kernels.loaded
     kernels.loaded = lambda: (loaded, loader.Status(True, "a variant"))
     try:
@@ -229,31 +229,31 @@ def using(loaded: Any) -> Iterator[None]:
         kernels.loaded = before
 
 
-class Work:
-    """Blocks of the default chain, or of a stage that is not in it."""
+class StageWorkload:
+    """Blocks of the default chain, or of a stage that is not part of it."""
 
-    def __init__(self, trick: Trick) -> None:
+    def __init__(self, optimisation: Optimisation) -> None:
         rng = np.random.default_rng(0)
-        blocks = max(2, round(24000 / trick.blocks))
-        self.sound = [0.1 * rng.standard_normal((2, trick.blocks)) for _ in range(blocks)]
-        self.stage = trick.stage
+        blocks = max(2, round(24000 / optimisation.blocks))
+        self.sound = [0.1 * rng.standard_normal((2, optimisation.blocks)) for _ in range(blocks)]
+        self.stage = optimisation.stage
         self.filterbank, self.hair_cell = STAGES["gammatone"](RATE), STAGES["ihc"](RATE)
         inner = [self.hair_cell.process(self.filterbank.process(block)) for block in self.sound]
         if not self.stage:
             self.stages = [STAGES[kind](RATE) for kind in CHAIN]
         elif self.stage == "gabor":
             rate = 100.0
-            self.given = [np.abs(block[..., :: round(RATE / rate)]).copy() for block in inner]
+            self.inputs = [np.abs(block[..., :: round(RATE / rate)]).copy() for block in inner]
             self.stages = [STAGES[self.stage](SignalFormat(RATE, rate, True, 441, 882))]
         else:
-            self.given = inner
+            self.inputs = inner
             self.stages = [STAGES[self.stage](RATE)]
 
     def run(self, number: int) -> float:
-        """One block; returns seconds of the thread."""
+        """Compute one block; return the seconds of the thread."""
         if self.stage:
             begin = time.thread_time()
-            kept: Any = self.stages[0].process(self.given[number])
+            kept: Any = self.stages[0].process(self.inputs[number])
             return time.thread_time() - begin
         begin = time.thread_time()
         filtered = self.filterbank.process(self.sound[number])
@@ -264,82 +264,86 @@ class Work:
         return spent
 
     def turn(self, loaded: Any) -> float:
-        """All blocks."""
+        """Compute all blocks; return the seconds."""
         with using(loaded):
             return sum(self.run(number) for number in range(len(self.sound)))
 
 
-class Tree:
-    """The default chain through the tree, on as many cores as there are; it is the clock on the wall that counts."""
+class TreeWorkload:
+    """The default chain through the tree, on all cores, in wall-clock time."""
 
-    SECONDS = 5  # of sound
+    SECONDS = 5  # length of the sound
 
-    def __init__(self, trick: Trick) -> None:
+    def __init__(self, optimisation: Optimisation) -> None:
         self.sound = 0.1 * np.random.default_rng(0).standard_normal((2, self.SECONDS * round(RATE)))
-        self.blocks = trick.blocks
+        self.blocks = optimisation.blocks
 
     def turn(self, loaded: Any) -> float:
-        """All of it."""
+        """Process the sound; return the seconds."""
         with using(loaded):
             begin = time.perf_counter()
             rosafe.process(self.sound, RATE, block_frames=self.blocks, outputs=CHAIN)
             return time.perf_counter() - begin
 
 
-def measure(work: Work | Tree, with_it: Any, without: Any, rounds: int) -> float:
-    """What a trick brings, as a share of the time with it."""
-    work.turn(without), work.turn(with_it)
+def measure(work: StageWorkload | TreeWorkload, optimised: Any, without: Any, rounds: int) -> float:
+    """Return the additional time without an optimisation, relative to the time with it."""
+    work.turn(without), work.turn(optimised)
     ratios = []
     for number in range(rounds):
         if number % 2:
-            ratios.append(1 / (work.turn(with_it) / work.turn(without)))
+            ratios.append(1 / (work.turn(optimised) / work.turn(without)))
         else:
-            ratios.append(work.turn(without) / work.turn(with_it))
+            ratios.append(work.turn(without) / work.turn(optimised))
     return float(np.median(ratios)) - 1
 
 
 def main() -> int:
-    """Compile, measure, print, write."""
-    parser = report.arguments("Time the kernels with and without each of their tricks.")
-    parser.add_argument("--rounds", type=int, default=25, help="turns of each side (default %(default)s)")
-    parser.add_argument("--only", default="", metavar="TEXT", help="the tricks whose line has this; writes nothing")
-    parser.add_argument("--compiler", default="gcc", help="as one types it (default %(default)s)")
+    """Compile, measure, print and write."""
+    parser = report.arguments("Time the kernels with and without each of their optimisations.")
+    parser.add_argument("--rounds", type=int, default=25, help="number of turns (default %(default)s)")
+    parser.add_argument(
+        "--only", default="", metavar="TEXT", help="only optimisations whose row contains TEXT, without writing files"
+    )
+    parser.add_argument("--compiler", default="gcc", help="command of the compiler (default %(default)s)")
     parser.epilog = "example: /usr/bin/python3 benchmarks/tricks.py --rounds 50 --only Toom"
     options = parser.parse_args()
-    tricks = [trick for trick in TRICKS if options.only in f"{trick.text} {trick.source} {trick.stage}"]
-    if options.rounds < 1 or not tricks:
-        parser.error("no rounds" if tricks else f"no trick has {options.only!r} in its line")
+    chosen = [entry for entry in OPTIMISATIONS if options.only in f"{entry.text} {entry.source} {entry.stage}"]
+    if options.rounds < 1:
+        parser.error("--rounds: expected at least 1")
+    if not chosen:
+        parser.error(f"--only: no row contains {options.only!r}")
     if shutil.which(options.compiler) is None:
-        parser.error(f"there is no compiler {options.compiler!r} here")
+        parser.error(f"--compiler: {options.compiler!r} not found")
     if not kernels.status().compiled:
-        sys.exit(f"tricks.py: there are no kernels here: {kernels.status().detail}")
-    page = report.Report(options, "What each trick in the kernels brings")
+        sys.exit(f"tricks.py: kernels are not used: {kernels.status().detail}")
+    page = report.Report(options, "Optimisations in the kernels")
     page.say(f"* compiler: {options.compiler}; the kernels in use are {kernels.status().detail.partition(';')[0]}")
     page.say()
-    page.say("How much more time the default chain takes without it, or a stage that is not in the chain.")
+    page.say("Additional time of the default chain, or of a stage that is not part of it, without an optimisation.")
     page.say()
     best = loader.load(min(build.libraries().items())[1]).rosafe_processor_level()
-    levels = [level for level in build.libraries() if best >= level >= min(best, 3)]  # SSE is nobody's any more
+    levels = [level for level in build.libraries() if best >= level >= min(best, 3)]  # nearly all processors have AVX2
     names = [build.ISA_LEVELS[platform.machine()][level] for level in levels]
-    shares: dict[Trick, list[str]] = {trick: [] for trick in tricks}
+    shares: dict[Optimisation, list[str]] = {optimisation: [] for optimisation in chosen}
     with tempfile.TemporaryDirectory(prefix="tricks.") as scratch:
         for level, name in zip(levels, names, strict=True):
             folder = Path(scratch) / name
             folder.mkdir()
-            with_all, *variants = Workshop(folder, options.compiler, level).libraries(tricks)
+            with_all, *variants = Compilation(folder, options.compiler, level).libraries(chosen)
             cores = os.sched_getaffinity(0)
-            for trick, variant in zip(tricks, variants, strict=True):
-                os.sched_setaffinity(0, sorted(cores)[-trick.cores :])
-                work = Tree(trick) if trick.cores > 1 else Work(trick)
+            for optimisation, variant in zip(chosen, variants, strict=True):
+                os.sched_setaffinity(0, sorted(cores)[-optimisation.cores :])
+                work = TreeWorkload(optimisation) if optimisation.cores > 1 else StageWorkload(optimisation)
                 share = measure(work, with_all, variant, options.rounds)
-                shares[trick].append(f"{share:.1%}")
-                print(f"{name} {share:7.1%}  {trick.text}", file=sys.stderr)
+                shares[optimisation].append(f"{share:.1%}")
+                print(f"{name} {share:7.1%}  {optimisation.text}", file=sys.stderr)
             os.sched_setaffinity(0, cores)
     rows = [
-        [trick.text, trick.source, str(trick.blocks), trick.stage or CHAIN_ON[trick.cores], *found]
-        for trick, found in shares.items()
+        [entry.text, entry.source, str(entry.blocks), entry.stage or CHAIN_ON[entry.cores], *found]
+        for entry, found in shares.items()
     ]
-    page.table(["trick", "in", "blocks of", "of", *names], rows)
+    page.table(["optimisation", "in", "blocks of", "of", *names], rows)
     if not options.only:
         page.write("tricks.md")
     return 0

@@ -1,7 +1,8 @@
-"""The formulas once more, for accuracy.py: sample by sample, in 80-bit floating point, straight from the papers.
+"""References for accuracy.py: the formulas of the papers, computed sample by sample in 80-bit floating point.
 
-Nothing of `rosafe` is used, nor its forms: filters are difference equations run in Python, correlations direct sums.
-Where numpy's long double has no more than 64 bits (not x86), this truth is no better than what it is to judge.
+This module uses neither the code nor the algorithms of `rosafe`: filters are difference equations in Python, and
+correlations are direct sums. If numpy's long double has only 64 bits (not x86), these references are no more accurate
+than `rosafe` itself.
 """
 
 from __future__ import annotations
@@ -20,21 +21,21 @@ LongArray = NDArray[Any]  # of np.longdouble
 PI = Long("3.14159265358979323846264338327950288")
 EPSILON = Long("2.2204e-16")
 
-Truth = TypeVar("Truth", bound=Callable[..., Any])
+Function = TypeVar("Function", bound=Callable[..., Any])
 
 
-def remembered(function: Truth) -> Truth:
-    """Keep every result: kernels and twins are held to the same truths, which take longest of all."""
-    known: dict[bytes, Any] = {}
+def cached(function: Function) -> Function:
+    """Cache all results, which are slow to compute and are used for both the kernels and numpy."""
+    results: dict[bytes, Any] = {}
 
     @functools.wraps(function)
-    def answer(*arguments: Any, **more: Any) -> Any:
-        key = pickle.dumps((arguments, more))
-        if key not in known:
-            known[key] = function(*arguments, **more)
-        return known[key]
+    def wrapper(*arguments: Any, **keywords: Any) -> Any:
+        key = pickle.dumps((arguments, keywords))
+        if key not in results:
+            results[key] = function(*arguments, **keywords)
+        return results[key]
 
-    return cast(Truth, answer)
+    return cast(Function, wrapper)
 
 
 # --- filters ----------------------------------------------------------------------------------------------------
@@ -43,7 +44,7 @@ Section = tuple[Any, Any, Any, Any, Any]  # b0, b1, b2, a1, a2
 
 
 def difference_equation(section: Section, x: LongArray) -> LongArray:
-    """y[n] = b0 x[n] + b1 x[n-1] + b2 x[n-2] - a1 y[n-1] - a2 y[n-2] of (..., N), from rest."""
+    """y[n] = b0 x[n] + b1 x[n-1] + b2 x[n-2] - a1 y[n-1] - a2 y[n-2] for (..., N), with zero initial state."""
     b0, b1, b2, a1, a2 = section
     y = np.zeros_like(x)
     x1 = x2 = y1 = y2 = np.zeros(x.shape[:-1], Long)
@@ -54,7 +55,7 @@ def difference_equation(section: Section, x: LongArray) -> LongArray:
 
 
 def butterworth(order: int, cutoff: float, rate: float, high: bool = False) -> list[Section]:
-    """Butterworth's poles exp(j pi (2k + order - 1) / 2 order), by the bilinear transform with prewarping."""
+    """Butterworth filter: poles exp(j pi (2k + order - 1) / 2 order), bilinear transform with prewarping."""
     warped = np.tan(PI * Long(cutoff) / Long(rate))
     sections: list[Section] = []
     for pair in range(order // 2):
@@ -68,9 +69,9 @@ def butterworth(order: int, cutoff: float, rate: float, high: bool = False) -> l
     return sections
 
 
-@remembered
+@cached
 def run(sections: list[Section], x: LongArray) -> LongArray:
-    """`x` (..., N) through all sections."""
+    """Filter `x` (..., N) with all sections."""
     for section in sections:
         x = difference_equation(section, x)
     return x
@@ -88,9 +89,9 @@ def leaky(tau: Any, x: LongArray, start: Any = 0) -> LongArray:
 # --- pre-processing ---------------------------------------------------------------------------------------------
 
 
-@remembered
+@cached
 def gain_control(x: LongArray, rate: float, seconds: float) -> LongArray:
-    """(2, N) as one block, with sound in both ears from its begin on."""
+    """Gain control of (2, N) as one block, with sound in both ears from its beginning."""
     tau = seconds * rate
     span = min(x.shape[-1], math.floor(tau + 0.5))
     powers = [leaky(Long(seconds) * Long(rate), ear**2, np.mean(ear[:span] ** 2)) for ear in x]
@@ -98,7 +99,7 @@ def gain_control(x: LongArray, rate: float, seconds: float) -> LongArray:
 
 
 def fourier(x: Any, sign: int) -> NDArray[np.clongdouble]:
-    """The sum of x[n] exp(sign 2 pi j k n / N) over n, for all k."""
+    """Return the sum of x[n] exp(sign 2 pi j k n / N) over n, for all k."""
     size = len(x)
     turns = np.outer(np.arange(size), np.arange(size)) % size
     angles = 2 * PI * np.arange(size) / size
@@ -107,7 +108,7 @@ def fourier(x: Any, sign: int) -> NDArray[np.clongdouble]:
 
 
 def frequency_sampling(frequencies: Any, amplitudes: Any) -> LongArray:
-    """A linear-phase filter of 513 taps: amplitudes on 513 points up to the last frequency, Hamming window."""
+    """Linear-phase filter of 513 taps: amplitudes on 513 points up to the last frequency, Hamming window."""
     grid = np.arange(513) * Long(frequencies[-1]) / 512
     at = np.clip(np.searchsorted(frequencies, grid, side="right") - 1, 0, len(frequencies) - 2)
     f, a = np.asarray(frequencies, Long), np.asarray(amplitudes, Long)
@@ -119,17 +120,17 @@ def frequency_sampling(frequencies: Any, amplitudes: Any) -> LongArray:
     return taps * (Long("0.54") - Long("0.46") * np.cos(2 * PI * n / 512))
 
 
-@remembered
+@cached
 def jepsen(impedance: Any, rate: float) -> LongArray:
-    """The middle ear of Jepsen et al. from their table of (Hz, impedance)."""
+    """Middle-ear filter of Jepsen et al. from their table of (Hz, impedance)."""
     below = [(f, 1 / Long(z)) for f, z in impedance if f < rate / 2]
     taps = frequency_sampling(*zip((0, 0), *below, (rate / 2, 0), strict=True))
     return taps / np.abs(fourier(taps, -1)).max() * Long("1e-8") * Long(10) ** (Long(104) / 20)
 
 
-@remembered
+@cached
 def lopezpoveda(displacement: Any, velocity: Any, rate: float) -> LongArray:
-    """The middle ear of Lopez-Poveda and Meddis from the tables of (Hz, µm) and (Hz, m/s); minimum phase."""
+    """Middle-ear filter of Lopez-Poveda and Meddis from tables of (Hz, µm) and (Hz, m/s); minimum phase."""
     scale = Long("1e-6") * 2 * PI * np.sqrt(Long(2)) / Long(10) ** (Long(104) / 20)
     points = sorted([(f, d * f * scale) for f, d in displacement] + [(f, Long(v)) for f, v in velocity])
     if rate <= 20000:
@@ -142,7 +143,7 @@ def lopezpoveda(displacement: Any, velocity: Any, rate: float) -> LongArray:
         points.append((rate / 2, v / (1 + (rate / 2 - f) * Long("0.1") / 1000)))
     taps = frequency_sampling(*zip((0, 0), *points, strict=True)) / Long("20e-6")
     magnitude = np.abs(fourier(taps, -1))
-    causal = np.r_[1, np.full(256, 2), np.zeros(256)]  # of an analytic signal, in the domain of its Fourier transform
+    causal = np.r_[1, np.full(256, 2), np.zeros(256)]  # spectral weights of an analytic signal
     phase = -(fourier(fourier(np.log(magnitude), -1) * causal, 1) / 513).imag
     return (fourier(magnitude * (np.cos(phase) + 1j * np.sin(phase)), 1) / 513).real
 
@@ -150,9 +151,9 @@ def lopezpoveda(displacement: Any, velocity: Any, rate: float) -> LongArray:
 # --- filterbanks ------------------------------------------------------------------------------------------------
 
 
-@remembered
+@cached
 def gammatone(x: LongArray, rate: float, frequencies: Any, order: int, width: float) -> tuple[LongArray, LongArray]:
-    """Output and envelope, (2, C, N), of the cascade of complex one-pole filters."""
+    """Return output and envelope, (2, C, N), of cascades of complex one-pole filters."""
     f = np.asarray(frequencies, Long)
     beta = 2 * PI * Long(width) * (Long("24.7") + Long("0.108") * f) / Long(rate)
     theta = 2 * PI * f / Long(rate)
@@ -168,9 +169,9 @@ def gammatone(x: LongArray, rate: float, frequencies: Any, order: int, width: fl
     return 2 * analytic.real, 2 * np.hypot(analytic.real, analytic.imag)
 
 
-@remembered
+@cached
 def drnl(x: LongArray, rate: float, frequency: float) -> LongArray:
-    """One channel, (2, N) to (2, N), by table III of Lopez-Poveda and Meddis as used in CASP."""
+    """One DRNL channel, (2, N) to (2, N), by table III of Lopez-Poveda and Meddis as used in CASP."""
     log = np.log10(Long(frequency))
 
     def power(intercept: str, slope: str, at: Any = log) -> Any:
@@ -194,10 +195,10 @@ def drnl(x: LongArray, rate: float, frequency: float) -> LongArray:
     return run(linear, x * power("4.20405", "-0.47909")) + nonlinear
 
 
-# --- hair cells and what follows --------------------------------------------------------------------------------
+# --- hair cells and framed stages --------------------------------------------------------------------------------
 
 
-@remembered
+@cached
 def hair_cell(method: str, x: LongArray, envelope: LongArray, rate: float) -> LongArray:
     """(2, C, N) to (2, C, N)."""
     half = np.maximum(x, 0)
@@ -212,12 +213,13 @@ def hair_cell(method: str, x: LongArray, envelope: LongArray, rate: float) -> Lo
         "hilbert": lambda: envelope,
         "joergensen": lambda: run(butterworth(1, 150, rate), envelope),
         "dau": lambda: run(butterworth(2, 1000, rate), half),
+        "dau1996": lambda: run(butterworth(1, 1000, rate), half),
         "breebart": lambda: run(butterworth(1, 2000, rate) * 5, half),
     }[method]()
 
 
 def window(name: str, size: int) -> LongArray:
-    """The symmetric window."""
+    """Return the symmetric window."""
     i = np.arange(size).astype(Long)
     turn = 2 * PI * i / (size - 1)
     rising = np.minimum(i, i[::-1])
@@ -233,26 +235,26 @@ def window(name: str, size: int) -> LongArray:
 
 
 def frames(x: LongArray, shape: LongArray, hop: int) -> LongArray:
-    """Windowed frames (..., F, w), each cut out by itself."""
+    """Return windowed frames (..., F, w), each cut separately."""
     starts = range(0, x.shape[-1] - len(shape) + 1, hop)
     return np.stack([shape * x[..., start : start + len(shape)] for start in starts], axis=-2)
 
 
-@remembered
+@cached
 def level_difference(x: LongArray, shape: LongArray, hop: int) -> LongArray:
     """(2, C, N) to (C, F) in dB."""
     left, right = np.mean(frames(x, shape, hop) ** 2, axis=-1)
     return 10 * np.log10((right + EPSILON) / (left + EPSILON))
 
 
-@remembered
+@cached
 def ratemap(x: LongArray, shape: LongArray, hop: int, rate: float, decay: float, power: bool) -> LongArray:
     """(2, C, N) to (2, C, F)."""
     cut = frames(leaky(Long(rate) * Long(decay), x), shape, hop)
     return np.mean(cut**2 if power else cut, axis=-1)
 
 
-@remembered
+@cached
 def correlation(x: LongArray, shape: LongArray, hop: int, reach: int) -> LongArray:
     """(2, C, N) to (C, 2 reach + 1, F), each lag a sum of products."""
     left, right = frames(x, shape, hop)

@@ -1,9 +1,9 @@
-"""The yardstick: the default chain as fast as plain numpy and scipy do it, to measure `rosafe` against.
+"""The default chain in plain numpy and scipy, as fast as possible: the reference for the speed of `rosafe`.
 
-The best forms found without compiled code of one's own: a complex `sosfilt` per channel, `lfilter` over all rows, frame
-energies by a matrix product over half windows (the hop is half the window), and real FFTs of a good length, in batches
-that fit the cache. It takes the defaults only, at any sample rate and number of channels where the hop is half the
-window, and checks nothing.
+It uses the fastest forms without additional compiled code: a complex `sosfilt` per channel, `lfilter` over all rows,
+frame energies by a matrix product over half windows (the hop is half the window), and real FFTs of a suitable length,
+in batches that fit into the cache. It supports the defaults only, for any sample rate and number of channels with a hop
+of half the window, and checks no arguments.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from rosafe.dsp.erb import bandwidth
 from rosafe.representations.crosscorrelation import EPSILON
 
 FloatArray = NDArray[np.float64]
-BATCH = 64  # frames that are transformed at a time
+BATCH = 64  # frames per transform
 
 Step = Callable[[FloatArray], FloatArray]
 
@@ -59,15 +59,15 @@ def hair_cell(sample_rate: float, channels: int) -> Step:
     return process
 
 
-class _Kept:
-    """The samples from the start of the next frame on."""
+class _FrameBuffer:
+    """Buffer of the samples from the start of the next frame on."""
 
     def __init__(self, window: FloatArray, hop: int, channels: int) -> None:
         self.size, self.hop = len(window), hop
         self.samples = np.zeros((2, channels, 0))
 
     def with_block(self, block: FloatArray) -> FloatArray:
-        """What was kept, and `block` behind it."""
+        """Return the buffered samples followed by `block`."""
         samples = np.concatenate((self.samples, block), axis=-1)
         frames = max(0, (samples.shape[-1] - self.size) // self.hop + 1)
         self.samples = samples[..., frames * self.hop :]
@@ -75,7 +75,7 @@ class _Kept:
 
 
 def _half_window_energies(samples: FloatArray, weights: FloatArray) -> FloatArray:
-    """Per frame of two halves, the sum of the weighted squares; `weights` is (half, 2)."""
+    """Return the sum of the weighted squares of each frame of two halves; `weights` is (half, 2)."""
     half = len(weights)
     halves = samples.shape[-1] // half
     squares = np.square(samples[..., : halves * half]).reshape(*samples.shape[:-1], halves, half)
@@ -89,11 +89,11 @@ def _weights(window: FloatArray) -> FloatArray:
 
 def ild(window: FloatArray, channels: int) -> Step:
     """(2, C, N) to (C, F) in dB."""
-    kept = _Kept(window, len(window) // 2, channels)
+    buffer = _FrameBuffer(window, len(window) // 2, channels)
     weights = _weights(window)
 
     def process(block: FloatArray) -> FloatArray:
-        left, right = _half_window_energies(kept.with_block(block), weights)
+        left, right = _half_window_energies(buffer.with_block(block), weights)
         return 10 * np.log10((right + EPSILON) / (left + EPSILON))
 
     return process
@@ -101,7 +101,7 @@ def ild(window: FloatArray, channels: int) -> Step:
 
 def ratemap(sample_rate: float, window: FloatArray, channels: int) -> Step:
     """(2, C, N) to (2, C, F), power."""
-    kept = _Kept(window, len(window) // 2, channels)
+    buffer = _FrameBuffer(window, len(window) // 2, channels)
     weights = _weights(window)
     retention = np.exp(-1 / (sample_rate * 0.008))
     state = np.zeros((2, channels, 1))
@@ -109,22 +109,22 @@ def ratemap(sample_rate: float, window: FloatArray, channels: int) -> Step:
     def process(block: FloatArray) -> FloatArray:
         nonlocal state
         integrated, state = signal.lfilter([1 - retention], [1, -retention], block, zi=state)
-        return _half_window_energies(kept.with_block(integrated), weights)
+        return _half_window_energies(buffer.with_block(integrated), weights)
 
     return process
 
 
 def cross_correlation(sample_rate: float, window: FloatArray, channels: int, delay: float = 0.0011) -> Step:
     """(2, C, N) to (C, L, F)."""
-    kept = _Kept(window, len(window) // 2, channels)
+    buffer = _FrameBuffer(window, len(window) // 2, channels)
     reach = int(np.ceil(delay * sample_rate))
     transform = fft.next_fast_len(len(window) + reach, real=True)
 
     def process(block: FloatArray) -> FloatArray:
-        samples = kept.with_block(block)
-        if samples.shape[-1] < kept.size:
+        samples = buffer.with_block(block)
+        if samples.shape[-1] < buffer.size:
             return np.zeros((channels, 2 * reach + 1, 0))
-        frames = sliding_window_view(samples, kept.size, axis=-1)[..., :: kept.hop, :]
+        frames = sliding_window_view(samples, buffer.size, axis=-1)[..., :: buffer.hop, :]
         output = np.empty((channels, 2 * reach + 1, frames.shape[2]))
         at_once = max(1, BATCH // frames.shape[2])
         for first in range(0, channels, at_once):
@@ -142,7 +142,7 @@ def cross_correlation(sample_rate: float, window: FloatArray, channels: int, del
 
 
 def chain(sample_rate: float, frequencies: FloatArray, window: FloatArray) -> dict[str, Step]:
-    """A step for each of the seven stages, in the chain's order; `ihc` feeds the last three."""
+    """Return a step for each of the seven stages, in order; `ihc` is the input of the last three."""
     channels = len(frequencies)
     steps: dict[str, Any] = {
         "input": lambda block: block / (2**31 - 1),

@@ -1,4 +1,4 @@
-# Sourced by catkin's setup.sh: lets tclsh, Octave and MATLAB find the package genomix. TCLLIBPATH is a Tcl list.
+# Sourced by catkin's setup.sh: puts the package genomix on the paths of tclsh, Octave and MATLAB. TCLLIBPATH is a Tcl list.
 # shellcheck shell=sh
 case " ${TCLLIBPATH:-} " in
   *" $CATKIN_ENV_HOOK_WORKSPACE/lib/tcltk "*) ;;

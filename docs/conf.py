@@ -1,4 +1,4 @@
-"""For Sphinx: these documents, and the library's reference from its docstrings (numpydoc)."""
+"""Sphinx configuration: these documents, and the API reference from docstrings (numpydoc)."""
 
 import sys
 from pathlib import Path
@@ -27,13 +27,15 @@ autodoc_member_order = "bysource"
 numpydoc_class_members_toctree = False
 numpydoc_show_class_members = False
 numpydoc_validation_checks = {"GL06", "GL07", "GL08", "PR01", "PR02", "PR03", "PR10", "RT03", "SS01", "YD01"}
-numpydoc_validation_exclude = {r"^rosafe\.[a-z]+\."}  # what `import rosafe` brings has all of it
+numpydoc_validation_exclude = {r"^rosafe\.[a-z]+\."}  # only the public names of `rosafe` are checked
 myst_heading_anchors = 4
+myst_enable_extensions = ["dollarmath"]
+myst_dmath_allow_space = False
 suppress_warnings = ["myst.header"]  # headings of some pages begin below the first
 
 
 def setup(app: Sphinx) -> None:
-    """Rules of nft are shown as they are: Pygments does not know them."""
+    """Show nft rules without highlighting: Pygments has no lexer for them."""
     app.add_lexer("nft", TextLexer)
 
 

@@ -1,4 +1,4 @@
-"""Draws docs/representations.png: two seconds of the built-in scene in every representation."""
+"""Plot docs/representations.png: all representations of two seconds of the built-in scene."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from rosafe.representations.registry import builtin_stages
 from rosafe.view.axes import style
 
 RATE, SECONDS, COLUMNS = 44100, 2, 3
-PARAMETERS = {"ac_wSizeSec": 0.03, "pi_confThres": 0.4}  # the voice is low, and the noise clear
+PARAMETERS = {"ac_wSizeSec": 0.03, "pi_confThres": 0.4}  # suitable for the low voice and the noise
 
 
 def main() -> None:
@@ -30,8 +30,8 @@ def main() -> None:
     with style():
         figure = Figure(figsize=(5.2 * COLUMNS, 2.1 * rows), dpi=80, layout="constrained")
         grid = figure.add_gridspec(rows, COLUMNS)
-        for name, place in zip(names, grid, strict=False):
-            rosafe.plot(result, name, figure.add_subplot(place))
+        for name, cell in zip(names, grid, strict=False):
+            rosafe.plot(result, name, figure.add_subplot(cell))
         canvas = FigureCanvasAgg(figure)
         canvas.draw()
     picture = Image.fromarray(np.asarray(canvas.buffer_rgba())).convert("RGB")

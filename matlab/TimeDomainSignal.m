@@ -9,7 +9,7 @@ classdef TimeDomainSignal < rosafe.TimeDomainSignal
 
     methods (Static)
         function obj = construct(varargin)
-            %CONSTRUCT  As the constructor.
+            %CONSTRUCT  Same as the constructor.
             obj = TimeDomainSignal(varargin{:});
         end
     end

@@ -9,7 +9,7 @@ classdef TimeFrequencySignal < rosafe.TimeFrequencySignal
 
     methods (Static)
         function obj = construct(varargin)
-            %CONSTRUCT  As the constructor.
+            %CONSTRUCT  Same as the constructor.
             obj = TimeFrequencySignal(varargin{:});
         end
     end

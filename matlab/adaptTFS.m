@@ -1,11 +1,11 @@
 function [chunkLeft, chunkRight] = adaptTFS(framesOnPort, numberOfChannels, left, isBinaural, right)
-%ADAPTTFS  The time-frequency signals of a port as matrices, frames by channels.
+%ADAPTTFS  Convert the time-frequency signals of a port to matrices, frames by channels.
 %
 %   chunkLeft = adaptTFS(framesOnPort, numberOfChannels, left, 0)
 %   [chunkLeft, chunkRight] = adaptTFS(framesOnPort, numberOfChannels, left, 1, right)
 %
-%   LEFT and RIGHT are those of a port, such as out.ildPort.left, also of one read with '-m'. The order (..., left,
-%   right, isBinaural) of older scripts is understood too.
+%   LEFT and RIGHT are fields of a port, for example out.ildPort.left, also if it was read with '-m'. The order
+%   (..., left, right, isBinaural) of older scripts is accepted as well.
 
 if nargin == 5 && ~(isscalar(isBinaural) && (isnumeric(isBinaural) || islogical(isBinaural)))
     [isBinaural, right] = deal(right, isBinaural);
@@ -28,7 +28,7 @@ else
     end
 end
 if ~isequal(size(chunk), [frames channels])
-    error('adaptTFS:size', 'the signal has %d frames of %d channels, and not %d of %d', size(chunk, 1), ...
-        size(chunk, 2), frames, channels);
+    error('adaptTFS:size', 'expected a signal of %d frames and %d channels, got %d and %d', frames, channels, ...
+        size(chunk, 1), size(chunk, 2));
 end
 end

@@ -1,14 +1,14 @@
 classdef dataObject_RosAFE < handle
-%DATAOBJECT_ROSAFE  Starts the sound, and holds what a manager_RosAFE fetches of the representations.
+%DATAOBJECT_ROSAFE  Starts the capture, and stores the signals that a manager_RosAFE reads.
 %
 %   dObj = dataObject_RosAFE(bass, rosAFE, inputDevice, sampleRate, framesPerChunk)
 %   dObj = dataObject_RosAFE(bass, rosAFE, inputDevice, sampleRate, framesPerChunk, bufferSize_s_bass, ...
 %       bufferSize_s_rosAFE_port, bufferSize_s_rosAFE_getSignal, bufferSize_s_matlab)
 %
-%   The buffers are in seconds: of bass's port (1), of rosAFE's ports (1), of what getSignals can return (0.5), and of
-%   the signals here (10). Every representation that rosAFE has is a cell array with a row for each of its processors:
-%   dObj.ild{1, 1}, and with a column for each ear where it has two: dObj.ratemap{1, 2} is the right one; precedence has
-%   columns for time and level differences and correlations. dObj.ild{1}.Data holds the numbers (BufferedSignal).
+%   The buffers are in seconds: of the port of bass (1), of the ports of rosAFE (1), of getSignals (0.5), and of the
+%   signals in this object (10). Each representation is a cell array with one row per processor: dObj.ild{1, 1}. If it
+%   has two ears, the columns are the ears: dObj.ratemap{1, 2} is the right one. The columns of precedence are time
+%   differences, level differences and correlations. dObj.ild{1}.Data contains the values (see rosafe.BufferedSignal).
 
     properties (SetAccess = private)
         bass
@@ -18,23 +18,23 @@ classdef dataObject_RosAFE < handle
         bufferSize_s_rosAFE_port
         bufferSize_s_rosAFE_getSignal
         bufferSize_s_matlab
-        acquire  % the request of the acquisition
+        acquire  % the request of the capture
     end
 
     properties (Access = private)
-        kinds   % what genomixd tells of the representations, by kind
-        held    % cell arrays of signals, by kind
+        kinds   % descriptions of the representations, by kind
+        stored  % cell arrays of signals, by kind
     end
 
     properties (Constant, Access = private)
-        CHUNK = 2205; % frames that bass reads at a time
+        CHUNK = 2205; % frames per chunk of bass
     end
 
     methods
         function dObj = dataObject_RosAFE(bass, rosAFE, inputDevice, sampleRate, framesPerChunk, bufferSize_s_bass, ...
                 bufferSize_s_rosAFE_port, bufferSize_s_rosAFE_getSignal, bufferSize_s_matlab)
             if nargin < 5
-                error('dataObject_RosAFE:arguments', ['dataObject_RosAFE takes bass, rosAFE, inputDevice, ' ...
+                error('dataObject_RosAFE:arguments', ['dataObject_RosAFE: expected bass, rosAFE, inputDevice, ' ...
                     'sampleRate, framesPerChunk, and up to four buffer sizes']);
             end
             sizes = {1, 1, 0.5, 10};
@@ -50,12 +50,12 @@ classdef dataObject_RosAFE < handle
                 sizes{:};
             about = describe(rosAFE);
             dObj.kinds = about.representations;
-            dObj.held = structfun(@(kind) {}, dObj.kinds, 'UniformOutput', false);
+            dObj.stored = structfun(@(kind) {}, dObj.kinds, 'UniformOutput', false);
             dObj.acquire = rosafe.acquire(bass, rosAFE, sampleRate, seconds, dObj.CHUNK, inputDevice);
         end
 
         function varargout = subsref(dObj, s)
-            % Representations are read like properties: dObj.ild, also by another of their names.
+            % Representations are read like properties, by any of their names: dObj.ild
             kind = '';
             if strcmp(s(1).type, '.')
                 kind = kindOf(dObj, s(1).subs);
@@ -63,14 +63,14 @@ classdef dataObject_RosAFE < handle
             if isempty(kind)
                 [varargout{1:nargout}] = builtin('subsref', dObj, s);
             elseif isscalar(s)
-                varargout = {dObj.held.(kind)};
+                varargout = {dObj.stored.(kind)};
             else
-                [varargout{1:max(1, nargout)}] = subsref(dObj.held.(kind), s(2:end));
+                [varargout{1:max(1, nargout)}] = subsref(dObj.stored.(kind), s(2:end));
             end
         end
 
         function kind = kindOf(dObj, name)
-            %KINDOF  The kind of representation by one of its names: 'ihc', 'innerhaircell', 'IhcProc'; '' for none.
+            %KINDOF  Return the kind for a name of a representation ('ihc', 'innerhaircell', 'IhcProc'), or ''.
             names = fieldnames(dObj.kinds);
             for k = 1:numel(names)
                 about = dObj.kinds.(names{k});
@@ -83,40 +83,40 @@ classdef dataObject_RosAFE < handle
         end
 
         function about = representations(dObj)
-            %REPRESENTATIONS  What genomixd tells of the representations, a field for each kind.
+            %REPRESENTATIONS  Return the descriptions of the representations, one field per kind.
             about = dObj.kinds;
         end
 
         function names = fieldnames(dObj)
-            %FIELDNAMES  The representations, as addProcessor takes them.
+            %FIELDNAMES  Return the names of the representations for addProcessor.
             names = struct2cell(structfun(@(kind) kind.word, dObj.kinds, 'UniformOutput', false));
         end
 
         function addSignals(dObj, kind, signals)
-            %ADDSIGNALS  Hold the signals of a processor, a cell row, in the place of those that it had.
+            %ADDSIGNALS  Store the signals of a processor, a cell row, and replace its previous ones.
             row = find(strcmp(signals{1}.Label, labels(dObj, kind)));
             if isempty(row)
-                row = size(dObj.held.(kind), 1) + 1;
+                row = size(dObj.stored.(kind), 1) + 1;
             end
-            dObj.held.(kind)(row, 1:numel(signals)) = signals;
+            dObj.stored.(kind)(row, 1:numel(signals)) = signals;
         end
 
         function signals = signalsOf(dObj, kind, label)
-            %SIGNALSOF  The row of a processor, empty where there is none.
-            signals = dObj.held.(kind)(strcmp(label, labels(dObj, kind)), :);
+            %SIGNALSOF  Return the signals of a processor, or an empty cell array.
+            signals = dObj.stored.(kind)(strcmp(label, labels(dObj, kind)), :);
         end
 
         function keepOnly(dObj, kind, kept)
-            %KEEPONLY  Let go of the signals of a kind whose processors are not among those named.
-            dObj.held.(kind) = dObj.held.(kind)(ismember(labels(dObj, kind), kept), :);
+            %KEEPONLY  Remove the signals of a kind except those of the given processors.
+            dObj.stored.(kind) = dObj.stored.(kind)(ismember(labels(dObj, kind), kept), :);
         end
 
         function clearData(dObj, bClearInput)
-            %CLEARDATA  Forget all frames; with 0, not those of the input.
-            for kind = fieldnames(dObj.held).'
+            %CLEARDATA  Remove all frames; with 0, keep those of the input.
+            for kind = fieldnames(dObj.stored).'
                 about = dObj.kinds.(kind{1});
                 if nargin < 2 || bClearInput || ~isempty(about.parent)
-                    cellfun(@clearData, dObj.held.(kind{1}));
+                    cellfun(@clearData, dObj.stored.(kind{1}));
                 end
             end
         end
@@ -124,8 +124,8 @@ classdef dataObject_RosAFE < handle
 
     methods (Access = private)
         function names = labels(dObj, kind)
-            % The processors whose signals are held, in the order of the rows.
-            names = cellfun(@(signal) signal.Label, dObj.held.(kind)(:, 1:min(1, end)), 'UniformOutput', false);
+            % The processors with stored signals, in the order of the rows.
+            names = cellfun(@(signal) signal.Label, dObj.stored.(kind)(:, 1:min(1, end)), 'UniformOutput', false);
         end
     end
 end

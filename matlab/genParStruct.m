@@ -1,8 +1,8 @@
 function p = genParStruct(varargin)
-%GENPARSTRUCT  A structure of parameters: genParStruct('fb_nChannels', 16, 'ild_wSizeSec', 0.03)
+%GENPARSTRUCT  Create a structure of parameters: genParStruct('fb_nChannels', 16, 'ild_wSizeSec', 0.03)
 
 if mod(nargin, 2) || ~iscellstr(varargin(1:2:end))
-    error('genParStruct:arguments', 'genParStruct takes pairs of a name and a value');
+    error('genParStruct:arguments', 'genParStruct: expected pairs of a name and a value');
 end
 p = struct();
 for k = 1:2:nargin

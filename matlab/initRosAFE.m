@@ -1,7 +1,7 @@
 function [bass, rosAFE, client] = initRosAFE(varargin)
-%INITROSAFE  Both components and the client: [bass, rosAFE, client] = initRosAFE()
+%INITROSAFE  Load both components: [bass, rosAFE, client] = initRosAFE()
 %
-%   Folders to be put on the path may be given, as to the original's function; those that do not exist are passed over.
+%   Arguments are folders that are added to the path, as in the original; missing folders are ignored.
 
 for folder = varargin(cellfun(@(name) exist(name, 'dir') == 7, varargin))
     addpath(genpath(folder{1}));

@@ -1,17 +1,17 @@
 classdef manager_RosAFE < handle
-%MANAGER_ROSAFE  Asks rosAFE for representations, and fetches them into a data object.
+%MANAGER_ROSAFE  Requests representations from rosAFE and reads them into a data object.
 %
 %   mObj = manager_RosAFE(dObj)                          % dObj: a dataObject_RosAFE
 %   mObj = manager_RosAFE(dObj, 'ild', genParStruct('fb_nChannels', 16))
-%   mObj.addProcessor('ratemap')                         % with all that it depends on
-%   mObj.processChunk()                                  % the new frames are in dObj.ild{1}.Data now
+%   mObj.addProcessor('ratemap')                         % with all processors that it needs
+%   mObj.processChunk()                                  % appends new frames to dObj.ild{1}.Data
 %   mObj.modifyParameter('time_0', 'pp_bRemoveDC', '1')
 %   mObj.deleteProcessor('ild', 1)
 %   mObj.cleanup()
 %
-%   Representations are all that rosAFE has, those of plugins too: fieldnames(dObj) lists them. What is there already
-%   with the same parameters is used again. Processors has a field for each kind of processor, with their parameters in
-%   force: mObj.Processors.gammatone{1}.fb_cfHz.
+%   All representations of rosAFE are available, including plugins; fieldnames(dObj) lists them. Existing processors
+%   with the same parameters are reused. Processors has one field for each kind of processor, with the current
+%   parameters: mObj.Processors.gammatone{1}.fb_cfHz.
 
     properties (SetAccess = private)
         Processors
@@ -20,13 +20,13 @@ classdef manager_RosAFE < handle
     end
 
     properties (Access = private)
-        told  % what getProcessors tells of all processors, [] before it was asked
+        listed  % the processors listed by getProcessors; [] before the first call
     end
 
     methods
         function mObj = manager_RosAFE(dObj, request, p)
             if nargin < 1
-                error('manager_RosAFE:arguments', 'a manager is built upon a dataObject_RosAFE');
+                error('manager_RosAFE:arguments', 'manager_RosAFE: expected a dataObject_RosAFE');
             end
             mObj.dObj = dObj;
             mObj.RosAFE = dObj.RosAFE;
@@ -40,13 +40,13 @@ classdef manager_RosAFE < handle
         end
 
         function [out, varargout] = addProcessor(mObj, request, p)
-            %ADDPROCESSOR  Have a representation computed: sOut = mObj.addProcessor(request, p)
+            %ADDPROCESSOR  Request a representation: sOut = mObj.addProcessor(request, p)
             %
-            %   P is a struct of parameters that are not the defaults, of the representation and of all that it depends
-            %   on. REQUEST and P may be cell arrays, for several at once. SOUT is a row of the data object, a signal
-            %   for each ear.
+            %   P is a struct with parameters of the representation and of the processors that it needs; the others have
+            %   their defaults. REQUEST and P may be cell arrays for several representations. SOUT is a row of the data
+            %   object: one signal for each ear.
             if nargin < 2 || isempty(request)
-                error('manager_RosAFE:arguments', 'addProcessor takes a representation, such as ''ild''');
+                error('manager_RosAFE:arguments', 'addProcessor: expected a representation, for example ''ild''');
             end
             if nargin < 3
                 p = [];
@@ -61,101 +61,103 @@ classdef manager_RosAFE < handle
                 varargout = outs(2:end);
                 return
             end
-            asked = mObj.RosAFE.request(request, parametersOf(mObj, p));
-            refuse(asked);
+            answer = mObj.RosAFE.request(request, parametersOf(mObj, p));
+            check(answer);
             update(mObj);
-            [~, kind] = named(mObj, asked.result.name);
-            out = signalsOf(mObj.dObj, kind, asked.result.name);
+            [~, kind] = named(mObj, answer.result.name);
+            out = signalsOf(mObj.dObj, kind, answer.result.name);
         end
 
         function processor = hasProcessor(mObj, type, p)
-            %HASPROCESSOR  The parameters of a processor that computes a type with given parameters, or 0.
+            %HASPROCESSOR  Return the parameters of a processor of a type with given parameters, or 0.
             %
-            %   TYPE: a representation or the request of its processors: 'ild', 'ildProc', 'onsetStrength', 'onsetProc'.
-            %   P is a struct as that of addProcessor; what it lacks has to have its default.
+            %   TYPE is a representation or its request: 'ild', 'ildProc', 'onsetStrength', 'onsetProc'. P is a struct
+            %   as in addProcessor; other parameters must have their defaults.
             if nargin < 3
                 p = [];
             end
             about = representations(mObj.dObj);
-            asked = mObj.RosAFE.find(about.(typeOf(mObj, type)).word, parametersOf(mObj, p));
+            answer = mObj.RosAFE.find(about.(typeOf(mObj, type)).word, parametersOf(mObj, p));
             update(mObj);
             processor = 0;
-            if strcmp(asked.status, 'done')
-                processor = named(mObj, asked.result.name);
-            elseif isempty(regexp(asked.exception.ex, '::e_(noSuchProcessor|existsAlready)$', 'once'))
-                refuse(asked);
+            if strcmp(answer.status, 'done')
+                processor = named(mObj, answer.result.name);
+            elseif isempty(regexp(answer.exception.ex, '::e_(noSuchProcessor|existsAlready)$', 'once'))
+                check(answer);
             end
         end
 
         function processChunk(mObj)
-            %PROCESSCHUNK  Add what all processors have computed since the last call to the signals of the data object.
+            %PROCESSCHUNK  Append the new frames of all processors to the signals of the data object.
             update(mObj);
-            for processor = mObj.told
-                got = mObj.RosAFE.getRepresentation('-m', processor{1}.name);
-                if strcmp(got.status, 'error') && ~isempty(strfind(got.exception.ex, 'e_noSuchProcessor')) %#ok<STREMP>
-                    continue % another client has just removed it
+            for processor = mObj.listed
+                answer = mObj.RosAFE.getRepresentation('-m', processor{1}.name);
+                failed = strcmp(answer.status, 'error');
+                if failed && ~isempty(strfind(answer.exception.ex, 'e_noSuchProcessor')) %#ok<STREMP>
+                    continue % another client has removed the processor
                 end
-                refuse(got);
-                append(mObj, processor{1}, got.result.parts);
+                check(answer);
+                append(mObj, processor{1}, answer.result.parts);
             end
         end
 
         function deleteProcessor(mObj, type, number)
-            %DELETEPROCESSOR  Remove a processor and all that depend on it: by type and number, or by its name alone.
+            %DELETEPROCESSOR  Remove a processor and all that depend on it, by type and number or by name.
             name = type;
             if nargin > 2
                 processors = mObj.Processors.(typeOf(mObj, type));
                 if ~any(number == 1:numel(processors))
-                    error('manager_RosAFE:number', 'there is no processor %g of type ''%s''', number, type);
+                    error('manager_RosAFE:number', 'number: expected 1 to %d for type ''%s'', got %g', ...
+                        numel(processors), type, number);
                 end
                 name = processors{number}.name;
             end
-            refuse(mObj.RosAFE.removeProcessor(name));
+            check(mObj.RosAFE.removeProcessor(name));
             update(mObj);
         end
 
         function modifyParameter(mObj, procName, paramName, newValue)
-            %MODIFYPARAMETER  Change a parameter of a processor, by its name, to a text, a number or several of them.
+            %MODIFYPARAMETER  Change a parameter of a processor to a text, a number, or a cell array of these.
             if iscell(newValue)
                 newValue = strjoin(cellfun(@textOf, newValue(:).', 'UniformOutput', false), ' ');
             end
-            refuse(mObj.RosAFE.modifyParameter(procName, paramName, textOf(newValue)));
+            check(mObj.RosAFE.modifyParameter(procName, paramName, textOf(newValue)));
             update(mObj);
         end
 
         function cleanup(mObj)
-            %CLEANUP  Remove all processors but the input.
+            %CLEANUP  Remove all processors except the input.
             update(mObj);
             roots = {''};
-            for processor = mObj.told % in the order of creation: parents first
+            for processor = mObj.listed % in the order of creation, parents first
                 if isempty(processor{1}.upperDepName)
                     roots{end + 1} = processor{1}.name; %#ok<AGROW>
                 elseif any(strcmp(processor{1}.upperDepName, roots))
-                    refuse(mObj.RosAFE.removeProcessor(processor{1}.name));
+                    check(mObj.RosAFE.removeProcessor(processor{1}.name));
                 end
             end
             update(mObj);
         end
 
         function reset(mObj)
-            %RESET  Forget the frames that the data object holds.
+            %RESET  Remove all frames from the data object.
             clearData(mObj.dObj);
         end
     end
 
     methods (Access = private)
         function update(mObj)
-            % Ask for all processors, and have signals for just those, as they are now.
-            asked = mObj.RosAFE.getProcessors();
-            refuse(asked);
-            processors = asked.result.processors(:).';
+            % Read the list of processors, and create or remove signals accordingly.
+            answer = mObj.RosAFE.getProcessors();
+            check(answer);
+            processors = answer.result.processors(:).';
             kinds = representations(mObj.dObj);
-            % What genomixd does not know, as the plugin that it is of is the node's alone, cannot be asked for here.
+            % Ignore processors of plugins that genomixd has not loaded.
             processors = processors(cellfun(@(processor) isfield(kinds, processor.kind), processors));
-            if isequal(mObj.told, processors)
+            if isequal(mObj.listed, processors)
                 return
             end
-            mObj.told = processors;
+            mObj.listed = processors;
             arrange(mObj);
             for kind = fieldnames(mObj.Processors).'
                 names = cellfun(@(processor) processor.name, mObj.Processors.(kind{1}), 'UniformOutput', false);
@@ -163,52 +165,52 @@ classdef manager_RosAFE < handle
             end
             for processor = processors
                 signals = newSignals(mObj, processor{1});
-                held = signalsOf(mObj.dObj, processor{1}.kind, processor{1}.name);
-                if isempty(held) || ~all(cellfun(@alike, signals, held))
+                stored = signalsOf(mObj.dObj, processor{1}.kind, processor{1}.name);
+                if isempty(stored) || ~all(cellfun(@compatible, signals, stored))
                     addSignals(mObj.dObj, processor{1}.kind, signals);
                 end
             end
         end
 
         function arrange(mObj)
-            % Processors, by kind, with the values of their parameters.
+            % Set Processors: by kind, with the values of their parameters.
             about = describe(mObj.RosAFE);
             types = about.services.request.parameters;
             mObj.Processors = structfun(@(kind) cell(1, 0), representations(mObj.dObj), 'UniformOutput', false);
-            for processor = mObj.told
+            for processor = mObj.listed
                 values = struct('name', processor{1}.name);
                 for parameter = processor{1}.parameters(:).'
                     name = parameter{1}.name;
-                    words = isfield(types, name) && ~isempty(strfind(types.(name).type, 'string')); %#ok<STREMP>
-                    values.(name) = valueOf(parameter{1}.value, words);
+                    isText = isfield(types, name) && ~isempty(strfind(types.(name).type, 'string')); %#ok<STREMP>
+                    values.(name) = valueOf(parameter{1}.value, isText);
                 end
                 mObj.Processors.(processor{1}.kind){end + 1} = values;
             end
         end
 
         function kind = typeOf(mObj, name)
-            % The kind of processors that is meant: 'gammatone' by that name, 'gammatoneProc' or 'filterbank'.
+            % Return the kind for a name, for example 'gammatone' for 'gammatoneProc' or 'filterbank'.
             kind = kindOf(mObj.dObj, name);
             if isempty(kind)
-                error('manager_RosAFE:type', 'there is no type of processors ''%s''; there are: %s', name, ...
-                    strjoin(fieldnames(mObj.dObj).', ', '));
+                error('manager_RosAFE:type', 'type: expected one of %s, got ''%s''', ...
+                    strjoin(fieldnames(mObj.dObj).', ', '), name);
             end
         end
 
         function [values, kind, processor] = named(mObj, name)
-            % A processor: the values of its parameters, its kind, and what getProcessors tells of it.
-            names = cellfun(@(processor) processor.name, mObj.told, 'UniformOutput', false);
+            % Return the parameters of a processor, its kind, and its entry in the list of processors.
+            names = cellfun(@(processor) processor.name, mObj.listed, 'UniformOutput', false);
             if ~any(strcmp(name, names))
-                error('manager_RosAFE:removed', 'somebody has removed the processor %s', name);
+                error('manager_RosAFE:removed', 'the processor %s has been removed by another client', name);
             end
-            processor = mObj.told{strcmp(name, names)};
+            processor = mObj.listed{strcmp(name, names)};
             kind = processor.kind;
             same = cellfun(@(other) strcmp(other.name, name), mObj.Processors.(kind));
             values = mObj.Processors.(kind){same};
         end
 
         function signals = newSignals(mObj, processor)
-            % Signals for what a processor computes: for each of its parts and, where those are of one ear, each ear.
+            % Create the signals of a processor: one for each part, and for each ear if the part has ears.
             about = representations(mObj.dObj);
             about = about.(processor.kind);
             parts = fieldnames(about.parts);
@@ -230,7 +232,7 @@ classdef manager_RosAFE < handle
         end
 
         function signal = newSignal(mObj, processor, name, rows, channel)
-            % A signal of the class that the MATLAB front-end has for such axes.
+            % Create a signal of the class that the MATLAB Auditory Front-End uses for these axes.
             fs = processor.rate;
             label = processor.name;
             seconds = mObj.dObj.bufferSize_s_matlab;
@@ -249,7 +251,7 @@ classdef manager_RosAFE < handle
         end
 
         function values = coordinates(mObj, processor, axis)
-            % What lies along an axis: the kind's own coordinate for its last axis, else what its parent says.
+            % Return the coordinates of an axis: those of the kind for its last axis, otherwise those of the parent.
             n = sizeOf(processor, axis);
             about = representations(mObj.dObj);
             while true
@@ -268,7 +270,7 @@ classdef manager_RosAFE < handle
                 end
                 break
             end
-            if numel(values) ~= n % nobody says
+            if numel(values) ~= n % no coordinates are known
                 values = num2cell(1:n);
             end
             if strcmp(axis, 'feature')
@@ -279,7 +281,7 @@ classdef manager_RosAFE < handle
         end
 
         function append(mObj, processor, parts)
-            % What getRepresentation gives, as frames by rows for each ear, to the processor's signals.
+            % Append the answer of getRepresentation to the signals of the processor: frames by rows for each ear.
             signals = signalsOf(mObj.dObj, processor.kind, processor.name);
             at = 0;
             for part = parts(:).'
@@ -288,7 +290,7 @@ classdef manager_RosAFE < handle
                 sizes = part{1}.shape(:).';
                 ears = prod(sizes(strcmp('ear', axes_of)));
                 fits = cellfun(@(axis) sizes(strcmp(axis, axes_of)) == sizeOf(processor, axis), rows);
-                if all(fits) && sizes(end) > 0 % else they have changed since getProcessors
+                if all(fits) && sizes(end) > 0 % otherwise, they have changed since getProcessors
                     [~, order] = ismember([{'time'} rows {'ear'}], fliplr(axes_of));
                     order(order == 0) = [];
                     data = permute(reshape(part{1}.data, [fliplr(sizes) 1]), [order, numel(order) + 1]);
@@ -303,14 +305,14 @@ classdef manager_RosAFE < handle
         end
 
         function parameters = parametersOf(mObj, p)
-            % What is given, and what the data object says about the input.
+            % Return the given parameters and those of the input.
             parameters = struct( ...
                 'nFramesPerBlock', mObj.dObj.framesPerChunk, ...
                 'bufferSize_s_port', mObj.dObj.bufferSize_s_rosAFE_port, ...
                 'bufferSize_s_getSignal', mObj.dObj.bufferSize_s_rosAFE_getSignal);
             p = plain(p);
             if isfield(p, 'pp_bMiddleEarFiltering') && ~isfield(p, 'pp_bUnityComp')
-                p.pp_bUnityComp = 1; % the default of the MATLAB front-end; without the filter it means nothing
+                p.pp_bUnityComp = 1; % the default of the MATLAB Auditory Front-End; used with this filter only
             end
             for name = fieldnames(p).'
                 parameters.(name{1}) = p.(name{1});
@@ -320,40 +322,40 @@ classdef manager_RosAFE < handle
 end
 
 function rows = rowsOf(axes_of)
-% The axes less ears and time.
+% Return the axes except ears and time.
 rows = axes_of(~ismember(axes_of, {'ear', 'time'}));
 end
 
 function n = sizeOf(processor, axis)
-% How much of an axis a processor puts out.
+% Return the size of an axis.
 shape = [processor.shape{:}];
 n = shape(strcmp(axis, processor.axes(:).'));
 end
 
-function yes = alike(signal, held)
-% Whether the frames of one signal can follow those of another.
-yes = strcmp(class(signal), class(held));
+function yes = compatible(signal, stored)
+% Return whether the frames of one signal can be appended to another.
+yes = strcmp(class(signal), class(stored));
 for name = {'FsHz', 'cfHz', 'lags', 'modCfHz', 'fList'}
-    yes = yes && (~isprop(signal, name{1}) || isequal(signal.(name{1}), held.(name{1})));
+    yes = yes && (~isprop(signal, name{1}) || isequal(signal.(name{1}), stored.(name{1})));
 end
 end
 
-function value = valueOf(text, words)
-% The value that a text of getProcessors tells: a number or, where WORDS is true, a word; or a row of them.
+function value = valueOf(text, isText)
+% Convert a text of getProcessors to a value: a number, a text if ISTEXT is true, or a row of these.
 value = text;
 if ~isempty(text) && text(1) == '['
     value = strtrim(strsplit(text(2:end - 1), ','));
     value = value(~cellfun(@isempty, value));
-    if ~words
+    if ~isText
         value = num2cell(str2double(value));
     end
-elseif ~words
+elseif ~isText
     value = str2double(text);
 end
 end
 
 function text = textOf(value)
-% The text that modifyParameter reads as a value, to the last digit.
+% Convert a value to a text for modifyParameter with full precision.
 if ischar(value)
     text = strtrim(value);
 else
@@ -362,11 +364,11 @@ end
 end
 
 function p = plain(p)
-% A struct, also of the parameter object of the MATLAB front-end.
+% Convert parameters to a struct, also a parameter object of the MATLAB Auditory Front-End.
 if isempty(p)
     p = struct();
 elseif isstruct(p) && ~isscalar(p)
-    error('manager_RosAFE:arguments', 'there are %d structures of parameters in place of one', numel(p));
+    error('manager_RosAFE:arguments', 'p: expected one structure of parameters, got %d', numel(p));
 elseif isobject(p)
     p = cell2struct(values(p.map).', keys(p.map).', 1);
 end
@@ -381,14 +383,14 @@ elseif numel(request) == 1
     request = repmat(request, size(p));
 end
 if numel(request) ~= numel(p)
-    error('manager_RosAFE:arguments', 'there are %d requests and %d structures of parameters', numel(request), ...
-        numel(p));
+    error('manager_RosAFE:arguments', 'p: expected %d structures of parameters, one for each request, got %d', ...
+        numel(request), numel(p));
 end
 requests = request;
 parameters = p;
 end
 
-function refuse(request)
+function check(request)
 if strcmp(request.status, 'error')
     error('manager_RosAFE:refused', 'Error%s', genomix.request.explain(request.exception));
 elseif ~isempty(request.warning)

@@ -1,3 +1,3 @@
 function startAuditoryFrontEnd()
-%STARTAUDITORYFRONTEND  Nothing to start: stands in where Two!Ears' MATLAB front-end is not on the path.
+%STARTAUDITORYFRONTEND  Does nothing. It is called if the MATLAB Auditory Front-End of Two!Ears is not on the path.
 end

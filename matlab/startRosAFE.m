@@ -1,5 +1,5 @@
 function startRosAFE()
-%STARTROSAFE  Put the folder of this file on the path, for the examples of the original begin so.
+%STARTROSAFE  Add the folder of this file to the path. The examples of the original call it first.
 
 addpath(fileparts(mfilename('fullpath')));
 end

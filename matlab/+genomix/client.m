@@ -1,93 +1,93 @@
 classdef client < handle
-%CLIENT  A connection to genomixd, through which the components of the ROS graph are used.
+%CLIENT  A connection to genomixd, which gives access to the components of the ROS graph.
 %
-%   client = genomix.client                   % the genomixd of this machine (or of the environment's GENOMIXD)
-%   client = genomix.client('host:8080')      % that of another one; 8080 is the port unless another is given
-%   client = genomix.client('-columns')       % with sequences as N-by-1 cells, not 1-by-N; also after an address
+%   client = genomix.client                   % genomixd on this machine, or at the environment variable GENOMIXD
+%   client = genomix.client('host:8080')      % on another machine; the default port is 8080
+%   client = genomix.client('-columns')       % sequences are N-by-1 cells, not 1-by-N; also after an address
 %   rosAFE = client.load('rosAFE')            % a genomix.component
 %   left = client.load('rosAFE', '-i', 'left')
-%   delete(client)                            % activities go on
+%   delete(client)                            % activities continue
 %
 %   See docs/matlab.md.
 
     properties (SetAccess = private)
         address  % host:port of genomixd
-        session  % the name under which genomixd knows this client
-        columns  % whether sequences are N-by-1 cells, as in the original's first version
+        session  % name of the session of this client
+        columns  % whether sequences are N-by-1 cells, as in the first version of the original
     end
 
     properties (Access = private)
-        lost = false; % whether genomixd did not answer the last time
+        lost = false; % whether the last request was not answered
     end
 
     methods
         function obj = client(varargin)
-            given = cellfun(@genomix.wire.chars, varargin, 'UniformOutput', false);
-            obj.columns = ~isempty(given) && ischar(given{end}) && strcmp(given{end}, '-columns');
-            given = given(1:end - obj.columns);
-            if isempty(given)
-                given = {getenv('GENOMIXD')};
-            elseif numel(given) > 1
-                error('genomix:connection', 'after the address of genomixd there may be only: ''-columns''');
+            args = cellfun(@genomix.wire.chars, varargin, 'UniformOutput', false);
+            obj.columns = ~isempty(args) && ischar(args{end}) && strcmp(args{end}, '-columns');
+            args = args(1:end - obj.columns);
+            if isempty(args)
+                args = {getenv('GENOMIXD')};
+            elseif numel(args) > 1
+                error('genomix:connection', 'expected at most ''-columns'' after the address of genomixd');
             end
-            obj.address = full_address(given{1});
-            [~, obj.session] = fileparts(tempname()); % MATLAB's rand begins alike in every process
+            obj.address = full_address(args{1});
+            [~, obj.session] = fileparts(tempname()); % the numbers of rand are the same in every new process of MATLAB
             obj.get('/components', {}, false);
         end
 
         function component = load(obj, component, varargin)
-            %LOAD  A component that runs, as a genomix.component: load(name), load(name, '-i', instance)
+            %LOAD  Return a running component as a genomix.component: load(name), load(name, '-i', instance)
             if nargin > 1
                 component = genomix.wire.chars(component);
             end
             if nargin < 2 || ~ischar(component) || isempty(component)
-                error('genomix:load', 'load takes the name of a component, such as ''rosAFE''');
+                error('genomix:load', 'load: expected the name of a component, for example ''rosAFE''');
             end
-            [~, name] = fileparts(component); % the original takes paths of plug-ins, too
+            [~, name] = fileparts(component); % the original also accepts paths of plug-ins
             query = {};
             varargin = cellfun(@genomix.wire.chars, varargin, 'UniformOutput', false);
             if numel(varargin) == 2 && strcmp(varargin{1}, '-i') && ischar(varargin{2})
                 query = {'i', varargin{2}};
             elseif ~isempty(varargin)
-                error('genomix:load', 'after the name of a component there may be only: ''-i'', ''instance''');
+                error('genomix:load', 'load: expected ''-i'', ''instance'' after the name of a component');
             end
             [about, failed] = obj.get(['/load/' genomix.wire.quote(name)], query, false);
             if failed
                 error('genomix:load', 'load %s: %s', component, genomix.request.explain(about));
             elseif ~isstruct(about) || ~all(isfield(about, {'name', 'instance', 'services', 'ports'})) || ...
                     ~isstruct(about.services) || ~isstruct(about.ports)
-                error('genomix:connection', 'what answers at %s is no genomixd', obj.address);
+                error('genomix:connection', 'the server at %s is not a genomixd', obj.address);
             end
             component = genomix.component(obj, about);
         end
 
         function rpath(~, ~)
-            %RPATH  Accepted for the original's scripts: components are found on the graph, there are no plug-ins.
+            %RPATH  Accepted for scripts of the original, without effect: components are found on the ROS graph.
         end
 
         function [answer, failed] = get(obj, path, query, matrices)
-            %GET  The answer of genomixd to a URL of this session; see genomix.wire.fetch.
+            %GET  Request a URL in this session and return the answer; see genomix.wire.fetch.
             if isempty(obj.session)
-                error('genomix:connection', 'the client was deleted');
+                error('genomix:connection', 'the client has been deleted');
             end
-            obj.lost = true; % unless it returns
+            obj.lost = true; % until the answer is received
             [answer, failed] = genomix.wire.fetch(obj.address, path, [{'s', obj.session}; query], matrices, ...
                 obj.columns);
             obj.lost = false;
         end
 
         function yes = isConnected(obj)
-            %ISCONNECTED  Whether there is a session, and genomixd has answered the last time.
+            %ISCONNECTED  Return whether there is a session and the last request was answered.
             yes = ~isempty(obj.session) && ~obj.lost;
         end
 
         function delete(obj)
-            %DELETE  End the session. Activities go on.
+            %DELETE  End the session. Activities continue.
             if isConnected(obj)
                 try
                     obj.get('/session/stop', {}, false);
                 catch
-                    % Then the server is gone, and the session with it.
+                    % The server has ended, and with it the session.
                 end
             end
             obj.session = '';
@@ -101,7 +101,7 @@ end
 
 function address = full_address(address)
 if ~isempty(address) && ~(ischar(address) && isrow(address))
-    error('genomix:connection', 'the address of genomixd is a text, such as ''host:8080''');
+    error('genomix:connection', 'address: expected a text, for example ''host:8080''');
 end
 address = regexprep(address, '^http://|/+$', '');
 if isempty(address) || address(1) == ':'

@@ -1,21 +1,21 @@
 classdef component < handle
-%COMPONENT  A component of the ROS graph: its services and ports as properties that are called.
+%COMPONENT  A component of the ROS graph. Its services and ports are properties that can be called.
 %
-%   rosAFE                                    % lists them
+%   rosAFE                                    % lists services and ports
 %   r = rosAFE.InputProc('-a', 'input', 12000, 1, 1)
 %   r = rosAFE.GammatoneProc(struct('fb_nChannels', 16))
 %   p = rosAFE.ildPort('ild')
 %
-%   A service takes its arguments by position, or as one struct by name; what is missing takes its default. It returns
-%   a genomix.request when it is done, with '-a' as the first argument as soon as it is acknowledged. A port returns a
-%   struct with one field of its name. With '-m', sequences of numbers are matrices and no cell arrays. '-h' prints what
-%   there is to know about a service or port. Upper and lower case do not matter where there is no doubt.
+%   A service accepts its arguments by position, or one struct with arguments by name; missing arguments have their
+%   defaults. It returns a genomix.request when it has finished, or, with '-a' as the first argument, when it has been
+%   accepted. A port returns a struct with one field of its name. With '-m', sequences of numbers are matrices and not
+%   cell arrays. '-h' prints a description of the service or port. Names are case-insensitive if they are unambiguous.
 %
-%   genomix.client/load makes components. delete(component) forgets one, and leaves it running.
+%   Use genomix.client/load to create components. delete(component) deletes the object; the component continues to run.
 
     properties (Access = private)
         client
-        about  % what genomixd tells of the component
+        about  % the description of the component
     end
 
     methods
@@ -26,7 +26,8 @@ classdef component < handle
 
         function varargout = subsref(obj, s)
             if ~strcmp(s(1).type, '.')
-                error('genomix:component', 'a component has services and ports: rosAFE.getParameters()');
+                error('genomix:component', ...
+                    'expected a service or a port of the component, for example rosAFE.getParameters()');
             end
             called = numel(s) > 1 && strcmp(s(2).type, '()');
             if strcmp(s(1).subs, 'delete')
@@ -36,7 +37,7 @@ classdef component < handle
             if called
                 value = call(obj, s(1).subs, s(2).subs);
                 if nargout == 0 && isequal(value, [])
-                    return % help was shown
+                    return % help was printed
                 end
             else
                 name = entry(obj, s(1).subs);
@@ -49,7 +50,7 @@ classdef component < handle
         end
 
         function names = fieldnames(obj)
-            %FIELDNAMES  The names of the services and ports.
+            %FIELDNAMES  Return the names of the services and ports.
             names = {};
             if ~isempty(obj.about)
                 names = [fieldnames(obj.about.services); fieldnames(obj.about.ports)];
@@ -57,22 +58,22 @@ classdef component < handle
         end
 
         function names = properties(obj)
-            %PROPERTIES  As fieldnames.
+            %PROPERTIES  Same as fieldnames.
             names = fieldnames(obj);
         end
 
         function yes = isprop(obj, name)
-            %ISPROP  Whether there is a service or port of exactly this name.
+            %ISPROP  Return whether there is a service or port of exactly this name.
             yes = any(strcmp(name, fieldnames(obj)));
         end
 
         function about = describe(obj)
-            %DESCRIBE  What genomixd tells about the component, its services and ports.
+            %DESCRIBE  Return the description of the component, its services and ports.
             about = obj.about;
         end
 
         function delete(obj)
-            %DELETE  Forget the component, which goes on.
+            %DELETE  Delete the object. The component continues to run.
             if isempty(obj.about)
                 return
             end
@@ -81,7 +82,7 @@ classdef component < handle
                     obj.client.get(['/unload/' obj.about.name], {}, false);
                 end
             catch
-                % Then the server or the client is gone, and has forgotten it already.
+                % The server or the session has ended already.
             end
             obj.about = [];
         end
@@ -101,31 +102,31 @@ classdef component < handle
     end
 
     methods (Access = private)
-        function value = call(obj, name, given)
-            % A service is called or a port is read.
+        function value = call(obj, name, args)
+            % Call a service or read a port.
             [name, kind] = entry(obj, name);
             flags = struct('a', false, 'm', false, 'h', false);
-            given = cellfun(@genomix.wire.chars, given, 'UniformOutput', false);
-            while ~isempty(given) && ischar(given{1}) && any(strcmp(given{1}, {'-a', '-m', '-h'}))
-                flags.(given{1}(2)) = true;
-                given(1) = [];
+            args = cellfun(@genomix.wire.chars, args, 'UniformOutput', false);
+            while ~isempty(args) && ischar(args{1}) && any(strcmp(args{1}, {'-a', '-m', '-h'}))
+                flags.(args{1}(2)) = true;
+                args(1) = [];
             end
-            described = obj.about.(kind).(name);
+            description = obj.about.(kind).(name);
             if flags.h
-                fprintf('%s\n', genomix.wire.help(obj.about.name, name, described));
+                fprintf('%s\n', genomix.wire.help(obj.about.name, name, description));
                 value = [];
                 return
             end
-            if isempty(given) && genomix.wire.interactive()
-                given = genomix.wire.ask(described);
+            if isempty(args) && genomix.wire.interactive()
+                args = genomix.wire.ask(description);
             end
             path = ['/' genomix.wire.quote(obj.about.name) '/' name];
             query = {'i', obj.about.instance};
             try
                 if strcmp(kind, 'ports')
-                    query = [query; element(given, described)];
+                    query = [query; element(args, description)];
                 else
-                    query = [query; {'input', input_of(given)}];
+                    query = [query; {'input', input_of(args)}];
                 end
             catch problem
                 value = genomix.request.failure('::genom::serialization', [name ': ' problem.message]);
@@ -143,59 +144,59 @@ classdef component < handle
             elseif failed
                 value = genomix.request(obj.client, struct('status', 'error', 'exception', answer), flags.m);
             else
-                told = struct('status', 'done', 'output', answer);
+                state = struct('status', 'done', 'output', answer);
                 if isfield(answer, 'warning')
-                    told.warning = answer.warning;
-                    told.output = rmfield(answer, 'warning');
+                    state.warning = answer.warning;
+                    state.output = rmfield(answer, 'warning');
                 end
-                value = genomix.request(obj.client, told, flags.m);
+                value = genomix.request(obj.client, state, flags.m);
             end
         end
 
         function [name, kind] = entry(obj, name)
-            % The service or port that is meant, and which of both it is.
+            % Find a service or port by name; return its name and 'services' or 'ports'.
             if isempty(obj.about)
-                error('genomix:component', 'the component was deleted; client.load loads it again');
+                error('genomix:component', 'the component was deleted; load it again with client.load');
             end
-            for same = {@strcmp, @strcmpi}
+            for compare = {@strcmp, @strcmpi}
                 for kinds = {'services', 'ports'}
                     kind = kinds{1};
                     entries = obj.about.(kind);
                     names = fieldnames(entries);
                     for k = 1:numel(names)
-                        if any(same{1}(name, [names(k); entries.(names{k}).aliases(:)]))
+                        if any(compare{1}(name, [names(k); entries.(names{k}).aliases(:)]))
                             name = names{k};
                             return
                         end
                     end
                 end
             end
-            error('genomix:component', '%s has no service or port ''%s''; it has: %s', obj.about.name, name, ...
-                strjoin(fieldnames(obj).', ', '));
+            error('genomix:component', '%s: expected a service or port (%s), got ''%s''', obj.about.name, ...
+                strjoin(fieldnames(obj).', ', '), name);
         end
     end
 end
 
-function query = element(given, port)
-% The first argument names the element of a port; scripts give some to ports that have none.
+function query = element(args, port)
+% Return the element of a port, the first argument; ignore arguments of ports without elements.
 query = cell(0, 2);
-if isempty(given) || ~port.multiple
+if isempty(args) || ~port.multiple
     return
 end
-if ~ischar(given{1}) || size(given{1}, 1) > 1
-    error('genomix:argument', 'the name of an element is one text, and no %s', class(given{1}));
+if ~ischar(args{1}) || size(args{1}, 1) > 1
+    error('genomix:argument', 'element: expected a text, got %s', class(args{1}));
 end
-genomix.wire.utf8(given{1}); % raises an error where it is none
-query = {'element', given{1}};
+genomix.wire.utf8(args{1}); % raises an error if it is not valid
+query = {'element', args{1}};
 end
 
-function text = input_of(given)
-if numel(given) == 1 && isstruct(given{1})
-    text = genomix.wire.encode(given{1});
+function text = input_of(args)
+if numel(args) == 1 && isstruct(args{1})
+    text = genomix.wire.encode(args{1});
 else
-    text = genomix.wire.encode(given);
+    text = genomix.wire.encode(args);
 end
-if numel(text) > 80000 % three times as many in a URL, of which genomixd takes 256 KiB
-    error('genomix:argument', 'the arguments are too long: %d characters', numel(text));
+if numel(text) > 80000 % up to three times as many in a URL, which may have 256 KiB
+    error('genomix:argument', 'expected arguments of at most 80000 characters, got %d', numel(text));
 end
 end

@@ -1,5 +1,5 @@
 classdef CorrelationSignal < rosafe.BufferedSignal
-%CORRELATIONSIGNAL  Frames by channels by lags, of one ear or of both. See rosafe.BufferedSignal.
+%CORRELATIONSIGNAL  Frames by channels by lags, for one ear or both. See rosafe.BufferedSignal.
 
     properties (SetAccess = private)
         cfHz  % centre frequencies of the channels
@@ -14,13 +14,13 @@ classdef CorrelationSignal < rosafe.BufferedSignal
         end
 
         function h = plot(obj, h)
-            %PLOT  Draw the mean over the channels, lags over time, into a figure or axes if given.
+            %PLOT  Draw the mean over the channels, lags over time, into the given figure or axes, or a new figure.
             if nargin < 2
                 h = [];
             end
             h = place(obj, h);
             if ~isempty(obj.Data)
-                picture(obj, permute(mean(obj.Data, 2), [1 3 2]), 1000 * obj.lags);
+                drawImage(obj, permute(mean(obj.Data, 2), [1 3 2]), 1000 * obj.lags);
                 ylabel('Lag (ms)');
             end
         end

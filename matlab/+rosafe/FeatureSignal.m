@@ -1,8 +1,8 @@
 classdef FeatureSignal < rosafe.BufferedSignal
-%FEATURESIGNAL  Frames by features of one ear: pitch and its candidates, spectral features. See rosafe.BufferedSignal.
+%FEATURESIGNAL  Frames by features of one ear: pitch and raw pitch, or spectral features. See rosafe.BufferedSignal.
 
     properties (SetAccess = private)
-        fList  % what the columns are
+        fList  % names of the columns
     end
 
     methods
@@ -12,10 +12,10 @@ classdef FeatureSignal < rosafe.BufferedSignal
         end
 
         function h = plot(obj, h, feature)
-            %PLOT  Draw the features over time, or those that are named, into a figure or axes if given.
+            %PLOT  Draw all features, or the given ones, over time into the given figure or axes, or a new figure.
             %
-            %   A pitch lies over the raw pitch, in Hz. Other features have different units: several are a picture, of
-            %   each the part of its own range.
+            %   The pitch is drawn over the raw pitch, in Hz. Several other features, which have different units, are
+            %   drawn as an image, each scaled to its own range.
             if nargin < 2
                 h = [];
             end
@@ -28,7 +28,7 @@ classdef FeatureSignal < rosafe.BufferedSignal
             h = place(obj, h);
             values = obj.Data;
             if isempty(values)
-                values = NaN(1, numel(obj.fList)); % nothing has come yet
+                values = NaN(1, numel(obj.fList)); % no frames yet
             end
             t = (0:size(values, 1) - 1) / obj.FsHz;
             values = values(:, drawn);
@@ -64,5 +64,5 @@ function ranges(t, names, values)
     axis('xy');
     ticks = unique(round(linspace(1, numel(names), min(numel(names), 16))));
     set(gca(), 'ytick', ticks, 'yticklabel', names(ticks));
-    ylabel(colorbar(), 'part of its range');
+    ylabel(colorbar(), 'relative to the range of the feature');
 end

@@ -14,13 +14,13 @@ classdef ModulationSignal < rosafe.BufferedSignal
         end
 
         function h = plot(obj, h)
-            %PLOT  Draw the mean over the channels, filters over time, into a figure or axes if given.
+            %PLOT  Draw the mean over the channels, filters over time, into the given figure or axes, or a new figure.
             if nargin < 2
                 h = [];
             end
             h = place(obj, h);
             if ~isempty(obj.Data)
-                picture(obj, permute(mean(obj.Data, 2), [1 3 2]), obj.modCfHz);
+                drawImage(obj, permute(mean(obj.Data, 2), [1 3 2]), obj.modCfHz);
                 ylabel('Modulation frequency (Hz)');
             end
         end

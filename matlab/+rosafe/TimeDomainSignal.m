@@ -1,5 +1,5 @@
 classdef TimeDomainSignal < rosafe.BufferedSignal
-%TIMEDOMAINSIGNAL  Samples of one ear: the input or what pre-processing made of it. See rosafe.BufferedSignal.
+%TIMEDOMAINSIGNAL  Samples of one ear: the input, or the output of the pre-processing. See rosafe.BufferedSignal.
 
     methods
         function obj = TimeDomainSignal(fs, bufferSize_s, name, label, channel)
@@ -7,7 +7,7 @@ classdef TimeDomainSignal < rosafe.BufferedSignal
         end
 
         function h = plot(obj, h)
-            %PLOT  Draw the samples over time, into a figure or axes if given.
+            %PLOT  Draw the samples over time, into the given figure or axes, or a new figure.
             if nargin < 2
                 h = [];
             end

@@ -1,5 +1,5 @@
 classdef TimeFrequencySignal < rosafe.BufferedSignal
-%TIMEFREQUENCYSIGNAL  Frames by channels of one ear, or of both for level differences. See rosafe.BufferedSignal.
+%TIMEFREQUENCYSIGNAL  Frames by channels for one ear, or interaural differences. See rosafe.BufferedSignal.
 
     properties (SetAccess = private)
         cfHz  % centre frequencies of the channels
@@ -12,13 +12,13 @@ classdef TimeFrequencySignal < rosafe.BufferedSignal
         end
 
         function h = plot(obj, h)
-            %PLOT  Draw the channels over time, into a figure or axes if given.
+            %PLOT  Draw the channels over time, into the given figure or axes, or a new figure.
             if nargin < 2
                 h = [];
             end
             h = place(obj, h);
             if ~isempty(obj.Data)
-                picture(obj, obj.Data, obj.cfHz);
+                drawImage(obj, obj.Data, obj.cfHz);
                 ylabel('Centre frequency (Hz)');
             end
         end

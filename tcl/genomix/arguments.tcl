@@ -1,7 +1,7 @@
-# The arguments of a service as JSON. The server checks names and types; here is only what Tcl's syntax leaves open.
+# Conversion of the arguments of a service to JSON. The server checks names and types.
 
-# The JSON object for the words of a call: nothing, one dict of parameters, or values by position; for a composite, the
-# first value and a dict of all others.
+# Return the words of a call as a JSON object. The words are a dict of parameters, values by position, or none. For a
+# composite, they are the first value and a dict of the others.
 proc ::genomix::Input {service about words} {
     set parameters [dict get $about parameters]
     if {[dict get $about composite] && [llength $words] > 1} {
@@ -10,8 +10,8 @@ proc ::genomix::Input {service about words} {
         set pairs [lindex $words 0]
     } else {
         if {[llength $words] > [dict size $parameters]} {
-            ::genomix::Refuse "$service: [llength $words] arguments are too many;\
-                it takes [::genomix::Listed [dict keys $parameters]]"
+            ::genomix::Refuse "$service: expected at most [dict size $parameters] arguments\
+                ([::genomix::Listed [dict keys $parameters]]), got [llength $words]"
         }
         set pairs {}
         foreach value $words name [lrange [dict keys $parameters] 0 [llength $words]-1] {
@@ -25,18 +25,18 @@ proc ::genomix::Input {service about words} {
     return "{[join $members ,]}"
 }
 
-# The pairs of names and values of the words `first {name value ...}`.
+# Return names and values for the words `first {name value ...}`.
 proc ::genomix::FirstAndDict {service parameters words} {
     lassign $words first others
     set name [lindex $parameters 0]
     if {[llength $words] > 2 || [catch {dict size $others}]} {
-        ::genomix::Refuse "$service: after $name comes a dict of parameters, and not \"[lrange $words 1 end]\""
+        ::genomix::Refuse "$service: expected a dict of parameters after $name, got \"[lrange $words 1 end]\""
     }
     return [list $name $first {*}$others]
 }
 
-# Whether the only word of a call is a dict of parameters, and not the value of the first one: its keys are names of
-# parameters, or at least look like names, so that a misspelt one is told and not taken for a value.
+# Return whether the only word of a call is a dict of parameters, and not the value of the first parameter: its keys are
+# parameters or look like names. A misspelt name is therefore reported and not used as a value.
 proc ::genomix::IsDict {service parameters word} {
     if {[catch {llength $word} length]} {
         return 0
@@ -50,7 +50,7 @@ proc ::genomix::IsDict {service parameters word} {
         set names [expr {$names && [regexp {^[A-Za-z_]\w*$} $name]}]
     }
     if {$known && $length % 2} {
-        ::genomix::Refuse "$service: [lindex $word end] has no value in \"$word\""
+        ::genomix::Refuse "$service: expected a value for [lindex $word end], got \"$word\""
     }
     return [expr {$length % 2 == 0 && ($known || $names)}]
 }
@@ -59,7 +59,7 @@ proc ::genomix::IsParameter {parameters name} {
     return [expr {[::genomix::Parameter $parameters $name] ne ""}]
 }
 
-# What is known about a parameter, by its name or an alias; empty for none.
+# Return the description of a parameter by its name or an alias, or an empty string.
 proc ::genomix::Parameter {parameters name} {
     if {[dict exists $parameters $name]} {
         return [dict get $parameters $name]
@@ -78,12 +78,12 @@ proc ::genomix::JsonValue {parameters name value} {
         return [::genomix::JsonString $value]
     }
     if {[catch {::genomix::Elements $value} elements]} {
-        ::genomix::Refuse "$name: \"$value\" is not a list ([dict get $about type])"
+        ::genomix::Refuse "$name: expected a list ([dict get $about type]), got \"$value\""
     }
     return "\[[join [lmap element $elements {::genomix::JsonString $element}] ,]\]"
 }
 
-# The elements of a sequence given as an index dict {0 a 1 b}, or as a list where the keys are no indexes.
+# Return the elements of a sequence: an index dict {0 a 1 b}, or a list if the keys are not indexes.
 proc ::genomix::Elements {value} {
     set length [llength $value]
     if {$length % 2 == 0} {

@@ -1,10 +1,10 @@
-# The handles genomix1, genomix2, ...: a connection to one genomixd, and the components loaded through it.
+# The handles genomix1, genomix2, ...: the connection to one genomixd, and the components loaded from it.
 
 oo::class create ::genomix::Client {
-    # Host Port: of the server.   Session: our name there.   Channel: the kept connection, or empty.
-    # Components: what the server told about each loaded component, by the name of its namespace.
-    # Events: the connection on which the server tells of requests, or empty.   Event: the one that is being read.
-    # Requests: the requests that are not finished, by their ids.
+    # Host Port: of the server.   Session: the name of our session.   Channel: the persistent connection, or empty.
+    # Components: the description of each loaded component, by namespace.
+    # Events: the connection for events of requests, or empty.   Event: the event that is being read.
+    # Requests: the unfinished requests, by id.
     variable Host Port Session Channel Components Events Event Requests
 
     constructor {host port} {
@@ -27,8 +27,8 @@ oo::class create ::genomix::Client {
 
     # load component ?-i instance? ?as name?
     #
-    # Offer the services and ports of a component that runs as commands of the namespace ::name (by default that of
-    # the instance, by default that of the component), and return that name.
+    # Create commands for the services and ports of a running component in the namespace ::name, and return the name.
+    # The default is the name of the instance, or of the component.
     method load {component args} {
         set query {}
         foreach {option value} $args {
@@ -36,22 +36,23 @@ oo::class create ::genomix::Client {
                 -i {dict set query i $value}
                 as {dict set query as $value}
                 default {
-                    ::genomix::Refuse "load: unknown option \"$option\", there are: -i instance, as name"
+                    ::genomix::Refuse "load: expected -i instance or as name, got \"$option\""
                 }
             }
         }
         if {[llength $args] % 2} {
-            ::genomix::Refuse "load: [lindex $args end] needs a value"
+            ::genomix::Refuse "load: expected a value for [lindex $args end]"
         }
         set component [file rootname [file tail $component]]
         set description [my get [list load $component] $query]
         if {[catch {dict get $description name} name]
             || [catch {dict size [dict get $description services]}] || [catch {dict size [dict get $description ports]}]
         } {
-            ::genomix::Refuse "genomixd at $Host:$Port describes no component" ::genom::mwerr
+            ::genomix::Refuse "genomixd at $Host:$Port: expected the description of a component, got another answer" \
+                ::genom::mwerr
         }
         if {![regexp {^[A-Za-z]\w*$} $name] || $name in {genomix oo tcl zlib el}} {
-            ::genomix::Refuse "load: \"$name\" cannot be the name of a component's namespace; use: as name"
+            ::genomix::Refuse "load: \"$name\" is not allowed as a namespace; choose another one with: as name"
         }
         if {[dict exists $Components $name]} {
             my Remove $name
@@ -63,10 +64,10 @@ oo::class create ::genomix::Client {
 
     # unload name
     #
-    # Remove the commands of a component; the component itself goes on.
+    # Remove the commands of a component. The component continues to run.
     method unload {name} {
         if {![dict exists $Components $name]} {
-            ::genomix::Refuse "unload: \"$name\" is not loaded; loaded are: [dict keys $Components]"
+            ::genomix::Refuse "unload: expected one of the loaded components ([dict keys $Components]), got \"$name\""
         }
         my Remove $name
         catch {my get [list unload $name]}
@@ -82,21 +83,21 @@ oo::class create ::genomix::Client {
 
     # rpath dir
     #
-    # Accepted for the original's scripts. Components are found on the ROS graph, so there is nowhere to look.
+    # Accepted for scripts of the original, without effect. Components are found on the ROS graph.
     method rpath {dir} {
         return
     }
 
-    # --- for the other files of the package ---
+    # --- used by the other files of the package ---
 
     method description {name} {
         return [dict get $Components $name]
     }
 
-    # GET /words...?query of our session, and return the answer. Errors are those of the component or of the server.
+    # Send GET /words...?query in our session and return the answer. Raise the errors of the component or of the server.
     method get {words {query {}}} {
         if {[lindex $words 0] in {call send}} {
-            # Whatever the server has forgotten (it may be another one by now) it loads again.
+            # The server loads the component again if it has been restarted.
             dict set query i [dict get $Components [lindex $words 1] instance]
         }
         dict set query s $Session
@@ -123,7 +124,7 @@ oo::class create ::genomix::Client {
             return $body
         }
         if {[catch {dict get $body ex}]} {
-            ::genomix::Refuse "genomixd at $Host:$Port answers $status: [string range $body 0 200]" ::genom::mwerr
+            ::genomix::Refuse "genomixd at $Host:$Port: status $status: [string range $body 0 200]" ::genom::mwerr
         }
         ::genomix::Raise $body
     }
@@ -133,9 +134,9 @@ oo::class create ::genomix::Client {
         set Channel ""
     }
 
-    # --- requests in the background ---
+    # --- background requests ---
 
-    # Send a request that the server tells us the end of; the words and query are those of the URL.
+    # Send a background request; words and query are those of the URL.
     method send {words query callback} {
         my Listen
         set request [::genomix::Request create ::genomix::request[incr ::genomix::requests] [self] \
@@ -143,7 +144,8 @@ oo::class create ::genomix::Client {
         try {
             set status [my get $words $query]
             if {[catch {list [dict get $status id] [dict get $status status]}]} {
-                ::genomix::Refuse "genomixd at $Host:$Port does not say what has become of it" ::genom::mwerr
+                ::genomix::Refuse "genomixd at $Host:$Port: expected the status of the request, got another answer" \
+                    ::genom::mwerr
             }
         } on error {message options} {
             $request destroy
@@ -154,7 +156,7 @@ oo::class create ::genomix::Client {
         return $request
     }
 
-    # Follow a request no more.
+    # Ignore further events of a request.
     method forget {id} {
         dict unset Requests $id
     }
@@ -164,19 +166,19 @@ oo::class create ::genomix::Client {
             return
         }
         set Events [::genomix::http::open $Host $Port]
-        # HTTP/1.0: the answer comes as it is and not in chunks.
+        # HTTP/1.0: the answer is not chunked.
         ::genomix::http::send $Events $Host $Port \
             [::genomix::http::url {session listen} [dict create s $Session syntax tcl]] 1.0
         if {[catch {::genomix::http::head $Events} head] || [lindex $head 0] != 200} {
             catch {close $Events}
             set Events ""
-            ::genomix::Refuse "genomixd at $Host:$Port tells no events: $head" ::genom::mwerr
+            ::genomix::Refuse "genomixd at $Host:$Port: no events are available: $head" ::genom::mwerr
         }
         fconfigure $Events -blocking 0
         fileevent $Events readable [namespace code {my ReadEvents}]
     }
 
-    # Take what events have come so far.
+    # Process the events that have been received.
     method poll {} {
         if {$Events ne ""} {
             my ReadEvents
@@ -187,7 +189,7 @@ oo::class create ::genomix::Client {
         while {$Events ne "" && ![catch {gets $Events line} length] && $length >= 0} {
             set line [encoding convertfrom utf-8 [string trimright $line \r]]
             if {$line eq ""} {
-                if {[catch {my TakeEvent $Event}]} {
+                if {[catch {my HandleEvent $Event}]} {
                     my Lost
                 }
                 set Event {}
@@ -196,13 +198,13 @@ oo::class create ::genomix::Client {
             }
         }
         if {$Events ne "" && (
-            [catch {eof $Events} over] || $over || [chan pending input $Events] > $::genomix::http::longestEvent
+            [catch {eof $Events} ended] || $ended || [chan pending input $Events] > $::genomix::http::maxEvent
         )} {
             my Lost
         }
     }
 
-    method TakeEvent {event} {
+    method HandleEvent {event} {
         set event [dict merge {event {} data {}} $event]
         switch -- [dict get $event event] {
             request {
@@ -217,15 +219,15 @@ oo::class create ::genomix::Client {
         }
     }
 
-    # The server is gone, and with it all word of what is under way.
+    # Mark all unfinished requests as failed, because the connection to the server is lost.
     method Lost {} {
         catch {close $Events}
         set Events ""
         set what "the connection to genomixd at $Host:$Port is lost"
         set status [dict create status error exception [dict create ex ::genom::mwerr detail [dict create what $what]]]
-        set aloud 1 ;# once is enough
+        set report 1 ;# only the first one is reported
         foreach request [dict values $Requests] {
-            set aloud [expr {![$request update $status $aloud] && $aloud}]
+            set report [expr {![$request update $status $report] && $report}]
         }
     }
 }

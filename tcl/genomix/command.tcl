@@ -1,6 +1,6 @@
-# The commands of a component: one per service and port, with switches, background requests and help.
+# The commands of a component: one for each service and port, with switches, background requests and help.
 
-# Make the commands of a component in the namespace ::name.
+# Create the commands of a component in the namespace ::name.
 proc ::genomix::Offer {client name description} {
     foreach {kind entries} [list Service [dict get $description services] Port [dict get $description ports]] {
         dict for {entry about} $entries {
@@ -12,7 +12,7 @@ proc ::genomix::Offer {client name description} {
             }
         }
     }
-    # The user's guide writes ":: rosAFE :: modifyParameter", with spaces.
+    # The user guide writes ":: rosAFE :: modifyParameter" with spaces.
     if {[info commands ::] eq ""} {
         interp alias {} :: {} ::genomix::Spaced
     }
@@ -27,7 +27,7 @@ proc ::genomix::Spaced {{component ""} {colons ""} {service ""} args} {
     tailcall $command {*}$args
 }
 
-# A service was called: component::service ?switch ...? ?--? ?argument ...? ?& ?callback ...??
+# Call a service: component::service ?switch ...? ?--? ?argument ...? ?& ?callback ...??
 proc ::genomix::Service {client name service args} {
     set about [dict get [$client description $name] services $service]
     lassign [::genomix::Words $args ${name}::$service] switches words background callback
@@ -42,7 +42,7 @@ proc ::genomix::Service {client name service args} {
     tailcall ::genomix::Perform $client [list $name $service] $query $switches $background $callback
 }
 
-# A port was read: component::port ?switch ...? ?--? ?element? ?& ?callback ...??
+# Read a port: component::port ?switch ...? ?--? ?element? ?& ?callback ...??
 proc ::genomix::Port {client name port args} {
     set about [dict get [$client description $name] ports $port]
     lassign [::genomix::Words $args ${name}::$port] switches words background callback
@@ -50,16 +50,16 @@ proc ::genomix::Port {client name port args} {
         return [::genomix::PortHelp $name $port $about]
     }
     if {[llength $words] > 1} {
-        ::genomix::Refuse "${name}::$port takes one element, and not [llength $words] arguments"
+        ::genomix::Refuse "${name}::$port: expected at most one element, got [llength $words] arguments"
     }
     set query [dict create element [lindex $words 0]]
     tailcall ::genomix::Perform $client [list $name $port] $query $switches $background $callback
 }
 
-# Do what the switches say: wait for the result, or return a request.
+# Send a request; wait for its result or return it, depending on the switches.
 proc ::genomix::Perform {client words query switches background callback} {
     if {$::tcl_interactive} {
-        $client poll ;# tclsh serves no events at its prompt
+        $client poll ;# tclsh does not process events at its prompt
         foreach request [dict keys $::genomix::failed] {
             catch {$request overdue}
         }
@@ -77,7 +77,7 @@ proc ::genomix::Perform {client words query switches background callback} {
     return [$client get [list call {*}$words] $query]
 }
 
-# Take the words of a command apart: {switches arguments background callback}.
+# Parse the words of a command; return {switches arguments background callback}.
 proc ::genomix::Words {arguments command} {
     set switches {help 0 send 0 ack 0 oneway 0}
     while {[string match -?* [lindex $arguments 0]] && ![string is double -strict [lindex $arguments 0]]} {
@@ -85,11 +85,11 @@ proc ::genomix::Words {arguments command} {
         if {$word eq "--"} {
             break
         }
-        set known [lsearch -all -inline -glob [dict keys $switches] [string range $word 1 end]*]
-        if {[llength $known] != 1} {
-            ::genomix::Refuse "$command: unknown switch \"$word\"; there are: -help, -send, -ack, -oneway, --"
+        set matching [lsearch -all -inline -glob [dict keys $switches] [string range $word 1 end]*]
+        if {[llength $matching] != 1} {
+            ::genomix::Refuse "$command: expected a switch (-help, -send, -ack, -oneway, --), got \"$word\""
         }
-        dict set switches [lindex $known 0] 1
+        dict set switches [lindex $matching 0] 1
     }
     set at [lsearch -exact $arguments &]
     if {$at < 0} {

@@ -1,18 +1,18 @@
-# The Tcl package genomix: uses components of the ROS graph (rosAFE, bass) through the HTTP server genomixd.
+# The Tcl package genomix: a client of ROS components (rosAFE, bass) through the HTTP server genomixd.
 #
 #   package require genomix
 #   set g [genomix::connect]                  ;# or genomix::connect host:port, or genomix::localhost
 #   $g load rosAFE
 #   rosAFE::GammatoneProc {name left fb_nChannels 32}
 #   puts [rosAFE::getParameters]
-#   puts [rosAFE::request ild {fb_nChannels 16}]      ;# all that the representation needs; docs/request.md
+#   puts [rosAFE::request ild {fb_nChannels 16}]      ;# with all processors that it needs; docs/request.md
 #   set request [rosAFE::getSignals &]; $request wait; puts [$request result]
-#   rosAFE::modifyParameter ... & callback    ;# without a callback, an error that nobody looks at goes to bgerror
-#   rosAFE::GammatoneProc -h                  ;# tells parameters, types, defaults and ranges
+#   rosAFE::modifyParameter ... & callback    ;# without a callback, unread errors are reported to bgerror
+#   rosAFE::GammatoneProc -h                  ;# prints parameters, types, defaults and ranges
 #
-# Errors: the message is a dict `ex ::rosAFE::e_noSuchProcessor ?detail {...}? ?what {...}?`, what being the reason where
-# that is no member of the detail; the error code is {GENOM ex detail}.
-# What comes from the server is data; none of it is ever evaluated.
+# Errors: the message is a dict `ex ::rosAFE::e_noSuchProcessor ?detail {...}? ?what {...}?`, with the reason in `what`,
+# unless the detail contains it. The error code is {GENOM ex detail}.
+# Data from the server is never evaluated.
 
 package require Tcl 8.6
 
@@ -20,11 +20,11 @@ namespace eval ::genomix {
     namespace export connect localhost
 
     variable root [file dirname [file normalize [info script]]]
-    variable clients 0 ;# made so far; handles are genomix1, genomix2, ...
-    variable requests 0 ;# in the background, made so far; their commands are ::genomix::request1, ...
-    variable attention 500 ;# ms in which a script may look at a failed request before its error is told
-    variable failed {} ;# requests in the background of whose errors nobody has been told yet, as keys
-    variable private {} ;# the server that localhost started: {channel port}
+    variable clients 0 ;# number of handles so far: genomix1, genomix2, ...
+    variable requests 0 ;# number of background requests so far: ::genomix::request1, ...
+    variable reportDelay 500 ;# ms in which a script can read the status of a failed request; then its error is reported
+    variable failed {} ;# background requests with unreported errors, as keys
+    variable private {} ;# the server started by localhost: {channel port}
 }
 
 # genomix::connect ?host?:port??
@@ -37,7 +37,7 @@ proc ::genomix::connect {{address ""}} {
         set address $::env(GENOMIXD)
     }
     if {![regexp {^(\[[^]]+\]|[^:]*)(:(\d+))?$} $address -> host - port]} {
-        ::genomix::Refuse "address \"$address\" is not host, host:port or :port"
+        ::genomix::Refuse "address: expected host, host:port or :port, got \"$address\""
     }
     set host [string trim $host {[]}]
     set client [::genomix::Client create ::genomix[incr clients] \
@@ -47,7 +47,7 @@ proc ::genomix::connect {{address ""}} {
 
 # genomix::localhost
 #
-# The same with a server of our own, on a free port, that ends with this process.
+# As connect, with a private server on a free port that ends with this process.
 proc ::genomix::localhost {} {
     variable private
     if {$private eq {} || [eof [lindex $private 0]]} {
@@ -58,7 +58,7 @@ proc ::genomix::localhost {} {
 
 proc ::genomix::StartServer {} {
     variable root
-    # In a checkout beside the package; where catkin installed us, in bin/; else wherever PATH has it.
+    # In a checkout next to the package, in bin/ of a catkin installation, or on PATH.
     set program [lindex [auto_execok genomixd] 0]
     foreach place {../../scripts ../../../bin} {
         set candidate [file normalize [file join $root $place genomixd]]
@@ -75,7 +75,7 @@ proc ::genomix::StartServer {} {
         catch {close $channel}
         ::genomix::Refuse "cannot start $program" ::genom::mwerr
     }
-    # Non-blocking, so that the end of this process does not wait for that of the server.
+    # Non-blocking, so that this process does not wait for the end of the server.
     fconfigure $channel -blocking 0
     return [list $channel $port]
 }
@@ -89,12 +89,12 @@ proc ::genomix::Raise {body} {
     return -code error -level 2 -errorcode [list GENOM [dict get $body ex] $detail] $body
 }
 
-# A text on one line, for a terminal.
+# Return a text as one line, for a terminal.
 proc ::genomix::OneLine {text} {
     return [regsub -all {[[:cntrl:]]+} $text { }]
 }
 
-# Raise the error of something that was not even sent.
+# Raise an error for a request that has not been sent.
 proc ::genomix::Refuse {what {ex ::genom::serialization}} {
     set detail [dict create what $what]
     return -code error -level 2 -errorcode [list GENOM $ex $detail] [dict create ex $ex detail $detail]

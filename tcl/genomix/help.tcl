@@ -1,21 +1,21 @@
-# What -h tells: parameters with type, default, range and text.
+# The output of -h: parameters with type, default, range and description.
 
 proc ::genomix::ServiceHelp {name service about} {
     set lines [list "${name}::$service: [dict get $about doc]"]
     if {[dict get $about composite]} {
         lappend lines "  ${name}::$service [lindex [dict get $about parameters] 0] ?{parameter value ...}?"
     }
-    dict for {parameter told} [dict get $about parameters] {
-        set line "  $parameter ([dict get $told type]"
-        if {[dict get $told required]} {
+    dict for {parameter description} [dict get $about parameters] {
+        set line "  $parameter ([dict get $description type]"
+        if {[dict get $description required]} {
             append line ", no default"
         } else {
-            append line ", default [list [dict get $told default]]"
+            append line ", default [list [dict get $description default]]"
         }
-        if {[dict get $told range] ne ""} {
-            append line ", [dict get $told range]"
+        if {[dict get $description range] ne ""} {
+            append line ", [dict get $description range]"
         }
-        lappend lines "$line): [dict get $told doc]"
+        lappend lines "$line): [dict get $description doc]"
     }
     if {![dict size [dict get $about parameters]]} {
         lappend lines "  no parameters"
@@ -24,7 +24,7 @@ proc ::genomix::ServiceHelp {name service about} {
         lappend lines "  returns $output ($type)"
     }
     if {[dict get $about activity]} {
-        lappend lines "  an activity: returns once it runs, with & at once; goes on until it is stopped"
+        lappend lines "  an activity: returns when it is running, or immediately with &; runs until it is stopped"
     }
     foreach error [dict values [dict get $about throws]] {
         lappend lines "  may fail with $error"
@@ -36,12 +36,12 @@ proc ::genomix::PortHelp {name port about} {
     set element [expr {[dict get $about multiple] ? " element" : ""}]
     set lines [list "${name}::$port$element: [dict get $about doc]" "  returns $port ([dict get $about type])"]
     if {![dict get $about output]} {
-        lset lines 1 "  an input port: connect_port connects it"
+        lset lines 1 "  an input port: connect it with connect_port"
     }
     return [join $lines \n]
 }
 
-# {a b c} as "a, b, c"; "no parameters" for none.
+# Return {a b c} as "a, b, c", and an empty list as "no parameters".
 proc ::genomix::Listed {names} {
     return [expr {[llength $names] ? [join $names ", "] : "no parameters"}]
 }

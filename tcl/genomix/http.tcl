@@ -1,13 +1,13 @@
-# HTTP GET for genomix: one kept connection per client, on which calls wait without serving events. What is at the other
-# end may be no genomixd: nothing is read without a bound, and no size is believed.
+# HTTP GET for genomix: one persistent connection per client; calls wait without processing events. The server may be
+# another program, therefore all sizes are limited.
 
 namespace eval ::genomix::http {
-    variable encoded ;# what each byte becomes in a URL
-    variable longestLine 65536 ;# characters of a header
-    variable longestEvent [expr {1 << 24}] ;# bytes of one
-    variable largest [expr {1 << 30}] ;# bytes of an answer
-    variable piece [expr {1 << 18}] ;# bytes read at a time
-    variable patience 1000 ;# ms, then a person at a terminal is told how far an answer has come
+    variable encoded ;# the encoding of each byte in a URL
+    variable maxLine 65536 ;# characters of a header
+    variable maxEvent [expr {1 << 24}] ;# bytes of an event
+    variable maxAnswer [expr {1 << 30}] ;# bytes of an answer
+    variable readSize [expr {1 << 18}] ;# bytes per read
+    variable progressDelay 1000 ;# ms until the progress of an answer is shown on a terminal
 }
 
 apply {{} {
@@ -19,7 +19,7 @@ apply {{} {
     }
 } ::genomix::http}
 
-# A text as part of a URL.
+# Encode a text as a part of a URL.
 proc ::genomix::http::encode {text} {
     variable encoded
     set out ""
@@ -29,7 +29,7 @@ proc ::genomix::http::encode {text} {
     return $out
 }
 
-# The path and query of a URL; words are the parts of the path, query is a dict.
+# Return path and query of a URL; words are the parts of the path, query is a dict.
 proc ::genomix::http::url {words query} {
     set path ""
     foreach word $words {
@@ -42,7 +42,7 @@ proc ::genomix::http::url {words query} {
     return $path?[join $pairs &]
 }
 
-# A new connection.
+# Open a connection.
 proc ::genomix::http::open {host port} {
     if {[catch {socket $host $port} channel]} {
         ::genomix::Refuse "no genomixd at $host:$port ($channel)" ::genom::mwerr
@@ -51,7 +51,7 @@ proc ::genomix::http::open {host port} {
     return $channel
 }
 
-# Whether a kept connection can be used again: the server has neither closed it nor said anything unasked.
+# Return whether a connection can be used again: the server has neither closed it nor sent unexpected data.
 proc ::genomix::http::alive {channel} {
     fconfigure $channel -blocking 0
     set alive [expr {![catch {read $channel 1} text] && $text eq "" && ![eof $channel]}]
@@ -65,12 +65,12 @@ proc ::genomix::http::send {channel host port url {version 1.1}} {
     flush $channel
 }
 
-# The next line, without its end.
+# Read the next line without its end.
 proc ::genomix::http::line {channel} {
-    variable longestLine
+    variable maxLine
     set line ""
     while 1 {
-        # What has come of it, and then the next character, so that one without an end is noticed.
+        # Read the available part of the line, then one character, so that an endless line is detected.
         fconfigure $channel -blocking 0
         set whole [expr {[gets $channel rest] >= 0}]
         set length [expr {[string length $line] + [chan pending input $channel]}]
@@ -78,27 +78,27 @@ proc ::genomix::http::line {channel} {
         if {$whole} {
             return [string trimright $line$rest \r]
         }
-        if {$length > $longestLine} {
-            error "a line without an end"
+        if {$length > $maxLine} {
+            error "expected a line of at most $maxLine characters, got a longer one"
         }
         set next [read $channel 1]
         switch -- $next {
-            "" {error "the connection ended before an answer came"}
+            "" {error "the connection was closed before the answer"}
             "\n" {return [string trimright $line \r]}
         }
         append line $next
     }
 }
 
-# The status code and the headers (names in lower case) of the answer that comes.
+# Read the status code and the headers (names in lower case) of an answer.
 proc ::genomix::http::head {channel} {
     if {![regexp {^HTTP/1\.[01] (\d{3})} [line $channel] -> status]} {
-        error "no answer of a genomixd"
+        error "expected an HTTP answer of genomixd, got other data"
     }
     set headers {}
     for {set count 0} {[set line [line $channel]] ne ""} {incr count} {
         if {$count == 100} {
-            error "headers without an end"
+            error "expected at most 100 headers, got more"
         }
         if {[regexp {^([^:]+):\s*(.*)$} $line -> name value]} {
             dict set headers [string tolower $name] $value
@@ -107,13 +107,13 @@ proc ::genomix::http::head {channel} {
     return [list $status $headers]
 }
 
-# The text that follows a head. A person at a terminal is told how far it has come, of `what`, if it takes long.
+# Read the body of an answer. If it takes long, show the progress of `what` on a terminal.
 proc ::genomix::http::body {channel headers what} {
-    variable largest
-    variable piece
-    set begun [clock milliseconds]
-    lassign {0 0 0} told last taken
-    set body [binary format {}] ;# bytes, to which bytes are appended without a look at all that is there
+    variable maxAnswer
+    variable readSize
+    set started [clock milliseconds]
+    lassign {0 0 0} shown last received
+    set body [binary format {}] ;# a byte array, to which bytes are appended without conversion
     try {
         while {!$last} {
             if {[dict exists $headers content-length]} {
@@ -123,38 +123,39 @@ proc ::genomix::http::body {channel headers what} {
                 scan $size %x size
                 set last [expr {$size == 0}]
             }
-            if {!$known || $size > $largest - $taken} {
-                error "an answer of no size that there is"
+            if {!$known || $size > $maxAnswer - $received} {
+                error "expected a size of at most $maxAnswer bytes, got another one"
             }
             while {$size > 0} {
-                set part [read $channel [expr {min($size, $piece)}]]
+                set part [read $channel [expr {min($size, $readSize)}]]
                 if {$part eq ""} {
-                    error "the connection ended within an answer"
+                    error "the connection was closed within the answer"
                 }
                 append body $part
-                incr taken [string length $part]
+                incr received [string length $part]
                 incr size -[string length $part]
-                set told [tell $what $begun $told $taken]
+                set shown [showProgress $what $started $shown $received]
             }
             if {![dict exists $headers content-length]} {
                 line $channel
             }
         }
     } finally {
-        if {$told} {
+        if {$shown} {
             puts -nonewline stderr "\r\033\[K"
         }
     }
     return [encoding convertfrom utf-8 $body]
 }
 
-# Tell how much has come on a line of its own; when that was done the last time.
-proc ::genomix::http::tell {what begun told bytes} {
-    variable patience
+# Show the received amount in one line; return the time when it was last shown.
+proc ::genomix::http::showProgress {what started shown bytes} {
+    variable progressDelay
     set now [clock milliseconds]
-    if {$now - $begun < $patience || $now - $told < 200 || [catch {fconfigure stderr -mode}]} {
-        return $told ;# it is early, or nobody looks: only terminals have a mode
+    if {$now - $started < $progressDelay || $now - $shown < 200 || [catch {fconfigure stderr -mode}]} {
+        return $shown ;# too early, or stderr is not a terminal, which has a mode
     }
-    puts -nonewline stderr [format "\r%s: %.1f MB in %.0f s" $what [expr {$bytes / 1e6}] [expr {($now - $begun) / 1e3}]]
+    set seconds [expr {($now - $started) / 1e3}]
+    puts -nonewline stderr [format "\r%s: %.1f MB in %.0f s" $what [expr {$bytes / 1e6}] $seconds]
     return $now
 }

@@ -1,17 +1,17 @@
-# Requests in the background: commands that tell what has become of a request, and of its result.
+# Background requests: commands that return the status and the result of a request.
 
 oo::class create ::genomix::Request {
-    # Client: the handle it went through.   Command: what was called.   Id: the server's name for it.
-    # Status: sent, done or error.   Output: the result, once it is here.   Exception: the error, as a dict.
-    # Callback: a command prefix, or empty.   Changed: written at the end and when patience ends; `wait` waits for that.
-    # Seen: whether somebody has asked for the status since the end.   Timer: what will tell of an error, or empty.
-    # Warning: of the component, or empty.   Made: when it was made, in ms.
-    variable Client Command Id Status Output Exception Callback Changed Seen Timer Warning Made
+    # Client: the handle.   Command: the command that was called.   Id: the id given by the server.
+    # Status: sent, done or error.   Output: the result, when it has been received.   Exception: the error, as a dict.
+    # Callback: a command prefix, or empty.   Changed: written at the end and after a timeout; `wait` waits for it.
+    # Seen: whether the status has been read since the end.   Timer: the timer that reports an error, or empty.
+    # Warning: of the component, or empty.   Created: time of creation, ms.
+    variable Client Command Id Status Output Exception Callback Changed Seen Timer Warning Created
 
     constructor {client command callback} {
         lassign [list $client $command $callback] Client Command Callback
         lassign {{} sent {} {} 0 0 {} {}} Id Status Output Exception Changed Seen Timer Warning
-        set Made [clock milliseconds]
+        set Created [clock milliseconds]
     }
 
     destructor {
@@ -21,14 +21,14 @@ oo::class create ::genomix::Request {
 
     # id
     #
-    # The request's id, such as rosAFE::3.
+    # Return the id of the request, for example rosAFE::3.
     method id {} {
         return $Id
     }
 
     # status
     #
-    # sent until the request ends, then done or error.
+    # Return sent until the request ends, then done or error.
     method status {} {
         if {$Status eq "sent"} {
             $Client poll
@@ -39,10 +39,10 @@ oo::class create ::genomix::Request {
 
     # result
     #
-    # The result, a dict. Raises the request's error where it failed, and ::genomix::e_notDone before its end.
+    # Return the result, a dict. Raise the error of a failed request, and ::genomix::e_notDone before its end.
     method result {} {
         switch -- [my status] {
-            sent {::genomix::Refuse "$Id is not done yet" ::genomix::e_notDone}
+            sent {::genomix::Refuse "$Id is not finished yet" ::genomix::e_notDone}
             error {::genomix::Raise $Exception}
         }
         if {$Output eq "large"} {
@@ -53,7 +53,7 @@ oo::class create ::genomix::Request {
 
     # warning
     #
-    # What the component has to say of a request that it grants all the same: a word that it does not know, say.
+    # Return the component's warning about an accepted request, for example about an unknown choice; empty for none.
     method warning {} {
         if {$Status eq "sent"} {
             $Client poll
@@ -63,16 +63,16 @@ oo::class create ::genomix::Request {
 
     # wait ?ms?
     #
-    # Serve events until the request ends, or for so many milliseconds, and return its status.
+    # Process events until the request ends, or for at most `ms` milliseconds, and return its status.
     method wait {{ms ""}} {
         if {$ms ne "" && (![string is entier -strict $ms] || $ms < 0)} {
-            ::genomix::Refuse "wait: \"$ms\" is not a number of milliseconds"
+            ::genomix::Refuse "wait: expected a number of milliseconds, got \"$ms\""
         }
         set timer ""
         if {$ms ne ""} {
-            set timer [after $ms [list set [namespace current]::Changed late]]
+            set timer [after $ms [list set [namespace current]::Changed timeout]]
         }
-        while {[my status] eq "sent" && $Changed ne "late"} {
+        while {[my status] eq "sent" && $Changed ne "timeout"} {
             vwait [namespace current]::Changed
         }
         after cancel $timer
@@ -82,7 +82,7 @@ oo::class create ::genomix::Request {
 
     # abort
     #
-    # Ask the component to end the activity; the request is done when it has.
+    # Ask the component to end the activity. The request is done when the activity has ended.
     method abort {} {
         $Client get {request abort} [dict create id $Id]
         return
@@ -90,60 +90,61 @@ oo::class create ::genomix::Request {
 
     # clean
     #
-    # Forget the request; what it started goes on.
+    # Forget the request. The activity that it has started continues.
     method clean {} {
         $Client forget $Id
         catch {$Client get {request clean} [dict create id $Id]}
         my destroy
     }
 
-    # --- for the client ---
+    # --- used by the client ---
 
-    # Take what the server says. An error that nobody looks at, nor any callback, is told; 1 where that may happen.
-    method update {told {aloud 1}} {
-        if {[dict exists $told id]} {
-            set Id [dict get $told id]
+    # Process a status of the server. Return 1 if the error of a request without a callback will be reported, unless the
+    # status is read.
+    method update {new {report 1}} {
+        if {[dict exists $new id]} {
+            set Id [dict get $new id]
         }
-        if {$Warning eq "" && [dict exists $told warning]} {
-            set Warning [dict get $told warning]
+        if {$Warning eq "" && [dict exists $new warning]} {
+            set Warning [dict get $new warning]
             if {$::tcl_interactive} {
                 puts stderr "$Command &: warning: [::genomix::OneLine $Warning]"
             }
         }
-        if {$Status ne "sent" || [dict get $told status] eq "sent"} {
+        if {$Status ne "sent" || [dict get $new status] eq "sent"} {
             return 0
         }
-        set Status [dict get $told status]
+        set Status [dict get $new status]
         if {$Status eq "error"} {
-            set Exception [dict get $told exception]
-        } elseif {[dict exists $told output]} {
-            set Output [list here [dict get $told output]]
+            set Exception [dict get $new exception]
+        } elseif {[dict exists $new output]} {
+            set Output [list here [dict get $new output]]
         } else {
             set Output large
         }
         $Client forget $Id
         set Changed 1
         if {$Callback ne ""} {
-            # As an event of its own: an error in it is the callback's, and goes to bgerror.
+            # In a separate event: an error in the callback is reported to bgerror.
             after 0 [list {*}$Callback [self]]
-        } elseif {$aloud && $Status eq "error"} {
-            set Timer [after $::genomix::attention [namespace code {my Complain}]]
+        } elseif {$report && $Status eq "error"} {
+            set Timer [after $::genomix::reportDelay [namespace code {my ReportError}]]
             dict set ::genomix::failed [self] 1
             return 1
         }
         return 0
     }
 
-    # Tell of the error now, where nobody serves events: at the prompt of tclsh.
+    # Report the error immediately: the prompt of tclsh does not process events.
     method overdue {} {
-        if {[clock milliseconds] - $Made >= $::genomix::attention} {
+        if {[clock milliseconds] - $Created >= $::genomix::reportDelay} {
             after cancel $Timer
-            my Complain
+            my ReportError
         }
     }
 
-    # As Tcl tells of errors in the background, in one line.
-    method Complain {} {
+    # Report the error in one line, as a background error of Tcl.
+    method ReportError {} {
         dict unset ::genomix::failed [self]
         if {$Seen} {
             return

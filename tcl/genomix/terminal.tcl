@@ -1,9 +1,9 @@
-# What an interactive shell needs: what a command takes, and the values that a user types for a call without arguments.
+# Support for interactive shells: the arguments of commands, and questions for the parameters of a call.
 
 # genomix::about command
 #
-# {service parameters switches values} or {port {} switches {}} for a command of a component, empty for any other; of a
-# composite, values are what its first word can be, after which comes the dict of parameters.
+# Return {service parameters switches values} or {port {} switches {}} for a command of a component, and an empty string
+# for others. The first word of a composite is one of the values; a dict of parameters follows it.
 proc ::genomix::about {command} {
     set name [namespace eval :: [list namespace which -command $command]]
     if {$name eq "" || [catch {interp alias {} $name} alias]} {
@@ -28,8 +28,8 @@ proc ::genomix::about {command} {
     return
 }
 
-# Whether the user shall be asked for the arguments of a call: eltclsh says whether it was typed there, and a `--` says
-# that there are none.
+# Return whether to ask the user for the arguments of a call: if it was typed at the prompt of eltclsh, has no arguments
+# and no `--`.
 proc ::genomix::Asks {arguments words parameters} {
     return [expr {
         ![llength $words] && [dict size $parameters] && "--" ni $arguments
@@ -37,8 +37,8 @@ proc ::genomix::Asks {arguments words parameters} {
     }]
 }
 
-# A dict of what the user types for each parameter, of a composite only for those without a default; nothing typed means
-# the default.
+# Ask the user for each parameter, of a composite only for those without a default, and return a dict. An empty answer
+# selects the default.
 proc ::genomix::Ask {service} {
     set given {}
     dict for {name about} [dict get $service parameters] {

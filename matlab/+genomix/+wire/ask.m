@@ -1,5 +1,5 @@
 function answers = ask(about)
-%ASK  The arguments of a service, or the element of a port, that a person at the prompt gives; Return takes the default.
+%ASK  Ask the user for the arguments of a service or the element of a port; Return selects the default.
 
 answers = {};
 if isfield(about, 'multiple')
@@ -8,25 +8,25 @@ if isfield(about, 'multiple')
     end
     return
 end
-given = struct();
+args = struct();
 names = fieldnames(about.parameters);
 for k = 1:numel(names)
     parameter = about.parameters.(names{k});
     default = '';
     if ~parameter.required
-        default = [' (' genomix.wire.shown(parameter.default) ')'];
+        default = [' (' genomix.wire.value_text(parameter.default) ')'];
     end
     answer = unquoted(input(sprintf('%s %s: %s%s > ', parameter.type, names{k}, parameter.doc, default), 's'));
     if ~isempty(answer)
-        given.(names{k}) = answer; % genomixd reads numbers in texts
+        args.(names{k}) = answer; % genomixd accepts numbers as texts
     end
 end
 if ~isempty(names)
-    answers = {given};
+    answers = {args};
 end
 end
 
 function text = unquoted(text)
-% People type texts as in a script, with their quotes: one pair is not part of them.
+% Remove one pair of quotes, because users type texts as in a script.
 text = regexprep(strtrim(text), '^([''"])(.*)\1$', '$2');
 end

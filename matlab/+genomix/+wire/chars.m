@@ -1,5 +1,5 @@
 function value = chars(value)
-%CHARS  A text of MATLAB's class string as one of class char; anything else as it is.
+%CHARS  Convert a text of class string to class char; return other values unchanged.
 
 if isa(value, 'string') && isscalar(value)
     value = char(value);

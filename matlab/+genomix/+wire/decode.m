@@ -1,31 +1,31 @@
 function [value, failed] = decode(bytes, matrices, columns)
-%DECODE  The value of a packed answer of genomixd (docs/genomixd.md), a row of uint8.
+%DECODE  Decode a packed answer of genomixd (docs/genomixd.md), a row of uint8.
 %
-%   A structure becomes a struct. A sequence becomes a 1-by-N cell array, also one of numbers, and N-by-1 where COLUMNS
-%   is true. Where MATRICES is true, a sequence of numbers becomes an N-by-1 matrix, and a signal a matrix: frames,
-%   frames by channels, or frames by channels by lags. FAILED is true for an exception.
+%   A structure is converted to a struct, a sequence to a 1-by-N cell array, or N-by-1 if COLUMNS is true. If MATRICES
+%   is true, a sequence of numbers is converted to an N-by-1 matrix, and a signal to a matrix: frames, frames by
+%   channels, or frames by channels by lags. FAILED is true for an exception.
 %
-%   Bytes that are no such answer raise the error genomix:connection. No size is believed that is not there.
+%   Other bytes raise the error genomix:connection. Sizes are checked before memory is allocated.
 
 form = struct('matrices', matrices, 'columns', nargin > 2 && columns);
 try
     failed = bytes(1) == uint8('!');
     [value, at] = item(bytes, 1 + failed, form, 0);
     if at <= numel(bytes)
-        refuse('something follows its end');
+        fail('data after the end');
     end
     if failed && ~(isstruct(value) && isfield(value, 'ex') && ischar(value.ex))
-        refuse('an exception without a name');
+        fail('expected an exception with a name');
     end
 catch problem
-    error('genomix:connection', 'an answer that this version of +genomix cannot read (%s)', problem.message);
+    error('genomix:connection', 'expected an answer in the format of this version of +genomix (%s)', problem.message);
 end
 end
 
 function [value, at] = item(bytes, at, form, depth)
-% The value that begins there, and where the next one does. Reading past the end is an error of the index.
-DEEPEST = 50;
-MANY = 2e4;
+% Return the value at an index, and the index of the next one. Reading past the end raises an index error.
+MAX_DEPTH = 50;
+MAX_ELEMENTS = 2e4;
 END = uint8('.');
 kind = char(bytes(at));
 at = at + 1;
@@ -46,10 +46,10 @@ switch kind
         n = 0;
         while bytes(at) ~= END
             n = n + 1;
-            if n > MANY || depth > DEEPEST
-                refuse('too many elements');
+            if n > MAX_ELEMENTS || depth > MAX_DEPTH
+                fail('too many elements');
             elseif n > numel(value)
-                value{2 * n} = []; % room for as many again
+                value{2 * n} = []; % doubles the capacity
             end
             [value{n}, at] = item(bytes, at, form, depth + 1);
         end
@@ -60,8 +60,8 @@ switch kind
         n = 0;
         while bytes(at) ~= END
             n = n + 1;
-            if n > MANY || depth > DEEPEST || bytes(at) ~= uint8('s')
-                refuse('no structure');
+            if n > MAX_ELEMENTS || depth > MAX_DEPTH || bytes(at) ~= uint8('s')
+                fail('expected a structure');
             end
             [name, at] = text(bytes, at + 1);
             if ~isvarname(name)
@@ -73,27 +73,27 @@ switch kind
     case 'S'
         [value, at] = signal(bytes, at, form);
     otherwise
-        refuse(sprintf('kind %d', kind));
+        fail(sprintf('kind %d', kind));
 end
 end
 
 function [value, at] = signal(bytes, at, form)
-LARGEST = 1e6; % of what is empty, and so takes no bytes
+MAX_SIZE = 1e6; % of a dimension of an empty signal
 [levels, at] = count(bytes, at);
 if levels < 1 || levels > 8
-    refuse('a signal of too many levels');
+    fail('expected a signal of 1 to 8 levels');
 end
 names = cell(1, levels);
-sizes = ones(1, max(levels, 2)); % the innermost first, as MATLAB counts dimensions
+sizes = ones(1, max(levels, 2)); % the innermost level is the first dimension
 for k = levels:-1:1
     [names{k}, at] = text(bytes, at);
     if ~isvarname(names{k})
-        refuse('a level without a name');
+        fail('expected a level with a name');
     end
     [sizes(k), at] = count(bytes, at);
 end
-if ~all(sizes) && any(sizes > LARGEST)
-    refuse('too large for something empty');
+if ~all(sizes) && any(sizes > MAX_SIZE)
+    fail('an empty signal is too large');
 end
 [value, at] = numbers(bytes, at, prod(sizes));
 value = reshape(value, sizes);
@@ -103,11 +103,11 @@ end
 end
 
 function value = levels_of(block, names, level, form)
-% The structs and cells of one level: dataN of data, for instance.
+% Return the structs and cells of one level, for example dataN of data.
 if level == 1
     parts = num2cell(block(:));
 elseif isempty(block)
-    % All parts are alike; they share one.
+    % All parts are equal and share one value.
     rest = [size(block) ones(1, level)];
     parts = repmat({levels_of(zeros([rest(1:level - 1) 1]), names, level - 1, form)}, size(block, level), 1);
 else
@@ -121,7 +121,7 @@ value = struct(names{level}, {cells(parts, form)});
 end
 
 function value = cells(value, form)
-% A sequence: a row, as in the original, or a column, as in its first version.
+% Return a sequence as a row, as in the original, or as a column, as in its first version.
 if form.columns
     value = reshape(value, [], 1);
 else
@@ -131,7 +131,7 @@ end
 
 function [value, at] = numbers(bytes, at, n)
 if 8 * n > numel(bytes)
-    refuse('too many numbers');
+    fail('too many numbers');
 end
 value = reshape(typecast(bytes(at:at + 8 * n - 1), 'double'), n, 1);
 at = at + 8 * n;
@@ -140,7 +140,7 @@ end
 function [value, at] = text(bytes, at)
 [n, at] = count(bytes, at);
 if n > numel(bytes)
-    refuse('too long a text');
+    fail('a text is too long');
 end
 raw = bytes(at:at + n - 1);
 value = char(raw);
@@ -155,6 +155,6 @@ value = double(typecast(bytes(at:at + 3), 'uint32'));
 at = at + 4;
 end
 
-function refuse(why)
-error('genomix:connection', '%s', why);
+function fail(reason)
+error('genomix:connection', '%s', reason);
 end

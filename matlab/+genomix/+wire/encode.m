@@ -1,8 +1,8 @@
 function text = encode(value)
-%ENCODE  An argument of a request as JSON.
+%ENCODE  Encode an argument of a request as JSON.
 %
-%   Numbers, logicals, texts, cell arrays and matrices (as sequences), and structs (as objects). Anything else raises
-%   the error genomix:argument.
+%   Supported are numbers, logicals, texts, cell arrays and matrices (as sequences), and structs (as objects). Other
+%   values raise the error genomix:argument.
 
 value = genomix.wire.chars(value);
 if ischar(value) && (isrow(value) || isempty(value))
@@ -24,7 +24,7 @@ elseif (isnumeric(value) || islogical(value)) && isreal(value)
         text = ['[' text ']'];
     end
 else
-    error('genomix:argument', 'an argument of class %s (%s) cannot be sent', class(value), ...
+    error('genomix:argument', 'expected a number, text, cell array, matrix or struct, got %s (%s)', class(value), ...
         strjoin(arrayfun(@int2str, size(value), 'UniformOutput', false), 'x'));
 end
 end
@@ -41,7 +41,7 @@ end
 end
 
 function text = quoted(value)
-genomix.wire.utf8(value); % raises an error where it is none
+genomix.wire.utf8(value); % raises an error if it is not valid
 value = strrep(strrep(value, '\', '\\'), '"', '\"');
 if any(value < ' ')
     for code = 0:31

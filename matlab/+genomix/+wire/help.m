@@ -1,5 +1,5 @@
 function text = help(component, name, about)
-%HELP  What there is to know about a service or port, for people.
+%HELP  Return the description of a service or port as text.
 
 lines = {sprintf('%s.%s: %s', component, name, about.doc)};
 if isfield(about, 'multiple')
@@ -14,7 +14,7 @@ for k = 1:numel(names)
     parameter = about.parameters.(names{k});
     line = sprintf('  %s %s: %s', parameter.type, names{k}, parameter.doc);
     if ~parameter.required
-        line = [line ' (' genomix.wire.shown(parameter.default) ')']; %#ok<AGROW>
+        line = [line ' (' genomix.wire.value_text(parameter.default) ')']; %#ok<AGROW>
     end
     if ~isempty(parameter.range)
         line = [line ', ' parameter.range]; %#ok<AGROW>

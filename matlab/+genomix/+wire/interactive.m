@@ -1,5 +1,5 @@
 function yes = interactive()
-%INTERACTIVE  Whether a person at the prompt called: no script or function did, and the input is a terminal.
+%INTERACTIVE  Return whether the call was typed at the prompt: not in a script or function, and on a terminal.
 
 here = fileparts(fileparts(mfilename('fullpath')));
 callers = dbstack('-completenames');
@@ -8,7 +8,7 @@ if ~yes
     return
 end
 if exist('OCTAVE_VERSION', 'builtin')
-    % Octave has no isatty; the shell inherits our input.
+    % Octave has no isatty; the shell inherits the standard input.
     yes = isguirunning() || system('[ -t 0 ]') == 0;
 else
     yes = usejava('desktop');

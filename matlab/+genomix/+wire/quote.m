@@ -1,5 +1,5 @@
 function text = quote(text)
-%QUOTE  A text as a part of a URL: what is no letter, digit or one of -_.~ becomes a percent sign and two hex digits.
+%QUOTE  Encode a text for a URL: bytes except letters, digits and -_.~ become a percent sign and two hex digits.
 
 bytes = genomix.wire.utf8(text);
 plain = (bytes >= 'a' & bytes <= 'z') | (bytes >= 'A' & bytes <= 'Z') | (bytes >= '0' & bytes <= '9') | ...

@@ -1,13 +1,13 @@
 function bytes = utf8(text)
-%UTF8  A text as bytes. What is no text in Unicode, such as half a pair of surrogates, raises genomix:argument.
+%UTF8  Encode a text. Invalid Unicode, for example an unpaired surrogate, raises the error genomix:argument.
 
 try
     bytes = unicode2native(text, 'UTF-8');
-    whole = isequal(native2unicode(bytes, 'UTF-8'), text) || isempty(text);
+    valid = isequal(native2unicode(bytes, 'UTF-8'), text) || isempty(text);
 catch
-    whole = false;
+    valid = false;
 end
-if ~whole
-    error('genomix:argument', 'a text with bytes that are no UTF-8 cannot be sent');
+if ~valid
+    error('genomix:argument', 'expected a text in valid Unicode');
 end
 end

@@ -1,0 +1,97 @@
+"""Processor time of the node for blocks of 220 to 12000 frames, with one worker and two.
+
+``/usr/bin/python3 benchmarks/blocks.py`` starts real nodes on a private master for each row. bass plays the device
+``scene:`` at 44.1 kHz in chunks of the length of a block, at most 2205 frames, with 20 chunks on its port. rosAFE
+computes the default tree of seven processors. The figures are averages over 12 s, which begin 2 s after the start.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+
+import graph
+from report import Report, arguments
+
+BLOCKS = (12000, 2205, 882, 441, 220)
+CHUNK = 2205  # maximum frames per chunk
+START_SECONDS = 2.0
+TICKS = os.sysconf("SC_CLK_TCK")
+
+
+def processor_seconds(pid: int) -> float:
+    """Return the processor time of a process so far, in user and system mode."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / TICKS
+
+
+def load(bench: graph.Bench, seconds: float) -> list[float]:
+    """Return the load of rosAFE and bass in per cent of a core, and the resident memory of rosAFE in MB."""
+    time.sleep(START_SECONDS)
+    pids = [bench.pid("/rosAFE"), bench.pid("/bass")]
+    begin, before = time.monotonic(), [processor_seconds(pid) for pid in pids]
+    time.sleep(seconds)
+    elapsed = time.monotonic() - begin
+    loads = [100 * (processor_seconds(pid) - old) / elapsed for pid, old in zip(pids, before, strict=True)]
+    return [*loads, graph.resident(pids[0])]
+
+
+def measure(block: int, workers: int | None, seconds: float, topics: Sequence[str] = ()) -> list[float]:
+    """Return the figures of `load` for the default tree with blocks of `block` frames."""
+    os.environ.pop("ROSAFE_WORKERS", None)
+    if workers is not None:
+        os.environ["ROSAFE_WORKERS"] = str(workers)
+    with graph.bench() as bench:
+        bench.build(block, 1.0, min(block, CHUNK))
+        subscriber = bench.subscribe(topics) if topics else None
+        figures = load(bench, seconds)
+        if subscriber is not None:
+            subscriber.close()
+        health = bench.health()
+    if health != "no frames lost":
+        raise RuntimeError(f"blocks of {block}: {health}")
+    return figures
+
+
+def idle(seconds: float) -> tuple[float, float]:
+    """Return the load of rosAFE in per cent of a core without sound, and with sound but without processors."""
+    with graph.bench() as bench:
+        silent = load(bench, seconds)[0]
+        bench.start_sound(CHUNK)
+        return silent, load(bench, seconds)[0]
+
+
+def main() -> int:
+    """Measure, print, write."""
+    parser = arguments("Processor time of the node for blocks of different lengths.")
+    parser.add_argument("--seconds", type=float, default=12.0, help="duration of a measurement (default %(default)s)")
+    parser.add_argument("--blocks", type=int, nargs="+", default=BLOCKS, help="frames per block (default %(default)s)")
+    options = parser.parse_args()
+    if options.seconds <= 0 or min(options.blocks) < 1:
+        parser.error("--seconds: above 0; --blocks: at least 1")
+    page = Report(options, "Blocks")
+    found: list[list[str]] = []
+    reference: list[float] = []
+    for block in options.blocks:
+        default = graph.in_child(measure, block, None, options.seconds)
+        subscribed = graph.in_child(measure, block, None, options.seconds, [graph.topic("ild")])
+        single = graph.in_child(measure, block, 1, options.seconds)
+        reference = reference or [default[0], subscribed[0]]
+        ratios = [default[0] / reference[0], subscribed[0] / reference[1]]
+        figures = [default[0], ratios[0], subscribed[0], ratios[1], single[0], default[1]]
+        found.append([str(block), *(f"{figure:.1f}" for figure in figures), f"{default[2]:.0f}"])
+    base = f"over {options.blocks[0]}"
+    head = ["frames per block", "rosAFE, %", base, "ILD subscribed, %", base, "1 worker, %", "bass, %", "rosAFE, MB"]
+    page.table(head, found)
+    silent, connected = graph.in_child(idle, options.seconds)
+    page.say()
+    page.say(f"rosAFE without sound: {silent:.1f} % of a core; with sound, without processors: {connected:.1f} %.")
+    page.write("blocks.md")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
